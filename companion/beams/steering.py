@@ -1,0 +1,39 @@
+"""Directions and steering vectors.
+
+Angles of a unit direction u in the array frame: azimuth = atan2(u_y, u_x), to the right;
+elevation = asin(-u_z), up. The steering vector of direction u is
+
+    a(u)_m = exp(+j 2 pi / wavelength  p_m . u)
+
+with p_m the position of element m. (MATH: array, steering, weights; for a line along y this is
+the published exp(j 2 pi / wavelength d m sin theta).)
+"""
+
+import math
+
+import numpy as np
+
+from companion.beams.arrays import Array
+from companion.values import ComplexArray, FloatArray
+
+
+def angles_rad(directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Azimuth and elevation of unit directions in the array frame, (N, 3)."""
+    azimuth = np.arctan2(directions[:, 1], directions[:, 0])
+    return azimuth, np.arcsin(np.clip(-directions[:, 2], -1.0, 1.0))
+
+
+def steering_matrix(array: Array, directions: FloatArray) -> ComplexArray:
+    """A, shape (M, N): one steering vector a column, for unit directions (N, 3)."""
+    phase = (2 * np.pi / array.wavelength_m) * (array.elements_m @ directions.T)
+    matrix: ComplexArray = np.exp(1j * phase)
+    return matrix
+
+
+def pointing_bound_rad(bound_m: float, range_m: float) -> float | None:
+    """How far off the true direction can lie, for a position error of at most ``bound_m``.
+
+    The angle of the tangent to the ball of the error, asin(bound / range) with the range to the
+    *predicted* position; None where the array lies inside the ball and every direction is possible.
+    """
+    return math.asin(bound_m / range_m) if bound_m < range_m else None

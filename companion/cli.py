@@ -1,0 +1,288 @@
+"""The command ``companion``: commands to calls."""
+
+import os
+
+# Before numpy is loaded: the matrices are small, and more BLAS threads make them slower.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+import companion
+from companion.console import OneLineErrors, Progress
+
+CONFIG = click.option("--config", type=click.Path(path_type=Path), help="Settings: a TOML file.")
+CENTER = click.option(
+    "--center",
+    metavar="SRC",
+    help="What carries the array: SYSID:COMPID, LAT,LON,ALT[,HEADING] or home.",
+)
+JSON = click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
+
+
+@click.group(name="companion", cls=OneLineErrors)
+@click.version_option(companion.__version__)
+def main() -> None:
+    """Predicts where UAVs are from MAVLink, and computes the beams that follow them.
+
+    Example: companion demo
+    """
+
+
+@main.command()
+@CONFIG
+@click.option(
+    "--link", "links", metavar="URL", multiple=True, help="udpin:HOST:PORT, tcp:HOST:PORT"
+)
+@CENTER
+@click.option("--listen", metavar="HOST:PORT", help="Where HTTP is served [127.0.0.1:8080].")
+@click.option("--record", metavar="DIR", help="Write recordings to this directory.")
+@click.option("--insecure", is_flag=True, help="Serve beyond this machine without a token.")
+def run(
+    config: Path | None,
+    links: tuple[str, ...],
+    center: str | None,
+    listen: str | None,
+    record: str | None,
+    insecure: bool,
+) -> None:
+    """The live service. COMPANION_TOKEN in the environment sets a bearer token for HTTP.
+
+    Example: companion run --link udpin:0.0.0.0:14550 --center 5:1 --record recordings
+    """
+    from companion import live
+    from companion.config import load
+
+    with _user_errors():
+        settings = load(config).override(
+            center={"source": center},
+            links={"urls": list(links) or None},
+            server={"listen": listen},
+            recording={"directory": record},
+        )
+        live.run(settings, token=os.environ.get("COMPANION_TOKEN"), insecure=insecure)
+
+
+@main.command()
+@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after so long.")
+@click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True)
+@click.option("--open", "open_page", is_flag=True, help="Open the page in a browser.")
+def demo(seconds: float | None, port: int, open_page: bool) -> None:
+    """Everything on this machine: four UAVs, the service, the page; recorded to recordings/.
+
+    Example: companion demo --seconds 60
+    """
+    from companion import demo as scenario
+    from companion import live
+
+    with _user_errors():
+        settings = scenario.settings("recordings").override(server={"listen": f"127.0.0.1:{port}"})
+        live.run(settings, traffic=scenario.traffic, seconds=seconds, open_page=open_page)
+
+
+@main.command()
+@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@CONFIG
+@CENTER
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help="The recording to write [recordings/, named after the log].",
+)
+@click.option("--no-record", is_flag=True, help="Write no recording.")
+@click.option("--speed", metavar="max|X", default="max", show_default=True, help="Pace.")
+@JSON
+def replay(
+    logs: tuple[Path, ...],
+    config: Path | None,
+    center: str | None,
+    out: Path | None,
+    no_record: bool,
+    speed: str,
+    as_json: bool,
+) -> None:
+    """Logs (.tlog, raw MAVLink, our own .mcap) through the same pipeline as the live service.
+
+    Without --center (or settings) the array stands where the first report was made. A recording
+    of our own is replayed with the settings that it holds.
+
+    Example: companion replay flight.tlog --center 5:1 --json
+    """
+    from companion import replay as replaying
+
+    progress = Progress()
+    with _user_errors():
+        settings = replaying.settings_for(logs, config, center)
+        if settings.center.source is None:
+            click.echo("no --center: the array stands where the first report was made", err=True)
+        writer = None if no_record else replaying.writer_for(logs, settings, out)
+        summary = replaying.replay(
+            logs,
+            settings,
+            writer,
+            _speed(speed),
+            lambda frames, seconds: progress.show(f"{frames} frames, {seconds:.0f} s of log"),
+        )
+    progress.clear()
+    click.echo(json.dumps(summary) if as_json else _replay_text(summary))
+
+
+def _speed(text: str) -> float | None:
+    if text == "max":
+        return None
+    try:
+        factor = float(text)
+    except ValueError:
+        factor = 0.0
+    if not 0 < factor < float("inf"):
+        raise click.BadParameter(f"{text!r} is neither max nor a number above 0")
+    return factor
+
+
+def _replay_text(summary: dict[str, Any]) -> str:
+    lines = [
+        f"{summary['frames']} frames, {summary['duration_s']:.0f} s of log in"
+        f" {summary['wall_s']:.1f} s; center {summary['center']}"
+    ]
+    for uav, seen in summary["uavs"].items():
+        lines.append(
+            f"  {uav:12} {seen['state']:9} {seen['reports']:6} reports"
+            f"  dt {_number(seen['dt_median_s'])} s  latency p95 {_number(seen['latency_p95_s'])} s"
+            f"  innovation {_number(seen['innovation_rms_m'])} m rms"
+        )
+    beams = summary["beams"]
+    lines.append(
+        f"{beams['updates']} beam updates, {beams['regularised']} regularised,"
+        f" condition number to {_number(beams['condition_number_max'])}"
+    )
+    lines += [f"  rejected {reason}: {n}" for reason, n in summary["rejected"].items()]
+    if summary["recording"]:
+        lines.append(f"recording {summary['recording']}")
+    return "\n".join([*lines, f"digest {summary['digest']}"])
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+@main.command()
+@click.option(
+    "--dt",
+    metavar="S[,S...]",
+    required=True,
+    callback=lambda _context, _option, text: _numbers(text),
+    help="Seconds between reports.",
+)
+@click.option("--model", type=click.Choice(["position"]), default="position", show_default=True)
+@click.option("--alpha", metavar="A|auto", default="auto", show_default=True, help="In (0, 1).")
+@click.option(
+    "--feedthrough",
+    type=float,
+    default=0.0,
+    show_default=True,
+    help="Seconds by which a report leads the position.",
+)
+@click.option("--mu-max", type=click.FloatRange(min=0), help="The largest mu to accept, s^2.")
+@click.option(
+    "--method",
+    type=click.Choice(["closed-form", "lmi"]),
+    default="closed-form",
+    show_default=True,
+)
+@JSON
+def design(
+    dt: list[float],
+    model: str,
+    alpha: str,
+    feedthrough: float,
+    mu_max: float | None,
+    method: str,
+    as_json: bool,
+) -> None:
+    """Observer gains, their certificate, and the largest feasible interval between reports.
+
+    Example: companion design --dt 0.15,0.5 --alpha 0.5 --feedthrough 0.5 --mu-max 0.05
+    """
+    from companion import designing
+
+    with _user_errors():
+        rows = [
+            designing.row(dt_s, feedthrough, _alpha(alpha), mu_max, model, method) for dt_s in dt
+        ]
+    if as_json:
+        click.echo(json.dumps(rows))
+        return
+    for row in rows:
+        limit = "" if row["dt_limit_s"] is None else f"  dt limit {row['dt_limit_s']:.4f} s"
+        click.echo(
+            f"dt {row['dt_s']:g} s  alpha {row['alpha']:g}  L {row['L']:.4f}  Q {row['Q']:.4f}"
+            f"  mu {row['mu']:.4g} s²  gamma {row['gamma']:.4g} s"
+            f"  peak gain {row['peak_gain']:.4g} s"
+            f"  {'feasible' if row['feasible'] else 'NOT feasible'}{limit}"
+        )
+
+
+def _numbers(text: str) -> list[float]:
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise click.BadParameter(f"{text!r} is not a list of numbers such as 0.1,0.5") from error
+
+
+def _alpha(text: str) -> float | None:
+    if text == "auto":
+        return None
+    try:
+        return float(text)
+    except ValueError as error:
+        raise click.BadParameter(f"alpha is 'auto' or a number, not {text!r}") from error
+
+
+@main.command()
+@click.argument(
+    "files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path)
+)
+@JSON
+def recover(files: tuple[Path, ...], as_json: bool) -> None:
+    """A recording cut short becomes a finished one; says what was lost.
+
+    Example: companion recover recordings/companion-20260101T120000Z.mcap.active
+    """
+    from companion.recording.recover import recover as recover_file
+
+    with _user_errors():
+        for file in files:
+            found = recover_file(file)
+            answer = {
+                "file": str(found.path),
+                "changed": found.changed,
+                "messages": dict(found.messages),
+                "lost_bytes": found.lost_bytes,
+            }
+            done = "recovered" if found.changed else "complete already"
+            text = f"{done}, {sum(found.messages.values())} messages, {found.lost_bytes} bytes lost"
+            click.echo(json.dumps(answer) if as_json else f"{found.path}: {text}")
+
+
+class _user_errors:  # noqa: N801 - reads as a statement
+    """Turns what a user can do wrong into one line on stderr."""
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        if isinstance(error, click.ClickException | None):
+            return
+        if isinstance(error, OSError):
+            where = f"{error.filename}: " if error.filename else ""
+            raise click.ClickException(f"{where}{error.strerror or error}") from error
+        if isinstance(error, ValueError) and _is_meant_for_users(error):
+            raise click.ClickException(str(error)) from error
+
+
+def _is_meant_for_users(error: ValueError) -> bool:
+    """Our own subclasses of ValueError, and plain ones raised by our own checks."""
+    return type(error) is ValueError or type(error).__module__.startswith("companion")

@@ -1,0 +1,226 @@
+"""Settings: a TOML file and flags, checked once at start, frozen from then on.
+
+Every key is listed here with its unit, default and range. An error names the key, the value and
+what is allowed.
+"""
+
+import json
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    PositiveFloat,
+    ValidationError,
+)
+
+from companion.values import Source
+
+
+class ConfigError(ValueError):
+    """Settings that cannot be used; the message is one line for the user."""
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleCenter:
+    """The array rides on a vehicle in the stream: its position and attitude are followed."""
+
+    source: Source
+
+    def __str__(self) -> str:
+        return str(self.source)
+
+
+@dataclass(frozen=True, slots=True)
+class FixedCenter:
+    """The array stands: degrees, metres, heading from true north; level."""
+
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
+    heading_deg: float = 0.0
+
+    def __str__(self) -> str:
+        return f"{self.lat_deg},{self.lon_deg},{self.alt_m},{self.heading_deg}"
+
+
+@dataclass(frozen=True, slots=True)
+class HomeCenter:
+    """A fixed station, level and facing north, where the first accepted report was made."""
+
+    def __str__(self) -> str:
+        return "home"
+
+
+Center = VehicleCenter | FixedCenter | HomeCenter
+
+
+def parse_center(text: str) -> Center:
+    """Read ``SYSID:COMPID``, ``LAT,LON,ALT[,HEADING]`` or ``home``; ``ValueError`` otherwise."""
+    if text == "home":
+        return HomeCenter()
+    if "," not in text:
+        return VehicleCenter(Source.parse(text))
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (3, 4):
+        raise ValueError(f"{text!r} is not LAT,LON,ALT[,HEADING], such as 47.4,8.55,500,90")
+    if not (abs(numbers[0]) <= 90 and abs(numbers[1]) <= 180):
+        raise ValueError(f"{text!r}: latitude is within 90 degrees and longitude within 180")
+    return FixedCenter(*numbers)
+
+
+def _center_text(text: str) -> str:
+    parse_center(text)
+    return text
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class CenterSettings(_Section):
+    """What carries the array; ``run`` refuses to start without it."""
+
+    source: Annotated[str, AfterValidator(_center_text)] | None = None
+
+
+class LinkSettings(_Section):
+    """Where MAVLink comes from."""
+
+    urls: tuple[str, ...] = ()
+
+
+class ClockSettings(_Section):
+    """``constant_delay_s``: the known smallest latency of the links, which no one-way
+    observation can see."""
+
+    constant_delay_s: Annotated[FiniteFloat, Field(ge=0, le=10)] = 0.0
+
+
+class ObserverSettings(_Section):
+    """The observer and what it takes for granted: bounds that are never exceeded."""
+
+    model: Literal["position"] = "position"
+    alpha: Literal["auto"] | Annotated[float, Field(gt=0, lt=1)] = "auto"
+    feedthrough_s: Annotated[float, Field(ge=-10, le=10)] = 0.0
+    velocity_lead_s: Annotated[float, Field(gt=0, le=10)] = 0.2
+    speed_max_mps: PositiveFloat = 60.0
+    acceleration_max_mps2: PositiveFloat = 10.0
+    position_noise_m: PositiveFloat = 3.0
+    velocity_noise_mps: PositiveFloat = 0.5
+
+
+class TrackSettings(_Section):
+    """Ages of the newest report at which a track passes to the next state, seconds."""
+
+    coasting_s: PositiveFloat = 2.0
+    stale_s: PositiveFloat = 15.0
+    lost_s: PositiveFloat = 60.0
+
+
+class ArraySettings(_Section):
+    """A uniform linear array along the y axis of its mount; mount angles of array from body."""
+
+    kind: Literal["ula"] = "ula"
+    elements: Annotated[int, Field(ge=1, le=4096)] = 64
+    frequency_hz: PositiveFloat = 30e9
+    spacing_wavelengths: PositiveFloat = 0.5
+    mount_roll_deg: float = 0.0
+    mount_pitch_deg: float = 0.0
+    mount_yaw_deg: float = 0.0
+
+
+class BeamSettings(_Section):
+    """When weights are made, for when, for whom, and when zero forcing gives way to RZF."""
+
+    update_hz: Annotated[float, Field(gt=0, le=1000)] = 20.0
+    actuation_delay_s: Annotated[float, Field(ge=0, le=10)] = 0.01
+    targets: Literal["telemetry", "all"] = "telemetry"
+    condition_limit: Annotated[float, Field(ge=1, le=1e6)] = 10.0
+    regularisation: Annotated[float, Field(gt=0, le=10)] = 0.01
+
+
+class RecordingSettings(_Section):
+    """Where recordings go (None: nowhere) and how often weights are written."""
+
+    directory: str | None = None
+    weights_hz: Literal["all"] | PositiveFloat = 10.0
+
+
+class ServerSettings(_Section):
+    """Where HTTP is served."""
+
+    listen: str = "127.0.0.1:8080"
+
+
+class Settings(_Section):
+    """All settings of the service."""
+
+    center: CenterSettings = CenterSettings()
+    links: LinkSettings = LinkSettings()
+    clocks: ClockSettings = ClockSettings()
+    observer: ObserverSettings = ObserverSettings()
+    tracks: TrackSettings = TrackSettings()
+    array: ArraySettings = ArraySettings()
+    beams: BeamSettings = BeamSettings()
+    recording: RecordingSettings = RecordingSettings()
+    server: ServerSettings = ServerSettings()
+
+    @classmethod
+    def from_toml(cls, text: str, where: str) -> Self:
+        """Read settings; ``ConfigError``, beginning with ``where``, if they cannot be used."""
+        try:
+            return cls.model_validate(tomllib.loads(text))
+        except tomllib.TOMLDecodeError as error:
+            raise ConfigError(f"{where}: not TOML: {error}") from error
+        except ValidationError as error:
+            raise ConfigError(f"{where}: {_first(error)}") from error
+
+    def to_toml(self) -> str:
+        """All settings, defaults included, as ``from_toml`` reads them."""
+        lines: list[str] = []
+        for name, keys in self.model_dump(mode="json", exclude_none=True).items():
+            # A JSON string, number, boolean or flat list is one of TOML too.
+            lines += [f"[{name}]", *(f"{key} = {json.dumps(keys[key])}" for key in keys), ""]
+        return "\n".join(lines)
+
+    def override(self, **sections: dict[str, Any]) -> "Settings":
+        """These settings with some keys replaced; None leaves a key as it is."""
+        merged = self.model_dump(mode="json", exclude_none=True)
+        for name, keys in sections.items():
+            merged[name].update({key: value for key, value in keys.items() if value is not None})
+        try:
+            return Settings.model_validate(merged)
+        except ValidationError as error:
+            raise ConfigError(_first(error)) from error
+
+
+def load(path: Path | None) -> Settings:
+    """The settings of a TOML file, or the defaults. Raises ``ConfigError``."""
+    if path is None:
+        return Settings()
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not TOML: it is not UTF-8 text") from error
+    return Settings.from_toml(text, str(path))
+
+
+def _first(error: ValidationError) -> str:
+    """The first thing wrong, in one line: key, value, what is allowed."""
+    wrong = error.errors(include_url=False)[0]
+    key = ".".join(str(part) for part in wrong["loc"] if isinstance(part, str))
+    if wrong["type"] == "extra_forbidden":
+        return f"{key} is not a setting"
+    return f"{key} = {wrong['input']!r}: {wrong['msg']}"

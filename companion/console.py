@@ -1,0 +1,52 @@
+"""What the commands share: user mistakes as one line on stderr, and progress on a terminal."""
+
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import click
+
+
+class OneLineErrors(click.Group):
+    """A group whose user mistakes are one line on stderr, without the usage text."""
+
+    def main(
+        self,
+        args: Sequence[str] | None = None,
+        prog_name: str | None = None,
+        complete_var: str | None = None,
+        standalone_mode: bool = True,
+        **extra: Any,
+    ) -> Any:
+        """Run; see ``click.Command.main``."""
+        extra |= {"prog_name": prog_name, "complete_var": complete_var, "standalone_mode": False}
+        work: Callable[[], Any] = partial(super().main, args, **extra)
+        if not standalone_mode:
+            return work()
+        try:
+            sys.exit(work() or 0)
+        except click.exceptions.NoArgsIsHelpError as error:
+            error.show()
+            sys.exit(error.exit_code)
+        except click.ClickException as error:
+            click.echo(f"{self.name}: {' '.join(error.format_message().split())}", err=True)
+            sys.exit(error.exit_code)
+        except click.Abort:
+            sys.exit(130)
+
+
+class Progress:
+    """One line on stderr that is written over; nothing where stderr is not a terminal."""
+
+    def __init__(self) -> None:
+        self._on = sys.stderr.isatty()
+
+    def show(self, text: str) -> None:
+        """Replace the line."""
+        if self._on:
+            click.echo(f"\r\033[K{text}", nl=False, err=True)
+
+    def clear(self) -> None:
+        """Take the line away."""
+        self.show("")

@@ -1,0 +1,67 @@
+"""Starts and stops the live service from the command line.                              [shell]"""
+
+import asyncio
+import signal
+import socket
+import webbrowser
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+import click
+import uvloop
+
+from companion.config import Settings
+from companion.server.access import bind
+from companion.service import Service, require_center
+
+
+def run(
+    settings: Settings,
+    *,
+    token: str | None = None,
+    insecure: bool = False,
+    traffic: Callable[[str], Coroutine[Any, Any, None]] | None = None,
+    seconds: float | None = None,
+    open_page: bool = False,
+) -> None:
+    """Serve until SIGINT, SIGTERM or ``seconds`` have passed; then finish the recording.
+
+    ``traffic`` is run beside, with the address of the first link. ``ValueError`` or ``OSError``
+    where the settings do not allow to start.
+    """
+    require_center(settings)
+    if not settings.links.urls:
+        raise ValueError("say where MAVLink comes from: --link udpin:0.0.0.0:14550")
+    http = bind(settings.server.listen, token=token, insecure=insecure)
+    with http:
+        service = Service(settings, lambda text: click.echo(text, err=True))
+        host, port = http.getsockname()[:2]
+        page = f"http://{f'[{host}]' if ':' in host else host}:{port}"
+        with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+            runner.run(_serve(service, http, token, traffic, seconds, page, open_page))
+
+
+async def _serve(
+    service: Service,
+    http: socket.socket,
+    token: str | None,
+    traffic: Callable[[str], Coroutine[Any, Any, None]] | None,
+    seconds: float | None,
+    page: str,
+    open_page: bool,
+) -> None:
+    loop, until = asyncio.get_running_loop(), asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, until.set)
+    if seconds is not None:
+        loop.call_later(seconds, until.set)
+    others = [traffic(service.links()[0].url)] if traffic else []
+    click.echo(
+        f"companion serves {page} and listens on {', '.join(link.url for link in service.links())}"
+    )
+    if open_page:
+        webbrowser.open(page)
+    await service.run(http, token, until, *others)
+    recording = service.recording()
+    if recording.file:
+        click.echo(f"recording {recording.file}: {recording.messages} messages")

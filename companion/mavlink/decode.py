@@ -1,0 +1,198 @@
+"""Frames to messages, one function a message, each field with its own validity.
+
+Sources: the message definitions of https://mavlink.io/en/messages/common.html. MAVLink 2 cuts
+trailing zero bytes of a payload, and a version 1 frame has no extension fields: both are read as
+zeros, as the standard says, and where zero means "not sent" the value is None.
+"""
+
+import math
+import struct
+from collections.abc import Callable
+from typing import Final
+
+from companion.values import (
+    AltitudeDatum,
+    Attitude,
+    Frame,
+    GnssStatus,
+    Message,
+    Presence,
+    Reason,
+    Rejection,
+    Report,
+    SystemTime,
+)
+
+HEARTBEAT: Final = 0
+SYSTEM_TIME: Final = 2
+GPS_RAW_INT: Final = 24
+ATTITUDE: Final = 30
+GLOBAL_POSITION_INT: Final = 33
+ADSB_VEHICLE: Final = 246
+
+NULL_ISLAND_RADIUS_M: Final = 5000.0
+"""Around 0 N 0 E nothing is believed: estimators without a fix wander there by some metres."""
+_METRES_PER_DEGREE: Final = 111_195.0
+
+# ADSB_FLAGS
+_COORDS, _ALTITUDE, _HEADING, _VELOCITY, _VERTICAL = 1, 2, 4, 8, 128
+
+
+class _RefusedError(Exception):
+    """Internal to this module: the message is a rejection, with this reason."""
+
+    def __init__(self, reason: Reason, detail: str = "") -> None:
+        super().__init__(reason)
+        self.reason = reason
+        self.detail = detail
+
+
+def decode(frame: Frame) -> Message | Rejection | None:
+    """The message in a frame; None for messages that nobody here reads.
+
+    A frame whose fields cannot be used is a ``Rejection`` with its reason.
+    """
+    decoder = _DECODERS.get(frame.msgid)
+    if decoder is None:
+        return None
+    try:
+        return decoder(frame)
+    except _RefusedError as why:
+        return Rejection(
+            frame.t_ns, str(frame.source), why.reason, msgid=frame.msgid, detail=why.detail
+        )
+
+
+def _fields(frame: Frame, layout: struct.Struct) -> tuple[int, ...]:
+    return layout.unpack(frame.payload.ljust(layout.size, b"\0")[: layout.size])
+
+
+def _position(lat_1e7: int, lon_1e7: int) -> tuple[float, float]:
+    """Degrees; refuses what is no place on Earth, and what is said before there is a fix."""
+    lat_deg, lon_deg = lat_1e7 * 1e-7, lon_1e7 * 1e-7
+    if abs(lat_deg) > 90.0 or abs(lon_deg) > 180.0:
+        raise _RefusedError(Reason.MALFORMED, f"latitude {lat_deg}, longitude {lon_deg}")
+    if math.hypot(lat_deg, lon_deg) * _METRES_PER_DEGREE < NULL_ISLAND_RADIUS_M:
+        raise _RefusedError(Reason.ZERO_POSITION)
+    return lat_deg, lon_deg
+
+
+_GLOBAL_POSITION_INT = struct.Struct("<IiiiihhhH")
+
+
+def _global_position_int(frame: Frame) -> Report:
+    """Position and velocity as the autopilot has them; vz positive down, hdg 65535 unknown."""
+    boot_ms, lat, lon, alt_mm, rel_mm, vx, vy, vz, hdg = _fields(frame, _GLOBAL_POSITION_INT)
+    lat_deg, lon_deg = _position(lat, lon)
+    return Report(
+        t_ns=frame.t_ns,
+        link=frame.link,
+        uav=str(frame.source),
+        source=frame.source,
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        alt_m=alt_mm * 1e-3,
+        alt_datum=AltitudeDatum.MSL,
+        relative_alt_m=rel_mm * 1e-3,
+        velocity_ne_mps=(vx * 1e-2, vy * 1e-2),
+        velocity_down_mps=vz * 1e-2,
+        heading_deg=None if hdg == 65535 else hdg * 1e-2,
+        boot_ms=boot_ms,
+        tslc_s=None,
+    )
+
+
+_ADSB_VEHICLE = struct.Struct("<IiiiHHhHHB9sBB")
+
+
+def _adsb_vehicle(frame: Frame) -> Report:
+    """An aircraft as a receiver relays it. Each field counts only if its own flag is set.
+
+    ``ver_velocity`` is positive up; ``heading`` is the course over ground.
+    """
+    fields = _ADSB_VEHICLE.unpack(frame.payload.ljust(_ADSB_VEHICLE.size, b"\0")[:38])
+    icao, lat, lon, alt_mm, heading_cdeg, speed_cmps, climb_cmps, flags = fields[:8]
+    datum, tslc_s = fields[9], fields[12]
+    if not flags & _COORDS:
+        raise _RefusedError(Reason.NO_POSITION)
+    lat_deg, lon_deg = _position(lat, lon)
+    heading_deg = heading_cdeg * 1e-2 if flags & _HEADING else None
+    velocity_ne_mps = None
+    if flags & _VELOCITY and heading_deg is not None:
+        course, speed_mps = math.radians(heading_deg), speed_cmps * 1e-2
+        velocity_ne_mps = (speed_mps * math.cos(course), speed_mps * math.sin(course))
+    return Report(
+        t_ns=frame.t_ns,
+        link=frame.link,
+        uav=f"icao:{icao:06X}",
+        source=frame.source,
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        alt_m=alt_mm * 1e-3 if flags & _ALTITUDE else None,
+        alt_datum=AltitudeDatum.GEOMETRIC if datum == 1 else AltitudeDatum.PRESSURE,
+        relative_alt_m=None,
+        velocity_ne_mps=velocity_ne_mps,
+        velocity_down_mps=-climb_cmps * 1e-2 if flags & _VERTICAL else None,
+        heading_deg=heading_deg,
+        boot_ms=None,
+        tslc_s=float(tslc_s),
+    )
+
+
+_ATTITUDE = struct.Struct("<Iffffff")
+
+
+def _attitude(frame: Frame) -> Attitude:
+    """Attitude of the body (FRD) from NED, radians, with its body rates."""
+    boot_ms, *angles = _fields(frame, _ATTITUDE)
+    if not all(map(math.isfinite, angles)):
+        raise _RefusedError(Reason.MALFORMED, "an angle or rate is not a number")
+    return Attitude(frame.t_ns, frame.source, boot_ms, *angles)
+
+
+_HEARTBEAT = struct.Struct("<IBBBBB")
+_ARMED: Final = 128
+
+
+def _heartbeat(frame: Frame) -> Presence:
+    _, mav_type, autopilot, base_mode, status, _ = _fields(frame, _HEARTBEAT)
+    return Presence(frame.t_ns, frame.source, mav_type, autopilot, status, bool(base_mode & _ARMED))
+
+
+_GPS_RAW_INT = struct.Struct("<QiiiHHHHBBiIIIIH")
+
+
+def _gps_raw_int(frame: Frame) -> GnssStatus:
+    """Fix type and accuracies; the accuracies are extension fields, 0 where not sent."""
+    fields = _fields(frame, _GPS_RAW_INT)
+    fix_type, satellites, h_acc, v_acc, vel_acc = fields[8], fields[9], *fields[11:14]
+    return GnssStatus(
+        t_ns=frame.t_ns,
+        source=frame.source,
+        fix_type=fix_type,
+        satellites=None if satellites == 255 else satellites,
+        h_acc_m=h_acc * 1e-3 or None,
+        v_acc_m=v_acc * 1e-3 or None,
+        vel_acc_mps=vel_acc * 1e-3 or None,
+    )
+
+
+_SYSTEM_TIME = struct.Struct("<QI")
+
+
+def _system_time(frame: Frame) -> SystemTime:
+    """The Unix clock is 0 where the sender has none; whether it is right is another matter."""
+    unix_us, boot_ms = _fields(frame, _SYSTEM_TIME)
+    return SystemTime(frame.t_ns, frame.source, unix_us or None, boot_ms)
+
+
+_DECODERS: Final[dict[int, Callable[[Frame], Message]]] = {
+    HEARTBEAT: _heartbeat,
+    SYSTEM_TIME: _system_time,
+    GPS_RAW_INT: _gps_raw_int,
+    ATTITUDE: _attitude,
+    GLOBAL_POSITION_INT: _global_position_int,
+    ADSB_VEHICLE: _adsb_vehicle,
+}
+DECODED: Final = frozenset(_DECODERS)
+"""The ids that ``decode`` reads."""

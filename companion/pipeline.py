@@ -1,0 +1,331 @@
+"""The whole program as a fold over events: the live service, replay and the tests drive this one.
+
+Pure and synchronous. Time comes with the events; the same events give the same outputs and the
+same digest, whoever feeds them.
+"""
+
+import hashlib
+import struct
+from collections import Counter
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from companion.beams import arrays, precoding
+from companion.beams.aim import AIMABLE, aim
+from companion.config import Center, FixedCenter, Settings, VehicleCenter, parse_center
+from companion.mavlink.clocks import SenderClock
+from companion.mavlink.decode import DECODED, decode
+from companion.mavlink.dedupe import Dedupe
+from companion.tracking import carrier
+from companion.tracking.fleet import Ages, Fleet
+from companion.tracking.geodesy import LocalFrame
+from companion.tracking.observer import Bounds, PositionModel
+from companion.values import (
+    Attitude,
+    Carrier,
+    Estimate,
+    Event,
+    Fix,
+    FloatArray,
+    Frame,
+    Message,
+    Notice,
+    Output,
+    Presence,
+    Reason,
+    Rejection,
+    Report,
+    Severity,
+    Source,
+    Tick,
+    Track,
+    TrackState,
+    Update,
+)
+
+
+def with_ticks(events: Iterable[Event], update_hz: float) -> Iterator[Event]:
+    """Events of a log that has no ticks, with those that a timer would have made among them."""
+    period_ns = round(1e9 / update_hz)
+    due_ns: int | None = None
+    for event in events:
+        if due_ns is None:
+            due_ns = event.t_ns + period_ns
+        while due_ns <= event.t_ns:
+            yield Tick(due_ns)
+            due_ns += period_ns
+        yield event
+
+
+class Digest:
+    """SHA-256 over every estimate and every set of weights, in order."""
+
+    def __init__(self) -> None:
+        self._hash = hashlib.sha256()
+
+    def add(self, output: Estimate | Update) -> None:
+        """Take in one output; little-endian doubles and integers, names in UTF-8."""
+        if isinstance(output, Estimate):
+            self._estimate(output.fix.uav, output.fix.t_ns, output.position_ned_m, output.bound_m)
+            return
+        for track in output.tracks:
+            self._estimate(track.uav, track.valid_at_ns, track.position_ned_m, track.bound_m)
+        self._hash.update("\0".join(output.beams.uavs).encode())
+        self._hash.update(output.beams.weights.astype("<c16", copy=False).tobytes())
+
+    def _estimate(self, uav: str, t_ns: int, position_ned_m: FloatArray, bound_m: float) -> None:
+        self._hash.update(uav.encode())
+        self._hash.update(struct.pack("<q4d", t_ns, *position_ned_m, bound_m))
+
+    def hexdigest(self) -> str:
+        """The digest so far."""
+        return self._hash.hexdigest()
+
+
+class Pipeline:
+    """State of the program. ``step`` takes events in order; the rest only looks.
+
+    ``ConfigError`` or ``ValueError`` on settings that do not make sense together.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.frames = 0
+        self.updates = 0
+        self.rejected: Counter[Reason] = Counter()
+        self.rejected_by_source: dict[str, Counter[Reason]] = {}
+        self.digest = Digest()
+        self.array = _array(settings)
+        self.local: LocalFrame | None = None
+        self.last_update: Update | None = None
+        self.presence: dict[Source, Presence] = {}
+        self._center: Center = parse_center(settings.center.source or "home")
+        self._carrier_id = str(self._center) if isinstance(self._center, VehicleCenter) else None
+        self._attitude: tuple[int, Attitude] | None = None
+        self._clocks: dict[Source, SenderClock] = {}
+        self._dedupe = Dedupe()
+        self._fleet = _fleet(settings)
+        self._targets: list[str] = []  # in the order in which they were first heard
+        self._precoder = precoding.Precoder(
+            settings.beams.condition_limit, settings.beams.regularisation
+        )
+        self._states: dict[str, TrackState] = {}
+        if isinstance(self._center, FixedCenter):
+            self._set_origin(self._center)
+
+    # --- the fold ---------------------------------------------------------------------------
+
+    def step(self, event: Event) -> list[Output]:
+        """What one event brings. Events come in order of time."""
+        match event:
+            case Frame():
+                outputs = self._frame(event)
+            case Tick():
+                outputs = self._tick(event)
+            case Rejection():
+                outputs = [event]
+        for output in outputs:
+            if isinstance(output, Rejection):
+                self.rejected[output.reason] += output.count
+                by_source = self.rejected_by_source.setdefault(output.source, Counter())
+                by_source[output.reason] += output.count
+            elif isinstance(output, Estimate | Update):
+                self.digest.add(output)
+        return outputs
+
+    def _frame(self, frame: Frame) -> list[Output]:
+        self.frames += 1
+        if frame.msgid not in DECODED:
+            return []
+        message: Message | Rejection | None = decode(frame)
+        match message:
+            case Rejection():
+                return [message]
+            case Report():
+                if self._dedupe.is_repeat(frame):
+                    return [Rejection(frame.t_ns, message.uav, Reason.DUPLICATE)]
+                return self._report(message)
+            case Attitude() if str(message.source) == self._carrier_id:
+                return self._carrier_attitude(message)
+            case Presence():
+                self.presence[message.source] = message
+        return []
+
+    def _report(self, report: Report) -> list[Output]:
+        outputs: list[Output] = []
+        if report.boot_ms is None:
+            t_ns = report.t_ns - round((report.tslc_s or 0.0) * 1e9)
+        else:
+            t_ns = self._place(report.source, report.t_ns, report.boot_ms, outputs)
+        if report.alt_m is None:
+            outputs.append(Rejection(report.t_ns, report.uav, Reason.NO_ALTITUDE))
+            return outputs
+        if self.local is None:
+            outputs.append(self._first_report(report, report.alt_m))
+        placed = self._fleet.accept(self._fix(report, t_ns, report.alt_m))
+        if isinstance(placed, Estimate) and placed.dt_s is None and self.is_target(report.uav):
+            self._targets.append(report.uav)
+        return [*outputs, placed]
+
+    def _place(self, source: Source, arrival_ns: int, boot_ms: int, outputs: list[Output]) -> int:
+        """A stamp on the node's timeline; a reboot begins the sender's track anew."""
+        clock = self._clocks.get(source)
+        if clock is None:
+            delay_ns = round(self.settings.clocks.constant_delay_s * 1e9)
+            clock = self._clocks.setdefault(source, SenderClock(delay_ns))
+        reading = clock.place(arrival_ns, boot_ms)
+        if reading.rebooted:
+            self._restart(str(source))
+            text = f"{source} was restarted: its boot clock stepped back to {boot_ms / 1e3:.1f} s"
+            outputs.append(Notice(arrival_ns, Severity.WARNING, str(source), text))
+        return reading.t_ns
+
+    def _restart(self, uav: str) -> None:
+        self._fleet.restart(uav)
+        if uav in self._targets:
+            self._targets.remove(uav)
+
+    def _first_report(self, report: Report, alt_m: float) -> Notice:
+        """The first position of all sets the origin of the local frame, and ``home``."""
+        home = FixedCenter(report.lat_deg, report.lon_deg, alt_m)
+        self._set_origin(home)
+        if self._carrier_id is not None:
+            return Notice(report.t_ns, Severity.INFO, "origin", f"local frame begins at {home}")
+        self._center = home
+        text = f"home is where {report.uav} first reported: {home}, level, facing north"
+        return Notice(report.t_ns, Severity.INFO, "home", text)
+
+    def _set_origin(self, at: FixedCenter) -> None:
+        self.local = LocalFrame(at.lat_deg, at.lon_deg, at.alt_m)
+
+    def _fix(self, report: Report, t_ns: int, alt_m: float) -> Fix:
+        assert self.local is not None
+        velocity = None
+        if report.velocity_ne_mps is not None and report.velocity_down_mps is not None:
+            there = np.array([*report.velocity_ne_mps, report.velocity_down_mps])
+            velocity = self.local.local_from_ned(report.lat_deg, report.lon_deg) @ there
+        position = self.local.position_ned_m(report.lat_deg, report.lon_deg, alt_m)
+        return Fix(report.uav, t_ns, report.t_ns, position, velocity, report)
+
+    def _carrier_attitude(self, attitude: Attitude) -> list[Output]:
+        outputs: list[Output] = []
+        t_ns = self._place(attitude.source, attitude.t_ns, attitude.boot_ms, outputs)
+        if self._attitude is None or t_ns > self._attitude[0] or outputs:
+            self._attitude = (t_ns, attitude)
+        return outputs
+
+    def _tick(self, tick: Tick) -> list[Output]:
+        self.updates += 1
+        self.last_update = self.look(tick.t_ns)
+        return [*self._state_changes(tick.t_ns), self.last_update]
+
+    def _state_changes(self, now_ns: int) -> list[Notice]:
+        """One notice for each target, or the carrier, whose state is another than at the last tick.
+
+        Passing traffic comes and goes without a word.
+        """
+        watched = [*self._targets, self._carrier_id] if self._carrier_id else self._targets
+        states = self._fleet.states(now_ns, watched)
+        changed = [uav for uav, state in states.items() if self._states.get(uav) is not state]
+        self._states = states
+        notices = []
+        for uav in changed:
+            bad = states[uav] in (TrackState.STALE, TrackState.LOST)
+            severity = Severity.WARNING if bad else Severity.INFO
+            notices.append(Notice(now_ns, severity, uav, f"{uav} is {states[uav]}"))
+        return notices
+
+    # --- looking ----------------------------------------------------------------------------
+
+    def look(self, now_ns: int, lead_s: float = 0.0) -> Update:
+        """Targets and beams at the actuation delay and ``lead_s`` from now. Changes nothing."""
+        delay_s = self.settings.beams.actuation_delay_s + lead_s
+        valid_at_ns = now_ns + round(delay_s * 1e9)
+        states = self._fleet.states(now_ns, self._targets)
+        aimed_at = [uav for uav, state in states.items() if state is not TrackState.LOST]
+        tracks = self._tracks(aimed_at, now_ns, valid_at_ns)
+        found = self.carrier(now_ns, valid_at_ns)
+        known, unfit = (None, found) if isinstance(found, str) else (found, None)
+        beams = aim(now_ns, valid_at_ns, tracks, known, self.array, self._precoder)
+        return Update(now_ns, known, unfit, tuple(tracks), beams)
+
+    def tracks(self, now_ns: int, valid_at_ns: int) -> list[Track]:
+        """Every UAV heard of, target or not, at a time; the carrier is not among them."""
+        others = [uav for uav in self._fleet.uavs if uav != self._carrier_id]
+        return self._tracks(others, now_ns, valid_at_ns)
+
+    def _tracks(self, uavs: list[str], now_ns: int, valid_at_ns: int) -> list[Track]:
+        found = (self._fleet.track(uav, now_ns, valid_at_ns) for uav in uavs)
+        return [track for track in found if track is not None]
+
+    def is_target(self, uav: str) -> bool:
+        """Whether beams are wanted for it: not for the carrier, for ADS-B traffic only if asked."""
+        if uav == self._carrier_id:
+            return False
+        return self.settings.beams.targets == "all" or not uav.startswith("icao:")
+
+    def geodetic(self, position_ned_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Latitude and longitude in degrees and height in metres of local points, (N, 3).
+
+        ``ValueError`` before the first report, when there are no local points.
+        """
+        if self.local is None:
+            raise ValueError("no report yet, so there is no local frame")
+        return self.local.geodetic(position_ned_m)
+
+    def newest(self, uav: str) -> Fix | None:
+        """The newest accepted report of a UAV or of the carrier."""
+        return self._fleet.newest(uav)
+
+    @property
+    def center(self) -> Center:
+        """What carries the array, ``home`` resolved once it is known."""
+        return self._center
+
+    def carrier(self, now_ns: int, valid_at_ns: int) -> Carrier | str:
+        """Where the array is and how it is turned, or why that is not known."""
+        at = self._center
+        if self.local is None:
+            return "no report yet"
+        if isinstance(at, FixedCenter):
+            place = (at.lat_deg, at.lon_deg, at.alt_m)
+            return carrier.fixed(valid_at_ns, self.local, place, np.radians(at.heading_deg))
+        vehicle = str(at)
+        track = self._fleet.track(vehicle, now_ns, valid_at_ns)
+        newest = self._fleet.newest(vehicle)
+        if track is None or newest is None:
+            return f"no position from the carrier {vehicle}"
+        if track.state not in AIMABLE:
+            return f"the carrier {vehicle} is {track.state}"
+        if self._attitude is None:
+            return f"no attitude from the carrier {vehicle}"
+        t_ns, attitude = self._attitude
+        if now_ns - t_ns > self.settings.tracks.coasting_s * 1e9:
+            return f"the attitude of the carrier {vehicle} is too old"
+        return carrier.moving(self.local, track, newest, attitude, t_ns)
+
+
+def _array(settings: Settings) -> arrays.Array:
+    given = settings.array
+    mount = np.radians([given.mount_roll_deg, given.mount_pitch_deg, given.mount_yaw_deg])
+    return arrays.uniform_linear(
+        given.elements,
+        given.frequency_hz,
+        given.spacing_wavelengths,
+        carrier.body_from_ned(*mount),
+    )
+
+
+def _fleet(settings: Settings) -> Fleet:
+    given = settings.observer
+    bounds = Bounds(
+        given.speed_max_mps,
+        given.acceleration_max_mps2,
+        given.position_noise_m,
+        given.velocity_noise_mps,
+    )
+    alpha = None if given.alpha == "auto" else given.alpha
+    model = PositionModel(bounds, alpha, given.feedthrough_s, given.velocity_lead_s)
+    ages = settings.tracks
+    return Fleet(model, Ages(ages.coasting_s, ages.stale_s, ages.lost_s))

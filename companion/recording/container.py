@@ -1,0 +1,137 @@
+"""Walks an MCAP file in the order in which it was written, as far as it is intact.
+
+The index at a file's end is not used: a killed process leaves none, and the order by time that
+it serves is not the order in which things happened. Layout: https://mcap.dev/spec. A chunk
+counts only when its checksum holds. One that does not, in the middle of a file, is passed over
+and counted; a record that goes on past the end of the file ends the walk.
+"""
+
+import struct
+from collections.abc import Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
+from mcap.stream_reader import get_chunk_data_stream
+from zstandard import ZstdError
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+_HEADER: Final = struct.Struct("<BQ")  # opcode, length of what follows
+_MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_LARGEST_CHUNK: Final = 1 << 28
+"""Bytes. Ours are about a mebibyte; a damaged size must not ask for all of the memory."""
+
+# What torn or damaged bytes make the libraries raise; a failed checksum is a ValueError.
+_DAMAGE: Final = (McapError, struct.error, ZstdError, ValueError, MemoryError)
+
+
+class Message(NamedTuple):
+    channel: Channel
+    sequence: int
+    log_time_ns: int
+    publish_time_ns: int
+    data: bytes
+
+
+class Damage(NamedTuple):
+    """So many bytes could not be read, or nothing says what they mean."""
+
+    size_bytes: int
+
+
+Content = Message | Attachment | Metadata | Damage
+
+
+class Walk:
+    """One pass over a file. Iterate once; what is asked of it afterwards is then complete.
+
+    ``topics``: hand on messages of these only (None: all). ``OSError`` where the file cannot be
+    read.
+    """
+
+    def __init__(self, path: Path, topics: frozenset[str] | None = None) -> None:
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.complete = False
+        """The file's end is there, so it was closed in an orderly way."""
+        self.lost_bytes = 0
+        """Bytes that do not belong to any record which can be read."""
+        self._path = path
+        self._topics = topics
+
+    def __iter__(self) -> Iterator[Content]:
+        for opcode, size, body in self._records():
+            try:
+                contents = self._contents(opcode, body)
+            except _DAMAGE:
+                self.lost_bytes += size
+                yield Damage(size)
+                continue
+            yield from contents
+
+    def _records(self) -> Iterator[tuple[int, int, bytes]]:
+        """(opcode, bytes in the file, body) of the records before the file's summary."""
+        size = self._path.stat().st_size
+        with self._path.open("rb") as file:
+            at = len(file.read(len(MAGIC)))
+            in_data = True
+            while len(header := file.read(_HEADER.size)) == _HEADER.size:
+                opcode, length = _HEADER.unpack(header)
+                stop = at + _HEADER.size + length
+                if stop > size or opcode == 0:
+                    break
+                body = file.read(length)
+                at = stop
+                if opcode == Opcode.FOOTER:
+                    self.complete = file.read(len(MAGIC)) == MAGIC
+                    return
+                # After the end of the data come copies of the schemas and channels, and indexes.
+                in_data = in_data and opcode != Opcode.DATA_END
+                if in_data:
+                    yield opcode, _HEADER.size + length, body
+        self.lost_bytes += size - at
+
+    def _contents(self, opcode: int, body: bytes) -> list[Content]:
+        if opcode == Opcode.CHUNK:
+            chunk = Chunk.read(ReadDataStream(BytesIO(body)))
+            if chunk.uncompressed_size > _LARGEST_CHUNK:
+                raise ValueError("no chunk is that large")
+            stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+            return self._in_chunk(stream.read(size))
+        if opcode == Opcode.ATTACHMENT:
+            return [Attachment.read(ReadDataStream(BytesIO(body)))]
+        if opcode == Opcode.METADATA:
+            return [Metadata.read(ReadDataStream(BytesIO(body)))]
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):  # a file without chunks
+            return self._in_chunk(_HEADER.pack(opcode, len(body)) + body)
+        return []
+
+    def _in_chunk(self, data: bytes) -> list[Content]:
+        """The wanted messages of a chunk; remembers the schemas and channels between them."""
+        found: list[Content] = []
+        at = orphaned = 0
+        while at < len(data):
+            opcode, length = _HEADER.unpack_from(data, at)
+            start, at = at + _HEADER.size, at + _HEADER.size + length
+            if opcode == Opcode.MESSAGE:
+                channel_id, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(data, start)
+                channel = self.channels.get(channel_id)
+                if channel is None or channel.schema_id not in self.schemas:
+                    orphaned += _HEADER.size + length
+                elif self._topics is None or channel.topic in self._topics:
+                    raw = data[start + _MESSAGE.size : at]
+                    found.append(Message(channel, sequence, log_ns, publish_ns, raw))
+            elif opcode == Opcode.SCHEMA:
+                schema = Schema.read(ReadDataStream(BytesIO(data[start:at])))
+                self.schemas[schema.id] = schema
+            elif opcode == Opcode.CHANNEL:
+                channel = Channel.read(ReadDataStream(BytesIO(data[start:at])))
+                self.channels[channel.id] = channel
+        if orphaned:  # the chunk that described their channel was damaged
+            self.lost_bytes += orphaned
+            found.append(Damage(orphaned))
+        return found

@@ -1,0 +1,168 @@
+"""The program's values as the messages of a recording, and back where they are read back."""
+
+import math
+from typing import Any, Final
+
+import numpy as np
+
+from companion.recording import schemas
+from companion.values import (
+    BeamSet,
+    Fix,
+    FloatArray,
+    Frame,
+    Notice,
+    Reason,
+    Rejection,
+    Severity,
+    Source,
+    Track,
+)
+
+FRAME_ID: Final = "wgs84"
+"""LocationFix's own frame: nothing in a recording hangs on it."""
+_LEVEL: Final = {
+    Severity.INFO: schemas.LogMessage.INFO,
+    Severity.WARNING: schemas.LogMessage.WARNING,
+    Severity.ERROR: schemas.LogMessage.ERROR,
+}
+
+
+def _timestamp(t_ns: int) -> dict[str, int]:
+    seconds, nanos = divmod(t_ns, 1_000_000_000)
+    return {"seconds": seconds, "nanos": nanos}
+
+
+def fix(value: Fix) -> Any:
+    """Where a UAV said it was: the report's own degrees. An unknown altitude is NaN, not 0."""
+    report = value.report
+    return schemas.LocationFixMessage(
+        timestamp=_timestamp(value.t_ns),
+        frame_id=FRAME_ID,
+        latitude=report.lat_deg,
+        longitude=report.lon_deg,
+        altitude=math.nan if report.alt_m is None else report.alt_m,
+    )
+
+
+def predicted(track: Track, lat_deg: float, lon_deg: float, alt_m: float) -> Any:
+    """Where a UAV is taken to be at ``valid_at_ns``, with a covariance made from its bound.
+
+    The bound is a guarantee, not a statistic. The covariance is bound²/3 on each axis: its trace,
+    the mean square of the error, is bound², the largest that any distribution within the bound
+    can have. So a viewer's 1-sigma ellipsoid errs on the safe side on average, and the bound is
+    its radius times √3. No covariance where there is no finite bound.
+    """
+    message = schemas.LocationFixMessage(
+        timestamp=_timestamp(track.valid_at_ns),
+        frame_id=FRAME_ID,
+        latitude=lat_deg,
+        longitude=lon_deg,
+        altitude=alt_m,
+    )
+    if math.isfinite(track.bound_m):
+        variance_m2 = track.bound_m**2 / 3
+        message.position_covariance.extend(
+            (variance_m2, 0.0, 0.0, 0.0, variance_m2, 0.0, 0.0, 0.0, variance_m2)
+        )
+        message.position_covariance_type = schemas.LocationFixMessage.APPROXIMATED
+    return message
+
+
+def track(value: Track, t_ns: int) -> Any:
+    """``t_ns``: when the update was made that the track belongs to."""
+    return schemas.TrackMessage(
+        t_ns=t_ns,
+        uav=value.uav,
+        state=value.state.value,
+        valid_at_ns=value.valid_at_ns,
+        age_s=value.age_s,
+        position_ned_m=_vector(value.position_ned_m),
+        velocity_ned_mps=_vector(value.velocity_ned_mps),
+        unknown_input_mps=_vector(value.unknown_input_mps),
+        bound_m=value.bound_m,
+        dt_s=value.dt_s,
+        latency_s=value.latency_s,
+        gamma=value.gamma,
+        innovation_m=value.innovation_m,
+        reports=value.reports,
+    )
+
+
+def _vector(value: FloatArray | None) -> list[float]:
+    return [] if value is None else value.tolist()
+
+
+def weights(value: BeamSet) -> Any:
+    """The weights as single precision: a viewer's copy, since a replay makes them again."""
+    return schemas.WeightsMessage(
+        t_ns=value.t_ns,
+        valid_at_ns=value.valid_at_ns,
+        uavs=value.uavs,
+        elements=value.weights.shape[0],
+        weights_complex64=value.weights.astype(np.dtype("<c8")).tobytes("C"),
+        method=value.method.value,
+        condition_number=value.condition_number,
+        beam=[
+            {
+                "uav": beam.uav,
+                "azimuth_rad": beam.azimuth_rad,
+                "elevation_rad": beam.elevation_rad,
+                "range_m": beam.range_m,
+                "pointing_bound_rad": beam.pointing_bound_rad,
+                "gain_db": beam.gain_db,
+            }
+            for beam in value.beams
+        ],
+        left_out=[{"uav": out.uav, "reason": out.reason} for out in value.left_out],
+    )
+
+
+def log(value: Notice) -> Any:
+    """A notice as a line in a viewer's log panel, under the name of what it is about."""
+    return schemas.LogMessage(
+        timestamp=_timestamp(value.t_ns),
+        level=_LEVEL[value.severity],
+        name=value.subject,
+        message=value.text,
+    )
+
+
+def rejection(value: Rejection, *, is_event: bool) -> Any:
+    return schemas.RejectionMessage(
+        t_ns=value.t_ns,
+        source=value.source,
+        reason=value.reason.value,
+        count=value.count,
+        msgid=value.msgid,
+        detail=value.detail,
+        is_event=is_event,
+    )
+
+
+# --- and back -----------------------------------------------------------------------------------
+
+
+def to_frame(data: bytes, sources: dict[tuple[int, int], Source]) -> Frame:
+    """``sources``: those seen so far; one value for each is enough. ``DecodeError`` on nonsense."""
+    message = schemas.FrameMessage.FromString(data)
+    ids = (message.sysid, message.compid)
+    source = sources.get(ids)
+    if source is None:
+        source = sources.setdefault(ids, Source(*ids))
+    return Frame(message.t_ns, message.link, source, message.msgid, message.raw)
+
+
+def to_rejection(data: bytes) -> Rejection | None:
+    """None for one that the pipeline made: it will make it again."""
+    message = schemas.RejectionMessage.FromString(data)
+    if not message.is_event:
+        return None
+    return Rejection(
+        message.t_ns,
+        message.source,
+        Reason(message.reason),
+        message.count,
+        message.msgid if message.HasField("msgid") else None,
+        message.detail,
+    )

@@ -1,0 +1,129 @@
+"""One door to every kind of log: what is in a file decides, never what it is called.
+
+Our own recordings give back exactly the events that drove the live run, in that order; telemetry
+logs and raw MAVLink give the events that a live run would have had.
+"""
+
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+from typing import Final, Literal
+
+from google.protobuf.message import DecodeError
+from mcap.records import Attachment, Metadata
+
+from companion.recording import messages, schemas, tlog
+from companion.recording.container import MAGIC, Damage, Walk
+from companion.recording.writer import SETTINGS
+from companion.values import Event, Reason, Rejection, Source, Tick
+
+LogKind = Literal["tlog", "mavlink", "mcap"]
+_EVENT_TOPICS: Final = frozenset(
+    (schemas.FRAMES_TOPIC, schemas.TICKS_TOPIC, schemas.REJECTIONS_TOPIC)
+)
+
+
+class LogError(ValueError):
+    """A file that cannot be used. The message is one line: the file, and why."""
+
+
+def log_kind(path: Path) -> LogKind:
+    """What kind of log a file is; ``LogError`` where it is none."""
+    return _open(path)[0]
+
+
+def read_log(path: Path) -> Iterator[Event]:
+    """The events of a log, in order; ``LogError`` at once where the file cannot be used.
+
+    ``Frame.link`` is the recorded link, or the file's name where the log knows of no links. A
+    recording cut short gives what is intact, and then ends; damage with intact events after it
+    is a ``Rejection`` of so many bytes of garbage.
+    """
+    kind, data = _open(path)
+    if kind == "tlog":
+        return tlog.read_tlog(data, path.name)
+    if kind == "mavlink":
+        return tlog.read_raw(data, path.name)
+    events = _recorded(path)
+    first = next(events, None)
+    if first is None:
+        raise LogError(f"{path}: an MCAP file, but no MAVLink frame in it")
+    return chain((first,), events)
+
+
+def read_settings(path: Path) -> str | None:
+    """The settings (TOML) that a recording was made with; None where the log has none."""
+    if log_kind(path) != "mcap":
+        return None
+    for content in Walk(path, frozenset()):
+        if isinstance(content, Attachment) and content.name == SETTINGS:
+            return content.data.decode()
+    return None
+
+
+def read_metadata(path: Path) -> dict[str, dict[str, str]]:
+    """The metadata records of a recording by name, ``versions`` and ``summary`` among them.
+
+    Empty for other logs; without ``summary`` where the recording was cut short.
+    """
+    if log_kind(path) != "mcap":
+        return {}
+    walk = Walk(path, frozenset())
+    return {found.name: found.metadata for found in walk if isinstance(found, Metadata)}
+
+
+def _open(path: Path) -> tuple[LogKind, bytes]:
+    """The kind of log, and its bytes unless it is an MCAP file, which is read piece by piece."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(len(MAGIC))
+            if head == MAGIC:
+                return "mcap", b""
+            data = head + file.read()
+    except FileNotFoundError:
+        raise LogError(f"{path}: no such file") from None
+    except IsADirectoryError:
+        raise LogError(f"{path}: is a directory, not a log") from None
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror}") from None
+    if not data:
+        raise LogError(f"{path}: is empty")
+    kind = tlog.sniff(data)
+    if kind is None:
+        raise LogError(f"{path}: no MAVLink frame in it")
+    return kind, data
+
+
+def _recorded(path: Path) -> Iterator[Event]:
+    sources: dict[tuple[int, int], Source] = {}
+    t_ns = 0
+    damaged = 0
+    try:
+        for content in Walk(path, _EVENT_TOPICS):
+            if isinstance(content, Damage):
+                damaged += content.size_bytes
+                continue
+            if isinstance(content, Attachment | Metadata):
+                continue
+            event = _event(content.channel.topic, content.data, sources)
+            if event is None:
+                continue
+            if damaged:
+                yield Rejection(
+                    t_ns, path.name, Reason.GARBAGE, damaged, detail="recording damaged"
+                )
+                damaged = 0
+            t_ns = event.t_ns
+            yield event
+    except (DecodeError, ValueError) as error:
+        raise LogError(f"{path}: not a recording of this program: {error}") from None
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _event(topic: str, data: bytes, sources: dict[tuple[int, int], Source]) -> Event | None:
+    if topic == schemas.FRAMES_TOPIC:
+        return messages.to_frame(data, sources)
+    if topic == schemas.TICKS_TOPIC:
+        return Tick(schemas.TickMessage.FromString(data).t_ns)
+    return messages.to_rejection(data)

@@ -1,0 +1,174 @@
+"""A recording cut short becomes a finished one.
+
+What is intact is written again through the same library, so the result has its index and opens
+in every viewer; the torn original goes only when its replacement is whole and on the disk.
+"""
+
+import fcntl
+import os
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from mcap.records import Attachment, Metadata
+from mcap.writer import Writer as McapWriter
+
+from companion.recording.container import MAGIC, Content, Damage, Message, Walk
+from companion.recording.reader import LogError
+from companion.recording.writer import ACTIVE, free_name, sync_folder
+
+_PARTIAL: Final = ".recovering"
+
+
+class BeingRecordedError(LogError):
+    """The recording is not a leftover: a process has it open."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recovered:
+    """What came of a recording cut short.
+
+    ``path`` is the finished file. ``messages`` by topic, ``last_ns`` the latest time among them
+    (None without any), ``lost_bytes`` how much of the torn file could not be used. ``changed`` is
+    False for a file that was complete and is left as it was.
+    """
+
+    path: Path
+    messages: Mapping[str, int]
+    last_ns: int | None
+    lost_bytes: int
+    changed: bool
+
+
+def recover(path: Path) -> Recovered:
+    """Finish ``x.mcap.active`` as ``x.mcap``, a cut ``x.mcap`` as ``x.recovered.mcap``.
+
+    Never over another file: then ``x-1.mcap`` and so on. ``x.mcap.active`` is removed when that
+    is done, a cut ``x.mcap`` is kept. ``LogError`` where the file is not an MCAP file, is
+    being recorded, cannot be read, or where its replacement cannot be written.
+    """
+    try:
+        return _recover(path)
+    except FileNotFoundError:
+        raise LogError(f"{path}: no such file") from None
+    except IsADirectoryError:
+        raise LogError(f"{path}: is a directory, not a recording") from None
+    except OSError as error:
+        raise LogError(f"{path}: cannot be recovered: {error.strerror}") from None
+
+
+def recover_leftovers(folder: Path) -> list[Recovered | LogError]:
+    """Recover every ``*.mcap.active`` in a folder; one that cannot be is told of, and kept.
+
+    A file that is being recorded, by whatever process, is left alone and is not in the list.
+    """
+    results: list[Recovered | LogError] = []
+    for path in sorted(folder.glob(f"*.mcap{ACTIVE}")):
+        try:
+            results.append(recover(path))
+        except BeingRecordedError:
+            continue
+        except LogError as error:
+            results.append(error)
+    return results
+
+
+def _recover(path: Path) -> Recovered:
+    with path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise BeingRecordedError(f"{path}: is being recorded just now") from None
+        return _rewrite(path, file.read(len(MAGIC)))
+
+
+def _rewrite(path: Path, head: bytes) -> Recovered:
+    active = path.name.endswith(ACTIVE)
+    # A process killed at the very start may leave no more than a piece of the magic bytes.
+    if not (head == MAGIC or (active and MAGIC.startswith(head))):
+        raise LogError(f"{path}: not an MCAP recording")
+    final = path.with_suffix("") if active else path.with_suffix(".recovered.mcap")
+    partial = final.with_name(final.name + _PARTIAL)
+    walk = Walk(path)
+    tally = _Tally()
+    try:
+        with partial.open("wb") as out:
+            _Copy(McapWriter(out), walk, tally).run()
+            out.flush()
+            os.fsync(out.fileno())
+        whole = walk.complete and not walk.lost_bytes
+        if whole and not active:
+            return tally.result(path, 0, changed=False)
+        final = free_name(final)
+        (path if whole else partial).rename(final)
+    finally:
+        partial.unlink(missing_ok=True)
+    sync_folder(final.parent)
+    if active:
+        path.unlink(missing_ok=True)
+    return tally.result(final, walk.lost_bytes, changed=True)
+
+
+class _Tally:
+    """Counts what is kept."""
+
+    def __init__(self) -> None:
+        self._messages: Counter[str] = Counter()
+        self._last_ns: int | None = None
+
+    def count(self, message: Message) -> None:
+        self._messages[message.channel.topic] += 1
+        self._last_ns = max(self._last_ns or 0, message.log_time_ns)
+
+    def result(self, path: Path, lost_bytes: int, *, changed: bool) -> Recovered:
+        return Recovered(path, dict(self._messages), self._last_ns, lost_bytes, changed)
+
+
+class _Copy:
+    """Writes what a walk finds into a new file; ids of schemas and channels are given anew."""
+
+    def __init__(self, mcap: McapWriter, walk: Walk, tally: _Tally) -> None:
+        self._mcap = mcap
+        self._walk = walk
+        self._tally = tally
+        self._schemas: dict[int, int] = {}
+        self._channels: dict[int, int] = {}
+
+    def run(self) -> None:
+        self._mcap.start(library="companion")
+        for content in self._walk:
+            self._add(content)
+        self._mcap.finish()  # type: ignore[no-untyped-call]
+
+    def _add(self, content: Content) -> None:
+        match content:
+            case Message(channel, sequence, log_ns, publish_ns, data):
+                channel_id = self._channels.get(channel.id) or self._register(content)
+                self._mcap.add_message(channel_id, log_ns, data, publish_ns, sequence)
+                self._tally.count(content)
+            case Attachment():
+                self._mcap.add_attachment(
+                    content.create_time,
+                    content.log_time,
+                    content.name,
+                    content.media_type,
+                    content.data,
+                )
+            case Metadata():
+                self._mcap.add_metadata(content.name, content.metadata)
+            case Damage():
+                pass  # the walk has counted its bytes
+
+    def _register(self, message: Message) -> int:
+        channel = message.channel
+        schema_id = self._schemas.get(channel.schema_id)
+        if schema_id is None:
+            schema = self._walk.schemas[channel.schema_id]
+            schema_id = self._mcap.register_schema(schema.name, schema.encoding, schema.data)
+            self._schemas[channel.schema_id] = schema_id
+        channel_id = self._mcap.register_channel(
+            channel.topic, channel.message_encoding, schema_id, channel.metadata
+        )
+        return self._channels.setdefault(channel.id, channel_id)

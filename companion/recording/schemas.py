@@ -1,0 +1,203 @@
+"""What the messages of a recording look like: protobuf on every channel.
+
+Positions and log lines are Foxglove's own messages, which viewers draw as they are. The rest is
+described here and built at run time, so that no generated file has to be kept in step. A
+``Schema`` carries the whole ``FileDescriptorSet``: a recording can be read by anyone, years from
+now, with nothing but the file.
+
+``encode_frame`` and ``encode_tick`` pack the two messages that come by the thousand a second by
+hand; the bytes are those of the generated classes (a test holds them together).
+"""
+
+import struct
+from typing import Any, Final, NamedTuple
+
+from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from google.protobuf.descriptor_pb2 import (
+    DescriptorProto,
+    FieldDescriptorProto,
+    FileDescriptorProto,
+    FileDescriptorSet,
+)
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
+
+from companion.values import Frame
+
+# A field is "[repeated|optional] type name"; its number is its place in the list, so fields are
+# only ever appended: a number that has been written once keeps its meaning.
+_MESSAGES: Final[dict[str, list[str]]] = {
+    "Frame": ["fixed64 t_ns", "string link", "uint32 sysid", "uint32 compid", "uint32 msgid",
+              "bytes raw"],
+    "Tick": ["fixed64 t_ns"],
+    "Rejection": ["fixed64 t_ns", "string source", "string reason", "uint64 count",
+                  "optional uint32 msgid", "string detail", "bool is_event"],
+    "Track": ["string uav", "string state", "fixed64 valid_at_ns", "double age_s",
+              "repeated double position_ned_m", "repeated double velocity_ned_mps",
+              "repeated double unknown_input_mps", "double bound_m", "optional double dt_s",
+              "optional double latency_s", "optional double gamma",
+              "optional double innovation_m", "uint32 reports", "fixed64 t_ns"],
+    "Beam": ["string uav", "double azimuth_rad", "double elevation_rad", "double range_m",
+             "optional double pointing_bound_rad", "double gain_db"],
+    "LeftOut": ["string uav", "string reason"],
+    "Weights": ["fixed64 t_ns", "fixed64 valid_at_ns", "repeated string uavs", "uint32 elements",
+                "bytes weights_complex64", "string method", "optional double condition_number",
+                "repeated Beam beam", "repeated LeftOut left_out"],
+}  # fmt: skip
+"""``Track``: a vector is empty where it is unknown, else north, east, down. ``Weights``:
+``weights_complex64`` is (elements, len(uavs)), row-major, interleaved little-endian float32 real
+and imaginary parts. ``Rejection.is_event``: made while framing, so it drove the pipeline; the
+others the pipeline made itself."""
+
+_TYPES: Final = {
+    "fixed64": FieldDescriptorProto.TYPE_FIXED64,
+    "uint64": FieldDescriptorProto.TYPE_UINT64,
+    "uint32": FieldDescriptorProto.TYPE_UINT32,
+    "double": FieldDescriptorProto.TYPE_DOUBLE,
+    "string": FieldDescriptorProto.TYPE_STRING,
+    "bytes": FieldDescriptorProto.TYPE_BYTES,
+    "bool": FieldDescriptorProto.TYPE_BOOL,
+}
+
+
+def _describe_field(into: DescriptorProto, number: int, declared: str) -> None:
+    *label, kind, name = declared.split()
+    field = into.field.add(name=name, number=number, label=FieldDescriptorProto.LABEL_OPTIONAL)
+    if kind in _TYPES:
+        field.type = _TYPES[kind]
+    else:
+        field.type = FieldDescriptorProto.TYPE_MESSAGE
+        field.type_name = f".companion.{kind}"
+    if label == ["repeated"]:
+        field.label = FieldDescriptorProto.LABEL_REPEATED
+    elif label == ["optional"]:
+        # proto3 keeps "not there" apart from 0 by a oneof of its own for each such field.
+        field.proto3_optional = True
+        field.oneof_index = len(into.oneof_decl)
+        into.oneof_decl.add(name=f"_{name}")
+
+
+def _describe() -> FileDescriptorProto:
+    file = FileDescriptorProto(
+        name="companion/recording.proto", package="companion", syntax="proto3"
+    )
+    for message, fields in _MESSAGES.items():
+        described = file.message_type.add(name=message)
+        for number, declared in enumerate(fields, start=1):
+            _describe_field(described, number, declared)
+    return file
+
+
+_POOL: Final = DescriptorPool()  # of its own: names cannot clash with other protobuf users
+_POOL.Add(_describe())
+
+
+def _message(name: str) -> Any:
+    return GetMessageClass(_POOL.FindMessageTypeByName(f"companion.{name}"))
+
+
+FrameMessage: Final = _message("Frame")
+TickMessage: Final = _message("Tick")
+RejectionMessage: Final = _message("Rejection")
+TrackMessage: Final = _message("Track")
+WeightsMessage: Final = _message("Weights")
+LocationFixMessage: Final[Any] = LocationFix
+LogMessage: Final[Any] = Log
+
+
+class Schema(NamedTuple):
+    """A message type as MCAP has it: full name, serialised ``FileDescriptorSet``."""
+
+    name: str
+    descriptor_set: bytes
+
+
+def _with_dependencies(message: Any) -> Schema:
+    """The schema of a message class: its file and all that it imports, dependencies first."""
+    files = FileDescriptorSet()
+    seen: set[str] = set()
+
+    def add(file: Any) -> None:
+        if file.name in seen:
+            return
+        seen.add(file.name)
+        for dependency in file.dependencies:
+            add(dependency)
+        file.CopyToProto(files.file.add())
+
+    add(message.DESCRIPTOR.file)
+    return Schema(message.DESCRIPTOR.full_name, files.SerializeToString())
+
+
+FRAME: Final = _with_dependencies(FrameMessage)
+TICK: Final = _with_dependencies(TickMessage)
+REJECTION: Final = _with_dependencies(RejectionMessage)
+TRACK: Final = _with_dependencies(TrackMessage)
+WEIGHTS: Final = _with_dependencies(WeightsMessage)
+LOCATION_FIX: Final = _with_dependencies(LocationFixMessage)
+LOG: Final = _with_dependencies(LogMessage)
+
+FRAMES_TOPIC: Final = "/mavlink/frames"
+TICKS_TOPIC: Final = "/ticks"
+REJECTIONS_TOPIC: Final = "/rejections"
+TRACKS_TOPIC: Final = "/tracks"
+WEIGHTS_TOPIC: Final = "/beams/weights"
+LOG_TOPIC: Final = "/log"
+
+# Tag bytes: field number << 3 | wire type (0 varint, 1 eight bytes, 2 length-delimited).
+_TIME = struct.Struct("<BQ")
+_T_NS, _LINK, _SYSID, _COMPID, _MSGID, _RAW = 0x09, 0x12, 0x18, 0x20, 0x28, 0x32
+
+
+def _varint(value: int) -> bytes:
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    out.append(value)
+    return bytes(out)
+
+
+def _number(tag: int, value: int) -> bytes:
+    return bytes([tag]) + _varint(value) if value else b""
+
+
+def encode_tick(t_ns: int) -> bytes:
+    """``companion.Tick``; ``t_ns`` in [0, 2⁶⁴)."""
+    return _TIME.pack(_T_NS, t_ns) if t_ns else b""
+
+
+class FrameEncoder:
+    """``companion.Frame`` messages; keeps the packed head of each (link, source, id) it has seen.
+
+    There are a few hundred of those in hours of traffic, so all that is left for a frame is its
+    time and its bytes.
+    """
+
+    def __init__(self) -> None:
+        self._heads: dict[tuple[str, tuple[int, int], int], bytes] = {}
+
+    def encode(self, frame: Frame) -> bytes:
+        key = (frame.link, frame.source, frame.msgid)
+        head = self._heads.get(key)
+        if head is None:
+            head = self._heads.setdefault(key, self._head(frame))
+        raw = frame.raw
+        size = len(raw)
+        length = bytes((_RAW, size)) if size < 0x80 else bytes((_RAW,)) + _varint(size)
+        return (
+            b"".join((encode_tick(frame.t_ns), head, length, raw))
+            if size
+            else (encode_tick(frame.t_ns) + head)
+        )
+
+    @staticmethod
+    def _head(frame: Frame) -> bytes:
+        link = frame.link.encode()
+        return (
+            (bytes([_LINK]) + _varint(len(link)) + link if link else b"")
+            + _number(_SYSID, frame.source.sysid)
+            + _number(_COMPID, frame.source.compid)
+            + _number(_MSGID, frame.msgid)
+        )

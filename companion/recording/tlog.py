@@ -1,0 +1,220 @@
+"""Logs of other programs: telemetry logs, and MAVLink as it came over the wire.
+
+A telemetry log (.tlog) has, before every frame, the Unix time in microseconds as eight bytes,
+big-endian. Raw MAVLink has no stamps; the sender's boot clock has to do.
+"""
+
+import re
+from collections.abc import Iterator
+from itertools import islice
+from typing import Final, Literal, NamedTuple
+
+from companion.mavlink.framing import (
+    BAD_CRC,
+    UNKNOWN_MESSAGE,
+    Splitter,
+    claimed_length,
+    examine,
+    next_magic,
+)
+from companion.recording.timeline import LINGERS_NS, Timeline
+from companion.values import Event, Frame, Reason, Rejection, Source
+
+STAMP: Final = 8
+"""Bytes of the stamp before each frame of a telemetry log."""
+_PIECE: Final = 1 << 16
+_MANY_PAIRS: Final = 50
+_REASON: Final = {UNKNOWN_MESSAGE: Reason.UNKNOWN_MESSAGE, BAD_CRC: Reason.BAD_CRC}
+_BOOT_MS_AT: Final = {33: 0, 30: 0, 2: 8}
+"""Where the payloads of GLOBAL_POSITION_INT, ATTITUDE and SYSTEM_TIME hold time_boot_ms."""
+_magics = re.compile(b"[\xfd\xfe]").finditer
+
+
+# --- which kind ---------------------------------------------------------------------------------
+
+
+def sniff(data: bytes) -> Literal["tlog", "mavlink"] | None:
+    """What kind of log the bytes are, by what stands between frames that follow one another.
+
+    None where there is no MAVLink: a lone frame counts only at the start of the file, since one
+    in twenty megabytes of noise holds what looks like a frame.
+    """
+    stamped = bare = 0
+    at, end = 0, len(data)
+    while at < end and max(stamped, bare) < _MANY_PAIRS:
+        at, length = _next_frame(data, at, end)
+        after = at + length
+        if not length:
+            break
+        if after < end and examine(data, after, end) > 0:
+            bare += 1
+        elif after + STAMP < end and examine(data, after + STAMP, end) > 0:
+            stamped += 1
+        at = after
+    if stamped or bare:
+        return "tlog" if stamped > bare else "mavlink"
+    if data and examine(data, 0, end) > 0:
+        return "mavlink"
+    return "tlog" if end > STAMP and examine(data, STAMP, end) > 0 else None
+
+
+def _next_frame(data: bytes, at: int, end: int) -> tuple[int, int]:
+    """Where the first checked frame at or after ``at`` starts, and its length (0: none)."""
+    for found in _magics(data, at, end):
+        length = examine(data, found.start(), end)
+        if length > 0:
+            return found.start(), length
+    return end, 0
+
+
+# --- telemetry logs -----------------------------------------------------------------------------
+
+
+class _Stretch(NamedTuple):
+    """A frame of a telemetry log, and what had to be skipped to get to it.
+
+    ``length`` 0: no more frames. ``stamp_ns`` is None where the frame before it leaves no room
+    for a stamp.
+    """
+
+    stamp_ns: int | None
+    start: int
+    length: int
+    lost: dict[Reason, int]
+
+
+_NOTHING: Final[dict[Reason, int]] = {}
+
+
+def read_tlog(data: bytes, link: str) -> Iterator[Event]:
+    """The events of a telemetry log, on a time line that never steps back nor leaps.
+
+    A rejection has the time of the frame after it. A frame whose stamp is bad is still handed
+    on, after a rejection that says so.
+    """
+    ahead = _stretches(data)
+    first = list(islice(ahead, 3))
+    timeline = Timeline([s.stamp_ns for s in first if s.stamp_ns is not None])
+    sources: dict[tuple[int, int], Source] = {}
+    for group in (first, ahead):
+        for stamp_ns, start, length, lost in group:
+            off_ns = None if stamp_ns is None else timeline.place(stamp_ns)
+            for reason, count in lost.items():
+                yield Rejection(timeline.t_ns, link, reason, count)
+            if not length:
+                return
+            if off_ns is not None:
+                yield _bad_stamp(timeline.t_ns, link, off_ns)
+            elif stamp_ns is None:
+                yield Rejection(timeline.t_ns, link, Reason.BAD_STAMP, detail="no stamp")
+            yield _frame(timeline.t_ns, link, data[start : start + length], sources)
+
+
+def _bad_stamp(t_ns: int, link: str, off_ns: int) -> Rejection:
+    way = "back" if off_ns < 0 else "ahead"
+    return Rejection(
+        t_ns, link, Reason.BAD_STAMP, detail=f"{abs(off_ns) / 1e9:.6g} s {way}, clamped"
+    )
+
+
+def _frame(t_ns: int, link: str, raw: bytes, sources: dict[tuple[int, int], Source]) -> Frame:
+    if raw[0] == 0xFD:
+        ids, msgid = (raw[5], raw[6]), raw[7] | raw[8] << 8 | raw[9] << 16
+    else:
+        ids, msgid = (raw[3], raw[4]), raw[5]
+    source = sources.get(ids)
+    if source is None:
+        source = sources.setdefault(ids, Source(*ids))
+    return Frame(t_ns, link, source, msgid, raw)
+
+
+def _stretches(data: bytes) -> Iterator[_Stretch]:
+    at, end = 0, len(data)
+    while at < end:
+        start, lost = at + STAMP, _NOTHING
+        length = examine(data, start, end) if start < end else 0
+        if length <= 0:
+            start, length = _next_frame(data, at, end)
+            stop = max(at, start - STAMP) if length else end
+            lost = _skipped(data, at, stop)
+        stamped = length > 0 and start - STAMP >= at
+        stamp_ns = int.from_bytes(data[start - STAMP : start], "big") * 1000 if stamped else None
+        yield _Stretch(stamp_ns, start, length, lost)
+        at = start + length
+
+
+def _skipped(data: bytes, at: int, stop: int) -> dict[Reason, int]:
+    """What lies in [at, stop), where no frame checks, counted as ``Splitter`` counts.
+
+    Failed frames that stand one after the other, each behind its stamp, count once each; bytes
+    are garbage where they belong to neither.
+    """
+    lost: dict[Reason, int] = {}
+    end = len(data)
+    while at < stop:
+        for start in (at + STAMP, at):
+            verdict = examine(data, start, end) if start < stop else 0
+            if reason := _REASON.get(verdict):
+                lost[reason] = lost.get(reason, 0) + 1
+                at = start + claimed_length(data, start, end)
+                break
+        else:
+            resume = min(next_magic(data, at + 1, end), stop)
+            lost[Reason.GARBAGE] = lost.get(Reason.GARBAGE, 0) + resume - at
+            at = resume
+    return lost
+
+
+# --- raw MAVLink --------------------------------------------------------------------------------
+
+
+def read_raw(data: bytes, link: str) -> Iterator[Event]:
+    """The events of raw MAVLink. The time is the boot clock of the first source that sends one.
+
+    It counts from the epoch and never steps back; frames before the first that tells the time
+    get the time of that one.
+    """
+    timeline: Timeline | None = None
+    clock: Source | None = None
+    early: list[Event] = []
+    for event in _split(data, link):
+        stamp_ns = _boot_ns(event, clock) if isinstance(event, Frame) else None
+        off_ns = None
+        if stamp_ns is not None and isinstance(event, Frame):
+            if timeline is None:
+                timeline, clock = Timeline([stamp_ns]), event.source
+                yield from (_at(before, timeline.t_ns) for before in early)
+                early.clear()
+            off_ns = timeline.place(stamp_ns)
+        if timeline is None:
+            early.append(event)
+            continue
+        # Messages of one sender may be a little out of step: only more than that is a bad stamp.
+        if off_ns is not None and abs(off_ns) > LINGERS_NS:
+            yield _bad_stamp(timeline.t_ns, link, off_ns)
+        yield _at(event, timeline.t_ns)
+    yield from early
+
+
+def _split(data: bytes, link: str) -> Iterator[Frame | Rejection]:
+    splitter = Splitter(link)
+    for at in range(0, len(data), _PIECE):
+        yield from splitter.feed(0, data[at : at + _PIECE])
+    yield from splitter.finish(0)
+
+
+def _at(event: Event, t_ns: int) -> Event:
+    if isinstance(event, Frame):
+        return event._replace(t_ns=t_ns)
+    if isinstance(event, Rejection):
+        return Rejection(t_ns, event.source, event.reason, event.count, event.msgid, event.detail)
+    return event
+
+
+def _boot_ns(frame: Frame, clock: Source | None) -> int | None:
+    at = _BOOT_MS_AT.get(frame.msgid)
+    if at is None or clock not in (None, frame.source):
+        return None
+    # MAVLink 2 cuts trailing zeros, so what is missing is zero.
+    boot_ms = int.from_bytes(frame.payload[at : at + 4], "little")
+    return boot_ms * 1_000_000

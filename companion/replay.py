@@ -1,0 +1,193 @@
+"""Logs through the pipeline: the same fold as the live service, as fast as it goes.     [shell]"""
+
+import heapq
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+import companion
+from companion.config import Settings, load
+from companion.pipeline import Pipeline, with_ticks
+from companion.recording.reader import log_kind, read_log, read_settings
+from companion.recording.writer import Writer
+from companion.values import Estimate, Event, Tick, Update
+
+FLUSH_EVERY_S: Final = 1.0
+TICKED: Final = "mcap"
+"""The kind of log that holds the ticks of the run it was recorded from."""
+
+
+@dataclass(slots=True)
+class Tally:
+    """What a replay saw, gathered as it goes."""
+
+    reports: Counter[str] = field(default_factory=Counter)
+    dt_s: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    latency_s: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    innovation_m: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    updates: int = 0
+    regularised: int = 0
+    condition_number_max: float | None = None
+    first_ns: int | None = None
+    last_ns: int = 0
+
+    def event(self, event: Event) -> None:
+        """Take note of the times that events span."""
+        if self.first_ns is None:
+            self.first_ns = event.t_ns
+        self.last_ns = event.t_ns
+
+    def estimate(self, estimate: Estimate) -> None:
+        """Take in an accepted report."""
+        fix = estimate.fix
+        self.reports[fix.uav] += 1
+        self.latency_s[fix.uav].append((fix.arrival_ns - fix.t_ns) * 1e-9)
+        if estimate.dt_s is not None and estimate.innovation_m is not None:
+            self.dt_s[fix.uav].append(estimate.dt_s)
+            self.innovation_m[fix.uav].append(estimate.innovation_m)
+
+    def update(self, update: Update) -> None:
+        """Take in a beam update; those without beams do not count."""
+        condition = update.beams.condition_number
+        if condition is None:
+            return
+        self.updates += 1
+        self.regularised += update.beams.regularised
+        self.condition_number_max = max(condition, self.condition_number_max or 0.0)
+
+
+def settings_for(logs: Sequence[Path], config: Path | None, center: str | None) -> Settings:
+    """The settings of a replay: a given file, else those of a recording of ours, else defaults.
+
+    ``LogError`` or ``ConfigError`` where a log or the settings cannot be used.
+    """
+    recorded = read_settings(logs[0]) if config is None else None
+    settings = Settings.from_toml(recorded, str(logs[0])) if recorded else load(config)
+    return settings.override(center={"source": center})
+
+
+def writer_for(logs: Sequence[Path], settings: Settings, out: Path | None) -> Writer:
+    """A recording of the replay: at ``out``, else in the settings' directory or ``recordings/``."""
+    kept = settings.recording
+    first_ns = next(read_log(logs[0])).t_ns
+    where = out or Path(kept.directory or "recordings")
+    weights_hz = None if kept.weights_hz == "all" else kept.weights_hz
+    return Writer(
+        where, settings.to_toml(), {"companion": companion.__version__}, weights_hz, first_ns
+    )
+
+
+def replay(
+    logs: Sequence[Path],
+    settings: Settings,
+    writer: Writer | None = None,
+    speed: float | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> dict[str, Any]:
+    """Run logs through a pipeline and sum up, as ``companion replay --json`` prints it.
+
+    Several logs are merged by time. ``writer`` gets everything and is closed; ``speed`` paces by
+    the stamps (None: as fast as it goes); ``progress(frames, seconds of log)`` is called now and
+    then. ``LogError`` for a log that cannot be used, ``OSError`` where the recording cannot be
+    written.
+    """
+    started_s = time.monotonic()
+    pipeline, tally = Pipeline(settings), Tally()
+    flush_due_s = started_s + FLUSH_EVERY_S
+    for event in _paced(_events(logs, settings), speed):
+        outputs = pipeline.step(event)
+        tally.event(event)
+        if writer:
+            writer.event(event)
+        for output in outputs:
+            match output:
+                case Estimate():
+                    tally.estimate(output)
+                case Update():
+                    tally.update(output)
+                case _:
+                    pass
+            if writer:
+                writer.output(output, pipeline.geodetic)
+        if time.monotonic() >= flush_due_s:
+            flush_due_s += FLUSH_EVERY_S
+            if writer:
+                writer.flush()
+            if progress:
+                progress(pipeline.frames, (tally.last_ns - (tally.first_ns or 0)) * 1e-9)
+    digest = pipeline.digest.hexdigest()
+    recording = writer.close({"digest": digest}) if writer else None
+    summary = _summary(pipeline, tally)
+    return summary | {
+        "wall_s": time.monotonic() - started_s,
+        "recording": str(recording) if recording else None,
+        "digest": digest,
+    }
+
+
+def _events(logs: Sequence[Path], settings: Settings) -> Iterator[Event]:
+    """All events in order of time, with ticks."""
+    if len(logs) == 1 and log_kind(logs[0]) == TICKED:
+        return read_log(logs[0])
+    without_ticks = [_no_ticks(read_log(log)) for log in logs]
+    merged = heapq.merge(*without_ticks, key=lambda event: event.t_ns)
+    return with_ticks(merged, settings.beams.update_hz)
+
+
+def _no_ticks(events: Iterator[Event]) -> Iterator[Event]:
+    return (event for event in events if not isinstance(event, Tick))
+
+
+def _paced(events: Iterable[Event], speed: float | None) -> Iterator[Event]:
+    """Hold each event back until its time, at ``speed`` times the time of the log."""
+    first: tuple[int, float] | None = None
+    for event in events:
+        if speed is not None:
+            if first is None:
+                first = (event.t_ns, time.monotonic())
+            due_s = first[1] + (event.t_ns - first[0]) * 1e-9 / speed
+            time.sleep(max(0.0, due_s - time.monotonic()))
+        yield event
+
+
+def _summary(pipeline: Pipeline, tally: Tally) -> dict[str, Any]:
+    now_ns = tally.last_ns
+    tracks = pipeline.tracks(now_ns, now_ns)
+    return {
+        "frames": pipeline.frames,
+        "rejected": {str(reason): count for reason, count in sorted(pipeline.rejected.items())},
+        "reports": {track.uav: tally.reports[track.uav] for track in tracks},
+        "uavs": {
+            track.uav: {
+                "reports": tally.reports[track.uav],
+                "dt_median_s": _percentile(tally.dt_s[track.uav], 50),
+                "dt_max_s": _percentile(tally.dt_s[track.uav], 100),
+                "latency_p50_s": _percentile(tally.latency_s[track.uav], 50),
+                "latency_p95_s": _percentile(tally.latency_s[track.uav], 95),
+                "innovation_rms_m": _rms(tally.innovation_m[track.uav]),
+                "gamma": track.gamma,
+                "state": str(track.state),
+            }
+            for track in tracks
+        },
+        "center": str(pipeline.center),
+        "beams": {
+            "updates": tally.updates,
+            "condition_number_max": tally.condition_number_max,
+            "regularised": tally.regularised,
+        },
+        "duration_s": (now_ns - (tally.first_ns or now_ns)) * 1e-9,
+    }
+
+
+def _percentile(values: list[float], percent: float) -> float | None:
+    return float(np.percentile(values, percent)) if values else None
+
+
+def _rms(values: list[float]) -> float | None:
+    return float(np.sqrt(np.mean(np.square(values)))) if values else None

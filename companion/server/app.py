@@ -1,0 +1,173 @@
+"""The HTTP API and the dashboard's files, over a running node. Read only."""
+
+import io
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import FastAPI, HTTPException, Query, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse, Response
+from fastapi.staticfiles import StaticFiles
+from prometheus_client import CollectorRegistry, generate_latest
+from starlette.exceptions import HTTPException as StarletteHTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+import companion
+from companion.server import views
+from companion.server.access import BearerToken
+from companion.server.metrics import NodeCollector
+from companion.server.views import Node
+
+LeadMs = Annotated[float, Query(ge=0, le=10_000, description="milliseconds ahead of now")]
+CONTENT_POLICY = b"default-src 'self'; frame-ancestors 'none'"
+
+
+def create_app(node: Node, token: str | None = None) -> ASGIApp:
+    """The ASGI application for a node; with a token, all but ``/healthz`` asks for it."""
+    app = FastAPI(
+        title="companion",
+        version=companion.__version__,
+        description="Location-aware beamforming from MAVLink.",
+    )
+    app.add_exception_handler(StarletteHTTPException, _problem)
+    app.add_exception_handler(RequestValidationError, _unprocessable)
+    _health_routes(app, node)
+    _state_routes(app, node)
+    _beam_routes(app, node)
+    app.mount("/", StaticFiles(directory=web_directory(), html=True))
+    secured: ASGIApp = _ContentPolicy(app)
+    return BearerToken(secured, token) if token else secured
+
+
+def web_directory() -> Path:
+    """Where the dashboard's files are: inside the installed package, or beside it in a checkout."""
+    package = Path(companion.__file__).parent
+    installed = package / "_web"
+    return installed if installed.is_dir() else package.parent / "web"
+
+
+def _health_routes(app: FastAPI, node: Node) -> None:
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(NodeCollector(node))
+
+    @app.get("/healthz", summary="The process answers")
+    async def healthz() -> dict[str, str]:
+        return {"status": "ok"}
+
+    @app.get("/readyz", summary="Fit to be used, or why not (503)")
+    async def readyz() -> JSONResponse:
+        reasons = node.unfit()
+        return JSONResponse(
+            {"ready": not reasons, "reasons": reasons}, status_code=503 if reasons else 200
+        )
+
+    @app.get("/metrics", summary="Prometheus")
+    async def metrics() -> Response:
+        return Response(generate_latest(registry), media_type="text/plain; version=0.0.4")
+
+
+def _state_routes(app: FastAPI, node: Node) -> None:
+    @app.get("/v1/status", summary="Version, uptime, links, center, recording, rates")
+    async def status() -> dict[str, Any]:
+        return views.status(node, companion.__version__)
+
+    @app.get("/v1/uavs", summary="Every UAV as it is now")
+    async def uavs() -> dict[str, Any]:
+        return {"valid_at": views.rfc3339(node.now_ns()), "uavs": views.uavs(node)}
+
+    @app.get("/v1/uavs/{uav}", summary="One UAV as it is now")
+    async def one_uav(uav: str) -> dict[str, Any]:
+        found = views.uavs(node, only=uav)
+        if not found:
+            raise HTTPException(404, f"no UAV {uav!r} has been heard")
+        return found[0]
+
+
+def _beam_routes(app: FastAPI, node: Node) -> None:
+    @app.get("/v1/beams", summary="The beams, applied lead_ms from now")
+    async def beams(lead_ms: LeadMs = 0.0) -> dict[str, Any]:
+        update = node.pipeline.look(node.now_ns(), lead_ms * 1e-3)
+        return views.beams(node, update, lead_ms)
+
+    @app.get(
+        "/v1/beams/weights",
+        summary="The M×N weights, by Accept: JSON, application/x-npy, application/octet-stream",
+        response_class=Response,
+    )
+    async def weights(request: Request, lead_ms: LeadMs = 0.0) -> Response:
+        beam_set = node.pipeline.look(node.now_ns(), lead_ms * 1e-3).beams
+        headers = {
+            "x-valid-at": views.rfc3339(beam_set.valid_at_ns),
+            "x-uavs": ",".join(beam_set.uavs),
+        }
+        match _accepted(request.headers.get("accept", "*/*")):
+            case "application/json":
+                return JSONResponse(views.weights(beam_set, lead_ms), headers=headers)
+            case "application/x-npy":
+                file = io.BytesIO()
+                np.save(file, beam_set.weights, allow_pickle=False)
+                return Response(file.getvalue(), media_type="application/x-npy", headers=headers)
+            case "application/octet-stream":
+                raw = beam_set.weights.astype("<c8").tobytes()
+                return Response(raw, media_type="application/octet-stream", headers=headers)
+            case _:
+                raise HTTPException(406, f"weights come as {', '.join(WEIGHT_TYPES)}")
+
+
+WEIGHT_TYPES = ("application/json", "application/x-npy", "application/octet-stream")
+
+
+def _accepted(accept: str) -> str | None:
+    """The first type of an Accept header that weights come in; None if there is none."""
+    for part in accept.split(","):
+        wanted = part.split(";")[0].strip().lower()
+        if wanted in WEIGHT_TYPES:
+            return wanted
+        if wanted in ("*/*", "application/*", ""):
+            return WEIGHT_TYPES[0]
+    return None
+
+
+def problem(status: int, title: str, headers: dict[str, str] | None = None) -> JSONResponse:
+    """An error as RFC 9457 has it."""
+    body = {"type": "about:blank", "title": title, "status": status}
+    return JSONResponse(
+        body, status_code=status, headers=headers, media_type="application/problem+json"
+    )
+
+
+async def _problem(_request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, StarletteHTTPException)
+    return problem(error.status_code, str(error.detail), dict(error.headers or {}))
+
+
+async def _unprocessable(_request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)
+    wrong = error.errors()[0]
+    where = ".".join(str(part) for part in wrong["loc"])
+    return problem(422, f"{where}: {wrong['msg']}")
+
+
+class _ContentPolicy:
+    """ASGI middleware: nothing on the page comes from elsewhere (but for ``/docs``)."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or scope["path"] == "/docs":
+            await self._app(scope, receive, send)
+            return
+
+        async def with_policy(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                message["headers"] = [
+                    *message.get("headers", []),
+                    (b"content-security-policy", CONTENT_POLICY),
+                    (b"x-content-type-options", b"nosniff"),
+                    (b"cache-control", b"no-cache"),
+                ]
+            await send(message)
+
+        await self._app(scope, receive, with_policy)

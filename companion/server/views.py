@@ -1,0 +1,255 @@
+"""The program's state as the API shows it: degrees and metres, RFC 3339 times, null for unknown."""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any, Protocol
+
+import numpy as np
+
+from companion.beams.arrays import half_power_beamwidth_rad
+from companion.config import FixedCenter
+from companion.mavlink.links import LinkStatus
+from companion.pipeline import Pipeline
+from companion.values import BeamSet, Carrier, FloatArray, Track, Update
+
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingStatus:
+    """The recording as the API shows it; ``state`` is ``recording``, ``degraded`` or ``off``."""
+
+    state: str
+    file: str | None
+    bytes: int
+    messages: int
+    dropped: int
+
+
+class Node(Protocol):
+    """What the server looks at: the running service, or a test's stand-in for it."""
+
+    pipeline: Pipeline
+
+    def now_ns(self) -> int: ...
+    def uptime_s(self) -> float: ...
+    def links(self) -> list[LinkStatus]: ...
+    def recording(self) -> RecordingStatus: ...
+    def rates(self) -> Mapping[str, float | None]: ...
+    def unfit(self) -> list[str]: ...
+
+
+def rfc3339(t_ns: int) -> str:
+    """A time in UTC with milliseconds: 2026-11-20T13:00:00.123Z."""
+    seconds, milliseconds = divmod(t_ns // 1_000_000, 1000)
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{milliseconds:03d}Z"
+
+
+def vector(values: FloatArray | None) -> list[float] | None:
+    """A 3-vector as a list; None stays null."""
+    return None if values is None else [float(value) for value in values]
+
+
+def status(node: Node, version: str) -> Json:
+    """``/v1/status``."""
+    pipeline, now_ns = node.pipeline, node.now_ns()
+    recording = node.recording()
+    return {
+        "version": version,
+        "time": rfc3339(now_ns),
+        "uptime_s": node.uptime_s(),
+        "center": center(node),
+        "links": [link(item) for item in node.links()],
+        "recording": {
+            "state": recording.state,
+            "file": recording.file,
+            "bytes": recording.bytes,
+            "messages": recording.messages,
+            "dropped": recording.dropped,
+        },
+        "rates": dict(node.rates()),
+        "frames": pipeline.frames,
+        "updates": pipeline.updates,
+        "rejected": {str(reason): n for reason, n in sorted(pipeline.rejected.items())},
+        "digest": pipeline.digest.hexdigest(),
+    }
+
+
+def link(item: LinkStatus) -> Json:
+    """One link of ``/v1/status``."""
+    return {
+        "url": item.url,
+        "state": item.state,
+        "frames": item.frames,
+        "bytes": item.bytes,
+        "peers": item.peers,
+        "bad_crc": item.lost.get("bad-crc", 0),
+        "lost": dict(item.lost),
+    }
+
+
+def center(node: Node) -> Json:
+    """The carrier: where it is and how it is turned, as far as known."""
+    pipeline, now_ns = node.pipeline, node.now_ns()
+    view: Json = {
+        "source": str(pipeline.center),
+        "fixed": isinstance(pipeline.center, FixedCenter),
+        "lat_deg": None,
+        "lon_deg": None,
+        "alt_m": None,
+        "heading_deg": None,
+        "attitude_deg": None,
+        "age_s": None,
+        "bound_m": None,
+        "unfit": None,
+    }
+    found = pipeline.carrier(now_ns, now_ns)
+    if isinstance(found, str):
+        return view | {"unfit": found}
+    assert pipeline.local is not None
+    lat, lon, alt = pipeline.local.geodetic(found.position_ned_m[np.newaxis])
+    roll, pitch, yaw = euler_deg(found.body_from_local)
+    return view | {
+        "lat_deg": float(lat[0]),
+        "lon_deg": float(lon[0]),
+        "alt_m": float(alt[0]),
+        "heading_deg": yaw % 360,
+        "attitude_deg": {"roll": roll, "pitch": pitch, "yaw": yaw},
+        "age_s": found.age_s,
+        "bound_m": found.bound_m,
+    }
+
+
+def euler_deg(body_from_ned: FloatArray) -> tuple[float, float, float]:
+    """Roll, pitch and yaw in degrees of a rotation, in MAVLink's order (yaw, pitch, roll)."""
+    roll = np.arctan2(body_from_ned[1, 2], body_from_ned[2, 2])
+    pitch = np.arcsin(np.clip(-body_from_ned[0, 2], -1.0, 1.0))
+    yaw = np.arctan2(body_from_ned[0, 1], body_from_ned[0, 0])
+    return float(np.degrees(roll)), float(np.degrees(pitch)), float(np.degrees(yaw))
+
+
+def uavs(node: Node, only: str | None = None) -> list[Json]:
+    """Every UAV, or one, as it is now."""
+    pipeline, now_ns = node.pipeline, node.now_ns()
+    tracks = [
+        track for track in pipeline.tracks(now_ns, now_ns) if only is None or track.uav == only
+    ]
+    if not tracks or pipeline.local is None:
+        return []
+    found = pipeline.carrier(now_ns, now_ns)
+    carrier = None if isinstance(found, str) else found
+    places = np.array([track.position_ned_m for track in tracks])
+    geodetic = zip(*pipeline.local.geodetic(places), strict=True)
+    return [
+        uav(pipeline, track, carrier, tuple(map(float, place)))
+        for track, place in zip(tracks, geodetic, strict=True)
+    ]
+
+
+def uav(
+    pipeline: Pipeline, track: Track, carrier: Carrier | None, place: tuple[float, ...]
+) -> Json:
+    """One entry of ``/v1/uavs``; ``place`` is latitude, longitude and height."""
+    offset = None if carrier is None else track.position_ned_m - carrier.position_ned_m
+    north, east, down = (None, None, None) if offset is None else map(float, offset)
+    velocity = vector(track.velocity_ned_mps)
+    rejected = pipeline.rejected_by_source.get(track.uav, Counter())
+    newest = pipeline.newest(track.uav)
+    return {
+        "id": track.uav,
+        "state": str(track.state),
+        "target": pipeline.is_target(track.uav),
+        "valid_at": rfc3339(track.valid_at_ns),
+        "age_s": track.age_s,
+        "lat_deg": place[0],
+        "lon_deg": place[1],
+        "alt_m": place[2],
+        "north_m": north,
+        "east_m": east,
+        "down_m": down,
+        "velocity_ned_mps": velocity,
+        "speed_mps": None if velocity is None else float(np.linalg.norm(velocity)),
+        "heading_deg": newest.report.heading_deg if newest else None,
+        "unknown_input_mps": vector(track.unknown_input_mps),
+        "bound_m": track.bound_m,
+        "dt_s": track.dt_s,
+        "latency_s": track.latency_s,
+        "gamma": track.gamma,
+        "innovation_m": track.innovation_m,
+        "reports": track.reports,
+        "rejected": {str(reason): count for reason, count in sorted(rejected.items())},
+    }
+
+
+def beams(node: Node, update: Update, lead_ms: float) -> Json:
+    """``/v1/beams`` for one look."""
+    pipeline, beam_set = node.pipeline, update.beams
+    boresight = None
+    array_from_local = np.eye(3)
+    if update.carrier is not None:
+        array_from_local = pipeline.array.array_from_body @ update.carrier.body_from_local
+        boresight = float(np.degrees(np.arctan2(array_from_local[0, 1], array_from_local[0, 0])))
+    beamwidth = half_power_beamwidth_rad(pipeline.array)
+    return {
+        "valid_at": rfc3339(beam_set.valid_at_ns),
+        "age_s": (node.now_ns() - beam_set.t_ns) * 1e-9,
+        "lead_ms": lead_ms,
+        "beams": _beam_list(beam_set, array_from_local),
+        "array": {
+            "kind": pipeline.array.kind,
+            "elements": pipeline.array.size,
+            "frequency_hz": pipeline.settings.array.frequency_hz,
+            "half_power_beamwidth_deg": None if beamwidth is None else float(np.degrees(beamwidth)),
+            "boresight_bearing_deg": None if boresight is None else boresight % 360,
+        },
+        "method": str(beam_set.method),
+        "normalisation": "unit response",
+        "condition_number": beam_set.condition_number,
+        "regularised": beam_set.regularised,
+        "unfit": update.unfit,
+        "left_out": [{"uav": out.uav, "reason": out.reason} for out in beam_set.left_out],
+    }
+
+
+def _beam_list(beam_set: BeamSet, array_from_local: FloatArray) -> list[Json]:
+    entries = []
+    for beam in beam_set.beams:
+        level = np.cos(beam.elevation_rad)
+        direction = np.array(
+            [
+                level * np.cos(beam.azimuth_rad),
+                level * np.sin(beam.azimuth_rad),
+                -np.sin(beam.elevation_rad),
+            ]
+        )
+        north, east, _ = array_from_local.T @ direction
+        bound = beam.pointing_bound_rad
+        entries.append(
+            {
+                "uav": beam.uav,
+                "azimuth_deg": float(np.degrees(beam.azimuth_rad)),
+                "elevation_deg": float(np.degrees(beam.elevation_rad)),
+                "range_m": beam.range_m,
+                "bearing_deg": float(np.degrees(np.arctan2(east, north))) % 360,
+                "gain_db": beam.gain_db,
+                "guaranteed_gain_db": None,
+                "pointing_bound_deg": None if bound is None else float(np.degrees(bound)),
+                "sinr_db": None,
+            }
+        )
+    return entries
+
+
+def weights(beam_set: BeamSet, lead_ms: float) -> Json:
+    """``/v1/beams/weights`` as JSON: M rows, columns in the order of ``uavs``."""
+    return {
+        "valid_at": rfc3339(beam_set.valid_at_ns),
+        "lead_ms": lead_ms,
+        "uavs": list(beam_set.uavs),
+        "method": str(beam_set.method),
+        "normalisation": "unit response",
+        "re": beam_set.weights.real.tolist(),
+        "im": beam_set.weights.imag.tolist(),
+    }

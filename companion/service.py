@@ -1,0 +1,224 @@
+"""The live service: links, timer, recorder and HTTP around one pipeline.                [shell]"""
+
+import asyncio
+import contextlib
+import socket
+import time
+from collections import deque
+from collections.abc import Callable, Coroutine, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import uvicorn
+
+import companion
+from companion.config import Settings
+from companion.mavlink.links import Link, LinkStatus, parse_link
+from companion.pipeline import Pipeline
+from companion.recording.background import BackgroundRecorder
+from companion.recording.reader import LogError
+from companion.recording.recover import recover_leftovers
+from companion.recording.writer import Writer
+from companion.server.app import create_app
+from companion.server.views import RecordingStatus
+from companion.values import Event, Frame, Notice, Rejection, Tick
+
+RATE_WINDOW_S: Final = 2.0
+NOTICES_KEPT: Final = 200
+
+
+class Timeline:
+    """Nanoseconds since the Unix epoch that never step: the wall clock once, then the monotonic."""
+
+    def __init__(self) -> None:
+        self._start_ns = time.time_ns() - time.monotonic_ns()
+
+    def now_ns(self) -> int:
+        """Now, on the node's timeline."""
+        return self._start_ns + time.monotonic_ns()
+
+
+class Service:
+    """A running node; what the HTTP server looks at.
+
+    ``say`` gets one line for a person whenever something changes. Raises ``LinkError`` if a link
+    cannot be opened, ``OSError`` if the recording cannot.
+    """
+
+    def __init__(self, settings: Settings, say: Callable[[str], None]) -> None:
+        self.pipeline = Pipeline(settings)
+        self.notices: deque[Notice] = deque(maxlen=NOTICES_KEPT)
+        self._settings = settings
+        self._say = say
+        self._timeline = Timeline()
+        self._started_ns = self._timeline.now_ns()
+        self._rates: deque[tuple[int, int, int]] = deque()
+        self._links = [
+            Link(parse_link(url), self._received, self._timeline.now_ns)
+            for url in settings.links.urls
+        ]
+        for link in self._links:
+            link.open()
+        self._recorder = self._open_recorder()
+
+    async def run(
+        self,
+        http: socket.socket,
+        token: str | None,
+        until: asyncio.Event,
+        *others: Coroutine[Any, Any, None],
+    ) -> None:
+        """Serve until ``until`` is set, then finish the recording.
+
+        ``others``: further coroutines to run beside, for the demo; they are cancelled at the end.
+        """
+        server = _Server(
+            uvicorn.Config(
+                create_app(self, token), log_level="warning", lifespan="off", access_log=False
+            )
+        )
+        if self._recorder:
+            self._recorder.start()
+        try:
+            async with asyncio.TaskGroup() as group:
+                tasks = [group.create_task(self._tick(), name="ticks")]
+                tasks += [group.create_task(link.run(), name=str(link.url)) for link in self._links]
+                tasks.append(group.create_task(self._recover_leftovers(), name="recovery"))
+                tasks += [group.create_task(other, name="beside") for other in others]
+                serving = group.create_task(server.serve(sockets=[http]), name="http")
+                await until.wait()
+                server.should_exit = True
+                await serving
+                for task in tasks:
+                    task.cancel()
+        finally:
+            if self._recorder:
+                metadata = {"digest": self.pipeline.digest.hexdigest()}
+                await asyncio.to_thread(self._recorder.stop, metadata)
+
+    # --- what drives the pipeline -----------------------------------------------------------
+
+    def _received(self, items: list[Frame | Rejection]) -> None:
+        for item in items:
+            self._step(item)
+
+    def _step(self, event: Event) -> None:
+        outputs = self.pipeline.step(event)
+        if self._recorder:
+            self._recorder.put(event, outputs)
+        for output in outputs:
+            if isinstance(output, Notice):
+                self.notices.append(output)
+                self._say(output.text)
+
+    async def _tick(self) -> None:
+        """Ticks at the update rate; where the loop was held up, the missed ones are left out."""
+        loop = asyncio.get_running_loop()
+        period_s = 1 / self._settings.beams.update_hz
+        due_s = loop.time()
+        while True:
+            self._step(Tick(self._timeline.now_ns()))
+            self._count_rates()
+            due_s = max(due_s + period_s, loop.time())
+            await asyncio.sleep(due_s - loop.time())
+
+    def _count_rates(self) -> None:
+        now_ns = self.now_ns()
+        self._rates.append((now_ns, self.pipeline.frames, self.pipeline.updates))
+        while self._rates[0][0] < now_ns - RATE_WINDOW_S * 1e9:
+            self._rates.popleft()
+
+    # --- what the server looks at -----------------------------------------------------------
+
+    def now_ns(self) -> int:
+        """Now, on the node's timeline."""
+        return self._timeline.now_ns()
+
+    def uptime_s(self) -> float:
+        """Seconds since the service was made."""
+        return (self.now_ns() - self._started_ns) * 1e-9
+
+    def links(self) -> list[LinkStatus]:
+        """Each link's counts."""
+        return [link.status for link in self._links]
+
+    def rates(self) -> dict[str, float | None]:
+        """Frames and updates per second over the last seconds."""
+        if len(self._rates) < 2:
+            return {"frames_hz": None, "updates_hz": None}
+        (t0, frames0, updates0), (t1, frames1, updates1) = self._rates[0], self._rates[-1]
+        seconds = (t1 - t0) * 1e-9
+        return {
+            "frames_hz": (frames1 - frames0) / seconds,
+            "updates_hz": (updates1 - updates0) / seconds,
+        }
+
+    def recording(self) -> RecordingStatus:
+        """How the recording is doing."""
+        recorder = self._recorder
+        if recorder is None:
+            return RecordingStatus("off", None, 0, 0, 0)
+        state = "degraded" if recorder.failure or recorder.dropped else "recording"
+        writer = recorder.writer
+        return RecordingStatus(
+            state, writer.path.name, recorder.bytes, recorder.messages, recorder.dropped
+        )
+
+    def unfit(self) -> list[str]:
+        """Why the service is not fit to be used; empty when it is."""
+        update = self.pipeline.last_update
+        reasons = [
+            f"link {link.status.url} is {link.status.state}"
+            for link in self._links
+            if link.status.state != "up"
+        ]
+        late_s = 1.0 + 5 / self._settings.beams.update_hz
+        if update is None or (self.now_ns() - update.t_ns) * 1e-9 > late_s:
+            reasons.append("beam updates are late")
+        elif update.unfit:
+            reasons.append(update.unfit)
+        return reasons
+
+    async def _recover_leftovers(self) -> None:
+        """Finish what an earlier run, killed, left open; off the event loop."""
+        directory = self._settings.recording.directory
+        if directory is None:
+            return
+        for found in await asyncio.to_thread(recover_leftovers, Path(directory)):
+            if isinstance(found, LogError):
+                self._say(str(found))
+            else:
+                self._say(f"recovered {found.path} ({found.lost_bytes} bytes lost)")
+
+    def _open_recorder(self) -> BackgroundRecorder | None:
+        recording = self._settings.recording
+        if recording.directory is None:
+            return None
+        weights_hz = None if recording.weights_hz == "all" else recording.weights_hz
+        return BackgroundRecorder(
+            Writer(
+                Path(recording.directory),
+                self._settings.to_toml(),
+                {"companion": companion.__version__},
+                weights_hz,
+                self._started_ns,
+            ),
+            self.pipeline.geodetic,
+        )
+
+
+class _Server(uvicorn.Server):
+    """uvicorn, leaving the signals to whoever runs the service."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Capture none."""
+        yield
+
+
+def require_center(settings: Settings) -> None:
+    """``ValueError`` unless the settings say what carries the array."""
+    if settings.center.source is None:
+        raise ValueError(
+            "say what carries the array: --center SYSID:COMPID, LAT,LON,ALT[,HEADING] or home"
+        )

@@ -1,0 +1,73 @@
+"""Where the array's carrier is at the time of use, and how it is turned.
+
+Rotations are named by frames: ``body_from_ned @ v_ned`` is v in body axes (FRD).
+"""
+
+import math
+
+import numpy as np
+
+from companion.tracking.geodesy import LocalFrame
+from companion.values import Attitude, Carrier, Fix, FloatArray, Track
+
+
+def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> FloatArray:
+    """Rotation (3, 3) for MAVLink's attitude: yaw about z, then pitch about y, then roll about x.
+
+    Source: the aerospace sequence 3-2-1, e.g. Groves, Principles of GNSS (2013), eq. 2.22.
+    """
+    cr, sr = math.cos(roll_rad), math.sin(roll_rad)
+    cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
+    cy, sy = math.cos(yaw_rad), math.sin(yaw_rad)
+    return np.array(
+        [
+            [cp * cy, cp * sy, -sp],
+            [sr * sp * cy - cr * sy, sr * sp * sy + cr * cy, sr * cp],
+            [cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp],
+        ]
+    )
+
+
+def later_body_from_body(body_rates_radps: FloatArray, interval_s: float) -> FloatArray:
+    """How a body turns at constant body rates, (3,): rotation (3, 3) from its axes to later ones.
+
+    Rodrigues' formula for the rotation vector -rates * interval: what the body sees turns the
+    other way than the body.
+    """
+    vector = -np.asarray(body_rates_radps, dtype=float) * interval_s
+    angle = math.sqrt(vector @ vector)
+    if angle == 0.0:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    turned: FloatArray = np.eye(3) + math.sin(angle) * cross
+    turned += (1 - math.cos(angle)) * (cross @ cross)
+    return turned
+
+
+def fixed(
+    valid_at_ns: int, local: LocalFrame, place: tuple[float, float, float], heading_rad: float
+) -> Carrier:
+    """A level station at (latitude deg, longitude deg, height m)."""
+    body_from_local = body_from_ned(0.0, 0.0, heading_rad) @ local.local_from_ned(*place[:2]).T
+    return Carrier(valid_at_ns, local.position_ned_m(*place), body_from_local, 0.0, None)
+
+
+def moving(
+    local: LocalFrame, track: Track, newest: Fix, attitude: Attitude, attitude_t_ns: int
+) -> Carrier:
+    """A vehicle at its track's time: its attitude is carried on from its own time by its rates.
+
+    North and down there are those at its ``newest`` report, a few metres away.
+    """
+    rates = np.array([attitude.rollspeed_radps, attitude.pitchspeed_radps, attitude.yawspeed_radps])
+    then = body_from_ned(attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad)
+    since_s = (track.valid_at_ns - attitude_t_ns) * 1e-9
+    local_from_ned = local.local_from_ned(newest.report.lat_deg, newest.report.lon_deg)
+    return Carrier(
+        track.valid_at_ns,
+        track.position_ned_m,
+        later_body_from_body(rates, since_s) @ then @ local_from_ned.T,
+        track.bound_m,
+        track.age_s,
+    )

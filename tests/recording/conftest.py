@@ -1,0 +1,165 @@
+"""Small recordings and frames, made here; and where the big logs are, if they are."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import all as dialect
+
+from companion.recording.writer import Writer
+from companion.values import (
+    AltitudeDatum,
+    Beam,
+    BeamSet,
+    Estimate,
+    Event,
+    Fix,
+    FloatArray,
+    Frame,
+    LeftOut,
+    Method,
+    Notice,
+    Reason,
+    Rejection,
+    Report,
+    Severity,
+    Source,
+    Tick,
+    Track,
+    TrackState,
+    Update,
+)
+
+START_NS = 1_700_000_000_000_000_000
+SHARED = Path(__file__).parents[3] / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def shared_logs() -> list[Path]:
+    """Every log that other programs made; the test is skipped where they are missing."""
+    logs = sorted(SHARED.glob("*.tlog"))
+    if not logs:
+        pytest.skip(f"the shared recordings are missing ({SHARED})")
+    return logs
+
+
+@pytest.fixture(scope="session")
+def wire() -> Callable[..., list[bytes]]:
+    """``wire(n)``: n frames of three messages and two senders as they go over the wire."""
+
+    def make(count: int, *, v1: bool = False) -> list[bytes]:
+        made = []
+        for number in range(count):
+            mav = dialect.MAVLink(None, srcSystem=1 + number % 2, srcComponent=1)
+            mav.seq = number % 256
+            boot_ms = 1000 + 10 * number
+            message = (
+                mav.heartbeat_encode(2, 3, 0, 0, 4),
+                mav.global_position_int_encode(boot_ms, 473977419, 85455938, 0, 0, 1, 2, 3, 9000),
+                mav.attitude_encode(boot_ms, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6),
+            )[number % 3]
+            made.append(bytes(message.pack(mav, force_mavlink1=v1)))
+        return made
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def geodetic() -> Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]:
+    """A stand-in for the geodesy: it only has to tell the axes apart."""
+    return lambda ned_m: (47 + ned_m[:, 0] / 1e5, 8 + ned_m[:, 1] / 1e5, -ned_m[:, 2])
+
+
+@pytest.fixture(scope="session")
+def events(wire: Callable[..., list[bytes]]) -> Callable[[int], list[Event]]:
+    """``events(n)``: frames, ticks and framing rejections, times equal and stepping back."""
+
+    def make(count: int) -> list[Event]:
+        made: list[Event] = []
+        for number, raw in enumerate(wire(count)):
+            t_ns = START_NS + 10_000_000 * number - (5_000_000 if number % 5 == 0 else 0)
+            link = f"udpin:127.0.0.1:{14550 + number % 2}"
+            msgid = raw[7] | raw[8] << 8 | raw[9] << 16
+            made.append(Frame(t_ns, link, Source(raw[5], raw[6]), msgid, raw))
+            if number % 10 == 0:
+                made.append(Tick(t_ns))
+            if number % 17 == 0:
+                made.append(Rejection(t_ns, link, Reason.GARBAGE, 3 + number))
+        return made
+
+    return make
+
+
+def _track(uav: str, t_ns: int) -> Track:
+    return Track(
+        uav, TrackState.LIVE, t_ns + 5, 0.25, np.array([10.0, 20.0, -30.0]), None,
+        np.array([0.1, 0.2, 0.3]), 3.0, 0.1, None, 0.4, 0.0, 7,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def update() -> Callable[[int], Update]:
+    """``update(t_ns)``: two tracks, one beam on each, one UAV left out."""
+    weights = np.array((np.arange(8).reshape(4, 2) + 0.5) * (1 - 2j), dtype=np.complex128)
+
+    def make(t_ns: int) -> Update:
+        beams = (
+            Beam("1:1", 0.1, -0.2, 100.0, None, 18.0),
+            Beam("icao:4CA7B3", 0.3, 0.0, 50.0, 0.02, 17.5),
+        )
+        left_out = (LeftOut("9:1", "behind the array"),)
+        chosen = BeamSet(t_ns, t_ns + 5, beams, weights, Method.ZERO_FORCING, 1.5, left_out)
+        return Update(t_ns, None, None, (_track("1:1", t_ns), _track("icao:4CA7B3", t_ns)), chosen)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def estimate() -> Estimate:
+    """An accepted report without an altitude, true a tenth of a second before it came."""
+    report = Report(
+        START_NS, "udp", "1:1", Source(1, 1), 47.5, 8.5, None, AltitudeDatum.MSL, None,
+        None, None, None, 1000, None,
+    )  # fmt: skip
+    fix = Fix("1:1", START_NS - 100_000_000, START_NS, np.zeros(3), None, report)
+    return Estimate(fix, np.zeros(3), 1.0, None, None)
+
+
+@pytest.fixture
+def record(
+    events: Callable[[int], list[Event]],
+    geodetic: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]],
+    update: Callable[[int], Update],
+    estimate: Estimate,
+) -> Callable[..., list[Event]]:
+    """``record(writer, n)``: writes n frames and what came of them; returns the events.
+
+    ``flush_every``: frames between flushes; ``flushed`` takes (bytes, events) at each.
+    """
+
+    def run(
+        writer: Writer,
+        count: int,
+        flush_every: int | None = None,
+        flushed: list[tuple[int, int]] | None = None,
+    ) -> list[Event]:
+        driven = events(count)
+        for number, event in enumerate(driven, start=1):
+            writer.event(event)
+            if number % 3 == 0:
+                writer.output(estimate, geodetic)
+                writer.output(Rejection(event.t_ns, "1:1", Reason.DUPLICATE), geodetic)
+            if isinstance(event, Tick):
+                writer.output(update(event.t_ns), geodetic)
+                notice = Notice(event.t_ns, Severity.WARNING, "1:1", "1:1 is stale")
+                writer.output(notice, geodetic)
+            if isinstance(event, Rejection):
+                writer.output(event, geodetic)  # as the pipeline hands it through
+            if flush_every and number % flush_every == 0:
+                writer.flush()
+                if flushed is not None:
+                    flushed.append((writer.size_bytes, number))
+        return driven
+
+    return run

@@ -1,0 +1,262 @@
+"""A recording cut anywhere, by whatever, is finished with no more than one flush lost."""
+
+import random
+import signal
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from companion.recording.reader import LogError, read_log, read_metadata, read_settings
+from companion.recording.recover import Recovered, recover, recover_leftovers
+from companion.recording.writer import Writer
+from companion.values import Event, Frame, Reason, Rejection, Tick
+
+Record = Callable[..., list[Event]]
+FLUSH_EVERY = 25
+
+
+@pytest.fixture
+def recording(tmp_path: Path, record: Record) -> tuple[Path, list[Event], list[tuple[int, int]]]:
+    """A finished recording, its events, and (size, events so far) at each flush."""
+    flushed: list[tuple[int, int]] = []
+    writer = Writer(tmp_path / "whole", "[a]\n", {"companion": "1"}, None, 0)
+    flushed.append((writer.size_bytes, 0))
+    driven = record(writer, 400, FLUSH_EVERY, flushed)
+    return writer.close({"digest": "d"}), driven, flushed
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def recovered_events(path: Path) -> list[Event]:
+    try:
+        return list(read_log(path))
+    except LogError:  # nothing was flushed before the cut
+        return []
+
+
+def test_cut_anywhere_no_more_than_one_flush_is_lost(
+    tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]]
+) -> None:
+    whole, driven, flushed = recording
+    data = whole.read_bytes()
+    rng = random.Random(11)
+    cuts = [0, 1, 7, 8, 9, 16, 17, *(rng.randrange(len(data)) for _ in range(120)), len(data) - 1]
+    for number, cut in enumerate(cuts):
+        torn = tmp_path / f"{number}.mcap.active"
+        torn.write_bytes(data[:cut])
+        result = recover(torn)
+        assert result.path == tmp_path / f"{number}.mcap" and result.changed
+        assert not torn.exists()
+        kept = recovered_events(result.path)
+        assert kept == driven[: len(kept)]
+        safe = max((events for size, events in flushed if size <= cut), default=0)
+        assert len(kept) >= safe
+        assert sum(result.messages.get(t, 0) for t in ("/mavlink/frames", "/ticks")) == sum(
+            isinstance(event, Frame | Tick) for event in kept
+        )
+        if cut >= flushed[0][0]:
+            assert read_settings(result.path) == "[a]\n"
+            assert read_metadata(result.path)["versions"] == {"companion": "1"}
+        with result.path.open("rb") as file:
+            summary = make_reader(file, validate_crcs=True).get_summary()
+        assert summary is not None and summary.statistics is not None
+        assert summary.statistics.message_count == sum(result.messages.values())
+
+
+def test_a_torn_file_reads_as_far_as_it_goes(
+    tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]]
+) -> None:
+    whole, driven, flushed = recording
+    data = whole.read_bytes()
+    for size, events in flushed[1:]:
+        for more in (0, 5, 40):
+            torn = tmp_path / "torn"
+            torn.write_bytes(data[: size + more])
+            assert list(read_log(torn)) == driven[:events]
+
+
+def test_everything_of_an_intact_part_is_kept(
+    tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]]
+) -> None:
+    """Message for message, outputs included, byte for byte."""
+    whole, _, flushed = recording
+    cut = tmp_path / "cut.mcap"
+    size = flushed[-1][0]
+    cut.write_bytes(whole.read_bytes()[: size + 30])
+    result = recover(cut)
+    assert cut.exists() and result.path == tmp_path / "cut.recovered.mcap"
+    assert result.lost_bytes == 30
+
+    def contents(path: Path) -> list[tuple[str, int, int, bytes]]:
+        with path.open("rb") as file:
+            found = make_reader(file).iter_messages(log_time_order=False)
+            return [(c.topic, m.sequence, m.log_time, m.data) for _, c, m in found]
+
+    kept = contents(result.path)
+    assert kept == contents(whole)[: len(kept)]
+    assert result.messages == Counter(topic for topic, *_ in kept)
+    assert result.last_ns == max(log_time for _, _, log_time, _ in kept)
+
+
+def test_a_finished_recording_is_left_alone(
+    tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]]
+) -> None:
+    whole, driven, _ = recording
+    before = whole.read_bytes()
+    result = recover(whole)
+    assert (result.path, result.changed, result.lost_bytes) == (whole, False, 0)
+    assert whole.read_bytes() == before
+    assert names(whole.parent) == [whole.name]
+    # Killed between the last byte and the new name: only the name is missing.
+    active = tmp_path / "done.mcap.active"
+    active.write_bytes(before)
+    assert recover(active).path.read_bytes() == before
+    assert list(read_log(tmp_path / "done.mcap")) == driven
+
+
+def test_no_other_file_is_overwritten(
+    tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]]
+) -> None:
+    whole, _, _ = recording
+    (tmp_path / "x.mcap").write_bytes(b"mine")
+    (tmp_path / "x.mcap.active").write_bytes(whole.read_bytes()[:-100])
+    assert recover(tmp_path / "x.mcap.active").path == tmp_path / "x-1.mcap"
+    assert (tmp_path / "x.mcap").read_bytes() == b"mine"
+
+
+def test_the_original_stays_until_the_new_file_is_whole(
+    tmp_path: Path,
+    recording: tuple[Path, list[Event], list[tuple[int, int]]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    whole, _, _ = recording
+    torn = tmp_path / "x.mcap.active"
+    torn.write_bytes(whole.read_bytes()[:-100])
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("companion.recording.recover.os.fsync", full)
+    with pytest.raises(LogError, match=r"x\.mcap\.active: cannot be recovered: No space left"):
+        recover(torn)
+    assert torn.read_bytes() == whole.read_bytes()[:-100]
+    assert names(tmp_path) == ["whole", "x.mcap.active"]
+
+
+def test_damage_in_the_middle_costs_one_chunk_and_is_said(
+    tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]]
+) -> None:
+    whole, driven, flushed = recording
+    broken = bytearray(whole.read_bytes())
+    broken[flushed[5][0] + 200] ^= 0xFF  # in the chunk after the fifth flush
+    path = tmp_path / "broken.mcap"
+    path.write_bytes(broken)
+    events = list(read_log(path))
+    first, last = flushed[5][1], flushed[6][1]
+    said = events[first]
+    assert isinstance(said, Rejection) and said.reason is Reason.GARBAGE and said.count > 200
+    assert events == [*driven[:first], said, *driven[last:]]
+    result = recover(path)
+    assert result.changed and result.lost_bytes == said.count
+    assert list(read_log(result.path)) == [*driven[:first], *driven[last:]]
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_flipped_bytes_never_raise(
+    tmp_path: Path,
+    recording: tuple[Path, list[Event], list[tuple[int, int]]],
+    seed: int,
+) -> None:
+    broken = bytearray(recording[0].read_bytes())
+    rng = random.Random(seed)
+    for _ in range(5):
+        broken[rng.randrange(8, len(broken))] ^= 1 << rng.randrange(8)
+    path = tmp_path / "broken.mcap.active"
+    path.write_bytes(broken)
+    driven = set(map(repr, recording[1]))
+    before = [e for e in recovered_events(path) if not isinstance(e, Rejection)]
+    assert set(map(repr, before)) <= driven
+    after = [e for e in recovered_events(recover(path).path) if not isinstance(e, Rejection)]
+    assert after == before
+
+
+def test_leftovers_are_recovered_and_what_cannot_be_is_told(
+    tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]]
+) -> None:
+    data = recording[0].read_bytes()
+    folder = tmp_path / "leftovers"
+    folder.mkdir()
+    (folder / "a.mcap.active").write_bytes(data[:-10])
+    (folder / "b.mcap.active").write_bytes(b"something else")
+    (folder / "c.mcap").write_bytes(data)
+    (folder / "d.mcap.active").touch()
+    live = Writer(folder, "", {}, None, 0)
+    results = recover_leftovers(folder)
+    assert [type(result) for result in results] == [Recovered, LogError, Recovered]
+    assert live.path.exists()
+    with pytest.raises(LogError, match="is being recorded"):
+        recover(live.path)
+    live.close({})
+    assert names(folder) == [
+        "a.mcap", "b.mcap.active", "c.mcap", "companion-19700101T000000Z.mcap", "d.mcap",
+    ]  # fmt: skip
+
+
+def test_what_is_no_recording_is_said(tmp_path: Path) -> None:
+    (tmp_path / "empty.mcap").touch()
+    (tmp_path / "text.mcap").write_text("hello, this is no recording")
+    for name, why in [
+        ("missing.mcap", "no such file"),
+        ("", "is a directory"),
+        ("empty.mcap", "not an MCAP recording"),
+        ("text.mcap", "not an MCAP recording"),
+    ]:
+        with pytest.raises(LogError, match=why):
+            recover(tmp_path / name)
+    assert names(tmp_path) == ["empty.mcap", "text.mcap"]
+
+
+_RECORD_FOREVER = """
+import itertools, sys
+from pathlib import Path
+from companion.recording.writer import Writer
+from companion.values import Frame, Source
+writer = Writer(Path(sys.argv[1]), "[a]", {}, None, 0)
+for number in itertools.count():
+    raw = bytes([0xFD, 9, 0, 0, number % 256, 1, 1, 0, 0, 0]) + number.to_bytes(11, "little")
+    writer.event(Frame(number, "udp", Source(1, 1), 0, raw))
+    if number % 1000 == 999:
+        writer.flush()
+        print(number + 1, flush=True)
+"""
+
+
+def test_a_killed_process_loses_nothing_that_was_flushed(tmp_path: Path) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", _RECORD_FOREVER, str(tmp_path)], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        for _ in range(20):
+            flushed = int(process.stdout.readline())
+        process.send_signal(signal.SIGKILL)
+        rest = process.stdout.read().split()
+        assert process.wait() == -signal.SIGKILL
+    flushed = int(rest[-1]) if rest else flushed
+    [leftover] = tmp_path.iterdir()
+    assert leftover.name.endswith(".mcap.active")
+    read = list(read_log(leftover))
+    [result] = recover_leftovers(tmp_path)
+    assert isinstance(result, Recovered)
+    events = list(read_log(result.path))
+    assert events == read
+    assert [event.t_ns for event in events] == list(range(len(events)))
+    assert len(events) >= flushed
+    assert result.messages == {"/mavlink/frames": len(events)}
+    assert read_settings(result.path) == "[a]"

@@ -1,0 +1,259 @@
+"""The command: what it prints, and that a mistake is one line on stderr."""
+
+import json
+import random
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from companion.values import Frame
+from sitl_replay import scenario
+from sitl_replay.cli import main
+from sitl_replay.recorder import TlogWriter
+from sitl_replay.vehicles import schedule
+
+COMMAND = [sys.executable, "-c", "from sitl_replay.cli import main; main()"]
+SOMEWHERE = "udpout:127.0.0.1:9"
+
+
+@pytest.fixture
+def receiver() -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound:
+        bound.bind(("127.0.0.1", 0))
+        bound.settimeout(20.0)
+        yield bound
+
+
+def url_of(bound: socket.socket, scheme: str = "udpout") -> str:
+    return f"{scheme}:127.0.0.1:{bound.getsockname()[1]}"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["fly", "papr", "--to", SOMEWHERE], "'papr' is not one of 'paper', 'hover'"),
+        (["fly", "paper"], "Missing option '--to'"),
+        (["fly", "paper", "--to", "udpin:127.0.0.1:9"], "is not udpout:HOST:PORT"),
+        (["fly", "paper", "--to", "udpout:127.0.0.1:99999"], "is not a port"),
+        (["fly", "paper", "--to", "udpout:no-such-host.invalid:9"], "no-such-host.invalid"),
+        (["fly", "paper", "--to", SOMEWHERE, "--uavs", "201"], "1<=x<=200"),
+        (["fly", "paper", "--to", SOMEWHERE, "--duration", "nan"], "a number above 0"),
+        (["fly", "paper", "--to", SOMEWHERE, "--duration", "-1"], "a number above 0"),
+        (["fly", "paper", "--to", SOMEWHERE, "--record", "."], "is a directory"),
+        (["fly", "paper", "--to", SOMEWHERE, "--record", "no/such/a.tlog"], "no/such/a.tlog"),
+        (["play", ".", "--to", SOMEWHERE], "is a directory"),
+        (["play", "nowhere.tlog", "--to", SOMEWHERE], "does not exist"),
+        (["play", "empty.tlog", "--to", SOMEWHERE, "--speed", "fast"], "above 0, or 'max'"),
+        (["record", "--from", SOMEWHERE, "--out", "a.tlog"], "udpin:HOST:PORT"),
+        (["record", "--from", "udpin:127.0.0.1:9"], "Missing option '--out'"),
+        (["record", "--from", "udpin:192.0.2.1:9999", "--out", "a.tlog"], "udpin:192.0.2.1"),
+        (["land"], "No such command 'land'"),
+    ],
+)
+def test_a_mistake_is_one_line(
+    arguments: list[str], complaint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty.tlog").touch()
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code not in (0, None)
+    assert isinstance(result.exception, SystemExit)
+    assert result.stdout == ""
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("sitl-replay: ")
+    assert complaint in line
+
+
+def test_a_refused_connection_is_one_line() -> None:
+    with socket.socket() as gone:
+        gone.bind(("127.0.0.1", 0))
+        url = url_of(gone, "tcp")
+    result = CliRunner().invoke(main, ["fly", "paper", "--to", url])
+    assert result.exit_code == 1
+    assert result.stderr == f"sitl-replay: {url}: Connection refused\n"
+
+
+def commands() -> list[click.Command]:
+    return [main, *main.commands.values()]
+
+
+@pytest.mark.parametrize("command", commands(), ids=lambda command: str(command.name))
+def test_every_help_has_an_example(command: click.Command) -> None:
+    arguments = [] if command is main else [str(command.name)]
+    result = CliRunner().invoke(main, [*arguments, "--help"])
+    assert result.exit_code == 0
+    assert "Example: sitl-replay" in " ".join(result.stdout.split())
+
+
+def test_list() -> None:
+    text = CliRunner().invoke(main, ["list"]).stdout
+    listed = json.loads(CliRunner().invoke(main, ["list", "--json"]).stdout)
+    assert [one["name"] for one in listed] == list(scenario.BUILDERS) == ["paper", "hover"]
+    for one in listed:
+        assert f"{one['name']:8} {one['description']}\n" in text
+
+
+def test_fly_sends_and_sums_up(receiver: socket.socket, tmp_path: Path) -> None:
+    tlog = tmp_path / "a.tlog"
+    arguments = ["fly", "hover", "--uavs", "2", "--to", url_of(receiver), "--duration", "0.3"]
+    result = CliRunner().invoke(main, [*arguments, "--seed", "8", "--record", str(tlog), "--json"])
+    assert (result.exit_code, result.stderr) == (0, "")
+    summary = json.loads(result.stdout)
+    meant = [sent.raw for sent in schedule(scenario.hover(2), seed=8, duration_s=0.3)]
+    assert summary["frames"] == sum(summary["by_message"].values()) == len(meant)
+    assert tlog.stat().st_size == summary["bytes"] + 8 * summary["frames"]
+    assert 0.2 < summary["duration_s"] < 1.0
+    sources = {receiver.recv(300)[5] for _ in meant}
+    assert sources == {1, 2, 5}
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_flight_well(
+    receiver: socket.socket, tmp_path: Path, stop: signal.Signals
+) -> None:
+    tlog = tmp_path / "a.tlog"
+    arguments = ["fly", "paper", "--to", url_of(receiver), "--record", str(tlog)]
+    with subprocess.Popen(
+        [*COMMAND, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as flight:
+        receiver.recv(300)
+        receiver.recv(300)
+        flight.send_signal(stop)
+        out, err = flight.communicate(timeout=20)
+    assert (flight.returncode, err) == (0, "")
+    (line,) = out.splitlines()
+    assert line.startswith("sent ")
+    assert tlog.stat().st_size > 0
+
+
+def test_record_until_a_signal(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    tlog = tmp_path / "heard.tlog"
+    raw = next(schedule(scenario.hover())).raw
+    arguments = ["record", "--from", f"udpin:127.0.0.1:{port}", "--out", str(tlog), "--json"]
+    with (
+        subprocess.Popen([*COMMAND, *arguments], stdout=subprocess.PIPE, text=True) as recording,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
+        sender.connect(("127.0.0.1", port))
+        sender.settimeout(0.02)
+        accepted = 0
+        while accepted < 5:  # a port that nobody listens on yet refuses what was sent before
+            try:
+                sender.send(raw)
+                sender.recv(1)
+            except ConnectionRefusedError:
+                accepted = 0
+            except TimeoutError:
+                accepted += 1
+        recording.send_signal(signal.SIGTERM)
+        out, _ = recording.communicate(timeout=20)
+    assert recording.returncode == 0
+    summary = json.loads(out)
+    assert summary["frames"] >= 5
+    assert summary["rejected"] == {}
+    assert tlog.stat().st_size == summary["frames"] * (8 + len(raw))
+
+
+def written(path: Path, stamps_s: list[float]) -> list[bytes]:
+    """A tlog under the stamps given; its frames."""
+    frames = [sent.raw for sent in schedule(scenario.hover(), duration_s=2.0)][: len(stamps_s)]
+    with TlogWriter(path) as writer:
+        for t_s, raw in zip(stamps_s, frames, strict=True):
+            writer.write(1_760_000_000_000_000_000 + round(t_s * 1e9), raw)
+    return frames
+
+
+def test_play(receiver: socket.socket, tmp_path: Path) -> None:
+    pytest.importorskip("companion.recording.reader")
+    log = tmp_path / "a.tlog"
+    frames = written(log, [0.0, 0.05, 0.1, 0.2])
+    result = CliRunner().invoke(main, ["play", str(log), "--to", url_of(receiver), "--json"])
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert [receiver.recv(300) for _ in frames] == frames
+    summary = json.loads(result.stdout)
+    assert (summary["frames"], summary["clamped"]) == (4, 0)
+    assert 0.2 <= summary["duration_s"] < 0.6
+
+
+@pytest.mark.parametrize("content", [b"", random.Random(1).randbytes(100), b"\n" * 5000], ids=len)
+def test_a_log_without_a_frame_is_one_line(content: bytes, tmp_path: Path) -> None:
+    pytest.importorskip("companion.recording.reader")
+    log = tmp_path / "bad.tlog"
+    log.write_bytes(content)
+    result = CliRunner().invoke(main, ["play", str(log), "--to", SOMEWHERE])
+    assert result.exit_code == 1
+    assert isinstance(result.exception, SystemExit)
+    (line,) = result.stderr.splitlines()
+    assert "bad.tlog" in line
+
+
+def test_a_log_that_breaks_on_the_way_is_one_line(
+    receiver: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # What a reader does on a torn file: some frames, then its error, a ValueError.
+    raw = next(schedule(scenario.hover())).raw
+
+    def torn() -> Iterator[Frame]:
+        yield Frame(t_ns=0, link="log", source=scenario.CARRIER.source, msgid=0, raw=raw)
+        raise ValueError("torn.tlog: cut short")
+
+    monkeypatch.setattr("sitl_replay.cli.frames_of", lambda *_: torn())
+    result = CliRunner().invoke(main, ["play", __file__, "--to", url_of(receiver)])
+    assert (result.exit_code, result.stderr) == (1, "sitl-replay: torn.tlog: cut short\n")
+    assert receiver.recv(300) == raw
+
+
+def test_broken_stamps_are_told_once(receiver: socket.socket, tmp_path: Path) -> None:
+    pytest.importorskip("companion.recording.reader")
+    log = tmp_path / "a.tlog"
+    written(log, [0.0, 100.0, 300.0, 300.1, 200.0])
+    arguments = ["play", str(log), "--to", url_of(receiver), "--speed", "100", "--json"]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 0
+    (line,) = result.stderr.splitlines()
+    assert "3 time stamps" in line
+    assert 0.1 <= json.loads(result.stdout)["duration_s"] < 0.6
+
+
+def test_rejections_of_a_log_are_summed_up(receiver: socket.socket, tmp_path: Path) -> None:
+    pytest.importorskip("companion.recording.reader")
+    log = tmp_path / "a.tlog"
+    frames = written(log, [0.0, 0.01, 1e7, 0.02, 0.03, 0.04])
+    damaged = bytearray(log.read_bytes())
+    damaged[-3] ^= 0x40  # in the last frame
+    log.write_bytes(damaged)
+    result = CliRunner().invoke(main, ["play", str(log), "--to", url_of(receiver), "--json"])
+    summary = json.loads(result.stdout)
+    assert [receiver.recv(300) for _ in frames[:-1]] == frames[:-1]
+    assert (result.exit_code, summary["frames"], summary["clamped"]) == (0, 5, 1)
+    assert summary["rejected"] == {"bad-crc": 1}
+    assert "1 time stamps" in result.stderr
+    assert summary["duration_s"] < 1.0
+
+
+def test_a_link_lost_on_the_way_is_a_failure(receiver: socket.socket) -> None:
+    def leave() -> None:
+        server.accept()[0].close()
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        leaving = threading.Thread(target=leave)
+        leaving.start()
+        lost = url_of(server, "tcp")
+        arguments = ["--to", lost, "--to", url_of(receiver), "--duration", "0.5", "--json"]
+        result = CliRunner().invoke(main, ["fly", "paper", *arguments])
+        leaving.join()
+    assert result.exit_code == 1
+    summary = json.loads(result.stdout)
+    assert [text.startswith(lost) for text in summary["lost"]] == [True]
+    assert summary["frames"] > 20

@@ -1,0 +1,286 @@
+"""The player over real sockets on the loopback."""
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from companion.values import Frame, Source
+from sitl_replay import player, scenario
+from sitl_replay.links import LinkError
+from sitl_replay.vehicles import schedule
+
+
+@pytest.fixture
+def receiver() -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound:
+        bound.bind(("127.0.0.1", 0))
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+        bound.settimeout(5.0)
+        yield bound
+
+
+def url_of(bound: socket.socket) -> str:
+    return f"udpout:127.0.0.1:{bound.getsockname()[1]}"
+
+
+def waiting(bound: socket.socket) -> list[bytes]:
+    """What has arrived."""
+    bound.setblocking(False)
+    found = []
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            found.append(bound.recv(300))
+    return found
+
+
+def log_of(stamps_s: list[float]) -> list[Frame]:
+    """Frames of the hover scenario under the stamps given."""
+    made = schedule(scenario.hover(1))
+    return [
+        Frame(
+            t_ns=round(t_s * 1e9),
+            link="log",
+            source=Source(*sent.raw[5:7]),
+            msgid=player.msgid(sent.raw),
+            raw=sent.raw,
+        )
+        for t_s, sent in zip(stamps_s, made, strict=False)
+    ]
+
+
+def without_clock(raw: bytes) -> bytes | None:
+    """A frame, unless it tells the time of day."""
+    return None if player.msgid(raw) == dialect.MAVLINK_MSG_ID_SYSTEM_TIME else raw
+
+
+def test_a_udp_socket_receives_what_is_flown(receiver: socket.socket) -> None:
+    tally = asyncio.run(player.fly(scenario.paper(), [url_of(receiver)], 0.6, seed=5))
+    got = waiting(receiver)
+    meant = [sent.raw for sent in schedule(scenario.paper(), seed=5, duration_s=0.6)]
+    assert list(map(without_clock, got)) == list(map(without_clock, meant))
+    assert (tally.frames, tally.octets) == (len(got), sum(map(len, got)))
+    assert tally.messages.total() == tally.frames
+
+
+def test_it_flies_in_real_time(receiver: socket.socket) -> None:
+    tally = asyncio.run(player.fly(scenario.hover(), [url_of(receiver)], 0.5))
+    last_s = [sent.t_s for sent in schedule(scenario.hover(), duration_s=0.5)][-1]
+    assert tally.duration_s >= last_s
+    assert tally.duration_s < last_s + 0.3
+
+
+def test_every_link_gets_every_frame(receiver: socket.socket) -> None:
+    with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as second:
+        try:
+            second.bind(("::1", 0))
+        except OSError:
+            pytest.skip("no IPv6 loopback here")
+        urls = [url_of(receiver), f"udpout:[::1]:{second.getsockname()[1]}"]
+        tally = asyncio.run(player.fly(scenario.hover(), urls, 0.2))
+        assert len(waiting(receiver)) == len(waiting(second)) == tally.frames > 0
+
+
+def test_a_refused_udp_peer_is_no_error(receiver: socket.socket) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
+        gone.bind(("127.0.0.1", 0))
+        nobody = url_of(gone)
+    tally = asyncio.run(player.fly(scenario.hover(), [nobody, url_of(receiver)], 0.3))
+    assert len(waiting(receiver)) == tally.frames > 5
+    assert tally.lost == []
+
+
+def test_udp_goes_on_when_the_peer_comes_back() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as first:
+        first.bind(("127.0.0.1", 0))
+        address = first.getsockname()
+    url = f"udpout:127.0.0.1:{address[1]}"
+
+    async def scene() -> bytes:
+        tally = player.Tally()
+        flight = asyncio.create_task(player.fly(scenario.hover(), [url], tally=tally))
+        loop = asyncio.get_running_loop()
+        arrived: asyncio.Future[bytes] = loop.create_future()
+
+        class Late(asyncio.DatagramProtocol):
+            def datagram_received(self, data: bytes, addr: object) -> None:
+                if not arrived.done():
+                    arrived.set_result(data)
+
+        while tally.frames < 10:  # most of them refused
+            await asyncio.sleep(0.005)
+        transport, _ = await loop.create_datagram_endpoint(Late, local_addr=address)
+        try:
+            return await asyncio.wait_for(arrived, 5.0)
+        finally:
+            transport.close()
+            flight.cancel()
+
+    assert asyncio.run(scene())[0] == 0xFD
+
+
+def test_a_tcp_peer_gets_the_stream() -> None:
+    async def scene() -> tuple[bytes, player.Tally]:
+        received = bytearray()
+        ended = asyncio.Event()
+
+        async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            writer.write(b"whatever a ground station says")
+            received.extend(await reader.read(-1))
+            writer.close()
+            ended.set()
+
+        server = await asyncio.start_server(serve, "127.0.0.1", 0)
+        port = server.sockets[0].getsockname()[1]
+        tally = await player.fly(scenario.hover(), [f"tcp:127.0.0.1:{port}"], 0.3)
+        await asyncio.wait_for(ended.wait(), 5.0)
+        server.close()
+        return bytes(received), tally
+
+    stream, tally = asyncio.run(scene())
+    assert len(dialect.MAVLink(None).parse_buffer(stream) or []) == tally.frames > 5
+    assert len(stream) == tally.octets
+
+
+async def closing_server() -> tuple[asyncio.Server, str]:
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readexactly(20)
+        writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    return server, f"tcp:127.0.0.1:{server.sockets[0].getsockname()[1]}"
+
+
+def test_a_vanished_tcp_peer_ends_the_flight() -> None:
+    async def scene() -> None:
+        server, url = await closing_server()
+        async with server:
+            with pytest.raises(LinkError, match=url):
+                await asyncio.wait_for(player.fly(scenario.hover(), [url]), 5.0)
+
+    asyncio.run(scene())
+
+
+def test_the_other_links_outlive_a_vanished_peer(
+    receiver: socket.socket, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def scene() -> tuple[str, player.Tally]:
+        server, url = await closing_server()
+        async with server:
+            return url, await player.fly(scenario.hover(), [url, url_of(receiver)], 0.8)
+
+    url, tally = asyncio.run(scene())
+    assert len(waiting(receiver)) == tally.frames
+    assert [text.startswith(url) for text in tally.lost] == [True]
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+
+
+def test_a_refused_tcp_peer_is_told_by_its_url() -> None:
+    with socket.socket() as gone:
+        gone.bind(("127.0.0.1", 0))
+        port = gone.getsockname()[1]
+    with pytest.raises(LinkError, match=f"tcp:127.0.0.1:{port}: Connection refused"):
+        asyncio.run(player.fly(scenario.hover(), [f"tcp:127.0.0.1:{port}"]))
+
+
+def test_a_peer_that_does_not_read_holds_nobody_up(receiver: socket.socket) -> None:
+    # Real time: frames for it are dropped and counted, once its buffers are full.
+    with socket.create_server(("127.0.0.1", 0)) as deaf:
+        deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        url = f"tcp:127.0.0.1:{deaf.getsockname()[1]}"
+        frames = log_of([0.0] * 20) * 10_000
+        tally = asyncio.run(player.play(frames, [url]))
+    assert tally.frames == len(frames)
+    assert 0 < tally.dropped < tally.frames
+
+
+def test_a_cancelled_flight_closes_its_links_and_its_log(
+    receiver: socket.socket, tmp_path: Path
+) -> None:
+    tlog = tmp_path / "cut.tlog"
+    tally = player.Tally()
+
+    async def scene() -> set[asyncio.Task[object]]:
+        flight = asyncio.create_task(
+            player.fly(scenario.paper(), [url_of(receiver)], record=tlog, tally=tally)
+        )
+        loop = asyncio.get_running_loop()
+        await loop.sock_recv(receiver, 300)
+        flight.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await flight
+        return asyncio.all_tasks() - {asyncio.current_task()}
+
+    receiver.setblocking(False)
+    assert asyncio.run(scene()) == set()
+    assert tally.frames >= 1
+    assert tlog.stat().st_size == tally.octets + 8 * tally.frames
+
+
+def test_a_log_is_played_as_it_is(receiver: socket.socket) -> None:
+    frames = log_of([0.0, 0.1, 0.15, 0.3])
+    tally = asyncio.run(player.play(frames, [url_of(receiver)]))
+    assert waiting(receiver) == [frame.raw for frame in frames]
+    assert 0.3 <= tally.duration_s < 0.6
+    assert tally.clamped == 0
+
+
+@pytest.mark.parametrize(("speed", "seconds"), [(2.0, 0.15), (None, 0.0)])
+def test_speed(receiver: socket.socket, speed: float | None, seconds: float) -> None:
+    frames = log_of([0.0, 0.1, 0.2, 0.3])
+    tally = asyncio.run(player.play(frames, [url_of(receiver)], speed))
+    assert len(waiting(receiver)) == 4
+    assert seconds <= tally.duration_s < seconds + 0.14
+
+
+def test_at_full_speed_a_slow_tcp_peer_loses_nothing() -> None:
+    frames = log_of([0.0] * 20) * 10_000
+
+    async def scene() -> tuple[int, player.Tally]:
+        count, stalled_at = 0, -1
+        ended = asyncio.Event()
+        tally = player.Tally()
+
+        async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            nonlocal count, stalled_at
+            while tally.frames != stalled_at:  # read only when nothing more goes in
+                stalled_at = tally.frames
+                await asyncio.sleep(0.05)
+            while data := await reader.read(1 << 16):
+                count += len(data)
+            writer.close()
+            ended.set()
+
+        server = await asyncio.start_server(serve, "127.0.0.1", 0)
+        url = f"tcp:127.0.0.1:{server.sockets[0].getsockname()[1]}"
+        await player.play(frames, [url], None, tally=tally)
+        await asyncio.wait_for(ended.wait(), 10.0)
+        server.close()
+        assert 0 < stalled_at < len(frames)
+        return count, tally
+
+    count, tally = asyncio.run(scene())
+    assert tally.dropped == 0
+    assert count == tally.octets == sum(len(frame.raw) for frame in frames)
+
+
+def test_broken_stamps_are_clamped_and_counted() -> None:
+    tally = player.Tally()
+    stamps_s = [100.0, 101.0, 41.0, 42.5, 1e9, 1e9 + 5.0, 0.0, 0.25]
+    times_s = [t_s for t_s, _ in player.on_timeline(log_of(stamps_s), tally)]
+    assert times_s == pytest.approx([0.0, 1.0, 1.0, 2.5, 7.5, 12.5, 12.5, 12.75])
+    assert tally.clamped == 3
+
+
+def test_message_ids_of_both_versions() -> None:
+    message = dialect.MAVLink_attitude_message(1, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0)
+    sender = dialect.MAVLink(None, srcSystem=253, srcComponent=7)
+    assert player.msgid(message.pack(sender)) == 30
+    assert player.msgid(message.pack(sender, force_mavlink1=True)) == 30
+    wide = dialect.MAVLink_wind_message(1.0, 2.0, 3.0).pack(sender)
+    assert player.message_name(player.msgid(wide)) == "WIND"
+    assert player.message_name(70_000) == "UNKNOWN_70000"

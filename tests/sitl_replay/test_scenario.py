@@ -1,0 +1,127 @@
+"""Trajectories and attitudes: their derivatives, and the figures of the paper (MATH.md 8)."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sitl_replay import scenario
+from sitl_replay.scenario import BUILDERS, Circle, Pose, Sway, Vehicle
+
+STEP_S = 1e-5
+TIMES_S = (0.0, 0.37, 3.1, 12.9, 61.3)
+ALL = [
+    pytest.param(vehicle, id=f"{name}-{vehicle.source}")
+    for name, build in BUILDERS.items()
+    for vehicle in build(6).vehicles
+]
+
+
+@pytest.mark.parametrize("vehicle", ALL)
+@pytest.mark.parametrize("t_s", TIMES_S)
+def test_velocity_is_the_derivative_of_position(vehicle: Vehicle, t_s: float) -> None:
+    after = np.array(vehicle.trajectory(t_s + STEP_S).position_ned_m)
+    before = np.array(vehicle.trajectory(t_s - STEP_S).position_ned_m)
+    slope_mps = (after - before) / (2 * STEP_S)
+    assert slope_mps == pytest.approx(vehicle.trajectory(t_s).velocity_ned_mps, abs=1e-4)
+
+
+def rotation(pose: Pose) -> Rotation:
+    """NED from body."""
+    return Rotation.from_euler("ZYX", [pose.yaw_rad, pose.pitch_rad, pose.roll_rad])
+
+
+@pytest.mark.parametrize("vehicle", ALL)
+@pytest.mark.parametrize("t_s", TIMES_S)
+def test_body_rates_are_those_of_the_attitude(vehicle: Vehicle, t_s: float) -> None:
+    # The turn between two moments, seen from the body, is what gyroscopes measure.
+    before = rotation(vehicle.attitude(t_s - STEP_S))
+    after = rotation(vehicle.attitude(t_s + STEP_S))
+    measured_radps = (before.inv() * after).as_rotvec() / (2 * STEP_S)
+    assert measured_radps == pytest.approx(vehicle.attitude(t_s)[3:], abs=1e-7)
+
+
+def test_body_rates_far_from_level() -> None:
+    # At ±1° the cross terms hardly show: a large sway proves the signs.
+    sway = Sway(turn_rate_radps=0.4, amplitude_rad=0.8)
+    for t_s in TIMES_S:
+        turn = rotation(sway(t_s - STEP_S)).inv() * rotation(sway(t_s + STEP_S))
+        assert turn.as_rotvec() / (2 * STEP_S) == pytest.approx(sway(t_s)[3:], abs=1e-6)
+
+
+def test_the_carrier_hovers_northward_within_a_degree() -> None:
+    carrier = scenario.paper().carrier
+    poses = np.array([carrier.attitude(t_s)[:3] for t_s in np.arange(0.0, 120.0, 0.05)])
+    assert np.abs(poses).max() <= math.radians(1.0)
+    assert np.abs(poses).max(axis=0).min() > math.radians(0.3)
+    assert carrier.trajectory(77.0) == ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    assert str(carrier.source) == "5:1"
+
+
+def test_paper_speeds_and_radii() -> None:
+    calm = scenario.paper(gust=0.0)
+    for vehicle, radius_m in zip(calm.uavs, (100, 150, 200, 250), strict=True):
+        motions = [vehicle.trajectory(t_s) for t_s in np.arange(0.0, 13.0, 0.01)]
+        ranges_m = np.array([math.hypot(*m.position_ned_m[:2]) for m in motions])
+        speeds_mps = np.array([math.hypot(*m.velocity_ned_mps) for m in motions])
+        assert np.abs(ranges_m - radius_m).max() < 1e-9
+        assert np.abs(speeds_mps - radius_m / 2).max() < 1e-9
+    assert math.hypot(*calm.uavs[3].trajectory(5.0).velocity_ned_mps) == pytest.approx(125.0)
+
+
+def test_paper_velocity_as_printed() -> None:
+    # MATH.md 8, with its gust term as a velocity; north first, a quarter turn apart.
+    t_s = 2.3
+    for index, vehicle in enumerate(scenario.paper().uavs):
+        speed_mps, phase_rad = 0.5 * (100 + 50 * index), index * math.pi / 2
+        slow, fast = 0.5 * t_s + phase_rad, 5.0 * t_s + phase_rad
+        expected = (
+            speed_mps * math.cos(slow) + speed_mps / 5 * math.cos(fast),
+            -speed_mps * math.sin(slow) - speed_mps / 5 * math.sin(fast),
+            0.0,
+        )
+        assert vehicle.trajectory(t_s).velocity_ned_mps == pytest.approx(expected)
+
+
+def test_gusts_keep_the_circle_about_the_carrier() -> None:
+    circle = Circle(100.0, 0.5, 0.0, 0.0)
+    period_s = math.tau / 0.5
+    positions = [circle(t_s).position_ned_m for t_s in np.linspace(0, period_s, 1000, False)]
+    assert np.mean(positions, axis=0) == pytest.approx((0, 0, 0), abs=1e-9)
+    assert circle(3.0).position_ned_m == pytest.approx(circle(3.0 + period_s).position_ned_m)
+
+
+def test_uavs_use_three_dimensions_and_report_unevenly() -> None:
+    uavs = scenario.paper(8).uavs
+    assert [-uav.trajectory(1.0).position_ned_m[2] for uav in uavs] == [0, 10, 20, 30] * 2
+    assert [uav.report_interval_s for uav in uavs] == [0.10, 0.15, 0.20, 0.25] * 2
+
+
+@pytest.mark.parametrize("build", BUILDERS.values(), ids=BUILDERS)
+def test_a_large_fleet_has_its_own_ids_and_sendable_speeds(
+    build: Callable[[int], scenario.Scenario],
+) -> None:
+    fleet = build(scenario.MAX_UAVS)
+    sources = {vehicle.source for vehicle in fleet.vehicles}
+    assert len(sources) == scenario.MAX_UAVS + 1
+    assert {source.sysid for source in sources} == set(range(1, scenario.MAX_UAVS + 2))
+    assert len({vehicle.uptime_ms for vehicle in fleet.vehicles}) == len(sources)
+    for uav in fleet.uavs:
+        assert math.hypot(*uav.trajectory(9.0).velocity_ned_mps) < 1.2 * 125.0 + 1e-6
+
+
+@pytest.mark.parametrize("build", BUILDERS.values(), ids=BUILDERS)
+@pytest.mark.parametrize("uavs", [-1, 0, 201])
+def test_fleet_sizes_out_of_range(build: Callable[[int], scenario.Scenario], uavs: int) -> None:
+    with pytest.raises(ValueError, match="1 to 200 can fly"):
+        build(uavs)
+
+
+def test_hovering_uavs_are_spread_before_the_array() -> None:
+    motions = [uav.trajectory(0.0).position_ned_m for uav in scenario.hover(5).uavs]
+    azimuths_deg = [math.degrees(math.atan2(east, north)) for north, east, _ in motions]
+    assert azimuths_deg == pytest.approx([-60, -30, 0, 30, 60])
+    (alone,) = scenario.hover(1).uavs
+    assert alone.trajectory(0.0).position_ned_m == pytest.approx((150.0, 0.0, 0.0))

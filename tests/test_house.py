@@ -1,0 +1,398 @@
+"""The rules of the house, as tests: what may live in which room, and what must not be committed.
+
+Each rule is a function from source text to a list of faults, run over the tree and, below, over
+small pieces of bad code that it must refuse: a rule that finds nothing there has gone blind.
+Which room may import which is import-linter's part (``pyproject.toml``); it is run here as well.
+"""
+
+import ast
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = ("companion", "sitl_replay")
+LOCKS = ("requirements.lock", "requirements-dev.lock")
+LONGEST_MODULE_LINES = 400
+
+PURE = (
+    "companion/values.py",
+    "companion/config.py",
+    "companion/pipeline.py",
+    "companion/mavlink/",
+    "companion/tracking/",
+    "companion/beams/",
+)
+SHELL = ("companion/mavlink/links.py", "companion/mavlink/presence.py")
+READS_FILES = ("companion/config.py",)
+
+# Modules by which clocks, sockets, files, threads and processes are reached.
+# fmt: off
+IMPURE_MODULES = frozenset({
+    "anyio", "asyncio", "concurrent", "glob", "io", "multiprocessing", "os", "pathlib", "select",
+    "selectors", "serial", "shutil", "signal", "socket", "socketserver", "ssl", "subprocess",
+    "tempfile", "threading", "time",
+})
+# fmt: on
+FILE_MODULES = frozenset({"pathlib"})
+FILE_CALLS = frozenset({"open", "read_bytes", "read_text", "write_bytes", "write_text"})
+CLOCK_CALLS = frozenset({"now", "today", "utcnow"})
+
+# In parts, so that this file does not hold what it looks for.
+# fmt: off
+REGISTRY_HOSTS = tuple(".".join(parts) for parts in (
+    ("pypi", "org"), ("pythonhosted", "org"), ("anaconda", "org"), ("npmjs", "org"),
+    ("npmjs", "com"), ("yarnpkg", "com"), ("unpkg", "com"), ("jsdelivr", "net"), ("jsr", "io"),
+    ("crates", "io"), ("rubygems", "org"), ("proxy", "golang", "org"), ("maven", "org"),
+    ("docker", "io"), ("ghcr", "io"), ("quay", "io"), ("gcr", "io"),
+))
+# fmt: on
+
+
+def sources() -> list[str]:
+    """Every module of both packages, as a path from the root."""
+    found = (p for package in PACKAGES for p in (ROOT / package).rglob("*.py"))
+    return sorted(p.relative_to(ROOT).as_posix() for p in found)
+
+
+def committed() -> list[str]:
+    """Every file that is or would be committed; without git, every file not made by a tool."""
+    git = ("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard")
+    if shutil.which("git") and (ROOT / ".git").exists():
+        done = subprocess.run(git, cwd=ROOT, capture_output=True, check=True)
+        names = done.stdout.decode().split("\0")
+        return sorted(name for name in names if name and (ROOT / name).is_file())
+    made = re.compile(r"(^|/)(\.git|\.venv|\.\w+_cache|\.hypothesis|__pycache__|build|dist)/")
+    found = (p.relative_to(ROOT).as_posix() for p in ROOT.rglob("*") if p.is_file())
+    return sorted(name for name in found if not made.search(name))
+
+
+def is_pure(path: str) -> bool:
+    """Whether the module at ``path`` is in a room without clock, socket, file and await."""
+    return path.startswith(PURE) and path not in SHELL
+
+
+def imports(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Line and full dotted name of everything imported; ``from a import b`` gives ``a.b``."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, name.name) for name in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            module = "." * node.level + (node.module or "")
+            yield from ((node.lineno, f"{module}.{name.name}") for name in node.names)
+
+
+# --- the rules: path and source text to faults --------------------------------------------------
+
+
+def impurities(path: str, text: str) -> list[str]:
+    """Await, clocks, sockets and files in a pure room."""
+    if not is_pure(path):
+        return []
+    tree = ast.parse(text)
+    may_read = path in READS_FILES
+    banned = IMPURE_MODULES - FILE_MODULES if may_read else IMPURE_MODULES
+    faults = [
+        f"{path}:{line}: imports {name}"
+        for line, name in imports(tree)
+        if name.split(".")[0] in banned
+    ]
+    for node in ast.walk(tree):
+        match node:
+            case ast.AsyncFunctionDef() | ast.Await() | ast.AsyncFor() | ast.AsyncWith():
+                faults.append(f"{path}:{node.lineno}: is asynchronous")
+            case ast.comprehension(is_async=1):
+                faults.append(f"{path}:{node.iter.lineno}: is asynchronous")
+            case ast.Call(func=ast.Name(id=name) | ast.Attribute(attr=name)):
+                if name in CLOCK_CALLS:
+                    faults.append(f"{path}:{node.lineno}: reads a clock: {name}()")
+                if name in FILE_CALLS and not may_read:
+                    faults.append(f"{path}:{node.lineno}: touches a file: {name}()")
+    return faults
+
+
+def heavy_imports(path: str, text: str) -> list[str]:
+    """CVXPY outside the LMI; pymavlink's mavutil anywhere."""
+    tree = ast.parse(text)
+    faults = []
+    for line, name in imports(tree):
+        if name.startswith("cvxpy") and path != "companion/tracking/lmi.py":
+            faults.append(f"{path}:{line}: imports cvxpy")
+        if "mavutil" in name.split("."):
+            faults.append(f"{path}:{line}: imports mavutil")
+    return faults
+
+
+def foreign_imports(path: str, text: str) -> list[str]:
+    """``values`` imports only the standard library and numpy."""
+    if path != "companion/values.py":
+        return []
+    allowed = sys.stdlib_module_names | {"numpy"}
+    return [
+        f"{path}:{line}: imports {name}"
+        for line, name in imports(ast.parse(text))
+        if name.split(".")[0] not in allowed
+    ]
+
+
+def strangers(path: str, text: str) -> list[str]:
+    """``sitl_replay`` knows the values, the wire and the reader, and nothing else of us."""
+    if not path.startswith("sitl_replay/"):
+        return []
+    allowed = re.compile(r"companion\.(values|mavlink|recording\.reader|__version__)(\.|$)")
+    return [
+        f"{path}:{line}: imports {name}"
+        for line, name in imports(ast.parse(text))
+        if name.split(".")[0] == "companion" and not allowed.match(name)
+    ]
+
+
+def undocumented(path: str, text: str) -> list[str]:
+    """Modules, public classes, functions and methods without a docstring.
+
+    Properties are attributes: the docstring of their class speaks of them. Methods of a class
+    with a base may be what the base has documented.
+    """
+    tree = ast.parse(text)
+    faults = [] if ast.get_docstring(tree) or not tree.body else [f"{path}:1: no docstring"]
+
+    def visit(body: list[ast.stmt], prefix: str) -> None:
+        for node in body:
+            if not isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+                continue
+            marks = {ast.unparse(mark).split(".")[-1] for mark in node.decorator_list}
+            if node.name.startswith("_") or marks & {"property", "setter", "overload"}:
+                continue
+            if not ast.get_docstring(node):
+                faults.append(f"{path}:{node.lineno}: {prefix}{node.name} has no docstring")
+            if isinstance(node, ast.ClassDef) and not node.bases:
+                visit(node.body, f"{prefix}{node.name}.")
+
+    visit(tree.body, "")
+    return faults
+
+
+def overlong(path: str, text: str) -> list[str]:
+    """Modules that one can no longer hold in the head."""
+    lines = text.count("\n")
+    return [f"{path}: {lines} lines"] if lines >= LONGEST_MODULE_LINES else []
+
+
+def nameless(path: str, _text: str) -> list[str]:
+    """Modules named after nothing."""
+    bad = Path(path).stem in {"utils", "util", "helpers", "helper", "common", "misc"}
+    return [f"{path}: says nothing of what is in it"] if bad else []
+
+
+Rule = Callable[[str, str], list[str]]
+RULES: tuple[Rule, ...] = (
+    impurities,
+    heavy_imports,
+    foreign_imports,
+    strangers,
+    undocumented,
+    overlong,
+    nameless,
+)
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.__name__)
+def test_the_tree_keeps_the_rule(rule: Rule) -> None:
+    paths = sources()
+    assert "companion/values.py" in paths
+    faults = [fault for p in paths for fault in rule(p, (ROOT / p).read_text(encoding="utf-8"))]
+    assert not faults, "\n" + "\n".join(faults)
+
+
+BEAMS = "companion/beams/steering.py"
+BAD = [
+    (impurities, BEAMS, "async def f(): ..."),
+    (impurities, BEAMS, "async def f():\n    return [x async for x in g()]"),
+    (impurities, BEAMS, "import time"),
+    (impurities, BEAMS, "def f():\n    from time import monotonic_ns"),
+    (impurities, BEAMS, "import asyncio.events as e"),
+    (impurities, BEAMS, "import socket"),
+    (impurities, BEAMS, "from os import path"),
+    (impurities, BEAMS, "from pathlib import Path"),
+    (impurities, BEAMS, "data = open('x')"),
+    (impurities, BEAMS, "data = p.read_text()"),
+    (impurities, "companion/values.py", "from datetime import datetime\nt = datetime.now()"),
+    (impurities, "companion/tracking/fleet.py", "t = time.time_ns(); import time"),
+    (impurities, "companion/pipeline.py", "import threading"),
+    (impurities, "companion/mavlink/framing.py", "import selectors"),
+    (impurities, "companion/config.py", "import os"),
+    (heavy_imports, "companion/tracking/design.py", "import cvxpy as cp"),
+    (heavy_imports, "companion/studies/paper.py", "def f():\n    from cvxpy import Variable"),
+    (heavy_imports, "sitl_replay/player.py", "from pymavlink import mavutil"),
+    (heavy_imports, "companion/mavlink/links.py", "import pymavlink.mavutil"),
+    (heavy_imports, "companion/service.py", "from pymavlink.mavutil import mavlink_connection"),
+    (foreign_imports, "companion/values.py", "import scipy.linalg"),
+    (foreign_imports, "companion/values.py", "from companion.config import Settings"),
+    (foreign_imports, "companion/values.py", "from .mavlink import framing"),
+    (strangers, "sitl_replay/player.py", "from companion.pipeline import step"),
+    (strangers, "sitl_replay/player.py", "import companion.server.app"),
+    (strangers, "sitl_replay/player.py", "from companion.recording import writer"),
+    (strangers, "sitl_replay/player.py", "from companion import service"),
+    (undocumented, BEAMS, "x = 1"),
+    (undocumented, BEAMS, '"""."""\ndef f(): ...'),
+    (undocumented, BEAMS, '"""."""\nasync def f(): ...'),
+    (undocumented, BEAMS, '"""."""\nclass C:\n    x: int'),
+    (undocumented, BEAMS, '"""."""\nclass C:\n    """."""\n    def f(self): ...'),
+    (overlong, BEAMS, "x = 1\n" * LONGEST_MODULE_LINES),
+    (nameless, "companion/beams/utils.py", ""),
+    (nameless, "sitl_replay/helpers.py", ""),
+]
+
+
+@pytest.mark.parametrize(("rule", "path", "text"), BAD)
+def test_the_rule_refuses(rule: Rule, path: str, text: str) -> None:
+    assert rule(path, text)
+
+
+GOOD = [
+    (impurities, "companion/mavlink/links.py", "import asyncio\nasync def f(): ..."),
+    (impurities, "companion/recording/writer.py", "from pathlib import Path\nx = open('y')"),
+    (impurities, "companion/config.py", "from pathlib import Path\nx = Path('a').read_text()"),
+    (impurities, BEAMS, "from datetime import datetime\nimport numpy as np\ntime = 3\ntimeout = 4"),
+    (heavy_imports, "companion/tracking/lmi.py", "def f():\n    import cvxpy"),
+    (heavy_imports, "companion/mavlink/decode.py", "from pymavlink.dialects.v20 import all"),
+    (foreign_imports, "companion/values.py", "import enum\nfrom numpy.typing import NDArray"),
+    (strangers, "sitl_replay/player.py", "from companion.values import Source"),
+    (strangers, "sitl_replay/player.py", "from companion.mavlink.framing import Splitter"),
+    (strangers, "sitl_replay/player.py", "from companion.recording.reader import frames"),
+    (undocumented, BEAMS, '"""."""\ndef _f(): ...\nclass _C: ...'),
+    (undocumented, BEAMS, ""),
+    (overlong, BEAMS, "x = 1\n" * (LONGEST_MODULE_LINES - 1)),
+]
+
+
+@pytest.mark.parametrize(("rule", "path", "text"), GOOD)
+def test_the_rule_allows(rule: Rule, path: str, text: str) -> None:
+    assert rule(path, text) == []
+
+
+# --- what imports what: import-linter -----------------------------------------------------------
+
+
+def lint_imports(root: Path) -> subprocess.CompletedProcess[str]:
+    """Run import-linter over the packages at ``root``, with the contracts found there."""
+    run = "from importlinter.cli import lint_imports_command; lint_imports_command()"
+    command = (sys.executable, "-c", run, "--no-cache")
+    return subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
+
+
+def test_the_rooms_import_in_the_order_of_the_flow() -> None:
+    done = lint_imports(ROOT)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(
+    ("path", "text"),
+    [
+        ("companion/beams/bad.py", "import companion.tracking"),
+        ("companion/mavlink/bad.py", "import companion.beams"),
+        ("companion/tracking/bad.py", "def f():\n    from companion.mavlink import framing"),
+        ("companion/values.py", "import companion.beams"),
+        ("companion/recording/bad.py", "import companion.server"),
+        ("companion/server/bad.py", "import sitl_replay"),
+        ("companion/studies/bad.py", "import companion.server"),
+        ("companion/tracking/bad.py", "def f():\n    import cvxpy"),
+        ("sitl_replay/bad.py", "import cvxpy"),
+    ],
+)
+def test_import_linter_refuses(tmp_path: Path, path: str, text: str) -> None:
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    for package in PACKAGES:
+        for directory in [ROOT / package, *(p.parent for p in (ROOT / package).rglob("*.py"))]:
+            room = tmp_path / directory.relative_to(ROOT)
+            room.mkdir(parents=True, exist_ok=True)
+            (room / "__init__.py").touch()
+    (tmp_path / "companion/values.py").touch()
+    assert lint_imports(tmp_path).returncode == 0
+    (tmp_path / path).write_text(text, encoding="utf-8")
+    done = lint_imports(tmp_path)
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "BROKEN" in done.stdout
+
+
+def test_the_service_starts_without_the_solver() -> None:
+    """What ``companion run`` imports does not load CVXPY."""
+    if not (ROOT / "companion/service.py").exists():
+        pytest.skip("there is no companion/service.py yet")
+    run = "import sys, companion.cli, companion.service; sys.exit('cvxpy' in sys.modules)"
+    done = subprocess.run((sys.executable, "-c", run), cwd=ROOT, capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr.decode() or "cvxpy was loaded"
+
+
+# --- what is committed --------------------------------------------------------------------------
+
+
+def registries(data: bytes) -> list[str]:
+    """Hosts of package registries named in a file."""
+    lowered = data.lower()
+    return [host for host in REGISTRY_HOSTS if host.encode() in lowered]
+
+
+def lock_faults(text: str) -> list[str]:
+    """Requirements of a lock without an exact version or a hash, and anything with an address."""
+    faults = [line for line in text.splitlines() if "://" in line or line.startswith("-")]
+    for entry in text.replace("\\\n", " ").splitlines():
+        if entry.strip() and not re.match(r"[\w.-]+==\S+ .*--hash=sha256:[0-9a-f]{64}", entry):
+            faults.append(entry)
+    return faults
+
+
+def test_no_committed_file_names_a_registry() -> None:
+    paths = committed()
+    assert {"LICENSE", "pyproject.toml", *LOCKS} <= set(paths)
+    found = {path: registries((ROOT / path).read_bytes()) for path in paths}
+    assert not {path: hosts for path, hosts in found.items() if hosts}
+
+
+@pytest.mark.parametrize("host", REGISTRY_HOSTS)
+def test_a_registry_is_found(host: str) -> None:
+    assert registries(f"see HTTPS://files.{host.upper()}/simple".encode())
+
+
+@pytest.mark.parametrize("lock", LOCKS)
+def test_a_lock_has_versions_and_hashes_and_no_address(lock: str) -> None:
+    text = (ROOT / lock).read_text(encoding="utf-8")
+    assert "numpy==" in text
+    assert lock_faults(text) == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "numpy==2.0.0\n",
+        "numpy>=2.0.0 \\\n    --hash=sha256:" + "0" * 64 + "\n",
+        "numpy @ https://example.test/numpy.whl \\\n    --hash=sha256:" + "0" * 64 + "\n",
+        "--index-url somewhere\n",
+        "numpy==2.0.0 \\\n    --hash=md5:" + "0" * 32 + "\n",
+    ],
+)
+def test_a_bad_lock_is_refused(text: str) -> None:
+    assert lock_faults(text)
+
+
+def test_the_wheel_and_the_locks_agree() -> None:
+    """Every dependency that ``pyproject.toml`` names is pinned."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    wanted = {
+        "requirements.lock": [
+            *project["project"]["dependencies"],
+            *project["build-system"]["requires"],
+            *project["dependency-groups"]["build"],
+        ],
+        "requirements-dev.lock": project["project"]["optional-dependencies"]["dev"],
+    }
+    for lock, requirements in wanted.items():
+        pinned = set(re.findall(r"^([\w.-]+)==", (ROOT / lock).read_text("utf-8"), re.MULTILINE))
+        names = {re.split(r"[^\w.-]", requirement)[0] for requirement in requirements}
+        assert names <= pinned, f"{lock} lacks {names - pinned}: run `make lock`"

@@ -1,0 +1,63 @@
+// Behind everything: range rings and compass.
+
+function rings(view) {
+  const [radiusM, stepM] = view.scale.rings;
+  const reachM = Math.hypot(view.width, view.height) / 2 / view.pxPerM;
+  const found = [];
+  for (let m = stepM; m <= reachM && found.length < 40; m += stepM) {
+    found.push({ m, px: m * view.pxPerM, outer: m === radiusM });
+  }
+  return found;
+}
+
+export function drawRings(view) {
+  const { context } = view;
+  context.strokeStyle = view.colour.grid;
+  for (const { px, outer } of rings(view)) {
+    context.lineWidth = outer ? 1.6 : 1;
+    context.globalAlpha = px > view.outerPx + 1 ? 0.45 : 1;
+    context.beginPath();
+    context.arc(...view.centre, px, 0, 2 * Math.PI);
+    context.stroke();
+  }
+  context.globalAlpha = 1;
+}
+
+/** Returns the boxes that the labels take, for others to keep away from. */
+export function drawRingLabels(view) {
+  const boxes = [];
+  for (const { m, px, outer } of rings(view)) {
+    if (px < 26) continue;
+    // Below the middle and to the left: seldom in the way of the boresight or of the compass.
+    const [x, y] = view.atBearing(225, px);
+    if (y > view.height - 8 || x < 16) continue;
+    view.write(ringLabel(m), x, y, { colour: "gridtext", size: 11, align: "center",
+      weight: outer ? 600 : 400 });
+    boxes.push([x - 20, y - 7, x + 20, y + 7]);
+  }
+  return boxes;
+}
+
+export function drawCompass(view) {
+  const { context } = view;
+  context.strokeStyle = view.colour.grid;
+  context.lineWidth = 1;
+  for (let deg = 0; deg < 360; deg += 10) {
+    const long = deg % 30 === 0;
+    context.beginPath();
+    context.moveTo(...view.atBearing(deg, view.outerPx));
+    context.lineTo(...view.atBearing(deg, view.outerPx + (long ? 8 : 4)));
+    context.stroke();
+    if (!long) continue;
+    const [x, y] = view.atBearing(deg, view.outerPx + 18);
+    const cardinal = { 0: "N", 90: "E", 180: "S", 270: "W" }[deg];
+    view.write(cardinal ?? String(deg).padStart(3, "0"), x, y, {
+      colour: cardinal === "N" ? "text" : "gridtext", size: cardinal ? 14 : 10.5,
+      weight: cardinal ? 700 : 400, align: "center",
+    });
+  }
+}
+
+function ringLabel(m) {
+  return m >= 1000 ? `${Number((m / 1000).toFixed(2))} km` : `${m} m`;
+}

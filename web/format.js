@@ -1,0 +1,106 @@
+// Numbers to text. Unknown (null, undefined, NaN, infinite) is a dash everywhere, never 0.
+
+export const UNKNOWN = "–";
+const NBSP = "\u00a0";
+const MINUS = "\u2212";
+
+export const known = (value) => typeof value === "number" && Number.isFinite(value);
+
+/** A number with a fixed count of decimals and a real minus sign; "-0.0" is written "0.0". */
+export function fixed(value, decimals = 0, { signed = false } = {}) {
+  if (!known(value)) return UNKNOWN;
+  const text = Math.abs(value).toFixed(decimals);
+  const isZero = Number(text) === 0;
+  if (isZero) return text;
+  if (value < 0) return MINUS + text;
+  return signed ? `+${text}` : text;
+}
+
+/** The same with its unit; the unit of an unknown value is left away. */
+function withUnit(value, decimals, unit, options) {
+  return known(value) ? fixed(value, decimals, options) + unit : UNKNOWN;
+}
+
+/** Three significant figures at least, metres below 10 km. */
+export function metres(value) {
+  if (known(value) && Math.abs(value) >= 9999.5) return withUnit(value / 1000, 1, `${NBSP}km`);
+  const decimals = known(value) && Math.abs(value) < 99.95 ? 1 : 0;
+  return withUnit(value, decimals, `${NBSP}m`);
+}
+
+export const signedMetres = (value) => withUnit(value, 0, `${NBSP}m`, { signed: true });
+export const degrees = (value, decimals = 1) => withUnit(value, decimals, "°");
+export const signedDegrees = (value) => withUnit(value, 1, "°", { signed: true });
+export const speed = (value) => withUnit(value, 1, `${NBSP}m/s`);
+export const decibels = (value) => withUnit(value, 1, `${NBSP}dB`);
+export const perSecond = (value) => withUnit(value, value < 10 ? 1 : 0, `${NBSP}/s`);
+
+/** A bearing as three digits, 000° to 359°. */
+export function bearing(value) {
+  if (!known(value)) return UNKNOWN;
+  const whole = ((Math.round(value) % 360) + 360) % 360;
+  return `${String(whole).padStart(3, "0")}°`;
+}
+
+/** Seconds with the decimals that matter at that size. */
+export function seconds(value) {
+  if (!known(value)) return UNKNOWN;
+  const size = Math.abs(value);
+  return withUnit(value, size < 9.995 ? 2 : size < 99.95 ? 1 : 0, `${NBSP}s`);
+}
+
+export function milliseconds(valueS) {
+  if (!known(valueS)) return UNKNOWN;
+  return Math.abs(valueS) >= 9.9995
+    ? seconds(valueS)
+    : withUnit(valueS * 1000, 0, `${NBSP}ms`);
+}
+
+/** A span of time for a person: 42 s, 3 min 05 s, 2 h 07 min, 3 d 04 h. */
+export function duration(valueS) {
+  if (!known(valueS)) return UNKNOWN;
+  const whole = Math.max(0, Math.floor(valueS));
+  const two = (part) => String(part).padStart(2, "0");
+  if (whole < 60) return `${whole}${NBSP}s`;
+  if (whole < 3600) return `${Math.floor(whole / 60)}${NBSP}min ${two(whole % 60)}${NBSP}s`;
+  const hours = Math.floor(whole / 3600);
+  if (hours < 24) return `${hours}${NBSP}h ${two(Math.floor((whole % 3600) / 60))}${NBSP}min`;
+  return `${Math.floor(hours / 24)}${NBSP}d ${two(hours % 24)}${NBSP}h`;
+}
+
+export function bytes(value) {
+  if (!known(value)) return UNKNOWN;
+  const units = ["B", "kB", "MB", "GB", "TB"];
+  let scaled = value;
+  let unit = 0;
+  while (scaled >= 999.5 && unit < units.length - 1) {
+    scaled /= 1000;
+    unit += 1;
+  }
+  return withUnit(scaled, unit === 0 || scaled >= 99.95 ? 0 : 1, NBSP + units[unit]);
+}
+
+/** A whole count, thousands apart by a narrow space: 12 345. */
+export function count(value) {
+  if (!known(value)) return UNKNOWN;
+  return fixed(value, 0).replace(/\B(?=(\d{3})+(?!\d))/g, "\u202f");
+}
+
+export function hertz(value) {
+  if (!known(value)) return UNKNOWN;
+  if (value >= 1e9) return `${Number((value / 1e9).toFixed(2))}${NBSP}GHz`;
+  if (value >= 1e6) return `${Number((value / 1e6).toFixed(2))}${NBSP}MHz`;
+  return `${Number(value.toFixed(0))}${NBSP}Hz`;
+}
+
+/** The time of day of an RFC 3339 stamp, in UTC: 13:00:05 UTC. */
+export function clock(stamp) {
+  const date = new Date(stamp ?? NaN);
+  return Number.isNaN(date.getTime()) ? UNKNOWN : `${date.toISOString().slice(11, 19)} UTC`;
+}
+
+/** Latitude and longitude with five decimals, about a metre. */
+export function position(latDeg, lonDeg) {
+  if (!known(latDeg) || !known(lonDeg)) return UNKNOWN;
+  return `${fixed(latDeg, 5)}°, ${fixed(lonDeg, 5)}°`;
+}

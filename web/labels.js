@@ -1,0 +1,59 @@
+// The names beside the symbols of the plan view.
+
+import * as format from "./format.js";
+
+const CROWD = 8; // with more UAVs than this, a label without room is left away
+
+/** Labels go where they cover nothing; in a crowd the second line goes, then the label. */
+export function drawLabels(view, ringLabels) {
+  const [x, y] = view.centre;
+  const taken = [...ringLabels, [x - 12, y - 12, x + 12, y + 12]];
+  taken.push(...view.hits.map((hit) => [hit.x - 9, hit.y - 9, hit.x + 9, hit.y + 9]));
+  const isChosen = ({ uav }) => uav.id === view.scene.selected;
+  for (const hit of [...view.hits].sort((a, b) => isChosen(b) - isChosen(a))) {
+    const lines = labelOf(hit);
+    const label = findPlace(view, hit, lines, taken)
+      ?? findPlace(view, hit, lines.slice(0, 1), taken)
+      ?? (view.hits.length <= CROWD || isChosen(hit) ? findPlace(view, hit, lines, []) : null);
+    if (!label) continue;
+    taken.push(label.box);
+    drawLabel(view, hit.uav, label);
+  }
+}
+
+/** The first place beside a symbol that is inside the picture and not taken, or null. */
+function findPlace(view, { x, y }, lines, taken) {
+  const widthPx = Math.max(
+    view.measure(lines[0], 13, 700), lines[1] ? view.measure(lines[1], 11.5, 400) : 0,
+  );
+  const heightPx = lines[1] ? 31 : 16;
+  const box = [
+    [x + 14, y - heightPx / 2], [x - 14 - widthPx, y - heightPx / 2],
+    [x + 12, y + 10], [x - 12 - widthPx, y + 10],
+    [x + 12, y - 10 - heightPx], [x - 12 - widthPx, y - 10 - heightPx],
+    [x - widthPx / 2, y - 14 - heightPx], [x - widthPx / 2, y + 14],
+  ].map(([left, top]) => [left, top, left + widthPx, top + heightPx])
+    .find((place) => holds(view, place) && !taken.some((other) => overlap(place, other)));
+  return box ? { box, lines } : null;
+}
+
+function drawLabel(view, uav, { box: [left, top], lines }) {
+  const struck = !view.scene.uavsLive;
+  const colour = struck || ["stale", "lost"].includes(uav.state) ? "muted" : "text";
+  view.write(lines[0], left, top + 8, { colour, size: 13, weight: 700, struck });
+  if (lines[1]) view.write(lines[1], left, top + 24, { colour: "muted", size: 11.5, struck });
+}
+
+function holds(view, [left, top, right, bottom]) {
+  return left > 4 && top > 4 && right < view.width - 4 && bottom < view.height - 4;
+}
+
+function labelOf({ uav, beyond }) {
+  const up = format.known(uav.down_m) ? -uav.down_m : null;
+  const flatM = Math.hypot(uav.north_m, uav.east_m);
+  const height = format.known(up) ? `${up >= 0 ? "↑" : "↓"}${format.metres(Math.abs(up))}` : "";
+  if (beyond) return [uav.id, `${format.metres(flatM)} away`];
+  return [uav.id, uav.state === "live" ? height : `${height} ${uav.state}`.trim()];
+}
+
+const overlap = (a, b) => a[0] < b[2] && b[0] < a[2] && a[1] < b[3] && b[1] < a[3];

@@ -1,0 +1,235 @@
+// Everything that is words: the header, the banner, the side panels.
+
+import * as format from "./format.js";
+
+const $ = (id) => document.getElementById(id);
+
+function setText(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+function setChip(element, level, text) {
+  element.dataset.level = level;
+  setText(element, text);
+}
+
+function setNotice(element, text) {
+  element.hidden = text === "";
+  setText(element, text);
+}
+
+/** Fill a list with `[left, right, level?, title?]` lines; says `none` where there are none. */
+function setPairs(list, pairs, none) {
+  const wanted = JSON.stringify(pairs);
+  if (list.dataset.shown === wanted) return; // leave the page alone when nothing has changed
+  list.dataset.shown = wanted;
+  const lines = pairs.map(([left, right, level = "", title = ""]) => {
+    const line = document.createElement("li");
+    line.dataset.level = level;
+    line.title = title;
+    for (const text of [left, right]) {
+      const part = document.createElement("span");
+      part.textContent = text;
+      line.append(part);
+    }
+    return line;
+  });
+  if (!lines.length) {
+    const line = document.createElement("li");
+    line.className = "muted";
+    line.textContent = none;
+    lines.push(line);
+  }
+  list.replaceChildren(...lines);
+}
+
+// --- connection ---------------------------------------------------------------------------------
+
+const CHIPS = {
+  waiting: ["wait", "connecting…"],
+  live: ["good", "connected"],
+  late: ["warn", "answers late"],
+  partial: ["bad", "connection failing"],
+  frozen: ["bad", "estimates stopped"],
+  lost: ["bad", "connection lost"],
+  never: ["bad", "no connection"],
+};
+
+function bannerText(link, lastStamp) {
+  const since = link.silentS === undefined ? "" : format.duration(link.silentS);
+  switch (link.state) {
+    case "lost":
+      return link.never
+        ? ["No connection", `Nothing received from the service yet (${link.problem}). `
+          + "Still trying."]
+        : ["CONNECTION LOST", `Nothing received for ${since} (${link.problem}). What is shown is `
+          + `from ${lastStamp} and is no longer true. Still trying.`];
+    case "partial":
+      return ["CONNECTION FAILING", `No answer about ${link.what} (${link.problem}): struck values `
+        + "are no longer true. Still trying."];
+    case "frozen":
+      return ["ESTIMATES STOPPED", `The service answers, but its time stands still at ${lastStamp} `
+        + `(${link.what}): struck values are no longer true.`];
+    default:
+      return null;
+  }
+}
+
+function showBanner(title, detail) {
+  $("banner").hidden = false;
+  setText($("banner-title"), title);
+  setText($("banner-detail"), detail);
+}
+
+/** This page itself has failed: what it shows cannot be relied on. */
+export function showFault(error) {
+  showBanner("DISPLAY FAULT", `This page could not show what the service sent (${error.message}). `
+    + "Struck values are no longer true; reload the page.");
+}
+
+export function showConnection(link, lastStamp) {
+  setChip($("connection"), ...CHIPS[link.never ? "never" : link.state]);
+  const text = bannerText(link, format.clock(lastStamp));
+  if (text) showBanner(...text);
+  else $("banner").hidden = true;
+}
+
+export function showReadiness(answer) {
+  const reasons = (answer?.reasons ?? []).join("; ");
+  if (!answer) setChip($("readiness"), "wait", `readiness ${format.UNKNOWN}`);
+  else if (answer.ready) setChip($("readiness"), "good", "ready");
+  else setChip($("readiness"), "warn", "not ready");
+  setNotice($("reasons"), answer && !answer.ready
+    ? `Not ready: ${reasons || "no reason given"}` : "");
+}
+
+// --- status -------------------------------------------------------------------------------------
+
+const RECORDING_LEVEL = { recording: "good", off: "", degraded: "bad" };
+
+function showCenter(center) {
+  const element = $("center");
+  if (!center) return setText(element, format.UNKNOWN);
+  const where = format.position(center.lat_deg, center.lon_deg);
+  const parts = [center.source ?? format.UNKNOWN];
+  if (where === format.UNKNOWN) parts.push("no position yet");
+  else {
+    parts.push(where, format.metres(center.alt_m), `heading ${format.bearing(center.heading_deg)}`);
+  }
+  if (format.known(center.age_s)) parts.push(`${format.seconds(center.age_s)} old`);
+  const old = format.known(center.age_s) && center.age_s > 3;
+  element.dataset.level = where === format.UNKNOWN || old ? "warn" : "";
+  return setText(element, parts.join(" · "));
+}
+
+function showRecording(recording) {
+  const element = $("recording");
+  const parts = [recording?.state ?? format.UNKNOWN];
+  if (recording && format.known(recording.bytes) && recording.state !== "off") {
+    parts.push(format.bytes(recording.bytes));
+  }
+  element.dataset.level = RECORDING_LEVEL[recording?.state] ?? "";
+  element.title = recording?.file ?? "";
+  setText(element, parts.join(" · "));
+}
+
+function showLinks(links) {
+  const pairs = (links ?? []).map((link) => {
+    const frames = `${format.count(link.frames)} frames`;
+    const bad = link.bad_crc > 0 ? `, ${format.count(link.bad_crc)} bad CRC` : "";
+    const plural = link.peers === 1 ? "" : "s";
+    const peers = format.known(link.peers) ? `, ${link.peers} peer${plural}` : "";
+    return [
+      link.url, `${link.state} · ${frames}${bad}${peers}`, link.state === "up" ? "good" : "warn",
+    ];
+  });
+  setPairs($("links"), pairs, "none");
+}
+
+/** What each reason means, for the reader's pointer; an unknown reason is shown as it is. */
+const REASONS = {
+  "garbage": "bytes between frames",
+  "bad-crc": "framed, but the checksum is wrong",
+  "unknown-message": "a message that cannot be checked",
+  "bad-stamp": "a log's time stamp stepped or leapt",
+  "malformed": "fields that cannot be what they say",
+  "zero-position": "near 0° N 0° E: sent before a fix",
+  "no-fix": "the sender has no GNSS fix",
+  "no-position": "ADS-B without valid coordinates",
+  "no-altitude": "no altitude known",
+  "duplicate": "the same report again",
+  "out-of-order": "older than what is known",
+  "unreachable": "farther than the aircraft can have flown",
+};
+
+/** Counts by reason, and when this page last saw each of them rise. */
+export class Rejections {
+  constructor() {
+    this.seen = new Map();
+  }
+
+  show(rejected, now) {
+    const first = this.seen.size === 0;
+    for (const [reason, total] of Object.entries(rejected ?? {})) {
+      const before = this.seen.get(reason);
+      // What was there when the page was opened has no known time.
+      if (!before) this.seen.set(reason, { total, at: first ? null : now });
+      else if (total !== before.total) this.seen.set(reason, { total, at: now });
+    }
+    const pairs = Object.entries(rejected ?? {})
+      .sort(([, a], [, b]) => b - a)
+      .map(([reason, total]) => {
+        const { at } = this.seen.get(reason);
+        const when = at === null ? "" : ` · ${ago((now - at) / 1000)}`;
+        const unit = reason === "garbage" ? " B" : "";
+        return [reason, `${format.count(total)}${unit}${when}`, "", REASONS[reason] ?? ""];
+      });
+    setPairs($("rejections"), pairs, rejected ? "none" : format.UNKNOWN);
+  }
+}
+
+function ago(seconds) {
+  if (seconds < 5) return "now";
+  return `${format.duration(seconds < 60 ? Math.floor(seconds / 5) * 5 : seconds)} ago`;
+}
+
+export function showStatus(status) {
+  setText($("version"), `v${status.version}`);
+  setText($("uptime"), format.duration(status.uptime_s));
+  setText($("frames"), format.perSecond(status.rates?.frames_hz));
+  setText($("updates"), format.perSecond(status.rates?.updates_hz));
+  showCenter(status.center);
+  showRecording(status.recording);
+  showLinks(status.links);
+}
+
+// --- beams --------------------------------------------------------------------------------------
+
+const METHODS = { zf: "Zero forcing", rzf: "Regularised zero forcing" };
+
+export function showBeams(answer) {
+  const { beams, array, left_out: leftOut } = answer;
+  const regularised = answer.regularised || answer.method === "rzf";
+  setText($("beams-line"), [
+    METHODS[answer.method] ?? answer.method ?? format.UNKNOWN,
+    `${beams.length} beam${beams.length === 1 ? "" : "s"}`,
+    `condition number ${conditionNumber(answer.condition_number)}`,
+  ].join(" · "));
+  setText($("beams-array"), array ? [
+    `${format.count(array.elements)} elements (${array.kind?.toUpperCase() ?? format.UNKNOWN})`,
+    format.hertz(array.frequency_hz),
+    `beamwidth ${format.degrees(array.half_power_beamwidth_deg, 2)}`,
+    `boresight ${format.bearing(array.boresight_bearing_deg)}`,
+    `lead ${format.milliseconds(format.known(answer.lead_ms) ? answer.lead_ms / 1000 : null)}`,
+  ].join(" · ") : format.UNKNOWN);
+  setNotice($("beams-warning"), regularised
+    ? "▲ Regularised fallback: the UAVs are too close in angle for zero forcing, so nulls on the "
+      + "others are not exact." : "");
+  const out = (leftOut ?? []).map(({ uav, reason }) => [uav, reason, "warn"]);
+  setPairs($("left-out"), out, "no one");
+}
+
+function conditionNumber(value) {
+  if (!format.known(value)) return format.UNKNOWN;
+  return value < 1000 ? format.fixed(value, 2) : value.toExponential(1);
+}

@@ -1,0 +1,309 @@
+// The plan view: the carrier in the middle, north up, metres to scale.
+
+import { drawCompass, drawRingLabels, drawRings } from "./backdrop.js";
+import * as format from "./format.js";
+import { drawLabels } from "./labels.js";
+import { Scale } from "./scale.js";
+import { drawBeams, withAlpha } from "./wedges.js";
+
+const RADIANS = Math.PI / 180;
+const MARGIN_PX = 30; // room for the compass outside the outermost ring
+const GAP_MS = 2500; // a trail is not drawn through a hole in what was received
+const LEADER_S = 2; // the line ahead of a UAV: where it is in so many seconds
+
+const COLOURS = [
+  "plan", "grid", "gridtext", "text", "muted", "live", "coast", "stale", "beam", "bore", "bad",
+];
+
+export class PlanView {
+  constructor(canvas, trails, onSelect) {
+    Object.assign(this, { canvas, trails, context: canvas.getContext("2d") });
+    this.scene = { uavs: [], beams: [], array: null, selected: null, uavsLive: false };
+    this.scale = new Scale();
+    this.queued = false;
+    this.hits = [];
+    new ResizeObserver(() => this.resize()).observe(canvas);
+    canvas.addEventListener("click", (event) => onSelect(this.nearest(event)));
+    this.recolour();
+  }
+
+  /** Read the colours of the theme from the style sheet. */
+  recolour() {
+    const style = getComputedStyle(document.documentElement);
+    this.colour = Object.fromEntries(
+      COLOURS.map((name) => [name, style.getPropertyValue(`--${name}`).trim()]),
+    );
+    this.font = style.getPropertyValue("--font").trim() || "sans-serif";
+    this.redraw();
+  }
+
+  resize() {
+    const ratio = window.devicePixelRatio || 1;
+    this.width = this.canvas.clientWidth;
+    this.height = this.canvas.clientHeight;
+    this.canvas.width = Math.round(this.width * ratio);
+    this.canvas.height = Math.round(this.height * ratio);
+    this.ratio = ratio;
+    this.redraw();
+  }
+
+  show(scene, now) {
+    this.scene = scene;
+    // The lost are left out: one that flew off long ago would make all the others small.
+    this.scale.follow(scene.uavs
+      .filter((uav) => placed(uav) && uav.state !== "lost")
+      .map((uav) => Math.hypot(uav.north_m, uav.east_m)), now);
+    this.redraw();
+  }
+
+  zoom(steps) {
+    this.scale.zoom(steps);
+    this.redraw();
+  }
+
+  fitAll() {
+    this.scale.fitAll();
+    this.show(this.scene, performance.now());
+  }
+
+  // --- drawing ----------------------------------------------------------------------------------
+
+  redraw() {
+    if (this.queued) return;
+    this.queued = true;
+    requestAnimationFrame(() => {
+      this.queued = false;
+      if (!this.width || !this.height) return;
+      const moving = this.scale.ease();
+      this.draw();
+      if (moving) this.redraw();
+    });
+  }
+
+  draw() {
+    const { context, width, height, ratio } = this;
+    this.centre = [width / 2, height / 2];
+    this.outerPx = Math.max(40, Math.min(width, height) / 2 - MARGIN_PX);
+    this.pxPerM = this.outerPx / this.scale.radiusM;
+    context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    context.globalAlpha = 1;
+    context.setLineDash([]);
+    context.fillStyle = this.colour.plan;
+    context.fillRect(0, 0, width, height);
+    drawRings(this);
+    drawCompass(this);
+    const uavs = this.scene.uavs.filter(placed);
+    drawBeams(this, uavs);
+    uavs.forEach((uav) => this.drawTrail(uav));
+    uavs.forEach((uav) => this.drawBound(uav));
+    this.drawCarrier();
+    this.hits = uavs.map((uav) => this.drawUav(uav));
+    drawLabels(this, drawRingLabels(this));
+    this.drawMessage(uavs);
+  }
+
+  at(northM, eastM) {
+    return [this.centre[0] + eastM * this.pxPerM, this.centre[1] - northM * this.pxPerM];
+  }
+
+  atBearing(bearingDeg, px) {
+    const angle = bearingDeg * RADIANS;
+    return [this.centre[0] + px * Math.sin(angle), this.centre[1] - px * Math.cos(angle)];
+  }
+
+  colourOf(uav) {
+    if (!this.scene.uavsLive) return this.colour.stale;
+    return { live: this.colour.live, coasting: this.colour.coast }[uav.state] ?? this.colour.stale;
+  }
+
+  /** Thick where reports held it up, thin where it is an estimate alone. */
+  drawTrail(uav) {
+    if (!format.known(uav.lat_deg)) return;
+    const { context } = this;
+    const trail = this.trails.of(uav, this.scene.now);
+    context.strokeStyle = this.colourOf(uav);
+    context.lineCap = "round";
+    for (let i = 1; i < trail.length; i += 1) {
+      const [older, newer] = [trail[i - 1], trail[i]];
+      if (newer.at - older.at > GAP_MS) continue;
+      const solid = older.measured && newer.measured;
+      context.lineWidth = solid ? 2.4 : 1;
+      context.globalAlpha = (solid ? 0.75 : 0.7) * (1 - older.age) ** 1.2 + 0.04;
+      context.beginPath();
+      context.moveTo(...this.at(older.north, older.east));
+      context.lineTo(...this.at(newer.north, newer.east));
+      context.stroke();
+    }
+    context.globalAlpha = 1;
+  }
+
+  drawBound(uav) {
+    if (!format.known(uav.bound_m)) return;
+    const { context } = this;
+    const px = uav.bound_m * this.pxPerM;
+    if (px > 4 * Math.hypot(this.width, this.height)) return;
+    context.beginPath();
+    context.arc(...this.at(uav.north_m, uav.east_m), px, 0, 2 * Math.PI);
+    context.fillStyle = withAlpha(this.colourOf(uav), 0.1);
+    context.fill();
+    context.strokeStyle = this.colourOf(uav);
+    context.globalAlpha = 0.8;
+    context.lineWidth = 1;
+    context.setLineDash(uav.state === "live" ? [] : [4, 4]);
+    context.stroke();
+    context.setLineDash([]);
+    context.globalAlpha = 1;
+  }
+
+  drawCarrier() {
+    const { context } = this;
+    const { headingDeg } = this.scene;
+    context.save();
+    context.translate(...this.centre);
+    context.fillStyle = this.colour.plan;
+    context.strokeStyle = this.scene.uavsLive ? this.colour.text : this.colour.stale;
+    context.lineWidth = 2;
+    context.beginPath();
+    context.arc(0, 0, 9, 0, 2 * Math.PI);
+    context.fill();
+    context.stroke();
+    if (format.known(headingDeg)) {
+      context.rotate(headingDeg * RADIANS);
+      context.fillStyle = context.strokeStyle;
+      polygon(context, [[0, -7], [4.5, 5], [0, 2.5], [-4.5, 5]]);
+      context.fill();
+    }
+    context.restore();
+  }
+
+  /** Draw the symbol of a UAV; returns where it is, for labels and for the pointer. */
+  drawUav(uav) {
+    const [x, y] = this.at(uav.north_m, uav.east_m);
+    const inside = x > 8 && y > 8 && x < this.width - 8 && y < this.height - 8;
+    if (!inside) return this.drawBeyond(uav);
+    const { context } = this;
+    const colour = this.colourOf(uav);
+    const velocity = uav.velocity_ned_mps;
+    const moving = velocity && Math.hypot(velocity[0], velocity[1]) > 0.3;
+    context.save();
+    context.translate(x, y);
+    context.strokeStyle = colour;
+    context.lineWidth = 2;
+    if (uav.state !== "lost" && moving) this.drawLeader(velocity);
+    if (moving) context.rotate(Math.atan2(velocity[1], velocity[0]));
+    if (this.scene.selected === uav.id) this.drawSelection();
+    context.fillStyle = uav.state === "live" ? colour : this.colour.plan;
+    context.beginPath();
+    if (uav.state === "lost") {
+      polygon(context, [[-6, -6], [6, 6]]);
+      context.moveTo(6, -6);
+      context.lineTo(-6, 6);
+    } else if (moving) polygon(context, [[0, -9], [6.5, 8], [0, 4.5], [-6.5, 8]]);
+    else context.arc(0, 0, 6, 0, 2 * Math.PI);
+    if (uav.state !== "lost") context.fill();
+    context.stroke();
+    context.restore();
+    return { uav, x, y, beyond: false };
+  }
+
+  drawLeader(velocity) {
+    const { context } = this;
+    context.save();
+    context.lineWidth = 1.2;
+    context.beginPath();
+    context.moveTo(0, 0);
+    context.lineTo(velocity[1] * LEADER_S * this.pxPerM, -velocity[0] * LEADER_S * this.pxPerM);
+    context.stroke();
+    context.restore();
+  }
+
+  drawSelection() {
+    const { context } = this;
+    context.save();
+    context.strokeStyle = this.colour.text;
+    context.lineWidth = 1.5;
+    context.beginPath();
+    context.arc(0, 0, 15, 0, 2 * Math.PI);
+    context.stroke();
+    context.restore();
+  }
+
+  /** A UAV outside the picture: an arrow at the edge, in its direction. */
+  drawBeyond(uav) {
+    const { context } = this;
+    const angle = Math.atan2(uav.east_m, uav.north_m);
+    const [dx, dy] = [Math.sin(angle), -Math.cos(angle)];
+    const reach = Math.min(
+      (this.width / 2 - 16) / Math.max(1e-9, Math.abs(dx)),
+      (this.height / 2 - 16) / Math.max(1e-9, Math.abs(dy)),
+    );
+    const [x, y] = [this.centre[0] + dx * reach, this.centre[1] + dy * reach];
+    context.save();
+    context.translate(x, y);
+    context.rotate(angle);
+    context.fillStyle = this.colourOf(uav);
+    polygon(context, [[0, -9], [7, 4], [-7, 4]]);
+    context.fill();
+    context.restore();
+    return { uav, x, y, beyond: true };
+  }
+
+  measure(text, size, weight) {
+    this.context.font = `${weight} ${size}px ${this.font}`;
+    return this.context.measureText(text).width;
+  }
+
+  write(text, x, y, { colour, size, weight = 400, align = "left", struck = false }) {
+    const { context } = this;
+    context.font = `${weight} ${size}px ${this.font}`;
+    context.textAlign = align;
+    context.textBaseline = "middle";
+    context.lineJoin = "round";
+    context.lineWidth = 3.5;
+    context.strokeStyle = this.colour.plan;
+    context.strokeText(text, x, y);
+    context.fillStyle = this.colour[colour];
+    context.fillText(text, x, y);
+    if (!struck) return;
+    const widthPx = context.measureText(text).width;
+    context.fillRect(align === "center" ? x - widthPx / 2 : x, y, widthPx, 1.4);
+  }
+
+  /** What must not be overlooked, across the middle of the picture. */
+  drawMessage(uavs) {
+    const { message, uavsLive } = this.scene;
+    const text = message
+      || (uavsLive && this.scene.uavs.length && !uavs.length
+        ? "No carrier position: UAVs cannot be placed" : "");
+    if (!text) return;
+    const { context } = this;
+    const size = this.width < 500 ? 16 : 22;
+    const y = this.centre[1] + this.outerPx * 0.42;
+    const widthPx = this.measure(text, size, 700) + 36;
+    context.fillStyle = message ? this.colour.bad : this.colour.plan;
+    context.fillRect(this.centre[0] - widthPx / 2, y - size, widthPx, size * 2);
+    context.font = `700 ${size}px ${this.font}`;
+    context.textAlign = "center";
+    context.textBaseline = "middle";
+    context.fillStyle = message ? this.colour.plan : this.colour.text;
+    context.fillText(text, this.centre[0], y);
+  }
+
+  nearest(event) {
+    let best = null;
+    let bestPx = 26;
+    for (const { uav, x, y } of this.hits) {
+      const px = Math.hypot(event.offsetX - x, event.offsetY - y);
+      if (px < bestPx) [best, bestPx] = [uav.id, px];
+    }
+    return best;
+  }
+}
+
+const placed = (uav) => format.known(uav.north_m) && format.known(uav.east_m);
+
+function polygon(context, points) {
+  context.beginPath();
+  points.forEach(([x, y], index) => (index ? context.lineTo(x, y) : context.moveTo(x, y)));
+  context.closePath();
+}

@@ -1,0 +1,130 @@
+// The table of UAVs: one row a UAV, kept between updates so that focus and selection stay.
+
+import * as format from "./format.js";
+
+const halfWidthDeg = (array) =>
+  format.known(array?.half_power_beamwidth_deg) ? array.half_power_beamwidth_deg / 2 : null;
+
+/** The pointing bound, with a warning where the UAV can be outside the half-power beam. */
+function pointingBound({ beam, array }) {
+  const bound = beam?.pointing_bound_deg;
+  const text = format.degrees(bound, 2);
+  const limit = halfWidthDeg(array);
+  if (beam && !format.known(bound)) {
+    return { text: `▲ ${text}`, level: "warn", title: "No bound: the UAV can be anywhere" };
+  }
+  if (!format.known(bound) || limit === null || bound <= limit) return { text };
+  return {
+    text: `▲ ${text}`, level: "warn",
+    title: `More than half the beamwidth (${format.degrees(limit, 2)}): the beam may miss`,
+  };
+}
+
+function range(uav) {
+  const parts = [uav.north_m, uav.east_m, uav.down_m];
+  return parts.every(format.known) ? Math.hypot(...parts) : null;
+}
+
+/** Columns in their order. `feed`: which answer a value stands on; `short`: for narrow screens. */
+const COLUMNS = [
+  { key: "state", label: "State", feed: "uavs", show: ({ uav }) => ({ text: uav.state }) },
+  { key: "range", label: "Range", feed: "uavs", title: "Slant range from the carrier",
+    show: ({ uav }) => ({ text: format.metres(range(uav)) }) },
+  { key: "azimuth", label: "Azimuth", feed: "beams", title: "Right of the array's boresight",
+    show: ({ beam }) => ({ text: format.signedDegrees(beam?.azimuth_deg) }) },
+  { key: "elevation", label: "Elevation", feed: "beams", title: "Above the array's boresight",
+    show: ({ beam }) => ({ text: format.signedDegrees(beam?.elevation_deg) }) },
+  { key: "speed", label: "Speed", feed: "uavs",
+    show: ({ uav }) => ({ text: format.speed(uav.speed_mps) }) },
+  { key: "age", label: "Age", feed: "uavs", title: "Since the newest accepted report",
+    show: ({ uav, sinceS }) => ({
+      text: format.seconds(format.known(uav.age_s) ? uav.age_s + sinceS : null),
+    }) },
+  { key: "dt", label: "ΔT", feed: "uavs", title: "Last interval between reports",
+    show: ({ uav }) => ({ text: format.seconds(uav.dt_s) }) },
+  { key: "latency", label: "Latency", feed: "uavs", title: "From when it was true to arrival",
+    show: ({ uav }) => ({ text: format.milliseconds(uav.latency_s) }) },
+  { key: "bound", label: "Bound", feed: "uavs", title: "Guaranteed position error, at most",
+    show: ({ uav }) => ({ text: format.metres(uav.bound_m) }) },
+  { key: "pointing", label: "Pointing bound", short: "Pointing", feed: "beams",
+    title: "How far the true direction can lie from the beam", show: pointingBound },
+  { key: "gain", label: "Gain", feed: "beams", title: "Array gain towards the prediction",
+    show: ({ beam }) => ({ text: format.decibels(beam?.gain_db) }) },
+];
+
+const make = (tag, attributes = {}) => {
+  const element = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+  return element;
+};
+
+const setText = (element, text) => {
+  if (element.textContent !== text) element.textContent = text;
+};
+
+export class UavTable {
+  constructor(table, onSelect) {
+    this.body = table.tBodies[0];
+    this.onSelect = onSelect;
+    this.rows = new Map();
+    const head = table.tHead.rows[0];
+    for (const { label, title, key } of [{ label: "UAV", key: "id" }, ...COLUMNS]) {
+      const cell = make("th", { scope: "col", role: "columnheader", "data-key": key });
+      if (title) cell.title = title;
+      cell.textContent = label;
+      head.append(cell);
+    }
+  }
+
+  /** Show these UAVs, in this order. `sinceS`: seconds since the answer came. */
+  update(uavs, { beams, array, sinceS, selected }) {
+    const present = new Set(uavs.map((uav) => uav.id));
+    for (const [id, row] of this.rows) {
+      if (!present.has(id)) {
+        row.line.remove();
+        this.rows.delete(id);
+      }
+    }
+    uavs.forEach((uav, index) => {
+      const row = this.rows.get(uav.id) ?? this.addRow(uav.id);
+      if (this.body.rows[index] !== row.line) {
+        this.body.insertBefore(row.line, this.body.rows[index] ?? null);
+      }
+      this.fill(row, { uav, beam: beams.get(uav.id), array, sinceS }, uav.id === selected);
+    });
+  }
+
+  addRow(id) {
+    const line = make("tr", { role: "row" });
+    const head = make("th", { scope: "row", role: "rowheader", "data-feed": "uavs" });
+    const button = make("button", { type: "button", class: "pick" });
+    button.textContent = id;
+    button.addEventListener("click", () => this.onSelect(id));
+    head.append(button);
+    line.append(head);
+    const cells = COLUMNS.map(({ key, label, short = label, feed }) => {
+      const cell = make("td", {
+        role: "cell", "data-key": key, "data-label": short, "data-feed": feed,
+      });
+      const value = make("span");
+      cell.append(value);
+      line.append(cell);
+      return { cell, value };
+    });
+    const row = { line, button, cells };
+    this.rows.set(id, row);
+    return row;
+  }
+
+  fill(row, context, isSelected) {
+    row.line.dataset.state = context.uav.state;
+    row.button.setAttribute("aria-pressed", String(isSelected));
+    COLUMNS.forEach((column, index) => {
+      const { cell, value } = row.cells[index];
+      const { text, level = "", title = "" } = column.show(context);
+      setText(value, text);
+      cell.dataset.level = level;
+      cell.title = title;
+    });
+  }
+}

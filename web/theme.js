@@ -1,0 +1,33 @@
+// Dark unless the operator chose light; the choice is remembered in this browser.
+
+const KEY = "companion.theme";
+
+function remembered() {
+  try {
+    return localStorage.getItem(KEY);
+  } catch {
+    return null; // storage is refused to this page: the default will do
+  }
+}
+
+function remember(theme) {
+  try {
+    localStorage.setItem(KEY, theme);
+  } catch {
+    // storage is refused to this page: the choice holds until it is closed
+  }
+}
+
+export function setUpTheme(button, onChange) {
+  const apply = (theme) => {
+    document.documentElement.dataset.theme = theme;
+    button.textContent = theme === "dark" ? "Light theme" : "Dark theme";
+    onChange();
+  };
+  apply(remembered() === "light" ? "light" : "dark");
+  button.addEventListener("click", () => {
+    const theme = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
+    remember(theme);
+    apply(theme);
+  });
+}

@@ -161,7 +161,7 @@ class Service:
         state = "degraded" if recorder.failure or recorder.dropped else "recording"
         writer = recorder.writer
         return RecordingStatus(
-            state, writer.path.name, recorder.bytes, recorder.messages, recorder.dropped
+            state, writer.path.name, recorder.bytes, writer.messages, recorder.dropped
         )
 
     def unfit(self) -> list[str]:

@@ -27,7 +27,6 @@ class BackgroundRecorder:
 
     def __init__(self, writer: Writer, geodetic: Geodetic) -> None:
         self.writer = writer
-        self.messages = 0
         self.bytes = 0
         self.dropped = 0
         self.failure: str | None = None
@@ -59,11 +58,19 @@ class BackgroundRecorder:
     def _run(self) -> None:
         try:
             self._write_until_stopped()
+        except OSError as error:
+            self._fail(error)
+            self.writer.abandon()
+            while self._queue.get() is not None:  # until `stop`, so that it need not wait
+                self.dropped += 1
+            return
+        try:
             self.writer.close(self._metadata)
         except OSError as error:
-            self.failure = f"{error.strerror or error}: {self.writer.path}"
-            while self._queue.get() is not None:  # keep `put` and `stop` from blocking
-                self.dropped += 1
+            self._fail(error)
+
+    def _fail(self, error: OSError) -> None:
+        self.failure = f"{self.writer.path}: {error.strerror or error}"
 
     def _write_until_stopped(self) -> None:
         flush_due_s = time.monotonic() + FLUSH_S
@@ -76,7 +83,6 @@ class BackgroundRecorder:
                 self.writer.event(event)
                 for output in outputs:
                     self.writer.output(output, self._geodetic)
-                self.messages += 1 + len(outputs)
             except queue.Empty:
                 pass
             if time.monotonic() >= flush_due_s:

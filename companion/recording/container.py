@@ -1,12 +1,17 @@
 """Walks an MCAP file in the order in which it was written, as far as it is intact.
 
 The index at a file's end is not used: a killed process leaves none, and the order by time that
-it serves is not the order in which things happened. Layout: https://mcap.dev/spec. A chunk
-counts only when its checksum holds. One that does not, in the middle of a file, is passed over
-and counted; a record that goes on past the end of the file ends the walk.
+it serves is not the order in which things happened. Where there is an end, the copies of the
+schemas and channels in it make up for a damaged chunk that had the originals.
+
+Layout: https://mcap.dev/spec. A chunk counts only when its checksum holds. One that does not, in
+the middle of a file, is passed over and counted; a record that goes on past the end of the file
+ends the walk.
 """
 
+import contextlib
 import struct
+import zlib
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
@@ -22,6 +27,10 @@ from zstandard import ZstdError
 MAGIC: Final = b"\x89MCAP0\r\n"
 _HEADER: Final = struct.Struct("<BQ")  # opcode, length of what follows
 _MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_END: Final = struct.Struct("<BQQQI8s")
+"""The footer record and the magic bytes: opcode, length, start of the summary and of its offsets,
+CRC-32 from the start of the summary to just before itself."""
+_UNCHECKED: Final = 4 + len(MAGIC)
 _LARGEST_CHUNK: Final = 1 << 28
 """Bytes. Ours are about a mebibyte; a damaged size must not ask for all of the memory."""
 
@@ -64,6 +73,7 @@ class Walk:
         self._topics = topics
 
     def __iter__(self) -> Iterator[Content]:
+        self._read_descriptions()
         for opcode, size, body in self._records():
             try:
                 contents = self._contents(opcode, body)
@@ -73,12 +83,28 @@ class Walk:
                 continue
             yield from contents
 
+    def _read_descriptions(self) -> None:
+        """Schemas and channels from the summary, if the file has one and its checksum holds."""
+        size = self._path.stat().st_size
+        with self._path.open("rb") as file:
+            file.seek(max(0, size - _END.size))
+            end = file.read()
+            if not end.endswith(MAGIC) or end[0] != Opcode.FOOTER:  # a short file starts otherwise
+                return
+            _, _, summary_at, _, checksum, _ = _END.unpack(end)
+            if not 0 < summary_at <= size - _END.size:
+                return
+            file.seek(summary_at)
+            summary = file.read(size - summary_at)
+        if zlib.crc32(summary[:-_UNCHECKED]) == checksum:
+            with contextlib.suppress(*_DAMAGE):  # another program's: the data has them as well
+                self._in_chunk(summary[: -_END.size])
+
     def _records(self) -> Iterator[tuple[int, int, bytes]]:
-        """(opcode, bytes in the file, body) of the records before the file's summary."""
+        """(opcode, bytes in the file, body) of the records up to the file's end."""
         size = self._path.stat().st_size
         with self._path.open("rb") as file:
             at = len(file.read(len(MAGIC)))
-            in_data = True
             while len(header := file.read(_HEADER.size)) == _HEADER.size:
                 opcode, length = _HEADER.unpack(header)
                 stop = at + _HEADER.size + length
@@ -89,10 +115,7 @@ class Walk:
                 if opcode == Opcode.FOOTER:
                     self.complete = file.read(len(MAGIC)) == MAGIC
                     return
-                # After the end of the data come copies of the schemas and channels, and indexes.
-                in_data = in_data and opcode != Opcode.DATA_END
-                if in_data:
-                    yield opcode, _HEADER.size + length, body
+                yield opcode, _HEADER.size + length, body
         self.lost_bytes += size - at
 
     def _contents(self, opcode: int, body: bytes) -> list[Content]:

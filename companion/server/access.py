@@ -49,6 +49,7 @@ def bind(listen: str, *, token: str | None, insecure: bool) -> socket.socket:
         bound = socket.socket(family, kind, proto)
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         bound.bind(address)
+        bound.listen(1024)  # who reads the address may connect at once
     except OSError as error:
         raise ListenError(f"{listen}: {error.strerror}") from error
     return bound

@@ -168,6 +168,37 @@ def test_damage_in_the_middle_costs_one_chunk_and_is_said(
     assert list(read_log(result.path)) == [*driven[:first], *driven[last:]]
 
 
+def test_damage_at_the_beginning_costs_no_more(
+    tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]]
+) -> None:
+    """The first chunk describes the channels, and so does the end of the file if it is there."""
+    whole, driven, flushed = recording
+    broken = bytearray(whole.read_bytes())
+    broken[flushed[0][0] + 200] ^= 0xFF
+    path = tmp_path / "broken.mcap"
+    path.write_bytes(broken)
+    said, *events = read_log(path)
+    assert isinstance(said, Rejection) and said.reason is Reason.GARBAGE
+    assert events == driven[flushed[1][1] :]
+    result = recover(path)
+    assert result.lost_bytes == said.count
+    assert list(read_log(result.path)) == events
+    # Neither one nor the other: what is there means nothing, and that is said.
+    path.write_bytes(broken[:-1])
+    with pytest.raises(LogError, match="no MAVLink frame"):
+        read_log(path)
+    path.with_name("broken.recovered.mcap").unlink()
+    assert recover(path).lost_bytes > 2 * said.count
+
+
+def test_the_latest_time_need_not_be_the_last(tmp_path: Path) -> None:
+    with Writer(tmp_path / "x.mcap", "", {}, None, 0) as writer:
+        for t_ns in (5, 9, 7):
+            writer.event(Tick(t_ns))
+        writer.flush()
+    assert recover(writer.path).last_ns == 9
+
+
 @pytest.mark.parametrize("seed", range(40))
 def test_flipped_bytes_never_raise(
     tmp_path: Path,

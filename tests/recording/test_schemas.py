@@ -2,7 +2,7 @@
 
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from companion.recording import messages, schemas
@@ -30,6 +30,9 @@ REJECTIONS = st.builds(
 
 
 @given(FRAMES)
+@example(Frame(1, "x" * 200, Source(0, 255), 2**24 - 1, b"\xfd" * 200))
+@example(Frame(0, "", Source(0, 0), 0, b"\xfd" * 127))
+@example(Frame(0, "", Source(0, 0), 0, b"\xfd" * 128))
 def test_a_hand_packed_frame_is_the_generated_one(frame: Frame) -> None:
     generated = schemas.FrameMessage(
         t_ns=frame.t_ns,
@@ -69,6 +72,13 @@ def test_every_schema_is_complete_in_itself() -> None:
         for file in FileDescriptorSet.FromString(schema.descriptor_set).file:
             pool.Add(file)  # raises where a dependency does not come before it
         assert pool.FindMessageTypeByName(schema.name).full_name == schema.name
+
+
+def test_an_optional_field_says_so_to_every_reader() -> None:
+    file = FileDescriptorSet.FromString(schemas.TRACK.descriptor_set).file[0]
+    [track] = [message for message in file.message_type if message.name == "Track"]
+    optional = [field.name for field in track.field if field.proto3_optional]
+    assert optional == ["dt_s", "latency_s", "gamma", "innovation_m"]
 
 
 def test_the_numbers_of_the_fields_stay() -> None:

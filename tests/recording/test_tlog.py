@@ -190,6 +190,13 @@ def test_a_bad_stamp_is_said_and_the_frame_handed_on(wire: Wire) -> None:
     ]
 
 
+def test_a_bad_first_stamp_leaves_the_others_alone(wire: Wire) -> None:
+    frames = wire(10)
+    data = struct.pack(">Q", START_US + 10**18) + stamped(frames)[8:]
+    times = [event.t_ns for event in read_tlog(data, "x") if isinstance(event, Frame)]
+    assert times == [(START_US + max(n, 1) * 10_000) * 1000 for n in range(10)]
+
+
 @settings(max_examples=200)
 @given(st.lists(st.binary(max_size=40) | st.sampled_from([UNKNOWN, b"\xfd", b"\xfe\x09"])))
 def test_any_bytes_at_all(pieces: list[bytes]) -> None:
@@ -224,6 +231,15 @@ def test_raw_mavlink_without_a_clock_is_at_the_epoch() -> None:
     mav = dialect.MAVLink(None)
     heartbeat = bytes(mav.heartbeat_encode(2, 3, 0, 0, 4).pack(mav))
     assert [event.t_ns for event in read_raw(heartbeat * 3, "x")] == [0, 0, 0]
+
+
+def test_messages_of_one_sender_may_be_a_little_out_of_step() -> None:
+    mav = dialect.MAVLink(None)
+    boots_ms = [1000, 1010, 1004, 1020, 1015]
+    data = b"".join(bytes(mav.attitude_encode(ms, 0, 0, 0, 0, 0, 0).pack(mav)) for ms in boots_ms)
+    events = list(read_raw(data, "x"))
+    assert [event.t_ns // 1_000_000 for event in events] == [1000, 1010, 1010, 1020, 1020]
+    assert lost(events) == {}
 
 
 def test_raw_mavlink_goes_on_over_a_reboot() -> None:

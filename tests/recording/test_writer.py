@@ -1,6 +1,7 @@
 """What is written can be read back, in order, by this program and by any reader of MCAP."""
 
 import math
+import os
 import struct
 from collections import Counter
 from collections.abc import Callable
@@ -17,7 +18,7 @@ from mcap.reader import make_reader
 
 from companion.recording.reader import log_kind, read_log, read_metadata, read_settings
 from companion.recording.writer import Writer
-from companion.values import Estimate, Event, Frame, Source, Tick, Update
+from companion.values import Estimate, Event, Frame, Rejection, Source, Tick, Update
 
 START_NS = 1_700_000_000_000_000_000
 Record = Callable[..., list[Event]]
@@ -69,8 +70,10 @@ def test_the_file_has_its_name_settings_and_metadata(tmp_path: Path, record: Rec
 def test_nothing_is_overwritten_in_a_folder(tmp_path: Path) -> None:
     first, second = open_writer(tmp_path), open_writer(tmp_path)
     second_path, first_path = second.close({}), first.close({})
-    third_path = open_writer(tmp_path).close({})
+    third = open_writer(tmp_path)
     stem = "companion-20231114T221320Z"
+    assert third.path.name == f"{stem}-2.mcap.active"
+    third_path = third.close({})
     assert [first_path.name, second_path.name, third_path.name] == [
         f"{stem}.mcap",
         f"{stem}-1.mcap",
@@ -88,6 +91,20 @@ def test_a_file_that_is_asked_for_by_name_is_replaced_on_close(tmp_path: Path) -
     writer.event(Tick(5))
     assert writer.close({}) == path
     assert list(read_log(path)) == [Tick(5)]
+
+
+def test_a_flush_reaches_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """That the power may fail cannot be had in a test: what was asked of the system can."""
+    writer = open_writer(tmp_path)
+    synced: list[int] = []
+    monkeypatch.setattr(
+        "companion.recording.writer.os.fsync", lambda fd: synced.append(os.fstat(fd).st_size)
+    )
+    writer.event(Tick(5))
+    writer.flush()
+    assert synced == [writer.path.stat().st_size] == [writer.size_bytes]
+    size = writer.close({}).stat().st_size
+    assert synced[1] == size and len(synced) == 3  # the last is the folder, for the new name
 
 
 def test_left_without_close_it_stays_active(tmp_path: Path, record: Record) -> None:
@@ -115,6 +132,9 @@ def test_every_channel_can_be_decoded_from_the_file_alone(tmp_path: Path, record
     }
     counts = Counter(topic for topic, _, _ in found)
     assert counts["/mavlink/frames"] == sum(isinstance(event, Frame) for event in driven)
+    by_pipeline = Counter(m.is_event for topic, _, m in found if topic == "/rejections")
+    assert by_pipeline[True] == sum(isinstance(event, Rejection) for event in driven)
+    assert by_pipeline[False] == len(driven) // 3  # and none of the above a second time
     assert [message.sequence for _, message, _ in found] == list(range(len(found)))
     frames = [(raw.log_time, message.t_ns) for topic, raw, message in found if "frames" in topic]
     assert frames == [(event.t_ns, event.t_ns) for event in driven if isinstance(event, Frame)]

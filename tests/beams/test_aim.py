@@ -1,0 +1,173 @@
+"""Aiming: who gets a beam, where it points, and what turning the world changes."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+
+from companion.beams.aim import aim
+from companion.beams.arrays import Array, uniform_linear
+from companion.beams.precoding import Precoder
+from companion.values import BeamSet, Carrier, FloatArray, Method, Track, TrackState
+
+EYE = np.eye(3)
+ARRAY = uniform_linear(16, 30e9, 0.5, EYE)
+PLACES = {"1:1": (100.0, 20.0, -10.0), "2:1": (80.0, -60.0, 5.0), "3:1": (30.0, 90.0, 0.0)}
+
+
+def track(
+    uav: str, position: FloatArray | tuple[float, ...], state: str = "live", bound_m: float = 2.0
+) -> Track:
+    return Track(
+        uav, TrackState(state), 9, 0.1, np.array(position, dtype=float), None, None, bound_m, None,
+        None, None, None, 1,
+    )  # fmt: skip
+
+
+def carrier(
+    position: tuple[float, ...] = (0, 0, 0), turn: FloatArray = EYE, bound_m: float = 0.0
+) -> Carrier:
+    return Carrier(9, np.array(position, dtype=float), turn, bound_m, None)
+
+
+def pointed(
+    tracks: list[Track], at: Carrier | None, array: Array = ARRAY, limit: float = 10.0
+) -> BeamSet:
+    return aim(7, 9, tracks, at, array, Precoder(limit, 0.01))
+
+
+def test_beams_point_where_the_tracks_are() -> None:
+    """Right is positive azimuth, up positive elevation, from the array's boresight."""
+    at = carrier((10, 20, -5))
+    tracks = [track("a", (110, 120, -5)), track("b", (60, -30, -55)), track("c", (110, 20, 95))]
+    found = pointed(tracks, at)
+    assert (found.t_ns, found.valid_at_ns) == (7, 9)
+    assert [beam.uav for beam in found.beams] == ["a", "b", "c"]
+    angles = [(45, 0, 141.42), (-45, math.degrees(math.atan2(1, math.sqrt(2))), 86.60)]
+    angles.append((0, -45, 141.42))
+    for beam, (azimuth, elevation, range_m) in zip(found.beams, angles, strict=True):
+        assert math.degrees(beam.azimuth_rad) == pytest.approx(azimuth, abs=1e-9)
+        assert math.degrees(beam.elevation_rad) == pytest.approx(elevation, abs=1e-9)
+        assert beam.range_m == pytest.approx(range_m, abs=0.01)
+        assert beam.pointing_bound_rad == pytest.approx(math.asin(2.0 / beam.range_m))
+
+
+def test_the_carrier_s_bound_adds_to_the_track_s() -> None:
+    (beam,) = pointed([track("a", (100, 0, 0), bound_m=3.0)], carrier(bound_m=4.0)).beams
+    assert beam.pointing_bound_rad == pytest.approx(math.asin(0.07))
+    (beam,) = pointed([track("a", (100, 0, 0), bound_m=60.0)], carrier(bound_m=40.0)).beams
+    assert beam.pointing_bound_rad is None
+
+
+def test_weights_respond_to_their_own_direction_alone() -> None:
+    """By the phases written out for elements along y, half a wave apart."""
+    found = pointed([track(uav, place) for uav, place in PLACES.items()], carrier())
+    assert (found.method, found.regularised) == (Method.ZERO_FORCING, False)
+    assert found.weights.shape == (16, 3)
+    assert found.uavs == tuple(PLACES)
+    a = np.array(
+        [
+            [np.exp(1j * np.pi * m * y / math.dist((0, 0, 0), (x, y, z))) for m in range(16)]
+            for x, y, z in PLACES.values()
+        ]
+    )
+    assert np.abs(a @ found.weights - np.eye(3)).max() < 1e-9
+    assert found.condition_number == pytest.approx(np.linalg.cond(a))
+    for column, beam in enumerate(found.beams):
+        power = np.sum(np.abs(found.weights[:, column]) ** 2)
+        assert beam.gain_db == pytest.approx(-10 * math.log10(power))
+
+
+@pytest.mark.parametrize("order", [("1:1", "2:1", "3:1"), ("3:1", "1:1", "2:1")])
+def test_columns_come_in_the_order_of_the_tracks(order: tuple[str, ...]) -> None:
+    plain = pointed([track(uav, PLACES[uav]) for uav in PLACES], carrier())
+    found = pointed([track(uav, PLACES[uav]) for uav in order], carrier())
+    assert found.uavs == order
+    for column, uav in enumerate(order):
+        same = plain.weights[:, plain.uavs.index(uav)]
+        assert found.weights[:, column] == pytest.approx(same, abs=1e-12)
+
+
+def test_who_is_left_out_and_why() -> None:
+    tracks = [
+        track("live", (100, 0, 0)),
+        track("stale", (90, 40, 0), "stale"),
+        track("lost", (80, -40, 0), "lost"),
+        track("coasting", (70, 50, 0), "coasting"),
+        track("here", (0, 0.6, 0.6)),
+        track("beside", (0, 1.1, 0.0)),
+    ]
+    found = pointed(tracks, carrier())
+    assert found.uavs == ("live", "coasting", "beside")
+    assert found.weights.shape == (16, 3)
+    assert {left.uav: left.reason for left in found.left_out} == {
+        "stale": "its reports are stale",
+        "lost": "its reports are lost",
+        "here": "it is within 1 m of the array",
+    }
+
+
+def test_without_a_carrier_there_are_no_beams() -> None:
+    found = pointed([track("a", (100, 0, 0)), track("b", (0, 100, 0), "stale")], None)
+    assert (found.beams, found.weights.shape, found.condition_number) == ((), (16, 0), None)
+    assert [left.uav for left in found.left_out] == ["a", "b"]
+    assert {left.reason for left in found.left_out} == {"the carrier is not known"}
+
+
+@pytest.mark.parametrize("tracks", [[], [track("a", (5, 0, 0), "stale")]])
+def test_without_anyone_to_aim_at_there_are_no_beams(tracks: list[Track]) -> None:
+    found = pointed(tracks, carrier())
+    assert (found.beams, found.weights.shape) == ((), (16, 0))
+    assert len(found.left_out) == len(tracks)
+
+
+def test_mirror_images_are_regularised() -> None:
+    found = pointed([track("ahead", (80, 60, 0)), track("behind", (-80, 60, 0))], carrier())
+    assert found.regularised
+    assert np.all(np.isfinite(found.weights))
+    assert all(math.isfinite(beam.gain_db) for beam in found.beams)
+
+
+def assert_same_beams(a: BeamSet, b: BeamSet) -> None:
+    assert a.weights == pytest.approx(b.weights, abs=1e-9)
+    for one, other in zip(a.beams, b.beams, strict=True):
+        assert one.azimuth_rad == pytest.approx(other.azimuth_rad, abs=1e-9)
+        assert one.elevation_rad == pytest.approx(other.elevation_rad, abs=1e-9)
+        assert one.range_m == pytest.approx(other.range_m)
+        assert one.pointing_bound_rad == pytest.approx(other.pointing_bound_rad)
+
+
+@settings(max_examples=50)
+@given(st.integers(0, 2**32 - 1))
+def test_turning_the_carrier_is_turning_the_world_the_other_way(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    turn, mount, pose = (m.as_matrix() for m in Rotation.random(3, rng=rng))
+    shift = rng.uniform(-500, 500, 3)
+    place = rng.uniform(-50, 50, 3)
+    array = uniform_linear(16, 30e9, 0.5, mount)
+    tracks = [track(uav, np.array(p)) for uav, p in PLACES.items()]
+    plain = pointed(tracks, carrier(tuple(place), pose), array)
+    # The world, carrier included, turned and moved.
+    moved = [track(uav, turn @ np.array(p) + shift) for uav, p in PLACES.items()]
+    turned = carrier(tuple(turn @ place + shift), pose @ turn.T)
+    assert_same_beams(plain, pointed(moved, turned, array))
+    # The mount turned one way and the carrier the other.
+    other = uniform_linear(16, 30e9, 0.5, mount @ turn)
+    assert_same_beams(plain, pointed(tracks, carrier(tuple(place), turn.T @ pose), other))
+    # The mount alone, or the carrier alone: the same, for they follow one another.
+    straight = uniform_linear(16, 30e9, 0.5, EYE)
+    assert_same_beams(plain, pointed(tracks, carrier(tuple(place), mount @ pose), straight))
+
+
+def test_a_mount_that_looks_right_sees_the_right_ahead() -> None:
+    """Array yawed by 90 degrees: body's right is its boresight."""
+    right = Rotation.from_euler("ZYX", [math.pi / 2, 0, 0]).as_matrix().T
+    array = uniform_linear(16, 30e9, 0.5, right)
+    (beam,) = pointed([track("a", (0, 100, 0))], carrier(), array).beams
+    assert beam.azimuth_rad == pytest.approx(0.0, abs=1e-12)
+
+

@@ -1,0 +1,108 @@
+"""Steering vectors by brute force; the pointing bound against an adversary."""
+
+import cmath
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.beams import steering
+from companion.beams.arrays import SPEED_OF_LIGHT_MPS, Array, uniform_linear
+from companion.values import FloatArray
+
+AZIMUTHS = st.floats(-math.pi + 1e-9, math.pi)
+ELEVATIONS = st.floats(-1.57, 1.57)
+DIRECTIONS = st.lists(st.tuples(AZIMUTHS, ELEVATIONS), min_size=1, max_size=6)
+
+
+def unit(azimuth_rad: float, elevation_rad: float) -> tuple[float, float, float]:
+    """x boresight, y right, z down."""
+    level = math.cos(elevation_rad)
+    return (
+        level * math.cos(azimuth_rad),
+        level * math.sin(azimuth_rad),
+        -math.sin(elevation_rad),
+    )
+
+
+def test_the_known_steering_vector() -> None:
+    """Five elements at 0, .1, ..., .4 m, 1 GHz, 45 degrees."""
+    elements = np.array([[0.0, 0.1 * m, 0.0] for m in range(5)])
+    array = Array("list", elements, 299_792_458 / 1e9, np.eye(3))
+    found = steering.steering_matrix(array, np.array([unit(math.radians(45), 0)]))
+    golden = [1, 0.0887 + 0.9961j, -0.9843 + 0.1767j, -0.2633 - 0.9647j, 0.9376 - 0.3478j]
+    assert found.shape == (5, 1)
+    assert found[:, 0] == pytest.approx(np.array(golden), abs=6e-5)
+
+
+@given(DIRECTIONS, st.integers(0, 2**32 - 1))
+def test_steering_is_the_sum_written_out(
+    angles: list[tuple[float, float]], seed: int
+) -> None:
+    """Elements anywhere in space."""
+    elements = np.random.default_rng(seed).uniform(-0.05, 0.05, (7, 3))
+    array = Array("list", elements, 0.01, np.eye(3))
+    directions = np.array([unit(*pair) for pair in angles])
+    found = steering.steering_matrix(array, directions)
+    assert found.shape == (7, len(angles))
+    for m in range(7):
+        for n, direction in enumerate(directions):
+            path_m = sum(elements[m, k] * direction[k] for k in range(3))
+            assert found[m, n] == pytest.approx(cmath.exp(2j * math.pi * path_m / 0.01), abs=1e-9)
+
+
+@given(st.floats(-1.5, 1.5))
+def test_in_the_plane_it_is_the_published_vector(theta_rad: float) -> None:
+    """exp(j 2 pi / wavelength d m sin theta)."""
+    array = uniform_linear(8, 30e9, 0.5, np.eye(3))
+    found = steering.steering_matrix(array, np.array([unit(theta_rad, 0.0)]))[:, 0]
+    wavelength_m = SPEED_OF_LIGHT_MPS / 30e9
+    phase = 2 * np.pi / wavelength_m * (wavelength_m / 2) * np.arange(8) * np.sin(theta_rad)
+    assert found == pytest.approx(np.exp(1j * phase), abs=1e-9)
+
+
+@given(DIRECTIONS)
+def test_angles_are_those_of_the_directions(angles: list[tuple[float, float]]) -> None:
+    azimuths, elevations = steering.angles_rad(np.array([unit(*pair) for pair in angles]))
+    assert azimuths == pytest.approx(np.array([pair[0] for pair in angles]), abs=1e-6)
+    assert elevations == pytest.approx(np.array([pair[1] for pair in angles]), abs=1e-6)
+
+
+def test_straight_up_is_up() -> None:
+    # Rounding may leave a unit vector a little too long.
+    _, elevations = steering.angles_rad(np.array([[0, 0, -1 - 1e-15], [0, 0, 1 + 1e-15]]))
+    assert elevations == pytest.approx([math.pi / 2, -math.pi / 2])
+
+
+def angle_rad(a: FloatArray, b: FloatArray) -> float:
+    return math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b))
+
+
+@given(st.floats(1.0, 5000.0), st.floats(0.0, 0.999), st.integers(0, 2**32 - 1))
+def test_no_position_within_the_ball_is_farther_off(
+    range_m: float, share: float, seed: int
+) -> None:
+    """And the tangent attains it."""
+    rng = np.random.default_rng(seed)
+    bound_m = share * range_m
+    bound_rad = steering.pointing_bound_rad(bound_m, range_m)
+    assert bound_rad is not None
+    towards, aside = np.linalg.qr(rng.standard_normal((3, 2)))[0].T
+    predicted = range_m * towards
+    offsets = rng.standard_normal((200, 3))
+    offsets *= (bound_m * rng.uniform(0, 1, 200) ** (1 / 3) / np.linalg.norm(offsets, axis=1))[
+        :, np.newaxis
+    ]
+    for offset in offsets:
+        assert angle_rad(predicted + offset, predicted) <= bound_rad + 1e-9
+    # The worst: where a line through the array touches the ball, at a right angle to its radius.
+    tangent = bound_m * (-share * towards + math.sqrt(1 - share**2) * aside)
+    assert np.linalg.norm(tangent) == pytest.approx(bound_m)
+    assert angle_rad(predicted + tangent, predicted) >= 0.999 * bound_rad
+
+
+@pytest.mark.parametrize("bound_m", [100.0, 100.1, 1e9])
+def test_inside_the_ball_every_direction_is_possible(bound_m: float) -> None:
+    assert steering.pointing_bound_rad(bound_m, 100.0) is None

@@ -1,0 +1,193 @@
+"""The live service as its users have it: real processes, real UDP, real HTTP."""
+
+import io
+import json
+import math
+import signal
+import subprocess
+import sys
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pymap3d
+import pytest
+from support import BIN
+
+from companion.mavlink.decode import decode
+from companion.recording.reader import read_log, read_metadata
+from companion.values import Frame, Report
+
+RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
+
+
+PAPER_BOUNDS = """[observer]
+speed_max_mps = 151.0
+acceleration_max_mps2 = 190.0
+position_noise_m = 1.0
+velocity_noise_mps = 0.1
+"""
+STAMPS_OFF_DEG = 0.5
+"""What the flown log's own stamps, those of sending, are worth at 29 degrees a second."""
+
+
+def fly(port: int, record: Path, seconds: float = 5.0) -> "subprocess.Popen[str]":
+    """The paper's four UAVs and the carrier, as real traffic."""
+    to = f"udpout:127.0.0.1:{port}"
+    command = [BIN / "sitl-replay", "fly", "paper", "--to", to, "--duration", str(seconds)]
+    return subprocess.Popen([*command, "--record", str(record)], stdout=subprocess.PIPE, text=True)
+
+
+def true_bearings_deg(tlog: Path) -> dict[str, Any]:
+    """By UAV, a function of Unix seconds: the bearing from the carrier, from what was flown;
+    not a number before and after."""
+    seen: dict[str, list[tuple[float, float, float, float]]] = {}
+    for event in read_log(tlog):
+        message = decode(event) if isinstance(event, Frame) else None
+        if isinstance(message, Report) and message.alt_m is not None:
+            entry = (event.t_ns * 1e-9, message.lat_deg, message.lon_deg, message.alt_m)
+            seen.setdefault(message.uav, []).append(entry)
+    _, *home = seen.pop("5:1")[0]
+    bearings = {}
+    for uav, entries in seen.items():
+        t, lat, lon, alt = np.array(entries).T
+        north, east, _ = pymap3d.geodetic2ned(lat, lon, alt, *home)
+        angle = np.unwrap(np.arctan2(east, north))
+        bearings[uav] = lambda at, t=t, angle=angle: math.degrees(
+            np.interp(at, t, angle, left=math.nan, right=math.nan)
+        )
+    return bearings
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_follows_flying_vehicles_and_stops_cleanly(
+    start_node: Any, tmp_path: Path, number: signal.Signals
+) -> None:
+    settings = tmp_path / "settings.toml"
+    settings.write_text(PAPER_BOUNDS)
+    record = ("--config", str(settings), "--record", str(tmp_path / "recordings"))
+    node = start_node(*RUN, *record)
+    flight = fly(node.udp_port, tmp_path / "flown.tlog")
+    node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
+    assert json.loads(node.get("/readyz")[1])["ready"]
+    asked = []
+    while flight.poll() is None:
+        asked.append(node.json("/v1/beams"))
+    uavs = node.json("/v1/uavs")["uavs"]
+    returncode, out, err = node.stop(number)
+
+    assert flight.communicate()[0].startswith("sent")
+    assert returncode == 0, err
+    assert "Traceback" not in err
+    assert {uav["id"] for uav in uavs} == {"1:1", "2:1", "3:1", "4:1"}
+    bearing_at = true_bearings_deg(tmp_path / "flown.tlog")
+    errors_deg: list[float] = []
+    travelled: dict[str, list[float]] = {uav: [] for uav in bearing_at}
+    for answer in asked:
+        assert answer["age_s"] < 0.2
+        at = datetime.fromisoformat(answer["valid_at"]).timestamp()
+        for beam in answer["beams"]:
+            true_deg = bearing_at[beam["uav"]](at)
+            if math.isnan(true_deg):  # past the last thing flown
+                continue
+            off_deg = abs((beam["bearing_deg"] - true_deg + 180) % 360 - 180)
+            assert off_deg <= beam["pointing_bound_deg"] + STAMPS_OFF_DEG, beam
+            errors_deg.append(off_deg)
+            travelled[beam["uav"]].append(true_deg)
+    assert len(errors_deg) > 100
+    assert np.median(errors_deg) < 0.5
+    assert all(max(angles) - min(angles) > 30 for angles in travelled.values())
+
+    (recording,) = (tmp_path / "recordings").iterdir()
+    assert recording.suffix == ".mcap"
+    replayed = subprocess.run(
+        [BIN / "companion", "replay", recording, "--no-record", "--json"],
+        capture_output=True,
+        check=True,
+    )
+    assert json.loads(replayed.stdout)["digest"] == read_metadata(recording)["summary"]["digest"]
+    assert recording.name in out
+
+
+def test_weights_point_where_the_beams_say(start_node: Any, tmp_path: Path) -> None:
+    node = start_node(*RUN)
+    with fly(node.udp_port, tmp_path / "flown.tlog", seconds=4) as flight:
+        node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
+        status, body = node.get("/v1/beams/weights?lead_ms=100", "application/x-npy")
+        weights = np.load(io.BytesIO(body))
+        as_json = node.json("/v1/beams/weights")
+        raw = np.frombuffer(node.get("/v1/beams/weights", "application/octet-stream")[1], "<c8")
+        flight.wait()
+    assert status == 200
+    assert weights.shape == (64, 4)
+    assert weights.dtype == np.complex128
+    assert np.array(as_json["re"]).shape == (64, 4) == np.array(as_json["im"]).shape
+    assert sorted(as_json["uavs"]) == ["1:1", "2:1", "3:1", "4:1"]
+    assert raw.size == 64 * 4
+    assert np.all(np.isfinite(weights))
+
+
+def test_without_a_carrier_it_says_so(start_node: Any) -> None:
+    node = start_node(*RUN)
+    status, body = node.get("/readyz")
+    assert status == 503
+    assert json.loads(body)["reasons"] == ["no report yet"]
+    assert node.get("/healthz")[0] == 200
+    assert node.json("/v1/beams")["beams"] == []
+    assert node.json("/v1/beams")["condition_number"] is None
+    assert node.json("/v1/status")["recording"]["state"] == "off"
+
+
+@pytest.mark.parametrize(
+    ("path", "accept", "expected"),
+    [
+        ("/v1/uavs/9:9", "application/json", 404),
+        ("/v1/nothing", "application/json", 404),
+        ("/v1/beams?lead_ms=x", "application/json", 422),
+        ("/v1/beams?lead_ms=-1", "application/json", 422),
+        ("/v1/beams/weights", "image/png", 406),
+    ],
+)
+def test_errors_are_problem_json(start_node: Any, path: str, accept: str, expected: int) -> None:
+    node = start_node(*RUN)
+    status, body = node.get(path, accept)
+    assert status == expected
+    assert json.loads(body)["status"] == expected
+    assert json.loads(body)["title"]
+
+
+def test_the_page_is_served(start_node: Any) -> None:
+    node = start_node(*RUN)
+    status, body = node.get("/", "text/html")
+    assert status == 200
+    assert b"<canvas" in body
+    assert node.json("/openapi.json")["info"]["title"] == "companion"
+
+
+def test_a_token_is_asked_for(start_node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COMPANION_TOKEN", "s3cret")
+    node = start_node(*RUN)
+    assert node.get("/v1/status")[0] == 401
+    assert node.get("/")[0] == 401
+    assert node.get("/healthz")[0] == 200
+
+
+def test_the_demo_runs_by_itself_and_loads_no_solver(tmp_path: Path) -> None:
+    code = (
+        "import sys\n"
+        "from companion.cli import main\n"
+        "main(['demo', '--seconds', '2', '--port', '0'], standalone_mode=False)\n"
+        "assert not {'cvxpy', 'clarabel', 'pymavlink.mavutil'} & set(sys.modules)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    (recording,) = (tmp_path / "recordings").glob("*.mcap")
+    assert any(isinstance(event, Frame) for event in read_log(recording))

@@ -1,0 +1,121 @@
+"""Attitudes and their prediction: against scipy's rotations and integrated kinematics."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from companion.tracking import carrier
+from companion.tracking.geodesy import LocalFrame
+from companion.values import Attitude, Fix, FloatArray, Source, Track, TrackState
+
+ANGLES = st.floats(-math.pi, math.pi)
+RATES = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
+S = 1_000_000_000
+
+
+def oracle(roll_rad: float, pitch_rad: float, yaw_rad: float) -> FloatArray:
+    """scipy's matrix takes body coordinates to NED: intrinsic yaw, pitch, roll."""
+    return Rotation.from_euler("ZYX", [yaw_rad, pitch_rad, roll_rad]).as_matrix().T
+
+
+def proper(matrix: FloatArray) -> None:
+    assert matrix @ matrix.T == pytest.approx(np.eye(3), abs=1e-12)
+    assert np.linalg.det(matrix) == pytest.approx(1.0)
+
+
+@given(ANGLES, ANGLES, ANGLES)
+def test_attitudes_are_mavlink_s(roll: float, pitch: float, yaw: float) -> None:
+    turned = carrier.body_from_ned(roll, pitch, yaw)
+    proper(turned)
+    assert turned == pytest.approx(oracle(roll, pitch, yaw), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("angles_rad", "ned", "body"),
+    [
+        ((0, 0, math.pi / 2), (0, 1, 0), (1, 0, 0)),  # heading east, east is ahead
+        ((0, math.pi / 6, 0), (0, 0, 1), (-0.5, 0, math.sqrt(0.75))),  # nose up, down is behind
+        ((math.pi / 6, 0, 0), (0, 0, 1), (0, 0.5, math.sqrt(0.75))),  # right wing low
+    ],
+)
+def test_signs(
+    angles_rad: tuple[float, float, float], ned: tuple[int, int, int], body: tuple[float, ...]
+) -> None:
+    assert carrier.body_from_ned(*angles_rad) @ ned == pytest.approx(body, abs=1e-12)
+
+
+def integrated(rates: FloatArray, interval_s: float) -> FloatArray:
+    """dC/dt = -[rates]x C from C = 1, by Runge and Kutta."""
+    x, y, z = rates
+    slope = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    turned, steps = np.eye(3), 400
+    h = interval_s / steps
+    for _ in range(steps):
+        k1 = slope @ turned
+        k2 = slope @ (turned + h / 2 * k1)
+        k3 = slope @ (turned + h / 2 * k2)
+        turned = turned + h / 6 * (k1 + 2 * k2 + 2 * k3 + slope @ (turned + h * k3))
+    return turned
+
+
+@given(RATES, st.floats(-2.0, 2.0))
+def test_constant_rates_turn_as_the_kinematics_say(
+    rates: tuple[float, float, float], interval_s: float
+) -> None:
+    later = carrier.later_body_from_body(np.array(rates), interval_s)
+    proper(later)
+    assert later == pytest.approx(integrated(np.array(rates), interval_s), abs=1e-7)
+
+
+def test_turning_right_is_turning_right() -> None:
+    """Yaw rate is positive to the right: heading 0 becomes heading 0.3 rad."""
+    later = carrier.later_body_from_body(np.array([0, 0, 0.6]), 0.5)
+    assert later @ oracle(0, 0, 0) == pytest.approx(oracle(0, 0, 0.3), abs=1e-12)
+    assert carrier.later_body_from_body(np.zeros(3), 5.0).tolist() == np.eye(3).tolist()
+
+
+def test_a_fixed_station_is_level_and_faces_its_heading() -> None:
+    local = LocalFrame(47.4, 8.5, 500.0)
+    station = carrier.fixed(7, local, (48.0, 9.5, 100.0), math.radians(90.0))
+    assert station.valid_at_ns == 7
+    assert (station.bound_m, station.age_s) == (0.0, None)
+    assert station.position_ned_m == pytest.approx(local.position_ned_m(48.0, 9.5, 100.0))
+    # Up, north and east there: below, to the left, ahead.
+    for place, body in (
+        ((48.0, 9.5, 110.0), (0, 0, -10)),
+        ((48.0001, 9.5, 100.0), (0, -11.12, 0)),
+        ((48.0, 9.5001, 100.0), (7.46, 0, 0)),
+    ):
+        offset = local.position_ned_m(*place) - station.position_ned_m
+        assert station.body_from_local @ offset == pytest.approx(body, abs=0.02)
+    proper(station.body_from_local)
+
+
+def test_a_vehicle_s_attitude_is_carried_on_to_the_time_of_use(fix: Callable[..., Fix]) -> None:
+    """Its rates act for as long as its attitude is older than the track's time."""
+    local = LocalFrame(47.4, 8.5, 500.0)
+    far = (49.0, 12.0)
+    track = Track(
+        "5:1", TrackState.LIVE, 12 * S, 0.5, np.array([1.0, 2, 3]), None, None, 4.5, None, None,
+        None, None, 1,
+    )  # fmt: skip
+    attitude = Attitude(0, Source(5, 1), 0, 0.2, -0.1, 1.0, 0.3, -0.2, 0.5)
+    newest = _at(fix, *far)
+    found = carrier.moving(local, track, newest, attitude, 11 * S - S // 4)
+    rates = np.array([0.3, -0.2, 0.5])
+    then = oracle(0.2, -0.1, 1.0) @ local.local_from_ned(*far).T
+    assert found.body_from_local == pytest.approx(integrated(rates, 1.25) @ then, abs=1e-9)
+    proper(found.body_from_local)
+    assert (found.valid_at_ns, found.bound_m, found.age_s) == (12 * S, 4.5, 0.5)
+    assert found.position_ned_m.tolist() == [1, 2, 3]
+
+
+def _at(make: Callable[..., Fix], lat_deg: float, lon_deg: float) -> Fix:
+    made = make(0, [0, 0, 0])
+    return replace(made, report=replace(made.report, lat_deg=lat_deg, lon_deg=lon_deg))

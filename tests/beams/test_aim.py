@@ -169,5 +169,3 @@ def test_a_mount_that_looks_right_sees_the_right_ahead() -> None:
     array = uniform_linear(16, 30e9, 0.5, right)
     (beam,) = pointed([track("a", (0, 100, 0))], carrier(), array).beams
     assert beam.azimuth_rad == pytest.approx(0.0, abs=1e-12)
-
-

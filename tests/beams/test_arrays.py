@@ -38,9 +38,7 @@ def test_the_known_half_power_beamwidths(elements: int, half_deg: float) -> None
 
 
 @pytest.mark.parametrize(("elements", "spacing"), [(2, 0.5), (3, 0.5), (8, 0.7), (64, 0.5)])
-def test_the_half_power_beamwidth_is_where_the_power_is_half(
-    elements: int, spacing: float
-) -> None:
+def test_the_half_power_beamwidth_is_where_the_power_is_half(elements: int, spacing: float) -> None:
     array = arrays.uniform_linear(elements, 10e9, spacing, EYE)
 
     def excess(theta_rad: float) -> float:

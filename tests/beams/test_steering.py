@@ -38,9 +38,7 @@ def test_the_known_steering_vector() -> None:
 
 
 @given(DIRECTIONS, st.integers(0, 2**32 - 1))
-def test_steering_is_the_sum_written_out(
-    angles: list[tuple[float, float]], seed: int
-) -> None:
+def test_steering_is_the_sum_written_out(angles: list[tuple[float, float]], seed: int) -> None:
     """Elements anywhere in space."""
     elements = np.random.default_rng(seed).uniform(-0.05, 0.05, (7, 3))
     array = Array("list", elements, 0.01, np.eye(3))
@@ -80,7 +78,7 @@ def angle_rad(a: FloatArray, b: FloatArray) -> float:
     return math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b))
 
 
-@given(st.floats(1.0, 5000.0), st.floats(0.0, 0.999), st.integers(0, 2**32 - 1))
+@given(st.floats(1.0, 5000.0), st.floats(1e-3, 0.999), st.integers(0, 2**32 - 1))
 def test_no_position_within_the_ball_is_farther_off(
     range_m: float, share: float, seed: int
 ) -> None:
@@ -91,8 +89,8 @@ def test_no_position_within_the_ball_is_farther_off(
     assert bound_rad is not None
     towards, aside = np.linalg.qr(rng.standard_normal((3, 2)))[0].T
     predicted = range_m * towards
-    offsets = rng.standard_normal((200, 3))
-    offsets *= (bound_m * rng.uniform(0, 1, 200) ** (1 / 3) / np.linalg.norm(offsets, axis=1))[
+    offsets = rng.standard_normal((20, 3))
+    offsets *= (bound_m * rng.uniform(0, 1, 20) ** (1 / 3) / np.linalg.norm(offsets, axis=1))[
         :, np.newaxis
     ]
     for offset in offsets:

@@ -1,0 +1,273 @@
+"""Settings: what is read, what is refused, and how that is said."""
+
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.config import (
+    BeamSettings,
+    ConfigError,
+    FixedCenter,
+    HomeCenter,
+    ObserverSettings,
+    Settings,
+    VehicleCenter,
+    load,
+    parse_center,
+)
+from companion.values import Source
+
+
+def refusal(text: str) -> str:
+    with pytest.raises(ConfigError) as caught:
+        Settings.from_toml(text, "there.toml")
+    message = str(caught.value)
+    assert message.startswith("there.toml: ")
+    assert "\n" not in message
+    return message.removeprefix("there.toml: ")
+
+
+# --- errors -------------------------------------------------------------------------------------
+
+# Section, key, value as TOML, the value as it is said, and what is allowed.
+WRONG = [
+    ("center", "source", '"there"', "there", "SYSID:COMPID"),
+    ("center", "source", '"300:1"', "300:1", "at most 255"),
+    ("center", "source", '"91,0,0"', "91,0,0", "latitude is within 90"),
+    ("center", "source", "5", "5", "string"),
+    ("links", "urls", '"udpin:0.0.0.0:1"', "udpin", "tuple"),
+    ("links", "urls", "[7]", "7", "string"),
+    ("clocks", "constant_delay_s", "-0.1", "-0.1", "greater than or equal to 0"),
+    ("clocks", "constant_delay_s", "11", "11", "less than or equal to 10"),
+    ("observer", "model", '"kinematics"', "kinematics", "position"),
+    ("observer", "feedthrough_s", "11.0", "11.0", "less than or equal to 10"),
+    ("observer", "velocity_lead_s", "0.0", "0.0", "greater than 0"),
+    ("observer", "speed_max_mps", "-3", "-3", "greater than 0"),
+    ("observer", "speed_max_mps", "inf", "inf", "finite"),
+    ("observer", "position_noise_m", "nan", "nan", "finite|greater than 0"),
+    ("observer", "acceleration_max_mps2", '"fast"', "fast", "number"),
+    ("tracks", "lost_s", "0", "0", "greater than 0"),
+    ("array", "kind", '"circle"', "circle", "ula"),
+    ("array", "elements", "0", "0", "greater than or equal to 1"),
+    ("array", "elements", "2.5", "2.5", "integer"),
+    ("array", "elements", "5000", "5000", "less than or equal to 4096"),
+    ("array", "mount_yaw_deg", "nan", "nan", "finite"),
+    ("beams", "update_hz", "1001", "1001", "less than or equal to 1000"),
+    ("beams", "targets", '"some"', "some", "'telemetry' or 'all'"),
+    ("beams", "condition_limit", "0.5", "0.5", "greater than or equal to 1"),
+    ("recording", "directory", "7", "7", "string"),
+    ("server", "listen", "8080", "8080", "string"),
+]
+
+
+@pytest.mark.parametrize(("section", "key", "value", "said", "allowed"), WRONG)
+def test_an_error_names_key_value_and_what_is_allowed(
+    section: str, key: str, value: str, said: str, allowed: str
+) -> None:
+    message = refusal(f"[{section}]\n{key} = {value}\n")
+    assert re.match(rf"{section}\.{key} = .*{re.escape(said)}.*: ", message), message
+    assert re.search(allowed, message.split(": ", 1)[1]), message
+
+
+@pytest.mark.parametrize("value", ["2", "0", "1.0", '"fast"', "-0.5"])
+def test_alpha_is_auto_or_between_0_and_1(value: str) -> None:
+    """A key of two kinds is named as it is written, and both kinds are said."""
+    message = refusal(f"[observer]\nalpha = {value}\n")
+    assert message.startswith("observer.alpha = "), message
+    assert "auto" in message
+    assert re.search("0|1|number", message.split(": ", 1)[1]), message
+
+
+@pytest.mark.parametrize("value", ["0", "-1", '"some"'])
+def test_weights_hz_is_all_or_above_0(value: str) -> None:
+    message = refusal(f"[recording]\nweights_hz = {value}\n")
+    assert message.startswith("recording.weights_hz = "), message
+    assert "all" in message
+    assert re.search("0|number", message.split(": ", 1)[1]), message
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        ("[tracks]\nstale = 4\n", "tracks.stale"),
+        ("[radar]\nrange = 4\n", "radar"),
+        ("source = '5:1'\n", "source"),
+    ],
+)
+def test_a_key_that_is_no_setting_is_named(text: str, key: str) -> None:
+    assert refusal(text) == f"{key} is not a setting"
+
+
+def test_a_section_is_a_table() -> None:
+    assert refusal("center = 3\n").startswith("center = 3: ")
+
+
+@pytest.mark.parametrize("text", ["[array", "array = ", "x = 1\nx = 2\n", "= 3", "a = 'é"])
+def test_what_is_not_toml_is_said_to_be_not_toml(text: str) -> None:
+    assert refusal(text).startswith("not TOML: ")
+
+
+@pytest.mark.parametrize("text", ["[tracks]\ncoasting_s = 100\n", "[tracks]\nlost_s = 10\n"])
+def test_a_track_passes_its_states_in_order(text: str) -> None:
+    """coasting_s <= stale_s <= lost_s, or a state would never be seen."""
+    assert "tracks" in refusal(text)
+
+
+# --- files --------------------------------------------------------------------------------------
+
+
+def test_without_a_file_there_are_the_defaults() -> None:
+    assert load(None) == Settings()
+
+
+def test_a_file_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_text('[array]\nelements = 128\n[center]\nsource = "5:1"\n', encoding="utf-8")
+    found = load(path)
+    assert (found.array.elements, found.center.source) == (128, "5:1")
+    assert found.beams == BeamSettings()
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"missing\.toml: No such file"):
+        load(tmp_path / "missing.toml")
+    with pytest.raises(ConfigError, match="Is a directory"):
+        load(tmp_path)
+    (tmp_path / "latin.toml").write_bytes(b"# \xe9\n")
+    with pytest.raises(ConfigError, match=r"latin\.toml: not TOML: it is not UTF-8"):
+        load(tmp_path / "latin.toml")
+    (tmp_path / "bad.toml").write_text("[array]\nelements = 0\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"bad\.toml: array\.elements = 0: "):
+        load(tmp_path / "bad.toml")
+
+
+# --- to TOML and back ---------------------------------------------------------------------------
+
+POSITIVE = st.floats(0, exclude_min=True, allow_nan=False, allow_infinity=False)
+SCALAR = st.characters(exclude_categories=["Cs"])
+
+
+@given(
+    directory=st.none() | st.text(SCALAR, max_size=20),
+    urls=st.lists(st.text(SCALAR, max_size=20), max_size=3),
+    alpha=st.just("auto") | st.floats(0, 1, exclude_min=True, exclude_max=True),
+    speed=POSITIVE,
+    weights_hz=st.just("all") | POSITIVE,
+    elements=st.integers(1, 4096),
+    yaw_deg=st.floats(allow_nan=False, allow_infinity=False),
+    source=st.none() | st.sampled_from(["5:1", "home", "47.4,8.5,500,-90"]),
+)
+def test_settings_survive_being_written(
+    directory: str | None,
+    urls: list[str],
+    alpha: float | str,
+    speed: float,
+    weights_hz: float | str,
+    elements: int,
+    yaw_deg: float,
+    source: str | None,
+) -> None:
+    made = Settings.model_validate(
+        {
+            "center": {"source": source},
+            "links": {"urls": urls},
+            "observer": {"alpha": alpha, "speed_max_mps": speed},
+            "recording": {"directory": directory, "weights_hz": weights_hz},
+            "array": {"elements": elements, "mount_yaw_deg": yaw_deg},
+        }
+    )
+    assert Settings.from_toml(made.to_toml(), "written") == made
+
+
+def test_what_is_written_holds_every_default() -> None:
+    text = Settings().to_toml()
+    assert Settings.from_toml(text, "written") == Settings()
+    for name, section in Settings():
+        assert f"[{name}]\n" in text
+        for key, value in section:
+            assert (f"\n{key} = " in text) == (value is not None), key
+
+
+# --- flags --------------------------------------------------------------------------------------
+
+
+def test_flags_override_and_none_leaves_a_key() -> None:
+    before = Settings.from_toml('[center]\nsource = "5:1"\n[array]\nelements = 8\n', "x")
+    after = before.override(
+        center={"source": None}, array={"elements": 16, "kind": None}, links={"urls": ["tcp:a:1"]}
+    )
+    assert after.center.source == "5:1"
+    assert (after.array.elements, after.array.kind) == (16, "ula")
+    assert after.links.urls == ("tcp:a:1",)
+    assert before.array.elements == 8
+    assert after.observer == ObserverSettings()
+    assert before.override() == before
+
+
+def test_a_bad_flag_is_an_error_of_settings() -> None:
+    with pytest.raises(ConfigError, match=r"^array\.elements = 0: .*greater than or equal to 1"):
+        Settings().override(array={"elements": 0})
+    with pytest.raises(ConfigError, match=r"^array\.columns is not a setting"):
+        Settings().override(array={"columns": 3})
+
+
+# --- what carries the array ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "center"),
+    [
+        ("home", HomeCenter()),
+        ("5:1", VehicleCenter(Source(5, 1))),
+        ("255:0", VehicleCenter(Source(255, 0))),
+        ("47.4,8.55,500", FixedCenter(47.4, 8.55, 500.0, 0.0)),
+        ("-90,180,-3.5,-90", FixedCenter(-90.0, 180.0, -3.5, -90.0)),
+        (" 47.4, 8.55, 500, 90", FixedCenter(47.4, 8.55, 500.0, 90.0)),
+    ],
+)
+def test_centers(text: str, center: object) -> None:
+    assert parse_center(text) == center
+    assert parse_center(str(center)) == center
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "SYSID:COMPID"),
+        ("5", "SYSID:COMPID"),
+        ("5:", "SYSID:COMPID"),
+        ("a:b", "SYSID:COMPID"),
+        ("-1:1", "SYSID:COMPID"),
+        ("5:1:1", "SYSID:COMPID"),
+        ("Home", "SYSID:COMPID"),
+        ("256:1", "at most 255"),
+        ("1:256", "at most 255"),
+        ("47,8", "LAT,LON,ALT"),
+        ("47,8,500,90,1", "LAT,LON,ALT"),
+        ("47,8,high", "LAT,LON,ALT"),
+        ("47,,500", "LAT,LON,ALT"),
+        ("90.1,8,500", "latitude is within 90"),
+        ("47,-180.1,500", "longitude within 180"),
+        ("nan,8,500", "latitude"),
+        ("47,inf,500", "longitude"),
+    ],
+)
+def test_what_is_no_center_is_refused(text: str, said: str) -> None:
+    with pytest.raises(ValueError, match=said) as caught:
+        parse_center(text)
+    assert repr(text) in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["47,8,nan", "47,8,inf", "47,8,500,nan", "47,8,500,-inf"])
+def test_height_and_heading_of_a_center_are_numbers(text: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(repr(text))):
+        parse_center(text)
+
+
+@pytest.mark.parametrize("text", ["", "there"])
+def test_whoever_names_no_center_is_told_all_three_kinds(text: str) -> None:
+    with pytest.raises(ValueError, match=r"SYSID:COMPID.*LAT,LON,ALT.*home"):
+        parse_center(text)

@@ -1,0 +1,507 @@
+"""The whole program as a fold: real MAVLink frames in, beams out."""
+
+import math
+from collections.abc import Iterable
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pymap3d
+import pytest
+from pymavlink.dialects.v20 import all as dialect
+from scipy.spatial.transform import Rotation
+
+from companion.config import FixedCenter, Settings
+from companion.pipeline import Pipeline, with_ticks
+from companion.values import (
+    Estimate,
+    Event,
+    Frame,
+    Notice,
+    Output,
+    Reason,
+    Rejection,
+    Severity,
+    Source,
+    Tick,
+    Update,
+)
+from sitl_replay import scenario
+from sitl_replay.scenario import Scenario
+from sitl_replay.vehicles import schedule
+
+S = 1_000_000_000
+START_NS = 1_760_000_000 * S
+PLACE = (47.4, 8.55, 500.0)
+
+
+def frame(t_ns: int, raw: bytes, link: str = "udp") -> Frame:
+    msgid = raw[7] | raw[8] << 8 | raw[9] << 16
+    return Frame(t_ns, link, Source(raw[5], raw[6]), msgid, raw)
+
+
+def sent(t_s: float, source: str, message: Any, seq: int = 0, link: str = "udp") -> Frame:
+    sysid, compid = Source.parse(source)
+    sender = dialect.MAVLink(None, srcSystem=sysid, srcComponent=compid)
+    sender.seq = seq
+    return frame(START_NS + round(t_s * 1e9), bytes(message.pack(sender)), link)
+
+
+def position(
+    t_s: float,
+    source: str,
+    ned_m: tuple[float, float, float] = (0, 0, 0),
+    velocity_mps: tuple[float, float, float] = (0, 0, 0),
+    *,
+    boot_s: float | None = None,
+    seq: int = 0,
+    link: str = "udp",
+) -> Frame:
+    """GLOBAL_POSITION_INT of a place told from PLACE, without latency."""
+    lat, lon, alt = pymap3d.ned2geodetic(*ned_m, *PLACE)
+    message = dialect.MAVLink_global_position_int_message(
+        round(1000 * (100 + t_s if boot_s is None else boot_s)),
+        round(float(lat) * 1e7), round(float(lon) * 1e7), round(float(alt) * 1e3), 0,
+        *(round(100 * v) for v in velocity_mps), 65535,
+    )  # fmt: skip
+    return sent(t_s, source, message, seq, link)
+
+
+def attitude(t_s: float, source: str, *angles: float) -> Frame:
+    rpy = angles or (0.0, 0.0, 0.0)
+    message = dialect.MAVLink_attitude_message(round(1000 * (100 + t_s)), *rpy, 0.0, 0.0, 0.0)
+    return sent(t_s, source, message)
+
+
+def adsb(t_s: float, ned_m: tuple[float, float, float], flags: int = 1 | 2) -> Frame:
+    lat, lon, alt = pymap3d.ned2geodetic(*ned_m, *PLACE)
+    message = dialect.MAVLink_adsb_vehicle_message(
+        0x4CA7B3, round(float(lat) * 1e7), round(float(lon) * 1e7), 1, round(float(alt) * 1e3),
+        0, 0, 0, b"TEST", 0, 1, flags, 0,
+    )  # fmt: skip
+    return sent(t_s, "5:1", message)
+
+
+def tick(t_s: float) -> Tick:
+    return Tick(START_NS + round(t_s * 1e9))
+
+
+def settings(center: str | None = "5:1", **sections: dict[str, Any]) -> Settings:
+    return Settings().override(center={"source": center}, **sections)
+
+
+def run(pipeline: Pipeline, events: Iterable[Event]) -> list[Output]:
+    return [output for event in events for output in pipeline.step(event)]
+
+
+def updated(pipeline: Pipeline, t_s: float) -> Update:
+    *_, update = pipeline.step(tick(t_s))
+    assert isinstance(update, Update)
+    return update
+
+
+def flown(flight: Scenario, seconds: float, seed: int = 1) -> list[Event]:
+    """A scenario's traffic with ticks among it."""
+    frames = (
+        frame(START_NS + round(t_s * 1e9), raw)
+        for t_s, _, raw in schedule(flight, seed, START_NS, seconds)
+    )
+    return list(with_ticks(frames, 20.0))
+
+
+@pytest.fixture(scope="module")
+def paper() -> list[Event]:
+    return flown(scenario.paper(4), 4.0)
+
+
+# --- beams that point where the UAVs are --------------------------------------------------------
+
+
+def test_two_uavs_and_a_carrier_that_is_turned() -> None:
+    """Heading east, nose up by 10 degrees: the angles by plane geometry."""
+    pipeline = Pipeline(settings())
+    nose_rad = math.radians(10)
+    for t_s in np.arange(0, 2, 0.1):
+        for made in (
+            position(t_s, "5:1"),
+            attitude(t_s, "5:1", 0.0, nose_rad, math.pi / 2),
+            position(t_s, "1:1", (0, 200, 0)),
+            position(t_s, "2:1", (100, 0, -50)),
+        ):
+            pipeline.step(made)
+    update = updated(pipeline, 2.0)
+    assert update.unfit is None
+    assert update.beams.uavs == ("1:1", "2:1")
+    ahead, left = update.beams.beams
+    # East is ahead and, seen from a nose that points up, below; north is to the left.
+    assert math.degrees(ahead.azimuth_rad) == pytest.approx(0, abs=0.02)
+    assert math.degrees(ahead.elevation_rad) == pytest.approx(-10, abs=0.02)
+    assert ahead.range_m == pytest.approx(200, abs=0.05)
+    forward, up = 50 * math.sin(nose_rad), 50 * math.cos(nose_rad)
+    assert left.azimuth_rad == pytest.approx(math.atan2(-100, forward), abs=3e-4)
+    assert left.elevation_rad == pytest.approx(math.asin(up / math.hypot(100, 50)), abs=3e-4)
+    assert pipeline.last_update is update
+    assert pipeline.updates == 1
+
+
+@pytest.mark.parametrize("mount_deg", [(0, 0, 0), (20.0, -30.0, 140.0)])
+def test_beams_on_hovering_uavs_are_where_the_scenario_has_them(
+    mount_deg: tuple[float, float, float],
+) -> None:
+    """The carrier sways; scipy turns the directions, at the time at which the beams apply."""
+    flight = scenario.hover(4)
+    keys = ("mount_roll_deg", "mount_pitch_deg", "mount_yaw_deg")
+    mount = dict(zip(keys, mount_deg, strict=True))
+    pipeline = Pipeline(settings(array=mount, beams={"actuation_delay_s": 0.03}))
+    outputs = run(pipeline, flown(flight, 5.0))
+    updates = [o for o in outputs if isinstance(o, Update) and o.t_ns > START_NS + 3 * S]
+    assert len(updates) >= 35
+    roll, pitch, yaw = mount_deg
+    array = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True).as_matrix().T
+    for update in updates:
+        assert update.beams.valid_at_ns == update.t_ns + 30_000_000
+        pose = flight.carrier.attitude((update.beams.valid_at_ns - START_NS) * 1e-9)
+        body = Rotation.from_euler("ZYX", [pose.yaw_rad, pose.pitch_rad, pose.roll_rad])
+        assert set(update.beams.uavs) == {"1:1", "2:1", "3:1", "4:1"}
+        for beam in update.beams.beams:
+            (vehicle,) = (v for v in flight.uavs if str(v.source) == beam.uav)
+            ned = np.array(vehicle.trajectory(0.0).position_ned_m)
+            x, y, z = array @ body.as_matrix().T @ ned / np.linalg.norm(ned)
+            assert beam.range_m == pytest.approx(np.linalg.norm(ned), abs=0.1)
+            assert beam.azimuth_rad == pytest.approx(math.atan2(y, x), abs=2e-3)
+            assert beam.elevation_rad == pytest.approx(math.asin(-z), abs=2e-3)
+        assert not update.beams.regularised
+
+
+def test_the_truth_is_within_the_bounds_of_the_paper_s_flight(paper: list[Event]) -> None:
+    """Up to 125 m/s with gusts: positions and directions within what the update vouches for."""
+    flight = scenario.paper(4)
+    bounds = {
+        "speed_max_mps": 151.0, "acceleration_max_mps2": 190.0, "position_noise_m": 1.0,
+        "velocity_noise_mps": 0.1,
+    }  # fmt: skip
+    pipeline = Pipeline(settings(observer=bounds))
+    updates = [o for o in run(pipeline, paper) if isinstance(o, Update)]
+    checked = 0
+    for update in updates[20:]:
+        assert update.carrier is not None
+        t_s = (update.beams.valid_at_ns - START_NS) * 1e-9
+        pose = flight.carrier.attitude(t_s)
+        body = Rotation.from_euler("ZYX", [pose.yaw_rad, pose.pitch_rad, pose.roll_rad])
+        here = update.carrier.position_ned_m
+        for track, beam in zip(update.tracks, update.beams.beams, strict=True):
+            (vehicle,) = (v for v in flight.uavs if str(v.source) == beam.uav)
+            ned = np.array(vehicle.trajectory(t_s).position_ned_m)
+            # The local frame begins elsewhere, and the carrier has noise of its own.
+            slack_m = update.carrier.bound_m
+            away = np.linalg.norm(track.position_ned_m - here - ned)
+            assert away <= track.bound_m + slack_m
+            truth = body.as_matrix().T @ ned / np.linalg.norm(ned)
+            level = math.cos(beam.elevation_rad)
+            pointed = np.array(
+                [
+                    level * math.cos(beam.azimuth_rad),
+                    level * math.sin(beam.azimuth_rad),
+                    -math.sin(beam.elevation_rad),
+                ]
+            )
+            assert beam.pointing_bound_rad is not None
+            assert math.acos(min(1.0, truth @ pointed)) <= beam.pointing_bound_rad
+            checked += 1
+        if not update.beams.regularised:
+            count = len(update.beams.beams)
+            lambdas = [np.sin(b.azimuth_rad) * np.cos(b.elevation_rad) for b in update.beams.beams]
+            a = np.exp(1j * np.pi * np.outer(np.arange(64), lambdas))
+            assert np.abs(a.T @ update.beams.weights - np.eye(count)).max() < 1e-9
+    assert checked > 200
+
+
+def test_a_lead_asks_for_a_later_time() -> None:
+    pipeline = Pipeline(settings(center="47.4,8.55,500"))
+    for t_s in (0.0, 0.1, 0.2):
+        east_m = 10 * t_s
+        pipeline.step(position(t_s, "1:1", (100, east_m, 0), (0, 10, 0)))
+    now_ns = tick(0.2).t_ns
+    plain, led = pipeline.look(now_ns), pipeline.look(now_ns, lead_s=2.0)
+    assert led.beams.valid_at_ns - plain.beams.valid_at_ns == 2 * S
+    assert plain.tracks[0].position_ned_m[1] == pytest.approx(2.1, abs=0.03)
+    assert led.tracks[0].position_ned_m[1] == pytest.approx(22.1, abs=0.03)
+    assert led.tracks[0].bound_m > plain.tracks[0].bound_m
+
+
+# --- what carries the array ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("center", ["home", None])
+def test_home_is_where_the_first_report_was_made(center: str | None) -> None:
+    pipeline = Pipeline(settings(center))
+    assert pipeline.step(tick(0))[0].unfit == "no report yet"  # type: ignore[union-attr]
+    zero = dialect.MAVLink_global_position_int_message(1, 0, 0, 0, 0, 0, 0, 0, 0)
+    pipeline.step(sent(0.1, "9:1", zero))  # not accepted
+    home, first = pipeline.step(position(0.2, "1:1", (10, 20, -30)))
+    assert isinstance(home, Notice)
+    assert (home.subject, home.severity) == ("home", Severity.INFO)
+    assert "1:1" in home.text
+    assert isinstance(first, Estimate)
+    lat, lon, alt = pymap3d.ned2geodetic(10, 20, -30, *PLACE)
+    at = pipeline.center
+    assert isinstance(at, FixedCenter)
+    assert (at.lat_deg, at.lon_deg) == pytest.approx((lat, lon), abs=1e-7)
+    assert at.alt_m == pytest.approx(alt, abs=1e-3)
+    pipeline.step(position(0.2, "2:1", (10, 120, -30)))
+    update = updated(pipeline, 0.3)
+    (beam,) = update.beams.beams
+    assert (beam.uav, update.unfit) == ("2:1", None)
+    assert math.degrees(beam.azimuth_rad) == pytest.approx(90, abs=0.02)  # facing north
+    assert [left.uav for left in update.beams.left_out] == ["1:1"]
+
+
+def test_a_fixed_station_faces_its_heading() -> None:
+    pipeline = Pipeline(settings("47.4,8.55,500,90"))
+    outputs = pipeline.step(position(0, "1:1", (0, 100, -100)))
+    assert [type(output) for output in outputs] == [Estimate]
+    update = updated(pipeline, 0.05)
+    (beam,) = update.beams.beams
+    assert math.degrees(beam.azimuth_rad) == pytest.approx(0, abs=0.02)
+    assert math.degrees(beam.elevation_rad) == pytest.approx(45, abs=0.02)
+    assert update.carrier is not None
+    assert (update.carrier.bound_m, update.carrier.age_s) == (0.0, None)
+
+
+def test_without_a_carrier_there_are_no_beams_and_it_says_why() -> None:
+    pipeline = Pipeline(settings())
+    assert updated(pipeline, 0).unfit == "no report yet"
+    pipeline.step(position(0.1, "1:1", (100, 0, 0)))
+    update = updated(pipeline, 0.2)
+    assert update.unfit == "no position from the carrier 5:1"
+    assert (update.carrier, update.beams.beams) == (None, ())
+    assert [left.uav for left in update.beams.left_out] == ["1:1"]
+    assert [track.uav for track in update.tracks] == ["1:1"]
+    pipeline.step(position(0.3, "5:1"))
+    assert updated(pipeline, 0.4).unfit == "no attitude from the carrier 5:1"
+    pipeline.step(attitude(0.5, "1:1"))  # another's does not do
+    assert updated(pipeline, 0.5).unfit == "no attitude from the carrier 5:1"
+    pipeline.step(attitude(0.5, "5:1"))
+    assert updated(pipeline, 0.6).unfit is None
+    pipeline.step(position(3.0, "5:1"))
+    assert updated(pipeline, 3.0).unfit == "the attitude of the carrier 5:1 is too old"
+    pipeline.step(attitude(18.5, "5:1"))
+    assert updated(pipeline, 18.5).unfit == "the carrier 5:1 is stale"
+
+
+def test_the_carrier_is_never_its_own_target() -> None:
+    pipeline = Pipeline(settings(beams={"targets": "all"}))
+    run(pipeline, [position(0, "5:1"), attitude(0, "5:1"), position(0, "1:1", (99, 0, 0))])
+    update = updated(pipeline, 0.1)
+    assert [track.uav for track in update.tracks] == ["1:1"]
+    assert update.beams.uavs == ("1:1",)
+    assert not pipeline.is_target("5:1")
+    now_ns = tick(0.1).t_ns
+    assert [track.uav for track in pipeline.tracks(now_ns, now_ns)] == ["1:1"]
+
+
+# --- what is a target, and what is not accepted -------------------------------------------------
+
+
+@pytest.mark.parametrize(("targets", "aimed"), [("telemetry", ()), ("all", ("icao:4CA7B3",))])
+def test_adsb_traffic_is_a_target_only_if_asked(targets: str, aimed: tuple[str, ...]) -> None:
+    pipeline = Pipeline(settings("47.4,8.55,500", beams={"targets": targets}))
+    (seen,) = pipeline.step(adsb(0, (3000, 500, -800)))
+    assert isinstance(seen, Estimate)
+    assert updated(pipeline, 0.1).beams.uavs == aimed
+    now_ns = tick(0.1).t_ns
+    assert [track.uav for track in pipeline.tracks(now_ns, now_ns)] == ["icao:4CA7B3"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "reason", "who"),
+    [(2, Reason.NO_POSITION, "5:1"), (1, Reason.NO_ALTITUDE, "icao:4CA7B3")],
+)
+def test_adsb_without_what_it_takes_is_counted(flags: int, reason: Reason, who: str) -> None:
+    pipeline = Pipeline(settings())
+    (refused,) = pipeline.step(adsb(0, (3000, 500, -800), flags))
+    assert isinstance(refused, Rejection)
+    assert refused.reason is reason
+    assert pipeline.rejected == {reason: 1}
+    assert pipeline.rejected_by_source == {who: {reason: 1}}
+    assert pipeline.local is None
+
+
+def test_the_same_report_over_two_links_counts_once() -> None:
+    pipeline = Pipeline(settings("home"))
+    pipeline.step(position(0, "1:1", seq=1))
+    again = position(0.0, "1:1", seq=77, link="tcp")._replace(t_ns=START_NS + S // 2)
+    (refused,) = pipeline.step(again)
+    assert refused == Rejection(again.t_ns, "1:1", Reason.DUPLICATE)
+    assert pipeline.rejected == {Reason.DUPLICATE: 1}
+    assert pipeline.frames == 2
+    track = pipeline.tracks(again.t_ns, again.t_ns)[0]
+    assert track.reports == 1
+
+
+def test_a_late_report_is_out_of_order() -> None:
+    pipeline = Pipeline(settings("home"))
+    run(pipeline, [position(0, "1:1"), position(1, "1:1", (1, 0, 0))])
+    late = position(1.5, "1:1", (0.5, 0, 0), boot_s=100.5)
+    (refused,) = pipeline.step(late)
+    assert isinstance(refused, Rejection)
+    assert refused.reason is Reason.OUT_OF_ORDER
+    assert pipeline.rejected == {Reason.OUT_OF_ORDER: 1}
+
+
+def test_a_position_at_0_0_is_counted_and_makes_no_track() -> None:
+    pipeline = Pipeline(settings())
+    zero = dialect.MAVLink_global_position_int_message(1, 200, -300, 0, 0, 0, 0, 0, 0)
+    for t_s in (0.0, 0.1):
+        (refused,) = pipeline.step(sent(t_s, "1:1", zero))
+        assert isinstance(refused, Rejection)
+        assert refused.reason is Reason.ZERO_POSITION
+    assert pipeline.rejected == {Reason.ZERO_POSITION: 2}
+    assert updated(pipeline, 0.2).tracks == ()
+
+
+def test_rejections_pass_through_and_are_counted() -> None:
+    pipeline = Pipeline(settings())
+    garbage = Rejection(START_NS, "udp", Reason.GARBAGE, 17)
+    assert pipeline.step(garbage) == [garbage]
+    pipeline.step(garbage)
+    pipeline.step(Rejection(START_NS, "tcp", Reason.BAD_CRC, 2))
+    assert pipeline.rejected == {Reason.GARBAGE: 34, Reason.BAD_CRC: 2}
+    assert pipeline.rejected_by_source["udp"] == {Reason.GARBAGE: 34}
+    assert pipeline.frames == 0
+
+
+def test_frames_that_nobody_reads_are_counted_and_no_more() -> None:
+    pipeline = Pipeline(settings())
+    before = pipeline.digest.hexdigest()
+    assert pipeline.step(sent(0, "1:1", dialect.MAVLink_ping_message(1, 2, 3, 4))) == []
+    beat = dialect.MAVLink_heartbeat_message(2, 3, 128, 0, 4, 3)
+    assert pipeline.step(sent(0, "1:1", beat)) == []
+    assert pipeline.frames == 2
+    assert pipeline.presence[Source(1, 1)].armed
+    assert pipeline.digest.hexdigest() == before
+
+
+def test_a_reboot_is_said_and_begins_a_fresh_track() -> None:
+    pipeline = Pipeline(settings("47.4,8.55,500"))
+    for t_s in range(5):
+        pipeline.step(position(t_s, "1:1", (100 + t_s, 0, 0)))
+    pipeline.step(position(4, "2:1", (0, 90, 0)))
+    notice, first = pipeline.step(position(6, "1:1", (200, 0, 0), boot_s=3.0))
+    assert isinstance(notice, Notice)
+    assert (notice.subject, notice.severity) == ("1:1", Severity.WARNING)
+    assert "restarted" in notice.text
+    assert isinstance(first, Estimate)
+    assert first.dt_s is None
+    assert first.fix.t_ns == START_NS + 6 * S
+    update = updated(pipeline, 6.1)
+    tracks = {track.uav: track for track in update.tracks}
+    assert (tracks["1:1"].reports, tracks["2:1"].reports) == (1, 1)
+    assert tracks["1:1"].position_ned_m[0] == pytest.approx(200, abs=0.05)
+    assert set(update.beams.uavs) == {"1:1", "2:1"}
+    (second,) = pipeline.step(position(7, "1:1", (201, 0, 0), boot_s=4.0))
+    assert isinstance(second, Estimate)
+    assert second.dt_s == pytest.approx(1.0)
+
+
+def test_states_are_said_when_they_change() -> None:
+    pipeline = Pipeline(settings("47.4,8.55,500"))
+    pipeline.step(position(0, "1:1", (100, 0, 0)))
+    said = {}
+    for t_s in (0.1, 1.0, 2.5, 3.0, 16.0, 17.0, 61.0, 62.0):
+        *notices, update = pipeline.step(tick(t_s))
+        assert isinstance(update, Update)
+        said[t_s] = [(n.severity, n.text) for n in notices if isinstance(n, Notice)]
+        assert len(update.beams.beams) == (t_s < 15)
+        assert len(update.tracks) == (t_s < 60)
+    assert {t_s: notices for t_s, notices in said.items() if notices} == {
+        0.1: [(Severity.INFO, "1:1 is live")],
+        2.5: [(Severity.INFO, "1:1 is coasting")],
+        16.0: [(Severity.WARNING, "1:1 is stale")],
+        61.0: [(Severity.WARNING, "1:1 is lost")],
+    }
+
+
+# --- a fold: the same events, the same digest ---------------------------------------------------
+
+
+def test_the_same_events_give_the_same_digest(paper: list[Event]) -> None:
+    one, two = Pipeline(settings()), Pipeline(settings())
+    run(one, paper)
+    run(two, paper)
+    assert one.digest.hexdigest() == two.digest.hexdigest()
+    assert len(one.digest.hexdigest()) == 64
+
+
+def test_other_events_give_another_digest(paper: list[Event]) -> None:
+    def digest(events: list[Event], **sections: dict[str, Any]) -> str:
+        pipeline = Pipeline(settings(**sections))
+        run(pipeline, events)
+        return pipeline.digest.hexdigest()
+
+    reports = [n for n, e in enumerate(paper) if isinstance(e, Frame) and e.msgid == 33]
+    attitudes = [
+        n for n, e in enumerate(paper) if isinstance(e, Frame) and e.msgid == 30
+        and e.source == Source(5, 1)
+    ]  # fmt: skip
+    ticks = [n for n, e in enumerate(paper) if isinstance(e, Tick)]
+    digests = [digest(paper), digest(flown(scenario.paper(4), 4.0, seed=2))]
+    for dropped in (reports[30], attitudes[30], ticks[30]):
+        digests.append(digest(paper[:dropped] + paper[dropped + 1 :]))
+    digests.append(digest(paper, array={"elements": 32}))
+    digests.append(digest(paper, observer={"position_noise_m": 4.0}))
+    assert len(set(digests)) == len(digests)
+
+
+def test_looking_changes_nothing(paper: list[Event]) -> None:
+    """Neither the digest nor what comes out later."""
+    quiet, watched = Pipeline(settings()), Pipeline(settings())
+    for number, event in enumerate(paper):
+        plain, seen = quiet.step(event), watched.step(event)
+        assert repr(plain) == repr(seen)
+        if number % 7 == 0:
+            for lead_s in (0.0, 0.5, -0.2):
+                watched.look(event.t_ns + number, lead_s)
+            watched.tracks(event.t_ns + S, event.t_ns + 2 * S)
+            watched.carrier(event.t_ns + S, event.t_ns)
+            watched.newest("1:1")
+    assert quiet.digest.hexdigest() == watched.digest.hexdigest()
+    assert quiet.updates == watched.updates
+    last = watched.last_update
+    watched.look(START_NS + 100 * S)
+    assert watched.last_update is last
+
+
+def test_geodetic_is_the_way_back() -> None:
+    pipeline = Pipeline(settings("47.4,8.55,500"))
+    lat, lon, alt = pipeline.geodetic(np.array([[10.0, 20, -30]]))
+    assert (lat[0], lon[0], alt[0]) == pytest.approx(pymap3d.ned2geodetic(10, 20, -30, *PLACE))
+    with pytest.raises(ValueError, match="no report yet"):
+        Pipeline(settings()).geodetic(np.zeros((1, 3)))
+
+
+# --- the timer of a log -------------------------------------------------------------------------
+
+
+def test_ticks_come_at_the_rate_asked_for() -> None:
+    frames = [position(t_s, "1:1") for t_s in (0.0, 0.01, 0.3, 0.31, 1.0)]
+    events = list(with_ticks(frames, 20.0))
+    ticks = [event.t_ns for event in events if isinstance(event, Tick)]
+    assert ticks == [START_NS + n * 50_000_000 for n in range(1, 21)]
+    assert [event for event in events if isinstance(event, Frame)] == frames
+    assert events[0] is frames[0]
+    assert all(a.t_ns <= b.t_ns for a, b in pairwise(events))
+    # What a timer would have made by the time of a frame comes before it.
+    assert events.index(frames[4]) == len(events) - 1
+
+
+def test_a_period_is_rounded_once_not_at_every_tick() -> None:
+    frames = [position(t_s, "1:1") for t_s in (0.0, 10.0)]
+    ticks = [e.t_ns for e in with_ticks(frames, 3.0) if isinstance(e, Tick)]
+    assert ticks == [START_NS + n * 333_333_333 for n in range(1, 31)]
+
+
+def test_no_events_no_ticks() -> None:
+    assert list(with_ticks([], 20.0)) == []
+    garbage = Rejection(START_NS, "udp", Reason.GARBAGE)
+    assert list(with_ticks([garbage, garbage], 1000.0)) == [garbage, garbage]

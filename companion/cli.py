@@ -279,6 +279,8 @@ class _user_errors:  # noqa: N801 - reads as a statement
         if isinstance(error, OSError):
             where = f"{error.filename}: " if error.filename else ""
             raise click.ClickException(f"{where}{error.strerror or error}") from error
+        if type(error).__name__ == "LmiError":  # by name: its module loads the solver
+            raise click.ClickException(str(error)) from error
         if isinstance(error, ValueError) and _is_meant_for_users(error):
             raise click.ClickException(str(error)) from error
 

@@ -5,6 +5,7 @@ what is allowed.
 """
 
 import json
+import math
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from pydantic import (
     FiniteFloat,
     PositiveFloat,
     ValidationError,
+    model_validator,
 )
 
 from companion.values import Source
@@ -65,13 +67,15 @@ def parse_center(text: str) -> Center:
     """Read ``SYSID:COMPID``, ``LAT,LON,ALT[,HEADING]`` or ``home``; ``ValueError`` otherwise."""
     if text == "home":
         return HomeCenter()
-    if "," not in text:
+    if ":" in text:
         return VehicleCenter(Source.parse(text))
+    if "," not in text:
+        raise ValueError(f"{text!r} is not SYSID:COMPID, LAT,LON,ALT[,HEADING] or home")
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) not in (3, 4):
+    if len(numbers) not in (3, 4) or not all(map(math.isfinite, numbers[2:])):
         raise ValueError(f"{text!r} is not LAT,LON,ALT[,HEADING], such as 47.4,8.55,500,90")
     if not (abs(numbers[0]) <= 90 and abs(numbers[1]) <= 180):
         raise ValueError(f"{text!r}: latitude is within 90 degrees and longitude within 180")
@@ -126,6 +130,12 @@ class TrackSettings(_Section):
     stale_s: PositiveFloat = 15.0
     lost_s: PositiveFloat = 60.0
 
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        if not self.coasting_s <= self.stale_s <= self.lost_s:
+            raise ValueError("coasting_s <= stale_s <= lost_s: a track passes its states in order")
+        return self
+
 
 class ArraySettings(_Section):
     """A uniform linear array along the y axis of its mount; mount angles of array from body."""
@@ -140,12 +150,15 @@ class ArraySettings(_Section):
 
 
 class BeamSettings(_Section):
-    """When weights are made, for when, for whom, and when zero forcing gives way to RZF."""
+    """When weights are made, for when, for whom, and when zero forcing gives way to RZF.
+
+    Up to ``condition_limit`` = 1000 zero forcing holds to 1e-9: its error grows with the square.
+    """
 
     update_hz: Annotated[float, Field(gt=0, le=1000)] = 20.0
     actuation_delay_s: Annotated[float, Field(ge=0, le=10)] = 0.01
     targets: Literal["telemetry", "all"] = "telemetry"
-    condition_limit: Annotated[float, Field(ge=1, le=1e6)] = 10.0
+    condition_limit: Annotated[float, Field(ge=1, le=1e3)] = 10.0
     regularisation: Annotated[float, Field(gt=0, le=10)] = 0.01
 
 
@@ -189,8 +202,7 @@ class Settings(_Section):
         """All settings, defaults included, as ``from_toml`` reads them."""
         lines: list[str] = []
         for name, keys in self.model_dump(mode="json", exclude_none=True).items():
-            # A JSON string, number, boolean or flat list is one of TOML too.
-            lines += [f"[{name}]", *(f"{key} = {json.dumps(keys[key])}" for key in keys), ""]
+            lines += [f"[{name}]", *(f"{key} = {_toml(keys[key])}" for key in keys), ""]
         return "\n".join(lines)
 
     def override(self, **sections: dict[str, Any]) -> "Settings":
@@ -217,10 +229,20 @@ def load(path: Path | None) -> Settings:
     return Settings.from_toml(text, str(path))
 
 
+def _toml(value: object) -> str:
+    """A string, number, boolean or flat list: as in JSON, but for what TOML wants escaped."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
 def _first(error: ValidationError) -> str:
-    """The first thing wrong, in one line: key, value, what is allowed."""
-    wrong = error.errors(include_url=False)[0]
-    key = ".".join(str(part) for part in wrong["loc"] if isinstance(part, str))
-    if wrong["type"] == "extra_forbidden":
+    """The first thing wrong, in one line: key, value, what is allowed.
+
+    A key of two kinds has an error for each kind, under one name.
+    """
+    errors = error.errors(include_url=False)
+    place = errors[0]["loc"][:2]
+    key = ".".join(map(str, place))
+    if errors[0]["type"] == "extra_forbidden":
         return f"{key} is not a setting"
-    return f"{key} = {wrong['input']!r}: {wrong['msg']}"
+    allowed = dict.fromkeys(wrong["msg"] for wrong in errors if wrong["loc"][:2] == place)
+    return f"{key} = {errors[0]['input']!r}: {', or '.join(allowed)}"

@@ -14,11 +14,11 @@ import numpy as np
 from companion.beams import arrays, precoding
 from companion.beams.aim import AIMABLE, aim
 from companion.config import Center, FixedCenter, Settings, VehicleCenter, parse_center
-from companion.mavlink.clocks import SenderClock
+from companion.mavlink.clocks import Reading, SenderClock
 from companion.mavlink.decode import DECODED, decode
 from companion.mavlink.dedupe import Dedupe
 from companion.tracking import carrier
-from companion.tracking.fleet import Ages, Fleet
+from companion.tracking.fleet import Ages, Fleet, SenderTime
 from companion.tracking.geodesy import LocalFrame
 from companion.tracking.observer import Bounds, PositionModel
 from companion.values import (
@@ -104,8 +104,9 @@ class Pipeline:
         self._carrier_id = str(self._center) if isinstance(self._center, VehicleCenter) else None
         self._attitude: tuple[int, Attitude] | None = None
         self._clocks: dict[Source, SenderClock] = {}
+        self._clocks_by_uav: dict[str, SenderClock] = {}
         self._dedupe = Dedupe()
-        self._fleet = _fleet(settings)
+        self._fleet = _fleet(settings, self._sender_ns)
         self._targets: list[str] = []  # in the order in which they were first heard
         self._precoder = precoding.Precoder(
             settings.beams.condition_limit, settings.beams.regularisation
@@ -156,35 +157,47 @@ class Pipeline:
         outputs: list[Output] = []
         if report.boot_ms is None:
             t_ns = report.t_ns - round((report.tslc_s or 0.0) * 1e9)
+            sender_ns = t_ns
         else:
-            t_ns = self._place(report.source, report.t_ns, report.boot_ms, outputs)
+            placed = self._place(report.source, report.t_ns, report.boot_ms, outputs)
+            t_ns, sender_ns = placed.t_ns, placed.sender_ns
         if report.alt_m is None:
             outputs.append(Rejection(report.t_ns, report.uav, Reason.NO_ALTITUDE))
             return outputs
         if self.local is None:
             outputs.append(self._first_report(report, report.alt_m))
-        placed = self._fleet.accept(self._fix(report, t_ns, report.alt_m))
-        if isinstance(placed, Estimate) and placed.dt_s is None and self.is_target(report.uav):
+        accepted = self._fleet.accept(self._fix(report, sender_ns, t_ns, report.alt_m))
+        if isinstance(accepted, Estimate) and accepted.dt_s is None and self.is_target(report.uav):
             self._targets.append(report.uav)
-        return [*outputs, placed]
+        return [*outputs, accepted]
 
-    def _place(self, source: Source, arrival_ns: int, boot_ms: int, outputs: list[Output]) -> int:
+    def _place(
+        self, source: Source, arrival_ns: int, boot_ms: int, outputs: list[Output]
+    ) -> Reading:
         """A stamp on the node's timeline; a reboot begins the sender's track anew."""
         clock = self._clocks.get(source)
         if clock is None:
             delay_ns = round(self.settings.clocks.constant_delay_s * 1e9)
             clock = self._clocks.setdefault(source, SenderClock(delay_ns))
+            self._clocks_by_uav[str(source)] = clock
         reading = clock.place(arrival_ns, boot_ms)
         if reading.rebooted:
             self._restart(str(source))
             text = f"{source} was restarted: its boot clock stepped back to {boot_ms / 1e3:.1f} s"
             outputs.append(Notice(arrival_ns, Severity.WARNING, str(source), text))
-        return reading.t_ns
+        return reading
+
+    def _sender_ns(self, uav: str, node_ns: int) -> int:
+        """A time of the node on a UAV's own timeline; ADS-B traffic has none."""
+        clock = self._clocks_by_uav.get(uav)
+        return node_ns if clock is None else clock.sender_ns(node_ns)
 
     def _restart(self, uav: str) -> None:
         self._fleet.restart(uav)
         if uav in self._targets:
             self._targets.remove(uav)
+        if uav == self._carrier_id:
+            self._attitude = None
 
     def _first_report(self, report: Report, alt_m: float) -> Notice:
         """The first position of all sets the origin of the local frame, and ``home``."""
@@ -199,20 +212,20 @@ class Pipeline:
     def _set_origin(self, at: FixedCenter) -> None:
         self.local = LocalFrame(at.lat_deg, at.lon_deg, at.alt_m)
 
-    def _fix(self, report: Report, t_ns: int, alt_m: float) -> Fix:
+    def _fix(self, report: Report, sender_ns: int, t_ns: int, alt_m: float) -> Fix:
         assert self.local is not None
         velocity = None
         if report.velocity_ne_mps is not None and report.velocity_down_mps is not None:
             there = np.array([*report.velocity_ne_mps, report.velocity_down_mps])
             velocity = self.local.local_from_ned(report.lat_deg, report.lon_deg) @ there
         position = self.local.position_ned_m(report.lat_deg, report.lon_deg, alt_m)
-        return Fix(report.uav, t_ns, report.t_ns, position, velocity, report)
+        return Fix(report.uav, sender_ns, t_ns, report.t_ns, position, velocity, report)
 
     def _carrier_attitude(self, attitude: Attitude) -> list[Output]:
         outputs: list[Output] = []
-        t_ns = self._place(attitude.source, attitude.t_ns, attitude.boot_ms, outputs)
-        if self._attitude is None or t_ns > self._attitude[0] or outputs:
-            self._attitude = (t_ns, attitude)
+        placed = self._place(attitude.source, attitude.t_ns, attitude.boot_ms, outputs)
+        if self._attitude is None or placed.sender_ns > self._attitude[0]:
+            self._attitude = (placed.sender_ns, attitude)
         return outputs
 
     def _tick(self, tick: Tick) -> list[Output]:
@@ -300,10 +313,12 @@ class Pipeline:
             return f"the carrier {vehicle} is {track.state}"
         if self._attitude is None:
             return f"no attitude from the carrier {vehicle}"
-        t_ns, attitude = self._attitude
-        if now_ns - t_ns > self.settings.tracks.coasting_s * 1e9:
+        made_ns, attitude = self._attitude
+        if self._sender_ns(vehicle, now_ns) - made_ns > self.settings.tracks.coasting_s * 1e9:
             return f"the attitude of the carrier {vehicle} is too old"
-        return carrier.moving(self.local, track, newest, attitude, t_ns)
+        return carrier.moving(
+            self.local, track, newest, attitude, self._sender_ns(vehicle, valid_at_ns) - made_ns
+        )
 
 
 def _array(settings: Settings) -> arrays.Array:
@@ -317,7 +332,7 @@ def _array(settings: Settings) -> arrays.Array:
     )
 
 
-def _fleet(settings: Settings) -> Fleet:
+def _fleet(settings: Settings, sender_time: SenderTime) -> Fleet:
     given = settings.observer
     bounds = Bounds(
         given.speed_max_mps,
@@ -328,4 +343,4 @@ def _fleet(settings: Settings) -> Fleet:
     alpha = None if given.alpha == "auto" else given.alpha
     model = PositionModel(bounds, alpha, given.feedthrough_s, given.velocity_lead_s)
     ages = settings.tracks
-    return Fleet(model, Ages(ages.coasting_s, ages.stale_s, ages.lost_s))
+    return Fleet(model, Ages(ages.coasting_s, ages.stale_s, ages.lost_s), sender_time)

@@ -210,11 +210,15 @@ Message = Report | Attitude | Presence | GnssStatus | SystemTime
 class Fix:
     """A report accepted: on the node's timeline and in the local frame.
 
-    ``t_ns`` is when the position was true, ``arrival_ns`` when it came; their difference is the
-    latency that is seen. ``position_ned_m`` and ``velocity_ned_mps``: shape (3,), local frame.
+    ``sender_ns`` is when the position was true on the sender's own timeline (intervals between
+    reports are taken there: they carry nothing of the link), ``t_ns`` the same on the node's as far
+    as was known on arrival at ``arrival_ns``; the last two differ by the latency that is seen. For
+    a report without a sender's clock the two timelines are one. ``position_ned_m`` and
+    ``velocity_ned_mps``: shape (3,), local frame.
     """
 
     uav: str
+    sender_ns: int
     t_ns: int
     arrival_ns: int
     position_ned_m: FloatArray

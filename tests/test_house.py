@@ -142,10 +142,10 @@ def foreign_imports(path: str, text: str) -> list[str]:
 
 
 def strangers(path: str, text: str) -> list[str]:
-    """``sitl_replay`` knows the values, the wire and the reader, and nothing else of us."""
+    """``sitl_replay`` knows the values, the wire, the reader and the console, no more of us."""
     if not path.startswith("sitl_replay/"):
         return []
-    allowed = re.compile(r"companion\.(values|mavlink|recording\.reader|__version__)(\.|$)")
+    allowed = re.compile(r"companion\.(values|mavlink|recording\.reader|console|__version__)(\.|$)")
     return [
         f"{path}:{line}: imports {name}"
         for line, name in imports(ast.parse(text))

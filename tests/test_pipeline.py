@@ -349,6 +349,18 @@ def test_a_late_report_is_out_of_order() -> None:
     assert pipeline.rejected == {Reason.OUT_OF_ORDER: 1}
 
 
+def test_reports_that_waited_together_are_not_out_of_order() -> None:
+    """Read at once, made one after the other: the newest is what the track goes on from."""
+    pipeline = Pipeline(settings("47.4,8.55,500"))
+    for number in range(5):
+        made = position(2.0, "1:1", (100, number, 0), boot_s=100 + 0.1 * number)
+        pipeline.step(made)
+    assert not pipeline.rejected
+    newest = pipeline.newest("1:1")
+    assert newest is not None
+    assert newest.position_ned_m[1] == pytest.approx(4, abs=0.02)
+
+
 def test_a_position_at_0_0_is_counted_and_makes_no_track() -> None:
     pipeline = Pipeline(settings())
     zero = dialect.MAVLink_global_position_int_message(1, 200, -300, 0, 0, 0, 0, 0, 0)
@@ -435,7 +447,7 @@ def test_the_same_events_give_the_same_digest(paper: list[Event]) -> None:
 
 def test_other_events_give_another_digest(paper: list[Event]) -> None:
     def digest(events: list[Event], **sections: dict[str, Any]) -> str:
-        pipeline = Pipeline(settings(**sections))
+        pipeline = Pipeline(settings("5:1", **sections))
         run(pipeline, events)
         return pipeline.digest.hexdigest()
 

@@ -42,6 +42,8 @@ def precode(steering: ComplexArray, settings: Precoder) -> Precoding:
     if users == 0:
         return Precoding(np.empty((size, 0), dtype=complex), Method.ZERO_FORCING, None)
     gram = steering.T @ steering.conj()
+    if not np.isfinite(gram).all():
+        raise ValueError("a steering vector holds what is not a number")
     condition = _condition_number(gram)
     if condition <= settings.condition_limit:
         solved = _solve(gram, steering)
@@ -50,7 +52,7 @@ def precode(steering: ComplexArray, settings: Precoder) -> Precoding:
     loaded = gram + settings.regularisation * size * np.eye(users)
     solved = _solve(loaded, steering)
     if solved is None:
-        raise ValueError("steering vectors hold what is not a number")
+        raise ValueError("the regularised matrix is not positive definite")
     return Precoding(solved, Method.REGULARISED, condition)
 
 

@@ -24,8 +24,10 @@ _WRAP_MS: Final = 1 << 32
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """One stamp placed: when it was true, on the node's timeline, and how long it took to come."""
+    """One stamp placed: on the sender's timeline (its boot clock past any wrap), on the node's as
+    far as known by now, and how long it took to come."""
 
+    sender_ns: int
     t_ns: int
     latency_s: float
     rebooted: bool
@@ -53,7 +55,16 @@ class SenderClock:
             self._newest_ns = boot_ns
         offset_ns = self._lower(arrival_ns, arrival_ns - boot_ns)
         t_ns = boot_ns + offset_ns - self._constant_delay_ns
-        return Reading(t_ns, (arrival_ns - t_ns) * 1e-9, rebooted)
+        return Reading(boot_ns, t_ns, (arrival_ns - t_ns) * 1e-9, rebooted)
+
+    def sender_ns(self, node_ns: int) -> int:
+        """A time of the node on the sender's timeline, by what is known now.
+
+        ``ValueError`` before the first stamp.
+        """
+        if not self._envelope:
+            raise ValueError("no stamp yet, so the sender's clock is not known")
+        return node_ns - self._envelope[0][1] + self._constant_delay_ns
 
     def _unwrap(self, boot_ms: int) -> tuple[int, bool]:
         """Boot time past the wrap of 32-bit milliseconds (49.7 days), and whether it restarted."""

@@ -96,7 +96,7 @@ def _global_position_int(frame: Frame) -> Report:
         relative_alt_m=rel_mm * 1e-3,
         velocity_ne_mps=(vx * 1e-2, vy * 1e-2),
         velocity_down_mps=vz * 1e-2,
-        heading_deg=None if hdg == 65535 else hdg * 1e-2,
+        heading_deg=hdg * 1e-2 if hdg <= 36_000 else None,
         boot_ms=boot_ms,
         tslc_s=None,
     )
@@ -116,7 +116,7 @@ def _adsb_vehicle(frame: Frame) -> Report:
     if not flags & _COORDS:
         raise _RefusedError(Reason.NO_POSITION)
     lat_deg, lon_deg = _position(lat, lon)
-    heading_deg = heading_cdeg * 1e-2 if flags & _HEADING else None
+    heading_deg = heading_cdeg * 1e-2 if flags & _HEADING and heading_cdeg <= 36_000 else None
     velocity_ne_mps = None
     if flags & _VELOCITY and heading_deg is not None:
         course, speed_mps = math.radians(heading_deg), speed_cmps * 1e-2

@@ -26,7 +26,7 @@ class Dedupe:
         """True if the same content came before, within the window."""
         while self._order and self._order[0][0] < frame.t_ns - WINDOW_NS:
             self._forget(*self._order.popleft())
-        key = bytes(frame.source) + frame.msgid.to_bytes(3, "little") + frame.payload
+        key = bytes(frame.source) + frame.msgid.to_bytes(3, "little") + frame.payload.rstrip(b"\0")
         repeat = key in self._seen
         if not repeat:
             self._seen[key] = frame.t_ns

@@ -54,8 +54,12 @@ def parse_link(text: str) -> LinkUrl:
         raise LinkError(f"{text!r} is not udpin:HOST:PORT or tcp:HOST:PORT")
     if host.startswith("[") and host.endswith("]"):
         host = host[1:-1]
-    elif ":" in host:
+    if not _may_be_a_host(host):
+        raise LinkError(f"{text!r}: {host!r} cannot be the name of a host")
+    if ":" in host and not address.startswith("["):
         raise LinkError(f"{text!r}: an IPv6 host stands in brackets, as in udpin:[::]:14550")
+    if scheme == "tcp" and int(port) == 0:
+        raise LinkError(f"{text!r}: nobody listens on port 0")
     return LinkUrl("udpin" if scheme == "udpin" else "tcp", host, int(port))
 
 
@@ -100,6 +104,12 @@ class Link:
         finally:
             self.status.state = "down"
 
+    def _hang_up(self, peer: object) -> None:
+        """The peer is gone: what its last, unfinished frame swallowed is looked through."""
+        splitter = self._splitters.pop(peer, None)
+        if splitter is not None:
+            self._count(splitter.finish(self._now_ns()))
+
     def take(self, peer: object, data: bytes) -> None:
         """Split what a peer sent and hand it on."""
         splitter = self._splitters.get(peer)
@@ -111,7 +121,9 @@ class Link:
         else:
             self._splitters.move_to_end(peer)
         self.status.bytes += len(data)
-        found = splitter.feed(self._now_ns(), data)
+        self._count(splitter.feed(self._now_ns(), data))
+
+    def _count(self, found: list[Frame | Rejection]) -> None:
         for item in found:
             if isinstance(item, Rejection):
                 self.status.lost[item.reason] = self.status.lost.get(item.reason, 0) + item.count
@@ -143,7 +155,7 @@ class Link:
                     while data := await reader.read(1 << 16):
                         self.take(None, data)
                 finally:
-                    self._splitters.pop(None, None)
+                    self._hang_up(None)
                     writer.close()
             self.status.state = "connecting"
             await asyncio.sleep(RETRY_S[min(attempt, len(RETRY_S) - 1)])
@@ -174,6 +186,13 @@ def _bound_udp(url: LinkUrl) -> socket.socket:
         bound.close()
         raise LinkError(f"{url}: {error.strerror}") from error
     return bound
+
+
+def _may_be_a_host(host: str) -> bool:
+    try:
+        return host != "" and host.isascii() and len(host.encode("idna")) > 0
+    except UnicodeError:  # a label that is empty, or too long
+        return False
 
 
 def _is_ipv6(host: str) -> bool:

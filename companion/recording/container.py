@@ -39,6 +39,8 @@ _DAMAGE: Final = (McapError, struct.error, ZstdError, ValueError, MemoryError)
 
 
 class Message(NamedTuple):
+    """One message of a recording, with the channel it is on."""
+
     channel: Channel
     sequence: int
     log_time_ns: int

@@ -129,6 +129,7 @@ def log(value: Notice) -> Any:
 
 
 def rejection(value: Rejection, *, is_event: bool) -> Any:
+    """``is_event``: it drove the pipeline, rather than coming out of it."""
     return schemas.RejectionMessage(
         t_ns=value.t_ns,
         source=value.source,

@@ -179,6 +179,7 @@ class FrameEncoder:
         self._heads: dict[tuple[str, tuple[int, int], int], bytes] = {}
 
     def encode(self, frame: Frame) -> bytes:
+        """The message's bytes, as the generated class would serialise it."""
         key = (frame.link, frame.source, frame.msgid)
         head = self._heads.get(key)
         if head is None:

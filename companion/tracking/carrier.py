@@ -54,20 +54,19 @@ def fixed(
 
 
 def moving(
-    local: LocalFrame, track: Track, newest: Fix, attitude: Attitude, attitude_t_ns: int
+    local: LocalFrame, track: Track, newest: Fix, attitude: Attitude, since_ns: int
 ) -> Carrier:
-    """A vehicle at its track's time: its attitude is carried on from its own time by its rates.
+    """A vehicle at its track's time; its attitude, ``since_ns`` old by then, goes on at its rates.
 
     North and down there are those at its ``newest`` report, a few metres away.
     """
     rates = np.array([attitude.rollspeed_radps, attitude.pitchspeed_radps, attitude.yawspeed_radps])
     then = body_from_ned(attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad)
-    since_s = (track.valid_at_ns - attitude_t_ns) * 1e-9
     local_from_ned = local.local_from_ned(newest.report.lat_deg, newest.report.lon_deg)
     return Carrier(
         track.valid_at_ns,
         track.position_ned_m,
-        later_body_from_body(rates, since_s) @ then @ local_from_ned.T,
+        later_body_from_body(rates, since_ns * 1e-9) @ then @ local_from_ned.T,
         track.bound_m,
         track.age_s,
     )

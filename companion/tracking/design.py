@@ -84,7 +84,7 @@ def dt_limit_s(mu_max: float, feedthrough_s: float, alpha: float) -> float:
     if not mu_max >= 0:
         raise ValueError(f"mu is at least 0, not {mu_max}")
     d = feedthrough_s
-    return float(d + np.sqrt(alpha * mu_max + (1 - alpha) * d * d))
+    return max(0.0, float(d + np.sqrt(alpha * mu_max + (1 - alpha) * d * d)))
 
 
 def best_alpha(dt_s: float, feedthrough_s: float) -> float:
@@ -152,6 +152,8 @@ def design(dt_s: float, feedthrough_s: float, alpha: float | None = None) -> Des
     if alpha is None:
         alpha = best_alpha(dt_s, feedthrough_s)
     _check(dt_s, alpha)
+    if not np.isfinite(feedthrough_s):
+        raise ValueError(f"the feedthrough is a number of seconds, not {feedthrough_s}")
     mu = mu_star(dt_s, feedthrough_s, alpha)
     l_gain = gain(dt_s, feedthrough_s, alpha)
     p = 1 / mu if mu > 0 else 1.0

@@ -6,7 +6,7 @@ newest accepted report and the time asked for decide.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from companion.tracking import observer
@@ -43,10 +43,19 @@ class _Tracked:
     unknown_input_mps: FloatArray | None = None
 
 
-class Fleet:
-    """All tracks, by UAV id. ``accept`` reports, ask for a ``track`` at a time."""
+SenderTime = Callable[[str, int], int]
+"""(UAV, time of the node) to that time on the UAV's own timeline, by what is known now."""
 
-    def __init__(self, model: PositionModel, ages: Ages) -> None:
+
+class Fleet:
+    """All tracks, by UAV id. ``accept`` reports, ask for a ``track`` at a time of the node.
+
+    Tracks live on each sender's own timeline, so that what a link does to a report's arrival
+    enters neither the intervals nor their order; ``sender_time`` leads there.
+    """
+
+    def __init__(self, model: PositionModel, ages: Ages, sender_time: SenderTime) -> None:
+        self._sender_time = sender_time
         self._model = model
         self._ages = ages
         self._tracked: dict[str, _Tracked] = {}
@@ -59,7 +68,7 @@ class Fleet:
             state = observer.begin(fix, self._model)
             self._tracked[fix.uav] = _Tracked(fix, state, latency_s)
             return Estimate(fix, state.estimate_ned_m, state.bound_m, None, None)
-        dt_s = (fix.t_ns - tracked.state.t_ns) * 1e-9
+        dt_s = (fix.sender_ns - tracked.state.t_ns) * 1e-9
         if dt_s <= 0:
             detail = f"{-dt_s:.3f} s older than the report before it"
             return Rejection(fix.arrival_ns, fix.uav, Reason.OUT_OF_ORDER, detail=detail)
@@ -83,12 +92,13 @@ class Fleet:
         tracked = self._tracked.get(uav)
         if tracked is None:
             return None
-        predicted = observer.predict(tracked.state, valid_at_ns, self._model)
+        use_ns = self._sender_time(uav, valid_at_ns)
+        predicted = observer.predict(tracked.state, use_ns, self._model)
         return Track(
             uav=uav,
-            state=self._ages.state((now_ns - tracked.state.t_ns) * 1e-9),
+            state=self._ages.state((self._sender_time(uav, now_ns) - tracked.state.t_ns) * 1e-9),
             valid_at_ns=valid_at_ns,
-            age_s=(valid_at_ns - tracked.state.t_ns) * 1e-9,
+            age_s=(use_ns - tracked.state.t_ns) * 1e-9,
             position_ned_m=predicted.position_ned_m,
             velocity_ned_mps=observer.velocity_ned_mps(tracked.state, tracked.unknown_input_mps),
             unknown_input_mps=tracked.unknown_input_mps,
@@ -113,7 +123,9 @@ class Fleet:
     def states(self, now_ns: int, uavs: Iterable[str]) -> dict[str, TrackState]:
         """The states of those tracks that exist, without predicting anything."""
         return {
-            uav: self._ages.state((now_ns - self._tracked[uav].state.t_ns) * 1e-9)
+            uav: self._ages.state(
+                (self._sender_time(uav, now_ns) - self._tracked[uav].state.t_ns) * 1e-9
+            )
             for uav in uavs
             if uav in self._tracked
         }

@@ -49,6 +49,9 @@ def solve(
     """
     if not 0.0 < alpha < 1.0:
         raise ValueError(f"alpha lies strictly between 0 and 1, not {alpha}")
+    plant = (a, b, c, d, h)
+    scale = float(np.abs(b).max()) or 1.0  # the unit of time: mu goes with its square
+    b, d = b / scale, d / scale
     (n, m), r, k = b.shape, c.shape[0], h.shape[0]
     p = cp.Variable((n, n), symmetric=True)
     z = cp.Variable((n, r))
@@ -69,7 +72,9 @@ def solve(
         raise LmiError(f"the solver failed: {failure}") from failure
     if problem.status != cp.OPTIMAL or p.value is None or z.value is None:
         raise LmiError(f"the solver's answer is {problem.status}")
-    return _certified(p.value, z.value, float(mu.value), (a, b, c, d, h), alpha)
+    return _certified(
+        p.value / scale**2, z.value / scale**2, float(mu.value) * scale**2, plant, alpha
+    )
 
 
 def _symmetric(matrix: cp.Expression) -> cp.Expression:
@@ -84,6 +89,8 @@ def _certified(
     alpha: float,
 ) -> LmiSolution:
     """Check the solver's answer by eigenvalues in numpy alone."""
+    if np.linalg.eigvalsh(p)[0] <= 0:
+        raise LmiError("the solver's P is not positive definite")
     gain: FloatArray = np.linalg.solve(p, z).astype(float)
     margin = lmi_margin(p, gain, mu, plant, alpha)
     if margin < -1e-6:

@@ -11,13 +11,16 @@ where W bounds the speed and N the report's noise. The same step with b = the ti
 report, whatever it is, predicts: the estimate at t is what the observer would hold if its next
 report came at t. The gain is the same for all axes, so norms of 3-vectors obey the same bound.
 
+Where it is the sender that leads, by d, the mean velocities over d and over b differ by at most
+A |b - d| / 2, A a bound on acceleration, and N has d times that besides.
+
 A sender that also reports velocity lets us choose the feedthrough: y = p + d v leads the
 position by d, with noise  N = N_p + d (N_v + A b / 2)  since the mean velocity of the interval
-differs from v by at most A b / 2, A a bound on acceleration. With d >= b the unknown velocity is
+differs from v by at most A b / 2. With d >= b the unknown velocity is
 decoupled altogether (l d = b), and what is left is noise and acceleration:
 x^+ = x^ + b v + (b / d)(p - x^). Here d = max(``velocity_lead_s``, b).
 
-Time is an argument; states are frozen values.
+Time is an argument, on the sender's own timeline; states are frozen values.
 """
 
 from dataclasses import dataclass
@@ -78,7 +81,7 @@ def begin(fix: Fix, model: PositionModel) -> PositionState:
     bounds = model.bounds
     bound_m = bounds.position_noise_m + abs(model.feedthrough_s) * bounds.speed_mps
     return PositionState(
-        fix.t_ns, fix.position_ned_m, bound_m, fix.position_ned_m, fix.velocity_ned_mps
+        fix.sender_ns, fix.position_ned_m, bound_m, fix.position_ned_m, fix.velocity_ned_mps
     )
 
 
@@ -88,7 +91,9 @@ def predict(state: PositionState, t_ns: int, model: PositionModel) -> Prediction
     b = (t_ns - state.t_ns) * 1e-9
     if b <= 0:
         return Prediction(state.estimate_ned_m, state.bound_m - b * bounds.speed_mps, 0.0)
-    d, y, noise_m = model.feedthrough_s, state.position_ned_m, bounds.position_noise_m
+    d, y = model.feedthrough_s, state.position_ned_m
+    # The mean velocity of the sender's lead is not quite that of the interval.
+    noise_m = bounds.position_noise_m + abs(d) * bounds.acceleration_mps2 * abs(b - d) / 2
     if state.velocity_ned_mps is not None:
         lead_s = max(model.velocity_lead_s, b)
         d += lead_s
@@ -111,13 +116,13 @@ def update(
     The last is W^ = (x^+ - x^) / b, shape (3,), m/s: the velocity that the estimate needed.
     Raises ``ValueError`` for a report that is not newer than the state.
     """
-    if fix.t_ns <= state.t_ns:
+    if fix.sender_ns <= state.t_ns:
         raise ValueError("a report must be newer than the one before it")
-    predicted = predict(state, fix.t_ns, model)
-    interval_s = (fix.t_ns - state.t_ns) * 1e-9
+    predicted = predict(state, fix.sender_ns, model)
+    interval_s = (fix.sender_ns - state.t_ns) * 1e-9
     unknown_input = (predicted.position_ned_m - state.estimate_ned_m) / interval_s
     after = PositionState(
-        fix.t_ns,
+        fix.sender_ns,
         predicted.position_ned_m,
         predicted.bound_m,
         fix.position_ned_m,

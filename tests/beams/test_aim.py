@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-
 from companion.beams.aim import aim
 from companion.beams.arrays import Array, uniform_linear
 from companion.beams.precoding import Precoder

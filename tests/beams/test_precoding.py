@@ -19,7 +19,8 @@ SINES = st.floats(-0.999, 0.999)
 
 def matrix(sines: list[float], elements: int = 16) -> ComplexArray:
     """Steering of a half-wave line for directions in the plane, by their sines."""
-    return np.exp(1j * np.pi * np.outer(np.arange(elements), sines))
+    made: ComplexArray = np.exp(1j * np.pi * np.outer(np.arange(elements), sines))
+    return made
 
 
 def apart(seed: int, users: int, elements: int = 16) -> ComplexArray:
@@ -144,7 +145,9 @@ def test_what_is_not_a_number_is_refused(users: int) -> None:
 @given(st.integers(0, 1000), st.integers(1, 5))
 def test_the_gain_is_the_power_towards_its_own_direction(seed: int, users: int) -> None:
     a = apart(seed, users)
-    weights = np.random.default_rng(seed).standard_normal((16, users)) * (1 + 0.5j)
+    weights: ComplexArray = np.random.default_rng(seed).standard_normal(
+        (16, users)
+    ) * np.complex128(1 + 0.5j)
     found = gain_db(a, weights)
     for n in range(users):
         towards = sum(a[m, n] * weights[m, n] for m in range(16))

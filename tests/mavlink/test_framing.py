@@ -6,6 +6,7 @@ The oracle is pymavlink's generated dialect, as a packer and (``scan`` in confte
 import random
 from collections import Counter
 from collections.abc import Callable, Iterable
+from itertools import pairwise
 
 import pytest
 from hypothesis import given, settings
@@ -54,7 +55,7 @@ def checked(head: bytes, payload: bytes, seed: int) -> bytes:
     """A frame made by hand, ``head`` from the magic byte on, with the checksum it should have."""
     body = head[1:] + payload
     crc = dialect.x25crc(body + bytes([seed])).crc
-    return head[:1] + body + crc.to_bytes(2, "little")
+    return head[:1] + body + int(crc).to_bytes(2, "little")
 
 
 def traffic(count: int) -> list[bytes]:
@@ -201,7 +202,7 @@ def test_frames_and_counts_do_not_depend_on_the_cuts(
     edges = [0, *sorted(min(cut, len(data)) for cut in cuts), len(data)]
     frames, lost = split([data])
     assert raws(frames) == scan(data)
-    for way in (bytewise(data), [data[a:b] for a, b in zip(edges, edges[1:], strict=False)]):
+    for way in (bytewise(data), [data[a:b] for a, b in pairwise(edges)]):
         again, lost_again = split(way)
         assert raws(again) == raws(frames)
         assert lost_again == lost
@@ -299,6 +300,24 @@ def test_a_damaged_length_takes_no_good_frame_with_it() -> None:
             assert lost == {Reason.BAD_CRC: 1}
 
 
+def test_a_claim_ends_with_the_next_good_frame() -> None:
+    """What is damaged behind it counts for itself, even within the length first claimed."""
+    made = [frame for frame in traffic(40) if len(frame) < 40][:12]
+    first = made[0][:1] + b"\xff" + made[0][2:]
+    stream = [first, made[1], b"0123456789", damaged(made[2]), *made[3:]]
+    for way in (stream, [b"".join(stream)], bytewise(b"".join(stream))):
+        frames, lost = split(way)
+        assert raws(frames) == [made[1], *made[3:]]
+        assert lost == {Reason.BAD_CRC: 2, Reason.GARBAGE: 10}
+
+
+def test_the_signature_of_a_damaged_frame_is_no_garbage() -> None:
+    made = [frame for frame in traffic(30) if frame[0] == 0xFD and frame[2] & 1]
+    frames, lost = split([made[0], damaged(made[1]), made[2]])
+    assert raws(frames) == [made[0], made[2]]
+    assert lost == {Reason.BAD_CRC: 1}
+
+
 def test_good_frames_in_an_unfinished_claim_are_found_at_the_end() -> None:
     made = [frame for frame in traffic(5) if len(frame) < 60][:3]
     cut_short = made[0][:1] + b"\xff" + made[0][2:]
@@ -391,7 +410,7 @@ def test_the_cut_against_a_parser_run_over_the_stream(cut_frames: list[bytes]) -
     ]
     rng = random.Random(4)
     edges = [0, *sorted(rng.sample(range(len(stream)), 3000)), len(stream)]
-    frames, lost = split(stream[a:b] for a, b in zip(edges, edges[1:], strict=False))
+    frames, lost = split(stream[a:b] for a, b in pairwise(edges))
     assert [(*frame.source, frame.msgid, frame.raw) for frame in frames] == expected
     assert lost == {}
 

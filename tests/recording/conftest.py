@@ -122,7 +122,7 @@ def estimate() -> Estimate:
         START_NS, "udp", "1:1", Source(1, 1), 47.5, 8.5, None, AltitudeDatum.MSL, None,
         None, None, None, 1000, None,
     )  # fmt: skip
-    fix = Fix("1:1", START_NS - 100_000_000, START_NS, np.zeros(3), None, report)
+    fix = Fix("1:1", 100_000_000, START_NS - 100_000_000, START_NS, np.zeros(3), None, report)
     return Estimate(fix, np.zeros(3), 1.0, None, None)
 
 

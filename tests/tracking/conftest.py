@@ -29,6 +29,6 @@ def fix() -> MakeFix:
         )  # fmt: skip
         velocity = None if velocity_ned_mps is None else np.array(velocity_ned_mps, dtype=float)
         position = np.array(position_ned_m, dtype=float)
-        return Fix(uav, t_ns, t_ns + late_ns, position, velocity, report)
+        return Fix(uav, t_ns, t_ns, t_ns + late_ns, position, velocity, report)
 
     return make

@@ -98,7 +98,7 @@ def test_alpha_lies_between_0_and_1(alpha: float) -> None:
 def test_what_cannot_be_met_is_an_error() -> None:
     """A growing state that is not measured: no gain, no P."""
     unmeasured = 0 * ONE
-    with pytest.raises(lmi.LmiError, match="^the solver"):
+    with pytest.raises(lmi.LmiError, match=r"^the solver"):
         lmi.solve(2 * ONE, ONE, unmeasured, unmeasured, ONE, 0.5)
 
 

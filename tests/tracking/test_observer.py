@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -16,6 +16,8 @@ from companion.values import Fix, FloatArray
 
 MakeFix = Callable[..., Fix]
 BOUNDS = Bounds(speed_mps=30.0, acceleration_mps2=8.0, position_noise_m=1.5, velocity_noise_mps=0.4)
+# For adversaries of the stacked model, in which one velocity holds from report to report.
+STEPPED = replace(BOUNDS, acceleration_mps2=1e-9)
 S = 1_000_000_000
 ROUNDING_M = 1e-6
 
@@ -38,10 +40,10 @@ class Adversary:
         if self.kind == "steady":
             return norm * self.along
         if self.kind == "switching":
-            return norm * self.along * self.rng.choice([-1.0, 1.0])
-        vector = self.rng.standard_normal(3)
+            return norm * self.along * float(self.rng.choice([-1.0, 1.0]))
+        vector: FloatArray = self.rng.standard_normal(3)
         vector *= norm / np.sqrt(vector @ vector)
-        return vector if self.kind == "surface" else vector * self.rng.uniform()
+        return vector if self.kind == "surface" else vector * float(self.rng.uniform())
 
 
 def adversaries(count: int) -> Iterator[Adversary]:
@@ -68,7 +70,7 @@ def test_positions_alone_never_leave_the_bound(
     fix: MakeFix, feedthrough_s: float, alpha: float | None
 ) -> None:
     """Speed and noise bounded, nothing else; the sender's lead is by the same mean velocity."""
-    model = PositionModel(BOUNDS, alpha, feedthrough_s)
+    model = PositionModel(STEPPED, alpha, feedthrough_s)
     worst = 0.0
     for adversary in adversaries(400):
         position, t_ns, state = np.zeros(3), 17 * S, None
@@ -145,13 +147,34 @@ def test_a_lead_of_the_sender_and_velocities_keep_the_bound(
             assert error_m <= found.bound_m + ROUNDING_M
 
 
+@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("feedthrough_s", [0.5, -0.3])
+def test_a_lead_in_time_keeps_the_bound(fix: MakeFix, feedthrough_s: float, told: bool) -> None:
+    """The sender tells where it will be, or was: its mean velocity there is another than here."""
+    model = PositionModel(BOUNDS, None, feedthrough_s)
+    for start_mps, acceleration in ((0.0, 8.0), (-10.0, 8.0), (10.0, -8.0)):
+
+        def place(t_s: float, v: float = start_mps, a: float = acceleration) -> FloatArray:
+            return np.array([v * t_s + a * t_s**2 / 2, 0.0, 0.0])
+
+        for b_ns in (S // 10, S // 5, S // 2, S, 2 * S):
+            velocity = np.array([start_mps, 0, 0]) if told else None
+            report = place(feedthrough_s)
+            known = PositionState(0, place(0.0), 0.0, report, velocity)
+            found = observer.predict(known, b_ns, model)
+            error_m = observer.norm_m(found.position_ned_m - place(b_ns * 1e-9))
+            # The report may have its noise besides.
+            gain = abs(_gain(fix, model, b_ns)) if not told else 0.0
+            assert error_m + gain * BOUNDS.position_noise_m <= found.bound_m + ROUNDING_M
+
+
 @pytest.mark.parametrize("alpha", [None, 0.5])
 @pytest.mark.parametrize("feedthrough_s", [0.0, 0.15, 0.5, -0.3])
 def test_a_greedy_adversary_reaches_the_bound(
     fix: MakeFix, feedthrough_s: float, alpha: float | None
 ) -> None:
     """Knowing the gains to come, it takes noise and velocity as they hurt most: all of it."""
-    model = PositionModel(BOUNDS, alpha, feedthrough_s)
+    model = PositionModel(STEPPED, alpha, feedthrough_s)
     along = np.array([0.6, 0.0, -0.8])
     reached = []
     for seed in range(100):
@@ -212,6 +235,7 @@ def test_a_constant_velocity_is_followed_exactly(
         else:
             state = advance(state, made, model)
         t_ns += after_ms * 1_000_000
+    assert state is not None
     asked_ns = state.t_ns + beyond_ms * 1_000_000
     found = observer.predict(state, asked_ns, model)
     assert found.position_ned_m == pytest.approx(speeds * (asked_ns * 1e-9), abs=1e-6)
@@ -269,7 +293,9 @@ def test_rotated_inputs_give_rotated_outputs(
     rng = np.random.default_rng(seed)
     turn = Rotation.random(rng=rng).as_matrix()
     model = PositionModel(BOUNDS, None, feedthrough_s)
-    plain, turned, t_ns = None, None, 0
+    plain: PositionState | None = None
+    turned: PositionState | None = None
+    t_ns = 0
     for _ in range(6):
         position, velocity = rng.normal(0, 100, 3), rng.normal(0, 20, 3)
         straight = fix(t_ns, position, velocity if told else None)

@@ -12,15 +12,8 @@ from typing import Any
 import click
 
 import companion
-from companion.console import OneLineErrors, Progress
-
-CONFIG = click.option("--config", type=click.Path(path_type=Path), help="Settings: a TOML file.")
-CENTER = click.option(
-    "--center",
-    metavar="SRC",
-    help="What carries the array: SYSID:COMPID, LAT,LON,ALT[,HEADING] or home.",
-)
-JSON = click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
+from companion.cli_design import design, study
+from companion.console import CENTER, CONFIG, JSON, OneLineErrors, Progress, user_errors
 
 
 @click.group(name="companion", cls=OneLineErrors)
@@ -56,7 +49,7 @@ def run(
     from companion import live
     from companion.config import load
 
-    with _user_errors():
+    with user_errors():
         settings = load(config).override(
             center={"source": center},
             links={"urls": list(links) or None},
@@ -78,7 +71,7 @@ def demo(seconds: float | None, port: int, open_page: bool) -> None:
     from companion import demo as scenario
     from companion import live
 
-    with _user_errors():
+    with user_errors():
         settings = scenario.settings("recordings").override(server={"listen": f"127.0.0.1:{port}"})
         live.run(settings, traffic=scenario.traffic, seconds=seconds, open_page=open_page)
 
@@ -114,7 +107,7 @@ def replay(
     from companion import replay as replaying
 
     progress = Progress()
-    with _user_errors():
+    with user_errors():
         settings = replaying.settings_for(logs, config, center)
         if settings.center.source is None:
             click.echo("no --center: the array stands where the first report was made", err=True)
@@ -169,79 +162,6 @@ def _number(value: float | None) -> str:
 
 
 @main.command()
-@click.option(
-    "--dt",
-    metavar="S[,S...]",
-    required=True,
-    callback=lambda _context, _option, text: _numbers(text),
-    help="Seconds between reports.",
-)
-@click.option("--model", type=click.Choice(["position"]), default="position", show_default=True)
-@click.option("--alpha", metavar="A|auto", default="auto", show_default=True, help="In (0, 1).")
-@click.option(
-    "--feedthrough",
-    type=float,
-    default=0.0,
-    show_default=True,
-    help="Seconds by which a report leads the position.",
-)
-@click.option("--mu-max", type=click.FloatRange(min=0), help="The largest mu to accept, s^2.")
-@click.option(
-    "--method",
-    type=click.Choice(["closed-form", "lmi"]),
-    default="closed-form",
-    show_default=True,
-)
-@JSON
-def design(
-    dt: list[float],
-    model: str,
-    alpha: str,
-    feedthrough: float,
-    mu_max: float | None,
-    method: str,
-    as_json: bool,
-) -> None:
-    """Observer gains, their certificate, and the largest feasible interval between reports.
-
-    Example: companion design --dt 0.15,0.5 --alpha 0.5 --feedthrough 0.5 --mu-max 0.05
-    """
-    from companion import designing
-
-    with _user_errors():
-        rows = [
-            designing.row(dt_s, feedthrough, _alpha(alpha), mu_max, model, method) for dt_s in dt
-        ]
-    if as_json:
-        click.echo(json.dumps(rows))
-        return
-    for row in rows:
-        limit = "" if row["dt_limit_s"] is None else f"  dt limit {row['dt_limit_s']:.4f} s"
-        click.echo(
-            f"dt {row['dt_s']:g} s  alpha {row['alpha']:g}  L {row['L']:.4f}  Q {row['Q']:.4f}"
-            f"  mu {row['mu']:.4g} s²  gamma {row['gamma']:.4g} s"
-            f"  peak gain {row['peak_gain']:.4g} s"
-            f"  {'feasible' if row['feasible'] else 'NOT feasible'}{limit}"
-        )
-
-
-def _numbers(text: str) -> list[float]:
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError as error:
-        raise click.BadParameter(f"{text!r} is not a list of numbers such as 0.1,0.5") from error
-
-
-def _alpha(text: str) -> float | None:
-    if text == "auto":
-        return None
-    try:
-        return float(text)
-    except ValueError as error:
-        raise click.BadParameter(f"alpha is 'auto' or a number, not {text!r}") from error
-
-
-@main.command()
 @click.argument(
     "files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path)
 )
@@ -253,7 +173,7 @@ def recover(files: tuple[Path, ...], as_json: bool) -> None:
     """
     from companion.recording.recover import recover as recover_file
 
-    with _user_errors():
+    with user_errors():
         for file in files:
             found = recover_file(file)
             answer = {
@@ -267,24 +187,5 @@ def recover(files: tuple[Path, ...], as_json: bool) -> None:
             click.echo(json.dumps(answer) if as_json else f"{found.path}: {text}")
 
 
-class _user_errors:  # noqa: N801 - reads as a statement
-    """Turns what a user can do wrong into one line on stderr."""
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        if isinstance(error, click.ClickException | None):
-            return
-        if isinstance(error, OSError):
-            where = f"{error.filename}: " if error.filename else ""
-            raise click.ClickException(f"{where}{error.strerror or error}") from error
-        if type(error).__name__ == "LmiError":  # by name: its module loads the solver
-            raise click.ClickException(str(error)) from error
-        if isinstance(error, ValueError) and _is_meant_for_users(error):
-            raise click.ClickException(str(error)) from error
-
-
-def _is_meant_for_users(error: ValueError) -> bool:
-    """Our own subclasses of ValueError, and plain ones raised by our own checks."""
-    return type(error) is ValueError or type(error).__module__.startswith("companion")
+main.add_command(design)
+main.add_command(study)

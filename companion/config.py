@@ -8,8 +8,9 @@ import json
 import math
 import tomllib
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -22,7 +23,10 @@ from pydantic import (
     model_validator,
 )
 
+from companion.tracking.kinematic import KinematicDesign
 from companion.values import Source
+
+DEFAULT_DESIGN: Final = "kinematic_default.json"
 
 
 class ConfigError(ValueError):
@@ -92,9 +96,13 @@ class _Section(BaseModel):
 
 
 class CenterSettings(_Section):
-    """What carries the array; ``run`` refuses to start without it."""
+    """What carries the array; ``run`` refuses to start without it.
+
+    ``attitude_bound_deg`` bounds the error of a vehicle's attitude, mounting included.
+    """
 
     source: Annotated[str, AfterValidator(_center_text)] | None = None
+    attitude_bound_deg: Annotated[float, Field(ge=0, le=180)] = 1.0
 
 
 class LinkSettings(_Section):
@@ -104,31 +112,60 @@ class LinkSettings(_Section):
 
 
 class ClockSettings(_Section):
-    """``constant_delay_s``: the known smallest latency of the links, which no one-way
-    observation can see."""
+    """How senders' boot clocks are put on the node's timeline.
 
-    constant_delay_s: Annotated[FiniteFloat, Field(ge=0, le=10)] = 0.0
+    ``constant_delay_s`` is how old a report is when it arrives at its earliest, which no one-way
+    observation can see: the link's smallest latency, and the age of the position at its stamp
+    (ArduPilot's trails by 28 ms in simulation). The default is what none stays below. ``window_s``
+    is how far back the lower envelope of the arrivals looks. ``trust_gnss``
+    believes SYSTEM_TIME where it passes its checks, given that the node's own clock is UTC to
+    within ``node_utc_error_s``.
+    """
+
+    constant_delay_s: Annotated[FiniteFloat, Field(ge=0, le=10)] = 0.01
+    window_s: Annotated[float, Field(ge=5, le=3600)] = 60.0
+    trust_gnss: bool = False
+    node_utc_error_s: Annotated[float, Field(ge=0, le=10)] | None = None
 
 
 class ObserverSettings(_Section):
-    """The observer and what it takes for granted: bounds that are never exceeded."""
+    """The observer and what it takes for granted: bounds that are never exceeded.
 
-    model: Literal["position"] = "position"
+    Speed, acceleration and noise are norms of 3-vectors. Where the autopilot sends its own
+    accuracy (GPS_RAW_INT) and ``follow_accuracy`` is true, ``accuracy_factor`` times that accuracy
+    takes the place of the noise. ``alpha``, ``feedthrough_s`` and ``velocity_lead_s`` are of the
+    position model; ``feed_forward`` (an estimated acceleration) and ``design`` (a file of gains
+    that ``companion design --model kinematic --out`` wrote) are of the kinematic one.
+    """
+
+    model: Literal["kinematic", "position"] = "kinematic"
     alpha: Literal["auto"] | Annotated[float, Field(gt=0, lt=1)] = "auto"
     feedthrough_s: Annotated[float, Field(ge=-10, le=10)] = 0.0
     velocity_lead_s: Annotated[float, Field(gt=0, le=10)] = 0.2
+    feed_forward: bool = True
+    design: str | None = None
     speed_max_mps: PositiveFloat = 60.0
-    acceleration_max_mps2: PositiveFloat = 10.0
+    acceleration_max_mps2: PositiveFloat = 5.0
     position_noise_m: PositiveFloat = 3.0
     velocity_noise_mps: PositiveFloat = 0.5
+    follow_accuracy: bool = True
+    accuracy_factor: PositiveFloat = 3.0
 
 
 class TrackSettings(_Section):
-    """Ages of the newest report at which a track passes to the next state, seconds."""
+    """Ages of the newest report at which a track passes to the next state, seconds.
+
+    ``window_s``: how late a report may come and still be used as if in order. A track is begun
+    again from reports that were refused once ``reacquire_reports`` of them agree over
+    ``reacquire_s``.
+    """
 
     coasting_s: PositiveFloat = 2.0
     stale_s: PositiveFloat = 15.0
     lost_s: PositiveFloat = 60.0
+    window_s: PositiveFloat = 5.0
+    reacquire_reports: Annotated[int, Field(ge=2, le=60)] = 3
+    reacquire_s: Annotated[float, Field(ge=0, le=60)] = 3.0
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
@@ -227,6 +264,21 @@ def load(path: Path | None) -> Settings:
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not TOML: it is not UTF-8 text") from error
     return Settings.from_toml(text, str(path))
+
+
+def kinematic_design(settings: Settings) -> KinematicDesign:
+    """The gains of the kinematic observer: those named, or those that come with the program.
+
+    Their certificate is verified. ``ConfigError`` where they cannot be used.
+    """
+    named = settings.observer.design
+    source = Path(named) if named else resources.files("companion.tracking") / DEFAULT_DESIGN
+    try:
+        return KinematicDesign.from_json(source.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"observer.design = {named!r}: {error.strerror}") from error
+    except ValueError as error:
+        raise ConfigError(f"observer.design = {named!r}: {error}") from error
 
 
 def _toml(value: object) -> str:

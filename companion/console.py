@@ -3,9 +3,18 @@
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import click
+
+CONFIG = click.option("--config", type=click.Path(path_type=Path), help="Settings: a TOML file.")
+CENTER = click.option(
+    "--center",
+    metavar="SRC",
+    help="What carries the array: SYSID:COMPID, LAT,LON,ALT[,HEADING] or home.",
+)
+JSON = click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
 
 
 class OneLineErrors(click.Group):
@@ -50,3 +59,26 @@ class Progress:
     def clear(self) -> None:
         """Take the line away."""
         self.show("")
+
+
+class user_errors:  # noqa: N801 - reads as a statement
+    """Turns what a user can do wrong into one line on stderr."""
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        if isinstance(error, click.ClickException | None):
+            return
+        if isinstance(error, OSError):
+            where = f"{error.filename}: " if error.filename else ""
+            raise click.ClickException(f"{where}{error.strerror or error}") from error
+        if type(error).__name__ == "LmiError":  # by name: its module loads the solver
+            raise click.ClickException(str(error)) from error
+        if isinstance(error, ValueError) and _is_meant_for_users(error):
+            raise click.ClickException(str(error)) from error
+
+
+def _is_meant_for_users(error: ValueError) -> bool:
+    """Our own subclasses of ValueError, and plain ones raised by our own checks."""
+    return type(error) is ValueError or type(error).__module__.startswith("companion")

@@ -11,16 +11,16 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from companion.beams import arrays, precoding
+from companion import assembly
 from companion.beams.aim import AIMABLE, aim
 from companion.config import Center, FixedCenter, Settings, VehicleCenter, parse_center
-from companion.mavlink.clocks import Reading, SenderClock
+from companion.mavlink.clocks import ClockEstimate, SenderClock, Stamp
 from companion.mavlink.decode import DECODED, decode
 from companion.mavlink.dedupe import Dedupe
-from companion.tracking import carrier
-from companion.tracking.fleet import Ages, Fleet, SenderTime
+from companion.tracking import carrier, noise
+from companion.tracking.fleet import SenderTime
 from companion.tracking.geodesy import LocalFrame
-from companion.tracking.observer import Bounds, PositionModel
+from companion.tracking.identity import Identities
 from companion.values import (
     Attitude,
     Carrier,
@@ -29,6 +29,7 @@ from companion.values import (
     Fix,
     FloatArray,
     Frame,
+    GnssStatus,
     Message,
     Notice,
     Output,
@@ -36,8 +37,10 @@ from companion.values import (
     Reason,
     Rejection,
     Report,
+    ReportNoise,
     Severity,
     Source,
+    SystemTime,
     Tick,
     Track,
     TrackState,
@@ -96,9 +99,11 @@ class Pipeline:
         self.rejected: Counter[Reason] = Counter()
         self.rejected_by_source: dict[str, Counter[Reason]] = {}
         self.digest = Digest()
-        self.array = _array(settings)
+        self.array = assembly.array(settings)
         self.local: LocalFrame | None = None
         self.last_update: Update | None = None
+        self._noise_settings = assembly.noise(settings)
+        self._noise: dict[Source, ReportNoise] = {}
         self.presence: dict[Source, Presence] = {}
         self._center: Center = parse_center(settings.center.source or "home")
         self._carrier_id = str(self._center) if isinstance(self._center, VehicleCenter) else None
@@ -106,11 +111,10 @@ class Pipeline:
         self._clocks: dict[Source, SenderClock] = {}
         self._clocks_by_uav: dict[str, SenderClock] = {}
         self._dedupe = Dedupe()
-        self._fleet = _fleet(settings, self._sender_ns)
+        self._fleet = assembly.fleet(settings, self._sender_time)
         self._targets: list[str] = []  # in the order in which they were first heard
-        self._precoder = precoding.Precoder(
-            settings.beams.condition_limit, settings.beams.regularisation
-        )
+        self._precoder = assembly.precoder(settings)
+        self._identities = Identities()
         self._states: dict[str, TrackState] = {}
         if isinstance(self._center, FixedCenter):
             self._set_origin(self._center)
@@ -149,6 +153,11 @@ class Pipeline:
                 return self._report(message)
             case Attitude() if str(message.source) == self._carrier_id:
                 return self._carrier_attitude(message)
+            case GnssStatus():
+                self._noise[message.source] = noise.reported(message, self._noise_settings)
+            case SystemTime() if message.unix_us is not None:
+                clock = self._clock(message.source)
+                clock.system_time(message.t_ns, message.unix_us, message.boot_ms)
             case Presence():
                 self.presence[message.source] = message
         return []
@@ -159,38 +168,56 @@ class Pipeline:
             t_ns = report.t_ns - round((report.tslc_s or 0.0) * 1e9)
             sender_ns = t_ns
         else:
-            placed = self._place(report.source, report.t_ns, report.boot_ms, outputs)
-            t_ns, sender_ns = placed.t_ns, placed.sender_ns
+            stamp = self._stamp(report.source, report.t_ns, report.boot_ms, outputs)
+            if stamp is None:
+                return [*outputs, Rejection(report.t_ns, report.uav, Reason.UNPLACED_STAMP)]
+            t_ns, sender_ns = report.t_ns - round(stamp.latency_s * 1e9), stamp.sender_ns
         if report.alt_m is None:
             outputs.append(Rejection(report.t_ns, report.uav, Reason.NO_ALTITUDE))
             return outputs
         if self.local is None:
             outputs.append(self._first_report(report, report.alt_m))
         accepted = self._fleet.accept(self._fix(report, sender_ns, t_ns, report.alt_m))
-        if isinstance(accepted, Estimate) and accepted.dt_s is None and self.is_target(report.uav):
-            self._targets.append(report.uav)
+        if isinstance(accepted, Estimate):
+            if accepted.dt_s is None and self.is_target(report.uav):
+                self._targets = list(dict.fromkeys([*self._targets, report.uav]))
+            if report.boot_ms is None:
+                self._identities.observe(accepted.fix, self._telemetry(accepted.fix.t_ns))
+            if accepted.reacquired:
+                text = f"{report.uav} is tracked anew: its reports agree, but not with its past"
+                outputs.append(Notice(report.t_ns, Severity.WARNING, report.uav, text))
         return [*outputs, accepted]
 
-    def _place(
-        self, source: Source, arrival_ns: int, boot_ms: int, outputs: list[Output]
-    ) -> Reading:
-        """A stamp on the node's timeline; a reboot begins the sender's track anew."""
+    def _clock(self, source: Source) -> SenderClock:
         clock = self._clocks.get(source)
         if clock is None:
-            delay_ns = round(self.settings.clocks.constant_delay_s * 1e9)
-            clock = self._clocks.setdefault(source, SenderClock(delay_ns))
+            clock = self._clocks.setdefault(source, assembly.clock(self.settings))
             self._clocks_by_uav[str(source)] = clock
-        reading = clock.place(arrival_ns, boot_ms)
-        if reading.rebooted:
+        return clock
+
+    def _stamp(
+        self, source: Source, arrival_ns: int, boot_ms: int, outputs: list[Output]
+    ) -> Stamp | None:
+        """A stamp on the sender's timeline; a reboot begins the sender's track anew."""
+        stamp = self._clock(source).observe(arrival_ns, boot_ms)
+        if stamp is not None and stamp.rebooted:
             self._restart(str(source))
             text = f"{source} was restarted: its boot clock stepped back to {boot_ms / 1e3:.1f} s"
             outputs.append(Notice(arrival_ns, Severity.WARNING, str(source), text))
-        return reading
+        return stamp
 
-    def _sender_ns(self, uav: str, node_ns: int) -> int:
-        """A time of the node on a UAV's own timeline; ADS-B traffic has none."""
+    def _sender_time(self, uav: str, node_ns: int) -> SenderTime:
+        """A time of the node on a UAV's own timeline; that of ADS-B traffic is the node's."""
         clock = self._clocks_by_uav.get(uav)
-        return node_ns if clock is None else clock.sender_ns(node_ns)
+        estimate = clock.estimate() if clock else None
+        if clock is None or estimate is None:
+            return SenderTime(node_ns, noise.ADSB_TIME_BOUND_S)
+        return SenderTime(clock.sender_ns(node_ns), estimate.uncertainty_s)
+
+    def clock_estimate(self, uav: str) -> ClockEstimate | None:
+        """What is known of a UAV's clock; None for one that has none."""
+        clock = self._clocks_by_uav.get(uav)
+        return clock.estimate() if clock else None
 
     def _restart(self, uav: str) -> None:
         self._fleet.restart(uav)
@@ -219,13 +246,17 @@ class Pipeline:
             there = np.array([*report.velocity_ne_mps, report.velocity_down_mps])
             velocity = self.local.local_from_ned(report.lat_deg, report.lon_deg) @ there
         position = self.local.position_ned_m(report.lat_deg, report.lon_deg, alt_m)
-        return Fix(report.uav, sender_ns, t_ns, report.t_ns, position, velocity, report)
+        if report.boot_ms is None:
+            errors = noise.relayed(velocity, self.settings.observer.speed_max_mps)
+        else:
+            errors = self._noise.get(report.source, self._noise_settings.default)
+        return Fix(report.uav, sender_ns, t_ns, report.t_ns, position, velocity, errors, report)
 
     def _carrier_attitude(self, attitude: Attitude) -> list[Output]:
         outputs: list[Output] = []
-        placed = self._place(attitude.source, attitude.t_ns, attitude.boot_ms, outputs)
-        if self._attitude is None or placed.sender_ns > self._attitude[0]:
-            self._attitude = (placed.sender_ns, attitude)
+        stamp = self._stamp(attitude.source, attitude.t_ns, attitude.boot_ms, outputs)
+        if stamp is not None and (self._attitude is None or stamp.sender_ns > self._attitude[0]):
+            self._attitude = (stamp.sender_ns, attitude)
         return outputs
 
     def _tick(self, tick: Tick) -> list[Output]:
@@ -255,7 +286,7 @@ class Pipeline:
         """Targets and beams at the actuation delay and ``lead_s`` from now. Changes nothing."""
         delay_s = self.settings.beams.actuation_delay_s + lead_s
         valid_at_ns = now_ns + round(delay_s * 1e9)
-        states = self._fleet.states(now_ns, self._targets)
+        states = self._fleet.states(now_ns, filter(self.is_target, self._targets))
         aimed_at = [uav for uav, state in states.items() if state is not TrackState.LOST]
         tracks = self._tracks(aimed_at, now_ns, valid_at_ns)
         found = self.carrier(now_ns, valid_at_ns)
@@ -272,9 +303,18 @@ class Pipeline:
         found = (self._fleet.track(uav, now_ns, valid_at_ns) for uav in uavs)
         return [track for track in found if track is not None]
 
+    def _telemetry(self, at_ns: int) -> list[Track]:
+        """What reports itself, at a time."""
+        own = [uav for uav in self._fleet.uavs if uav in self._clocks_by_uav]
+        return self._tracks(own, at_ns, at_ns)
+
+    def same_as(self, uav: str) -> str | None:
+        """The telemetry track that a relayed aircraft is; None if it is itself."""
+        return self._identities.same_as(uav)
+
     def is_target(self, uav: str) -> bool:
         """Whether beams are wanted for it: not for the carrier, for ADS-B traffic only if asked."""
-        if uav == self._carrier_id:
+        if uav == self._carrier_id or self.same_as(uav) is not None:
             return False
         return self.settings.beams.targets == "all" or not uav.startswith("icao:")
 
@@ -314,33 +354,11 @@ class Pipeline:
         if self._attitude is None:
             return f"no attitude from the carrier {vehicle}"
         made_ns, attitude = self._attitude
-        if self._sender_ns(vehicle, now_ns) - made_ns > self.settings.tracks.coasting_s * 1e9:
+        if (
+            self._sender_time(vehicle, now_ns).sender_ns - made_ns
+            > self.settings.tracks.coasting_s * 1e9
+        ):
             return f"the attitude of the carrier {vehicle} is too old"
-        return carrier.moving(
-            self.local, track, newest, attitude, self._sender_ns(vehicle, valid_at_ns) - made_ns
-        )
-
-
-def _array(settings: Settings) -> arrays.Array:
-    given = settings.array
-    mount = np.radians([given.mount_roll_deg, given.mount_pitch_deg, given.mount_yaw_deg])
-    return arrays.uniform_linear(
-        given.elements,
-        given.frequency_hz,
-        given.spacing_wavelengths,
-        carrier.body_from_ned(*mount),
-    )
-
-
-def _fleet(settings: Settings, sender_time: SenderTime) -> Fleet:
-    given = settings.observer
-    bounds = Bounds(
-        given.speed_max_mps,
-        given.acceleration_max_mps2,
-        given.position_noise_m,
-        given.velocity_noise_mps,
-    )
-    alpha = None if given.alpha == "auto" else given.alpha
-    model = PositionModel(bounds, alpha, given.feedthrough_s, given.velocity_lead_s)
-    ages = settings.tracks
-    return Fleet(model, Ages(ages.coasting_s, ages.stale_s, ages.lost_s), sender_time)
+        since_ns = self._sender_time(vehicle, valid_at_ns).sender_ns - made_ns
+        bound_rad = np.radians(self.settings.center.attitude_bound_deg)
+        return carrier.moving(self.local, track, newest, attitude, since_ns, bound_rad)

@@ -43,15 +43,9 @@ class Source(NamedTuple):
         return cls(int(sysid), int(compid))
 
 
-# --- what drives the pipeline: events -----------------------------------------------------------
-
-
 class Frame(NamedTuple):
-    """One MAVLink frame whose checksum holds.
-
-    A tuple rather than a dataclass: there is one for every frame received, wanted or not.
-    ``raw`` is the whole frame, magic byte to checksum or signature.
-    """
+    """One MAVLink frame whose checksum holds; ``raw`` is all of it, magic byte to checksum or
+    signature. A tuple, for there is one for every frame received, wanted or not."""
 
     t_ns: int
     link: str
@@ -91,9 +85,14 @@ class Reason(StrEnum):
     UNKNOWN_MESSAGE = "unknown-message"  # an id without a known checksum seed: cannot be trusted
     BAD_STAMP = "bad-stamp"  # a log's own time stamp steps back or leaps; the step was clamped
     MALFORMED = "malformed"  # a checked frame whose fields cannot be what they say
+    UNREACHABLE = "unreachable"  # farther from the track than it can have flown since
+    ALTITUDE_JUMP = "altitude-jump"  # the same in height alone: the datum has changed
+    FROZEN = "frozen"  # a fresh stamp on an old position, while the velocity says it moves
+    SHARED_ID = "shared-id"  # two vehicles send under one id: neither can be believed
     ZERO_POSITION = "zero-position"  # within 5 km of 0 N 0 E: what is sent before a fix
     NO_POSITION = "no-position"  # ADSB_VEHICLE whose flags do not vouch for its coordinates
     NO_ALTITUDE = "no-altitude"  # a position in the plane only, and no altitude known before
+    UNPLACED_STAMP = "unplaced-stamp"  # off the sender's clock, and not enough others yet to agree
     DUPLICATE = "duplicate"  # the same report again, over this link or another
     OUT_OF_ORDER = "out-of-order"  # older than what the track already holds
 
@@ -115,9 +114,6 @@ Event = Frame | Tick | Rejection
 event as well: the bytes are gone, but that they came is part of what happened."""
 
 
-# --- bytes to reports ---------------------------------------------------------------------------
-
-
 class AltitudeDatum(StrEnum):
     """What a height is measured from; pressure altitude is off by the weather, up to 100s of m."""
 
@@ -128,11 +124,9 @@ class AltitudeDatum(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A position that a UAV sent of itself, or that a receiver relayed of it.
-
-    Degrees, metres, m/s in the north-east-down frame at the UAV itself. ``boot_ms`` is the
-    sender's clock at the position, ``tslc_s`` the age that an ADS-B receiver states in its stead.
-    """
+    """A position that a UAV sent of itself, or that a receiver relayed of it: degrees, metres, m/s
+    in the north-east-down frame at the UAV itself. ``boot_ms`` is the sender's clock at the
+    position, ``tslc_s`` the age that an ADS-B receiver states in its stead."""
 
     t_ns: int
     link: str
@@ -203,19 +197,25 @@ class SystemTime:
 Message = Report | Attitude | Presence | GnssStatus | SystemTime
 
 
-# --- reports to tracks --------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class ReportNoise:
+    """Bounds on one report's errors: of the position in the plane, in height and in norm, and of
+    the velocity in norm."""
+
+    horizontal_m: float
+    vertical_m: float
+    position_m: float
+    velocity_mps: float
 
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """A report accepted: on the node's timeline and in the local frame.
-
-    ``sender_ns`` is when the position was true on the sender's own timeline (intervals between
-    reports are taken there: they carry nothing of the link), ``t_ns`` the same on the node's as far
-    as was known on arrival at ``arrival_ns``; the last two differ by the latency that is seen. For
-    a report without a sender's clock the two timelines are one. ``position_ned_m`` and
-    ``velocity_ned_mps``: shape (3,), local frame.
-    """
+    """A report on the node's timeline and in the local frame: ``sender_ns`` is when the
+    position was true on the sender's own timeline (intervals between reports are taken there:
+    they carry nothing of the link), ``t_ns`` the same on the node's as far as was known on
+    arrival at ``arrival_ns``; the last two differ by the latency that is seen. For a report
+    without a sender's clock the two timelines are one. ``position_ned_m`` and
+    ``velocity_ned_mps``: shape (3,), local frame; ``noise`` bounds their errors."""
 
     uav: str
     sender_ns: int
@@ -223,23 +223,24 @@ class Fix:
     arrival_ns: int
     position_ned_m: FloatArray
     velocity_ned_mps: FloatArray | None
+    noise: ReportNoise
     report: Report
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """What the observer makes of an accepted report, at the report's time.
-
-    ``position_ned_m`` (3,) is the estimate before this report enters it, ``bound_m`` its error
-    bound, ``innovation_m`` how far the report lies from it, ``dt_s`` the interval since the report
-    before. The last two are None for the first report of a track.
-    """
+    """What the observer makes of an accepted report, at its time: ``position_ned_m`` (3,) is
+    the estimate before this report enters it, ``bound_m`` its error bound, ``innovation_m`` how
+    far the report lies from it, ``dt_s`` the interval since the report before. The last two are
+    None for the first report of a track. ``reacquired``: the track was begun again, from
+    reports that disagreed with it but not with one another."""
 
     fix: Fix
     position_ned_m: FloatArray
     bound_m: float
     innovation_m: float | None
     dt_s: float | None
+    reacquired: bool = False
 
 
 class TrackState(StrEnum):
@@ -256,7 +257,10 @@ class Track:
     """What is known of one UAV at ``valid_at_ns``; local frame.
 
     ``bound_m`` bounds the position error's norm if the settings' bounds on speed, acceleration
-    and noise hold; ``age_s`` is ``valid_at_ns`` less the time of the newest accepted report;
+    and noise hold, ``horizontal_bound_m`` and ``vertical_bound_m`` its two parts: the error lies in
+    that upright cylinder. What is not known of the sender's clock, ``clock_bound_s``, is in them.
+    ``acceleration_ned_mps2`` is what was fed forward; ``age_s`` is ``valid_at_ns`` less the time of
+    the newest accepted report;
     ``dt_s`` the last interval between reports, ``gamma`` the certified gain over all of them;
     ``innovation_m`` how far the last report lay from its prediction.
     """
@@ -268,7 +272,11 @@ class Track:
     position_ned_m: FloatArray
     velocity_ned_mps: FloatArray | None
     unknown_input_mps: FloatArray | None
+    acceleration_ned_mps2: FloatArray | None
     bound_m: float
+    horizontal_bound_m: float
+    vertical_bound_m: float
+    clock_bound_s: float
     dt_s: float | None
     latency_s: float | None
     gamma: float | None
@@ -280,18 +288,19 @@ class Track:
 class Carrier:
     """Where the array is at ``valid_at_ns``, and how it is turned: ``body_from_local``, (3, 3).
 
-    ``bound_m`` bounds its position's error; ``age_s`` is that of its newest report, None for a
-    fixed station.
+    ``body_rates_radps`` (3,) turn it about its own axes. ``bound_m`` bounds its position's error,
+    ``attitude_bound_rad`` the angle by which its attitude can be off; ``age_s`` is that of its
+    newest report, None for a fixed station.
     """
 
     valid_at_ns: int
     position_ned_m: FloatArray
+    velocity_ned_mps: FloatArray | None
     body_from_local: FloatArray
+    body_rates_radps: FloatArray
     bound_m: float
+    attitude_bound_rad: float
     age_s: float | None
-
-
-# --- tracks to weights --------------------------------------------------------------------------
 
 
 class Method(StrEnum):
@@ -303,7 +312,8 @@ class Method(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Beam:
-    """One beam: angles in the array frame (azimuth to the right, elevation up), range in metres.
+    """One beam: azimuth (to the right) and elevation (up) in the array frame, range in metres, and
+    how fast they change (None where a velocity is not known).
 
     ``gain_db`` is the array gain towards the predicted direction under unit weight power,
     ``pointing_bound_rad`` how far the true direction can lie from it (None: anywhere).
@@ -313,6 +323,9 @@ class Beam:
     azimuth_rad: float
     elevation_rad: float
     range_m: float
+    azimuth_rate_radps: float | None
+    elevation_rate_radps: float | None
+    range_rate_mps: float | None
     pointing_bound_rad: float | None
     gain_db: float
 
@@ -372,10 +385,8 @@ class Notice:
 
 @dataclass(frozen=True, slots=True)
 class Update:
-    """What a tick brings: every target at the time of use, and the beams on them.
-
-    Without a carrier there are no beams, and ``unfit`` says why.
-    """
+    """Every target at the time of use, and the beams on them; without a carrier there are none,
+    and ``unfit`` says why."""
 
     t_ns: int
     carrier: Carrier | None

@@ -42,7 +42,17 @@ WRONG = [
     ("links", "urls", "[7]", "7", "string"),
     ("clocks", "constant_delay_s", "-0.1", "-0.1", "greater than or equal to 0"),
     ("clocks", "constant_delay_s", "11", "11", "less than or equal to 10"),
-    ("observer", "model", '"kinematics"', "kinematics", "position"),
+    ("observer", "model", '"kinematics"', "kinematics", "'kinematic' or 'position'"),
+    ("observer", "feed_forward", '"often"', "often", "boolean"),
+    ("observer", "follow_accuracy", "2", "2", "boolean"),
+    ("observer", "accuracy_factor", "0", "0", "greater than 0"),
+    ("observer", "velocity_noise_mps", "0", "0", "greater than 0"),
+    ("center", "attitude_bound_deg", "181", "181", "less than or equal to 180"),
+    ("center", "attitude_bound_deg", "-1", "-1", "greater than or equal to 0"),
+    ("tracks", "window_s", "0", "0", "greater than 0"),
+    ("tracks", "reacquire_reports", "1", "1", "greater than or equal to 2"),
+    ("tracks", "reacquire_reports", "61", "61", "less than or equal to 60"),
+    ("tracks", "reacquire_s", "61", "61", "less than or equal to 60"),
     ("observer", "feedthrough_s", "11.0", "11.0", "less than or equal to 10"),
     ("observer", "velocity_lead_s", "0.0", "0.0", "greater than 0"),
     ("observer", "speed_max_mps", "-3", "-3", "greater than 0"),
@@ -121,6 +131,9 @@ def test_a_track_passes_its_states_in_order(text: str) -> None:
 
 def test_without_a_file_there_are_the_defaults() -> None:
     assert load(None) == Settings()
+    observer = load(None).observer
+    assert (observer.model, observer.acceleration_max_mps2) == ("kinematic", 5.0)
+    assert (observer.feed_forward, observer.follow_accuracy) == (True, True)
 
 
 def test_a_file_is_read(tmp_path: Path) -> None:
@@ -159,6 +172,9 @@ SCALAR = st.characters(exclude_categories=["Cs"])
     elements=st.integers(1, 4096),
     yaw_deg=st.floats(allow_nan=False, allow_infinity=False),
     source=st.none() | st.sampled_from(["5:1", "home", "47.4,8.5,500,-90"]),
+    model=st.sampled_from(["kinematic", "position"]),
+    follow=st.booleans(),
+    attitude_bound_deg=st.floats(0, 180),
 )
 def test_settings_survive_being_written(
     directory: str | None,
@@ -169,12 +185,20 @@ def test_settings_survive_being_written(
     elements: int,
     yaw_deg: float,
     source: str | None,
+    model: str,
+    follow: bool,
+    attitude_bound_deg: float,
 ) -> None:
     made = Settings.model_validate(
         {
-            "center": {"source": source},
+            "center": {"source": source, "attitude_bound_deg": attitude_bound_deg},
             "links": {"urls": urls},
-            "observer": {"alpha": alpha, "speed_max_mps": speed},
+            "observer": {
+                "alpha": alpha,
+                "speed_max_mps": speed,
+                "model": model,
+                "follow_accuracy": follow,
+            },
             "recording": {"directory": directory, "weights_hz": weights_hz},
             "array": {"elements": elements, "mount_yaw_deg": yaw_deg},
         }

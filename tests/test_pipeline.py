@@ -87,7 +87,9 @@ def tick(t_s: float) -> Tick:
 
 
 def settings(center: str | None = "5:1", **sections: dict[str, Any]) -> Settings:
-    return Settings().override(center={"source": center}, **sections)
+    """Made-up senders' stamps are exact, and arrive at once."""
+    clocks = {"constant_delay_s": 0.0}
+    return Settings().override(center={"source": center}, **{"clocks": clocks, **sections})
 
 
 def run(pipeline: Pipeline, events: Iterable[Event]) -> list[Output]:
@@ -339,10 +341,24 @@ def test_the_same_report_over_two_links_counts_once() -> None:
     assert track.reports == 1
 
 
-def test_a_late_report_is_out_of_order() -> None:
+def test_a_late_report_is_put_in_its_place() -> None:
+    """Half a second late: the track is what it would be had it come in time."""
+    made = [position(t_s, "1:1", (t_s, t_s**2, 0), (1, 2 * t_s, 0)) for t_s in (0.0, 0.5, 1.0)]
+    in_order, late = Pipeline(settings("home")), Pipeline(settings("home"))
+    run(in_order, made)
+    found = run(late, [made[0], made[2], made[1]._replace(t_ns=START_NS + S)])
+    assert isinstance(found[-1], Estimate)
+    assert not late.rejected
+    one, other = (updated(pipeline, 1.5).tracks[0] for pipeline in (in_order, late))
+    assert one.position_ned_m.tolist() == other.position_ned_m.tolist()
+    assert (one.bound_m, one.reports) == (other.bound_m, 3)
+
+
+def test_a_report_later_than_the_window_is_out_of_order() -> None:
     pipeline = Pipeline(settings("home"))
     run(pipeline, [position(0, "1:1"), position(1, "1:1", (1, 0, 0))])
-    late = position(1.5, "1:1", (0.5, 0, 0), boot_s=100.5)
+    late = position(7.5, "1:1", (0.5, 0, 0), boot_s=100.5)
+    pipeline.step(position(7.0, "1:1", (7, 0, 0)))
     (refused,) = pipeline.step(late)
     assert isinstance(refused, Rejection)
     assert refused.reason is Reason.OUT_OF_ORDER
@@ -359,6 +375,85 @@ def test_reports_that_waited_together_are_not_out_of_order() -> None:
     newest = pipeline.newest("1:1")
     assert newest is not None
     assert newest.position_ned_m[1] == pytest.approx(4, abs=0.02)
+
+
+def accuracy(t_s: float, source: str, h_acc_m: float, v_acc_m: float, vel_mps: float) -> Frame:
+    """GPS_RAW_INT; an accuracy of 0 is one that is not sent."""
+    message = dialect.MAVLink_gps_raw_int_message(
+        round(1e6 * t_s), 3, 0, 0, 0, 100, 100, 0, 0, 12, 0,
+        *(round(1000 * value) for value in (h_acc_m, v_acc_m, vel_mps)), 0, 0,
+    )  # fmt: skip
+    return sent(t_s, source, message)
+
+
+def noise_of(pipeline: Pipeline, uav: str) -> tuple[float, float, float]:
+    newest = pipeline.newest(uav)
+    assert newest is not None
+    return newest.noise.horizontal_m, newest.noise.vertical_m, newest.noise.velocity_mps
+
+
+@pytest.mark.parametrize(
+    ("follow", "accuracies", "expected"),
+    [
+        (True, (0.8, 1.5, 0.1), (2.0, 3.75, 0.25)),
+        (True, (0.8, 0.0, 0.0), (2.0, 6.0, 0.7)),
+        (True, (0.0, 1.5, 0.0), (6.0, 3.75, 0.7)),
+        (False, (0.8, 1.5, 0.1), (6.0, 6.0, 0.7)),
+    ],
+)
+def test_the_autopilot_s_own_accuracy_is_followed_if_asked(
+    follow: bool, accuracies: tuple[float, float, float], expected: tuple[float, float, float]
+) -> None:
+    """From the next report of that sender on, times the factor; what is not sent is the default."""
+    given = {
+        "position_noise_m": 6.0, "velocity_noise_mps": 0.7,
+        "accuracy_factor": 2.5, "follow_accuracy": follow,
+    }  # fmt: skip
+    pipeline = Pipeline(settings("home", observer=given))
+    pipeline.step(position(0.0, "1:1"))
+    assert noise_of(pipeline, "1:1") == (6.0, 6.0, 0.7)
+    pipeline.step(accuracy(0.1, "1:1", *accuracies))
+    run(pipeline, [position(0.2, "1:1"), position(0.2, "2:1", (50, 0, 0))])
+    assert noise_of(pipeline, "1:1") == pytest.approx(expected)
+    assert noise_of(pipeline, "2:1") == (6.0, 6.0, 0.7)
+    pipeline.step(accuracy(0.3, "1:1", 0, 0, 0))  # it is sent no longer
+    pipeline.step(position(0.4, "1:1"))
+    assert noise_of(pipeline, "1:1") == (6.0, 6.0, 0.7)
+
+
+def test_a_relayed_report_is_as_good_as_transponders_are() -> None:
+    """100 m, and the way flown in the second to which its time is known."""
+    pipeline = Pipeline(settings("home", observer={"speed_max_mps": 90.0}))
+    run(pipeline, [accuracy(0.0, "5:1", 0.5, 0.5, 0.1), adsb(0.1, (3000, 500, -800))])
+    assert noise_of(pipeline, "icao:4CA7B3") == pytest.approx((190.0, 190.0, 10.0))
+    lat, lon, alt = pymap3d.ned2geodetic(3000, 540, -800, *PLACE)
+    told = dialect.MAVLink_adsb_vehicle_message(
+        0x4CA7B3, round(float(lat) * 1e7), round(float(lon) * 1e7), 1, round(float(alt) * 1e3),
+        9000, 4000, 300, b"TEST", 0, 1, 1 | 2 | 4 | 8 | 128, 0,
+    )  # fmt: skip
+    pipeline.step(sent(1.1, "5:1", told))
+    assert noise_of(pipeline, "icao:4CA7B3") == pytest.approx((140.1, 140.1, 10.0), abs=0.1)
+    now_ns = tick(1.2).t_ns
+    (track,) = pipeline.tracks(now_ns, now_ns)
+    assert track.clock_bound_s == 1.0
+
+
+def test_a_track_that_is_begun_again_is_said_once() -> None:
+    """A jump of 200 m that lasts."""
+    pipeline = Pipeline(settings("47.4,8.55,500"))
+    outputs: list[Output] = []
+    for number in range(100):
+        place = (100 + (200 if number >= 50 else 0), 0.1 * number, 0)
+        outputs += pipeline.step(position(number / 10, "1:1", place, (0, 1, 0)))
+    (notice,) = (output for output in outputs if isinstance(output, Notice))
+    assert (notice.subject, notice.severity) == ("1:1", Severity.WARNING)
+    assert "1:1 is tracked anew" in notice.text
+    estimate = outputs[outputs.index(notice) + 1]
+    assert isinstance(estimate, Estimate)
+    assert estimate.reacquired
+    assert estimate.fix.arrival_ns == notice.t_ns == START_NS + 8 * S
+    assert pipeline.rejected == {Reason.UNREACHABLE: 30}
+    assert updated(pipeline, 10.0).beams.uavs == ("1:1",)
 
 
 def test_a_position_at_0_0_is_counted_and_makes_no_track() -> None:
@@ -399,6 +494,10 @@ def test_a_reboot_is_said_and_begins_a_fresh_track() -> None:
     for t_s in range(5):
         pipeline.step(position(t_s, "1:1", (100 + t_s, 0, 0)))
     pipeline.step(position(4, "2:1", (0, 90, 0)))
+    for t_s in (5.0, 5.5):  # a stamp far back is not believed before others agree
+        (refused,) = pipeline.step(position(t_s, "1:1", (200, 0, 0), boot_s=t_s - 3))
+        assert isinstance(refused, Rejection)
+        assert refused.reason is Reason.UNPLACED_STAMP
     notice, first = pipeline.step(position(6, "1:1", (200, 0, 0), boot_s=3.0))
     assert isinstance(notice, Notice)
     assert (notice.subject, notice.severity) == ("1:1", Severity.WARNING)
@@ -461,7 +560,9 @@ def test_other_events_give_another_digest(paper: list[Event]) -> None:
     for dropped in (reports[30], attitudes[30], ticks[30]):
         digests.append(digest(paper[:dropped] + paper[dropped + 1 :]))
     digests.append(digest(paper, array={"elements": 32}))
-    digests.append(digest(paper, observer={"position_noise_m": 4.0}))
+    digests.append(digest(paper, observer={"position_noise_m": 4.0, "follow_accuracy": False}))
+    digests.append(digest(paper, observer={"model": "position"}))
+    digests.append(digest(paper, observer={"feed_forward": False}))
     assert len(set(digests)) == len(digests)
 
 

@@ -1,5 +1,6 @@
 """Tracks to beams: who gets one, where it points, and the weights of all of them together."""
 
+import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -48,15 +49,20 @@ def aim(
     made = precode(matrix, precoder)
     azimuths, elevations = steering.angles_rad(directions)
     gains = gain_db(matrix, made.weights)
+    rates = [
+        _rates(track, carrier, array, float(ranges_m[i]), directions[i])
+        for i, track in enumerate(aimed)
+    ]
     beams = tuple(
         Beam(
             uav=track.uav,
             azimuth_rad=float(azimuths[i]),
             elevation_rad=float(elevations[i]),
             range_m=float(ranges_m[i]),
-            pointing_bound_rad=steering.pointing_bound_rad(
-                track.bound_m + carrier.bound_m, float(ranges_m[i])
-            ),
+            azimuth_rate_radps=rates[i][0],
+            elevation_rate_radps=rates[i][1],
+            range_rate_mps=rates[i][2],
+            pointing_bound_rad=_pointing_bound_rad(track, carrier, float(ranges_m[i])),
             gain_db=float(gains[i]),
         )
         for i, track in enumerate(aimed)
@@ -64,6 +70,37 @@ def aim(
     return BeamSet(
         now_ns, valid_at_ns, beams, made.weights, made.method, made.condition_number, left_out
     )
+
+
+def _pointing_bound_rad(track: Track, carrier: Carrier, range_m: float) -> float | None:
+    """Both positions' errors seen from the array, and the attitude's; None: any direction."""
+    seen = steering.pointing_bound_rad(track.bound_m + carrier.bound_m, range_m)
+    return None if seen is None else min(seen + carrier.attitude_bound_rad, math.pi)
+
+
+def _rates(
+    track: Track, carrier: Carrier, array: Array, range_m: float, direction: FloatArray
+) -> tuple[float | None, float | None, float | None]:
+    """Rates of azimuth, elevation (rad/s) and range (m/s) of a unit direction in the array frame.
+
+    Straight up and straight down the azimuth has no rate.
+    """
+    if track.velocity_ned_mps is None or carrier.velocity_ned_mps is None:
+        return None, None, None
+    array_from_local = array.array_from_body @ carrier.body_from_local
+    moving = array_from_local @ (track.velocity_ned_mps - carrier.velocity_ned_mps)
+    range_rate_mps = float(moving @ direction)
+    turning = array.array_from_body @ carrier.body_rates_radps
+    x, y, z = direction.tolist()
+    w1, w2, w3 = turning.tolist()
+    across = ((moving - range_rate_mps * direction) / range_m).tolist()
+    x_rate = across[0] - (w2 * z - w3 * y)
+    y_rate = across[1] - (w3 * x - w1 * z)
+    z_rate = across[2] - (w1 * y - w2 * x)
+    level = x * x + y * y
+    if level < 1e-12:
+        return None, None, range_rate_mps
+    return (x * y_rate - y * x_rate) / level, -z_rate / math.sqrt(level), range_rate_mps
 
 
 def _refusal(track: Track, carrier: Carrier | None) -> str | None:

@@ -48,10 +48,10 @@ def fix(value: Fix) -> Any:
 def predicted(track: Track, lat_deg: float, lon_deg: float, alt_m: float) -> Any:
     """Where a UAV is taken to be at ``valid_at_ns``, with a covariance made from its bound.
 
-    The bound is a guarantee, not a statistic. The covariance is bound²/3 on each axis: its trace,
-    the mean square of the error, is bound², the largest that any distribution within the bound
-    can have. So a viewer's 1-sigma ellipsoid errs on the safe side on average, and the bound is
-    its radius times √3. No covariance where there is no finite bound.
+    The bound is a guarantee, not a statistic. The covariance is half the square of the horizontal
+    bound on each of its two axes, and the square of the vertical one: its traces are the largest
+    mean square errors that any distribution within the bounds can have. So a viewer's 1-sigma
+    ellipsoid errs on the safe side on average. No covariance where there is no finite bound.
     """
     message = schemas.LocationFixMessage(
         timestamp=_timestamp(track.valid_at_ns),
@@ -61,10 +61,8 @@ def predicted(track: Track, lat_deg: float, lon_deg: float, alt_m: float) -> Any
         altitude=alt_m,
     )
     if math.isfinite(track.bound_m):
-        variance_m2 = track.bound_m**2 / 3
-        message.position_covariance.extend(
-            (variance_m2, 0.0, 0.0, 0.0, variance_m2, 0.0, 0.0, 0.0, variance_m2)
-        )
+        plane_m2, height_m2 = track.horizontal_bound_m**2 / 2, track.vertical_bound_m**2
+        message.position_covariance.extend((plane_m2, 0, 0, 0, plane_m2, 0, 0, 0, height_m2))
         message.position_covariance_type = schemas.LocationFixMessage.APPROXIMATED
     return message
 
@@ -85,6 +83,10 @@ def track(value: Track, t_ns: int) -> Any:
         latency_s=value.latency_s,
         gamma=value.gamma,
         innovation_m=value.innovation_m,
+        acceleration_ned_mps2=_vector(value.acceleration_ned_mps2),
+        horizontal_bound_m=value.horizontal_bound_m,
+        vertical_bound_m=value.vertical_bound_m,
+        clock_bound_s=value.clock_bound_s,
         reports=value.reports,
     )
 
@@ -111,6 +113,9 @@ def weights(value: BeamSet) -> Any:
                 "range_m": beam.range_m,
                 "pointing_bound_rad": beam.pointing_bound_rad,
                 "gain_db": beam.gain_db,
+                "azimuth_rate_radps": beam.azimuth_rate_radps,
+                "elevation_rate_radps": beam.elevation_rate_radps,
+                "range_rate_mps": beam.range_rate_mps,
             }
             for beam in value.beams
         ],

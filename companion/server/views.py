@@ -10,6 +10,7 @@ import numpy as np
 
 from companion.beams.arrays import half_power_beamwidth_rad
 from companion.config import FixedCenter
+from companion.mavlink.clocks import ClockEstimate
 from companion.mavlink.links import LinkStatus
 from companion.pipeline import Pipeline
 from companion.values import BeamSet, Carrier, FloatArray, Track, Update
@@ -161,6 +162,7 @@ def uav(
         "id": track.uav,
         "state": str(track.state),
         "target": pipeline.is_target(track.uav),
+        "same_as": pipeline.same_as(track.uav),
         "valid_at": rfc3339(track.valid_at_ns),
         "age_s": track.age_s,
         "lat_deg": place[0],
@@ -173,13 +175,31 @@ def uav(
         "speed_mps": None if velocity is None else float(np.linalg.norm(velocity)),
         "heading_deg": newest.report.heading_deg if newest else None,
         "unknown_input_mps": vector(track.unknown_input_mps),
+        "acceleration_ned_mps2": vector(track.acceleration_ned_mps2),
         "bound_m": track.bound_m,
+        "bound_ellipsoid_ned_m": [track.horizontal_bound_m] * 2 + [track.vertical_bound_m],
+        "clock_bound_s": track.clock_bound_s,
+        "clock": clock(pipeline.clock_estimate(track.uav)),
         "dt_s": track.dt_s,
         "latency_s": track.latency_s,
         "gamma": track.gamma,
         "innovation_m": track.innovation_m,
         "reports": track.reports,
         "rejected": {str(reason): count for reason, count in sorted(rejected.items())},
+    }
+
+
+def clock(estimate: ClockEstimate | None) -> Json | None:
+    """What is known of a sender's clock; null for ADS-B traffic, which has none."""
+    if estimate is None:
+        return None
+    return {
+        "kind": str(estimate.kind),
+        "offset_s": estimate.offset_ns * 1e-9,
+        "drift_ppm": estimate.drift_ppm,
+        "uncertainty_s": estimate.uncertainty_s,
+        "constant_delay_s": estimate.constant_delay_s,
+        "latency_s": estimate.latency_s,
     }
 
 
@@ -213,6 +233,10 @@ def beams(node: Node, update: Update, lead_ms: float) -> Json:
     }
 
 
+def _degrees(angle_rad: float | None) -> float | None:
+    return None if angle_rad is None else float(np.degrees(angle_rad))
+
+
 def _beam_list(beam_set: BeamSet, array_from_local: FloatArray) -> list[Json]:
     entries = []
     for beam in beam_set.beams:
@@ -225,7 +249,6 @@ def _beam_list(beam_set: BeamSet, array_from_local: FloatArray) -> list[Json]:
             ]
         )
         north, east, _ = array_from_local.T @ direction
-        bound = beam.pointing_bound_rad
         entries.append(
             {
                 "uav": beam.uav,
@@ -233,9 +256,12 @@ def _beam_list(beam_set: BeamSet, array_from_local: FloatArray) -> list[Json]:
                 "elevation_deg": float(np.degrees(beam.elevation_rad)),
                 "range_m": beam.range_m,
                 "bearing_deg": float(np.degrees(np.arctan2(east, north))) % 360,
+                "azimuth_rate_dps": _degrees(beam.azimuth_rate_radps),
+                "elevation_rate_dps": _degrees(beam.elevation_rate_radps),
+                "range_rate_mps": beam.range_rate_mps,
                 "gain_db": beam.gain_db,
                 "guaranteed_gain_db": None,
-                "pointing_bound_deg": None if bound is None else float(np.degrees(bound)),
+                "pointing_bound_deg": _degrees(beam.pointing_bound_rad),
                 "sinr_db": None,
             }
         )

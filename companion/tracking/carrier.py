@@ -50,11 +50,19 @@ def fixed(
 ) -> Carrier:
     """A level station at (latitude deg, longitude deg, height m)."""
     body_from_local = body_from_ned(0.0, 0.0, heading_rad) @ local.local_from_ned(*place[:2]).T
-    return Carrier(valid_at_ns, local.position_ned_m(*place), body_from_local, 0.0, None)
+    still = np.zeros(3)
+    return Carrier(
+        valid_at_ns, local.position_ned_m(*place), still, body_from_local, still, 0.0, 0.0, None
+    )
 
 
 def moving(
-    local: LocalFrame, track: Track, newest: Fix, attitude: Attitude, since_ns: int
+    local: LocalFrame,
+    track: Track,
+    newest: Fix,
+    attitude: Attitude,
+    since_ns: int,
+    attitude_bound_rad: float,
 ) -> Carrier:
     """A vehicle at its track's time; its attitude, ``since_ns`` old by then, goes on at its rates.
 
@@ -66,7 +74,10 @@ def moving(
     return Carrier(
         track.valid_at_ns,
         track.position_ned_m,
+        track.velocity_ned_mps,
         later_body_from_body(rates, since_ns * 1e-9) @ then @ local_from_ned.T,
+        rates,
         track.bound_m,
+        attitude_bound_rad,
         track.age_s,
     )

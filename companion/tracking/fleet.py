@@ -1,4 +1,4 @@
-"""Which track a report belongs to, and how the tracks age.
+"""Which track a report belongs to, whether it can be true, and how the tracks age.
 
 A track is live while reports come, coasting when they fail to, stale when too old to point a
 beam at, and lost; the ages at which it passes on are settings. Nothing here keeps time: the
@@ -7,11 +7,18 @@ newest accepted report and the time asked for decide.
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Any
 
-from companion.tracking import observer
-from companion.tracking.observer import PositionModel, PositionState
+import numpy as np
+
+from companion.tracking.estimates import Observer, Prediction
+from companion.tracking.gate import GateSettings, Suspects, is_frozen, refusal
+from companion.tracking.history import History
 from companion.values import Estimate, Fix, FloatArray, Reason, Rejection, Track, TrackState
+
+ACCELERATION_FADES_S = 3.0
+"""An estimated acceleration is fed forward fading at this time constant: it does not last."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,89 +38,226 @@ class Ages:
         return TrackState.COASTING if age_s > self.coasting_s else TrackState.LIVE
 
 
+@dataclass(frozen=True, slots=True)
+class SenderTime:
+    """A time of the node on a sender's own timeline, and how far that can be off."""
+
+    sender_ns: int
+    bound_s: float
+
+
+ToSenderTime = Callable[[str, int], SenderTime]
+"""(UAV, time of the node) to the time on the UAV's own timeline, by what is known now."""
+
+
+@dataclass(frozen=True, slots=True)
+class FleetSettings:
+    """How tracks are kept: the greatest speed and acceleration that are taken for possible;
+    ``window_s``, how late a report may come and still be used in order; ``feed_forward``, whether
+    an estimated acceleration enters predictions."""
+
+    speed_max_mps: float
+    acceleration_max_mps2: float
+    ages: Ages = field(default_factory=Ages)
+    gate: GateSettings = field(default_factory=GateSettings)
+    window_s: float = 5.0
+    feed_forward: bool = False
+
+
 @dataclass(slots=True)
 class _Tracked:
-    newest: Fix
-    state: PositionState
-    latency_s: float
+    history: History[Any]
+    suspects: Suspects[Any]
+    arrived: Fix
+    newest: Estimate
     reports: int = 1
-    dt_s: float | None = None
-    innovation_m: float | None = None
+    believable_ns: int = 0
+    unknown_input: FloatArray | None = None
     mu_max_s2: float | None = None
-    unknown_input_mps: FloatArray | None = None
-
-
-SenderTime = Callable[[str, int], int]
-"""(UAV, time of the node) to that time on the UAV's own timeline, by what is known now."""
+    acceleration: FloatArray | None = None
 
 
 class Fleet:
     """All tracks, by UAV id. ``accept`` reports, ask for a ``track`` at a time of the node.
 
     Tracks live on each sender's own timeline, so that what a link does to a report's arrival
-    enters neither the intervals nor their order; ``sender_time`` leads there.
+    enters neither the intervals nor their order; ``to_sender_time`` leads there.
     """
 
-    def __init__(self, model: PositionModel, ages: Ages, sender_time: SenderTime) -> None:
-        self._sender_time = sender_time
-        self._model = model
-        self._ages = ages
+    def __init__(
+        self, observer: Observer[Any], settings: FleetSettings, to_sender_time: ToSenderTime
+    ) -> None:
+        self._observer = observer
+        self._settings = settings
+        self._to_sender_time = to_sender_time
         self._tracked: dict[str, _Tracked] = {}
 
+    # --- reports in -------------------------------------------------------------------------
+
     def accept(self, fix: Fix) -> Estimate | Rejection:
-        """Put a report to its track, or begin one; a report older than the track is rejected."""
-        latency_s = (fix.arrival_ns - fix.t_ns) * 1e-9
+        """Put a report to its track, or begin one; or say why it is not used."""
         tracked = self._tracked.get(fix.uav)
-        if tracked is None:
-            state = observer.begin(fix, self._model)
-            self._tracked[fix.uav] = _Tracked(fix, state, latency_s)
-            return Estimate(fix, state.estimate_ned_m, state.bound_m, None, None)
-        dt_s = (fix.sender_ns - tracked.state.t_ns) * 1e-9
-        if dt_s <= 0:
-            detail = f"{-dt_s:.3f} s older than the report before it"
-            return Rejection(fix.arrival_ns, fix.uav, Reason.OUT_OF_ORDER, detail=detail)
-        tracked.state, predicted, tracked.unknown_input_mps = observer.update(
-            tracked.state, fix, self._model
-        )
-        tracked.newest = fix
-        innovation_m = observer.norm_m(fix.position_ned_m - predicted.position_ned_m)
-        tracked.innovation_m = innovation_m
-        tracked.mu_max_s2 = max(predicted.mu_s2, tracked.mu_max_s2 or 0.0)
-        tracked.dt_s, tracked.latency_s = dt_s, latency_s
+        if tracked is None or self._is_lost(tracked, fix):
+            return self._begin(fix)
+        index = tracked.history.index(fix.sender_ns)
+        if index is None:
+            return _rejected(fix, Reason.OUT_OF_ORDER, "older than the window for late reports")
+        before = tracked.history.entries[max(index - 1, 0)]
+        wrong = self._wrong(tracked, index, fix)
+        if wrong is None:
+            wrong = refusal(self._observer.predict(before.state, fix.sender_ns), fix)
+            if wrong is not None:
+                return self._suspect(tracked, fix, wrong)
+        if wrong is not None:
+            return _rejected(fix, *wrong)
+        tracked.believable_ns = max(tracked.believable_ns, fix.sender_ns)
+        if tracked.suspects.goes_on(fix.sender_ns):
+            return _rejected(fix, Reason.SHARED_ID, "a second vehicle reports under this id")
+        return self._use(tracked, index, fix)
+
+    def _begin(self, fix: Fix, reports: int = 0) -> Estimate:
+        history: History[Any] = History(self._observer, fix, round(self._settings.window_s * 1e9))
+        suspects: Suspects[Any] = Suspects(self._observer, self._settings.gate)
+        first = Estimate(fix, fix.position_ned_m, fix.noise.position_m, None, None)
+        self._tracked[fix.uav] = _Tracked(history, suspects, fix, first, reports + 1)
+        return first
+
+    def _is_lost(self, tracked: _Tracked, fix: Fix) -> bool:
+        """After so long a gap there is nothing left to compare with."""
+        gap_s = (fix.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
+        return gap_s > self._settings.ages.lost_s
+
+    def _wrong(self, tracked: _Tracked, index: int, fix: Fix) -> tuple[Reason, str] | None:
+        """What can be told without a prediction: a repeated stamp, a resent position."""
+        entries = tracked.history.entries
+        if index < len(entries) and entries[index].fix.sender_ns == fix.sender_ns:
+            return Reason.DUPLICATE, "a second report with the same stamp"
+        arrived, tracked.arrived = tracked.arrived, fix
+        if index == len(entries) and is_frozen(arrived, fix):
+            return Reason.FROZEN, "a fresh stamp on the position of the report before"
+        return None
+
+    def _suspect(
+        self, tracked: _Tracked, fix: Fix, why: tuple[Reason, str]
+    ) -> Estimate | Rejection:
+        tracked.suspects.add(fix)
+        newest_ns = max(tracked.history.newest.fix.sender_ns, tracked.believable_ns)
+        silent_s = (fix.sender_ns - newest_ns) * 1e-9
+        if not tracked.suspects.agree() or silent_s < self._settings.gate.reacquire_s:
+            return _rejected(fix, *why)
+        first, *rest = tracked.suspects.take()
+        begun = self._begin(first, tracked.reports)
+        for later in rest:
+            begun = self._use(self._tracked[fix.uav], len(self._history(fix.uav).entries), later)
+        self._tracked[fix.uav].arrived = fix
+        return replace(begun, reacquired=True)
+
+    def _history(self, uav: str) -> History[Any]:
+        return self._tracked[uav].history
+
+    def _use(self, tracked: _Tracked, index: int, fix: Fix) -> Estimate:
+        history = tracked.history
+        history.insert(index, fix)
         tracked.reports += 1
-        return Estimate(fix, predicted.position_ned_m, predicted.bound_m, innovation_m, dt_s)
+        tracked.acceleration = self._acceleration(history)
+        tracked.newest = self._estimate(tracked, len(history.entries) - 1)
+        tracked.unknown_input = _unknown_input(history)
+        if tracked.newest.fix is fix:
+            return tracked.newest
+        at = next(i for i, entry in enumerate(history.entries) if entry.fix is fix)
+        return self._estimate(tracked, at)
+
+    def _estimate(self, tracked: _Tracked, at: int) -> Estimate:
+        entry = tracked.history.entries[at]
+        predicted = entry.predicted
+        if predicted is None:
+            fix = entry.fix
+            return Estimate(fix, fix.position_ned_m, fix.noise.position_m, None, None)
+        if predicted.mu_s2 is not None:
+            tracked.mu_max_s2 = max(predicted.mu_s2, tracked.mu_max_s2 or 0.0)
+        off = entry.fix.position_ned_m - predicted.position_ned_m
+        before_ns = tracked.history.entries[at - 1].fix.sender_ns if at else None
+        dt_s = None if before_ns is None else (entry.fix.sender_ns - before_ns) * 1e-9
+        innovation_m = math.sqrt(off @ off)
+        return Estimate(entry.fix, predicted.position_ned_m, predicted.bound_m, innovation_m, dt_s)
+
+    def _acceleration(self, history: History[Any]) -> FloatArray | None:
+        """What is fed forward, no more than the greatest that is taken for possible."""
+        found = history.acceleration() if self._settings.feed_forward else None
+        if found is None:
+            return None
+        most_mps2 = self._settings.acceleration_max_mps2
+        size = math.sqrt(found @ found)
+        return found if size <= most_mps2 else found * (most_mps2 / size)
 
     def restart(self, uav: str) -> None:
         """Forget a track: its sender was restarted, and its times begin anew."""
         self._tracked.pop(uav, None)
+
+    # --- tracks out -------------------------------------------------------------------------
 
     def track(self, uav: str, now_ns: int, valid_at_ns: int) -> Track | None:
         """One UAV at ``valid_at_ns``, its state judged at ``now_ns``; None if never seen."""
         tracked = self._tracked.get(uav)
         if tracked is None:
             return None
-        use_ns = self._sender_time(uav, valid_at_ns)
-        predicted = observer.predict(tracked.state, use_ns, self._model)
+        at = self._to_sender_time(uav, valid_at_ns)
+        now = at.sender_ns - (valid_at_ns - now_ns)
+        predicted = self._predict(tracked, at)
+        newest = tracked.history.newest
+        last = tracked.newest
         return Track(
             uav=uav,
-            state=self._ages.state((self._sender_time(uav, now_ns) - tracked.state.t_ns) * 1e-9),
+            state=self._settings.ages.state((now - newest.fix.sender_ns) * 1e-9),
             valid_at_ns=valid_at_ns,
-            age_s=(use_ns - tracked.state.t_ns) * 1e-9,
+            age_s=(at.sender_ns - newest.fix.sender_ns) * 1e-9,
             position_ned_m=predicted.position_ned_m,
-            velocity_ned_mps=observer.velocity_ned_mps(tracked.state, tracked.unknown_input_mps),
-            unknown_input_mps=tracked.unknown_input_mps,
+            velocity_ned_mps=predicted.velocity_ned_mps,
+            unknown_input_mps=tracked.unknown_input,
+            acceleration_ned_mps2=tracked.acceleration,
             bound_m=predicted.bound_m,
-            dt_s=tracked.dt_s,
-            latency_s=tracked.latency_s,
+            horizontal_bound_m=predicted.horizontal_m,
+            vertical_bound_m=predicted.vertical_m,
+            clock_bound_s=at.bound_s,
+            dt_s=last.dt_s,
+            latency_s=(newest.fix.arrival_ns - newest.fix.t_ns) * 1e-9,
             gamma=None if tracked.mu_max_s2 is None else math.sqrt(tracked.mu_max_s2),
-            innovation_m=tracked.innovation_m,
+            innovation_m=last.innovation_m,
             reports=tracked.reports,
         )
+
+    def _predict(self, tracked: _Tracked, at: SenderTime) -> Prediction:
+        """The observer's prediction, with the acceleration and the clock's doubt in its bound."""
+        newest = tracked.history.newest
+        found = self._observer.predict(newest.state, at.sender_ns)
+        ahead_s = (at.sender_ns - newest.fix.sender_ns) * 1e-9
+        widened_m = 0.0
+        if tracked.acceleration is not None and found.velocity_ned_mps is not None and ahead_s > 0:
+            found, widened_m = _fed_forward(found, tracked.acceleration, ahead_s)
+        if at.bound_s > 0:
+            widened_m += at.bound_s * self._fastest_mps(found, at.bound_s)
+        if widened_m == 0.0:
+            return found
+        return replace(
+            found,
+            bound_m=found.bound_m + widened_m,
+            horizontal_m=found.horizontal_m + widened_m,
+            vertical_m=found.vertical_m + widened_m,
+        )
+
+    def _fastest_mps(self, found: Prediction, within_s: float) -> float:
+        """How fast it can be within a time of the prediction's own."""
+        most_mps = self._settings.speed_max_mps
+        if found.velocity_ned_mps is None or found.velocity_bound_mps is None:
+            return most_mps
+        speed_mps = math.sqrt(found.velocity_ned_mps @ found.velocity_ned_mps)
+        gained_mps = self._settings.acceleration_max_mps2 * within_s
+        return min(most_mps, speed_mps + found.velocity_bound_mps + gained_mps)
 
     def newest(self, uav: str) -> Fix | None:
         """The newest accepted report of a UAV."""
         tracked = self._tracked.get(uav)
-        return tracked.newest if tracked else None
+        return tracked.history.newest.fix if tracked else None
 
     @property
     def uavs(self) -> list[str]:
@@ -123,9 +267,51 @@ class Fleet:
     def states(self, now_ns: int, uavs: Iterable[str]) -> dict[str, TrackState]:
         """The states of those tracks that exist, without predicting anything."""
         return {
-            uav: self._ages.state(
-                (self._sender_time(uav, now_ns) - self._tracked[uav].state.t_ns) * 1e-9
+            uav: self._settings.ages.state(
+                (
+                    self._to_sender_time(uav, now_ns).sender_ns
+                    - self._tracked[uav].history.newest.fix.sender_ns
+                )
+                * 1e-9
             )
             for uav in uavs
             if uav in self._tracked
         }
+
+
+def _rejected(fix: Fix, reason: Reason, detail: str) -> Rejection:
+    return Rejection(fix.arrival_ns, fix.uav, reason, detail=detail)
+
+
+def _fed_forward(
+    found: Prediction, acceleration: FloatArray, ahead_s: float
+) -> tuple[Prediction, float]:
+    """A prediction with the acceleration fading over the time ahead, and what the bound gains.
+
+    The bound already allows for any acceleration up to its limit; the part that was fed forward
+    may be wrong by its whole size besides.
+    """
+    fade = ACCELERATION_FADES_S
+    shrink = math.exp(-ahead_s / fade)
+    displacement = fade * fade * (shrink - 1 + ahead_s / fade) * acceleration
+    assert found.velocity_ned_mps is not None
+    faster = fade * (1 - shrink) * acceleration
+    moved = replace(
+        found,
+        position_ned_m=found.position_ned_m + displacement,
+        velocity_ned_mps=found.velocity_ned_mps + faster,
+        velocity_bound_mps=(found.velocity_bound_mps or 0.0) + math.sqrt(faster @ faster),
+    )
+    return moved, math.sqrt(displacement @ displacement)
+
+
+def _unknown_input(history: History[Any]) -> FloatArray | None:
+    """W^ = (x^+ - x^) / dT over the newest interval, m/s, (3,): what the estimate needed."""
+    if len(history.entries) < 2:
+        return None
+    before, newest = history.entries[-2:]
+    if newest.predicted is None:
+        return None
+    start = before.fix if before.predicted is None else before.predicted
+    step = newest.predicted.position_ned_m - start.position_ned_m
+    return np.asarray(step / ((newest.fix.sender_ns - before.fix.sender_ns) * 1e-9))

@@ -25,32 +25,22 @@ Time is an argument, on the sender's own timeline; states are frozen values.
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from companion.tracking import design
+from companion.tracking.estimates import Prediction
 from companion.values import Fix, FloatArray
 
 
 @dataclass(frozen=True, slots=True)
-class Bounds:
-    """What is taken for granted, and all that is: norms of 3-vectors that are never exceeded."""
+class PositionModel:
+    """Settings of the observer, norms of 3-vectors that are never exceeded among them.
+
+    ``alpha=None`` takes the best one at each interval. ``feedthrough_s``: by how much the *sender*
+    makes its reports lead (negative: lag); 0 where the time of a report is known.
+    ``velocity_lead_s``: the least lead that is made of a reported velocity; more smooths more.
+    """
 
     speed_mps: float
     acceleration_mps2: float
-    position_noise_m: float
-    velocity_noise_mps: float
-
-
-@dataclass(frozen=True, slots=True)
-class PositionModel:
-    """Settings of the observer. ``alpha=None`` takes the best one at each interval.
-
-    ``feedthrough_s``: by how much the *sender* makes its reports lead (negative: lag); 0 where
-    the time of a report is known. ``velocity_lead_s``: the least lead that is made of a reported
-    velocity; more smooths more.
-    """
-
-    bounds: Bounds
     alpha: float | None = None
     feedthrough_s: float = 0.0
     velocity_lead_s: float = 0.2
@@ -60,82 +50,58 @@ class PositionModel:
 class PositionState:
     """The estimate at a report's time, made before that report, and the report itself."""
 
-    t_ns: int
+    fix: Fix
     estimate_ned_m: FloatArray
     bound_m: float
-    position_ned_m: FloatArray
-    velocity_ned_mps: FloatArray | None
 
 
-@dataclass(frozen=True, slots=True)
-class Prediction:
-    """Position and its bound at an asked time; ``mu`` is the design's figure for that interval."""
+class PositionObserver:
+    """The observer on the position model; see ``estimates.Observer``."""
 
-    position_ned_m: FloatArray
-    bound_m: float
-    mu_s2: float
+    def __init__(self, model: PositionModel) -> None:
+        self.model = model
 
+    def begin(self, fix: Fix) -> PositionState:
+        """A track of one report: the report is the estimate."""
+        lead_m = abs(self.model.feedthrough_s) * self.model.speed_mps
+        return PositionState(fix, fix.position_ned_m, fix.noise.position_m + lead_m)
 
-def begin(fix: Fix, model: PositionModel) -> PositionState:
-    """A track of one report: the report is the estimate."""
-    bounds = model.bounds
-    bound_m = bounds.position_noise_m + abs(model.feedthrough_s) * bounds.speed_mps
-    return PositionState(
-        fix.sender_ns, fix.position_ned_m, bound_m, fix.position_ned_m, fix.velocity_ned_mps
-    )
+    def predict(self, state: PositionState, sender_ns: int) -> Prediction:
+        """Where the UAV is; before the report's own time nothing is extrapolated."""
+        model, fix = self.model, state.fix
+        b = (sender_ns - fix.sender_ns) * 1e-9
+        if b <= 0:
+            bound_m = state.bound_m - b * model.speed_mps
+            return self._made(state, state.estimate_ned_m, bound_m, b, 0.0)
+        d, y, noise_m = model.feedthrough_s, fix.position_ned_m, fix.noise.position_m
+        # The mean velocity of the sender's lead is not quite that of the interval.
+        noise_m += abs(d) * model.acceleration_mps2 * abs(b - d) / 2
+        if fix.velocity_ned_mps is not None:
+            lead_s = max(model.velocity_lead_s, b)
+            d += lead_s
+            y = y + lead_s * fix.velocity_ned_mps
+            noise_m += lead_s * (fix.noise.velocity_mps + model.acceleration_mps2 * b / 2)
+        alpha = design.best_alpha(b, d) if model.alpha is None else model.alpha
+        gain = design.gain(b, d, alpha)
+        bound_m = (
+            abs(1 - gain) * state.bound_m
+            + abs(gain * d - b) * model.speed_mps
+            + abs(gain) * noise_m
+        )
+        estimate = state.estimate_ned_m + gain * (y - state.estimate_ned_m)
+        return self._made(state, estimate, bound_m, b, design.mu_star(b, d, alpha))
 
+    def after(self, _state: PositionState, predicted: Prediction, fix: Fix) -> PositionState:
+        """The state at a report: the delayed observer's estimate there does not use it yet."""
+        return PositionState(fix, predicted.position_ned_m, predicted.bound_m)
 
-def predict(state: PositionState, t_ns: int, model: PositionModel) -> Prediction:
-    """Where the UAV is at ``t_ns``. Before the report's own time nothing is extrapolated."""
-    bounds = model.bounds
-    b = (t_ns - state.t_ns) * 1e-9
-    if b <= 0:
-        return Prediction(state.estimate_ned_m, state.bound_m - b * bounds.speed_mps, 0.0)
-    d, y = model.feedthrough_s, state.position_ned_m
-    # The mean velocity of the sender's lead is not quite that of the interval.
-    noise_m = bounds.position_noise_m + abs(d) * bounds.acceleration_mps2 * abs(b - d) / 2
-    if state.velocity_ned_mps is not None:
-        lead_s = max(model.velocity_lead_s, b)
-        d += lead_s
-        y = y + lead_s * state.velocity_ned_mps
-        noise_m += lead_s * (bounds.velocity_noise_mps + bounds.acceleration_mps2 * b / 2)
-    alpha = design.best_alpha(b, d) if model.alpha is None else model.alpha
-    gain = design.gain(b, d, alpha)
-    bound_m = (
-        abs(1 - gain) * state.bound_m + abs(gain * d - b) * bounds.speed_mps + abs(gain) * noise_m
-    )
-    estimate = state.estimate_ned_m + gain * (y - state.estimate_ned_m)
-    return Prediction(estimate, bound_m, design.mu_star(b, d, alpha))
-
-
-def update(
-    state: PositionState, fix: Fix, model: PositionModel
-) -> tuple[PositionState, Prediction, FloatArray]:
-    """The state at a newer report, the prediction made for it, and the unknown-input estimate.
-
-    The last is W^ = (x^+ - x^) / b, shape (3,), m/s: the velocity that the estimate needed.
-    Raises ``ValueError`` for a report that is not newer than the state.
-    """
-    if fix.sender_ns <= state.t_ns:
-        raise ValueError("a report must be newer than the one before it")
-    predicted = predict(state, fix.sender_ns, model)
-    interval_s = (fix.sender_ns - state.t_ns) * 1e-9
-    unknown_input = (predicted.position_ned_m - state.estimate_ned_m) / interval_s
-    after = PositionState(
-        fix.sender_ns,
-        predicted.position_ned_m,
-        predicted.bound_m,
-        fix.position_ned_m,
-        fix.velocity_ned_mps,
-    )
-    return after, predicted, unknown_input
-
-
-def velocity_ned_mps(state: PositionState, unknown_input: FloatArray | None) -> FloatArray | None:
-    """The best known velocity: the reported one, else the unknown-input estimate."""
-    return state.velocity_ned_mps if state.velocity_ned_mps is not None else unknown_input
-
-
-def norm_m(vector: FloatArray) -> float:
-    """Euclidean norm of a 3-vector."""
-    return float(np.sqrt(vector @ vector))
+    def _made(
+        self, state: PositionState, estimate: FloatArray, bound_m: float, b: float, mu_s2: float
+    ) -> Prediction:
+        """The velocity is the reported one: it may have changed at the greatest acceleration."""
+        fix = state.fix
+        changed_mps = fix.noise.velocity_mps + self.model.acceleration_mps2 * abs(b)
+        velocity_bound_mps = None if fix.velocity_ned_mps is None else changed_mps
+        return Prediction(
+            estimate, fix.velocity_ned_mps, bound_m, bound_m, bound_m, velocity_bound_mps, mu_s2
+        )

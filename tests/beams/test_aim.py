@@ -11,26 +11,37 @@ from scipy.spatial.transform import Rotation
 from companion.beams.aim import aim
 from companion.beams.arrays import Array, uniform_linear
 from companion.beams.precoding import Precoder
-from companion.values import BeamSet, Carrier, FloatArray, Method, Track, TrackState
+from companion.values import Beam, BeamSet, Carrier, FloatArray, Method, Track, TrackState
 
 EYE = np.eye(3)
+STILL = np.zeros(3)
 ARRAY = uniform_linear(16, 30e9, 0.5, EYE)
 PLACES = {"1:1": (100.0, 20.0, -10.0), "2:1": (80.0, -60.0, 5.0), "3:1": (30.0, 90.0, 0.0)}
 
 
 def track(
-    uav: str, position: FloatArray | tuple[float, ...], state: str = "live", bound_m: float = 2.0
+    uav: str,
+    position: FloatArray | tuple[float, ...],
+    state: str = "live",
+    bound_m: float = 2.0,
+    velocity: FloatArray | None = None,
 ) -> Track:
     return Track(
-        uav, TrackState(state), 9, 0.1, np.array(position, dtype=float), None, None, bound_m, None,
-        None, None, None, 1,
+        uav, TrackState(state), 9, 0.1, np.array(position, dtype=float), velocity, None, None,
+        bound_m, bound_m, bound_m, 0.0, None, None, None, None, 1,
     )  # fmt: skip
 
 
 def carrier(
-    position: tuple[float, ...] = (0, 0, 0), turn: FloatArray = EYE, bound_m: float = 0.0
+    position: tuple[float, ...] | FloatArray = (0, 0, 0),
+    turn: FloatArray = EYE,
+    bound_m: float = 0.0,
+    velocity: FloatArray | None = None,
+    rates: FloatArray = STILL,
+    attitude_bound_rad: float = 0.0,
 ) -> Carrier:
-    return Carrier(9, np.array(position, dtype=float), turn, bound_m, None)
+    place = np.array(position, dtype=float)
+    return Carrier(9, place, velocity, turn, rates, bound_m, attitude_bound_rad, None)
 
 
 def pointed(
@@ -60,6 +71,29 @@ def test_the_carrier_s_bound_adds_to_the_track_s() -> None:
     assert beam.pointing_bound_rad == pytest.approx(math.asin(0.07))
     (beam,) = pointed([track("a", (100, 0, 0), bound_m=60.0)], carrier(bound_m=40.0)).beams
     assert beam.pointing_bound_rad is None
+
+
+def test_the_attitude_s_bound_turns_every_direction() -> None:
+    tracks = [track("a", (100, 0, 0), bound_m=3.0), track("b", (0, 50, 0), bound_m=60.0)]
+    near, anywhere = pointed(tracks, carrier(bound_m=4.0, attitude_bound_rad=0.05)).beams
+    assert near.pointing_bound_rad == pytest.approx(math.asin(0.07) + 0.05)
+    assert anywhere.pointing_bound_rad is None
+    (beam,) = pointed(tracks[:1], carrier(attitude_bound_rad=math.pi)).beams
+    assert beam.pointing_bound_rad == math.pi  # no direction lies farther away
+
+
+def test_a_true_direction_lies_within_the_pointing_bound() -> None:
+    """The worst of both errors at once: positions apart across, the attitude turned further."""
+    tracks = [track("a", (100, 0, 0), bound_m=6.0)]
+    (beam,) = pointed(tracks, carrier(bound_m=2.0, attitude_bound_rad=0.1)).beams
+    assert beam.pointing_bound_rad is not None
+    worst = 0.0
+    for angle in np.linspace(0, math.pi, 721):
+        true = np.array([100.0, 0, 0]) + 8.0 * np.array([math.cos(angle), math.sin(angle), 0])
+        x, y, _ = Rotation.from_euler("z", 0.1).as_matrix() @ true
+        worst = max(worst, abs(math.atan2(y, x)))
+    assert worst <= beam.pointing_bound_rad + 1e-12
+    assert worst == pytest.approx(beam.pointing_bound_rad, abs=1e-5)
 
 
 def test_weights_respond_to_their_own_direction_alone() -> None:
@@ -168,3 +202,64 @@ def test_a_mount_that_looks_right_sees_the_right_ahead() -> None:
     array = uniform_linear(16, 30e9, 0.5, right)
     (beam,) = pointed([track("a", (0, 100, 0))], carrier(), array).beams
     assert beam.azimuth_rad == pytest.approx(0.0, abs=1e-12)
+
+
+# --- how fast the angles change -----------------------------------------------------------------
+
+
+def integrated(rates: FloatArray, seconds: float) -> FloatArray:
+    """Axes that turn at constant rates about themselves, seen from where they were."""
+    turned: FloatArray = Rotation.from_rotvec(rates * seconds).as_matrix().T
+    return turned
+
+
+@settings(max_examples=200)
+@given(st.integers(0, 2**32 - 1))
+def test_rates_are_those_of_positions_and_of_the_turning_carrier(seed: int) -> None:
+    """Central differences of what is aimed at a moment earlier and later."""
+    rng = np.random.default_rng(seed)
+    pose, mount = (m.as_matrix() for m in Rotation.random(2, rng=rng))
+    array = uniform_linear(16, 30e9, 0.5, mount)
+    place, here = rng.uniform(-300, 300, 3), rng.uniform(-50, 50, 3)
+    velocity, own, rates = rng.normal(0, 30, 3), rng.normal(0, 30, 3), rng.normal(0, 1.0, 3)
+
+    def at(t_s: float) -> Beam | None:
+        there = carrier(here + own * t_s, integrated(rates, t_s) @ pose, 0.0, own, rates)
+        tracks = [track("a", place + velocity * t_s, velocity=velocity)]
+        return next(iter(pointed(tracks, there, array).beams), None)
+
+    h_s = 1e-5
+    before, beam, after = at(-h_s), at(0.0), at(h_s)
+    if beam is None or abs(beam.elevation_rad) > 1.5 or beam.range_m < 10.0:
+        return  # where a finite difference says little
+    assert before is not None
+    assert after is not None
+    turned = (after.azimuth_rad - before.azimuth_rad + math.pi) % (2 * math.pi) - math.pi
+    assert beam.azimuth_rate_radps == pytest.approx(turned / (2 * h_s), rel=1e-4, abs=1e-5)
+    raised = (after.elevation_rad - before.elevation_rad) / (2 * h_s)
+    assert beam.elevation_rate_radps == pytest.approx(raised, rel=1e-4, abs=1e-5)
+    farther = (after.range_m - before.range_m) / (2 * h_s)
+    assert beam.range_rate_mps == pytest.approx(farther, rel=1e-4, abs=1e-4)
+
+
+def test_a_turning_carrier_alone_moves_the_beam_the_other_way() -> None:
+    """Yaw to the right sends what is ahead to the left, roll to the right lifts the right."""
+    ahead, right = track("a", (100, 0, 0), velocity=STILL), track("b", (0, 100, 0), velocity=STILL)
+    at = carrier(velocity=STILL, rates=np.array([0.2, 0.0, 0.3]))
+    one, other = pointed([ahead, right], at).beams
+    assert one.azimuth_rate_radps == pytest.approx(-0.3)
+    assert one.elevation_rate_radps == pytest.approx(0.0)
+    assert other.azimuth_rate_radps == pytest.approx(-0.3)
+    assert other.elevation_rate_radps == pytest.approx(0.2)  # the right wing sinks below it
+    assert (one.range_rate_mps, other.range_rate_mps) == (0.0, 0.0)
+
+
+def test_a_rate_that_is_not_known_is_none() -> None:
+    velocity = np.array([0.0, 0.0, 7.0])
+    for moving, own in ((None, STILL), (velocity, None)):
+        (beam,) = pointed([track("a", (99, 0, 0), velocity=moving)], carrier(velocity=own)).beams
+        assert (beam.azimuth_rate_radps, beam.elevation_rate_radps) == (None, None)
+        assert beam.range_rate_mps is None
+    (beam,) = pointed([track("a", (0, 0, 50), velocity=velocity)], carrier(velocity=STILL)).beams
+    assert (beam.azimuth_rate_radps, beam.elevation_rate_radps) == (None, None)
+    assert beam.range_rate_mps == pytest.approx(7.0)

@@ -23,6 +23,7 @@ from companion.values import (
     Reason,
     Rejection,
     Report,
+    ReportNoise,
     Severity,
     Source,
     Tick,
@@ -94,7 +95,7 @@ def events(wire: Callable[..., list[bytes]]) -> Callable[[int], list[Event]]:
 def _track(uav: str, t_ns: int) -> Track:
     return Track(
         uav, TrackState.LIVE, t_ns + 5, 0.25, np.array([10.0, 20.0, -30.0]), None,
-        np.array([0.1, 0.2, 0.3]), 3.0, 0.1, None, 0.4, 0.0, 7,
+        np.array([0.1, 0.2, 0.3]), None, 3.0, 2.0, 2.5, 0.0, 0.1, None, 0.4, 0.0, 7,
     )  # fmt: skip
 
 
@@ -105,8 +106,8 @@ def update() -> Callable[[int], Update]:
 
     def make(t_ns: int) -> Update:
         beams = (
-            Beam("1:1", 0.1, -0.2, 100.0, None, 18.0),
-            Beam("icao:4CA7B3", 0.3, 0.0, 50.0, 0.02, 17.5),
+            Beam("1:1", 0.1, -0.2, 100.0, None, None, None, None, 18.0),
+            Beam("icao:4CA7B3", 0.3, 0.0, 50.0, 0.01, -0.02, 3.0, 0.02, 17.5),
         )
         left_out = (LeftOut("9:1", "behind the array"),)
         chosen = BeamSet(t_ns, t_ns + 5, beams, weights, Method.ZERO_FORCING, 1.5, left_out)
@@ -122,7 +123,10 @@ def estimate() -> Estimate:
         START_NS, "udp", "1:1", Source(1, 1), 47.5, 8.5, None, AltitudeDatum.MSL, None,
         None, None, None, 1000, None,
     )  # fmt: skip
-    fix = Fix("1:1", 100_000_000, START_NS - 100_000_000, START_NS, np.zeros(3), None, report)
+    noise = ReportNoise(3.0, 3.0, 4.25, 0.5)
+    fix = Fix(
+        "1:1", 100_000_000, START_NS - 100_000_000, START_NS, np.zeros(3), None, noise, report
+    )
     return Estimate(fix, np.zeros(3), 1.0, None, None)
 
 

@@ -153,8 +153,10 @@ def test_a_fix_and_a_prediction_as_viewers_see_them(tmp_path: Path, record: Reco
     assert predicted.altitude == 30.0
     assert predicted.timestamp.ToNanoseconds() == raw.log_time + 5
     covariance = np.array(predicted.position_covariance).reshape(3, 3)
-    assert np.trace(covariance) == pytest.approx(3.0**2)  # the bound, squared
-    assert np.array_equal(covariance, covariance[0, 0] * np.eye(3))
+    track = found["/tracks"][1]
+    # The mean squares that the bounds allow: half the horizontal one on each axis of the plane.
+    plane, height = track.horizontal_bound_m**2 / 2, track.vertical_bound_m**2
+    assert covariance == pytest.approx(np.diag([plane, plane, height]))
     assert predicted.position_covariance_type == predicted.APPROXIMATED
 
 

@@ -1,19 +1,25 @@
 """Reports, accepted, as the observer and the fleet take them."""
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from companion.values import AltitudeDatum, Fix, Report, Source
+from companion.values import AltitudeDatum, Fix, Report, ReportNoise, Source
 
 MakeFix = Callable[..., Fix]
+NOISE = ReportNoise(1.2, 0.9, math.hypot(1.2, 0.9), 0.4)
+"""1.5 m in space."""
 
 
 @pytest.fixture(scope="session")
 def fix() -> MakeFix:
-    """``fix(t_ns, position, velocity=None)``: arrived ``late_ns`` after it was true."""
+    """``fix(t_ns, position, velocity=None)``: arrived ``late_ns`` after it was true.
+
+    The sender's timeline is the node's; the report's degrees tell positions apart, no more.
+    """
 
     def make(
         t_ns: int,
@@ -22,13 +28,15 @@ def fix() -> MakeFix:
         *,
         uav: str = "1:1",
         late_ns: int = 0,
+        noise: ReportNoise = NOISE,
     ) -> Fix:
-        report = Report(
-            t_ns + late_ns, "udp", uav, Source(1, 1), 47.0, 8.0, 500.0, AltitudeDatum.MSL, None,
-            None, None, None, 1000, None,
-        )  # fmt: skip
         velocity = None if velocity_ned_mps is None else np.array(velocity_ned_mps, dtype=float)
         position = np.array(position_ned_m, dtype=float)
-        return Fix(uav, t_ns, t_ns, t_ns + late_ns, position, velocity, report)
+        lat_deg, lon_deg = 47.0 + position[0] * 9e-6, 8.0 + position[1] * 13e-6
+        report = Report(
+            t_ns + late_ns, "udp", uav, Source(1, 1), lat_deg, lon_deg, 500.0 - position[2],
+            AltitudeDatum.MSL, None, None, None, None, 1000, None,
+        )  # fmt: skip
+        return Fix(uav, t_ns, t_ns, t_ns + late_ns, position, velocity, noise, report)
 
     return make

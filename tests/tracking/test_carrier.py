@@ -84,7 +84,10 @@ def test_a_fixed_station_is_level_and_faces_its_heading() -> None:
     local = LocalFrame(47.4, 8.5, 500.0)
     station = carrier.fixed(7, local, (48.0, 9.5, 100.0), math.radians(90.0))
     assert station.valid_at_ns == 7
-    assert (station.bound_m, station.age_s) == (0.0, None)
+    assert (station.bound_m, station.attitude_bound_rad, station.age_s) == (0.0, 0.0, None)
+    assert station.velocity_ned_mps is not None
+    assert station.velocity_ned_mps.tolist() == [0, 0, 0]
+    assert station.body_rates_radps.tolist() == [0, 0, 0]
     assert station.position_ned_m == pytest.approx(local.position_ned_m(48.0, 9.5, 100.0))
     # Up, north and east there: below, to the left, ahead.
     for place, body in (
@@ -102,18 +105,25 @@ def test_a_vehicle_s_attitude_is_carried_on_to_the_time_of_use(fix: Callable[...
     local = LocalFrame(47.4, 8.5, 500.0)
     far = (49.0, 12.0)
     track = Track(
-        "5:1", TrackState.LIVE, 12 * S, 0.5, np.array([1.0, 2, 3]), None, None, 4.5, None, None,
-        None, None, 1,
+        "5:1", TrackState.LIVE, 12 * S, 0.5, np.array([1.0, 2, 3]), np.array([4.0, 5, 6]), None,
+        None, 4.5, 3.6, 2.7, 0.0, None, None, None, None, 1,
     )  # fmt: skip
     attitude = Attitude(0, Source(5, 1), 0, 0.2, -0.1, 1.0, 0.3, -0.2, 0.5)
     newest = _at(fix, *far)
-    found = carrier.moving(local, track, newest, attitude, S + S // 4)
+    found = carrier.moving(local, track, newest, attitude, S + S // 4, 0.02)
     rates = np.array([0.3, -0.2, 0.5])
     then = oracle(0.2, -0.1, 1.0) @ local.local_from_ned(*far).T
     assert found.body_from_local == pytest.approx(integrated(rates, 1.25) @ then, abs=1e-9)
     proper(found.body_from_local)
     assert (found.valid_at_ns, found.bound_m, found.age_s) == (12 * S, 4.5, 0.5)
+    assert found.attitude_bound_rad == 0.02
     assert found.position_ned_m.tolist() == [1, 2, 3]
+    assert found.velocity_ned_mps is not None
+    assert found.velocity_ned_mps.tolist() == [4, 5, 6]
+    assert found.body_rates_radps.tolist() == [0.3, -0.2, 0.5]
+    silent = replace(track, velocity_ned_mps=None)
+    unknown = carrier.moving(local, silent, newest, attitude, S + S // 4, 0.02)
+    assert unknown.velocity_ned_mps is None
 
 
 def _at(make: Callable[..., Fix], lat_deg: float, lon_deg: float) -> Fix:

@@ -1,29 +1,43 @@
 """Tracks: how they begin, age, refuse and are forgotten."""
 
-from collections.abc import Callable
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from companion.tracking import observer
-from companion.tracking.fleet import Ages, Fleet
-from companion.tracking.observer import Bounds, PositionModel
-from companion.values import Estimate, Fix, Reason, Rejection, TrackState
+from companion.tracking.fleet import Ages, Fleet, FleetSettings, SenderTime
+from companion.tracking.gate import GateSettings
+from companion.tracking.kinematic_observer import KinematicModel, KinematicObserver
+from companion.tracking.observer import PositionModel, PositionObserver
+from companion.values import (
+    Estimate,
+    Fix,
+    FloatArray,
+    Reason,
+    Rejection,
+    ReportNoise,
+    Track,
+    TrackState,
+)
 
 MakeFix = Callable[..., Fix]
 S = 1_000_000_000
-MODEL = PositionModel(Bounds(30.0, 8.0, 1.5, 0.4), alpha=0.5)
+OBSERVER = PositionObserver(PositionModel(30.0, 8.0, alpha=0.5))
 AGES = Ages(2.0, 15.0, 60.0)
+SETTINGS = FleetSettings(30.0, 8.0, AGES)
 
 
-def same_time(_uav: str, node_ns: int) -> int:
-    """A sender whose timeline is the node's."""
-    return node_ns
+def same_time(_uav: str, node_ns: int) -> SenderTime:
+    """A sender whose timeline is the node's, as is well known."""
+    return SenderTime(node_ns, 0.0)
 
 
 @pytest.fixture
 def fleet() -> Fleet:
-    return Fleet(MODEL, AGES, same_time)
+    return Fleet(OBSERVER, SETTINGS, same_time)
 
 
 @pytest.mark.parametrize(
@@ -65,7 +79,7 @@ def test_a_second_report_is_judged_by_the_prediction_made_for_it(
     fleet.accept(first)
     found = fleet.accept(second)
     assert isinstance(found, Estimate)
-    expected = observer.predict(observer.begin(first, MODEL), 101 * S, MODEL)
+    expected = OBSERVER.predict(OBSERVER.begin(first), 101 * S)
     assert found.position_ned_m == pytest.approx([10, 0, 0])
     assert found.bound_m == expected.bound_m
     assert found.innovation_m == pytest.approx(5.0)
@@ -76,6 +90,8 @@ def test_a_second_report_is_judged_by_the_prediction_made_for_it(
     assert track.dt_s == pytest.approx(1.0)
     assert track.innovation_m == pytest.approx(5.0)
     assert track.velocity_ned_mps == pytest.approx(np.array([10.0, 0, 0]))
+    assert track.unknown_input_mps == pytest.approx([10, 0, 0])
+    assert not found.reacquired
     assert fleet.newest("1:1") is second
 
 
@@ -90,17 +106,20 @@ def test_gamma_is_that_of_the_worst_interval(fleet: Fleet, fix: MakeFix) -> None
     assert track.dt_s == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("older_ns", [0, 1, S])
-def test_a_report_out_of_order_is_rejected_and_changes_nothing(
-    fleet: Fleet, fix: MakeFix, older_ns: int
+@pytest.mark.parametrize(
+    ("older_ns", "reason"),
+    [(0, Reason.DUPLICATE), (5 * S + 1, Reason.OUT_OF_ORDER), (50 * S, Reason.OUT_OF_ORDER)],
+)
+def test_a_report_that_is_too_old_or_came_twice_is_rejected_and_changes_nothing(
+    fleet: Fleet, fix: MakeFix, older_ns: int, reason: Reason
 ) -> None:
     fleet.accept(fix(100 * S, [0, 0, 0]))
     newest = fix(101 * S, [1, 0, 0])
     fleet.accept(newest)
     before = fleet.track("1:1", 102 * S, 102 * S)
-    late = fleet.accept(fix(101 * S - older_ns, [50, 0, 0], late_ns=3 * S))
+    late = fleet.accept(fix(101 * S - older_ns, [3, 0, 0], late_ns=3 * S))
     assert isinstance(late, Rejection)
-    assert (late.reason, late.source) == (Reason.OUT_OF_ORDER, "1:1")
+    assert (late.reason, late.source) == (reason, "1:1")
     assert late.t_ns == 104 * S - older_ns
     after = fleet.track("1:1", 102 * S, 102 * S)
     assert before is not None
@@ -108,6 +127,28 @@ def test_a_report_out_of_order_is_rejected_and_changes_nothing(
     assert after.position_ned_m.tolist() == before.position_ned_m.tolist()
     assert (after.reports, after.latency_s) == (2, before.latency_s)
     assert fleet.newest("1:1") is newest
+
+
+def test_a_late_report_is_put_in_its_place(fix: MakeFix) -> None:
+    """And leaves what a report in time would have left."""
+    made = [fix(n * S, [10 * n, n * n, 0], [10, 2 * n, 0], late_ns=S // 8) for n in range(100, 106)]
+    one, other = Fleet(OBSERVER, SETTINGS, same_time), Fleet(OBSERVER, SETTINGS, same_time)
+    for n in range(6):
+        assert isinstance(one.accept(made[n]), Estimate)
+    for n in (0, 1, 3, 2, 5):
+        assert isinstance(other.accept(made[n]), Estimate)
+    late = other.accept(made[4])
+    assert isinstance(late, Estimate)
+    assert late.fix is made[4]
+    assert (late.dt_s, late.reacquired) == (1.0, False)
+    a, b = one.track("1:1", 106 * S, 107 * S), other.track("1:1", 106 * S, 107 * S)
+    assert a is not None
+    assert b is not None
+    for name in ("position_ned_m", "velocity_ned_mps", "unknown_input_mps"):
+        assert getattr(a, name).tolist() == getattr(b, name).tolist()
+    assert (a.bound_m, a.dt_s, a.innovation_m, a.reports, a.age_s, a.latency_s) == (
+        b.bound_m, b.dt_s, b.innovation_m, b.reports, b.age_s, b.latency_s
+    )  # fmt: skip
 
 
 def test_a_restart_begins_anew(fleet: Fleet, fix: MakeFix) -> None:
@@ -126,7 +167,7 @@ def test_a_restart_begins_anew(fleet: Fleet, fix: MakeFix) -> None:
 
 
 def test_tracks_do_not_touch_one_another(fix: MakeFix) -> None:
-    both, alone = Fleet(MODEL, AGES, same_time), Fleet(MODEL, AGES, same_time)
+    both, alone = Fleet(OBSERVER, SETTINGS, same_time), Fleet(OBSERVER, SETTINGS, same_time)
     for t_s in range(100, 110):
         made = fix(t_s * S, [t_s, 0, 0])
         both.accept(made)
@@ -137,3 +178,337 @@ def test_tracks_do_not_touch_one_another(fix: MakeFix) -> None:
     assert b is not None
     assert a.position_ned_m.tolist() == b.position_ned_m.tolist()
     assert a.bound_m == b.bound_m
+
+
+# --- what cannot be true ------------------------------------------------------------------------
+
+KINEMATIC = KinematicObserver(KinematicModel(30.0, 5.0))
+NOISE = ReportNoise(2.0, 2.0, math.hypot(2.0, 2.0), 0.4)
+CRUISE_MPS = 12.0
+
+
+def tracking(
+    feed_mps2: float | None = None, doubt_s: float = 0.0, ages: Ages = AGES, **gate: float
+) -> Fleet:
+    given = FleetSettings(
+        30.0, feed_mps2 or 5.0, ages, GateSettings(**gate), feed_forward=feed_mps2 is not None
+    )
+    return Fleet(KINEMATIC, given, lambda _, t_ns: SenderTime(t_ns, doubt_s))
+
+
+def circling(t_s: float, radius_m: float = 60.0) -> tuple[FloatArray, FloatArray]:
+    """Position and velocity of level flight in a circle at 12 m/s: 2.4 m/s^2."""
+    turned = CRUISE_MPS / radius_m * t_s
+    ahead = np.array([-math.sin(turned), math.cos(turned), 0.0])
+    side = np.array([math.cos(turned), math.sin(turned), 0.0])
+    return radius_m * side - np.array([0, 0, 100.0]), CRUISE_MPS * ahead
+
+
+Shift = Callable[[float], tuple[float, float, float]]
+
+
+def flight(
+    fix: MakeFix, times_s: Iterable[float], shift: Shift = lambda _: (0, 0, 0), seed: int = 0
+) -> list[Fix]:
+    """Reports of the circle, with noise within its bounds, and wrong by ``shift``."""
+    rng, made = np.random.default_rng(seed), []
+    for t_s in times_s:
+        position, velocity = circling(t_s)
+        angle, height = rng.uniform(0, 2 * math.pi), rng.uniform(-2, 2)
+        wrong = np.array([2 * math.cos(angle), 2 * math.sin(angle), height]) * 0.99
+        told = velocity + 0.2 * rng.uniform(-1, 1, 3)
+        place = position + wrong + np.array(shift(t_s))
+        made.append(fix(round(t_s * S), place, told, noise=NOISE))
+    return made
+
+
+def seen(fleet: Fleet, t_s: float) -> Track:
+    found = fleet.track("1:1", round(t_s * S), round(t_s * S))
+    assert found is not None
+    return found
+
+
+def holds(track: Track, truth: FloatArray) -> float:
+    """The truth is in the cylinder; how far off the position is."""
+    off = track.position_ned_m - truth
+    assert math.hypot(off[0], off[1]) <= track.horizontal_bound_m + 1e-6
+    assert abs(off[2]) <= track.vertical_bound_m + 1e-6
+    assert math.sqrt(off @ off) <= track.bound_m + 1e-6
+    return math.sqrt(off @ off)
+
+
+def reasons(outcomes: Iterable[Estimate | Rejection]) -> Counter[Reason | None]:
+    return Counter(one.reason if isinstance(one, Rejection) else None for one in outcomes)
+
+
+def every(interval_s: float, start_s: float, end_s: float) -> list[float]:
+    return [start_s + interval_s * n for n in range(round((end_s - start_s) / interval_s))]
+
+
+def test_one_bad_report_is_refused_and_nothing_is_gated_on_it(fix: MakeFix) -> None:
+    """The good ones that follow lie far from the bad one, and near what was accepted before it."""
+    fleet = tracking()
+    made = flight(
+        fix, every(0.2, 0, 30), lambda t_s: (500, 0, 0) if abs(t_s - 10) < 0.05 else (0, 0, 0)
+    )
+    outcomes = [fleet.accept(one) for one in made]
+    assert reasons(outcomes) == {None: 149, Reason.UNREACHABLE: 1}
+    refused = outcomes[50]
+    assert isinstance(refused, Rejection)
+    assert (refused.t_ns, refused.source) == (10 * S, "1:1")
+    assert "m off, at most" in refused.detail
+
+
+def test_a_glitch_is_sat_out(fix: MakeFix) -> None:
+    """25 m to the north for two seconds: none of it enters, and the bounds go on to hold."""
+    fleet = tracking()
+    for one in flight(
+        fix, every(0.2, 0, 40), lambda t_s: (25, 0, 0) if 9.9 < t_s < 11.9 else (0, 0, 0)
+    ):
+        t_s = one.sender_ns * 1e-9
+        outcome = fleet.accept(one)
+        glitch = 9.9 < t_s < 11.9
+        assert isinstance(outcome, Rejection if glitch else Estimate)
+        if isinstance(outcome, Estimate):
+            assert not outcome.reacquired
+        for later_s in (0.0, 0.1):
+            holds(seen(fleet, t_s + later_s), circling(t_s + later_s)[0])
+    assert seen(fleet, 40).reports == 190
+
+
+def test_a_jump_that_lasts_is_followed_once(fix: MakeFix) -> None:
+    """Refused for as long as it takes to be believed; then the track begins anew from it."""
+    fleet = tracking()
+    jumped = flight(fix, every(0.2, 0, 40), lambda t_s: (25, 0, 0) if t_s > 9.9 else (0, 0, 0))
+    outcomes = [fleet.accept(one) for one in jumped]
+    again = [n for n, one in enumerate(outcomes) if isinstance(one, Estimate) and one.reacquired]
+    refused = [n for n, one in enumerate(outcomes) if isinstance(one, Rejection)]
+    assert len(again) == 1
+    assert 12.99 <= jumped[again[0]].sender_ns * 1e-9 <= 13.3
+    assert refused == list(range(50, again[0]))
+    assert {outcomes[n].reason for n in refused} == {Reason.UNREACHABLE}
+    assert isinstance(outcomes[again[0]], Estimate)
+    assert outcomes[again[0]].fix is jumped[again[0]]
+    assert fleet.newest("1:1") is jumped[-1]
+    track = seen(fleet, 40)
+    assert track.reports == 200  # those that were refused count: the track begins with them
+    holds(track, circling(40)[0] + np.array([25, 0, 0]))
+
+
+@pytest.mark.parametrize("rate_hz", [5, 10, 25, 50])
+def test_a_jump_is_followed_at_any_rate(fix: MakeFix, rate_hz: int) -> None:
+    fleet = tracking()
+    times_s = every(1 / rate_hz, 0, 10)
+    jumped = flight(fix, times_s, lambda t_s: (400, 0, 0) if t_s > 4.99 else (0, 0, 0))
+    outcomes = [fleet.accept(one) for one in jumped]
+    assert sum(isinstance(one, Estimate) and one.reacquired for one in outcomes) == 1
+
+
+def test_a_change_of_the_height_s_datum_has_its_own_reason(fix: MakeFix) -> None:
+    fleet = tracking()
+    made = flight(fix, every(0.2, 0, 20), lambda t_s: (0, 0, -40) if t_s > 9.9 else (0, 0, 0))
+    found = reasons(fleet.accept(one) for one in made)
+    assert set(found) == {None, Reason.ALTITUDE_JUMP}
+    assert 14 <= found[Reason.ALTITUDE_JUMP] <= 16
+    holds(seen(fleet, 20), circling(20)[0] - np.array([0, 0, 40.0]))
+
+
+def test_positions_that_are_sent_again_are_not_used(fix: MakeFix) -> None:
+    """Fresh stamps and velocities, old positions: for three seconds, then it flies on."""
+    fleet, outcomes = tracking(), []
+    made = flight(fix, every(0.2, 0, 20))
+    for number, one in enumerate(made):
+        frozen = 50 <= number < 65
+        place = made[49] if frozen else one
+        told = replace(one, position_ned_m=place.position_ned_m, report=place.report)
+        outcomes.append(fleet.accept(told))
+        holds(seen(fleet, number / 5 + 0.1), circling(number / 5 + 0.1)[0])
+    assert reasons(outcomes) == {None: 85, Reason.FROZEN: 15}
+    assert all(isinstance(one, Rejection) for one in outcomes[50:65])
+
+
+def test_a_position_sent_again_just_after_a_jump_was_believed_is_not_used(fix: MakeFix) -> None:
+    fleet = tracking()
+    for one in flight(fix, every(0.2, 0, 20), lambda t_s: (400, 0, 0) if t_s > 9.9 else (0, 0, 0)):
+        outcome = fleet.accept(one)
+        if isinstance(outcome, Estimate) and outcome.reacquired:
+            break
+    again = fleet.accept(replace(one, sender_ns=one.sender_ns + S // 5))
+    assert isinstance(again, Rejection)
+    assert again.reason is Reason.FROZEN
+
+
+def two_under_one_id(fix: MakeFix, end_s: float) -> list[Fix]:
+    """Five reports a second of each, 2 km apart: farther than can be forgotten in a while."""
+    here = flight(fix, every(0.2, 0, end_s))
+    there = flight(fix, every(0.2, 0.1, end_s + 0.1), lambda _: (0, 2000, 0), seed=1)
+    return sorted(here + there, key=lambda one: one.sender_ns)
+
+
+def test_two_vehicles_under_one_id_are_said(fix: MakeFix) -> None:
+    """At first the second one's reports are refused, then, while both go on, everyone's."""
+    fleet = tracking()
+    outcomes = [fleet.accept(one) for one in two_under_one_id(fix, 5.9)]
+    early = reasons(outcomes[:30])
+    assert early == {None: 15, Reason.UNREACHABLE: 15}
+    late = reasons(outcomes[34:])
+    assert set(late) == {Reason.SHARED_ID, Reason.UNREACHABLE}
+    assert late[Reason.SHARED_ID] >= 10
+
+
+def test_of_two_vehicles_under_one_id_neither_becomes_the_track(fix: MakeFix) -> None:
+    """As long as both go on, the track does not leap from the one to the other."""
+    fleet = tracking()
+    outcomes = [fleet.accept(one) for one in two_under_one_id(fix, 20)]
+    assert not any(isinstance(one, Estimate) and one.reacquired for one in outcomes)
+
+
+def test_a_hole_is_coasted_over(fix: MakeFix) -> None:
+    """12 s without a report: the bound grows, and holds; the first report after it is taken."""
+    fleet = tracking()
+    for one in flight(fix, every(0.2, 0, 10)):
+        assert isinstance(fleet.accept(one), Estimate)
+    bounds = []
+    for t_s in every(0.5, 10, 22):
+        track = seen(fleet, t_s)
+        holds(track, circling(t_s)[0])
+        bounds.append(track.horizontal_bound_m)
+        assert track.state is (TrackState.LIVE if t_s < 11.9 else TrackState.COASTING)
+    assert bounds == sorted(bounds)
+    assert bounds[-1] > 20 * bounds[0]
+    after = flight(fix, every(0.2, 22, 25))
+    assert reasons(fleet.accept(one) for one in after) == {None: 15}
+    track = seen(fleet, 25)
+    assert track.state is TrackState.LIVE
+    holds(track, circling(25)[0])
+    assert track.horizontal_bound_m < 5.0
+
+
+@pytest.mark.parametrize(("gap_s", "anew"), [(59.9, False), (60.1, True)])
+def test_a_lost_track_begins_anew(fix: MakeFix, gap_s: float, anew: bool) -> None:
+    """Wherever it comes back: there is nothing left to compare it with."""
+    fleet = tracking()
+    fleet.accept(fix(0, [0, 0, 0], [0, 0, 0]))
+    found = fleet.accept(fix(round(gap_s * S), [20_000, 0, 0], [0, 0, 0]))
+    assert isinstance(found, Estimate if anew else Rejection)
+    if isinstance(found, Estimate):
+        assert (found.dt_s, found.reacquired) == (None, False)
+        assert seen(fleet, gap_s).reports == 1
+
+
+# --- what is added to the observer --------------------------------------------------------------
+
+
+def errors_m(fix: MakeFix, feed_mps2: float | None, ahead_s: float) -> float:
+    """The mean error over a circle, ``ahead_s`` past the newest report."""
+    fleet, off = tracking(feed_mps2), []
+    for one in flight(fix, every(0.2, 0, 60)):
+        assert isinstance(fleet.accept(one), Estimate)
+        t_s = one.sender_ns * 1e-9 + ahead_s
+        if one.sender_ns > 5 * S:
+            off.append(holds(seen(fleet, t_s), circling(t_s)[0]))
+    return float(np.mean(off))
+
+
+def test_an_acceleration_fed_forward_helps_in_a_turn(fix: MakeFix) -> None:
+    """Two seconds ahead: 2.4 m/s^2 are 4.8 m that would be missed."""
+    assert errors_m(fix, 5.0, 2.0) < 0.7 * errors_m(fix, None, 2.0)
+    assert errors_m(fix, 5.0, 0.0) == errors_m(fix, None, 0.0)
+
+
+def test_what_is_fed_forward_fades(fix: MakeFix) -> None:
+    """A constant at first, then ever less, with three seconds; the bound has its whole size."""
+    plain, fed = tracking(), tracking(5.0)
+    for n in range(11):
+        one = fix(n * S // 5, [n * n * 0.04, 0, 0], [0.4 * n, 0, 0], noise=NOISE)  # 2 m/s^2
+        plain.accept(one)
+        fed.accept(one)
+    for ahead_s in (0.0, 0.1, 1.0, 3.0, 10.0):
+        a, b = seen(plain, 2 + ahead_s), seen(fed, 2 + ahead_s)
+        assert a.acceleration_ned_mps2 is None
+        assert b.acceleration_ned_mps2 == pytest.approx([2, 0, 0])
+        times = np.linspace(0, ahead_s, 20001)
+        middles = (times[:-1] + times[1:]) / 2
+        speeds = np.concatenate([[0], np.cumsum(2 * np.exp(-middles / 3) * np.diff(times))])
+        way_m = float(np.trapezoid(speeds, times))
+        assert b.position_ned_m - a.position_ned_m == pytest.approx([way_m, 0, 0], abs=2e-3)
+        faster = b.velocity_ned_mps - a.velocity_ned_mps
+        assert faster == pytest.approx([speeds[-1], 0, 0], abs=2e-3)
+        for name in ("bound_m", "horizontal_bound_m", "vertical_bound_m"):
+            assert getattr(b, name) - getattr(a, name) == pytest.approx(way_m, abs=2e-3)
+    earlier = seen(fed, 1.5)
+    assert earlier.position_ned_m.tolist() == seen(plain, 1.5).position_ned_m.tolist()
+
+
+def test_no_more_is_fed_forward_than_is_possible(fix: MakeFix) -> None:
+    fleet = tracking(3.0)
+    for n in range(5):
+        fleet.accept(fix(n * S // 5, [n / 9, 0, 0], [0, 0.6 * n, 0.8 * n], noise=NOISE))  # 5 m/s^2
+    assert seen(fleet, 0.8).acceleration_ned_mps2 == pytest.approx([0, 1.8, 2.4])
+
+
+@pytest.mark.parametrize("doubt_s", [0.0, 0.4])
+def test_no_adversary_leaves_what_the_fleet_says(fix: MakeFix, doubt_s: float) -> None:
+    """Accelerations to and fro, all the noise there may be, a clock that is off: none is refused,
+    and the truth stays in the bounds."""
+    for seed in range(150):
+        rng = np.random.default_rng(seed)
+        fleet = tracking(5.0, doubt_s)
+        position, velocity, t_s = np.zeros(3), rng.normal(0, 5, 3), 0.0
+        for _ in range(25):
+            plane, fast = rng.normal(0, 1, 2), rng.normal(0, 1, 3)
+            plane, fast = plane * 2 / math.hypot(*plane), fast * 0.4 / math.hypot(*fast)
+            wrong = np.array([*plane, 2 * rng.choice([-1, 1])]) * (1 - 1e-9)
+            made = fix(round(t_s * S), position + wrong, velocity + fast, noise=NOISE)
+            assert isinstance(fleet.accept(made), Estimate)
+            step_s = round(float(10 ** rng.uniform(-1.5, 0.5)), 9)
+            push = (
+                rng.normal(0, 1, 3) if seed % 2 else rng.choice([-1, 1]) * np.array([0, 0.6, 0.8])
+            )
+            if float((velocity + push) @ velocity) > 20**2:
+                push = -velocity
+            push = push * 5.0 / math.hypot(*push)
+            for ahead_s in (0.0, rng.uniform(0, step_s), step_s):
+                off_s = rng.choice([-1, 1]) * min(doubt_s, ahead_s, step_s - ahead_s)
+                true_s = ahead_s + off_s
+                truth = position + velocity * true_s + push * true_s**2 / 2
+                holds(seen(fleet, t_s + ahead_s), truth)
+            position = position + velocity * step_s + push * step_s**2 / 2
+            velocity, t_s = velocity + push * step_s, round(t_s + step_s, 9)
+
+
+def test_doubt_of_the_clock_is_worth_the_way_flown_in_it(fix: MakeFix) -> None:
+    sure, unsure = tracking(), tracking(doubt_s=0.5)
+    for fleet in (sure, unsure):
+        fleet.accept(fix(0, [0, 0, 0], [10, 0, 0], noise=NOISE))
+    a, b = seen(sure, 1), seen(unsure, 1)
+    assert (a.clock_bound_s, b.clock_bound_s) == (0.0, 0.5)
+    # At most 10 m/s by the report, 0.4 by its noise, 5 by its acceleration since.
+    for name in ("bound_m", "horizontal_bound_m", "vertical_bound_m"):
+        widened_m = getattr(b, name) - getattr(a, name)
+        assert widened_m + 1e-9 >= 0.5 * 15.4
+        assert widened_m <= 0.5 * (15.4 + 0.5 * 5.0) + 1e-9
+    a, b = seen(sure, 40), seen(unsure, 40)
+    assert b.horizontal_bound_m - a.horizontal_bound_m == pytest.approx(0.5 * 30.0)
+
+
+def test_doubt_of_the_clock_covers_an_acceleration_in_it(fix: MakeFix) -> None:
+    """At full acceleration, asked a second too early: 2.5 m beyond the way at its speed."""
+    fleet = tracking(doubt_s=1.0)
+    fleet.accept(
+        fix(0, [0, 0, 0], [0, 0, 0], noise=replace(NOISE, horizontal_m=1e-6, velocity_mps=1e-6))
+    )
+    for ahead_s in (0.0, 0.5, 2.0):
+        true_s = ahead_s + 1.0
+        holds(seen(fleet, ahead_s), np.array([5.0 * true_s**2 / 2, 0, 0]))
+
+
+def test_without_a_velocity_doubt_is_worth_the_greatest_speed(fix: MakeFix) -> None:
+    fleets = [
+        Fleet(OBSERVER, SETTINGS, lambda _, t_ns, doubt_s=doubt_s: SenderTime(t_ns, doubt_s))
+        for doubt_s in (0.0, 0.5)
+    ]
+    for fleet in fleets:
+        fleet.accept(fix(0, [0, 0, 0]))
+    a, b = (seen(fleet, 1) for fleet in fleets)
+    assert b.bound_m - a.bound_m == pytest.approx(0.5 * 30.0)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -10,14 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from companion.tracking import observer
-from companion.tracking.observer import Bounds, PositionModel, PositionState
-from companion.values import Fix, FloatArray
+from companion.tracking.observer import PositionModel, PositionObserver, PositionState
+from companion.values import Fix, FloatArray, ReportNoise
 
 MakeFix = Callable[..., Fix]
-BOUNDS = Bounds(speed_mps=30.0, acceleration_mps2=8.0, position_noise_m=1.5, velocity_noise_mps=0.4)
+SPEED_MPS, ACCELERATION_MPS2 = 30.0, 8.0
+NOISE = ReportNoise(1.2, 0.9, math.hypot(1.2, 0.9), 0.4)  # 1.5 m in space
+NOISE_M = 1.5
 # For adversaries of the stacked model, in which one velocity holds from report to report.
-STEPPED = replace(BOUNDS, acceleration_mps2=1e-9)
+STILL_MPS2 = 1e-9
 S = 1_000_000_000
 ROUNDING_M = 1e-6
 
@@ -60,8 +61,25 @@ def interval_ns(rng: np.random.Generator) -> int:
     return int(10 ** rng.uniform(7.3, 9.5))
 
 
-def advance(state: PositionState | None, fix: Fix, model: PositionModel) -> PositionState:
-    return observer.begin(fix, model) if state is None else observer.update(state, fix, model)[0]
+def observing(
+    alpha: float | None = None,
+    feedthrough_s: float = 0.0,
+    velocity_lead_s: float = 0.2,
+    *,
+    acceleration_mps2: float = ACCELERATION_MPS2,
+) -> PositionObserver:
+    model = PositionModel(SPEED_MPS, acceleration_mps2, alpha, feedthrough_s, velocity_lead_s)
+    return PositionObserver(model)
+
+
+def advance(state: PositionState | None, fix: Fix, observer: PositionObserver) -> PositionState:
+    if state is None:
+        return observer.begin(fix)
+    return observer.after(state, observer.predict(state, fix.sender_ns), fix)
+
+
+def norm_m(vector: FloatArray) -> float:
+    return float(np.sqrt(vector @ vector))
 
 
 @pytest.mark.parametrize("alpha", [None, 0.5])
@@ -70,19 +88,19 @@ def test_positions_alone_never_leave_the_bound(
     fix: MakeFix, feedthrough_s: float, alpha: float | None
 ) -> None:
     """Speed and noise bounded, nothing else; the sender's lead is by the same mean velocity."""
-    model = PositionModel(STEPPED, alpha, feedthrough_s)
+    observer = observing(alpha, feedthrough_s, acceleration_mps2=STILL_MPS2)
     worst = 0.0
     for adversary in adversaries(400):
         position, t_ns, state = np.zeros(3), 17 * S, None
         for _ in range(12):
-            velocity, b_ns = adversary(BOUNDS.speed_mps), interval_ns(adversary.rng)
-            report = position + feedthrough_s * velocity + adversary(BOUNDS.position_noise_m)
-            state = advance(state, fix(t_ns, report), model)
+            velocity, b_ns = adversary(SPEED_MPS), interval_ns(adversary.rng)
+            report = position + feedthrough_s * velocity + adversary(NOISE_M)
+            state = advance(state, fix(t_ns, report), observer)
             for part in (0.0, adversary.rng.uniform(), 1.0):
                 asked_ns = round(part * b_ns)
-                found = observer.predict(state, t_ns + asked_ns, model)
+                found = observer.predict(state, t_ns + asked_ns)
                 truth = position + velocity * (asked_ns * 1e-9)
-                error_m = observer.norm_m(found.position_ned_m - truth)
+                error_m = norm_m(found.position_ned_m - truth)
                 assert error_m <= found.bound_m + ROUNDING_M
                 worst = max(worst, error_m / found.bound_m)
             position = position + velocity * (b_ns * 1e-9)
@@ -96,28 +114,28 @@ def test_positions_and_velocities_never_leave_the_bound(
     fix: MakeFix, velocity_lead_s: float, alpha: float | None
 ) -> None:
     """Speed, acceleration and both noises bounded; a report may come without its velocity."""
-    model = PositionModel(BOUNDS, alpha, 0.0, velocity_lead_s)
+    observer = observing(alpha, 0.0, velocity_lead_s)
     worst = 0.0
     for adversary in adversaries(400):
         rng = adversary.rng
-        position, velocity = np.zeros(3), adversary(BOUNDS.speed_mps)
+        position, velocity = np.zeros(3), adversary(SPEED_MPS)
         t_ns, state, due_ns = 17 * S, None, 0
         for _ in range(40):
             if due_ns <= 0:
-                report = position + adversary(BOUNDS.position_noise_m)
-                speeds = velocity + adversary(BOUNDS.velocity_noise_mps)
+                report = position + adversary(NOISE_M)
+                speeds = velocity + adversary(NOISE.velocity_mps)
                 told = speeds if rng.uniform() < 0.9 else None
-                state = advance(state, fix(t_ns, report, told), model)
+                state = advance(state, fix(t_ns, report, told), observer)
                 due_ns = interval_ns(rng)
             assert state is not None
-            found = observer.predict(state, t_ns, model)
-            error_m = observer.norm_m(found.position_ned_m - position)
+            found = observer.predict(state, t_ns)
+            error_m = norm_m(found.position_ned_m - position)
             assert error_m <= found.bound_m + ROUNDING_M
             worst = max(worst, error_m / found.bound_m)
             step_ns = min(due_ns, int(rng.uniform(0.01, 1.0) * S))
             step_s = step_ns * 1e-9
-            wanted = velocity + adversary(BOUNDS.acceleration_mps2) * step_s
-            after = inside(wanted, BOUNDS.speed_mps)  # no more acceleration than was wanted
+            wanted = velocity + adversary(ACCELERATION_MPS2) * step_s
+            after = inside(wanted, SPEED_MPS)  # no more acceleration than was wanted
             position = position + (velocity + after) / 2 * step_s
             velocity, t_ns, due_ns = after, t_ns + step_ns, due_ns - step_ns
     assert worst > 0.5
@@ -128,22 +146,22 @@ def test_a_lead_of_the_sender_and_velocities_keep_the_bound(
     fix: MakeFix, alpha: float | None
 ) -> None:
     """At the next report's time, up to which the lead's mean velocity is that of the interval."""
-    model = PositionModel(BOUNDS, alpha, 0.4)
+    observer = observing(alpha, 0.4)
     for adversary in adversaries(400):
-        position, velocity = np.zeros(3), adversary(BOUNDS.speed_mps)
+        position, velocity = np.zeros(3), adversary(SPEED_MPS)
         t_ns, state = 17 * S, None
         for _ in range(12):
             b_ns = interval_ns(adversary.rng)
             b_s = b_ns * 1e-9
-            wanted = velocity + adversary(BOUNDS.acceleration_mps2) * b_s
-            after = inside(wanted, BOUNDS.speed_mps)
+            wanted = velocity + adversary(ACCELERATION_MPS2) * b_s
+            after = inside(wanted, SPEED_MPS)
             mean = (velocity + after) / 2
-            report = position + 0.4 * mean + adversary(BOUNDS.position_noise_m)
-            speeds = velocity + adversary(BOUNDS.velocity_noise_mps)
-            state = advance(state, fix(t_ns, report, speeds), model)
+            report = position + 0.4 * mean + adversary(NOISE_M)
+            speeds = velocity + adversary(NOISE.velocity_mps)
+            state = advance(state, fix(t_ns, report, speeds), observer)
             position, velocity, t_ns = position + mean * b_s, after, t_ns + b_ns
-            found = observer.predict(state, t_ns, model)
-            error_m = observer.norm_m(found.position_ned_m - position)
+            found = observer.predict(state, t_ns)
+            error_m = norm_m(found.position_ned_m - position)
             assert error_m <= found.bound_m + ROUNDING_M
 
 
@@ -151,7 +169,7 @@ def test_a_lead_of_the_sender_and_velocities_keep_the_bound(
 @pytest.mark.parametrize("feedthrough_s", [0.5, -0.3])
 def test_a_lead_in_time_keeps_the_bound(fix: MakeFix, feedthrough_s: float, told: bool) -> None:
     """The sender tells where it will be, or was: its mean velocity there is another than here."""
-    model = PositionModel(BOUNDS, None, feedthrough_s)
+    observer = observing(None, feedthrough_s)
     for start_mps, acceleration in ((0.0, 8.0), (-10.0, 8.0), (10.0, -8.0)):
 
         def place(t_s: float, v: float = start_mps, a: float = acceleration) -> FloatArray:
@@ -160,12 +178,12 @@ def test_a_lead_in_time_keeps_the_bound(fix: MakeFix, feedthrough_s: float, told
         for b_ns in (S // 10, S // 5, S // 2, S, 2 * S):
             velocity = np.array([start_mps, 0, 0]) if told else None
             report = place(feedthrough_s)
-            known = PositionState(0, place(0.0), 0.0, report, velocity)
-            found = observer.predict(known, b_ns, model)
-            error_m = observer.norm_m(found.position_ned_m - place(b_ns * 1e-9))
+            known = PositionState(fix(0, report, velocity), place(0.0), 0.0)
+            found = observer.predict(known, b_ns)
+            error_m = norm_m(found.position_ned_m - place(b_ns * 1e-9))
             # The report may have its noise besides.
-            gain = abs(_gain(fix, model, b_ns)) if not told else 0.0
-            assert error_m + gain * BOUNDS.position_noise_m <= found.bound_m + ROUNDING_M
+            gain = abs(_gain(fix, observer, b_ns)) if not told else 0.0
+            assert error_m + gain * NOISE_M <= found.bound_m + ROUNDING_M
 
 
 @pytest.mark.parametrize("alpha", [None, 0.5])
@@ -174,7 +192,7 @@ def test_a_greedy_adversary_reaches_the_bound(
     fix: MakeFix, feedthrough_s: float, alpha: float | None
 ) -> None:
     """Knowing the gains to come, it takes noise and velocity as they hurt most: all of it."""
-    model = PositionModel(STEPPED, alpha, feedthrough_s)
+    observer = observing(alpha, feedthrough_s, acceleration_mps2=STILL_MPS2)
     along = np.array([0.6, 0.0, -0.8])
     reached = []
     for seed in range(100):
@@ -184,14 +202,14 @@ def test_a_greedy_adversary_reaches_the_bound(
             b_ns = int(rng.uniform(0.05, 1.2) * S)
             b_s = b_ns * 1e-9
             # How the error depends on the noise and the velocity of this interval, by experiment.
-            gain = _gain(fix, model, b_ns)
+            gain = _gain(fix, observer, b_ns)
             push = math.copysign(1.0, (1 - gain) * error)
-            noise = push * math.copysign(BOUNDS.position_noise_m, gain)
-            speed = push * math.copysign(BOUNDS.speed_mps, gain * feedthrough_s - b_s)
+            noise = push * math.copysign(NOISE_M, gain)
+            speed = push * math.copysign(SPEED_MPS, gain * feedthrough_s - b_s)
             report = position + along * (feedthrough_s * speed + noise)
-            state = advance(state, fix(t_ns, report), model)
+            state = advance(state, fix(t_ns, report), observer)
             position, t_ns = position + along * (speed * b_s), t_ns + b_ns
-            found = observer.predict(state, t_ns, model)
+            found = observer.predict(state, t_ns)
             error = float(along @ (found.position_ned_m - position))
             assert abs(error) <= found.bound_m + ROUNDING_M
         reached.append(abs(error) / found.bound_m)
@@ -199,10 +217,10 @@ def test_a_greedy_adversary_reaches_the_bound(
     assert max(reached) >= 0.999
 
 
-def _gain(fix: MakeFix, model: PositionModel, b_ns: int) -> float:
+def _gain(fix: MakeFix, observer: PositionObserver, b_ns: int) -> float:
     """What share of a report goes into the estimate: at 0 m, with a report of 1 m."""
-    estimate = PositionState(0, np.zeros(3), 0.0, np.array([1.0, 0.0, 0.0]), None)
-    return float(observer.predict(estimate, b_ns, model).position_ned_m[0])
+    estimate = PositionState(fix(0, [1.0, 0.0, 0.0]), np.zeros(3), 0.0)
+    return float(observer.predict(estimate, b_ns).position_ned_m[0])
 
 
 @given(
@@ -222,7 +240,7 @@ def test_a_constant_velocity_is_followed_exactly(
 ) -> None:
     """With velocity reported; without, only where the sender's own lead tells it."""
     feedthrough_s = 0.0 if told else 2.0
-    model = PositionModel(BOUNDS, None, feedthrough_s, lead_s)
+    observer = observing(None, feedthrough_s, lead_s)
     speeds = np.array(velocity)
     t_ns, state = 17 * S, None
     for after_ms in intervals_ms:
@@ -231,54 +249,46 @@ def test_a_constant_velocity_is_followed_exactly(
         made = fix(t_ns, report, speeds if told else None)
         if state is None and not told:
             # Its first estimate is right, so that only what follows is judged.
-            state = PositionState(t_ns, position, 0.0, report, None)
+            state = PositionState(made, position, 0.0)
         else:
-            state = advance(state, made, model)
+            state = advance(state, made, observer)
         t_ns += after_ms * 1_000_000
     assert state is not None
-    asked_ns = state.t_ns + beyond_ms * 1_000_000
-    found = observer.predict(state, asked_ns, model)
+    asked_ns = state.fix.sender_ns + beyond_ms * 1_000_000
+    found = observer.predict(state, asked_ns)
     assert found.position_ned_m == pytest.approx(speeds * (asked_ns * 1e-9), abs=1e-6)
 
 
-def test_the_unknown_input_is_the_velocity_that_was_needed(fix: MakeFix) -> None:
-    model = PositionModel(BOUNDS)
-    state = observer.begin(fix(0, [0, 0, 0], [4.0, -2.0, 1.0]), model)
-    state, predicted, unknown_input = observer.update(
-        state, fix(2 * S, [9, 9, 9], [5.0, 5.0, 5.0]), model
-    )
-    assert predicted.position_ned_m == pytest.approx([8.0, -4.0, 2.0])
-    assert unknown_input == pytest.approx([4.0, -2.0, 1.0])
-    assert observer.velocity_ned_mps(state, unknown_input) == pytest.approx([5.0, 5.0, 5.0])
-    silent = observer.begin(fix(0, [0, 0, 0]), model)
-    assert observer.velocity_ned_mps(silent, unknown_input) is unknown_input
-    assert observer.velocity_ned_mps(silent, None) is None
+def test_the_velocity_is_the_reported_one_and_may_have_changed_since(fix: MakeFix) -> None:
+    observer = observing()
+    state = observer.begin(fix(0, [0, 0, 0], [4.0, -2.0, 1.0]))
+    found = observer.predict(state, 2 * S)
+    assert found.position_ned_m == pytest.approx([8.0, -4.0, 2.0])
+    assert found.velocity_ned_mps == pytest.approx([4.0, -2.0, 1.0])
+    assert found.velocity_bound_mps == pytest.approx(0.4 + 2 * 8.0)
+    assert (found.horizontal_m, found.vertical_m) == (found.bound_m, found.bound_m)
+    state = advance(state, fix(2 * S, [9, 9, 9], [5.0, 5.0, 5.0]), observer)
+    assert observer.predict(state, 2 * S).velocity_ned_mps == pytest.approx([5.0, 5.0, 5.0])
+    silent = observer.predict(observer.begin(fix(0, [0, 0, 0])), S)
+    assert (silent.velocity_ned_mps, silent.velocity_bound_mps) == (None, None)
 
 
 def test_before_the_report_nothing_is_extrapolated(fix: MakeFix) -> None:
     """The estimate stands, and its bound grows by what can have been flown."""
-    model = PositionModel(BOUNDS)
-    state = observer.begin(fix(10 * S, [1, 2, 3], [20.0, 0, 0]), model)
-    state = observer.update(state, fix(11 * S, [21, 2, 3], [20.0, 0, 0]), model)[0]
-    at = observer.predict(state, 11 * S, model)
-    earlier = observer.predict(state, 11 * S - S // 2, model)
+    observer = observing()
+    state = observer.begin(fix(10 * S, [1, 2, 3], [20.0, 0, 0]))
+    state = advance(state, fix(11 * S, [21, 2, 3], [20.0, 0, 0]), observer)
+    at = observer.predict(state, 11 * S)
+    earlier = observer.predict(state, 11 * S - S // 2)
     assert earlier.position_ned_m == pytest.approx(at.position_ned_m)
-    assert earlier.bound_m == pytest.approx(at.bound_m + 0.5 * BOUNDS.speed_mps)
+    assert earlier.bound_m == pytest.approx(at.bound_m + 0.5 * SPEED_MPS)
     assert at.bound_m == state.bound_m
 
 
 def test_the_first_report_is_the_estimate(fix: MakeFix) -> None:
-    state = observer.begin(fix(S, [1, 2, 3]), PositionModel(BOUNDS, None, -0.5))
+    state = observing(None, -0.5).begin(fix(S, [1, 2, 3]))
     assert state.estimate_ned_m.tolist() == [1, 2, 3]
     assert state.bound_m == pytest.approx(1.5 + 0.5 * 30.0)
-
-
-@pytest.mark.parametrize("step_ns", [0, -1, -S])
-def test_an_older_report_is_refused(fix: MakeFix, step_ns: int) -> None:
-    model = PositionModel(BOUNDS)
-    state = observer.begin(fix(S, [0, 0, 0]), model)
-    with pytest.raises(ValueError, match="newer than the one before"):
-        observer.update(state, fix(S + step_ns, [0, 0, 0]), model)
 
 
 @settings(max_examples=50)
@@ -292,7 +302,7 @@ def test_rotated_inputs_give_rotated_outputs(
 ) -> None:
     rng = np.random.default_rng(seed)
     turn = Rotation.random(rng=rng).as_matrix()
-    model = PositionModel(BOUNDS, None, feedthrough_s)
+    observer = observing(None, feedthrough_s)
     plain: PositionState | None = None
     turned: PositionState | None = None
     t_ns = 0
@@ -300,19 +310,19 @@ def test_rotated_inputs_give_rotated_outputs(
         position, velocity = rng.normal(0, 100, 3), rng.normal(0, 20, 3)
         straight = fix(t_ns, position, velocity if told else None)
         rotated = fix(t_ns, turn @ position, turn @ velocity if told else None)
-        plain, turned = advance(plain, straight, model), advance(turned, rotated, model)
+        plain, turned = advance(plain, straight, observer), advance(turned, rotated, observer)
         t_ns += interval_ns(rng)
-        a, b = (observer.predict(state, t_ns, model) for state in (plain, turned))
+        a, b = (observer.predict(state, t_ns) for state in (plain, turned))
         assert b.position_ned_m == pytest.approx(turn @ a.position_ned_m, abs=1e-8)
         assert (b.bound_m, b.mu_s2) == (a.bound_m, a.mu_s2)
 
 
 def test_values_are_not_written_to(fix: MakeFix) -> None:
-    model = PositionModel(BOUNDS)
+    observer = observing()
     given_fix = fix(0, [1, 2, 3], [4, 5, 6])
-    state = observer.begin(given_fix, model)
-    observer.update(state, fix(S, [7, 8, 9], [1, 1, 1]), model)
-    observer.predict(state, S, model)
+    state = observer.begin(given_fix)
+    advance(state, fix(S, [7, 8, 9], [1, 1, 1]), observer)
+    observer.predict(state, S)
     assert given_fix.position_ned_m.tolist() == [1, 2, 3]
     assert given_fix.velocity_ned_mps is not None
     assert given_fix.velocity_ned_mps.tolist() == [4, 5, 6]

@@ -1,0 +1,85 @@
+"""Settings to the parts of the pipeline."""
+
+import numpy as np
+
+from companion.beams import arrays
+from companion.beams.precoding import Precoder
+from companion.config import Settings, kinematic_design
+from companion.mavlink.clocks import ClockSettings, SenderClock
+from companion.tracking.carrier import body_from_ned
+from companion.tracking.fleet import Ages, Fleet, FleetSettings, ToSenderTime
+from companion.tracking.gate import GateSettings
+from companion.tracking.kinematic_observer import KinematicModel, KinematicObserver, scheduled
+from companion.tracking.noise import NoiseSettings
+from companion.tracking.observer import PositionModel, PositionObserver
+from companion.values import ReportNoise
+
+
+def array(settings: Settings) -> arrays.Array:
+    """The antenna array on its mount."""
+    given = settings.array
+    mount = np.radians([given.mount_roll_deg, given.mount_pitch_deg, given.mount_yaw_deg])
+    return arrays.uniform_linear(
+        given.elements, given.frequency_hz, given.spacing_wavelengths, body_from_ned(*mount)
+    )
+
+
+def precoder(settings: Settings) -> Precoder:
+    """How weights are made."""
+    return Precoder(settings.beams.condition_limit, settings.beams.regularisation)
+
+
+def noise(settings: Settings) -> NoiseSettings:
+    """Bounds on the errors of reports."""
+    given = settings.observer
+    most_m = given.position_noise_m
+    default = ReportNoise(most_m, most_m, most_m, given.velocity_noise_mps)
+    return NoiseSettings(default, given.accuracy_factor if given.follow_accuracy else None)
+
+
+def observer(settings: Settings) -> PositionObserver | KinematicObserver:
+    """The observer that every track uses."""
+    given = settings.observer
+    if given.model == "position":
+        return PositionObserver(
+            PositionModel(
+                given.speed_max_mps,
+                given.acceleration_max_mps2,
+                None if given.alpha == "auto" else given.alpha,
+                given.feedthrough_s,
+                given.velocity_lead_s,
+            )
+        )
+    gain = scheduled(kinematic_design(settings))
+    return KinematicObserver(KinematicModel(given.speed_max_mps, given.acceleration_max_mps2, gain))
+
+
+def clock(settings: Settings) -> SenderClock:
+    """The clock of one sender, nothing known of it yet."""
+    given = settings.clocks
+    return SenderClock(
+        ClockSettings(
+            constant_delay_s=given.constant_delay_s,
+            trust_gnss=given.trust_gnss,
+            node_utc_error_s=given.node_utc_error_s,
+            window_s=given.window_s,
+        )
+    )
+
+
+def fleet(settings: Settings, to_sender_time: ToSenderTime) -> Fleet:
+    """All tracks, none yet."""
+    given, kept = settings.observer, settings.tracks
+    feeds = given.model == "kinematic" and given.feed_forward
+    return Fleet(
+        observer(settings),
+        FleetSettings(
+            given.speed_max_mps,
+            given.acceleration_max_mps2,
+            Ages(kept.coasting_s, kept.stale_s, kept.lost_s),
+            GateSettings(kept.reacquire_reports, kept.reacquire_s),
+            kept.window_s,
+            feeds,
+        ),
+        to_sender_time,
+    )

@@ -1,0 +1,180 @@
+"""Which line a stamp lies on: late frames, reboots, leaps, and the wrap of the boot clock.
+
+While a sender runs, its stamps lie on and above one line (``envelope.py``). A stamp belongs to
+the line while it is late by less than ``late_max_ns``:
+
+- Stamps off the line by more start a *run*. Three of a run that advance, over at least half a
+  second, and with none between them that advances the line, are a new line; until then they have
+  no time. If the boot clock stepped back it is a reboot; if it leapt ahead it is the same boot
+  with a new offset, and the sender's timeline leaps with it.
+- A sender that restarts within ``late_max_ns`` of its boot steps back by no more than late frames
+  do. Late frames catch up with the line, a restarted clock does not: five stamps of the first
+  seconds of a boot, over at least a second, none of which advances the line, and which all lag
+  equally (to a second), are a reboot. A clock that stood still lags in the same way, by more
+  than ``late_max_ns``, and goes on.
+- Frames of the line before, which come for up to ``late_max_ns`` after it was left, have no time.
+
+A reboot is therefore one event, told at the stamp that confirms it. What is not told apart: a
+second link that lags by seconds and is alone left within the first ``late_max_ns`` of a boot
+looks like a reboot.
+"""
+
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+from companion.mavlink.envelope import Envelope
+
+_NS: Final = 1_000_000_000
+_NS_PER_MS: Final = 1_000_000
+_WRAP_MS: Final = 1 << 32
+WRAP_NS: Final = _WRAP_MS * _NS_PER_MS
+"""The 32-bit milliseconds of a boot clock wrap after 49.7 days."""
+_EARLY_NS: Final = -_NS
+"""A stamp fits a line that others have found if it is early by no more than this."""
+_RUN_KEPT: Final = 64
+
+
+class Placed(NamedTuple):
+    """A stamp on a line: the sender's time, unwrapped; whether it is the first on a new line,
+    and whether that is because of a reboot."""
+
+    x_ns: int
+    new_line: bool = False
+    rebooted: bool = False
+
+
+@dataclass(slots=True)
+class _Run:
+    """Stamps off the line, (arrival ns, boot ms), that lie on one of their own."""
+
+    stamps: list[tuple[int, int]] = field(default_factory=list)
+    lowest_ns: int = 0
+    highest_ns: int = 0
+
+    def add(self, arrival_ns: int, boot_ms: int, spread_ns: int) -> bool:
+        """Go on, or begin anew where the stamp is ``spread_ns`` off the others; whether the
+        stamp is now the newest of the run."""
+        lag_ns = arrival_ns - boot_ms * _NS_PER_MS
+        if self.stamps and max(abs(lag_ns - self.lowest_ns), abs(lag_ns - self.highest_ns)) > (
+            spread_ns
+        ):
+            self.stamps.clear()
+        if not self.stamps:
+            self.lowest_ns = self.highest_ns = lag_ns
+        elif boot_ms <= self.stamps[-1][1]:
+            return False
+        self.lowest_ns = min(self.lowest_ns, lag_ns)
+        self.highest_ns = max(self.highest_ns, lag_ns)
+        self.stamps.append((arrival_ns, boot_ms))
+        del self.stamps[:-_RUN_KEPT]
+        return True
+
+    def lasts(self, count: int, span_ns: int) -> bool:
+        """Whether it has so many stamps over so long a time."""
+        return len(self.stamps) >= count and self.stamps[-1][0] - self.stamps[0][0] >= span_ns
+
+
+class BootLine:
+    """The line of one sender's boot clock; ``observe`` takes its stamps in order of arrival.
+
+    ``window_ns``, ``drift_limit``, ``drift_unsure``: see ``Envelope``. ``late_max_ns``: no frame
+    is later. ``newest_ns`` is the newest sender time on the line.
+    """
+
+    def __init__(
+        self, window_ns: int, drift_limit: float, drift_unsure: float, late_max_ns: int
+    ) -> None:
+        self._shape = (window_ns, drift_limit, drift_unsure)
+        self._late_max_ns = late_max_ns
+        self.envelope = Envelope(*self._shape)
+        self.newest_ns = 0
+        self._run = _Run()
+        self._previous: tuple[Envelope, int] | None = None  # the line before, when it was left
+
+    def observe(self, arrival_ns: int, boot_ms: int) -> Placed | None:
+        """Place a stamp. None: it is a frame of the line before, or it is off the line and no
+        others have confirmed it so far."""
+        if not self.envelope:
+            return self._accept(arrival_ns, boot_ms * _NS_PER_MS)
+        x_ns = self.unwrap(boot_ms)
+        late_ns = self.late_ns(arrival_ns, x_ns)
+        if self._is_straggler(arrival_ns, boot_ms, late_ns):
+            return None
+        if abs(late_ns) <= self._late_max_ns:
+            return self._near(arrival_ns, boot_ms, x_ns)
+        if late_ns > 0 and x_ns > self.newest_ns:
+            return self._stalled(arrival_ns, boot_ms, x_ns)
+        advances = self._run.add(arrival_ns, boot_ms, self._late_max_ns)
+        if not (advances and self._run.lasts(3, _NS // 2)):
+            return None
+        stepped_back = boot_ms < self.newest_ns // _NS_PER_MS % _WRAP_MS
+        return self._begin_again(rebooted=stepped_back)
+
+    def unwrap(self, boot_ms: int) -> int:
+        """Boot time past the wrap: the one nearest to the newest, ns."""
+        return _unwrap(boot_ms, self.newest_ns)
+
+    def late_ns(self, arrival_ns: int, x_ns: int) -> int:
+        """How far a stamp lies above the line; below 0 where it lies under it."""
+        return arrival_ns - x_ns - self.envelope.at(x_ns)
+
+    def fits(self, arrival_ns: int, x_ns: int) -> bool:
+        """Whether a stamp can belong to the line."""
+        return bool(self.envelope) and abs(self.late_ns(arrival_ns, x_ns)) <= self._late_max_ns
+
+    def _accept(self, arrival_ns: int, x_ns: int) -> Placed:
+        self.envelope.add(x_ns, arrival_ns - x_ns)
+        self.newest_ns = max(self.newest_ns, x_ns)
+        return Placed(x_ns)
+
+    def _near(self, arrival_ns: int, boot_ms: int, x_ns: int) -> Placed:
+        """On the line: in order, late, or the first seconds of a boot after another such."""
+        if x_ns > self.newest_ns:
+            self._run.stamps.clear()
+        elif (
+            x_ns < self.newest_ns
+            and boot_ms * _NS_PER_MS < self._late_max_ns
+            and self._run.add(arrival_ns, boot_ms, _NS)
+            and self._run.lasts(5, _NS)
+        ):
+            return self._begin_again(rebooted=True)
+        return self._accept(arrival_ns, x_ns)
+
+    def _stalled(self, arrival_ns: int, boot_ms: int, x_ns: int) -> Placed:
+        """In order, but later than any frame: a link that stalled, or a clock that stood still."""
+        if self._run.add(arrival_ns, boot_ms, _NS) and self._run.lasts(5, 2 * _NS):
+            return self._begin_again(rebooted=False)
+        self.newest_ns = x_ns
+        return Placed(x_ns)
+
+    def _is_straggler(self, arrival_ns: int, boot_ms: int, late_ns: int) -> bool:
+        """Whether a stamp fits the line before, and not the present one."""
+        if self._previous is None:
+            return False
+        before, left_ns = self._previous
+        if arrival_ns - left_ns > self._late_max_ns:
+            self._previous = None
+            return False
+        x_ns = _unwrap(boot_ms, before.newest_ns)
+        was_late_ns = arrival_ns - x_ns - before.at(x_ns)
+        fits_before = _EARLY_NS <= was_late_ns <= self._late_max_ns
+        return fits_before and not _EARLY_NS <= late_ns <= self._late_max_ns
+
+    def _begin_again(self, *, rebooted: bool) -> Placed:
+        """The run becomes the line. After a reboot the sender's timeline begins anew."""
+        stamps = list(self._run.stamps)
+        self._run.stamps.clear()
+        self._previous = (self.envelope, stamps[0][0])
+        self.envelope = Envelope(*self._shape)
+        x_ns = stamps[0][1] * _NS_PER_MS if rebooted else self.newest_ns
+        for arrival_ns, boot_ms in stamps:
+            x_ns = _unwrap(boot_ms, x_ns)
+            self.envelope.add(x_ns, arrival_ns - x_ns)
+        self.newest_ns = x_ns
+        return Placed(x_ns, new_line=True, rebooted=rebooted)
+
+
+def _unwrap(boot_ms: int, newest_ns: int) -> int:
+    newest_ms = newest_ns // _NS_PER_MS
+    step_ms = (boot_ms - newest_ms + _WRAP_MS // 2) % _WRAP_MS - _WRAP_MS // 2
+    return (newest_ms + step_ms) * _NS_PER_MS

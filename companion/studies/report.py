@@ -1,0 +1,253 @@
+"""A prediction study for people: tables as text, and one HTML page that needs nothing else."""
+
+import math
+from collections.abc import Sequence
+from html import escape
+from typing import Any, Final
+
+from companion.studies.pointing import HALF_BEAMWIDTH_DEG, Row
+from companion.studies.prediction import Compared
+
+WIDTH, HEIGHT = 680, 300
+LEFT, RIGHT, TOP, BOTTOM = 56, 190, 14, 40
+# Distinct by colour, by dash and by mark, so that print in black and white can be read too.
+COLOURS: Final = ("#0b4f9e", "#b3261e", "#00695c", "#6a1b9a", "#a65b00", "#37474f", "#ad1457")
+DASHES: Final = ("", "6 3", "2 3", "9 3 2 3", "12 4", "4 2", "1 4")
+
+_STYLE: Final = """
+body { font: 15px/1.45 system-ui, sans-serif; color: #111; background: #fff;
+  max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
+h2 { margin-top: 2.2rem; border-bottom: 1px solid #999; }
+table { border-collapse: collapse; margin: .8rem 0; font-variant-numeric: tabular-nums; }
+caption { text-align: left; padding: .2rem 0; color: #333; }
+th, td { padding: .15rem .6rem; border-bottom: 1px solid #ccc; text-align: right; }
+th:first-child, td:first-child { text-align: left; }
+td.best { font-weight: 700; }
+code { overflow-wrap: anywhere; }
+svg { max-width: 100%; height: auto; }
+@media print { section { break-inside: avoid; } body { margin: 0; font-size: 11px; } }
+"""
+
+
+def pooled(rows: Sequence[Row], predictor: str, lead_s: float, key: str) -> float | None:
+    """A root mean square over all UAVs, each weighted by its answers; None without rows."""
+    chosen = [row for row in rows if row["predictor"] == predictor and row["lead_s"] == lead_s]
+    total = sum(row["n"] for row in chosen)
+    if not total:
+        return None
+    return math.sqrt(sum(row["n"] * row[key] ** 2 for row in chosen) / total)
+
+
+def text(found: Sequence[Compared]) -> str:
+    """The tables as text: RMS angle in degrees, all UAVs together."""
+    return "\n\n".join(_text_table(compared) for compared in found if compared.rows)
+
+
+def _text_table(compared: Compared) -> str:
+    leads, predictors = _axes(compared)
+    lines = [
+        f"{_title(compared)}: RMS angle error, degrees, at a lead of",
+        " " * 26 + "".join(f"{lead_s:>9g} s" for lead_s in leads) + "   beyond bound",
+    ]
+    for name in predictors:
+        cells = [pooled(compared.rows, name, lead_s, "angle_rms_deg") for lead_s in leads]
+        numbers = "".join(f"{_number(cell):>11}" for cell in cells)
+        lines.append(f"  {name:24}{numbers}   {_violations(compared, name)}")
+    return "\n".join(lines)
+
+
+def page(answer: dict[str, Any], found: Sequence[Compared]) -> str:
+    """The whole report as one HTML document, without anything from elsewhere."""
+    sections = "\n".join(_section(compared) for compared in found if compared.rows)
+    versions = ", ".join(f"{name} {version}" for name, version in answer["versions"].items())
+    return f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Predictors compared</title>
+<style>{_STYLE}</style>
+</head>
+<body>
+<h1>Predictors compared</h1>
+<p>A pointer at the array's place is asked 20 times a second where each UAV will be at now + lead.
+It uses only what has arrived by then. Errors count while the UAV flies. Angles are seen from the
+array's true position; {HALF_BEAMWIDTH_DEG}° is half the beamwidth of 64 elements. The Kalman
+filters were tuned in hindsight on the log itself; the observers and dead reckoning were not tuned.
+</p>
+<p><code>{escape(answer["command"])}</code><br>{escape(versions)}; seed {answer["seed"]}</p>
+{sections}
+</body>
+</html>
+"""
+
+
+def _section(compared: Compared) -> str:
+    tuned = "; ".join(
+        f"{name}: process noise {tuning.process_density:g} m²/s{'³' if name[-1] == 'v' else '⁵'},"
+        f" noise {tuning.position_noise_m:g} m and {tuning.velocity_noise_mps:g} m/s"
+        for name, tuning in compared.tuned.items()
+    )
+    return "\n".join(
+        [
+            f"<section><h2>{escape(_title(compared))}</h2>",
+            f"<p>{escape(_describe(compared))}</p>",
+            _chart(compared),
+            _table(compared, "angle_rms_deg", "RMS angle error, degrees, all UAVs together"),
+            _table(compared, "position_rms_m", "RMS position error, metres, all UAVs together"),
+            f"<p>Best of the grid: {escape(tuned)}.</p></section>",
+            _by_uav(compared),
+        ]
+    )
+
+
+def _table(compared: Compared, key: str, caption: str) -> str:
+    leads, predictors = _axes(compared)
+    cells = {
+        (name, lead_s): pooled(compared.rows, name, lead_s, key)
+        for name in predictors
+        for lead_s in leads
+    }
+    best = {
+        lead_s: min(_or_infinite(cells[name, lead_s]) for name in predictors) for lead_s in leads
+    }
+    head = "".join(f"<th>{lead_s:g} s</th>" for lead_s in leads)
+    lines = [
+        f"<table><caption>{caption}</caption>",
+        f"<thead><tr><th>predictor, at a lead of</th>{head}<th>beyond bound</th></tr></thead>",
+        "<tbody>",
+    ]
+    for name in predictors:
+        row = "".join(
+            f"<td{_best(cells[name, lead_s], best[lead_s])}>{_number(cells[name, lead_s])}</td>"
+            for lead_s in leads
+        )
+        lines.append(f"<tr><td>{escape(name)}</td>{row}<td>{_violations(compared, name)}</td></tr>")
+    return "\n".join([*lines, "</tbody></table>"])
+
+
+def _by_uav(compared: Compared) -> str:
+    """Every row of the study, folded away."""
+    keys = (
+        "uav", "predictor", "lead_s", "n", "angle_rms_deg", "angle_p95_deg", "angle_max_deg",
+        "within_beamwidth", "position_rms_m", "position_p95_m", "bound_violations",
+        "bound_median_m", "truth",
+    )  # fmt: skip
+    head = "".join(f"<th>{key}</th>" for key in keys)
+    body = "\n".join(
+        "<tr>" + "".join(f"<td>{escape(_cell(row[key]))}</td>" for key in keys) + "</tr>"
+        for row in compared.rows
+    )
+    return (
+        f"<details><summary>each UAV</summary><table><thead><tr>{head}</tr></thead>\n"
+        f"<tbody>{body}</tbody></table></details>"
+    )
+
+
+def _chart(compared: Compared) -> str:
+    """RMS angle (logarithmic) over lead, a line for each predictor."""
+    leads, predictors = _axes(compared)
+    series = {
+        name: [pooled(compared.rows, name, lead_s, "angle_rms_deg") for lead_s in leads]
+        for name in predictors
+    }
+    values = [value for line in series.values() for value in line if value]
+    if not values:
+        return ""
+    low, high = math.floor(math.log10(min(values))), math.ceil(math.log10(max(values)))
+    high = max(high, low + 1)
+    span_x, span_y = WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM
+    widest = max(leads) or 1.0
+
+    def x(lead_s: float) -> float:
+        return LEFT + span_x * lead_s / widest
+
+    def y(value: float) -> float:
+        return TOP + span_y * (high - math.log10(value)) / (high - low)
+
+    parts = [
+        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" role="img" font-size="12">',
+        f"<title>RMS angle error over lead: {escape(_title(compared))}</title>",
+    ]
+    for power in range(low, high + 1):
+        at = y(10.0**power)
+        parts.append(f'<path d="M{LEFT} {at:.1f}H{WIDTH - RIGHT}" stroke="#bbb"/>')
+        parts.append(
+            f'<text x="{LEFT - 6}" y="{at + 4:.1f}" text-anchor="end">{10.0**power:g}°</text>'
+        )
+    for lead_s in leads:
+        parts.append(
+            f'<text x="{x(lead_s):.1f}" y="{HEIGHT - BOTTOM + 16}" text-anchor="middle">'
+            f"{lead_s:g}</text>"
+        )
+    parts.append(
+        f'<text x="{LEFT + span_x / 2:.1f}" y="{HEIGHT - 6}" text-anchor="middle">lead, s</text>'
+    )
+    for number, (name, line) in enumerate(series.items()):
+        points = [(x(s), y(value)) for s, value in zip(leads, line, strict=True) if value]
+        parts.append(_line(points, number, name))
+    return "\n".join([*parts, "</svg>"])
+
+
+def _line(points: Sequence[tuple[float, float]], number: int, name: str) -> str:
+    colour, dash = COLOURS[number % len(COLOURS)], DASHES[number % len(DASHES)]
+    style = f'stroke="{colour}" stroke-width="2" stroke-dasharray="{dash}" fill="none"'
+    places = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
+    dots = "".join(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{colour}"/>' for x, y in points)
+    at, left = TOP + 10 + 18 * number, WIDTH - RIGHT + 14
+    return (
+        f'<polyline points="{places}" {style}/>{dots}'
+        f'<path d="M{left} {at}h26" {style}/>'
+        f'<text x="{left + 32}" y="{at + 4}">{escape(name)}</text>'
+    )
+
+
+def _axes(compared: Compared) -> tuple[list[float], list[str]]:
+    """The leads and the predictors, in the order in which they come."""
+    leads = dict.fromkeys(row["lead_s"] for row in compared.rows)
+    return list(leads), list(dict.fromkeys(row["predictor"] for row in compared.rows))
+
+
+def _title(compared: Compared) -> str:
+    return f"{compared.flown.log}, {compared.link.name} link"
+
+
+def _describe(compared: Compared) -> str:
+    link, rows = compared.link, compared.rows
+    uavs = ", ".join(dict.fromkeys(row["uav"] for row in rows))
+    truth = " and ".join(dict.fromkeys(row["truth"] for row in rows))
+    told = f"UAVs {uavs}; array at {compared.flown.center}; truth: {truth}. "
+    if link.latency_s is None:
+        return told + "Reports as they arrived in the log."
+    median_s, p95_s = link.latency_s
+    known = ", its least value taken as known" if link.known_delay else ""
+    return (
+        f"{told}Reports thinned to {link.rate_hz:g} Hz, {link.loss:.0%} lost, latency lognormal"
+        f" with median {median_s:g} s and 95th percentile {p95_s:g} s{known}."
+    )
+
+
+def _violations(compared: Compared, predictor: str) -> str:
+    """How many of a predictor's errors went beyond its own bound, over all rows."""
+    counts = [r["bound_violations"] for r in compared.rows if r["predictor"] == predictor]
+    if None in counts:
+        return "no bound"
+    return f"{sum(counts)} of {sum(r['n'] for r in compared.rows if r['predictor'] == predictor)}"
+
+
+def _or_infinite(value: float | None) -> float:
+    return math.inf if value is None else value
+
+
+def _best(value: float | None, best: float) -> str:
+    return ' class="best"' if value is not None and value <= best else ""
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,65 @@
+"""One aircraft under two names: its own telemetry, and what a receiver relays of it by ADS-B.
+
+Two beams on one aircraft would be two all but equal steering vectors, which ruin zero forcing. A
+relayed aircraft is taken for a telemetry track after several reports in a row that lie nearer to
+it than their errors allow to tell apart, and for itself again after as many that do not.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from companion.values import Fix, Track
+
+REPORTS_TO_DECIDE: Final = 5
+SPEED_APART_MPS: Final = 15.0
+
+
+@dataclass(slots=True)
+class _Count:
+    uav: str
+    in_a_row: int = 0
+
+
+class Identities:
+    """Which relayed aircraft is which telemetry track."""
+
+    def __init__(self) -> None:
+        self._counts: dict[str, _Count] = {}
+        self._same: dict[str, str] = {}
+
+    def same_as(self, uav: str) -> str | None:
+        """The telemetry track that a relayed aircraft is; None if it is itself."""
+        return self._same.get(uav)
+
+    def observe(self, relayed: Fix, telemetry: list[Track]) -> None:
+        """Compare a relayed report with the telemetry tracks at its time."""
+        near = [(_apart_m(relayed, track), track.uav) for track in telemetry]
+        nearest = min((pair for pair in near if pair[0] is not None), default=None)
+        match = nearest[1] if nearest else ""
+        count = self._counts.get(relayed.uav)
+        if count is None or count.uav != match:
+            count = self._counts[relayed.uav] = _Count(match)
+        count.in_a_row += 1
+        if count.in_a_row >= REPORTS_TO_DECIDE:
+            if match:
+                self._same[relayed.uav] = match
+            else:
+                self._same.pop(relayed.uav, None)
+
+
+def _apart_m(relayed: Fix, track: Track) -> float | None:
+    """The distance between two that may be one; None if they cannot be."""
+    offset = relayed.position_ned_m - track.position_ned_m
+    apart_m = float(np.hypot(offset[0], offset[1]))
+    if apart_m > relayed.noise.horizontal_m + track.horizontal_bound_m:
+        return None
+    if abs(offset[2]) > relayed.noise.vertical_m + track.vertical_bound_m:
+        return None
+    ours, theirs = track.velocity_ned_mps, relayed.velocity_ned_mps
+    if ours is not None and theirs is not None:
+        difference = ours - theirs
+        if difference @ difference > SPEED_APART_MPS**2:
+            return None
+    return apart_m

@@ -1,0 +1,173 @@
+"""Late frames, reboots, leaps and the wrap: which line a stamp lies on."""
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.mavlink.clocks import SenderClock, Stamp
+
+MS = 1_000_000
+S = 1_000_000_000
+EPOCH_NS = 1_700_000_000 * S
+WRAP_MS = 1 << 32
+
+Seen = list[tuple[int, int]]  # (arrival after the epoch, boot), ms
+
+
+def observe_all(seen: Seen, clock: SenderClock | None = None) -> list[Stamp | None]:
+    clock = clock or SenderClock()
+    return [clock.observe(EPOCH_NS + arrival * MS, boot) for arrival, boot in seen]
+
+
+def reboots(stamps: list[Stamp | None]) -> list[int]:
+    return [n for n, stamp in enumerate(stamps) if stamp is not None and stamp.rebooted]
+
+
+def run(arrival: int, boot: int, count: int, every: int = 200) -> Seen:
+    return [(arrival + n * every, boot + n * every) for n in range(count)]
+
+
+@pytest.mark.parametrize("back_ms", [1_200, 4_800, 9_700])
+def test_a_late_frame_is_no_reboot(back_ms: int) -> None:
+    stamps = observe_all(
+        [*run(0, 300_000, 50), (9_810, 309_800 - back_ms), (10_000, 310_000)],
+    )
+    assert not reboots(stamps)
+    late, after = stamps[-2:]
+    assert late is not None and after is not None
+    assert late.sender_ns == (309_800 - back_ms) * MS
+    assert late.latency_s == pytest.approx(back_ms / 1000 + 0.01)
+    assert after.latency_s == 0.0
+
+
+def test_a_link_that_lags_by_seconds_is_no_reboot() -> None:
+    """Beside a fast one, or alone: the sender's first seconds are over."""
+    fast, slow = run(0, 300_000, 100), run(4_001, 300_001, 100)
+    assert not reboots(observe_all(sorted([*fast, *slow])))
+    assert None not in observe_all(sorted([*fast, *slow]))
+    assert not reboots(observe_all(fast + run(20_000, 316_000, 40)))
+
+
+@pytest.mark.parametrize("boot_ms", [0, 12_000])
+@pytest.mark.parametrize("back_ms", [48_000, 260_000])
+def test_a_reboot_is_one_event_and_begins_anew(back_ms: int, boot_ms: int) -> None:
+    before = run(0, boot_ms + back_ms - 9_800, 50)
+    stamps = observe_all([*before, *run(10_000, boot_ms, 100)])
+    assert reboots(stamps) == [53]  # half a second after its first stamp
+    assert [n for n, stamp in enumerate(stamps) if stamp is None] == [50, 51, 52]
+    for n, stamp in enumerate(stamps[53:], start=3):
+        assert stamp is not None
+        assert stamp.sender_ns == (boot_ms + n * 200) * MS
+        assert stamp.latency_s == 0.0  # nothing is left of the old offset
+
+
+@pytest.mark.parametrize("uptime_ms", [4_000, 9_000])
+@pytest.mark.parametrize("late_ms", [0, 400])
+def test_a_reboot_shortly_after_a_boot(uptime_ms: int, late_ms: int) -> None:
+    """It steps back by no more than a late frame, and does not catch up."""
+    again = [(t + (late_ms if n % 2 else 0), b) for n, (t, b) in enumerate(run(0, 500, 40, 250))]
+    seen = run(0, 0, uptime_ms // 100, 100) + [(uptime_ms + 500 + t, b) for t, b in again]
+    stamps = observe_all(seen)
+    assert len(reboots(stamps)) == 1
+    after = stamps[reboots(stamps)[0] :]
+    assert reboots(stamps)[0] <= uptime_ms // 100 + 10
+    assert all(stamp is not None and stamp.latency_s <= 0.4 for stamp in after)
+
+
+def test_a_queue_that_is_flushed_in_the_first_seconds_is_no_reboot() -> None:
+    """Late frames in a burst catch up with the line."""
+    queued = [(8_000 + n * 10, 3_000 + n * 100) for n in range(45)]
+    stamps = observe_all([*run(0, 0, 80, 100), *queued, *run(8_500, 8_500, 20, 100)])
+    assert not reboots(stamps)
+    assert None not in stamps
+
+
+def test_stragglers_of_the_boot_before_have_no_time() -> None:
+    """Single or in a burst, up to seconds after the reboot; the new boot goes on."""
+    again = run(10_000, 1_000, 100)
+    late = [(13_105, 108_000), *((14_110 + n, 108_500 + n * 100) for n in range(10))]
+    seen = sorted([*run(0, 100_000, 50), *again, *late])
+    stamps = observe_all(seen)
+    assert len(reboots(stamps)) == 1
+    for (arrival, boot), stamp in zip(seen, stamps, strict=True):
+        if arrival > 11_000:
+            assert (stamp is None) == (boot > 50_000), arrival
+
+
+def test_a_stray_stamp_changes_nothing() -> None:
+    """One message of the sender with another clock in it, ahead or behind, again and again."""
+    steady = run(0, 100_000, 200, 100)
+    for boot in (7, 660_000, 4_000_000_000):
+        strays = [(150 + n * 1_000, boot) for n in range(18)]
+        seen = sorted([*steady, *strays])
+        stamps = observe_all(seen)
+        assert not reboots(stamps)
+        assert [s is None for s in stamps] == [b == boot for _, b in seen]
+
+
+def test_a_leap_ahead_is_no_reboot() -> None:
+    seen = [*run(0, 100_000, 50), *run(10_000, 110_000 + 560_000, 50)]
+    stamps = observe_all(seen)
+    assert not reboots(stamps)
+    placed = [s for s in stamps[53:] if s is not None]
+    assert len(placed) == 47
+    assert [s.sender_ns for s in placed] == [boot * MS for _, boot in seen[53:]]
+    assert all(s.latency_s == 0.0 for s in placed)
+
+
+def test_a_clock_that_stood_still_goes_on() -> None:
+    stamps = observe_all([*run(0, 100_000, 50), *run(70_000, 110_000, 50)])
+    assert not reboots(stamps)
+    assert None not in stamps
+    lags = [s.latency_s for s in stamps[50:] if s is not None]
+    assert lags[:10] == pytest.approx([60.0] * 10)
+    assert lags[10:] == pytest.approx([0.0] * 40)
+
+
+def test_the_wrap_is_neither_a_reboot_nor_a_leap() -> None:
+    start = WRAP_MS - 5_000
+    stamps = observe_all([(n * 100, (start + n * 100) % WRAP_MS) for n in range(200)])
+    assert not reboots(stamps)
+    times = [s.sender_ns for s in stamps if s is not None]
+    assert len(times) == 200
+    assert {b - a for a, b in pairwise(times)} == {100 * MS}
+    assert all(s is not None and s.latency_s == 0.0 for s in stamps)
+
+
+def test_a_late_frame_from_before_the_wrap() -> None:
+    stamps = observe_all([(0, WRAP_MS - 1_000), (1_500, 500), (1_600, WRAP_MS - 700), (1_700, 700)])
+    assert not reboots(stamps)
+    assert [s.latency_s for s in stamps if s] == pytest.approx([0.0, 0.0, 1.3, 0.0])
+
+
+@pytest.mark.parametrize("uptime_ms", [100_000, 2_000_000_000, 4_000_000_000])
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_a_reboot_after_any_uptime(uptime_ms: int, wrapped: bool) -> None:
+    before = run(0, WRAP_MS - 1_000, 10) if wrapped else []
+    before = [(t, b % WRAP_MS) for t, b in before]
+    seen = [*before, *run(uptime_ms, uptime_ms - 1_000, 10), *run(uptime_ms + 5_000, 700, 10)]
+    stamps = observe_all(seen)
+    assert reboots(stamps) == [len(before) + 13]
+    assert stamps[-1] is not None and stamps[-1].sender_ns == 2_500 * MS
+
+
+@settings(max_examples=300)
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 100_000), st.integers(0, WRAP_MS - 1) | st.integers(0, 60_000)),
+        min_size=1,
+        max_size=60,
+    )
+)
+def test_whatever_comes(steps: Seen) -> None:
+    """Leaps, reboots, wraps and nonsense: never later than the arrival."""
+    clock, arrival_ns = SenderClock(), EPOCH_NS
+    for gap_ms, boot_ms in steps:
+        arrival_ns += gap_ms * MS
+        stamp = clock.observe(arrival_ns, boot_ms)
+        if stamp is not None:
+            assert clock.node_ns(stamp.sender_ns) <= arrival_ns
+            assert stamp.latency_s >= 0.0
+            assert stamp.sender_ns // MS % WRAP_MS == boot_ms

@@ -1,0 +1,129 @@
+"""Which reports cannot be true, and when those that were refused are believed after all."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from companion.tracking.estimates import Prediction
+from companion.tracking.gate import GateSettings, Suspects, is_frozen, refusal
+from companion.tracking.kinematic_observer import KinematicModel, KinematicObserver
+from companion.values import Fix, Reason, ReportNoise
+
+MakeFix = Callable[..., Fix]
+S = 1_000_000_000
+OBSERVER = KinematicObserver(KinematicModel(30.0, 5.0))
+PREDICTED = Prediction(np.array([100.0, 0, -50]), None, 99.0, 10.0, 4.0, None, None)
+NOISE = ReportNoise(3.0, 2.0, math.hypot(3.0, 2.0), 0.5)
+
+
+@pytest.mark.parametrize(
+    ("place", "reason"),
+    [
+        ((100, 0, -50), None),
+        ((100 + 7.7, 10.3, -50), None),  # 12.86 m
+        ((100 + 13.01, 0, -50), Reason.UNREACHABLE),
+        ((100 - 9.5, 9.5, -50), Reason.UNREACHABLE),  # 13.4 m, though no axis is off by as much
+        ((100, 0, -44.01), None),
+        ((100, 0, -43.99), Reason.ALTITUDE_JUMP),
+        ((100, 0, -56.01), Reason.ALTITUDE_JUMP),
+        ((100, 12.9, -55.9), None),  # at the edge of the cylinder
+        ((100, 13.1, -90), Reason.UNREACHABLE),
+    ],
+)
+def test_a_report_outside_the_cylinder_cannot_be_true(
+    fix: MakeFix, place: tuple[float, ...], reason: Reason | None
+) -> None:
+    """Its own noise counts besides: 10 + 3 m in the plane, 4 + 2 m in height."""
+    found = refusal(PREDICTED, fix(0, place, noise=NOISE))
+    assert (None if found is None else found[0]) is reason
+
+
+def test_it_is_said_how_far_and_how_far_is_possible(fix: MakeFix) -> None:
+    found = refusal(PREDICTED, fix(0, [130, 40, -50], noise=NOISE))
+    assert found == (Reason.UNREACHABLE, "50.0 m off, at most 13.0 m possible")
+    found = refusal(PREDICTED, fix(0, [100, 0, -90], noise=NOISE))
+    assert found == (Reason.ALTITUDE_JUMP, "+40.0 m of height, at most 6.0 m possible")
+
+
+@pytest.mark.parametrize(
+    ("moved", "velocity", "after_s", "frozen"),
+    [
+        ((0, 0, 0), (5, 0, 0), 1.0, True),
+        ((0, 0, 0), (0, 0, -2), 1.0, True),
+        ((0, 0, 0), (5, 0, 0), 0.05, False),  # 0.25 m may be less than a digit
+        ((0, 0, 0), (0.9, 0, 0), 10.0, False),  # it hovers
+        ((0, 0, 0), None, 10.0, False),
+        ((0.01, 0, 0), (5, 0, 0), 1.0, False),
+        ((0, 0.01, 0), (5, 0, 0), 1.0, False),
+        ((0, 0, 0.01), (5, 0, 0), 1.0, False),
+    ],
+)
+def test_frozen_positions(
+    fix: MakeFix,
+    moved: tuple[float, ...],
+    velocity: tuple[float, ...] | None,
+    after_s: float,
+    frozen: bool,
+) -> None:
+    assert is_frozen(fix(0, [0, 0, 0]), fix(round(after_s * S), moved, velocity)) == frozen
+
+
+def suspects(fix: MakeFix, times_s: list[float], **changed: float) -> Suspects:
+    """Reports of a UAV that flies north at 10 m/s."""
+    run = Suspects(OBSERVER, GateSettings(**changed))
+    for t_s in times_s:
+        run.add(fix(round(t_s * S), [10 * t_s, 0, 0], [10, 0, 0]))
+    return run
+
+
+@pytest.mark.parametrize(
+    ("times_s", "agree"),
+    [
+        ([], False), ([0, 1.5, 3], True), ([0, 1.5, 2.99], False), ([0, 3], False),
+        ([0, 1, 2, 3], True), ([0, 1, 13, 14], False), ([0, 1, 13, 14, 16], True),
+    ],
+)  # fmt: skip
+def test_it_takes_enough_suspects_over_long_enough(
+    fix: MakeFix, times_s: list[float], agree: bool
+) -> None:
+    run = suspects(fix, times_s)
+    assert run.agree() is agree
+    assert len(suspects(fix, [0, 0.1], reacquire_reports=2, reacquire_s=0.1).take()) == 2
+
+
+def test_suspects_that_contradict_one_another_begin_again(fix: MakeFix) -> None:
+    run = suspects(fix, [0, 1, 2])
+    run.add(fix(3 * S, [300, 0, 0], [10, 0, 0]))
+    assert not run.agree()
+    assert [one.sender_ns for one in run.take()] == [3 * S]
+    assert run.take() == []
+
+
+def test_a_suspect_that_is_late_or_came_twice_counts_for_nothing(fix: MakeFix) -> None:
+    run = suspects(fix, [0, 2])
+    run.add(fix(2 * S, [20, 0, 0], [10, 0, 0]))
+    run.add(fix(S, [10, 0, 0], [10, 0, 0]))
+    assert [one.sender_ns for one in run.take()] == [0, 2 * S]
+
+
+def test_a_run_goes_on_for_as_long_as_it_is_not_forgotten(fix: MakeFix) -> None:
+    run = suspects(fix, [0, 1, 2, 3])
+    assert run.goes_on(3 * S)
+    assert run.goes_on(13 * S - 1)
+    assert not run.goes_on(13 * S)
+    assert not suspects(fix, [0, 1, 2]).goes_on(2 * S)
+
+
+def test_a_run_is_bounded(fix: MakeFix) -> None:
+    run = suspects(fix, [n / 10 for n in range(1000)])
+    kept = run.take()
+    assert len(kept) <= 100
+    assert kept[-1].sender_ns == round(99.9 * S)
+
+
+@pytest.mark.parametrize("rate_hz", [2, 10, 25, 50])
+def test_fast_reports_are_believed_as_soon_as_slow_ones(fix: MakeFix, rate_hz: int) -> None:
+    run = suspects(fix, [n / rate_hz for n in range(4 * rate_hz)])
+    assert run.agree()

@@ -72,3 +72,37 @@ def test_zero_forcing_against_pinv(elements: int, users: int) -> None:
     )
     print(f"\n{elements}x{users}: {theirs_s / ours_s:.1f} times as fast as pinv")
     assert theirs_s > ours_s
+
+
+@pytest.mark.parametrize("uavs", [4, 64])
+def test_a_kinematic_update_with_prediction_and_bound(uavs: int) -> None:
+    """One report taken in and one prediction made; the cost must not grow with the fleet."""
+    each_us = {count: _update_us(count) for count in (4, uavs)}
+    print(f"\n{each_us[uavs]:.0f} us for an update and a prediction with {uavs} UAVs")
+    assert each_us[uavs] < 2 * each_us[4]
+
+
+def _update_us(uavs: int) -> float:
+    settings = Settings()
+    fleet = assembly.fleet(settings, lambda _uav, t_ns: SenderTime(t_ns, 0.01))
+    noise = ReportNoise(1.0, 1.0, 1.4, 0.3)
+    report = Report(
+        0, "bench", "", Source(1, 1), 47.0, 8.0, 500.0, AltitudeDatum.MSL, None, None, None, None,
+        0, None,
+    )  # fmt: skip
+    velocity = np.array([5.0, 0.0, 0.0])
+    rounds = 4000 // uavs
+
+    def fly() -> None:
+        for n in range(rounds):
+            t_ns = fly.begin_ns + n * 100_000_000
+            position = velocity * (t_ns * 1e-9)
+            for uav in range(uavs):
+                name = str(uav)
+                fleet.accept(Fix(name, t_ns, t_ns, t_ns, position, velocity, noise, report))
+                fleet.track(name, t_ns, t_ns + 50_000_000)
+        fly.begin_ns += rounds * 100_000_000
+
+    fly.begin_ns = 1_000_000_000  # type: ignore[attr-defined]
+    (seconds,) = interleaved_s(fly)
+    return seconds / (rounds * uavs) * 1e6

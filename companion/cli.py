@@ -5,6 +5,7 @@ import os
 # Before numpy is loaded: the matrices are small, and more BLAS threads make them slower.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import gc
 import json
 from pathlib import Path
 from typing import Any
@@ -106,6 +107,7 @@ def replay(
     """
     from companion import replay as replaying
 
+    gc.set_threshold(200_000)  # millions of short-lived values, and no cycles among them
     progress = Progress()
     with user_errors():
         settings = replaying.settings_for(logs, config, center)

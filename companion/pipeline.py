@@ -262,15 +262,17 @@ class Pipeline:
     def _tick(self, tick: Tick) -> list[Output]:
         self.updates += 1
         self.last_update = self.look(tick.t_ns)
-        return [*self._state_changes(tick.t_ns), self.last_update]
+        return [*self._state_changes(self.last_update), self.last_update]
 
-    def _state_changes(self, now_ns: int) -> list[Notice]:
+    def _state_changes(self, update: Update) -> list[Notice]:
         """One notice for each target, or the carrier, whose state is another than at the last tick.
 
         Passing traffic comes and goes without a word.
         """
-        watched = [*self._targets, self._carrier_id] if self._carrier_id else self._targets
-        states = self._fleet.states(now_ns, watched)
+        now_ns = update.t_ns
+        states = {track.uav: track.state for track in update.tracks}
+        if self._carrier_id is not None:
+            states |= self._fleet.states(now_ns, [self._carrier_id])
         changed = [uav for uav, state in states.items() if self._states.get(uav) is not state]
         self._states = states
         notices = []
@@ -286,9 +288,7 @@ class Pipeline:
         """Targets and beams at the actuation delay and ``lead_s`` from now. Changes nothing."""
         delay_s = self.settings.beams.actuation_delay_s + lead_s
         valid_at_ns = now_ns + round(delay_s * 1e9)
-        states = self._fleet.states(now_ns, filter(self.is_target, self._targets))
-        aimed_at = [uav for uav, state in states.items() if state is not TrackState.LOST]
-        tracks = self._tracks(aimed_at, now_ns, valid_at_ns)
+        tracks = self._tracks(filter(self.is_target, self._targets), now_ns, valid_at_ns)
         found = self.carrier(now_ns, valid_at_ns)
         known, unfit = (None, found) if isinstance(found, str) else (found, None)
         beams = aim(now_ns, valid_at_ns, tracks, known, self.array, self._precoder)
@@ -299,7 +299,7 @@ class Pipeline:
         others = [uav for uav in self._fleet.uavs if uav != self._carrier_id]
         return self._tracks(others, now_ns, valid_at_ns)
 
-    def _tracks(self, uavs: list[str], now_ns: int, valid_at_ns: int) -> list[Track]:
+    def _tracks(self, uavs: Iterable[str], now_ns: int, valid_at_ns: int) -> list[Track]:
         found = (self._fleet.track(uav, now_ns, valid_at_ns) for uav in uavs)
         return [track for track in found if track is not None]
 

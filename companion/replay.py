@@ -99,7 +99,8 @@ def replay(
     started_s = time.monotonic()
     pipeline, tally = Pipeline(settings), Tally()
     flush_due_s = started_s + FLUSH_EVERY_S
-    for event in _paced(_events(logs, settings), speed):
+    events = _events(logs, settings)
+    for event in events if speed is None else _paced(events, speed):
         outputs = pipeline.step(event)
         tally.event(event)
         if writer:
@@ -134,24 +135,30 @@ def _events(logs: Sequence[Path], settings: Settings) -> Iterator[Event]:
     """All events in order of time, with ticks."""
     if len(logs) == 1 and log_kind(logs[0]) == TICKED:
         return read_log(logs[0])
-    without_ticks = [_no_ticks(read_log(log)) for log in logs]
-    merged = heapq.merge(*without_ticks, key=lambda event: event.t_ns)
+    without_ticks = [_without_ticks(log) for log in logs]
+    merged = (
+        heapq.merge(*without_ticks, key=lambda event: event.t_ns)
+        if len(logs) > 1
+        else without_ticks[0]
+    )
     return with_ticks(merged, settings.beams.update_hz)
 
 
-def _no_ticks(events: Iterator[Event]) -> Iterator[Event]:
+def _without_ticks(log: Path) -> Iterator[Event]:
+    events = read_log(log)
+    if log_kind(log) != TICKED:
+        return events
     return (event for event in events if not isinstance(event, Tick))
 
 
-def _paced(events: Iterable[Event], speed: float | None) -> Iterator[Event]:
+def _paced(events: Iterable[Event], speed: float) -> Iterator[Event]:
     """Hold each event back until its time, at ``speed`` times the time of the log."""
     first: tuple[int, float] | None = None
     for event in events:
-        if speed is not None:
-            if first is None:
-                first = (event.t_ns, time.monotonic())
-            due_s = first[1] + (event.t_ns - first[0]) * 1e-9 / speed
-            time.sleep(max(0.0, due_s - time.monotonic()))
+        if first is None:
+            first = (event.t_ns, time.monotonic())
+        due_s = first[1] + (event.t_ns - first[0]) * 1e-9 / speed
+        time.sleep(max(0.0, due_s - time.monotonic()))
         yield event
 
 

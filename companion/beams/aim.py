@@ -49,10 +49,7 @@ def aim(
     made = precode(matrix, precoder)
     azimuths, elevations = steering.angles_rad(directions)
     gains = gain_db(matrix, made.weights)
-    rates = [
-        _rates(track, carrier, array, float(ranges_m[i]), directions[i])
-        for i, track in enumerate(aimed)
-    ]
+    rates = _rates(aimed, carrier, array, ranges_m, directions)
     beams = tuple(
         Beam(
             uav=track.uav,
@@ -78,29 +75,48 @@ def _pointing_bound_rad(track: Track, carrier: Carrier, range_m: float) -> float
     return None if seen is None else min(seen + carrier.attitude_bound_rad, math.pi)
 
 
-def _rates(
-    track: Track, carrier: Carrier, array: Array, range_m: float, direction: FloatArray
-) -> tuple[float | None, float | None, float | None]:
-    """Rates of azimuth, elevation (rad/s) and range (m/s) of a unit direction in the array frame.
+Rates = tuple[float | None, float | None, float | None]
 
-    Straight up and straight down the azimuth has no rate.
+
+def _rates(
+    tracks: Sequence[Track],
+    carrier: Carrier,
+    array: Array,
+    ranges_m: FloatArray,
+    directions: FloatArray,
+) -> list[Rates]:
+    """Rates of azimuth, elevation (rad/s) and range (m/s) of unit directions in the array frame.
+
+    None without a velocity; straight up and straight down the azimuth has no rate.
     """
-    if track.velocity_ned_mps is None or carrier.velocity_ned_mps is None:
-        return None, None, None
+    unknown: Rates = (None, None, None)
+    moved = carrier.velocity_ned_mps
+    if moved is None:
+        return [unknown] * len(tracks)
+    known = [track.velocity_ned_mps is not None for track in tracks]
+    velocities = [moved if v is None else v for v in (t.velocity_ned_mps for t in tracks)]
     array_from_local = array.array_from_body @ carrier.body_from_local
-    moving = array_from_local @ (track.velocity_ned_mps - carrier.velocity_ned_mps)
-    range_rate_mps = float(moving @ direction)
-    turning = array.array_from_body @ carrier.body_rates_radps
-    x, y, z = direction.tolist()
-    w1, w2, w3 = turning.tolist()
-    across = ((moving - range_rate_mps * direction) / range_m).tolist()
-    x_rate = across[0] - (w2 * z - w3 * y)
-    y_rate = across[1] - (w3 * x - w1 * z)
-    z_rate = across[2] - (w1 * y - w2 * x)
-    level = x * x + y * y
-    if level < 1e-12:
-        return None, None, range_rate_mps
-    return (x * y_rate - y * x_rate) / level, -z_rate / math.sqrt(level), range_rate_mps
+    moving = (np.array(velocities) - moved) @ array_from_local.T
+    range_rates = np.einsum("nk,nk->n", moving, directions)
+    across = (moving - range_rates[:, np.newaxis] * directions) / ranges_m[:, np.newaxis]
+    w1, w2, w3 = (array.array_from_body @ carrier.body_rates_radps).tolist()
+    found: list[Rates] = []
+    for i, (x, y, z) in enumerate(directions.tolist()):
+        x_rate, y_rate, z_rate = across[i].tolist()
+        x_rate, y_rate, z_rate = (
+            x_rate - (w2 * z - w3 * y),
+            y_rate - (w3 * x - w1 * z),
+            z_rate - (w1 * y - w2 * x),
+        )
+        level = x * x + y * y
+        if not known[i]:
+            found.append(unknown)
+        elif level < 1e-12:
+            found.append((None, None, float(range_rates[i])))
+        else:
+            azimuth = (x * y_rate - y * x_rate) / level
+            found.append((azimuth, -z_rate / math.sqrt(level), float(range_rates[i])))
+    return found
 
 
 def _refusal(track: Track, carrier: Carrier | None) -> str | None:

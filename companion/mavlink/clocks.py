@@ -134,11 +134,13 @@ class SenderClock:
         self._gnss = Evidence(_DEEPEST_NS, _OLD_WINDOWS * window_ns)
         self._gnss_plausible = 0
         self._latency_s = 0.0
+        self._now: ClockEstimate | None = None  # what is known, until something more is
         self._median_gap: tuple[tuple[int, int], int] = ((-1, -1), 0)  # as of what state, and it
 
     def observe(self, arrival_ns: int, boot_ms: int) -> Stamp | None:
         """Place a stamp. None: it is a frame of the boot before, or it is off the line and no
         others have confirmed it so far; the report has no time and cannot be used."""
+        self._now = None
         placed = self._line.observe(arrival_ns, boot_ms)
         if placed is None:
             return None
@@ -154,6 +156,7 @@ class SenderClock:
     def timesync(self, sent_ns: int, received_ns: int, remote_ns: int) -> None:
         """One TIMESYNC round trip, of any length: sent and received on the node's timeline, and
         the sender's time since boot when it replied. Refused until a stamp was observed."""
+        self._now = None
         if not self._line.envelope:
             self.timesync_refused = "no stamp of this sender was seen so far"
         elif received_ns < sent_ns:
@@ -169,6 +172,7 @@ class SenderClock:
         Used only where the settings trust it and the node keeps UTC, and only after several in a
         row have implied latencies between -20 ms and 5 s.
         """
+        self._now = None
         self.gnss_refused = self._system_time(arrival_ns, unix_us, boot_ms)
         if self.gnss_refused is not None:
             self._gnss_plausible = 0
@@ -202,17 +206,20 @@ class SenderClock:
     def sender_ns(self, node_ns: int) -> int:
         """Sender time of a node time, ns: ``node_ns`` the other way round, to a few ns."""
         newest_ns = self._line.newest_ns  # rounding grows with the distance from here
-        ahead_ns = node_ns - self.node_ns(newest_ns)
+        known = self._now or self.estimate()
+        if known is None:
+            raise ValueError("no stamp of this sender was seen so far")
+        ahead_ns = node_ns - newest_ns - known.offset_ns
         return newest_ns + round(ahead_ns / (1.0 + self._line.envelope.drift))
 
     def estimate(self) -> ClockEstimate | None:
         """What is known of the clock at its newest stamp; None before any."""
-        if not self._line.envelope:
-            return None
+        if self._now is not None or not self._line.envelope:
+            return self._now
         kind, depth_ns, error_ns = self._depth()
         if kind is ClockKind.ENVELOPE:
             error_ns = self._envelope_error_ns()
-        return ClockEstimate(
+        self._now = ClockEstimate(
             kind=kind,
             offset_ns=self.node_ns(self._line.newest_ns) - self._line.newest_ns,
             drift_ppm=self._line.envelope.drift * 1e6,
@@ -220,6 +227,7 @@ class SenderClock:
             constant_delay_s=depth_ns * 1e-9,
             latency_s=self._latency_s,
         )
+        return self._now
 
     def _depth(self) -> tuple[ClockKind, int, float]:
         """How far below the envelope the clock is, by the best evidence, and its error; ns."""

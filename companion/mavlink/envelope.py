@@ -84,6 +84,7 @@ class Envelope:
         self._drift_limit = drift_limit
         self._drift_unsure = drift_unsure
         self._pieces: deque[_Piece] = deque()
+        self.count = 0
         self._newest: Point | None = None
         self._pivot: Point = (0, 0)
         self.drift = 0.0
@@ -101,10 +102,6 @@ class Envelope:
     @property
     def newest_ns(self) -> int:
         return self._newest[0] if self._newest else 0
-
-    @property
-    def count(self) -> int:
-        return sum(len(piece.samples) for piece in self._pieces)
 
     @property
     def independent(self) -> int:
@@ -159,6 +156,7 @@ class Envelope:
             piece.samples.append((x_ns, y_ns))
             piece.sum_x += x_ns
             piece.sum_y += y_ns
+            self.count += 1
 
     def _advance(self, x_ns: int) -> bool:
         """Open a new piece where one is due and drop what is too old; whether that happened."""
@@ -167,7 +165,7 @@ class Envelope:
             return False
         pieces.append(_Piece(index))
         while len(pieces) > PIECES or pieces[0].index * self._piece_ns < x_ns - self._oldest_ns:
-            pieces.popleft()
+            self.count -= len(pieces.popleft().samples)
         return True
 
     def _open_slopes(self) -> float:

@@ -1,16 +1,14 @@
 """What every observer takes and gives, so that tracks need not know which one they use."""
 
-from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 from companion.values import Fix, FloatArray
 
 State = TypeVar("State")
 
 
-@dataclass(frozen=True, slots=True)
-class Prediction:
-    """A UAV at an asked time; local frame, shapes (3,).
+class Prediction(NamedTuple):
+    """A UAV at an asked time; local frame, shapes (3,). A tuple, for several are made a report.
 
     The position's error lies in an upright cylinder: ``horizontal_m`` bounds its norm in the
     plane, ``vertical_m`` its height, ``bound_m`` its norm. ``velocity_bound_mps`` bounds the

@@ -75,6 +75,7 @@ class _Tracked:
     unknown_input: FloatArray | None = None
     mu_max_s2: float | None = None
     acceleration: FloatArray | None = None
+    acceleration_mps2: float = 0.0
 
 
 class Fleet:
@@ -104,16 +105,16 @@ class Fleet:
             return _rejected(fix, Reason.OUT_OF_ORDER, "older than the window for late reports")
         before = tracked.history.entries[max(index - 1, 0)]
         wrong = self._wrong(tracked, index, fix)
-        if wrong is None:
-            wrong = refusal(self._observer.predict(before.state, fix.sender_ns), fix)
-            if wrong is not None:
-                return self._suspect(tracked, fix, wrong)
         if wrong is not None:
             return _rejected(fix, *wrong)
+        predicted = self._observer.predict(before.state, fix.sender_ns)
+        impossible = refusal(predicted, fix)
+        if impossible is not None:
+            return self._suspect(tracked, fix, impossible)
         tracked.believable_ns = max(tracked.believable_ns, fix.sender_ns)
         if tracked.suspects.goes_on(fix.sender_ns):
             return _rejected(fix, Reason.SHARED_ID, "a second vehicle reports under this id")
-        return self._use(tracked, index, fix)
+        return self._use(tracked, index, fix, predicted)
 
     def _begin(self, fix: Fix, reports: int = 0) -> Estimate:
         history: History[Any] = History(self._observer, fix, round(self._settings.window_s * 1e9))
@@ -155,11 +156,13 @@ class Fleet:
     def _history(self, uav: str) -> History[Any]:
         return self._tracked[uav].history
 
-    def _use(self, tracked: _Tracked, index: int, fix: Fix) -> Estimate:
+    def _use(
+        self, tracked: _Tracked, index: int, fix: Fix, predicted: Prediction | None = None
+    ) -> Estimate:
         history = tracked.history
-        history.insert(index, fix)
+        history.insert(index, fix, predicted)
         tracked.reports += 1
-        tracked.acceleration = self._acceleration(history)
+        tracked.acceleration, tracked.acceleration_mps2 = self._acceleration(history)
         tracked.newest = self._estimate(tracked, len(history.entries) - 1)
         tracked.unknown_input = _unknown_input(history)
         if tracked.newest.fix is fix:
@@ -181,14 +184,14 @@ class Fleet:
         innovation_m = math.sqrt(off @ off)
         return Estimate(entry.fix, predicted.position_ned_m, predicted.bound_m, innovation_m, dt_s)
 
-    def _acceleration(self, history: History[Any]) -> FloatArray | None:
-        """What is fed forward, no more than the greatest that is taken for possible."""
+    def _acceleration(self, history: History[Any]) -> tuple[FloatArray | None, float]:
+        """What is fed forward and its size, no more than is taken for possible."""
         found = history.acceleration() if self._settings.feed_forward else None
         if found is None:
-            return None
+            return None, 0.0
         most_mps2 = self._settings.acceleration_max_mps2
         size = math.sqrt(found @ found)
-        return found if size <= most_mps2 else found * (most_mps2 / size)
+        return (found, size) if size <= most_mps2 else (found * (most_mps2 / size), most_mps2)
 
     def restart(self, uav: str) -> None:
         """Forget a track: its sender was restarted, and its times begin anew."""
@@ -231,28 +234,37 @@ class Fleet:
         newest = tracked.history.newest
         found = self._observer.predict(newest.state, at.sender_ns)
         ahead_s = (at.sender_ns - newest.fix.sender_ns) * 1e-9
-        widened_m = 0.0
-        if tracked.acceleration is not None and found.velocity_ned_mps is not None and ahead_s > 0:
-            found, widened_m = _fed_forward(found, tracked.acceleration, ahead_s)
+        position, velocity = found.position_ned_m, found.velocity_ned_mps
+        velocity_bound_mps, widened_m = found.velocity_bound_mps, 0.0
+        if tracked.acceleration is not None and velocity is not None and ahead_s > 0:
+            # The bound allows for any acceleration up to its limit; the part that is fed forward
+            # may be wrong by its whole size besides.
+            way_s2, gain_s = _fading(ahead_s)
+            position = position + way_s2 * tracked.acceleration
+            velocity = velocity + gain_s * tracked.acceleration
+            widened_m = way_s2 * tracked.acceleration_mps2
+            velocity_bound_mps = (velocity_bound_mps or 0.0) + gain_s * tracked.acceleration_mps2
         if at.bound_s > 0:
-            widened_m += at.bound_s * self._fastest_mps(found, at.bound_s)
-        if widened_m == 0.0:
-            return found
-        return replace(
-            found,
-            bound_m=found.bound_m + widened_m,
-            horizontal_m=found.horizontal_m + widened_m,
-            vertical_m=found.vertical_m + widened_m,
+            widened_m += at.bound_s * self._fastest_mps(velocity, velocity_bound_mps, at.bound_s)
+        return Prediction(
+            position,
+            velocity,
+            found.bound_m + widened_m,
+            found.horizontal_m + widened_m,
+            found.vertical_m + widened_m,
+            velocity_bound_mps,
+            found.mu_s2,
         )
 
-    def _fastest_mps(self, found: Prediction, within_s: float) -> float:
-        """How fast it can be within a time of the prediction's own."""
+    def _fastest_mps(
+        self, velocity: FloatArray | None, bound_mps: float | None, within_s: float
+    ) -> float:
+        """How fast it can be within a time of that at which it has this velocity."""
         most_mps = self._settings.speed_max_mps
-        if found.velocity_ned_mps is None or found.velocity_bound_mps is None:
+        if velocity is None or bound_mps is None:
             return most_mps
-        speed_mps = math.sqrt(found.velocity_ned_mps @ found.velocity_ned_mps)
         gained_mps = self._settings.acceleration_max_mps2 * within_s
-        return min(most_mps, speed_mps + found.velocity_bound_mps + gained_mps)
+        return min(most_mps, math.sqrt(velocity @ velocity) + bound_mps + gained_mps)
 
     def newest(self, uav: str) -> Fix | None:
         """The newest accepted report of a UAV."""
@@ -283,26 +295,11 @@ def _rejected(fix: Fix, reason: Reason, detail: str) -> Rejection:
     return Rejection(fix.arrival_ns, fix.uav, reason, detail=detail)
 
 
-def _fed_forward(
-    found: Prediction, acceleration: FloatArray, ahead_s: float
-) -> tuple[Prediction, float]:
-    """A prediction with the acceleration fading over the time ahead, and what the bound gains.
-
-    The bound already allows for any acceleration up to its limit; the part that was fed forward
-    may be wrong by its whole size besides.
-    """
-    fade = ACCELERATION_FADES_S
-    shrink = math.exp(-ahead_s / fade)
-    displacement = fade * fade * (shrink - 1 + ahead_s / fade) * acceleration
-    assert found.velocity_ned_mps is not None
-    faster = fade * (1 - shrink) * acceleration
-    moved = replace(
-        found,
-        position_ned_m=found.position_ned_m + displacement,
-        velocity_ned_mps=found.velocity_ned_mps + faster,
-        velocity_bound_mps=(found.velocity_bound_mps or 0.0) + math.sqrt(faster @ faster),
-    )
-    return moved, math.sqrt(displacement @ displacement)
+def _fading(ahead_s: float) -> tuple[float, float]:
+    """What an acceleration of 1 that fades does within a time: displacement, gain in speed."""
+    fade_s = ACCELERATION_FADES_S
+    shrink = math.exp(-ahead_s / fade_s)
+    return fade_s * fade_s * (shrink - 1 + ahead_s / fade_s), fade_s * (1 - shrink)
 
 
 def _unknown_input(history: History[Any]) -> FloatArray | None:

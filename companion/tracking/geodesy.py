@@ -8,12 +8,18 @@ difference of positions.
 """
 
 import math
-from typing import cast
+from typing import Final
 
 import numpy as np
 import pymap3d
 
 from companion.values import FloatArray
+
+SEMI_MAJOR_M: Final = 6_378_137.0
+SEMI_MINOR_M: Final = SEMI_MAJOR_M * (1 - 1 / 298.257223563)
+ECCENTRICITY2: Final = 1 - (SEMI_MINOR_M / SEMI_MAJOR_M) ** 2
+SECOND_ECCENTRICITY2: Final = (SEMI_MAJOR_M / SEMI_MINOR_M) ** 2 - 1
+"""WGS84 (NIMA TR8350.2)."""
 
 
 def ned_from_ecef(lat_deg: float, lon_deg: float) -> FloatArray:
@@ -38,6 +44,7 @@ class LocalFrame:
     def __init__(self, lat_deg: float, lon_deg: float, alt_m: float) -> None:
         self.origin = (lat_deg, lon_deg, alt_m)
         self._local_from_ecef = ned_from_ecef(lat_deg, lon_deg)
+        self._origin_m = np.array(pymap3d.geodetic2ecef(lat_deg, lon_deg, alt_m), dtype=float)
 
     def position_ned_m(self, lat_deg: float, lon_deg: float, alt_m: float) -> FloatArray:
         """Local coordinates, shape (3,), of a place."""
@@ -49,8 +56,26 @@ class LocalFrame:
 
     def geodetic(self, position_ned_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Latitude and longitude in degrees and height in metres of local points, (N, 3)."""
-        north, east, down = np.asarray(position_ned_m, dtype=float).T
-        return cast(
-            tuple[FloatArray, FloatArray, FloatArray],
-            pymap3d.ned2geodetic(north, east, down, *self.origin),
+        ecef_m = np.asarray(position_ned_m, dtype=float) @ self._local_from_ecef + self._origin_m
+        places = [_geodetic(*point) for point in ecef_m.tolist()]
+        lat, lon, alt = np.array(places).reshape(-1, 3).T
+        return lat, lon, alt
+
+
+def _geodetic(x_m: float, y_m: float, z_m: float) -> tuple[float, float, float]:
+    """Bowring's formula (1976), two steps: exact to rounding wherever aircraft fly.
+
+    pymap3d does the same for arrays; for the few points of an update its overhead is most of it.
+    """
+    across_m = math.hypot(x_m, y_m)
+    lat = math.atan2(z_m, across_m * (1 - ECCENTRICITY2))
+    for _ in range(2):
+        reduced = math.atan2(SEMI_MINOR_M * math.sin(lat), SEMI_MAJOR_M * math.cos(lat))
+        lat = math.atan2(
+            z_m + SECOND_ECCENTRICITY2 * SEMI_MINOR_M * math.sin(reduced) ** 3,
+            across_m - ECCENTRICITY2 * SEMI_MAJOR_M * math.cos(reduced) ** 3,
         )
+    sine, cosine = math.sin(lat), math.cos(lat)
+    normal_m = SEMI_MAJOR_M / math.sqrt(1 - ECCENTRICITY2 * sine * sine)
+    alt_m = across_m * cosine + (z_m + ECCENTRICITY2 * normal_m * sine) * sine - normal_m
+    return math.degrees(lat), math.degrees(math.atan2(y_m, x_m)), alt_m

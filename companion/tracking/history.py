@@ -15,9 +15,10 @@ from companion.tracking.estimates import Observer, Prediction, State
 from companion.values import Fix, FloatArray
 
 ACCELERATION_WINDOW_NS = 5_000_000_000
-ACCELERATION_REPORTS = 5
+ACCELERATION_REPORTS, ACCELERATION_REPORTS_MAX = 5, 15
 """The acceleration is the slope of the velocities reported over the window, and of at least so
-many: fewer say more of their noise than of a turn."""
+many: fewer say more of their noise than of a turn. Of very many, every
+few do."""
 
 
 @dataclass(slots=True)
@@ -50,11 +51,18 @@ class History(Generic[State]):
             return None
         return bisect_left(self.entries, sender_ns, key=lambda entry: entry.fix.sender_ns)
 
-    def insert(self, index: int, fix: Fix) -> None:
-        """Put a report in its place and estimate what follows it again."""
-        self.entries.insert(index, Entry(fix, self.newest.state, None))
-        for at in range(index, len(self.entries)):
-            self.entries[at] = self._estimated(at)
+    def insert(self, index: int, fix: Fix, predicted: Prediction | None = None) -> None:
+        """Put a report in its place and estimate what follows it again.
+
+        ``predicted``: what the entry before predicts for it, if that was asked already.
+        """
+        if predicted is not None and index == len(self.entries):
+            state = self._observer.after(self.newest.state, predicted, fix)
+            self.entries.append(Entry(fix, state, predicted))
+        else:
+            self.entries.insert(index, Entry(fix, self.newest.state, None))
+            for at in range(index, len(self.entries)):
+                self.entries[at] = self._estimated(at)
         oldest_ns = self.newest.fix.sender_ns - self._window_ns
         while len(self.entries) > 1 and self.entries[1].fix.sender_ns <= oldest_ns:
             del self.entries[0]
@@ -70,17 +78,19 @@ class History(Generic[State]):
     def acceleration(self) -> FloatArray | None:
         """Least-squares slope of the newest reported velocities, m/s^2, (3,); None if unknown."""
         newest_ns = self.newest.fix.sender_ns
-        times: list[float] = []
+        times_ns: list[int] = []
         velocities: list[FloatArray] = []
-        for entry in reversed(self.entries):
+        stride = max(1, len(self.entries) // ACCELERATION_REPORTS_MAX)
+        for entry in self.entries[::-stride]:
             fix = entry.fix
             old = newest_ns - fix.sender_ns > ACCELERATION_WINDOW_NS
-            if fix.velocity_ned_mps is None or (old and len(times) >= ACCELERATION_REPORTS):
+            if fix.velocity_ned_mps is None or (old and len(times_ns) >= ACCELERATION_REPORTS):
                 break
-            times.append((fix.sender_ns - newest_ns) * 1e-9)
+            times_ns.append(fix.sender_ns - newest_ns)
             velocities.append(fix.velocity_ned_mps)
-        if len(times) < ACCELERATION_REPORTS:
+        if len(times_ns) < ACCELERATION_REPORTS:
             return None
-        t = np.array(times) - np.mean(times)
+        t = np.array(times_ns) * 1e-9
+        t -= t.sum() / len(t)
         slope: FloatArray = t @ np.array(velocities) / (t @ t)
         return slope

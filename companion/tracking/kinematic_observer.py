@@ -125,11 +125,19 @@ class KinematicObserver:
             + abs(l22) * noise.velocity_mps
             + model.acceleration_mps2 * age
         )
-        return self._limited(
-            fix,
-            age,
-            Prediction(position, velocity, bound_m, horizontal_m, vertical_m, velocity_mps, None),
+        bound_m = min(bound_m, math.hypot(horizontal_m, vertical_m))
+        found = Prediction(
+            position, velocity, bound_m, horizontal_m, vertical_m, velocity_mps, None
         )
+        reach_m = age * model.speed_mps
+        if (
+            velocity_mps <= model.speed_mps
+            and horizontal_m <= noise.horizontal_m + reach_m
+            and vertical_m <= noise.vertical_m + reach_m
+            and bound_m <= noise.position_m + reach_m
+        ):
+            return found  # the greatest speed says no more
+        return self._limited(fix, reach_m, found)
 
     def _gain(self, state: KinematicState, t: float) -> Gain:
         """The scheduled gain; without a reported velocity, A(t) [1; share / interval before]."""
@@ -156,12 +164,11 @@ class KinematicObserver:
             (fix.sender_ns - state.fix.sender_ns) * 1e-9,
         )
 
-    def _limited(self, fix: Fix, age_s: float, found: Prediction) -> Prediction:
+    def _limited(self, fix: Fix, reach_m: float, found: Prediction) -> Prediction:
         """The bounds where the greatest speed says more than the acceleration."""
         assert found.velocity_ned_mps is not None
         assert found.velocity_bound_mps is not None
         horizontal_m, vertical_m = found.horizontal_m, found.vertical_m
-        reach_m = age_s * self.model.speed_mps
         north, east, down = (found.position_ned_m - fix.position_ned_m).tolist()
         horizontal_m = min(horizontal_m, fix.noise.horizontal_m + reach_m + math.hypot(north, east))
         vertical_m = min(vertical_m, fix.noise.vertical_m + reach_m + abs(down))

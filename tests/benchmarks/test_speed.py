@@ -11,8 +11,12 @@ import numpy as np
 import pytest
 from support import BIN, shared_log
 
+from companion import assembly
 from companion.beams import arrays, precoding, steering
+from companion.config import Settings
 from companion.mavlink.framing import Splitter
+from companion.tracking.fleet import SenderTime
+from companion.values import AltitudeDatum, Fix, Report, ReportNoise, Source
 
 pytestmark = pytest.mark.benchmark
 ROUNDS = 5
@@ -93,16 +97,18 @@ def _update_us(uavs: int) -> float:
     velocity = np.array([5.0, 0.0, 0.0])
     rounds = 4000 // uavs
 
+    begin_ns = 1_000_000_000
+
     def fly() -> None:
+        nonlocal begin_ns
         for n in range(rounds):
-            t_ns = fly.begin_ns + n * 100_000_000
+            t_ns = begin_ns + n * 100_000_000
             position = velocity * (t_ns * 1e-9)
             for uav in range(uavs):
                 name = str(uav)
                 fleet.accept(Fix(name, t_ns, t_ns, t_ns, position, velocity, noise, report))
                 fleet.track(name, t_ns, t_ns + 50_000_000)
-        fly.begin_ns += rounds * 100_000_000
+        begin_ns += rounds * 100_000_000
 
-    fly.begin_ns = 1_000_000_000  # type: ignore[attr-defined]
     (seconds,) = interleaved_s(fly)
     return seconds / (rounds * uavs) * 1e6

@@ -50,7 +50,7 @@ def same_state(one: object, other: object) -> bool:
         if isinstance(getattr(one, name), np.ndarray)
         else getattr(one, name) is getattr(other, name)
         or getattr(one, name) == getattr(other, name)
-        for name in type(one).__dataclass_fields__
+        for name in type(one).__annotations__
     )
 
 

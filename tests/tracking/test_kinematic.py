@@ -18,17 +18,17 @@ from companion.tracking import kinematic, lmi
 from companion.tracking.kinematic import DesignError, KinematicDesign
 from companion.values import FloatArray
 
-FOLDER = Path(kinematic.__file__).parent
 NAMES = ("kinematic_default", "kinematic_no_velocity")
+FOLDERS = (Path(kinematic.__file__).parent, Path(__file__).parents[1] / "data")
 SPEED_MPS = 60.0
 
 
-def shipped(name: str) -> KinematicDesign:
-    text = (FOLDER / f"{name}.json").read_text(encoding="utf-8")
-    return KinematicDesign.from_json(text)
+def designed(folder: Path, name: str) -> KinematicDesign:
+    """The table that comes with the program, and one for senders without velocity."""
+    return KinematicDesign.from_json((folder / f"{name}.json").read_text(encoding="utf-8"))
 
 
-DESIGNS = [shipped(name) for name in NAMES]
+DESIGNS = [designed(*place) for place in zip(FOLDERS, NAMES, strict=True)]
 WITH_VELOCITY, WITHOUT = DESIGNS
 EACH = pytest.mark.parametrize("design", DESIGNS, ids=NAMES)
 

@@ -1,0 +1,100 @@
+"""Own telemetry and ADS-B of one aircraft are one; two aircraft that meet are two."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+from companion.tracking import noise
+from companion.tracking.identity import REPORTS_TO_DECIDE, Identities
+from companion.values import Fix, GnssStatus, ReportNoise, Source, Track, TrackState
+
+MakeFix = Callable[..., Fix]
+S = 1_000_000_000
+AIRCRAFT = "icao:4CA7B3"
+VELOCITY = (20.0, 0.0, 0.0)
+
+
+def track(uav: str, position: ArrayLike, velocity: ArrayLike | None = VELOCITY) -> Track:
+    speeds = None if velocity is None else np.array(velocity, dtype=float)
+    return Track(
+        uav, TrackState.LIVE, 0, 0.0, np.array(position, dtype=float), speeds, None, None,
+        5.0, 5.0, 5.0, 0.0, None, None, None, None, 1,
+    )  # fmt: skip
+
+
+def relayed(fix: MakeFix, n: int, position: ArrayLike, velocity: ArrayLike = VELOCITY) -> Fix:
+    speeds = np.array(velocity, dtype=float)
+    return fix(n * S, position, velocity, uav=AIRCRAFT, noise=noise.relayed(speeds, 60.0))
+
+
+def after(fix: MakeFix, offsets: list[float], *others: Track) -> str | None:
+    """Who it is taken for, after reports that far to the east of the first track."""
+    identities = Identities()
+    for n, east in enumerate(offsets):
+        here = [20.0 * n, 0, -300]
+        telemetry = [track("1:1", here), *others]
+        identities.observe(relayed(fix, n, [20.0 * n, east, -310]), telemetry)
+    return identities.same_as(AIRCRAFT)
+
+
+def test_one_aircraft_under_two_names_is_found_after_some_reports(fix: MakeFix) -> None:
+    assert after(fix, [30.0] * (REPORTS_TO_DECIDE - 1)) is None
+    assert after(fix, [30.0] * REPORTS_TO_DECIDE) == "1:1"
+
+
+def test_far_apart_it_is_itself(fix: MakeFix) -> None:
+    assert after(fix, [500.0] * 20) is None
+
+
+def test_the_nearest_is_taken(fix: MakeFix) -> None:
+    assert after(fix, [30.0] * 6, track("2:1", [100, 200, -300])) == "1:1"
+
+
+def test_a_short_meeting_is_no_match(fix: MakeFix) -> None:
+    """Passing within the errors for fewer reports than it takes."""
+    assert after(fix, [400, 300, 100, 0, -100, -300, -400, -500]) is None
+
+
+def test_another_way_of_flying_is_another_aircraft(fix: MakeFix) -> None:
+    identities = Identities()
+    for n in range(20):
+        telemetry = [track("1:1", [0, 0, -300])]
+        identities.observe(relayed(fix, n, [0, 10, -300], (0.0, 25.0, 0.0)), telemetry)
+    assert identities.same_as(AIRCRAFT) is None
+
+
+def test_it_is_itself_again_when_they_part(fix: MakeFix) -> None:
+    assert after(fix, [30.0] * 8 + [900.0] * (REPORTS_TO_DECIDE - 1)) == "1:1"
+    assert after(fix, [30.0] * 8 + [900.0] * REPORTS_TO_DECIDE) is None
+
+
+# --- bounds on a report's errors ------------------------------------------------------------------
+
+DEFAULT = ReportNoise(3.0, 3.0, 3.0, 0.5)
+
+
+def status(h: float | None, v: float | None, vel: float | None) -> GnssStatus:
+    return GnssStatus(0, Source(1, 1), 3, 12, h, v, vel)
+
+
+@pytest.mark.parametrize(
+    ("accuracies", "expected"),
+    [
+        ((0.5, 1.0, 0.1), (1.5, 3.0, 3.354, 0.3)),
+        ((None, 1.0, None), (3.0, 3.0, 4.243, 0.5)),
+        ((0.001, 0.001, 0.001), (0.02, 0.02, 0.0283, 0.02)),  # finer than what is sent
+    ],
+)
+def test_reported_accuracies_are_bounds_times_a_factor(
+    accuracies: tuple[float | None, ...], expected: tuple[float, ...]
+) -> None:
+    found = noise.reported(status(*accuracies), noise.NoiseSettings(DEFAULT, 3.0))
+    values = (found.horizontal_m, found.vertical_m, found.position_m, found.velocity_mps)
+    assert values == pytest.approx(expected, abs=1e-3)
+
+
+def test_reported_accuracies_can_be_ignored() -> None:
+    given = noise.NoiseSettings(DEFAULT, None)
+    assert noise.reported(status(0.5, 1.0, 0.1), given) == DEFAULT

@@ -618,3 +618,16 @@ def test_no_events_no_ticks() -> None:
     assert list(with_ticks([], 20.0)) == []
     garbage = Rejection(START_NS, "udp", Reason.GARBAGE)
     assert list(with_ticks([garbage, garbage], 1000.0)) == [garbage, garbage]
+
+
+def test_own_telemetry_and_adsb_of_one_aircraft_get_one_beam() -> None:
+    pipeline = Pipeline(settings("47.4,8.55,500", beams={"targets": "all"}))
+    for n in range(8):
+        here = (300.0 + 5 * n, 40.0, -120.0)
+        pipeline.step(position(n, "1:1", here, (5, 0, 0)))
+        pipeline.step(adsb(n + 0.1, (here[0] + 8, 30.0, -130.0)))
+        update = updated(pipeline, n + 0.2)
+        assert set(update.beams.uavs) == ({"1:1", "icao:4CA7B3"} if n < 4 else {"1:1"})
+    assert pipeline.same_as("icao:4CA7B3") == "1:1"
+    assert pipeline.same_as("1:1") is None
+    assert not pipeline.is_target("icao:4CA7B3")

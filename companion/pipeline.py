@@ -6,8 +6,9 @@ same digest, whoever feeds them.
 
 import hashlib
 import struct
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator
+from typing import Final
 
 import numpy as np
 
@@ -46,6 +47,9 @@ from companion.values import (
     TrackState,
     Update,
 )
+
+RECENT: Final = 8
+"""Rejections of each sender that are kept to be shown."""
 
 
 def with_ticks(events: Iterable[Event], update_hz: float) -> Iterator[Event]:
@@ -98,6 +102,7 @@ class Pipeline:
         self.updates = 0
         self.rejected: Counter[Reason] = Counter()
         self.rejected_by_source: dict[str, Counter[Reason]] = {}
+        self.recent_rejections: dict[str, deque[Rejection]] = {}
         self.digest = Digest()
         self.array = assembly.array(settings)
         self.local: LocalFrame | None = None
@@ -135,6 +140,8 @@ class Pipeline:
                 self.rejected[output.reason] += output.count
                 by_source = self.rejected_by_source.setdefault(output.source, Counter())
                 by_source[output.reason] += output.count
+                recent = self.recent_rejections.setdefault(output.source, deque(maxlen=RECENT))
+                recent.append(output)
             elif isinstance(output, Estimate | Update):
                 self.digest.add(output)
         return outputs

@@ -336,6 +336,7 @@ def test_the_same_report_over_two_links_counts_once() -> None:
     (refused,) = pipeline.step(again)
     assert refused == Rejection(again.t_ns, "1:1", Reason.DUPLICATE)
     assert pipeline.rejected == {Reason.DUPLICATE: 1}
+    assert list(pipeline.recent_rejections["1:1"]) == [refused]
     assert pipeline.frames == 2
     track = pipeline.tracks(again.t_ns, again.t_ns)[0]
     assert track.reports == 1

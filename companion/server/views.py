@@ -186,6 +186,10 @@ def uav(
         "innovation_m": track.innovation_m,
         "reports": track.reports,
         "rejected": {str(reason): count for reason, count in sorted(rejected.items())},
+        "recent_rejections": [
+            {"at": rfc3339(one.t_ns), "reason": str(one.reason), "detail": one.detail}
+            for one in pipeline.recent_rejections.get(track.uav, ())
+        ],
     }
 
 

@@ -49,9 +49,10 @@ export class PlanView {
 
   show(scene, now) {
     this.scene = scene;
-    // The lost are left out: one that flew off long ago would make all the others small.
-    this.scale.follow(scene.uavs
-      .filter((uav) => placed(uav) && uav.state !== "lost")
+    // Neither one that flew off long ago nor passing traffic may make those with a beam small.
+    const shown = scene.uavs.filter((uav) => placed(uav) && uav.state !== "lost");
+    const targets = shown.filter((uav) => uav.target !== false);
+    this.scale.follow((targets.length ? targets : shown)
       .map((uav) => Math.hypot(uav.north_m, uav.east_m)), now);
     this.redraw();
   }

@@ -48,6 +48,8 @@ from companion.values import (
     Update,
 )
 
+NEAR_M: Final = 2000.0
+"""Two reports of one aircraft are not further apart, however fast it is and however old one is."""
 RECENT: Final = 8
 """Rejections of each sender that are kept to be shown."""
 
@@ -189,7 +191,7 @@ class Pipeline:
             if accepted.dt_s is None and self.is_target(report.uav):
                 self._targets = list(dict.fromkeys([*self._targets, report.uav]))
             if report.boot_ms is None:
-                self._identities.observe(accepted.fix, self._telemetry(accepted.fix.t_ns))
+                self._identities.observe(accepted.fix, self._telemetry_near(accepted.fix))
             if accepted.reacquired:
                 text = f"{report.uav} is tracked anew: its reports agree, but not with its past"
                 outputs.append(Notice(report.t_ns, Severity.WARNING, report.uav, text))
@@ -310,10 +312,16 @@ class Pipeline:
         found = (self._fleet.track(uav, now_ns, valid_at_ns) for uav in uavs)
         return [track for track in found if track is not None]
 
-    def _telemetry(self, at_ns: int) -> list[Track]:
-        """What reports itself, at a time."""
-        own = [uav for uav in self._fleet.uavs if uav in self._clocks_by_uav]
-        return self._tracks(own, at_ns, at_ns)
+    def _telemetry_near(self, relayed: Fix) -> list[Track]:
+        """What reports itself and was last heard of near a relayed position, at its time."""
+        near = []
+        for uav in self._clocks_by_uav:
+            newest = self._fleet.newest(uav)
+            if newest is not None:
+                offset = newest.position_ned_m - relayed.position_ned_m
+                if offset @ offset < NEAR_M**2:
+                    near.append(uav)
+        return self._tracks(near, relayed.t_ns, relayed.t_ns)
 
     def same_as(self, uav: str) -> str | None:
         """The telemetry track that a relayed aircraft is; None if it is itself."""

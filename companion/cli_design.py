@@ -174,7 +174,7 @@ def study() -> None:
 @click.option(
     "--loss", metavar="F", type=float, default=0.1, show_default=True, help="Share that is lost."
 )
-@click.option("--known-delay", is_flag=True, help="The least latency is known, as by TIMESYNC.")
+@click.option("--known-delay", is_flag=True, help="The senders' clocks are known, as by TIMESYNC.")
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
 @JSON

@@ -115,8 +115,7 @@ class Pipeline:
         self._center: Center = parse_center(settings.center.source or "home")
         self._carrier_id = str(self._center) if isinstance(self._center, VehicleCenter) else None
         self._attitude: tuple[int, Attitude] | None = None
-        self._clocks: dict[Source, SenderClock] = {}
-        self._clocks_by_uav: dict[str, SenderClock] = {}
+        self._clocks: dict[str, SenderClock] = {}  # by SYSID:COMPID
         self._dedupe = Dedupe()
         self._fleet = assembly.fleet(settings, self._sender_time)
         self._targets: list[str] = []  # in the order in which they were first heard
@@ -198,10 +197,10 @@ class Pipeline:
         return [*outputs, accepted]
 
     def _clock(self, source: Source) -> SenderClock:
-        clock = self._clocks.get(source)
+        name = str(source)
+        clock = self._clocks.get(name)
         if clock is None:
-            clock = self._clocks.setdefault(source, assembly.clock(self.settings))
-            self._clocks_by_uav[str(source)] = clock
+            clock = self._clocks.setdefault(name, assembly.clock(self.settings))
         return clock
 
     def _stamp(
@@ -217,7 +216,7 @@ class Pipeline:
 
     def _sender_time(self, uav: str, node_ns: int) -> SenderTime:
         """A time of the node on a UAV's own timeline; that of ADS-B traffic is the node's."""
-        clock = self._clocks_by_uav.get(uav)
+        clock = self._clocks.get(uav)
         estimate = clock.estimate() if clock else None
         if clock is None or estimate is None:
             return SenderTime(node_ns, noise.ADSB_TIME_BOUND_S)
@@ -225,7 +224,7 @@ class Pipeline:
 
     def clock_estimate(self, uav: str) -> ClockEstimate | None:
         """What is known of a UAV's clock; None for one that has none."""
-        clock = self._clocks_by_uav.get(uav)
+        clock = self._clocks.get(uav)
         return clock.estimate() if clock else None
 
     def _restart(self, uav: str) -> None:
@@ -315,7 +314,7 @@ class Pipeline:
     def _telemetry_near(self, relayed: Fix) -> list[Track]:
         """What reports itself and was last heard of near a relayed position, at its time."""
         near = []
-        for uav in self._clocks_by_uav:
+        for uav in self._clocks:
             newest = self._fleet.newest(uav)
             if newest is not None:
                 offset = newest.position_ned_m - relayed.position_ned_m

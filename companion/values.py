@@ -91,10 +91,10 @@ class Reason(StrEnum):
     SHARED_ID = "shared-id"  # two vehicles send under one id: neither can be believed
     ZERO_POSITION = "zero-position"  # within 5 km of 0 N 0 E: what is sent before a fix
     NO_POSITION = "no-position"  # ADSB_VEHICLE whose flags do not vouch for its coordinates
-    NO_ALTITUDE = "no-altitude"  # a position in the plane only, and no altitude known before
+    NO_ALTITUDE = "no-altitude"  # a position in the plane only
     UNPLACED_STAMP = "unplaced-stamp"  # off the sender's clock, and not enough others yet to agree
     DUPLICATE = "duplicate"  # the same report again, over this link or another
-    OUT_OF_ORDER = "out-of-order"  # older than what the track already holds
+    OUT_OF_ORDER = "out-of-order"  # later than the window for late reports
 
 
 @dataclass(frozen=True, slots=True)

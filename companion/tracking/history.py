@@ -17,8 +17,7 @@ from companion.values import Fix, FloatArray
 ACCELERATION_WINDOW_NS = 5_000_000_000
 ACCELERATION_REPORTS, ACCELERATION_REPORTS_MAX = 5, 15
 """The acceleration is the slope of the velocities reported over the window, and of at least so
-many: fewer say more of their noise than of a turn. Of very many, every
-few do."""
+many: fewer say more of their noise than of a turn. Of very many, one in a few is taken."""
 
 
 @dataclass(slots=True)

@@ -22,8 +22,10 @@ LOCKS = ("requirements.lock", "requirements-dev.lock")
 LONGEST_MODULE_LINES = 400
 
 PURE = (
-    "companion/values.py",
+    "companion/values/",
     "companion/config.py",
+    "companion/beam_settings.py",
+    "companion/assembly.py",
     "companion/pipeline.py",
     "companion/mavlink/",
     "companion/tracking/",
@@ -130,14 +132,14 @@ def heavy_imports(path: str, text: str) -> list[str]:
 
 
 def foreign_imports(path: str, text: str) -> list[str]:
-    """``values`` imports only the standard library and numpy."""
-    if path != "companion/values.py":
+    """``values`` imports only the standard library, numpy and itself."""
+    if not path.startswith("companion/values/"):
         return []
     allowed = sys.stdlib_module_names | {"numpy"}
     return [
         f"{path}:{line}: imports {name}"
         for line, name in imports(ast.parse(text))
-        if name.split(".")[0] not in allowed
+        if name.split(".")[0] not in allowed and not name.startswith("companion.values.")
     ]
 
 
@@ -205,12 +207,13 @@ RULES: tuple[Rule, ...] = (
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.__name__)
 def test_the_tree_keeps_the_rule(rule: Rule) -> None:
     paths = sources()
-    assert "companion/values.py" in paths
+    assert "companion/values/received.py" in paths
     faults = [fault for p in paths for fault in rule(p, (ROOT / p).read_text(encoding="utf-8"))]
     assert not faults, "\n" + "\n".join(faults)
 
 
 BEAMS = "companion/beams/steering.py"
+VALUES = "companion/values/tracked.py"
 BAD = [
     (impurities, BEAMS, "async def f(): ..."),
     (impurities, BEAMS, "async def f():\n    return [x async for x in g()]"),
@@ -222,7 +225,7 @@ BAD = [
     (impurities, BEAMS, "from pathlib import Path"),
     (impurities, BEAMS, "data = open('x')"),
     (impurities, BEAMS, "data = p.read_text()"),
-    (impurities, "companion/values.py", "from datetime import datetime\nt = datetime.now()"),
+    (impurities, VALUES, "from datetime import datetime\nt = datetime.now()"),
     (impurities, "companion/tracking/fleet.py", "t = time.time_ns(); import time"),
     (impurities, "companion/pipeline.py", "import threading"),
     (impurities, "companion/mavlink/framing.py", "import selectors"),
@@ -232,9 +235,9 @@ BAD = [
     (heavy_imports, "sitl_replay/player.py", "from pymavlink import mavutil"),
     (heavy_imports, "companion/mavlink/links.py", "import pymavlink.mavutil"),
     (heavy_imports, "companion/service.py", "from pymavlink.mavutil import mavlink_connection"),
-    (foreign_imports, "companion/values.py", "import scipy.linalg"),
-    (foreign_imports, "companion/values.py", "from companion.config import Settings"),
-    (foreign_imports, "companion/values.py", "from .mavlink import framing"),
+    (foreign_imports, VALUES, "import scipy.linalg"),
+    (foreign_imports, VALUES, "from companion.config import Settings"),
+    (foreign_imports, VALUES, "from .mavlink import framing"),
     (strangers, "sitl_replay/player.py", "from companion.pipeline import step"),
     (strangers, "sitl_replay/player.py", "import companion.server.app"),
     (strangers, "sitl_replay/player.py", "from companion.recording import writer"),
@@ -262,7 +265,8 @@ GOOD = [
     (impurities, BEAMS, "from datetime import datetime\nimport numpy as np\ntime = 3\ntimeout = 4"),
     (heavy_imports, "companion/tracking/lmi.py", "def f():\n    import cvxpy"),
     (heavy_imports, "companion/mavlink/decode.py", "from pymavlink.dialects.v20 import all"),
-    (foreign_imports, "companion/values.py", "import enum\nfrom numpy.typing import NDArray"),
+    (foreign_imports, VALUES, "from companion.values.numbers import FloatArray"),
+    (foreign_imports, VALUES, "import enum\nfrom numpy.typing import NDArray"),
     (strangers, "sitl_replay/player.py", "from companion.values import Source"),
     (strangers, "sitl_replay/player.py", "from companion.mavlink.framing import Splitter"),
     (strangers, "sitl_replay/player.py", "from companion.recording.reader import frames"),
@@ -298,7 +302,7 @@ def test_the_rooms_import_in_the_order_of_the_flow() -> None:
         ("companion/beams/bad.py", "import companion.tracking"),
         ("companion/mavlink/bad.py", "import companion.beams"),
         ("companion/tracking/bad.py", "def f():\n    from companion.mavlink import framing"),
-        ("companion/values.py", "import companion.beams"),
+        (VALUES, "import companion.beams"),
         ("companion/recording/bad.py", "import companion.server"),
         ("companion/server/bad.py", "import sitl_replay"),
         ("companion/studies/bad.py", "import companion.server"),
@@ -313,7 +317,7 @@ def test_import_linter_refuses(tmp_path: Path, path: str, text: str) -> None:
             room = tmp_path / directory.relative_to(ROOT)
             room.mkdir(parents=True, exist_ok=True)
             (room / "__init__.py").touch()
-    (tmp_path / "companion/values.py").touch()
+    (tmp_path / "companion/values/tracked.py").touch()
     assert lint_imports(tmp_path).returncode == 0
     (tmp_path / path).write_text(text, encoding="utf-8")
     done = lint_imports(tmp_path)

@@ -17,6 +17,7 @@ from companion.values import (
     FloatArray,
     LeftOut,
     Method,
+    Normalisation,
     Track,
     TrackState,
 )
@@ -43,12 +44,22 @@ def aim(
     aimed = [track for track in tracks if refused[track.uav] is None]
     if carrier is None or not aimed:
         nothing: ComplexArray = np.empty((array.size, 0), dtype=complex)
-        return BeamSet(now_ns, valid_at_ns, (), nothing, Method.ZERO_FORCING, None, left_out)
+        return BeamSet(
+            now_ns,
+            valid_at_ns,
+            (),
+            nothing,
+            Method.ZERO_FORCING,
+            Normalisation.UNIT_RESPONSE,
+            None,
+            left_out,
+        )
     ranges_m, directions = _directions(aimed, carrier, array)
     matrix = steering.steering_matrix(array, directions)
     made = precode(matrix, precoder)
     azimuths, elevations = steering.angles_rad(directions)
     gains = gain_db(matrix, made.weights)
+    alone = gain_db(matrix, matrix.conj())
     rates = _rates(aimed, carrier, array, ranges_m, directions)
     beams = tuple(
         Beam(
@@ -61,11 +72,19 @@ def aim(
             range_rate_mps=rates[i][2],
             pointing_bound_rad=_pointing_bound_rad(track, carrier, float(ranges_m[i])),
             gain_db=float(gains[i]),
+            loss_db=float(alone[i] - gains[i]),
         )
         for i, track in enumerate(aimed)
     )
     return BeamSet(
-        now_ns, valid_at_ns, beams, made.weights, made.method, made.condition_number, left_out
+        now_ns,
+        valid_at_ns,
+        beams,
+        made.weights,
+        made.method,
+        Normalisation.UNIT_RESPONSE,
+        made.condition_number,
+        left_out,
     )
 
 

@@ -1,47 +1,181 @@
-"""Where the elements of the array are.
+"""Where the elements of an array are, how they face, and how the array sits on its carrier.
 
-Array frame: x boresight, y right, z down; metres. So far the uniform linear array along y, with
-its first element at the origin, which is the phase reference.
+Array frame: x boresight, y right, z down; metres. A uniform linear array (ULA) lies along y, a
+uniform rectangular one (URA) in the yz plane, a uniform circular one (UCA) in the xy plane; any
+list of positions will do as well. The origin of the array frame is the phase reference.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 
-from companion.values import FloatArray
+from companion.beams.elements import ISOTROPIC, Element, Pattern
+from companion.values import FloatArray, IntArray
 
 SPEED_OF_LIGHT_MPS: Final = 299_792_458.0
+SAME_PLACE_WAVELENGTHS: Final = 1e-9
+"""Positions that differ by less are one: 1e-8 rad of phase."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Array:
     """Element positions (M, 3) in the array frame, metres, at a wavelength in metres.
 
-    ``array_from_body`` (3, 3) is the mounting. Elements are isotropic.
+    ``array_from_body`` (3, 3) is the mounting, ``lever_arm_m`` (3,) where the array stands in the
+    body frame, from the point whose position the carrier reports. ``element`` is the pattern of
+    all elements; ``element_from_array`` (M, 3, 3) turns each to where it faces (None: all along
+    boresight). ``grid`` is rows and columns of a ULA or URA, elements row by row, else None.
+    ``partners`` (M,), found from the rest: each element's mirror image through the centroid,
+    None where the array has no such symmetry.
     """
 
     kind: str
     elements_m: FloatArray
     wavelength_m: float
     array_from_body: FloatArray
+    lever_arm_m: FloatArray = field(default_factory=lambda: np.zeros(3))
+    element: Element = ISOTROPIC
+    element_from_array: FloatArray | None = None
+    grid: tuple[int, int] | None = None
+    partners: IntArray | None = field(init=False, default=None)
+
+    def __post_init__(self) -> None:
+        if self.element_from_array is None:
+            object.__setattr__(self, "partners", _partners(self.elements_m, self.wavelength_m))
 
     @property
     def size(self) -> int:
         """M, the number of elements."""
         return len(self.elements_m)
 
+    @property
+    def wavenumber_radpm(self) -> float:
+        """2 pi / wavelength."""
+        return 2 * np.pi / self.wavelength_m
+
 
 def uniform_linear(
-    elements: int, frequency_hz: float, spacing_wavelengths: float, array_from_body: FloatArray
+    elements: int,
+    frequency_hz: float,
+    spacing_wavelengths: float,
+    array_from_body: FloatArray,
+    element: Element = ISOTROPIC,
+    lever_arm_m: FloatArray | None = None,
 ) -> Array:
-    """A uniform linear array along y. ``ValueError`` for what is no array."""
-    if elements < 1 or frequency_hz <= 0 or spacing_wavelengths <= 0:
+    """A uniform linear array along y, its first element at the origin.
+
+    ``ValueError`` for what is no array, here and below.
+    """
+    return uniform_rectangular(
+        1, elements, frequency_hz, spacing_wavelengths, array_from_body, element, lever_arm_m
+    )
+
+
+def uniform_rectangular(
+    rows: int,
+    columns: int,
+    frequency_hz: float,
+    spacing_wavelengths: float,
+    array_from_body: FloatArray,
+    element: Element = ISOTROPIC,
+    lever_arm_m: FloatArray | None = None,
+) -> Array:
+    """Rows downward (z) of elements to the right (y), the first at the origin, row by row.
+
+    One row is the uniform linear array.
+    """
+    wavelength_m = _wavelength_m(min(rows, columns), frequency_hz, spacing_wavelengths)
+    spacing_m = spacing_wavelengths * wavelength_m
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    elements_m = np.stack([np.zeros(rows * columns), column * spacing_m, row * spacing_m], axis=1)
+    kind = "ula" if rows == 1 else "ura"
+    lever = np.zeros(3) if lever_arm_m is None else lever_arm_m
+    return Array(
+        kind, elements_m, wavelength_m, array_from_body, lever, element, None, (rows, columns)
+    )
+
+
+def uniform_circular(
+    elements: int,
+    frequency_hz: float,
+    spacing_wavelengths: float,
+    array_from_body: FloatArray,
+    element: Element = ISOTROPIC,
+    lever_arm_m: FloatArray | None = None,
+) -> Array:
+    """A circle around the origin, the first element on x, on towards y; spacing is the chord
+    between neighbours. Elements that are not isotropic face outward."""
+    wavelength_m = _wavelength_m(elements, frequency_hz, spacing_wavelengths)
+    angle = 2 * np.pi * np.arange(elements) / elements
+    radius_m = spacing_wavelengths * wavelength_m / (2 * np.sin(np.pi / elements))
+    outward = np.stack([np.cos(angle), np.sin(angle), np.zeros(elements)], axis=1)
+    placed = outward * (radius_m if elements > 1 else 0.0)
+    return listed(placed, frequency_hz, array_from_body, element, lever_arm_m, outward, kind="uca")
+
+
+def listed(
+    elements_m: FloatArray,
+    frequency_hz: float,
+    array_from_body: FloatArray,
+    element: Element = ISOTROPIC,
+    lever_arm_m: FloatArray | None = None,
+    outward: FloatArray | None = None,
+    kind: str = "list",
+) -> Array:
+    """Elements at any positions (M, 3); ``outward`` (M, 3) is where each faces (None: boresight).
+
+    Two elements at one place are refused: they are one element wired twice.
+    """
+    wavelength_m = _wavelength_m(len(elements_m), frequency_hz, 1.0)
+    if elements_m.ndim != 2 or elements_m.shape[1] != 3 or not np.isfinite(elements_m).all():
+        raise ValueError("element positions are rows of three finite numbers, metres")
+    places = np.round(elements_m / (SAME_PLACE_WAVELENGTHS * wavelength_m))
+    if len(np.unique(places, axis=0)) < len(places):
+        raise ValueError("two elements stand at one place")
+    turned = None
+    if outward is not None and element.pattern is not Pattern.ISOTROPIC:
+        turned = _facing(outward, len(elements_m))
+    lever = np.zeros(3) if lever_arm_m is None else lever_arm_m
+    return Array(kind, elements_m, wavelength_m, array_from_body, lever, element, turned)
+
+
+def _wavelength_m(elements: int, frequency_hz: float, spacing: float) -> float:
+    if elements < 1 or frequency_hz <= 0 or spacing <= 0:
         raise ValueError("an array has at least one element, a frequency and a spacing above 0")
-    wavelength_m = SPEED_OF_LIGHT_MPS / frequency_hz
-    positions_m = np.zeros((elements, 3))
-    positions_m[:, 1] = np.arange(elements) * spacing_wavelengths * wavelength_m
-    return Array("ula", positions_m, wavelength_m, array_from_body)
+    return SPEED_OF_LIGHT_MPS / frequency_hz
+
+
+def _facing(outward: FloatArray, count: int) -> FloatArray:
+    """element_from_array (M, 3, 3): x outward, y level (to the right of outward) where it can be.
+
+    An element that faces straight up or down keeps the array's y.
+    """
+    if outward.shape != (count, 3) or not np.isfinite(outward).all():
+        raise ValueError("each element faces one direction of three finite numbers")
+    lengths = np.linalg.norm(outward, axis=1)
+    if not (lengths > 0).all():
+        raise ValueError("the direction in which an element faces has a length above 0")
+    x = outward / lengths[:, np.newaxis]
+    y = np.stack([-x[:, 1], x[:, 0], np.zeros(count)], axis=1)  # down cross outward
+    level = np.linalg.norm(y, axis=1)
+    y = np.where(
+        level[:, np.newaxis] > 1e-9, y / np.maximum(level, 1e-300)[:, np.newaxis], [0, 1, 0]
+    )
+    return np.stack([x, y, np.cross(x, y)], axis=1)
+
+
+def _partners(elements_m: FloatArray, wavelength_m: float) -> IntArray | None:
+    """For each element the one that mirrors it through the centroid; None unless all have one."""
+    centred = (elements_m - elements_m.mean(axis=0)) / wavelength_m
+    if not np.isfinite(centred).all():
+        return None
+    order = np.lexsort(np.round(centred, 6).T)
+    back = np.lexsort(np.round(-centred, 6).T)
+    partners = np.empty(len(centred), dtype=np.int64)
+    partners[order] = back
+    gap = np.abs(centred + centred[partners]).max(initial=0.0)
+    return partners if gap < SAME_PLACE_WAVELENGTHS else None
 
 
 def half_power_beamwidth_rad(array: Array) -> float | None:

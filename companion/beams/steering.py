@@ -3,10 +3,10 @@
 Angles of a unit direction u in the array frame: azimuth = atan2(u_y, u_x), to the right;
 elevation = asin(-u_z), up. The steering vector of direction u is
 
-    a(u)_m = exp(+j 2 pi / wavelength  p_m . u)
+    a(u)_m = g_m(u) exp(+j 2 pi / wavelength  p_m . u)
 
-with p_m the position of element m. (MATH: array, steering, weights; for a line along y this is
-the published exp(j 2 pi / wavelength d m sin theta).)
+with p_m the position of element m and g_m its amplitude. (MATH: array, steering, weights; for
+isotropic elements along y this is the published exp(j 2 pi / wavelength d m sin theta).)
 """
 
 import math
@@ -14,6 +14,7 @@ import math
 import numpy as np
 
 from companion.beams.arrays import Array
+from companion.beams.elements import Pattern
 from companion.values import ComplexArray, FloatArray
 
 
@@ -25,9 +26,24 @@ def angles_rad(directions: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def steering_matrix(array: Array, directions: FloatArray) -> ComplexArray:
     """A, shape (M, N): one steering vector a column, for unit directions (N, 3)."""
-    phase = (2 * np.pi / array.wavelength_m) * (array.elements_m @ directions.T)
+    phase = array.wavenumber_radpm * (array.elements_m @ directions.T)
     matrix: ComplexArray = np.exp(1j * phase)
+    if array.element.pattern is not Pattern.ISOTROPIC:
+        matrix *= amplitudes(array, directions)
     return matrix
+
+
+def amplitudes(array: Array, directions: FloatArray) -> FloatArray:
+    """What the elements radiate towards unit directions (N, 3): (M, N), or (1, N) if all alike."""
+    return array.element.amplitude(element_directions(array, directions))
+
+
+def element_directions(array: Array, directions: FloatArray) -> FloatArray:
+    """Unit directions (N, 3) in the frame of each element: (M, N, 3), or (1, N, 3) if all alike."""
+    if array.element_from_array is None:
+        return directions[np.newaxis]
+    turned: FloatArray = np.einsum("mij,nj->mni", array.element_from_array, directions)
+    return turned
 
 
 def pointing_bound_rad(bound_m: float, range_m: float) -> float | None:

@@ -1,0 +1,102 @@
+"""What one element of an array radiates in which direction.
+
+Element frame: x outward, y right, z down, as the array frame. An amplitude is the square root of
+the power gain over an isotropic element.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+import numpy as np
+
+from companion.values import FloatArray
+
+
+class Pattern(StrEnum):
+    """The shape of an element's pattern."""
+
+    ISOTROPIC = "isotropic"
+    COSINE = "cosine"
+    TR38901 = "3gpp"
+
+
+# 3GPP TR 38.901 table 7.3-1: 65 degrees between half powers, 30 dB at most, 8 dBi at best.
+WIDTH_DEG: Final = 65.0
+FLOOR_DB: Final = 30.0
+BEST_DBI: Final = 8.0
+
+
+@dataclass(frozen=True, slots=True)
+class Element:
+    """A pattern; ``exponent`` q is of the cosine alone.
+
+    ``ISOTROPIC``: gain 1 everywhere. ``COSINE``: power gain 2(q + 1) cos^q of the angle from
+    outward, nothing behind (the factor makes all of the power come out). ``TR38901``: the antenna
+    element of 3GPP TR 38.901, table 7.3-1.
+    """
+
+    pattern: Pattern = Pattern.ISOTROPIC
+    exponent: float = 1.0
+
+    def amplitude(self, directions: FloatArray) -> FloatArray:
+        """Amplitude towards unit directions (..., 3) in the element frame; shape (...)."""
+        match self.pattern:
+            case Pattern.ISOTROPIC:
+                return np.ones(directions.shape[:-1])
+            case Pattern.COSINE:
+                return self._cosine(directions[..., 0])
+            case Pattern.TR38901:
+                azimuth = np.arctan2(directions[..., 1], directions[..., 0])
+                elevation = np.arcsin(np.clip(directions[..., 2], -1.0, 1.0))
+                return _tr38901(np.abs(azimuth), np.abs(elevation))
+
+    def amplitude_range(
+        self, directions: FloatArray, radius_rad: float | FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Bounds: no direction within ``radius_rad`` of these has less or more amplitude.
+
+        Both are attained, but for the corners of TR 38.901, where the product of the two cuts is
+        bounded by the extremes of each.
+        """
+        match self.pattern:
+            case Pattern.ISOTROPIC:
+                both = np.ones(directions.shape[:-1])
+                return both, both
+            case Pattern.COSINE:
+                off = np.arccos(np.clip(directions[..., 0], -1.0, 1.0))
+                least = np.cos(np.minimum(off + radius_rad, np.pi))
+                return self._cosine(least), self._cosine(np.cos(np.maximum(off - radius_rad, 0.0)))
+            case Pattern.TR38901:
+                return _tr38901_range(directions, radius_rad)
+
+    def _cosine(self, cosine: FloatArray) -> FloatArray:
+        power = 2 * (self.exponent + 1) * np.maximum(cosine, 0.0) ** self.exponent
+        amplitude: FloatArray = np.sqrt(np.where(cosine > 0, power, 0.0))
+        return amplitude
+
+
+ISOTROPIC: Final = Element()
+
+
+def _tr38901(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> FloatArray:
+    """Table 7.3-1 for angles from outward, both 0 or more."""
+    down_db = np.minimum(12 * (np.degrees(elevation_rad) / WIDTH_DEG) ** 2, FLOOR_DB)
+    aside_db = np.minimum(12 * (np.degrees(azimuth_rad) / WIDTH_DEG) ** 2, FLOOR_DB)
+    gain_db = BEST_DBI - np.minimum(down_db + aside_db, FLOOR_DB)
+    amplitude: FloatArray = 10 ** (gain_db / 20)
+    return amplitude
+
+
+def _tr38901_range(
+    directions: FloatArray, radius_rad: float | FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    azimuth = np.abs(np.arctan2(directions[..., 1], directions[..., 0]))
+    elevation = np.abs(np.arcsin(np.clip(directions[..., 2], -1.0, 1.0)))
+    # A cap around elevation e reaches asin(sin(radius) / cos(e)) in azimuth, or over the pole.
+    over = elevation + radius_rad >= np.pi / 2
+    sine = np.sin(np.minimum(radius_rad, np.pi / 2)) / np.maximum(np.cos(elevation), 1e-300)
+    reach = np.where(over, np.pi, np.arcsin(np.clip(sine, 0.0, 1.0)))
+    least = _tr38901(np.minimum(azimuth + reach, np.pi), np.minimum(elevation + radius_rad, np.pi))
+    most = _tr38901(np.maximum(azimuth - reach, 0.0), np.maximum(elevation - radius_rad, 0.0))
+    return least, most

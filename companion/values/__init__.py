@@ -1,0 +1,87 @@
+"""The frozen values that flow through the program, from a received frame to a set of weights.
+
+Conventions, here and everywhere:
+
+* Time is integer nanoseconds since the Unix epoch on the node's own clock (``_ns``).
+* The *local frame* is north-east-down (NED), metres, tangent to WGS84 at a fixed origin.
+* The *body frame* is forward-right-down (FRD), as MAVLink has it; so is the *array frame*, with
+  x along boresight.
+* ``a_from_b`` is the 3x3 matrix that takes coordinates in frame b to coordinates in frame a.
+* Unknown is ``None``, never 0.
+
+Arrays inside these values are not to be written to.
+"""
+
+from companion.values.aimed import (
+    Beam,
+    BeamSet,
+    LeftOut,
+    Method,
+)
+from companion.values.numbers import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+)
+from companion.values.outputs import (
+    Notice,
+    Output,
+    Severity,
+    Update,
+)
+from companion.values.received import (
+    AltitudeDatum,
+    Attitude,
+    Event,
+    Frame,
+    GnssStatus,
+    Message,
+    Presence,
+    Reason,
+    Rejection,
+    Report,
+    Source,
+    SystemTime,
+    Tick,
+)
+from companion.values.tracked import (
+    Carrier,
+    Estimate,
+    Fix,
+    ReportNoise,
+    Track,
+    TrackState,
+)
+
+__all__ = [
+    "AltitudeDatum",
+    "Attitude",
+    "Beam",
+    "BeamSet",
+    "Carrier",
+    "ComplexArray",
+    "Estimate",
+    "Event",
+    "Fix",
+    "FloatArray",
+    "Frame",
+    "GnssStatus",
+    "IntArray",
+    "LeftOut",
+    "Message",
+    "Method",
+    "Notice",
+    "Output",
+    "Presence",
+    "Reason",
+    "Rejection",
+    "Report",
+    "ReportNoise",
+    "Severity",
+    "Source",
+    "SystemTime",
+    "Tick",
+    "Track",
+    "TrackState",
+    "Update",
+]

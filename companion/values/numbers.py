@@ -1,0 +1,8 @@
+"""Arrays of numbers, as they are written in types. They are not to be written to."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+IntArray = NDArray[np.int64]

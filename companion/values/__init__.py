@@ -17,6 +17,8 @@ from companion.values.aimed import (
     BeamSet,
     LeftOut,
     Method,
+    Normalisation,
+    Policy,
 )
 from companion.values.numbers import (
     ComplexArray,
@@ -70,8 +72,10 @@ __all__ = [
     "LeftOut",
     "Message",
     "Method",
+    "Normalisation",
     "Notice",
     "Output",
+    "Policy",
     "Presence",
     "Reason",
     "Rejection",

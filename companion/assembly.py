@@ -3,8 +3,9 @@
 import numpy as np
 
 from companion.beams import arrays
+from companion.beams.elements import Element, Pattern
 from companion.beams.precoding import Precoder
-from companion.config import Settings, kinematic_design
+from companion.config import ConfigError, Settings, kinematic_design
 from companion.mavlink.clocks import ClockSettings, SenderClock
 from companion.tracking.carrier import body_from_ned
 from companion.tracking.fleet import Ages, Fleet, FleetSettings, ToSenderTime
@@ -12,21 +13,63 @@ from companion.tracking.gate import GateSettings
 from companion.tracking.kinematic_observer import KinematicModel, KinematicObserver, scheduled
 from companion.tracking.noise import NoiseSettings
 from companion.tracking.observer import PositionModel, PositionObserver
-from companion.values import ReportNoise
+from companion.values import FloatArray, ReportNoise
 
 
 def array(settings: Settings) -> arrays.Array:
-    """The antenna array on its mount."""
+    """The antenna array on its mount. Raises ``ConfigError``."""
     given = settings.array
-    mount = np.radians([given.mount_roll_deg, given.mount_pitch_deg, given.mount_yaw_deg])
-    return arrays.uniform_linear(
-        given.elements, given.frequency_hz, given.spacing_wavelengths, body_from_ned(*mount)
+    mount = body_from_ned(
+        *np.radians([given.mount_roll_deg, given.mount_pitch_deg, given.mount_yaw_deg])
     )
+    element = Element(Pattern(given.element), given.element_exponent)
+    lever_arm_m = np.array(given.lever_arm_m)
+    spacing = given.spacing_wavelengths
+    if given.spacing_m is not None:
+        spacing = given.spacing_m * given.frequency_hz / arrays.SPEED_OF_LIGHT_MPS
+    on_carrier = (mount, element, lever_arm_m)
+    try:
+        match given.kind:
+            case "ula":
+                return arrays.uniform_linear(
+                    given.elements, given.frequency_hz, spacing, *on_carrier
+                )
+            case "ura":
+                return arrays.uniform_rectangular(
+                    given.rows, given.columns, given.frequency_hz, spacing, *on_carrier
+                )
+            case "uca":
+                return arrays.uniform_circular(
+                    given.elements, given.frequency_hz, spacing, *on_carrier
+                )
+            case "list":
+                placed = _rows(given.positions_m or ())
+                outward = placed[:, 3:6] if placed.shape[1] == 6 else None
+                return arrays.listed(placed[:, :3], given.frequency_hz, *on_carrier, outward)
+    except ValueError as error:
+        raise ConfigError(f"array: {error}") from error
+
+
+def _rows(positions_m: tuple[tuple[float, ...], ...]) -> FloatArray:
+    lengths = {len(row) for row in positions_m}
+    if lengths not in ({3}, {6}):
+        raise ValueError("positions_m are rows of 3 numbers, or all of 6")
+    return np.array(positions_m)
 
 
 def precoder(settings: Settings) -> Precoder:
     """How weights are made."""
-    return Precoder(settings.beams.condition_limit, settings.beams.regularisation)
+    given = settings.beams
+    return Precoder(
+        given.method,
+        given.policy,
+        given.loss_limit_db,
+        given.condition_limit,
+        given.regularisation,
+        given.normalisation,
+        given.priority,
+        given.widen,
+    )
 
 
 def noise(settings: Settings) -> NoiseSettings:

@@ -12,10 +12,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
+import numpy as np
 from pydantic import (
     AfterValidator,
-    BaseModel,
-    ConfigDict,
     Field,
     FiniteFloat,
     PositiveFloat,
@@ -23,8 +22,16 @@ from pydantic import (
     model_validator,
 )
 
+from companion.beam_settings import (
+    ArraySettings,
+    BeamSettings,
+    CodebookSettings,
+    HardwareSettings,
+    RadioSettings,
+    Section,
+)
 from companion.tracking.kinematic import KinematicDesign
-from companion.values import Source
+from companion.values import ComplexArray, FloatArray, Source
 
 DEFAULT_DESIGN: Final = "kinematic_default.json"
 
@@ -91,11 +98,7 @@ def _center_text(text: str) -> str:
     return text
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class CenterSettings(_Section):
+class CenterSettings(Section):
     """What carries the array; ``run`` refuses to start without it.
 
     ``attitude_bound_deg`` bounds the error of a vehicle's attitude, mounting included.
@@ -105,13 +108,13 @@ class CenterSettings(_Section):
     attitude_bound_deg: Annotated[float, Field(ge=0, le=180)] = 1.0
 
 
-class LinkSettings(_Section):
+class LinkSettings(Section):
     """Where MAVLink comes from."""
 
     urls: tuple[str, ...] = ()
 
 
-class ClockSettings(_Section):
+class ClockSettings(Section):
     """How senders' boot clocks are put on the node's timeline.
 
     ``constant_delay_s`` is how old a report is when it arrives at its earliest, which no one-way
@@ -128,7 +131,7 @@ class ClockSettings(_Section):
     node_utc_error_s: Annotated[float, Field(ge=0, le=10)] | None = None
 
 
-class ObserverSettings(_Section):
+class ObserverSettings(Section):
     """The observer and what it takes for granted: bounds that are never exceeded.
 
     Speed, acceleration and noise are norms of 3-vectors. Where the autopilot sends its own
@@ -152,7 +155,7 @@ class ObserverSettings(_Section):
     accuracy_factor: PositiveFloat = 3.0
 
 
-class TrackSettings(_Section):
+class TrackSettings(Section):
     """Ages of the newest report at which a track passes to the next state, seconds.
 
     ``window_s``: how late a report may come and still be used as if in order. A track is begun
@@ -174,45 +177,20 @@ class TrackSettings(_Section):
         return self
 
 
-class ArraySettings(_Section):
-    """A uniform linear array along the y axis of its mount; mount angles of array from body."""
-
-    kind: Literal["ula"] = "ula"
-    elements: Annotated[int, Field(ge=1, le=4096)] = 64
-    frequency_hz: PositiveFloat = 30e9
-    spacing_wavelengths: PositiveFloat = 0.5
-    mount_roll_deg: float = 0.0
-    mount_pitch_deg: float = 0.0
-    mount_yaw_deg: float = 0.0
-
-
-class BeamSettings(_Section):
-    """When weights are made, for when, for whom, and when zero forcing gives way to RZF.
-
-    Up to ``condition_limit`` = 1000 zero forcing holds to 1e-9: its error grows with the square.
-    """
-
-    update_hz: Annotated[float, Field(gt=0, le=1000)] = 20.0
-    actuation_delay_s: Annotated[float, Field(ge=0, le=10)] = 0.01
-    targets: Literal["telemetry", "all"] = "telemetry"
-    condition_limit: Annotated[float, Field(ge=1, le=1e3)] = 10.0
-    regularisation: Annotated[float, Field(gt=0, le=10)] = 0.01
-
-
-class RecordingSettings(_Section):
+class RecordingSettings(Section):
     """Where recordings go (None: nowhere) and how often weights are written."""
 
     directory: str | None = None
     weights_hz: Literal["all"] | PositiveFloat = 10.0
 
 
-class ServerSettings(_Section):
+class ServerSettings(Section):
     """Where HTTP is served."""
 
     listen: str = "127.0.0.1:8080"
 
 
-class Settings(_Section):
+class Settings(Section):
     """All settings of the service."""
 
     center: CenterSettings = CenterSettings()
@@ -222,6 +200,9 @@ class Settings(_Section):
     tracks: TrackSettings = TrackSettings()
     array: ArraySettings = ArraySettings()
     beams: BeamSettings = BeamSettings()
+    codebook: CodebookSettings = CodebookSettings()
+    hardware: HardwareSettings = HardwareSettings()
+    radio: RadioSettings = RadioSettings()
     recording: RecordingSettings = RecordingSettings()
     server: ServerSettings = ServerSettings()
 
@@ -263,7 +244,67 @@ def load(path: Path | None) -> Settings:
         raise ConfigError(f"{path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not TOML: it is not UTF-8 text") from error
-    return Settings.from_toml(text, str(path))
+    return _with_positions(Settings.from_toml(text, str(path)))
+
+
+def _with_positions(settings: Settings) -> Settings:
+    """Settings that hold the element positions themselves, so that a recording holds them too."""
+    named = settings.array.positions
+    if named is None:
+        return settings
+    rows = [tuple(row) for row in numbers_file("array.positions", named, 3).tolist()]
+    array = {**settings.array.model_dump(mode="json"), "positions": None, "positions_m": rows}
+    return settings.model_copy(update={"array": ArraySettings.model_validate(array)})
+
+
+def numbers_file(key: str, name: str, columns: int) -> FloatArray:
+    """The rows of a file of numbers (.npy, or text with commas or blanks), (n, >= columns).
+
+    ``ConfigError``, naming the key, where it cannot be read.
+    """
+    try:
+        if name.endswith(".npy"):
+            found = np.load(name, allow_pickle=False)
+        else:
+            text = Path(name).read_text(encoding="utf-8")
+            lines = (line.split("#")[0].replace(",", " ").split() for line in text.splitlines())
+            found = np.array([[float(word) for word in line] for line in lines if line])
+    except OSError as error:
+        raise ConfigError(f"{key} = {name!r}: {error.strerror}") from error
+    except (ValueError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{key} = {name!r}: not a table of numbers: {error}") from error
+    if found.ndim != 2 or found.shape[1] < columns or not np.isfinite(found).all():
+        raise ConfigError(f"{key} = {name!r}: rows of at least {columns} finite numbers are needed")
+    rows: FloatArray = found.astype(np.float64)
+    return rows
+
+
+def codebook_file(settings: Settings) -> ComplexArray:
+    """The beams of ``codebook.file``, one a column (M, K). ``ConfigError`` if it is not such."""
+    name = settings.codebook.file or ""
+    try:
+        found = np.load(name, allow_pickle=False)
+    except OSError as error:
+        raise ConfigError(f"codebook.file = {name!r}: {error.strerror or error}") from error
+    except ValueError as error:
+        raise ConfigError(f"codebook.file = {name!r}: {error}") from error
+    if found.ndim != 2 or found.dtype.kind not in "fc":
+        raise ConfigError(f"codebook.file = {name!r}: not a matrix of numbers")
+    beams: ComplexArray = found.astype(np.complex128)
+    return beams
+
+
+def calibration_text(settings: Settings) -> str | None:
+    """The calibration table of the hardware as text; None without one."""
+    name = settings.hardware.calibration
+    if name is None:
+        return None
+    try:
+        return Path(name).read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"hardware.calibration = {name!r}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"hardware.calibration = {name!r}: not UTF-8 text") from error
 
 
 def kinematic_design(settings: Settings) -> KinematicDesign:

@@ -3,10 +3,12 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from companion import assembly
 from companion.config import (
     BeamSettings,
     ConfigError,
@@ -65,9 +67,23 @@ WRONG = [
     ("array", "elements", "2.5", "2.5", "integer"),
     ("array", "elements", "5000", "5000", "less than or equal to 4096"),
     ("array", "mount_yaw_deg", "nan", "nan", "finite"),
+    ("array", "rows", "0", "0", "greater than or equal to 1"),
+    ("array", "spacing_m", "0", "0", "greater than 0"),
+    ("array", "element", '"dipole"', "dipole", "'isotropic', 'cosine' or '3gpp'"),
+    ("array", "element_exponent", "-1", "-1", "greater than or equal to 0"),
+    ("array", "lever_arm_m", "[1, 2]", "1, 2", "required"),
+    ("array", "field_of_view_deg", "361", "361", "less than or equal to 360"),
+    ("array", "azimuth_limits_deg", "[30, -30]", "30, -30", "first less than the second"),
+    ("beams", "method", '"best"', "best", "'zf', 'rzf' or 'mrt'"),
+    ("beams", "policy", '"pray"', "pray", "'regularise', 'group' or 'drop'"),
+    ("beams", "normalisation", '"max"', "max", "'total' or 'antenna'"),
+    ("beams", "loss_limit_db", "0", "0", "greater than 0"),
+    ("codebook", "oversampling", "0", "0", "greater than or equal to 1"),
+    ("radio", "uav_antennas", "0", "0", "greater than or equal to 1"),
+    ("radio", "bandwidth_hz", "-1", "-1", "greater than 0"),
     ("beams", "update_hz", "1001", "1001", "less than or equal to 1000"),
     ("beams", "targets", '"some"', "some", "'telemetry' or 'all'"),
-    ("beams", "condition_limit", "0.5", "0.5", "greater than or equal to 1"),
+    ("beams", "condition_limit", "1.0", "1.0", "greater than 1"),
     ("recording", "directory", "7", "7", "string"),
     ("server", "listen", "8080", "8080", "string"),
 ]
@@ -234,8 +250,115 @@ def test_flags_override_and_none_leaves_a_key() -> None:
 def test_a_bad_flag_is_an_error_of_settings() -> None:
     with pytest.raises(ConfigError, match=r"^array\.elements = 0: .*greater than or equal to 1"):
         Settings().override(array={"elements": 0})
-    with pytest.raises(ConfigError, match=r"^array\.columns is not a setting"):
-        Settings().override(array={"columns": 3})
+    with pytest.raises(ConfigError, match=r"^array\.shape is not a setting"):
+        Settings().override(array={"shape": 3})
+
+
+# --- the array ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '[array]\nkind = "list"\n',
+        '[array]\nkind = "ula"\npositions_m = [[0, 0, 0]]\n',
+        '[array]\nkind = "uca"\npositions = "there.csv"\n',
+    ],
+)
+def test_a_list_of_elements_goes_with_its_kind(text: str) -> None:
+    assert "goes with positions" in refusal(text)
+
+
+def test_a_codebook_file_goes_with_its_kind() -> None:
+    for text in ('kind = "file"', 'file = "beams.npy"', 'kind = "dft"\nfile = "beams.npy"'):
+        assert "goes with file" in refusal(f"[codebook]\n{text}\n")
+
+
+def test_a_rectangle_is_not_larger_than_a_line_may_be() -> None:
+    assert "at most 4096" in refusal('[array]\nkind = "ura"\nrows = 100\ncolumns = 100\n')
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("elements.csv", "# x, y, z\n0, 0, 0\n0, 0.005, 0  # the second\n\n0,0,0.005\n"),
+        ("elements.txt", "0 0 0\n0 0.005 0\n0 0 5e-3\n"),
+        ("elements.npy", None),
+    ],
+)
+def test_element_positions_are_read_into_the_settings(
+    tmp_path: Path, name: str, text: str | None
+) -> None:
+    """So a recording holds them, whatever becomes of the file."""
+    rows = [[0.0, 0.0, 0.0], [0.0, 0.005, 0.0], [0.0, 0.0, 0.005]]
+    file = tmp_path / name
+    if text is None:
+        np.save(file, np.array(rows))
+    else:
+        file.write_text(text, encoding="utf-8")
+    config = tmp_path / "settings.toml"
+    config.write_text(f'[array]\nkind = "list"\npositions = "{file}"\n', encoding="utf-8")
+    found = load(config)
+    file.unlink()
+    assert found.array.positions is None
+    assert found.array.positions_m == tuple(map(tuple, rows))
+    assert Settings.from_toml(found.to_toml(), "again") == found
+    assert assembly.array(found).elements_m == pytest.approx(np.array(rows))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (None, "No such file"),
+        ("0, 0\n0, 1\n", "rows of at least 3"),
+        ("0, 0, x\n", "not a table of numbers"),
+        ("0, 0, 0\n0, 0\n", "not a table of numbers"),
+        ("0, 0, nan\n", "finite"),
+        ("", "rows of at least 3"),
+    ],
+)
+def test_a_file_of_positions_that_will_not_do_is_named(
+    tmp_path: Path, text: str | None, said: str
+) -> None:
+    file = tmp_path / "elements.csv"
+    if text is not None:
+        file.write_text(text, encoding="utf-8")
+    config = tmp_path / "settings.toml"
+    config.write_text(f'[array]\nkind = "list"\npositions = "{file}"\n', encoding="utf-8")
+    with pytest.raises(ConfigError, match=said) as caught:
+        load(config)
+    assert str(caught.value).startswith(f"array.positions = '{file}'")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("array", "said"),
+    [
+        ({"kind": "list", "positions_m": [[0, 0, 0], [0, 0, 0]]}, "two elements stand at one"),
+        ({"kind": "list", "positions_m": [[0, 0], [0, 1]]}, "rows of 3 numbers"),
+        ({"kind": "list", "positions_m": [[0, 0, 0], [0, 0, 1, 1, 0, 0]]}, "rows of 3 numbers"),
+    ],
+)
+def test_what_is_no_array_is_an_error_of_settings(array: dict[str, object], said: str) -> None:
+    with pytest.raises(ConfigError, match=f"^array: .*{said}"):
+        assembly.array(Settings().override(array=array))
+
+
+def test_the_array_is_the_one_that_is_described() -> None:
+    ura = assembly.array(Settings().override(array={"kind": "ura", "rows": 2, "columns": 3}))
+    assert (ura.kind, ura.size, ura.grid) == ("ura", 6, (2, 3))
+    uca = assembly.array(Settings().override(array={"kind": "uca", "elements": 5}))
+    gap = np.linalg.norm(uca.elements_m[0] - uca.elements_m[1])
+    assert (uca.kind, gap) == ("uca", pytest.approx(uca.wavelength_m / 2))
+    metres = {"spacing_m": 0.015, "frequency_hz": 10e9, "lever_arm_m": [1.0, 0.0, -2.0]}
+    line = assembly.array(Settings().override(array=metres))
+    assert line.elements_m[1, 1] == pytest.approx(0.015)
+    assert line.lever_arm_m == pytest.approx(np.array([1.0, 0.0, -2.0]))
+    facing = [[0, 0, 0, 1, 0, 0], [0, 0.1, 0, 0, 1, 0]]
+    turned = {"kind": "list", "positions_m": facing, "element": "3gpp"}
+    listed = assembly.array(Settings().override(array=turned))
+    assert listed.element_from_array is not None
+    assert listed.element_from_array[1, 0] == pytest.approx(np.array([0, 1, 0]))
 
 
 # --- what carries the array ---------------------------------------------------------------------

@@ -2,22 +2,21 @@
 
 import math
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from companion.beams import steering
+from companion.beams import motion, steering, widening
 from companion.beams.arrays import Array
-from companion.beams.precoding import Precoder, gain_db, precode
+from companion.beams.coverage import EVERYWHERE, Coverage, refusals
+from companion.beams.elements import Pattern
+from companion.beams.precoding import Precoder, Precoding, gain_db, precode
 from companion.values import (
     Beam,
     BeamSet,
     Carrier,
-    ComplexArray,
     FloatArray,
     LeftOut,
-    Method,
-    Normalisation,
     Track,
     TrackState,
 )
@@ -25,6 +24,8 @@ from companion.values import (
 AIMABLE: Final = (TrackState.LIVE, TrackState.COASTING)
 NEAREST_M: Final = 1.0
 """Closer than this a direction means nothing: the far field is tens of metres away."""
+DARK: Final = 1e-3
+"""An amplitude of all elements that is no beam: 60 dB below an isotropic one."""
 
 
 def aim(
@@ -34,58 +35,104 @@ def aim(
     carrier: Carrier | None,
     array: Array,
     precoder: Precoder,
+    coverage: Coverage = EVERYWHERE,
 ) -> BeamSet:
     """One beam on every track that can be aimed at, nulls on the others; who is left out, and why.
 
     Columns of the weights come in the order of ``tracks``.
     """
-    refused = {track.uav: _refusal(track, carrier) for track in tracks}
+    refused = {track.uav: _refusal(track, carrier, array) for track in tracks}
+    seen = [track for track in tracks if refused[track.uav] is None]
+    beams: tuple[Beam, ...] = ()
+    made = precode(np.empty((array.size, 0), dtype=complex), precoder)
+    if carrier is not None and seen:
+        ranges_m, directions = motion.directions(seen, carrier, array)
+        hidden = _out_of_reach(directions, array, coverage)
+        refused |= {track.uav: why for track, why in zip(seen, hidden, strict=True)}
+        inside = [i for i, why in enumerate(hidden) if why is None]
+        if inside:
+            aimed = _Aimed([seen[i] for i in inside], ranges_m[inside], directions[inside])
+            beams, made, dropped = _beams(aimed, carrier, array, precoder)
+            refused |= dropped
     left_out = tuple(LeftOut(uav, why) for uav, why in refused.items() if why is not None)
-    aimed = [track for track in tracks if refused[track.uav] is None]
-    if carrier is None or not aimed:
-        nothing: ComplexArray = np.empty((array.size, 0), dtype=complex)
-        return BeamSet(
-            now_ns,
-            valid_at_ns,
-            (),
-            nothing,
-            Method.ZERO_FORCING,
-            Normalisation.UNIT_RESPONSE,
-            None,
-            left_out,
-        )
-    ranges_m, directions = _directions(aimed, carrier, array)
-    matrix = steering.steering_matrix(array, directions)
-    made = precode(matrix, precoder)
-    azimuths, elevations = steering.angles_rad(directions)
-    gains = gain_db(matrix, made.weights)
-    alone = gain_db(matrix, matrix.conj())
-    rates = _rates(aimed, carrier, array, ranges_m, directions)
-    beams = tuple(
-        Beam(
-            uav=track.uav,
-            azimuth_rad=float(azimuths[i]),
-            elevation_rad=float(elevations[i]),
-            range_m=float(ranges_m[i]),
-            azimuth_rate_radps=rates[i][0],
-            elevation_rate_radps=rates[i][1],
-            range_rate_mps=rates[i][2],
-            pointing_bound_rad=_pointing_bound_rad(track, carrier, float(ranges_m[i])),
-            gain_db=float(gains[i]),
-            loss_db=float(alone[i] - gains[i]),
-        )
-        for i, track in enumerate(aimed)
-    )
     return BeamSet(
         now_ns,
         valid_at_ns,
         beams,
         made.weights,
         made.method,
-        Normalisation.UNIT_RESPONSE,
+        made.normalisation,
         made.condition_number,
         left_out,
     )
+
+
+class _Aimed(NamedTuple):
+    """Those that can be aimed at: ranges (N,), unit directions (N, 3) in the array frame."""
+
+    tracks: list[Track]
+    ranges_m: FloatArray
+    directions: FloatArray
+
+
+def _beams(
+    aimed: _Aimed, carrier: Carrier, array: Array, precoder: Precoder
+) -> tuple[tuple[Beam, ...], Precoding, dict[str, str]]:
+    """Beams, their weights, and whom the policy left out."""
+    tracks, ranges_m, directions = aimed
+    matrix = steering.steering_matrix(array, directions)
+    bounds = [
+        _pointing_bound_rad(track, carrier, range_m)
+        for track, range_m in zip(tracks, ranges_m.tolist(), strict=True)
+    ]
+    spread = None
+    if precoder.widen:
+        widths = np.array([np.inf if bound is None else bound for bound in bounds])
+        spread = widening.spread(array, matrix, directions, widths)
+    made = precode(matrix, precoder, spread, _priorities(tracks, precoder.priority))
+    azimuths, elevations = steering.angles_rad(directions)
+    served = matrix[:, made.served]
+    gains = gain_db(served, made.weights).tolist()
+    alone = gain_db(served, served.conj()).tolist()
+    rates = motion.rates(tracks, carrier, array, ranges_m, directions)
+    beams = tuple(
+        Beam(
+            uav=tracks[i].uav,
+            azimuth_rad=float(azimuths[i]),
+            elevation_rad=float(elevations[i]),
+            range_m=float(ranges_m[i]),
+            azimuth_rate_radps=rates[i][0],
+            elevation_rate_radps=rates[i][1],
+            range_rate_mps=rates[i][2],
+            pointing_bound_rad=bounds[i],
+            gain_db=gains[column],
+            loss_db=alone[column] - gains[column],
+            group=int(made.groups[column]),
+            widened=spread is not None and bool(spread.broadened[i]),
+        )
+        for column, i in enumerate(made.served.tolist())
+    )
+    return beams, made, {tracks[user].uav: why for user, why in made.dropped.items()}
+
+
+def _priorities(tracks: Sequence[Track], priority: Sequence[str]) -> list[int]:
+    """Places of the tracks, those named first in the order of the names."""
+    ranks = {uav: rank for rank, uav in enumerate(priority)}
+    return sorted(range(len(tracks)), key=lambda i: ranks.get(tracks[i].uav, len(ranks)))
+
+
+def _out_of_reach(directions: FloatArray, array: Array, coverage: Coverage) -> list[str | None]:
+    """Why no beam can be pointed there; None if it can."""
+    reasons: list[str | None] = [None] * len(directions)
+    if coverage is not EVERYWHERE:
+        reasons = refusals(coverage, directions, directions @ array.array_from_body)
+    if array.element.pattern is not Pattern.ISOTROPIC:
+        dark = steering.amplitudes(array, directions).max(axis=0) < DARK
+        reasons = [
+            why or ("its elements radiate nothing there" if none else None)
+            for why, none in zip(reasons, dark.tolist(), strict=True)
+        ]
+    return reasons
 
 
 def _pointing_bound_rad(track: Track, carrier: Carrier, range_m: float) -> float | None:
@@ -94,67 +141,13 @@ def _pointing_bound_rad(track: Track, carrier: Carrier, range_m: float) -> float
     return None if seen is None else min(seen + carrier.attitude_bound_rad, math.pi)
 
 
-Rates = tuple[float | None, float | None, float | None]
-
-
-def _rates(
-    tracks: Sequence[Track],
-    carrier: Carrier,
-    array: Array,
-    ranges_m: FloatArray,
-    directions: FloatArray,
-) -> list[Rates]:
-    """Rates of azimuth, elevation (rad/s) and range (m/s) of unit directions in the array frame.
-
-    None without a velocity; straight up and straight down the azimuth has no rate.
-    """
-    unknown: Rates = (None, None, None)
-    moved = carrier.velocity_ned_mps
-    if moved is None:
-        return [unknown] * len(tracks)
-    known = [track.velocity_ned_mps is not None for track in tracks]
-    velocities = [moved if v is None else v for v in (t.velocity_ned_mps for t in tracks)]
-    array_from_local = array.array_from_body @ carrier.body_from_local
-    moving = (np.array(velocities) - moved) @ array_from_local.T
-    range_rates = np.einsum("nk,nk->n", moving, directions)
-    across = (moving - range_rates[:, np.newaxis] * directions) / ranges_m[:, np.newaxis]
-    w1, w2, w3 = (array.array_from_body @ carrier.body_rates_radps).tolist()
-    found: list[Rates] = []
-    for i, (x, y, z) in enumerate(directions.tolist()):
-        x_rate, y_rate, z_rate = across[i].tolist()
-        x_rate, y_rate, z_rate = (
-            x_rate - (w2 * z - w3 * y),
-            y_rate - (w3 * x - w1 * z),
-            z_rate - (w1 * y - w2 * x),
-        )
-        level = x * x + y * y
-        if not known[i]:
-            found.append(unknown)
-        elif level < 1e-12:
-            found.append((None, None, float(range_rates[i])))
-        else:
-            azimuth = (x * y_rate - y * x_rate) / level
-            found.append((azimuth, -z_rate / math.sqrt(level), float(range_rates[i])))
-    return found
-
-
-def _refusal(track: Track, carrier: Carrier | None) -> str | None:
+def _refusal(track: Track, carrier: Carrier | None, array: Array) -> str | None:
     """Why a track gets no beam; None if it does."""
     if carrier is None:
         return "the carrier is not known"
     if track.state not in AIMABLE:
         return f"its reports are {track.state}"
-    offset_m = track.position_ned_m - carrier.position_ned_m
+    offset_m = track.position_ned_m - motion.place_ned_m(carrier, array)
     if offset_m @ offset_m < NEAREST_M**2:
         return f"it is within {NEAREST_M:g} m of the array"
     return None
-
-
-def _directions(
-    tracks: Sequence[Track], carrier: Carrier, array: Array
-) -> tuple[FloatArray, FloatArray]:
-    """Ranges (N,) and unit directions in the array frame (N, 3)."""
-    offsets_m = np.array([track.position_ned_m for track in tracks]) - carrier.position_ned_m
-    ranges_m = np.sqrt(np.einsum("nk,nk->n", offsets_m, offsets_m))
-    array_from_local = array.array_from_body @ carrier.body_from_local
-    return ranges_m, (offsets_m / ranges_m[:, np.newaxis]) @ array_from_local.T

@@ -45,9 +45,9 @@ def carrier(
 
 
 def pointed(
-    tracks: list[Track], at: Carrier | None, array: Array = ARRAY, limit: float = 10.0
+    tracks: list[Track], at: Carrier | None, array: Array = ARRAY, limit: float = 100.0
 ) -> BeamSet:
-    return aim(7, 9, tracks, at, array, Precoder(limit, 0.01))
+    return aim(7, 9, tracks, at, array, Precoder(condition_limit=limit))
 
 
 def test_beams_point_where_the_tracks_are() -> None:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from companion.beams import arrays
+from companion.beams.coverage import EVERYWHERE, Coverage
 from companion.beams.elements import Element, Pattern
 from companion.beams.precoding import Precoder
 from companion.config import ConfigError, Settings, kinematic_design
@@ -55,6 +56,11 @@ def _rows(positions_m: tuple[tuple[float, ...], ...]) -> FloatArray:
     if lengths not in ({3}, {6}):
         raise ValueError("positions_m are rows of 3 numbers, or all of 6")
     return np.array(positions_m)
+
+
+def coverage(settings: Settings) -> Coverage:
+    """Where beams may point. Raises ``ConfigError``."""
+    return EVERYWHERE
 
 
 def precoder(settings: Settings) -> Precoder:

@@ -107,6 +107,8 @@ class Pipeline:
         self.recent_rejections: dict[str, deque[Rejection]] = {}
         self.digest = Digest()
         self.array = assembly.array(settings)
+        self.coverage = assembly.coverage(settings)
+        self.precoder = assembly.precoder(settings)
         self.local: LocalFrame | None = None
         self.last_update: Update | None = None
         self._noise_settings = assembly.noise(settings)
@@ -119,7 +121,6 @@ class Pipeline:
         self._dedupe = Dedupe()
         self._fleet = assembly.fleet(settings, self._sender_time)
         self._targets: list[str] = []  # in the order in which they were first heard
-        self._precoder = assembly.precoder(settings)
         self._identities = Identities()
         self._states: dict[str, TrackState] = {}
         if isinstance(self._center, FixedCenter):
@@ -299,7 +300,7 @@ class Pipeline:
         tracks = self._tracks(filter(self.is_target, self._targets), now_ns, valid_at_ns)
         found = self.carrier(now_ns, valid_at_ns)
         known, unfit = (None, found) if isinstance(found, str) else (found, None)
-        beams = aim(now_ns, valid_at_ns, tracks, known, self.array, self._precoder)
+        beams = aim(now_ns, valid_at_ns, tracks, known, self.array, self.precoder, self.coverage)
         return Update(now_ns, known, unfit, tuple(tracks), beams)
 
     def tracks(self, now_ns: int, valid_at_ns: int) -> list[Track]:

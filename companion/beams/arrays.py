@@ -26,7 +26,8 @@ class Array:
     body frame, from the point whose position the carrier reports. ``element`` is the pattern of
     all elements; ``element_from_array`` (M, 3, 3) turns each to where it faces (None: all along
     boresight). ``grid`` is rows and columns of a ULA or URA, elements row by row, else None.
-    ``partners`` (M,), found from the rest: each element's mirror image through the centroid,
+    Found from the rest: ``centred_m`` (M, 3), positions from their centroid; ``variance_m2``
+    (3, 3), their mean square; ``partners`` (M,), each element's mirror image through the centroid,
     None where the array has no such symmetry.
     """
 
@@ -38,11 +39,16 @@ class Array:
     element: Element = ISOTROPIC
     element_from_array: FloatArray | None = None
     grid: tuple[int, int] | None = None
+    centred_m: FloatArray = field(init=False)
+    variance_m2: FloatArray = field(init=False)
     partners: IntArray | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
+        centred_m = self.elements_m - self.elements_m.mean(axis=0)
+        object.__setattr__(self, "centred_m", centred_m)
+        object.__setattr__(self, "variance_m2", centred_m.T @ centred_m / self.size)
         if self.element_from_array is None:
-            object.__setattr__(self, "partners", _partners(self.elements_m, self.wavelength_m))
+            object.__setattr__(self, "partners", _partners(centred_m / self.wavelength_m))
 
     @property
     def size(self) -> int:
@@ -165,9 +171,8 @@ def _facing(outward: FloatArray, count: int) -> FloatArray:
     return np.stack([x, y, np.cross(x, y)], axis=1)
 
 
-def _partners(elements_m: FloatArray, wavelength_m: float) -> IntArray | None:
+def _partners(centred: FloatArray) -> IntArray | None:
     """For each element the one that mirrors it through the centroid; None unless all have one."""
-    centred = (elements_m - elements_m.mean(axis=0)) / wavelength_m
     if not np.isfinite(centred).all():
         return None
     order = np.lexsort(np.round(centred, 6).T)

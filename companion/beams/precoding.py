@@ -23,7 +23,7 @@ from typing import Final
 import numpy as np
 
 from companion.beams import grouping, zero_forcing
-from companion.beams.widening import Spread, nulled, power_gains, widen_nulls
+from companion.beams.widening import SOFT_LOADINGS, Spread, nulled, power_gains, widen_nulls
 from companion.values import ComplexArray, FloatArray, IntArray, Method, Normalisation, Policy
 
 
@@ -165,15 +165,29 @@ def _zero_forcing(
             if solved is not None and lost_db <= settings.loss_limit_db:
                 return _Columns(solved.weights, Method.ZERO_FORCING, condition, True, lost_db)
         else:
-            sharp = nulled(a, wide, 0.0)
-            least = _least_gains(a, wide, settings)
-            lost_db = _db((power_gains(a, wide.beams) / power_gains(a, sharp)).max())
+            found, lost_db = _wide_zero_forcing(a, wide, settings)
             if lost_db <= settings.loss_limit_db:
-                found = _unit_response(a, widen_nulls(a, wide, 0.0, sharp, least))
-                return _Columns(found, Method.ZERO_FORCING, condition, True, lost_db)
+                return _Columns(
+                    _unit_response(a, found), Method.ZERO_FORCING, condition, True, lost_db
+                )
     loading = _least_loading(gram, settings)
     found = _loaded(a, gram, wide, loading, settings, settings.loss_limit_db)
     return _Columns(found, Method.REGULARISED, condition, False, lost_db)
+
+
+def _wide_zero_forcing(
+    a: ComplexArray, wide: Spread, settings: Precoder
+) -> tuple[ComplexArray, float]:
+    """Broadened beams that null the others exactly, and what that costs the worst of them, dB."""
+    alone = power_gains(a, wide.beams)
+    found = nulled(a, wide, 0.0, SOFT_LOADINGS[0])
+    kept = power_gains(a, found)
+    least = alone * 10 ** (-settings.loss_limit_db / 10)
+    if (kept < least).any():
+        centred = nulled(a, wide, 0.0)
+        found = widen_nulls(a, wide, 0.0, centred, least)
+        kept = power_gains(a, centred)
+    return found, _db((alone / kept).max())
 
 
 def _loaded(

@@ -10,10 +10,14 @@ In terms of the aperture's width D across the line of sight, a bound e is w = e 
 in natural beams; the natural half-power beam has w = 0.44.
 """
 
+import functools
+import itertools
+import math
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy.linalg.lapack import zgesv
 
 from companion.beams.arrays import Array
 from companion.beams.steering import steering_matrix
@@ -35,6 +39,8 @@ NULL_SPACING: Final = 0.7
 FEWEST_WIDTHS: Final = 0.02
 MOST_RINGS: Final = 4
 MOST_RINGS_IN_SPACE: Final = 2
+MOST_POINTS: Final = 96
+"""In all, and never more than the array has degrees of freedom to spare: each is a null."""
 SOFT_LOADINGS: Final = (0.01, 0.1, 1.0, 10.0)
 TOO_CLOSE: Final = 0.5
 
@@ -76,7 +82,7 @@ def spread(
     beams = steering.conj()
     if broadened.any():
         beams *= np.exp(1j * _defocus_rad(array, axes, apertures_m, widths))
-    around, owners = _around(directions, bounds, axes, widths)
+    around, owners = _around(directions, bounds, axes, widths, array.size)
     points = steering_matrix(array, around)
     clear = _clear(points, around, owners, steering, directions, bounds)
     return Spread(beams, broadened, points[:, clear], owners[clear])
@@ -117,24 +123,24 @@ def nulled(
     its Schur complement. Linear least squares with weights 1/X; exact where X is 0.
     """
     users = steering.shape[1]
-    points, owners, loads = steering, np.arange(users), np.full(users, loading)
+    points, loads, begins = steering, np.full(users, loading), np.arange(users + 1)
     if soft is not None:
-        points = np.concatenate([steering, spread.points], axis=1)
-        owners = np.concatenate([owners, spread.owners])
-        power = np.einsum("mp,mp->p", spread.points.real, spread.points.real)
-        power += np.einsum("mp,mp->p", spread.points.imag, spread.points.imag)
-        loads = np.concatenate([loads, soft * power])
+        # User by user, the predicted direction first: each has its own block.
+        order = np.argsort(np.concatenate([np.arange(users), spread.owners]), kind="stable")
+        points = np.concatenate([steering, spread.points], axis=1)[:, order]
+        power = np.einsum("mp,mp->p", spread.points, spread.points.conj()).real
+        loads = np.concatenate([loads, soft * power])[order]
+        begins = np.searchsorted(spread.owners, begins) + begins
     gram = points.T @ points.conj()
-    gram[np.diag_indices_from(gram)] += loads
+    gram.flat[:: len(gram) + 1] += loads
     inverse = np.linalg.inv(gram)
+    blocks = [slice(begin, end) for begin, end in itertools.pairwise(begins.tolist())]
     reached = points.T @ spread.beams
-    for user in range(users):
-        own = owners == user
+    for user, own in enumerate(blocks):
         reached[own, user] = 0.0
     found = inverse @ reached
-    for user in range(users):
-        own = np.flatnonzero(owners == user)
-        held = np.linalg.solve(inverse[np.ix_(own, own)], found[own, user])
+    for user, own in enumerate(blocks):
+        _, _, held, _ = zgesv(inverse[own, own], found[own, user])
         found[:, user] -= inverse[:, own] @ held
     weights: ComplexArray = spread.beams - points.conj() @ found
     return weights
@@ -150,10 +156,8 @@ def power_gains(steering: ComplexArray, weights: ComplexArray) -> FloatArray:
 def _apertures(array: Array, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Principal axes of the array across each line of sight, (N, 3, 2), the longer one first, and
     their widths (N, 2) in metres: those of uniform lines with the same variance."""
-    centred = array.elements_m - array.elements_m.mean(axis=0)
-    variance = centred.T @ centred / array.size
     across = np.eye(3) - directions[:, :, np.newaxis] * directions[:, np.newaxis, :]
-    values, vectors = np.linalg.eigh(across @ variance @ across)
+    values, vectors = np.linalg.eigh(across @ array.variance_m2 @ across)
     widths_m = np.sqrt(12 * np.maximum(values[:, :0:-1], 0.0))
     return vectors[:, :, :0:-1], widths_m
 
@@ -164,46 +168,56 @@ def _defocus_rad(
     """Quadratic phase (M, N) over the aperture, for bounds in natural widths (N, 2)."""
     ends_rad = np.interp(widths, WIDTHS, CURVATURES_RAD)
     ends_rad = np.where(widths > WIDTHS[-1], CURVATURES_RAD[-1] / WIDTHS[-1] * widths, ends_rad)
-    centred = array.elements_m - array.elements_m.mean(axis=0)
     # A narrow axis has no curvature: its beam is wider than any bound.
     scale = np.where(ends_rad > 0, 2 / np.maximum(apertures_m, 1e-9 * array.wavelength_m), 0.0)
-    along = np.einsum("mk,nka->mna", centred, axes) * scale
+    along = np.tensordot(array.centred_m, axes, (1, 1)) * scale
     phase: FloatArray = np.einsum("mna,na->mn", along**2, ends_rad)
     return phase
 
 
 def _around(
-    directions: FloatArray, bounds_rad: FloatArray, axes: FloatArray, widths: FloatArray
+    directions: FloatArray,
+    bounds_rad: FloatArray,
+    axes: FloatArray,
+    widths: FloatArray,
+    elements: int,
 ) -> tuple[FloatArray, IntArray]:
-    """Directions (P, 3) within the bound around each user's, and whose they are (P,).
+    """Directions (P, 3) within the bound around each user's, and whose they are (P,), in order.
 
-    A line array sees one angle: points to both sides. Others: rings of 6, 12, ... points.
+    A line array sees one angle: points to both sides. Others: rings of 6, 12, ... points, or two
+    points across the longer axis where there are too many users for a ring.
     """
-    found, owners = [], []
-    for user in range(len(directions) if len(directions) > 1 else 0):
+    users = len(directions)
+    each = min(MOST_POINTS, elements - users) // users if users > 1 else 0
+    tangents, owners = [np.empty((0, 3))], [0] * 0
+    for user in range(users if each >= 2 else 0):
         longest, other = widths[user].tolist()
-        if longest <= FEWEST_WIDTHS:
-            continue
-        rings = max(1, int(np.ceil(longest / NULL_SPACING)))
-        if other <= FEWEST_WIDTHS:
-            rings = min(rings, MOST_RINGS)
-            share = np.arange(1, rings + 1) / rings
-            tangent = np.concatenate([share, -share])[:, np.newaxis] * axes[user, :, 0]
-        else:
-            rings = min(rings, MOST_RINGS_IN_SPACE)
-            angle = np.concatenate(
-                [np.pi / (3 * k) * np.arange(6 * k) for k in range(1, rings + 1)]
-            )
-            radius = np.concatenate([np.full(6 * k, k / rings) for k in range(1, rings + 1)])
-            on_axes = radius * np.stack([np.cos(angle), np.sin(angle)])
-            tangent = on_axes.T @ axes[user].T
-        length = np.linalg.norm(tangent, axis=1)[:, np.newaxis]
-        turned_rad = bounds_rad[user] * length
-        found.append(np.cos(turned_rad) * directions[user] + np.sin(turned_rad) * tangent / length)
-        owners.append(np.full(len(tangent), user))
-    if not found:
-        return np.empty((0, 3)), np.empty(0, dtype=np.int64)
-    return np.concatenate(found), np.concatenate(owners)
+        if longest > FEWEST_WIDTHS:
+            rings = max(1, math.ceil(longest / NULL_SPACING))
+            on_axes = _pattern(rings, each, in_space=other > FEWEST_WIDTHS)
+            tangents.append(on_axes @ axes[user].T)
+            owners += [user] * len(on_axes)
+    tangent, whose = np.concatenate(tangents), np.array(owners, dtype=np.int64)
+    length = np.sqrt(np.einsum("pk,pk->p", tangent, tangent))[:, np.newaxis]
+    turned_rad = bounds_rad[whose, np.newaxis] * length
+    around = np.cos(turned_rad) * directions[whose] + np.sin(turned_rad) * tangent / length
+    return around, whose
+
+
+@functools.cache
+def _pattern(rings: int, most: int, *, in_space: bool) -> FloatArray:
+    """Points (n, 2) in the unit disc, or on its first axis: at most ``most`` of them."""
+    if in_space and most >= 6:
+        rings = 2 if rings >= MOST_RINGS_IN_SPACE and most >= 18 else 1
+        points = [
+            (ring / rings * math.cos(angle), ring / rings * math.sin(angle))
+            for ring in range(1, rings + 1)
+            for angle in (math.pi / (3 * ring) * k for k in range(6 * ring))
+        ]
+    else:
+        rings = min(rings, MOST_RINGS, most // 2)
+        points = [(side * ring / rings, 0.0) for ring in range(1, rings + 1) for side in (1, -1)]
+    return np.array(points)
 
 
 def _clear(

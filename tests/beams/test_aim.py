@@ -9,9 +9,19 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from companion.beams.aim import aim
-from companion.beams.arrays import Array, uniform_linear
+from companion.beams.arrays import Array, listed, uniform_linear
+from companion.beams.elements import Element, Pattern
 from companion.beams.precoding import Precoder
-from companion.values import Beam, BeamSet, Carrier, FloatArray, Method, Track, TrackState
+from companion.values import (
+    Beam,
+    BeamSet,
+    Carrier,
+    FloatArray,
+    Method,
+    Policy,
+    Track,
+    TrackState,
+)
 
 EYE = np.eye(3)
 STILL = np.zeros(3)
@@ -202,6 +212,127 @@ def test_a_mount_that_looks_right_sees_the_right_ahead() -> None:
     array = uniform_linear(16, 30e9, 0.5, right)
     (beam,) = pointed([track("a", (0, 100, 0))], carrier(), array).beams
     assert beam.azimuth_rad == pytest.approx(0.0, abs=1e-12)
+
+
+# --- the array on its carrier -------------------------------------------------------------------
+
+
+@settings(max_examples=50)
+@given(st.integers(0, 2**32 - 1))
+def test_the_lever_arm_turns_with_the_carrier(seed: int) -> None:
+    """An array beside the navigation point is an array at that place."""
+    rng = np.random.default_rng(seed)
+    pose = Rotation.random(rng=rng).as_matrix()
+    lever = rng.uniform(-3, 3, 3)
+    array = uniform_linear(16, 30e9, 0.5, EYE, lever_arm_m=lever)
+    place = rng.uniform(-50, 50, 3)
+    tracks = [track(uav, np.array(p)) for uav, p in PLACES.items()]
+    found = pointed(tracks, carrier(place, pose), array)
+    there = pointed(tracks, carrier(place + pose.T @ lever, pose), ARRAY)
+    assert_same_beams(found, there)
+
+
+def test_the_lever_arm_is_in_the_body_frame() -> None:
+    """Two metres below the belly of a carrier that lies on its right side: two metres to its west,
+    when it looks north."""
+    array = uniform_linear(16, 30e9, 0.5, EYE, lever_arm_m=np.array([0.0, 0.0, 2.0]))
+    on_its_right = Rotation.from_euler("x", math.pi / 2).as_matrix().T
+    (beam,) = pointed([track("a", (0, 100, 0))], carrier(turn=on_its_right), array).beams
+    assert beam.range_m == pytest.approx(102.0)
+    (other,) = pointed([track("a", (0, -2.5, 0))], carrier(turn=on_its_right), array).left_out
+    assert other.reason == "it is within 1 m of the array"
+
+
+@settings(max_examples=50)
+@given(st.integers(0, 2**32 - 1))
+def test_turning_array_and_carrier_is_turning_the_world_for_every_array(seed: int) -> None:
+    """Weights and all: any geometry, elements that face somewhere, a lever arm."""
+    rng = np.random.default_rng(seed)
+    turn, mount, pose = (m.as_matrix() for m in Rotation.random(3, rng=rng))
+    elements = rng.uniform(-0.02, 0.02, (12, 3))
+    outward, lever = rng.standard_normal((12, 3)), rng.uniform(-2, 2, 3)
+    element = Element(Pattern.TR38901)
+    array = listed(elements, 30e9, mount, element, lever, outward)
+    place, shift = rng.uniform(-50, 50, 3), rng.uniform(-500, 500, 3)
+    tracks = [track(uav, np.array(p)) for uav, p in PLACES.items()]
+    plain = pointed(tracks, carrier(place, pose), array)
+    moved = [track(uav, turn @ np.array(p) + shift) for uav, p in PLACES.items()]
+    world = carrier(turn @ place + shift, pose @ turn.T)
+    assert_same_beams(plain, pointed(moved, world, array))
+    # The body's axes named otherwise: the mount and the lever arm turn with them.
+    other = listed(elements, 30e9, mount @ turn, element, turn.T @ lever, outward)
+    assert_same_beams(plain, pointed(tracks, carrier(place, turn.T @ pose), other))
+
+
+# --- what cannot be pointed at ------------------------------------------------------------------
+
+
+def test_behind_an_element_that_radiates_forward_there_is_no_beam() -> None:
+    array = uniform_linear(16, 30e9, 0.5, EYE, Element(Pattern.COSINE))
+    tracks = [track("ahead", (80, 60, 0)), track("behind", (-80, 60, 0))]
+    found = pointed(tracks, carrier(), array)
+    assert found.uavs == ("ahead",)
+    assert found.method is Method.ZERO_FORCING
+    (out,) = found.left_out
+    assert (out.uav, out.reason) == ("behind", "its elements radiate nothing there")
+
+
+@pytest.mark.parametrize("policy", Policy)
+def test_two_uavs_at_one_point_are_defined_under_every_policy(policy: Policy) -> None:
+    tracks = [track("a", (80, 60, 0)), track("b", (80, 60, 0)), track("c", (80, -60, 0))]
+    found = aim(7, 9, tracks, carrier(), ARRAY, Precoder(policy=policy, priority=("b",)))
+    assert np.all(np.isfinite(found.weights))
+    match policy:
+        case Policy.REGULARISE:
+            assert (found.uavs, found.method) == (("a", "b", "c"), Method.REGULARISED)
+            assert found.weights[:, 0] == pytest.approx(found.weights[:, 1], abs=1e-9)
+            assert found.groups == 1
+        case Policy.GROUP:
+            assert (found.uavs, found.method) == (("a", "b", "c"), Method.ZERO_FORCING)
+            assert found.groups == 2
+            one, other, _ = found.beams
+            assert one.group != other.group
+        case Policy.DROP:
+            assert found.uavs == ("b", "c")
+            (out,) = found.left_out
+            assert out.uav == "a"
+            assert out.reason.startswith("too close to one of higher priority")
+
+
+def test_straight_above_is_a_direction_like_any_other() -> None:
+    """A line along y sees it at right angles; its azimuth says nothing."""
+    tracks = [track("up", (0, 0, -100)), track("right", (0, 100, 0))]
+    found = pointed(tracks, carrier())
+    assert found.uavs == ("up", "right")
+    assert found.beams[0].elevation_rad == pytest.approx(math.pi / 2)
+    a = np.stack([np.ones(16), np.exp(1j * np.pi * np.arange(16))], axis=1)
+    assert np.abs(a.T @ found.weights - np.eye(2)).max() < 1e-9
+
+
+def test_at_zero_range_nothing_is_aimed() -> None:
+    found = pointed([track("here", (0, 0, 0))], carrier())
+    assert (found.beams, found.weights.shape) == ((), (16, 0))
+    assert [out.reason for out in found.left_out] == ["it is within 1 m of the array"]
+
+
+def test_what_a_beam_lacks_against_one_for_its_uav_alone() -> None:
+    found = pointed(
+        [track("a", (80, 60, 0), bound_m=0), track("b", (80, 67, 0), bound_m=0)], carrier()
+    )
+    for column, beam in enumerate(found.beams):
+        power = np.sum(np.abs(found.weights[:, column]) ** 2)
+        assert beam.loss_db == pytest.approx(10 * math.log10(16 * power))
+        assert beam.loss_db > 0.1
+    (alone,) = pointed([track("a", (80, 60, 0), bound_m=0)], carrier()).beams
+    assert alone.loss_db == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_beam_says_that_it_was_widened() -> None:
+    tracks = [track("sure", (100, 0, 0), bound_m=0.5), track("vague", (0, 100, 0), bound_m=30.0)]
+    sure, vague = pointed(tracks, carrier(turn=Rotation.from_euler("z", 0.7).as_matrix())).beams
+    assert (sure.widened, vague.widened) == (False, True)
+    sharp = aim(7, 9, tracks, carrier(), ARRAY, Precoder(widen=False))
+    assert [beam.widened for beam in sharp.beams] == [False, False]
 
 
 # --- how fast the angles change -----------------------------------------------------------------

@@ -116,10 +116,14 @@ def weights(value: BeamSet) -> Any:
                 "azimuth_rate_radps": beam.azimuth_rate_radps,
                 "elevation_rate_radps": beam.elevation_rate_radps,
                 "range_rate_mps": beam.range_rate_mps,
+                "loss_db": beam.loss_db,
+                "group": beam.group,
+                "widened": beam.widened,
             }
             for beam in value.beams
         ],
         left_out=[{"uav": out.uav, "reason": out.reason} for out in value.left_out],
+        normalisation=value.normalisation.value,
     )
 
 

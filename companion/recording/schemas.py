@@ -43,11 +43,11 @@ _MESSAGES: Final[dict[str, list[str]]] = {
     "Beam": ["string uav", "double azimuth_rad", "double elevation_rad", "double range_m",
              "optional double pointing_bound_rad", "double gain_db",
              "optional double azimuth_rate_radps", "optional double elevation_rate_radps",
-             "optional double range_rate_mps"],
+             "optional double range_rate_mps", "double loss_db", "uint32 group", "bool widened"],
     "LeftOut": ["string uav", "string reason"],
     "Weights": ["fixed64 t_ns", "fixed64 valid_at_ns", "repeated string uavs", "uint32 elements",
                 "bytes weights_complex64", "string method", "optional double condition_number",
-                "repeated Beam beam", "repeated LeftOut left_out"],
+                "repeated Beam beam", "repeated LeftOut left_out", "string normalisation"],
 }  # fmt: skip
 """``Track``: a vector is empty where it is unknown, else north, east, down. ``Weights``:
 ``weights_complex64`` is (elements, len(uavs)), row-major, interleaved little-endian float32 real

@@ -19,6 +19,7 @@ from companion.values import (
     Frame,
     LeftOut,
     Method,
+    Normalisation,
     Notice,
     Reason,
     Rejection,
@@ -106,11 +107,13 @@ def update() -> Callable[[int], Update]:
 
     def make(t_ns: int) -> Update:
         beams = (
-            Beam("1:1", 0.1, -0.2, 100.0, None, None, None, None, 18.0),
-            Beam("icao:4CA7B3", 0.3, 0.0, 50.0, 0.01, -0.02, 3.0, 0.02, 17.5),
+            Beam("1:1", 0.1, -0.2, 100.0, None, None, None, None, 18.0, 0.1),
+            Beam("icao:4CA7B3", 0.3, 0.0, 50.0, 0.01, -0.02, 3.0, 0.02, 17.5, 0.6, 1, True),
         )
         left_out = (LeftOut("9:1", "behind the array"),)
-        chosen = BeamSet(t_ns, t_ns + 5, beams, weights, Method.ZERO_FORCING, 1.5, left_out)
+        chosen = BeamSet(
+            t_ns, t_ns + 5, beams, weights, Method.ZERO_FORCING, Normalisation.STREAM, 1.5, left_out
+        )
         return Update(t_ns, None, None, (_track("1:1", t_ns), _track("icao:4CA7B3", t_ns)), chosen)
 
     return make

@@ -188,6 +188,11 @@ def test_weights_are_row_major_complex64(
     assert complex(numbers[2], numbers[3]) == expected[0, 1]
     assert complex(numbers[4], numbers[5]) == expected[1, 0]
     assert (message.method, message.condition_number) == ("zf", 1.5)
+    assert message.normalisation == "stream"
+    assert [(beam.loss_db, beam.group, beam.widened) for beam in message.beam] == [
+        (0.1, 0, False),
+        (0.6, 1, True),
+    ]
     assert [(out.uav, out.reason) for out in message.left_out] == [("9:1", "behind the array")]
 
 

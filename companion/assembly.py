@@ -1,12 +1,23 @@
 """Settings to the parts of the pipeline."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from companion.beams import arrays
-from companion.beams.coverage import EVERYWHERE, Coverage
+from companion.beams import arrays, codebooks
+from companion.beams.codebooks import Codebook
+from companion.beams.coverage import Coverage, Sector
 from companion.beams.elements import Element, Pattern
+from companion.beams.hardware import Calibration, parse_calibration
 from companion.beams.precoding import Precoder
-from companion.config import ConfigError, Settings, kinematic_design
+from companion.beams.rates import LinkBudget
+from companion.config import (
+    ConfigError,
+    Settings,
+    calibration_text,
+    codebook_file,
+    kinematic_design,
+)
 from companion.mavlink.clocks import ClockSettings, SenderClock
 from companion.tracking.carrier import body_from_ned
 from companion.tracking.fleet import Ages, Fleet, FleetSettings, ToSenderTime
@@ -60,7 +71,55 @@ def _rows(positions_m: tuple[tuple[float, ...], ...]) -> FloatArray:
 
 def coverage(settings: Settings) -> Coverage:
     """Where beams may point. Raises ``ConfigError``."""
-    return EVERYWHERE
+    given = settings.array
+
+    def radians(limits: tuple[float, float] | None) -> tuple[float, float] | None:
+        return None if limits is None else (np.radians(limits[0]), np.radians(limits[1]))
+
+    view = given.field_of_view_deg
+    try:
+        return Coverage(
+            None if view is None else np.radians(view),
+            radians(given.azimuth_limits_deg),
+            radians(given.elevation_limits_deg),
+            tuple(Sector(*np.radians(sector).tolist()) for sector in given.hidden_deg),
+        )
+    except ValueError as error:
+        raise ConfigError(f"array: {error}") from error
+
+
+@dataclass(frozen=True, slots=True)
+class Equipment:
+    """What answers about beams need beside the pipeline: stored beams and the calibration of the
+    hardware (None without), the radio link, and how many antennas each UAV combines."""
+
+    codebook: Codebook | None
+    calibration: Calibration | None
+    budget: LinkBudget
+    uav_antennas: int
+
+
+def equipment(settings: Settings, antenna: arrays.Array) -> Equipment:
+    """The equipment that the settings describe; reads their files. Raises ``ConfigError``."""
+    kept, radio = settings.codebook, settings.radio
+    codebook, calibration = None, None
+    try:
+        if kept.kind == "dft":
+            codebook = codebooks.dft(antenna, kept.oversampling)
+        elif kept.kind == "file":
+            codebook = codebooks.listed(codebook_file(settings), antenna)
+    except ValueError as error:
+        raise ConfigError(f"codebook: {error}") from error
+    text = calibration_text(settings)
+    try:
+        calibration = None if text is None else parse_calibration(text)
+    except ValueError as error:
+        raise ConfigError(f"hardware.calibration: {error}") from error
+    if calibration is not None and len(calibration.order) != antenna.size:
+        channels = f"{len(calibration.order)} channels for {antenna.size} elements"
+        raise ConfigError(f"hardware.calibration: {channels}")
+    budget = LinkBudget(radio.tx_power_dbm, radio.bandwidth_hz, radio.noise_figure_db)
+    return Equipment(codebook, calibration, budget, radio.uav_antennas)
 
 
 def precoder(settings: Settings) -> Precoder:

@@ -13,6 +13,7 @@ from typing import Any
 import click
 
 import companion
+from companion.cli_beams import weights
 from companion.cli_design import design, study
 from companion.console import CENTER, CONFIG, JSON, OneLineErrors, Progress, user_errors
 
@@ -191,3 +192,4 @@ def recover(files: tuple[Path, ...], as_json: bool) -> None:
 
 main.add_command(design)
 main.add_command(study)
+main.add_command(weights)

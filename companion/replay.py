@@ -99,7 +99,7 @@ def replay(
     started_s = time.monotonic()
     pipeline, tally = Pipeline(settings), Tally()
     flush_due_s = started_s + FLUSH_EVERY_S
-    events = _events(logs, settings)
+    events = log_events(logs, settings)
     for event in events if speed is None else _paced(events, speed):
         outputs = pipeline.step(event)
         tally.event(event)
@@ -131,7 +131,7 @@ def replay(
     }
 
 
-def _events(logs: Sequence[Path], settings: Settings) -> Iterator[Event]:
+def log_events(logs: Sequence[Path], settings: Settings) -> Iterator[Event]:
     """All events in order of time, with ticks."""
     if len(logs) == 1 and log_kind(logs[0]) == TICKED:
         return read_log(logs[0])

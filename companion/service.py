@@ -12,6 +12,7 @@ from typing import Any, Final
 import uvicorn
 
 import companion
+from companion import assembly
 from companion.config import Settings
 from companion.mavlink.links import Link, LinkStatus, parse_link
 from companion.pipeline import Pipeline
@@ -47,6 +48,7 @@ class Service:
 
     def __init__(self, settings: Settings, say: Callable[[str], None]) -> None:
         self.pipeline = Pipeline(settings)
+        self.equipment = assembly.equipment(settings, self.pipeline.array)
         self.notices: deque[Notice] = deque(maxlen=NOTICES_KEPT)
         self._settings = settings
         self._say = say

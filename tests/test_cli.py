@@ -17,7 +17,7 @@ def run(*arguments: str) -> Any:
 
 
 def test_the_commands_are_the_documented_ones() -> None:
-    assert set(COMMANDS) == {"demo", "run", "replay", "design", "recover", "study"}
+    assert set(COMMANDS) == {"demo", "run", "replay", "design", "recover", "study", "weights"}
 
 
 @pytest.mark.parametrize("command", COMMANDS)

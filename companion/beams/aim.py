@@ -124,7 +124,7 @@ def _priorities(tracks: Sequence[Track], priority: Sequence[str]) -> list[int]:
 def _out_of_reach(directions: FloatArray, array: Array, coverage: Coverage) -> list[str | None]:
     """Why no beam can be pointed there; None if it can."""
     reasons: list[str | None] = [None] * len(directions)
-    if coverage is not EVERYWHERE:
+    if coverage != EVERYWHERE:
         reasons = refusals(coverage, directions, directions @ array.array_from_body)
     if array.element.pattern is not Pattern.ISOTROPIC:
         dark = steering.amplitudes(array, directions).max(axis=0) < DARK

@@ -24,6 +24,14 @@ def angles_rad(directions: FloatArray) -> tuple[FloatArray, FloatArray]:
     return azimuth, np.arcsin(np.clip(-directions[:, 2], -1.0, 1.0))
 
 
+def unit_directions(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> FloatArray:
+    """Unit directions in the array frame, (N, 3), of azimuths and elevations (N,)."""
+    level = np.cos(elevation_rad)
+    return np.stack(
+        [level * np.cos(azimuth_rad), level * np.sin(azimuth_rad), -np.sin(elevation_rad)], axis=-1
+    )
+
+
 def steering_matrix(array: Array, directions: FloatArray) -> ComplexArray:
     """A, shape (M, N): one steering vector a column, for unit directions (N, 3)."""
     phase = array.wavenumber_radpm * (array.elements_m @ directions.T)

@@ -151,6 +151,7 @@ class SenderClock:
         latency_s = (arrival_ns - self.node_ns(placed.x_ns)) * 1e-9
         if placed.x_ns == self._line.newest_ns:
             self._latency_s = latency_s
+        self._remember_median()
         return Stamp(placed.x_ns, latency_s, placed.rebooted)
 
     def timesync(self, sent_ns: int, received_ns: int, remote_ns: int) -> None:
@@ -243,12 +244,15 @@ class SenderClock:
                     best = (kind, depth.depth_ns, error_ns)
         return best
 
-    def _envelope_error_ns(self) -> float:
-        """See ``ClockEstimate.uncertainty_s``; the first few frames may all have been slow."""
-        count = self._line.envelope.count
-        state = (self._line.envelope.fits, count // 16)
+    def _remember_median(self) -> None:
+        """The median gap, now and then: as stamps come, so that who asks when changes nothing."""
+        state = (self._line.envelope.fits, self._line.envelope.count // 16)
         if self._median_gap[0] != state:
             gaps = (y - self._line.envelope.at(x) for x, y in self._line.envelope.samples())
             self._median_gap = (state, median_low(gaps))
+
+    def _envelope_error_ns(self) -> float:
+        """See ``ClockEstimate.uncertainty_s``; the first few frames may all have been slow."""
+        count = self._line.envelope.count
         invisible_ns = max(0, self._median_gap[1] - self._constant_delay_ns)
         return invisible_ns + self._line.envelope.residual_ns() + _WORST_LATENCY_NS / count**2

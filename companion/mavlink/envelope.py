@@ -92,6 +92,7 @@ class Envelope:
         self.mean_gap_ns = 0.0
         self._cloud = _Cloud([(0, 0)], 0.0, 0.0)
         self._fitted = self._least_gap_ns = 0.0
+        self._independent_fitted = 0
         self._drift_error = (-1, drift_limit)  # as of which fit, and it
         self.fits = 0
         """How often the line was laid anew."""
@@ -171,7 +172,7 @@ class Envelope:
     def _open_slopes(self) -> float:
         """How far from the slope in use the slopes reach that are less likely than the best by
         no more than ``SIGNIFICANT``. The gap is convex in the slope: bisection, to a 1000th."""
-        scale = math.exp(SIGNIFICANT / max(1, self.independent))
+        scale = math.exp(SIGNIFICANT / max(1, self._independent_fitted))
         allowed_ns = (self._least_gap_ns + _RESOLUTION_NS) * scale - _RESOLUTION_NS
         furthest = self._drift_unsure
         for end in (-self._drift_limit, self._drift_limit):
@@ -210,6 +211,7 @@ class Envelope:
         else:
             self.drift, self._pivot, self.mean_gap_ns = 0.0, level_pivot, level_gap
         self._fitted, self._least_gap_ns = fitted, gap
+        self._independent_fitted = self.independent
 
 
 def _append(hull: list[Point], point: Point) -> None:

@@ -1,23 +1,24 @@
 """The HTTP API and the dashboard's files, over a running node. Read only."""
 
-import io
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-import numpy as np
 from fastapi import FastAPI, HTTPException, Query, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CollectorRegistry, generate_latest
+from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import companion
-from companion.server import views
+from companion.server import beam_views, views, weight_formats
 from companion.server.access import BearerToken
 from companion.server.metrics import NodeCollector
 from companion.server.views import Node
+from companion.server.words import rfc3339
+from companion.values import Update
 
 LeadMs = Annotated[float, Query(ge=0, le=10_000, description="milliseconds ahead of now")]
 CONTENT_POLICY = b"default-src 'self'; frame-ancestors 'none'"
@@ -74,7 +75,7 @@ def _state_routes(app: FastAPI, node: Node) -> None:
 
     @app.get("/v1/uavs", summary="Every UAV as it is now")
     async def uavs() -> dict[str, Any]:
-        return {"valid_at": views.rfc3339(node.now_ns()), "uavs": views.uavs(node)}
+        return {"valid_at": rfc3339(node.now_ns()), "uavs": views.uavs(node)}
 
     @app.get("/v1/uavs/{uav}", summary="One UAV as it is now")
     async def one_uav(uav: str) -> dict[str, Any]:
@@ -85,47 +86,64 @@ def _state_routes(app: FastAPI, node: Node) -> None:
 
 
 def _beam_routes(app: FastAPI, node: Node) -> None:
+    pipeline, equipment = node.pipeline, node.equipment
+
+    def look(lead_ms: float) -> Update:
+        return pipeline.look(node.now_ns(), lead_ms * 1e-3)
+
     @app.get("/v1/beams", summary="The beams, applied lead_ms from now")
     async def beams(lead_ms: LeadMs = 0.0) -> dict[str, Any]:
-        update = node.pipeline.look(node.now_ns(), lead_ms * 1e-3)
-        return views.beams(node, update, lead_ms)
+        update = look(lead_ms)
+        return await run_in_threadpool(beam_views.beams, pipeline, equipment, update, 0.0, lead_ms)
 
     @app.get(
         "/v1/beams/weights",
-        summary="The M×N weights, by Accept: JSON, application/x-npy, application/octet-stream",
+        summary="The M×N weights, by Accept: JSON, application/x-npy, raw, or a device's format",
         response_class=Response,
+        responses={200: {"content": {kind: {} for kind in weight_formats.TYPES.values()}}},
     )
     async def weights(request: Request, lead_ms: LeadMs = 0.0) -> Response:
-        beam_set = node.pipeline.look(node.now_ns(), lead_ms * 1e-3).beams
+        form = _accepted(request.headers.get("accept", "*/*"))
+        if form is None:
+            raise HTTPException(406, f"weights come as {', '.join(weight_formats.TYPES.values())}")
+        beam_set = look(lead_ms).beams
+        try:
+            body = await run_in_threadpool(
+                weight_formats.encode, form, beam_set, pipeline.array, equipment, lead_ms
+            )
+        except ValueError as error:  # what the device cannot do, as the beams are now
+            raise HTTPException(409, str(error)) from error
         headers = {
-            "x-valid-at": views.rfc3339(beam_set.valid_at_ns),
+            "x-valid-at": rfc3339(beam_set.valid_at_ns),
             "x-uavs": ",".join(beam_set.uavs),
+            "x-normalisation": str(beam_set.normalisation),
         }
-        match _accepted(request.headers.get("accept", "*/*")):
-            case "application/json":
-                return JSONResponse(views.weights(beam_set, lead_ms), headers=headers)
-            case "application/x-npy":
-                file = io.BytesIO()
-                np.save(file, beam_set.weights, allow_pickle=False)
-                return Response(file.getvalue(), media_type="application/x-npy", headers=headers)
-            case "application/octet-stream":
-                raw = beam_set.weights.astype("<c8").tobytes()
-                return Response(raw, media_type="application/octet-stream", headers=headers)
-            case _:
-                raise HTTPException(406, f"weights come as {', '.join(WEIGHT_TYPES)}")
+        return Response(body, media_type=weight_formats.TYPES[form], headers=headers)
 
-
-WEIGHT_TYPES = ("application/json", "application/x-npy", "application/octet-stream")
+    @app.get("/v1/pattern", summary="Array response in dB along a cut through each beam")
+    async def pattern(
+        cut: Literal["azimuth", "elevation"] = "azimuth",
+        points: Annotated[int, Query(ge=2, le=3601)] = 361,
+        uav: str | None = None,
+        lead_ms: LeadMs = 0.0,
+    ) -> dict[str, Any]:
+        update = look(lead_ms)
+        if uav is not None and uav not in update.beams.uavs:
+            raise HTTPException(404, f"there is no beam on {uav!r}")
+        return await run_in_threadpool(
+            beam_views.pattern, pipeline, update, cut, points, uav, lead_ms
+        )
 
 
 def _accepted(accept: str) -> str | None:
-    """The first type of an Accept header that weights come in; None if there is none."""
+    """The form of the first type of an Accept header that weights come in; None without one."""
+    forms = {media_type: form for form, media_type in weight_formats.TYPES.items()}
     for part in accept.split(","):
         wanted = part.split(";")[0].strip().lower()
-        if wanted in WEIGHT_TYPES:
-            return wanted
+        if wanted in forms:
+            return forms[wanted]
         if wanted in ("*/*", "application/*", ""):
-            return WEIGHT_TYPES[0]
+            return "json"
     return None
 
 

@@ -3,17 +3,17 @@
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import Any, Protocol
 
 import numpy as np
 
-from companion.beams.arrays import half_power_beamwidth_rad
+from companion.assembly import Equipment
 from companion.config import FixedCenter
 from companion.mavlink.clocks import ClockEstimate
 from companion.mavlink.links import LinkStatus
 from companion.pipeline import Pipeline
-from companion.values import BeamSet, Carrier, FloatArray, Track, Update
+from companion.server.words import rfc3339
+from companion.values import Carrier, FloatArray, Track
 
 Json = dict[str, Any]
 
@@ -33,6 +33,7 @@ class Node(Protocol):
     """What the server looks at: the running service, or a test's stand-in for it."""
 
     pipeline: Pipeline
+    equipment: Equipment
 
     def now_ns(self) -> int: ...
     def uptime_s(self) -> float: ...
@@ -40,12 +41,6 @@ class Node(Protocol):
     def recording(self) -> RecordingStatus: ...
     def rates(self) -> Mapping[str, float | None]: ...
     def unfit(self) -> list[str]: ...
-
-
-def rfc3339(t_ns: int) -> str:
-    """A time in UTC with milliseconds: 2026-11-20T13:00:00.123Z."""
-    seconds, milliseconds = divmod(t_ns // 1_000_000, 1000)
-    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{milliseconds:03d}Z"
 
 
 def vector(values: FloatArray | None) -> list[float] | None:
@@ -204,82 +199,4 @@ def clock(estimate: ClockEstimate | None) -> Json | None:
         "uncertainty_s": estimate.uncertainty_s,
         "constant_delay_s": estimate.constant_delay_s,
         "latency_s": estimate.latency_s,
-    }
-
-
-def beams(node: Node, update: Update, lead_ms: float) -> Json:
-    """``/v1/beams`` for one look."""
-    pipeline, beam_set = node.pipeline, update.beams
-    boresight = None
-    array_from_local = np.eye(3)
-    if update.carrier is not None:
-        array_from_local = pipeline.array.array_from_body @ update.carrier.body_from_local
-        boresight = float(np.degrees(np.arctan2(array_from_local[0, 1], array_from_local[0, 0])))
-    beamwidth = half_power_beamwidth_rad(pipeline.array)
-    return {
-        "valid_at": rfc3339(beam_set.valid_at_ns),
-        "age_s": (node.now_ns() - beam_set.t_ns) * 1e-9,
-        "lead_ms": lead_ms,
-        "beams": _beam_list(beam_set, array_from_local),
-        "array": {
-            "kind": pipeline.array.kind,
-            "elements": pipeline.array.size,
-            "frequency_hz": pipeline.settings.array.frequency_hz,
-            "half_power_beamwidth_deg": None if beamwidth is None else float(np.degrees(beamwidth)),
-            "boresight_bearing_deg": None if boresight is None else boresight % 360,
-        },
-        "method": str(beam_set.method),
-        "normalisation": "unit response",
-        "condition_number": beam_set.condition_number,
-        "regularised": beam_set.regularised,
-        "unfit": update.unfit,
-        "left_out": [{"uav": out.uav, "reason": out.reason} for out in beam_set.left_out],
-    }
-
-
-def _degrees(angle_rad: float | None) -> float | None:
-    return None if angle_rad is None else float(np.degrees(angle_rad))
-
-
-def _beam_list(beam_set: BeamSet, array_from_local: FloatArray) -> list[Json]:
-    entries = []
-    for beam in beam_set.beams:
-        level = np.cos(beam.elevation_rad)
-        direction = np.array(
-            [
-                level * np.cos(beam.azimuth_rad),
-                level * np.sin(beam.azimuth_rad),
-                -np.sin(beam.elevation_rad),
-            ]
-        )
-        north, east, _ = array_from_local.T @ direction
-        entries.append(
-            {
-                "uav": beam.uav,
-                "azimuth_deg": float(np.degrees(beam.azimuth_rad)),
-                "elevation_deg": float(np.degrees(beam.elevation_rad)),
-                "range_m": beam.range_m,
-                "bearing_deg": float(np.degrees(np.arctan2(east, north))) % 360,
-                "azimuth_rate_dps": _degrees(beam.azimuth_rate_radps),
-                "elevation_rate_dps": _degrees(beam.elevation_rate_radps),
-                "range_rate_mps": beam.range_rate_mps,
-                "gain_db": beam.gain_db,
-                "guaranteed_gain_db": None,
-                "pointing_bound_deg": _degrees(beam.pointing_bound_rad),
-                "sinr_db": None,
-            }
-        )
-    return entries
-
-
-def weights(beam_set: BeamSet, lead_ms: float) -> Json:
-    """``/v1/beams/weights`` as JSON: M rows, columns in the order of ``uavs``."""
-    return {
-        "valid_at": rfc3339(beam_set.valid_at_ns),
-        "lead_ms": lead_ms,
-        "uavs": list(beam_set.uavs),
-        "method": str(beam_set.method),
-        "normalisation": "unit response",
-        "re": beam_set.weights.real.tolist(),
-        "im": beam_set.weights.imag.tolist(),
     }

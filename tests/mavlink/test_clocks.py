@@ -213,6 +213,19 @@ def test_a_time_does_not_depend_on_how_late_the_report_came() -> None:
         assert clock.node_ns(7_000 * MS) == EPOCH_NS + 2_000 * MS
 
 
+@pytest.mark.parametrize("sky", [radio, wifi])
+def test_who_asks_when_changes_nothing(sky: Link) -> None:
+    """A clock that was asked now and then, and one that is asked at every stamp, say the same."""
+    seen = sky(5, 50e-6, 60)
+    seldom, often = SenderClock(), SenderClock()
+    for n, (arrival_ns, boot_ms) in enumerate(seen):
+        seldom.observe(arrival_ns, boot_ms)
+        often.observe(arrival_ns, boot_ms)
+        asked = known(often)
+        if n % 37 == 36:
+            assert known(seldom) == asked
+
+
 def test_before_the_first_stamp_nothing_is_known() -> None:
     clock = SenderClock()
     assert clock.estimate() is None

@@ -1,0 +1,147 @@
+"""What a beam is sure to give, wherever in its cone of error the true direction lies.
+
+The array gain of weights f towards u is |a(u)^T f|^2 / |f|^2 (MATH: array, steering, weights; the
+guaranteed gain: prediction to the time of use). Its least over the cone is found by branch and
+bound: cells whose bound could still be the least are split until bound and attained gain agree
+(``TOLERANCE_DB``) or the work is spent. What is returned is a bound of every cell, whenever it
+ends: never more than the truth for the least gain, never less for the largest.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from companion.beams import cone
+from companion.beams.arrays import Array
+from companion.beams.cone import Boxes, Cells, Cones
+from companion.beams.elements import Pattern
+from companion.values import ComplexArray, FloatArray
+
+TOLERANCE_DB: Final = 0.05
+TOLERANCE: Final = 1 - 10 ** (-TOLERANCE_DB / 20)
+NOTHING_DB: Final = 40.0
+"""A gain this far below the most that the weights can give anywhere is not pinned down further."""
+LEVELS: Final = 12
+MOST_CELLS: Final = 4096
+"""For each cone; a level that has begun is done."""
+BLOCK: Final = 2**18
+"""Elements times cells worked on at once: some megabytes."""
+
+
+def guaranteed_gains_db(
+    array: Array,
+    directions: FloatArray,
+    pointing_bounds_rad: Sequence[float | None],
+    weights: ComplexArray,
+) -> tuple[float | None, ...]:
+    """The least array gain in dB, element pattern included, that column n of the weights (M, N) is
+    proven to have towards every unit direction within the n-th bound of row n of the directions
+    (N, 3).
+
+    None where nothing is proven: the cone holds a null, or has no bound (None: any direction). The
+    true minimum is at most ``TOLERANCE_DB`` above, unless it lies ``NOTHING_DB`` down or the cone
+    is many beamwidths wide. ``ValueError`` for weights that are zero or do not fit.
+    """
+    unit, bounds = _cones(directions, pointing_bounds_rad)
+    powered = cone.unit_power(array, weights)
+    if weights.shape[1] != len(unit):
+        raise ValueError(f"{weights.shape[1]} columns of weights for {len(unit)} directions")
+    found: list[float | None] = [None] * len(unit)
+    bounded = np.flatnonzero([bound is not None for bound in pointing_bounds_rad])
+    least = _extremes(array, unit[bounded], bounds[bounded], powered[:, bounded], most=False)
+    for n, amplitude in zip(bounded.tolist(), least.tolist(), strict=True):
+        if amplitude > 0:
+            found[n] = 20 * math.log10(amplitude)
+    return tuple(found)
+
+
+def leakage_bounds(
+    array: Array,
+    directions: FloatArray,
+    pointing_bounds_rad: Sequence[float | None],
+    weights: ComplexArray,
+) -> FloatArray:
+    """(N, J): the most array gain, linear, that column j of the weights (M, J) can have towards any
+    unit direction within the i-th bound of row i of the directions (N, 3); None: any at all.
+
+    What UAV i can receive of the stream of UAV j at worst, but for the powers. The proof and its
+    tolerance are those of the least gain.
+    """
+    unit, bounds = _cones(directions, pointing_bounds_rad)
+    powered = cone.unit_power(array, weights)
+    row, column = np.indices((len(unit), weights.shape[1])).reshape(2, -1)
+    largest = _extremes(array, unit[row], bounds[row], powered[:, column], most=True)
+    return (largest**2).reshape(len(unit), weights.shape[1])
+
+
+def _cones(directions: FloatArray, given: Sequence[float | None]) -> tuple[FloatArray, FloatArray]:
+    """Unit directions and their bounds, checked; no bound is half a turn."""
+    bounds = np.array([np.pi if bound is None else bound for bound in given], dtype=float)
+    return cone.unit_directions(directions, bounds), bounds
+
+
+def _extremes(
+    array: Array, unit: FloatArray, bounds: FloatArray, weights: ComplexArray, most: bool
+) -> FloatArray:
+    """The least response (N,) of column n over cone n; ``most``: the largest, negated, that is the
+    least of what is negated throughout."""
+    if len(unit) == 0:
+        return np.empty(0)
+    cones = cone.cones_around(array, unit, bounds, np.abs(weights))
+    apart = cone.faces_apart(array)
+    scales = 1.0 if apart else array.element.amplitude_range(unit, bounds)[1]
+    nothing = 0.0 if most else 10 ** (-NOTHING_DB / 20)
+    proven, attained = np.full((2, len(unit)), np.inf)
+    spent = np.zeros(len(unit), dtype=np.int64)
+    boxes = cone.first_boxes(cones)
+    for level in range(LEVELS):
+        bound, seen = _over_boxes(cones, boxes, weights, level, most)
+        np.minimum.at(attained, boxes.cone, seen)
+        spent += np.bincount(boxes.cone, minlength=len(unit))
+        size = np.abs(attained)
+        enough = attained - size * TOLERANCE - 4 * scales * cones.rounding
+        going = (size > nothing * scales * cones.ceilings) & (spent < MOST_CELLS)
+        in_doubt = (bound < enough[boxes.cone]) & going[boxes.cone] & (level + 1 < LEVELS)
+        np.minimum.at(proven, boxes.cone[~in_doubt], bound[~in_doubt])
+        if not in_doubt.any():
+            break
+        boxes = cone.split(cones, boxes.take(in_doubt))
+    return proven
+
+
+def _over_boxes(
+    cones: Cones, boxes: Boxes, weights: ComplexArray, level: int, most: bool
+) -> tuple[FloatArray, FloatArray]:
+    """For each box a proven bound (C,) of the least, and what is attained in it."""
+    patterned = cones.array.element.pattern is not Pattern.ISOTROPIC
+    caps = 8 * 2 ** min(level, 4) + 1 if patterned else 1
+    step = max(1, BLOCK // cones.array.size)
+    starts = range(0, len(boxes.cone), step)
+    parts = [
+        _over_cells(cones, cone.cells(cones, boxes.take(slice(at, at + step)), caps), weights, most)
+        for at in starts
+    ]
+    return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+
+
+def _over_cells(
+    cones: Cones, cells: Cells, weights: ComplexArray, most: bool
+) -> tuple[FloatArray, FloatArray]:
+    received, unsure = cone.phasors(cones, cells)
+    chosen = weights[:, cells.cone]
+    terms = chosen * received
+    responses = terms.sum(axis=0)
+    low, high = cone.response_range(cones, cells, responses, cones.positions_m.T @ terms)
+    seen = np.abs(responses)
+    if unsure is not None:
+        slack = np.einsum("mc,mc->c", np.abs(chosen), unsure)
+        return (-high - slack, -seen) if most else (low - slack, seen)
+    least, largest = cones.array.element.amplitude_range(cells.caps, cells.caps_rad)
+    amplitude = cones.array.element.amplitude(cells.caps)
+    if most:
+        attained = np.where(cells.in_cone, amplitude, 0.0).max(axis=1)
+        return -high * largest.max(axis=1), -seen * attained
+    attained = np.where(cells.in_cone, amplitude, np.inf).min(axis=1)
+    return low * least.min(axis=1), seen * attained

@@ -15,6 +15,8 @@ import pymap3d
 import pytest
 from support import BIN
 
+from companion.beams import hardware
+from companion.beams.devices import MEDIA_TYPES, Device
 from companion.mavlink.decode import decode
 from companion.recording.reader import read_log, read_metadata
 from companion.values import Frame, Report
@@ -134,6 +136,64 @@ def test_weights_point_where_the_beams_say(start_node: Any, tmp_path: Path) -> N
     assert np.all(np.isfinite(weights))
 
 
+def test_beams_say_what_they_are_worth(start_node: Any, tmp_path: Path) -> None:
+    """Gain, what is guaranteed of it, signal to noise, and the stored beams to be swept."""
+    config = tmp_path / "settings.toml"
+    config.write_text(PAPER_BOUNDS + '[codebook]\nkind = "dft"\n', encoding="utf-8")
+    node = start_node(*RUN, "--config", str(config))
+    with fly(node.udp_port, tmp_path / "flown.tlog", seconds=8) as flight:
+        node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
+        node.wait_until(
+            "/v1/beams",
+            lambda answer: all(b["guaranteed_gain_db"] is not None for b in answer["beams"]),
+        )  # the clocks have settled
+        answers = [node.json(f"/v1/beams?lead_ms={lead}") for lead in (0, 50, 500)]
+        pattern = node.json("/v1/pattern?cut=azimuth&points=721")
+        one = node.json("/v1/pattern?cut=elevation&points=19&uav=2:1")
+        unknown = node.get("/v1/pattern?uav=9:9")[0]
+        flight.terminate()
+    for answer in answers:
+        assert answer["normalisation"] == "unit-response"
+        assert (answer["policy"], answer["groups"]) == ("regularise", 1)
+        assert answer["codebook_beams"] == 64
+        for beam in answer["beams"]:
+            guaranteed_db = beam["guaranteed_gain_db"]
+            assert guaranteed_db is None or guaranteed_db <= beam["gain_db"] + 1e-6
+            assert beam["cost_db"] == beam["loss_db"] >= -1e-9
+            assert -20 < beam["sinr_db"] < 80
+            stored = beam["codebook"]
+            assert stored["best"] in stored["candidates"]
+            assert stored["sweep_share"] == len(stored["candidates"]) / 64
+            assert stored["next"] is None or stored["next_in_s"] > 0
+    assert pattern["angles_deg"][0] == -180
+    assert {entry["uav"] for entry in pattern["patterns"]} == {"1:1", "2:1", "3:1", "4:1"}
+    for entry in pattern["patterns"]:
+        assert len(entry["response_db"]) == 721
+        at = np.interp(entry["target_deg"], pattern["angles_deg"], entry["response_db"])
+        assert at > entry["peak_db"] - 6
+        assert len(entry["null_depths_db"]) == 3
+        if pattern["method"] == "zf":
+            assert all(depth < -100 for depth in entry["null_depths_db"].values())
+    assert [entry["uav"] for entry in one["patterns"]] == ["2:1"]
+    assert len(one["angles_deg"]) == 19
+    assert unknown == 404
+
+
+def test_weights_for_a_device_or_the_reason_why_not(start_node: Any, tmp_path: Path) -> None:
+    node = start_node(*RUN)
+    with fly(node.udp_port, tmp_path / "flown.tlog", seconds=4) as flight:
+        node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
+        status, table = node.get("/v1/beams/weights", MEDIA_TYPES[Device.ADAR1000])
+        refused, why = node.get("/v1/beams/weights", MEDIA_TYPES[Device.TMYTEK])
+        flight.wait()
+    assert status == 200
+    read = hardware.parse(Device.ADAR1000, table.decode(), hardware.Calibration.ideal(range(64)))
+    assert sorted(read.uavs) == ["1:1", "2:1", "3:1", "4:1"]
+    assert read.weights.shape == (64, 4)
+    assert refused == 409
+    assert json.loads(why)["title"] == "tmytek drives 16 elements, the array has 64"
+
+
 def test_without_a_carrier_it_says_so(start_node: Any) -> None:
     node = start_node(*RUN)
     status, body = node.get("/readyz")
@@ -153,6 +213,10 @@ def test_without_a_carrier_it_says_so(start_node: Any) -> None:
         ("/v1/beams?lead_ms=x", "application/json", 422),
         ("/v1/beams?lead_ms=-1", "application/json", 422),
         ("/v1/beams/weights", "image/png", 406),
+        ("/v1/beams/weights", "application/vnd.adi.adar1000+csv", 409),
+        ("/v1/pattern?cut=sideways", "application/json", 422),
+        ("/v1/pattern?points=1", "application/json", 422),
+        ("/v1/pattern?uav=1:1", "application/json", 404),
     ],
 )
 def test_errors_are_problem_json(start_node: Any, path: str, accept: str, expected: int) -> None:

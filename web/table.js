@@ -14,9 +14,20 @@ function pointingBound({ beam, array }) {
     return { text: `▲ ${text}`, level: "warn", title: "No bound: the UAV can be anywhere" };
   }
   if (!format.known(bound) || limit === null || bound <= limit) return { text };
+  if (beam.widened) return { text, title: "More than half the beamwidth: the beam is broadened" };
   return {
     text: `▲ ${text}`, level: "warn",
     title: `More than half the beamwidth (${format.degrees(limit, 2)}): the beam may miss`,
+  };
+}
+
+/** The guaranteed gain, with a warning where there is none. */
+function guaranteedGain({ beam }) {
+  const text = format.decibels(beam?.guaranteed_gain_db);
+  if (!beam || format.known(beam.guaranteed_gain_db)) return { text };
+  return {
+    text: `▲ ${text}`, level: "warn",
+    title: "Nothing is guaranteed: within its bound the UAV may be in a null, or out of coverage",
   };
 }
 
@@ -50,6 +61,8 @@ const COLUMNS = [
     title: "How far the true direction can lie from the beam", show: pointingBound },
   { key: "gain", label: "Gain", feed: "beams", title: "Array gain towards the prediction",
     show: ({ beam }) => ({ text: format.decibels(beam?.gain_db) }) },
+  { key: "guaranteed", label: "Guaranteed gain", short: "Guaranteed", feed: "beams",
+    title: "The least gain wherever the UAV truly is within its bound", show: guaranteedGain },
 ];
 
 const make = (tag, attributes = {}) => {

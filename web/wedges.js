@@ -58,11 +58,18 @@ function drawBeam(view, beam, array, uav) {
   context.globalAlpha = 1;
 }
 
+/** Width of a beam in bearing, degrees: as wide as what is known of its target where widened. */
+function wedgeWidthDeg(beam, array) {
+  const naturalDeg = naturalWidthDeg(beam, array);
+  if (!beam.widened || !format.known(beam.pointing_bound_deg)) return naturalDeg;
+  return Math.max(naturalDeg, Math.min(120, 2 * beam.pointing_bound_deg));
+}
+
 /**
  * Half-power width in bearing, degrees. A line of elements has its beamwidth in the sine of the
  * angle off boresight, so the beam widens as it is steered away; other arrays as they are said.
  */
-function wedgeWidthDeg(beam, array) {
+function naturalWidthDeg(beam, array) {
   const widthDeg = array.half_power_beamwidth_deg;
   if (!format.known(widthDeg)) return 0;
   if (array.kind !== "ula" || !format.known(beam.azimuth_deg)) return widthDeg;

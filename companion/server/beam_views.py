@@ -209,6 +209,7 @@ def pattern(
         "valid_at": rfc3339(beam_set.valid_at_ns),
         "lead_ms": lead_ms,
         "cut": cut,
+        "method": str(beam_set.method),
         "angles_deg": np.degrees(angles).tolist(),
         "patterns": entries,
     }

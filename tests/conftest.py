@@ -1,5 +1,10 @@
 """Fixtures that several rooms' tests share."""
 
+import os
+
+# Before numpy is loaded, as the commands do: more BLAS threads make small matrices slower.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

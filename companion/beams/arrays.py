@@ -5,6 +5,7 @@ uniform rectangular one (URA) in the yz plane, a uniform circular one (UCA) in t
 list of positions will do as well. The origin of the array frame is the phase reference.
 """
 
+import math
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -16,6 +17,8 @@ from companion.values import FloatArray, IntArray
 SPEED_OF_LIGHT_MPS: Final = 299_792_458.0
 SAME_PLACE_WAVELENGTHS: Final = 1e-9
 """Positions that differ by less are one: 1e-8 rad of phase."""
+SLANTED: Final = np.array([math.sqrt(2), math.sqrt(3), math.sqrt(5)])
+"""Orders the elements; no two places of a regular array are level along it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,7 +150,7 @@ def listed(
 
 
 def _wavelength_m(elements: int, frequency_hz: float, spacing: float) -> float:
-    if elements < 1 or frequency_hz <= 0 or spacing <= 0:
+    if elements < 1 or not (0 < frequency_hz < math.inf and 0 < spacing < math.inf):
         raise ValueError("an array has at least one element, a frequency and a spacing above 0")
     return SPEED_OF_LIGHT_MPS / frequency_hz
 
@@ -172,31 +175,13 @@ def _facing(outward: FloatArray, count: int) -> FloatArray:
 
 
 def _partners(centred: FloatArray) -> IntArray | None:
-    """For each element the one that mirrors it through the centroid; None unless all have one."""
-    if not np.isfinite(centred).all():
-        return None
-    order = np.lexsort(np.round(centred, 6).T)
-    back = np.lexsort(np.round(-centred, 6).T)
+    """For each element the one that mirrors it through the centroid; None unless all have one.
+
+    The reflection reverses the order along any line, so the first along one pairs with the last.
+    On a line with irrational slopes no two elements of a grid or a circle stand level.
+    """
+    order = np.argsort(centred @ SLANTED)
     partners = np.empty(len(centred), dtype=np.int64)
-    partners[order] = back
+    partners[order] = order[::-1]
     gap = np.abs(centred + centred[partners]).max(initial=0.0)
     return partners if gap < SAME_PLACE_WAVELENGTHS else None
-
-
-def half_power_beamwidth_rad(array: Array) -> float | None:
-    """Full width of the broadside beam at half power; None for a single element.
-
-    Uniform weights on a uniform line of M elements, spacing d: found on the exact array factor
-    |sin(M x) / (M sin x)|^2 = 1/2 with x = pi d sin(theta) / wavelength.
-    """
-    count = array.size
-    if count < 2:
-        return None
-    spacing_m = float(array.elements_m[1, 1] - array.elements_m[0, 1])
-    low, high = 0.0, np.pi / count  # full gain; first null
-    for _ in range(60):
-        x = (low + high) / 2
-        power = (np.sin(count * x) / (count * np.sin(x))) ** 2
-        low, high = (x, high) if power > 0.5 else (low, x)
-    sine = low * array.wavelength_m / (np.pi * spacing_m)
-    return float(2 * np.arcsin(sine)) if sine <= 1 else None

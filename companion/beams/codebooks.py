@@ -6,6 +6,7 @@ alike their pattern is a common factor of all beams, and leaves the order of the
 then what is best without it, behind the elements as well.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
@@ -15,8 +16,8 @@ import numpy as np
 
 from companion.beams import cone, steering
 from companion.beams.arrays import Array
-from companion.beams.cone import BoolArray, Boxes, Cones
-from companion.values import ComplexArray, FloatArray, IntArray
+from companion.beams.cone import Boxes, Cones
+from companion.values import BoolArray, ComplexArray, FloatArray, IntArray
 
 LEVELS: Final = 12
 MOST_RESPONSES: Final = 2**18
@@ -60,11 +61,11 @@ class NextBest:
 def dft(array: Array, oversampling: int = 1) -> Codebook:
     """The beams of a discrete Fourier transform over a line or a grid of elements.
 
-    A line of n elements has K = n oversampling beams; the k-th steps by -2 pi k / K from element
-    to element and so points where spacing / wavelength times the sine off broadside is k / K, or
-    that less a whole number: for a half-wave line at sine 2k/K up to K/2, at 2k/K - 2 beyond. A
-    single element has one beam. On a grid the beams are the products of those of a column (z) and
-    of a row (y): index = k_z K_y + k_y. ``ValueError`` for an array without a grid.
+    A line of n elements along y has K = n oversampling beams; the k-th steps by -2 pi k / K from
+    element to element and so points where spacing / wavelength times u_y is k/K or that less a
+    whole number: at half a wavelength u_y = 2k/K up to k = K/2, and 2k/K - 2 beyond. A line of one
+    element has one beam. A grid has all products of a beam down its columns (u_z) and one along its
+    rows (u_y): index k_z K_y + k_y. ``ValueError`` for an array without a grid.
     """
     if array.grid is None:
         raise ValueError(f"a DFT codebook needs a ULA or a URA, not elements of kind {array.kind}")
@@ -150,7 +151,7 @@ def candidates(
 
 def _contest(cones: Cones, boxes: Boxes, weights: ComplexArray) -> tuple[BoolArray, BoolArray]:
     """Which beams can be best somewhere in which box, (K, C), and which are best at the middle of
-    one, (K,), but for rounding."""
+    one, (K,)."""
     size, beams = weights.shape
     placed = cones.positions_m.T[:, :, np.newaxis] * weights
     stacked = np.concatenate([weights[np.newaxis], placed]).transpose(0, 2, 1)
@@ -168,7 +169,7 @@ def _contest(cones: Cones, boxes: Boxes, weights: ComplexArray) -> tuple[BoolArr
             low, high = low - slack, high + slack
         possible[:, block] = high >= low.max(axis=0)
         middle = np.abs(sums[0])
-        seen |= (middle >= middle.max(axis=0) - 2 * cones.rounding[0]).any(axis=1)
+        seen |= (middle == middle.max(axis=0)).any(axis=1)
     return possible, seen
 
 
@@ -183,11 +184,12 @@ def next_best(
 
     ``directions_at`` gives unit directions (T, 3) for seconds from now (T,). They are sampled every
     ``step_s`` up to ``horizon_s``, and the first change between two samples is bisected. A beam
-    that is best for less than a step can be missed: ``sampling_step_s`` makes that rare, while
-    where two changes fall into one step, the one found is a change and need not be the first.
+    that is best for less than a step can be missed; where several changes fall into one step, what
+    is found is one of them. ``sampling_step_s`` is a step at which neither happens in practice.
+    ``ValueError`` for a horizon or a step that is none.
     """
-    if not (horizon_s > 0 and step_s > 0):
-        raise ValueError(f"horizon and step are above 0 s, not {horizon_s:g} and {step_s:g}")
+    if not (0 < horizon_s < math.inf and step_s > 0):
+        raise ValueError(f"horizon and step are above 0 s, not {horizon_s:g} s and {step_s:g} s")
 
     def best_at(times_s: FloatArray) -> IntArray:
         return best(codebook, array, directions_at(times_s))[0]
@@ -214,7 +216,8 @@ def sampling_step_s(codebook: Codebook, array: Array, rate_radps: float) -> floa
     """A step for ``next_best``: a quarter of the time in which a direction that turns by
     ``rate_radps`` crosses a beam; None where it does not turn or the array has no extent.
 
-    A beam is as wide as wavelength / extent, or less where there are more beams than elements.
+    A beam is taken to be as wide as wavelength / extent, or less where there are more beams than
+    elements.
     """
     centred = array.elements_m - array.elements_m.mean(axis=0)
     extent_m = 2 * float(np.sqrt(np.einsum("mk,mk->m", centred, centred).max()))

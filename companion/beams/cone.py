@@ -22,14 +22,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.beams import steering
 from companion.beams.arrays import SAME_PLACE_WAVELENGTHS, Array
 from companion.beams.elements import Pattern
-from companion.values import ComplexArray, FloatArray, IntArray
-
-BoolArray = NDArray[np.bool_]
+from companion.values import BoolArray, ComplexArray, FloatArray, IntArray
 
 MOST_INTERVALS: Final = 512
 MOST_RINGS: Final = 16
@@ -86,8 +83,9 @@ class Boxes:
 class Cells:
     """The same cells in space. ``middles`` (C, 3): a direction in each and in its cone.
 
-    Any other in the cell is off by d with |axes d| <= reach: ``axes`` (C, D, B) in the columns of
-    ``Cones``, ``reach`` (C, D). The cell lies in the union of its caps: ``caps`` (C, K, 3), unit
+    Any other in the cell is off by a sum of axes, each times at most its reach: ``reach`` (C, D);
+    ``axes`` (C, D, B), orthonormal but for the columns that ``Cones`` leaves out. (A line has one:
+    the others it does not see.) The cell lies in the union of its caps: ``caps`` (C, K, 3), unit
     directions, within ``caps_rad`` (C, K) of them; ``in_cone`` (C, K) says whose middle is inside.
     """
 
@@ -146,9 +144,10 @@ def cones_around(
     centred = array.elements_m - array.elements_m.mean(axis=0)
     far = centred[np.argmax(np.einsum("mk,mk->m", centred, centred))]
     extent_m = float(np.sqrt(far @ far))
-    along = far / extent_m if extent_m > 0 else np.array([0.0, 1.0, 0.0])
+    along = far / max(extent_m, 1e-300)
     aside_m = float(np.abs(centred - np.outer(centred @ along, along)).max())
-    line = aside_m <= SAME_PLACE_WAVELENGTHS * array.wavelength_m and not faces_apart(array)
+    aligned = extent_m > 0 and aside_m <= SAME_PLACE_WAVELENGTHS * array.wavelength_m
+    line = aligned and not faces_apart(array)
     if faces_apart(array):
         towards = steering.element_directions(array, directions)
         magnitudes = magnitudes * array.element.amplitude_range(towards, bounds_rad)[1]
@@ -160,7 +159,7 @@ def cones_around(
     moments -= ceilings[:, np.newaxis, np.newaxis] * np.einsum("ni,nj->nij", centres, centres)
     wavenumber = array.wavenumber_radpm
     phase = wavenumber * float(np.abs(array.elements_m).max())
-    unsure = (array.size + 8 * phase) * np.finfo(float).eps
+    unsure = (array.size + 16 + 8 * phase) * np.finfo(float).eps
     unsure += 4 * wavenumber * aside_m if line else 0.0
     poles = np.broadcast_to(along, directions.shape) if line else directions
     frames, tilts = _frames(poles, directions)
@@ -266,17 +265,18 @@ def _strips(cones: Cones, boxes: Boxes, caps: int) -> Cells:
 def _turn_rad(cones: Cones, boxes: Boxes) -> FloatArray:
     """The largest turn about the line at which a direction is both in the cell and in its cone.
 
-    cos t = (cos bound - cos r cos tilt) / (sin r sin tilt); its only extreme between the ends of
-    r is where cos r = cos tilt / cos bound.
+    sin^2(t / 2) = sin((bound + r - tilt) / 2) sin((bound - r + tilt) / 2) / (sin r sin tilt); its
+    only extreme between the ends of r is where cos r = cos tilt / cos bound.
     """
     tilt, bound = cones.tilts_rad[boxes.cone], cones.bounds_rad[boxes.cone]
-    near = np.where(np.abs(np.cos(bound)) < 1e-9, 1e-9, np.cos(bound))
-    widest = np.arccos(np.clip(np.cos(tilt) / near, -1.0, 1.0))
+    cosine = np.where(np.abs(np.cos(bound)) < 1e-9, 1e-9, np.cos(bound))
+    widest = np.arccos(np.clip(np.cos(tilt) / cosine, -1.0, 1.0))
     low, high = boxes.low[:, 0], boxes.high[:, 0]
     angles = np.stack([low, high, np.clip(widest, low, high)])
-    over = np.cos(bound) - np.cos(angles) * np.cos(tilt) - 1e-12
+    wide = bound + 8 * np.finfo(float).eps
+    over = np.sin((wide + angles - tilt) / 2) * np.sin((wide - angles + tilt) / 2)
     under = np.maximum(np.sin(angles) * np.sin(tilt), 1e-300)
-    turns: FloatArray = np.arccos(np.clip(over / under, -1.0, 1.0)).max(axis=0)
+    turns: FloatArray = 2 * np.arcsin(np.sqrt(np.clip(over / under, 0.0, 1.0))).max(axis=0)
     return turns
 
 

@@ -4,6 +4,7 @@ Element frame: x outward, y right, z down, as the array frame. An amplitude is t
 the power gain over an isotropic element.
 """
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
@@ -33,11 +34,15 @@ class Element:
 
     ``ISOTROPIC``: gain 1 everywhere. ``COSINE``: power gain 2(q + 1) cos^q of the angle from
     outward, nothing behind (the factor makes all of the power come out). ``TR38901``: the antenna
-    element of 3GPP TR 38.901, table 7.3-1.
+    element of 3GPP TR 38.901, table 7.3-1. ``ValueError`` for an exponent below 0.
     """
 
     pattern: Pattern = Pattern.ISOTROPIC
     exponent: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.exponent < math.inf:
+            raise ValueError(f"the exponent {self.exponent:g} of a cosine pattern is not 0 or more")
 
     def amplitude(self, directions: FloatArray) -> FloatArray:
         """Amplitude towards unit directions (..., 3) in the element frame; shape (...)."""
@@ -47,9 +52,7 @@ class Element:
             case Pattern.COSINE:
                 return self._cosine(directions[..., 0])
             case Pattern.TR38901:
-                azimuth = np.arctan2(directions[..., 1], directions[..., 0])
-                elevation = np.arcsin(np.clip(directions[..., 2], -1.0, 1.0))
-                return _tr38901(np.abs(azimuth), np.abs(elevation))
+                return _tr38901(*_aside_and_up(directions))
 
     def amplitude_range(
         self, directions: FloatArray, radius_rad: float | FloatArray
@@ -64,7 +67,8 @@ class Element:
                 both = np.ones(directions.shape[:-1])
                 return both, both
             case Pattern.COSINE:
-                off = np.arccos(np.clip(directions[..., 0], -1.0, 1.0))
+                aside = np.hypot(directions[..., 1], directions[..., 2])
+                off = np.arctan2(aside, directions[..., 0])  # arccos is 1e-8 off near 0
                 least = np.cos(np.minimum(off + radius_rad, np.pi))
                 return self._cosine(least), self._cosine(np.cos(np.maximum(off - radius_rad, 0.0)))
             case Pattern.TR38901:
@@ -79,6 +83,12 @@ class Element:
 ISOTROPIC: Final = Element()
 
 
+def _aside_and_up(directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Size of azimuth and of elevation; by arctan2, exact to rounding up to the poles."""
+    x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
+    return np.abs(np.arctan2(y, x)), np.arctan2(np.abs(z), np.hypot(x, y))
+
+
 def _tr38901(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> FloatArray:
     """Table 7.3-1 for angles from outward, both 0 or more."""
     down_db = np.minimum(12 * (np.degrees(elevation_rad) / WIDTH_DEG) ** 2, FLOOR_DB)
@@ -91,8 +101,7 @@ def _tr38901(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> FloatArray:
 def _tr38901_range(
     directions: FloatArray, radius_rad: float | FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    azimuth = np.abs(np.arctan2(directions[..., 1], directions[..., 0]))
-    elevation = np.abs(np.arcsin(np.clip(directions[..., 2], -1.0, 1.0)))
+    azimuth, elevation = _aside_and_up(directions)
     # A cap around elevation e reaches asin(sin(radius) / cos(e)) in azimuth, or over the pole.
     over = elevation + radius_rad >= np.pi / 2
     sine = np.sin(np.minimum(radius_rad, np.pi / 2)) / np.maximum(np.cos(elevation), 1e-300)

@@ -24,10 +24,12 @@ TOLERANCE: Final = 1 - 10 ** (-TOLERANCE_DB / 20)
 NOTHING_DB: Final = 40.0
 """A gain this far below the most that the weights can give anywhere is not pinned down further."""
 LEVELS: Final = 12
-MOST_CELLS: Final = 4096
-"""For each cone; a level that has begun is done."""
+CAPS: Final = 8
+"""And one more cover the arc of a first cell on a line; after each split, twice as many."""
+MOST_SPLIT: Final = 4096
+"""Cells of one cone; those with many caps count as more."""
 BLOCK: Final = 2**18
-"""Elements times cells worked on at once: some megabytes."""
+"""Elements or caps, times cells, worked on at once: some megabytes."""
 
 
 def guaranteed_gains_db(
@@ -41,8 +43,9 @@ def guaranteed_gains_db(
     (N, 3).
 
     None where nothing is proven: the cone holds a null, or has no bound (None: any direction). The
-    true minimum is at most ``TOLERANCE_DB`` above, unless it lies ``NOTHING_DB`` down or the cone
-    is many beamwidths wide. ``ValueError`` for weights that are zero or do not fit.
+    true minimum is at most ``TOLERANCE_DB`` above, unless it lies ``NOTHING_DB`` down or the work
+    is spent: over cones many beams wide, or where directive elements face apart and the weights set
+    them against one another (tenths of a dB). ``ValueError`` for weights that are zero or misfit.
     """
     unit, bounds = _cones(directions, pointing_bounds_rad)
     powered = cone.unit_power(array, weights)
@@ -66,8 +69,8 @@ def leakage_bounds(
     """(N, J): the most array gain, linear, that column j of the weights (M, J) can have towards any
     unit direction within the i-th bound of row i of the directions (N, 3); None: any at all.
 
-    What UAV i can receive of the stream of UAV j at worst, but for the powers. The proof and its
-    tolerance are those of the least gain.
+    What UAV i can receive of the stream of UAV j at worst, but for the powers. The true maximum is
+    at most ``TOLERANCE_DB`` below, with the exceptions of the least gain.
     """
     unit, bounds = _cones(directions, pointing_bounds_rad)
     powered = cone.unit_power(array, weights)
@@ -90,20 +93,22 @@ def _extremes(
     if len(unit) == 0:
         return np.empty(0)
     cones = cone.cones_around(array, unit, bounds, np.abs(weights))
-    apart = cone.faces_apart(array)
-    scales = 1.0 if apart else array.element.amplitude_range(unit, bounds)[1]
-    nothing = 0.0 if most else 10 ** (-NOTHING_DB / 20)
+    patterned = array.element.pattern is not Pattern.ISOTROPIC
+    scales = 1.0 if cone.faces_apart(array) else array.element.amplitude_range(unit, bounds)[1]
+    nothing = 10 ** (-NOTHING_DB / 20) * scales * cones.ceilings
     proven, attained = np.full((2, len(unit)), np.inf)
     spent = np.zeros(len(unit), dtype=np.int64)
     boxes = cone.first_boxes(cones)
     for level in range(LEVELS):
-        bound, seen = _over_boxes(cones, boxes, weights, level, most)
+        caps = CAPS * 2**level if patterned else 0
+        bound, seen = _over_boxes(cones, boxes, weights, caps + 1, most)
         np.minimum.at(attained, boxes.cone, seen)
-        spent += np.bincount(boxes.cone, minlength=len(unit))
         size = np.abs(attained)
-        enough = attained - size * TOLERANCE - 4 * scales * cones.rounding
-        going = (size > nothing * scales * cones.ceilings) & (spent < MOST_CELLS)
+        enough = attained - TOLERANCE * np.maximum(size, nothing)
+        going = most | (size > nothing)
         in_doubt = (bound < enough[boxes.cone]) & going[boxes.cone] & (level + 1 < LEVELS)
+        spent += (1 + caps // CAPS) * np.bincount(boxes.cone[in_doubt], minlength=len(unit))
+        in_doubt &= (spent <= MOST_SPLIT)[boxes.cone]
         np.minimum.at(proven, boxes.cone[~in_doubt], bound[~in_doubt])
         if not in_doubt.any():
             break
@@ -112,12 +117,10 @@ def _extremes(
 
 
 def _over_boxes(
-    cones: Cones, boxes: Boxes, weights: ComplexArray, level: int, most: bool
+    cones: Cones, boxes: Boxes, weights: ComplexArray, caps: int, most: bool
 ) -> tuple[FloatArray, FloatArray]:
     """For each box a proven bound (C,) of the least, and what is attained in it."""
-    patterned = cones.array.element.pattern is not Pattern.ISOTROPIC
-    caps = 8 * 2 ** min(level, 4) + 1 if patterned else 1
-    step = max(1, BLOCK // cones.array.size)
+    step = max(1, BLOCK // max(cones.array.size, caps))
     starts = range(0, len(boxes.cone), step)
     parts = [
         _over_cells(cones, cone.cells(cones, boxes.take(slice(at, at + step)), caps), weights, most)

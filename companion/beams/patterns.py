@@ -6,7 +6,8 @@ isotropic element at the same power, element gain is included. (MATH: array, ste
 An *azimuth cut* runs along a parallel: azimuth varies, elevation is fixed. An *elevation cut*
 runs along a meridian: elevation varies, azimuth is fixed. Lobes are measured on whole circles, so
 that a lobe may lie across azimuth 180 degrees or over a pole. All is found on the exact pattern:
-by a scan so fine that no lobe fits between two of its points, then by narrowing down.
+by a scan of at least eight points to the narrowest lobe that the array can make, then by
+narrowing down.
 """
 
 import math
@@ -33,8 +34,12 @@ HALVING_ROUNDS: Final = 10
 EXTREME_ROUNDS: Final = 12
 RIVALS_DB: Final = 0.5
 """A side lobe this far below the highest of the scan may yet be the highest."""
+ABREAST: Final = 1e-4
+"""Boresight component of a direction that is as good as square to it."""
+RIPPLE_DB: Final = 1.0
+"""How far the gain may rise above the peak within a lobe, as on a broadened one."""
 CLIMB_MOVES: Final = 400
-SINGULAR: Final = 1e-11
+SINGULAR: Final = 1e-9
 """Slope and curvature under this, relative to the gain, are rounding."""
 
 _GRID = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), axis=-1).reshape(9, 2)
@@ -100,7 +105,8 @@ class CutLobe:
     ``half_power_width_rad``: between the first places to either side where the gain falls to
     half of the peak. ``first_nulls_rad``: the first minimum after that on either side, as angles
     from the peak, (below 0, above 0). ``side_lobe_db``: the highest maximum outside of those, less
-    the peak. None where the gain never falls to half, and where there is no other maximum.
+    the peak. None where the gain never falls to half, or first rises a decibel above the peak (the
+    flank of a stronger lobe), and where there is no other maximum.
 
     An array whose elements all stand in one plane across boresight and face alike cannot tell
     front from back: the mirror lobe behind is not counted as a side lobe.
@@ -255,40 +261,43 @@ def _summit(array: Array, weights: ComplexArray, direction: FloatArray) -> Float
     """
     centred = array.elements_m - array.elements_m.mean(axis=0)
     aperture_m = 2 * float(np.linalg.norm(centred, axis=1).max())
-    reach = 0.05 if aperture_m == 0 else min(0.05, array.wavelength_m / aperture_m / 16)
+    widest = 0.05 if aperture_m == 0 else min(0.05, array.wavelength_m / aperture_m / 16)
     scatter = centred.T @ centred / max(aperture_m**2, 1e-300)
-    finest, best = reach / 64, 0.0
+    reach, best, top = widest, -1.0, direction
     here: FloatArray = direction
     for _ in range(CLIMB_MOVES):
         flat = np.eye(3) - np.outer(here, here)
         across = np.linalg.eigh(flat @ scatter @ flat - np.outer(here, here))[1][:, 1:].T
         around = here + reach * (_GRID @ across)
         gains = _gains(array, weights, around / np.linalg.norm(around, axis=1)[:, np.newaxis])
-        if gains.max() == 0:
-            return here
-        _, x, y, xx, xy, yy = (_QUADRATIC @ (gains / gains.max())).tolist()
-        step = _uphill(np.array([x, y]), np.array([[xx, xy], [xy, yy]]))
-        here = here + reach * (step @ across)
-        here = here / np.linalg.norm(here)
-        if np.linalg.norm(step) < 1 or gains[4] < best:
-            if reach <= finest:
-                return here
+        _, x, y, xx, xy, yy = (_QUADRATIC @ (gains / max(gains.max(), 1e-300))).tolist()
+        step = _uphill(np.array([x, y]), np.array([[xx, xy], [xy, yy]]), 4 * reach**2)
+        higher = gains[4] >= best
+        if higher:
+            best, top, onward = gains[4], here, here + reach * (step @ across)
+        else:  # the step before went too far
+            onward = top
+        if higher and np.linalg.norm(step) >= 1:
+            reach = min(2 * reach, widest)
+        elif reach > widest / 64:
             reach /= 4
-        best = max(best, float(gains[4]))
-    return here
+        else:
+            break
+        here = onward / np.linalg.norm(onward)
+    return top
 
 
-def _uphill(slope: FloatArray, curvature: FloatArray) -> FloatArray:
+def _uphill(slope: FloatArray, curvature: FloatArray, bend: float) -> FloatArray:
     """The step (2,) to the top of a quadratic, at most 2 along each of its axes.
 
-    Out of a hollow or off a saddle it goes along the axis that rises most. (On a ridge the sphere
-    itself bends a little: curvature far below that of the other axis is not of the hill.)
+    Out of a hollow or off a saddle it goes along the axis that rises most. On a ridge, what looks
+    like a rise is the sphere's own: it is at most ``bend`` of the other axis' curvature.
     """
     values, axes = np.linalg.eigh(curvature)
     along = slope @ axes
     newton = np.divide(along, -values, out=2 * np.sign(along), where=values < -SINGULAR)
     steps = np.where(np.abs(along) > SINGULAR, np.clip(newton, -2.0, 2.0), 0.0)
-    if not steps.any() and values[1] > max(SINGULAR, -values[0] / 100):
+    if not steps.any() and values[1] > max(SINGULAR, -bend * values[0]):
         steps[1] = 2.0
     climbed: FloatArray = axes @ steps
     return climbed
@@ -313,6 +322,9 @@ def _half_power(cut: _Cut, peak_rad: float) -> tuple[float | None, tuple[float, 
         bottom = (np.diff(gains, axis=1, append=-1.0) >= 0) & np.logical_or.accumulate(low, axis=1)
         if bottom.any(axis=1).all():
             fall, turn = low.argmax(axis=1), bottom.argmax(axis=1)
+            lobe_most = max(gains[0, : fall[0]].max(), gains[1, : fall[1]].max())
+            if lobe_most > 2 * half * 10 ** (RIPPLE_DB / 10):
+                return None, None
             edges = _crossings(cut, peak_rad, half, ways * offsets[fall - 1][:, np.newaxis], step)
             around = ways * offsets[turn][:, np.newaxis] + step * np.array([-1.0, 1.0])
             below, above = (_extremes(cut, peak_rad + around, -1.0)[0] - peak_rad).tolist()
@@ -359,14 +371,19 @@ def _side_lobe_db(cut: _Cut, peak_rad: float, nulls: tuple[float, float]) -> flo
     gains = _gains(cut.array, cut.weights, directions)
     tops = (gains >= np.roll(gains, 1)) & (gains > np.roll(gains, -1))
     tops &= (offsets > nulls[1]) & (offsets < 2 * math.pi + nulls[0])
-    if _mirrored(cut.array):
-        tops &= directions[:, 0] * directions[0, 0] >= 0
-    if not tops.any():
-        return None
-    rivals = tops & (gains >= gains[tops].max() * 10 ** (-RIVALS_DB / 10))
-    brackets = angles[rivals][:, np.newaxis] + step * np.array([-1.0, 1.0])
-    highest = _extremes(cut, brackets, 1.0)[1].max()
-    return float(_db(highest) - _db(gains[0]))
+    side = math.copysign(1.0, directions[0, 0])
+    mirrored = _mirrored(cut.array) and abs(directions[0, 0]) > ABREAST
+    if mirrored:
+        tops &= directions[:, 0] * side >= -step
+    while tops.any():
+        rivals = np.flatnonzero(tops & (gains >= gains[tops].max() * 10 ** (-RIVALS_DB / 10)))
+        brackets = angles[rivals][:, np.newaxis] + step * np.array([-1.0, 1.0])
+        found, highest = _extremes(cut, brackets, 1.0)
+        behind = mirrored & (cut.circle.directions(found)[:, 0] * side < -ABREAST)
+        if not behind.any():
+            return float(_db(highest.max()) - _db(gains[0]))
+        tops[rivals[behind]] = False
+    return None
 
 
 def _mirrored(array: Array) -> bool:

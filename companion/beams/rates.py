@@ -164,3 +164,30 @@ def predicted_sinr_db(
     with np.errstate(divide="ignore"):
         ratio_db: FloatArray = 10 * np.log10(ratio)
     return ratio_db
+
+
+def least_sinr_db(
+    least_gains: FloatArray,
+    leaks: FloatArray,
+    users: IntArray,
+    farthest_m: FloatArray,
+    groups: IntArray,
+    budget: LinkBudget,
+    wavelength_m: float,
+    uav_antennas: int = 1,
+) -> FloatArray:
+    """SINR that some of N UAVs have at the least on the line of sight, dB, (K,).
+
+    For ``users`` (K,), numbers below N: the least array gain of each one's own beam (K,), the most
+    that each beam can leak to it (K, N), both linear, and how far away it can be (K,). The power
+    of the budget is shared equally by the streams of each of the ``groups`` (N,). The SINR falls
+    with range, with leakage and with less gain, so that their worst together is the least.
+    """
+    together = _together(groups, len(groups))
+    stream_w = budget.tx_power_w / together.sum(axis=1)
+    path_gains = uav_antennas * free_space_gain(farthest_m, wavelength_m)
+    heard = together[users] * leaks * stream_w
+    heard[np.arange(len(users)), users] = 0.0
+    wanted = path_gains * least_gains * stream_w[users]
+    least: FloatArray = wanted / (path_gains * heard.sum(axis=1) + budget.noise_power_w)
+    return 10 * np.log10(least)

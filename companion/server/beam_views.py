@@ -4,12 +4,15 @@ Everything here is computed when it is asked for, from an update that no longer 
 run on any thread.
 """
 
+import functools
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
 
 from companion.assembly import Equipment
 from companion.beams import codebooks, guarantee, motion, patterns, rates
+from companion.beams.arrays import Array
 from companion.beams.coverage import margin_rad
 from companion.beams.steering import unit_directions
 from companion.pipeline import Pipeline
@@ -21,6 +24,8 @@ Json = dict[str, Any]
 AHEAD_S: Final = 30.0
 """How far ahead the next beam of a codebook is looked for."""
 MOST_SAMPLES: Final = 2000
+MOST_AT_WORST: Final = 16
+"""Beams up to which the worst that each hears of each other is worked out: that grows squared."""
 
 
 def beams(
@@ -32,8 +37,7 @@ def beams(
     if update.carrier is not None:
         array_from_local = array.array_from_body @ update.carrier.body_from_local
         boresight = float(np.degrees(np.arctan2(array_from_local[0, 1], array_from_local[0, 0])))
-    ahead = np.array([1.0, 0.0, 0.0])
-    azimuth_width, elevation_width = patterns.half_power_beamwidths_rad(array, ahead)
+    azimuth_width, elevation_width = _beamwidths_rad(array)
     return {
         "valid_at": rfc3339(beam_set.valid_at_ns),
         "age_s": age_s,
@@ -57,6 +61,12 @@ def beams(
         "unfit": update.unfit,
         "left_out": left_out(beam_set),
     }
+
+
+@functools.lru_cache(maxsize=4)
+def _beamwidths_rad(array: Array) -> tuple[float | None, float | None]:
+    """Of the beam along boresight, in azimuth and in elevation; worked out once for an array."""
+    return patterns.half_power_beamwidths_rad(array, np.array([1.0, 0.0, 0.0]))
 
 
 def left_out(beam_set: BeamSet) -> list[Json]:
@@ -88,7 +98,7 @@ def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[J
     )
     seen_locally = towards @ array.array_from_body @ carrier.body_from_local
     bearings = np.degrees(np.arctan2(seen_locally[:, 1], seen_locally[:, 0])) % 360
-    guaranteed = _guaranteed_db(pipeline, beam_set, towards)
+    guaranteed, guaranteed_sinr = _guaranteed_db(pipeline, equipment, update, towards)
     turns_db = 10 * np.log10(beam_set.groups)
     return [
         {
@@ -107,6 +117,7 @@ def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[J
             "group": beam.group,
             "widened": beam.widened,
             "pointing_bound_deg": degrees(beam.pointing_bound_rad),
+            "guaranteed_sinr_db": guaranteed_sinr[i],
             "sinr_db": float(sinr_db[i]) if np.isfinite(sinr_db[i]) else None,
             "codebook": _codebook_entry(pipeline, equipment, update, beam, towards[i]),
         }
@@ -115,18 +126,41 @@ def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[J
 
 
 def _guaranteed_db(
-    pipeline: Pipeline, beam_set: BeamSet, towards: FloatArray
-) -> tuple[float | None, ...]:
-    """The least gain wherever the UAVs truly are; None where that may be out of coverage."""
-    in_body = towards @ pipeline.array.array_from_body
-    margins = margin_rad(pipeline.coverage, towards, in_body).tolist()
+    pipeline: Pipeline, equipment: Equipment, update: Update, towards: FloatArray
+) -> tuple[Sequence[float | None], Sequence[float | None]]:
+    """The least gain and the least SINR wherever the UAVs truly are; None where one may be out of
+    coverage, in a null, or anywhere. The SINR is left open where there are many beams."""
+    array, beam_set = pipeline.array, update.beams
+    margins = margin_rad(pipeline.coverage, towards, towards @ array.array_from_body)
     bounds = [
         beam.pointing_bound_rad
         if beam.pointing_bound_rad is not None and beam.pointing_bound_rad <= margin
         else None
-        for beam, margin in zip(beam_set.beams, margins, strict=True)
+        for beam, margin in zip(beam_set.beams, margins.tolist(), strict=True)
     ]
-    return guarantee.guaranteed_gains_db(pipeline.array, towards, bounds, beam_set.weights)
+    gains_db = guarantee.guaranteed_gains_db(array, towards, bounds, beam_set.weights)
+    known = [i for i, gain_db in enumerate(gains_db) if gain_db is not None]
+    unknown: list[float | None] = [None] * len(bounds)
+    if not known or len(bounds) > MOST_AT_WORST or update.carrier is None:
+        return gains_db, unknown
+    farthest_m = {track.uav: track.bound_m + update.carrier.bound_m for track in update.tracks}
+    ranges_m = np.array([beam.range_m + farthest_m[beam.uav] for beam in beam_set.beams])
+    leaks = guarantee.leakage_bounds(
+        array, towards[known], [bounds[i] for i in known], beam_set.weights
+    )
+    sinr_db = rates.least_sinr_db(
+        10 ** (np.array([gains_db[i] for i in known], dtype=float) / 10),
+        leaks,
+        np.array(known),
+        ranges_m[known],
+        np.array([beam.group for beam in beam_set.beams]),
+        equipment.budget,
+        array.wavelength_m,
+        equipment.uav_antennas,
+    )
+    for i, value in zip(known, sinr_db.tolist(), strict=True):
+        unknown[i] = value
+    return gains_db, unknown
 
 
 def _codebook_entry(

@@ -21,6 +21,7 @@ from companion.values.aimed import (
     Policy,
 )
 from companion.values.numbers import (
+    BoolArray,
     ComplexArray,
     FloatArray,
     IntArray,
@@ -60,6 +61,7 @@ __all__ = [
     "Attitude",
     "Beam",
     "BeamSet",
+    "BoolArray",
     "Carrier",
     "ComplexArray",
     "Estimate",

@@ -1,14 +1,19 @@
-"""Element positions and beamwidths."""
+"""Element positions, where elements face, and which mirror one another."""
 
 import math
 
 import numpy as np
 import pytest
-from scipy.optimize import brentq
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from companion.beams import arrays, steering
+from companion.beams import arrays
+from companion.beams.elements import Element, Pattern
+from companion.values import FloatArray
 
 EYE = np.eye(3)
+LIGHT = arrays.SPEED_OF_LIGHT_MPS
+"""The frequency at which a metre is a wavelength."""
 
 
 def test_elements_stand_along_y() -> None:
@@ -30,27 +35,190 @@ def test_what_is_no_array_is_refused(elements: int, frequency_hz: float, spacing
         arrays.uniform_linear(elements, frequency_hz, spacing, EYE)
 
 
-@pytest.mark.parametrize(("elements", "half_deg"), [(64, 0.79), (128, 0.40)])
-def test_the_known_half_power_beamwidths(elements: int, half_deg: float) -> None:
-    width_rad = arrays.half_power_beamwidth_rad(arrays.uniform_linear(elements, 30e9, 0.5, EYE))
-    assert width_rad is not None
-    assert round(math.degrees(width_rad) / 2, 2) == half_deg
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_what_is_no_number_is_refused(bad: float) -> None:
+    with pytest.raises(ValueError, match="a frequency and a spacing above 0"):
+        arrays.uniform_linear(4, bad, 0.5, EYE)
+    with pytest.raises(ValueError, match="a frequency and a spacing above 0"):
+        arrays.uniform_circular(4, 1e9, bad, EYE)
 
 
-@pytest.mark.parametrize(("elements", "spacing"), [(2, 0.5), (3, 0.5), (8, 0.7), (64, 0.5)])
-def test_the_half_power_beamwidth_is_where_the_power_is_half(elements: int, spacing: float) -> None:
-    array = arrays.uniform_linear(elements, 10e9, spacing, EYE)
-
-    def excess(theta_rad: float) -> float:
-        direction = np.array([[math.cos(theta_rad), math.sin(theta_rad), 0.0]])
-        return float(abs(steering.steering_matrix(array, direction).sum() / elements) ** 2 - 0.5)
-
-    first_null_rad = math.asin(1 / (elements * spacing))
-    half_rad = brentq(excess, 0.0, first_null_rad)
-    assert arrays.half_power_beamwidth_rad(array) == pytest.approx(2 * half_rad, rel=1e-9)
+@pytest.mark.parametrize(("rows", "columns"), [(0, 4), (4, 0), (-1, -1)])
+def test_what_is_no_rectangle_is_refused(rows: int, columns: int) -> None:
+    with pytest.raises(ValueError, match="at least one element"):
+        arrays.uniform_rectangular(rows, columns, 1e9, 0.5, EYE)
 
 
-def test_no_beamwidth_where_there_is_no_beam() -> None:
-    assert arrays.half_power_beamwidth_rad(arrays.uniform_linear(1, 1e9, 0.5, EYE)) is None
-    # So close together that the power never falls to a half.
-    assert arrays.half_power_beamwidth_rad(arrays.uniform_linear(2, 1e9, 0.1, EYE)) is None
+def test_a_rectangle_is_numbered_row_by_row_to_the_right_then_down() -> None:
+    array = arrays.uniform_rectangular(3, 4, LIGHT, 0.6, EYE)
+    assert (array.kind, array.size, array.grid) == ("ura", 12, (3, 4))
+    for row in range(3):
+        for column in range(4):
+            place = array.elements_m[4 * row + column]
+            assert place == pytest.approx([0, 0.6 * column, 0.6 * row])
+    assert array.element_from_array is None
+
+
+def test_one_row_is_the_line() -> None:
+    row, line = (
+        arrays.uniform_rectangular(1, 5, 3e9, 0.5, EYE),
+        arrays.uniform_linear(5, 3e9, 0.5, EYE),
+    )
+    assert row.kind == line.kind == "ula"
+    assert row.grid == line.grid == (1, 5)
+    assert np.array_equal(row.elements_m, line.elements_m)
+
+
+@pytest.mark.parametrize("elements", [2, 3, 4, 7, 32])
+def test_a_circle_has_its_spacing_between_neighbours_and_starts_at_boresight(elements: int) -> None:
+    array = arrays.uniform_circular(elements, LIGHT, 0.5, EYE)
+    assert (array.kind, array.size, array.grid) == ("uca", elements, None)
+    gaps = np.linalg.norm(array.elements_m - np.roll(array.elements_m, -1, axis=0), axis=1)
+    assert gaps == pytest.approx(0.5)
+    radii = np.linalg.norm(array.elements_m, axis=1)
+    assert radii == pytest.approx(radii[0])
+    assert array.elements_m[0] == pytest.approx([radii[0], 0, 0])
+    assert not array.elements_m[:, 2].any()
+    turn = math.atan2(array.elements_m[1, 1], array.elements_m[1, 0])
+    assert turn == pytest.approx(2 * math.pi / elements)  # from x towards y
+
+
+def test_a_circle_of_one_stands_at_the_origin() -> None:
+    assert not arrays.uniform_circular(1, 1e9, 0.5, EYE).elements_m.any()
+
+
+COSINE = Element(Pattern.COSINE)
+
+
+def test_elements_of_a_circle_face_outward_unless_they_are_isotropic() -> None:
+    array = arrays.uniform_circular(6, 1e9, 0.5, EYE, COSINE)
+    turned = array.element_from_array
+    assert turned is not None
+    outward = array.elements_m / np.linalg.norm(array.elements_m, axis=1)[:, np.newaxis]
+    assert np.einsum("mij,mj->mi", turned, outward) == pytest.approx(np.array([[1, 0, 0]] * 6))
+    assert array.partners is None  # what is mirrored would face the other way
+    assert arrays.uniform_circular(6, 1e9, 0.5, EYE).element_from_array is None
+
+
+def test_elements_face_where_they_are_told_and_stay_level() -> None:
+    rng = np.random.default_rng(2)
+    outward = np.concatenate(
+        [rng.standard_normal((20, 3)), [[0, 0, 2], [0, 0, -0.5], [1e-13, 0, -1], [-3, 0, 0]]]
+    )
+    array = arrays.listed(
+        rng.uniform(-1, 1, (24, 3)), 1e9, EYE, Element(Pattern.TR38901), None, outward
+    )
+    turned = array.element_from_array
+    assert turned is not None
+    unit = outward / np.linalg.norm(outward, axis=1)[:, np.newaxis]
+    for m in range(24):
+        assert turned[m] @ turned[m].T == pytest.approx(EYE, abs=1e-12)
+        assert np.linalg.det(turned[m]) == pytest.approx(1)
+        assert turned[m, 0] == pytest.approx(unit[m])
+        assert turned[m, 1, 2] == pytest.approx(0)  # y is level ...
+        if m != 20:
+            assert turned[m, 2, 2] >= -1e-12  # ... and z down: not upside down
+    assert np.array_equal(turned[20, 1], [0, 1, 0])
+    assert np.array_equal(turned[21, 1], [0, 1, 0])
+
+
+def test_what_is_listed_is_kept() -> None:
+    places = np.random.default_rng(4).uniform(-1, 1, (6, 3))
+    lever = np.array([0.1, -0.2, 0.3])
+    array = arrays.listed(places, 2e9, EYE, COSINE, lever)
+    assert (array.kind, array.size, array.grid) == ("list", 6, None)
+    assert array.elements_m is places
+    assert array.lever_arm_m is lever
+    assert array.element is COSINE
+    assert array.element_from_array is None  # all along boresight
+    assert not arrays.listed(places, 2e9, EYE).lever_arm_m.any()
+    for made in (arrays.uniform_linear, arrays.uniform_circular):
+        array = made(3, 1e9, 0.5, EYE, COSINE, lever)
+        assert array.lever_arm_m is lever
+        assert array.element is COSINE
+
+
+PLACES = np.random.default_rng(6).uniform(-1, 1, (5, 3))
+TWICE = np.concatenate([PLACES, PLACES[2:3] + 1e-12])
+
+
+@pytest.mark.parametrize(
+    ("places", "outward", "reason"),
+    [
+        (np.zeros((0, 3)), None, "at least one element"),
+        (np.zeros(3), None, "rows of three finite numbers"),
+        (np.zeros((2, 2)), None, "rows of three finite numbers"),
+        (np.array([[0, 0, math.nan]]), None, "rows of three finite numbers"),
+        (np.array([[0, math.inf, 0]]), None, "rows of three finite numbers"),
+        (TWICE, None, "two elements stand at one place"),
+        (PLACES, np.ones((4, 3)), "each element faces one direction"),
+        (PLACES, np.full((5, 3), math.nan), "each element faces one direction"),
+        (PLACES, np.zeros((5, 3)), "has a length above 0"),
+    ],
+)
+def test_a_list_that_is_no_array_is_refused(
+    places: FloatArray, outward: FloatArray | None, reason: str
+) -> None:
+    with pytest.raises(ValueError, match=reason):
+        arrays.listed(places, LIGHT, EYE, COSINE, None, outward)
+
+
+# --- partners: each element's mirror image through the centroid ---------------------------------
+
+
+def check_partners(array: arrays.Array) -> None:
+    assert array.partners is not None
+    assert sorted(array.partners) == list(range(array.size))
+    assert np.array_equal(array.partners[array.partners], np.arange(array.size))
+    mirrored = 2 * array.elements_m.mean(axis=0) - array.elements_m
+    gap_m = np.abs(array.elements_m[array.partners] - mirrored).max()
+    assert gap_m < 1e-9 * array.wavelength_m
+
+
+@pytest.mark.parametrize("spacing", [0.5, 0.7, 1 / 3, 0.500001])
+def test_partners_of_lines_and_rectangles(spacing: float) -> None:
+    for rows, columns in ((1, 1), (1, 2), (1, 7), (1, 64), (2, 3), (5, 8), (16, 16), (9, 1)):
+        array = arrays.uniform_rectangular(rows, columns, 30e9, spacing, EYE)
+        check_partners(array)
+        assert np.array_equal(array.partners, np.arange(array.size)[::-1])
+
+
+@pytest.mark.parametrize("elements", [*range(2, 20), 31, 32, 255, 256])
+def test_partners_of_circles_are_opposite_if_there_are_any(elements: int) -> None:
+    array = arrays.uniform_circular(elements, 30e9, 0.5, EYE)
+    if elements % 2:
+        assert array.partners is None
+    else:
+        check_partners(array)
+
+
+@given(st.integers(0, 2**20))
+@settings(max_examples=100, deadline=None)
+def test_no_size_of_a_circle_hides_its_partners(step: int) -> None:
+    """Radii that put elements between two millionths of a wavelength, among others."""
+    radius = (step + 0.5) * 1e-6 / math.sin(math.pi / 4) + 0.5
+    check_partners(arrays.uniform_circular(8, LIGHT, 2 * radius * math.sin(math.pi / 8), EYE))
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 30), st.booleans())
+@settings(max_examples=100, deadline=None)
+def test_partners_of_lists(seed: int, pairs: int, central: bool) -> None:
+    """Turned, shifted, shuffled: found if every element has one, None if one is moved."""
+    rng = np.random.default_rng(seed)
+    half = rng.uniform(-5, 5, (pairs, 3))
+    places = np.concatenate([half, -half, np.zeros((int(central), 3))])
+    rng.shuffle(places)
+    places += rng.uniform(-10, 10, 3)
+    check_partners(arrays.listed(places, LIGHT, EYE))
+    if pairs + central > 1:
+        places[rng.integers(len(places))] += [0, 1e-6, 0]
+        assert arrays.listed(places, LIGHT, EYE).partners is None
+
+
+def test_partners_of_a_turned_rectangle() -> None:
+    flat = arrays.uniform_rectangular(6, 7, LIGHT, 0.5, EYE).elements_m
+    for tilt in np.radians([0, 30, 45, 60, 90]):
+        turn = np.array(
+            [[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]]
+        )
+        check_partners(arrays.listed(flat @ turn.T + [3, -2, 1], LIGHT, EYE))

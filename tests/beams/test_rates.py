@@ -17,9 +17,11 @@ from companion.beams.channel import (
     free_space_gain,
 )
 from companion.beams.elements import Element, Pattern
+from companion.beams.guarantee import guaranteed_gains_db, leakage_bounds
 from companion.beams.precoding import Precoder, precode
 from companion.beams.rates import (
     LinkBudget,
+    least_sinr_db,
     predicted_sinr_db,
     share_power,
     sinr,
@@ -296,3 +298,42 @@ def test_no_uavs_and_no_antennas() -> None:
     assert predicted_sinr_db(ARRAY, np.empty((0, 3)), np.empty(0), nothing, None, BUDGET).size == 0
     with pytest.raises(ValueError, match="uav_antennas"):
         predicted_sinr_db(ARRAY, APART, RANGES_M, nothing, None, BUDGET, uav_antennas=0)
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_no_link_within_the_bounds_is_worse_than_the_least(seed: int, turns: bool) -> None:
+    """True directions and ranges anywhere in their bounds, against the worst of each together."""
+    rng = np.random.default_rng(seed)
+    bounds = rng.uniform(0.001, 0.03, 4)
+    made = precode(steering.steering_matrix(ARRAY, APART), Precoder())
+    groups = np.array([0, 1, 0, 1]) if turns else np.zeros(4, dtype=np.int64)
+    gains_db = guaranteed_gains_db(ARRAY, APART, list(bounds), made.weights)
+    known = [i for i, gain_db in enumerate(gains_db) if gain_db is not None]
+    leaks = leakage_bounds(ARRAY, APART[known], list(bounds[known]), made.weights)
+    linear = 10 ** (np.array([gains_db[i] for i in known], dtype=float) / 10)
+    far_m = RANGES_M[known] + 5.0
+    least = least_sinr_db(
+        linear, leaks, np.array(known), far_m, groups, BUDGET, ARRAY.wavelength_m, 4
+    )
+    for _ in range(20):
+        aside = np.cross(APART, rng.standard_normal((4, 3)))
+        aside /= np.linalg.norm(aside, axis=1)[:, np.newaxis]
+        off = (bounds * rng.uniform(0, 1, 4))[:, np.newaxis]
+        true = np.cos(off) * APART + np.sin(off) * aside
+        at_m = RANGES_M + rng.uniform(-5, 5, 4)
+        found = predicted_sinr_db(ARRAY, true, at_m, made.weights, groups, BUDGET, 4)
+        assert (found[known] >= least - 1e-9).all()
+
+
+def test_the_least_is_attained_where_nothing_is_uncertain() -> None:
+    made = precode(steering.steering_matrix(ARRAY, APART), Precoder())
+    gains_db = guaranteed_gains_db(ARRAY, APART, [0.0] * 4, made.weights)
+    linear = 10 ** (np.array(gains_db, dtype=float) / 10)
+    leaks = leakage_bounds(ARRAY, APART, [0.0] * 4, made.weights)
+    everyone, together = np.arange(4), np.zeros(4, dtype=np.int64)
+    least = least_sinr_db(
+        linear, leaks, everyone, RANGES_M, together, BUDGET, ARRAY.wavelength_m, 2
+    )
+    same = predicted_sinr_db(ARRAY, APART, RANGES_M, made.weights, together, BUDGET, 2)
+    assert least == pytest.approx(same, abs=1e-6)

@@ -5,11 +5,19 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.beams import steering
-from companion.beams.arrays import SPEED_OF_LIGHT_MPS, Array, uniform_linear
+from companion.beams.arrays import (
+    SPEED_OF_LIGHT_MPS,
+    Array,
+    listed,
+    uniform_circular,
+    uniform_linear,
+    uniform_rectangular,
+)
+from companion.beams.elements import Element, Pattern
 from companion.values import FloatArray
 
 AZIMUTHS = st.floats(-math.pi + 1e-9, math.pi)
@@ -59,6 +67,58 @@ def test_in_the_plane_it_is_the_published_vector(theta_rad: float) -> None:
     wavelength_m = SPEED_OF_LIGHT_MPS / 30e9
     phase = 2 * np.pi / wavelength_m * (wavelength_m / 2) * np.arange(8) * np.sin(theta_rad)
     assert found == pytest.approx(np.exp(1j * phase), abs=1e-9)
+
+
+def written_out(array: Array, direction: FloatArray) -> list[complex]:
+    """g_m(u) exp(j k p_m . u), for a cosine of exponent 2 about where each element faces."""
+    found = []
+    for m, place in enumerate(array.elements_m.tolist()):
+        ahead = [1.0, 0.0, 0.0]
+        if array.element_from_array is not None:
+            ahead = array.element_from_array[m, 0].tolist()
+        cosine = sum(ahead[k] * direction[k] for k in range(3))
+        path_m = sum(place[k] * direction[k] for k in range(3))
+        gain = math.sqrt(6.0) * max(cosine, 0.0)
+        found.append(gain * cmath.exp(2j * math.pi * path_m / array.wavelength_m))
+    return found
+
+
+OUTWARD = np.random.default_rng(8).standard_normal((7, 3))
+PLACES = np.random.default_rng(9).uniform(-0.05, 0.05, (7, 3))
+SQUARE = Element(Pattern.COSINE, 2.0)
+FACING = {
+    "line": uniform_linear(5, 30e9, 0.5, np.eye(3), SQUARE),
+    "rectangle": uniform_rectangular(2, 3, 30e9, 0.5, np.eye(3), SQUARE),
+    "circle": uniform_circular(6, 30e9, 0.5, np.eye(3), SQUARE),
+    "list": listed(PLACES, 30e9, np.eye(3), SQUARE),
+    "list, each facing its way": listed(PLACES, 30e9, np.eye(3), SQUARE, None, OUTWARD),
+}
+
+
+@pytest.mark.parametrize("name", FACING)
+@given(angles=DIRECTIONS)
+@settings(max_examples=30)
+def test_steering_has_each_elements_gain(name: str, angles: list[tuple[float, float]]) -> None:
+    array = FACING[name]
+    directions = np.array([unit(*pair) for pair in angles])
+    found = steering.steering_matrix(array, directions)
+    gains = steering.amplitudes(array, directions)
+    turned = steering.element_directions(array, directions)
+    alike = array.element_from_array is None
+    assert gains.shape == (1 if alike else array.size, len(angles))
+    assert turned.shape == (*gains.shape, 3)
+    assert np.linalg.norm(turned, axis=2) == pytest.approx(np.ones(gains.shape))
+    for n, direction in enumerate(directions):
+        assert found[:, n] == pytest.approx(np.array(written_out(array, direction)), abs=1e-9)
+        assert np.abs(found[:, n]) == pytest.approx(gains[:, n].repeat(array.size if alike else 1))
+
+
+def test_a_direction_seen_by_an_element_that_faces_right() -> None:
+    """Ahead of the array is to the element's left; to the right of the array is ahead of it."""
+    right = np.array([[0.0, 1.0, 0.0]])
+    array = listed(np.zeros((1, 3)), 1e9, np.eye(3), SQUARE, None, right)
+    seen = steering.element_directions(array, np.array([unit(0, 0), unit(math.pi / 2, 0)]))
+    assert seen[0] == pytest.approx(np.array([[0, -1, 0], [1, 0, 0]]))
 
 
 @given(DIRECTIONS)

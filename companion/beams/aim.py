@@ -44,7 +44,7 @@ def aim(
     refused = {track.uav: _refusal(track, carrier, array) for track in tracks}
     seen = [track for track in tracks if refused[track.uav] is None]
     beams: tuple[Beam, ...] = ()
-    made = precode(np.empty((array.size, 0), dtype=complex), precoder)
+    made = None
     if carrier is not None and seen:
         ranges_m, directions = motion.directions(seen, carrier, array)
         hidden = _out_of_reach(directions, array, coverage)
@@ -54,6 +54,8 @@ def aim(
             aimed = _Aimed([seen[i] for i in inside], ranges_m[inside], directions[inside])
             beams, made, dropped = _beams(aimed, carrier, array, precoder)
             refused |= dropped
+    if made is None:
+        made = precode(np.empty((array.size, 0), dtype=complex), precoder)
     left_out = tuple(LeftOut(uav, why) for uav, why in refused.items() if why is not None)
     return BeamSet(
         now_ns,
@@ -80,7 +82,6 @@ def _beams(
 ) -> tuple[tuple[Beam, ...], Precoding, dict[str, str]]:
     """Beams, their weights, and whom the policy left out."""
     tracks, ranges_m, directions = aimed
-    matrix = steering.steering_matrix(array, directions)
     bounds = [
         _pointing_bound_rad(track, carrier, range_m)
         for track, range_m in zip(tracks, ranges_m.tolist(), strict=True)
@@ -88,7 +89,8 @@ def _beams(
     spread = None
     if precoder.widen:
         widths = np.array([np.inf if bound is None else bound for bound in bounds])
-        spread = widening.spread(array, matrix, directions, widths)
+        spread = widening.spread(array, directions, widths)
+    matrix = steering.steering_matrix(array, directions) if spread is None else spread.centres
     made = precode(matrix, precoder, spread, _priorities(tracks, precoder.priority))
     azimuths, elevations = steering.angles_rad(directions)
     served = matrix[:, made.served]

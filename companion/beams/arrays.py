@@ -17,6 +17,8 @@ from companion.values import FloatArray, IntArray
 SPEED_OF_LIGHT_MPS: Final = 299_792_458.0
 SAME_PLACE_WAVELENGTHS: Final = 1e-9
 """Positions that differ by less are one: 1e-8 rad of phase."""
+LINE_WAVELENGTHS: Final = 1e-6
+"""Elements that stand off a line by less, in the mean, are on it."""
 SLANTED: Final = np.array([math.sqrt(2), math.sqrt(3), math.sqrt(5)])
 """Orders the elements; no two places of a regular array are level along it."""
 
@@ -30,8 +32,9 @@ class Array:
     all elements; ``element_from_array`` (M, 3, 3) turns each to where it faces (None: all along
     boresight). ``grid`` is rows and columns of a ULA or URA, elements row by row, else None.
     Found from the rest: ``centred_m`` (M, 3), positions from their centroid; ``variance_m2``
-    (3, 3), their mean square; ``partners`` (M,), each element's mirror image through the centroid,
-    None where the array has no such symmetry.
+    (3, 3), their mean square; ``axis`` (3,), the line that they stand on, None where they do not;
+    ``partners`` (M,), each element's mirror image through the centroid, None where the array has
+    no such symmetry.
     """
 
     kind: str
@@ -44,12 +47,17 @@ class Array:
     grid: tuple[int, int] | None = None
     centred_m: FloatArray = field(init=False)
     variance_m2: FloatArray = field(init=False)
+    axis: FloatArray | None = field(init=False)
     partners: IntArray | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         centred_m = self.elements_m - self.elements_m.mean(axis=0)
         object.__setattr__(self, "centred_m", centred_m)
-        object.__setattr__(self, "variance_m2", centred_m.T @ centred_m / self.size)
+        variance_m2 = centred_m.T @ centred_m / self.size
+        values, vectors = np.linalg.eigh(variance_m2)
+        on_a_line = values[1] <= (LINE_WAVELENGTHS * self.wavelength_m) ** 2
+        object.__setattr__(self, "variance_m2", variance_m2)
+        object.__setattr__(self, "axis", vectors[:, 2] if on_a_line else None)
         if self.element_from_array is None:
             object.__setattr__(self, "partners", _partners(centred_m / self.wavelength_m))
 

@@ -49,8 +49,10 @@ def rates(
     known = [track.velocity_ned_mps is not None for track in tracks]
     velocities = [moved if v is None else v for v in (t.velocity_ned_mps for t in tracks)]
     array_from_local = array.array_from_body @ carrier.body_from_local
-    swung = np.cross(carrier.body_rates_radps, array.lever_arm_m) @ carrier.body_from_local
-    moving = (np.array(velocities) - moved - swung) @ array_from_local.T
+    if array.lever_arm_m.any():
+        swung = np.cross(carrier.body_rates_radps, array.lever_arm_m)
+        moved = moved + swung @ carrier.body_from_local
+    moving = (np.array(velocities) - moved) @ array_from_local.T
     range_rates = np.einsum("nk,nk->n", moving, directions)
     across = (moving - range_rates[:, np.newaxis] * directions) / ranges_m[:, np.newaxis]
     w1, w2, w3 = (array.array_from_body @ carrier.body_rates_radps).tolist()

@@ -180,13 +180,14 @@ def _wide_zero_forcing(
 ) -> tuple[ComplexArray, float]:
     """Broadened beams that null the others exactly, and what that costs the worst of them, dB."""
     alone = power_gains(a, wide.beams)
-    found = nulled(a, wide, 0.0, SOFT_LOADINGS[0])
+    found = nulled(wide, 0.0, SOFT_LOADINGS[0])
     kept = power_gains(a, found)
     least = alone * 10 ** (-settings.loss_limit_db / 10)
     if (kept < least).any():
-        centred = nulled(a, wide, 0.0)
-        found = widen_nulls(a, wide, 0.0, centred, least)
+        found = centred = nulled(wide, 0.0)
         kept = power_gains(a, centred)
+        if (kept >= least).all():
+            found = widen_nulls(wide, 0.0, centred, least, SOFT_LOADINGS[1:])
     return found, _db((alone / kept).max())
 
 
@@ -203,11 +204,11 @@ def _loaded(
         return _unit_response(a, a.conj() @ np.linalg.inv(gram + loading * np.eye(len(gram))))
     least = _least_gains(a, wide, settings)
     most = float(np.diag(gram).real.max()) * LOADINGS[-1]
-    centred = nulled(a, wide, loading)
+    centred = nulled(wide, loading)
     while loading < most and (power_gains(a, centred) < least).any() and loss_limit_db < np.inf:
-        loading *= 2.0
-        centred = nulled(a, wide, loading)
-    return _unit_response(a, widen_nulls(a, wide, loading, centred, least))
+        loading *= 4.0
+        centred = nulled(wide, loading)
+    return _unit_response(a, widen_nulls(wide, loading, centred, least))
 
 
 def _least_gains(a: ComplexArray, wide: Spread, settings: Precoder) -> FloatArray:

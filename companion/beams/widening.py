@@ -11,17 +11,16 @@ in natural beams; the natural half-power beam has w = 0.44.
 """
 
 import functools
-import itertools
 import math
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.linalg.lapack import zgesv
+from scipy.linalg.lapack import zpotrf, zpotri
 
 from companion.beams.arrays import Array
 from companion.beams.steering import steering_matrix
-from companion.values import ComplexArray, FloatArray, IntArray
+from companion.values import BoolArray, ComplexArray, FloatArray, IntArray
 
 WIDEST_RAD: Final = np.pi / 3
 """Farther than this neither beams nor nulls are widened."""
@@ -38,128 +37,170 @@ greatest, among those whose gain stays within 3 dB of its peak there (a search o
 NULL_SPACING: Final = 0.7
 FEWEST_WIDTHS: Final = 0.02
 MOST_RINGS: Final = 4
-MOST_RINGS_IN_SPACE: Final = 2
 MOST_POINTS: Final = 96
 """In all, and never more than the array has degrees of freedom to spare: each is a null."""
 SOFT_LOADINGS: Final = (0.01, 0.1, 1.0, 10.0)
 TOO_CLOSE: Final = 0.5
+UNUSED: Final = 1e9
+"""A loading under which a point has no weight at all."""
 
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """What widening needs to know: ``beams`` (M, N) are the broadened beams by themselves, where
-    ``broadened`` (N,); ``points`` (M, P) the steering vectors to be nulled beside the predicted
-    ones, around user ``owners`` (P,)."""
+    """What widening needs to know of N users.
+
+    ``beams`` (M, N) are the broadened beams by themselves, where ``broadened`` (N,). ``points``
+    (M, N K) are steering vectors, K a user in the order of the users: the predicted direction, then
+    those around it that are to be nulled as well, where ``usable`` (N K,). ``gram`` (N K, N K) is
+    S^T S* of the points S, ``reached`` (N K, N) what the beams radiate there.
+    """
 
     beams: ComplexArray
-    broadened: FloatArray
+    broadened: BoolArray
     points: ComplexArray
-    owners: IntArray
+    usable: BoolArray
+    gram: ComplexArray
+    reached: ComplexArray
+
+    @property
+    def each(self) -> int:
+        """K, the points of a user."""
+        return len(self.usable) // int(self.beams.shape[1])
+
+    @property
+    def centres(self) -> ComplexArray:
+        """Steering vectors (M, N) of the predicted directions: A."""
+        return self.points[:, :: self.each]
 
     def of(self, users: IntArray) -> "Spread":
         """What concerns some of the users, in their order."""
         if len(users) == self.beams.shape[1]:
             return self
-        where = {int(user): place for place, user in enumerate(users)}
-        mine = [p for p, owner in enumerate(self.owners.tolist()) if owner in where]
-        owners = np.array([where[int(self.owners[p])] for p in mine], dtype=np.int64)
-        return Spread(self.beams[:, users], self.broadened[users], self.points[:, mine], owners)
+        rows = (users[:, np.newaxis] * self.each + np.arange(self.each)).ravel()
+        return Spread(
+            self.beams[:, users],
+            self.broadened[users],
+            self.points[:, rows],
+            self.usable[rows],
+            self.gram[np.ix_(rows, rows)],
+            self.reached[np.ix_(rows, users)],
+        )
 
 
-def spread(
-    array: Array, steering: ComplexArray, directions: FloatArray, bounds_rad: FloatArray
-) -> Spread | None:
+def spread(array: Array, directions: FloatArray, bounds_rad: FloatArray) -> Spread | None:
     """How to widen for unit directions (N, 3) in the array frame, each known to its bound (N,).
 
-    ``steering`` (M, N) is that of the directions. None where all are known sharply enough.
+    None where all are known sharply enough.
     """
     bounds = np.minimum(bounds_rad, WIDEST_RAD)
     axes, apertures_m = _apertures(array, directions)
     widths = bounds[:, np.newaxis] * apertures_m / array.wavelength_m
     if not (widths > FEWEST_WIDTHS).any():
         return None
-    broadened = widths.max(axis=1) > WIDTHS[0]
-    beams = steering.conj()
+    around = _around(directions, bounds, axes, widths, array.size)
+    each = around.shape[1]
+    points = steering_matrix(array, around.reshape(-1, 3))
+    gram = points.T @ points.conj()
+    beams, reached = points[:, ::each].conj(), gram[:, ::each]
+    broadened: BoolArray = widths.max(axis=1) > WIDTHS[0]
     if broadened.any():
         beams *= np.exp(1j * _defocus_rad(array, axes, apertures_m, widths))
-    around, owners = _around(directions, bounds, axes, widths, array.size)
-    points = steering_matrix(array, around)
-    clear = _clear(points, around, owners, steering, directions, bounds)
-    return Spread(beams, broadened, points[:, clear], owners[clear])
+        reached = points.T @ beams
+    usable = _usable(gram, around, directions, bounds)
+    return Spread(beams, broadened, points, usable, gram, reached)
 
 
 def widen_nulls(
-    steering: ComplexArray,
     spread: Spread,
     loading: float,
     centred: ComplexArray,
     least_gains: FloatArray,
+    softnesses: tuple[float, ...] = SOFT_LOADINGS,
 ) -> ComplexArray:
     """Beams (M, N) that null the points around the other UAVs as well, as deeply as may be.
 
-    ``centred`` are those that null the predicted directions alone, with the same ``loading``. No
-    user's gain falls below ``least_gains`` (N,), if it did not before.
+    ``centred`` are those that null the predicted directions alone, with the same ``loading``; the
+    ``softnesses`` are tried in their order. No user's gain falls below ``least_gains`` (N,), if it
+    did not before.
     """
-    if not len(spread.owners):
+    if spread.each == 1:
         return centred
-    least = np.minimum(least_gains, power_gains(steering, centred))
-    for soft in SOFT_LOADINGS:
-        found = nulled(steering, spread, loading, soft)
-        if (power_gains(steering, found) >= least * (1 - 1e-9)).all():
+    least = np.minimum(least_gains, power_gains(spread.centres, centred)) * (1 - 1e-9)
+    for soft in softnesses:
+        found = nulled(spread, loading, soft)
+        if (power_gains(spread.centres, found) >= least).all():
             return found
     return centred
 
 
-def nulled(
-    steering: ComplexArray, spread: Spread, loading: float, soft: float | None = None
-) -> ComplexArray:
+def nulled(spread: Spread, loading: float, soft: float | None = None) -> ComplexArray:
     """The broadened beams (M, N), less what of them reaches the other UAVs.
 
     f_i = g_i - S* (S^T S* + X)^-1 S^T g_i over the directions S of all others than i: X is
     ``loading`` at the predicted ones (0: nulled exactly), ``soft`` times their power at the points
-    around them (None: these are left out).
+    around them (None: these are left out). Linear least squares with weights 1/X.
 
     One inverse over the points of all serves every user: that of a submatrix follows from it by
-    its Schur complement. Linear least squares with weights 1/X; exact where X is 0.
+    its Schur complement.
     """
-    users = steering.shape[1]
-    points, loads, begins = steering, np.full(users, loading), np.arange(users + 1)
-    if soft is not None:
-        # User by user, the predicted direction first: each has its own block.
-        order = np.argsort(np.concatenate([np.arange(users), spread.owners]), kind="stable")
-        points = np.concatenate([steering, spread.points], axis=1)[:, order]
-        power = np.einsum("mp,mp->p", spread.points, spread.points.conj()).real
-        loads = np.concatenate([loads, soft * power])[order]
-        begins = np.searchsorted(spread.owners, begins) + begins
-    gram = points.T @ points.conj()
-    gram.flat[:: len(gram) + 1] += loads
-    inverse = np.linalg.inv(gram)
-    blocks = [slice(begin, end) for begin, end in itertools.pairwise(begins.tolist())]
-    reached = points.T @ spread.beams
-    for user, own in enumerate(blocks):
-        reached[own, user] = 0.0
-    found = inverse @ reached
-    for user, own in enumerate(blocks):
-        _, _, held, _ = zgesv(inverse[own, own], found[own, user])
-        found[:, user] -= inverse[:, own] @ held
+    users, each = spread.beams.shape[1], spread.each
+    points, gram, reached = spread.points, spread.gram, spread.reached
+    if soft is None:
+        points, gram, reached, each = points[:, ::each], gram[::each, ::each], reached[::each], 1
+        loads = np.full(users, loading)
+    else:
+        loads = np.where(spread.usable, soft, UNUSED) * gram.diagonal().real
+        loads[::each] = loading
+    loaded = gram.copy()
+    loaded.flat[:: len(loaded) + 1] += loads
+    inverse = _inverse(loaded)
+    by_user = np.arange(users)
+    others = reached.reshape(users, each, users).copy()
+    others[by_user, :, by_user] = 0.0
+    found = inverse @ others.reshape(-1, users)
+    blocks = inverse.reshape(users, each, users, each)
+    own = blocks[by_user, :, by_user]
+    wrong = found.reshape(users, each, users)[by_user, :, by_user]
+    held = np.linalg.solve(own, wrong[:, :, np.newaxis])[:, :, 0]
+    found -= np.einsum("pnk,nk->pn", inverse.reshape(-1, users, each), held)
     weights: ComplexArray = spread.beams - points.conj() @ found
     return weights
 
 
+def _inverse(positive: ComplexArray) -> ComplexArray:
+    """Of a Hermitian matrix by Cholesky; where rounding makes it indefinite, by LU."""
+    factor, info = zpotrf(positive.T, overwrite_a=1)
+    if info:
+        return np.linalg.inv(positive).astype(np.complex128, copy=False)
+    upper, _ = zpotri(factor, overwrite_c=1)
+    found: ComplexArray = upper.T + np.triu(upper, 1).conj()
+    return found
+
+
 def power_gains(steering: ComplexArray, weights: ComplexArray) -> FloatArray:
     """Array gain of each column towards its own direction, |a^T f|^2 / |f|^2, (N,)."""
-    towards = np.abs(np.einsum("mn,mn->n", steering, weights)) ** 2
-    gains: FloatArray = towards / np.sum(np.abs(weights) ** 2, axis=0)
+    towards = np.einsum("mn,mn->n", steering, weights)
+    power = np.einsum("mn,mn->n", weights, weights.conj()).real
+    gains: FloatArray = (towards.real**2 + towards.imag**2) / power
     return gains
 
 
 def _apertures(array: Array, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Principal axes of the array across each line of sight, (N, 3, 2), the longer one first, and
+    """Principal axes of the array across each line of sight, (N, 2, 3), the longer one first, and
     their widths (N, 2) in metres: those of uniform lines with the same variance."""
+    if array.axis is not None:
+        along = directions @ array.axis
+        seen = array.axis - along[:, np.newaxis] * directions
+        length = np.sqrt(np.maximum(1 - along**2, 1e-30))
+        axes = np.zeros((len(directions), 2, 3))
+        axes[:, 0] = seen / length[:, np.newaxis]
+        widths_m = np.zeros((len(directions), 2))
+        widths_m[:, 0] = math.sqrt(12 * array.variance_m2.trace()) * length
+        return axes, widths_m
     across = np.eye(3) - directions[:, :, np.newaxis] * directions[:, np.newaxis, :]
     values, vectors = np.linalg.eigh(across @ array.variance_m2 @ across)
     widths_m = np.sqrt(12 * np.maximum(values[:, :0:-1], 0.0))
-    return vectors[:, :, :0:-1], widths_m
+    return vectors[:, :, :0:-1].transpose(0, 2, 1), widths_m
 
 
 def _defocus_rad(
@@ -167,11 +208,13 @@ def _defocus_rad(
 ) -> FloatArray:
     """Quadratic phase (M, N) over the aperture, for bounds in natural widths (N, 2)."""
     ends_rad = np.interp(widths, WIDTHS, CURVATURES_RAD)
-    ends_rad = np.where(widths > WIDTHS[-1], CURVATURES_RAD[-1] / WIDTHS[-1] * widths, ends_rad)
+    beyond = CURVATURES_RAD[-1] / WIDTHS[-1] * widths
+    ends_rad = np.where(widths > WIDTHS[-1], beyond, ends_rad)
     # A narrow axis has no curvature: its beam is wider than any bound.
-    scale = np.where(ends_rad > 0, 2 / np.maximum(apertures_m, 1e-9 * array.wavelength_m), 0.0)
-    along = np.tensordot(array.centred_m, axes, (1, 1)) * scale
-    phase: FloatArray = np.einsum("mna,na->mn", along**2, ends_rad)
+    scale = np.sqrt(ends_rad) * 2 / np.maximum(apertures_m, 1e-9 * array.wavelength_m)
+    along = array.centred_m @ (axes * scale[:, :, np.newaxis]).reshape(-1, 3).T
+    along *= along
+    phase: FloatArray = along[:, ::2] + along[:, 1::2]
     return phase
 
 
@@ -181,34 +224,29 @@ def _around(
     axes: FloatArray,
     widths: FloatArray,
     elements: int,
-) -> tuple[FloatArray, IntArray]:
-    """Directions (P, 3) within the bound around each user's, and whose they are (P,), in order.
+) -> FloatArray:
+    """Directions (N, K, 3): each user's own, then those within its bound around it.
 
-    A line array sees one angle: points to both sides. Others: rings of 6, 12, ... points, or two
+    A line array sees one angle: points to both sides. Others: rings of 6, 12, ... points, or
     points across the longer axis where there are too many users for a ring.
     """
     users = len(directions)
-    each = min(MOST_POINTS, elements - users) // users if users > 1 else 0
-    tangents, owners = [np.empty((0, 3))], [0] * 0
-    for user in range(users if each >= 2 else 0):
-        longest, other = widths[user].tolist()
-        if longest > FEWEST_WIDTHS:
-            rings = max(1, math.ceil(longest / NULL_SPACING))
-            on_axes = _pattern(rings, each, in_space=other > FEWEST_WIDTHS)
-            tangents.append(on_axes @ axes[user].T)
-            owners += [user] * len(on_axes)
-    tangent, whose = np.concatenate(tangents), np.array(owners, dtype=np.int64)
-    length = np.sqrt(np.einsum("pk,pk->p", tangent, tangent))[:, np.newaxis]
-    turned_rad = bounds_rad[whose, np.newaxis] * length
-    around = np.cos(turned_rad) * directions[whose] + np.sin(turned_rad) * tangent / length
-    return around, whose
+    most = min(MOST_POINTS, elements - users) // users if users > 1 else 0
+    if most < 2:
+        return directions[:, np.newaxis]
+    rings = max(1, math.ceil(float(widths.max()) / NULL_SPACING))
+    disc, radii = _pattern(rings, most, in_space=bool((widths[:, 1] > FEWEST_WIDTHS).any()))
+    turned_rad = bounds_rad[:, np.newaxis] * radii
+    aside = (np.sin(turned_rad) / np.maximum(radii, 1e-300))[:, :, np.newaxis] * (disc @ axes)
+    return np.cos(turned_rad)[:, :, np.newaxis] * directions[:, np.newaxis] + aside
 
 
 @functools.cache
-def _pattern(rings: int, most: int, *, in_space: bool) -> FloatArray:
-    """Points (n, 2) in the unit disc, or on its first axis: at most ``most`` of them."""
+def _pattern(rings: int, most: int, *, in_space: bool) -> tuple[FloatArray, FloatArray]:
+    """The middle of the unit disc, and at most ``most`` points in it or on its first axis, (K, 2);
+    and how far out they are, (K,)."""
     if in_space and most >= 6:
-        rings = 2 if rings >= MOST_RINGS_IN_SPACE and most >= 18 else 1
+        rings = 2 if rings >= 2 and most >= 18 else 1
         points = [
             (ring / rings * math.cos(angle), ring / rings * math.sin(angle))
             for ring in range(1, rings + 1)
@@ -217,23 +255,20 @@ def _pattern(rings: int, most: int, *, in_space: bool) -> FloatArray:
     else:
         rings = min(rings, MOST_RINGS, most // 2)
         points = [(side * ring / rings, 0.0) for ring in range(1, rings + 1) for side in (1, -1)]
-    return np.array(points)
+    disc = np.array([(0.0, 0.0), *points])
+    return disc, np.hypot(*disc.T)
 
 
-def _clear(
-    points: ComplexArray,
-    around: FloatArray,
-    owners: IntArray,
-    steering: ComplexArray,
-    directions: FloatArray,
-    bounds_rad: FloatArray,
-) -> IntArray:
-    """Points that can be nulled: not what another UAV must be served by, in its bound or so near
-    to it that the array can hardly tell them apart."""
-    power = np.sum(np.abs(points) ** 2, axis=0)
-    alike = np.abs(points.T @ steering.conj()) ** 2
-    alike /= np.maximum(np.outer(power, np.sum(np.abs(steering) ** 2, axis=0)), 1e-300)
-    inside = around @ directions.T > np.cos(bounds_rad)
-    others = owners[:, np.newaxis] != np.arange(len(directions))
-    blocked = (others & (inside | (alike > TOO_CLOSE**2))).any(axis=1)
-    return np.flatnonzero(~blocked & (power > 1e-12))
+def _usable(
+    gram: ComplexArray, around: FloatArray, directions: FloatArray, bounds_rad: FloatArray
+) -> BoolArray:
+    """Points (N K,) that can be nulled: not what another UAV must be served by, in its bound or so
+    near to it that the array can hardly tell them apart; nor where the array radiates nothing."""
+    users, each = around.shape[:2]
+    power = gram.diagonal().real
+    alike = np.abs(gram[:, ::each]) ** 2 > TOO_CLOSE**2 * np.outer(power, power[::each])
+    inside = around.reshape(-1, 3) @ directions.T > np.cos(bounds_rad)
+    blocked = (alike | inside).reshape(users, each, users)
+    blocked[np.arange(users), :, np.arange(users)] = False
+    usable: BoolArray = ~blocked.any(axis=2).ravel() & (power > 1e-12 * power.max())
+    return usable

@@ -82,7 +82,7 @@ def test_zero_forcing_gives_each_its_own_and_nothing_of_the_others(
     directions = somewhere(data, users)
     a = steering.steering_matrix(array, directions)
     bounds = np.random.default_rng(seed).uniform(0, 0.1, users)
-    wide = spread(array, a, directions, bounds) if widen else None
+    wide = spread(array, directions, bounds) if widen else None
     found = precode(a, Precoder(), wide)
     assert found.weights.shape == (16, users)
     assert np.all(np.isfinite(found.weights))

@@ -218,3 +218,49 @@ def prediction(
         (out / "prediction.html").write_text(report.page(answer, found), encoding="utf-8")
     progress.clear()
     click.echo(json.dumps(answer) if as_json else report.text(found))
+
+
+@study.command()
+@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@CONFIG
+@CENTER
+@click.option(
+    "--hz", type=float, default=5.0, show_default=True, help="Looks a second of the log's time."
+)
+@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
+@JSON
+def beams(
+    logs: tuple[Path, ...],
+    config: Path | None,
+    center: str | None,
+    hz: float,
+    out: Path,
+    as_json: bool,
+) -> None:
+    """What an array would have done over a flight: gains, guarantees, what must be swept.
+
+    The beams as the settings make them, and beside them the same not widened. Where the log has
+    the simulator's truth (SIM_STATE) every guarantee is put to the test. Writes DIR/beams.json,
+    DIR/beams.html and the figures as SVG. A recording of our own is studied with the
+    settings that it holds.
+
+    Example: companion study beams flight.tlog --center 5:1 --out report
+    """
+    from companion.replay import settings_for
+    from companion.studies import beam_report
+    from companion.studies.beams import Setting, study
+
+    progress = Progress()
+    with user_errors():
+        settings = tuple(settings_for([log], config, center) for log in logs)
+        setting = Setting(logs, settings, hz, center, str(config) if config else None)
+        out.mkdir(parents=True, exist_ok=True)
+        if any(each.center.source is None for each in settings):
+            click.echo("no --center: the array stands where the first report was made", err=True)
+        answer, found = study(setting, progress.show)
+        progress.show("drawing")
+        (out / "beams.json").write_text(json.dumps(answer, indent=1), encoding="utf-8")
+        for name, content in beam_report.files(answer, found).items():
+            (out / name).write_bytes(content)
+    progress.clear()
+    click.echo(json.dumps(answer) if as_json else beam_report.text(found))

@@ -69,6 +69,13 @@ def aim(
     )
 
 
+def directions(beam_set: BeamSet) -> FloatArray:
+    """Unit directions (N, 3) of the beams in the array frame."""
+    azimuths = np.array([beam.azimuth_rad for beam in beam_set.beams])
+    elevations = np.array([beam.elevation_rad for beam in beam_set.beams])
+    return steering.unit_directions(azimuths, elevations)
+
+
 class _Aimed(NamedTuple):
     """Those that can be aimed at: ranges (N,), unit directions (N, 3) in the array frame."""
 

@@ -16,6 +16,7 @@ import numpy as np
 from companion.beams import cone
 from companion.beams.arrays import Array
 from companion.beams.cone import Boxes, Cells, Cones
+from companion.beams.coverage import Coverage, margin_rad
 from companion.beams.elements import Pattern
 from companion.values import ComplexArray, FloatArray
 
@@ -148,3 +149,18 @@ def _over_cells(
         return -high * largest.max(axis=1), -seen * attained
     attained = np.where(cells.in_cone, amplitude, np.inf).min(axis=1)
     return low * least.min(axis=1), seen * attained
+
+
+def covered_bounds(
+    array: Array,
+    coverage: Coverage,
+    directions: FloatArray,
+    pointing_bounds_rad: Sequence[float | None],
+) -> list[float | None]:
+    """The bounds of unit directions (N, 3) in the array frame, None where a cone reaches past the
+    coverage: a UAV may be out there, and then nothing is sure."""
+    margins = margin_rad(coverage, directions, directions @ array.array_from_body)
+    return [
+        bound if bound is not None and bound <= margin else None
+        for bound, margin in zip(pointing_bounds_rad, margins.tolist(), strict=True)
+    ]

@@ -12,9 +12,8 @@ import numpy as np
 
 from companion.assembly import Equipment
 from companion.beams import codebooks, guarantee, motion, patterns, rates
+from companion.beams.aim import directions
 from companion.beams.arrays import Array
-from companion.beams.coverage import margin_rad
-from companion.beams.steering import unit_directions
 from companion.pipeline import Pipeline
 from companion.server.words import degrees, rfc3339
 from companion.values import Beam, BeamSet, FloatArray, Update
@@ -74,12 +73,6 @@ def left_out(beam_set: BeamSet) -> list[Json]:
     return [{"uav": out.uav, "reason": out.reason} for out in beam_set.left_out]
 
 
-def directions(beam_set: BeamSet) -> FloatArray:
-    """Unit directions (N, 3) of the beams in the array frame."""
-    azimuths = np.array([beam.azimuth_rad for beam in beam_set.beams])
-    return unit_directions(azimuths, np.array([beam.elevation_rad for beam in beam_set.beams]))
-
-
 def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[Json]:
     beam_set, carrier = update.beams, update.carrier
     if carrier is None or not beam_set.beams:
@@ -131,13 +124,9 @@ def _guaranteed_db(
     """The least gain and the least SINR wherever the UAVs truly are; None where one may be out of
     coverage, in a null, or anywhere. The SINR is left open where there are many beams."""
     array, beam_set = pipeline.array, update.beams
-    margins = margin_rad(pipeline.coverage, towards, towards @ array.array_from_body)
-    bounds = [
-        beam.pointing_bound_rad
-        if beam.pointing_bound_rad is not None and beam.pointing_bound_rad <= margin
-        else None
-        for beam, margin in zip(beam_set.beams, margins.tolist(), strict=True)
-    ]
+    bounds = guarantee.covered_bounds(
+        array, pipeline.coverage, towards, [beam.pointing_bound_rad for beam in beam_set.beams]
+    )
     gains_db = guarantee.guaranteed_gains_db(array, towards, bounds, beam_set.weights)
     known = [i for i, gain_db in enumerate(gains_db) if gain_db is not None]
     unknown: list[float | None] = [None] * len(bounds)

@@ -8,6 +8,7 @@ import numpy as np
 
 from companion.assembly import Equipment
 from companion.beams import hardware
+from companion.beams.aim import directions
 from companion.beams.arrays import SPEED_OF_LIGHT_MPS, Array
 from companion.beams.devices import MEDIA_TYPES, Device
 from companion.beams.steering import steering_matrix
@@ -50,7 +51,7 @@ def device_table(
 ) -> hardware.DeviceTable:
     """The settings of a device that come nearest to the weights: each beam towards its own UAV,
     away from the others of its group. ``ValueError`` as above."""
-    steering = steering_matrix(array, beam_views.directions(beam_set))
+    steering = steering_matrix(array, directions(beam_set))
     wanted = []
     for i, beam in enumerate(beam_set.beams):
         others = [j for j, one in enumerate(beam_set.beams) if j != i and one.group == beam.group]

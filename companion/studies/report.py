@@ -14,7 +14,7 @@ LEFT, RIGHT, TOP, BOTTOM = 56, 190, 14, 40
 COLOURS: Final = ("#0b4f9e", "#b3261e", "#00695c", "#6a1b9a", "#a65b00", "#37474f", "#ad1457")
 DASHES: Final = ("", "6 3", "2 3", "9 3 2 3", "12 4", "4 2", "1 4")
 
-_STYLE: Final = """
+STYLE: Final = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #111; background: #fff;
   max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
 h2 { margin-top: 2.2rem; border-bottom: 1px solid #999; }
@@ -22,8 +22,10 @@ table { border-collapse: collapse; margin: .8rem 0; font-variant-numeric: tabula
 caption { text-align: left; padding: .2rem 0; color: #333; }
 th, td { padding: .15rem .6rem; border-bottom: 1px solid #ccc; text-align: right; }
 th:first-child, td:first-child { text-align: left; }
+figure { margin: 1.2rem 0; }
 td.best { font-weight: 700; }
 code { overflow-wrap: anywhere; }
+details { overflow-x: auto; }
 svg { max-width: 100%; height: auto; }
 @media print { section { break-inside: avoid; } body { margin: 0; font-size: 11px; } }
 """
@@ -66,7 +68,7 @@ def page(answer: dict[str, Any], found: Sequence[Compared]) -> str:
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>Predictors compared</title>
-<style>{_STYLE}</style>
+<style>{STYLE}</style>
 </head>
 <body>
 <h1>Predictors compared</h1>

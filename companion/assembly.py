@@ -108,6 +108,8 @@ def equipment(settings: Settings, antenna: arrays.Array) -> Equipment:
             codebook = codebooks.dft(antenna, kept.oversampling)
         elif kept.kind == "file":
             codebook = codebooks.listed(codebook_file(settings), antenna)
+    except ConfigError:
+        raise
     except ValueError as error:
         raise ConfigError(f"codebook: {error}") from error
     text = calibration_text(settings)

@@ -14,7 +14,8 @@ from pydantic import (
 
 from companion.values import Method, Normalisation, Policy
 
-Position = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+Metres = Annotated[float, Field(ge=-1e4, le=1e4)]
+Position = tuple[Metres, Metres, Metres]
 Interval = tuple[FiniteFloat, FiniteFloat]
 HiddenSector = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 
@@ -29,6 +30,12 @@ def _rising(interval: Interval) -> Interval:
     if not interval[0] < interval[1]:
         raise ValueError("from and to, the first less than the second")
     return interval
+
+
+def _once(names: tuple[str, ...]) -> tuple[str, ...]:
+    if len(set(names)) < len(names):
+        raise ValueError("each UAV once, in descending order")
+    return names
 
 
 class ArraySettings(Section):
@@ -53,10 +60,10 @@ class ArraySettings(Section):
     rows: Annotated[int, Field(ge=1, le=256)] = 8
     columns: Annotated[int, Field(ge=1, le=256)] = 8
     positions: str | None = None
-    positions_m: tuple[tuple[FiniteFloat, ...], ...] | None = None
-    frequency_hz: PositiveFloat = 30e9
-    spacing_wavelengths: PositiveFloat = 0.5
-    spacing_m: PositiveFloat | None = None
+    positions_m: Annotated[tuple[tuple[Metres, ...], ...], Field(max_length=4096)] | None = None
+    frequency_hz: Annotated[float, Field(ge=1e3, le=1e15)] = 30e9
+    spacing_wavelengths: Annotated[float, Field(gt=0, le=1e4)] = 0.5
+    spacing_m: Annotated[float, Field(gt=0, le=1e4)] | None = None
     element: Literal["isotropic", "cosine", "3gpp"] = "isotropic"
     element_exponent: Annotated[float, Field(ge=0, le=100)] = 1.0
     mount_roll_deg: float = 0.0
@@ -100,7 +107,7 @@ class BeamSettings(Section):
     condition_limit: Annotated[float, Field(gt=1, le=1e3)] = 100.0
     regularisation: Annotated[float, Field(gt=0, le=1e6)] = 0.01
     normalisation: Normalisation = Normalisation.UNIT_RESPONSE
-    priority: tuple[str, ...] = ()
+    priority: Annotated[tuple[str, ...], AfterValidator(_once)] = ()
     widen: bool = True
 
 

@@ -1,6 +1,7 @@
 """The command ``companion weights``: the beams at a time of a log, for a notebook or a device."""
 
 import json
+import math
 import sys
 from pathlib import Path
 
@@ -60,16 +61,18 @@ def weights(
     from companion.replay import settings_for
     from companion.server import beam_views, weight_formats
 
+    if math.isnan(lead_ms):
+        raise click.UsageError("--lead-ms nan: 0 to 10000 is allowed")
     if form in ("npy", "raw") and out is None and sys.stdout.isatty():
         raise click.UsageError(f"{form} is not text: name a file with --out, or use a pipe")
     progress = Progress()
     with user_errors():
         settings = settings_for(logs, config, center)
+        equipment = assembly.equipment(settings, assembly.array(settings))
         pipeline, update = moment.look(
             logs, settings, at, lead_ms * 1e-3, lambda done_s: progress.show(f"{done_s:.0f} s")
         )
         progress.clear()
-        equipment = assembly.equipment(settings, pipeline.array)
         if update.unfit is not None:
             raise click.ClickException(f"no beams at {at}: {update.unfit}")
         if form == "json":

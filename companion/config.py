@@ -10,9 +10,11 @@ import tomllib
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from tokenize import TokenError
 from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import (
     AfterValidator,
     Field,
@@ -263,34 +265,45 @@ def numbers_file(key: str, name: str, columns: int) -> FloatArray:
 
     ``ConfigError``, naming the key, where it cannot be read.
     """
-    try:
-        if name.endswith(".npy"):
-            found = np.load(name, allow_pickle=False)
-        else:
-            text = Path(name).read_text(encoding="utf-8")
-            lines = (line.split("#")[0].replace(",", " ").split() for line in text.splitlines())
-            found = np.array([[float(word) for word in line] for line in lines if line])
-    except OSError as error:
-        raise ConfigError(f"{key} = {name!r}: {error.strerror}") from error
-    except (ValueError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{key} = {name!r}: not a table of numbers: {error}") from error
+    found = _npy_file(key, name, "fiu") if name.endswith(".npy") else _text_file(key, name)
     if found.ndim != 2 or found.shape[1] < columns or not np.isfinite(found).all():
         raise ConfigError(f"{key} = {name!r}: rows of at least {columns} finite numbers are needed")
     rows: FloatArray = found.astype(np.float64)
     return rows
 
 
+def _text_file(key: str, name: str) -> NDArray[Any]:
+    try:
+        text = Path(name).read_text(encoding="utf-8")
+        lines = (line.split("#")[0].replace(",", " ").split() for line in text.splitlines())
+        return np.array([[float(word) for word in line] for line in lines if line])
+    except OSError as error:
+        raise ConfigError(f"{key} = {name!r}: {error.strerror}") from error
+    except ValueError as error:
+        raise ConfigError(f"{key} = {name!r}: not a table of numbers: {error}") from error
+
+
+def _npy_file(key: str, name: str, kinds: str) -> NDArray[Any]:
+    """The array of a .npy file, of one of these kinds of numbers."""
+    try:
+        with Path(name).open("rb") as file:
+            found = np.lib.format.read_array(file, allow_pickle=False)
+    except OSError as error:
+        raise ConfigError(f"{key} = {name!r}: {error.strerror or error}") from error
+    except (ValueError, MemoryError, TokenError) as error:  # the header is read as Python text
+        first = str(error).splitlines()[0]
+        raise ConfigError(f"{key} = {name!r}: not a .npy file of numbers: {first}") from error
+    if found.dtype.kind not in kinds:
+        raise ConfigError(f"{key} = {name!r}: {found.dtype} are not the numbers that are needed")
+    return found
+
+
 def codebook_file(settings: Settings) -> ComplexArray:
     """The beams of ``codebook.file``, one a column (M, K). ``ConfigError`` if it is not such."""
     name = settings.codebook.file or ""
-    try:
-        found = np.load(name, allow_pickle=False)
-    except OSError as error:
-        raise ConfigError(f"codebook.file = {name!r}: {error.strerror or error}") from error
-    except ValueError as error:
-        raise ConfigError(f"codebook.file = {name!r}: {error}") from error
-    if found.ndim != 2 or found.dtype.kind not in "fc":
-        raise ConfigError(f"codebook.file = {name!r}: not a matrix of numbers")
+    found = _npy_file("codebook.file", name, "fciu")
+    if found.ndim != 2:
+        raise ConfigError(f"codebook.file = {name!r}: not a matrix, but of shape {found.shape}")
     beams: ComplexArray = found.astype(np.complex128)
     return beams
 

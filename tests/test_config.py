@@ -9,6 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion import assembly
+from companion.beams.coverage import EVERYWHERE
+from companion.beams.precoding import Precoder
 from companion.config import (
     BeamSettings,
     ConfigError,
@@ -84,6 +86,14 @@ WRONG = [
     ("beams", "update_hz", "1001", "1001", "less than or equal to 1000"),
     ("beams", "targets", '"some"', "some", "'telemetry' or 'all'"),
     ("beams", "condition_limit", "1.0", "1.0", "greater than 1"),
+    ("beams", "condition_limit", "1001.0", "1001.0", "less than or equal to 1000"),
+    ("beams", "regularisation", "0", "0", "greater than 0"),
+    ("beams", "priority", '["1:1", "2:1", "1:1"]', "1:1", "each UAV once"),
+    ("array", "frequency_hz", "1e-300", "1e-300", "greater than or equal to 1000"),
+    ("array", "frequency_hz", "1e300", "1e+300", "less than or equal to"),
+    ("array", "spacing_m", "1e300", "1e+300", "less than or equal to"),
+    ("array", "spacing_wavelengths", "1e300", "1e+300", "less than or equal to"),
+    ("array", "lever_arm_m", "[1e200, 0, 0]", "1e+200", "less than or equal to"),
     ("recording", "directory", "7", "7", "string"),
     ("server", "listen", "8080", "8080", "string"),
 ]
@@ -342,6 +352,72 @@ def test_a_file_of_positions_that_will_not_do_is_named(
 def test_what_is_no_array_is_an_error_of_settings(array: dict[str, object], said: str) -> None:
     with pytest.raises(ConfigError, match=f"^array: .*{said}"):
         assembly.array(Settings().override(array=array))
+
+
+def test_the_coverage_is_the_one_that_is_described() -> None:
+    given = {
+        "field_of_view_deg": 120.0,
+        "azimuth_limits_deg": [-50.0, 40.0],
+        "elevation_limits_deg": [-30.0, 20.0],
+        "hidden_deg": [[170.0, -170.0, -90.0, -10.0]],
+    }
+    found = assembly.coverage(Settings().override(array=given))
+    assert found.field_of_view_rad == pytest.approx(np.radians(120))
+    assert found.azimuth_limits_rad == pytest.approx(np.radians([-50, 40]))
+    assert found.elevation_limits_rad == pytest.approx(np.radians([-30, 20]))
+    (hidden,) = found.hidden
+    assert str(hidden) == "azimuth 170 to -170, elevation -90 to -10"
+    assert assembly.coverage(Settings()) == EVERYWHERE
+    wrong = Settings().override(array={"hidden_deg": [[0.0, 200.0, 0.0, 10.0]]})
+    with pytest.raises(ConfigError, match=r"^array: azimuth 0 to 200 degrees"):
+        assembly.coverage(wrong)
+
+
+def test_the_equipment_is_the_one_that_is_described(tmp_path: Path) -> None:
+    def made(**sections: dict[str, object]) -> assembly.Equipment:
+        found = Settings().override(array={"elements": 4}, **sections)
+        return assembly.equipment(found, assembly.array(found))
+
+    bare = made()
+    assert (bare.codebook, bare.calibration, bare.uav_antennas) == (None, None, 4)
+    radio = made(
+        radio={
+            "tx_power_dbm": 17.0, "bandwidth_hz": 1e6, "noise_figure_db": 3.0, "uav_antennas": 2,
+        }
+    )  # fmt: skip
+    assert (radio.budget.tx_power_dbm, radio.budget.bandwidth_hz) == (17.0, 1e6)
+    assert (radio.budget.noise_figure_db, radio.uav_antennas) == (3.0, 2)
+    stored = made(codebook={"kind": "dft", "oversampling": 3}).codebook
+    assert stored is not None
+    assert stored.weights.shape == (4, 12)
+    table = tmp_path / "measured.csv"
+    lines = [f"{c},{3 - c},{10 * c},0" for c in range(4)]
+    table.write_text("channel,element,phase_deg,gain_db\n" + "\n".join(lines), encoding="utf-8")
+    calibrated = made(hardware={"calibration": str(table)}).calibration
+    assert calibrated is not None
+    assert calibrated.order == (3, 2, 1, 0)
+    table.write_text("channel,element,phase_deg,gain_db\n0,0,0,0\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"^hardware\.calibration: 1 channels for 4 elements"):
+        made(hardware={"calibration": str(table)})
+    table.write_bytes(b"\xff")
+    with pytest.raises(ConfigError, match=r"^hardware\.calibration = .*not UTF-8"):
+        made(hardware={"calibration": str(table)})
+    with pytest.raises(ConfigError, match=r"^hardware\.calibration = .*No such file"):
+        made(hardware={"calibration": str(tmp_path / "missing.csv")})
+    with pytest.raises(ConfigError, match=r"^codebook: a DFT codebook needs"):
+        settings = Settings().override(codebook={"kind": "dft"}, array={"kind": "uca"})
+        assembly.equipment(settings, assembly.array(settings))
+
+
+def test_the_precoder_is_the_one_that_is_described() -> None:
+    given = {
+        "method": "rzf", "policy": "drop", "loss_limit_db": 5.0, "condition_limit": 50.0,
+        "regularisation": 0.5, "normalisation": "antenna", "priority": ["2:1"], "widen": False,
+    }  # fmt: skip
+    found = assembly.precoder(Settings().override(beams=given))
+    for key, value in given.items():
+        assert getattr(found, key) == (tuple(value) if isinstance(value, list) else value), key
+    assert assembly.precoder(Settings()) == Precoder()
 
 
 def test_the_array_is_the_one_that_is_described() -> None:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from companion.values import ComplexArray, FloatArray, IntArray
+from companion.values import ComplexArray, IntArray
 
 Fits = Callable[[Sequence[int]], bool]
 """Whether zero forcing serves these users within the limits."""
@@ -19,15 +19,18 @@ def semi_orthogonal(steering: ComplexArray, order: Sequence[int], fits: Fits) ->
     """
     left = list(order)
     groups = []
+    unit: ComplexArray = steering / np.linalg.norm(steering, axis=0)
     while left:
         group = [left.pop(0)]
+        outside = _less(unit, group[0])
         while left:
-            apart = _share_outside(steering[:, left], steering[:, group])
+            apart = np.sum(np.abs(outside[:, left]) ** 2, axis=0)
             best = left[int(np.argmax(apart))]
             if not fits([*group, best]):
                 break
             group.append(best)
             left.remove(best)
+            outside = _less(outside, best)
         groups.append(np.sort(np.array(group)))
     return groups
 
@@ -41,10 +44,9 @@ def without_the_lowest(order: Sequence[int], fits: Fits) -> IntArray:
     return np.sort(np.array(kept))
 
 
-def _share_outside(candidates: ComplexArray, group: ComplexArray) -> FloatArray:
-    """The share of each candidate's power that lies outside the span of a group, (n,)."""
-    basis, _ = np.linalg.qr(group)
-    inside = np.abs(basis.conj().T @ candidates) ** 2
-    whole = np.sum(np.abs(candidates) ** 2, axis=0)
-    share: FloatArray = 1 - inside.sum(axis=0) / whole
-    return share
+def _less(outside: ComplexArray, taken: int) -> ComplexArray:
+    """Parts of all users (M, N) outside the span of a group, once one more belongs to it
+    (a step of modified Gram and Schmidt)."""
+    axis = outside[:, taken] / np.linalg.norm(outside[:, taken])
+    rest: ComplexArray = outside - np.outer(axis, axis.conj() @ outside)
+    return rest

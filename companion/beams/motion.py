@@ -81,7 +81,8 @@ def directions_ahead(
     """Unit directions (T, 3) of a UAV at times after the track's own; None without its velocity.
 
     Track and carrier go on at their velocities, the track with its acceleration, and the carrier
-    turns at its body rates: good for as long as that is so.
+    turns at its body rates: good for as long as that is so. Boresight stands for the direction of
+    what is where the array is.
     """
     velocity, own = track.velocity_ned_mps, carrier.velocity_ned_mps
     if velocity is None or own is None:
@@ -99,5 +100,8 @@ def directions_ahead(
         seen_m = along + (seen_m - along) * np.cos(angle) + np.cross(axis, seen_m) * np.sin(angle)
     seen_m = (seen_m - array.lever_arm_m) @ array.array_from_body.T
     ranges_m = np.linalg.norm(seen_m, axis=1)
-    found: FloatArray = seen_m / np.maximum(ranges_m, 1e-9)[:, np.newaxis]
+    here = (ranges_m < 1e-9)[:, np.newaxis]
+    found: FloatArray = np.where(here, [1.0, 0.0, 0.0], seen_m) / np.where(
+        here, 1.0, ranges_m[:, np.newaxis]
+    )
     return found

@@ -12,12 +12,13 @@ conjugated.) RZF is ZF at x = 0 and tends to MRT as x grows.
 What zero forcing costs user i is known from the inverse alone: its gain falls from |a_i|^2 to
 1 / [(A^T A*)^-1]_ii. Past ``loss_limit_db`` for any user, or past a condition number of A, the
 policy decides: load the matrix by the least x at which no user loses more (the loss of each falls
-with x, see ``_least_loading``), serve groups in turns, or leave out the lowest priorities. A
+with x, see ``_least_loading``), serve groups in turns, or leave out the lowest priorities. All of
+that is judged with the columns of A at one length: what elements radiate there is no closeness. A
 mirror image of a line array, or two UAVs behind one another, is where that happens.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -47,8 +48,8 @@ class Precoder:
 class Precoding:
     """Weights (M, K) for the ``served`` users (K,), how they were made, and what it costs.
 
-    ``groups`` (K,) is each one's turn; ``condition_number`` that of A, the worst of the groups
-    (None without users); ``dropped`` says why a user is not served.
+    ``groups`` (K,) is each one's turn; ``condition_number`` that of A with columns of one length,
+    the worst of the groups (None without users); ``dropped`` says why a user is not served.
     """
 
     weights: ComplexArray
@@ -60,6 +61,12 @@ class Precoding:
     dropped: dict[int, str]
 
 
+LEAST_LOADING: Final = 1e-12
+LEAST_WIDE_LOADING: Final = 1e-6
+"""Of the trace, where RZF itself is the method: with less a singular matrix may stay singular, and
+broadened beams be nothing but the rounding of what is left of them."""
+ROUNDING: Final = 1e-11
+"""Of a beam's response to its own user: what is left of it at the others is taken away beyond."""
 LOADINGS: Final = np.logspace(-6, 6, 49)
 """Where ``_least_loading`` looks, in mean eigenvalues; beyond the last it is MRT to 1e-6."""
 
@@ -93,14 +100,15 @@ def precode(
         order = list(range(users)) if priorities is None else list(priorities)
 
         def fits(some: Sequence[int]) -> bool:
-            return _columns(steering, settings, spread, np.sort(np.array(some))).fit
+            return _fits(steering, settings, spread, np.sort(np.array(some)))
 
         if settings.policy is Policy.GROUP:
             groups = grouping.semi_orthogonal(steering, order, fits)
         else:
             groups = [grouping.without_the_lowest(order, fits)]
-            lost_db = f"{plain.zero_forcing_loss_db:.0f} dB"
-            why = f"too close to one of higher priority: to tell all apart would cost {lost_db}"
+            lost_db = plain.zero_forcing_loss_db
+            cost = f"cost {lost_db:.0f} dB" if np.isfinite(lost_db) else "pass the condition limit"
+            why = f"too close to one of higher priority: to tell all apart would {cost}"
             dropped = dict.fromkeys(set(order).difference(groups[0].tolist()), why)
         made = [_columns(steering, settings, spread, group) for group in groups]
     served = np.sort(np.concatenate(groups))
@@ -135,18 +143,44 @@ def _columns(
     steering: ComplexArray, settings: Precoder, spread: Spread | None, users: IntArray
 ) -> _Columns:
     a = steering if len(users) == steering.shape[1] else steering[:, users]
-    gram = a.T @ a.conj()
-    condition = _condition_number(np.linalg.eigvalsh(gram).astype(np.float64, copy=False))
+    lengths = np.linalg.norm(a, axis=0)
+    even: ComplexArray = a / lengths
+    gram = even.T @ even.conj()
+    condition = _condition_number(gram)
     wide = None if spread is None else spread.of(users)
     match settings.method:
         case Method.MATCHED:
             own = a.conj() if wide is None else wide.beams
             return _Columns(_unit_response(a, own), Method.MATCHED, condition)
         case Method.REGULARISED:
-            found = _loaded(a, gram, wide, settings.regularisation * len(a), settings)
-            return _Columns(found, Method.REGULARISED, condition)
+            gram = a.T @ a.conj()
+            least = LEAST_LOADING if wide is None else LEAST_WIDE_LOADING
+            loading = max(settings.regularisation * len(a), least * float(gram.trace().real))
+            if wide is None:
+                found = a.conj() @ np.linalg.inv(gram + loading * np.eye(len(gram)))
+            else:
+                centred = nulled(wide, loading)
+                keep = power_gains(a, wide.beams) * 10 ** (-settings.loss_limit_db / 10)
+                found = widen_nulls(wide, loading, centred, keep)
+            return _Columns(_unit_response(a, found), Method.REGULARISED, condition)
         case Method.ZERO_FORCING:
-            return _zero_forcing(a, gram, condition, wide, settings)
+            made = _zero_forcing(even, gram, condition, wide, settings)
+            return replace(made, weights=made.weights / lengths)
+
+
+def _fits(
+    steering: ComplexArray, settings: Precoder, spread: Spread | None, users: IntArray
+) -> bool:
+    """Whether ``_columns`` would be fit, without the price of what comes when it is not."""
+    a = steering[:, users]
+    even: ComplexArray = a / np.linalg.norm(a, axis=0)
+    if _condition_number(even.T @ even.conj()) > settings.condition_limit:
+        return False
+    if spread is None:
+        solved = zero_forcing.solve(even)
+        return solved is not None and _db(solved.loss_factors.max()) <= settings.loss_limit_db
+    wide = spread.of(users)
+    return _lost_db(wide, nulled(wide, 0.0)) <= settings.loss_limit_db
 
 
 def _zero_forcing(
@@ -156,7 +190,10 @@ def _zero_forcing(
     wide: Spread | None,
     settings: Precoder,
 ) -> _Columns:
-    """Zero forcing where its cost is within the limits, else the least loading that is."""
+    """Zero forcing where its cost is within the limits, else the least loading that is.
+
+    For columns of unit length.
+    """
     lost_db = np.inf
     if condition <= settings.condition_limit:
         if wide is None:
@@ -165,55 +202,62 @@ def _zero_forcing(
             if solved is not None and lost_db <= settings.loss_limit_db:
                 return _Columns(solved.weights, Method.ZERO_FORCING, condition, True, lost_db)
         else:
-            found, lost_db = _wide_zero_forcing(a, wide, settings)
+            found, lost_db = _wide_zero_forcing(wide, settings)
             if lost_db <= settings.loss_limit_db:
-                return _Columns(
-                    _unit_response(a, found), Method.ZERO_FORCING, condition, True, lost_db
-                )
+                exact = _unit_response(a, _exactly(a, found))
+                return _Columns(exact, Method.ZERO_FORCING, condition, True, lost_db)
     loading = _least_loading(gram, settings)
-    found = _loaded(a, gram, wide, loading, settings, settings.loss_limit_db)
-    return _Columns(found, Method.REGULARISED, condition, False, lost_db)
+    if wide is None:
+        found = a.conj() @ np.linalg.inv(gram + loading * np.eye(len(gram)))
+    else:
+        found = _wide_loaded(wide, loading, settings)
+    return _Columns(_unit_response(a, found), Method.REGULARISED, condition, False, lost_db)
 
 
-def _wide_zero_forcing(
-    a: ComplexArray, wide: Spread, settings: Precoder
-) -> tuple[ComplexArray, float]:
+def _wide_zero_forcing(wide: Spread, settings: Precoder) -> tuple[ComplexArray, float]:
     """Broadened beams that null the others exactly, and what that costs the worst of them, dB."""
-    alone = power_gains(a, wide.beams)
+    alone = power_gains(wide.centres, wide.beams)
     found = nulled(wide, 0.0, SOFT_LOADINGS[0])
-    kept = power_gains(a, found)
+    kept = power_gains(wide.centres, found)
     least = alone * 10 ** (-settings.loss_limit_db / 10)
     if (kept < least).any():
         found = centred = nulled(wide, 0.0)
-        kept = power_gains(a, centred)
+        kept = power_gains(wide.centres, centred)
         if (kept >= least).all():
             found = widen_nulls(wide, 0.0, centred, least, SOFT_LOADINGS[1:])
     return found, _db((alone / kept).max())
 
 
-def _loaded(
-    a: ComplexArray,
-    gram: ComplexArray,
-    wide: Spread | None,
-    loading: float,
-    settings: Precoder,
-    loss_limit_db: float = np.inf,
-) -> ComplexArray:
-    """Regularised columns; broadened ones by more loading where they lose more than the limit."""
-    if wide is None:
-        return _unit_response(a, a.conj() @ np.linalg.inv(gram + loading * np.eye(len(gram))))
-    least = _least_gains(a, wide, settings)
-    most = float(np.diag(gram).real.max()) * LOADINGS[-1]
-    centred = nulled(wide, loading)
-    while loading < most and (power_gains(a, centred) < least).any() and loss_limit_db < np.inf:
+def _wide_loaded(wide: Spread, loading: float, settings: Precoder) -> ComplexArray:
+    """Broadened beams with so much loading, of each one's power, that none loses more than the
+    limit against itself alone; ``loading`` at the least."""
+    power = np.einsum("mn,mn->n", wide.centres, wide.centres.conj()).real
+    least = power_gains(wide.centres, wide.beams) * 10 ** (-settings.loss_limit_db / 10)
+    centred = nulled(wide, loading * power)
+    while loading < LOADINGS[-1] and (power_gains(wide.centres, centred) < least).any():
         loading *= 4.0
-        centred = nulled(wide, loading)
-    return _unit_response(a, widen_nulls(wide, loading, centred, least))
+        centred = nulled(wide, loading * power)
+    return widen_nulls(wide, loading * power, centred, least)
 
 
-def _least_gains(a: ComplexArray, wide: Spread, settings: Precoder) -> FloatArray:
-    """What each broadened beam must keep of the gain that it has alone."""
-    return power_gains(a, wide.beams) * 10 ** (-settings.loss_limit_db / 10)
+def _exactly(a: ComplexArray, found: ComplexArray) -> ComplexArray:
+    """Beams without the rest of rounding that points nulled beside the others may have left."""
+    stray = a.T @ found
+    own = np.abs(stray.diagonal())
+    np.fill_diagonal(stray, 0.0)
+    if (np.abs(stray) <= ROUNDING * own).all():
+        return found
+    solved = zero_forcing.solve(a)
+    if solved is None:
+        return found
+    exact: ComplexArray = found - solved.weights @ stray
+    return exact
+
+
+def _lost_db(wide: Spread, found: ComplexArray) -> float:
+    """What beams cost the worst user against its own broadened beam alone, dB."""
+    alone = power_gains(wide.centres, wide.beams)
+    return _db((alone / power_gains(wide.centres, found)).max())
 
 
 def _unit_response(a: ComplexArray, weights: ComplexArray) -> ComplexArray:
@@ -226,11 +270,12 @@ def _db(power_ratio: float) -> float:
     return 10 * float(np.log10(power_ratio))
 
 
-def _condition_number(eigenvalues: FloatArray) -> float:
-    """cond(A), from the eigenvalues of A^T A*, ascending.
+def _condition_number(gram: ComplexArray) -> float:
+    """cond(A), from the eigenvalues of A^T A*.
 
     Finite always: past about 1e7 rounding hides the smallest eigenvalue and the figure stays there.
     """
+    eigenvalues = np.linalg.eigvalsh(gram)
     least, most = eigenvalues[0], eigenvalues[-1]
     return float(np.sqrt(most / max(least, most * len(eigenvalues) * np.finfo(float).eps)))
 
@@ -241,7 +286,7 @@ def _least_loading(gram: ComplexArray, settings: Precoder) -> float:
     With A^T A* = V diag(l) V^H and w_k = |v_ik|^2 l_k, the gain of user i over that of its own
     beam is (sum w y)^2 / (sum w . sum w y^2), y_k = 1/(l_k + x). Its derivative in x has the sign
     of (sum w y^3)(sum w y) - (sum w y^2)^2, which is never negative (Cauchy and Schwarz): the
-    loss falls with x, to none. So the least x is found by bisection.
+    loss falls with x, to none. So the least x is found on a grid, and then on a finer one.
     """
     values, vectors = np.linalg.eigh(gram)
     values = np.maximum(values, 0.0)
@@ -258,7 +303,6 @@ def _least_loading(gram: ComplexArray, settings: Precoder) -> float:
         worst: FloatArray = (own**2 / (shares.sum(axis=1)[:, np.newaxis] * (shares @ y**2))).min(0)
         return worst
 
-    low, high = 0.0, 0.0
     loadings = scale * LOADINGS
     enough = kept(loadings) >= wanted
     first = int(np.argmax(enough)) if enough.any() else len(loadings) - 1
@@ -275,7 +319,7 @@ def _normalise(weights: ComplexArray, how: Normalisation, turns: IntArray) -> No
     if how is Normalisation.STREAM:
         weights /= np.linalg.norm(weights, axis=0)
         return
-    for turn in range(int(turns.max(initial=-1)) + 1):
+    for turn in range(int(turns.max()) + 1):
         columns = turns == turn
         power = np.abs(weights[:, columns]) ** 2
         if how is Normalisation.TOTAL:

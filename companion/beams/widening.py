@@ -2,9 +2,10 @@
 
 A UAV lies within its pointing bound of where it is predicted. A beam sharper than that misses it,
 so its main lobe is broadened: a quadratic phase over the aperture makes each part of the array
-look in another direction within the bound (the defocused, or spoiled, beam). Nulls are widened by
-nulling points around the predicted direction as well, softly: those that stand in the way of
-serving another UAV count less.
+look in another direction within the bound (the defocused, or spoiled, beam). That is for lines
+seen from the side; elsewhere a part of the array serves alone, so small that within the bound its
+elements are in phase. Nulls are widened by nulling points around the predicted direction as well,
+softly: those that stand in the way of serving another UAV count less.
 
 In terms of the aperture's width D across the line of sight, a bound e is w = e D / wavelength wide
 in natural beams; the natural half-power beam has w = 0.44.
@@ -41,6 +42,11 @@ MOST_POINTS: Final = 96
 """In all, and never more than the array has degrees of freedom to spare: each is a null."""
 SOFT_LOADINGS: Final = (0.01, 0.1, 1.0, 10.0)
 TOO_CLOSE: Final = 0.5
+DEEP: Final = 1 / 3
+"""Depth over width, in phase over the bound, from which a quadratic phase is not the better way."""
+MOST_DEFOCUSED: Final = 0.27
+"""Natural widths for each element (30 degrees at half a wavelength): beyond there are gaps."""
+MOST_CENTRES: Final = 64
 UNUSED: Final = 1e9
 """A loading under which a point has no weight at all."""
 
@@ -95,16 +101,23 @@ def spread(array: Array, directions: FloatArray, bounds_rad: FloatArray) -> Spre
     bounds = np.minimum(bounds_rad, WIDEST_RAD)
     axes, apertures_m = _apertures(array, directions)
     widths = bounds[:, np.newaxis] * apertures_m / array.wavelength_m
-    if not (widths > FEWEST_WIDTHS).any():
+    along = np.einsum("nk,kl,nl->n", directions, array.variance_m2, directions)
+    depths = np.sqrt(12 * np.maximum(along, 0.0)) * (1 - np.cos(bounds)) / array.wavelength_m
+    broadened: BoolArray = np.maximum(widths.max(axis=1), depths) > WIDTHS[0]
+    if not (broadened.any() or (widths > FEWEST_WIDTHS).any()):
         return None
     around = _around(directions, bounds, axes, widths, array.size)
     each = around.shape[1]
     points = steering_matrix(array, around.reshape(-1, 3))
     gram = points.T @ points.conj()
     beams, reached = points[:, ::each].conj(), gram[:, ::each]
-    broadened: BoolArray = widths.max(axis=1) > WIDTHS[0]
     if broadened.any():
-        beams *= np.exp(1j * _defocus_rad(array, axes, apertures_m, widths))
+        in_part = broadened & ~_defocuses(array, widths.max(axis=1), depths)
+        phases_rad = _defocus_rad(array, axes, apertures_m, widths)
+        beams *= np.exp(1j * np.where(in_part, 0.0, phases_rad))
+        if in_part.any():
+            shown = (directions[in_part], bounds[in_part], beams[:, in_part])
+            beams[:, in_part] *= _parts(array, *shown)
         reached = points.T @ beams
     usable = _usable(gram, around, directions, bounds)
     return Spread(beams, broadened, points, usable, gram, reached)
@@ -112,7 +125,7 @@ def spread(array: Array, directions: FloatArray, bounds_rad: FloatArray) -> Spre
 
 def widen_nulls(
     spread: Spread,
-    loading: float,
+    loading: float | FloatArray,
     centred: ComplexArray,
     least_gains: FloatArray,
     softnesses: tuple[float, ...] = SOFT_LOADINGS,
@@ -133,12 +146,13 @@ def widen_nulls(
     return centred
 
 
-def nulled(spread: Spread, loading: float, soft: float | None = None) -> ComplexArray:
+def nulled(spread: Spread, loading: float | FloatArray, soft: float | None = None) -> ComplexArray:
     """The broadened beams (M, N), less what of them reaches the other UAVs.
 
     f_i = g_i - S* (S^T S* + X)^-1 S^T g_i over the directions S of all others than i: X is
-    ``loading`` at the predicted ones (0: nulled exactly), ``soft`` times their power at the points
-    around them (None: these are left out). Linear least squares with weights 1/X.
+    ``loading`` at the predicted ones (0: nulled exactly; or one each, (N,)), ``soft`` times their
+    power at the points around them (None: these are left out). Linear least squares with weights
+    1/X.
 
     One inverse over the points of all serves every user: that of a submatrix follows from it by
     its Schur complement.
@@ -147,7 +161,7 @@ def nulled(spread: Spread, loading: float, soft: float | None = None) -> Complex
     points, gram, reached = spread.points, spread.gram, spread.reached
     if soft is None:
         points, gram, reached, each = points[:, ::each], gram[::each, ::each], reached[::each], 1
-        loads = np.full(users, loading)
+        loads = np.broadcast_to(loading, users)
     else:
         loads = np.where(spread.usable, soft, UNUSED) * gram.diagonal().real
         loads[::each] = loading
@@ -216,6 +230,39 @@ def _defocus_rad(
     along *= along
     phase: FloatArray = along[:, ::2] + along[:, 1::2]
     return phase
+
+
+def _defocuses(array: Array, widths: FloatArray, depths: FloatArray) -> BoolArray:
+    """Where a quadratic phase is the better way (N,): on lines seen from the side.
+
+    Across a plane each axis spoils what the other has, and round a circle the phase is the same
+    everywhere, or its parts cancel in the middle.
+    """
+    dense: BoolArray = widths <= MOST_DEFOCUSED * array.size
+    return dense & (depths <= DEEP * widths) & (array.axis is not None)
+
+
+def _parts(
+    array: Array, directions: FloatArray, bounds_rad: FloatArray, beams: ComplexArray
+) -> BoolArray:
+    """For each user the strongest part (M, N) of the array whose elements stand so near to one of
+    them that, within the bound, no phase turns against its by more than at the ends of a natural
+    half-power beam: nothing cancels."""
+    placed = array.centred_m / array.wavelength_m
+    centres = np.arange(0, array.size, -(-array.size // MOST_CENTRES))
+    apart = np.sum((placed[centres, np.newaxis] - placed) ** 2, axis=2)
+    found = np.empty(beams.shape, dtype=bool)
+    for user, bound_rad in enumerate(bounds_rad.tolist()):
+        power = np.abs(beams[:, user]) ** 2
+        depth = placed @ directions[user]
+        deep = np.abs(depth[centres, np.newaxis] - depth)
+        aside = np.sqrt(np.maximum(apart - deep**2, 0.0))
+        near = aside * math.sin(bound_rad) + deep * (1 - math.cos(bound_rad)) <= WIDTHS[0] / 2
+        powers = near @ power
+        strongest = near[np.argmax(powers)]
+        alone = np.arange(array.size) == np.argmax(power)  # where no centre sees the user
+        found[:, user] = strongest if powers.max() > power.max() else alone
+    return found
 
 
 def _around(

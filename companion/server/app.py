@@ -1,5 +1,6 @@
 """The HTTP API and the dashboard's files, over a running node. Read only."""
 
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -136,15 +137,25 @@ def _beam_routes(app: FastAPI, node: Node) -> None:
 
 
 def _accepted(accept: str) -> str | None:
-    """The form of the first type of an Accept header that weights come in; None without one."""
+    """The form that an Accept header likes best (RFC 9110: by q, the first of those alike); None
+    where it takes none of them."""
     forms = {media_type: form for form, media_type in weight_formats.TYPES.items()}
-    for part in accept.split(","):
-        wanted = part.split(";")[0].strip().lower()
+    parts = [part.lower().replace(" ", "") for part in accept.split(",")]
+    for part in sorted(parts, key=_quality, reverse=True):
+        wanted = part.split(";")[0]
+        if _quality(part) <= 0:
+            break
         if wanted in forms:
             return forms[wanted]
         if wanted in ("*/*", "application/*", ""):
             return "json"
     return None
+
+
+def _quality(part: str) -> float:
+    """The q of one part of an Accept header; 1 where there is none that can be read."""
+    found = re.search(r";q=([01](?:\.\d*)?)(?:;|$)", part)
+    return float(found[1]) if found else 1.0
 
 
 def problem(status: int, title: str, headers: dict[str, str] | None = None) -> JSONResponse:

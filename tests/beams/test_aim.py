@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from companion.beams.aim import aim
 from companion.beams.arrays import Array, listed, uniform_linear
+from companion.beams.coverage import Coverage, Sector
 from companion.beams.elements import Element, Pattern
 from companion.beams.precoding import Precoder
 from companion.values import (
@@ -331,8 +332,66 @@ def test_a_beam_says_that_it_was_widened() -> None:
     tracks = [track("sure", (100, 0, 0), bound_m=0.5), track("vague", (0, 100, 0), bound_m=30.0)]
     sure, vague = pointed(tracks, carrier(turn=Rotation.from_euler("z", 0.7).as_matrix())).beams
     assert (sure.widened, vague.widened) == (False, True)
-    sharp = aim(7, 9, tracks, carrier(), ARRAY, Precoder(widen=False))
+    turned = carrier(turn=Rotation.from_euler("z", 0.7).as_matrix())
+    sharp = aim(7, 9, tracks, turned, ARRAY, Precoder(widen=False))
     assert [beam.widened for beam in sharp.beams] == [False, False]
+
+
+def test_a_uav_that_can_be_anywhere_has_the_widest_beam() -> None:
+    tracks = [track("a", (100, 20, 0), bound_m=0.1), track("b", (100, -60, 0), bound_m=500.0)]
+    near, anywhere = pointed(tracks, carrier()).beams
+    assert (near.widened, anywhere.widened) == (False, True)
+    assert anywhere.pointing_bound_rad is None
+    assert anywhere.loss_db > 8.0
+
+
+def test_what_is_said_of_a_beam_is_of_its_own_uav_when_others_are_dropped() -> None:
+    """The first is left out: bounds, widths and gains are not those of one place before."""
+    tracks = [
+        track("twin", (80, 60, 0), bound_m=3.0),
+        track("kept", (80, 60, 0), bound_m=0.2),
+        track("vague", (80, -20, 0), bound_m=30.0),
+    ]
+    array = uniform_linear(16, 30e9, 0.5, EYE, Element(Pattern.COSINE))
+    how = Precoder(policy=Policy.DROP, priority=("kept", "vague"))
+    found = aim(7, 9, tracks, carrier(), array, how)
+    assert found.uavs == ("kept", "vague")
+    for beam, one in zip(found.beams, tracks[1:], strict=True):
+        (alone,) = aim(7, 9, [one], carrier(), array, Precoder()).beams
+        assert beam.pointing_bound_rad == alone.pointing_bound_rad
+        assert beam.widened is alone.widened
+        assert beam.gain_db - alone.gain_db == pytest.approx(0.0, abs=3.0)
+        assert beam.loss_db >= -1e-9
+    assert [beam.widened for beam in found.beams] == [False, True]
+    cosine = Element(Pattern.COSINE).amplitude(np.array([[0.8, 0.6, 0.0]]))[0]
+    most_db = 10 * math.log10(16 * cosine**2)
+    assert found.beams[0].gain_db + found.beams[0].loss_db == pytest.approx(most_db)
+
+
+def test_what_is_not_covered_is_left_out_in_the_frames_that_its_limits_are_in() -> None:
+    """Array yawed to the right on a carrier that heads east: steering limits turn with the array,
+    what the airframe hides with the carrier."""
+    right = Rotation.from_euler("z", math.pi / 2).as_matrix().T
+    array = uniform_linear(16, 30e9, 0.5, right, Element(Pattern.COSINE))
+    east = carrier(turn=right)
+    hidden = Sector(math.radians(80), math.radians(100), -math.pi / 2, math.pi / 2)
+    tracks = [
+        track("ahead", (-100, 0, 0)),  # south: right of the nose, the array's boresight
+        track("aside", (-60, 80, 0)),
+        track("behind", (100, 0, 0)),
+    ]
+    reasons = {
+        out.uav: out.reason
+        for out in aim(7, 9, tracks, east, array, Precoder(), Coverage(hidden=(hidden,))).left_out
+    }
+    assert reasons.keys() == {"ahead", "behind"}
+    assert reasons["ahead"].startswith("hidden by the airframe")
+    assert reasons["behind"] == "its elements radiate nothing there"
+    limits = Coverage(azimuth_limits_rad=(-0.5, 0.5))
+    found = aim(7, 9, tracks, east, array, Precoder(), limits)
+    assert found.uavs == ("ahead",)
+    assert [out.uav for out in found.left_out] == ["aside", "behind"]
+    assert all("outside the steering limits" in out.reason for out in found.left_out)
 
 
 # --- how fast the angles change -----------------------------------------------------------------
@@ -383,6 +442,25 @@ def test_a_turning_carrier_alone_moves_the_beam_the_other_way() -> None:
     assert other.azimuth_rate_radps == pytest.approx(-0.3)
     assert other.elevation_rate_radps == pytest.approx(0.2)  # the right wing sinks below it
     assert (one.range_rate_mps, other.range_rate_mps) == (0.0, 0.0)
+
+
+def test_an_array_on_a_boom_swings_with_the_turning_carrier() -> None:
+    """10 m ahead of the centre at 0.3 rad/s to the right: 3 m/s sideways, towards what is right."""
+    array = uniform_linear(16, 30e9, 0.5, EYE, lever_arm_m=np.array([10.0, 0.0, 0.0]))
+    at = carrier(velocity=STILL, rates=np.array([0.0, 0.0, 0.3]))
+    (beam,) = pointed([track("a", (10, 50, 0), velocity=STILL)], at, array).beams
+    assert beam.range_rate_mps == pytest.approx(-3.0)
+    assert beam.azimuth_rate_radps == pytest.approx(-0.3)
+    (beam,) = pointed([track("a", (60, 0, 0), velocity=STILL)], at, array).beams
+    assert beam.azimuth_rate_radps == pytest.approx(-0.3 - 3.0 / 50.0)
+
+
+def test_a_hair_off_straight_up_the_azimuth_has_no_rate() -> None:
+    at = carrier(velocity=STILL)
+    up = track("a", (1e-6, 0, -50), velocity=np.array([0.0, 1.0, 0.0]))
+    (beam,) = pointed([up], at).beams
+    assert (beam.azimuth_rate_radps, beam.elevation_rate_radps) == (None, None)
+    assert beam.range_rate_mps == pytest.approx(0.0)
 
 
 def test_a_rate_that_is_not_known_is_none() -> None:

@@ -44,6 +44,20 @@ def test_directions_ahead_are_those_of_positions_ahead(seed: int, accelerates: b
         assert direction == pytest.approx(seen / np.linalg.norm(seen), abs=1e-9)
 
 
+def test_through_the_array_itself_directions_stay_unit_vectors() -> None:
+    """A UAV that flies through it is at no direction for one instant."""
+    array = uniform_linear(4, 30e9, 0.5, np.eye(3))
+    at = Carrier(9, np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3), 0.0, 0.0, None)
+    place, velocity = np.array([0.0, 30.0, 0.0]), np.array([0.0, -10.0, 0.0])
+    track = Track(
+        "a", TrackState.LIVE, 9, 0.1, place, velocity, None, None,
+        2.0, 2.0, 2.0, 0.0, None, None, None, None, 1,
+    )  # fmt: skip
+    found = motion.directions_ahead(track, at, array, np.array([2.0, 3.0, 4.0]))
+    assert found is not None
+    assert found == pytest.approx(np.array([[0, 1, 0], [1, 0, 0], [0, -1, 0]]))
+
+
 def test_without_a_velocity_nothing_is_known_ahead() -> None:
     rng = np.random.default_rng(1)
     array = uniform_linear(4, 30e9, 0.5, np.eye(3))

@@ -15,9 +15,11 @@ from companion.beams.arrays import (
     uniform_linear,
     uniform_rectangular,
 )
+from companion.beams.elements import Element, Pattern
 from companion.beams.precoding import Precoder, gain_db, precode
 from companion.beams.steering import steering_matrix
-from companion.values import ComplexArray, FloatArray, Method
+from companion.beams.widening import power_gains
+from companion.values import ComplexArray, FloatArray, Method, Policy
 
 EYE = np.eye(3)
 LINE = uniform_linear(64, 30e9, 0.5, EYE)
@@ -157,3 +159,211 @@ def test_points_stay_clear_of_other_users() -> None:
             assert abs(np.dot(point, a[:, 1 - owner].conj())) / 64 <= 0.5
             kept += 1
     assert 0 < kept < 2 * (wide.each - 1)
+    # Bounds apart, but hardly told apart by a line of 64: the points between them are left out.
+    close = towards((0, 0), (1.6, 0))
+    a = steering_matrix(LINE, close)
+    wide = widening.spread(LINE, close, np.radians([0.75, 0.75]))
+    assert wide is not None
+    around = np.abs(wide.points.T @ a.conj()).reshape(2, wide.each, 2)[:, 1:] / 64
+    usable = wide.usable.reshape(2, wide.each)[:, 1:]
+    for owner in (0, 1):
+        assert around[owner, usable[owner], 1 - owner].max(initial=0.0) <= 0.5
+    assert usable.any()
+    assert not usable.all()
+
+
+def test_points_fill_the_bound_in_space_and_no_more_than_can_be_spared() -> None:
+    for array, directions, beside in (
+        (RECTANGLE, FOUR, 6),  # (64 - 4) // 4 = 15: one ring
+        (RECTANGLE, FOUR[[0, 3]], 18),
+        (uniform_linear(5, 30e9, 0.5, EYE), FOUR, 0),
+        (RECTANGLE, FOUR[:1], 0),  # nobody to be kept from
+    ):
+        wide = widening.spread(array, directions, np.full(len(directions), 0.2))
+        assert wide is not None
+        assert wide.each == 1 + beside
+        assert wide.centres == pytest.approx(steering_matrix(array, directions))
+
+
+@pytest.mark.parametrize("array", [LINE, RECTANGLE, CIRCLE])
+@pytest.mark.parametrize("loading", [0.0, 3.0])
+@pytest.mark.parametrize("soft", [None, 0.01, 1.0])
+def test_nulls_are_those_of_least_squares_user_by_user(
+    array: Array, loading: float, soft: float | None
+) -> None:
+    """One inverse for all, against a solve for each over what belongs to the others."""
+    a = steering_matrix(array, FOUR)
+    wide = widening.spread(array, FOUR, np.radians([2.0, 9.0, 1.0, 6.0]))
+    assert wide is not None
+    found = widening.nulled(wide, loading, soft)
+    owners = np.repeat(np.arange(4), wide.each)
+    around = np.arange(len(owners)) % wide.each > 0
+    for user in range(4):
+        others = np.arange(4) != user
+        points, loads = a[:, others], np.full(3, loading)
+        if soft is not None:
+            beside = wide.points[:, around & wide.usable & (owners != user)]
+            points = np.concatenate([points, beside], axis=1)
+            loads = np.append(loads, soft * np.sum(np.abs(beside) ** 2, axis=0))
+        gram = points.T @ points.conj() + np.diag(loads)
+        own = wide.beams[:, user]
+        expected = own - points.conj() @ np.linalg.solve(gram, points.T @ own)
+        assert found[:, user] == pytest.approx(expected, abs=1e-7)
+
+
+def test_what_concerns_some_users_is_theirs_in_their_order() -> None:
+    bounds = np.radians([2.0, 9.0, 1.0, 16.0])
+    wide = widening.spread(RECTANGLE, FOUR, bounds)
+    assert wide is not None
+    assert wide.of(np.arange(4)) is wide
+    some = wide.of(np.array([0, 2, 3]))
+    assert some.each == wide.each
+    assert np.array_equal(some.beams, wide.beams[:, [0, 2, 3]])
+    assert some.broadened.tolist() == wide.broadened[[0, 2, 3]].tolist()
+    assert some.gram == pytest.approx(some.points.T @ some.points.conj())
+    assert some.reached == pytest.approx(some.points.T @ some.beams)
+    for place, user in enumerate([0, 2, 3]):
+        mine, theirs = (slice(n * wide.each, (n + 1) * wide.each) for n in (user, place))
+        assert np.array_equal(some.points[:, theirs], wide.points[:, mine])
+        assert np.array_equal(some.usable[theirs], wide.usable[mine])
+
+
+def test_nulls_are_widened_even_where_the_limit_is_passed_without() -> None:
+    """What a user has lost already is no reason against wide nulls."""
+    a = steering_matrix(LINE, FOUR)
+    wide = widening.spread(LINE, FOUR, np.radians([1.0, 1.0, 1.0, 1.0]))
+    assert wide is not None
+    centred = widening.nulled(wide, 0.0)
+    found = widening.widen_nulls(wide, 0.0, centred, 0.999 * power_gains(a, centred))
+    more = widening.widen_nulls(wide, 0.0, 0.5 * found, 1e9 * power_gains(a, found))
+    assert more == pytest.approx(found, abs=1e-9)
+    # Where nothing may be lost against the centred nulls, they stay.
+    kept = widening.widen_nulls(wide, 0.0, centred, 1.001 * power_gains(a, centred))
+    assert (power_gains(a, kept) >= power_gains(a, centred) * (1 - 1e-8)).all()
+
+
+@pytest.mark.parametrize("policy", [Policy.GROUP, Policy.DROP])
+@pytest.mark.parametrize("seed", range(8))
+def test_groups_of_broadened_beams_are_within_the_price(policy: Policy, seed: int) -> None:
+    """Each against its broadened beam alone; all exact."""
+    rng = np.random.default_rng(seed)
+    directions = towards(*((azimuth, 0.0) for azimuth in rng.uniform(-10, 10, 7)))
+    a = steering_matrix(LINE, directions)
+    wide = widening.spread(LINE, directions, rng.uniform(0, 0.12, 7))
+    assert wide is not None
+    found = precode(a, Precoder(policy=policy), wide)
+    assert found.method is Method.ZERO_FORCING
+    assert found.groups.max() > 0 or found.dropped
+    lost_db = gain_db(a, wide.beams)[found.served] - gain_db(a[:, found.served], found.weights)
+    assert lost_db.max() <= 3 + 1e-6
+    for turn in range(found.groups.max() + 1):
+        now = found.groups == turn
+        response = a[:, found.served[now]].T @ found.weights[:, now]
+        assert np.abs(response - np.eye(now.sum())).max() < 1e-9
+
+
+def test_maximum_ratio_takes_the_broadened_beams_as_they_are() -> None:
+    a = steering_matrix(LINE, FOUR)
+    wide = widening.spread(LINE, FOUR, np.full(4, 0.1))
+    assert wide is not None
+    found = precode(a, Precoder(Method.MATCHED), wide).weights
+    ratio = found / wide.beams
+    assert ratio == pytest.approx(np.broadcast_to(ratio[0], ratio.shape))
+
+
+SCATTERED = listed(np.random.default_rng(3).uniform(-0.04, 0.04, (64, 3)), 30e9, EYE)
+SPARSE = uniform_linear(4, 30e9, 3.0, EYE)
+FACING = listed(
+    np.random.default_rng(3).uniform(-0.04, 0.04, (64, 3)),
+    30e9,
+    EYE,
+    Element(Pattern.COSINE, 4.0),
+    None,
+    np.random.default_rng(4).standard_normal((64, 3)),
+)
+EVERY = {
+    "line": LINE, "rectangle": RECTANGLE, "circle": CIRCLE, "scattered": SCATTERED,
+    "sparse": SPARSE, "facing": FACING,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("array", EVERY.values(), ids=EVERY)
+@pytest.mark.parametrize("angles_deg", [(0, 0), (30, 20), (80, 0), (90, 0), (0, 60), (0, 90)])
+def test_a_broadened_beam_has_no_hole_whatever_the_array(
+    array: Array, angles_deg: tuple[float, float]
+) -> None:
+    """From every side, along the line too, and for bounds up to anywhere: not much below one
+    element alone, and never much below the sharp beam."""
+    directions = towards(angles_deg)
+    a = steering_matrix(array, directions)
+    strongest_db = 20 * np.log10(np.abs(a).max())
+    for bound_deg in (1.0, 3.0, 5.0, 8.0, 12.0, 15.0, 20.0, 30.0, 45.0, 60.0):
+        bounds = np.radians([bound_deg])
+        wide = widening.spread(array, directions, bounds)
+        if array is FACING and bound_deg > 30:
+            continue  # one that faces elsewhere sees what the part does not
+        crowd = within(directions[0], bounds[0], count=600)
+        beams = a.conj() if wide is None else wide.beams
+        broad = power_db(array, beams, crowd).min()
+        sharp = power_db(array, a.conj(), crowd).min()
+        if array is not FACING:  # whose elements may not see all of the bound
+            assert broad > -6.0, bound_deg
+        assert broad > sharp - 3.5, bound_deg
+        assert gain_db(a, beams)[0] > strongest_db - 4.0, bound_deg
+
+
+@pytest.mark.parametrize("array", [CIRCLE, RECTANGLE, SCATTERED])
+def test_the_part_that_serves_is_as_large_as_the_bound_lets_it(array: Array) -> None:
+    """The wider the bound, the fewer elements; those that are left keep their phase."""
+    directions = towards((10, 50))
+    a = steering_matrix(array, directions)
+    counts = []
+    for bound_deg in (9.0, 12.0, 18.0, 30.0, 60.0):
+        wide = widening.spread(array, directions, np.radians([bound_deg]))
+        assert wide is not None
+        on = np.abs(wide.beams[:, 0]) > 0
+        assert wide.beams[on, 0] == pytest.approx(a[on, 0].conj())
+        counts.append(int(on.sum()))
+    assert counts == sorted(counts, reverse=True)
+    assert array.size > counts[0] > counts[-1] >= 1
+
+
+def test_only_who_is_not_known_is_served_by_a_part() -> None:
+    a = steering_matrix(CIRCLE, FOUR)
+    wide = widening.spread(CIRCLE, FOUR, np.radians([3.3, 20.0, 3.3, 20.0]))
+    assert wide is not None
+    assert wide.broadened.tolist() == [False, True, False, True]
+    assert wide.beams[:, 0::2] == pytest.approx(a[:, 0::2].conj())
+    assert (np.abs(wide.beams[:, 1::2]) == 0).any(axis=0).all()
+
+
+def test_a_part_is_found_where_few_elements_see_the_user() -> None:
+    """One element of 200 faces it: that one serves."""
+    outward = np.tile([-1.0, 0.0, 0.0], (200, 1))
+    outward[77] = [1.0, 0.0, 0.0]
+    places = np.random.default_rng(1).uniform(-5, 5, (200, 3))
+    array = listed(places, 30e9, EYE, Element(Pattern.COSINE), None, outward)
+    directions = towards((0, 0))
+    wide = widening.spread(array, directions, np.array([0.3]))
+    assert wide is not None
+    assert np.flatnonzero(np.abs(wide.beams[:, 0])).tolist() == [77]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_exact_to_the_last_digits_at_the_widest_limits(seed: int) -> None:
+    """Points nulled beside the others leave no more of the rest than plain zero forcing does."""
+    rng = np.random.default_rng(seed)
+    array = uniform_linear(16, 30e9, 0.1, EYE)
+    angles = np.stack([np.sort(rng.uniform(-70, 70, 5)), np.zeros(5)], axis=1)
+    directions = towards(*map(tuple, angles))
+    a = steering_matrix(array, directions)
+    wide = widening.spread(array, directions, np.full(5, 0.05))
+    found = precode(a, Precoder(loss_limit_db=60.0, condition_limit=1000.0), wide)
+    if found.method is Method.ZERO_FORCING:
+        assert np.abs(a.T @ found.weights - np.eye(5)).max() < 1e-9
+    some = widening.spread(array, directions[[0, 0]], np.full(2, 0.05))
+    for regularisation in (1e-300, 1e-12, 1e-6):
+        how = Precoder(Method.REGULARISED, regularisation=regularisation)
+        twins = precode(a[:, [0, 0]], how, some).weights
+        assert np.all(np.isfinite(twins))
+        assert np.einsum("m,mn->n", a[:, 0], twins) == pytest.approx(np.ones(2), abs=1e-9)

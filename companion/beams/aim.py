@@ -41,7 +41,8 @@ def aim(
 
     Columns of the weights come in the order of ``tracks``.
     """
-    refused = {track.uav: _refusal(track, carrier, array) for track in tracks}
+    place = None if carrier is None else motion.place_ned_m(carrier, array)
+    refused = {track.uav: _refusal(track, place) for track in tracks}
     seen = [track for track in tracks if refused[track.uav] is None]
     beams: tuple[Beam, ...] = ()
     made = None
@@ -102,7 +103,8 @@ def _beams(
     azimuths, elevations = steering.angles_rad(directions)
     served = matrix[:, made.served]
     gains = gain_db(served, made.weights).tolist()
-    alone = gain_db(served, served.conj()).tolist()
+    power = np.einsum("mn,mn->n", served, served.conj()).real
+    alone = (10 * np.log10(power)).tolist()
     rates = motion.rates(tracks, carrier, array, ranges_m, directions)
     beams = tuple(
         Beam(
@@ -150,13 +152,13 @@ def _pointing_bound_rad(track: Track, carrier: Carrier, range_m: float) -> float
     return None if seen is None else min(seen + carrier.attitude_bound_rad, math.pi)
 
 
-def _refusal(track: Track, carrier: Carrier | None, array: Array) -> str | None:
-    """Why a track gets no beam; None if it does."""
-    if carrier is None:
+def _refusal(track: Track, place_ned_m: FloatArray | None) -> str | None:
+    """Why a track gets no beam from an array at a place; None if it does."""
+    if place_ned_m is None:
         return "the carrier is not known"
     if track.state not in AIMABLE:
         return f"its reports are {track.state}"
-    offset_m = track.position_ned_m - motion.place_ned_m(carrier, array)
+    offset_m = track.position_ned_m - place_ned_m
     if offset_m @ offset_m < NEAREST_M**2:
         return f"it is within {NEAREST_M:g} m of the array"
     return None

@@ -14,6 +14,8 @@ from companion.values import Carrier, FloatArray, Track
 
 def place_ned_m(carrier: Carrier, array: Array) -> FloatArray:
     """Where the array itself is, (3,), local frame: the carrier's position and the lever arm."""
+    if not array.lever_arm_m.any():
+        return carrier.position_ned_m
     place: FloatArray = carrier.position_ned_m + carrier.body_from_local.T @ array.lever_arm_m
     return place
 

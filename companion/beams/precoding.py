@@ -217,15 +217,17 @@ def _zero_forcing(
 def _wide_zero_forcing(wide: Spread, settings: Precoder) -> tuple[ComplexArray, float]:
     """Broadened beams that null the others exactly, and what that costs the worst of them, dB."""
     alone = power_gains(wide.centres, wide.beams)
-    found = nulled(wide, 0.0, SOFT_LOADINGS[0])
-    kept = power_gains(wide.centres, found)
     least = alone * 10 ** (-settings.loss_limit_db / 10)
-    if (kept < least).any():
-        found = centred = nulled(wide, 0.0)
-        kept = power_gains(wide.centres, centred)
+    for soft in SOFT_LOADINGS[:2]:
+        found = nulled(wide, 0.0, soft)
+        kept = power_gains(wide.centres, found)
         if (kept >= least).all():
-            found = widen_nulls(wide, 0.0, centred, least, SOFT_LOADINGS[1:])
-    return found, _db((alone / kept).max())
+            return found, _db((alone / kept).max())
+    centred = nulled(wide, 0.0)
+    kept = power_gains(wide.centres, centred)
+    if (kept >= least).all():
+        centred = widen_nulls(wide, 0.0, centred, least, SOFT_LOADINGS[2:])
+    return centred, _db((alone / kept).max())
 
 
 def _wide_loaded(wide: Spread, loading: float, settings: Precoder) -> ComplexArray:

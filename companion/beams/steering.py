@@ -10,12 +10,16 @@ isotropic elements along y this is the published exp(j 2 pi / wavelength d m sin
 """
 
 import math
+from typing import Final
 
 import numpy as np
 
 from companion.beams.arrays import Array
 from companion.beams.elements import Pattern
 from companion.values import ComplexArray, FloatArray
+
+POWERS_PAY: Final = 1000
+"""Entries of a steering matrix from which on powers are cheaper than exponentials."""
 
 
 def angles_rad(directions: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -34,11 +38,42 @@ def unit_directions(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> Float
 
 def steering_matrix(array: Array, directions: FloatArray) -> ComplexArray:
     """A, shape (M, N): one steering vector a column, for unit directions (N, 3)."""
-    phase = array.wavenumber_radpm * (array.elements_m @ directions.T)
-    matrix: ComplexArray = np.exp(1j * phase)
+    if array.grid is None or array.size * len(directions) < POWERS_PAY:
+        matrix: ComplexArray = np.exp(
+            1j * array.wavenumber_radpm * (array.elements_m @ directions.T)
+        )
+    else:
+        matrix = _on_grid(array, directions, *array.grid)
     if array.element.pattern is not Pattern.ISOTROPIC:
         matrix *= amplitudes(array, directions)
     return matrix
+
+
+def _on_grid(array: Array, directions: FloatArray, rows: int, columns: int) -> ComplexArray:
+    """Phase factors (M, N) of elements that stand row by row on a grid from the origin: powers of
+    the factor from one element to the next, which is cheaper than so many exponentials."""
+    across = _powers(array, array.elements_m[1 % columns], directions, columns)
+    if rows == 1:
+        return across
+    down = _powers(array, array.elements_m[columns], directions, rows)
+    found: ComplexArray = (down[:, np.newaxis] * across).reshape(rows * columns, -1)
+    return found
+
+
+def _powers(array: Array, step_m: FloatArray, directions: FloatArray, count: int) -> ComplexArray:
+    """exp(j k step . u) to the powers 0 to ``count`` - 1, (count, N): by doubling, so that rounding
+    does not add up along the line."""
+    found: ComplexArray = np.empty((count, len(directions)), dtype=complex)
+    found[0] = 1.0
+    if count == 1:
+        return found
+    factor = np.exp(1j * array.wavenumber_radpm * (directions @ step_m))
+    done = 1
+    while done < count:
+        found[done : 2 * done] = found[: min(done, count - done)] * factor
+        factor = factor * factor
+        done *= 2
+    return found
 
 
 def amplitudes(array: Array, directions: FloatArray) -> FloatArray:

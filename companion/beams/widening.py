@@ -37,7 +37,7 @@ greatest, among those whose gain stays within 3 dB of its peak there (a search o
 
 NULL_SPACING: Final = 0.7
 FEWEST_WIDTHS: Final = 0.02
-MOST_RINGS: Final = 4
+MOST_RINGS: Final = 3
 MOST_POINTS: Final = 96
 """In all, and never more than the array has degrees of freedom to spare: each is a null."""
 SOFT_LOADINGS: Final = (0.01, 0.1, 1.0, 10.0)

@@ -164,3 +164,19 @@ def test_no_position_within_the_ball_is_farther_off(
 @pytest.mark.parametrize("bound_m", [100.0, 100.1, 1e9])
 def test_inside_the_ball_every_direction_is_possible(bound_m: float) -> None:
     assert steering.pointing_bound_rad(bound_m, 100.0) is None
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns"), [(1, 64), (1, 1024), (8, 8), (64, 1), (5, 33), (1, 1)]
+)
+@pytest.mark.parametrize("users", [1, 7, 300])
+def test_powers_on_a_grid_are_the_exponentials(rows: int, columns: int, users: int) -> None:
+    """However many: few are taken one way and many the other."""
+    array = uniform_rectangular(rows, columns, 30e9, 0.7, np.eye(3))
+    directions = np.random.default_rng(users).standard_normal((users, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, np.newaxis]
+    found = steering.steering_matrix(array, directions)
+    phase = 2 * np.pi / array.wavelength_m * (array.elements_m @ directions.T)
+    assert found.shape == (rows * columns, users)
+    assert np.abs(found - np.exp(1j * phase)).max() < 1e-11
+    assert found.flags.c_contiguous

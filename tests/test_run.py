@@ -124,6 +124,7 @@ def test_weights_point_where_the_beams_say(start_node: Any, tmp_path: Path) -> N
         node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
         status, body = node.get("/v1/beams/weights?lead_ms=100", "application/x-npy")
         weights = np.load(io.BytesIO(body))
+        liked = node.get("/v1/beams/weights", "application/json;q=0.5, application/x-npy;q=0.9")[1]
         as_json = node.json("/v1/beams/weights")
         raw = np.frombuffer(node.get("/v1/beams/weights", "application/octet-stream")[1], "<c8")
         flight.wait()
@@ -133,6 +134,7 @@ def test_weights_point_where_the_beams_say(start_node: Any, tmp_path: Path) -> N
     assert np.array(as_json["re"]).shape == (64, 4) == np.array(as_json["im"]).shape
     assert sorted(as_json["uavs"]) == ["1:1", "2:1", "3:1", "4:1"]
     assert raw.size == 64 * 4
+    assert np.load(io.BytesIO(liked)).shape == (64, 4)
     assert np.all(np.isfinite(weights))
 
 
@@ -212,7 +214,9 @@ def test_without_a_carrier_it_says_so(start_node: Any) -> None:
         ("/v1/nothing", "application/json", 404),
         ("/v1/beams?lead_ms=x", "application/json", 422),
         ("/v1/beams?lead_ms=-1", "application/json", 422),
+        ("/v1/beams?lead_ms=nan", "application/json", 422),
         ("/v1/beams/weights", "image/png", 406),
+        ("/v1/beams/weights", "application/x-npy;q=0", 406),
         ("/v1/beams/weights", "application/vnd.adi.adar1000+csv", 409),
         ("/v1/pattern?cut=sideways", "application/json", 422),
         ("/v1/pattern?points=1", "application/json", 422),

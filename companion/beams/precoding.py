@@ -17,6 +17,7 @@ that is judged with the columns of A at one length: what elements radiate there 
 mirror image of a line array, or two UAVs behind one another, is where that happens.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -107,7 +108,7 @@ def precode(
         else:
             groups = [grouping.without_the_lowest(order, fits)]
             lost_db = plain.zero_forcing_loss_db
-            cost = f"cost {lost_db:.0f} dB" if np.isfinite(lost_db) else "pass the condition limit"
+            cost = f"cost {lost_db:.0f} dB" if np.isfinite(lost_db) else "pass the limits"
             why = f"too close to one of higher priority: to tell all apart would {cost}"
             dropped = dict.fromkeys(set(order).difference(groups[0].tolist()), why)
         made = [_columns(steering, settings, spread, group) for group in groups]
@@ -180,7 +181,8 @@ def _fits(
         solved = zero_forcing.solve(even)
         return solved is not None and _db(solved.loss_factors.max()) <= settings.loss_limit_db
     wide = spread.of(users)
-    return _lost_db(wide, nulled(wide, 0.0)) <= settings.loss_limit_db
+    kept = power_gains(wide.centres, nulled(wide, 0.0))
+    return _lost_db(power_gains(wide.centres, wide.beams), kept) <= settings.loss_limit_db
 
 
 def _zero_forcing(
@@ -222,12 +224,12 @@ def _wide_zero_forcing(wide: Spread, settings: Precoder) -> tuple[ComplexArray, 
         found = nulled(wide, 0.0, soft)
         kept = power_gains(wide.centres, found)
         if (kept >= least).all():
-            return found, _db((alone / kept).max())
+            return found, _lost_db(alone, kept)
     centred = nulled(wide, 0.0)
     kept = power_gains(wide.centres, centred)
     if (kept >= least).all():
         centred = widen_nulls(wide, 0.0, centred, least, SOFT_LOADINGS[2:])
-    return centred, _db((alone / kept).max())
+    return centred, _lost_db(alone, kept)
 
 
 def _wide_loaded(wide: Spread, loading: float, settings: Precoder) -> ComplexArray:
@@ -235,10 +237,21 @@ def _wide_loaded(wide: Spread, loading: float, settings: Precoder) -> ComplexArr
     limit against itself alone; ``loading`` at the least."""
     power = np.einsum("mn,mn->n", wide.centres, wide.centres.conj()).real
     least = power_gains(wide.centres, wide.beams) * 10 ** (-settings.loss_limit_db / 10)
-    centred = nulled(wide, loading * power)
-    while loading < LOADINGS[-1] and (power_gains(wide.centres, centred) < least).any():
-        loading *= 4.0
+
+    def keeps(centred: ComplexArray) -> bool:
+        return bool((power_gains(wide.centres, centred) >= least).all())
+
+    centred, too_little = nulled(wide, loading * power), loading
+    while loading < LOADINGS[-1] and not keeps(centred):
+        too_little, loading = loading, 8.0 * loading
         centred = nulled(wide, loading * power)
+    for _ in range(3 if loading > too_little else 0):
+        between = math.sqrt(too_little * loading)
+        tried = nulled(wide, between * power)
+        if keeps(tried):
+            loading, centred = between, tried
+        else:
+            too_little = between
     return widen_nulls(wide, loading * power, centred, least)
 
 
@@ -256,10 +269,10 @@ def _exactly(a: ComplexArray, found: ComplexArray) -> ComplexArray:
     return exact
 
 
-def _lost_db(wide: Spread, found: ComplexArray) -> float:
-    """What beams cost the worst user against its own broadened beam alone, dB."""
-    alone = power_gains(wide.centres, wide.beams)
-    return _db((alone / power_gains(wide.centres, found)).max())
+def _lost_db(alone: FloatArray, kept: FloatArray) -> float:
+    """What the worst user loses of the gain that its beam has alone, dB; inf where all of it."""
+    worst = float((kept / alone).min())
+    return -_db(worst) if worst > 0 else np.inf
 
 
 def _unit_response(a: ComplexArray, weights: ComplexArray) -> ComplexArray:

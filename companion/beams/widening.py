@@ -192,10 +192,11 @@ def _inverse(positive: ComplexArray) -> ComplexArray:
 
 
 def power_gains(steering: ComplexArray, weights: ComplexArray) -> FloatArray:
-    """Array gain of each column towards its own direction, |a^T f|^2 / |f|^2, (N,)."""
+    """Array gain of each column towards its own direction, |a^T f|^2 / |f|^2, (N,); 0 where nothing
+    is left of one."""
     towards = np.einsum("mn,mn->n", steering, weights)
     power = np.einsum("mn,mn->n", weights, weights.conj()).real
-    gains: FloatArray = (towards.real**2 + towards.imag**2) / power
+    gains: FloatArray = (towards.real**2 + towards.imag**2) / np.maximum(power, 1e-300)
     return gains
 
 

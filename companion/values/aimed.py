@@ -78,7 +78,8 @@ class BeamSet:
 
     With A the (M, N) steering matrix of the predicted directions, zero forcing has AᵀF = I among
     the UAVs of a group (diagonal, under another normalisation): nulls on the others.
-    ``condition_number`` is that of A in the 2-norm, the worst of the groups (None without beams).
+    ``condition_number`` is that of A in the 2-norm, its columns at one length, the worst of the
+    groups (None without beams).
     ``t_ns`` is when the update was made, ``valid_at_ns`` when the beams are applied.
     """
 

@@ -339,7 +339,7 @@ def test_however_little_is_loaded_weights_are_finite(
 def test_who_cannot_be_told_apart_at_all_is_not_said_to_cost_inf_db() -> None:
     found = precode(matrix([0.3, 0.3]), Precoder(policy=Policy.DROP))
     assert found.dropped == {
-        1: "too close to one of higher priority: to tell all apart would pass the condition limit"
+        1: "too close to one of higher priority: to tell all apart would pass the limits"
     }
 
 

@@ -367,3 +367,49 @@ def test_exact_to_the_last_digits_at_the_widest_limits(seed: int) -> None:
         twins = precode(a[:, [0, 0]], how, some).weights
         assert np.all(np.isfinite(twins))
         assert np.einsum("m,mn->n", a[:, 0], twins) == pytest.approx(np.ones(2), abs=1e-9)
+
+
+def test_where_wide_nulls_cost_too_much_the_exact_ones_stay() -> None:
+    """The softest points at once would cost 6 dB, the predicted directions alone 2."""
+    rng = np.random.default_rng(27)
+    directions = towards(*((azimuth, 0.0) for azimuth in rng.uniform(-60, 60, 4)))
+    a = steering_matrix(LINE, directions)
+    wide = widening.spread(LINE, directions, np.radians(rng.uniform(0.5, 3, 4)))
+    assert wide is not None
+    alone = gain_db(a, wide.beams)
+    assert (alone - gain_db(a, widening.nulled(wide, 0.0, 0.01))).max() > 6
+    found = precode(a, Precoder(), wide)
+    assert found.method is Method.ZERO_FORCING
+    assert (alone - gain_db(a, found.weights)).max() <= 3.0 + 1e-6
+
+
+@pytest.mark.parametrize("seed", [192, 797, 1008, 1244])
+def test_no_more_is_loaded_than_broadened_beams_need(seed: int) -> None:
+    """Some of the limit is used where it must be passed without loading."""
+    rng = np.random.default_rng(seed)
+    directions = towards(*((azimuth, 0.0) for azimuth in rng.uniform(-8, 8, 4)))
+    a = steering_matrix(LINE, directions)
+    wide = widening.spread(LINE, directions, np.radians(rng.uniform(0, 3, 4)))
+    assert wide is not None
+    found = precode(a, Precoder(), wide)
+    assert found.method is Method.REGULARISED
+    assert 0.5 < (gain_db(a, wide.beams) - gain_db(a, found.weights)).max() <= 3.0 + 1e-6
+
+
+@pytest.mark.parametrize("policy", Policy)
+def test_finite_where_one_element_is_all_that_two_users_have(policy: Policy) -> None:
+    """The one sees no other element; all of what the other is served by would be nulled."""
+    outward = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    places = np.array([[0.0, 0.02, 0.0], [0.0, -0.02, 0.0]])
+    array = listed(places, 30e9, EYE, Element(Pattern.COSINE), None, outward)
+    directions = towards((90.0, 0.0), (50.0, 0.0))
+    a = steering_matrix(array, directions)
+    wide = widening.spread(array, directions, np.full(2, np.inf))
+    assert wide is not None
+    assert np.flatnonzero(wide.beams[:, 1]).tolist() == [0]
+    assert power_gains(a, np.zeros_like(a)).tolist() == [0.0, 0.0]
+    found = precode(a, Precoder(policy=policy), wide)
+    assert np.all(np.isfinite(found.weights))
+    assert len(found.served) == (1 if policy is Policy.DROP else 2)
+    lost_db = gain_db(a, wide.beams)[found.served] - gain_db(a[:, found.served], found.weights)
+    assert lost_db.max() <= 3 + 1e-6

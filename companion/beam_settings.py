@@ -88,6 +88,9 @@ class ArraySettings(Section):
 class BeamSettings(Section):
     """When weights are made, for when, for whom, how, and what is done when that costs too much.
 
+    ``update_hz`` is how often weights are made unasked, for recordings and for the page. Whoever
+    asks gets weights made for that moment and the lead asked for, however seldom that is.
+
     ``method`` is zero forcing, regularised (by ``regularisation`` times the number of elements) or
     maximum ratio. Where zero forcing would cost any UAV more than ``loss_limit_db`` against a beam
     for it alone, or the condition number passes ``condition_limit``, the ``policy`` decides:
@@ -98,7 +101,7 @@ class BeamSettings(Section):
     Up to ``condition_limit`` = 1000 zero forcing holds to 1e-9: its error grows with the square.
     """
 
-    update_hz: Annotated[float, Field(gt=0, le=1000)] = 20.0
+    update_hz: Annotated[float, Field(gt=0, le=1000)] = 10.0
     actuation_delay_s: Annotated[float, Field(ge=0, le=10)] = 0.01
     targets: Literal["telemetry", "all"] = "telemetry"
     method: Method = Method.ZERO_FORCING

@@ -154,8 +154,8 @@ def test_looks_are_at_the_last_tick(short: Path, hz: float) -> None:
     seen = list(updates(short, Pipeline(settings), hz))
     assert [update.t_ns for _, update in seen] == expected
     late_s = [t_s - (update.t_ns - begins_ns) * 1e-9 for t_s, update in seen]
-    assert -1e-9 <= min(late_s) <= max(late_s) < 0.05
-    assert len(seen) == pytest.approx(8 * min(hz, 20), abs=2)
+    assert -1e-9 <= min(late_s) <= max(late_s) < 1 / settings.beams.update_hz
+    assert len(seen) == pytest.approx(8 * min(hz, settings.beams.update_hz), abs=2)
 
 
 def test_sharp_beams_are_those_of_a_pipeline_that_does_not_widen(

@@ -248,8 +248,7 @@ class SenderClock:
         """The median gap, now and then: as stamps come, so that who asks when changes nothing."""
         state = (self._line.envelope.fits, self._line.envelope.count // 16)
         if self._median_gap[0] != state:
-            gaps = (y - self._line.envelope.at(x) for x, y in self._line.envelope.samples())
-            self._median_gap = (state, median_low(gaps))
+            self._median_gap = (state, median_low(self._line.envelope.gaps_ns()))
 
     def _envelope_error_ns(self) -> float:
         """See ``ClockEstimate.uncertainty_s``; the first few frames may all have been slow."""

@@ -125,9 +125,15 @@ class Envelope:
         if renewed or y_ns < self.at(x_ns):
             self._fit()
 
-    def samples(self) -> list[Point]:
-        """A selection of the window's points, at most 16 from each of its pieces."""
-        return [point for piece in self._pieces for point in piece.samples]
+    def gaps_ns(self) -> list[int]:
+        """How far a selection of the window's points, at most 16 from each of its pieces, lies
+        above the line."""
+        (x0_ns, y0_ns), drift, floor = self._pivot, self.drift, math.floor
+        return [
+            y_ns - y0_ns - floor(drift * (x_ns - x0_ns))
+            for piece in self._pieces
+            for x_ns, y_ns in piece.samples
+        ]
 
     def points(self) -> list[Point]:
         """The points of the window that some line under all of them may touch, by x."""

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.linalg.lapack import zpotrf, zpotri
 
 from companion.beams.arrays import Array
 from companion.beams.steering import steering_matrix
@@ -149,13 +148,11 @@ def widen_nulls(
 def nulled(spread: Spread, loading: float | FloatArray, soft: float | None = None) -> ComplexArray:
     """The broadened beams (M, N), less what of them reaches the other UAVs.
 
-    f_i = g_i - S* (S^T S* + X)^-1 S^T g_i over the directions S of all others than i: X is
-    ``loading`` at the predicted ones (0: nulled exactly; or one each, (N,)), ``soft`` times their
-    power at the points around them (None: these are left out). Linear least squares with weights
-    1/X.
-
-    One inverse over the points of all serves every user: that of a submatrix follows from it by
-    its Schur complement.
+    f_i = g_i - S* (S^T S* + X)^-1 r_i over the directions S of all, where r_i is what g_i radiates
+    to the others, and 0 to its own: there the beam is to stay as it is. X is ``loading`` at the
+    predicted directions (0: exact; or one each, (N,)), ``soft`` times their power at the points
+    around them (None: these are left out). Linear least squares with weights 1/X. Sharp beams
+    without points around come out as ZF and RZF, but for their lengths.
     """
     users, each = spread.beams.shape[1], spread.each
     points, gram, reached = spread.points, spread.gram, spread.reached
@@ -167,28 +164,12 @@ def nulled(spread: Spread, loading: float | FloatArray, soft: float | None = Non
         loads[::each] = loading
     loaded = gram.copy()
     loaded.flat[:: len(loaded) + 1] += loads
-    inverse = _inverse(loaded)
     by_user = np.arange(users)
     others = reached.reshape(users, each, users).copy()
     others[by_user, :, by_user] = 0.0
-    found = inverse @ others.reshape(-1, users)
-    blocks = inverse.reshape(users, each, users, each)
-    own = blocks[by_user, :, by_user]
-    wrong = found.reshape(users, each, users)[by_user, :, by_user]
-    held = np.linalg.solve(own, wrong[:, :, np.newaxis])[:, :, 0]
-    found -= np.einsum("pnk,nk->pn", inverse.reshape(-1, users, each), held)
+    found = np.linalg.solve(loaded, others.reshape(-1, users))
     weights: ComplexArray = spread.beams - points.conj() @ found
     return weights
-
-
-def _inverse(positive: ComplexArray) -> ComplexArray:
-    """Of a Hermitian matrix by Cholesky; where rounding makes it indefinite, by LU."""
-    factor, info = zpotrf(positive.T, overwrite_a=1)
-    if info:
-        return np.linalg.inv(positive).astype(np.complex128, copy=False)
-    upper, _ = zpotri(factor, overwrite_c=1)
-    found: ComplexArray = upper.T + np.triu(upper, 1).conj()
-    return found
 
 
 def power_gains(steering: ComplexArray, weights: ComplexArray) -> FloatArray:

@@ -492,8 +492,8 @@ def test_the_peak_of_a_matched_beam_is_found_from_anywhere_on_its_hill(seed: int
     start = np.array([math.sqrt(1 - right**2 - down**2), right, down])
     found = patterns.lobe(array, matched(array, at), start)
     peak = towards(math.degrees(found.peak_azimuth_rad), math.degrees(found.peak_elevation_rad))
-    assert peak == pytest.approx(at, abs=1e-4)  # a lobe is 0.25 wide, and flat at its top
-    assert found.peak_db == pytest.approx(10 * math.log10(64), abs=1e-9)
+    assert peak == pytest.approx(at, abs=3e-4)  # a lobe is 0.25 wide, and flat at its top
+    assert found.peak_db == pytest.approx(10 * math.log10(64), abs=1e-6)
 
 
 def test_from_the_bottom_of_a_null_it_climbs_out() -> None:

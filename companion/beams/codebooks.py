@@ -219,7 +219,7 @@ def sampling_step_s(codebook: Codebook, array: Array, rate_radps: float) -> floa
     A beam is taken to be as wide as wavelength / extent, or less where there are more beams than
     elements.
     """
-    centred = array.elements_m - array.elements_m.mean(axis=0)
+    centred = array.centred_m
     extent_m = 2 * float(np.sqrt(np.einsum("mk,mk->m", centred, centred).max()))
     if rate_radps == 0 or extent_m == 0:
         return None

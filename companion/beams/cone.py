@@ -141,7 +141,7 @@ def cones_around(
 ) -> Cones:
     """Cones within ``bounds_rad`` (N,) of unit directions (N, 3), for the responses of weights that
     are at most ``magnitudes`` (M, N)."""
-    centred = array.elements_m - array.elements_m.mean(axis=0)
+    centred = array.centred_m
     far = centred[np.argmax(np.einsum("mk,mk->m", centred, centred))]
     extent_m = float(np.sqrt(far @ far))
     along = far / max(extent_m, 1e-300)

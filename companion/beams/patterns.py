@@ -211,7 +211,7 @@ class _Cut:
         Between elements 2 r apart in the plane of the circle the phase turns by at most 2 k r a
         radian, and no fringe of the pattern is finer.
         """
-        centred = self.array.elements_m - self.array.elements_m.mean(axis=0)
+        centred = self.array.centred_m
         radius_m = np.hypot(centred @ self.circle.ahead, centred @ self.circle.aside).max()
         fringes = 2 * self.array.wavenumber_radpm * float(radius_m)
         return max(LEAST_POINTS, math.ceil(POINTS_PER_SIDE_LOBE * fringes))
@@ -259,7 +259,7 @@ def _summit(array: Array, weights: ComplexArray, direction: FloatArray) -> Float
     They lie along the axes of the array as seen from there, which are mostly those of the hill:
     on a ridge (a line of elements has its peak on a cone) it goes straight up.
     """
-    centred = array.elements_m - array.elements_m.mean(axis=0)
+    centred = array.centred_m
     aperture_m = 2 * float(np.linalg.norm(centred, axis=1).max())
     widest = 0.05 if aperture_m == 0 else min(0.05, array.wavelength_m / aperture_m / 16)
     scatter = centred.T @ centred / max(aperture_m**2, 1e-300)

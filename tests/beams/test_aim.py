@@ -472,3 +472,18 @@ def test_a_rate_that_is_not_known_is_none() -> None:
     (beam,) = pointed([track("a", (0, 0, 50), velocity=velocity)], carrier(velocity=STILL)).beams
     assert (beam.azimuth_rate_radps, beam.elevation_rate_radps) == (None, None)
     assert beam.range_rate_mps == pytest.approx(7.0)
+
+
+def test_behind_the_field_of_view_there_is_no_beam_and_no_null() -> None:
+    """Who is in view gets the beam that it would have alone: nothing is spent on the other."""
+    view = Coverage(field_of_view_rad=math.radians(120))
+    ahead = track("ahead", (80, 60, 0))
+    tracks = [ahead, track("aside", (10, 99, 0)), track("behind", (-80, 60, 0))]
+    found = aim(7, 9, tracks, carrier(), ARRAY, Precoder(), view)
+    alone = aim(7, 9, [ahead], carrier(), ARRAY, Precoder(), view)
+    assert found.uavs == ("ahead",)
+    assert np.array_equal(found.weights, alone.weights)
+    assert {out.uav: out.reason for out in found.left_out} == {
+        "aside": "84.2 degrees off boresight, outside the field of view of 120",
+        "behind": "143.1 degrees off boresight, outside the field of view of 120",
+    }

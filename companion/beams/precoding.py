@@ -172,7 +172,8 @@ def _columns(
 def _fits(
     steering: ComplexArray, settings: Precoder, spread: Spread | None, users: IntArray
 ) -> bool:
-    """Whether ``_columns`` would be fit, without the price of what comes when it is not."""
+    """Whether zero forcing of the predicted directions alone is within the limits: as ``_columns``
+    judges, but without the price of wide nulls and of what comes when it is not."""
     a = steering[:, users]
     even: ComplexArray = a / np.linalg.norm(a, axis=0)
     if _condition_number(even.T @ even.conj()) > settings.condition_limit:

@@ -35,17 +35,22 @@ CURVATURES_RAD: Final = np.array(
 greatest, among those whose gain stays within 3 dB of its peak there (a search over 0 to 60 rad)."""
 
 NULL_SPACING: Final = 0.7
+"""Natural widths between points that are nulled: nulls further apart do not join up."""
 FEWEST_WIDTHS: Final = 0.02
+"""A bound of fewer natural widths than this changes nothing."""
 MOST_RINGS: Final = 3
 MOST_POINTS: Final = 96
 """In all, and never more than the array has degrees of freedom to spare: each is a null."""
 SOFT_LOADINGS: Final = (0.01, 0.1, 1.0, 10.0)
+"""What is tried for the points, of their power: the deepest nulls first."""
 TOO_CLOSE: Final = 0.5
+"""Likeness (amplitude) to another UAV's steering vector from which a point is not nulled."""
 DEEP: Final = 1 / 3
 """Depth over width, in phase over the bound, from which a quadratic phase is not the better way."""
 MOST_DEFOCUSED: Final = 0.27
 """Natural widths for each element (30 degrees at half a wavelength): beyond there are gaps."""
 MOST_CENTRES: Final = 64
+"""Elements that are tried as the middle of the part that serves."""
 UNUSED: Final = 1e9
 """A loading under which a point has no weight at all."""
 

@@ -14,7 +14,8 @@ import uvicorn
 import companion
 from companion import assembly
 from companion.config import Settings
-from companion.mavlink.links import Link, LinkStatus, parse_link
+from companion.mavlink.links import Link, LinkStatus
+from companion.mavlink.urls import parse_link
 from companion.pipeline import Pipeline
 from companion.recording.background import BackgroundRecorder
 from companion.recording.reader import LogError

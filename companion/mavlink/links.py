@@ -9,14 +9,14 @@ damage another's frames.
 
 import asyncio
 import contextlib
-import ipaddress
 import socket
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import Final
 
 from companion.mavlink.framing import Splitter
+from companion.mavlink.urls import LinkError, LinkUrl
 from companion.values import Frame, Rejection
 
 RECEIVE_BUFFER_BYTES: Final = 4 << 20
@@ -25,42 +25,7 @@ PEERS_MAX: Final = 4096
 """Splitters kept for the peers heard last: a scan of the port must not fill the memory."""
 RETRY_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
 
-Scheme = Literal["udpin", "tcp"]
 Receive = Callable[[list[Frame | Rejection]], None]
-
-
-class LinkError(ValueError):
-    """A link that cannot be opened; the message is one line for the user."""
-
-
-@dataclass(frozen=True, slots=True)
-class LinkUrl:
-    """A parsed link address; ``str`` gives it as the user wrote it."""
-
-    scheme: Scheme
-    host: str
-    port: int
-
-    def __str__(self) -> str:
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"{self.scheme}:{host}:{self.port}"
-
-
-def parse_link(text: str) -> LinkUrl:
-    """Read ``udpin:HOST:PORT`` or ``tcp:HOST:PORT``; ``LinkError`` otherwise."""
-    scheme, _, address = text.partition(":")
-    host, _, port = address.rpartition(":")
-    if scheme not in ("udpin", "tcp") or not host or not port.isdecimal() or int(port) > 65535:
-        raise LinkError(f"{text!r} is not udpin:HOST:PORT or tcp:HOST:PORT")
-    if host.startswith("[") and host.endswith("]"):
-        host = host[1:-1]
-    if not _may_be_a_host(host):
-        raise LinkError(f"{text!r}: {host!r} cannot be the name of a host")
-    if ":" in host and not address.startswith("["):
-        raise LinkError(f"{text!r}: an IPv6 host stands in brackets, as in udpin:[::]:14550")
-    if scheme == "tcp" and int(port) == 0:
-        raise LinkError(f"{text!r}: nobody listens on port 0")
-    return LinkUrl("udpin" if scheme == "udpin" else "tcp", host, int(port))
 
 
 @dataclass(slots=True)
@@ -174,7 +139,7 @@ class _Datagrams(asyncio.DatagramProtocol):
 
 def _bound_udp(url: LinkUrl) -> socket.socket:
     try:
-        family = socket.AF_INET6 if _is_ipv6(url.host) else socket.AF_INET
+        family = socket.AF_INET6 if url.is_ipv6 else socket.AF_INET
         bound = socket.socket(family, socket.SOCK_DGRAM)
     except OSError as error:
         raise LinkError(f"{url}: {error.strerror}") from error
@@ -186,17 +151,3 @@ def _bound_udp(url: LinkUrl) -> socket.socket:
         bound.close()
         raise LinkError(f"{url}: {error.strerror}") from error
     return bound
-
-
-def _may_be_a_host(host: str) -> bool:
-    try:
-        return host != "" and host.isascii() and len(host.encode("idna")) > 0
-    except UnicodeError:  # a label that is empty, or too long
-        return False
-
-
-def _is_ipv6(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).version == 6
-    except ValueError:
-        return False

@@ -75,6 +75,11 @@ class Reason(StrEnum):
     NO_POSITION = "no-position"  # ADSB_VEHICLE whose flags do not vouch for its coordinates
     NO_ALTITUDE = "no-altitude"  # a position in the plane only
     UNPLACED_STAMP = "unplaced-stamp"  # off the sender's clock, and not enough others yet to agree
+    NOT_ALLOWED = "not-allowed"  # a sender that the lists of the settings keep out
+    UNSIGNED = "unsigned"  # without a signature, over a link that requires them
+    BAD_SIGNATURE = "bad-signature"  # signed with another key, or altered
+    REPLAYED = "replayed"  # well signed, but not newer than what was heard before
+    SOCKET_OVERFLOW = "socket-overflow"  # lost before it was read: the system's buffer was full
     DUPLICATE = "duplicate"  # the same report again, over this link or another
     OUT_OF_ORDER = "out-of-order"  # later than the window for late reports
 

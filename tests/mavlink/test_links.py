@@ -10,7 +10,8 @@ import pytest
 from pymavlink.dialects.v20 import all as dialect
 
 from companion.mavlink import links
-from companion.mavlink.links import PEERS_MAX, Link, LinkError, parse_link
+from companion.mavlink.links import PEERS_MAX, Link
+from companion.mavlink.urls import LinkError, parse_link
 from companion.values import Frame, Reason, Rejection
 
 LIMIT_S = 20.0

@@ -39,6 +39,7 @@ from companion.values import (
     Rejection,
     Report,
     ReportNoise,
+    RoundTrip,
     Severity,
     Source,
     SystemTime,
@@ -137,6 +138,9 @@ class Pipeline:
                 outputs = self._tick(event)
             case Rejection():
                 outputs = [event]
+            case RoundTrip():
+                self._clock(event.source).timesync(event.sent_ns, event.t_ns, event.remote_ns)
+                outputs = []
         for output in outputs:
             if isinstance(output, Rejection):
                 self.rejected[output.reason] += output.count

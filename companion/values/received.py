@@ -96,9 +96,21 @@ class Rejection:
     detail: str = ""
 
 
-Event = Frame | Tick | Rejection
+@dataclass(frozen=True, slots=True)
+class RoundTrip:
+    """A TIMESYNC request of ours and its answer, received at ``t_ns``: the sender's clock since
+    boot was ``remote_ns`` some time between ``sent_ns`` and ``t_ns`` of the node's."""
+
+    t_ns: int
+    source: Source
+    sent_ns: int
+    remote_ns: int
+
+
+Event = Frame | Tick | Rejection | RoundTrip
 """Everything that drives the pipeline, in order of time. A rejection made while framing is an
-event as well: the bytes are gone, but that they came is part of what happened."""
+event as well: the bytes are gone, but that they came is part of what happened. So is a round trip,
+for only the service knows which requests were its own."""
 
 
 class AltitudeDatum(StrEnum):

@@ -147,7 +147,7 @@ def _columns(
     lengths = np.linalg.norm(a, axis=0)
     even: ComplexArray = a / lengths
     gram = even.T @ even.conj()
-    condition = _condition_number(gram)
+    condition = _condition_number(even, gram)
     wide = None if spread is None else spread.of(users)
     match settings.method:
         case Method.MATCHED:
@@ -158,7 +158,7 @@ def _columns(
             least = LEAST_LOADING if wide is None else LEAST_WIDE_LOADING
             loading = max(settings.regularisation * len(a), least * float(gram.trace().real))
             if wide is None:
-                found = a.conj() @ np.linalg.inv(gram + loading * np.eye(len(gram)))
+                found = _loaded(a, gram, loading)
             else:
                 centred = nulled(wide, loading)
                 keep = power_gains(a, wide.beams) * 10 ** (-settings.loss_limit_db / 10)
@@ -176,7 +176,7 @@ def _fits(
     judges, but without the price of wide nulls and of what comes when it is not."""
     a = steering[:, users]
     even: ComplexArray = a / np.linalg.norm(a, axis=0)
-    if _condition_number(even.T @ even.conj()) > settings.condition_limit:
+    if _condition_number(even, even.T @ even.conj()) > settings.condition_limit:
         return False
     if spread is None:
         solved = zero_forcing.solve(even)
@@ -209,9 +209,9 @@ def _zero_forcing(
             if lost_db <= settings.loss_limit_db:
                 exact = _unit_response(a, _exactly(a, found))
                 return _Columns(exact, Method.ZERO_FORCING, condition, True, lost_db)
-    loading = _least_loading(gram, settings)
+    loading = _least_loading(a, gram, settings)
     if wide is None:
-        found = a.conj() @ np.linalg.inv(gram + loading * np.eye(len(gram)))
+        found = _loaded(a, gram, loading)
     else:
         found = _wide_loaded(wide, loading, settings)
     return _Columns(_unit_response(a, found), Method.REGULARISED, condition, False, lost_db)
@@ -286,17 +286,44 @@ def _db(power_ratio: float) -> float:
     return 10 * float(np.log10(power_ratio))
 
 
-def _condition_number(gram: ComplexArray) -> float:
+def _loaded(a: ComplexArray, gram: ComplexArray, loading: float) -> ComplexArray:
+    """A* (A^T A* + x I)^-1, by the smaller of the two matrices that can be inverted for it."""
+    if len(gram) <= len(a):
+        found: ComplexArray = a.conj() @ np.linalg.inv(gram + loading * np.eye(len(gram)))
+        return found
+    outer = a.conj() @ a.T
+    return np.linalg.solve(outer + loading * np.eye(len(a)), a.conj())
+
+
+def _condition_number(a: ComplexArray, gram: ComplexArray) -> float:
     """cond(A), from the eigenvalues of A^T A*.
 
     Finite always: past about 1e7 rounding hides the smallest eigenvalue and the figure stays there.
+    With more users than elements the smallest is 0, and the figure is that of rounding alone.
     """
+    rounding = len(gram) * float(np.finfo(float).eps)
+    if len(gram) > len(a):
+        return rounding**-0.5
     eigenvalues = np.linalg.eigvalsh(gram)
     least, most = eigenvalues[0], eigenvalues[-1]
-    return float(np.sqrt(most / max(least, most * len(eigenvalues) * np.finfo(float).eps)))
+    return float(np.sqrt(most / max(least, most * rounding)))
 
 
-def _least_loading(gram: ComplexArray, settings: Precoder) -> float:
+def _spectrum(a: ComplexArray, gram: ComplexArray) -> tuple[FloatArray, FloatArray]:
+    """Eigenvalues l of A^T A*, ascending, and what each has of each user's column, |v_ik|^2 l_k.
+
+    By the smaller of A^T A* and A* A^T, whose eigenvalues are the same but for zeros, which have
+    no part in any column: v_k sqrt(l_k) = A^T u_k.
+    """
+    if len(gram) <= len(a):
+        values, vectors = np.linalg.eigh(gram)
+        values = np.maximum(values, 0.0)
+        return values, np.abs(vectors) ** 2 * values
+    values, vectors = np.linalg.eigh(a.conj() @ a.T)
+    return np.maximum(values, 0.0), np.abs(a.T @ vectors) ** 2
+
+
+def _least_loading(a: ComplexArray, gram: ComplexArray, settings: Precoder) -> float:
     """The least x at which no user loses more than the limit and the condition is in its limit.
 
     With A^T A* = V diag(l) V^H and w_k = |v_ik|^2 l_k, the gain of user i over that of its own
@@ -304,13 +331,12 @@ def _least_loading(gram: ComplexArray, settings: Precoder) -> float:
     of (sum w y^3)(sum w y) - (sum w y^2)^2, which is never negative (Cauchy and Schwarz): the
     loss falls with x, to none. So the least x is found on a grid, and then on a finer one.
     """
-    values, vectors = np.linalg.eigh(gram)
-    values = np.maximum(values, 0.0)
-    scale = values.mean()
-    shares = np.abs(vectors) ** 2 * values
+    values, shares = _spectrum(a, gram)
+    scale = float(values.sum()) / len(gram)
     wanted = 10 ** (-settings.loss_limit_db / 10)
     square = settings.condition_limit**2
-    least = max((values[-1] - square * values[0]) / (square - 1), 1e-12 * scale)
+    smallest = values[0] if len(gram) <= len(a) else 0.0
+    least = max((values[-1] - square * smallest) / (square - 1), 1e-12 * scale)
 
     def kept(loadings: FloatArray) -> FloatArray:
         """The worst user's share of its own beam's gain, for each loading."""

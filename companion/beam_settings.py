@@ -4,26 +4,19 @@ from typing import Annotated, Literal, Self
 
 from pydantic import (
     AfterValidator,
-    BaseModel,
-    ConfigDict,
     Field,
     FiniteFloat,
     PositiveFloat,
     model_validator,
 )
 
+from companion.section import Section
 from companion.values import Method, Normalisation, Policy
 
 Metres = Annotated[float, Field(ge=-1e4, le=1e4)]
 Position = tuple[Metres, Metres, Metres]
 Interval = tuple[FiniteFloat, FiniteFloat]
 HiddenSector = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
-
-
-class Section(BaseModel):
-    """A part of the settings: frozen, and no key that is not known."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 def _rising(interval: Interval) -> Interval:

@@ -21,7 +21,6 @@ from pydantic import (
     FiniteFloat,
     PositiveFloat,
     ValidationError,
-    model_validator,
 )
 
 from companion.beam_settings import (
@@ -30,8 +29,14 @@ from companion.beam_settings import (
     CodebookSettings,
     HardwareSettings,
     RadioSettings,
-    Section,
 )
+from companion.link_settings import (
+    LinkSettings,
+    PresenceSettings,
+    SigningSettings,
+    TrackSettings,
+)
+from companion.section import Section
 from companion.tracking.kinematic import KinematicDesign
 from companion.values import ComplexArray, FloatArray, Source
 
@@ -111,12 +116,6 @@ class CenterSettings(Section):
     attitude_bound_deg: Annotated[float, Field(ge=0, le=180)] = 2.0
 
 
-class LinkSettings(Section):
-    """Where MAVLink comes from."""
-
-    urls: tuple[str, ...] = ()
-
-
 class ClockSettings(Section):
     """How senders' boot clocks are put on the node's timeline.
 
@@ -158,28 +157,6 @@ class ObserverSettings(Section):
     accuracy_factor: PositiveFloat = 3.0
 
 
-class TrackSettings(Section):
-    """Ages of the newest report at which a track passes to the next state, seconds.
-
-    ``window_s``: how late a report may come and still be used as if in order. A track is begun
-    again from reports that were refused once ``reacquire_reports`` of them agree over
-    ``reacquire_s``.
-    """
-
-    coasting_s: PositiveFloat = 2.0
-    stale_s: PositiveFloat = 15.0
-    lost_s: PositiveFloat = 60.0
-    window_s: PositiveFloat = 5.0
-    reacquire_reports: Annotated[int, Field(ge=2, le=60)] = 3
-    reacquire_s: Annotated[float, Field(ge=0, le=60)] = 3.0
-
-    @model_validator(mode="after")
-    def _in_order(self) -> Self:
-        if not self.coasting_s <= self.stale_s <= self.lost_s:
-            raise ValueError("coasting_s <= stale_s <= lost_s: a track passes its states in order")
-        return self
-
-
 class RecordingSettings(Section):
     """Where recordings go (None: nowhere) and how often weights are written."""
 
@@ -198,6 +175,8 @@ class Settings(Section):
 
     center: CenterSettings = CenterSettings()
     links: LinkSettings = LinkSettings()
+    presence: PresenceSettings = PresenceSettings()
+    signing: SigningSettings = SigningSettings()
     clocks: ClockSettings = ClockSettings()
     observer: ObserverSettings = ObserverSettings()
     tracks: TrackSettings = TrackSettings()
@@ -337,7 +316,10 @@ def kinematic_design(settings: Settings) -> KinematicDesign:
 
 
 def _toml(value: object) -> str:
-    """A string, number, boolean or flat list: as in JSON, but for what TOML wants escaped."""
+    """A string, number, boolean, flat list or table: as in JSON, but for what TOML wants else."""
+    if isinstance(value, dict):
+        pairs = (f"{_toml(key)} = {_toml(found)}" for key, found in value.items())
+        return "{" + ", ".join(pairs) + "}"
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 

@@ -44,6 +44,14 @@ WRONG = [
     ("center", "source", "5", "5", "string"),
     ("links", "urls", '"udpin:0.0.0.0:1"', "udpin", "tuple"),
     ("links", "urls", "[7]", "7", "string"),
+    ("links", "urls", '["udpin:x"]', "udpin:x", "udpin:HOST:PORT"),
+    ("presence", "enabled", '"always"', "always", "boolean"),
+    ("presence", "system_id", "255", "255", "less than or equal to 254"),
+    ("presence", "position_hz", "0", "0", "greater than 0"),
+    ("signing", "keys", '{"radio" = "key"}', "radio", "serial:DEVICE:BAUD"),
+    ("signing", "allow_unsigned", '["tcp:a:1"]', "tcp:a:1", "has no key"),
+    ("tracks", "allow", '["one"]', "one", "SYSID:COMPID or icao:HEX"),
+    ("tracks", "deny", '["icao:4ca7b3"]', "icao:4ca7b3", "SYSID:COMPID or icao:HEX"),
     ("clocks", "constant_delay_s", "-0.1", "-0.1", "greater than or equal to 0"),
     ("clocks", "constant_delay_s", "11", "11", "less than or equal to 10"),
     ("observer", "model", '"kinematics"', "kinematics", "'kinematic' or 'position'"),
@@ -186,12 +194,15 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
 # --- to TOML and back ---------------------------------------------------------------------------
 
 POSITIVE = st.floats(0, exclude_min=True, allow_nan=False, allow_infinity=False)
+LINKS = ["udpin:[::]:14550", "tcp:ground.example:5760", 'serial:/dev/"tty" = 1:57600']
 SCALAR = st.characters(exclude_categories=["Cs"])
 
 
 @given(
     directory=st.none() | st.text(SCALAR, max_size=20),
-    urls=st.lists(st.text(SCALAR, max_size=20), max_size=3),
+    urls=st.lists(st.sampled_from(LINKS), max_size=3),
+    keys=st.dictionaries(st.sampled_from(LINKS), st.text(SCALAR, max_size=20)),
+    deny=st.lists(st.sampled_from(["3:1", "*:190", "icao:4C*"]), max_size=2),
     alpha=st.just("auto") | st.floats(0, 1, exclude_min=True, exclude_max=True),
     speed=POSITIVE,
     weights_hz=st.just("all") | POSITIVE,
@@ -205,6 +216,8 @@ SCALAR = st.characters(exclude_categories=["Cs"])
 def test_settings_survive_being_written(
     directory: str | None,
     urls: list[str],
+    keys: dict[str, str],
+    deny: list[str],
     alpha: float | str,
     speed: float,
     weights_hz: float | str,
@@ -219,6 +232,8 @@ def test_settings_survive_being_written(
         {
             "center": {"source": source, "attitude_bound_deg": attitude_bound_deg},
             "links": {"urls": urls},
+            "signing": {"keys": keys, "allow_unsigned": sorted(keys)[:1]},
+            "tracks": {"deny": deny},
             "observer": {
                 "alpha": alpha,
                 "speed_max_mps": speed,

@@ -210,10 +210,7 @@ def _zero_forcing(
                 exact = _unit_response(a, _exactly(a, found))
                 return _Columns(exact, Method.ZERO_FORCING, condition, True, lost_db)
     loading = _least_loading(a, gram, settings)
-    if wide is None:
-        found = _loaded(a, gram, loading)
-    else:
-        found = _wide_loaded(wide, loading, settings)
+    found = _loaded(a, gram, loading) if wide is None else _wide_loaded(wide, loading, settings)
     return _Columns(_unit_response(a, found), Method.REGULARISED, condition, False, lost_db)
 
 
@@ -292,7 +289,8 @@ def _loaded(a: ComplexArray, gram: ComplexArray, loading: float) -> ComplexArray
         found: ComplexArray = a.conj() @ np.linalg.inv(gram + loading * np.eye(len(gram)))
         return found
     outer = a.conj() @ a.T
-    return np.linalg.solve(outer + loading * np.eye(len(a)), a.conj())
+    few: ComplexArray = np.linalg.inv(outer + loading * np.eye(len(a))) @ a.conj()
+    return few
 
 
 def _condition_number(a: ComplexArray, gram: ComplexArray) -> float:
@@ -303,7 +301,7 @@ def _condition_number(a: ComplexArray, gram: ComplexArray) -> float:
     """
     rounding = len(gram) * float(np.finfo(float).eps)
     if len(gram) > len(a):
-        return rounding**-0.5
+        return 1.0 / math.sqrt(rounding)
     eigenvalues = np.linalg.eigvalsh(gram)
     least, most = eigenvalues[0], eigenvalues[-1]
     return float(np.sqrt(most / max(least, most * rounding)))

@@ -14,6 +14,7 @@ from companion.values import (
     Notice,
     Reason,
     Rejection,
+    RoundTrip,
     Severity,
     Source,
     Track,
@@ -150,6 +151,17 @@ def rejection(value: Rejection, *, is_event: bool) -> Any:
     )
 
 
+def round_trip(value: RoundTrip) -> Any:
+    """A TIMESYNC request of the service and its answer."""
+    return schemas.RoundTripMessage(
+        t_ns=value.t_ns,
+        sysid=value.source.sysid,
+        compid=value.source.compid,
+        sent_ns=value.sent_ns,
+        remote_ns=value.remote_ns,
+    )
+
+
 # --- and back -----------------------------------------------------------------------------------
 
 
@@ -161,6 +173,13 @@ def to_frame(data: bytes, sources: dict[tuple[int, int], Source]) -> Frame:
     if source is None:
         source = sources.setdefault(ids, Source(*ids))
     return Frame(message.t_ns, message.link, source, message.msgid, message.raw)
+
+
+def to_round_trip(data: bytes) -> RoundTrip:
+    """``DecodeError`` on nonsense."""
+    message = schemas.RoundTripMessage.FromString(data)
+    source = Source(message.sysid, message.compid)
+    return RoundTrip(message.t_ns, source, message.sent_ns, message.remote_ns)
 
 
 def to_rejection(data: bytes) -> Rejection | None:

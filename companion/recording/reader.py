@@ -19,7 +19,12 @@ from companion.values import Event, Reason, Rejection, Source, Tick
 
 LogKind = Literal["tlog", "mavlink", "mcap"]
 _EVENT_TOPICS: Final = frozenset(
-    (schemas.FRAMES_TOPIC, schemas.TICKS_TOPIC, schemas.REJECTIONS_TOPIC)
+    (
+        schemas.FRAMES_TOPIC,
+        schemas.TICKS_TOPIC,
+        schemas.REJECTIONS_TOPIC,
+        schemas.ROUND_TRIPS_TOPIC,
+    )
 )
 
 
@@ -126,4 +131,6 @@ def _event(topic: str, data: bytes, sources: dict[tuple[int, int], Source]) -> E
         return messages.to_frame(data, sources)
     if topic == schemas.TICKS_TOPIC:
         return Tick(schemas.TickMessage.FromString(data).t_ns)
+    if topic == schemas.ROUND_TRIPS_TOPIC:
+        return messages.to_round_trip(data)
     return messages.to_rejection(data)

@@ -33,6 +33,8 @@ _MESSAGES: Final[dict[str, list[str]]] = {
     "Tick": ["fixed64 t_ns"],
     "Rejection": ["fixed64 t_ns", "string source", "string reason", "uint64 count",
                   "optional uint32 msgid", "string detail", "bool is_event"],
+    "RoundTrip": ["fixed64 t_ns", "uint32 sysid", "uint32 compid", "fixed64 sent_ns",
+                  "sfixed64 remote_ns"],
     "Track": ["string uav", "string state", "fixed64 valid_at_ns", "double age_s",
               "repeated double position_ned_m", "repeated double velocity_ned_mps",
               "repeated double unknown_input_mps", "double bound_m", "optional double dt_s",
@@ -52,10 +54,11 @@ _MESSAGES: Final[dict[str, list[str]]] = {
 """``Track``: a vector is empty where it is unknown, else north, east, down. ``Weights``:
 ``weights_complex64`` is (elements, len(uavs)), row-major, interleaved little-endian float32 real
 and imaginary parts. ``Rejection.is_event``: made while framing, so it drove the pipeline; the
-others the pipeline made itself."""
+others the pipeline made itself. ``RoundTrip``: a TIMESYNC request of the service, answered."""
 
 _TYPES: Final = {
     "fixed64": FieldDescriptorProto.TYPE_FIXED64,
+    "sfixed64": FieldDescriptorProto.TYPE_SFIXED64,
     "uint64": FieldDescriptorProto.TYPE_UINT64,
     "uint32": FieldDescriptorProto.TYPE_UINT32,
     "double": FieldDescriptorProto.TYPE_DOUBLE,
@@ -104,6 +107,7 @@ def _message(name: str) -> Any:
 FrameMessage: Final = _message("Frame")
 TickMessage: Final = _message("Tick")
 RejectionMessage: Final = _message("Rejection")
+RoundTripMessage: Final = _message("RoundTrip")
 TrackMessage: Final = _message("Track")
 WeightsMessage: Final = _message("Weights")
 LocationFixMessage: Final[Any] = LocationFix
@@ -137,6 +141,7 @@ def _with_dependencies(message: Any) -> Schema:
 FRAME: Final = _with_dependencies(FrameMessage)
 TICK: Final = _with_dependencies(TickMessage)
 REJECTION: Final = _with_dependencies(RejectionMessage)
+ROUND_TRIP: Final = _with_dependencies(RoundTripMessage)
 TRACK: Final = _with_dependencies(TrackMessage)
 WEIGHTS: Final = _with_dependencies(WeightsMessage)
 LOCATION_FIX: Final = _with_dependencies(LocationFixMessage)
@@ -145,6 +150,7 @@ LOG: Final = _with_dependencies(LogMessage)
 FRAMES_TOPIC: Final = "/mavlink/frames"
 TICKS_TOPIC: Final = "/ticks"
 REJECTIONS_TOPIC: Final = "/rejections"
+ROUND_TRIPS_TOPIC: Final = "/timesync"
 TRACKS_TOPIC: Final = "/tracks"
 WEIGHTS_TOPIC: Final = "/beams/weights"
 LOG_TOPIC: Final = "/log"

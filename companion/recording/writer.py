@@ -31,6 +31,7 @@ from companion.values import (
     Notice,
     Output,
     Rejection,
+    RoundTrip,
     Tick,
     Track,
     Update,
@@ -112,6 +113,9 @@ class Writer:
                 self._add(self._ticks, event.t_ns, schemas.encode_tick(event.t_ns))
             case Rejection():
                 self._add_rejection(event, is_event=True)
+            case RoundTrip():
+                channel = self._channel(schemas.ROUND_TRIPS_TOPIC, schemas.ROUND_TRIP)
+                self._add(channel, event.t_ns, messages.round_trip(event).SerializeToString())
 
     def output(self, output: Output, geodetic: Geodetic) -> None:
         """Record what came of an event. A rejection that is that very event is not written twice.

@@ -25,6 +25,7 @@ from companion.values import (
     Rejection,
     Report,
     ReportNoise,
+    RoundTrip,
     Severity,
     Source,
     Tick,
@@ -75,7 +76,7 @@ def geodetic() -> Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArra
 
 @pytest.fixture(scope="session")
 def events(wire: Callable[..., list[bytes]]) -> Callable[[int], list[Event]]:
-    """``events(n)``: frames, ticks and framing rejections, times equal and stepping back."""
+    """``events(n)``: frames, ticks, framing rejections, round trips; times step back."""
 
     def make(count: int) -> list[Event]:
         made: list[Event] = []
@@ -88,6 +89,9 @@ def events(wire: Callable[..., list[bytes]]) -> Callable[[int], list[Event]]:
                 made.append(Tick(t_ns))
             if number % 17 == 0:
                 made.append(Rejection(t_ns, link, Reason.GARBAGE, 3 + number))
+            if number % 23 == 0:
+                remote_ns = (-1) ** number * 1_000_000 * number
+                made.append(RoundTrip(t_ns, Source(1, 1), t_ns - 40_000_000, remote_ns))
         return made
 
     return make

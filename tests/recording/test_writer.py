@@ -123,6 +123,7 @@ def test_every_channel_can_be_decoded_from_the_file_alone(tmp_path: Path, record
         "/mavlink/frames": "companion.Frame",
         "/ticks": "companion.Tick",
         "/rejections": "companion.Rejection",
+        "/timesync": "companion.RoundTrip",
         "/uav/1:1/fix": "foxglove.LocationFix",
         "/uav/1:1/predicted": "foxglove.LocationFix",
         "/uav/icao:4CA7B3/predicted": "foxglove.LocationFix",

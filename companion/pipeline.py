@@ -4,10 +4,8 @@ Pure and synchronous. Time comes with the events; the same events give the same 
 same digest, whoever feeds them.
 """
 
-import hashlib
-import struct
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Final
 
 import numpy as np
@@ -15,9 +13,11 @@ import numpy as np
 from companion import assembly
 from companion.beams.aim import AIMABLE, aim
 from companion.config import Center, FixedCenter, Settings, VehicleCenter, parse_center
+from companion.digest import Digest
+from companion.mavlink.admission import Admission
 from companion.mavlink.clocks import ClockEstimate, SenderClock, Stamp
 from companion.mavlink.decode import DECODED, decode
-from companion.mavlink.dedupe import Dedupe
+from companion.mavlink.dedupe import Dedupe, LinkShare
 from companion.tracking import carrier, noise
 from companion.tracking.fleet import SenderTime
 from companion.tracking.geodesy import LocalFrame
@@ -55,44 +55,6 @@ RECENT: Final = 8
 """Rejections of each sender that are kept to be shown."""
 
 
-def with_ticks(events: Iterable[Event], update_hz: float) -> Iterator[Event]:
-    """Events of a log that has no ticks, with those that a timer would have made among them."""
-    period_ns = round(1e9 / update_hz)
-    due_ns: int | None = None
-    for event in events:
-        if due_ns is None:
-            due_ns = event.t_ns + period_ns
-        while due_ns <= event.t_ns:
-            yield Tick(due_ns)
-            due_ns += period_ns
-        yield event
-
-
-class Digest:
-    """SHA-256 over every estimate and every set of weights, in order."""
-
-    def __init__(self) -> None:
-        self._hash = hashlib.sha256()
-
-    def add(self, output: Estimate | Update) -> None:
-        """Take in one output; little-endian doubles and integers, names in UTF-8."""
-        if isinstance(output, Estimate):
-            self._estimate(output.fix.uav, output.fix.t_ns, output.position_ned_m, output.bound_m)
-            return
-        for track in output.tracks:
-            self._estimate(track.uav, track.valid_at_ns, track.position_ned_m, track.bound_m)
-        self._hash.update("\0".join(output.beams.uavs).encode())
-        self._hash.update(output.beams.weights.astype("<c16", copy=False).tobytes())
-
-    def _estimate(self, uav: str, t_ns: int, position_ned_m: FloatArray, bound_m: float) -> None:
-        self._hash.update(uav.encode())
-        self._hash.update(struct.pack("<q4d", t_ns, *position_ned_m, bound_m))
-
-    def hexdigest(self) -> str:
-        """The digest so far."""
-        return self._hash.hexdigest()
-
-
 class Pipeline:
     """State of the program. ``step`` takes events in order; the rest only looks.
 
@@ -120,6 +82,7 @@ class Pipeline:
         self._attitude: tuple[int, Attitude] | None = None
         self._clocks: dict[str, SenderClock] = {}  # by SYSID:COMPID
         self._dedupe = Dedupe()
+        self._admission = Admission(settings.tracks.allow, settings.tracks.deny)
         self._fleet = assembly.fleet(settings, self._sender_time)
         self._targets: list[str] = []  # in the order in which they were first heard
         self._identities = Identities()
@@ -163,6 +126,8 @@ class Pipeline:
             case Report():
                 if self._dedupe.is_repeat(frame):
                     return [Rejection(frame.t_ns, message.uav, Reason.DUPLICATE)]
+                if message.uav != self._carrier_id and not self._admission.admits(message.uav):
+                    return [Rejection(frame.t_ns, message.uav, Reason.NOT_ALLOWED)]
                 return self._report(message)
             case Attitude() if str(message.source) == self._carrier_id:
                 return self._carrier_attitude(message)
@@ -185,6 +150,7 @@ class Pipeline:
             if stamp is None:
                 return [*outputs, Rejection(report.t_ns, report.uav, Reason.UNPLACED_STAMP)]
             t_ns, sender_ns = report.t_ns - round(stamp.latency_s * 1e9), stamp.sender_ns
+            self._dedupe.took(stamp.latency_s)
         if report.alt_m is None:
             outputs.append(Rejection(report.t_ns, report.uav, Reason.NO_ALTITUDE))
             return outputs
@@ -326,6 +292,10 @@ class Pipeline:
                 if offset @ offset < NEAR_M**2:
                     near.append(uav)
         return self._tracks(near, relayed.t_ns, relayed.t_ns)
+
+    def link_share(self, link: str) -> LinkShare:
+        """What a link has brought of the reports so far."""
+        return self._dedupe.shares.get(link) or LinkShare()
 
     def same_as(self, uav: str) -> str | None:
         """The telemetry track that a relayed aircraft is; None if it is itself."""

@@ -12,9 +12,10 @@ import numpy as np
 
 import companion
 from companion.config import Settings, load
-from companion.pipeline import Pipeline, with_ticks
+from companion.pipeline import Pipeline
 from companion.recording.reader import log_kind, read_log, read_settings
 from companion.recording.writer import Writer
+from companion.ticks import with_ticks
 from companion.values import Estimate, Event, Tick, Update
 
 FLUSH_EVERY_S: Final = 1.0

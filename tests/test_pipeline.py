@@ -12,7 +12,8 @@ from pymavlink.dialects.v20 import all as dialect
 from scipy.spatial.transform import Rotation
 
 from companion.config import FixedCenter, Settings
-from companion.pipeline import Pipeline, with_ticks
+from companion.pipeline import Pipeline
+from companion.ticks import with_ticks
 from companion.values import (
     Estimate,
     Event,

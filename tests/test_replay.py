@@ -13,8 +13,9 @@ from support import BIN, shared_log
 
 from companion.beams.steering import steering_matrix
 from companion.config import Settings
-from companion.pipeline import Pipeline, with_ticks
+from companion.pipeline import Pipeline
 from companion.recording.reader import read_log
+from companion.ticks import with_ticks
 from companion.values import Update
 
 

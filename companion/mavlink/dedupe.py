@@ -1,4 +1,4 @@
-"""The same report over several links, or twice over one, counts once.
+"""The same report over several links, or twice over one, counts once; which was first is known.
 
 A report is known by its content: sender, message and payload. The sequence number is no part of
 it, since every link has its own. GLOBAL_POSITION_INT carries a boot time, so equal content is the
@@ -7,32 +7,69 @@ the window has heard nothing new.
 """
 
 from collections import deque
+from dataclasses import dataclass, field
 from typing import Final
 
 from companion.values import Frame
 
 WINDOW_NS: Final = 30_000_000_000
 """Longer than any link has been seen to lag behind another."""
+LATENCIES_KEPT: Final = 256
+
+
+@dataclass(slots=True)
+class LinkShare:
+    """What a link has brought of the reports: ``first`` those that it brought before any other
+    link, ``repeats`` those that were there already. ``latencies_s`` are the newest, repeats
+    included: how old a report was when it came over this link."""
+
+    first: int = 0
+    repeats: int = 0
+    latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=LATENCIES_KEPT))
+
+
+@dataclass(slots=True)
+class _First:
+    """A report as it came for the first time; its latency is None until it is known."""
+
+    t_ns: int
+    link: str
+    latency_s: float | None = None
 
 
 class Dedupe:
-    """Remembers the reports of the last ``WINDOW_NS``, by content."""
+    """Remembers the reports of the last ``WINDOW_NS``, by content, and counts them by link."""
 
     def __init__(self) -> None:
-        self._seen: dict[bytes, int] = {}
-        self._order: deque[tuple[int, bytes]] = deque()
+        self.shares: dict[str, LinkShare] = {}
+        self._seen: dict[bytes, _First] = {}
+        self._order: deque[tuple[bytes, _First]] = deque()
 
     def is_repeat(self, frame: Frame) -> bool:
         """True if the same content came before, within the window."""
-        while self._order and self._order[0][0] < frame.t_ns - WINDOW_NS:
+        while self._order and self._order[0][1].t_ns < frame.t_ns - WINDOW_NS:
             self._forget(*self._order.popleft())
+        share = self.shares.get(frame.link)
+        if share is None:
+            share = self.shares.setdefault(frame.link, LinkShare())
         key = bytes(frame.source) + frame.msgid.to_bytes(3, "little") + frame.payload.rstrip(b"\0")
-        repeat = key in self._seen
-        if not repeat:
-            self._seen[key] = frame.t_ns
-            self._order.append((frame.t_ns, key))
-        return repeat
+        first = self._seen.get(key)
+        if first is None:
+            first = self._seen[key] = _First(frame.t_ns, frame.link)
+            self._order.append((key, first))
+            share.first += 1
+            return False
+        share.repeats += 1
+        if first.latency_s is not None:
+            share.latencies_s.append(first.latency_s + (frame.t_ns - first.t_ns) * 1e-9)
+        return True
 
-    def _forget(self, t_ns: int, key: bytes) -> None:
-        if self._seen.get(key) == t_ns:
+    def took(self, latency_s: float) -> None:
+        """The report that was new last was so old when it came."""
+        _, first = self._order[-1]
+        first.latency_s = latency_s
+        self.shares[first.link].latencies_s.append(latency_s)
+
+    def _forget(self, key: bytes, first: _First) -> None:
+        if self._seen.get(key) is first:
             del self._seen[key]

@@ -122,3 +122,26 @@ def test_memory_is_that_of_one_window() -> None:
         tracemalloc.stop()
     assert sizes[0] > per_window * 30  # it does remember the window
     assert sizes[1] < 1.2 * sizes[0]
+
+
+def test_which_link_was_first_and_how_late_each_is() -> None:
+    """Link b brings all that a brings 40 ms later, and every tenth that a lost."""
+    dedupe = Dedupe()
+    for n in range(100):
+        t_ns = EPOCH_NS + n * S // 10
+        for link, late_ns in (("a", 0), ("b", S // 25)):
+            if link == "a" and n % 10 == 0:
+                continue
+            if not dedupe.is_repeat(sent(t_ns + late_ns, link, boot_ms=n * 100)):
+                dedupe.took(0.1 + late_ns / S)
+    a, b = dedupe.shares["a"], dedupe.shares["b"]
+    assert (a.first, a.repeats, b.first, b.repeats) == (90, 0, 10, 90)
+    assert list(a.latencies_s) == pytest.approx([0.1] * 90)
+    assert list(b.latencies_s) == pytest.approx([0.14] * 100)
+
+
+def test_a_latency_that_is_not_known_is_not_made_up() -> None:
+    dedupe = Dedupe()
+    assert not dedupe.is_repeat(relayed(EPOCH_NS))
+    assert dedupe.is_repeat(relayed(EPOCH_NS + S))
+    assert not dedupe.shares["a"].latencies_s

@@ -1,6 +1,7 @@
 """Starts and stops the live service from the command line.                              [shell]"""
 
 import asyncio
+import gc
 import signal
 import socket
 import webbrowser
@@ -36,8 +37,17 @@ def run(
         service = Service(settings, lambda text: click.echo(text, err=True))
         host, port = http.getsockname()[:2]
         page = f"http://{f'[{host}]' if ':' in host else host}:{port}"
+        _tame_collector()
         with asyncio.Runner(loop_factory=_loop_factory()) as runner:
             runner.run(_serve(service, http, token, traffic, seconds, page, open_page))
+
+
+def _tame_collector() -> None:
+    """Full collections look through everything that was ever loaded, for a tenth of a second:
+    what is there now is left out of them, and they become rare."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 100)
 
 
 def _loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:

@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import all as dialect
 from scipy.spatial.transform import Rotation
 
 from companion.config import FixedCenter, Settings
+from companion.mavlink.clocks import ClockKind
 from companion.pipeline import Pipeline
 from companion.ticks import with_ticks
 from companion.values import (
@@ -22,6 +23,7 @@ from companion.values import (
     Output,
     Reason,
     Rejection,
+    RoundTrip,
     Severity,
     Source,
     Tick,
@@ -633,3 +635,60 @@ def test_own_telemetry_and_adsb_of_one_aircraft_get_one_beam() -> None:
     assert pipeline.same_as("icao:4CA7B3") == "1:1"
     assert pipeline.same_as("1:1") is None
     assert not pipeline.is_target("icao:4CA7B3")
+
+
+# --- links, lists and round trips ---------------------------------------------------------------
+
+
+def test_who_is_denied_is_not_tracked_and_that_is_counted() -> None:
+    lists = {"allow": ["*:1"], "deny": ["2:1", "5:1"]}
+    pipeline = Pipeline(settings(tracks=lists))
+    for t_s in np.arange(0, 2, 0.1):
+        for source in ("1:1", "2:1", "3:7", "5:1"):
+            run(pipeline, [position(t_s, source, (100.0, 0.0, 0.0))])
+        run(pipeline, [adsb(t_s, (500.0, 0.0, -50.0))])
+    now_ns = START_NS + 2 * S
+    assert [track.uav for track in pipeline.tracks(now_ns, now_ns)] == ["1:1"]
+    assert pipeline.newest("5:1") is not None  # the carrier always is
+    refused = {
+        uav: counts[Reason.NOT_ALLOWED] for uav, counts in pipeline.rejected_by_source.items()
+    }
+    assert refused["2:1"] == refused["3:7"] == 20
+    assert refused["icao:4CA7B3"] > 0
+    assert "5:1" not in refused
+
+
+def test_the_link_that_is_first_is_known_and_both_latencies_are() -> None:
+    """``fast`` brings a report at once and ``slow`` brings it 50 ms later; one was lost on fast."""
+    pipeline = Pipeline(settings("47.4,8.55,500"))
+    for n in range(50):
+        both = [position(n / 10, "1:1", link="fast"), position(n / 10, "1:1", link="slow")]
+        if n == 30:
+            del both[0]
+        late = both[-1]._replace(t_ns=both[-1].t_ns + S // 20)
+        run(pipeline, [*both[:-1], late])
+    fast, slow = pipeline.link_share("fast"), pipeline.link_share("slow")
+    assert (fast.first, fast.repeats, slow.first, slow.repeats) == (49, 0, 1, 49)
+    assert np.median(fast.latencies_s) == pytest.approx(0.0, abs=1e-3)
+    assert np.median(slow.latencies_s) == pytest.approx(0.05, abs=1e-3)
+    assert pipeline.rejected[Reason.DUPLICATE] == 49
+    assert pipeline.link_share("another").first == 0
+
+
+def test_a_round_trip_tells_what_one_way_cannot() -> None:
+    """Every report takes 300 ms at least; the answers of TIMESYNC show it."""
+    pipeline = Pipeline(settings("47.4,8.55,500"))
+    for n in range(40):
+        made_s = n / 4
+        late = position(made_s, "1:1")._replace(t_ns=START_NS + round((made_s + 0.3) * S))
+        run(pipeline, [late])
+        sent_ns = late.t_ns + S // 50
+        remote_ns = (
+            sent_ns + S // 100 - START_NS + 100 * S
+        )  # halfway; the boot clock began at 100 s
+        assert pipeline.step(RoundTrip(sent_ns + S // 50, Source(1, 1), sent_ns, remote_ns)) == []
+    estimate = pipeline.clock_estimate("1:1")
+    assert estimate is not None
+    assert estimate.kind is ClockKind.TIMESYNC
+    assert estimate.latency_s == pytest.approx(0.3, abs=0.011)
+    assert estimate.uncertainty_s < 0.02

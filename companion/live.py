@@ -4,6 +4,7 @@ import asyncio
 import gc
 import signal
 import socket
+import sys
 import webbrowser
 from collections.abc import Callable, Coroutine
 from typing import Any
@@ -37,14 +38,17 @@ def run(
         service = Service(settings, lambda text: click.echo(text, err=True))
         host, port = http.getsockname()[:2]
         page = f"http://{f'[{host}]' if ':' in host else host}:{port}"
-        _tame_collector()
+        _tame_interpreter()
         with asyncio.Runner(loop_factory=_loop_factory()) as runner:
             runner.run(_serve(service, http, token, traffic, seconds, page, open_page))
 
 
-def _tame_collector() -> None:
-    """Full collections look through everything that was ever loaded, for a tenth of a second:
-    what is there now is left out of them, and they become rare."""
+def _tame_interpreter() -> None:
+    """Nothing may hold the event loop up. Full collections look through everything that was ever
+    loaded, for a tenth of a second: what is there now is left out of them, and they become rare.
+    The recorder's thread gives way after a millisecond: each answer over HTTP waits for its turn
+    several times."""
+    sys.setswitchinterval(0.001)
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 100)

@@ -30,12 +30,17 @@ def main() -> None:
 @main.command()
 @CONFIG
 @click.option(
-    "--link", "links", metavar="URL", multiple=True, help="udpin:HOST:PORT, tcp:HOST:PORT"
+    "--link",
+    "links",
+    metavar="URL",
+    multiple=True,
+    help="udpin|udpout|tcp|tcpin:HOST:PORT or serial:DEVICE:BAUD. May be given several times.",
 )
 @CENTER
 @click.option("--listen", metavar="HOST:PORT", help="Where HTTP is served [127.0.0.1:8080].")
 @click.option("--record", metavar="DIR", help="Write recordings to this directory.")
 @click.option("--insecure", is_flag=True, help="Serve beyond this machine without a token.")
+@click.option("--silent", is_flag=True, help="Send no MAVLink at all, whatever the settings say.")
 def run(
     config: Path | None,
     links: tuple[str, ...],
@@ -43,8 +48,11 @@ def run(
     listen: str | None,
     record: str | None,
     insecure: bool,
+    silent: bool,
 ) -> None:
     """The live service. COMPANION_TOKEN in the environment sets a bearer token for HTTP.
+
+    It sends nothing over MAVLink unless [presence] in the settings allows it.
 
     Example: companion run --link udpin:0.0.0.0:14550 --center 5:1 --record recordings
     """
@@ -55,6 +63,7 @@ def run(
         settings = load(config).override(
             center={"source": center},
             links={"urls": list(links) or None},
+            presence={"enabled": False if silent else None},
             server={"listen": listen},
             recording={"directory": record},
         )

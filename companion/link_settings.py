@@ -44,8 +44,8 @@ class PresenceSettings(Section):
     enabled: bool = False
     system_id: Annotated[int, Field(ge=1, le=254)] | None = None
     component_id: Annotated[int, Field(ge=25, le=250)] = 191
-    position_hz: Annotated[float, Field(gt=0, le=50)] | None = None
-    attitude_hz: Annotated[float, Field(gt=0, le=400)] | None = None
+    position_hz: Annotated[float, Field(ge=0.1, le=100)] | None = None
+    attitude_hz: Annotated[float, Field(ge=0.1, le=100)] | None = None
 
 
 class SigningSettings(Section):

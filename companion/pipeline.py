@@ -293,6 +293,10 @@ class Pipeline:
                     near.append(uav)
         return self._tracks(near, relayed.t_ns, relayed.t_ns)
 
+    def reporters(self) -> list[Source]:
+        """Who reports its own position, the carrier among them."""
+        return [Source.parse(uav) for uav in self._fleet.uavs if not uav.startswith("icao:")]
+
     def link_share(self, link: str) -> LinkShare:
         """What a link has brought of the reports so far."""
         return self._dedupe.shares.get(link) or LinkShare()

@@ -14,8 +14,8 @@ import uvicorn
 import companion
 from companion import assembly
 from companion.config import Settings
-from companion.mavlink.links import Link, LinkStatus
-from companion.mavlink.urls import parse_link
+from companion.mavlink.link_status import LinkStatus
+from companion.mavlink.rates import MessageRate
 from companion.pipeline import Pipeline
 from companion.recording.background import BackgroundRecorder
 from companion.recording.reader import LogError
@@ -23,7 +23,8 @@ from companion.recording.recover import recover_leftovers
 from companion.recording.writer import Writer
 from companion.server.app import create_app
 from companion.server.views import RecordingStatus
-from companion.values import Event, Frame, Notice, Rejection, Tick
+from companion.traffic import Traffic
+from companion.values import Event, Notice, Tick
 
 RATE_WINDOW_S: Final = 2.0
 NOTICES_KEPT: Final = 200
@@ -44,7 +45,8 @@ class Service:
     """A running node; what the HTTP server looks at.
 
     ``say`` gets one line for a person whenever something changes. Raises ``LinkError`` if a link
-    cannot be opened, ``OSError`` if the recording cannot.
+    cannot be opened, ``ConfigError`` if the settings cannot be used, ``OSError`` if the recording
+    cannot be opened.
     """
 
     def __init__(self, settings: Settings, say: Callable[[str], None]) -> None:
@@ -56,12 +58,9 @@ class Service:
         self._timeline = Timeline()
         self._started_ns = self._timeline.now_ns()
         self._rates: deque[tuple[int, int, int]] = deque()
-        self._links = [
-            Link(parse_link(url), self._received, self._timeline.now_ns)
-            for url in settings.links.urls
-        ]
-        for link in self._links:
-            link.open()
+        self._recorder: BackgroundRecorder | None = None
+        self._traffic = Traffic(settings, self._step, self._notify, self._timeline.now_ns)
+        self._traffic.open()
         self._recorder = self._open_recorder()
 
     async def run(
@@ -85,7 +84,7 @@ class Service:
         try:
             async with asyncio.TaskGroup() as group:
                 tasks = [group.create_task(self._tick(), name="ticks")]
-                tasks += [group.create_task(link.run(), name=str(link.url)) for link in self._links]
+                tasks.append(group.create_task(self._traffic.run(), name="links"))
                 tasks.append(group.create_task(self._recover_leftovers(), name="recovery"))
                 tasks += [group.create_task(other, name="beside") for other in others]
                 serving = group.create_task(server.serve(sockets=[http]), name="http")
@@ -95,15 +94,12 @@ class Service:
                 for task in tasks:
                     task.cancel()
         finally:
+            self._traffic.close()
             if self._recorder:
                 metadata = {"digest": self.pipeline.digest.hexdigest()}
                 await asyncio.to_thread(self._recorder.stop, metadata)
 
     # --- what drives the pipeline -----------------------------------------------------------
-
-    def _received(self, items: list[Frame | Rejection]) -> None:
-        for item in items:
-            self._step(item)
 
     def _step(self, event: Event) -> None:
         outputs = self.pipeline.step(event)
@@ -111,8 +107,17 @@ class Service:
             self._recorder.put(event, outputs)
         for output in outputs:
             if isinstance(output, Notice):
-                self.notices.append(output)
-                self._say(output.text)
+                self._show(output)
+
+    def _notify(self, notice: Notice) -> None:
+        """What a person should know, and what the pipeline does not."""
+        if self._recorder:
+            self._recorder.put(None, [notice])
+        self._show(notice)
+
+    def _show(self, notice: Notice) -> None:
+        self.notices.append(notice)
+        self._say(notice.text)
 
     async def _tick(self) -> None:
         """Ticks at the update rate; where the loop was held up, the missed ones are left out."""
@@ -122,6 +127,7 @@ class Service:
         while True:
             self._step(Tick(self._timeline.now_ns()))
             self._count_rates()
+            self._traffic.speak(not self.unfit(), self.pipeline.reporters())
             due_s = max(due_s + period_s, loop.time())
             await asyncio.sleep(due_s - loop.time())
 
@@ -143,7 +149,15 @@ class Service:
 
     def links(self) -> list[LinkStatus]:
         """Each link's counts."""
-        return [link.status for link in self._links]
+        return [link.status for link in self._traffic.links]
+
+    def events(self) -> list[Notice]:
+        """The newest notices, the oldest of them first."""
+        return list(self.notices)
+
+    def message_rates(self) -> list[MessageRate]:
+        """The message rates that are asked for, and how far that has come."""
+        return self._traffic.rates()
 
     def rates(self) -> dict[str, float | None]:
         """Frames and updates per second over the last seconds."""
@@ -170,11 +184,8 @@ class Service:
     def unfit(self) -> list[str]:
         """Why the service is not fit to be used; empty when it is."""
         update = self.pipeline.last_update
-        reasons = [
-            f"link {link.status.url} is {link.status.state}"
-            for link in self._links
-            if link.status.state != "up"
-        ]
+        states = [link.status.state for link in self._traffic.links]
+        reasons = [] if "up" in states else ["no link is up"]
         late_s = 1.0 + 5 / self._settings.beams.update_hz
         if update is None or (self.now_ns() - update.t_ns) * 1e-9 > late_s:
             reasons.append("beam updates are late")

@@ -47,7 +47,7 @@ WRONG = [
     ("links", "urls", '["udpin:x"]', "udpin:x", "udpin:HOST:PORT"),
     ("presence", "enabled", '"always"', "always", "boolean"),
     ("presence", "system_id", "255", "255", "less than or equal to 254"),
-    ("presence", "position_hz", "0", "0", "greater than 0"),
+    ("presence", "position_hz", "0", "0", "greater than or equal to 0.1"),
     ("signing", "keys", '{"radio" = "key"}', "radio", "serial:DEVICE:BAUD"),
     ("signing", "allow_unsigned", '["tcp:a:1"]', "tcp:a:1", "has no key"),
     ("tracks", "allow", '["one"]', "one", "SYSID:COMPID or icao:HEX"),

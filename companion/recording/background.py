@@ -16,7 +16,7 @@ QUEUE_MAX: Final = 50_000
 """Some seconds of the busiest stream."""
 FLUSH_S: Final = 1.0
 
-_Item = tuple[Event, Sequence[Output]]
+_Item = tuple[Event | None, Sequence[Output]]
 
 
 class BackgroundRecorder:
@@ -39,8 +39,8 @@ class BackgroundRecorder:
         """Begin to write."""
         self._thread.start()
 
-    def put(self, event: Event, outputs: Sequence[Output]) -> None:
-        """Hand over an event and what came of it. Never waits."""
+    def put(self, event: Event | None, outputs: Sequence[Output]) -> None:
+        """Hand over an event and what came of it; None for what came of no event. Never waits."""
         if self.failure is not None:
             self.dropped += 1
             return
@@ -80,7 +80,8 @@ class BackgroundRecorder:
                 if item is None:
                     return
                 event, outputs = item
-                self.writer.event(event)
+                if event is not None:
+                    self.writer.event(event)
                 for output in outputs:
                     self.writer.output(output, self._geodetic)
             except queue.Empty:

@@ -14,7 +14,7 @@ from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import companion
-from companion.server import beam_views, views, weight_formats
+from companion.server import beam_views, link_views, views, weight_formats
 from companion.server.access import BearerToken
 from companion.server.metrics import NodeCollector
 from companion.server.views import Node
@@ -84,6 +84,22 @@ def _state_routes(app: FastAPI, node: Node) -> None:
         if not found:
             raise HTTPException(404, f"no UAV {uav!r} has been heard")
         return found[0]
+
+
+    @app.get("/v1/links", summary="Links, who is heard over each, and the rates asked for")
+    async def links() -> dict[str, Any]:
+        now_ns = node.now_ns()
+        shown = [
+            link_views.link(item, node.pipeline.link_share(item.url), now_ns)
+            | {"components": link_views.components(item, now_ns)}
+            for item in node.links()
+        ]
+        rates = [link_views.rate(rate) for rate in node.message_rates()]
+        return {"valid_at": rfc3339(now_ns), "links": shown, "message_rates": rates}
+
+    @app.get("/v1/events", summary="What was said to the operator last")
+    async def events() -> dict[str, Any]:
+        return {"events": [link_views.event(notice) for notice in node.events()]}
 
 
 def _beam_routes(app: FastAPI, node: Node) -> None:

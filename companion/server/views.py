@@ -10,10 +10,12 @@ import numpy as np
 from companion.assembly import Equipment
 from companion.config import FixedCenter
 from companion.mavlink.clocks import ClockEstimate
-from companion.mavlink.links import LinkStatus
+from companion.mavlink.link_status import LinkStatus
+from companion.mavlink.rates import MessageRate
 from companion.pipeline import Pipeline
+from companion.server import link_views
 from companion.server.words import rfc3339
-from companion.values import Carrier, FloatArray, Track
+from companion.values import Carrier, FloatArray, Notice, Track
 
 Json = dict[str, Any]
 
@@ -41,6 +43,8 @@ class Node(Protocol):
     def recording(self) -> RecordingStatus: ...
     def rates(self) -> Mapping[str, float | None]: ...
     def unfit(self) -> list[str]: ...
+    def message_rates(self) -> list[MessageRate]: ...
+    def events(self) -> list[Notice]: ...
 
 
 def vector(values: FloatArray | None) -> list[float] | None:
@@ -57,7 +61,9 @@ def status(node: Node, version: str) -> Json:
         "time": rfc3339(now_ns),
         "uptime_s": node.uptime_s(),
         "center": center(node),
-        "links": [link(item) for item in node.links()],
+        "links": [
+            link_views.link(item, pipeline.link_share(item.url), now_ns) for item in node.links()
+        ],
         "recording": {
             "state": recording.state,
             "file": recording.file,
@@ -70,19 +76,6 @@ def status(node: Node, version: str) -> Json:
         "updates": pipeline.updates,
         "rejected": {str(reason): n for reason, n in sorted(pipeline.rejected.items())},
         "digest": pipeline.digest.hexdigest(),
-    }
-
-
-def link(item: LinkStatus) -> Json:
-    """One link of ``/v1/status``."""
-    return {
-        "url": item.url,
-        "state": item.state,
-        "frames": item.frames,
-        "bytes": item.bytes,
-        "peers": item.peers,
-        "bad_crc": item.lost.get("bad-crc", 0),
-        "lost": dict(item.lost),
     }
 
 

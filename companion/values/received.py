@@ -79,6 +79,7 @@ class Reason(StrEnum):
     UNSIGNED = "unsigned"  # without a signature, over a link that requires them
     BAD_SIGNATURE = "bad-signature"  # signed with another key, or altered
     REPLAYED = "replayed"  # well signed, but not newer than what was heard before
+    SECRET = "secret"  # SETUP_SIGNING carries a key: it is not used, and not recorded
     SOCKET_OVERFLOW = "socket-overflow"  # lost before it was read: the system's buffer was full
     DUPLICATE = "duplicate"  # the same report again, over this link or another
     OUT_OF_ORDER = "out-of-order"  # later than the window for late reports

@@ -75,9 +75,7 @@ class Traffic:
             if warning:
                 self._notify(Notice(now_ns, Severity.WARNING, url, warning))
             unsigned = url in signing.allow_unsigned
-            guard = self._timestamps.guard(
-                url, key, number % 256, now_ns, allow_unsigned=unsigned
-            )
+            guard = self._timestamps.guard(url, key, number % 256, now_ns, allow_unsigned=unsigned)
         return Link(parsed, self._received, self._now_ns, self._notify, guard)
 
     async def run(self) -> None:

@@ -105,7 +105,7 @@ def main() -> None:
     help="How many UAVs fly about the carrier.",
 )
 @duration_option
-@click.option("--seed", type=int, default=0, show_default=True, help="Of timer phases and jitter.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Of what is left to chance.")
 @click.option(
     "--record",
     type=click.Path(dir_okay=False, writable=True, path_type=Path),
@@ -128,7 +128,10 @@ def fly(
     """
     tally = player.Tally()
     urls = [str(url) for url in links]
-    flight = scenario.BUILDERS[name](uavs)
+    try:
+        flight = scenario.BUILDERS[name](uavs, seed)
+    except ValueError as error:
+        raise click.BadParameter(f"{name}: {error}", param_hint="'--uavs'") from error
     run(player.fly(flight, urls, duration_s, seed, record, tally=tally), tally)
     conclude(tally, "sent", as_json)
 
@@ -200,14 +203,14 @@ def list_scenarios(as_json: bool) -> None:
 
     Example: sitl-replay list
     """
-    built = [build(4) for build in scenario.BUILDERS.values()]
+    built = [build() for build in scenario.BUILDERS.values()]
     if as_json:
         click.echo(
             json.dumps([{"name": one.name, "description": one.description} for one in built])
         )
         return
     for one in built:
-        click.echo(f"{one.name:8} {one.description}")
+        click.echo(f"{one.name:9} {one.description}")
 
 
 def frames_of(log: Path, tally: player.Tally) -> Iterator[Frame]:

@@ -30,8 +30,30 @@ PURE = (
     "companion/mavlink/",
     "companion/tracking/",
     "companion/beams/",
+    "companion/digest.py",
+    "companion/link_settings.py",
+    "companion/section.py",
+    "companion/ticks.py",
+    "sitl_replay/attitudes.py",
+    "sitl_replay/fleet.py",
+    "sitl_replay/flights.py",
+    "sitl_replay/geodesy.py",
+    "sitl_replay/motion.py",
+    "sitl_replay/paths.py",
+    "sitl_replay/payloads.py",
+    "sitl_replay/relay.py",
+    "sitl_replay/scenario.py",
+    "sitl_replay/vehicles.py",
+    "sitl_replay/wind.py",
 )
-SHELL = ("companion/mavlink/links.py", "companion/mavlink/presence.py")
+SHELL = (
+    "companion/mavlink/endpoints.py",
+    "companion/mavlink/links.py",
+    "companion/mavlink/serial_port.py",
+    "companion/mavlink/signing_store.py",
+    "companion/mavlink/tcp.py",
+    "companion/mavlink/udp.py",
+)
 READS_FILES = ("companion/config.py",)
 
 # Modules by which clocks, sockets, files, threads and processes are reached.

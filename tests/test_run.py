@@ -199,9 +199,8 @@ def test_weights_for_a_device_or_the_reason_why_not(start_node: Any, tmp_path: P
 
 def test_without_a_carrier_it_says_so(start_node: Any) -> None:
     node = start_node(*RUN)
-    status, body = node.get("/readyz")
-    assert status == 503
-    assert json.loads(body)["reasons"] == ["no report yet"]
+    node.wait_until("/readyz", lambda answer: answer["reasons"] == ["no report yet"])
+    assert node.get("/readyz")[0] == 503
     assert node.get("/healthz")[0] == 200
     assert node.json("/v1/beams")["beams"] == []
     assert node.json("/v1/beams")["condition_number"] is None

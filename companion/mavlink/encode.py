@@ -62,12 +62,18 @@ def heartbeat(source: Source) -> Outgoing:
     return Outgoing(source, HEARTBEAT, payload)
 
 
-def set_message_interval(source: Source, target: Source, msgid: int, interval_us: int) -> Outgoing:
-    """COMMAND_LONG with MAV_CMD_SET_MESSAGE_INTERVAL; answered by COMMAND_ACK."""
+def set_message_interval(
+    source: Source, target: Source, msgid: int, interval_us: int, confirmation: int = 0
+) -> Outgoing:
+    """COMMAND_LONG with MAV_CMD_SET_MESSAGE_INTERVAL; answered by COMMAND_ACK.
+
+    ``confirmation`` counts how often it was sent before without an answer
+    (https://mavlink.io/en/services/command.html).
+    """
     payload = struct.pack(
         "<7fHBBB",
         *(float(msgid), float(interval_us), 0.0, 0.0, 0.0, 0.0, 0.0),
-        *(MAV_CMD_SET_MESSAGE_INTERVAL, target.sysid, target.compid, 0),
+        *(MAV_CMD_SET_MESSAGE_INTERVAL, target.sysid, target.compid, confirmation),
     )
     return Outgoing(source, COMMAND_LONG, payload)
 

@@ -1,153 +1,232 @@
-"""Where MAVLink comes from: asyncio endpoints.                                           [shell]
+"""Where MAVLink comes from and goes to: asyncio endpoints.                               [shell]
 
-    udpin:HOST:PORT    listen for datagrams, from any number of peers
-    tcp:HOST:PORT      connect, and connect again when the peer goes away
+    udpin:HOST:PORT      listen for datagrams, from any number of peers
+    udpout:HOST:PORT     send datagrams to one peer, and hear what it answers
+    tcp:HOST:PORT        connect, and connect again when the peer goes away
+    tcpin:HOST:PORT      listen for connections, any number of them
+    serial:DEVICE:BAUD   a serial port, which may be unplugged and plugged in again
 
 IPv6 hosts stand in brackets. Every peer has its own splitter: what one peer truncates cannot
 damage another's frames.
 """
 
 import asyncio
-import contextlib
-import socket
-from collections import OrderedDict
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Final
+from collections.abc import Callable, Hashable
+from typing import Final, Protocol
 
-from companion.mavlink.framing import Splitter
+from companion.mavlink.encode import Outgoing, pack
+from companion.mavlink.endpoints import Endpoint, Upcalls, reason
+from companion.mavlink.link_status import LinkStatus
+from companion.mavlink.peers import Peer, Peers
+from companion.mavlink.serial_port import SerialPort
+from companion.mavlink.tcp import TcpIn, TcpOut
+from companion.mavlink.udp import UdpIn, UdpOut
 from companion.mavlink.urls import LinkError, LinkUrl
-from companion.values import Frame, Rejection
+from companion.values import Frame, Notice, Reason, Rejection, Severity, Source
 
-RECEIVE_BUFFER_BYTES: Final = 4 << 20
-"""Stock socket buffers lose frames from about 20 000 a second on (measured)."""
-PEERS_MAX: Final = 4096
-"""Splitters kept for the peers heard last: a scan of the port must not fill the memory."""
+__all__ = ["Guard", "Link", "LinkStatus", "Notify", "Receive"]
+
 RETRY_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
+STEADY_S: Final = 1.0
+"""A connection must hold so long to be called back: one that breaks at once is still an outage."""
+PEER_ACTIVE_S: Final = 10.0
+"""A listening UDP link sends to those of whom a frame came within this time."""
 
 Receive = Callable[[list[Frame | Rejection]], None]
+Notify = Callable[[Notice], None]
 
 
-@dataclass(slots=True)
-class LinkStatus:
-    """What a link has seen so far."""
+class Guard(Protocol):
+    """Message signing of one link (https://mavlink.io/en/guide/message_signing.html)."""
 
-    url: str
-    state: str = "down"
-    frames: int = 0
-    bytes: int = 0
-    peers: int = 0
-    lost: dict[str, int] = field(default_factory=dict)
+    def refusal(self, frame: Frame) -> Reason | None:
+        """Why a frame must not be used; None: it may. Asked once for each frame, in order."""
+
+    def sign(self, raw: bytes, now_ns: int) -> bytes:
+        """A packed MAVLink 2 frame with its signature."""
 
 
 class Link:
     """One endpoint: call ``open`` for early errors, then ``run`` until cancelled.
 
     ``receive`` is called with what each datagram or read held, on the event loop; ``now_ns`` is
-    the node's timeline.
+    the node's timeline. ``notify`` is told once when the link goes, and once when it is back.
+    ``guard``, where there is one, refuses frames and signs what is sent.
+
+    All is to be called on the event loop, but ``open``, which comes before it runs.
     """
 
-    def __init__(self, url: LinkUrl, receive: Receive, now_ns: Callable[[], int]) -> None:
+    def __init__(
+        self,
+        url: LinkUrl,
+        receive: Receive,
+        now_ns: Callable[[], int],
+        notify: Notify | None = None,
+        guard: Guard | None = None,
+    ) -> None:
         self.url = url
         self.status = LinkStatus(str(url))
         self._receive = receive
         self._now_ns = now_ns
-        self._splitters: OrderedDict[object, Splitter] = OrderedDict()
-        self._socket: socket.socket | None = None
+        self._notify = notify
+        self._guard = guard
+        self._peers = Peers(self.status, self._finish)
+        upcalls = Upcalls(self._up, self.take, self._hang_up, self._overflow)
+        self._endpoint = _endpoint(url, self.status, upcalls)
+        self._is_out = False
+        self._steady: asyncio.TimerHandle | None = None
 
     def open(self) -> None:
-        """Bind a listening link; ``LinkError`` where the address cannot be had."""
-        if self.url.scheme != "udpin":
-            return
-        self._socket = _bound_udp(self.url)
-        self.status.url = str(LinkUrl("udpin", self.url.host, self._socket.getsockname()[1]))
+        """Take a listening link's address: ``LinkError`` where it cannot be had.
+
+        That a peer or a device is away is no error; it is tried again for as long as ``run`` runs.
+        """
+        try:
+            port = self._endpoint.open()
+        except OSError as error:
+            raise LinkError(f"{self.url}: {reason(error)}") from error
+        if port is not None:
+            self.status.url = str(LinkUrl(self.url.scheme, self.url.host, port))
 
     async def run(self) -> None:
-        """Serve until cancelled."""
+        """Serve until cancelled; what is lost is tried again, ever more rarely until frames come.
+
+        Raises what ``receive`` raises.
+        """
+        attempt = 0
         try:
-            await (self._run_udp() if self.url.scheme == "udpin" else self._run_tcp())
+            while True:
+                self.status.state = "connecting"
+                frames = self.status.frames
+                try:
+                    await self._endpoint.serve()
+                except OSError as error:
+                    self._say_it_is_down(reason(error))
+                if self.status.frames > frames:
+                    attempt = 0
+                self.status.state = "connecting"
+                await asyncio.sleep(RETRY_S[min(attempt, len(RETRY_S) - 1)])
+                attempt += 1
         finally:
+            self._cancel_steady()
             self.status.state = "down"
 
-    def _hang_up(self, peer: object) -> None:
-        """The peer is gone: what its last, unfinished frame swallowed is looked through."""
-        splitter = self._splitters.pop(peer, None)
-        if splitter is not None:
-            self._count(splitter.finish(self._now_ns()))
+    # --- receiving --------------------------------------------------------------------------
 
-    def take(self, peer: object, data: bytes) -> None:
+    def take(self, key: Hashable, data: bytes) -> None:
         """Split what a peer sent and hand it on."""
-        splitter = self._splitters.get(peer)
-        if splitter is None:
-            splitter = self._splitters.setdefault(peer, Splitter(self.status.url))
-            self.status.peers += 1
-            if len(self._splitters) > PEERS_MAX:
-                self._splitters.popitem(last=False)
-        else:
-            self._splitters.move_to_end(peer)
+        peer = self._peers.at(key)
         self.status.bytes += len(data)
-        self._count(splitter.feed(self._now_ns(), data))
-
-    def _count(self, found: list[Frame | Rejection]) -> None:
-        for item in found:
-            if isinstance(item, Rejection):
-                self.status.lost[item.reason] = self.status.lost.get(item.reason, 0) + item.count
-            else:
-                self.status.frames += 1
+        found = peer.splitter.feed(self._now_ns(), data)
         if found:
-            self._receive(found)
+            self._hand_on(peer, found)
 
-    async def _run_udp(self) -> None:
-        assert self._socket is not None, "open() comes first"
-        loop = asyncio.get_running_loop()
-        transport, _ = await loop.create_datagram_endpoint(
-            lambda: _Datagrams(self), sock=self._socket
-        )
+    def _hand_on(self, peer: Peer, found: list[Frame | Rejection]) -> None:
+        if self._guard is not None:
+            found = [_admitted(self._guard, item) for item in found]
+        self._peers.count(peer, found)
+        self._receive(found)
+
+    def _hang_up(self, key: Hashable) -> None:
+        """The peer is gone."""
+        peer = self._peers.find(key)
+        if peer is not None:
+            self._finish(peer)
+            self._peers.forget(peer)
+
+    def _finish(self, peer: Peer) -> None:
+        """No more will come of a peer: what its last, unfinished frame swallowed is looked
+        through."""
+        found = peer.splitter.finish(self._now_ns())
+        if found:
+            self._hand_on(peer, found)
+
+    def _overflow(self, count: int) -> None:
+        """The system has dropped datagrams; whose they were, nobody knows."""
+        lost = self.status.lost
+        lost[Reason.SOCKET_OVERFLOW] = lost.get(Reason.SOCKET_OVERFLOW, 0) + count
+        reject = Rejection(self._now_ns(), self.status.url, Reason.SOCKET_OVERFLOW, count)
+        self._receive([reject])
+
+    # --- sending ----------------------------------------------------------------------------
+
+    def send(self, message: Outgoing) -> int:
+        """Send to every peer heard within ``PEER_ACTIVE_S`` (udpin), to every connection (tcpin),
+        or to the one peer. How many took it; never waits, never raises."""
+        keys = self._endpoint.peers()
+        if keys is None:
+            peers = self._peers.heard_since(self._now_ns() - int(PEER_ACTIVE_S * 1e9))
+        else:
+            peers = [self._peers.at(key) for key in keys]
+        return sum([self._send(peer, message) for peer in peers])
+
+    def send_to(self, target: Source, message: Outgoing) -> bool:
+        """Send to the peer over which ``target`` was last heard on this link: False if it never
+        was, or has hung up, or does not take it."""
+        peer = self._peers.last_of(target)
+        return peer is not None and self._send(peer, message)
+
+    def _send(self, peer: Peer, message: Outgoing) -> bool:
+        """MAVLink 1 goes to those only who speak nothing else: over a link with a guard nobody,
+        for it cannot be signed."""
+        in_v1 = peer.speaks_v1_only and self._guard is None and message.msgid < 256
+        raw = pack(message, peer.next_sequence(), 1 if in_v1 else 2)
+        if self._guard is not None:
+            raw = self._guard.sign(raw, self._now_ns())
+        taken = self._endpoint.write(peer.key, raw)
+        if taken:
+            self.status.sent += 1
+        else:
+            self.status.send_dropped += 1
+        return taken
+
+    # --- coming and going -------------------------------------------------------------------
+
+    def _up(self) -> None:
         self.status.state = "up"
-        try:
-            await loop.create_future()  # until cancelled
-        finally:
-            transport.close()
+        self._cancel_steady()
+        if self._is_out:
+            loop = asyncio.get_running_loop()
+            self._steady = loop.call_later(STEADY_S, self._say_it_is_back)
 
-    async def _run_tcp(self) -> None:
-        attempt = 0
-        while True:
-            with contextlib.suppress(OSError):
-                reader, writer = await asyncio.open_connection(self.url.host, self.url.port)
-                attempt = 0
-                self.status.state = "up"
-                try:
-                    while data := await reader.read(1 << 16):
-                        self.take(None, data)
-                finally:
-                    self._hang_up(None)
-                    writer.close()
-            self.status.state = "connecting"
-            await asyncio.sleep(RETRY_S[min(attempt, len(RETRY_S) - 1)])
-            attempt += 1
+    def _say_it_is_back(self) -> None:
+        self._is_out = False
+        self._say(Severity.INFO, "is back")
 
+    def _say_it_is_down(self, why: str) -> None:
+        self._cancel_steady()
+        if not self._is_out:
+            self._is_out = True
+            self._say(Severity.WARNING, f"is down: {why}; trying again")
 
-class _Datagrams(asyncio.DatagramProtocol):
-    """One socket serves all its senders."""
+    def _say(self, severity: Severity, what: str) -> None:
+        if self._notify is not None:
+            url = self.status.url
+            self._notify(Notice(self._now_ns(), severity, url, f"link {url} {what}"))
 
-    def __init__(self, link: Link) -> None:
-        self._link = link
-
-    def datagram_received(self, data: bytes, addr: tuple[str | int, ...]) -> None:
-        self._link.take(addr, data)
+    def _cancel_steady(self) -> None:
+        if self._steady is not None:
+            self._steady.cancel()
+            self._steady = None
 
 
-def _bound_udp(url: LinkUrl) -> socket.socket:
-    try:
-        family = socket.AF_INET6 if url.is_ipv6 else socket.AF_INET
-        bound = socket.socket(family, socket.SOCK_DGRAM)
-    except OSError as error:
-        raise LinkError(f"{url}: {error.strerror}") from error
-    try:
-        bound.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        bound.setblocking(False)
-        bound.bind((url.host, url.port))
-    except OSError as error:
-        bound.close()
-        raise LinkError(f"{url}: {error.strerror}") from error
-    return bound
+def _endpoint(url: LinkUrl, status: LinkStatus, upcalls: Upcalls) -> Endpoint:
+    match url.scheme:
+        case "udpin":
+            return UdpIn(url, status, upcalls)
+        case "udpout":
+            return UdpOut(url, status, upcalls)
+        case "tcp":
+            return TcpOut(url, upcalls)
+        case "tcpin":
+            return TcpIn(url, upcalls)
+        case "serial":
+            return SerialPort(url, upcalls)
+
+
+def _admitted(guard: Guard, item: Frame | Rejection) -> Frame | Rejection:
+    """The item, or the refusal of it."""
+    refusal = None if isinstance(item, Rejection) else guard.refusal(item)
+    if refusal is None or isinstance(item, Rejection):
+        return item
+    return Rejection(item.t_ns, str(item.source), refusal, msgid=item.msgid)

@@ -10,6 +10,7 @@ IPv6 hosts stand in brackets.
 """
 
 import ipaddress
+import re
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Final, Literal, cast, get_args
@@ -18,6 +19,8 @@ Scheme = Literal["udpin", "udpout", "tcp", "tcpin", "serial"]
 SCHEMES: Final[tuple[Scheme, ...]] = get_args(Scheme)
 _LISTENS: Final = ("udpin", "tcpin")
 _BAUD_MAX: Final = 20_000_000
+_NUMBER: Final = re.compile(r"[0-9]{1,8}")
+_NAME: Final = re.compile(r"[A-Za-z0-9._-]+")
 
 
 class LinkError(ValueError):
@@ -39,14 +42,6 @@ class LinkUrl:
         host = f"[{self.host}]" if self.scheme != "serial" and ":" in self.host else self.host
         return f"{self.scheme}:{host}:{self.port}"
 
-    @property
-    def is_ipv6(self) -> bool:
-        """Whether the host is an IPv6 address in figures."""
-        try:
-            return self.scheme != "serial" and ipaddress.ip_address(self.host).version == 6
-        except ValueError:
-            return False
-
 
 def parse_link(text: str, schemes: Collection[Scheme] = SCHEMES) -> LinkUrl:
     """Read a link of one of ``schemes``. ``LinkError`` says what is wrong with it.
@@ -55,22 +50,24 @@ def parse_link(text: str, schemes: Collection[Scheme] = SCHEMES) -> LinkUrl:
     """
     scheme, _, address = text.partition(":")
     host, _, port = address.rpartition(":")
-    if scheme not in schemes or not host or not (port.isascii() and port.isdecimal()):
+    if scheme not in schemes or not host or not _NUMBER.fullmatch(port):
         raise LinkError(f"{text!r} is not {_forms(schemes)}")
     if scheme == "serial":
         return _serial(text, host, int(port))
     bracketed = host.startswith("[") and host.endswith("]")
     host = host[1:-1] if bracketed else host
-    if not _may_be_a_host(host):
-        raise LinkError(f"{text!r}: {host!r} cannot be the name of a host")
     if (":" in host) is not bracketed:
         raise LinkError(f"{text!r}: an IPv6 host stands in brackets, as in udpin:[::]:14550")
+    if not (_is_ipv6(host) if bracketed else _may_be_a_name(host)):
+        raise LinkError(f"{text!r}: {host!r} cannot be the name or address of a host")
     if int(port) > 65535 or (int(port) == 0 and scheme not in _LISTENS):
         raise LinkError(f"{text!r}: {port} is not a port, 1 to 65535")
     return LinkUrl(cast(Scheme, scheme), host, int(port))
 
 
 def _serial(text: str, device: str, baud: int) -> LinkUrl:
+    if not device.isprintable():
+        raise LinkError(f"{text!r}: {device!r} cannot be the name of a device")
     if not 1 <= baud <= _BAUD_MAX:
         raise LinkError(f"{text!r}: {baud} is not a baud rate, 1 to {_BAUD_MAX}")
     return LinkUrl("serial", device, baud)
@@ -81,8 +78,17 @@ def _forms(schemes: Collection[Scheme]) -> str:
     return forms[0] if len(forms) == 1 else f"{', '.join(forms[:-1])} or {forms[-1]}"
 
 
-def _may_be_a_host(host: str) -> bool:
+def _is_ipv6(host: str) -> bool:
     try:
-        return host != "" and host.isascii() and len(host.encode("idna")) > 0
+        ipaddress.IPv6Address(host)
+    except ValueError:
+        return False
+    return True
+
+
+def _may_be_a_name(host: str) -> bool:
+    """Also an IPv4 address is one."""
+    try:
+        return _NAME.fullmatch(host) is not None and len(host.encode("idna")) > 0
     except UnicodeError:  # a label that is empty, or too long
         return False

@@ -85,7 +85,6 @@ def _state_routes(app: FastAPI, node: Node) -> None:
             raise HTTPException(404, f"no UAV {uav!r} has been heard")
         return found[0]
 
-
     @app.get("/v1/links", summary="Links, who is heard over each, and the rates asked for")
     async def links() -> dict[str, Any]:
         now_ns = node.now_ns()

@@ -37,6 +37,12 @@ CASES = {
             *TARGET, d.MAV_CMD_SET_MESSAGE_INTERVAL, 0, 33, 100_000, 0, 0, 0, 0, 0
         ),
     ),
+    "set_message_interval again": (
+        encode.set_message_interval(OURS, TARGET, 30, 66_667, confirmation=2),
+        lambda d: d.MAVLink_command_long_message(
+            *TARGET, d.MAV_CMD_SET_MESSAGE_INTERVAL, 2, 30, 66_667, 0, 0, 0, 0, 0
+        ),
+    ),
     "request_data_stream": (
         encode.request_data_stream(OURS, TARGET, 6, 10),
         lambda d: d.MAVLink_request_data_stream_message(*TARGET, d.MAV_DATA_STREAM_POSITION, 10, 1),

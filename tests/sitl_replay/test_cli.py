@@ -44,7 +44,8 @@ def url_of(bound: socket.socket, scheme: str = "udpout") -> str:
         (["fly", "paper", "--to", "udpin:127.0.0.1:9"], "is not udpout:HOST:PORT"),
         (["fly", "paper", "--to", "udpout:127.0.0.1:99999"], "is not a port"),
         (["fly", "paper", "--to", "udpout:no-such-host.invalid:9"], "no-such-host.invalid"),
-        (["fly", "paper", "--to", SOMEWHERE, "--uavs", "201"], "1<=x<=200"),
+        (["fly", "paper", "--to", SOMEWHERE, "--uavs", "1001"], "1<=x<=1000"),
+        (["fly", "adsb", "--to", SOMEWHERE, "--uavs", "2"], "adsb: 2 UAVs: 3 to 1000 can fly"),
         (["fly", "paper", "--to", SOMEWHERE, "--duration", "nan"], "a number above 0"),
         (["fly", "paper", "--to", SOMEWHERE, "--duration", "-1"], "a number above 0"),
         (["fly", "paper", "--to", SOMEWHERE, "--record", "."], "is a directory"),
@@ -96,9 +97,10 @@ def test_every_help_has_an_example(command: click.Command) -> None:
 def test_list() -> None:
     text = CliRunner().invoke(main, ["list"]).stdout
     listed = json.loads(CliRunner().invoke(main, ["list", "--json"]).stdout)
-    assert [one["name"] for one in listed] == list(scenario.BUILDERS) == ["paper", "hover"]
+    assert [one["name"] for one in listed] == list(scenario.BUILDERS)
+    assert len(listed) == 9
     for one in listed:
-        assert f"{one['name']:8} {one['description']}\n" in text
+        assert f"{one['name']:9} {one['description']}\n" in text
 
 
 def test_fly_sends_and_sums_up(receiver: socket.socket, tmp_path: Path) -> None:
@@ -113,6 +115,18 @@ def test_fly_sends_and_sums_up(receiver: socket.socket, tmp_path: Path) -> None:
     assert 0.2 < summary["duration_s"] < 1.0
     sources = {receiver.recv(300)[5] for _ in meant}
     assert sources == {1, 2, 5}
+
+
+def test_fly_gives_the_seed_to_the_scenario(receiver: socket.socket, tmp_path: Path) -> None:
+    # A record holds what was sent, stamped: positions tell which tour was flown.
+    tlog = tmp_path / "a.tlog"
+    arguments = ["fly", "waypoints", "--to", url_of(receiver), "--duration", "0.3", "--seed", "9"]
+    result = CliRunner().invoke(main, [*arguments, "--record", str(tlog)])
+    assert result.exit_code == 0
+    flown = schedule(scenario.waypoints(4, seed=9), seed=9, duration_s=0.3)
+    meant = {t.raw for t in flown if t.raw[7] == 33}
+    assert meant
+    assert all(raw in tlog.read_bytes() for raw in meant)
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])

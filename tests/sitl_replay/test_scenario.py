@@ -1,12 +1,12 @@
 """Trajectories and attitudes: their derivatives, and the figures of the paper (MATH.md 8)."""
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from companion.values import Source
 from sitl_replay import scenario
 from sitl_replay.scenario import BUILDERS, Circle, Pose, Sway, Vehicle
 
@@ -99,24 +99,77 @@ def test_uavs_use_three_dimensions_and_report_unevenly() -> None:
     assert [uav.report_interval_s for uav in uavs] == [0.10, 0.15, 0.20, 0.25] * 2
 
 
-@pytest.mark.parametrize("build", BUILDERS.values(), ids=BUILDERS)
-def test_a_large_fleet_has_its_own_ids_and_sendable_speeds(
-    build: Callable[[int], scenario.Scenario],
-) -> None:
-    fleet = build(scenario.MAX_UAVS)
+@pytest.mark.parametrize("name", BUILDERS)
+def test_a_large_fleet_has_its_own_ids_and_sendable_speeds(name: str) -> None:
+    fleet = BUILDERS[name](scenario.MAX_UAVS)
     sources = {vehicle.source for vehicle in fleet.vehicles}
-    assert len(sources) == scenario.MAX_UAVS + 1
-    assert {source.sysid for source in sources} == set(range(1, scenario.MAX_UAVS + 2))
-    assert len({vehicle.uptime_ms for vehicle in fleet.vehicles}) == len(sources)
+    names = {vehicle.name for vehicle in fleet.vehicles}
+    assert len(fleet.vehicles) == len(names) == scenario.MAX_UAVS + 1 == 1001
+    assert len(sources) == 1001 - (name == "shared-id")
+    assert {source.sysid for source in sources} == set(range(1, 251))
+    assert [source for source in sources if source.sysid == 5] == [scenario.CARRIER.source]
+    assert {source.compid for source in sources} == {1, 2, 3, 4, 5}
+    assert len({vehicle.uptime_ms for vehicle in fleet.vehicles}) == 1001
     for uav in fleet.uavs:
         assert math.hypot(*uav.trajectory(9.0).velocity_ned_mps) < 1.2 * 125.0 + 1e-6
 
 
-@pytest.mark.parametrize("build", BUILDERS.values(), ids=BUILDERS)
-@pytest.mark.parametrize("uavs", [-1, 0, 201])
-def test_fleet_sizes_out_of_range(build: Callable[[int], scenario.Scenario], uavs: int) -> None:
-    with pytest.raises(ValueError, match="1 to 200 can fly"):
-        build(uavs)
+def test_component_ids_count_on_once_the_system_ids_are_used_up() -> None:
+    ids = [str(uav.source) for uav in scenario.swarm(1000).uavs]
+    assert ids[:6] == ["1:1", "2:1", "3:1", "4:1", "6:1", "7:1"]
+    assert ids[247:251] == ["249:1", "250:1", "1:2", "2:2"]
+    assert ids[999] == "4:5"
+
+
+@pytest.mark.parametrize("name", BUILDERS)
+@pytest.mark.parametrize("uavs", [-1, 0, 1001])
+def test_fleet_sizes_out_of_range(name: str, uavs: int) -> None:
+    with pytest.raises(ValueError, match="to 1000 can fly"):
+        BUILDERS[name](uavs)
+
+
+@pytest.mark.parametrize(("name", "fewest"), [("adsb", 3), ("shared-id", 2)])
+def test_some_scenarios_need_several(name: str, fewest: int) -> None:
+    with pytest.raises(ValueError, match=f"^{fewest - 1} UAVs: {fewest} to 1000 can fly$"):
+        BUILDERS[name](fewest - 1)
+    assert len(BUILDERS[name](fewest).uavs) == fewest
+
+
+@pytest.mark.parametrize("name", set(BUILDERS) - {"hover"})
+def test_one_uav_more_moves_no_other(name: str) -> None:
+    few, many = BUILDERS[name](5, seed=2), BUILDERS[name](6, seed=2)
+    for one, same in zip(few.uavs, many.uavs[:5], strict=True):
+        assert (one.name, one.trajectory(8.0)) == (same.name, same.trajectory(8.0))
+
+
+SEEDED = ("waypoints", "racetrack", "swarm", "adsb")
+
+
+@pytest.mark.parametrize("name", BUILDERS)
+def test_the_seed_decides_what_is_left_to_chance(name: str) -> None:
+    here, again, other = (
+        [uav.trajectory(31.0) for uav in BUILDERS[name](4, seed).uavs] for seed in (1, 1, 2)
+    )
+    assert here == again
+    assert (here != other) == (name in SEEDED)
+
+
+def test_truth_is_found_by_id() -> None:
+    flight = scenario.adsb(4)
+    (third,) = flight.truth("3:1", 12.0)
+    assert (third,) == flight.truth(Source(3, 1), 12.0) == flight.truth("icao:F00006", 12.0)
+    assert third == flight.uavs[2].trajectory(12.0)
+    assert flight.truth("5:1", 12.0) == (((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),)
+    assert len(flight.truth("icao:F00001", 12.0)) == 1
+    assert flight.truth("77:1", 12.0) == ()
+
+
+def test_two_go_by_a_shared_id() -> None:
+    flight = scenario.shared_id(4)
+    assert [str(uav.source) for uav in flight.uavs] == ["1:1", "1:1", "2:1", "3:1"]
+    for t_s in np.arange(0.0, 200.0, 1.7):
+        one, two = flight.truth("1:1", t_s)
+        assert 500.0 < math.dist(one.position_ned_m, two.position_ned_m) < 700.0
 
 
 def test_hovering_uavs_are_spread_before_the_array() -> None:

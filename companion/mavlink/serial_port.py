@@ -1,0 +1,123 @@
+"""A serial port for a link, by pyserial and the loop's own readers.                      [shell]"""
+
+import asyncio
+import contextlib
+import errno
+import os
+import termios
+from collections.abc import Collection, Hashable
+from typing import Any, Final
+
+from companion.mavlink.endpoints import Upcalls, settle
+from companion.mavlink.urls import LinkUrl
+
+WRITE_BUFFER_BYTES: Final = 4096
+"""Beside the system's own: 0.7 s at 57 600 baud. What is older than that had better be lost."""
+_READ_BYTES: Final = 1 << 16
+
+
+class SerialPort:
+    """A serial device, of which nobody else on this machine reads. It may be unplugged."""
+
+    def __init__(self, url: LinkUrl, upcalls: Upcalls) -> None:
+        self._url = url
+        self._upcalls = upcalls
+        self._descriptor: int | None = None
+        self._lost: asyncio.Future[Exception] | None = None
+        self._unsent = bytearray()
+
+    def open(self) -> None:
+        """Nothing can be known yet: the device may be plugged in later."""
+
+    async def serve(self) -> None:
+        """Open the device, and serve until it is gone."""
+        loop = asyncio.get_running_loop()
+        port = _opened(self._url.host, self._url.port)
+        self._descriptor = descriptor = port.fileno()
+        self._lost = loop.create_future()
+        self._unsent.clear()
+        loop.add_reader(descriptor, self._read, descriptor)
+        self._upcalls.up()
+        try:
+            raise await self._lost
+        finally:
+            self._descriptor = None
+            loop.remove_reader(descriptor)
+            loop.remove_writer(descriptor)
+            _close(port)
+            self._upcalls.hang_up(None)
+
+    def peers(self) -> Collection[Hashable]:
+        """The one, while the device is open."""
+        return () if self._descriptor is None else (None,)
+
+    def write(self, key: Hashable, raw: bytes) -> bool:
+        """A frame into the port, or into the buffer while it has room; the key is None."""
+        descriptor = self._descriptor
+        if descriptor is None or len(self._unsent) + len(raw) > WRITE_BUFFER_BYTES:
+            return False
+        self._unsent += raw
+        if len(self._unsent) == len(raw):
+            self._write_on(descriptor)
+        return True
+
+    def _read(self, descriptor: int) -> None:
+        try:
+            data = os.read(descriptor, _READ_BYTES)
+        except (BlockingIOError, InterruptedError):
+            return
+        except OSError as error:
+            self._lose(error)
+            return
+        if not data:
+            self._lose(OSError(errno.ENODEV, os.strerror(errno.ENODEV)))
+            return
+        try:
+            self._upcalls.take(None, data)
+        except Exception as fault:  # of the program: it is to end the link, not to vanish
+            self._lose(fault)
+
+    def _write_on(self, descriptor: int) -> None:
+        try:
+            del self._unsent[: os.write(descriptor, self._unsent)]
+        except (BlockingIOError, InterruptedError):
+            pass
+        except OSError as error:
+            self._lose(error)
+            return
+        loop = asyncio.get_running_loop()
+        if self._unsent:
+            loop.add_writer(descriptor, self._write_on, descriptor)
+        else:
+            loop.remove_writer(descriptor)
+
+    def _lose(self, why: Exception) -> None:
+        assert self._lost is not None
+        settle(self._lost, why)
+
+
+def _opened(device: str, baud: int) -> Any:
+    """The port: raw, 8N1, nobody else's, never waiting. ``OSError`` where that cannot be had."""
+    import serial  # type: ignore[import-untyped]  # only where there is a serial link
+
+    try:
+        port = serial.Serial(device, baud, exclusive=True, timeout=0)
+    except serial.SerialException as error:
+        if error.errno == errno.EAGAIN:  # its lock is taken
+            raise OSError(errno.EBUSY, os.strerror(errno.EBUSY)) from error
+        raise
+    except (ValueError, termios.error) as error:
+        raise OSError(f"not at {baud} baud: {error}") from error
+    # pyserial has reads of nothing give nothing, which is also how the end of a device looks.
+    # With at least one byte asked for, nothing there is EAGAIN, and an empty read is the end.
+    settings = termios.tcgetattr(port.fileno())
+    settings[6][termios.VMIN] = 1
+    termios.tcsetattr(port.fileno(), termios.TCSANOW, settings)
+    return port
+
+
+def _close(port: Any) -> None:
+    """Close without waiting, half a minute it may be, until the device has taken what is unsent."""
+    with contextlib.suppress(termios.error):  # the device is gone, and what was unsent with it
+        termios.tcflush(port.fileno(), termios.TCOFLUSH)
+    port.close()

@@ -4,7 +4,6 @@ Pure and synchronous. Time comes with the events; the same events give the same 
 same digest, whoever feeds them.
 """
 
-from collections import Counter, deque
 from collections.abc import Iterable
 from typing import Final
 
@@ -15,9 +14,11 @@ from companion.beams.aim import AIMABLE, aim
 from companion.config import Center, FixedCenter, Settings, VehicleCenter, parse_center
 from companion.digest import Digest
 from companion.mavlink.admission import Admission
+from companion.mavlink.adsb import Aircraft
 from companion.mavlink.clocks import ClockEstimate, SenderClock, Stamp
 from companion.mavlink.decode import DECODED, decode
 from companion.mavlink.dedupe import Dedupe, LinkShare
+from companion.refusals import Refusals
 from companion.tracking import carrier, noise
 from companion.tracking.fleet import SenderTime
 from companion.tracking.geodesy import LocalFrame
@@ -31,7 +32,6 @@ from companion.values import (
     FloatArray,
     Frame,
     GnssStatus,
-    Message,
     Notice,
     Output,
     Presence,
@@ -46,13 +46,12 @@ from companion.values import (
     Tick,
     Track,
     TrackState,
+    Traffic,
     Update,
 )
 
 NEAR_M: Final = 2000.0
 """Two reports of one aircraft are not further apart, however fast it is and however old one is."""
-RECENT: Final = 8
-"""Rejections of each sender that are kept to be shown."""
 
 
 class Pipeline:
@@ -65,9 +64,7 @@ class Pipeline:
         self.settings = settings
         self.frames = 0
         self.updates = 0
-        self.rejected: Counter[Reason] = Counter()
-        self.rejected_by_source: dict[str, Counter[Reason]] = {}
-        self.recent_rejections: dict[str, deque[Rejection]] = {}
+        self.refusals = Refusals()
         self.digest = Digest()
         self.array = assembly.array(settings)
         self.coverage = assembly.coverage(settings)
@@ -83,6 +80,7 @@ class Pipeline:
         self._clocks: dict[str, SenderClock] = {}  # by SYSID:COMPID
         self._dedupe = Dedupe()
         self._admission = Admission(settings.tracks.allow, settings.tracks.deny)
+        self._aircraft = Aircraft()
         self._fleet = assembly.fleet(settings, self._sender_time)
         self._targets: list[str] = []  # in the order in which they were first heard
         self._identities = Identities()
@@ -106,11 +104,7 @@ class Pipeline:
                 outputs = []
         for output in outputs:
             if isinstance(output, Rejection):
-                self.rejected[output.reason] += output.count
-                by_source = self.rejected_by_source.setdefault(output.source, Counter())
-                by_source[output.reason] += output.count
-                recent = self.recent_rejections.setdefault(output.source, deque(maxlen=RECENT))
-                recent.append(output)
+                self.refusals.add(output)
             elif isinstance(output, Estimate | Update):
                 self.digest.add(output)
         return outputs
@@ -119,7 +113,7 @@ class Pipeline:
         self.frames += 1
         if frame.msgid not in DECODED:
             return []
-        message: Message | Rejection | None = decode(frame)
+        message = decode(frame)
         match message:
             case Rejection():
                 return [message]
@@ -129,6 +123,10 @@ class Pipeline:
                 if message.uav != self._carrier_id and not self._admission.admits(message.uav):
                     return [Rejection(frame.t_ns, message.uav, Reason.NOT_ALLOWED)]
                 return self._report(message)
+            case Traffic():
+                if not self._admission.admits(message.uav):
+                    return [Rejection(frame.t_ns, message.uav, Reason.NOT_ALLOWED)]
+                return self._traffic(message)
             case Attitude() if str(message.source) == self._carrier_id:
                 return self._carrier_attitude(message)
             case GnssStatus():
@@ -139,6 +137,18 @@ class Pipeline:
             case Presence():
                 self.presence[message.source] = message
         return []
+
+    def _traffic(self, said: Traffic) -> list[Output]:
+        """A track does not go on from one datum to another: they differ by the weather."""
+        datum = self._aircraft.datum(said.uav)
+        merged = self._aircraft.merge(said)
+        if isinstance(merged, Rejection):
+            return [merged]
+        if datum in (None, merged.alt_datum):
+            return self._report(merged)
+        self._restart(said.uav)
+        text = f"{said.uav} is tracked anew: its altitude is {merged.alt_datum} now, not {datum}"
+        return [Notice(said.t_ns, Severity.INFO, said.uav, text), *self._report(merged)]
 
     def _report(self, report: Report) -> list[Output]:
         outputs: list[Output] = []
@@ -151,12 +161,9 @@ class Pipeline:
                 return [*outputs, Rejection(report.t_ns, report.uav, Reason.UNPLACED_STAMP)]
             t_ns, sender_ns = report.t_ns - round(stamp.latency_s * 1e9), stamp.sender_ns
             self._dedupe.took(stamp.latency_s)
-        if report.alt_m is None:
-            outputs.append(Rejection(report.t_ns, report.uav, Reason.NO_ALTITUDE))
-            return outputs
         if self.local is None:
-            outputs.append(self._first_report(report, report.alt_m))
-        accepted = self._fleet.accept(self._fix(report, sender_ns, t_ns, report.alt_m))
+            outputs.append(self._first_report(report))
+        accepted = self._fleet.accept(self._fix(report, sender_ns, t_ns))
         if isinstance(accepted, Estimate):
             if accepted.dt_s is None and self.is_target(report.uav):
                 self._targets = list(dict.fromkeys([*self._targets, report.uav]))
@@ -205,9 +212,9 @@ class Pipeline:
         if uav == self._carrier_id:
             self._attitude = None
 
-    def _first_report(self, report: Report, alt_m: float) -> Notice:
+    def _first_report(self, report: Report) -> Notice:
         """The first position of all sets the origin of the local frame, and ``home``."""
-        home = FixedCenter(report.lat_deg, report.lon_deg, alt_m)
+        home = FixedCenter(report.lat_deg, report.lon_deg, report.alt_m)
         self._set_origin(home)
         if self._carrier_id is not None:
             return Notice(report.t_ns, Severity.INFO, "origin", f"local frame begins at {home}")
@@ -218,15 +225,16 @@ class Pipeline:
     def _set_origin(self, at: FixedCenter) -> None:
         self.local = LocalFrame(at.lat_deg, at.lon_deg, at.alt_m)
 
-    def _fix(self, report: Report, sender_ns: int, t_ns: int, alt_m: float) -> Fix:
+    def _fix(self, report: Report, sender_ns: int, t_ns: int) -> Fix:
         assert self.local is not None
         velocity = None
         if report.velocity_ne_mps is not None and report.velocity_down_mps is not None:
             there = np.array([*report.velocity_ne_mps, report.velocity_down_mps])
             velocity = self.local.local_from_ned(report.lat_deg, report.lon_deg) @ there
-        position = self.local.position_ned_m(report.lat_deg, report.lon_deg, alt_m)
+        position = self.local.position_ned_m(report.lat_deg, report.lon_deg, report.alt_m)
         if report.boot_ms is None:
-            errors = noise.relayed(velocity, self.settings.observer.speed_max_mps)
+            most_mps = self.settings.observer.speed_max_mps
+            errors = noise.relayed(velocity, report.alt_age_s, most_mps)
         else:
             errors = self._noise.get(report.source, self._noise_settings.default)
         return Fix(report.uav, sender_ns, t_ns, report.t_ns, position, velocity, errors, report)

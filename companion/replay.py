@@ -168,7 +168,9 @@ def _summary(pipeline: Pipeline, tally: Tally) -> dict[str, Any]:
     tracks = pipeline.tracks(now_ns, now_ns)
     return {
         "frames": pipeline.frames,
-        "rejected": {str(reason): count for reason, count in sorted(pipeline.rejected.items())},
+        "rejected": {
+            str(reason): count for reason, count in sorted(pipeline.refusals.total.items())
+        },
         "reports": {track.uav: tally.reports[track.uav] for track in tracks},
         "uavs": {
             track.uav: {

@@ -116,7 +116,7 @@ def final_tracks(events: list[Event], at_ns: int) -> dict[str, Track]:
     pipeline = Pipeline(Settings().override(center={"source": "47.3977419,8.5455938,488"}))
     for event in events:
         pipeline.step(event)
-    assert not pipeline.rejected.keys() - {"duplicate", "zero-position", "out-of-order"}
+    assert not pipeline.refusals.total.keys() - {"duplicate", "zero-position", "out-of-order"}
     tracks = pipeline.tracks(at_ns, at_ns)
     return {track.uav: track for track in tracks if not track.uav.startswith("icao:")}
 
@@ -164,7 +164,7 @@ def test_real_flights_are_not_gated(name: str) -> None:
     for event in read_log(shared_log(name)):
         pipeline.step(event)
     gated = {"unreachable", "altitude-jump", "frozen", "shared-id"}
-    assert not gated & {str(reason) for reason in pipeline.rejected}
+    assert not gated & {str(reason) for reason in pipeline.refusals.total}
 
 
 def with_glitch(events: list[Event], sysid: int, from_s: float, to_s: float) -> list[Event]:
@@ -191,10 +191,10 @@ def test_a_glitch_is_gated_and_the_rest_of_the_flight_is_not(cut_log: Path) -> N
     pipeline = Pipeline(Settings().override(center={"source": "5:1"}))
     for event in with_glitch(events, 2, 8.0, 10.0):
         pipeline.step(event)
-    rejected = pipeline.rejected_by_source
-    assert set(rejected.get("2:1", {})) == {"unreachable"}
-    assert 15 <= rejected["2:1"].total() <= 22
-    assert not any("unreachable" in rejected.get(f"{n}:1", {}) for n in (1, 3, 4, 5))
+    refused = pipeline.refusals.of("2:1").counts
+    assert set(refused) == {"unreachable"}
+    assert 15 <= refused.total() <= 22
+    assert not any("unreachable" in pipeline.refusals.of(f"{n}:1").counts for n in (1, 3, 4, 5))
     now_ns = events[-1].t_ns
     (track,) = (t for t in pipeline.tracks(now_ns, now_ns) if t.uav == "2:1")
     assert track.state == "live"

@@ -32,6 +32,7 @@ PURE = (
     "companion/beams/",
     "companion/digest.py",
     "companion/link_settings.py",
+    "companion/refusals.py",
     "companion/section.py",
     "companion/ticks.py",
     "sitl_replay/attitudes.py",

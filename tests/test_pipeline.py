@@ -327,9 +327,38 @@ def test_adsb_without_what_it_takes_is_counted(flags: int, reason: Reason, who: 
     (refused,) = pipeline.step(adsb(0, (3000, 500, -800), flags))
     assert isinstance(refused, Rejection)
     assert refused.reason is reason
-    assert pipeline.rejected == {reason: 1}
-    assert pipeline.rejected_by_source == {who: {reason: 1}}
+    assert pipeline.refusals.total == {reason: 1}
+    assert pipeline.refusals.of(who).counts == {reason: 1}
     assert pipeline.local is None
+
+
+def relayed(t_s: float, north_m: float, alt_m: float, datum: int, relay: str = "5:1") -> Frame:
+    """ADSB_VEHICLE of what flies north at 50 m/s, level; ``datum`` is ADSB_ALTITUDE_TYPE."""
+    lat, lon, _ = pymap3d.ned2geodetic(north_m, 500, 0, *PLACE)
+    message = dialect.MAVLink_adsb_vehicle_message(
+        0x4CA7B3, round(float(lat) * 1e7), round(float(lon) * 1e7), datum, round(alt_m * 1e3),
+        0, 5000, 0, b"TEST", 0, 0, 1 | 2 | 4 | 8 | 128, 0,
+    )  # fmt: skip
+    return sent(t_s, relay, message)
+
+
+def test_an_aircraft_of_two_relays_is_one_track_at_one_datum() -> None:
+    """One relay has its altitude by pressure, 300 m off; when the other falls silent, so be it."""
+    pipeline = Pipeline(settings("47.4,8.55,500"))
+    heard = [relayed(t_s, 50 * t_s, 1300, 1) for t_s in range(10)]
+    heard += [relayed(t_s + 0.5, 50 * t_s + 25, 1000, 0, "6:1") for t_s in range(30)]
+    heard += [relayed(t_s + 0.6, 50 * t_s, 1300, 1, "7:1") for t_s in range(10)]
+    outputs = run(pipeline, sorted(heard, key=lambda each: each.t_ns))
+    heights = [o.fix.report.alt_m for o in outputs if isinstance(o, Estimate)]
+    assert heights == [1300] * 29 + [1000] * 11  # 1300 was said at 9 s for the last time
+    assert pipeline.refusals.total == {Reason.DUPLICATE: 10}
+    (notice,) = (output for output in outputs if isinstance(output, Notice))
+    assert (notice.subject, notice.severity) == ("icao:4CA7B3", Severity.INFO)
+    assert "is pressure now, not geometric" in notice.text
+    now_ns = tick(30).t_ns
+    (track,) = pipeline.tracks(now_ns, now_ns)
+    assert track.position_ned_m[2] == pytest.approx(-500, abs=1)
+    assert track.reports == 11  # of the new datum alone
 
 
 def test_the_same_report_over_two_links_counts_once() -> None:
@@ -338,8 +367,8 @@ def test_the_same_report_over_two_links_counts_once() -> None:
     again = position(0.0, "1:1", seq=77, link="tcp")._replace(t_ns=START_NS + S // 2)
     (refused,) = pipeline.step(again)
     assert refused == Rejection(again.t_ns, "1:1", Reason.DUPLICATE)
-    assert pipeline.rejected == {Reason.DUPLICATE: 1}
-    assert list(pipeline.recent_rejections["1:1"]) == [refused]
+    assert pipeline.refusals.total == {Reason.DUPLICATE: 1}
+    assert list(pipeline.refusals.of("1:1").recent) == [refused]
     assert pipeline.frames == 2
     track = pipeline.tracks(again.t_ns, again.t_ns)[0]
     assert track.reports == 1
@@ -352,7 +381,7 @@ def test_a_late_report_is_put_in_its_place() -> None:
     run(in_order, made)
     found = run(late, [made[0], made[2], made[1]._replace(t_ns=START_NS + S)])
     assert isinstance(found[-1], Estimate)
-    assert not late.rejected
+    assert not late.refusals.total
     one, other = (updated(pipeline, 1.5).tracks[0] for pipeline in (in_order, late))
     assert one.position_ned_m.tolist() == other.position_ned_m.tolist()
     assert (one.bound_m, one.reports) == (other.bound_m, 3)
@@ -366,7 +395,7 @@ def test_a_report_later_than_the_window_is_out_of_order() -> None:
     (refused,) = pipeline.step(late)
     assert isinstance(refused, Rejection)
     assert refused.reason is Reason.OUT_OF_ORDER
-    assert pipeline.rejected == {Reason.OUT_OF_ORDER: 1}
+    assert pipeline.refusals.total == {Reason.OUT_OF_ORDER: 1}
 
 
 def test_reports_that_waited_together_are_not_out_of_order() -> None:
@@ -375,7 +404,7 @@ def test_reports_that_waited_together_are_not_out_of_order() -> None:
     for number in range(5):
         made = position(2.0, "1:1", (100, number, 0), boot_s=100 + 0.1 * number)
         pipeline.step(made)
-    assert not pipeline.rejected
+    assert not pipeline.refusals.total
     newest = pipeline.newest("1:1")
     assert newest is not None
     assert newest.position_ned_m[1] == pytest.approx(4, abs=0.02)
@@ -456,7 +485,7 @@ def test_a_track_that_is_begun_again_is_said_once() -> None:
     assert isinstance(estimate, Estimate)
     assert estimate.reacquired
     assert estimate.fix.arrival_ns == notice.t_ns == START_NS + 8 * S
-    assert pipeline.rejected == {Reason.UNREACHABLE: 30}
+    assert pipeline.refusals.total == {Reason.UNREACHABLE: 30}
     assert updated(pipeline, 10.0).beams.uavs == ("1:1",)
 
 
@@ -467,7 +496,7 @@ def test_a_position_at_0_0_is_counted_and_makes_no_track() -> None:
         (refused,) = pipeline.step(sent(t_s, "1:1", zero))
         assert isinstance(refused, Rejection)
         assert refused.reason is Reason.ZERO_POSITION
-    assert pipeline.rejected == {Reason.ZERO_POSITION: 2}
+    assert pipeline.refusals.total == {Reason.ZERO_POSITION: 2}
     assert updated(pipeline, 0.2).tracks == ()
 
 
@@ -477,8 +506,8 @@ def test_rejections_pass_through_and_are_counted() -> None:
     assert pipeline.step(garbage) == [garbage]
     pipeline.step(garbage)
     pipeline.step(Rejection(START_NS, "tcp", Reason.BAD_CRC, 2))
-    assert pipeline.rejected == {Reason.GARBAGE: 34, Reason.BAD_CRC: 2}
-    assert pipeline.rejected_by_source["udp"] == {Reason.GARBAGE: 34}
+    assert pipeline.refusals.total == {Reason.GARBAGE: 34, Reason.BAD_CRC: 2}
+    assert pipeline.refusals.of("udp").counts == {Reason.GARBAGE: 34}
     assert pipeline.frames == 0
 
 
@@ -651,7 +680,8 @@ def test_who_is_denied_is_not_tracked_and_that_is_counted() -> None:
     assert [track.uav for track in pipeline.tracks(now_ns, now_ns)] == ["1:1"]
     assert pipeline.newest("5:1") is not None  # the carrier always is
     refused = {
-        uav: counts[Reason.NOT_ALLOWED] for uav, counts in pipeline.rejected_by_source.items()
+        uav: pipeline.refusals.of(uav).counts[Reason.NOT_ALLOWED]
+        for uav in pipeline.refusals.senders()
     }
     assert refused["2:1"] == refused["3:7"] == 20
     assert refused["icao:4CA7B3"] > 0
@@ -671,7 +701,7 @@ def test_the_link_that_is_first_is_known_and_both_latencies_are() -> None:
     assert (fast.first, fast.repeats, slow.first, slow.repeats) == (49, 0, 1, 49)
     assert np.median(fast.latencies_s) == pytest.approx(0.0, abs=1e-3)
     assert np.median(slow.latencies_s) == pytest.approx(0.05, abs=1e-3)
-    assert pipeline.rejected[Reason.DUPLICATE] == 49
+    assert pipeline.refusals.total[Reason.DUPLICATE] == 49
     assert pipeline.link_share("another").first == 0
 
 

@@ -21,6 +21,7 @@ from companion.values import (
     Rejection,
     Report,
     SystemTime,
+    Traffic,
 )
 
 HEARTBEAT: Final = 0
@@ -34,8 +35,10 @@ NULL_ISLAND_RADIUS_M: Final = 5000.0
 """Around 0 N 0 E nothing is believed: estimators without a fix wander there by some metres."""
 _METRES_PER_DEGREE: Final = 111_195.0
 
-# ADSB_FLAGS
-_COORDS, _ALTITUDE, _HEADING, _VELOCITY, _VERTICAL = 1, 2, 4, 8, 128
+# ADSB_FLAGS. Not asked for: 256 is BARO_VALID to some and "retransmitted" to others (PX4).
+_COORDS, _ALTITUDE, _HEADING, _VELOCITY, _CALLSIGN, _VERTICAL = 1, 2, 4, 8, 16, 128
+_DATUM: Final = {0: AltitudeDatum.PRESSURE, 1: AltitudeDatum.GEOMETRIC}  # ADSB_ALTITUDE_TYPE
+_ICAO_MAX: Final = 0xFF_FFFF
 
 
 class _RefusedError(Exception):
@@ -105,38 +108,46 @@ def _global_position_int(frame: Frame) -> Report:
 _ADSB_VEHICLE = struct.Struct("<IiiiHHhHHB9sBB")
 
 
-def _adsb_vehicle(frame: Frame) -> Report:
+def _adsb_vehicle(frame: Frame) -> Traffic:
     """An aircraft as a receiver relays it. Each field counts only if its own flag is set.
 
-    ``ver_velocity`` is positive up; ``heading`` is the course over ground.
+    ``ver_velocity`` is positive up; ``heading`` is the course over ground. A speed without a
+    course is no velocity, an altitude of an undefined type no altitude, an address of 0 or of
+    more than 24 bits (ICAO Annex 10) no aircraft.
     """
     fields = _ADSB_VEHICLE.unpack(frame.payload.ljust(_ADSB_VEHICLE.size, b"\0")[:38])
     icao, lat, lon, alt_mm, heading_cdeg, speed_cmps, climb_cmps, flags = fields[:8]
-    datum, tslc_s = fields[9], fields[12]
-    if not flags & _COORDS:
-        raise _RefusedError(Reason.NO_POSITION)
-    lat_deg, lon_deg = _position(lat, lon)
+    altitude_type, callsign, emitter_type, tslc_s = fields[9:]
+    if not 0 < icao <= _ICAO_MAX:
+        raise _RefusedError(Reason.MALFORMED, f"ICAO address {icao:#x}")
     heading_deg = heading_cdeg * 1e-2 if flags & _HEADING and heading_cdeg <= 36_000 else None
     velocity_ne_mps = None
     if flags & _VELOCITY and heading_deg is not None:
         course, speed_mps = math.radians(heading_deg), speed_cmps * 1e-2
         velocity_ne_mps = (speed_mps * math.cos(course), speed_mps * math.sin(course))
-    return Report(
+    datum = _DATUM.get(altitude_type) if flags & _ALTITUDE else None
+    return Traffic(
         t_ns=frame.t_ns,
         link=frame.link,
-        uav=f"icao:{icao:06X}",
+        icao=icao,
         source=frame.source,
-        lat_deg=lat_deg,
-        lon_deg=lon_deg,
-        alt_m=alt_mm * 1e-3 if flags & _ALTITUDE else None,
-        alt_datum=AltitudeDatum.GEOMETRIC if datum == 1 else AltitudeDatum.PRESSURE,
-        relative_alt_m=None,
+        callsign=_callsign(callsign) if flags & _CALLSIGN else None,
+        emitter_type=emitter_type,
+        position_deg=_position(lat, lon) if flags & _COORDS else None,
+        alt_m=alt_mm * 1e-3 if datum is not None else None,
+        alt_datum=datum,
+        heading_deg=heading_deg,
         velocity_ne_mps=velocity_ne_mps,
         velocity_down_mps=-climb_cmps * 1e-2 if flags & _VERTICAL else None,
-        heading_deg=heading_deg,
-        boot_ms=None,
-        tslc_s=float(tslc_s),
+        tslc_s=tslc_s,
     )
+
+
+def _callsign(padded: bytes) -> str | None:
+    """Up to the first zero byte, without the blanks that fill it up; None where nothing is left,
+    or what cannot be printed."""
+    text = padded.partition(b"\0")[0].decode("latin-1").strip()
+    return text if text and text.isascii() and text.isprintable() else None
 
 
 _ATTITUDE = struct.Struct("<Iffffff")

@@ -2,8 +2,7 @@
 
 A report is known by its content: sender, message and payload. The sequence number is no part of
 it, since every link has its own. GLOBAL_POSITION_INT carries a boot time, so equal content is the
-same report; ADSB_VEHICLE carries none, and a receiver that sends the same content again within
-the window has heard nothing new.
+same report. ADSB_VEHICLE carries none: ``adsb`` knows what is new in it.
 """
 
 from collections import deque

@@ -35,14 +35,14 @@ def _timestamp(t_ns: int) -> dict[str, int]:
 
 
 def fix(value: Fix) -> Any:
-    """Where a UAV said it was: the report's own degrees. An unknown altitude is NaN, not 0."""
+    """Where a UAV said it was: the report's own degrees."""
     report = value.report
     return schemas.LocationFixMessage(
         timestamp=_timestamp(value.t_ns),
         frame_id=FRAME_ID,
         latitude=report.lat_deg,
         longitude=report.lon_deg,
-        altitude=math.nan if report.alt_m is None else report.alt_m,
+        altitude=report.alt_m,
     )
 
 

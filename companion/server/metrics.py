@@ -24,7 +24,7 @@ class NodeCollector(Collector):
         rejected = CounterMetricFamily(
             "companion_rejected", "What was received and not used, by reason", labels=["reason"]
         )
-        for reason, count in pipeline.rejected.items():
+        for reason, count in pipeline.refusals.total.items():
             rejected.add_metric([str(reason)], count)
         yield rejected
         states = GaugeMetricFamily("companion_uavs", "UAVs by state", labels=["state"])

@@ -1,6 +1,5 @@
 """The program's state as the API shows it: degrees and metres, RFC 3339 times, null for unknown."""
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -74,7 +73,7 @@ def status(node: Node, version: str) -> Json:
         "rates": dict(node.rates()),
         "frames": pipeline.frames,
         "updates": pipeline.updates,
-        "rejected": {str(reason): n for reason, n in sorted(pipeline.rejected.items())},
+        "rejected": {str(reason): n for reason, n in sorted(pipeline.refusals.total.items())},
         "digest": pipeline.digest.hexdigest(),
     }
 
@@ -144,7 +143,7 @@ def uav(
     offset = None if carrier is None else track.position_ned_m - carrier.position_ned_m
     north, east, down = (None, None, None) if offset is None else map(float, offset)
     velocity = vector(track.velocity_ned_mps)
-    rejected = pipeline.rejected_by_source.get(track.uav, Counter())
+    refused = pipeline.refusals.of(track.uav)
     newest = pipeline.newest(track.uav)
     return {
         "id": track.uav,
@@ -173,10 +172,10 @@ def uav(
         "gamma": track.gamma,
         "innovation_m": track.innovation_m,
         "reports": track.reports,
-        "rejected": {str(reason): count for reason, count in sorted(rejected.items())},
+        "rejected": {str(reason): count for reason, count in sorted(refused.counts.items())},
         "recent_rejections": [
             {"at": rfc3339(one.t_ns), "reason": str(one.reason), "detail": one.detail}
-            for one in pipeline.recent_rejections.get(track.uav, ())
+            for one in refused.recent
         ],
     }
 

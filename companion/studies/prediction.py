@@ -101,7 +101,7 @@ class FleetPredictor:
 
 _UAV: Final = "1:1"
 _REPORT: Final = Report(
-    0, "study", _UAV, Source(1, 1), 0.0, 0.0, None, AltitudeDatum.MSL, None, None, None, None,
+    0, "study", _UAV, Source(1, 1), 0.0, 0.0, 0.0, AltitudeDatum.MSL, None, None, None, None,
     None, None,
 )  # fmt: skip
 """Stands for the message that a fix was made of, which tracking does not look into."""

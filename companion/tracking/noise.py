@@ -47,11 +47,15 @@ def _bound(accuracy: float | None, factor: float, default: float) -> float:
     return default if accuracy is None else max(QUANTISATION, factor * accuracy)
 
 
-def relayed(velocity_ned_mps: FloatArray | None, speed_max_mps: float) -> ReportNoise:
-    """Of an ADS-B report: a time in whole seconds is worth the way flown in one."""
+def relayed(
+    velocity_ned_mps: FloatArray | None, alt_age_s: float, speed_max_mps: float
+) -> ReportNoise:
+    """Of an ADS-B report: a time in whole seconds is worth the way flown in one, and an altitude
+    that was true at another time what can be climbed between."""
     if velocity_ned_mps is None:
         way_m = ADSB_TIME_BOUND_S * speed_max_mps
     else:
         way_m = ADSB_TIME_BOUND_S * float(np.sqrt(velocity_ned_mps @ velocity_ned_mps))
     off_m = ADSB_NOISE_M + way_m
-    return ReportNoise(off_m, off_m, math.hypot(off_m, off_m), ADSB_VELOCITY_NOISE_MPS)
+    vertical_m = off_m + alt_age_s * speed_max_mps
+    return ReportNoise(off_m, vertical_m, math.hypot(off_m, vertical_m), ADSB_VELOCITY_NOISE_MPS)

@@ -47,6 +47,7 @@ from companion.values.received import (
     Source,
     SystemTime,
     Tick,
+    Traffic,
 )
 from companion.values.tracked import (
     Carrier,
@@ -91,5 +92,6 @@ __all__ = [
     "Tick",
     "Track",
     "TrackState",
+    "Traffic",
     "Update",
 ]

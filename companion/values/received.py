@@ -126,7 +126,8 @@ class AltitudeDatum(StrEnum):
 class Report:
     """A position that a UAV sent of itself, or that a receiver relayed of it: degrees, metres, m/s
     in the north-east-down frame at the UAV itself. ``boot_ms`` is the sender's clock at the
-    position, ``tslc_s`` the age that an ADS-B receiver states in its stead."""
+    position, ``tslc_s`` the age that an ADS-B receiver states in its stead. ``alt_age_s``: how far
+    apart in time the position and the altitude were true; 0 where one message had both."""
 
     t_ns: int
     link: str
@@ -134,7 +135,7 @@ class Report:
     source: Source
     lat_deg: float
     lon_deg: float
-    alt_m: float | None
+    alt_m: float
     alt_datum: AltitudeDatum
     relative_alt_m: float | None
     velocity_ne_mps: tuple[float, float] | None
@@ -142,6 +143,35 @@ class Report:
     heading_deg: float | None
     boot_ms: int | None
     tslc_s: float | None
+    alt_age_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Traffic:
+    """What a receiver relays of an aircraft (ADSB_VEHICLE): degrees, metres, m/s in the
+    north-east-down frame at the aircraft. ``source`` is the relay. A field that its own flag does
+    not vouch for is None; ``alt_datum`` is None where ``alt_m`` is. ``tslc_s`` counts whole seconds
+    since the aircraft was last heard; ``emitter_type`` is MAVLink's ADSB_EMITTER_TYPE, which knows
+    vehicles on the ground and obstacles as well."""
+
+    t_ns: int
+    link: str
+    icao: int
+    source: Source
+    callsign: str | None
+    emitter_type: int
+    position_deg: tuple[float, float] | None
+    alt_m: float | None
+    alt_datum: AltitudeDatum | None
+    heading_deg: float | None
+    velocity_ne_mps: tuple[float, float] | None
+    velocity_down_mps: float | None
+    tslc_s: int
+
+    @property
+    def uav(self) -> str:
+        """The aircraft's name here: ``icao:`` and six hexadecimal digits."""
+        return f"icao:{self.icao:06X}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,4 +224,4 @@ class SystemTime:
     boot_ms: int
 
 
-Message = Report | Attitude | Presence | GnssStatus | SystemTime
+Message = Report | Traffic | Attitude | Presence | GnssStatus | SystemTime

@@ -23,6 +23,7 @@ from companion.values import (
     Report,
     Source,
     SystemTime,
+    Traffic,
 )
 
 Make = Callable[..., Frame]
@@ -82,11 +83,14 @@ def adsb(
     speed: int = 0,
     climb: int = 0,
     tslc: int = 0,
+    icao: int = 0x4CA7B3,
+    callsign: bytes = b"EIN123",
+    emitter_type: int = 3,
 ) -> Frame:
     return sent(
         dialect.MAVLink_adsb_vehicle_message(
-            0x4CA7B3, lat, lon, altitude_type, altitude, heading, speed, climb, b"EIN123", 3,
-            tslc, flags, 1200,
+            icao, lat, lon, altitude_type, altitude, heading, speed, climb, callsign,
+            emitter_type, tslc, flags, 1200,
         )
     )  # fmt: skip
 
@@ -106,6 +110,12 @@ def gps_raw_int(
 def report(frame: Frame) -> Report:
     found = decode(frame)
     assert isinstance(found, Report), found
+    return found
+
+
+def traffic(frame: Frame) -> Traffic:
+    found = decode(frame)
+    assert isinstance(found, Traffic), found
     return found
 
 
@@ -144,11 +154,12 @@ def expected(m: dialect.MAVLink_message, t_ns: int, link: str) -> Message | None
             )  # fmt: skip
         case "ADSB_VEHICLE":
             course, speed = math.radians(m.heading / 100), m.hor_velocity / 100
-            return Report(
-                t_ns, link, f"icao:{m.ICAO_address:06X}", source, m.lat / 1e7, m.lon / 1e7,
-                m.altitude / 1000, AltitudeDatum.PRESSURE, None,
-                (speed * math.cos(course), speed * math.sin(course)), -m.ver_velocity / 100,
-                m.heading / 100, None, float(m.tslc),
+            datums = (AltitudeDatum.PRESSURE, AltitudeDatum.GEOMETRIC)
+            return Traffic(
+                t_ns, link, m.ICAO_address, source, m.callsign, m.emitter_type,
+                (m.lat / 1e7, m.lon / 1e7), m.altitude / 1000, datums[m.altitude_type],
+                m.heading / 100, (speed * math.cos(course), speed * math.sin(course)),
+                -m.ver_velocity / 100, m.tslc,
             )  # fmt: skip
     return None
 
@@ -251,8 +262,10 @@ def test_near_null_island_nothing_is_believed(make: Make, lat: int, lon: int) ->
     ],
 )
 def test_everywhere_else_on_earth_is_believed(make: Make, lat: int, lon: int) -> None:
-    found = report(make(lat=lat, lon=lon))
-    assert (found.lat_deg, found.lon_deg) == pytest.approx((lat / 1e7, lon / 1e7), abs=1e-12)
+    found = decode(make(lat=lat, lon=lon))
+    assert isinstance(found, Report | Traffic)
+    place = (found.lat_deg, found.lon_deg) if isinstance(found, Report) else found.position_deg
+    assert place == pytest.approx((lat / 1e7, lon / 1e7), abs=1e-12)
 
 
 @pytest.mark.parametrize("make", [position, adsb])
@@ -274,17 +287,40 @@ def test_what_is_no_place_on_earth_is_malformed(make: Make, lat: int, lon: int) 
 # --- ADSB_VEHICLE -------------------------------------------------------------------------------
 
 
+def test_the_flags_are_those_of_the_dialect() -> None:
+    """One at a time, no other field is there."""
+    names = {
+        dialect.ADSB_FLAGS_VALID_COORDS: "position_deg",
+        dialect.ADSB_FLAGS_VALID_ALTITUDE: "alt_m",
+        dialect.ADSB_FLAGS_VALID_HEADING: "heading_deg",
+        dialect.ADSB_FLAGS_VALID_VELOCITY: None,  # a speed without a course is no velocity
+        dialect.ADSB_FLAGS_VALID_CALLSIGN: "callsign",
+        dialect.ADSB_FLAGS_VALID_SQUAWK: None,
+        dialect.ADSB_FLAGS_SIMULATED: None,
+        dialect.ADSB_FLAGS_VERTICAL_VELOCITY_VALID: "velocity_down_mps",
+        dialect.ADSB_FLAGS_BARO_VALID: None,
+        dialect.ADSB_FLAGS_SOURCE_UAT: None,
+    }
+    assert names.keys() == dialect.enums["ADSB_FLAGS"].keys() - {dialect.ADSB_FLAGS_ENUM_END}
+    fields = {name for name in names.values() if name} | {"velocity_ne_mps", "alt_datum"}
+    for flag, name in names.items():
+        found = traffic(adsb(flag, altitude=1, heading=2, speed=3, climb=4))
+        there = {field for field in fields if getattr(found, field) is not None}
+        assert there == {name, "alt_datum" if name == "alt_m" else name} - {None}
+
+
 @settings(max_examples=400)
 @given(
     flags=st.integers(0, 0xFFFF),
-    altitude_type=st.integers(0, 1),
+    altitude_type=st.integers(0, 3),
     altitude=st.integers(-(2**31), 2**31 - 1),
-    heading=st.integers(0, 35_999),
+    heading=st.integers(0, 0xFFFF),
     speed=st.integers(0, 0xFFFF),
     climb=st.integers(-(2**15), 2**15 - 1),
     tslc=st.integers(0, 255),
+    emitter_type=st.integers(0, 255),
 )
-def test_an_adsb_field_is_none_exactly_when_its_flag_is_clear(
+def test_an_adsb_field_is_none_exactly_when_nobody_vouches_for_it(
     flags: int,
     altitude_type: int,
     altitude: int,
@@ -292,25 +328,32 @@ def test_an_adsb_field_is_none_exactly_when_its_flag_is_clear(
     speed: int,
     climb: int,
     tslc: int,
+    emitter_type: int,
 ) -> None:
-    frame = adsb(
-        flags,
-        altitude_type=altitude_type,
-        altitude=altitude,
-        heading=heading,
-        speed=speed,
-        climb=climb,
-        tslc=tslc,
+    found = traffic(
+        adsb(
+            flags,
+            altitude_type=altitude_type,
+            altitude=altitude,
+            heading=heading,
+            speed=speed,
+            climb=climb,
+            tslc=tslc,
+            emitter_type=emitter_type,
+        )
     )
-    if not flags & dialect.ADSB_FLAGS_VALID_COORDS:
-        assert rejected(frame) is Reason.NO_POSITION
-        return
-    found = report(frame)
-    has_altitude = flags & dialect.ADSB_FLAGS_VALID_ALTITUDE
-    has_heading = flags & dialect.ADSB_FLAGS_VALID_HEADING
+    datum = {
+        dialect.ADSB_ALTITUDE_TYPE_PRESSURE_QNH: AltitudeDatum.PRESSURE,
+        dialect.ADSB_ALTITUDE_TYPE_GEOMETRIC: AltitudeDatum.GEOMETRIC,
+    }.get(altitude_type)
+    has_altitude = flags & dialect.ADSB_FLAGS_VALID_ALTITUDE and datum
+    has_heading = flags & dialect.ADSB_FLAGS_VALID_HEADING and heading <= 36_000
     has_speed = flags & dialect.ADSB_FLAGS_VALID_VELOCITY
     has_climb = flags & dialect.ADSB_FLAGS_VERTICAL_VELOCITY_VALID
+    place = pytest.approx((HERE[0] / 1e7, HERE[1] / 1e7), abs=1e-12)
+    assert found.position_deg == (place if flags & dialect.ADSB_FLAGS_VALID_COORDS else None)
     assert found.alt_m == (pytest.approx(altitude / 1000) if has_altitude else None)
+    assert found.alt_datum is (datum if has_altitude else None)
     assert found.heading_deg == (pytest.approx(heading / 100) if has_heading else None)
     assert found.velocity_down_mps == (pytest.approx(-climb / 100) if has_climb else None)
     if has_speed and has_heading:
@@ -318,22 +361,46 @@ def test_an_adsb_field_is_none_exactly_when_its_flag_is_clear(
         ahead = (speed / 100 * math.cos(course), speed / 100 * math.sin(course))
         assert found.velocity_ne_mps == pytest.approx(ahead, abs=1e-9)
     else:
-        assert found.velocity_ne_mps is None  # a speed without a course is no velocity
-    datums = (AltitudeDatum.PRESSURE, AltitudeDatum.GEOMETRIC)
-    assert found.alt_datum is datums[altitude_type]
-    assert found.tslc_s == tslc
-    assert (found.boot_ms, found.relative_alt_m) == (None, None)
-    assert (found.uav, found.source) == ("icao:4CA7B3", (7, 3))
+        assert found.velocity_ne_mps is None
+    assert found.callsign == ("EIN123" if flags & dialect.ADSB_FLAGS_VALID_CALLSIGN else None)
+    assert (found.tslc_s, found.emitter_type) == (tslc, emitter_type)
+    assert (found.icao, found.uav, found.source) == (0x4CA7B3, "icao:4CA7B3", (7, 3))
 
 
 def test_an_adsb_position_is_not_judged_without_its_flag() -> None:
-    assert rejected(adsb(0xFFFF & ~1, lat=0, lon=0)) is Reason.NO_POSITION
-    assert rejected(adsb(0xFFFF & ~1, lat=2**31 - 1)) is Reason.NO_POSITION
+    for place in ({"lat": 0, "lon": 0}, {"lat": 2**31 - 1}):
+        assert traffic(adsb(0xFFFF & ~1, **place)).position_deg is None
 
 
 def test_adsb_climb_is_positive_up() -> None:
-    assert report(adsb(climb=250)).velocity_down_mps == pytest.approx(-2.5)
-    assert report(adsb(heading=9000, speed=1000)).velocity_ne_mps == pytest.approx((0.0, 10.0))
+    assert traffic(adsb(climb=250)).velocity_down_mps == pytest.approx(-2.5)
+    assert traffic(adsb(heading=9000, speed=1000)).velocity_ne_mps == pytest.approx((0.0, 10.0))
+
+
+@pytest.mark.parametrize("flags", [0, 0xFFFF])
+def test_an_address_is_24_bits_and_not_0(flags: int) -> None:
+    for icao in (0, 1 << 24, 0xFFFF_FFFF):
+        assert rejected(adsb(flags, icao=icao)) is Reason.MALFORMED
+    assert traffic(adsb(flags, icao=1)).uav == "icao:000001"
+    assert traffic(adsb(flags, icao=0xFF_FFFF)).uav == "icao:FFFFFF"
+
+
+@pytest.mark.parametrize(
+    ("padded", "callsign"),
+    [
+        (b"", None),
+        (b"EZY85MH", "EZY85MH"),
+        (b"N12345  ", "N12345"),
+        (b"SIM 5590\0", "SIM 5590"),
+        (b"123456789", "123456789"),  # not ended by a zero
+        (b"        ", None),
+        (b"AB\0garb", "AB"),
+        (b"\xe9\xfe\xff", None),
+        (b"A\x07B", None),
+    ],
+)
+def test_a_callsign_is_what_can_be_read(padded: bytes, callsign: str | None) -> None:
+    assert traffic(adsb(callsign=padded)).callsign == callsign
 
 
 # --- what is cut off, and what is missing -------------------------------------------------------
@@ -361,7 +428,7 @@ def test_a_payload_of_one_byte() -> None:
     assert decode(frame) == Presence(T_NS, Source(7, 3), 0, 0, 0, False)
     assert rejected(sent(dialect.MAVLink_adsb_vehicle_message(
         0, 0, 0, 0, 0, 0, 0, 0, b"", 0, 0, 0, 0
-    ))) is Reason.NO_POSITION  # fmt: skip
+    ))) is Reason.MALFORMED  # fmt: skip
     frame = sent(dialect.MAVLink_gps_raw_int_message(0, 0, 0, 0, 0, 0, 0, 0, 0, 0))
     assert decode(frame) == GnssStatus(T_NS, Source(7, 3), 0, 0, None, None, None)
 
@@ -372,9 +439,10 @@ def test_an_adsb_payload_cut_within_its_flags() -> None:
         1, *HERE, 0, 0, 0, 0, 0, b"", 0, 0, dialect.ADSB_FLAGS_VALID_COORDS, 0
     ))  # fmt: skip
     assert len(frame.payload) == 23
-    found = report(frame)
-    assert (found.uav, found.alt_m, found.heading_deg) == ("icao:000001", None, None)
-    assert (found.velocity_ne_mps, found.velocity_down_mps, found.tslc_s) == (None, None, 0.0)
+    place = pytest.approx((HERE[0] / 1e7, HERE[1] / 1e7), abs=1e-12)
+    assert traffic(frame) == Traffic(
+        T_NS, "udpin:x", 1, Source(7, 3), None, 0, place, None, None, None, None, None, 0
+    )
 
 
 def test_a_later_standard_may_append_fields() -> None:

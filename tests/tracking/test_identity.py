@@ -26,7 +26,7 @@ def track(uav: str, position: ArrayLike, velocity: ArrayLike | None = VELOCITY) 
 
 def relayed(fix: MakeFix, n: int, position: ArrayLike, velocity: ArrayLike = VELOCITY) -> Fix:
     speeds = np.array(velocity, dtype=float)
-    return fix(n * S, position, velocity, uav=AIRCRAFT, noise=noise.relayed(speeds, 60.0))
+    return fix(n * S, position, velocity, uav=AIRCRAFT, noise=noise.relayed(speeds, 0.0, 60.0))
 
 
 def after(fix: MakeFix, offsets: list[float], *others: Track) -> str | None:

@@ -7,7 +7,7 @@ import json
 import math
 import signal
 import sys
-from collections.abc import Callable, Coroutine, Iterable, Iterator, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +15,31 @@ import click
 
 from companion import __version__
 from companion.console import OneLineErrors
+from companion.mavlink.urls import LinkUrl, parse_link
 from companion.values import Event, Frame, Reason, Rejection
 from sitl_replay import player, recorder, scenario
-from sitl_replay.links import RECEIVING, SENDING, LinkError, Url
+from sitl_replay.faults import Fault, described, in_order
+from sitl_replay.faulty_traffic import HELD_MAX, OVERFLOW
 
 PROGRESS_EVERY_S = 0.5
 
 
-def as_links(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> tuple[Url, ...]:
+def as_links(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> tuple[LinkUrl, ...]:
     """The URLs of links to send over; a usage error says what is allowed."""
-    return tuple(_url(value, SENDING) for value in values)
+    return tuple(_url(value) for value in values)
 
 
-def as_source(_: click.Context, __: click.Parameter, value: str) -> Url:
+def as_source(_: click.Context, __: click.Parameter, value: str) -> LinkUrl:
     """The URL of a link to listen to."""
-    return _url(value, RECEIVING)
+    return _url(value)
+
+
+def as_faults(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> list[Fault]:
+    """The faults; a usage error says what is allowed."""
+    try:
+        return in_order([Fault.parse(value) for value in values])
+    except ValueError as error:
+        raise click.BadParameter(str(error)) from error
 
 
 def as_duration(_: click.Context, __: click.Parameter, value: str | None) -> float | None:
@@ -42,9 +52,9 @@ def as_speed(_: click.Context, __: click.Parameter, value: str) -> float | None:
     return None if value == "max" else _positive(value, "a number above 0, or 'max'")
 
 
-def _url(text: str, schemes: Sequence[str]) -> Url:
+def _url(text: str) -> LinkUrl:
     try:
-        return Url.parse(text, schemes)
+        return parse_link(text)
     except ValueError as error:
         raise click.BadParameter(str(error)) from error
 
@@ -60,8 +70,8 @@ def _positive(text: str, what: str) -> float:
 
 
 def sending_options(command: Callable[..., None]) -> Callable[..., None]:
-    """``--to`` and ``--json``, for the commands that send."""
-    command = json_option(command)
+    """``--to``, ``--fault`` and ``--json``, for the commands that send."""
+    command = fault_option(json_option(command))
     return click.option(
         "--to",
         "links",
@@ -69,12 +79,23 @@ def sending_options(command: Callable[..., None]) -> Callable[..., None]:
         multiple=True,
         required=True,
         callback=as_links,
-        help="Where to send: udpout:HOST:PORT or tcp:HOST:PORT. May be given several times.",
+        help="Where to send: udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD, tcpin:HOST:PORT"
+        " (serves those who connect) or udpin:HOST:PORT (answers those who send it anything)."
+        " The last two wait for their first peer before it begins. May be given several times.",
     )(command)
 
 
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="The summary as one JSON object."
+)
+fault_option = click.option(
+    "--fault",
+    "faults",
+    metavar="NAME[@SYSID[:COMPID]]=VALUE",
+    multiple=True,
+    callback=as_faults,
+    help="Make the traffic faulty (see below), for all or for one system or component alone."
+    " May be given several times.",
 )
 duration_option = click.option(
     "--duration",
@@ -83,6 +104,15 @@ duration_option = click.option(
     callback=as_duration,
     help="Stop after so many seconds.",
 )
+FAULTS = f"""Faults, in the order in which they are applied, whatever the order of the options.
+The first four are the senders' own and the same on every link: their frames are rewritten with a
+checksum that holds, and lose a signature. The others strike each link by itself.
+The same --seed and input give the same bytes at the same times; seconds count from the start
+(of the log: at --speed 2 they pass twice as fast).
+
+{described()}
+
+No more than {HELD_MAX} frames are held back; beyond, they are lost and counted as {OVERFLOW}."""
 
 
 @click.group(name="sitl-replay", cls=OneLineErrors)
@@ -94,7 +124,7 @@ def main() -> None:
     """
 
 
-@main.command()
+@main.command(epilog=FAULTS)
 @click.argument("name", metavar="SCENARIO", type=click.Choice(list(scenario.BUILDERS)))
 @sending_options
 @click.option(
@@ -105,7 +135,9 @@ def main() -> None:
     help="How many UAVs fly about the carrier.",
 )
 @duration_option
-@click.option("--seed", type=int, default=0, show_default=True, help="Of what is left to chance.")
+@click.option(
+    "--seed", type=int, default=0, show_default=True, help="Of what is left to chance, and faults."
+)
 @click.option(
     "--record",
     type=click.Path(dir_okay=False, writable=True, path_type=Path),
@@ -113,11 +145,12 @@ def main() -> None:
 )
 def fly(
     name: str,
-    links: tuple[Url, ...],
+    links: tuple[LinkUrl, ...],
     uavs: int,
     duration_s: float | None,
     seed: int,
     record: Path | None,
+    faults: list[Fault],
     as_json: bool,
 ) -> None:
     """Fly SCENARIO (see `sitl-replay list`): synthetic vehicles as MAVLink 2.
@@ -132,11 +165,11 @@ def fly(
         flight = scenario.BUILDERS[name](uavs, seed)
     except ValueError as error:
         raise click.BadParameter(f"{name}: {error}", param_hint="'--uavs'") from error
-    run(player.fly(flight, urls, duration_s, seed, record, tally=tally), tally)
+    run(player.fly(flight, urls, duration_s, seed, record, faults=faults, tally=tally), tally)
     conclude(tally, "sent", as_json)
 
 
-@main.command()
+@main.command(epilog=FAULTS)
 @click.argument("log", type=click.Path(exists=True, dir_okay=False, readable=True, path_type=Path))
 @sending_options
 @click.option(
@@ -147,17 +180,29 @@ def fly(
     show_default=True,
     help="Times as fast as it was; max: without waiting (over UDP a slow receiver loses frames).",
 )
-def play(log: Path, links: tuple[Url, ...], speed: float | None, as_json: bool) -> None:
+@click.option("--seed", type=int, default=0, show_default=True, help="Of the faults.")
+def play(
+    log: Path,
+    links: tuple[LinkUrl, ...],
+    speed: float | None,
+    seed: int,
+    faults: list[Fault],
+    as_json: bool,
+) -> None:
     """Play LOG (.tlog, raw MAVLink, .mcap) as live traffic.
 
     Paced by the log's stamps; where they step back or leap by more than 5 s, the step is played
     as 0 or 5 s, and the end says how many were.
 
     Example: sitl-replay play flight.tlog --to udpout:127.0.0.1:14550 --speed 2
+
+    Example: sitl-replay play flight.tlog --to tcpin:127.0.0.1:5760 --fault loss=0.1
+    --fault jitter=0.2 --fault frozen@3:1=20:5 --seed 7
     """
     tally = player.Tally()
     urls = [str(url) for url in links]
-    run(player.play(frames_of(log, tally), urls, speed, tally=tally), tally)
+    frames = frames_of(log, tally)
+    run(player.play(frames, urls, speed, faults=faults, seed=seed, tally=tally), tally)
     if tally.clamped:
         click.echo(
             f"{log}: {tally.clamped} time stamps step back, or leap by more than 5 s;"
@@ -174,7 +219,9 @@ def play(log: Path, links: tuple[Url, ...], speed: float | None, as_json: bool) 
     metavar="URL",
     callback=as_source,
     required=True,
-    help="What to listen to: udpin:HOST:PORT or tcp:HOST:PORT.",
+    help="What to listen to: udpin:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT, serial:DEVICE:BAUD or"
+    " udpout:HOST:PORT. Nothing is sent there; only over udpout an empty datagram each second,"
+    " until something is heard, since the peer cannot know of us otherwise.",
 )
 @click.option(
     "--out",
@@ -184,10 +231,11 @@ def play(log: Path, links: tuple[Url, ...], speed: float | None, as_json: bool) 
 )
 @duration_option
 @json_option
-def record(url: Url, out: Path, duration_s: float | None, as_json: bool) -> None:
+def record(url: LinkUrl, out: Path, duration_s: float | None, as_json: bool) -> None:
     """Write MAVLink traffic to a tlog, until --duration, SIGINT or SIGTERM.
 
-    Frames whose checksum is wrong, or whose message is unknown, are counted and not written.
+    Stamps are Unix time at the start and never step back. Frames whose checksum is wrong, or
+    whose message is unknown, are counted and not written.
 
     Example: sitl-replay record --from udpin:0.0.0.0:14550 --out flight.tlog
     """
@@ -248,7 +296,7 @@ def run(work: Coroutine[Any, Any, object], count: player.Tally | recorder.Heard)
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         raise click.ClickException(f"{where}{error.strerror or error}") from error
-    except (LinkError, ValueError) as error:  # a LogError is a ValueError
+    except ValueError as error:  # a LinkError, a LogError
         raise click.ClickException(str(error)) from error
 
 
@@ -284,6 +332,8 @@ def conclude(count: player.Tally | recorder.Heard, done: str, as_json: bool) -> 
         unusable = [f", {number} {why}" for why, number in count.rejected.items()]
         if isinstance(count, player.Tally) and count.dropped:
             unusable.append(f", {count.dropped} dropped")
+        if isinstance(count, player.Tally):
+            unusable += [f", {name}: {number}" for name, number in count.faults.items()]
         sizes = f"{count.frames} frames, {count.octets} bytes in {count.duration_s:.1f} s"
         click.echo(f"{done} {sizes}{''.join(unusable)}")
     if isinstance(count, player.Tally) and count.lost:
@@ -301,4 +351,9 @@ def summary_of(count: player.Tally | recorder.Heard) -> dict[str, Any]:
     common["rejected"] = dict(count.rejected)
     if isinstance(count, recorder.Heard):
         return common
-    return common | {"dropped": count.dropped, "clamped": count.clamped, "lost": count.lost}
+    return common | {
+        "dropped": count.dropped,
+        "clamped": count.clamped,
+        "faults": dict(count.faults),
+        "lost": count.lost,
+    }

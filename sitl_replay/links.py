@@ -1,160 +1,96 @@
-"""Where traffic goes to and comes from: link URLs, and sending endpoints over asyncio."""
+"""Links by their URLs.
+
+udpout:HOST:PORT      one datagram a frame, to one peer
+udpin:HOST:PORT       to everybody who has sent something here, as to a vehicle's own port
+tcp:HOST:PORT         connect, once
+tcpin:HOST:PORT       serve everybody who connects, from then on, as SITL does
+serial:DEVICE:BAUD
+"""
 
 import asyncio
-import os
 import socket
-from collections.abc import Sequence
-from typing import NamedTuple, Protocol, Self
+from typing import Final
 
-SENDING = ("udpout", "tcp")
-RECEIVING = ("udpin", "tcp")
-MAX_PORT = 65_535
+from companion.mavlink.urls import LinkError, LinkUrl
+from sitl_replay.endpoints import (
+    Endpoint,
+    Receive,
+    TcpPeer,
+    TcpServer,
+    UdpPeer,
+    UdpServer,
+    ignore,
+    reason,
+)
 
-
-class LinkError(Exception):
-    """A link that cannot be opened, or whose peer is gone. The message names the URL."""
-
-
-class Url(NamedTuple):
-    """A link as users of MAVLink write it: ``SCHEME:HOST:PORT``, IPv6 hosts in brackets."""
-
-    scheme: str
-    host: str
-    port: int
-
-    def __str__(self) -> str:
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"{self.scheme}:{host}:{self.port}"
-
-    @classmethod
-    def parse(cls, text: str, schemes: Sequence[str] = SENDING) -> Self:
-        """Read a URL of one of ``schemes``; ``ValueError`` says what is wrong with it."""
-        scheme, _, rest = text.partition(":")
-        host, _, port = rest.rpartition(":")
-        bracketed = host.startswith("[") and host.endswith("]")
-        host = host[1:-1] if bracketed else host
-        if scheme not in schemes or not host or (":" in host) != bracketed:
-            forms = " or ".join(f"{known}:HOST:PORT" for known in schemes)
-            raise ValueError(f"{text!r} is not {forms} (an IPv6 host in brackets)")
-        if not (port.isdecimal() and port.isascii() and 1 <= int(port) <= MAX_PORT):
-            raise ValueError(f"{text!r}: {port!r} is not a port, 1 to {MAX_PORT}")
-        return cls(scheme, host, int(port))
+RECEIVE_BUFFER_BYTES: Final = 4 << 20
 
 
-class Peer(Protocol):
-    """Something that frames are sent to."""
-
-    url: Url
-    dropped: int
-    """Frames not sent because the peer does not take them fast enough."""
-    lost: str
-    """Why the peer is gone for good; empty while it is there."""
-
-    def send(self, raw: bytes) -> None:
-        """Send one frame, or drop it when the peer is behind. Never waits, never raises."""
-
-    async def writable(self) -> None:
-        """Wait until a frame would not be dropped, or the peer is lost."""
-
-    async def close(self) -> None:
-        """Send what is buffered, within a second, and close."""
-
-
-class _FlowControl:
-    """What both transports have: they say when their buffer is full and when it is not."""
-
-    def __init__(self, url: Url) -> None:
-        self.url = url
-        self.dropped = 0
-        self.lost = ""
-        self.closed = asyncio.Event()
-        self._room = asyncio.Event()
-        self._room.set()
-
-    def pause_writing(self) -> None:
-        self._room.clear()
-
-    def resume_writing(self) -> None:
-        self._room.set()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        self.lost = self.lost or (str(exc) if exc else "the peer closed the connection")
-        self._room.set()
-        self.closed.set()
-
-    async def writable(self) -> None:
-        await self._room.wait()
-
-    def has_room(self) -> bool:
-        if not self._room.is_set():
-            self.dropped += 1
-        return self._room.is_set() and not self.lost
-
-
-class UdpPeer(_FlowControl, asyncio.DatagramProtocol):
-    """One datagram a frame. A peer that is not there yet (ICMP refused) is no error."""
-
-    transport: asyncio.DatagramTransport
-
-    def connection_made(self, transport: asyncio.DatagramTransport) -> None:  # type: ignore[override]
-        self.transport = transport
-
-    def error_received(self, exc: Exception) -> None:
-        """Refused or unreachable: datagrams may be lost, and the next may arrive."""
-
-    def send(self, raw: bytes) -> None:
-        if self.has_room():
-            self.transport.sendto(raw)
-
-    async def close(self) -> None:
-        await _close(self, self.transport)
-
-
-class TcpPeer(_FlowControl, asyncio.Protocol):
-    """A connection, opened once. What the peer sends is read and thrown away."""
-
-    transport: asyncio.Transport
-
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        self.transport = transport
-
-    def send(self, raw: bytes) -> None:
-        if self.has_room():
-            self.transport.write(raw)
-
-    async def close(self) -> None:
-        await _close(self, self.transport)
-
-
-async def _close(
-    peer: UdpPeer | TcpPeer, transport: asyncio.DatagramTransport | asyncio.Transport
-) -> None:
-    transport.close()
+async def open_endpoint(url: LinkUrl, receive: Receive = ignore) -> Endpoint:
+    """Open a link. ``LinkError`` where that is not possible."""
     try:
-        await asyncio.wait_for(peer.closed.wait(), timeout=1.0)
-    except TimeoutError:
-        transport.abort()
+        match url.scheme:
+            case "udpout":
+                return await _udp_peer(url, receive)
+            case "udpin":
+                return await _udp_server(url, receive)
+            case "tcp":
+                return await _tcp_peer(url, receive)
+            case "tcpin":
+                return await _tcp_server(url, receive)
+            case "serial":
+                from sitl_replay.serial_port import open_port
 
-
-async def open_peer(url: Url) -> Peer:
-    """Open a link to send over. ``LinkError`` where that is not possible."""
-    loop = asyncio.get_running_loop()
-    peer: UdpPeer | TcpPeer
-    try:
-        if url.scheme == "tcp":
-            _, peer = await loop.create_connection(lambda: TcpPeer(url), url.host, url.port)
-        else:
-            _, peer = await loop.create_datagram_endpoint(
-                lambda: UdpPeer(url), remote_addr=(url.host, url.port)
-            )
+                return open_port(url, receive)
     except (OSError, UnicodeError) as error:
         raise LinkError(f"{url}: {reason(error)}") from error
+
+
+async def _udp_peer(url: LinkUrl, receive: Receive) -> UdpPeer:
+    opened = await _udp_socket(url)
+    _, peer = await asyncio.get_running_loop().create_datagram_endpoint(
+        lambda: UdpPeer(url, receive, opened), sock=opened
+    )
     return peer
 
 
-def reason(error: Exception) -> str:
-    """What the system says of a failure, in a few words."""
-    # asyncio words its own ("Connect call failed …"); a failed look-up has errors of its own.
-    if isinstance(error, OSError) and error.errno and not isinstance(error, socket.gaierror):
-        return os.strerror(error.errno)
-    return (error.strerror if isinstance(error, OSError) else None) or str(error)
+async def _udp_server(url: LinkUrl, receive: Receive) -> UdpServer:
+    opened = await _udp_socket(url)
+    chosen = LinkUrl(url.scheme, url.host, opened.getsockname()[1])
+    _, peer = await asyncio.get_running_loop().create_datagram_endpoint(
+        lambda: UdpServer(chosen, receive), sock=opened
+    )
+    return peer
+
+
+async def _udp_socket(url: LinkUrl) -> socket.socket:
+    """Connected or bound. By hand: it is then closed if that fails, on every event loop."""
+    loop = asyncio.get_running_loop()
+    found = await loop.getaddrinfo(url.host, url.port, type=socket.SOCK_DGRAM)
+    family, kind, protocol, _, address = found[0]
+    opened = socket.socket(family, kind, protocol)
+    try:
+        opened.setblocking(False)
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        if url.scheme == "udpin":
+            opened.bind(address)
+        else:
+            opened.connect(address)
+    except BaseException:
+        opened.close()
+        raise
+    return opened
+
+
+async def _tcp_peer(url: LinkUrl, receive: Receive) -> TcpPeer:
+    loop = asyncio.get_running_loop()
+    _, peer = await loop.create_connection(lambda: TcpPeer(url, receive), url.host, url.port)
+    return peer
+
+
+async def _tcp_server(url: LinkUrl, receive: Receive) -> TcpServer:
+    loop = asyncio.get_running_loop()
+    peer = TcpServer(url, receive)
+    peer.server = await loop.create_server(peer.visitor, url.host, url.port)
+    peer.url = LinkUrl(url.scheme, url.host, peer.server.sockets[0].getsockname()[1])
+    return peer

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import logging
+import math
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
@@ -11,8 +12,13 @@ from pathlib import Path
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from companion.mavlink.urls import LinkError, LinkUrl, parse_link
 from companion.values import Frame
-from sitl_replay.links import LinkError, Peer, Url, open_peer
+from sitl_replay.content_faults import msgid_of
+from sitl_replay.endpoints import Endpoint
+from sitl_replay.faults import Fault
+from sitl_replay.faulty_traffic import Delivery, Network, Senders
+from sitl_replay.links import open_endpoint
 from sitl_replay.recorder import TlogWriter
 from sitl_replay.scenario import Scenario
 from sitl_replay.vehicles import schedule
@@ -28,10 +34,12 @@ BATCH = 32
 class Tally:
     """What has been sent so far; kept up to date while it runs.
 
-    ``frames`` and ``octets`` count each frame once, however many links it goes to. ``dropped``
-    counts, over all links, frames that a slow peer did not take; ``clamped`` the time stamps of a
-    log that step back or leap; ``rejected`` what else of a log was not usable, by reason;
-    ``lost`` the links whose peer went away, with the reason.
+    ``frames`` and ``octets`` count each frame once, however many links it goes to and whatever
+    becomes of it there: ``faults`` says that, over all links, for each fault that was asked for.
+    ``dropped`` counts, over all links, frames that a slow peer did not take, or that came to a
+    link with nobody there; ``clamped`` the time stamps of a log that step back or leap;
+    ``rejected`` what else of a log was not usable, by reason; ``lost`` the links whose peer went
+    away, with the reason.
     """
 
     frames: int = 0
@@ -41,18 +49,14 @@ class Tally:
     duration_s: float = 0.0
     messages: Counter[int] = field(default_factory=Counter)
     rejected: Counter[str] = field(default_factory=Counter)
+    faults: Counter[str] = field(default_factory=Counter)
     lost: list[str] = field(default_factory=list)
 
     def count(self, raw: bytes) -> None:
         """Count one frame."""
         self.frames += 1
         self.octets += len(raw)
-        self.messages[msgid(raw)] += 1
-
-
-def msgid(raw: bytes) -> int:
-    """The message id of a MAVLink 1 or 2 frame."""
-    return int.from_bytes(raw[7:10], "little") if raw[0] == dialect.PROTOCOL_MARKER_V2 else raw[5]
+        self.messages[msgid_of(raw)] += 1
 
 
 def message_name(known: int) -> str:
@@ -68,29 +72,35 @@ async def fly(
     seed: int = 0,
     record: Path | None = None,
     *,
+    faults: Sequence[Fault] = (),
     tally: Tally | None = None,
 ) -> Tally:
-    """Fly a scenario over ``links`` (``udpout:…``, ``tcp:…``), until ``duration_s`` or cancelled.
+    """Fly a scenario over ``links`` (see ``links``), until ``duration_s`` or cancelled.
 
-    ``record`` names a tlog that gets every frame with the time at which it was due. ``tally`` may
-    be given to watch the count, or to have it after a cancellation.
-    Errors: ``ValueError`` for a bad URL; ``LinkError`` for a link that cannot be opened, or when
-    every peer is gone; ``OSError`` where the tlog cannot be written. Links and tlog are closed in
-    any case.
+    It begins when every link that listens has its first peer. ``record`` names a tlog that gets
+    every frame as its sender sends it, with the time at which it was due: with the faults of
+    senders, not with those of links. ``tally`` may be given to watch the count, or to have it
+    after a cancellation.
+    Errors: ``LinkError`` for a bad URL, for a link that cannot be opened, or when every peer is
+    gone; ``FaultError`` for faults that do not go together; ``OSError`` where the tlog cannot be
+    written. Links and tlog are closed in any case.
     """
     tally = Tally() if tally is None else tally
-    urls = [Url.parse(link) for link in links]
+    senders = Senders(faults, seed, tally.faults)
+    network = Network(faults, len(links), seed, tally.faults)
+    urls = [parse_link(link) for link in links]
     with TlogWriter(record) if record else contextlib.nullcontext() as writer:
-        async with _opened(urls, tally) as peers:
+        async with _opened(urls, tally) as endpoints:
             epoch_ns = time.time_ns()
 
             def due() -> Iterator[tuple[float, bytes]]:
-                for t_s, _, raw in schedule(scenario, seed, epoch_ns, duration_s):
+                for t_s, _, made in schedule(scenario, seed, epoch_ns, duration_s):
+                    raw = senders.altered(t_s, made)
                     yield t_s, raw
                     if writer is not None:  # asked for the next one: this one is sent
                         writer.write(epoch_ns + round(t_s * 1e9), raw)
 
-            await _send_all(due(), peers, 1.0, tally)
+            await _Sending(endpoints, network, 1.0, tally).send_all(due())
     return tally
 
 
@@ -99,19 +109,26 @@ async def play(
     links: Sequence[str],
     speed: float | None = 1.0,
     *,
+    faults: Sequence[Fault] = (),
+    seed: int = 0,
     tally: Tally | None = None,
 ) -> Tally:
     """Send the frames of a log over ``links``, paced by their stamps.
 
-    ``speed`` multiplies the pace; None is as fast as the links take it (UDP takes anything, and
-    a slow receiver loses what it cannot hold). Only ``t_ns`` and ``raw`` of a frame are used. A
-    stamp that steps back counts as no step, one that leaps as 5 s (``Tally.clamped``).
+    It begins when every link that listens has its first peer. ``speed`` multiplies the pace, of
+    faults as well; None is as fast as the links take it (UDP takes anything, and a slow receiver
+    loses what it cannot hold). Only ``t_ns`` and ``raw`` of a frame are used. A stamp that steps
+    back counts as no step, one that leaps as 5 s (``Tally.clamped``). ``seed`` is of the faults.
     Errors: as ``fly``; and what iterating over ``frames`` raises.
     """
     tally = Tally() if tally is None else tally
-    urls = [Url.parse(link) for link in links]
-    async with _opened(urls, tally) as peers:
-        await _send_all(on_timeline(frames, tally), peers, speed, tally)
+    senders = Senders(faults, seed, tally.faults)
+    network = Network(faults, len(links), seed, tally.faults)
+    urls = [parse_link(link) for link in links]
+    async with _opened(urls, tally) as endpoints:
+        timed = on_timeline(frames, tally)
+        sent = ((t_s, senders.altered(t_s, raw)) for t_s, raw in timed)
+        await _Sending(endpoints, network, speed, tally).send_all(sent)
     return tally
 
 
@@ -129,48 +146,83 @@ def on_timeline(frames: Iterable[Frame], tally: Tally) -> Iterator[tuple[float, 
 
 
 @contextlib.asynccontextmanager
-async def _opened(urls: Sequence[Url], tally: Tally) -> AsyncIterator[list[Peer]]:
-    """The links, opened; closed at the end, with their dropped frames and the time counted."""
+async def _opened(urls: Sequence[LinkUrl], tally: Tally) -> AsyncIterator[list[Endpoint]]:
+    """The links, each with somebody there; closed at the end, their dropped frames counted."""
     loop = asyncio.get_running_loop()
-    opened: list[Peer] = []
+    opened: list[Endpoint] = []
     start_s = loop.time()
     try:
         for url in urls:
-            opened.append(await open_peer(url))
+            opened.append(await open_endpoint(url))
+        for endpoint in opened:
+            if not endpoint.somebody.is_set():
+                log.warning("%s: waiting for a first peer", endpoint.url)
+        for endpoint in opened:
+            await endpoint.somebody.wait()
         start_s = loop.time()
-        yield list(opened)
+        yield opened
     finally:
         tally.duration_s = loop.time() - start_s
-        tally.dropped += sum(peer.dropped for peer in opened)
-        for peer in opened:
-            await peer.close()
+        tally.dropped += sum(endpoint.dropped for endpoint in opened)
+        for endpoint in opened:
+            await endpoint.close()
 
 
-async def _send_all(
-    items: Iterable[tuple[float, bytes]], peers: list[Peer], speed: float | None, tally: Tally
-) -> None:
-    # Against one start instant, not from frame to frame: nothing adds up to a drift.
-    loop = asyncio.get_running_loop()
-    start_s = loop.time()
-    for t_s, raw in items:
-        wait_s = 0.0 if speed is None else start_s + t_s / speed - loop.time()
-        if wait_s > 0.0 or tally.frames % BATCH == 0:
+class _Sending:
+    """One run over open links. Against one start instant, so that nothing adds up to a drift."""
+
+    def __init__(
+        self, endpoints: list[Endpoint], network: Network, speed: float | None, tally: Tally
+    ) -> None:
+        self._endpoints = endpoints
+        self._there = list(endpoints)
+        self._network = network
+        self._speed = speed
+        self._tally = tally
+        self._loop = asyncio.get_running_loop()
+        self._start_s = self._loop.time()
+        self._steps = 0
+
+    async def send_all(self, items: Iterable[tuple[float, bytes]]) -> None:
+        """Send every frame when it arrives by the faults of its link, and what is late at last."""
+        for t_s, raw in items:
+            await self._send_held(t_s)
+            await self._until(t_s)
+            self._tally.count(raw)
+            self._network.take(t_s, raw)
+            for delivery in self._network.due(t_s):
+                await self._send(delivery)
+            self._drop_the_lost()
+        await self._send_held(math.inf)
+
+    async def _send_held(self, until_s: float) -> None:
+        for delivery in self._network.due(until_s):
+            await self._until(delivery.t_s)
+            await self._send(delivery)
+            self._drop_the_lost()
+
+    async def _until(self, t_s: float) -> None:
+        """Wait until then; others get their turn also where there is nothing to wait for."""
+        speed = self._speed
+        wait_s = 0.0 if speed is None else self._start_s + t_s / speed - self._loop.time()
+        if wait_s > 0.0 or self._steps % BATCH == 0:
             await asyncio.sleep(max(0.0, wait_s))
-        for peer in peers:
-            if speed is None:
-                await peer.writable()
-            peer.send(raw)
-        tally.count(raw)
-        if any(peer.lost for peer in peers):
-            peers[:] = _still_there(peers, tally)
+        self._steps += 1
 
+    async def _send(self, delivery: Delivery) -> None:
+        endpoint = self._endpoints[delivery.link]
+        if self._speed is None:
+            await endpoint.writable()
+        endpoint.send(delivery.raw)
 
-def _still_there(peers: list[Peer], tally: Tally) -> list[Peer]:
-    """The peers that are left. ``LinkError`` when there is none."""
-    gone = [f"{peer.url}: {peer.lost}" for peer in peers if peer.lost]
-    tally.lost += gone
-    if len(gone) == len(peers):
-        raise LinkError("; ".join(gone))
-    for text in gone:
-        log.warning("%s; going on without it", text)
-    return [peer for peer in peers if not peer.lost]
+    def _drop_the_lost(self) -> None:
+        """Go on with those that are left. ``LinkError`` when there is none."""
+        gone = [f"{one.url}: {one.lost}" for one in self._there if one.lost]
+        if not gone:
+            return
+        self._tally.lost += gone
+        self._there = [one for one in self._there if not one.lost]
+        if not self._there:
+            raise LinkError("; ".join(gone))
+        for text in gone:
+            log.warning("%s; going on without it", text)

@@ -1,24 +1,25 @@
 """Writes tlogs: what QGroundControl and MAVProxy read, 8 bytes of Unix µs (big-endian) a frame."""
 
 import asyncio
-import socket
+import logging
+import math
 import struct
 import time
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import Final, Self
 
+from companion.mavlink.framing import Splitter
+from companion.mavlink.urls import LinkError, LinkUrl
 from companion.values import Frame, Rejection
-from sitl_replay.links import LinkError, Url, reason
+from sitl_replay.endpoints import PEERS_MAX, Endpoint, UdpPeer
+from sitl_replay.links import open_endpoint
 
-if TYPE_CHECKING:
-    from companion.mavlink.framing import Splitter
+log = logging.getLogger(__name__)
 
-FLUSH_EVERY_NS = 1_000_000_000
-RECEIVE_BUFFER_BYTES = 4 << 20
-MAX_PEERS = 256
+FLUSH_EVERY_NS: Final = 1_000_000_000
 
 
 class TlogWriter:
@@ -36,8 +37,12 @@ class TlogWriter:
         """Append one whole frame, received or sent at ``t_ns`` (Unix time)."""
         self._file.write(struct.pack(">Q", t_ns // 1000) + raw)
         if abs(t_ns - self._flushed_ns) >= FLUSH_EVERY_NS:
-            self._file.flush()
+            self.flush()
             self._flushed_ns = t_ns
+
+    def flush(self) -> None:
+        """Hand to the system what was written so far."""
+        self._file.flush()
 
     def __enter__(self) -> Self:
         return self
@@ -63,108 +68,113 @@ class Heard:
 
 
 async def record(
-    url: Url, out: Path, duration_s: float | None = None, *, heard: Heard | None = None
+    url: LinkUrl, out: Path, duration_s: float | None = None, *, heard: Heard | None = None
 ) -> Heard:
-    """Write what arrives over ``url`` (``udpin:`` or ``tcp:``) to the tlog ``out``.
+    """Write what arrives over ``url`` to the tlog ``out``, and send nothing.
 
-    Until ``duration_s`` has passed, a TCP peer closes, or it is cancelled. Frames whose checksum
+    Nothing but this: over ``udpout`` an empty datagram each second until something is heard, for
+    the peer cannot know otherwise that somebody listens.
+
+    Until ``duration_s`` has passed, a TCP peer closes, a serial port vanishes, or it is
+    cancelled. Stamps are Unix time when it starts and go on with the monotonic clock: they never
+    step back. What was heard is in the file a second later at the latest. Frames whose checksum
     does not hold, or cannot be checked because their id is unknown, are counted in
     ``Heard.rejected`` and not written.
     Errors: ``OSError`` where ``out`` cannot be written; ``LinkError`` where the link cannot be
-    opened, or closes before ``duration_s``.
+    opened, breaks, or closes before ``duration_s``.
     """
     heard = Heard() if heard is None else heard
     loop = asyncio.get_running_loop()
     with TlogWriter(out) as writer:
-        listener = _Listener(url, writer, heard)
-        transport = await _open(listener, url)
+        ear = _Ear(url, writer, heard)
+        endpoint = await open_endpoint(url, ear.take)
+        if endpoint.url != url:
+            log.warning("listening on %s", endpoint.url)
         start_s = loop.time()
         try:
-            await asyncio.wait_for(listener.ended, duration_s)
-        except TimeoutError:
-            return heard
+            ended = await _listen(endpoint, ear, duration_s)
         finally:
             heard.duration_s = loop.time() - start_s
-            transport.close()
-            listener.finish()
-    if duration_s is not None:
+            await endpoint.close()
+            ear.finish()
+    if ended and endpoint.broken:
+        raise LinkError(f"{url}: {endpoint.lost}")
+    if ended and duration_s is not None:
         raise LinkError(f"{url}: closed after {heard.duration_s:.1f} s, {heard.frames} frames")
     return heard
 
 
-class _Listener(asyncio.DatagramProtocol, asyncio.Protocol):
-    """Both kinds of link end here: bytes from a peer, split into frames, written."""
+async def _listen(endpoint: Endpoint, ear: "_Ear", duration_s: float | None) -> bool:
+    """Listen until the duration is over (False) or the link has ended (True)."""
+    loop = asyncio.get_running_loop()
+    end_s = math.inf if duration_s is None else loop.time() + duration_s
+    while (left_s := end_s - loop.time()) > 0.0:
+        if isinstance(endpoint, UdpPeer) and not ear.has_heard:
+            endpoint.knock()
+        await asyncio.wait({ear.ended}, timeout=min(FLUSH_EVERY_NS * 1e-9, left_s))
+        if ear.ended.done():
+            ear.ended.result()  # raises what it failed with
+            return True
+        ear.writer.flush()
+    return False
 
-    def __init__(self, url: Url, writer: TlogWriter, heard: Heard) -> None:
+
+class _Ear:
+    """Bytes from peers, split into frames and written."""
+
+    def __init__(self, url: LinkUrl, writer: TlogWriter, heard: Heard) -> None:
+        self.writer = writer
         self.ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        """Done when no more can come; with an exception where the file cannot be written."""
+        self.has_heard = False
         self._url = url
-        self._writer = writer
         self._heard = heard
         # One splitter a peer: a truncated datagram must not damage the next peer's frame.
         self._splitters: dict[object, Splitter] = {}
+        self._unix_less_monotonic_ns = time.time_ns() - time.monotonic_ns()
 
-    def datagram_received(self, data: bytes, addr: object) -> None:
-        self._take(data, addr)
-
-    def data_received(self, data: bytes) -> None:
-        self._take(data, self._url)
-
-    def connection_lost(self, exc: Exception | None) -> None:
+    def take(self, peer: object, data: bytes) -> None:
+        """What a peer sent; ``b""`` when it has left."""
         if self.ended.done():
             return
-        if exc is None:
-            self.ended.set_result(None)
-        else:
-            self.ended.set_exception(LinkError(f"{self._url}: {reason(exc)}"))
-
-    def _take(self, data: bytes, peer: object) -> None:
-        if self.ended.done():
-            return
+        self.has_heard = True
         try:
-            self._write(data, peer)
+            if data:
+                self._keep(self._splitter(peer).feed(self._now_ns(), data))
+                return
+            self._give_up(peer)
         except OSError as error:  # a full disk: asyncio would log it and go on
             self.ended.set_exception(error)
-
-    def _write(self, data: bytes, peer: object) -> None:
-        self._keep(self._splitter(peer).feed(time.time_ns(), data))
+            return
+        if self._url.scheme in ("tcp", "serial"):
+            self.ended.set_result(None)
 
     def finish(self) -> None:
         """Keep what an unfinished frame of each peer still hides."""
-        for splitter in self._splitters.values():
-            self._keep(splitter.finish(time.time_ns()))
+        for peer in tuple(self._splitters):
+            self._give_up(peer)
+
+    def _give_up(self, peer: object) -> None:
+        splitter = self._splitters.pop(peer, None)
+        if splitter is not None:
+            self._keep(splitter.finish(self._now_ns()))
 
     def _keep(self, items: list[Frame | Rejection]) -> None:
         for item in items:
             if isinstance(item, Rejection):
                 self._heard.rejected[item.reason.value] += item.count
                 continue
-            self._writer.write(item.t_ns, item.raw)
+            self.writer.write(item.t_ns, item.raw)
             self._heard.frames += 1
             self._heard.octets += len(item.raw)
             self._heard.messages[item.msgid] += 1
 
-    def _splitter(self, peer: object) -> "Splitter":
-        from companion.mavlink.framing import Splitter
-
+    def _splitter(self, peer: object) -> Splitter:
         if peer not in self._splitters:
-            if len(self._splitters) >= MAX_PEERS:
-                del self._splitters[next(iter(self._splitters))]
+            if len(self._splitters) >= PEERS_MAX:
+                self._give_up(next(iter(self._splitters)))
             self._splitters[peer] = Splitter(str(self._url))
         return self._splitters[peer]
 
-
-async def _open(listener: _Listener, url: Url) -> asyncio.BaseTransport:
-    loop = asyncio.get_running_loop()
-    transport: asyncio.BaseTransport
-    try:
-        if url.scheme == "tcp":
-            transport, _ = await loop.create_connection(lambda: listener, url.host, url.port)
-        else:
-            transport, _ = await loop.create_datagram_endpoint(
-                lambda: listener, local_addr=(url.host, url.port)
-            )
-            endpoint: socket.socket = transport.get_extra_info("socket")
-            endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-    except (OSError, UnicodeError) as error:
-        raise LinkError(f"{url}: {reason(error)}") from error
-    return transport
+    def _now_ns(self) -> int:
+        return time.monotonic_ns() + self._unix_less_monotonic_ns

@@ -98,7 +98,7 @@ class SerialPort:
 
 def _opened(device: str, baud: int) -> Any:
     """The port: raw, 8N1, nobody else's, never waiting. ``OSError`` where that cannot be had."""
-    import serial  # type: ignore[import-untyped]  # only where there is a serial link
+    import serial  # only where there is a serial link
 
     try:
         port = serial.Serial(device, baud, exclusive=True, timeout=0)

@@ -2,21 +2,28 @@
 
 import json
 import random
+import re
 import signal
 import socket
 import subprocess
 import sys
 import threading
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 import click
 import pytest
 from click.testing import CliRunner
+from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from companion.values import Frame
+from companion.recording.writer import Writer
+from companion.values import Frame, Source, Tick
 from sitl_replay import scenario
 from sitl_replay.cli import main
+from sitl_replay.content_faults import sender_of
+from sitl_replay.faults import KINDS, Fault
+from sitl_replay.faulty_traffic import Network
 from sitl_replay.recorder import TlogWriter
 from sitl_replay.vehicles import schedule
 
@@ -41,7 +48,19 @@ def url_of(bound: socket.socket, scheme: str = "udpout") -> str:
     [
         (["fly", "papr", "--to", SOMEWHERE], "'papr' is not one of 'paper', 'hover'"),
         (["fly", "paper"], "Missing option '--to'"),
-        (["fly", "paper", "--to", "udpin:127.0.0.1:9"], "is not udpout:HOST:PORT"),
+        (["fly", "paper", "--to", "udp:127.0.0.1:9"], "is not udpin:HOST:PORT, udpout:HOST:PORT"),
+        (["fly", "paper", "--to", "serial:nowhere:57600"], "serial:nowhere:57600: No such file"),
+        (["fly", "paper", "--to", "serial:/dev/null:57600"], "serial:/dev/null:57600: "),
+        (["fly", "paper", "--to", "tcpin:192.0.2.1:9"], "tcpin:192.0.2.1:9: Cannot assign"),
+        (["fly", "paper", "--to", SOMEWHERE, "--fault", "los=1"], "'los' is none of drift, reboot"),
+        (
+            ["play", "empty.tlog", "--to", SOMEWHERE, "--fault", "loss=2"],
+            "'loss=2': P is '2', allowed: 0 to 1, as in loss=0.1",
+        ),
+        (
+            ["fly", "paper", "--to", SOMEWHERE, "--fault", "loss=0", "--fault", "loss=1"],
+            "loss is given 2 times",
+        ),
         (["fly", "paper", "--to", "udpout:127.0.0.1:99999"], "is not a port"),
         (["fly", "paper", "--to", "udpout:no-such-host.invalid:9"], "no-such-host.invalid"),
         (["fly", "paper", "--to", SOMEWHERE, "--uavs", "1001"], "1<=x<=1000"),
@@ -53,7 +72,7 @@ def url_of(bound: socket.socket, scheme: str = "udpout") -> str:
         (["play", ".", "--to", SOMEWHERE], "is a directory"),
         (["play", "nowhere.tlog", "--to", SOMEWHERE], "does not exist"),
         (["play", "empty.tlog", "--to", SOMEWHERE, "--speed", "fast"], "above 0, or 'max'"),
-        (["record", "--from", SOMEWHERE, "--out", "a.tlog"], "udpin:HOST:PORT"),
+        (["record", "--from", "127.0.0.1:9", "--out", "a.tlog"], "is not udpin:HOST:PORT"),
         (["record", "--from", "udpin:127.0.0.1:9"], "Missing option '--out'"),
         (["record", "--from", "udpin:192.0.2.1:9999", "--out", "a.tlog"], "udpin:192.0.2.1"),
         (["land"], "No such command 'land'"),
@@ -271,3 +290,90 @@ def test_a_link_lost_on_the_way_is_a_failure(receiver: socket.socket) -> None:
     summary = json.loads(result.stdout)
     assert [text.startswith(lost) for text in summary["lost"]] == [True]
     assert summary["frames"] > 20
+
+
+@pytest.mark.parametrize("command", ["play", "fly"])
+def test_the_help_has_every_fault(command: str) -> None:
+    text = " ".join(CliRunner().invoke(main, [command, "--help"]).stdout.split())
+    for kind in KINDS.values():
+        assert f"{kind.form}: {kind.meaning}. As in {kind.example}" in text
+
+
+def written_as(kind: str, folder: Path, stamps_s: list[float]) -> tuple[Path, list[bytes]]:
+    """A log of a kind with frames under the stamps given; a raw one has boot clocks instead."""
+    if kind == "tlog":
+        return folder / "a.tlog", written(folder / "a.tlog", stamps_s)
+    frames = []
+    for t_s in stamps_s:
+        message = dialect.MAVLink_attitude_message(round(1000 * t_s), *[1.0] * 6)
+        frames.append(message.pack(dialect.MAVLink(None, srcSystem=3, srcComponent=1)))
+    if kind == "raw":
+        path = folder / "a.raw"
+        path.write_bytes(b"".join(frames))
+        return path, frames
+    writer = Writer(folder / "a.mcap", "", {}, None, 0)
+    for t_s, raw in zip(stamps_s, frames, strict=True):
+        t_ns = 10**18 + round(t_s * 1e9)
+        writer.event(Frame(t_ns, "udpin:127.0.0.1:1", Source(3, 1), 30, raw))
+        writer.event(Tick(t_ns))
+    return writer.close({}), frames
+
+
+@pytest.mark.parametrize("kind", ["tlog", "raw", "mcap"])
+def test_every_kind_of_log_is_played_with_its_broken_stamps_clamped(
+    kind: str, receiver: socket.socket, tmp_path: Path
+) -> None:
+    path, frames = written_as(kind, tmp_path, [0.0, 10.0, 10.1, 200.0, 200.1])
+    arguments = ["play", str(path), "--to", url_of(receiver), "--speed", "50", "--json"]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 0
+    assert [receiver.recv(300) for _ in frames] == frames
+    summary = json.loads(result.stdout)
+    assert (summary["frames"], summary["clamped"], summary["faults"]) == (5, 2, {})
+    assert 0.2 <= summary["duration_s"] < 0.6
+    (line,) = result.stderr.splitlines()
+    assert "2 time stamps step back, or leap by more than 5 s" in line
+
+
+def test_faults_are_summed_up(receiver: socket.socket, tmp_path: Path) -> None:
+    path, frames = written_as("tlog", tmp_path, [0.01 * number for number in range(60)])
+    arguments = ["play", str(path), "--to", url_of(receiver), "--seed", "7"]
+    for text in ("duplication@1:1=1", "loss=0.5", "jitter@77=1"):
+        arguments += ["--fault", text]
+    summary = json.loads(CliRunner().invoke(main, [*arguments, "--json"]).stdout)
+    assert summary["frames"] == len(frames)
+    assert list(summary["faults"]) == ["loss", "duplication@1:1", "jitter@77"]
+    lost, doubled = summary["faults"]["loss"], summary["faults"]["duplication@1:1"]
+    assert summary["faults"]["jitter@77"] == 0
+    network = Network([Fault.parse("loss=0.5")], 1, 7, Counter())
+    for raw in frames:
+        network.take(0.0, raw)
+    assert lost == len(frames) - len(kept := [one.raw for one in network.due()])
+    got = [receiver.recv(300) for _ in range(len(frames) - lost + doubled)]
+    assert set(got) == set(kept)
+    assert sum(sender_of(raw) == (1, 1) for raw in set(got)) == doubled > 0
+    text = CliRunner().invoke(main, arguments).stdout
+    assert text.endswith(f", loss: {lost}, duplication@1:1: {doubled}, jitter@77: 0\n")
+
+
+def test_a_flight_for_those_who_connect(tmp_path: Path) -> None:
+    arguments = ["fly", "paper", "--to", "tcpin:127.0.0.1:0", "--fault", "reboot=0.1", "--json"]
+    with subprocess.Popen(
+        [*COMMAND, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as flight:
+        assert flight.stderr is not None
+        line = flight.stderr.readline()
+        found = re.fullmatch(r"tcpin:127\.0\.0\.1:(\d+): waiting for a first peer\n", line)
+        assert found, line
+        with socket.create_connection(("127.0.0.1", int(found[1])), timeout=20.0) as peer:
+            received = 0
+            while received < 4000:
+                received += len(peer.recv(4096))
+            flight.send_signal(signal.SIGTERM)
+            while data := peer.recv(4096):
+                received += len(data)
+            out, _ = flight.communicate(timeout=20)
+    assert flight.returncode == 0
+    summary = json.loads(out)
+    assert summary["faults"]["reboot"] > 5
+    assert (summary["bytes"], summary["dropped"], summary["lost"]) == (received, 0, [])

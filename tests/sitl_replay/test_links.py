@@ -1,63 +1,375 @@
-"""Link URLs, and what a peer that does not read costs."""
+"""Endpoints over real sockets and a pseudo-terminal, on both event loops."""
 
 import asyncio
+import contextlib
+import os
+import pty
 import socket
+from collections.abc import Callable, Coroutine
+from typing import Any
 
 import pytest
+import uvloop
 
-from sitl_replay.links import RECEIVING, Url, open_peer
+from companion.mavlink.urls import LinkError, LinkUrl, parse_link
+from sitl_replay.endpoints import PEERS_MAX, Endpoint, UdpPeer
+from sitl_replay.links import open_endpoint
+from sitl_replay.serial_port import SERIAL_BUFFER_BYTES
+
+FRAME = bytes(range(1, 41))
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("udpout:127.0.0.1:14550", ("udpout", "127.0.0.1", 14550)),
-        ("tcp:drone.example:5760", ("tcp", "drone.example", 5760)),
-        ("udpout:[::1]:14550", ("udpout", "::1", 14550)),
-    ],
-)
-def test_read_and_written_alike(text: str, expected: tuple[str, str, int]) -> None:
-    url = Url.parse(text)
-    assert url == expected
-    assert str(url) == text
+@pytest.fixture(params=[asyncio.new_event_loop, uvloop.new_event_loop], ids=["asyncio", "uvloop"])
+def run(request: pytest.FixtureRequest) -> Callable[[Coroutine[Any, Any, Any]], Any]:
+    """Runs a scene to its end on one kind of loop, within some seconds."""
+
+    def until_done(scene: Coroutine[Any, Any, Any]) -> Any:
+        with asyncio.Runner(loop_factory=request.param) as runner:
+            return runner.run(asyncio.wait_for(scene, 20.0))
+
+    return until_done
+
+
+Run = Callable[[Coroutine[Any, Any, Any]], Any]
+
+
+async def until(good: Callable[[], Any]) -> None:
+    """Poll: what the other end has got is not ours to await."""
+    async with asyncio.timeout(5.0):
+        while not good():
+            await asyncio.sleep(0.005)
+
+
+async def received(bound: socket.socket) -> tuple[bytes, Any]:
+    """The next datagram of a socket that no loop knows, and from where."""
+    found: list[tuple[bytes, Any]] = []
+
+    def arrived() -> bool:
+        with contextlib.suppress(BlockingIOError):
+            found.append(bound.recvfrom(300))
+        return bool(found)
+
+    await until(arrived)
+    return found[0]
+
+
+class Heard:
+    """What an endpoint hands on."""
+
+    def __init__(self) -> None:
+        self.pieces: list[tuple[object, bytes]] = []
+
+    def __call__(self, peer: object, data: bytes) -> None:
+        self.pieces.append((peer, data))
+
+    def octets(self) -> bytes:
+        return b"".join(data for _, data in self.pieces)
+
+
+def udp(host: str = "127.0.0.1") -> socket.socket:
+    """A bound datagram socket; the test is skipped where the host's family is missing."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    bound = socket.socket(family, socket.SOCK_DGRAM)
+    try:
+        bound.bind((host, 0))
+    except OSError:
+        bound.close()
+        pytest.skip(f"no {host} here")
+    bound.setblocking(False)
+    return bound
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "[::1]"])
+def test_udpout_sends_hears_and_knocks(run: Run, host: str) -> None:
+    heard = Heard()
+
+    async def scene(other: socket.socket) -> list[bytes]:
+        peer = await open_endpoint(parse_link(f"udpout:{host}:{other.getsockname()[1]}"), heard)
+        assert isinstance(peer, UdpPeer)
+        assert peer.somebody.is_set()
+        peer.knock()
+        peer.send(FRAME)
+        got = []
+        for _ in range(2):
+            data, address = await received(other)
+            got.append(data)
+        other.sendto(b"answer", address)
+        await until(heard.octets)
+        await peer.close()
+        return got
+
+    with udp(host.strip("[]")) as other:
+        assert run(scene(other)) == [b"", FRAME]
+    assert heard.octets() == b"answer"
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "[::1]"])
+def test_udpin_sends_to_everybody_it_has_heard(run: Run, host: str) -> None:
+    heard = Heard()
+
+    async def scene(first: socket.socket, second: socket.socket) -> None:
+        endpoint = await open_endpoint(parse_link(f"udpin:{host}:0"), heard)
+        assert endpoint.url.port > 0
+        address = (host.strip("[]"), endpoint.url.port)
+        endpoint.send(b"nobody there")
+        assert (endpoint.dropped, endpoint.somebody.is_set()) == (1, False)
+        first.sendto(b"", address)  # an opener
+        await endpoint.somebody.wait()
+        await endpoint.writable()
+        endpoint.send(b"one")
+        assert (await received(first))[0] == b"one"
+        second.sendto(b"hello", address)
+        await until(heard.octets)
+        endpoint.send(b"two")
+        assert (await received(first))[0] == b"two"
+        assert (await received(second))[0] == b"two"
+        assert (endpoint.dropped, endpoint.lost) == (1, "")
+        await endpoint.close()
+
+    with udp(host.strip("[]")) as first, udp(host.strip("[]")) as second:
+        run(scene(first, second))
+    assert heard.octets() == b"hello"
+
+
+def test_udpin_goes_on_when_peers_are_gone_and_keeps_a_bounded_number(run: Run) -> None:
+    async def scene(first: socket.socket, early: socket.socket, last: socket.socket) -> None:
+        heard = Heard()
+        endpoint = await open_endpoint(parse_link("udpin:127.0.0.1:0"), heard)
+        address = ("127.0.0.1", endpoint.url.port)
+        first.sendto(b".", address)
+        early.sendto(b".", address)
+        with contextlib.ExitStack() as stack:  # all open at once: each has a port of its own
+            for _ in range(PEERS_MAX - 2):
+                stack.enter_context(udp()).sendto(b".", address)
+            await until(lambda: len(heard.octets()) == PEERS_MAX)
+        endpoint.send(b"one")  # refused by all but two
+        for peer in (first, early):
+            assert (await received(peer))[0] == b"one"
+        first.sendto(b".", address)
+        last.sendto(b".", address)  # one too many: the one unheard for longest goes
+        await until(lambda: len(heard.octets()) == PEERS_MAX + 2)
+        endpoint.send(b"two")
+        for peer in (first, last):
+            assert (await received(peer))[0] == b"two"
+        with pytest.raises(BlockingIOError):
+            early.recv(300)
+        await endpoint.close()
+
+    with udp() as first, udp() as early, udp() as last:
+        run(scene(first, early, last))
+
+
+def test_tcp_hears_and_is_lost_when_the_peer_closes(run: Run) -> None:
+    heard = Heard()
+
+    async def scene() -> Endpoint:
+        async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            writer.write(await reader.readexactly(len(FRAME)))
+            writer.close()
+
+        server = await asyncio.start_server(serve, "127.0.0.1", 0)
+        async with server:
+            port = server.sockets[0].getsockname()[1]
+            peer = await open_endpoint(LinkUrl("tcp", "127.0.0.1", port), heard)
+            peer.send(FRAME)
+            await until(lambda: peer.lost)
+            peer.send(FRAME)
+            await peer.writable()  # at once
+            await peer.close()
+        return peer
+
+    peer = run(scene())
+    assert heard.pieces == [(peer, FRAME), (peer, b"")]
+    assert (peer.lost, peer.broken, peer.dropped) == ("the peer closed the connection", False, 0)
+
+
+def test_what_is_dropped_is_not_kept(run: Run) -> None:
+    async def scene(url: LinkUrl) -> None:
+        peer: Any = await open_endpoint(url)
+        while peer.dropped < 1000:
+            peer.send(bytes(1000))
+        assert peer.transport.get_write_buffer_size() < 1 << 18
+        await peer.close()
+
+    with socket.create_server(("127.0.0.1", 0)) as deaf:
+        run(scene(LinkUrl("tcp", "127.0.0.1", deaf.getsockname()[1])))
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "[::1]"])
+def test_tcpin_serves_everybody_from_then_on(run: Run, host: str) -> None:
+    async def scene() -> tuple[list[bytes], Heard]:
+        heard = Heard()
+        server = await open_endpoint(parse_link(f"tcpin:{host}:0"), heard)
+        address = (host.strip("[]"), server.url.port)
+        server.send(b"nobody there")
+        assert (server.dropped, server.somebody.is_set()) == (1, False)
+        first, first_out = await asyncio.open_connection(*address)
+        first_out.write(b"hello")
+        await server.somebody.wait()
+        server.send(b"one")
+        assert await first.readexactly(3) == b"one"
+        second, second_out = await asyncio.open_connection(*address)
+        second_out.write(b"hi")
+        await until(lambda: len(heard.octets()) == 7)
+        server.send(b"two")
+        assert await first.readexactly(3) == await second.readexactly(3) == b"two"
+        first_out.close()
+        await until(lambda: any(data == b"" for _, data in heard.pieces))
+        server.send(b"three")
+        rest = [await second.readexactly(5)]
+        second_out.close()
+        await until(lambda: not server.somebody.is_set())
+        server.send(b"nobody there")
+        assert (server.dropped, server.lost, server.broken) == (2, "", False)
+        third, third_out = await asyncio.open_connection(*address)
+        await server.writable()  # waits for somebody
+        server.send(b"four")
+        await server.close()
+        rest.append(await third.read())
+        third_out.close()
+        with pytest.raises(OSError):
+            await asyncio.open_connection(*address)
+        return rest, heard
+
+    if ":" in host:
+        udp("::1").close()
+    rest, heard = run(scene())
+    assert rest == [b"three", b"four"]
+    assert len({peer for peer, _ in heard.pieces}) == 3
+
+
+def test_a_visitor_that_does_not_read_holds_nobody_up(run: Run) -> None:
+    async def scene() -> tuple[int, int]:
+        server = await open_endpoint(parse_link("tcpin:127.0.0.1:0"))
+        address = ("127.0.0.1", server.url.port)
+        with socket.create_connection(address):  # never reads
+            reader, writer = await asyncio.open_connection(*address)
+            await until(lambda: len(server._visitors) == 2)  # type: ignore[attr-defined]
+            sent = 0
+            while server.dropped < 100:
+                server.send(bytes(1000))
+                sent += 1000
+                assert await reader.readexactly(1000) == bytes(1000)
+            writer.close()
+            await until(lambda: len(server._visitors) == 1)  # type: ignore[attr-defined]
+            dropped = server.dropped
+            await server.close()
+        assert server.dropped >= dropped  # the count outlives the connection
+        return sent, dropped
+
+    sent, dropped = run(scene())
+    assert sent > 100_000
+    assert dropped == 100
 
 
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("", "is not udpout:HOST:PORT or tcp:HOST:PORT"),
-        ("udpin:127.0.0.1:14550", "is not udpout"),
-        ("127.0.0.1:14550", "is not udpout"),
-        ("udpout:14550", "is not udpout"),
-        ("udpout::14550", "is not udpout"),
-        ("udpout:::1:14550", "brackets"),
-        ("udpout:[localhost]:14550", "brackets"),
-        ("tcp:localhost:", "'' is not a port"),
-        ("tcp:localhost:0", "'0' is not a port"),
-        ("tcp:localhost:65536", "'65536' is not a port"),
-        ("tcp:localhost:-1", "'-1' is not a port"),
-        ("tcp:localhost:٣", "is not a port"),
+        ("serial:/nowhere/tty:57600", "No such file or directory"),
+        ("serial:/dev/null:57600", "Inappropriate ioctl"),
+        ("tcp:127.0.0.1:1", "Connection refused"),
+        ("udpin:192.0.2.1:14550", "Cannot assign requested address"),
+        ("tcpin:192.0.2.1:5760", "Cannot assign requested address"),
     ],
 )
-def test_what_is_wrong_is_said(text: str, complaint: str) -> None:
-    with pytest.raises(ValueError, match=complaint):
-        Url.parse(text)
+def test_a_link_that_cannot_be_opened_is_told_by_its_url(
+    run: Run, text: str, complaint: str
+) -> None:
+    with pytest.raises(LinkError, match=complaint) as caught:
+        run(open_endpoint(parse_link(text)))
+    assert str(caught.value).startswith(f"{text}: ")
 
 
-def test_listening_has_schemes_of_its_own() -> None:
-    assert Url.parse("udpin:0.0.0.0:14550", RECEIVING).port == 14550
-    with pytest.raises(ValueError, match=r"udpin:HOST:PORT or tcp:HOST:PORT"):
-        Url.parse("udpout:127.0.0.1:14550", RECEIVING)
+def terminal() -> tuple[int, LinkUrl]:
+    """The far end of a serial line, and the link to the near one."""
+    far, near = pty.openpty()
+    url = parse_link(f"serial:{os.ttyname(near)}:921600")
+    os.close(near)  # pyserial opens it again
+    os.set_blocking(far, False)
+    return far, url
 
 
-def test_what_is_dropped_is_not_kept() -> None:
-    async def scene(url: Url) -> None:
-        peer = await open_peer(url)
-        frame = bytes(1000)
-        while peer.dropped < 1000:
-            peer.send(frame)
-        assert peer.transport.get_write_buffer_size() < 1 << 18  # type: ignore[attr-defined]
-        await peer.close()
+def test_serial_sends_and_hears_every_byte(run: Run) -> None:
+    async def scene(far: int, url: LinkUrl) -> bytes:
+        heard = Heard()
+        port = await open_endpoint(url, heard)
+        os.write(far, bytes(range(256)))
+        await until(lambda: len(heard.octets()) == 256)
+        assert heard.octets() == bytes(range(256))
+        port.send(bytes(range(256)))
+        await port.close()
+        assert heard.pieces[-1] == (port, b"")
+        return os.read(far, 1000)
 
-    with socket.create_server(("127.0.0.1", 0)) as deaf:
-        asyncio.run(scene(Url("tcp", "127.0.0.1", deaf.getsockname()[1])))
+    far, url = terminal()
+    try:
+        assert run(scene(far, url)) == bytes(range(256))
+    finally:
+        os.close(far)
+
+
+def test_a_slow_serial_port_drops_whole_frames_and_keeps_little(run: Run) -> None:
+    async def scene(far: int, url: LinkUrl) -> None:
+        port = await open_endpoint(url)
+        sent = 0
+        while not port.dropped:
+            port.send(FRAME)
+            sent += 1
+        sent -= 1
+        assert len(port._unsent) <= SERIAL_BUFFER_BYTES + len(FRAME)  # type: ignore[attr-defined]
+        got = bytearray()
+
+        def read_some() -> bool:
+            """Whether there is nothing to be read: EIO is what an end without its other says."""
+            try:
+                got.extend(os.read(far, 1000))
+            except OSError:
+                return True
+            return False
+
+        await until(lambda: read_some() and len(got) == sent * len(FRAME))
+        await asyncio.wait_for(port.writable(), 5.0)
+        while not port._unsent:  # type: ignore[attr-defined]
+            port.send(FRAME)
+            sent += 1
+        closing = asyncio.ensure_future(port.close())  # with some of it still here
+        await until(lambda: read_some() and closing.done())
+        assert bytes(got) == FRAME * sent
+
+    far, url = terminal()
+    try:
+        run(scene(far, url))
+    finally:
+        os.close(far)
+
+
+def test_an_unplugged_serial_port_is_lost(run: Run) -> None:
+    heard = Heard()
+
+    async def scene(far: int, url: LinkUrl) -> Endpoint:
+        port = await open_endpoint(url, heard)
+        os.close(far)
+        await until(lambda: port.lost)
+        port.send(FRAME)
+        await port.close()
+        return port
+
+    port = run(scene(*terminal()))
+    assert port.broken
+    assert port.lost
+    assert heard.pieces == [(port, b"")]
+
+
+def test_a_serial_port_is_had_by_one_alone(run: Run) -> None:
+    async def scene(url: LinkUrl) -> None:
+        port = await open_endpoint(url)
+        with pytest.raises(LinkError, match=r"^serial:.*: "):
+            await open_endpoint(url)
+        await port.close()
+        await (await open_endpoint(url)).close()
+
+    far, url = terminal()
+    try:
+        run(scene(url))
+    finally:
+        os.close(far)

@@ -2,16 +2,22 @@
 
 import asyncio
 import contextlib
+import os
+import pty
 import socket
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from companion.mavlink.urls import LinkError
 from companion.values import Frame, Source
 from sitl_replay import player, scenario
-from sitl_replay.links import LinkError
+from sitl_replay.content_faults import Drift, msgid_of
+from sitl_replay.faults import Fault, FaultError
+from sitl_replay.faulty_traffic import Senders
 from sitl_replay.vehicles import schedule
 
 
@@ -46,7 +52,7 @@ def log_of(stamps_s: list[float]) -> list[Frame]:
             t_ns=round(t_s * 1e9),
             link="log",
             source=Source(*sent.raw[5:7]),
-            msgid=player.msgid(sent.raw),
+            msgid=msgid_of(sent.raw),
             raw=sent.raw,
         )
         for t_s, sent in zip(stamps_s, made, strict=False)
@@ -55,7 +61,7 @@ def log_of(stamps_s: list[float]) -> list[Frame]:
 
 def without_clock(raw: bytes) -> bytes | None:
     """A frame, unless it tells the time of day."""
-    return None if player.msgid(raw) == dialect.MAVLINK_MSG_ID_SYSTEM_TIME else raw
+    return None if msgid_of(raw) == dialect.MAVLINK_MSG_ID_SYSTEM_TIME else raw
 
 
 def test_a_udp_socket_receives_what_is_flown(receiver: socket.socket) -> None:
@@ -276,11 +282,165 @@ def test_broken_stamps_are_clamped_and_counted() -> None:
     assert tally.clamped == 3
 
 
-def test_message_ids_of_both_versions() -> None:
-    message = dialect.MAVLink_attitude_message(1, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0)
-    sender = dialect.MAVLink(None, srcSystem=253, srcComponent=7)
-    assert player.msgid(message.pack(sender)) == 30
-    assert player.msgid(message.pack(sender, force_mavlink1=True)) == 30
-    wide = dialect.MAVLink_wind_message(1.0, 2.0, 3.0).pack(sender)
-    assert player.message_name(player.msgid(wide)) == "WIND"
+def test_message_names() -> None:
+    assert player.message_name(168) == "WIND"
     assert player.message_name(70_000) == "UNKNOWN_70000"
+
+
+# --- links that listen, serial links, and faults ------------------------------------------------
+
+
+async def port_told(caplog: pytest.LogCaptureFixture) -> int:
+    """The port of the link that waits for its first peer."""
+    async with asyncio.timeout(5.0):
+        while not (texts := [r.getMessage() for r in caplog.records if "waiting" in r.msg]):
+            await asyncio.sleep(0.005)
+    return int(texts[0].split(": ")[0].rpartition(":")[2])
+
+
+def test_a_tcp_server_waits_for_its_first_peer_and_outlives_it(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async def scene() -> tuple[bytes, bytes, player.Tally]:
+        tally = player.Tally()
+        url = "tcpin:127.0.0.1:0"
+        flight = asyncio.create_task(player.play(log_of([0.0, 0.5, 1.0]), [url], tally=tally))
+        port = await port_told(caplog)
+        assert tally.frames == 0
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        first = await reader.readexactly(len(log_of([0.0])[0].raw))
+        writer.close()
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        rest = await reader.read()
+        await flight
+        writer.close()
+        return first, rest, tally
+
+    first, rest, tally = asyncio.run(scene())
+    frames = log_of([0.0, 0.5, 1.0])
+    assert first + rest == b"".join(frame.raw for frame in frames)
+    assert (tally.frames, tally.lost) == (3, [])
+    assert 1.0 <= tally.duration_s < 1.4
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+
+
+def test_with_nobody_connected_frames_are_dropped(caplog: pytest.LogCaptureFixture) -> None:
+    async def scene() -> player.Tally:
+        flight = asyncio.create_task(
+            player.play(log_of([0.0, 0.4, 0.5, 0.6]), ["tcpin:127.0.0.1:0"])
+        )
+        port = await port_told(caplog)
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        await reader.readexactly(20)
+        writer.close()
+        return await flight
+
+    tally = asyncio.run(scene())
+    assert (tally.frames, tally.dropped, tally.lost) == (4, 3, [])
+
+
+def test_a_udp_server_sends_to_who_has_sent_it_something(
+    receiver: socket.socket, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def scene() -> None:
+        flight = asyncio.create_task(player.play(log_of([0.0, 0.1, 0.2]), ["udpin:127.0.0.1:0"]))
+        receiver.sendto(b"", ("127.0.0.1", await port_told(caplog)))
+        await flight
+
+    asyncio.run(scene())
+    assert waiting(receiver) == [frame.raw for frame in log_of([0.0, 0.1, 0.2])]
+
+
+def test_a_serial_port_gets_the_stream() -> None:
+    far, near = pty.openpty()
+    url = f"serial:{os.ttyname(near)}:57600"
+    os.close(near)
+    try:
+        tally = asyncio.run(player.play(log_of([0.0, 0.05, 0.1]), [url]))
+        assert os.read(far, 4096) == b"".join(frame.raw for frame in log_of([0.0, 0.05, 0.1]))
+    finally:
+        os.close(far)
+    assert (tally.frames, tally.dropped) == (3, 0)
+
+
+def faults(*texts: str) -> list[Fault]:
+    return [Fault.parse(text) for text in texts]
+
+
+def test_faults_strike_each_link_by_itself(receiver: socket.socket) -> None:
+    frames = log_of([0.01 * number for number in range(60)])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as second:
+        second.bind(("127.0.0.1", 0))
+        urls = [url_of(receiver), url_of(second)]
+        asked = faults("loss=0.4", "drift=24000", "delay=0.2")
+        tallies = [asyncio.run(player.play(frames, urls, faults=asked, seed=3)) for _ in range(2)]
+        got = [waiting(one) for one in (receiver, second)]
+    halves = [(one[: len(one) // 2], one[len(one) // 2 :]) for one in got]
+    assert all(first == again for first, again in halves)  # the same seed
+    assert set(halves[0][0]) != set(halves[1][0])
+    drift = Drift(24_000.0)
+    meant = {drift(0.0, frame.raw) for frame in frames}
+    assert {*halves[0][0], *halves[1][0]} <= meant
+    for tally in tallies:
+        assert tally.frames == len(frames)
+        assert tally.faults["loss"] == 2 * len(frames) - len(got[0]) // 2 - len(got[1]) // 2
+        assert tally.faults["delay"] == 2 * len(frames) - tally.faults["loss"]
+        assert 0.75 <= tally.duration_s < 1.2  # what is late is waited for
+
+
+def test_late_frames_come_late_in_real_time(receiver: socket.socket) -> None:
+    async def scene() -> list[float]:
+        loop = asyncio.get_running_loop()
+        start_s = loop.time()
+        arrivals_s: list[float] = []
+        frames = log_of([0.0, 0.1, 0.5])
+        flight = asyncio.create_task(
+            player.play(frames, [url_of(receiver)], faults=faults("delay=0.3"))
+        )
+        for _ in frames:
+            await loop.sock_recv(receiver, 300)
+            arrivals_s.append(loop.time() - start_s)
+        await flight
+        return arrivals_s
+
+    receiver.setblocking(False)
+    arrivals_s = asyncio.run(scene())
+    assert arrivals_s == pytest.approx([0.3, 0.4, 0.8], abs=0.09)
+    assert min(arrivals_s) >= 0.3
+
+
+def test_faults_pass_as_fast_as_the_log(receiver: socket.socket) -> None:
+    frames = log_of([0.0, 1.0, 2.0])
+    asked = faults("delay=2")
+    tally = asyncio.run(player.play(frames, [url_of(receiver)], 10.0, faults=asked))
+    assert 0.4 <= tally.duration_s < 0.6
+    tally = asyncio.run(player.play(frames, [url_of(receiver)], None, faults=asked))
+    assert tally.duration_s < 0.2
+    assert len(waiting(receiver)) == 6
+
+
+def test_a_flight_records_what_its_senders_send(receiver: socket.socket, tmp_path: Path) -> None:
+    tlog = tmp_path / "a.tlog"
+    asked = faults("loss=1", "reboot=0.2")
+    tally = asyncio.run(
+        player.fly(scenario.hover(), [url_of(receiver)], 0.5, record=tlog, faults=asked)
+    )
+    assert waiting(receiver) == []
+    assert tally.faults["loss"] == tally.frames > 10
+    assert tally.faults["reboot"] > 3
+    data, raws = tlog.read_bytes(), []
+    while data:
+        raws.append(data[8 : 20 + data[9]])
+        data = data[20 + data[9] :]
+    assert len(raws) == tally.frames
+    meant = schedule(scenario.hover(), duration_s=0.5)
+    senders = Senders(asked, 0, Counter())
+    sent = [senders.altered(one.t_s, one.raw) for one in meant]
+    assert list(map(without_clock, raws)) == list(map(without_clock, sent))
+
+
+def test_faults_that_do_not_go_together_open_nothing(tmp_path: Path) -> None:
+    with pytest.raises(FaultError, match="loss is given 2 times"):
+        asyncio.run(
+            player.fly(scenario.hover(), ["tcp:127.0.0.1:1"], faults=faults("loss=1", "loss=0.5"))
+        )

@@ -167,13 +167,22 @@ def nulled(spread: Spread, loading: float | FloatArray, soft: float | None = Non
     else:
         loads = np.where(spread.usable, soft, UNUSED) * gram.diagonal().real
         loads[::each] = loading
-    loaded = gram.copy()
-    loaded.flat[:: len(loaded) + 1] += loads
     by_user = np.arange(users)
     others = reached.reshape(users, each, users).copy()
     others[by_user, :, by_user] = 0.0
-    found = np.linalg.solve(loaded, others.reshape(-1, users))
-    weights: ComplexArray = spread.beams - points.conj() @ found
+    others = others.reshape(-1, users)
+    weights: ComplexArray
+    if len(loads) > len(points) and (loads > 0).all():
+        # More directions than elements: the smaller matrix, by S* (G + X)^-1 = (S* X^-1 S^T + 1)^-1
+        # S* X^-1.
+        scaled = points.conj() / loads
+        few = scaled @ points.T
+        few.flat[:: len(few) + 1] += 1.0
+        weights = spread.beams - np.linalg.solve(few, scaled @ others)
+    else:
+        loaded = gram.copy()
+        loaded.flat[:: len(loaded) + 1] += loads
+        weights = spread.beams - points.conj() @ np.linalg.solve(loaded, others)
     return weights
 
 

@@ -80,7 +80,7 @@ class Pipeline:
         self._clocks: dict[str, SenderClock] = {}  # by SYSID:COMPID
         self._dedupe = Dedupe()
         self._admission = Admission(settings.tracks.allow, settings.tracks.deny)
-        self._aircraft = Aircraft()
+        self.aircraft = Aircraft()
         self._fleet = assembly.fleet(settings, self._sender_time)
         self._targets: list[str] = []  # in the order in which they were first heard
         self._identities = Identities()
@@ -140,8 +140,8 @@ class Pipeline:
 
     def _traffic(self, said: Traffic) -> list[Output]:
         """A track does not go on from one datum to another: they differ by the weather."""
-        datum = self._aircraft.datum(said.uav)
-        merged = self._aircraft.merge(said)
+        datum = self.aircraft.datum(said.uav)
+        merged = self.aircraft.merge(said)
         if isinstance(merged, Rejection):
             return [merged]
         if datum in (None, merged.alt_datum):

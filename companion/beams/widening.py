@@ -168,9 +168,9 @@ def nulled(spread: Spread, loading: float | FloatArray, soft: float | None = Non
         loads = np.where(spread.usable, soft, UNUSED) * gram.diagonal().real
         loads[::each] = loading
     by_user = np.arange(users)
-    others = reached.reshape(users, each, users).copy()
-    others[by_user, :, by_user] = 0.0
-    others = others.reshape(-1, users)
+    by_other = reached.reshape(users, each, users).copy()
+    by_other[by_user, :, by_user] = 0.0
+    others = by_other.reshape(-1, users)
     weights: ComplexArray
     if len(loads) > len(points) and (loads > 0).all():
         # More directions than elements: the smaller matrix, by S* (G + X)^-1 = (S* X^-1 S^T + 1)^-1

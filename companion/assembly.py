@@ -190,6 +190,7 @@ def fleet(settings: Settings, to_sender_time: ToSenderTime) -> Fleet:
             GateSettings(kept.reacquire_reports, kept.reacquire_s),
             kept.window_s,
             feeds,
+            kept.most,
         ),
         to_sender_time,
     )

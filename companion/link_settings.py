@@ -85,7 +85,9 @@ class TrackSettings(Section):
     """Who is tracked, and ages of the newest report at which a track passes to the next state, s.
 
     ``allow`` names those who are (all, where it is empty), ``deny`` those who are not, whatever
-    ``allow`` says: ``3:1``, ``3:*``, ``icao:4CA7B3``, ``icao:*``. The carrier always is.
+    ``allow`` says: ``3:1``, ``3:*``, ``icao:4CA7B3``, ``icao:*``. The carrier always is. After
+    ``dropped_s`` a UAV is forgotten. Of ``most`` at a time more are refused: memory and time for
+    beams are bounded, whoever sends.
 
     ``window_s``: how late a report may come and still be used as if in order. A track is begun
     again from reports that were refused once ``reacquire_reports`` of them agree over
@@ -97,12 +99,17 @@ class TrackSettings(Section):
     coasting_s: PositiveFloat = 2.0
     stale_s: PositiveFloat = 15.0
     lost_s: PositiveFloat = 60.0
+    dropped_s: PositiveFloat = 600.0
+    most: Annotated[int, Field(ge=1, le=100_000)] = 2000
     window_s: PositiveFloat = 5.0
     reacquire_reports: Annotated[int, Field(ge=2, le=60)] = 3
     reacquire_s: Annotated[float, Field(ge=0, le=60)] = 3.0
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
-        if not self.coasting_s <= self.stale_s <= self.lost_s:
-            raise ValueError("coasting_s <= stale_s <= lost_s: a track passes its states in order")
+        ages = (self.coasting_s, self.stale_s, self.lost_s, self.dropped_s)
+        if list(ages) != sorted(ages):
+            raise ValueError(
+                "coasting_s <= stale_s <= lost_s <= dropped_s: a track passes its states in order"
+            )
         return self

@@ -50,6 +50,10 @@ from companion.values import (
     Update,
 )
 
+DROP_EVERY: Final = 100
+"""Updates between two looks for those that have gone."""
+CLOCKS_MAX: Final = 4096
+"""Of senders that are not tracked the clocks are forgotten beyond, the oldest first."""
 NEAR_M: Final = 2000.0
 """Two reports of one aircraft are not further apart, however fast it is and however old one is."""
 
@@ -206,7 +210,7 @@ class Pipeline:
         return clock.estimate() if clock else None
 
     def _restart(self, uav: str) -> None:
-        self._fleet.restart(uav)
+        self._fleet.forget(uav)
         if uav in self._targets:
             self._targets.remove(uav)
         if uav == self._carrier_id:
@@ -248,8 +252,22 @@ class Pipeline:
 
     def _tick(self, tick: Tick) -> list[Output]:
         self.updates += 1
+        dropped = self._drop_silent(tick.t_ns) if self.updates % DROP_EVERY == 0 else []
         self.last_update = self.look(tick.t_ns)
-        return [*self._state_changes(self.last_update), self.last_update]
+        return [*dropped, *self._state_changes(self.last_update), self.last_update]
+
+    def _drop_silent(self, now_ns: int) -> list[Notice]:
+        """Whoever has not been heard for long takes no more memory, and no time of any update."""
+        for_s, notices = self.settings.tracks.dropped_s, []
+        for uav in self._fleet.silent(now_ns, for_s):
+            text = f"{uav} is dropped: nothing of it for {for_s:.0f} s"
+            if self.is_target(uav):
+                notices.append(Notice(now_ns, Severity.INFO, uav, text))
+            self._restart(uav)
+        for name in list(self._clocks)[: max(0, len(self._clocks) - CLOCKS_MAX)]:
+            if self._fleet.newest(name) is None:
+                del self._clocks[name]
+        return notices
 
     def _state_changes(self, update: Update) -> list[Notice]:
         """One notice for each target, or the carrier, whose state is another than at the last tick.

@@ -722,3 +722,32 @@ def test_a_round_trip_tells_what_one_way_cannot() -> None:
     assert estimate.kind is ClockKind.TIMESYNC
     assert estimate.latency_s == pytest.approx(0.3, abs=0.011)
     assert estimate.uncertainty_s < 0.02
+
+
+def test_who_is_long_gone_is_dropped_and_comes_back_as_new() -> None:
+    ages = {"coasting_s": 1.0, "stale_s": 2.0, "lost_s": 3.0, "dropped_s": 8.0}
+    pipeline = Pipeline(settings("47.4,8.55,500", tracks=ages))
+    outputs = run(pipeline, [position(n / 10, "1:1", (50.0, 0.0, 0.0)) for n in range(10)])
+    events: list[Event] = [position(0.95 + n / 10, "2:1", (0.0, 50.0, 0.0)) for n in range(300)]
+    events += [tick(n / 10) for n in range(300)]
+    outputs += run(pipeline, sorted(events, key=lambda event: event.t_ns))
+    said = [one.text for one in outputs if isinstance(one, Notice) and one.subject == "1:1"]
+    assert said == [
+        *(f"1:1 is {state}" for state in ("live", "coasting", "stale", "lost")),
+        "1:1 is dropped: nothing of it for 8 s",
+    ]
+    now_ns = START_NS + 30 * S
+    assert [track.uav for track in pipeline.tracks(now_ns, now_ns)] == ["2:1"]
+    (again,) = run(pipeline, [position(31.0, "1:1", (60.0, 0.0, 0.0))])
+    assert isinstance(again, Estimate)
+    assert again.dt_s is None
+
+
+def test_no_more_are_tracked_than_the_settings_allow() -> None:
+    pipeline = Pipeline(settings("47.4,8.55,500", tracks={"most": 3}))
+    for n in range(20):
+        for sysid in range(1, 11):
+            run(pipeline, [position(n / 10, f"{sysid}:1", (10.0 * sysid, 0.0, 0.0))])
+    now_ns = START_NS + 2 * S
+    assert [t.uav for t in pipeline.tracks(now_ns, now_ns)] == ["1:1", "2:1", "3:1"]
+    assert pipeline.refusals.total == {Reason.TOO_MANY: 7 * 20}

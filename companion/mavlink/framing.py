@@ -28,6 +28,8 @@ SIGNED: Final = 0x01
 """The only incompatibility flag defined; a frame with another one must be dropped."""
 LONGEST_FRAME: Final = 10 + 255 + 2 + 13
 
+SOURCES_MAX: Final = 1024
+
 INCOMPLETE: Final = 0
 NOT_A_FRAME: Final = -1
 UNKNOWN_MESSAGE: Final = -2
@@ -164,6 +166,8 @@ class Splitter:
         ids = (buffer[first], buffer[first + 1])
         source = self._sources.get(ids)
         if source is None:
+            if len(self._sources) >= SOURCES_MAX:
+                self._sources.clear()  # one value for each is a saving, and no more
             source = self._sources.setdefault(ids, Source(*ids))
         return Frame(
             t_ns, self.link, source, self._msgid(buffer, at), bytes(buffer[at : at + length])

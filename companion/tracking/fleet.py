@@ -54,7 +54,7 @@ ToSenderTime = Callable[[str, int], SenderTime]
 class FleetSettings:
     """How tracks are kept: the greatest speed and acceleration that are taken for possible;
     ``window_s``, how late a report may come and still be used in order; ``feed_forward``, whether
-    an estimated acceleration enters predictions."""
+    an estimated acceleration enters predictions; ``most``, how many tracks there may be."""
 
     speed_max_mps: float
     acceleration_max_mps2: float
@@ -62,6 +62,7 @@ class FleetSettings:
     gate: GateSettings = field(default_factory=GateSettings)
     window_s: float = 5.0
     feed_forward: bool = False
+    most: int = 2000
 
 
 @dataclass(slots=True)
@@ -98,6 +99,8 @@ class Fleet:
     def accept(self, fix: Fix) -> Estimate | Rejection:
         """Put a report to its track, or begin one; or say why it is not used."""
         tracked = self._tracked.get(fix.uav)
+        if tracked is None and len(self._tracked) >= self._settings.most:
+            return _rejected(fix, Reason.TOO_MANY, f"{self._settings.most} tracks are kept")
         if tracked is None or self._is_lost(tracked, fix):
             return self._begin(fix)
         index = tracked.history.index(fix.sender_ns)
@@ -193,9 +196,14 @@ class Fleet:
         size = math.sqrt(found @ found)
         return (found, size) if size <= most_mps2 else (found * (most_mps2 / size), most_mps2)
 
-    def restart(self, uav: str) -> None:
-        """Forget a track: its sender was restarted, and its times begin anew."""
+    def forget(self, uav: str) -> None:
+        """Forget a track: its sender was restarted, and its times begin anew; or it is gone."""
         self._tracked.pop(uav, None)
+
+    def silent(self, now_ns: int, for_s: float) -> list[str]:
+        """Those of whom no accepted report has arrived for so long, node time."""
+        before_ns = now_ns - round(for_s * 1e9)
+        return [uav for uav, one in self._tracked.items() if one.arrived.arrival_ns < before_ns]
 
     # --- tracks out -------------------------------------------------------------------------
 

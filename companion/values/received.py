@@ -76,6 +76,7 @@ class Reason(StrEnum):
     NO_ALTITUDE = "no-altitude"  # a position in the plane only
     UNPLACED_STAMP = "unplaced-stamp"  # off the sender's clock, and not enough others yet to agree
     NOT_ALLOWED = "not-allowed"  # a sender that the lists of the settings keep out
+    TOO_MANY = "too-many"  # another sender, where as many are tracked as the settings allow
     UNSIGNED = "unsigned"  # without a signature, over a link that requires them
     BAD_SIGNATURE = "bad-signature"  # signed with another key, or altered
     REPLAYED = "replayed"  # well signed, but not newer than what was heard before

@@ -155,8 +155,8 @@ def test_a_restart_begins_anew(fleet: Fleet, fix: MakeFix) -> None:
     fleet.accept(fix(100 * S, [0, 0, 0]))
     fleet.accept(fix(100 * S, [0, 0, 0], uav="2:1"))
     assert fleet.uavs == ["1:1", "2:1"]
-    fleet.restart("1:1")
-    fleet.restart("9:1")  # never seen
+    fleet.forget("1:1")
+    fleet.forget("9:1")  # never seen
     assert fleet.uavs == ["2:1"]
     assert fleet.track("1:1", 0, 0) is None
     assert fleet.newest("1:1") is None

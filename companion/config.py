@@ -333,5 +333,6 @@ def _first(error: ValidationError) -> str:
     key = ".".join(map(str, place))
     if errors[0]["type"] == "extra_forbidden":
         return f"{key} is not a setting"
-    allowed = dict.fromkeys(wrong["msg"] for wrong in errors if wrong["loc"][:2] == place)
+    said = [wrong["msg"] for wrong in errors if wrong["loc"][:2] == place]
+    allowed = dict.fromkeys(text.removeprefix("Value error, ") for text in said)
     return f"{key} = {errors[0]['input']!r}: {', or '.join(allowed)}"

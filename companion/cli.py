@@ -39,6 +39,12 @@ def main() -> None:
 @CENTER
 @click.option("--listen", metavar="HOST:PORT", help="Where HTTP is served [127.0.0.1:8080].")
 @click.option("--record", metavar="DIR", help="Write recordings to this directory.")
+@click.option(
+    "--foxglove",
+    metavar="PORT",
+    type=click.IntRange(0, 65535),
+    help="Live channels for Foxglove and Lichtblick, on this machine. Needs the extra [live].",
+)
 @click.option("--insecure", is_flag=True, help="Serve beyond this machine without a token.")
 @click.option("--silent", is_flag=True, help="Send no MAVLink at all, whatever the settings say.")
 def run(
@@ -47,6 +53,7 @@ def run(
     center: str | None,
     listen: str | None,
     record: str | None,
+    foxglove: int | None,
     insecure: bool,
     silent: bool,
 ) -> None:
@@ -64,7 +71,7 @@ def run(
             center={"source": center},
             links={"urls": list(links) or None},
             presence={"enabled": False if silent else None},
-            server={"listen": listen},
+            server={"listen": listen, "foxglove": foxglove},
             recording={"directory": record},
         )
         live.run(settings, token=os.environ.get("COMPANION_TOKEN"), insecure=insecure)
@@ -164,6 +171,7 @@ def _replay_text(summary: dict[str, Any]) -> str:
         f" condition number to {_number(beams['condition_number_max'])}"
     )
     lines += [f"  rejected {reason}: {n}" for reason, n in summary["rejected"].items()]
+    lines += [f"  missing: {line}" for line in summary["missing"]]
     if summary["recording"]:
         lines.append(f"recording {summary['recording']}")
     return "\n".join([*lines, f"digest {summary['digest']}"])

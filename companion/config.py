@@ -140,7 +140,8 @@ class ObserverSettings(Section):
     accuracy (GPS_RAW_INT) and ``follow_accuracy`` is true, ``accuracy_factor`` times that accuracy
     takes the place of the noise. ``alpha``, ``feedthrough_s`` and ``velocity_lead_s`` are of the
     position model; ``feed_forward`` (an estimated acceleration) and ``design`` (a file of gains
-    that ``companion design --model kinematic --out`` wrote) are of the kinematic one.
+    that ``companion design --model kinematic --out`` wrote, which is read into ``design_json``)
+    are of the kinematic one.
     """
 
     model: Literal["kinematic", "position"] = "kinematic"
@@ -149,6 +150,7 @@ class ObserverSettings(Section):
     velocity_lead_s: Annotated[float, Field(gt=0, le=10)] = 0.2
     feed_forward: bool = True
     design: str | None = None
+    design_json: str | None = None
     speed_max_mps: PositiveFloat = 60.0
     acceleration_max_mps2: PositiveFloat = 5.0
     position_noise_m: PositiveFloat = 3.0
@@ -158,16 +160,23 @@ class ObserverSettings(Section):
 
 
 class RecordingSettings(Section):
-    """Where recordings go (None: nowhere) and how often weights are written."""
+    """Where recordings go (None: nowhere), how often at most weights, tracks and the scene are
+    written, and when a new file is begun: at a size, in millions of bytes (None: however large it
+    grows), and after a time. The files of a run replay together to its digest."""
 
     directory: str | None = None
     weights_hz: Literal["all"] | PositiveFloat = 10.0
+    scene_hz: Annotated[float, Field(gt=0, le=100)] = 2.0
+    rotate_mb: Annotated[float, Field(ge=0.1, le=1e6)] | None = None
+    rotate_s: Annotated[float, Field(ge=1, le=1e7)] = 3600.0
 
 
 class ServerSettings(Section):
-    """Where HTTP is served."""
+    """Where HTTP is served; ``foxglove`` is the port on this machine at which the channels of a
+    recording are live (None: nowhere, 0: one that is free). It needs the extra ``live``."""
 
     listen: str = "127.0.0.1:8080"
+    foxglove: Annotated[int, Field(ge=0, le=65535)] | None = None
 
 
 class Settings(Section):
@@ -226,7 +235,7 @@ def load(path: Path | None) -> Settings:
         raise ConfigError(f"{path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not TOML: it is not UTF-8 text") from error
-    return _with_positions(Settings.from_toml(text, str(path)))
+    return _with_design(_with_positions(Settings.from_toml(text, str(path))))
 
 
 def _with_positions(settings: Settings) -> Settings:
@@ -300,19 +309,34 @@ def calibration_text(settings: Settings) -> str | None:
         raise ConfigError(f"hardware.calibration = {name!r}: not UTF-8 text") from error
 
 
+def _with_design(settings: Settings) -> Settings:
+    """Settings that hold the observer's gains themselves, so that a recording holds them too."""
+    named = settings.observer.design
+    if named is None:
+        return settings
+    try:
+        text = Path(named).read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"observer.design = {named!r}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"observer.design = {named!r}: not UTF-8 text") from error
+    return settings.override(observer={"design_json": text})
+
+
 def kinematic_design(settings: Settings) -> KinematicDesign:
     """The gains of the kinematic observer: those named, or those that come with the program.
 
     Their certificate is verified. ``ConfigError`` where they cannot be used.
     """
-    named = settings.observer.design
-    source = Path(named) if named else resources.files("companion.tracking") / DEFAULT_DESIGN
+    given = _with_design(settings).observer if settings.observer.design_json is None else None
+    given = given or settings.observer
     try:
+        if given.design_json is not None:
+            return KinematicDesign.from_json(given.design_json)
+        source = resources.files("companion.tracking") / DEFAULT_DESIGN
         return KinematicDesign.from_json(source.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"observer.design = {named!r}: {error.strerror}") from error
     except ValueError as error:
-        raise ConfigError(f"observer.design = {named!r}: {error}") from error
+        raise ConfigError(f"observer.design = {given.design!r}: {error}") from error
 
 
 def _toml(value: object) -> str:

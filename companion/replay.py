@@ -13,7 +13,9 @@ import numpy as np
 import companion
 from companion.config import Settings, load
 from companion.pipeline import Pipeline
-from companion.recording.reader import log_kind, read_log, read_settings
+from companion.recording import parts
+from companion.recording.parts import Story
+from companion.recording.reader import LogError, log_kind, read_log, read_parts, read_settings
 from companion.recording.writer import Writer
 from companion.ticks import with_ticks
 from companion.values import Estimate, Event, Tick, Update
@@ -92,7 +94,8 @@ def replay(
 ) -> dict[str, Any]:
     """Run logs through a pipeline and sum up, as ``companion replay --json`` prints it.
 
-    Several logs are merged by time. ``writer`` gets everything and is closed; ``speed`` paces by
+    Several logs are merged by time; the parts of one run follow one another, and ``missing`` is
+    what they lack. ``writer`` gets everything and is closed; ``speed`` paces by
     the stamps (None: as fast as it goes); ``progress(frames, seconds of log)`` is called now and
     then. ``LogError`` for a log that cannot be used, ``OSError`` where the recording cannot be
     written.
@@ -128,14 +131,21 @@ def replay(
     return summary | {
         "wall_s": time.monotonic() - started_s,
         "recording": str(recording) if recording else None,
+        "missing": missing(logs),
         "digest": digest,
     }
 
 
 def log_events(logs: Sequence[Path], settings: Settings) -> Iterator[Event]:
-    """All events in order of time, with ticks."""
+    """All events in order of time, with ticks; those of several parts of one run as they were.
+
+    ``LogError`` where a log cannot be used, or one part of a run is given twice.
+    """
     if len(logs) == 1 and log_kind(logs[0]) == TICKED:
         return read_log(logs[0])
+    ordered = _in_order(_stories(logs))
+    if ordered is not None:
+        return read_parts(ordered)
     without_ticks = [_without_ticks(log) for log in logs]
     merged = (
         heapq.merge(*without_ticks, key=lambda event: event.t_ns)
@@ -143,6 +153,27 @@ def log_events(logs: Sequence[Path], settings: Settings) -> Iterator[Event]:
         else without_ticks[0]
     )
     return with_ticks(merged, settings.beams.update_hz)
+
+
+def missing(logs: Sequence[Path]) -> list[str]:
+    """What recordings say of events that they do not hold, a line for each; so a replay of them
+    cannot come to the live run's digest. ``LogError`` as for a replay."""
+    stories = _stories(logs)
+    return parts.missing(stories, _in_order(stories) or logs)
+
+
+def _stories(logs: Sequence[Path]) -> dict[Path, Story]:
+    try:
+        return {log: parts.read_story(log) for log in logs}
+    except (OSError, ValueError) as error:
+        raise LogError(f"{logs[0]}: cannot be read: {error}") from None
+
+
+def _in_order(stories: dict[Path, Story]) -> list[Path] | None:
+    try:
+        return parts.in_order(stories)
+    except ValueError as error:
+        raise LogError(str(error)) from None
 
 
 def _without_ticks(log: Path) -> Iterator[Event]:
@@ -165,25 +196,27 @@ def _paced(events: Iterable[Event], speed: float) -> Iterator[Event]:
 
 def _summary(pipeline: Pipeline, tally: Tally) -> dict[str, Any]:
     now_ns = tally.last_ns
-    tracks = pipeline.tracks(now_ns, now_ns)
+    tracks = {track.uav: track for track in pipeline.tracks(now_ns, now_ns)}
+    carrier = str(pipeline.center)
+    heard = [uav for uav in dict.fromkeys([*tally.reports, *tracks]) if uav != carrier]
     return {
         "frames": pipeline.frames,
         "rejected": {
             str(reason): count for reason, count in sorted(pipeline.refusals.total.items())
         },
-        "reports": {track.uav: tally.reports[track.uav] for track in tracks},
+        "reports": {uav: tally.reports[uav] for uav in heard},
         "uavs": {
-            track.uav: {
-                "reports": tally.reports[track.uav],
-                "dt_median_s": _percentile(tally.dt_s[track.uav], 50),
-                "dt_max_s": _percentile(tally.dt_s[track.uav], 100),
-                "latency_p50_s": _percentile(tally.latency_s[track.uav], 50),
-                "latency_p95_s": _percentile(tally.latency_s[track.uav], 95),
-                "innovation_rms_m": _rms(tally.innovation_m[track.uav]),
-                "gamma": track.gamma,
-                "state": str(track.state),
+            uav: {
+                "reports": tally.reports[uav],
+                "dt_median_s": _percentile(tally.dt_s[uav], 50),
+                "dt_max_s": _percentile(tally.dt_s[uav], 100),
+                "latency_p50_s": _percentile(tally.latency_s[uav], 50),
+                "latency_p95_s": _percentile(tally.latency_s[uav], 95),
+                "innovation_rms_m": _rms(tally.innovation_m[uav]),
+                "gamma": tracks[uav].gamma if uav in tracks else None,
+                "state": str(tracks[uav].state) if uav in tracks else "dropped",
             }
-            for track in tracks
+            for uav in heard
         },
         "center": str(pipeline.center),
         "beams": {

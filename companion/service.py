@@ -5,7 +5,7 @@ import contextlib
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,14 +17,17 @@ from companion.config import Settings
 from companion.mavlink.link_status import LinkStatus
 from companion.mavlink.rates import MessageRate
 from companion.pipeline import Pipeline
-from companion.recording.background import BackgroundRecorder
+from companion.recording.background import BackgroundRecorder, Rotation
+from companion.recording.live import LiveChannels
+from companion.recording.parts import Part
 from companion.recording.reader import LogError
 from companion.recording.recover import recover_leftovers
+from companion.recording.scene import Scene
 from companion.recording.writer import Writer
 from companion.server.app import create_app
 from companion.server.views import RecordingStatus
 from companion.traffic import Traffic
-from companion.values import Event, Notice, Tick
+from companion.values import Event, Notice, Output, Tick
 
 RATE_WINDOW_S: Final = 2.0
 NOTICES_KEPT: Final = 200
@@ -46,7 +49,7 @@ class Service:
 
     ``say`` gets one line for a person whenever something changes. Raises ``LinkError`` if a link
     cannot be opened, ``ConfigError`` if the settings cannot be used, ``OSError`` if the recording
-    cannot be opened.
+    cannot be opened, ``LiveError`` if the live channels cannot be served.
     """
 
     def __init__(self, settings: Settings, say: Callable[[str], None]) -> None:
@@ -59,6 +62,7 @@ class Service:
         self._started_ns = self._timeline.now_ns()
         self._rates: deque[tuple[int, int, int]] = deque()
         self._recorder: BackgroundRecorder | None = None
+        self._live = self._open_live()
         self._traffic = Traffic(settings, self._step, self._notify, self._timeline.now_ns)
         self._traffic.open()
         self._recorder = self._open_recorder()
@@ -81,6 +85,8 @@ class Service:
         )
         if self._recorder:
             self._recorder.start()
+        if self._live:
+            self._live.start()
         try:
             async with asyncio.TaskGroup() as group:
                 tasks = [group.create_task(self._tick(), name="ticks")]
@@ -95,25 +101,36 @@ class Service:
                     task.cancel()
         finally:
             self._traffic.close()
+            if self._live:
+                await asyncio.to_thread(self._live.stop)
             if self._recorder:
                 metadata = {"digest": self.pipeline.digest.hexdigest()}
                 await asyncio.to_thread(self._recorder.stop, metadata)
+                self._tell_of_recorder(self._recorder)
 
     # --- what drives the pipeline -----------------------------------------------------------
 
     def _step(self, event: Event) -> None:
         outputs = self.pipeline.step(event)
-        if self._recorder:
-            self._recorder.put(event, outputs)
+        self._hand_over(event, outputs)
         for output in outputs:
             if isinstance(output, Notice):
                 self._show(output)
 
+    def _hand_over(self, event: Event | None, outputs: Sequence[Output]) -> None:
+        if self._recorder:
+            self._recorder.put(event, outputs)
+        if self._live:
+            self._live.put(event, outputs)
+
     def _notify(self, notice: Notice) -> None:
         """What a person should know, and what the pipeline does not."""
-        if self._recorder:
-            self._recorder.put(None, [notice])
+        self._hand_over(None, [notice])
         self._show(notice)
+
+    def _tell_of_recorder(self, recorder: BackgroundRecorder) -> None:
+        for severity, text in recorder.news():
+            self._notify(Notice(self.now_ns(), severity, "recording", text))
 
     def _show(self, notice: Notice) -> None:
         self.notices.append(notice)
@@ -132,6 +149,8 @@ class Service:
             began_s = loop.time()
             self._step(Tick(self._timeline.now_ns()))
             self._count_rates()
+            if self._recorder:
+                self._tell_of_recorder(self._recorder)
             self._traffic.speak(not self.unfit(), self.pipeline.reporters())
             ended_s = loop.time()
             due_s = max(due_s + period_s, ended_s + (ended_s - began_s))
@@ -181,10 +200,9 @@ class Service:
         recorder = self._recorder
         if recorder is None:
             return RecordingStatus("off", None, 0, 0, 0)
-        state = "degraded" if recorder.failure or recorder.dropped else "recording"
-        writer = recorder.writer
+        state = "degraded" if recorder.degraded else "recording"
         return RecordingStatus(
-            state, writer.path.name, recorder.bytes, writer.messages, recorder.dropped
+            state, recorder.file, recorder.bytes, recorder.messages, recorder.dropped
         )
 
     def unfit(self) -> list[str]:
@@ -211,19 +229,38 @@ class Service:
                 self._say(f"recovered {found.path} ({found.lost_bytes} bytes lost)")
 
     def _open_recorder(self) -> BackgroundRecorder | None:
-        recording = self._settings.recording
-        if recording.directory is None:
+        kept = self._settings.recording
+        if kept.directory is None:
             return None
-        weights_hz = None if recording.weights_hz == "all" else recording.weights_hz
-        return BackgroundRecorder(
-            Writer(
-                Path(recording.directory),
-                self._settings.to_toml(),
-                {"companion": companion.__version__},
-                weights_hz,
-                self._started_ns,
-            ),
-            self.pipeline.geodetic,
+        size_bytes = None if kept.rotate_mb is None else kept.rotate_mb * 1e6
+        rotation = Rotation(size_bytes, kept.rotate_s)
+        return BackgroundRecorder(self._open_part, self.pipeline.geodetic, rotation)
+
+    def _open_live(self) -> LiveChannels | None:
+        """On this machine alone: the protocol knows of no token."""
+        port = self._settings.server.foxglove
+        if port is None:
+            return None
+        live = LiveChannels("127.0.0.1", port, self.pipeline.geodetic, self._scene())
+        self._say(f"live channels for Foxglove and Lichtblick on ws://127.0.0.1:{live.port}")
+        return live
+
+    def _scene(self) -> Scene:
+        return Scene(self.pipeline.array, self._settings.recording.scene_hz)
+
+    def _open_part(self, part: Part) -> Writer:
+        kept = self._settings.recording
+        where = Path(kept.directory or "")
+        if part.number > 1 and where.suffix == ".mcap" and not where.is_dir():
+            where = where.parent  # a file was asked for: those that follow it stand beside it
+        return Writer(
+            where,
+            self._settings.to_toml(),
+            {"companion": companion.__version__},
+            None if kept.weights_hz == "all" else kept.weights_hz,
+            self._started_ns if part.number == 1 else self.now_ns(),
+            self._scene(),
+            part,
         )
 
 

@@ -1,92 +1,285 @@
 """A recorder on a thread of its own: the event loop hands over and goes on.
 
-The queue is bounded. What does not fit is counted and said; beams never wait for a disk.
+The queue is bounded. What does not fit is counted and said; beams never wait for a disk. A disk
+that fails is tried again, less and less often: what was not yet on it is kept as far as the
+queue goes, and the recording goes on in a new file. What is missing then is written down there.
 """
 
+import contextlib
+import errno
+import os
 import queue
 import threading
 import time
-from collections.abc import Sequence
-from typing import Final
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
 
-from companion.recording.writer import Geodetic, Writer
-from companion.values import Event, Output
+from companion.recording.entries import Geodetic
+from companion.recording.parts import Hole, Part
+from companion.recording.writer import Writer
+from companion.values import Event, Output, Severity
 
 QUEUE_MAX: Final = 50_000
 """Some seconds of the busiest stream."""
 FLUSH_S: Final = 1.0
+RETRY_FIRST_S: Final = 1.0
+RETRY_MAX_S: Final = 30.0
+STOP_MAX_S: Final = 30.0
+"""For so long the end of the service waits for a disk that does not answer."""
+ROOM_BYTES: Final = 8 << 20
+"""So much must be free before a recording is gone on with: with less it would soon end again."""
 
-_Item = tuple[Event | None, Sequence[Output]]
+_TOO_SLOW: Final = "the disk was too slow"
+
+
+@dataclass(frozen=True, slots=True)
+class Rotation:
+    """When a new part is begun: at a size in bytes, after so many seconds; None: never."""
+
+    size_bytes: float | None = None
+    after_s: float | None = None
+
+
+NEVER: Final = Rotation()
+
+
+class _Item(NamedTuple):
+    """An event and what came of it; ``missed`` events before it did not fit into the queue."""
+
+    event: Event | None
+    outputs: Sequence[Output]
+    missed: int
+
+    @property
+    def t_ns(self) -> int:
+        return self.event.t_ns if self.event is not None else 0
 
 
 class BackgroundRecorder:
-    """Owns a ``Writer`` from ``start`` to ``stop``.
+    """Owns a ``Writer`` from ``start`` to ``stop``, and those of the parts that follow.
 
-    A failing disk ends the recording, not the service: ``failure`` then says why.
+    ``open_part`` makes the writer of a part; the first is made at once, and its ``OSError`` is
+    the caller's. Later ones are this recorder's: ``failure`` says why nothing is written just
+    now, ``news`` what a person should know. ``dropped`` counts what was handed over and is not
+    recorded, ``messages`` and ``bytes`` what is, the latter in the newest file.
     """
 
-    def __init__(self, writer: Writer, geodetic: Geodetic) -> None:
-        self.writer = writer
+    def __init__(
+        self,
+        open_part: Callable[[Part], Writer],
+        geodetic: Geodetic,
+        rotation: Rotation = NEVER,
+        queue_max: int = QUEUE_MAX,
+    ) -> None:
         self.bytes = 0
         self.dropped = 0
         self.failure: str | None = None
+        self._open_part = open_part
         self._geodetic = geodetic
-        self._queue: queue.Queue[_Item | None] = queue.Queue(QUEUE_MAX)
+        self._rotation = rotation
+        self._part = Part.first()
+        self._writer = open_part(self._part)
+        self._begun_s = time.monotonic()
+        self._finished_messages = 0  # of the parts before this one
+        self._queue: queue.Queue[_Item | None] = queue.Queue(queue_max)
+        self._queue_max = queue_max
+        self._missed = 0
+        self._overrun = False
+        self._unsafe: list[_Item] = []  # written, but not yet on the disk
+        self._lost = 0  # events of which nobody knows whether they are on a disk
+        self._why = _TOO_SLOW
+        self._retry_s = RETRY_FIRST_S
+        self._news: deque[tuple[Severity, str]] = deque(maxlen=100)
         self._metadata: dict[str, str] = {}
+        self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+
+    # --- the side of the event loop ---------------------------------------------------------
 
     def start(self) -> None:
         """Begin to write."""
         self._thread.start()
 
     def put(self, event: Event | None, outputs: Sequence[Output]) -> None:
-        """Hand over an event and what came of it; None for what came of no event. Never waits."""
-        if self.failure is not None:
-            self.dropped += 1
-            return
-        try:
-            self._queue.put_nowait((event, outputs))
-        except queue.Full:
-            self.dropped += 1
+        """Hand over an event and what came of it; None for what came of no event. Never waits.
+
+        Once the queue is full nothing is taken until half of it is written: one long hole can be
+        told of, a thousand short ones would be a recording of holes.
+        """
+        if self._overrun and self._queue.qsize() <= self._queue_max // 2:
+            self._overrun = False
+            self._tell(Severity.INFO, f"recording again: {self._missed} events are missing")
+        if not self._overrun:
+            try:
+                self._queue.put_nowait(_Item(event, outputs, self._missed))
+                self._missed = 0
+                return
+            except queue.Full:
+                self._overrun = True
+                if self.failure is None:
+                    self._tell(Severity.ERROR, "not all is recorded: the disk is too slow")
+        self.dropped += 1
+        self._missed += event is not None
 
     def stop(self, metadata: dict[str, str]) -> None:
-        """Write what is queued, finish the file and return when it is on the disk."""
+        """Write what is queued, finish the file and return when it is on the disk.
+
+        A disk that fails is tried once more; one that does not answer is waited for
+        ``STOP_MAX_S`` seconds.
+        """
         self._metadata = metadata
-        self._queue.put(None)
-        self._thread.join()
+        self._stopping.set()
+        with contextlib.suppress(queue.Full):  # it only wakes who waits, and then nobody does
+            self._queue.put_nowait(None)
+        self._thread.join(STOP_MAX_S)
+        if self._thread.is_alive():
+            self._tell(Severity.ERROR, f"{self._writer.path} is not finished: no answer from disk")
+
+    def news(self) -> list[tuple[Severity, str]]:
+        """What a person should know and was not yet told."""
+        told = []
+        while self._news:
+            told.append(self._news.popleft())
+        return told
+
+    @property
+    def degraded(self) -> bool:
+        """Whether something is not being recorded just now."""
+        return self.failure is not None or self._overrun
+
+    @property
+    def file(self) -> str:
+        """The name of the newest file."""
+        return self._writer.path.name
+
+    @property
+    def messages(self) -> int:
+        """Messages recorded in all parts so far."""
+        return self._finished_messages + self._writer.messages
+
+    # --- the side of the thread -------------------------------------------------------------
 
     def _run(self) -> None:
-        try:
-            self._write_until_stopped()
-        except OSError as error:
-            self._fail(error)
-            self.writer.abandon()
-            while self._queue.get() is not None:  # until `stop`, so that it need not wait
-                self.dropped += 1
-            return
-        try:
-            self.writer.close(self._metadata)
-        except OSError as error:
-            self._fail(error)
+        while not self._record():
+            if not self._reopen():
+                return
 
-    def _fail(self, error: OSError) -> None:
-        self.failure = f"{self.writer.path}: {error.strerror or error}"
+    def _record(self) -> bool:
+        """Write until stopped; False where that failed."""
+        try:
+            self._go_on()
+            self._write_until_stopped()
+            self._finish()
+        except OSError as error:
+            self._fail(error)
+            return False
+        return True
+
+    def _go_on(self) -> None:
+        """Begin with what the file before did not get."""
+        if self._lost:
+            t_ns = next((item.t_ns for item in self._unsafe if item.t_ns), time.time_ns())
+            self._writer.hole(Hole(t_ns, self._lost, self._why))
+        for item in self._unsafe:
+            self._write(item)
+        self._flush()
+        self._lost = 0
+        if self.failure is not None:
+            self.failure = None
+            self._tell(Severity.INFO, f"recording again, into {self.file}")
 
     def _write_until_stopped(self) -> None:
         flush_due_s = time.monotonic() + FLUSH_S
-        while True:
-            try:
+        while not (self._stopping.is_set() and self._queue.empty()):
+            item = None
+            with contextlib.suppress(queue.Empty):
                 item = self._queue.get(timeout=max(0.0, flush_due_s - time.monotonic()))
-                if item is None:
-                    return
-                event, outputs = item
-                if event is not None:
-                    self.writer.event(event)
-                for output in outputs:
-                    self.writer.output(output, self._geodetic)
-            except queue.Empty:
-                pass
-            if time.monotonic() >= flush_due_s:
-                self.writer.flush()
-                self.bytes = self.writer.size_bytes
+            if item is not None:
+                self._unsafe.append(item)
+                self._write(item)
+            if time.monotonic() >= flush_due_s or len(self._unsafe) >= self._queue_max:
+                self._flush()
+                self._rotate_if_due()
                 flush_due_s = time.monotonic() + FLUSH_S
+
+    def _write(self, item: _Item) -> None:
+        if item.missed:
+            self._writer.hole(Hole(item.t_ns, item.missed, self._why))
+        if item.event is not None:
+            self._writer.event(item.event)
+        for output in item.outputs:
+            self._writer.output(output, self._geodetic)
+
+    def _flush(self) -> None:
+        self._writer.flush()
+        self._unsafe.clear()
+        self._retry_s = RETRY_FIRST_S
+        self.bytes = self._writer.size_bytes
+
+    def _finish(self) -> None:
+        if self._missed:
+            self._writer.hole(Hole(time.time_ns(), self._missed, self._why))
+        self._flush()
+        self._writer.close(self._metadata)
+        self.bytes = self._writer.size_bytes
+
+    def _rotate_if_due(self) -> None:
+        size_bytes, after_s = self._rotation.size_bytes, self._rotation.after_s
+        large = size_bytes is not None and self.bytes >= size_bytes
+        old = after_s is not None and time.monotonic() - self._begun_s >= after_s
+        if self._writer.flushed and (large or old):
+            self._writer.close({})
+            self._open_next()
+
+    def _open_next(self) -> None:
+        """The writer of the next part; of the same one again where nothing of it is on a disk."""
+        before = self._writer
+        part = self._part.after(before.path.name) if before.flushed else self._part
+        made = self._open_part(part)
+        self._finished_messages += before.flushed
+        self._writer, self._part, self._begun_s = made, part, time.monotonic()
+
+    # --- when the disk fails ----------------------------------------------------------------
+
+    def _fail(self, error: OSError) -> None:
+        """Said once, however often it is tried again."""
+        self._why = error.strerror or str(error)
+        if self.failure is None:
+            text = f"nothing is recorded: {self._writer.path}: {self._why}; trying again"
+            self._tell(Severity.ERROR, text)
+        self.failure = f"{self._writer.path}: {self._why}"
+        if not self._writer.salvage():
+            self._lost += sum(item.event is not None for item in self._unsafe)
+            self.dropped += len(self._unsafe)
+            self._unsafe.clear()
+
+    def _reopen(self) -> bool:
+        """Try again until it works; False where the service ended before that."""
+        while True:
+            stopped = self._stopping.wait(self._retry_s)
+            self._retry_s = min(2 * self._retry_s, RETRY_MAX_S)
+            try:
+                self._open_next()
+                self._require_room()
+                return True
+            except OSError as error:
+                self._fail(error)
+            if stopped:
+                self._give_up()
+                return False
+
+    def _require_room(self) -> None:
+        found = os.statvfs(self._writer.path.parent)
+        if found.f_bavail * found.f_frsize < ROOM_BYTES:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def _give_up(self) -> None:
+        self.dropped += len(self._unsafe)
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self.dropped += self._queue.get_nowait() is not None
+
+    def _tell(self, severity: Severity, text: str) -> None:
+        self._news.append((severity, text))

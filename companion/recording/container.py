@@ -60,8 +60,8 @@ Content = Message | Attachment | Metadata | Damage
 class Walk:
     """One pass over a file. Iterate once; what is asked of it afterwards is then complete.
 
-    ``topics``: hand on messages of these only (None: all). ``OSError`` where the file cannot be
-    read.
+    ``topics``: hand on messages of these only (None: all; of none: what is in chunks is passed
+    over unread). ``OSError`` where the file cannot be read.
     """
 
     def __init__(self, path: Path, topics: frozenset[str] | None = None) -> None:
@@ -121,7 +121,7 @@ class Walk:
         self.lost_bytes += size - at
 
     def _contents(self, opcode: int, body: bytes) -> list[Content]:
-        if opcode == Opcode.CHUNK:
+        if opcode == Opcode.CHUNK and self._topics != frozenset():
             chunk = Chunk.read(ReadDataStream(BytesIO(body)))
             if chunk.uncompressed_size > _LARGEST_CHUNK:
                 raise ValueError("no chunk is that large")

@@ -29,7 +29,8 @@ _LEVEL: Final = {
 }
 
 
-def _timestamp(t_ns: int) -> dict[str, int]:
+def timestamp(t_ns: int) -> dict[str, int]:
+    """A ``google.protobuf.Timestamp``, or a ``Duration``, of nanoseconds."""
     seconds, nanos = divmod(t_ns, 1_000_000_000)
     return {"seconds": seconds, "nanos": nanos}
 
@@ -38,7 +39,7 @@ def fix(value: Fix) -> Any:
     """Where a UAV said it was: the report's own degrees."""
     report = value.report
     return schemas.LocationFixMessage(
-        timestamp=_timestamp(value.t_ns),
+        timestamp=timestamp(value.t_ns),
         frame_id=FRAME_ID,
         latitude=report.lat_deg,
         longitude=report.lon_deg,
@@ -55,7 +56,7 @@ def predicted(track: Track, lat_deg: float, lon_deg: float, alt_m: float) -> Any
     ellipsoid errs on the safe side on average. No covariance where there is no finite bound.
     """
     message = schemas.LocationFixMessage(
-        timestamp=_timestamp(track.valid_at_ns),
+        timestamp=timestamp(track.valid_at_ns),
         frame_id=FRAME_ID,
         latitude=lat_deg,
         longitude=lon_deg,
@@ -131,7 +132,7 @@ def weights(value: BeamSet) -> Any:
 def log(value: Notice) -> Any:
     """A notice as a line in a viewer's log panel, under the name of what it is about."""
     return schemas.LogMessage(
-        timestamp=_timestamp(value.t_ns),
+        timestamp=timestamp(value.t_ns),
         level=_LEVEL[value.severity],
         name=value.subject,
         message=value.text,

@@ -4,7 +4,7 @@ Our own recordings give back exactly the events that drove the live run, in that
 logs and raw MAVLink give the events that a live run would have had.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Final, Literal
@@ -54,6 +54,12 @@ def read_log(path: Path) -> Iterator[Event]:
     if first is None:
         raise LogError(f"{path}: an MCAP file, but no MAVLink frame in it")
     return chain((first,), events)
+
+
+def read_parts(paths: Sequence[Path]) -> Iterator[Event]:
+    """The events of recordings one after the other; some of them may hold none. As ``read_log``,
+    but ``LogError`` comes where a file is reached."""
+    return chain.from_iterable(map(_recorded, paths))
 
 
 def read_settings(path: Path) -> str | None:

@@ -1,9 +1,9 @@
 """What the messages of a recording look like: protobuf on every channel.
 
-Positions and log lines are Foxglove's own messages, which viewers draw as they are. The rest is
-described here and built at run time, so that no generated file has to be kept in step. A
-``Schema`` carries the whole ``FileDescriptorSet``: a recording can be read by anyone, years from
-now, with nothing but the file.
+Positions, log lines and the scene are Foxglove's own messages, which viewers draw as they are.
+The rest is described here and built at run time, so that no generated file has to be kept in
+step. A ``Schema`` carries the whole ``FileDescriptorSet``: a recording can be read by anyone,
+years from now, with nothing but the file.
 
 ``encode_frame`` and ``encode_tick`` pack the two messages that come by the thousand a second by
 hand; the bytes are those of the generated classes (a test holds them together).
@@ -12,8 +12,11 @@ hand; the bytes are those of the generated classes (a test holds them together).
 import struct
 from typing import Any, Final, NamedTuple
 
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.descriptor_pb2 import (
     DescriptorProto,
     FieldDescriptorProto,
@@ -112,6 +115,9 @@ TrackMessage: Final = _message("Track")
 WeightsMessage: Final = _message("Weights")
 LocationFixMessage: Final[Any] = LocationFix
 LogMessage: Final[Any] = Log
+FrameTransformMessage: Final[Any] = FrameTransform
+SceneEntityMessage: Final[Any] = SceneEntity
+SceneUpdateMessage: Final[Any] = SceneUpdate
 
 
 class Schema(NamedTuple):
@@ -146,6 +152,8 @@ TRACK: Final = _with_dependencies(TrackMessage)
 WEIGHTS: Final = _with_dependencies(WeightsMessage)
 LOCATION_FIX: Final = _with_dependencies(LocationFixMessage)
 LOG: Final = _with_dependencies(LogMessage)
+FRAME_TRANSFORM: Final = _with_dependencies(FrameTransformMessage)
+SCENE_UPDATE: Final = _with_dependencies(SceneUpdateMessage)
 
 FRAMES_TOPIC: Final = "/mavlink/frames"
 TICKS_TOPIC: Final = "/ticks"
@@ -154,6 +162,8 @@ ROUND_TRIPS_TOPIC: Final = "/timesync"
 TRACKS_TOPIC: Final = "/tracks"
 WEIGHTS_TOPIC: Final = "/beams/weights"
 LOG_TOPIC: Final = "/log"
+TF_TOPIC: Final = "/tf"
+SCENE_TOPIC: Final = "/scene"
 
 # Tag bytes: field number << 3 | wire type (0 varint, 1 eight bytes, 2 length-delimited).
 _TIME = struct.Struct("<BQ")

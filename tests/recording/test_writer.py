@@ -279,3 +279,19 @@ def test_six_minutes_of_busy_traffic_are_written_in_two_seconds(
     took_s = perf_counter() - began_s
     print(f"{writer.messages} messages in {took_s:.2f} s")
     assert took_s < 4.0
+
+
+def test_what_is_salvaged_ends_at_the_last_flush(tmp_path: Path) -> None:
+    """A chunk that went to the disk by itself since then is taken back: it is written elsewhere."""
+    writer = open_writer(tmp_path)
+    noise = np.random.default_rng(1)
+    writer.event(Tick(5))
+    writer.flush()
+    for number in range(12_000):
+        writer.event(Frame(number, "udp", Source(1, 1), 0, noise.bytes(280)))
+    assert writer.path.stat().st_size > 2 << 20
+    assert writer.salvage()
+    assert list(read_log(writer.path)) == [Tick(5)]
+    assert writer.path.stat().st_size == writer.size_bytes
+    empty = open_writer(tmp_path / "empty")
+    assert empty.salvage() and list(empty.path.parent.iterdir()) == []

@@ -1,0 +1,121 @@
+"""A run in several files, and what is missing from it.
+
+A recording is cut into *parts* by size and time, and goes on in a new part when a disk that had
+failed works again. Each part says so at its head, so that a replay can put them together; where
+events could not be recorded, a part has a record that says how many.
+"""
+
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from itertools import pairwise
+from pathlib import Path
+from typing import Final, NamedTuple, Self
+from uuid import uuid4
+
+from mcap.records import Metadata
+
+from companion.recording.container import MAGIC, Walk
+
+PART: Final = "part"
+HOLE: Final = "hole"
+
+
+class Part(NamedTuple):
+    """Which part of which run a file is. ``run`` is the same in all of them, ``number`` counts
+    from 1, ``continues`` is the name of the file before, as it was when this one was begun."""
+
+    run: str
+    number: int
+    continues: str
+
+    @classmethod
+    def first(cls) -> Self:
+        """The first part of a new run."""
+        return cls(uuid4().hex, 1, "")
+
+    def after(self, name: str) -> "Part":
+        """The part that follows this one, which is in the file ``name``."""
+        return Part(self.run, self.number + 1, name)
+
+    def metadata(self) -> dict[str, str]:
+        """As it stands in a file."""
+        return {"run": self.run, "number": str(self.number), "continues": self.continues}
+
+    @classmethod
+    def from_metadata(cls, found: Mapping[str, str]) -> "Part | None":
+        """None where that is not what a part says of itself."""
+        number = found.get("number", "")
+        if not number.isdecimal() or "run" not in found:
+            return None
+        return cls(found["run"], int(number), found.get("continues", ""))
+
+
+class Hole(NamedTuple):
+    """So many events before ``t_ns``, and after those written before, were not recorded."""
+
+    t_ns: int
+    events: int
+    why: str
+
+    def metadata(self) -> dict[str, str]:
+        """As it stands in a file."""
+        return {"t_ns": str(self.t_ns), "events": str(self.events), "why": self.why}
+
+    @classmethod
+    def from_metadata(cls, found: Mapping[str, str]) -> "Hole":
+        """``KeyError`` or ``ValueError`` where that is no hole of ours."""
+        return cls(int(found["t_ns"]), int(found["events"]), found["why"])
+
+
+class Story(NamedTuple):
+    """What a log says of itself: which part it is, if one, and what is missing from it."""
+
+    part: Part | None
+    holes: tuple[Hole, ...]
+
+
+def read_story(path: Path) -> Story:
+    """Empty for a log that is not a recording. ``OSError`` where it cannot be read."""
+    with path.open("rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            return Story(None, ())
+    part, holes = None, []
+    for record in Walk(path, frozenset()):
+        if isinstance(record, Metadata) and record.name == PART:
+            part = Part.from_metadata(record.metadata)
+        elif isinstance(record, Metadata) and record.name == HOLE:
+            holes.append(Hole.from_metadata(record.metadata))
+    return Story(part, tuple(holes))
+
+
+def in_order(stories: Mapping[Path, Story]) -> list[Path] | None:
+    """Several parts of one run, in the order in which they were written; None for other logs.
+
+    ``ValueError`` where two files are the same part.
+    """
+    parts = {path: story.part for path, story in stories.items() if story.part is not None}
+    if len(parts) < max(2, len(stories)) or len({part.run for part in parts.values()}) != 1:
+        return None
+    ordered = sorted(parts, key=lambda path: parts[path].number)
+    for one, other in pairwise(ordered):
+        if parts[one].number == parts[other].number:
+            raise ValueError(f"{one} and {other} are both part {parts[one].number} of one run")
+    return ordered
+
+
+def missing(stories: Mapping[Path, Story], ordered: Sequence[Path]) -> list[str]:
+    """What a replay of these logs cannot know of, a line for each; empty for a whole run."""
+    lines = []
+    before = 0
+    for path in ordered:
+        story = stories[path]
+        if story.part is not None:
+            skipped = range(before + 1, story.part.number)
+            if skipped:
+                which = " to ".join(dict.fromkeys((str(skipped[0]), str(skipped[-1]))))
+                lines.append(f"{path}: part {which} of the run is not here")
+            before = story.part.number
+        for hole in story.holes:
+            at = datetime.fromtimestamp(hole.t_ns * 1e-9, tz=UTC).isoformat(timespec="seconds")
+            lines.append(f"{path}: {hole.events} events before {at} are missing: {hole.why}")
+    return lines

@@ -1,0 +1,44 @@
+"""The layout that comes with the documentation is whole, and names only what a recording has."""
+
+import json
+import re
+from typing import Any
+
+from support import ROOT
+
+from companion.recording import entries, schemas
+from companion.recording.scene import CARRIER, MAP
+
+LAYOUT = json.loads((ROOT / "docs" / "lichtblick-layout.json").read_text())
+PANELS = {"3D", "map", "Plot", "RosOut"}
+
+
+def leaves(node: Any) -> list[str]:
+    """The panels of a tree of splits."""
+    if isinstance(node, str):
+        return [node]
+    assert node["direction"] in ("row", "column")
+    return [*leaves(node["first"]), *leaves(node["second"])]
+
+
+def test_every_panel_is_placed_once() -> None:
+    placed = leaves(LAYOUT["layout"])
+    assert sorted(placed) == sorted(LAYOUT["configById"])
+    assert {panel.split("!")[0] for panel in placed} == PANELS
+
+
+def test_it_names_only_topics_fields_and_frames_that_are_there() -> None:
+    panels = LAYOUT["configById"]
+    topics = dict(entries.NAMED)
+    assert topics[panels["RosOut!log"]["topicToRender"]] is schemas.LOG
+    assert {topics[topic] for topic in panels["3D!beams"]["topics"]} == {schemas.SCENE_UPDATE}
+    assert panels["3D!beams"]["followTf"] == CARRIER
+    assert panels["3D!beams"]["layers"]["grid"]["frameId"] == MAP
+    fields = schemas.TrackMessage.DESCRIPTOR.fields_by_name
+    paths = [path["value"] for name in panels for path in panels[name].get("paths", [])]
+    assert len(paths) == 8
+    for path in paths:
+        found = re.fullmatch(r'(/\w+)\{(\w+)=="\d+:\d+"\}\.(\w+)', path)
+        assert found is not None, path
+        assert topics[found[1]] is schemas.TRACK
+        assert found[2] in fields and found[3] in fields

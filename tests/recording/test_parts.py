@@ -1,0 +1,143 @@
+"""Files of one run find their order, and say what is missing; those of several do not mix."""
+
+import json
+import subprocess
+from itertools import permutations
+from pathlib import Path
+
+import pytest
+from support import BIN
+
+from companion.config import Settings, load
+from companion.pipeline import Pipeline
+from companion.recording.parts import Hole, Part, in_order, missing, read_story
+from companion.recording.reader import LogError, read_log
+from companion.recording.recover import recover
+from companion.recording.writer import Writer
+from companion.replay import log_events, replay, settings_for
+from companion.replay import missing as missing_of
+from companion.ticks import with_ticks
+from companion.values import Event, Tick
+
+START_NS = 1_700_000_000_000_000_000
+
+
+def write(path: Path, part: Part | None, events: list[Event], hole: Hole | None = None) -> Path:
+    writer = Writer(path, Settings().to_toml(), {}, None, START_NS, part=part)
+    if hole is not None:
+        writer.hole(hole)
+    for event in events:
+        writer.event(event)
+    return writer.close({})
+
+
+@pytest.fixture
+def run_in_three(tmp_path: Path, cut_log: Path) -> tuple[list[Path], list[Event], str]:
+    """A flight in three parts whose names are not in order, its events and its digest."""
+    settings = Settings()
+    pipeline = Pipeline(settings)
+    events = list(with_ticks(read_log(cut_log), settings.beams.update_hz))
+    for event in events:
+        pipeline.step(event)
+    part, logs = Part.first(), []
+    third = len(events) // 3
+    for name, piece in (("c", events[:third]), ("a", events[third : 2 * third]), ("b", [])):
+        rest = piece or events[2 * third :]
+        logs.append(write(tmp_path / f"{name}.mcap", part, rest))
+        part = part.after(f"{name}.mcap")
+    return logs, events, pipeline.digest.hexdigest()
+
+
+def test_parts_in_any_order_replay_to_the_digest_of_the_run(
+    run_in_three: tuple[list[Path], list[Event], str],
+) -> None:
+    logs, events, digest = run_in_three
+    for shuffled in permutations(logs):
+        assert list(log_events(shuffled, Settings())) == events
+    summary = replay([logs[2], logs[0], logs[1]], Settings())
+    assert summary["digest"] == digest
+    assert summary["missing"] == []
+    assert replay(logs[1:], Settings())["digest"] != digest
+
+
+def test_a_recovered_part_keeps_its_place(
+    run_in_three: tuple[list[Path], list[Event], str], tmp_path: Path
+) -> None:
+    logs, events, _ = run_in_three
+    cut = tmp_path / "d.mcap.active"
+    cut.write_bytes(logs[1].read_bytes()[:-400])
+    assert read_story(recover(cut).path) == read_story(logs[1])
+    assert list(log_events([logs[0], tmp_path / "d.mcap", logs[2]], Settings())) == events
+
+
+def test_what_is_not_there_is_said(run_in_three: tuple[list[Path], list[Event], str]) -> None:
+    one, two, three = run_in_three[0]
+    assert missing_of([one, two]) == []  # of the end nobody can know
+    assert missing_of([one, three]) == [f"{three}: part 2 of the run is not here"]
+    assert missing_of([three]) == [f"{three}: part 1 to 2 of the run is not here"]
+    assert missing_of([three, two]) == [f"{two}: part 1 of the run is not here"]
+
+
+def test_a_hole_is_said_where_it_is(tmp_path: Path) -> None:
+    part = Part.first()
+    path = write(tmp_path / "a.mcap", part, [Tick(7)], Hole(START_NS, 12, "no room"))
+    assert read_story(path).holes == (Hole(START_NS, 12, "no room"),)
+    assert missing_of([path]) == [
+        f"{path}: 12 events before 2023-11-14T22:13:20+00:00 are missing: no room"
+    ]
+    command = [BIN / "companion", "replay", path, "--no-record"]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "  missing: " in said and "12 events" in said
+
+
+def test_a_part_twice_is_refused(tmp_path: Path) -> None:
+    part = Part.first()
+    logs = [write(tmp_path / f"{name}.mcap", part, [Tick(7)]) for name in "ab"]
+    with pytest.raises(LogError, match=r"a\.mcap and .*b\.mcap are both part 1 of one run"):
+        log_events(logs, Settings())
+
+
+@pytest.mark.parametrize("alone", [False, True])
+def test_different_runs_are_merged_by_time_as_before(tmp_path: Path, alone: bool) -> None:
+    one = write(tmp_path / "a.mcap", None if alone else Part.first(), [Tick(1), Tick(3)])
+    other = write(tmp_path / "b.mcap", Part.first(), [Tick(2)])
+    assert in_order({log: read_story(log) for log in (one, other)}) is None
+    assert list(log_events([one, other], Settings())) == []  # ticks of their own are made
+
+
+def test_an_empty_part_is_part_of_a_run(tmp_path: Path) -> None:
+    part = Part.first()
+    one = write(tmp_path / "a.mcap", part, [Tick(1)])
+    other = write(tmp_path / "b.mcap", part.after("a.mcap"), [])
+    assert list(log_events([one, other], Settings())) == [Tick(1)]
+
+
+def test_nonsense_about_parts_is_none() -> None:
+    assert Part.from_metadata({"run": "a", "number": "x"}) is None
+    assert Part.from_metadata({"number": "1"}) is None
+    part = Part.first().after("x")
+    assert Part.from_metadata(part.metadata()) == part
+    assert missing({}, []) == []
+
+
+def test_a_recording_holds_the_gains_of_its_observer(tmp_path: Path, cut_log: Path) -> None:
+    """The file that the settings name may be another one, or none, when it is replayed."""
+    from importlib import resources
+
+    shipped = (resources.files("companion.tracking") / "kinematic_default.json").read_text()
+    changed = json.loads(shipped)
+    changed_text = json.dumps(changed)
+    design, config = tmp_path / "design.json", tmp_path / "config.toml"
+    design.write_text(changed_text)
+    config.write_text(f"[observer]\ndesign = {json.dumps(str(design))}\n")
+    settings = load(config)
+    path = tmp_path / "a.mcap"
+    digest = replay([cut_log], settings, Writer(path, settings.to_toml(), {}, None, START_NS))[
+        "digest"
+    ]
+    design.write_text("another")
+    held = settings_for([path], None, None)
+    assert held.observer.design_json == changed_text
+    assert replay([path], held)["digest"] == digest
+    design.unlink()
+    assert replay([path], settings_for([path], None, None))["digest"] == digest

@@ -1,0 +1,144 @@
+"""The picture in space says what the beams and tracks say, in frames with z upwards."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from companion.beams.arrays import Array, uniform_linear, uniform_rectangular
+from companion.beams.patterns import half_power_beamwidths_rad
+from companion.beams.steering import unit_directions
+from companion.recording.scene import ARRAY, CARRIER, MAP, WIDEST_RAD, Scene
+from companion.tracking.carrier import body_from_ned
+from companion.values import (
+    Beam,
+    BeamSet,
+    Carrier,
+    FloatArray,
+    Method,
+    Normalisation,
+    Track,
+    TrackState,
+    Update,
+)
+
+NOW_NS = 1_700_000_000_000_000_000
+ANGLES = st.floats(-3.1, 3.1)
+TURNS = st.tuples(ANGLES, st.floats(-1.5, 1.5), ANGLES)
+
+
+def array_on(turn: tuple[float, float, float], lever_arm_m: FloatArray) -> Array:
+    return uniform_linear(8, 3e9, 0.5, body_from_ned(*turn), lever_arm_m=lever_arm_m)
+
+
+def update_of(array: Array, turn: tuple[float, float, float], place_ned_m: FloatArray) -> Update:
+    """One track, live, and a beam on it, as the array at that place and attitude sees it."""
+    carrier = Carrier(
+        NOW_NS, np.array([10.0, -20.0, -30.0]), None, body_from_ned(*turn), np.zeros(3), 1.0,
+        0.01, 0.1,
+    )  # fmt: skip
+    begin = carrier.position_ned_m + carrier.body_from_local.T @ array.lever_arm_m
+    seen = array.array_from_body @ carrier.body_from_local @ (place_ned_m - begin)
+    range_m = float(np.linalg.norm(seen))
+    azimuth, elevation = math.atan2(seen[1], seen[0]), math.asin(-seen[2] / range_m)
+    beam = Beam("1:1", azimuth, elevation, range_m, None, None, None, 0.1, 9.0, 0.0)
+    track = Track(
+        "1:1", TrackState.LIVE, NOW_NS, 0.1, place_ned_m, None, None, None, 5.0, 4.0, 3.0, 0.0,
+        0.1, 0.05, 1.0, 0.5, 9,
+    )  # fmt: skip
+    beams = BeamSet(
+        NOW_NS, NOW_NS, (beam,), np.ones((8, 1), complex), Method.ZERO_FORCING,
+        Normalisation.STREAM, 1.0, (),
+    )  # fmt: skip
+    return Update(NOW_NS, carrier, None, (track,), beams)
+
+
+def xyz(vector: object) -> FloatArray:
+    return np.array([getattr(vector, axis) for axis in "xyz"])
+
+
+def turned(quaternion: object) -> Rotation:
+    return Rotation.from_quat([getattr(quaternion, part) for part in "xyzw"])
+
+
+@given(TURNS, TURNS, st.tuples(*[st.floats(-500, 500)] * 3))
+def test_what_is_drawn_ends_at_the_uav(
+    mount: tuple[float, float, float],
+    attitude: tuple[float, float, float],
+    place: tuple[float, float, float],
+) -> None:
+    place_ned_m = np.array([place[0] + 2000.0, *place[1:]])
+    array = array_on(mount, np.array([1.0, 2.0, 3.0]))
+    update = update_of(array, attitude, place_ned_m)
+    scene = Scene(array, 2.0)
+    uav, beam = scene.picture(update).entities
+    east_north_up = [place_ned_m[1], place_ned_m[0], -place_ned_m[2]]
+    assert xyz(uav.texts[0].pose.position) == pytest.approx(east_north_up)
+    begin, end = map(xyz, beam.lines[0].points)
+    assert end == pytest.approx(np.array(east_north_up), abs=1e-6)
+    (cone,) = beam.cylinders
+    half = turned(cone.pose.orientation).apply([0, 0, cone.size.z / 2])
+    assert xyz(cone.pose.position) - half == pytest.approx(begin, abs=1e-6)
+    assert xyz(cone.pose.position) + half == pytest.approx(end, abs=1e-6)
+    assert (cone.bottom_scale, cone.top_scale) == (0, 1)  # the apex is at the array
+
+    # The chain of frames leads to the same: the UAV's place seen from the array, z upwards.
+    on_map, on_carrier = scene.transforms(update)
+    assert (on_map.parent_frame_id, on_map.child_frame_id) == (MAP, CARRIER)
+    assert (on_carrier.parent_frame_id, on_carrier.child_frame_id) == (CARRIER, ARRAY)
+    seen = end
+    for transform in (on_map, on_carrier):
+        seen = turned(transform.rotation).inv().apply(seen - xyz(transform.translation))
+    drawn = update.beams.beams[0]
+    flat = drawn.range_m * math.cos(drawn.elevation_rad)
+    expected = [
+        flat * math.cos(drawn.azimuth_rad),
+        -flat * math.sin(drawn.azimuth_rad),  # azimuth grows to the right, y to the left
+        drawn.range_m * math.sin(drawn.elevation_rad),
+    ]
+    assert seen == pytest.approx(np.array(expected), abs=1e-6)
+
+
+def test_a_level_carrier_that_faces_north_has_x_north_and_z_up() -> None:
+    array = array_on((0, 0, 0), np.array([1.0, 2.0, 3.0]))
+    update = update_of(array, (0, 0, 0), np.array([1000.0, 0.0, 0.0]))
+    on_map, on_carrier = Scene(array, 2.0).transforms(update)
+    assert xyz(on_map.translation).tolist() == [-20, 10, 30]
+    assert turned(on_map.rotation).apply(np.eye(3)) == pytest.approx(
+        np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])  # x north, y west, z up, in east-north-up
+    )
+    assert xyz(on_carrier.translation).tolist() == [1, -2, -3]
+
+
+@pytest.mark.parametrize("azimuth_deg", [0.0, 30.0, -50.0])
+def test_cones_are_about_as_wide_as_the_beams(azimuth_deg: float) -> None:
+    array = uniform_rectangular(16, 32, 3e9, 0.5, np.eye(3))
+    azimuth, elevation = math.radians(azimuth_deg), 0.2
+    direction = unit_directions(np.array([azimuth]), np.array([elevation]))[0]
+    exact = half_power_beamwidths_rad(array, direction)
+    across, upright = Scene(array, 2.0).widths_rad(direction)
+    assert across == pytest.approx(exact[0] * math.cos(elevation), rel=0.25)
+    assert upright == pytest.approx(exact[1], rel=0.25)
+    line = Scene(uniform_linear(8, 3e9, 0.5, np.eye(3)), 2.0).widths_rad(direction)
+    assert line[0] < line[1] / 2 <= WIDEST_RAD / 2
+
+
+def test_the_bound_is_the_cylinder_that_is_guaranteed_and_goes_by_itself() -> None:
+    array = array_on((0, 0, 0), np.zeros(3))
+    update = update_of(array, (0, 0, 0), np.array([1000.0, 0.0, 0.0]))
+    uav, _ = Scene(array, 4.0).picture(update).entities
+    (cylinder,) = uav.cylinders
+    assert xyz(cylinder.size).tolist() == [8, 8, 6]
+    assert (cylinder.bottom_scale, cylinder.top_scale) == (1, 1)
+    assert uav.lifetime.ToNanoseconds() == 750_000_000
+    assert uav.timestamp.ToNanoseconds() == NOW_NS
+    assert uav.texts[0].text == "1:1 live"
+    unbounded = replace(update.tracks[0], bound_m=math.inf, state=TrackState.LOST)
+    (gone,) = Scene(array, 4.0).picture(replace(update, carrier=None, tracks=(unbounded,))).entities
+    assert not gone.cylinders
+    assert gone.spheres[0].color != uav.spheres[0].color
+    assert Scene(array, 4.0).transforms(replace(update, carrier=None)) == []

@@ -88,6 +88,7 @@ class Pipeline:
         self._fleet = assembly.fleet(settings, self._sender_time)
         self._targets: list[str] = []  # in the order in which they were first heard
         self._identities = Identities()
+        self._shared_ids: set[str] = set()
         self._states: dict[str, TrackState] = {}
         if isinstance(self._center, FixedCenter):
             self._set_origin(self._center)
@@ -161,6 +162,9 @@ class Pipeline:
             sender_ns = t_ns
         else:
             stamp = self._stamp(report.source, report.t_ns, report.boot_ms, outputs)
+            if self._clock(report.source).is_shared(report.t_ns):
+                return [*outputs, *self._shared(report)]
+            self._shared_ids.discard(report.uav)
             if stamp is None:
                 return [*outputs, Rejection(report.t_ns, report.uav, Reason.UNPLACED_STAMP)]
             t_ns, sender_ns = report.t_ns - round(stamp.latency_s * 1e9), stamp.sender_ns
@@ -177,6 +181,16 @@ class Pipeline:
                 text = f"{report.uav} is tracked anew: its reports agree, but not with its past"
                 outputs.append(Notice(report.t_ns, Severity.WARNING, report.uav, text))
         return [*outputs, accepted]
+
+    def _shared(self, report: Report) -> list[Output]:
+        """Two boot clocks run under one id: whose report this is, nobody knows."""
+        uav, t_ns = report.uav, report.t_ns
+        refused = Rejection(t_ns, uav, Reason.SHARED_ID, detail="two boot clocks under this id")
+        if uav in self._shared_ids:
+            return [refused]
+        self._shared_ids.add(uav)
+        text = f"two vehicles share the id {uav}: neither is believed"
+        return [Notice(t_ns, Severity.WARNING, uav, text), refused]
 
     def _clock(self, source: Source) -> SenderClock:
         name = str(source)

@@ -154,6 +154,10 @@ class SenderClock:
         self._remember_median()
         return Stamp(placed.x_ns, latency_s, placed.rebooted)
 
+    def is_shared(self, arrival_ns: int) -> bool:
+        """Whether two clocks go on side by side: two senders have this one's id."""
+        return self._line.is_shared(arrival_ns)
+
     def timesync(self, sent_ns: int, received_ns: int, remote_ns: int) -> None:
         """One TIMESYNC round trip, of any length: sent and received on the node's timeline, and
         the sender's time since boot when it replied. Refused until a stamp was observed."""

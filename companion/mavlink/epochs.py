@@ -12,6 +12,8 @@ the line while it is late by less than ``late_max_ns``:
   seconds of a boot, over at least a second, none of which advances the line, and which all lag
   equally (to a second), are a reboot. A clock that stood still lags in the same way, by more
   than ``late_max_ns``, and goes on.
+- Stamps off the line that lie on a line of their own for three seconds, while the line advances
+  between them, are of a second clock: two senders share one id.
 - Frames of the line before, which come for up to ``late_max_ns`` after it was left, have no time.
 
 A reboot is therefore one event, told at the stamp that confirms it. What is not told apart: a
@@ -32,6 +34,9 @@ WRAP_NS: Final = _WRAP_MS * _NS_PER_MS
 _EARLY_NS: Final = -_NS
 """A stamp fits a line that others have found if it is early by no more than this."""
 _RUN_KEPT: Final = 64
+_RIVAL_LASTS_NS: Final = 3 * _NS
+_RIVAL_SILENT_NS: Final = 10 * _NS
+"""A second clock is one after so long, and is gone when it was silent for so long."""
 
 
 class Placed(NamedTuple):
@@ -50,6 +55,7 @@ class _Run:
     stamps: list[tuple[int, int]] = field(default_factory=list)
     lowest_ns: int = 0
     highest_ns: int = 0
+    begun_ns: int = 0
 
     def add(self, arrival_ns: int, boot_ms: int, spread_ns: int) -> bool:
         """Go on, or begin anew where the stamp is ``spread_ns`` off the others; whether the
@@ -61,6 +67,7 @@ class _Run:
             self.stamps.clear()
         if not self.stamps:
             self.lowest_ns = self.highest_ns = lag_ns
+            self.begun_ns = arrival_ns
         elif boot_ms <= self.stamps[-1][1]:
             return False
         self.lowest_ns = min(self.lowest_ns, lag_ns)
@@ -68,6 +75,11 @@ class _Run:
         self.stamps.append((arrival_ns, boot_ms))
         del self.stamps[:-_RUN_KEPT]
         return True
+
+    def forget(self, arrival_ns: int) -> None:
+        """Begin anew where it has been silent for long."""
+        if self.stamps and arrival_ns - self.stamps[-1][0] > _RIVAL_SILENT_NS:
+            self.stamps.clear()
 
     def lasts(self, count: int, span_ns: int) -> bool:
         """Whether it has so many stamps over so long a time."""
@@ -89,6 +101,7 @@ class BootLine:
         self.envelope = Envelope(*self._shape)
         self.newest_ns = 0
         self._run = _Run()
+        self._rival = _Run()
         self._previous: tuple[Envelope, int] | None = None  # the line before, when it was left
 
     def observe(self, arrival_ns: int, boot_ms: int) -> Placed | None:
@@ -105,10 +118,18 @@ class BootLine:
         if late_ns > 0 and x_ns > self.newest_ns:
             return self._stalled(arrival_ns, boot_ms, x_ns)
         advances = self._run.add(arrival_ns, boot_ms, self._late_max_ns)
+        self._rival.forget(arrival_ns)
+        self._rival.add(arrival_ns, boot_ms, self._late_max_ns)
         if not (advances and self._run.lasts(3, _NS // 2)):
             return None
         stepped_back = boot_ms < self.newest_ns // _NS_PER_MS % _WRAP_MS
         return self._begin_again(rebooted=stepped_back)
+
+    def is_shared(self, arrival_ns: int) -> bool:
+        """Whether a second clock goes on beside the line: two senders have one id."""
+        self._rival.forget(arrival_ns)
+        stamps = self._rival.stamps
+        return len(stamps) >= 5 and stamps[-1][0] - self._rival.begun_ns >= _RIVAL_LASTS_NS
 
     def unwrap(self, boot_ms: int) -> int:
         """Boot time past the wrap: the one nearest to the newest, ns."""
@@ -164,6 +185,7 @@ class BootLine:
         """The run becomes the line. After a reboot the sender's timeline begins anew."""
         stamps = list(self._run.stamps)
         self._run.stamps.clear()
+        self._rival.stamps.clear()
         self._previous = (self.envelope, stamps[0][0])
         self.envelope = Envelope(*self._shape)
         x_ns = stamps[0][1] * _NS_PER_MS if rebooted else self.newest_ns

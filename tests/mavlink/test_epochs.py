@@ -171,3 +171,38 @@ def test_whatever_comes(steps: Seen) -> None:
             assert clock.node_ns(stamp.sender_ns) <= arrival_ns
             assert stamp.latency_s >= 0.0
             assert stamp.sender_ns // MS % WRAP_MS == boot_ms
+
+
+def shared_at(seen: Seen) -> list[int]:
+    """The arrivals, ms, at which two clocks are known to run."""
+    clock, found = SenderClock(), []
+    for arrival, boot in seen:
+        clock.observe(EPOCH_NS + arrival * MS, boot)
+        if clock.is_shared(EPOCH_NS + arrival * MS):
+            found.append(arrival)
+    return found
+
+
+@pytest.mark.parametrize("apart_ms", [-3_600_000, -40_000, 40_000, 3_600_000])
+def test_two_clocks_side_by_side_are_two_senders(apart_ms: int) -> None:
+    first, second = run(0, 5_000_000, 100), run(10_050, 5_010_000 + apart_ms, 50)
+    found = shared_at(sorted([*first, *second]))
+    assert 12_500 <= found[0] <= 13_600
+    assert found == [t for t, _ in sorted([*first, *second]) if t >= found[0]]
+
+
+def test_once_the_second_is_silent_the_first_is_believed_again() -> None:
+    first, second = run(0, 5_000_000, 200), run(5_050, 9_000_000, 40)
+    found = shared_at(sorted([*first, *second]))
+    assert found[-1] == pytest.approx(5_050 + 39 * 200 + 10_000, abs=250)
+
+
+def test_what_one_sender_alone_does_is_never_taken_for_two() -> None:
+    """Reboots, late frames, another link that lags, a leap, bursts."""
+    alone = run(0, 300_000, 100)
+    late = [(12_000 + n, 310_000 - 180 * n) for n in range(20)]
+    assert not shared_at([*alone, *run(20_000, 1_000, 100)])
+    assert not shared_at(sorted([*alone, *late]))
+    assert not shared_at(sorted([*alone, *run(4_001, 300_001, 100)]))
+    assert not shared_at([*alone, *run(20_000, 900_000, 100)])
+    assert not shared_at([(10_000 * (n // 50 + 1), 300_000 + 200 * n) for n in range(300)])

@@ -21,14 +21,17 @@ demo: .venv/.runtime
 test: .venv/.dev
 	$(PYTEST)
 
-# The formatter, the linter, the types, the rules of the house and the container's schema. The
+# The formatter, the linter, the types, the rules of the house and the container's files. The
 # rest of the tests is not run a second time here: `make test` has warnings as errors already.
 check: .venv/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy --strict companion sitl_replay
 	$(BIN)/lint-imports
+	$(BIN)/hadolint Dockerfile
 	$(BIN)/check-jsonschema --builtin-schema vendor.compose-spec docker-compose.yml
+	@if docker compose version >/dev/null 2>&1; then docker compose --profile demo config --quiet; \
+	else echo "no docker compose here: docker-compose.yml is held against its schema alone"; fi
 	$(PYTEST) -q tests/test_house.py
 
 # Tests marked `benchmark` and `soak`, which `make test` leaves out. No such test: status 5.

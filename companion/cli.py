@@ -7,6 +7,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import gc
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,13 @@ import companion
 from companion.cli_beams import weights
 from companion.cli_design import design, study
 from companion.console import CENTER, CONFIG, JSON, OneLineErrors, Progress, user_errors
+
+LISTEN = click.option(
+    "--listen", metavar="HOST:PORT", help="Where HTTP is served [127.0.0.1:8080]."
+)
+INSECURE = click.option(
+    "--insecure", is_flag=True, help="Serve beyond this machine without a token."
+)
 
 
 @click.group(name="companion", cls=OneLineErrors)
@@ -37,7 +45,7 @@ def main() -> None:
     help="udpin|udpout|tcp|tcpin:HOST:PORT or serial:DEVICE:BAUD. May be given several times.",
 )
 @CENTER
-@click.option("--listen", metavar="HOST:PORT", help="Where HTTP is served [127.0.0.1:8080].")
+@LISTEN
 @click.option("--record", metavar="DIR", help="Write recordings to this directory.")
 @click.option(
     "--foxglove",
@@ -45,7 +53,7 @@ def main() -> None:
     type=click.IntRange(0, 65535),
     help="Live channels for Foxglove and Lichtblick, on this machine. Needs the extra [live].",
 )
-@click.option("--insecure", is_flag=True, help="Serve beyond this machine without a token.")
+@INSECURE
 @click.option("--silent", is_flag=True, help="Send no MAVLink at all, whatever the settings say.")
 def run(
     config: Path | None,
@@ -104,7 +112,12 @@ def demo(seconds: float | None, port: int, open_page: bool) -> None:
     help="The recording to write [recordings/, named after the log].",
 )
 @click.option("--no-record", is_flag=True, help="Write no recording.")
-@click.option("--speed", metavar="max|X", default="max", show_default=True, help="Pace.")
+@click.option(
+    "--speed", metavar="max|X", help="Pace, in times of the log's own [max; 1 if served]."
+)
+@click.option("--serve", is_flag=True, help="The page and the API over it, until stopped.")
+@LISTEN
+@INSECURE
 @JSON
 def replay(
     logs: tuple[Path, ...],
@@ -112,33 +125,54 @@ def replay(
     center: str | None,
     out: Path | None,
     no_record: bool,
-    speed: str,
+    speed: str | None,
+    serve: bool,
+    listen: str | None,
+    insecure: bool,
     as_json: bool,
 ) -> None:
     """Logs (.tlog, raw MAVLink, our own .mcap) through the same pipeline as the live service.
 
     Without --center (or settings) the array stands where the first report was made. A recording
-    of our own is replayed with the settings that it holds.
+    of our own is replayed with the settings that it holds. With --serve, the page shows the
+    replay as it goes, and its end, until SIGINT.
 
     Example: companion replay flight.tlog --center 5:1 --json
     """
     from companion import replay as replaying
+    from companion import served_replay
+    from companion.config import load
 
+    if not serve and (listen or insecure):
+        raise click.UsageError("--listen and --insecure go with --serve")
     gc.set_threshold(200_000)  # millions of short-lived values, and no cycles among them
     progress = Progress()
     with user_errors():
         settings = replaying.settings_for(logs, config, center)
         if settings.center.source is None:
             click.echo("no --center: the array stands where the first report was made", err=True)
-        writer = None if no_record else replaying.writer_for(logs, settings, out)
+        record = partial(replaying.writer_for, logs, settings, out) if not no_record else None
+        if serve:
+            served_replay.serve(
+                served_replay.Asked(logs, settings, _speed(speed or "1"), record),
+                load(config).override(server={"listen": listen}).server.listen,
+                partial(_show_replay, as_json),
+                token=os.environ.get("COMPANION_TOKEN"),
+                insecure=insecure,
+            )
+            return
         summary = replaying.replay(
             logs,
             settings,
-            writer,
-            _speed(speed),
+            record() if record else None,
+            _speed(speed or "max"),
             lambda frames, seconds: progress.show(f"{frames} frames, {seconds:.0f} s of log"),
         )
     progress.clear()
+    _show_replay(as_json, summary)
+
+
+def _show_replay(as_json: bool, summary: dict[str, Any]) -> None:
     click.echo(json.dumps(summary) if as_json else _replay_text(summary))
 
 

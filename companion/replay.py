@@ -18,7 +18,7 @@ from companion.recording.parts import Story
 from companion.recording.reader import LogError, log_kind, read_log, read_parts, read_settings
 from companion.recording.writer import Writer
 from companion.ticks import with_ticks
-from companion.values import Estimate, Event, Tick, Update
+from companion.values import Estimate, Event, Output, Tick, Update
 
 FLUSH_EVERY_S: Final = 1.0
 TICKED: Final = "mcap"
@@ -85,6 +85,49 @@ def writer_for(logs: Sequence[Path], settings: Settings, out: Path | None) -> Wr
     )
 
 
+class Run:
+    """A replay under way: the pipeline, what it has seen, and the recording of it."""
+
+    def __init__(self, settings: Settings, writer: Writer | None) -> None:
+        self.pipeline = Pipeline(settings)
+        self.writer = writer
+        self.tally = Tally()
+        self._started_s = time.monotonic()
+
+    @property
+    def at_s(self) -> float:
+        """Seconds of log so far."""
+        return (self.tally.last_ns - (self.tally.first_ns or 0)) * 1e-9
+
+    def step(self, event: Event) -> list[Output]:
+        """Take in the next event; what it brings. ``OSError`` where it cannot be recorded."""
+        outputs = self.pipeline.step(event)
+        self.tally.event(event)
+        if self.writer:
+            self.writer.event(event)
+        for output in outputs:
+            match output:
+                case Estimate():
+                    self.tally.estimate(output)
+                case Update():
+                    self.tally.update(output)
+                case _:
+                    pass
+            if self.writer:
+                self.writer.output(output, self.pipeline.geodetic)
+        return outputs
+
+    def finish(self) -> dict[str, Any]:
+        """Close the recording and sum up. ``OSError`` where the recording cannot be written."""
+        digest = self.pipeline.digest.hexdigest()
+        recording = self.writer.close({"digest": digest}) if self.writer else None
+        return _summary(self.pipeline, self.tally) | {
+            "wall_s": time.monotonic() - self._started_s,
+            "recording": str(recording) if recording else None,
+            "digest": digest,
+        }
+
+
 def replay(
     logs: Sequence[Path],
     settings: Settings,
@@ -100,40 +143,18 @@ def replay(
     then. ``LogError`` for a log that cannot be used, ``OSError`` where the recording cannot be
     written.
     """
-    started_s = time.monotonic()
-    pipeline, tally = Pipeline(settings), Tally()
-    flush_due_s = started_s + FLUSH_EVERY_S
+    run = Run(settings, writer)
+    flush_due_s = time.monotonic() + FLUSH_EVERY_S
     events = log_events(logs, settings)
     for event in events if speed is None else _paced(events, speed):
-        outputs = pipeline.step(event)
-        tally.event(event)
-        if writer:
-            writer.event(event)
-        for output in outputs:
-            match output:
-                case Estimate():
-                    tally.estimate(output)
-                case Update():
-                    tally.update(output)
-                case _:
-                    pass
-            if writer:
-                writer.output(output, pipeline.geodetic)
+        run.step(event)
         if time.monotonic() >= flush_due_s:
             flush_due_s += FLUSH_EVERY_S
             if writer:
                 writer.flush()
             if progress:
-                progress(pipeline.frames, (tally.last_ns - (tally.first_ns or 0)) * 1e-9)
-    digest = pipeline.digest.hexdigest()
-    recording = writer.close({"digest": digest}) if writer else None
-    summary = _summary(pipeline, tally)
-    return summary | {
-        "wall_s": time.monotonic() - started_s,
-        "recording": str(recording) if recording else None,
-        "missing": missing(logs),
-        "digest": digest,
-    }
+                progress(run.pipeline.frames, run.at_s)
+    return run.finish() | {"missing": missing(logs)}
 
 
 def log_events(logs: Sequence[Path], settings: Settings) -> Iterator[Event]:

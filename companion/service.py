@@ -1,15 +1,12 @@
 """The live service: links, timer, recorder and HTTP around one pipeline.                [shell]"""
 
 import asyncio
-import contextlib
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Coroutine, Iterator, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from pathlib import Path
-from typing import Any, Final
-
-import uvicorn
+from typing import Any
 
 import companion
 from companion import assembly
@@ -24,13 +21,10 @@ from companion.recording.reader import LogError
 from companion.recording.recover import recover_leftovers
 from companion.recording.scene import Scene
 from companion.recording.writer import Writer
-from companion.server.app import create_app
 from companion.server.views import RecordingStatus
+from companion.serving import NOTICES_KEPT, Rates, Server
 from companion.traffic import Traffic
 from companion.values import Event, Notice, Output, Tick
-
-RATE_WINDOW_S: Final = 2.0
-NOTICES_KEPT: Final = 200
 
 
 class Timeline:
@@ -45,7 +39,7 @@ class Timeline:
 
 
 class Service:
-    """A running node; what the HTTP server looks at.
+    """A running node; what the HTTP server looks at. ``answering``: set once HTTP is served.
 
     ``say`` gets one line for a person whenever something changes. Raises ``LinkError`` if a link
     cannot be opened, ``ConfigError`` if the settings cannot be used, ``OSError`` if the recording
@@ -56,11 +50,12 @@ class Service:
         self.pipeline = Pipeline(settings)
         self.equipment = assembly.equipment(settings, self.pipeline.array)
         self.notices: deque[Notice] = deque(maxlen=NOTICES_KEPT)
+        self.answering = asyncio.Event()
         self._settings = settings
         self._say = say
         self._timeline = Timeline()
         self._started_ns = self._timeline.now_ns()
-        self._rates: deque[tuple[int, int, int]] = deque()
+        self._rates = Rates()
         self._recorder: BackgroundRecorder | None = None
         self._live = self._open_live()
         self._traffic = Traffic(settings, self._step, self._notify, self._timeline.now_ns)
@@ -78,11 +73,7 @@ class Service:
 
         ``others``: further coroutines to run beside, for the demo; they are cancelled at the end.
         """
-        server = _Server(
-            uvicorn.Config(
-                create_app(self, token), log_level="warning", lifespan="off", access_log=False
-            )
-        )
+        server = Server(self, token, self.answering)
         if self._recorder:
             self._recorder.start()
         if self._live:
@@ -148,19 +139,13 @@ class Service:
         while True:
             began_s = loop.time()
             self._step(Tick(self._timeline.now_ns()))
-            self._count_rates()
+            self._rates.count(self.now_ns(), self.pipeline.frames, self.pipeline.updates)
             if self._recorder:
                 self._tell_of_recorder(self._recorder)
             self._traffic.speak(not self.unfit(), self.pipeline.reporters())
             ended_s = loop.time()
             due_s = max(due_s + period_s, ended_s + (ended_s - began_s))
             await asyncio.sleep(due_s - loop.time())
-
-    def _count_rates(self) -> None:
-        now_ns = self.now_ns()
-        self._rates.append((now_ns, self.pipeline.frames, self.pipeline.updates))
-        while self._rates[0][0] < now_ns - RATE_WINDOW_S * 1e9:
-            self._rates.popleft()
 
     # --- what the server looks at -----------------------------------------------------------
 
@@ -186,14 +171,7 @@ class Service:
 
     def rates(self) -> dict[str, float | None]:
         """Frames and updates per second over the last seconds."""
-        if len(self._rates) < 2:
-            return {"frames_hz": None, "updates_hz": None}
-        (t0, frames0, updates0), (t1, frames1, updates1) = self._rates[0], self._rates[-1]
-        seconds = (t1 - t0) * 1e-9
-        return {
-            "frames_hz": (frames1 - frames0) / seconds,
-            "updates_hz": (updates1 - updates0) / seconds,
-        }
+        return self._rates.newest()
 
     def recording(self) -> RecordingStatus:
         """How the recording is doing."""
@@ -210,12 +188,20 @@ class Service:
         update = self.pipeline.last_update
         states = [link.status.state for link in self._traffic.links]
         reasons = [] if "up" in states else ["no link is up"]
-        late_s = 1.0 + 5 / self._settings.beams.update_hz
-        if update is None or (self.now_ns() - update.t_ns) * 1e-9 > late_s:
+        if update is None or self.updates_late():
             reasons.append("beam updates are late")
         elif update.unfit:
             reasons.append(update.unfit)
         return reasons
+
+    def updates_late(self) -> bool:
+        """Whether the newest beam update is older than it can be while all is well."""
+        update = self.pipeline.last_update
+        late_s = 1.0 + 5 / self._settings.beams.update_hz
+        return update is None or (self.now_ns() - update.t_ns) * 1e-9 > late_s
+
+    def replay(self) -> None:
+        """It is live."""
 
     async def _recover_leftovers(self) -> None:
         """Finish what an earlier run, killed, left open; off the event loop."""
@@ -262,15 +248,6 @@ class Service:
             self._scene(),
             part,
         )
-
-
-class _Server(uvicorn.Server):
-    """uvicorn, leaving the signals to whoever runs the service."""
-
-    @contextlib.contextmanager
-    def capture_signals(self) -> Iterator[None]:
-        """Capture none."""
-        yield
 
 
 def require_center(settings: Settings) -> None:

@@ -1,7 +1,7 @@
 """The program's state as the API shows it: degrees and metres, RFC 3339 times, null for unknown."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -30,8 +30,23 @@ class RecordingStatus:
     dropped: int
 
 
+@dataclass(frozen=True, slots=True)
+class ReplayStatus:
+    """How far a replay is: seconds of ``log`` since its first event, of how many (None while that
+    is not known). ``speed``: in times of the log's own, None for as fast as it goes. ``state``:
+    ``running`` or ``finished``."""
+
+    log: str
+    speed: float | None
+    at_s: float
+    of_s: float | None
+    state: str
+
+
 class Node(Protocol):
-    """What the server looks at: the running service, or a test's stand-in for it."""
+    """What the server looks at: the running service, a replay, or a test's stand-in for them.
+
+    ``replay`` is None where the node is live."""
 
     pipeline: Pipeline
     equipment: Equipment
@@ -44,6 +59,7 @@ class Node(Protocol):
     def unfit(self) -> list[str]: ...
     def message_rates(self) -> list[MessageRate]: ...
     def events(self) -> list[Notice]: ...
+    def replay(self) -> ReplayStatus | None: ...
 
 
 def vector(values: FloatArray | None) -> list[float] | None:
@@ -54,7 +70,7 @@ def vector(values: FloatArray | None) -> list[float] | None:
 def status(node: Node, version: str) -> Json:
     """``/v1/status``."""
     pipeline, now_ns = node.pipeline, node.now_ns()
-    recording = node.recording()
+    recording, replay = node.recording(), node.replay()
     return {
         "version": version,
         "time": rfc3339(now_ns),
@@ -75,6 +91,7 @@ def status(node: Node, version: str) -> Json:
         "updates": pipeline.updates,
         "rejected": {str(reason): n for reason, n in sorted(pipeline.refusals.total.items())},
         "digest": pipeline.digest.hexdigest(),
+        "replay": asdict(replay) if replay else None,
     }
 
 

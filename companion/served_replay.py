@@ -1,0 +1,252 @@
+"""A replay that is looked at while it goes: the same page and API as over a live run.    [shell]
+
+What is served is the replayed pipeline, and now is the time of the log's newest event: each answer
+is what the live service would have given then. No event is left out, however slow the machine is,
+so the digest at the end is that of a replay that nobody looked at.
+"""
+
+import asyncio
+import socket
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain, islice
+from pathlib import Path
+from typing import Any, Final
+
+import click
+
+from companion import assembly
+from companion.config import Settings
+from companion.mavlink.link_status import LinkStatus
+from companion.mavlink.peers import Peers
+from companion.mavlink.rates import MessageRate
+from companion.recording.writer import Writer
+from companion.replay import FLUSH_EVERY_S, Run, log_events, missing
+from companion.server.access import bind
+from companion.server.views import RecordingStatus, ReplayStatus
+from companion.serving import NOTICES_KEPT, Rates, Server, address, pause, run_until_told
+from companion.values import Event, Frame, Notice, Rejection, Tick
+
+TURN_S: Final = 0.005
+"""So long the replay holds the event loop at most before others have their turn."""
+MEASURED_AT_ONCE: Final = 20_000
+"""So many events of the log are read before the measuring can be stopped."""
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What is to be replayed, and how fast: ``speed`` as in ``companion.replay.replay``.
+
+    ``record`` makes the recording of it; None for none."""
+
+    logs: Sequence[Path]
+    settings: Settings
+    speed: float | None
+    record: Callable[[], Writer] | None
+
+
+def serve(
+    asked: Asked,
+    listen: str,
+    show: Callable[[dict[str, Any]], None],
+    *,
+    token: str | None = None,
+    insecure: bool = False,
+) -> None:
+    """Replay and serve on ``listen`` (HOST:PORT) until SIGINT or SIGTERM.
+
+    ``show``: see ``ServedReplay.run``. ``LogError``, ``ConfigError``, ``ListenError`` or
+    ``OSError`` for what cannot be used.
+    """
+    with bind(listen, token=token, insecure=insecure) as http:
+        node = ServedReplay(asked, _say)
+        _say(f"companion serves {address(http)} and replays {node.name}")
+        run_until_told(partial(node.run, http, token, show))
+
+
+def _say(text: str) -> None:
+    click.echo(text, err=True)
+
+
+class ServedReplay:
+    """A replay as the server sees it (``companion.server.views.Node``).
+
+    ``say`` gets what a live run would tell a person. ``LogError`` for a log, ``ConfigError`` for
+    settings, ``OSError`` for a recording that cannot be used.
+    """
+
+    def __init__(self, asked: Asked, say: Callable[[str], None]) -> None:
+        logs, settings = asked.logs, asked.settings
+        events = log_events(logs, settings)
+        first = next(events)
+        self._run = Run(settings, asked.record() if asked.record else None)
+        self.pipeline = self._run.pipeline
+        self.equipment = assembly.equipment(settings, self.pipeline.array)
+        self.name = ", ".join(log.name for log in logs)
+        self._missing = missing(logs)
+        self._measured = (islice(log_events(logs, settings), 1, None), first.t_ns)
+        self._events = chain((first,), events)
+        self._now_ns = first.t_ns
+        self._speed = asked.speed
+        self._say = say
+        self._started_s = time.monotonic()
+        self._finished = False
+        self._of_s: float | None = None
+        self._notices: deque[Notice] = deque(maxlen=NOTICES_KEPT)
+        self._rates = Rates()
+        self._links: dict[str, _ReplayedLink] = {}
+
+    async def run(
+        self,
+        http: socket.socket,
+        token: str | None,
+        show: Callable[[dict[str, Any]], None],
+        until: asyncio.Event,
+    ) -> None:
+        """Replay, and serve until ``until`` is set, also when the log has ended.
+
+        ``show`` gets the summary (see ``companion.replay.replay``) when the log has ended, or what
+        there is of it when ``until`` is set before that. ``LogError`` for a log that turns out to
+        be none, ``OSError`` where the recording cannot be written.
+        """
+        answering = asyncio.Event()
+        server = Server(self, token, answering)
+        failed: Exception | None = None
+        try:
+            async with asyncio.TaskGroup() as group:
+                serving = group.create_task(server.serve(sockets=[http]), name="http")
+                await answering.wait()
+                measuring = group.create_task(self._measure(), name="length")
+                await self._replay(until)
+                summary = await asyncio.to_thread(self._run.finish)
+                show(summary | {"missing": self._missing})
+                await until.wait()
+                measuring.cancel()
+                server.should_exit = True
+                await serving
+        except* (ValueError, OSError) as group_of_one:
+            failed = group_of_one.exceptions[0]
+        if failed:
+            raise failed
+
+    async def _replay(self, until: asyncio.Event) -> None:
+        """Every event at its time, until told to stop."""
+        loop = asyncio.get_running_loop()
+        began_s, first_ns = loop.time(), self._now_ns
+        turn_s = flush_s = began_s
+        for event in self._events:
+            now_s = loop.time()
+            if self._speed is not None:
+                due_s = began_s + (event.t_ns - first_ns) * 1e-9 / self._speed
+                if due_s > now_s:
+                    await pause(until, due_s - now_s)
+                    now_s = turn_s = loop.time()
+            if now_s - turn_s > TURN_S:
+                await asyncio.sleep(0)
+                turn_s = loop.time()
+            if until.is_set():
+                self._say(f"stopped after {self._run.at_s:.1f} s of {self.name}")
+                return
+            self._step(event)
+            if self._run.writer and now_s - flush_s > FLUSH_EVERY_S:
+                await asyncio.to_thread(self._run.writer.flush)
+                flush_s = turn_s = loop.time()
+        self._finished = True
+        self._of_s = self._run.at_s
+
+    def _step(self, event: Event) -> None:
+        outputs = self._run.step(event)
+        self._now_ns = event.t_ns
+        match event:
+            case Tick():
+                self._rates.count(event.t_ns, self.pipeline.frames, self.pipeline.updates)
+            case Frame():
+                link = self._links.get(event.link)
+                if link is None:
+                    link = self._links.setdefault(event.link, _ReplayedLink(event.link))
+                link.take(event)
+            case Rejection() if event.source in self._links:
+                self._links[event.source].take(event)
+        for output in outputs:
+            if isinstance(output, Notice):
+                self._notices.append(output)
+                self._say(output.text)
+
+    async def _measure(self) -> None:
+        """How long the log is, by reading it through beside."""
+        events, first_ns = self._measured
+        last_ns: int | None = first_ns
+        while last_ns is not None:
+            end_ns, last_ns = last_ns, await asyncio.to_thread(_last_ns, events)
+        self._of_s = (end_ns - first_ns) * 1e-9
+
+    # --- what the server looks at -----------------------------------------------------------
+
+    def now_ns(self) -> int:
+        """The time of the newest event."""
+        return self._now_ns
+
+    def uptime_s(self) -> float:
+        """Seconds since the replay began, whatever its speed."""
+        return time.monotonic() - self._started_s
+
+    def links(self) -> list[LinkStatus]:
+        """The links that the log knows of, as far as frames tell: ``up`` while it goes on."""
+        for link in self._links.values():
+            link.status.state = "down" if self._finished else "up"
+        return [link.status for link in self._links.values()]
+
+    def recording(self) -> RecordingStatus:
+        """The recording of the replay."""
+        writer = self._run.writer
+        if writer is None:
+            return RecordingStatus("off", None, 0, 0, 0)
+        return RecordingStatus("recording", writer.path.name, writer.size_bytes, writer.messages, 0)
+
+    def rates(self) -> dict[str, float | None]:
+        """Frames and updates per second of the log."""
+        return self._rates.newest()
+
+    def unfit(self) -> list[str]:
+        """Why the live service would not have been fit to be used then; or that it is over."""
+        update = self.pipeline.last_update
+        reasons = ["the replay has finished"] if self._finished else []
+        if update is None:
+            return [*reasons, "no beam update yet"]
+        return [*reasons, update.unfit] if update.unfit else reasons
+
+    def message_rates(self) -> list[MessageRate]:
+        """Nobody is asked for anything."""
+        return []
+
+    def events(self) -> list[Notice]:
+        """The newest notices, the oldest of them first."""
+        return list(self._notices)
+
+    def replay(self) -> ReplayStatus:
+        """How far it is."""
+        state = "finished" if self._finished else "running"
+        return ReplayStatus(self.name, self._speed, self._run.at_s, self._of_s, state)
+
+
+class _ReplayedLink:
+    """Counts of one link, from its frames in the log. Its peers are not told apart there."""
+
+    def __init__(self, url: str) -> None:
+        self.status = LinkStatus(url)
+        self._peers = Peers(self.status, lambda _peer: None)
+        self._peer = self._peers.at(url)
+
+    def take(self, item: Frame | Rejection) -> None:
+        self._peers.count(self._peer, [item])
+        if isinstance(item, Frame):
+            self.status.bytes += len(item.raw)
+
+
+def _last_ns(events: Iterator[Event]) -> int | None:
+    """The time of the last of the next events; None where there are none."""
+    newest = deque(islice(events, MEASURED_AT_ONCE), maxlen=1)
+    return newest[0].t_ns if newest else None

@@ -1,0 +1,189 @@
+"""The container's files, and as much of what they promise as can be had without a container."""
+
+import fnmatch
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from support import BIN, ROOT
+
+RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
+DOCKERFILE = (ROOT / "Dockerfile").read_text(encoding="utf-8")
+COMPOSE = (ROOT / "docker-compose.yml").read_text(encoding="utf-8")
+
+
+def lint(text: str, tmp_path: Path) -> "subprocess.CompletedProcess[str]":
+    """hadolint over a Dockerfile."""
+    path = tmp_path / "Dockerfile"
+    path.write_text(text, encoding="utf-8")
+    command = [BIN / "hadolint", path]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def against_schema(text: str, tmp_path: Path) -> int:
+    """The exit status of the check against the Compose specification."""
+    path = tmp_path / "docker-compose.yml"
+    path.write_text(text, encoding="utf-8")
+    command = [BIN / "check-jsonschema", "--builtin-schema", "vendor.compose-spec", path]
+    return subprocess.run(command, capture_output=True, check=False).returncode
+
+
+def instruction(name: str) -> list[str]:
+    """The exec form of the Dockerfile's last instruction of that name."""
+    text = DOCKERFILE.replace("\\\n", " ")
+    found: list[str] = re.findall(rf"^{name} .*?(\[.*\])$", text, re.MULTILINE)
+    return list(json.loads(found[-1]))
+
+
+def test_the_dockerfile_is_clean(tmp_path: Path) -> None:
+    assert lint(DOCKERFILE, tmp_path).stdout == ""
+    careless = DOCKERFILE.replace("USER 10001:10001", "USER root").replace(
+        "WORKDIR /tmp", "RUN cd /tmp && pip install numpy"
+    )
+    assert lint(careless, tmp_path).returncode != 0
+
+
+def test_the_compose_file_fits_its_schema(tmp_path: Path) -> None:
+    assert against_schema(COMPOSE, tmp_path) == 0
+    assert against_schema(COMPOSE.replace("read_only:", "readonly:"), tmp_path) != 0
+
+
+def test_make_check_holds_both() -> None:
+    recipe = (ROOT / "Makefile").read_text(encoding="utf-8").split("\ncheck:")[1].split("\n\n")[0]
+    assert "hadolint Dockerfile" in recipe
+    assert "vendor.compose-spec docker-compose.yml" in recipe
+
+
+def test_packages_come_as_wheels_with_hashes() -> None:
+    (install,) = [line for line in DOCKERFILE.splitlines() if "requirements.lock" in line][-1:]
+    assert "--require-hashes" in install
+    assert "--only-binary :all:" in install
+
+
+@pytest.mark.parametrize("name", ["companion", "sim"])
+def test_a_service_has_no_rights(name: str) -> None:
+    service = yaml.safe_load(COMPOSE)["services"][name]
+    assert service["read_only"] is True
+    assert service["cap_drop"] == ["ALL"]
+    assert service["security_opt"] == ["no-new-privileges:true"]
+    assert "user" not in service  # that of the image
+    assert re.findall(r"^USER (\S+)$", DOCKERFILE, re.MULTILINE) == ["10001:10001"]
+
+
+def test_only_this_machine_reaches_the_page() -> None:
+    services = yaml.safe_load(COMPOSE)["services"]
+    published = [port for one in services.values() for port in one.get("ports", [])]
+    assert [port for port in published if port.endswith(":8080")] == ["127.0.0.1:8080:8080"]
+    assert services["sim"]["profiles"] == ["demo"]
+    assert "profiles" not in services["companion"]
+
+
+def test_the_commands_are_understood(start_node: Any) -> None:
+    """What image and compose file run, with addresses of this machine, starts and is fed."""
+    services = yaml.safe_load(COMPOSE)["services"]
+    assert services["companion"]["command"] == instruction("CMD")
+    assert instruction("ENTRYPOINT") == ["companion"]
+    command = [
+        {"udpin:0.0.0.0:14550": RUN[2], "0.0.0.0:8080": RUN[4]}.get(word, word)
+        for word in services["companion"]["command"]
+    ]
+    record = command.index("--record")
+    node = start_node(*command[:record], *command[record + 2 :])
+    sim = [
+        word.replace("companion:14550", f"127.0.0.1:{node.udp_port}")
+        for word in services["sim"]["command"]
+    ]
+    assert services["sim"]["entrypoint"] == ["sitl-replay"]
+    with subprocess.Popen([BIN / "sitl-replay", *sim], stdout=subprocess.DEVNULL) as flying:
+        node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
+        flying.terminate()
+
+
+@pytest.mark.parametrize("token", [None, "s3cret"])
+def test_health_is_that_of_readyz(
+    start_node: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, token: str | None
+) -> None:
+    if token:
+        monkeypatch.setenv("COMPANION_TOKEN", token)
+    node = start_node(*RUN)
+
+    def check() -> int:
+        program, *arguments = instruction("HEALTHCHECK")
+        assert program == "python"
+        here = [word.replace("http://127.0.0.1:8080", node.url) for word in arguments]
+        command = [sys.executable, *here]
+        return subprocess.run(command, capture_output=True, timeout=30, check=False).returncode
+
+    assert check() == 1  # no report yet
+    to = f"udpout:127.0.0.1:{node.udp_port}"
+    with subprocess.Popen(
+        [BIN / "sitl-replay", "fly", "paper", "--to", to], stdout=subprocess.DEVNULL
+    ) as flying:
+        waited = next((n for n in range(100) if check() == 0), None)
+        flying.terminate()
+    assert waited is not None
+
+
+def context(target: Path) -> None:
+    """What ``docker build`` is given: the tree as .dockerignore leaves it."""
+    lines = (ROOT / ".dockerignore").read_text(encoding="utf-8").splitlines()
+    rules = [line for line in lines if line and not line.startswith("#")]
+    assert rules[0] == "*"
+    drop = [Path(rule).name for rule in rules if rule.startswith("**/")]
+    for name in (rule[1:] for rule in rules if rule.startswith("!")):
+        source = ROOT / name
+        if source.is_dir():
+            shutil.copytree(source, target / name, ignore=shutil.ignore_patterns(*drop))
+        else:
+            shutil.copy(source, target / name)
+    assert not any(fnmatch.fnmatch(path.name, "*.pyc") for path in target.rglob("*"))
+
+
+def test_the_image_installs_and_runs_from_what_it_is_given(tmp_path: Path) -> None:
+    """Installed apart, read only, without HOME and in another directory; the page is in it."""
+    source, installed, record = (tmp_path / name for name in ("src", "installed", "recordings"))
+    source.mkdir()
+    context(source)
+    wheel = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index"]
+    wheel += ["--no-build-isolation", "--target", str(installed), str(source)]
+    subprocess.run(wheel, check=True, capture_output=True, timeout=100)
+    shutil.rmtree(source)
+    for path in [installed, *installed.rglob("*")]:
+        path.chmod(0o555 if path.is_dir() else 0o444)
+    environment = {name: value for name, value in os.environ.items() if name != "HOME"}
+    environment |= {"PYTHONPATH": str(installed), "PYTHONDONTWRITEBYTECODE": "1"}
+    code = (
+        "import companion, pathlib\n"
+        f"assert pathlib.Path(companion.__file__).is_relative_to({str(installed)!r})\n"
+        "from companion.server.app import web_directory\n"
+        f"assert web_directory().is_relative_to({str(installed)!r})\n"
+        "assert (web_directory() / 'index.html').is_file()\n"
+        "from companion import live\n"
+        "from companion.cli import main\n"
+        "from companion.config import Settings\n"
+        "settings = Settings().override(center={'source': '5:1'},\n"
+        "    links={'urls': ['udpin:127.0.0.1:0']}, server={'listen': '127.0.0.1:0'},\n"
+        f"    recording={{'directory': {str(record)!r}}})\n"
+        "live.run(settings, seconds=0.5)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    for path in [installed, *installed.rglob("*")]:
+        if path.is_dir():
+            path.chmod(0o755)  # so that pytest can take it away
+    assert done.returncode == 0, done.stderr
+    assert len(list(record.glob("*.mcap"))) == 1

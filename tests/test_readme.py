@@ -1,0 +1,205 @@
+"""The README is run: every command in it, and every snippet.
+
+Its blocks are cut into commands and settings. A command is run by what its first words say; one
+that nobody here knows how to run fails, and so does a way of running that no command asks for.
+What differs from the README: the flight is the short one that comes with the tests, addresses are
+those of this run, and what runs for ever is stopped once it has shown what it promises.
+"""
+
+import json
+import re
+import shlex
+import shutil
+import socket
+import subprocess
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from support import BIN, ROOT
+
+from companion.config import Settings
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+BLOCKS = [
+    "\n".join(line[4:] for line in block.split("\n")).strip()
+    for block in re.findall(r"(?:^    .*\n?|^\n(?=    ))+", README, re.MULTILINE)
+]
+SETTINGS = [block for block in BLOCKS if block.startswith("[")]
+COMMANDS = [line for block in BLOCKS if block not in SETTINGS for line in block.split("\n") if line]
+COMMANDS += re.findall(r"`((?:make|companion|sitl-replay|docker) [^`…]*)`", README)
+
+Started = Callable[..., Any]
+
+
+def words_of(command: str) -> list[str]:
+    """The words of a command, its comment left out; a program of .venv by its name."""
+    words = shlex.split(command, comments=True)
+    return [words[0].removeprefix(".venv/bin/"), *words[1:]]
+
+
+def run(words: list[str], where: Path) -> "subprocess.CompletedProcess[str]":
+    """Run one of our programs to its end, which must be good."""
+    done = subprocess.run(
+        [BIN / words[0], *words[1:]],
+        cwd=where,
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+def make(words: list[str], _: Path, start_node: Started) -> None:
+    """What make would do; not done, for it makes an environment first."""
+    command = ["make", "--dry-run", "--always-make", *words[1:]]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    does = {"demo": "companion demo", "test": "pytest", "check": "ruff check", "bench": "benchmark"}
+    assert does[words[1]] in done.stdout
+
+
+def curl(words: list[str], where: Path, start_node: Started) -> None:
+    """Asked of a demo that runs, by Python."""
+    node = start_node("demo", "--port", "0", "--seconds", "60")
+    node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
+    (url,) = [word for word in words if word.startswith("http://127.0.0.1:8080/")]
+    headers = dict(words[i + 1].split(": ") for i, word in enumerate(words) if word == "-H")
+    request = urllib.request.Request(url.replace("http://127.0.0.1:8080", node.url), None, headers)
+    with urllib.request.urlopen(request, timeout=10) as answer:
+        body = answer.read()
+    if "-o" in words:
+        (where / words[words.index("-o") + 1]).write_bytes(body)
+        assert np.load(where / "weights.npy").shape == (64, 4)
+    else:
+        assert {beam["uav"] for beam in json.loads(body)["beams"]} == {"1:1", "2:1", "3:1", "4:1"}
+
+
+def to_its_end(words: list[str], where: Path, start_node: Started) -> None:
+    """Replays, designs and studies end by themselves."""
+    done = run(words, where)
+    assert done.stdout or (where / "weights.npy").exists()
+    if "--out" in words:
+        assert (where / words[words.index("--out") + 1]).exists()
+
+
+def live(words: list[str], where: Path, start_node: Started) -> None:
+    """It serves, and what settings it names are those of the README."""
+    if words[1:] == ["--config", "settings.toml"] or "settings.toml" in words:
+        (block,) = SETTINGS
+        with socket.create_server(("127.0.0.1", 0)) as nobody:
+            address = f"127.0.0.1:{nobody.getsockname()[1]}"
+        text = block.replace("192.0.2.7:5760", address).replace("0.0.0.0:14550", "127.0.0.1:0")
+        (where / "settings.toml").write_text(text, encoding="utf-8")
+    words = [word.replace("0.0.0.0:14550", "127.0.0.1:0") for word in words[1:]]
+    node = start_node(*words, "--listen", "127.0.0.1:0")
+    status = node.json("/v1/status")
+    assert status["center"]["source"] == "5:1"
+    assert status["recording"]["state"] == ("recording" if "--record" in words else "off")
+    returncode, _, err = node.stop()
+    assert returncode == 0, err
+
+
+def traffic(words: list[str], where: Path, start_node: Started) -> None:
+    """Sent to a service, which comes to see it."""
+    node = start_node(
+        *("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
+    )
+    words = [word.replace("127.0.0.1:14550", f"127.0.0.1:{node.udp_port}") for word in words]
+    with subprocess.Popen(
+        [BIN / words[0], *words[1:]], cwd=where, stdout=subprocess.DEVNULL
+    ) as sending:
+        node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
+        sending.terminate()
+
+
+def compose(words: list[str], where: Path, start_node: Started) -> None:
+    """The services and profiles that it names are there; and what compose says, where it is."""
+    known = yaml.safe_load((ROOT / "docker-compose.yml").read_text(encoding="utf-8"))["services"]
+    rest = words[2:]
+    if rest[0] == "--profile":
+        assert any(rest[1] in service.get("profiles", []) for service in known.values())
+        rest = rest[2:]
+    assert rest[0] == "up"
+    assert set(rest[1:]) <= set(known)
+    if (
+        shutil.which("docker")
+        and not subprocess.run(
+            ["docker", "compose", "version"], capture_output=True, check=False
+        ).returncode
+    ):
+        subprocess.run(["docker", "compose", "config", "--quiet"], cwd=ROOT, check=True)
+
+
+RUNNERS: dict[str, Callable[[list[str], Path, Started], None]] = {
+    "make": make,
+    "curl": curl,
+    "companion replay": to_its_end,
+    "companion weights": to_its_end,
+    "companion design": to_its_end,
+    "companion study": to_its_end,
+    "companion run": live,
+    "sitl-replay fly": traffic,
+    "sitl-replay play": traffic,
+    "docker compose": compose,
+}
+FULL = {"companion study prediction"}
+"""Said in the text as a name, without its arguments."""
+
+
+def runner_of(command: str) -> str:
+    """The key of ``RUNNERS`` for a command; ``LookupError`` where nobody knows how to run it."""
+    words = words_of(command)
+    for key in (" ".join(words[:2]), words[0]):
+        if key in RUNNERS:
+            return key
+    raise LookupError(f"README.md: nobody knows how to run: {command}")
+
+
+@pytest.mark.parametrize("command", sorted(set(COMMANDS) - FULL))
+def test_the_command_does_what_it_should(
+    command: str,
+    tmp_path: Path,
+    cut_log: Path,
+    start_node: Started,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    shutil.copy(cut_log, tmp_path / "flight.tlog")
+    monkeypatch.chdir(tmp_path)  # `recordings` and the like are made here
+    words = ["12" if word == "120" else word for word in words_of(command)]  # it is 25 s long
+    RUNNERS[runner_of(command)](words, tmp_path, start_node)
+
+
+def test_names_of_commands_are_run_in_full() -> None:
+    for name in FULL:
+        assert any(
+            " ".join(words_of(command)).startswith(name + " ") for command in set(COMMANDS) - FULL
+        )
+
+
+def test_every_way_of_running_is_asked_for() -> None:
+    assert {runner_of(command) for command in COMMANDS} == set(RUNNERS)
+    assert len(SETTINGS) == 1
+
+
+def test_a_command_that_nobody_knows_is_found() -> None:
+    with pytest.raises(LookupError, match="companion fnord"):
+        runner_of(".venv/bin/companion fnord --now")
+
+
+def test_the_settings_are_good() -> None:
+    (block,) = SETTINGS
+    settings = Settings.from_toml(block, "README.md")
+    assert settings.array.elements == 64
+
+
+def test_every_link_leads_somewhere() -> None:
+    """Files that the text links to are there."""
+    for path in re.findall(r"\]\(([^)#:]+)\)", README):
+        assert (ROOT / path).exists(), path

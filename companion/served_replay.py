@@ -26,6 +26,8 @@ from companion.mavlink.rates import MessageRate
 from companion.recording.writer import Writer
 from companion.replay import FLUSH_EVERY_S, Run, log_events, missing
 from companion.server.access import bind
+from companion.server.last_messages import LastMessages
+from companion.server.lateness import Lateness
 from companion.server.views import RecordingStatus, ReplayStatus
 from companion.serving import NOTICES_KEPT, Rates, Server, address, pause, run_until_told
 from companion.values import Event, Frame, Notice, Rejection, Tick
@@ -98,6 +100,9 @@ class ServedReplay:
         self._notices: deque[Notice] = deque(maxlen=NOTICES_KEPT)
         self._rates = Rates()
         self._links: dict[str, _ReplayedLink] = {}
+        self.last_messages = LastMessages()
+        self.lateness = Lateness()
+        self._ticked = asyncio.Event()
 
     async def run(
         self,
@@ -144,6 +149,7 @@ class ServedReplay:
                 if due_s > now_s:
                     await pause(until, due_s - now_s)
                     now_s = turn_s = loop.time()
+                    self.lateness.observe(now_s - due_s)
             if now_s - turn_s > TURN_S:
                 await asyncio.sleep(0)
                 turn_s = loop.time()
@@ -163,7 +169,10 @@ class ServedReplay:
         match event:
             case Tick():
                 self._rates.count(event.t_ns, self.pipeline.frames, self.pipeline.updates)
+                self._ticked.set()  # who waits goes on, and
+                self._ticked.clear()  # who comes now waits for the next
             case Frame():
+                self.last_messages.add(event)
                 link = self._links.get(event.link)
                 if link is None:
                     link = self._links.setdefault(event.link, _ReplayedLink(event.link))
@@ -225,6 +234,10 @@ class ServedReplay:
     def events(self) -> list[Notice]:
         """The newest notices, the oldest of them first."""
         return list(self._notices)
+
+    async def ticked(self) -> None:
+        """Return after the next update of the log."""
+        await self._ticked.wait()
 
     def replay(self) -> ReplayStatus:
         """How far it is."""

@@ -21,10 +21,12 @@ from companion.recording.reader import LogError
 from companion.recording.recover import recover_leftovers
 from companion.recording.scene import Scene
 from companion.recording.writer import Writer
+from companion.server.last_messages import LastMessages
+from companion.server.lateness import Lateness
 from companion.server.views import RecordingStatus
 from companion.serving import NOTICES_KEPT, Rates, Server
 from companion.traffic import Traffic
-from companion.values import Event, Notice, Output, Tick
+from companion.values import Event, Frame, Notice, Output, Tick
 
 
 class Timeline:
@@ -51,6 +53,9 @@ class Service:
         self.equipment = assembly.equipment(settings, self.pipeline.array)
         self.notices: deque[Notice] = deque(maxlen=NOTICES_KEPT)
         self.answering = asyncio.Event()
+        self.last_messages = LastMessages()
+        self.lateness = Lateness()
+        self._ticked = asyncio.Event()
         self._settings = settings
         self._say = say
         self._timeline = Timeline()
@@ -102,6 +107,8 @@ class Service:
     # --- what drives the pipeline -----------------------------------------------------------
 
     def _step(self, event: Event) -> None:
+        if isinstance(event, Frame):
+            self.last_messages.add(event)
         outputs = self.pipeline.step(event)
         self._hand_over(event, outputs)
         for output in outputs:
@@ -143,15 +150,22 @@ class Service:
             if self._recorder:
                 self._tell_of_recorder(self._recorder)
             self._traffic.speak(not self.unfit(), self.pipeline.reporters())
+            self._ticked.set()  # who waits goes on, and
+            self._ticked.clear()  # who comes now waits for the next
             ended_s = loop.time()
             due_s = max(due_s + period_s, ended_s + (ended_s - began_s))
             await asyncio.sleep(due_s - loop.time())
+            self.lateness.observe(loop.time() - due_s)
 
     # --- what the server looks at -----------------------------------------------------------
 
     def now_ns(self) -> int:
         """Now, on the node's timeline."""
         return self._timeline.now_ns()
+
+    async def ticked(self) -> None:
+        """Return after the next tick."""
+        await self._ticked.wait()
 
     def uptime_s(self) -> float:
         """Seconds since the service was made."""

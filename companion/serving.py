@@ -17,6 +17,10 @@ from companion.server.views import Node
 
 RATE_WINDOW_S: Final = 2.0
 NOTICES_KEPT: Final = 200
+STREAM_TAKES_BYTES: Final = 1024
+"""The largest message that a WebSocket client can make the server read."""
+FAREWELL_S: Final = 2
+"""How long the end waits for a client that does not read, or a download: there may be no end."""
 
 
 class Server(uvicorn.Server):
@@ -28,7 +32,17 @@ class Server(uvicorn.Server):
 
     def __init__(self, node: Node, token: str | None, answering: asyncio.Event) -> None:
         app = create_app(node, token)
-        super().__init__(uvicorn.Config(app, log_level="warning", lifespan="off", access_log=False))
+        super().__init__(
+            uvicorn.Config(
+                app,
+                log_level="warning",
+                lifespan="off",
+                access_log=False,
+                ws_max_size=STREAM_TAKES_BYTES,
+                ws_per_message_deflate=False,  # a message is made once, for all
+                timeout_graceful_shutdown=FAREWELL_S,
+            )
+        )
         self._answering = answering
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:

@@ -1,14 +1,30 @@
 """Who may ask: anybody on this machine; from elsewhere only with a bearer token."""
 
+import base64
+import binascii
 import hmac
 import ipaddress
 import socket
+import sys
+from typing import Final
 
 from starlette.datastructures import Headers
-from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.websockets import WebSocket
+
+from companion.server.responses import problem
 
 OPEN_PATHS = frozenset({"/healthz"})
+SUBPROTOCOL: Final = "companion.v1"
+"""What a WebSocket client that names subprotocols is to name, and is answered."""
+BEARER: Final = "bearer."
+"""A subprotocol that begins so carries the token, base64url without padding: a page in a browser
+cannot set headers, and an address with a token in it ends up in logs and histories."""
+UNAUTHORISED: Final = 4401
+
+UNSENT_BYTES: Final = 16_384
+"""The system queues no more than this of what a client does not take: else megabytes, and who
+reads a stream slowly would be sent what is long past. Connections inherit it."""
 
 
 class ListenError(ValueError):
@@ -48,6 +64,8 @@ def bind(listen: str, *, token: str | None, insecure: bool) -> socket.socket:
         )[0]
         bound = socket.socket(family, kind, proto)
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if sys.platform == "linux":
+            bound.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_BYTES)
         bound.bind(address)
         bound.listen(1024)  # who reads the address may connect at once
     except OSError as error:
@@ -56,22 +74,41 @@ def bind(listen: str, *, token: str | None, insecure: bool) -> socket.socket:
 
 
 class BearerToken:
-    """ASGI middleware: every path but ``/healthz`` wants ``Authorization: Bearer TOKEN``."""
+    """ASGI middleware: every path but ``/healthz`` wants ``Authorization: Bearer TOKEN``.
+
+    A WebSocket may bring it as a subprotocol instead (``BEARER``), beside ``SUBPROTOCOL``. Without
+    a right token it is opened and closed with 4401, whatever its path: a page in a browser cannot
+    see the status of a handshake that is refused.
+    """
 
     def __init__(self, app: ASGIApp, token: str) -> None:
         self._app = app
-        self._expected = f"Bearer {token}".encode()
+        self._token = token.encode()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "http" and scope["path"] not in OPEN_PATHS:
-            given = Headers(scope=scope).get("authorization", "").encode()
-            if not hmac.compare_digest(given, self._expected):
-                refusal = JSONResponse(
-                    {"type": "about:blank", "title": "a bearer token is needed", "status": 401},
-                    status_code=401,
-                    headers={"www-authenticate": "Bearer"},
-                    media_type="application/problem+json",
-                )
-                await refusal(scope, receive, send)
-                return
-        await self._app(scope, receive, send)
+        if (scope["type"] == "http" and scope["path"] in OPEN_PATHS) or self._may(scope):
+            await self._app(scope, receive, send)
+        elif scope["type"] == "websocket":
+            websocket = WebSocket(scope, receive, send)
+            offered = scope.get("subprotocols", [])
+            await websocket.accept(SUBPROTOCOL if SUBPROTOCOL in offered else None)
+            await websocket.close(UNAUTHORISED, "a bearer token is needed")
+        else:
+            title, headers = "a bearer token is needed", {"www-authenticate": "Bearer"}
+            await problem(401, title, headers)(scope, receive, send)
+
+    def _may(self, scope: Scope) -> bool:
+        given = [Headers(scope=scope).get("authorization", "").encode()]
+        for offered in scope.get("subprotocols", []):
+            if offered.startswith(BEARER):
+                given.append(b"Bearer " + _decoded(offered.removeprefix(BEARER)))
+        expected = b"Bearer " + self._token
+        return any(hmac.compare_digest(one, expected) for one in given)
+
+
+def _decoded(text: str) -> bytes:
+    """Base64url without padding; nothing where it is none."""
+    try:
+        return base64.urlsafe_b64decode(text + "=" * (-len(text) % 4))
+    except (binascii.Error, ValueError):
+        return b""

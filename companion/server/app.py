@@ -1,44 +1,52 @@
 """The HTTP API and the dashboard's files, over a running node. Read only."""
 
-import re
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Final
 
-from fastapi import FastAPI, HTTPException, Query, Request
-from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse, Response
+from fastapi import FastAPI, HTTPException, WebSocket
+from fastapi.responses import Response
 from fastapi.staticfiles import StaticFiles
-from prometheus_client import CollectorRegistry, generate_latest
-from starlette.concurrency import run_in_threadpool
-from starlette.exceptions import HTTPException as StarletteHTTPException
+from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import companion
-from companion.server import beam_views, link_views, views, weight_formats
+from companion.server import beam_routes, file_routes, link_views, models, responses, views
 from companion.server.access import BearerToken
+from companion.server.design_views import DesignView
 from companion.server.metrics import NodeCollector
+from companion.server.responses import answer, answers
+from companion.server.stream import Stream
 from companion.server.views import Node
 from companion.server.words import rfc3339
-from companion.values import Update
 
-LeadMs = Annotated[float, Query(ge=0, le=10_000, description="milliseconds ahead of now")]
-CONTENT_POLICY = b"default-src 'self'; frame-ancestors 'none'"
+CONTENT_POLICY: Final = b"default-src 'self'; frame-ancestors 'none'"
+DESCRIPTION: Final = """Location-aware beamforming from MAVLink. Read only.
+
+Angles in degrees, distances in metres; null is not known, never 0. Estimates are worked out for
+the moment at which they are asked for: `valid_at` says which, so no answer has an ETag. Errors are
+`application/problem+json` (RFC 9457). `WS /v1/stream?uav=…&topic=…&rate_hz=…` sends `uavs`,
+`beams`, `weights`, `status`, `links` and `events` as they change.
+"""
 
 
 def create_app(node: Node, token: str | None = None) -> ASGIApp:
     """The ASGI application for a node; with a token, all but ``/healthz`` asks for it."""
-    app = FastAPI(
-        title="companion",
-        version=companion.__version__,
-        description="Location-aware beamforming from MAVLink.",
-    )
-    app.add_exception_handler(StarletteHTTPException, _problem)
-    app.add_exception_handler(RequestValidationError, _unprocessable)
-    _health_routes(app, node)
+    app = FastAPI(title="companion", version=companion.__version__, description=DESCRIPTION)
+    app.router.redirect_slashes = False
+    responses.install(app)
+    stream = Stream(node)
+    _health_routes(app, node, stream)
     _state_routes(app, node)
-    _beam_routes(app, node)
-    app.mount("/", StaticFiles(directory=web_directory(), html=True))
-    secured: ASGIApp = _ContentPolicy(app)
+    beam_routes.add(app, node)
+    file_routes.add(app, node)
+
+    @app.websocket("/v1/stream")
+    async def streamed(websocket: WebSocket) -> None:
+        await stream.serve(websocket)
+
+    # Not mounted: a mount at / would match before a path whose method is wrong, and hide the 405.
+    app.router.default = _Files(StaticFiles(directory=web_directory(), html=True))
+    secured: ASGIApp = _Edge(app)
     return BearerToken(secured, token) if token else secured
 
 
@@ -49,158 +57,113 @@ def web_directory() -> Path:
     return installed if installed.is_dir() else package.parent / "web"
 
 
-def _health_routes(app: FastAPI, node: Node) -> None:
+def _health_routes(app: FastAPI, node: Node, stream: Stream) -> None:
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(NodeCollector(node))
+    registry.register(NodeCollector(node, stream))
+    ProcessCollector(registry=registry)
 
-    @app.get("/healthz", summary="The process answers")
-    async def healthz() -> dict[str, str]:
-        return {"status": "ok"}
+    @app.get("/healthz", summary="The process answers", responses=answers(models.Health))
+    async def healthz() -> Response:
+        return answer({"status": "ok"})
 
-    @app.get("/readyz", summary="Fit to be used, or why not (503)")
-    async def readyz() -> JSONResponse:
+    @app.get(
+        "/readyz",
+        summary="Fit to be used, or why not (503)",
+        responses=answers(models.Readiness)
+        | {503: {"model": models.Readiness, "description": "Not fit to be used"}},
+    )
+    async def readyz() -> Response:
         reasons = node.unfit()
-        return JSONResponse(
-            {"ready": not reasons, "reasons": reasons}, status_code=503 if reasons else 200
-        )
+        return answer({"ready": not reasons, "reasons": reasons}, 503 if reasons else 200)
 
-    @app.get("/metrics", summary="Prometheus")
+    @app.get(
+        "/metrics",
+        summary="Prometheus",
+        response_class=Response,
+        responses={200: {"content": {"text/plain": {}}}},
+    )
     async def metrics() -> Response:
         return Response(generate_latest(registry), media_type="text/plain; version=0.0.4")
 
 
 def _state_routes(app: FastAPI, node: Node) -> None:
-    @app.get("/v1/status", summary="Version, uptime, links, center, recording, rates")
-    async def status() -> dict[str, Any]:
-        return views.status(node, companion.__version__)
+    design_view = DesignView(node.pipeline.settings)
 
-    @app.get("/v1/uavs", summary="Every UAV as it is now")
-    async def uavs() -> dict[str, Any]:
-        return {"valid_at": rfc3339(node.now_ns()), "uavs": views.uavs(node)}
+    @app.get(
+        "/v1/status",
+        summary="Version, uptime, links, center, recording, rates",
+        responses=answers(models.Status),
+    )
+    async def status() -> Response:
+        return answer(views.status(node, companion.__version__))
 
-    @app.get("/v1/uavs/{uav}", summary="One UAV as it is now")
-    async def one_uav(uav: str) -> dict[str, Any]:
+    @app.get("/v1/uavs", summary="Every UAV as it is now", responses=answers(models.Uavs))
+    async def uavs() -> Response:
+        return answer({"valid_at": rfc3339(node.now_ns()), "uavs": views.uavs(node)})
+
+    @app.get(
+        "/v1/uavs/{uav}",
+        summary="One UAV as it is now",
+        responses=answers(models.UavState, 404, 422),
+    )
+    async def one_uav(uav: str) -> Response:
         found = views.uavs(node, only=uav)
         if not found:
             raise HTTPException(404, f"no UAV {uav!r} has been heard")
-        return found[0]
-
-    @app.get("/v1/links", summary="Links, who is heard over each, and the rates asked for")
-    async def links() -> dict[str, Any]:
-        now_ns = node.now_ns()
-        shown = [
-            link_views.link(item, node.pipeline.link_share(item.url), now_ns)
-            | {"components": link_views.components(item, now_ns)}
-            for item in node.links()
-        ]
-        rates = [link_views.rate(rate) for rate in node.message_rates()]
-        return {"valid_at": rfc3339(now_ns), "links": shown, "message_rates": rates}
-
-    @app.get("/v1/events", summary="What was said to the operator last")
-    async def events() -> dict[str, Any]:
-        return {"events": [link_views.event(notice) for notice in node.events()]}
-
-
-def _beam_routes(app: FastAPI, node: Node) -> None:
-    pipeline, equipment = node.pipeline, node.equipment
-
-    def look(lead_ms: float) -> Update:
-        return pipeline.look(node.now_ns(), lead_ms * 1e-3)
-
-    @app.get("/v1/beams", summary="The beams, applied lead_ms from now")
-    async def beams(lead_ms: LeadMs = 0.0) -> dict[str, Any]:
-        update = look(lead_ms)
-        return await run_in_threadpool(beam_views.beams, pipeline, equipment, update, 0.0, lead_ms)
+        return answer(found[0])
 
     @app.get(
-        "/v1/beams/weights",
-        summary="The M×N weights, by Accept: JSON, application/x-npy, raw, or a device's format",
-        response_class=Response,
-        responses={200: {"content": {kind: {} for kind in weight_formats.TYPES.values()}}},
+        "/v1/links",
+        summary="Links, who is heard over each, and the rates asked for",
+        responses=answers(models.Links),
     )
-    async def weights(request: Request, lead_ms: LeadMs = 0.0) -> Response:
-        form = _accepted(request.headers.get("accept", "*/*"))
-        if form is None:
-            raise HTTPException(406, f"weights come as {', '.join(weight_formats.TYPES.values())}")
-        beam_set = look(lead_ms).beams
-        try:
-            body = await run_in_threadpool(
-                weight_formats.encode, form, beam_set, pipeline.array, equipment, lead_ms
-            )
-        except ValueError as error:  # what the device cannot do, as the beams are now
-            raise HTTPException(409, str(error)) from error
-        headers = {
-            "x-valid-at": rfc3339(beam_set.valid_at_ns),
-            "x-uavs": ",".join(beam_set.uavs),
-            "x-normalisation": str(beam_set.normalisation),
-        }
-        return Response(body, media_type=weight_formats.TYPES[form], headers=headers)
+    async def links() -> Response:
+        return answer(views.links(node))
 
-    @app.get("/v1/pattern", summary="Array response in dB along a cut through each beam")
-    async def pattern(
-        cut: Literal["azimuth", "elevation"] = "azimuth",
-        points: Annotated[int, Query(ge=2, le=3601)] = 361,
-        uav: str | None = None,
-        lead_ms: LeadMs = 0.0,
-    ) -> dict[str, Any]:
-        update = look(lead_ms)
-        if uav is not None and uav not in update.beams.uavs:
-            raise HTTPException(404, f"there is no beam on {uav!r}")
-        return await run_in_threadpool(
-            beam_views.pattern, pipeline, update, cut, points, uav, lead_ms
-        )
-
-
-def _accepted(accept: str) -> str | None:
-    """The form that an Accept header likes best (RFC 9110: by q, the first of those alike); None
-    where it takes none of them."""
-    forms = {media_type: form for form, media_type in weight_formats.TYPES.items()}
-    parts = [part.lower().replace(" ", "") for part in accept.split(",")]
-    for part in sorted(parts, key=_quality, reverse=True):
-        wanted = part.split(";")[0]
-        if _quality(part) <= 0:
-            break
-        if wanted in forms:
-            return forms[wanted]
-        if wanted in ("*/*", "application/*", ""):
-            return "json"
-    return None
-
-
-def _quality(part: str) -> float:
-    """The q of one part of an Accept header; 1 where there is none that can be read."""
-    found = re.search(r";q=([01](?:\.\d*)?)(?:;|$)", part)
-    return float(found[1]) if found else 1.0
-
-
-def problem(status: int, title: str, headers: dict[str, str] | None = None) -> JSONResponse:
-    """An error as RFC 9457 has it."""
-    body = {"type": "about:blank", "title": title, "status": status}
-    return JSONResponse(
-        body, status_code=status, headers=headers, media_type="application/problem+json"
+    @app.get(
+        "/v1/events",
+        summary="What was said to the operator last",
+        responses=answers(models.Events),
     )
+    async def events() -> Response:
+        return answer({"events": [link_views.event(notice) for notice in node.events()]})
+
+    @app.get(
+        "/v1/design",
+        summary="The observer in use: gains at each UAV's interval, and their certificate",
+        responses=answers(models.Design),
+    )
+    async def design() -> Response:
+        return answer(design_view.show(node.pipeline, node.now_ns()))
 
 
-async def _problem(_request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, StarletteHTTPException)
-    return problem(error.status_code, str(error.detail), dict(error.headers or {}))
+class _Files:
+    """What is no path of the API: the dashboard's files, or nothing."""
+
+    def __init__(self, files: StaticFiles) -> None:
+        self._files = files
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "http":
+            await self._files(scope, receive, send)
+        else:
+            await WebSocket(scope, receive, send).close()  # before it is open: 403
 
 
-async def _unprocessable(_request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, RequestValidationError)
-    wrong = error.errors()[0]
-    where = ".".join(str(part) for part in wrong["loc"])
-    return problem(422, f"{where}: {wrong['msg']}")
-
-
-class _ContentPolicy:
-    """ASGI middleware: nothing on the page comes from elsewhere (but for ``/docs``)."""
+class _Edge:
+    """ASGI middleware: HEAD is GET without its body, which the server leaves out, and nothing on
+    a page comes from elsewhere (but for ``/docs``)."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or scope["path"] == "/docs":
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        if scope["method"] == "HEAD":
+            scope = {**scope, "method": "GET"}
+        if scope["path"] == "/docs":
             await self._app(scope, receive, send)
             return
 

@@ -1,22 +1,49 @@
-"""Prometheus metrics, read off the node when they are asked for."""
+"""Prometheus metrics, read off the node when they are asked for.
+
+Names as Prometheus has them: base units, ``_total`` for what only grows. The process's own
+(memory, CPU, open files) are those of the client library.
+"""
 
 from collections.abc import Iterator
 
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.core import (
+    CounterMetricFamily,
+    GaugeMetricFamily,
+    HistogramMetricFamily,
+    Metric,
+)
 from prometheus_client.registry import Collector
 
+import companion
+from companion.server.stream import Stream
 from companion.server.views import Node
 
 
 class NodeCollector(Collector):
-    """Counters and gauges of a node."""
+    """Counters and gauges of a node and of its stream."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, stream: Stream) -> None:
         self._node = node
+        self._stream = stream
 
     def collect(self) -> Iterator[Metric]:
         """All metrics at this moment."""
-        pipeline, now_ns = self._node.pipeline, self._node.now_ns()
+        yield from self._service()
+        yield from self._links()
+        yield from self._uavs()
+        yield from self._recording()
+
+    def _service(self) -> Iterator[Metric]:
+        node, pipeline = self._node, self._node.pipeline
+        build = GaugeMetricFamily("companion_build_info", "Version", labels=["version"])
+        build.add_metric([companion.__version__], 1)
+        yield build
+        yield GaugeMetricFamily(
+            "companion_uptime_seconds", "Time since the start", value=node.uptime_s()
+        )
+        yield GaugeMetricFamily(
+            "companion_ready", "1 if fit to be used", value=float(not node.unfit())
+        )
         yield CounterMetricFamily(
             "companion_frames", "MAVLink frames whose checksum held", value=pipeline.frames
         )
@@ -27,8 +54,50 @@ class NodeCollector(Collector):
         for reason, count in pipeline.refusals.total.items():
             rejected.add_metric([str(reason)], count)
         yield rejected
+        yield HistogramMetricFamily(
+            "companion_event_loop_lag_seconds",
+            "How late the ticks of the timer came",
+            buckets=node.lateness.buckets(),
+            sum_value=node.lateness.sum_s,
+        )
+        yield GaugeMetricFamily(
+            "companion_stream_clients", "Connected to /v1/stream", value=self._stream.clients
+        )
+        yield CounterMetricFamily(
+            "companion_stream_messages", "Sent over /v1/stream", value=self._stream.sent
+        )
+
+    def _links(self) -> Iterator[Metric]:
+        up = GaugeMetricFamily("companion_link_up", "1 if the link is up", labels=["link"])
+        counted = {
+            "frames": "Frames that came",
+            "bytes": "Bytes that came",
+            "gaps": "Frames missing by their sequence numbers",
+            "sent": "Frames that were sent",
+            "send_dropped": "Frames that a peer did not take",
+            "overflowed": "Datagrams that the system dropped",
+        }
+        families = {
+            name: CounterMetricFamily(f"companion_link_{name}", text, labels=["link"])
+            for name, text in counted.items()
+        }
+        lost = CounterMetricFamily(
+            "companion_link_lost", "Refused, by reason; garbage in bytes", labels=["link", "reason"]
+        )
+        for link in self._node.links():
+            up.add_metric([link.url], float(link.state == "up"))
+            for name, family in families.items():
+                count = getattr(link, name)
+                if count is not None:
+                    family.add_metric([link.url], count)
+            for reason, count in list(link.lost.items()):
+                lost.add_metric([link.url, str(reason)], count)
+        yield from (up, *families.values(), lost)
+
+    def _uavs(self) -> Iterator[Metric]:
+        pipeline, now_ns = self._node.pipeline, self._node.now_ns()
         states = GaugeMetricFamily("companion_uavs", "UAVs by state", labels=["state"])
-        bounds = GaugeMetricFamily("companion_bound_metres", "Position bound", labels=["uav"])
+        bounds = GaugeMetricFamily("companion_bound_meters", "Position bound", labels=["uav"])
         latency = GaugeMetricFamily("companion_latency_seconds", "Latency seen", labels=["uav"])
         by_state: dict[str, int] = {}
         for track in pipeline.tracks(now_ns, now_ns):
@@ -37,18 +106,29 @@ class NodeCollector(Collector):
             if track.latency_s is not None:
                 latency.add_metric([track.uav], track.latency_s)
         for state, count in by_state.items():
-            states.add_metric([state], count)
-        yield states
-        yield bounds
-        yield latency
+            states.add_metric([str(state)], count)
+        yield from (states, bounds, latency)
         update = pipeline.last_update
-        if update is not None and update.beams.condition_number is not None:
-            yield GaugeMetricFamily(
-                "companion_condition_number",
-                "Condition number of the steering matrix",
-                value=update.beams.condition_number,
-            )
+        if update is not None:
+            beams = update.beams
+            yield GaugeMetricFamily("companion_beams", "Beams formed", value=len(beams.beams))
+            if beams.condition_number is not None:
+                yield GaugeMetricFamily(
+                    "companion_condition_number",
+                    "Condition number of the steering matrix",
+                    value=beams.condition_number,
+                )
+
+    def _recording(self) -> Iterator[Metric]:
         recording = self._node.recording()
+        yield GaugeMetricFamily(
+            "companion_recording_up",
+            "1 if everything is recorded",
+            value=float(recording.state == "recording"),
+        )
+        yield GaugeMetricFamily(
+            "companion_recording_bytes", "Of the file being written", value=recording.bytes
+        )
         yield CounterMetricFamily(
             "companion_recording_dropped",
             "Events that the recorder could not take",

@@ -13,8 +13,10 @@ from companion.mavlink.link_status import LinkStatus
 from companion.mavlink.rates import MessageRate
 from companion.pipeline import Pipeline
 from companion.server import link_views
+from companion.server.last_messages import LastMessages
+from companion.server.lateness import Lateness
 from companion.server.words import rfc3339
-from companion.values import Carrier, FloatArray, Notice, Track
+from companion.values import Carrier, Fix, FloatArray, Notice, Track
 
 Json = dict[str, Any]
 
@@ -50,6 +52,8 @@ class Node(Protocol):
 
     pipeline: Pipeline
     equipment: Equipment
+    last_messages: LastMessages
+    lateness: Lateness
 
     def now_ns(self) -> int: ...
     def uptime_s(self) -> float: ...
@@ -60,6 +64,19 @@ class Node(Protocol):
     def message_rates(self) -> list[MessageRate]: ...
     def events(self) -> list[Notice]: ...
     def replay(self) -> ReplayStatus | None: ...
+    async def ticked(self) -> None: ...
+
+
+def links(node: Node) -> Json:
+    """``/v1/links``: who is heard over each, and the message rates that are asked for."""
+    now_ns = node.now_ns()
+    shown = [
+        link_views.link(item, node.pipeline.link_share(item.url), now_ns)
+        | {"components": link_views.components(item, now_ns)}
+        for item in node.links()
+    ]
+    rates = [link_views.rate(rate) for rate in node.message_rates()]
+    return {"valid_at": rfc3339(now_ns), "links": shown, "message_rates": rates}
 
 
 def vector(values: FloatArray | None) -> list[float] | None:
@@ -170,6 +187,7 @@ def uav(
         "callsign": pipeline.aircraft.callsign(track.uav),
         "relays": [str(relay) for relay in pipeline.aircraft.relays(track.uav)],
         "altitude_datum": str(newest.report.alt_datum) if newest else None,
+        "fix": None if newest is None else fix(newest),
         "valid_at": rfc3339(track.valid_at_ns),
         "age_s": track.age_s,
         "lat_deg": place[0],
@@ -197,6 +215,17 @@ def uav(
             {"at": rfc3339(one.t_ns), "reason": str(one.reason), "detail": one.detail}
             for one in refused.recent
         ],
+    }
+
+
+def fix(newest: Fix) -> Json:
+    """Where a UAV said last that it was."""
+    report = newest.report
+    return {
+        "at": rfc3339(newest.t_ns),
+        "lat_deg": report.lat_deg,
+        "lon_deg": report.lon_deg,
+        "alt_m": report.alt_m,
     }
 
 

@@ -1,0 +1,166 @@
+"""A client for a notebook or a radio's controller: what the service says, as plain values.
+
+    node = Client("http://127.0.0.1:8080")
+    weights = node.weights(lead_ms=20)      # M×N complex, one column a UAV
+    for message in node.stream(topics=["beams"], rate_hz=20):
+        ...
+
+Synchronous, and no more than the standard library, numpy and websockets. For use by one thread.
+"""
+
+import base64
+import io
+import json
+import urllib.error
+import urllib.request
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from http.client import HTTPException, HTTPResponse
+from typing import Any, Final
+from urllib.parse import quote, urlencode, urlsplit
+
+import numpy as np
+from websockets.exceptions import ConnectionClosed, WebSocketException
+from websockets.sync.client import connect
+
+from companion.values import ComplexArray
+
+Json = dict[str, Any]
+
+SUBPROTOCOL: Final = "companion.v1"
+
+
+class ServiceError(Exception):
+    """The service refused, failed, or could not be reached.
+
+    ``status``: the HTTP status, or the code with which a stream was closed; None where nothing was
+    answered. ``title`` says why.
+    """
+
+    def __init__(self, status: int | None, title: str) -> None:
+        super().__init__(title if status is None else f"{status}: {title}")
+        self.status = status
+        self.title = title
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """``matrix``: (M, N) complex, columns in the order of ``uavs``; ``valid_at_ns``: when they are
+    to be applied, nanoseconds since the Unix epoch on the service's clock."""
+
+    uavs: tuple[str, ...]
+    matrix: ComplexArray
+    valid_at_ns: int
+
+
+class Client:
+    """One service, at ``url`` (``http://HOST:PORT``), with its bearer token where it asks for one.
+
+    ``timeout_s`` is for connecting and for each answer. Every method raises ``ServiceError``.
+    """
+
+    def __init__(self, url: str, token: str | None = None, timeout_s: float = 10.0) -> None:
+        if urlsplit(url).scheme not in ("http", "https"):
+            raise ValueError(f"{url!r} is not http://HOST:PORT")
+        self._url = url.rstrip("/")
+        self._token = token
+        self._timeout_s = timeout_s
+
+    def status(self) -> Json:
+        """``/v1/status``: version, uptime, links, center, recording, rates."""
+        return self.get("/v1/status")
+
+    def uavs(self) -> list[Json]:
+        """Every UAV as it is now."""
+        found: list[Json] = self.get("/v1/uavs")["uavs"]
+        return found
+
+    def beams(self, lead_ms: float = 0.0) -> Json:
+        """``/v1/beams``: the beams that are applied in ``lead_ms`` milliseconds."""
+        return self.get("/v1/beams", lead_ms=lead_ms)
+
+    def weights(self, lead_ms: float = 0.0) -> Weights:
+        """The weights that are to be applied in ``lead_ms`` milliseconds."""
+        query = urlencode({"lead_ms": lead_ms})
+        with self._open(f"/v1/beams/weights?{query}", "application/x-npy") as answer:
+            body, headers = _read(answer), answer.headers
+        uavs = tuple(name for name in headers["x-uavs"].split(",") if name)
+        matrix = np.load(io.BytesIO(body), allow_pickle=False)
+        return Weights(uavs, matrix, int(headers["x-valid-at-ns"]))
+
+    def get(self, path: str, **query: object) -> Json:
+        """Any path of the API that answers an object in JSON."""
+        address = quote(path) + ("?" + urlencode(query, doseq=True) if query else "")
+        with self._open(address, "application/json") as answer:
+            found: Json = json.loads(_read(answer))
+        return found
+
+    def stream(
+        self,
+        uavs: Iterable[str] = (),
+        topics: Iterable[str] = (),
+        rate_hz: float = 10.0,
+    ) -> Iterator[Json]:
+        """What changes, as it changes (``companion.server.stream`` says what there is). Who takes
+        their time between two messages misses some. Close the iterator to end it; that the
+        service ends is a ``ServiceError`` with the status 1012."""
+        asked = urlencode({"uav": list(uavs), "topic": list(topics), "rate_hz": rate_hz}, True)
+        address = f"ws{self._url.removeprefix('http')}/v1/stream?{asked}"
+        protocols: Any = [SUBPROTOCOL]
+        if self._token is not None:
+            token = base64.urlsafe_b64encode(self._token.encode()).decode().rstrip("=")
+            protocols.append(f"bearer.{token}")
+        try:
+            with connect(
+                address,
+                subprotocols=protocols,
+                open_timeout=self._timeout_s,
+                max_size=None,
+                max_queue=1,
+                compression=None,
+            ) as websocket:
+                for message in websocket:
+                    yield json.loads(message)
+        except ConnectionClosed as error:
+            raise _closed(error) from error
+        except (OSError, WebSocketException) as error:
+            raise ServiceError(None, f"{self._url}: {error}") from error
+
+    def _open(self, address: str, accept: str) -> HTTPResponse:
+        headers = {"accept": accept}
+        if self._token is not None:
+            headers["authorization"] = f"Bearer {self._token}"
+        request = urllib.request.Request(self._url + address, headers=headers)
+        try:
+            found: HTTPResponse = urllib.request.urlopen(request, timeout=self._timeout_s)
+        except urllib.error.HTTPError as error:
+            with error:
+                raise ServiceError(error.code, _title(error)) from error
+        except (OSError, HTTPException) as error:
+            raise ServiceError(None, f"{self._url}: {_reason(error)}") from error
+        return found
+
+
+def _read(answer: HTTPResponse) -> bytes:
+    try:
+        return answer.read()
+    except (OSError, HTTPException) as error:
+        raise ServiceError(None, f"the answer broke off: {_reason(error)}") from error
+
+
+def _title(error: urllib.error.HTTPError) -> str:
+    """The problem's title; the status's own words where there is none."""
+    try:
+        return str(json.loads(error.read())["title"])
+    except (ValueError, KeyError, TypeError, OSError, HTTPException):
+        return str(error.reason)
+
+
+def _reason(error: Exception) -> str:
+    return str(getattr(error, "reason", None) or error)
+
+
+def _closed(error: ConnectionClosed) -> ServiceError:
+    if error.rcvd is None:
+        return ServiceError(None, "the connection was lost")
+    return ServiceError(error.rcvd.code, error.rcvd.reason or "the stream was closed")

@@ -1,0 +1,110 @@
+"""``/v1/beams``, ``/v1/beams/weights`` and ``/v1/pattern``: worked out when asked for."""
+
+import re
+from typing import Annotated, Any, Literal
+
+from fastapi import FastAPI, HTTPException, Query, Request
+from fastapi.responses import Response
+from starlette.concurrency import run_in_threadpool
+
+from companion.server import beam_views, models, weight_formats
+from companion.server.responses import answer, answers, refusals
+from companion.server.views import Node
+from companion.server.words import rfc3339
+from companion.values import Update
+
+LeadMs = Annotated[float, Query(ge=0, le=10_000, description="milliseconds ahead of now")]
+_JSON = {"schema": {"$ref": "#/components/schemas/Weights"}}
+_BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
+
+
+def add(app: FastAPI, node: Node) -> None:
+    """Add the routes to the application."""
+    pipeline, equipment = node.pipeline, node.equipment
+
+    def look(lead_ms: float) -> Update:
+        return pipeline.look(node.now_ns(), lead_ms * 1e-3)
+
+    @app.get(
+        "/v1/beams",
+        summary="The beams, applied lead_ms from now",
+        responses=answers(models.Beams, 422),
+    )
+    async def beams(lead_ms: LeadMs = 0.0) -> Response:
+        update = look(lead_ms)
+        return answer(
+            await run_in_threadpool(beam_views.beams, pipeline, equipment, update, 0.0, lead_ms)
+        )
+
+    @app.get(
+        "/v1/beams/weights",
+        summary="The M×N weights, by Accept: JSON, application/x-npy, raw, or a device's format",
+        response_class=Response,
+        responses=_weight_answers(),
+    )
+    async def weights(request: Request, lead_ms: LeadMs = 0.0) -> Response:
+        form = accepted(request.headers.get("accept", "*/*"))
+        if form is None:
+            raise HTTPException(406, f"weights come as {', '.join(weight_formats.TYPES.values())}")
+        beam_set = look(lead_ms).beams
+        try:
+            body = await run_in_threadpool(
+                weight_formats.encode, form, beam_set, pipeline.array, equipment, lead_ms
+            )
+        except ValueError as error:  # what the device cannot do, as the beams are now
+            raise HTTPException(409, str(error)) from error
+        headers = {
+            "x-valid-at": rfc3339(beam_set.valid_at_ns),
+            "x-valid-at-ns": str(beam_set.valid_at_ns),
+            "x-uavs": ",".join(beam_set.uavs),
+            "x-normalisation": str(beam_set.normalisation),
+            "vary": "accept",
+        }
+        return Response(body, media_type=weight_formats.TYPES[form], headers=headers)
+
+    @app.get(
+        "/v1/pattern",
+        summary="Array response in dB along a cut through each beam",
+        responses=answers(models.Pattern, 404, 422),
+    )
+    async def pattern(
+        cut: Literal["azimuth", "elevation"] = "azimuth",
+        points: Annotated[int, Query(ge=2, le=3601)] = 361,
+        uav: str | None = None,
+        lead_ms: LeadMs = 0.0,
+    ) -> Response:
+        update = look(lead_ms)
+        if uav is not None and uav not in update.beams.uavs:
+            raise HTTPException(404, f"there is no beam on {uav!r}")
+        return answer(
+            await run_in_threadpool(beam_views.pattern, pipeline, update, cut, points, uav, lead_ms)
+        )
+
+
+def _weight_answers() -> dict[int | str, dict[str, Any]]:
+    kinds = dict.fromkeys(weight_formats.TYPES.values(), _BINARY)
+    # The model is named for its schema to be in the document; the content says where it applies.
+    content = {"model": models.Weights, "content": kinds | {"application/json": _JSON}}
+    return {200: content} | refusals(406, 409, 422)
+
+
+def accepted(accept: str) -> str | None:
+    """The form that an Accept header likes best (RFC 9110: by q, the first of those alike); None
+    where it takes none of them."""
+    forms = {media_type: form for form, media_type in weight_formats.TYPES.items()}
+    parts = [part.lower().replace(" ", "") for part in accept.split(",")]
+    for part in sorted(parts, key=_quality, reverse=True):
+        wanted = part.split(";")[0]
+        if _quality(part) <= 0:
+            break
+        if wanted in forms:
+            return forms[wanted]
+        if wanted in ("*/*", "application/*", ""):
+            return "json"
+    return None
+
+
+def _quality(part: str) -> float:
+    """The q of one part of an Accept header; 1 where there is none that can be read."""
+    found = re.search(r";q=([01](?:\.\d*)?)(?:;|$)", part)
+    return float(found[1]) if found else 1.0

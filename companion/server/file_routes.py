@@ -1,0 +1,110 @@
+"""``/v1/recordings`` and ``/v1/mavlink``: what was recorded, and what was said last."""
+
+from typing import Annotated
+
+from fastapi import FastAPI, Header, HTTPException, Path
+from fastapi.responses import Response, StreamingResponse
+from starlette.concurrency import run_in_threadpool
+
+from companion.server import mavlink_views, models, recordings
+from companion.server.responses import answer, answers, refusals
+from companion.server.views import Node
+from companion.values import Source
+
+Id = Annotated[int, Path(ge=0, le=255)]
+
+
+def add(app: FastAPI, node: Node) -> None:
+    """Add the routes to the application."""
+    _recordings(app, node)
+    _mavlink(app, node)
+
+
+def _recordings(app: FastAPI, node: Node) -> None:
+    where = node.pipeline.settings.recording.directory
+
+    def current() -> recordings.Current:
+        status = node.recording()
+        return recordings.Current(status.file, status.bytes)
+
+    @app.get(
+        "/v1/recordings",
+        summary="The recordings: name, bytes, state, when begun",
+        responses=answers(models.Recordings),
+    )
+    async def listing() -> Response:
+        return answer({"recordings": await run_in_threadpool(recordings.listed, where, current())})
+
+    @app.get(
+        "/v1/recordings/{name}",
+        summary="A recording, or a range of its bytes; one being written as far as it is flushed",
+        response_class=Response,
+        responses={
+            200: {"content": {recordings.MEDIA_TYPE: {}}},
+            206: {"content": {recordings.MEDIA_TYPE: {}}, "description": "The bytes of Range"},
+            **refusals(404, 416, 422),
+        },
+    )
+    async def download(
+        name: str, wanted: Annotated[str | None, Header(alias="range")] = None
+    ) -> Response:
+        found = await run_in_threadpool(recordings.opened, where, name, current())
+        if found is None:
+            raise HTTPException(404, f"there is no recording {name!r}")
+        file, size = found
+        try:
+            part = recordings.span(wanted, size)
+        except recordings.UnsatisfiableRangeError as error:
+            file.close()
+            headers = {"content-range": f"bytes */{size}"}
+            raise HTTPException(416, str(error), headers) from error
+        start, stop = part or (0, size)
+        headers = {
+            "accept-ranges": "bytes",
+            "content-length": str(stop - start),
+            "content-disposition": f'attachment; filename="{name}"',
+        }
+        if part is not None:
+            headers["content-range"] = f"bytes {start}-{stop - 1}/{size}"
+        return StreamingResponse(
+            recordings.pieces(file, start, stop),
+            status_code=200 if part is None else 206,
+            headers=headers,
+            media_type=recordings.MEDIA_TYPE,
+        )
+
+
+def _mavlink(app: FastAPI, node: Node) -> None:
+    kept = node.last_messages
+
+    @app.get(
+        "/v1/mavlink/vehicles",
+        summary="The last messages of everybody, as mavlink2rest has them",
+        responses=answers(dict[str, models.MavlinkVehicle]),
+    )
+    async def vehicles() -> Response:
+        return answer(await run_in_threadpool(mavlink_views.vehicles, kept.by_sender()))
+
+    @app.get(
+        "/v1/mavlink/vehicles/{sys}/components/{comp}/messages",
+        summary="The last messages of one component",
+        responses=answers(dict[str, models.MavlinkMessage], 404, 422),
+    )
+    async def messages(sys: Id, comp: Id) -> Response:
+        found = kept.by_sender().get(Source(sys, comp))
+        if found is None:
+            raise HTTPException(404, f"nothing has been heard of {sys}:{comp}")
+        return answer(await run_in_threadpool(mavlink_views.messages, found))
+
+    @app.get(
+        "/v1/mavlink/vehicles/{sys}/components/{comp}/messages/{name}",
+        summary="The last message of a kind, as mavlink2rest has it",
+        responses=answers(models.MavlinkMessage, 404, 422),
+    )
+    async def message(sys: Id, comp: Id, name: str) -> Response:
+        dialect = await run_in_threadpool(mavlink_views.dialect)
+        msgid = dialect.msgid(name)
+        found = None if msgid is None else kept.find(Source(sys, comp), msgid)
+        if found is None:
+            raise HTTPException(404, f"{sys}:{comp} has sent no {name!r}")
+        return answer(dialect.message(found))

@@ -1,0 +1,366 @@
+"""What the API answers, for the OpenAPI document. Nothing is validated by these in flight.
+
+Angles in degrees, distances in metres, times in RFC 3339 (UTC). Null is not known, never 0.
+"""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, Field
+
+from companion.server import beam_models
+
+Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+Time = Annotated[str, Field(examples=["2026-11-20T13:00:00.123Z"])]
+Uav = Annotated[str, Field(description="SYSID:COMPID or icao:HEX", examples=["3:1"])]
+Link = Annotated[str, Field(examples=["udpin:0.0.0.0:14550"])]
+
+Beams, Weights, Pattern = beam_models.Beams, beam_models.Weights, beam_models.Pattern
+
+
+class Problem(BaseModel):
+    """An error (RFC 9457). ``title`` says what is wrong, in one line."""
+
+    type: Literal["about:blank"]
+    title: Annotated[str, Field(examples=["no UAV '9:9' has been heard"])]
+    status: Annotated[int, Field(examples=[404])]
+
+
+class Health(BaseModel):
+    """The process answers."""
+
+    status: Literal["ok"]
+
+
+class Readiness(BaseModel):
+    """Whether the service is fit to be used; ``reasons`` say why not."""
+
+    ready: bool
+    reasons: Annotated[list[str], Field(examples=[["no link is up"]])]
+
+
+class Clock(BaseModel):
+    """What is known of a sender's clock."""
+
+    kind: str
+    offset_s: float
+    drift_ppm: float | None
+    uncertainty_s: float | None
+    constant_delay_s: float | None
+    latency_s: float | None
+
+
+class Refusal(BaseModel):
+    """A report that was not used."""
+
+    at: Time
+    reason: Annotated[str, Field(examples=["unreachable"])]
+    detail: str
+
+
+class Fix(BaseModel):
+    """Where a UAV said last that it was, and when it was there."""
+
+    at: Time
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
+
+
+class UavState(BaseModel):
+    """One UAV as it is at ``valid_at``; north, east and down are seen from the array."""
+
+    id: Uav
+    state: Literal["live", "coasting", "stale", "lost"]
+    target: bool
+    same_as: Uav | None
+    callsign: Annotated[str | None, Field(examples=["SWR12A"])]
+    relays: list[str]
+    altitude_datum: Literal["msl", "pressure", "geometric"] | None
+    fix: Fix | None
+    valid_at: Time
+    age_s: float
+    lat_deg: Annotated[float, Field(examples=[47.3977])]
+    lon_deg: Annotated[float, Field(examples=[8.5456])]
+    alt_m: Annotated[float, Field(examples=[531.2])]
+    north_m: float | None
+    east_m: float | None
+    down_m: float | None
+    velocity_ned_mps: Vector | None
+    speed_mps: float | None
+    heading_deg: float | None
+    unknown_input_mps: Vector | None
+    acceleration_ned_mps2: Vector | None
+    bound_m: Annotated[float, Field(description="the position is within this", examples=[4.2])]
+    bound_ellipsoid_ned_m: Vector
+    clock_bound_s: float
+    clock: Clock | None
+    dt_s: float | None
+    latency_s: float | None
+    gamma: float | None
+    innovation_m: float | None
+    reports: int
+    rejected: dict[str, int]
+    recent_rejections: list[Refusal]
+
+
+class Uavs(BaseModel):
+    """Every UAV that was heard, at ``valid_at``."""
+
+    valid_at: Time
+    uavs: list[UavState]
+
+
+class Angles(BaseModel):
+    """Of the carrier's body."""
+
+    roll: float
+    pitch: float
+    yaw: float
+
+
+class Center(BaseModel):
+    """What carries the array; ``unfit`` says why its place is not known."""
+
+    source: Annotated[str, Field(examples=["5:1"])]
+    fixed: bool
+    lat_deg: float | None
+    lon_deg: float | None
+    alt_m: float | None
+    heading_deg: float | None
+    attitude_deg: Angles | None
+    age_s: float | None
+    bound_m: float | None
+    unfit: str | None
+
+
+class LinkReports(BaseModel):
+    """Of the reports over a link: how many came first over it, and how old they were."""
+
+    total: int
+    first: int
+    first_share: float | None
+    latency_p50_s: float | None
+    latency_p95_s: float | None
+
+
+class LinkState(BaseModel):
+    """One link; ``lost`` counts refusals by reason, garbage in bytes."""
+
+    url: Link
+    state: Literal["up", "connecting", "down"]
+    age_s: float | None
+    frames: int
+    bytes: int
+    peers: int
+    bad_crc: int
+    lost: dict[str, int]
+    gaps: int
+    late: int
+    repeats: int
+    overflowed: int | None
+    receive_buffer_bytes: int | None
+    sent: int
+    send_dropped: int
+    reports: LinkReports
+
+
+class Component(BaseModel):
+    """Who is heard over a link."""
+
+    id: Uav
+    frames: int
+    gaps: int
+    age_s: float
+    mavlink: Literal[1, 2]
+
+
+class HeardLink(LinkState):
+    """One link, and who is heard over it."""
+
+    components: list[Component]
+
+
+class MessageRate(BaseModel):
+    """A message whose rate is asked of a UAV."""
+
+    uav: Uav
+    message_id: int
+    wanted_hz: float
+    observed_hz: float | None
+    state: str
+    asked: int
+    changed_by: str | None
+
+
+class Links(BaseModel):
+    """Links, who is heard over each, and the rates that are asked for."""
+
+    valid_at: Time
+    links: list[HeardLink]
+    message_rates: list[MessageRate]
+
+
+class RecordingState(BaseModel):
+    """The recording that is being written."""
+
+    state: Literal["recording", "degraded", "off"]
+    file: str | None
+    bytes: int
+    messages: int
+    dropped: int
+
+
+class Rates(BaseModel):
+    """Over the last seconds."""
+
+    frames_hz: float | None
+    updates_hz: float | None
+
+
+class Replay(BaseModel):
+    """How far a replay is: seconds of the log, of how many; ``speed`` null: as fast as it goes."""
+
+    log: str
+    speed: float | None
+    at_s: float
+    of_s: float | None
+    state: Literal["running", "finished"]
+
+
+class Status(BaseModel):
+    """The service at a glance; ``replay`` is null where it is live."""
+
+    version: str
+    time: Time
+    uptime_s: float
+    center: Center
+    links: list[LinkState]
+    recording: RecordingState
+    rates: Rates
+    frames: int
+    updates: int
+    rejected: dict[str, int]
+    digest: str
+    replay: Replay | None
+
+
+class Event(BaseModel):
+    """Something that was said to the operator."""
+
+    at: Time
+    severity: Literal["info", "warning", "error"]
+    subject: str
+    text: Annotated[str, Field(examples=["3:1 is coasting"])]
+
+
+class Events(BaseModel):
+    """What was said last, the oldest first."""
+
+    events: list[Event]
+
+
+Matrix = list[list[float]]
+
+
+class Assumed(BaseModel):
+    """Bounds that the observer takes for granted."""
+
+    speed_max_mps: float
+    acceleration_max_mps2: float
+    position_noise_m: float
+    velocity_noise_mps: float
+
+
+class Certificate(BaseModel):
+    """Of the table of gains: e'Pe <= scale^2 stays so, whatever the order of intervals in the
+    range; ``scale`` is how much larger the assumed bounds are than those of the table."""
+
+    P: Matrix
+    dt_range_s: Annotated[list[float], Field(min_length=2, max_length=2)]
+    margin: float
+    scale: float
+    bound_m: float
+    provenance: str
+
+
+class UavDesign(BaseModel):
+    """The gains at a UAV's interval, with the keys of ``companion design --json``."""
+
+    uav: Uav
+    dt_s: float
+    model: Literal["kinematic", "position"]
+    alpha: float | None
+    feedthrough_s: float
+    L: float | Matrix
+    Q: float | Matrix
+    mu: float | None
+    gamma: float | None
+    peak_gain: float | None
+    residual: float | None
+    feasible: bool
+    dt_limit_s: float | None
+    method: Literal["lmi", "closed-form", "fixed-share"]
+
+
+class Design(BaseModel):
+    """The observer in use."""
+
+    valid_at: Time
+    model: Literal["kinematic", "position"]
+    assumed: Assumed
+    certificate: Certificate | None
+    designs: list[UavDesign]
+
+
+class Recording(BaseModel):
+    """A file that can be had at ``/v1/recordings/{name}``; ``unfinished`` was cut short."""
+
+    name: Annotated[str, Field(examples=["companion-20261120T130000Z.mcap"])]
+    bytes: int | None
+    state: Literal["recording", "finished", "unfinished"]
+    started: Time | None
+
+
+class Recordings(BaseModel):
+    """The recordings, by name."""
+
+    recordings: list[Recording]
+
+
+class MessageTime(BaseModel):
+    """When, how many, how often (1/s)."""
+
+    first_update: Time
+    last_update: Time
+    counter: int
+    frequency: float | None
+
+
+class MessageStatus(BaseModel):
+    """As mavlink2rest has it."""
+
+    time: MessageTime
+
+
+class MavlinkMessage(BaseModel):
+    """The last message of its kind: ``type`` is its name, beside its fields."""
+
+    message: Annotated[
+        dict[str, Any],
+        Field(examples=[{"type": "SYSTEM_TIME", "time_unix_usec": 0, "time_boot_ms": 81}]),
+    ]
+    status: MessageStatus
+
+
+class MavlinkComponent(BaseModel):
+    """One component: its last messages by name."""
+
+    id: int
+    messages: dict[str, MavlinkMessage]
+
+
+class MavlinkVehicle(BaseModel):
+    """One system: its components by id."""
+
+    id: int
+    components: dict[str, MavlinkComponent]

@@ -1,0 +1,134 @@
+"""``/v1/recordings``: which files there are, and their bytes, whole or in part.
+
+Only files that lie in the recording directory itself and are called like a recording: no folders,
+no links to elsewhere. A recording that is being written can be had as far as it has been flushed:
+it opens in every reader that takes a file cut short, and ``companion recover`` finishes it.
+"""
+
+import os
+import re
+from collections.abc import AsyncIterator, Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, BinaryIO, Final
+
+from starlette.concurrency import run_in_threadpool
+
+from companion.recording.writer import ACTIVE
+from companion.server.words import rfc3339
+
+Json = dict[str, Any]
+
+MEDIA_TYPE: Final = "application/x-mcap"
+_NAME: Final = re.compile(r"[A-Za-z0-9][\w.-]*\.mcap(\.active)?", re.ASCII)
+_STARTED: Final = re.compile(r"companion-(\d{8}T\d{6}Z)")
+_RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.ASCII)
+_PIECE_BYTES: Final = 1 << 18
+
+
+class UnsatisfiableRangeError(ValueError):
+    """A range that begins beyond the end of the file."""
+
+
+@dataclass(frozen=True, slots=True)
+class Current:
+    """The recording that is being written: its name, and how many bytes are on the disk."""
+
+    name: str | None
+    bytes: int
+
+
+def listed(where: str | None, current: Current) -> list[Json]:
+    """The recordings, by name. ``where`` as in the settings: a folder, or one file."""
+    entries = sorted(_entries(where), key=lambda entry: entry.name)
+    return [_shown(entry, current) for entry in entries]
+
+
+def _entries(where: str | None) -> Iterator[os.DirEntry[str]]:
+    """What counts as a recording. Nothing where there is no folder, or it cannot be read."""
+    if where is None:
+        return
+    path = Path(where)
+    only_file = path.suffix == ".mcap" and not path.is_dir()
+    names = {path.name, path.name + ACTIVE} if only_file else None
+    try:
+        with os.scandir(path.parent if only_file else path) as found:
+            for entry in found:
+                is_file = entry.is_file(follow_symlinks=False)
+                if is_file and _NAME.fullmatch(entry.name) and (not names or entry.name in names):
+                    yield entry
+    except OSError:
+        return
+
+
+def _shown(entry: os.DirEntry[str], current: Current) -> Json:
+    is_current = entry.name == current.name
+    state = "unfinished" if entry.name.endswith(ACTIVE) else "finished"
+    started = _STARTED.match(entry.name)
+    try:
+        size: int | None = (
+            current.bytes if is_current else entry.stat(follow_symlinks=False).st_size
+        )
+    except FileNotFoundError:  # finished, or tidied away, since the folder was read
+        size = None
+    return {
+        "name": entry.name,
+        "bytes": size,
+        "state": "recording" if is_current else state,
+        "started": rfc3339(_utc_ns(started[1])) if started else None,
+    }
+
+
+def _utc_ns(text: str) -> int:
+    at = datetime.strptime(text, "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
+    return int(at.timestamp()) * 1_000_000_000
+
+
+def opened(where: str | None, name: str, current: Current) -> tuple[BinaryIO, int] | None:
+    """The file, and how many of its bytes may be had; None where there is no such recording.
+
+    Open, it stays the same file, whatever becomes of its name.
+    """
+    found = next((entry for entry in _entries(where) if entry.name == name), None)
+    if found is None:
+        return None
+    try:
+        descriptor = os.open(found.path, os.O_RDONLY | os.O_NOFOLLOW)
+    except OSError:
+        return None
+    file = os.fdopen(descriptor, "rb")
+    size = os.fstat(descriptor).st_size
+    return file, min(size, current.bytes) if name == current.name else size
+
+
+def span(header: str | None, size: int) -> tuple[int, int] | None:
+    """First byte and the one after the last of a Range header; None: the whole file is meant.
+
+    RFC 9110, 14.2: what cannot be read, or asks for several parts, may be ignored.
+    ``UnsatisfiableRangeError`` for a range beyond the end.
+    """
+    found = _RANGE.fullmatch((header or "").replace(" ", ""))
+    if found is None or not (found[1] or found[2]):
+        return None
+    if not found[1]:
+        start, stop = max(0, size - int(found[2])), size
+    else:
+        start, stop = int(found[1]), min(size, int(found[2]) + 1 if found[2] else size)
+        if found[2] and int(found[2]) < int(found[1]):
+            return None
+    if start >= size or start >= stop:
+        raise UnsatisfiableRangeError(f"the file has {size} bytes")
+    return start, stop
+
+
+async def pieces(file: BinaryIO, start: int, stop: int) -> AsyncIterator[bytes]:
+    """The bytes from ``start`` to before ``stop``, read off the event loop; closes the file."""
+    with file:
+        await run_in_threadpool(file.seek, start)
+        while start < stop:
+            piece = await run_in_threadpool(file.read, min(_PIECE_BYTES, stop - start))
+            if not piece:
+                return
+            start += len(piece)
+            yield piece

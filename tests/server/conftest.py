@@ -1,0 +1,160 @@
+"""A node that stands still: a pipeline that has seen a flight, and a server in this process."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import pytest
+import uvicorn
+
+from companion import assembly
+from companion.config import Settings
+from companion.mavlink.link_status import ComponentStatus, LinkStatus
+from companion.mavlink.rates import MessageRate, RateState
+from companion.pipeline import Pipeline
+from companion.replay import log_events
+from companion.server.access import bind
+from companion.server.app import create_app
+from companion.server.last_messages import LastMessages
+from companion.server.lateness import Lateness
+from companion.server.views import RecordingStatus, ReplayStatus
+from companion.values import Frame, Notice, Severity, Source, Tick
+
+LOG = Path(__file__).parents[1] / "data" / "sitl_4circle_cut.tlog"
+FLOWN_S = 6.0
+
+
+class StandIn:
+    """What the server looks at, without links and clocks: time moves with ``tick`` alone."""
+
+    def __init__(self, settings: Settings, *, flown: bool = True) -> None:
+        self.pipeline = Pipeline(settings)
+        self.equipment = assembly.equipment(settings, self.pipeline.array)
+        self.last_messages = LastMessages()
+        self.lateness = Lateness()
+        self.notices: list[Notice] = []
+        self.current = RecordingStatus("off", None, 0, 0, 0)
+        self.replayed: ReplayStatus | None = None
+        self._ticked = asyncio.Event()
+        self._now_ns = 1_800_000_000_000_000_000
+        if flown:
+            self._fly(settings)
+
+    def _fly(self, settings: Settings) -> None:
+        begun_ns = None
+        for event in log_events([LOG], settings):
+            begun_ns = begun_ns or event.t_ns
+            if event.t_ns > begun_ns + FLOWN_S * 1e9:
+                return
+            self._now_ns = event.t_ns
+            if isinstance(event, Frame):
+                self.last_messages.add(event)
+            outputs = self.pipeline.step(event)
+            self.notices += [output for output in outputs if isinstance(output, Notice)]
+
+    def tick(self, after_s: float = 0.1) -> None:
+        """Time passes, and the beams are updated."""
+        self._now_ns += round(after_s * 1e9)
+        self.pipeline.step(Tick(self._now_ns))
+        self._ticked.set()
+        self._ticked.clear()
+
+    def say(self, text: str) -> None:
+        """A notice to the operator."""
+        self.notices.append(Notice(self._now_ns, Severity.INFO, "test", text))
+
+    async def ticked(self) -> None:
+        """Return after the next tick."""
+        await self._ticked.wait()
+
+    def now_ns(self) -> int:
+        """The time of the last event."""
+        return self._now_ns
+
+    def uptime_s(self) -> float:
+        """Some time."""
+        return 12.5
+
+    def links(self) -> list[LinkStatus]:
+        """One link that hears one vehicle, and one that hears nobody."""
+        heard = {Source(1, 1): ComponentStatus(7, 1, self._now_ns, 2)}
+        lost = {"garbage": 12}
+        one = LinkStatus("udpin:127.0.0.1:14550", "up", 7, 210, 1, lost, heard_ns=self._now_ns)
+        one.components = heard
+        return [one, LinkStatus("serial:/dev/ttyS0:57600", "connecting")]
+
+    def recording(self) -> RecordingStatus:
+        """As the test says."""
+        return self.current
+
+    def rates(self) -> dict[str, float | None]:
+        """One that is known and one that is not."""
+        return {"frames_hz": 70.0, "updates_hz": None}
+
+    def unfit(self) -> list[str]:
+        """Nothing is wrong."""
+        return []
+
+    def message_rates(self) -> list[MessageRate]:
+        """One that is asked for."""
+        return [MessageRate(Source(1, 1), 33, 10.0, None, RateState.ASKED, 1, None)]
+
+    def events(self) -> list[Notice]:
+        """What was said."""
+        return list(self.notices)
+
+    def replay(self) -> ReplayStatus | None:
+        """As the test says."""
+        return self.replayed
+
+
+def settings(**sections: dict[str, object]) -> Settings:
+    """Those of the log, with what is asked for besides."""
+    return Settings().override(center={"source": "5:1"}, **sections)
+
+
+@pytest.fixture
+def make_node() -> Callable[..., StandIn]:
+    """A node after some seconds of flight, or before (``flown=False``), with settings."""
+
+    def make(*, flown: bool = True, **sections: dict[str, object]) -> StandIn:
+        return StandIn(settings(**sections), flown=flown)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def shared_node() -> StandIn:
+    """One that no test changes: a beam has been made, and there is a codebook."""
+    node = StandIn(settings(codebook={"kind": "dft"}))
+    node.tick(0.0)
+    return node
+
+
+@pytest.fixture
+def serving() -> Callable[..., contextlib.AbstractAsyncContextManager[str]]:
+    """Serve a node on this event loop, over a real socket: gives HOST:PORT."""
+
+    @contextlib.asynccontextmanager
+    async def serve(node: StandIn, token: str | None = None) -> AsyncIterator[str]:
+        with bind("127.0.0.1:0", token=token, insecure=False) as listening:
+            server = uvicorn.Server(
+                uvicorn.Config(
+                    create_app(node, token),
+                    log_level="error",
+                    lifespan="off",
+                    ws_max_size=1024,
+                    ws_per_message_deflate=False,
+                    timeout_graceful_shutdown=1,
+                )
+            )
+            task = asyncio.create_task(server._serve(sockets=[listening]))
+            while not server.started:
+                await asyncio.sleep(0.001)
+            host, port = listening.getsockname()
+            yield f"{host}:{port}"
+            server.should_exit = True
+            await task
+
+    return serve

@@ -1,0 +1,199 @@
+"""Every answer is what its model says, no more and no less; every error is a problem."""
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import orjson
+import pytest
+from pydantic import TypeAdapter
+from starlette.testclient import TestClient
+
+from companion import designing
+from companion.server import models
+from companion.server.app import create_app
+from companion.server.beam_routes import accepted
+
+PATHS: dict[str, Any] = {
+    "/healthz": models.Health,
+    "/readyz": models.Readiness,
+    "/v1/status": models.Status,
+    "/v1/uavs": models.Uavs,
+    "/v1/uavs/1:1": models.UavState,
+    "/v1/links": models.Links,
+    "/v1/events": models.Events,
+    "/v1/design": models.Design,
+    "/v1/beams?lead_ms=20": models.Beams,
+    "/v1/beams/weights": models.Weights,
+    "/v1/pattern?points=5": models.Pattern,
+    "/v1/pattern?points=5&cut=elevation": models.Pattern,
+    "/v1/recordings": models.Recordings,
+    "/v1/mavlink/vehicles": dict[str, models.MavlinkVehicle],
+    "/v1/mavlink/vehicles/1/components/1/messages": dict[str, models.MavlinkMessage],
+    "/v1/mavlink/vehicles/1/components/1/messages/HEARTBEAT": models.MavlinkMessage,
+}
+
+
+@pytest.fixture(scope="module")
+def client(shared_node: Any) -> Iterator[TestClient]:
+    with TestClient(create_app(shared_node), raise_server_exceptions=False) as client:
+        yield client
+
+
+def holds(model: Any, answer: Any) -> None:
+    """The answer has the fields of the model, all of them, none besides, of its types."""
+    adapter = TypeAdapter(model)
+    read = adapter.validate_json(orjson.dumps(answer), strict=True)
+    assert adapter.dump_python(read) == answer
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_an_answer_is_what_its_model_says(client: TestClient, path: str) -> None:
+    answer = client.get(path)
+    assert answer.status_code == 200
+    assert answer.headers["content-type"] == "application/json"
+    holds(PATHS[path], answer.json())
+
+
+def test_what_is_compared_is_not_empty(client: TestClient) -> None:
+    """Lists with nothing in them would hold whatever the model says."""
+    uavs = client.get("/v1/uavs").json()["uavs"]
+    assert {uav["id"].startswith("icao:") for uav in uavs} == {True, False}
+    beams = client.get("/v1/beams").json()["beams"]
+    assert len(beams) == 4
+    assert beams[0]["codebook"] is not None
+    methods = {row["method"] for row in client.get("/v1/design").json()["designs"]}
+    assert "lmi" in methods
+    links = client.get("/v1/links").json()
+    assert links["links"][0]["components"]
+    assert links["message_rates"]
+    assert client.get("/v1/events").json()["events"]
+
+
+def test_before_anything_was_heard_the_models_hold_too(make_node: Any) -> None:
+    with TestClient(create_app(make_node(flown=False))) as client:
+        for path in ("/v1/status", "/v1/uavs", "/v1/beams", "/v1/beams/weights", "/v1/design"):
+            holds(PATHS.get(path) or models.Beams, client.get(path).json())
+
+
+def test_every_path_of_the_document_is_held_against_its_model(client: TestClient) -> None:
+    document = client.get("/openapi.json").json()
+    shown = {path.split("?")[0] for path in PATHS}
+    named = {path.format(uav="1:1", sys=1, comp=1, name="HEARTBEAT") for path in document["paths"]}
+    assert named == shown | {"/metrics", "/v1/recordings/HEARTBEAT"}
+
+
+def test_the_document_shows_problems_as_problems(client: TestClient) -> None:
+    document = client.get("/openapi.json").json()
+    for path, operations in document["paths"].items():
+        for status, shown in operations["get"]["responses"].items():
+            if status.startswith("4"):
+                assert list(shown["content"]) == ["application/problem+json"], path
+    weights = document["paths"]["/v1/beams/weights"]["get"]["responses"]["200"]["content"]
+    assert weights["application/json"]["schema"]["$ref"].endswith("/Weights")
+    assert weights["application/x-npy"]["schema"]["format"] == "binary"
+    assert "HTTPValidationError" not in document["components"]["schemas"]
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status"),
+    [
+        ("GET", "/v1/nothing", 404),
+        ("GET", "/v1/uavs/9:9", 404),
+        ("GET", "/v1/status/", 404),
+        ("POST", "/v1/status", 405),
+        ("DELETE", "/v1/recordings/x.mcap", 405),
+        ("POST", "/index.html", 405),
+        ("GET", "/v1/beams?lead_ms=1e999", 422),
+        ("GET", "/v1/mavlink/vehicles/256/components/1/messages/HEARTBEAT", 422),
+        ("GET", "/v1/mavlink/vehicles/one/components/1/messages/HEARTBEAT", 422),
+        ("GET", "/v1/mavlink/vehicles/1/components/1/messages/NO_SUCH", 404),
+        ("GET", "/v1/mavlink/vehicles/1/components/1/messages/heartbeat", 404),
+        ("GET", "/v1/mavlink/vehicles/9/components/1/messages/HEARTBEAT", 404),
+        ("GET", "/v1/mavlink/vehicles/9/components/1/messages", 404),
+        ("GET", "/v1/pattern?points=3602", 422),
+    ],
+)
+def test_every_error_is_a_problem(client: TestClient, method: str, path: str, status: int) -> None:
+    answer = client.request(method, path)
+    assert answer.status_code == status
+    assert answer.headers["content-type"] == "application/problem+json"
+    holds(models.Problem, answer.json())
+    assert answer.json()["status"] == status
+    if status == 405 and path.startswith("/v1"):
+        assert answer.headers["allow"] == "GET"
+
+
+def test_a_mistake_of_ours_is_a_problem_too(make_node: Any) -> None:
+    node = make_node(flown=False)
+    del node.notices  # so that `events` fails
+    with TestClient(create_app(node), raise_server_exceptions=False) as client:
+        answer = client.get("/v1/events")
+    assert answer.status_code == 500
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert "notices" not in answer.text
+
+
+def test_head_is_get_without_its_body(client: TestClient) -> None:
+    assert client.head("/v1/status").status_code == 200
+    assert client.head("/v1/uavs/9:9").status_code == 404
+
+
+@pytest.mark.parametrize(
+    ("accept", "form"),
+    [
+        ("*/*", "json"),
+        ("", "json"),
+        ("application/x-npy", "npy"),
+        ("application/json;q=0.1, application/x-npy;q=0.2", "npy"),
+        ("text/html, application/*;q=0.5", "json"),
+        ("text/html", None),
+        ("application/json;q=0", None),
+        ("application/json;q=much", "json"),
+        (",;q=;,", "json"),
+    ],
+)
+def test_what_is_accepted_is_given(accept: str, form: str | None) -> None:
+    assert accepted(accept) == form
+
+
+def test_numbers_that_are_none_are_null(make_node: Any) -> None:
+    node = make_node()
+    node.rates = lambda: {"frames_hz": float("nan"), "updates_hz": float("inf")}
+    with TestClient(create_app(node)) as client:
+        assert client.get("/v1/status").json()["rates"] == {"frames_hz": None, "updates_hz": None}
+
+
+def test_the_design_is_that_of_the_observer_in_use(client: TestClient, shared_node: Any) -> None:
+    """L by its definition, A(T) M(T); the worst error within the guarantee, at each interval."""
+    shown = client.get("/v1/design").json()
+    pipeline, certificate = shared_node.pipeline, shown["certificate"]
+    assert shown["assumed"]["acceleration_max_mps2"] == 5.0
+    assert certificate["scale"] == pytest.approx(6.0)  # 3 m of noise for the table's 0.5 m
+    p = np.array(certificate["P"])
+    assert certificate["bound_m"] == pytest.approx(6 * np.sqrt(np.linalg.inv(p)[0, 0]))
+    for row in shown["designs"]:
+        now_ns = shared_node.now_ns()
+        (track,) = [t for t in pipeline.tracks(now_ns, now_ns) if t.uav == row["uav"]]
+        assert row["dt_s"] == track.dt_s
+        transition = np.array([[1, row["dt_s"]], [0, 1]])
+        assert np.allclose(np.array(row["L"]) + np.array(row["Q"]), transition)
+        assert row["peak_gain"] <= row["gamma"] == certificate["bound_m"]
+        assert row["mu"] == pytest.approx(row["gamma"] ** 2)
+        closed = np.array(row["Q"])
+        start = np.linalg.solve(np.linalg.cholesky(p).T, np.array([0.6, 0.8]))
+        after = closed @ start
+        assert after @ p @ after < start @ p @ start
+
+
+def test_the_position_model_shows_what_companion_design_prints(make_node: Any) -> None:
+    node = make_node(observer={"model": "position", "alpha": 0.5})
+    with TestClient(create_app(node)) as client:
+        shown = client.get("/v1/design").json()
+    holds(models.Design, shown)
+    assert shown["certificate"] is None
+    for row in shown["designs"]:
+        lead_s = max(0.2, row["dt_s"])  # velocities are reported: velocity_lead_s, or the interval
+        expected = designing.row(row["dt_s"], lead_s, 0.5, None, "position", "closed-form")
+        assert row == {"uav": row["uav"], **json.loads(json.dumps(expected))}

@@ -1,0 +1,148 @@
+"""Recordings over HTTP: listed, whole, in part, while they are written, and nothing else."""
+
+import dataclasses
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from companion.server.app import create_app
+from companion.server.recordings import UnsatisfiableRangeError, span
+
+FINISHED = "companion-20261120T130000Z.mcap"
+CURRENT = "companion-20261120T140000Z.mcap.active"
+BYTES = bytes(range(256)) * 4000
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Two recordings, one of them being written, and what is none of anybody's business."""
+    folder = tmp_path / "recordings"
+    (folder / "below").mkdir(parents=True)
+    (folder / FINISHED).write_bytes(BYTES)
+    (folder / CURRENT).write_bytes(BYTES[:5000])
+    (folder / "cut.mcap.active").write_bytes(b"cut")
+    (folder / "settings.toml").write_text("secret")
+    (folder / "below" / "deep.mcap").write_text("secret")
+    (tmp_path / "outside.mcap").write_text("secret")
+    (folder / "linked.mcap").symlink_to(tmp_path / "outside.mcap")
+    (folder / ".hidden.mcap").write_text("secret")
+    os.mkfifo(folder / "pipe.mcap")
+    return folder
+
+
+@pytest.fixture
+def client(make_node: Any, folder: Path) -> Iterator[TestClient]:
+    node = make_node(flown=False, recording={"directory": str(folder)})
+    node.current = dataclasses.replace(node.current, state="recording", file=CURRENT, bytes=4096)
+    with TestClient(create_app(node)) as client:
+        yield client
+
+
+def test_recordings_are_listed_and_nothing_else(client: TestClient) -> None:
+    shown = client.get("/v1/recordings").json()["recordings"]
+    assert shown == [
+        {
+            "name": FINISHED,
+            "bytes": len(BYTES),
+            "state": "finished",
+            "started": "2026-11-20T13:00:00.000Z",
+        },
+        {
+            "name": CURRENT,
+            "bytes": 4096,
+            "state": "recording",
+            "started": "2026-11-20T14:00:00.000Z",
+        },
+        {"name": "cut.mcap.active", "bytes": 3, "state": "unfinished", "started": None},
+    ]
+
+
+def test_a_recording_comes_whole(client: TestClient) -> None:
+    answer = client.get(f"/v1/recordings/{FINISHED}")
+    assert answer.content == BYTES
+    assert answer.headers["content-length"] == str(len(BYTES))
+    assert answer.headers["accept-ranges"] == "bytes"
+    assert answer.headers["content-type"] == "application/x-mcap"
+
+
+def test_the_one_being_written_comes_as_far_as_it_is_flushed(client: TestClient) -> None:
+    assert client.get(f"/v1/recordings/{CURRENT}").content == BYTES[:4096]
+    rest = client.get(f"/v1/recordings/{CURRENT}", headers={"range": "bytes=4000-"})
+    assert rest.status_code == 206
+    assert rest.content == BYTES[4000:4096]
+
+
+@pytest.mark.parametrize(
+    ("asked", "start", "stop"),
+    [("0-0", 0, 1), ("100-199", 100, 200), ("1023990-", 1023990, 1024000), ("-7", -7, None)],
+)
+def test_a_range_comes_in_part(client: TestClient, asked: str, start: int, stop: int) -> None:
+    answer = client.get(f"/v1/recordings/{FINISHED}", headers={"range": f"bytes={asked}"})
+    assert answer.status_code == 206
+    assert answer.content == BYTES[start:stop]
+    first = start % len(BYTES)
+    last = first + len(answer.content) - 1
+    assert answer.headers["content-range"] == f"bytes {first}-{last}/{len(BYTES)}"
+
+
+def test_a_range_beyond_the_end_is_refused(client: TestClient) -> None:
+    answer = client.get(f"/v1/recordings/{FINISHED}", headers={"range": "bytes=1024000-"})
+    assert answer.status_code == 416
+    assert answer.headers["content-range"] == "bytes */1024000"
+    assert answer.headers["content-type"] == "application/problem+json"
+
+
+@pytest.mark.parametrize("header", [None, "", "bytes=", "bytes=-", "bytes=5-2", "bytes=0-1,4-5"])
+def test_a_range_that_says_nothing_is_ignored(header: str | None) -> None:
+    assert span(header, 10) is None
+
+
+def test_of_an_empty_file_there_is_no_range() -> None:
+    with pytest.raises(UnsatisfiableRangeError):
+        span("bytes=0-", 0)
+    with pytest.raises(UnsatisfiableRangeError):
+        span("bytes=-0", 10)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "settings.toml",
+        "linked.mcap",
+        ".hidden.mcap",
+        "pipe.mcap",
+        "below",
+        "below%2Fdeep.mcap",
+        "below/deep.mcap",
+        "..%2Foutside.mcap",
+        "%2e%2e%2foutside.mcap",
+        "..%5Coutside.mcap",
+        "%2Fetc%2Fpasswd",
+        FINISHED + "%00",
+        FINISHED + "%0A",
+        FINISHED.upper(),
+        "none.mcap",
+    ],
+)
+def test_nothing_else_is_given(client: TestClient, name: str) -> None:
+    answer = client.get(f"/v1/recordings/{name}")
+    assert answer.status_code == 404
+    assert b"secret" not in answer.content
+
+
+def test_without_a_folder_there_is_nothing(make_node: Any, tmp_path: Path) -> None:
+    for where in ({}, {"recording": {"directory": str(tmp_path / "missing")}}):
+        with TestClient(create_app(make_node(flown=False, **where))) as client:
+            assert client.get("/v1/recordings").json() == {"recordings": []}
+            assert client.get(f"/v1/recordings/{FINISHED}").status_code == 404
+
+
+def test_where_one_file_is_named_only_that_is_shown(make_node: Any, folder: Path) -> None:
+    node = make_node(flown=False, recording={"directory": str(folder / FINISHED)})
+    with TestClient(create_app(node)) as client:
+        (only,) = client.get("/v1/recordings").json()["recordings"]
+    assert only["name"] == FINISHED

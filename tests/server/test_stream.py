@@ -1,0 +1,297 @@
+"""``WS /v1/stream`` over a real socket: what is asked for comes, and the newest of it."""
+
+import asyncio
+import base64
+import gc
+import json
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+import pytest
+import uvloop
+from starlette.datastructures import QueryParams
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed
+from websockets.typing import Subprotocol
+
+from companion.server import models, stream
+from companion.server.stream import Topic, Wanted, wanted
+
+LOOPS: list[Callable[[], asyncio.AbstractEventLoop] | None] = [None, uvloop.new_event_loop]
+SOON_S = 10.0
+
+
+def run(coroutine: Coroutine[Any, Any, None], loop: Any = None) -> None:
+    with asyncio.Runner(loop_factory=loop) as runner:
+        runner.run(coroutine)
+
+
+async def said(websocket: ClientConnection) -> Any:
+    return json.loads(await asyncio.wait_for(websocket.recv(), SOON_S))
+
+
+async def closed(address: str, **options: Any) -> tuple[int, str]:
+    """Code and reason with which a stream is closed."""
+    async with connect(address, **options) as websocket:
+        with pytest.raises(ConnectionClosed) as raised:
+            await asyncio.wait_for(websocket.recv(), SOON_S)
+    assert raised.value.rcvd is not None
+    return raised.value.rcvd.code, raised.value.rcvd.reason
+
+
+@pytest.mark.parametrize("loop", LOOPS, ids=["asyncio", "uvloop"])
+def test_the_state_comes_at_once_and_with_every_update(
+    make_node: Any, serving: Any, loop: Any
+) -> None:
+    async def check() -> None:
+        node = make_node()
+        async with serving(node) as at, connect(f"ws://{at}/v1/stream?rate_hz=100") as websocket:
+            first = [await said(websocket) for _ in range(2)]
+            assert [message["topic"] for message in first] == ["uavs", "beams"]
+            for message in first:
+                assert message.keys() >= {"valid_at", "topic"}
+            models.Uavs.model_validate(first[0])
+            models.Beams.model_validate(first[1])
+            await asyncio.sleep(0.02)  # more than the period that was asked for
+            node.tick()
+            second = [await said(websocket) for _ in range(2)]
+            assert second[0]["valid_at"] > first[0]["valid_at"]
+            assert len(second[1]["beams"]) == 4
+
+    run(check(), loop)
+
+
+def test_only_those_uavs_and_topics_that_are_asked_for(make_node: Any, serving: Any) -> None:
+    async def check() -> None:
+        node = make_node()
+        node.tick()
+        query = "uav=2:1&uav=3:1&topic=weights&topic=uavs&topic=beams&topic=status&topic=links"
+        async with serving(node) as at, connect(f"ws://{at}/v1/stream?{query}") as websocket:
+            weights, uavs, beams, status, links = [await said(websocket) for _ in range(5)]
+        assert {one["id"] for one in uavs["uavs"]} == {"2:1", "3:1"}
+        assert {one["uav"] for one in beams["beams"]} == {"2:1", "3:1"}
+        models.Status.model_validate(status)
+        models.Links.model_validate(links)
+        models.Weights.model_validate(weights)
+        beam_set = node.pipeline.last_update.beams
+        columns = [beam_set.uavs.index(uav) for uav in weights["uavs"]]
+        assert {beam_set.uavs[i] for i in columns} == {"2:1", "3:1"}
+        assert weights["re"] == beam_set.weights[:, columns].real.tolist()
+        assert weights["im"] == beam_set.weights[:, columns].imag.tolist()
+
+    run(check())
+
+
+def test_events_come_when_there_is_a_new_one(make_node: Any, serving: Any) -> None:
+    async def check() -> None:
+        node = make_node()
+        query = "topic=events&topic=status&rate_hz=100"
+        async with serving(node) as at, connect(f"ws://{at}/v1/stream?{query}") as websocket:
+            events, status = await said(websocket), await said(websocket)
+            assert (events["topic"], status["topic"]) == ("events", "status")
+            await asyncio.sleep(0.02)
+            node.tick()
+            assert (await said(websocket))["topic"] == "status"
+            node.say("something new")
+            await asyncio.sleep(0.02)
+            node.tick()
+            assert (await said(websocket))["events"][-1]["text"] == "something new"
+
+    run(check())
+
+
+def test_no_more_messages_than_asked_for(make_node: Any, serving: Any) -> None:
+    async def check() -> None:
+        node = make_node()
+        query = "topic=uavs&rate_hz=5"
+        loop = asyncio.get_running_loop()
+        async with serving(node) as at, connect(f"ws://{at}/v1/stream?{query}") as websocket:
+            await said(websocket)
+            begun_s, count = loop.time(), 0
+            while loop.time() < begun_s + 0.7:
+                node.tick(0.01)
+                await asyncio.sleep(0.005)
+            websocket_messages = websocket.recv_messages.frames
+            count = len(websocket_messages.queue)
+        assert 2 <= count <= 4
+
+    run(check())
+
+
+def test_a_message_is_made_once_for_all_who_ask_for_the_same(make_node: Any, serving: Any) -> None:
+    """All get the very same bytes of a look at a time at which the clock has gone on."""
+
+    async def check() -> None:
+        node = make_node()
+        made = 0
+        links = node.links
+
+        def counted() -> Any:
+            nonlocal made
+            made += 1
+            return links()
+
+        node.links = counted
+        async with serving(node) as at:
+            many = [await connect(f"ws://{at}/v1/stream?topic=links") for _ in range(10)]
+            texts = {await asyncio.wait_for(one.recv(), SOON_S) for one in many}
+            assert len(texts) == 1
+            assert made == 1
+            for one in many:
+                await one.close()
+
+    run(check())
+
+
+@pytest.mark.parametrize(
+    ("query", "said_of"),
+    [
+        ("rate_hz=0", "rate_hz"),
+        ("rate_hz=nan", "rate_hz"),
+        ("rate_hz=fast", "rate_hz"),
+        ("uav=one", "uav"),
+        ("uav=1:1&uav=%00", "uav"),
+        ("uav=icao:xyz", "uav"),
+        ("topic=weather", "topic"),
+        ("rate=5", "'rate'"),
+        ("uav=" + "%F0%9F%9A%81" * 90, "uav"),
+    ],
+)
+def test_bad_arguments_close_it(shared_node: Any, serving: Any, query: str, said_of: str) -> None:
+    async def check() -> None:
+        async with serving(shared_node) as at:
+            code, reason = await closed(f"ws://{at}/v1/stream?{query}")
+        assert code == stream.BAD_ARGUMENTS
+        assert said_of in reason
+
+    run(check())
+
+
+def test_arguments_are_read() -> None:
+    assert wanted(QueryParams("")) == Wanted((Topic.UAVS, Topic.BEAMS), frozenset(), 10.0)
+    asked = wanted(QueryParams("uav=1:1&uav=icao:4CA7B3&topic=beams&topic=beams&rate_hz=0.5"))
+    assert asked == Wanted((Topic.BEAMS,), frozenset({"1:1", "icao:4CA7B3"}), 0.5)
+
+
+def test_who_sends_something_is_told_that_it_takes_nothing(shared_node: Any, serving: Any) -> None:
+    async def check() -> None:
+        async with serving(shared_node) as at, connect(f"ws://{at}/v1/stream") as websocket:
+            await websocket.send("subscribe")
+            with pytest.raises(ConnectionClosed) as raised:
+                while True:
+                    await said(websocket)
+        assert raised.value.rcvd.code == 1003
+
+    run(check())
+
+
+def test_a_page_from_elsewhere_may_not_ask(shared_node: Any, serving: Any) -> None:
+    async def check() -> None:
+        async with serving(shared_node) as at:
+            address = f"ws://{at}/v1/stream"
+            for origin in ("http://evil.example", "null", "http://[", f"http://{at}.example"):
+                assert (await closed(address, origin=origin))[0] == stream.ELSEWHERE
+            async with connect(address, origin=f"http://{at}") as websocket:
+                assert (await said(websocket))["topic"] == "uavs"
+
+    run(check())
+
+
+TOKEN = "s3cret/ü"
+AS_SUBPROTOCOL = "bearer." + base64.urlsafe_b64encode(TOKEN.encode()).decode().rstrip("=")
+
+
+def test_a_token_is_asked_for(shared_node: Any, serving: Any) -> None:
+    async def check() -> None:
+        async with serving(shared_node, TOKEN) as at:
+            address = f"ws://{at}/v1/stream"
+            wrong: list[dict[str, Any]] = [
+                {},
+                {"additional_headers": {"authorization": "Bearer wrong"}},
+                {"subprotocols": [Subprotocol("companion.v1")]},
+                {"subprotocols": [Subprotocol("companion.v1"), Subprotocol("bearer.d3Jvbmc")]},
+                {"subprotocols": [Subprotocol("companion.v1"), Subprotocol("bearer.d")]},
+                {"subprotocols": [Subprotocol("companion.v1"), Subprotocol("bearer.")]},
+            ]
+            for options in wrong:
+                assert (await closed(address, **options))[0] == 4401
+            assert (await closed(f"{address}?token=s3cret"))[0] == 4401
+            assert (await closed(f"ws://{at}/elsewhere"))[0] == 4401
+            given = [Subprotocol("companion.v1"), Subprotocol(AS_SUBPROTOCOL)]
+            async with connect(address, subprotocols=given) as websocket:
+                assert websocket.subprotocol == "companion.v1"
+                assert (await said(websocket))["topic"] == "uavs"
+
+    run(check())
+
+
+def test_a_token_in_the_header_opens_it_too(shared_node: Any, serving: Any) -> None:
+    async def check() -> None:
+        async with serving(shared_node, "s3cret") as at:
+            headers = {"authorization": "Bearer s3cret"}
+            async with connect(f"ws://{at}/v1/stream", additional_headers=headers) as websocket:
+                assert (await said(websocket))["topic"] == "uavs"
+
+    run(check())
+
+
+def test_who_goes_leaves_nothing_behind(make_node: Any, serving: Any) -> None:
+    async def check() -> None:
+        node = make_node()
+        async with serving(node) as at:
+            for _ in range(3):
+                async with connect(f"ws://{at}/v1/stream") as websocket:
+                    await said(websocket)
+            async with connect(f"ws://{at}/v1/stream") as websocket:
+                await said(websocket)
+                websocket.transport.abort()
+            tasks = {"_send", "receive"}
+
+            def left() -> int:
+                names = [task.get_coro().__qualname__ for task in asyncio.all_tasks()]
+                return sum(name.rsplit(".", 1)[-1] in tasks for name in names)
+
+            async with asyncio.timeout(SOON_S):
+                while left():
+                    node.tick()
+                    await asyncio.sleep(0.01)
+        gc.collect()
+
+    run(check())
+
+
+def test_a_client_that_does_not_read_misses_messages_and_holds_nobody_up(
+    make_node: Any, serving: Any
+) -> None:
+    """The reader gets every update, the other what was under way, and then the newest."""
+
+    async def check() -> None:
+        node = make_node()
+        query = "topic=weights&topic=beams&rate_hz=100"
+        async with serving(node) as at:
+            address = f"ws://{at}/v1/stream?{query}"
+            slow = await connect(address, max_queue=1)
+            reader = await connect(address)
+            heard = 0
+            for _ in range(150):
+                while json.loads(await asyncio.wait_for(reader.recv(), SOON_S))["topic"] != "beams":
+                    pass
+                heard += 1
+                await asyncio.sleep(0.01)
+                node.tick()
+            newest = json.loads(await asyncio.wait_for(reader.recv(), SOON_S))["valid_at"]
+            assert heard == 150
+            valid_at = []
+            for _ in range(400):
+                try:
+                    message = json.loads(await asyncio.wait_for(slow.recv(), 0.3))
+                except TimeoutError:
+                    break
+                valid_at.append(message["valid_at"])
+            await slow.close()
+            await reader.close()
+        assert valid_at == sorted(valid_at)
+        assert len(valid_at) < 250  # of 302: the system's buffers hold a few
+        assert valid_at[-1] == newest
+
+    run(check())

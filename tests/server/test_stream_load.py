@@ -1,0 +1,127 @@
+"""Many clients of the stream, some of whom never read: nobody else notices."""
+
+import asyncio
+import re
+import subprocess
+import time
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support import BIN, Node
+from websockets.asyncio.client import connect
+
+SETTINGS = "[beams]\nupdate_hz = 20\n"
+RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
+QUERY = "/v1/stream?topic=uavs&topic=beams&rate_hz=10"
+FRESH_S = 0.2
+MEMORY_BYTES = 60e6
+"""Room for 200 connections and their buffers, not for a queue of messages."""
+
+MEMORY = "process_resident_memory_bytes"
+CPU = "process_cpu_seconds_total"
+SENT = "companion_stream_messages_total"
+
+
+def lag(node: Node) -> list[tuple[float, float]]:
+    """Upper ends in seconds of the histogram of the event loop's lag, and its counts."""
+    text = node.get("/metrics")[1].decode()
+    found = re.findall(r'companion_event_loop_lag_seconds_bucket{le="(.*?)"} (\S+)', text)
+    return [(float(end), float(count)) for end, count in found]
+
+
+def p99_s(before: list[tuple[float, float]], after: list[tuple[float, float]]) -> float:
+    """The upper end of the bucket that holds the 99th percentile."""
+    counts = [b - a for (_, a), (_, b) in zip(before, after, strict=True)]
+    return next(
+        end for (end, _), count in zip(after, counts, strict=True) if count >= 0.99 * counts[-1]
+    )
+
+
+def metric(node: Node, name: str) -> float:
+    """The value of a metric without labels."""
+    found = re.search(rf"^{name} (\S+)$", node.get("/metrics")[1].decode(), re.MULTILINE)
+    assert found is not None
+    return float(found[1])
+
+
+async def read(address: str, until_s: float, ages_s: list[float], quiet_s: float) -> int:
+    """Read to the end; keep how old each message was on arrival, after a first while."""
+    heard = 0
+    async with connect(address, max_queue=4, compression=None) as websocket:
+        while time.time() < until_s:
+            text = await asyncio.wait_for(websocket.recv(), 5)
+            now_s = time.time()
+            heard += 1
+            if now_s > quiet_s:
+                stamp = re.search(r'"valid_at":"(.*?)"', str(text))
+                assert stamp is not None
+                ages_s.append(now_s - datetime.fromisoformat(stamp[1]).timestamp())
+    return heard
+
+
+async def crowd(node: Node, readers: int, deaf: int, seconds: float) -> tuple[list[int], Any]:
+    """How many messages each reader heard, and how old they were."""
+    address = node.url.replace("http", "ws", 1) + QUERY
+    ages_s: list[float] = []
+    silent = [
+        await connect(address, max_queue=1, compression=None, ping_interval=None)
+        for _ in range(deaf)
+    ]
+    begun_s = time.time()
+    until_s, quiet_s = begun_s + seconds, begun_s + 1.0
+    heard = await asyncio.gather(*[read(address, until_s, ages_s, quiet_s) for _ in range(readers)])
+    for one in silent:
+        one.transport.abort()
+    return heard, ages_s
+
+
+def measure(
+    node: Node, directory: Path, readers: int, deaf: int, seconds: float
+) -> dict[str, float]:
+    """A flight watched by nobody, then by the crowd."""
+    to = f"udpout:127.0.0.1:{node.udp_port}"
+    command = [BIN / "sitl-replay", "fly", "paper", "--to", to, "--duration", str(3 * seconds + 9)]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, cwd=directory) as flight:
+        try:
+            node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
+            start = lag(node)
+            time.sleep(seconds)  # what is measured is a time
+            alone, memory_bytes = lag(node), metric(node, MEMORY)
+            cpu_s, sent = metric(node, CPU), metric(node, SENT)
+            heard, ages_s = asyncio.run(crowd(node, readers, deaf, seconds))
+            watched = lag(node)
+            grown_bytes = metric(node, MEMORY) - memory_bytes
+            cpu_s, sent = metric(node, CPU) - cpu_s, metric(node, SENT) - sent
+        finally:
+            flight.kill()
+    ages_s.sort()
+    return {
+        "alone_p99_s": p99_s(start, alone),
+        "watched_p99_s": p99_s(alone, watched),
+        "grown_bytes": grown_bytes,
+        "cpu_per_message_s": cpu_s / sent,
+        "age_p99_s": ages_s[int(0.99 * len(ages_s))],
+        "least_heard": min(heard),
+    }
+
+
+@pytest.mark.parametrize(
+    ("readers", "deaf", "seconds"),
+    [
+        (18, 2, 3.0),
+        pytest.param(180, 20, 10.0, marks=pytest.mark.benchmark),
+    ],
+)
+def test_a_crowd_holds_nobody_up(
+    start_node: Any, tmp_path: Path, readers: int, deaf: int, seconds: float
+) -> None:
+    settings = tmp_path / "settings.toml"
+    settings.write_text(SETTINGS)
+    found = measure(start_node(*RUN, "--config", str(settings)), tmp_path, readers, deaf, seconds)
+    print(found)
+    assert found["grown_bytes"] < MEMORY_BYTES
+    assert found["age_p99_s"] < FRESH_S
+    assert found["least_heard"] > 0.5 * 2 * 10 * (seconds - 1)
+    assert found["watched_p99_s"] <= 2 * max(found["alone_p99_s"], 0.01)

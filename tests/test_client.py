@@ -1,0 +1,154 @@
+"""``companion.client`` against a live node, and against what is no node at all."""
+
+import itertools
+import json
+import socket
+import threading
+from contextlib import closing
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support import Node
+
+from companion.client import Client, ServiceError
+
+RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
+
+
+@pytest.fixture
+def flying(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start_node: Any) -> Node:
+    """The demo, once its four beams are up."""
+    monkeypatch.chdir(tmp_path)  # it records to ./recordings
+    node: Node = start_node("demo", "--port", "0", "--seconds", "60")
+    node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
+    return node
+
+
+def test_it_shows_what_the_service_says(flying: Node) -> None:
+    client = Client(flying.url + "/")
+    assert client.status()["version"]
+    assert {uav["id"] for uav in client.uavs()} == {"1:1", "2:1", "3:1", "4:1"}
+    beams = client.beams(lead_ms=50)
+    assert beams["lead_ms"] == 50
+    assert len(client.get("/v1/pattern", points=7, cut="elevation")["angles_deg"]) == 7
+    now, later = client.weights(), client.weights(lead_ms=5000)
+    assert now.matrix.shape == (64, 4)
+    assert now.matrix.dtype == np.complex128
+    assert sorted(now.uavs) == ["1:1", "2:1", "3:1", "4:1"]
+    assert 5.0e9 <= later.valid_at_ns - now.valid_at_ns < 8.0e9
+    assert not np.allclose(now.matrix, later.matrix)
+
+
+def test_a_stream_goes_on_until_it_is_closed(flying: Node) -> None:
+    client = Client(flying.url)
+    with closing(client.stream(["1:1"], ["uavs", "weights"], rate_hz=50)) as stream:
+        heard = list(itertools.islice(stream, 12))
+    assert {message["topic"] for message in heard} == {"uavs", "weights"}
+    stamps = [message["valid_at"] for message in heard if message["topic"] == "uavs"]
+    assert stamps == sorted(set(stamps))
+    assert all(message["uavs"] == ["1:1"] for message in heard if message["topic"] == "weights")
+
+
+def test_that_the_service_ends_is_said(flying: Node) -> None:
+    """A reader is told so, and one that never reads does not keep the service from ending."""
+    host, _, port = flying.url.removeprefix("http://").partition(":")
+    with socket.socket() as deaf:
+        deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        deaf.connect((host, int(port)))
+        deaf.sendall(
+            b"GET /v1/stream?rate_hz=100&topic=weights&topic=beams&topic=uavs HTTP/1.1\r\n"
+            b"Host: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+            b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+        )
+        stream = Client(flying.url).stream(rate_hz=50)
+        for _ in itertools.islice(stream, 60):
+            pass
+        returncode, _, err = flying.stop()
+        assert returncode == 0, err
+        assert "Traceback" not in err
+        with pytest.raises(ServiceError) as raised:
+            for _ in stream:
+                pass
+    assert raised.value.status == 1012
+
+
+def test_refusals_have_a_status_and_a_title(start_node: Any) -> None:
+    client = Client(start_node(*RUN).url)
+    with pytest.raises(ServiceError, match=r"422: query\.lead_ms: ") as raised:
+        client.beams(lead_ms=-1)
+    assert raised.value.status == 422
+    with pytest.raises(ServiceError, match="404: no UAV '9:9' has been heard"):
+        client.get("/v1/uavs/9:9")
+    with pytest.raises(ServiceError, match="4422: uav: 'x' is neither") as raised:
+        next(client.stream(uavs=["x"]))
+    assert raised.value.status == 4422
+    empty = client.weights()
+    assert empty.uavs == ()
+    assert empty.matrix.shape == (64, 0)
+
+
+def test_a_token_is_sent(start_node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COMPANION_TOKEN", "s3cret/ü")
+    node = start_node(*RUN)
+    for wrong in (Client(node.url), Client(node.url, "wrong")):
+        with pytest.raises(ServiceError, match="401: a bearer token is needed"):
+            wrong.status()
+        with pytest.raises(ServiceError, match="4401: a bearer token is needed"):
+            next(wrong.stream())
+
+
+def test_the_right_token_opens(start_node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COMPANION_TOKEN", "s3cret")
+    client = Client(start_node(*RUN).url, "s3cret")
+    assert client.status()["version"]
+    with closing(client.stream(topics=["status"])) as stream:
+        assert next(stream)["topic"] == "status"
+
+
+def test_where_nobody_answers() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    client = Client(f"http://127.0.0.1:{port}")
+    with pytest.raises(ServiceError, match="refused") as raised:
+        client.status()
+    assert raised.value.status is None
+    with pytest.raises(ServiceError, match="refused"):
+        next(client.stream())
+    with pytest.raises(ValueError, match="is not http"):
+        Client("ftp://127.0.0.1")
+
+
+class _Stranger(BaseHTTPRequestHandler):
+    """Something else that speaks HTTP: an error in HTML, and an answer that breaks off."""
+
+    def do_GET(self) -> None:
+        if self.path == "/v1/status":
+            self.send_error(503)
+            return
+        self.send_response(200)
+        self.send_header("content-length", "1000")
+        self.end_headers()
+        self.wfile.write(json.dumps({}).encode())
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+def test_what_is_no_service_of_ours() -> None:
+    with HTTPServer(("127.0.0.1", 0), _Stranger) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            client = Client(f"http://127.0.0.1:{server.server_port}")
+            with pytest.raises(ServiceError, match="503: Service Unavailable"):
+                client.status()
+            with pytest.raises(ServiceError, match="the answer broke off"):
+                client.uavs()
+            with pytest.raises(ServiceError):
+                next(client.stream())
+        finally:
+            server.shutdown()
+            thread.join()

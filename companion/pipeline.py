@@ -234,10 +234,11 @@ class Pipeline:
         """The first position of all sets the origin of the local frame, and ``home``."""
         home = FixedCenter(report.lat_deg, report.lon_deg, report.alt_m)
         self._set_origin(home)
+        place = f"{home.lat_deg:.6f}, {home.lon_deg:.6f}, {home.alt_m:.1f} m"
         if self._carrier_id is not None:
-            return Notice(report.t_ns, Severity.INFO, "origin", f"local frame begins at {home}")
+            return Notice(report.t_ns, Severity.INFO, "origin", f"local frame begins at {place}")
         self._center = home
-        text = f"home is where {report.uav} first reported: {home}, level, facing north"
+        text = f"home is where {report.uav} first reported: {place}; level, facing north"
         return Notice(report.t_ns, Severity.INFO, "home", text)
 
     def _set_origin(self, at: FixedCenter) -> None:

@@ -1,41 +1,76 @@
 // Polling. Each feed has one request in flight at most, keeps the newest answer only, backs off
 // while it fails, and knows how far its answer may be trusted. Local time is performance.now():
 // the clock of the browser's machine and that of the service need not agree.
+//
+// All feeds beat in time, on multiples of BEAT_MS: what is drawn together (UAVs, beams, pattern)
+// is asked at the same moment, or a fast UAV would seem to be beside its own beam. In all they are
+// five requests a second.
 
+const BEAT_MS = 850;
 const TIMEOUT_MS = 2000;
 const BACKOFF_MAX_MS = 2000;
-/** Without an answer for so long, what is on the screen is no longer true. */
+/** A value that is older than so much beyond its own period looks stale. */
+const LATE_MS = 1150;
+/** Without an answer for so long beyond its period, a value is no longer true. */
+const MISSED_MS = 2150;
+/** Without any answer at all for so long, the service is lost. */
 export const LOST_MS = 3000;
-/** Answers come, but the time that they are valid at stands still: as good as lost. */
-const FROZEN_MS = 3000;
+const BAD_ANSWERS = ["lost", "frozen", "waiting"];
 
 const isListOf = (list, key) =>
   Array.isArray(list) && list.every((entry) => typeof entry?.[key] === "string");
 
-/** What is polled. `stamp` is the field by which the service shows that it moves on. */
+/**
+ * What is polled, every so many beats. `stamp` is the field by which the service shows that it
+ * moves on; `offset`, in beats, spreads the slow ones out.
+ */
 const FEEDS = {
   uavs: {
-    path: "/v1/uavs", periodMs: 200, lateMs: 1200, what: "UAVs",
+    path: "/v1/uavs", beats: 1, what: "UAVs",
     stamp: (data) => data.valid_at, accepts: (data) => isListOf(data?.uavs, "id"),
   },
   beams: {
-    path: "/v1/beams", periodMs: 200, lateMs: 1200, what: "beams",
+    path: "/v1/beams", beats: 1, what: "beams",
     stamp: (data) => data.valid_at, accepts: (data) => isListOf(data?.beams, "uav"),
   },
+  pattern: {
+    path: ({ beamed }) => beamed && `/v1/pattern?points=361&uav=${encodeURIComponent(beamed)}`,
+    beats: 1, what: "pattern", accepts: (data) => Array.isArray(data?.patterns),
+  },
+  weights: {
+    path: ({ beamed }) => beamed && "/v1/beams/weights",
+    beats: 4, offset: 1, what: "weights", 
+    accepts: (data) => Array.isArray(data?.re) && Array.isArray(data?.im),
+  },
   status: {
-    path: "/v1/status", periodMs: 1000, lateMs: 2200, what: "status",
+    path: "/v1/status", beats: 4, what: "status",
     stamp: (data) => data.time, accepts: (data) => typeof data?.version === "string",
   },
   readyz: {
-    path: "/readyz", periodMs: 1000, lateMs: 2200, what: "readiness",
+    path: "/readyz", beats: 3, what: "readiness",
     // "Not ready" is an answer, not a failure.
     statuses: [503], accepts: (data) => typeof data?.ready === "boolean",
+  },
+  links: {
+    path: "/v1/links", beats: 6, offset: 2, what: "links",
+    accepts: (data) => isListOf(data?.links, "url"),
+  },
+  events: {
+    path: "/v1/events", beats: 6, offset: 4, what: "events",
+    accepts: (data) => isListOf(data?.events, "text"),
+  },
+  recordings: {
+    path: ({ hasRecordings }) => hasRecordings && "/v1/recordings",
+    beats: 20, offset: 3, what: "recordings",
+    accepts: (data) => isListOf(data?.recordings, "name"),
   },
 };
 
 export class Feed {
-  constructor(name, settings, onAnswer) {
-    Object.assign(this, { name, ...settings, onAnswer });
+  /** `context()` says what an address may depend on; an address of null is not asked now. */
+  constructor(name, settings, context, onAnswer) {
+    Object.assign(this, { name, offset: 0, ...settings, context, onAnswer });
+    this.periodMs = this.beats * BEAT_MS;
     this.data = null; // the newest answer
     this.startedAt = performance.now();
     this.answeredAt = null; // local time of the newest answer
@@ -48,14 +83,17 @@ export class Feed {
 
   async run() {
     for (;;) {
-      const begunAt = performance.now();
       await this.poll();
-      const tookMs = performance.now() - begunAt;
-      const waitMs = this.failures === 0
-        ? Math.max(0, this.periodMs - tookMs)
-        : Math.min(BACKOFF_MAX_MS, this.periodMs * 2 ** Math.min(this.failures, 8));
-      await this.pause(waitMs);
+      await this.pause(this.failures === 0 ? this.untilBeatMs()
+        : Math.min(BACKOFF_MAX_MS, BEAT_MS * 2 ** Math.min(this.failures, 8)));
     }
+  }
+
+  /** Milliseconds until this feed's next beat; who has nothing to ask looks again at each beat. */
+  untilBeatMs() {
+    const everyMs = this.answeredAt === null ? BEAT_MS : this.periodMs;
+    const phaseMs = performance.now() - this.offset * BEAT_MS;
+    return everyMs - (((phaseMs % everyMs) + everyMs) % everyMs);
   }
 
   /** Wait, or be woken: when the page is shown again or the network comes back. */
@@ -70,11 +108,18 @@ export class Feed {
   }
 
   async poll() {
+    const path = typeof this.path === "function" ? this.path(this.context()) : this.path;
+    if (!path) {
+      this.data = null; // there is nothing to ask about: nor is there an answer
+      this.startedAt = performance.now();
+      this.answeredAt = null;
+      return;
+    }
     const abort = new AbortController();
     const timer = setTimeout(() => abort.abort(), TIMEOUT_MS);
     let answer = null;
     try {
-      const response = await fetch(this.path, {
+      const response = await fetch(path, {
         signal: abort.signal, cache: "no-store", headers: { Accept: "application/json" },
       });
       if (!response.ok && !this.statuses?.includes(response.status)) {
@@ -95,7 +140,7 @@ export class Feed {
   take(data) {
     const now = performance.now();
     const stamp = this.stamp?.(data);
-    if (this.stamp === undefined || stamp !== this.lastStamp || this.movedAt === null) {
+    if (!this.stamp || stamp !== this.lastStamp || this.movedAt === null) {
       this.movedAt = now;
     }
     Object.assign(this, { data, answeredAt: now, lastStamp: stamp, failures: 0, problem: "" });
@@ -107,14 +152,22 @@ export class Feed {
     return (now - (this.answeredAt ?? this.startedAt)) / 1000;
   }
 
-  /** "waiting", "live", "late", "frozen" or "lost". The last two must never look live. */
+  /** "idle", "waiting", "live", "late", "frozen" or "lost". The last two must never look live. */
   health(now = performance.now()) {
     const silentMs = this.silenceS(now) * 1000;
-    if (silentMs > LOST_MS) return "lost";
+    const missedMs = this.periodMs + MISSED_MS;
+    const isIdle = typeof this.path === "function" && this.answeredAt === null
+      && this.failures === 0;
+    if (isIdle) return "idle";
+    if (silentMs > missedMs) return "lost";
     if (this.answeredAt === null) return "waiting";
     // A stamp of null is a service that has nothing to tell yet, not one that has stopped.
-    if (this.stamp && this.lastStamp && now - this.movedAt > FROZEN_MS) return "frozen";
-    return silentMs > this.lateMs ? "late" : "live";
+    if (this.stamp && this.lastStamp && now - this.movedAt > missedMs) return "frozen";
+    return silentMs > this.periodMs + LATE_MS ? "late" : "live";
+  }
+
+  isTrusted(now) {
+    return this.data !== null && !BAD_ANSWERS.includes(this.health(now));
   }
 }
 
@@ -125,33 +178,52 @@ function describe(error) {
   return error.message;
 }
 
-/** Start polling; `onAnswer()` is called after each answer. Returns the feeds by name. */
-export function startPolling(onAnswer) {
+/**
+ * Start polling. `context()` gives `{beamed}`, the UAV whose beam is looked at; `onAnswer(name)` is
+ * called after each answer. Returns the feeds by name.
+ */
+export function startPolling(context, onAnswer) {
   const feeds = {};
+  const known = { hasRecordings: false };
   for (const [name, settings] of Object.entries(FEEDS)) {
-    feeds[name] = new Feed(name, settings, onAnswer);
+    const everything = () => ({ ...known, ...context() });
+    feeds[name] = new Feed(name, settings, everything, () => onAnswer(name));
   }
   const wakeAll = () => Object.values(feeds).forEach((feed) => feed.wake());
   window.addEventListener("online", wakeAll);
   document.addEventListener("visibilitychange", () => document.hidden || wakeAll());
-  Object.values(feeds).forEach((feed) => feed.run());
+  // Once the caller has the feeds: what its context says depends on them.
+  queueMicrotask(() => Object.values(feeds).forEach((feed) => feed.run()));
+  findRecordings(known);
   return feeds;
+}
+
+/** Whether the service offers its recordings: asked once, for asking in vain is an error. */
+async function findRecordings(known) {
+  try {
+    const api = await (await fetch("/openapi.json")).json();
+    known.hasRecordings = "/v1/recordings" in api.paths;
+  } catch {
+    // without the document nothing is known of recordings, and none are shown
+  }
 }
 
 /** The connection as one word and, where it is bad, what to tell the operator. */
 export function connection(feeds, now = performance.now()) {
-  const all = Object.values(feeds);
+  const all = Object.values(feeds).filter((feed) => feed.health(now) !== "idle");
   const having = (...states) => all.filter((feed) => states.includes(feed.health(now)));
+  const silentS = Math.min(...all.map((feed) => feed.silenceS(now)));
+  if (silentS * 1000 > LOST_MS) {
+    const never = all.every((feed) => feed.answeredAt === null);
+    return { state: "lost", never, silentS, problem: feeds.uavs.problem };
+  }
   const lost = having("lost");
   const frozen = having("frozen");
   const names = (list) => list.map((feed) => feed.what).join(", ");
-  if (lost.length === all.length) {
-    const silentS = Math.min(...all.map((feed) => feed.silenceS(now)));
-    const never = all.every((feed) => feed.answeredAt === null);
-    return { state: "lost", never, silentS, problem: lost[0].problem };
-  }
   if (lost.length) return { state: "partial", what: names(lost), problem: lost[0].problem };
   if (frozen.length) return { state: "frozen", what: names(frozen) };
-  if (having("waiting").length) return { state: "waiting" };
+  if ([feeds.uavs, feeds.beams].some((feed) => feed.health(now) === "waiting")) {
+    return { state: "waiting" };
+  }
   return { state: having("late").length ? "late" : "live" };
 }

@@ -28,7 +28,6 @@ export function metres(value) {
   return withUnit(value, decimals, `${NBSP}m`);
 }
 
-export const signedMetres = (value) => withUnit(value, 0, `${NBSP}m`, { signed: true });
 export const degrees = (value, decimals = 1) => withUnit(value, decimals, "°");
 export const signedDegrees = (value) => withUnit(value, 1, "°", { signed: true });
 export const speed = (value) => withUnit(value, 1, `${NBSP}m/s`);
@@ -55,6 +54,15 @@ export function milliseconds(valueS) {
     ? seconds(valueS)
     : withUnit(valueS * 1000, 0, `${NBSP}ms`);
 }
+
+/** Two times in milliseconds: 2 / 5 ms. */
+export function millisecondsRange(fromS, toS) {
+  if (!known(fromS) || !known(toS)) return UNKNOWN;
+  return `${fixed(fromS * 1000)} / ${milliseconds(toS)}`;
+}
+
+/** A share of one as a percentage. */
+export const share = (value) => withUnit(known(value) ? value * 100 : null, 0, `${NBSP}%`);
 
 /** A span of time for a person: 42 s, 3 min 05 s, 2 h 07 min, 3 d 04 h. */
 export function duration(valueS) {
@@ -93,10 +101,16 @@ export function hertz(value) {
   return `${Number(value.toFixed(0))}${NBSP}Hz`;
 }
 
-/** The time of day of an RFC 3339 stamp, in UTC: 13:00:05 UTC. */
-export function clock(stamp) {
+/** The time of day of an RFC 3339 stamp, in UTC: 13:00:05. */
+export function timeOfDay(stamp) {
   const date = new Date(stamp ?? NaN);
-  return Number.isNaN(date.getTime()) ? UNKNOWN : `${date.toISOString().slice(11, 19)} UTC`;
+  return Number.isNaN(date.getTime()) ? UNKNOWN : date.toISOString().slice(11, 19);
+}
+
+/** The same with its zone: 13:00:05 UTC. */
+export function clock(stamp) {
+  const time = timeOfDay(stamp);
+  return time === UNKNOWN ? UNKNOWN : `${time} UTC`;
 }
 
 /** Latitude and longitude with five decimals, about a metre. */

@@ -1,45 +1,165 @@
-// Wires the page: what is polled goes to the plan view, the table and the panels.
+// Wires the page: what is polled goes into the history, and from there, or from minutes ago, to
+// the plan view, the table, the pictures and the lists.
 
 import { connection, startPolling } from "./api.js";
+import { Charts } from "./charts.js";
+import { $, setText } from "./dom.js";
+import { Focus } from "./focus.js";
+import * as format from "./format.js";
+import { History } from "./history.js";
+import { setUpKeys } from "./keys.js";
+import { showEvents, showLinks, showRecordings } from "./lists.js";
 import {
   showBeams, showConnection, showFault, showReadiness, showStatus, Rejections,
 } from "./panels.js";
 import { PlanView } from "./plan.js";
 import { UavTable } from "./table.js";
 import { setUpTheme } from "./theme.js";
-import { Trails } from "./trails.js";
+import { TimeBar } from "./timebar.js";
 
-const $ = (id) => document.getElementById(id);
 const LOOK_MS = 100; // how often ages and the connection are looked at, answers or not
+const SAME_BEAT_MS = 400;
 const STATE_ORDER = ["live", "coasting", "stale", "lost"];
 const COLLATOR = new Intl.Collator("en", { numeric: true });
+const KEPT = ["beams", "pattern", "weights", "links", "events", "status"];
 
 let selected = null;
-
-function select(id) {
-  selected = id === selected ? null : id;
-  refresh();
-}
-
-const trails = new Trails();
-const plan = new PlanView($("plan"), trails, select);
-const table = new UavTable($("uavs"), select);
-const rejections = new Rejections();
-const feeds = startPolling(refresh);
 let faulted = false;
+let isNew = false; // something has come since the pictures were last drawn
 
-const trusted = (feed, now) => !["lost", "frozen", "waiting"].includes(feed.health(now));
+const history = new History();
+const plan = new PlanView($("plan"), history, choose);
+const table = new UavTable($("uavs"), choose);
+const focus = new Focus();
+const rejections = new Rejections();
+const timebar = new TimeBar(history, refresh);
+const charts = new Charts((at) => timebar.showAt(at));
+const feeds = startPolling(() => ({ beamed: beamedUav(feeds.beams.data) }), take);
 
-function uavsInOrder() {
-  return [...(feeds.uavs.data?.uavs ?? [])].sort((a, b) => COLLATOR.compare(a.id, b.id));
+// --- what is shown -----------------------------------------------------------------------------
+
+function inOrder(uavs) {
+  return [...uavs].sort((a, b) => COLLATOR.compare(a.id, b.id));
 }
 
-/** Mark everything that stands on a feed whose answer is no longer true, or else on any. */
-function markLost(now, all = false) {
-  for (const feed of Object.values(feeds)) {
-    const lost = all || (feed.data !== null && !trusted(feed, now));
-    document.documentElement.toggleAttribute(`data-${feed.name}-lost`, lost);
+/** The UAV whose beam is looked at closely: the chosen one, or else the first that has a beam. */
+function beamedUav(answer) {
+  const ids = (answer?.beams ?? []).map((beam) => beam.uav).sort(COLLATOR.compare);
+  return ids.includes(selected) ? selected : ids[0] ?? null;
+}
+
+/** What is known now, as the history keeps it; what is no longer true is left out. */
+function presentMoment(now) {
+  const answers = Object.fromEntries(
+    KEPT.map((name) => [name, feeds[name].isTrusted(now) ? feeds[name].data : null]),
+  );
+  return {
+    ...answers,
+    at: feeds.uavs.answeredAt ?? now,
+    stamp: feeds.uavs.data?.valid_at ?? null,
+    uavs: inOrder(feeds.uavs.data?.uavs ?? []),
+    answer: answers.beams,
+    beams: answers.beams?.beams ?? [],
+    patternBeams: beamsAt(answers.pattern?.valid_at),
+  };
+}
+
+/** The beams at the time of the pattern: of two answers the nearer one. */
+function beamsAt(stamp) {
+  const time = Date.parse(stamp);
+  const answers = [feeds.beams.data, ...history.moments.slice(-3).map((moment) => moment.answer)];
+  const distance = (answer) => Math.abs(Date.parse(answer.valid_at) - time);
+  return answers.filter((answer) => answer)
+    .reduce((best, one) => (best && distance(best) <= distance(one) ? best : one), null);
+}
+
+/** An answer came. UAVs and beams of one beat make a moment of the history. */
+function take(name) {
+  const now = performance.now();
+  const { uavs, beams } = feeds;
+  const together = Math.abs(uavs.answeredAt - (beams.answeredAt ?? -Infinity)) < SAME_BEAT_MS;
+  const isFresh = uavs.answeredAt !== null && uavs.answeredAt > (history.newest?.at ?? -1);
+  if (isFresh && (together || !beams.isTrusted(now))) {
+    history.add(presentMoment(now));
+    isNew = true;
   }
+  if (name !== "status" || timebar.isLive) refresh();
+}
+
+/** Mark what stands on an answer that is late, or no longer true. The past was true in its time. */
+function markAges(now, all = false) {
+  const root = document.documentElement;
+  for (const feed of Object.values(feeds)) {
+    const past = !timebar.isLive && feed.name !== "readyz" && feed.name !== "recordings";
+    const lost = all || (feed.data !== null && !feed.isTrusted(now));
+    root.toggleAttribute(`data-${feed.name}-lost`, lost && !past);
+    root.toggleAttribute(`data-${feed.name}-late`, feed.health(now) === "late" && !past);
+  }
+}
+
+/** Show everything anew. Should that fail, say so: a page that stood still would look live. */
+function refresh() {
+  const now = performance.now();
+  const link = connection(feeds, now);
+  try {
+    markAges(now, link.state === "lost");
+    showAll(link, now);
+    faulted = false;
+  } catch (error) {
+    showFault(error);
+    markAges(now, true);
+    if (!faulted) console.error(error); // once, not ten times a second
+    faulted = true;
+  }
+}
+
+function showAll(link, now) {
+  const view = timebar.shown ?? liveView(now);
+  if (selected !== null && !view.uavs.some((uav) => uav.id === selected)) selected = null;
+  showConnection(link, feeds.uavs.data?.valid_at);
+  showReadiness(feeds.readyz.data);
+  showRecordings(feeds.recordings.data);
+  timebar.draw(now);
+  showMoment(view, link, now);
+  showPlan(view, link, now);
+  const pastAt = timebar.shown?.at ?? null;
+  charts.show(history, view.uavs, { selected, pastAt, isNew, now });
+  isNew = false;
+  nameThePage(view, link);
+}
+
+/** The newest answers, true or not: what is not true any more is marked, not hidden. */
+function liveView(now) {
+  const answers = Object.fromEntries(KEPT.map((name) => [name, feeds[name].data]));
+  return { ...presentMoment(now), ...answers, answer: answers.beams,
+    beams: answers.beams?.beams ?? [] };
+}
+
+/** Whether what stands on a feed may look true: what is past was true in its time. */
+function believed(feed, link, now) {
+  return !timebar.isLive || (link.state !== "lost" && feed.isTrusted(now));
+}
+
+function showMoment(view, link, now) {
+  if (view.status) {
+    showStatus(view.status);
+    rejections.show(view.status.rejected, now);
+  }
+  if (view.answer) showBeams(view.answer);
+  showLinks(view.links);
+  showEvents(view.events);
+  showCount(view.uavs);
+  table.update(view.uavs, {
+    beams: new Map(view.beams.map((beam) => [beam.uav, beam])),
+    array: view.answer?.array,
+    sinceS: timebar.isLive ? feeds.uavs.silenceS(now) : 0,
+    selected,
+  });
+  focus.show(view, beamedUav(view.answer), {
+    isLive: timebar.isLive,
+    patternTrusted: believed(feeds.pattern, link, now),
+    weightsTrusted: believed(feeds.weights, link, now),
+  });
 }
 
 function showCount(uavs) {
@@ -47,85 +167,74 @@ function showCount(uavs) {
     .map((state) => [state, uavs.filter((uav) => uav.state === state).length])
     .filter(([, number]) => number > 0)
     .map(([state, number]) => `${number} ${state}`);
-  $("uavs-count").textContent = parts.join(" · ");
+  setText($("uavs-count"), parts.join(" · "));
   $("uavs-empty").hidden = uavs.length > 0;
-  $("uavs-empty").textContent = feeds.uavs.data ? "No UAV has reported a position."
-    : "Nothing received yet.";
+  setText($("uavs-empty"), feeds.uavs.data ? "No UAV has reported a position."
+    : "Nothing received yet.");
 }
 
 /** What the plan view says of itself when it must not be believed; nothing while it is live. */
 function planMessage(link, now) {
+  if (!timebar.isLive) {
+    return `NOT LIVE – ${format.duration((now - timebar.shown.at) / 1000)} ago`;
+  }
   if (link.never) return "NOT LIVE – no connection";
   if (link.state === "lost") return "NOT LIVE – connection lost";
   if (feeds.uavs.health(now) === "frozen") return "NOT LIVE – estimates stopped";
   return feeds.uavs.health(now) === "lost" ? "NOT LIVE – no answer about UAVs" : "";
 }
 
-function showPlan(uavs, link, now) {
-  const beams = feeds.beams.data;
+function showPlan(view, link, now) {
   plan.show({
-    uavs,
-    beams: beams?.beams ?? [],
-    array: beams?.array ?? null,
-    headingDeg: feeds.status.data?.center?.heading_deg,
-    uavsLive: trusted(feeds.uavs, now),
-    beamsLive: trusted(feeds.beams, now),
+    uavs: view.uavs,
+    beams: view.beams,
+    array: view.answer?.array ?? null,
+    headingDeg: view.status?.center?.heading_deg,
+    uavsLive: believed(feeds.uavs, link, now),
+    beamsLive: believed(feeds.beams, link, now),
     message: planMessage(link, now),
+    isPast: !timebar.isLive,
     selected,
-    now,
+    at: view.at,
   }, now);
 }
 
-/** Show everything anew. Should that fail, say so: a page that stood still would look live. */
-function refresh() {
-  const now = performance.now();
-  const link = connection(feeds, now);
-  markLost(now);
-  try {
-    showAll(link, now);
-    faulted = false;
-  } catch (error) {
-    showFault(error);
-    markLost(now, true);
-    if (!faulted) console.error(error); // once, not ten times a second
-    faulted = true;
-  }
-}
-
-function showAll(link, now) {
-  const uavs = uavsInOrder();
-  if (selected !== null && !uavs.some((uav) => uav.id === selected)) selected = null;
-  const beams = feeds.beams.data;
-  if (feeds.uavs.data) trails.add(uavs, feeds.uavs.answeredAt);
-  showConnection(link, feeds.uavs.data?.valid_at);
-  showReadiness(feeds.readyz.data);
-  if (feeds.status.data) {
-    showStatus(feeds.status.data);
-    rejections.show(feeds.status.data.rejected, now);
-  }
-  if (beams) showBeams(beams);
-  showCount(uavs);
-  table.update(uavs, {
-    beams: new Map((beams?.beams ?? []).map((beam) => [beam.uav, beam])),
-    array: beams?.array,
-    sinceS: feeds.uavs.silenceS(now),
-    selected,
-  });
-  showPlan(uavs, link, now);
-  nameThePage(uavs, link);
-}
-
 /** The tab's title and the picture's name tell the state to whoever does not see the page. */
-function nameThePage(uavs, link) {
+function nameThePage({ uavs, beams }, link) {
   const trouble = { lost: "CONNECTION LOST", partial: "CONNECTION FAILING", frozen: "STOPPED" };
-  const title = `${trouble[link.state] ?? `${uavs.length} UAVs`} · companion`;
+  const state = trouble[link.state] ?? (timebar.isLive ? "" : "PAUSED");
+  const title = `${state || `${uavs.length} UAVs`} · companion`;
   if (document.title !== title) document.title = title;
-  const name = `Plan view: ${uavs.length} UAVs, ${feeds.beams.data?.beams.length ?? 0} beams`
-    + (trouble[link.state] ? `, not live: ${trouble[link.state].toLowerCase()}` : "");
+  const name = `Plan view: ${uavs.length} UAVs, ${beams.length} beams`
+    + (state ? `, not live: ${state.toLowerCase()}` : "");
   if ($("plan").getAttribute("aria-label") !== name) $("plan").setAttribute("aria-label", name);
 }
 
 // --- controls -----------------------------------------------------------------------------------
+
+/** Choose a UAV, or none by choosing it again. */
+function choose(id) {
+  selected = id === selected ? null : id;
+  feeds.pattern.wake();
+  refresh();
+}
+
+const shownIds = () => (timebar.shown?.uavs ?? inOrder(feeds.uavs.data?.uavs ?? []))
+  .map((uav) => uav.id);
+
+function chooseNth(n) {
+  const id = shownIds()[n - 1];
+  if (id !== undefined && id !== selected) choose(id);
+}
+
+function chooseNext(step) {
+  const ids = shownIds();
+  if (!ids.length) return;
+  const from = selected === null ? (step > 0 ? -1 : ids.length) : ids.indexOf(selected);
+  const id = ids[Math.max(0, Math.min(ids.length - 1, from + step))];
+  if (id !== selected) choose(id);
+  table.reveal(id);
+}
 
 function control(action) {
   action();
@@ -135,17 +244,12 @@ function control(action) {
 const zoomIn = () => control(() => plan.zoom(1));
 const zoomOut = () => control(() => plan.zoom(-1));
 const fitAll = () => control(() => plan.fitAll());
+const showHelp = () => $("help").showModal();
 
 $("zoom-in").addEventListener("click", zoomIn);
 $("zoom-out").addEventListener("click", zoomOut);
 $("zoom-fit").addEventListener("click", fitAll);
-$("plan").addEventListener("keydown", (event) => {
-  const action = { "+": zoomIn, "=": zoomIn, "-": zoomOut, "0": fitAll }[event.key];
-  if (action) {
-    event.preventDefault();
-    action();
-  }
-});
+$("help-open").addEventListener("click", showHelp);
 
 let wheeled = 0;
 $("plan").addEventListener("wheel", (event) => {
@@ -157,5 +261,23 @@ $("plan").addEventListener("wheel", (event) => {
   wheeled = 0;
 }, { passive: false });
 
-setUpTheme($("theme"), () => plan.recolour());
+const toggleTheme = setUpTheme($("theme"), () => {
+  for (const picture of [plan, focus, charts]) picture.recolour();
+});
+
+setUpKeys({
+  " ": () => timebar.toggle(),
+  "ArrowLeft": () => timebar.step(-1),
+  "ArrowRight": () => timebar.step(1),
+  "Shift+ArrowLeft": () => timebar.jump(-1),
+  "Shift+ArrowRight": () => timebar.jump(1),
+  "Home": () => timebar.toOldest(),
+  "End": () => timebar.goLive(),
+  "ArrowUp": () => chooseNext(-1),
+  "ArrowDown": () => chooseNext(1),
+  "Escape": () => selected !== null && choose(selected),
+  "t": toggleTheme,
+  "?": showHelp,
+  "+": zoomIn, "=": zoomIn, "-": zoomOut, "0": fitAll,
+}, chooseNth);
 setInterval(refresh, LOOK_MS);

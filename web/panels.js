@@ -1,12 +1,7 @@
 // Everything that is words: the header, the banner, the side panels.
 
+import { $, setPairs, setText } from "./dom.js";
 import * as format from "./format.js";
-
-const $ = (id) => document.getElementById(id);
-
-function setText(element, text) {
-  if (element.textContent !== text) element.textContent = text;
-}
 
 function setChip(element, level, text) {
   element.dataset.level = level;
@@ -16,31 +11,6 @@ function setChip(element, level, text) {
 function setNotice(element, text) {
   element.hidden = text === "";
   setText(element, text);
-}
-
-/** Fill a list with `[left, right, level?, title?]` lines; says `none` where there are none. */
-function setPairs(list, pairs, none) {
-  const wanted = JSON.stringify(pairs);
-  if (list.dataset.shown === wanted) return; // leave the page alone when nothing has changed
-  list.dataset.shown = wanted;
-  const lines = pairs.map(([left, right, level = "", title = ""]) => {
-    const line = document.createElement("li");
-    line.dataset.level = level;
-    line.title = title;
-    for (const text of [left, right]) {
-      const part = document.createElement("span");
-      part.textContent = text;
-      line.append(part);
-    }
-    return line;
-  });
-  if (!lines.length) {
-    const line = document.createElement("li");
-    line.className = "muted";
-    line.textContent = none;
-    lines.push(line);
-  }
-  list.replaceChildren(...lines);
 }
 
 // --- connection ---------------------------------------------------------------------------------
@@ -133,19 +103,6 @@ function showRecording(recording) {
   setText(element, parts.join(" · "));
 }
 
-function showLinks(links) {
-  const pairs = (links ?? []).map((link) => {
-    const frames = `${format.count(link.frames)} frames`;
-    const bad = link.bad_crc > 0 ? `, ${format.count(link.bad_crc)} bad CRC` : "";
-    const plural = link.peers === 1 ? "" : "s";
-    const peers = format.known(link.peers) ? `, ${link.peers} peer${plural}` : "";
-    return [
-      link.url, `${link.state} · ${frames}${bad}${peers}`, link.state === "up" ? "good" : "warn",
-    ];
-  });
-  setPairs($("links"), pairs, "none");
-}
-
 /** What each reason means, for the reader's pointer; an unknown reason is shown as it is. */
 const REASONS = {
   "garbage": "bytes between frames",
@@ -200,7 +157,6 @@ export function showStatus(status) {
   setText($("updates"), format.perSecond(status.rates?.updates_hz));
   showCenter(status.center);
   showRecording(status.recording);
-  showLinks(status.links);
 }
 
 // --- beams --------------------------------------------------------------------------------------

@@ -4,6 +4,8 @@ import { drawCompass, drawRingLabels, drawRings } from "./backdrop.js";
 import * as format from "./format.js";
 import { drawLabels } from "./labels.js";
 import { Scale } from "./scale.js";
+import { fontOf, readColours } from "./surface.js";
+import { trailOf } from "./trails.js";
 import { drawBeams, withAlpha } from "./wedges.js";
 
 const RADIANS = Math.PI / 180;
@@ -13,11 +15,12 @@ const LEADER_S = 2; // the line ahead of a UAV: where it is in so many seconds
 
 const COLOURS = [
   "plan", "grid", "gridtext", "text", "muted", "live", "coast", "stale", "beam", "bore", "bad",
+  "past", "on-past",
 ];
 
 export class PlanView {
-  constructor(canvas, trails, onSelect) {
-    Object.assign(this, { canvas, trails, context: canvas.getContext("2d") });
+  constructor(canvas, history, onSelect) {
+    Object.assign(this, { canvas, history, context: canvas.getContext("2d") });
     this.scene = { uavs: [], beams: [], array: null, selected: null, uavsLive: false };
     this.scale = new Scale();
     this.queued = false;
@@ -29,11 +32,8 @@ export class PlanView {
 
   /** Read the colours of the theme from the style sheet. */
   recolour() {
-    const style = getComputedStyle(document.documentElement);
-    this.colour = Object.fromEntries(
-      COLOURS.map((name) => [name, style.getPropertyValue(`--${name}`).trim()]),
-    );
-    this.font = style.getPropertyValue("--font").trim() || "sans-serif";
+    this.colour = readColours(COLOURS);
+    this.font = fontOf();
     this.redraw();
   }
 
@@ -121,7 +121,7 @@ export class PlanView {
   drawTrail(uav) {
     if (!format.known(uav.lat_deg)) return;
     const { context } = this;
-    const trail = this.trails.of(uav, this.scene.now);
+    const trail = trailOf(uav, this.history, this.scene.at);
     context.strokeStyle = this.colourOf(uav);
     context.lineCap = "round";
     for (let i = 1; i < trail.length; i += 1) {
@@ -132,19 +132,37 @@ export class PlanView {
       context.globalAlpha = (solid ? 0.75 : 0.7) * (1 - older.age) ** 1.2 + 0.04;
       context.beginPath();
       context.moveTo(...this.at(older.north, older.east));
-      context.lineTo(...this.at(newer.north, newer.east));
+      this.curveTo(older, newer);
       context.stroke();
     }
     context.globalAlpha = 1;
   }
 
+  /** From point to point as it was flown: the curve has the velocities at both ends (Hermite). */
+  curveTo(older, newer) {
+    const to = this.at(newer.north, newer.east);
+    if (!older.velocity || !newer.velocity) {
+      this.context.lineTo(...to);
+      return;
+    }
+    const thirdS = (newer.at - older.at) / 3000;
+    const [v0, v1] = [older.velocity, newer.velocity];
+    this.context.bezierCurveTo(
+      ...this.at(older.north + v0[0] * thirdS, older.east + v0[1] * thirdS),
+      ...this.at(newer.north - v1[0] * thirdS, newer.east - v1[1] * thirdS), ...to,
+    );
+  }
+
   drawBound(uav) {
-    if (!format.known(uav.bound_m)) return;
+    const [northM, eastM] = uav.bound_ellipsoid_ned_m ?? [];
+    if (!format.known(northM) || !format.known(eastM)) return;
     const { context } = this;
-    const px = uav.bound_m * this.pxPerM;
-    if (px > 4 * Math.hypot(this.width, this.height)) return;
+    const [alongPx, acrossPx] = [northM * this.pxPerM, eastM * this.pxPerM];
+    if (Math.max(alongPx, acrossPx) > 4 * Math.hypot(this.width, this.height)) return;
     context.beginPath();
-    context.arc(...this.at(uav.north_m, uav.east_m), px, 0, 2 * Math.PI);
+    context.ellipse(
+      ...this.at(uav.north_m, uav.east_m), acrossPx, alongPx, 0, 0, 2 * Math.PI,
+    );
     context.fillStyle = withAlpha(this.colourOf(uav), 0.1);
     context.fill();
     context.strokeStyle = this.colourOf(uav);
@@ -272,7 +290,7 @@ export class PlanView {
 
   /** What must not be overlooked, across the middle of the picture. */
   drawMessage(uavs) {
-    const { message, uavsLive } = this.scene;
+    const { message, uavsLive, isPast } = this.scene;
     const text = message
       || (uavsLive && this.scene.uavs.length && !uavs.length
         ? "No carrier position: UAVs cannot be placed" : "");
@@ -281,12 +299,14 @@ export class PlanView {
     const size = this.width < 500 ? 16 : 22;
     const y = this.centre[1] + this.outerPx * 0.42;
     const widthPx = this.measure(text, size, 700) + 36;
-    context.fillStyle = message ? this.colour.bad : this.colour.plan;
+    context.fillStyle = !message ? this.colour.plan
+      : isPast ? this.colour.past : this.colour.bad;
     context.fillRect(this.centre[0] - widthPx / 2, y - size, widthPx, size * 2);
     context.font = `700 ${size}px ${this.font}`;
     context.textAlign = "center";
     context.textBaseline = "middle";
-    context.fillStyle = message ? this.colour.plan : this.colour.text;
+    context.fillStyle = !message ? this.colour.text
+      : isPast ? this.colour["on-past"] : this.colour.plan;
     context.fillText(text, this.centre[0], y);
   }
 

@@ -1,5 +1,6 @@
 // The table of UAVs: one row a UAV, kept between updates so that focus and selection stay.
 
+import { make, setText } from "./dom.js";
 import * as format from "./format.js";
 
 const halfWidthDeg = (array) =>
@@ -36,6 +37,18 @@ function range(uav) {
   return parts.every(format.known) ? Math.hypot(...parts) : null;
 }
 
+/** Older than this, a UAV's values are drawn as old. */
+const OLD_S = 2;
+
+const ageOf = ({ uav, sinceS }) => (format.known(uav.age_s) ? uav.age_s + sinceS : null);
+
+function age(context) {
+  const ageS = ageOf(context);
+  const text = format.seconds(ageS);
+  if (!(ageS > OLD_S)) return { text };
+  return { text: `▲ ${text}`, level: "warn", title: "No report lately" };
+}
+
 /** Columns in their order. `feed`: which answer a value stands on; `short`: for narrow screens. */
 const COLUMNS = [
   { key: "state", label: "State", feed: "uavs", show: ({ uav }) => ({ text: uav.state }) },
@@ -48,9 +61,7 @@ const COLUMNS = [
   { key: "speed", label: "Speed", feed: "uavs",
     show: ({ uav }) => ({ text: format.speed(uav.speed_mps) }) },
   { key: "age", label: "Age", feed: "uavs", title: "Since the newest accepted report",
-    show: ({ uav, sinceS }) => ({
-      text: format.seconds(format.known(uav.age_s) ? uav.age_s + sinceS : null),
-    }) },
+    show: age },
   { key: "dt", label: "ΔT", feed: "uavs", title: "Last interval between reports",
     show: ({ uav }) => ({ text: format.seconds(uav.dt_s) }) },
   { key: "latency", label: "Latency", feed: "uavs", title: "From when it was true to arrival",
@@ -64,16 +75,6 @@ const COLUMNS = [
   { key: "guaranteed", label: "Guaranteed gain", short: "Guaranteed", feed: "beams",
     title: "The least gain wherever the UAV truly is within its bound", show: guaranteedGain },
 ];
-
-const make = (tag, attributes = {}) => {
-  const element = document.createElement(tag);
-  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
-  return element;
-};
-
-const setText = (element, text) => {
-  if (element.textContent !== text) element.textContent = text;
-};
 
 export class UavTable {
   constructor(table, onSelect) {
@@ -107,6 +108,11 @@ export class UavTable {
     });
   }
 
+  /** Bring a UAV's row into sight. */
+  reveal(id) {
+    this.rows.get(id)?.line.scrollIntoView({ block: "nearest" });
+  }
+
   addRow(id) {
     const line = make("tr", { role: "row" });
     const head = make("th", { scope: "row", role: "rowheader", "data-feed": "uavs" });
@@ -131,6 +137,8 @@ export class UavTable {
 
   fill(row, context, isSelected) {
     row.line.dataset.state = context.uav.state;
+    row.line.toggleAttribute("data-old", ageOf(context) > OLD_S);
+    row.line.toggleAttribute("data-selected", isSelected);
     row.button.setAttribute("aria-pressed", String(isSelected));
     COLUMNS.forEach((column, index) => {
       const { cell, value } = row.cells[index];

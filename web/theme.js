@@ -18,16 +18,19 @@ function remember(theme) {
   }
 }
 
+/** Returns what changes the theme. */
 export function setUpTheme(button, onChange) {
   const apply = (theme) => {
     document.documentElement.dataset.theme = theme;
-    button.textContent = theme === "dark" ? "Light theme" : "Dark theme";
+    button.textContent = theme === "dark" ? "Light" : "Dark";
     onChange();
   };
-  apply(remembered() === "light" ? "light" : "dark");
-  button.addEventListener("click", () => {
+  const toggle = () => {
     const theme = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
     remember(theme);
     apply(theme);
-  });
+  };
+  apply(remembered() === "light" ? "light" : "dark");
+  button.addEventListener("click", toggle);
+  return toggle;
 }

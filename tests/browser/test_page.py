@@ -1,5 +1,12 @@
-"""The dashboard in a real browser, on the running demo. Pictures go to ``out/screens``."""
+"""The dashboard in a real browser, on the running demo.
 
+Pictures go to ``out/screens``; with ``KEEP_SCREENS`` set, to ``docs`` as well.
+"""
+
+import functools
+import os
+import signal
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,10 +17,18 @@ from support import ROOT, Node
 pytestmark = pytest.mark.browser
 
 CHROMIUM = Path("/usr/bin/chromium")
-SCREENS = ROOT / "out" / "screens"
+SCREENS = ROOT / "docs" if os.environ.get("KEEP_SCREENS") else ROOT / "out" / "screens"
 QUIET = (
     *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+)
+UAVS = ("1:1", "2:1", "3:1", "4:1")
+DESKTOP = {"width": 1440, "height": 900}
+PHONE = {"width": 390, "height": 844}
+REQUESTS_PER_S = 5.0
+OVERFLOW = "document.documentElement.scrollWidth - innerWidth"
+AZIMUTHS = (
+    "[...document.querySelectorAll('td[data-key=azimuth]')].map(cell => cell.innerText).join()"
 )
 
 
@@ -30,44 +45,269 @@ def chromium() -> Iterator[Any]:
         browser.close()
 
 
-@pytest.fixture
-def demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Node]:
-    """The demo, once its four beams are up."""
-    monkeypatch.chdir(tmp_path)  # it records to ./recordings
-    node = Node("demo", "--port", "0", "--seconds", "60")
+def start_demo(directory: Path, port: int = 0) -> Node:
+    """The demo, recording to ``directory``, once its four beams are up."""
+    before = Path.cwd()
+    os.chdir(directory)  # it records to ./recordings
+    try:
+        node = Node("demo", "--port", str(port), "--seconds", "90")
+    finally:
+        os.chdir(before)
     node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
+    return node
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Node]:
+    """One demo for all tests that do not end it."""
+    node = start_demo(tmp_path_factory.mktemp("demo"))
     yield node
     node.stop()
 
 
-@pytest.mark.parametrize(("name", "width", "height"), [("desktop", 1440, 900), ("phone", 390, 844)])
-def test_every_uav_is_shown_and_moves(
-    chromium: Any, demo: Node, name: str, width: int, height: int
-) -> None:
-    page = chromium.new_page(viewport={"width": width, "height": height})
-    complaints: list[str] = []
-    page.on("console", lambda said: complaints.append(said.text) if said.type == "error" else None)
-    page.on("pageerror", lambda error: complaints.append(str(error)))
-    page.goto(demo.url)
-    for uav in ("1:1", "2:1", "3:1", "4:1"):
-        page.get_by_text(uav, exact=True).first.wait_for(timeout=3000)
-    page.get_by_text("ready", exact=True).first.wait_for(timeout=3000)
-    before = page.inner_text("table")
-    page.wait_for_function("text => document.querySelector('table').innerText !== text", arg=before)
-    page.wait_for_timeout(5000)  # for the picture alone: trails need some seconds to draw
+@pytest.fixture
+def start_mine(tmp_path: Path) -> Iterator[Any]:
+    """Starts demos for one test alone, and ends those that it left."""
+    nodes: list[Node] = []
+
+    def start(port: int = 0) -> Node:
+        nodes.append(start_demo(tmp_path, port))
+        return nodes[-1]
+
+    yield start
+    for node in nodes:
+        if node.process.poll() is None:
+            node.process.kill()
+            node.process.communicate()
+
+
+@pytest.fixture
+def open_page(chromium: Any) -> Iterator[Any]:
+    """Opens pages; at the end none of them may have complained, but of what was announced."""
+    pages: list[tuple[Any, list[str], bool]] = []
+
+    def start(url: str, viewport: dict[str, int], *, loses_service: bool = False) -> Any:
+        page = chromium.new_page(viewport=viewport)
+        complaints: list[str] = []
+        page.on("console", lambda said: said.type == "error" and complaints.append(said.text))
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        pages.append((page, complaints, loses_service))
+        page.goto(url)
+        return page
+
+    yield start
+    for page, complaints, loses_service in pages:
+        page.close()
+        # Chromium complains of every answer that is none or no success, and there are such then.
+        unheard = [text for text in complaints if not text.startswith("Failed to load resource")]
+        assert (unheard if loses_service else complaints) == []
+
+
+def wait_for_uavs(page: Any) -> None:
+    """Until every UAV of the demo is in the table, three seconds at most."""
+    for uav in UAVS:
+        page.locator("#uavs").get_by_text(uav, exact=True).wait_for(timeout=3000)
+
+
+def picture(page: Any, name: str) -> None:
+    """Keep what the page looks like."""
     SCREENS.mkdir(parents=True, exist_ok=True)
     page.screenshot(path=SCREENS / f"{name}.png")
-    assert complaints == []
-    page.close()
 
 
-def test_a_lost_service_is_unmistakable(chromium: Any, demo: Node) -> None:
-    page = chromium.new_page(viewport={"width": 1440, "height": 900})
+def drawn_colours(page: Any, canvas: str) -> int:
+    """How many colours a picture has: one, where nothing was drawn."""
+    return int(
+        page.evaluate(
+            """id => {
+                const canvas = document.querySelector(id);
+                const { data } = canvas.getContext("2d")
+                    .getImageData(0, 0, canvas.width, canvas.height);
+                return new Set(new Uint32Array(data.buffer)).size;
+            }""",
+            canvas,
+        )
+    )
+
+
+def test_everything_is_shown_and_moves_without_flooding(demo: Node, open_page: Any) -> None:
+    page = open_page(demo.url, DESKTOP)
+    wait_for_uavs(page)
+    page.get_by_text("ready", exact=True).wait_for(timeout=3000)
+    before = page.evaluate(AZIMUTHS)
+    page.wait_for_function(f"before => {AZIMUTHS} !== before", arg=before, timeout=3000)
+    page.locator("#pattern-facts [data-fact=peak]").get_by_text("dB").wait_for(timeout=3000)
+    page.locator("#links").get_by_text("udpin:").wait_for(timeout=6000)
+    page.locator("#events").get_by_text("4:1 is live").wait_for(timeout=6000)
+    page.wait_for_timeout(6000)  # so that the series and the rate of requests say something
+    times = page.evaluate("performance.getEntriesByType('resource')"
+                          ".filter(one => one.initiatorType === 'fetch')"
+                          ".map(one => one.startTime)")  # fmt: skip
+    recent = [at for at in times if at > max(times) - 5000]
+    assert len(recent) / 5 <= REQUESTS_PER_S * 1.1
+    canvases = ["#plan", "#pattern", "#elements"]
+    canvases += [f"#chart-{one} canvas" for one in ("pointing", "innovation", "latency", "gain")]
+    for canvas in canvases:
+        assert drawn_colours(page, canvas) > 5, canvas
+    assert page.evaluate(OVERFLOW) == 0
+    assert page.locator("#recordings-panel").is_hidden() == ("/v1/recordings" not in paths(demo))
+    picture(page, "dashboard")
+
+
+def paths(node: Node) -> dict[str, Any]:
+    """What the service offers."""
+    found: dict[str, Any] = node.json("/openapi.json")["paths"]
+    return found
+
+
+def test_the_keyboard_chooses_pauses_and_looks_back(demo: Node, open_page: Any) -> None:
+    page = open_page(demo.url, DESKTOP)
+    wait_for_uavs(page)
+    page.keyboard.press("2")
+    assert page.locator(".pick[aria-pressed=true]").inner_text() == "2:1"
+    page.keyboard.press("ArrowDown")
+    assert page.locator(".pick[aria-pressed=true]").inner_text() == "3:1"
+    page.keyboard.press("Escape")
+    assert page.locator(".pick[aria-pressed=true]").count() == 0
+    seen = remember_azimuths(page, seconds=4)
+    page.keyboard.press("Space")
+    paused = page.evaluate(AZIMUTHS)
+    assert page.locator("#past").is_visible()
+    assert "NOT LIVE" in page.locator("#past").inner_text()
+    assert page.title().startswith("PAUSED")
+    page.wait_for_timeout(1200)  # more than a beat: the page must stand still
+    assert page.evaluate(AZIMUTHS) == paused
+    page.keyboard.press("ArrowLeft")
+    page.keyboard.press("ArrowLeft")
+    past = page.evaluate(AZIMUTHS)
+    assert past != paused and past in seen
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowRight")
+    assert page.evaluate(AZIMUTHS) == paused
+    page.keyboard.press("End")
+    assert page.locator("#past").is_hidden()
+    page.wait_for_function(f"seen => !seen.includes({AZIMUTHS})", arg=[*seen, paused], timeout=3000)
+    page.keyboard.press("?")
+    assert page.locator("#help").is_visible()
+    page.keyboard.press("Escape")
+    assert page.locator("#help").is_hidden()
+
+
+def remember_azimuths(page: Any, seconds: float) -> list[str]:
+    """Every state of the table's azimuths over some seconds."""
+    seen: list[str] = page.evaluate(
+        f"""async milliseconds => {{
+            const seen = new Set();
+            const end = performance.now() + milliseconds;
+            while (performance.now() < end) {{
+                seen.add({AZIMUTHS});
+                await new Promise(requestAnimationFrame);
+            }}
+            return [...seen];
+        }}""",
+        seconds * 1000,
+    )
+    return seen
+
+
+def test_the_slider_looks_back(demo: Node, open_page: Any) -> None:
+    page = open_page(demo.url, PHONE)
+    wait_for_uavs(page)
+    seen = remember_azimuths(page, seconds=2.5)
+    page.locator("#scrub").fill("-1")
+    assert page.locator("#past").is_visible()
+    assert page.evaluate(AZIMUTHS) in seen
+    page.get_by_role("button", name="▶ Live").click()
+    assert page.locator("#past").is_hidden()
+    picture(page, "dashboard-phone")
+
+
+def fulfil(answer: Any, route: Any) -> None:
+    """Answer in the place of a service that has recordings to offer."""
+    route.fulfill(json=answer)
+
+
+def test_recordings_are_listed_with_a_link_where_there_are_any(demo: Node, open_page: Any) -> None:
+    page = open_page("about:blank", DESKTOP)
+    answers: dict[str, Any] = {
+        "/openapi.json": {"paths": {"/v1/recordings": {}}},
+        "/v1/recordings": {"recordings": [{"name": "a b.mcap", "bytes": 1500, "state": "closed"}]},
+    }
+    for path, answer in answers.items():
+        page.route(f"**{path}", functools.partial(fulfil, answer))
     page.goto(demo.url)
-    page.get_by_text("1:1", exact=True).first.wait_for(timeout=3000)
-    demo.process.kill()
-    demo.process.communicate()
-    page.get_by_text("CONNECTION LOST").first.wait_for(timeout=4000)
-    SCREENS.mkdir(parents=True, exist_ok=True)
-    page.screenshot(path=SCREENS / "lost.png")
-    page.close()
+    link = page.get_by_role("link", name="a b.mcap")
+    link.wait_for(timeout=4000)
+    assert link.get_attribute("href") == "/v1/recordings/a%20b.mcap"
+    assert "1.5\u00a0kB · closed" in page.locator("#recordings").text_content()
+
+
+def test_a_phone_shows_it_all_in_its_width(demo: Node, open_page: Any) -> None:
+    page = open_page(demo.url, PHONE)
+    wait_for_uavs(page)
+    page.locator("#links").get_by_text("udpin:").wait_for(timeout=6000)
+    assert page.evaluate(OVERFLOW) == 0
+    cut = page.evaluate("""[...document.querySelectorAll("main *, header *")]
+        .filter(one => one.checkVisibility() && !one.closest(".hidden, .u-wrap"))
+        .filter(one => one.getBoundingClientRect().right > innerWidth + 0.5)
+        .map(one => one.tagName + "." + one.className)""")
+    assert cut == []
+    assert page.locator("#pause").bounding_box()["height"] >= 40  # for cold fingers
+
+
+def test_themes_are_remembered_and_legible(demo: Node, open_page: Any) -> None:
+    page = open_page(demo.url, DESKTOP)
+    wait_for_uavs(page)
+    for theme in ("dark", "light"):
+        assert page.locator("html").get_attribute("data-theme") == theme
+        ratios = page.evaluate(CONTRASTS)
+        assert ratios["text"] >= 12 and ratios["muted"] >= 6, ratios
+        assert min(ratios.values()) >= 4.5, ratios
+        page.keyboard.press("t")
+    page.keyboard.press("t")
+    page.reload()
+    wait_for_uavs(page)
+    assert page.locator("html").get_attribute("data-theme") == "light"
+    page.wait_for_timeout(4000)  # for the picture alone
+    picture(page, "dashboard-light")
+
+
+CONTRASTS = """(() => {
+    const style = getComputedStyle(document.documentElement);
+    const light = name => {
+        const hex = style.getPropertyValue("--" + name).trim();
+        const [r, g, b] = [1, 3, 5].map(i => parseInt(hex.slice(i, i + 2), 16) / 255)
+            .map(c => c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4);
+        return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+    };
+    const names = ["text", "muted", "live", "coast", "stale", "beam", "warn", "bad"];
+    return Object.fromEntries(names.map(name => {
+        const [a, b] = [light(name), light("panel")].sort((x, y) => y - x);
+        return [name, (a + 0.05) / (b + 0.05)];
+    }));
+})()"""
+"""Contrast with the panels as WCAG 2 has it: 4.5 for text, 7 where it must be read in the sun."""
+
+
+def test_a_lost_service_is_unmistakable_and_heals(open_page: Any, start_mine: Any) -> None:
+    node = start_mine()
+    page = open_page(node.url, DESKTOP, loses_service=True)
+    wait_for_uavs(page)
+    style = "getComputedStyle(document.querySelector('td[data-key=range] span')).{}"
+    node.process.send_signal(signal.SIGSTOP)  # silent, but not gone
+    page.locator("html[data-uavs-late]").wait_for(state="attached", timeout=2800)
+    assert page.evaluate(style.format("fontStyle")) == "italic"
+    node.process.send_signal(signal.SIGCONT)
+    fresh = page.locator("html:not([data-uavs-late]):not([data-uavs-lost])")
+    fresh.wait_for(state="attached", timeout=3000)
+    page.wait_for_function(f"{style.format('fontStyle')} === 'normal'", timeout=3000)
+    node.process.kill()
+    node.process.communicate()
+    killed = time.monotonic()
+    page.get_by_text("CONNECTION LOST", exact=True).wait_for(timeout=4000)
+    assert time.monotonic() - killed < 4
+    assert page.evaluate(style.format("textDecorationLine")) == "line-through"
+    start_mine(port=int(node.url.rpartition(":")[2]))
+    page.locator("#banner").wait_for(state="hidden", timeout=5000)
+    page.get_by_text("connected", exact=True).wait_for(timeout=3000)
+    assert page.evaluate(style.format("textDecorationLine")) == "none"

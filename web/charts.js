@@ -1,0 +1,160 @@
+// Time series of the last minutes, a line a UAV: one picture for each thing that must stay small
+// (or, for gain, large). Drawn by uPlot, which is loaded as a plain script (vendor/README.md).
+
+import { $, make, setChildren } from "./dom.js";
+import { known } from "./format.js";
+import { fontOf, readColours } from "./surface.js";
+
+const SPANS_S = [30, 60, 180]; // the shortest that holds what there is
+const GAP_MS = 2500; // no line through a hole in what was received
+const MOST_LINES = 7; // as many hues as can be told apart
+const REDRAW_MS = 1000;
+/** Besides its hue every line has its own dash: no UAV is told by colour alone. */
+const DASHES = [[], [7, 3], [2, 3], [10, 3, 2, 3], [4, 2], [14, 4], [2, 6]];
+const HUES = DASHES.map((_, i) => `line${i}`);
+
+const CHARTS = [
+  { id: "pointing", of: (_, beam) => beam?.pointing_bound_deg },
+  { id: "innovation", of: (uav) => uav.innovation_m },
+  { id: "latency", of: (uav) => (known(uav.latency_s) ? uav.latency_s * 1000 : null) },
+  { id: "gain", of: (_, beam) => beam?.guaranteed_gain_db },
+];
+
+/** `uavs` to draw: the chosen one always, then the first ones of the table. */
+function chosenFew(uavs, selected) {
+  const ids = uavs.map((uav) => uav.id);
+  const few = ids.slice(0, MOST_LINES);
+  if (selected !== null && !few.includes(selected)) few[few.length - 1] = selected;
+  return few;
+}
+
+/** Columns for uPlot: seconds before now, then the values of each UAV; null for unknown. */
+function columns(moments, ids, of, now) {
+  const table = [[], ...ids.map(() => [])];
+  const row = (at, values) => [(at - now) / 1000, ...values].forEach((v, i) => table[i].push(v));
+  moments.forEach((moment, i) => {
+    const before = moments[i - 1];
+    if (before && moment.at - before.at > GAP_MS) row(before.at + 1, ids.map(() => null));
+    const beams = new Map(moment.beams.map((beam) => [beam.uav, beam]));
+    row(moment.at, ids.map((id) => {
+      const uav = moment.byId.get(id);
+      const value = uav && of(uav, beams.get(id));
+      return known(value) ? value : null;
+    }));
+  });
+  return table;
+}
+
+export class Charts {
+  constructor(onPick) {
+    Object.assign(this, { onPick, plots: [], ids: null, selected: null, drawnAt: 0, pastAt: null });
+    [this.spanS] = SPANS_S;
+    for (const { id } of CHARTS) {
+      new ResizeObserver(() => this.fit()).observe($(`chart-${id}`));
+    }
+    this.recolour();
+  }
+
+  recolour() {
+    this.colour = readColours([...HUES, "grid", "muted", "mark"]);
+    this.font = `11px ${fontOf()}`;
+    this.ids = null; // made anew with the new colours
+  }
+
+  fit() {
+    for (const { plot, box } of this.plots) {
+      if (box.clientWidth) plot.setSize({ width: box.clientWidth, height: box.clientHeight });
+    }
+  }
+
+  /** `pastAt`: the moment that the page shows, null while it is live. */
+  show(history, uavs, { selected, pastAt, isNew, now }) {
+    const ids = chosenFew(uavs, selected);
+    const changed = this.ids === null || ids.join() !== this.ids.join()
+      || selected !== this.selected;
+    const due = isNew || pastAt !== this.pastAt || now - this.drawnAt > REDRAW_MS;
+    if (!changed && !due) return;
+    Object.assign(this, { selected, pastAt, drawnAt: now, now });
+    if (changed) this.build(ids, uavs.length);
+    const oldestS = (now - (history.moments[0]?.at ?? now)) / 1000;
+    this.spanS = SPANS_S.find((spanS) => spanS >= oldestS) ?? SPANS_S.at(-1);
+    const moments = history.between(now - this.spanS * 1000, now);
+    CHARTS.forEach(({ of }, i) => this.plots[i].plot.setData(columns(moments, ids, of, now)));
+  }
+
+  build(ids, total) {
+    this.ids = ids;
+    this.plots.forEach(({ plot }) => plot.destroy());
+    this.plots = CHARTS.map(({ id }) => {
+      const box = $(`chart-${id}`);
+      const empty = [[], ...ids.map(() => [])];
+      return { box, plot: new globalThis.uPlot(this.options(box), empty, box) };
+    });
+    this.plots.forEach(({ plot }) => {
+      plot.over.addEventListener("click", () => {
+        this.onPick(performance.now() + plot.posToVal(plot.cursor.left, "x") * 1000);
+      });
+    });
+    showKey(ids, total);
+  }
+
+  options(box) {
+    const axis = {
+      stroke: this.colour.muted, font: this.font, ticks: { show: false },
+      grid: { stroke: this.colour.grid, width: 1 },
+    };
+    return {
+      width: Math.max(60, box.clientWidth), height: Math.max(60, box.clientHeight),
+      padding: [8, 16, 0, 0], legend: { show: false },
+      cursor: { y: false, points: { show: false }, drag: { x: false, y: false } },
+      scales: { x: { time: false, range: () => [-this.spanS, 0] } },
+      axes: [
+        { ...axis, size: 24, incrs: [10, 20, 60], values: (_, marks) => marks.map(agoLabel) },
+        { ...axis, size: 40, space: 24, values: (_, marks) => marks.map(plain) },
+      ],
+      series: [{}, ...this.ids.map((id, i) => ({
+        stroke: this.colour[HUES[i]], dash: DASHES[i], points: { show: false },
+        width: id === this.selected ? 2.6 : 1.4,
+      }))],
+      hooks: { draw: [(plot) => this.markPast(plot)] },
+    };
+  }
+
+  /** Where in the pictures the moment is that the rest of the page shows. */
+  markPast(plot) {
+    if (this.pastAt === null) return;
+    const { left, top, width, height } = plot.bbox;
+    const x = plot.valToPos((this.pastAt - this.now) / 1000, "x", true);
+    if (x < left || x > left + width) return;
+    plot.ctx.save();
+    plot.ctx.fillStyle = this.colour.mark;
+    plot.ctx.fillRect(x - 1.5, top, 3, height);
+    plot.ctx.restore();
+  }
+}
+
+const plain = (value) => String(value).replace("-", "−");
+
+function agoLabel(seconds) {
+  if (seconds === 0) return "now";
+  return seconds % 60 ? `−${-seconds} s` : `−${-seconds / 60} min`;
+}
+
+/** Which line is whose. */
+function showKey(ids, total) {
+  setChildren($("series-key"), [ids, total], () => {
+    const names = ids.map((id, i) => {
+      const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
+      svg.setAttribute("viewBox", "0 0 28 8");
+      svg.setAttribute("aria-hidden", "true");
+      const path = document.createElementNS("http://www.w3.org/2000/svg", "path");
+      path.setAttribute("d", "M0 4H28");
+      path.setAttribute("stroke-dasharray", DASHES[i].join(" "));
+      path.setAttribute("class", `line${i}`);
+      svg.append(path);
+      return make("li", {}, svg, id);
+    });
+    if (total > ids.length) names.push(make("li", { class: "muted" }, `of ${total} UAVs`));
+    return names;
+  });
+}

@@ -1,0 +1,33 @@
+// The few things that every panel does to the page.
+
+export const $ = (id) => document.getElementById(id);
+
+export function setText(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+/** An element with attributes and children; children are elements or text. */
+export function make(tag, attributes = {}, ...children) {
+  const element = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+  element.append(...children);
+  return element;
+}
+
+/** Put these children into a list, unless it shows the same already: `key` says what it shows. */
+export function setChildren(list, key, build) {
+  const wanted = JSON.stringify(key);
+  if (list.dataset.shown === wanted) return; // leave focus and selection alone
+  list.dataset.shown = wanted;
+  list.replaceChildren(...build());
+}
+
+/** Fill a list with `[left, right, level?, title?]` lines; says `none` where there are none. */
+export function setPairs(list, pairs, none) {
+  setChildren(list, [pairs, none], () => {
+    if (!pairs.length) return [make("li", { class: "muted" }, none)];
+    return pairs.map(([left, right, level = "", title = ""]) => make(
+      "li", { "data-level": level, title }, make("span", {}, left), make("span", {}, right),
+    ));
+  });
+}

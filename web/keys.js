@@ -1,0 +1,31 @@
+// The keyboard, for a page that is worked with gloves on.
+
+/** Native controls keep their own keys while the keyboard is on them. */
+function isTaken(event) {
+  const element = event.target;
+  if (event.ctrlKey || event.altKey || event.metaKey || event.isComposing) return true;
+  if (document.querySelector("dialog[open]")) return true;
+  if (element.matches("input, select, textarea")) {
+    return ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Home", "End"]
+      .includes(event.key);
+  }
+  // Space presses a button that was reached by the keyboard, not one that was clicked before.
+  const pressable = element.closest("button, a, summary");
+  return event.key === " " && pressable !== null && pressable.matches(":focus-visible");
+}
+
+/** `actions`: what each key does; `selectNth(n)`: 1 is the first row of the table. */
+export function setUpKeys(actions, selectNth) {
+  document.addEventListener("keydown", (event) => {
+    if (isTaken(event)) return;
+    const digit = /^[1-9]$/.test(event.key) ? Number(event.key) : null;
+    const key = event.shiftKey && event.key.startsWith("Arrow") ? `Shift+${event.key}` : event.key;
+    const action = digit === null ? actions[key] ?? actions[key.toLowerCase()]
+      : () => selectNth(digit);
+    if (!action) return;
+    event.preventDefault();
+    // A clicked button would be pressed by the key's release: it gives the keyboard back.
+    if (event.key === " " && event.target.matches("button")) event.target.blur();
+    action();
+  });
+}

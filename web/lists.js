@@ -1,0 +1,70 @@
+// Links, events and recordings.
+
+import { $, make, setChildren } from "./dom.js";
+import * as format from "./format.js";
+
+const EVENTS_SHOWN = 60;
+const SEVERITY_LEVEL = { info: "", warning: "warn", error: "bad", critical: "bad" };
+
+const LINK_COLUMNS = [
+  ["Frames", (link) => format.count(link.frames)],
+  ["Bad CRC", (link) => format.count(link.bad_crc)],
+  ["Gaps", (link) => format.count(link.gaps), "Frames that its sequence numbers say are missing"],
+  ["First", (link) => format.share(link.reports?.first_share),
+    "Share of its reports that came over no other link before"],
+  ["Latency", (link) => format.millisecondsRange(
+    link.reports?.latency_p50_s, link.reports?.latency_p95_s,
+  ), "From when a report was true to its arrival: half of them, 95 of 100"],
+];
+
+function linkLevel(link) {
+  if (link.state !== "up") return "bad";
+  return format.known(link.age_s) && link.age_s > 3.5 ? "warn" : "good";
+}
+
+/** A link and its counts; `level` shows by a mark as well as by colour. */
+function linkItem(link) {
+  const quiet = link.state === "up" && linkLevel(link) === "warn"
+    ? ` · silent ${format.duration(link.age_s)}` : "";
+  const head = make("p", { class: "link-head", "data-level": linkLevel(link) },
+    make("span", {}, link.url), make("b", {}, link.state + quiet));
+  const facts = LINK_COLUMNS.map(([label, show, title = ""]) => make(
+    "div", { title }, make("dt", {}, label), make("dd", {}, show(link)),
+  ));
+  const heard = (link.components ?? []).map((one) => one.id).join(" ");
+  const item = make("li", {}, head, make("dl", { class: "link-facts" }, ...facts));
+  if (heard) item.append(make("p", { class: "muted" }, `hears ${heard}`));
+  return item;
+}
+
+export function showLinks(answer) {
+  const links = answer?.links ?? [];
+  setChildren($("links"), links.length ? links : answer !== null, () => (links.length
+    ? links.map(linkItem) : [make("li", { class: "muted" }, answer ? "none" : format.UNKNOWN)]));
+}
+
+function eventItem({ at, severity, text }) {
+  return make("li", { "data-level": SEVERITY_LEVEL[severity] ?? "warn" },
+    make("time", { datetime: at }, format.timeOfDay(at)), make("span", {}, text));
+}
+
+/** The newest first. */
+export function showEvents(answer) {
+  const events = (answer?.events ?? []).slice(-EVENTS_SHOWN).reverse();
+  setChildren($("events"), events.length ? events : answer !== null, () => (events.length
+    ? events.map(eventItem) : [make("li", { class: "muted" }, answer ? "none" : format.UNKNOWN)]));
+}
+
+function recordingItem({ name, bytes, state }) {
+  const href = `/v1/recordings/${encodeURIComponent(name)}`;
+  const link = make("a", { href, download: "" }, name);
+  return make("li", {}, link, make("span", {}, [format.bytes(bytes), state].join(" · ")));
+}
+
+/** Nothing at all where the service does not offer them. */
+export function showRecordings(answer) {
+  const recordings = answer?.recordings ?? null;
+  $("recordings-panel").hidden = recordings === null;
+  if (recordings === null) return;
+  setChildren($("recordings"), recordings, () => recordings.map(recordingItem));
+}

@@ -1,0 +1,79 @@
+// Pause and look back. While the page shows the past it says so where nobody can overlook it.
+
+import { $, setText } from "./dom.js";
+import * as format from "./format.js";
+
+const JUMP_MS = 10_000;
+
+export class TimeBar {
+  constructor(history, onChange) {
+    Object.assign(this, { history, onChange });
+    this.shown = null; // the moment that is shown; null while the page is live
+    $("pause").addEventListener("click", () => this.toggle());
+    $("scrub").addEventListener("input", () => {
+      const agoMs = -Number($("scrub").value) * 1000;
+      this.show(this.history.at(performance.now() - agoMs));
+    });
+  }
+
+  get isLive() {
+    return this.shown === null;
+  }
+
+  toggle() {
+    if (this.isLive) this.show(this.history.newest);
+    else this.goLive();
+  }
+
+  goLive() {
+    this.shown = null;
+    this.onChange();
+  }
+
+  /** The page stays at this moment until it is sent elsewhere, even when it is long past. */
+  show(moment) {
+    if (moment === null) return; // nothing has been received: there is nothing to look back at
+    this.shown = moment;
+    this.onChange();
+  }
+
+  showAt(at) {
+    this.show(this.history.at(at));
+  }
+
+  /** One answer back or on. */
+  step(steps) {
+    const from = this.shown ?? this.history.newest;
+    if (from) this.show(this.history.stepFrom(from, steps));
+  }
+
+  /** Ten seconds back or on. */
+  jump(direction) {
+    const from = this.shown ?? this.history.newest;
+    if (from) this.showAt(from.at + direction * JUMP_MS);
+  }
+
+  toOldest() {
+    this.show(this.history.moments[0] ?? null);
+  }
+
+  draw(now) {
+    const { isLive, history } = this;
+    const reachS = history.moments.length ? (now - history.moments[0].at) / 1000 : 0;
+    const agoS = isLive ? 0 : (now - this.shown.at) / 1000;
+    document.documentElement.toggleAttribute("data-past", !isLive);
+    const scrub = $("scrub");
+    scrub.min = String(-Math.ceil(reachS));
+    // While it is dragged it is the operator's; else it follows the moment into the past.
+    if (!scrub.matches(":active")) scrub.value = String(-agoS);
+    scrub.setAttribute("aria-valuetext", isLive ? "live" : `${format.duration(agoS)} ago`);
+    setText($("pause"), isLive ? "❚❚ Pause" : "▶ Live");
+    $("pause").setAttribute("aria-pressed", String(!isLive));
+    setText($("reach"), `−${format.duration(reachS)}`);
+    setText($("time-mode"), isLive ? "now" : `−${format.duration(agoS)}`);
+    $("past").hidden = isLive;
+    if (isLive) return;
+    setText($("past-detail"), `All but connection and readiness is of `
+      + `${format.clock(this.shown.stamp)}, ${format.duration(agoS)} ago. Space: back to live.`);
+  }
+}

@@ -10,6 +10,7 @@ import json
 import re
 import shlex
 import shutil
+import signal
 import socket
 import subprocess
 import urllib.request
@@ -30,7 +31,10 @@ BLOCKS = [
     for block in re.findall(r"(?:^    .*\n?|^\n(?=    ))+", README, re.MULTILINE)
 ]
 SETTINGS = [block for block in BLOCKS if block.startswith("[")]
-COMMANDS = [line for block in BLOCKS if block not in SETTINGS for line in block.split("\n") if line]
+PYTHON = [block for block in BLOCKS if block.startswith("from ")]
+COMMANDS = [
+    line for block in BLOCKS if block not in SETTINGS + PYTHON for line in block.split("\n") if line
+]
 COMMANDS += re.findall(r"`((?:make|companion|sitl-replay|docker) [^`…]*)`", README)
 
 Started = Callable[..., Any]
@@ -77,8 +81,11 @@ def curl(words: list[str], where: Path, start_node: Started) -> None:
     if "-o" in words:
         (where / words[words.index("-o") + 1]).write_bytes(body)
         assert np.load(where / "weights.npy").shape == (64, 4)
+    elif url.endswith("/metrics"):
+        assert b"companion_frames_total" in body
     else:
-        assert {beam["uav"] for beam in json.loads(body)["beams"]} == {"1:1", "2:1", "3:1", "4:1"}
+        last_word = {"status": "version", "GLOBAL_POSITION_INT": "message"}.get(url.split("/")[-1])
+        assert (last_word in json.loads(body)) if last_word else (b'"1:1"' in body)
 
 
 def to_its_end(words: list[str], where: Path, start_node: Started) -> None:
@@ -87,6 +94,25 @@ def to_its_end(words: list[str], where: Path, start_node: Started) -> None:
     assert done.stdout or (where / "weights.npy").exists()
     if "--out" in words:
         assert (where / words[words.index("--out") + 1]).exists()
+
+
+def served(words: list[str], where: Path, start_node: Started) -> None:
+    """The replay of a recording that answers until it is stopped."""
+    words[words.index("--listen") + 1] = "127.0.0.1:0"
+    process = subprocess.Popen(
+        [BIN / words[0], *words[1:]], cwd=where, stderr=subprocess.PIPE, text=True,
+        stdout=subprocess.DEVNULL,
+    )  # fmt: skip
+    with process:
+        assert process.stderr is not None
+        said = (re.search(r"serves (http://\S+) and replays", line) for line in process.stderr)
+        found = next((one for one in said if one), None)
+        assert found is not None
+        with urllib.request.urlopen(found[1] + "/v1/status", timeout=10) as answer:
+            assert json.load(answer)["replay"]["log"] == "recording.mcap"
+        process.send_signal(signal.SIGINT)
+        process.stderr.read()
+    assert process.returncode == 0
 
 
 def live(words: list[str], where: Path, start_node: Started) -> None:
@@ -141,6 +167,8 @@ RUNNERS: dict[str, Callable[[list[str], Path, Started], None]] = {
     "make": make,
     "curl": curl,
     "companion replay": to_its_end,
+    "companion replay --serve": served,
+    "companion recover": to_its_end,
     "companion weights": to_its_end,
     "companion design": to_its_end,
     "companion study": to_its_end,
@@ -156,6 +184,8 @@ FULL = {"companion study prediction"}
 def runner_of(command: str) -> str:
     """The key of ``RUNNERS`` for a command; ``LookupError`` where nobody knows how to run it."""
     words = words_of(command)
+    if "--serve" in words:
+        return "companion replay --serve"
     for key in (" ".join(words[:2]), words[0]):
         if key in RUNNERS:
             return key
@@ -171,9 +201,23 @@ def test_the_command_does_what_it_should(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     shutil.copy(cut_log, tmp_path / "flight.tlog")
+    if "recording.mcap" in command:
+        run(["companion", "replay", "flight.tlog", "--out", "recording.mcap"], tmp_path)
     monkeypatch.chdir(tmp_path)  # `recordings` and the like are made here
     words = ["12" if word == "120" else word for word in words_of(command)]  # it is 25 s long
     RUNNERS[runner_of(command)](words, tmp_path, start_node)
+
+
+def test_python_does_what_it_should(
+    start_node: Started, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (block,) = PYTHON
+    node = start_node("demo", "--port", "0", "--seconds", "60")
+    node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
+    exec(block.replace("http://127.0.0.1:8080", node.url), {})
+    weights, beams = capsys.readouterr().out.splitlines()
+    assert weights.startswith("('1:1', ") and "(64, 4)" in weights
+    assert beams.startswith("beams 20")
 
 
 def test_names_of_commands_are_run_in_full() -> None:

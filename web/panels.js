@@ -103,6 +103,17 @@ function showRecording(recording) {
   setText(element, parts.join(" · "));
 }
 
+/** Whose past this is, where it is one: nobody may take a replay for the air. */
+function showReplay(replay) {
+  const element = $("replay");
+  element.hidden = !replay;
+  if (!replay) return;
+  const of = format.known(replay.of_s) ? ` of ${Math.round(replay.of_s)}` : "";
+  const pace = format.known(replay.speed) ? `${replay.speed}×` : "max";
+  const how = replay.state === "finished" ? "finished" : pace;
+  setChip(element, "warn", `replay ${replay.log} · ${Math.round(replay.at_s)}${of} s · ${how}`);
+}
+
 /** What each reason means, for the reader's pointer; an unknown reason is shown as it is. */
 const REASONS = {
   "garbage": "bytes between frames",
@@ -117,6 +128,17 @@ const REASONS = {
   "duplicate": "the same report again",
   "out-of-order": "older than what is known",
   "unreachable": "farther than the aircraft can have flown",
+  "altitude-jump": "the same in height: the datum has changed",
+  "frozen": "a fresh stamp on an old position",
+  "shared-id": "two vehicles send under one id",
+  "unplaced-stamp": "off the sender's clock",
+  "not-allowed": "kept out by the lists of the settings",
+  "too-many": "as many are tracked as the settings allow",
+  "unsigned": "no signature, where one is required",
+  "bad-signature": "signed with another key, or altered",
+  "replayed": "well signed, but played again",
+  "secret": "carries a signing key: not used, not recorded",
+  "socket-overflow": "lost before it was read: buffer full",
 };
 
 /** Counts by reason, and when this page last saw each of them rise. */
@@ -157,6 +179,7 @@ export function showStatus(status) {
   setText($("updates"), format.perSecond(status.rates?.updates_hz));
   showCenter(status.center);
   showRecording(status.recording);
+  showReplay(status.replay);
 }
 
 // --- beams --------------------------------------------------------------------------------------

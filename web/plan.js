@@ -5,7 +5,7 @@ import * as format from "./format.js";
 import { drawLabels } from "./labels.js";
 import { Scale } from "./scale.js";
 import { fontOf, readColours } from "./surface.js";
-import { trailOf } from "./trails.js";
+import { fixesOf, trailOf } from "./trails.js";
 import { drawBeams, withAlpha } from "./wedges.js";
 
 const RADIANS = Math.PI / 180;
@@ -96,6 +96,7 @@ export class PlanView {
     const uavs = this.scene.uavs.filter(placed);
     drawBeams(this, uavs);
     uavs.forEach((uav) => this.drawTrail(uav));
+    uavs.forEach((uav) => this.drawFixes(uav));
     uavs.forEach((uav) => this.drawBound(uav));
     this.drawCarrier();
     this.hits = uavs.map((uav) => this.drawUav(uav));
@@ -133,6 +134,25 @@ export class PlanView {
       context.beginPath();
       context.moveTo(...this.at(older.north, older.east));
       this.curveTo(older, newer);
+      context.stroke();
+    }
+    context.globalAlpha = 1;
+  }
+
+  /** What was reported, beside what is taken to be so now. */
+  drawFixes(uav) {
+    if (!format.known(uav.lat_deg)) return;
+    const { context } = this;
+    context.strokeStyle = this.colour.text;
+    context.lineWidth = 1.2;
+    for (const fix of fixesOf(uav, this.history, this.scene.at)) {
+      const [x, y] = this.at(fix.north, fix.east);
+      context.globalAlpha = 0.9 * (1 - fix.age) + 0.05;
+      context.beginPath();
+      context.moveTo(x - 3, y);
+      context.lineTo(x + 3, y);
+      context.moveTo(x, y - 3);
+      context.lineTo(x, y + 3);
       context.stroke();
     }
     context.globalAlpha = 1;

@@ -4,6 +4,7 @@
 import { known } from "./format.js";
 
 const KEEP_MS = 45_000;
+const FIXES_MS = 12_000;
 const WGS84_A_M = 6378137.0;
 const WGS84_E2 = 6.69437999014e-3;
 
@@ -37,6 +38,24 @@ export function trailOf(uav, history, at) {
       at: moment.at,
     }];
   });
+}
+
+/**
+ * Where a UAV said that it was, in metres relative to the carrier: `{north, east, age: 0 … 1}`, the
+ * newest reports that were seen, each once.
+ */
+export function fixesOf(uav, history, at) {
+  const scale = metresPerDegree(uav.lat_deg);
+  const seen = new Map();
+  for (const moment of history.between(at - FIXES_MS, at)) {
+    const fix = moment.byId.get(uav.id)?.fix;
+    if (known(fix?.lat_deg) && known(fix.lon_deg)) seen.set(fix.at, { fix, shownAt: moment.at });
+  }
+  return [...seen.values()].map(({ fix, shownAt }) => ({
+    north: uav.north_m + (fix.lat_deg - uav.lat_deg) * scale.north,
+    east: uav.east_m + wrapDegrees(fix.lon_deg - uav.lon_deg) * scale.east,
+    age: Math.min(1, (at - shownAt) / FIXES_MS),
+  }));
 }
 
 const wrapDegrees = (angle) => ((((angle + 180) % 360) + 360) % 360) - 180;

@@ -5,14 +5,16 @@ Pictures go to ``out/screens``; with ``KEEP_SCREENS`` set, to ``docs`` as well.
 
 import functools
 import os
+import re
 import signal
+import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from support import ROOT, Node
+from support import BIN, ROOT, Node
 
 pytestmark = pytest.mark.browser
 
@@ -311,3 +313,23 @@ def test_a_lost_service_is_unmistakable_and_heals(open_page: Any, start_mine: An
     page.locator("#banner").wait_for(state="hidden", timeout=5000)
     page.get_by_text("connected", exact=True).wait_for(timeout=3000)
     assert page.evaluate(style.format("textDecorationLine")) == "none"
+
+
+def test_a_replay_says_that_it_is_one(open_page: Any, cut_log: Path) -> None:
+    command = [BIN / "companion", "replay", cut_log, "--center", "5:1", "--no-record", "--serve"]
+    with subprocess.Popen(
+        [*command, "--listen", "127.0.0.1:0"],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+    ) as process:
+        assert process.stderr is not None
+        said = (re.search(r"serves (http://\S+) and", line) for line in process.stderr)
+        url = next(found for found in said if found)[1]
+        try:
+            page = open_page(url, DESKTOP, loses_service=True)
+            page.locator("#replay").get_by_text("replay sitl_4circle_cut.tlog").wait_for()
+            wait_for_uavs(page)
+        finally:
+            process.terminate()
+            process.stderr.read()

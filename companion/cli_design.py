@@ -5,6 +5,8 @@ from pathlib import Path
 
 import click
 
+from companion.cli_learned import train
+from companion.cli_link import link
 from companion.console import CENTER, CONFIG, JSON, Progress, user_errors
 
 
@@ -176,6 +178,22 @@ def study() -> None:
 )
 @click.option("--known-delay", is_flag=True, help="The senders' clocks are known, as by TIMESYNC.")
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
+@click.option(
+    "--snr",
+    "snr_db",
+    metavar="DB",
+    type=float,
+    default=20.0,
+    show_default=True,
+    help="At a UAV with the beam right on it: what the loss in spectral efficiency is of.",
+)
+@click.option(
+    "--learned",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Compare with this network as well, which `companion study train` made.",
+)
+@click.option("--jobs", metavar="N", type=click.IntRange(min=1), help="Processes.  [all cores]")
+@click.option("--cluster", metavar="ADDRESS", help="Work on a Dask cluster, such as tcp://H:8786.")
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
 @JSON
 def prediction(
@@ -188,6 +206,10 @@ def prediction(
     loss: float,
     known_delay: bool,
     seed: int,
+    snr_db: float,
+    learned: Path | None,
+    jobs: int | None,
+    cluster: str | None,
     out: Path,
     as_json: bool,
 ) -> None:
@@ -209,7 +231,10 @@ def prediction(
     with user_errors():
         radio = Link("radio", rate_hz, (latency_s[0], latency_s[1]), loss, known_delay)
         name = str(config) if config else None
-        setting = Setting(logs, center, tuple(leads_s), radio, seed, load(config), name)
+        setting = Setting(
+            logs, center, tuple(leads_s), radio, seed, load(config), name,
+            learned, snr_db, jobs, cluster,
+        )  # fmt: skip
         out.mkdir(parents=True, exist_ok=True)
         if center is None:
             click.echo("no --center: the array stands where the first report was made", err=True)
@@ -264,3 +289,56 @@ def beams(
             (out / name).write_bytes(content)
     progress.clear()
     click.echo(json.dumps(answer) if as_json else beam_report.text(found))
+
+
+@study.command()
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
+@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
+@JSON
+def paper(seed: int, out: Path, as_json: bool) -> None:
+    """The published experiments made again, and every claim judged.
+
+    Writes DIR/paper.json, DIR/paper.html and the figures as PNG and SVG.
+
+    Example: companion study paper --out report
+    """
+    from companion.studies import paper as experiments
+    from companion.studies import paper_claims, paper_page
+
+    progress = Progress()
+    with user_errors():
+        out.mkdir(parents=True, exist_ok=True)
+        answer, material = experiments.study(seed, progress.show)
+        answer["claims"] = paper_claims.judge(answer)
+        (out / "paper.json").write_text(json.dumps(answer, indent=1), encoding="utf-8")
+        for name, content in paper_page.paper_files(answer, material, progress.show).items():
+            (out / name).write_bytes(content)
+    progress.clear()
+    click.echo(json.dumps(answer) if as_json else paper_page.text(answer))
+
+
+@study.command()
+@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
+@JSON
+def dt(out: Path, as_json: bool) -> None:
+    """How often UAVs must report: feasible intervals and their bounds, as maps.
+
+    Writes DIR/dt.json, DIR/dt.html and the figures as PNG and SVG.
+
+    Example: companion study dt --out report
+    """
+    from companion.studies import dt_maps
+
+    progress = Progress()
+    with user_errors():
+        out.mkdir(parents=True, exist_ok=True)
+        answer, found = dt_maps.study(progress.show)
+        (out / "dt.json").write_text(json.dumps(answer), encoding="utf-8")
+        for name, content in dt_maps.files(answer, found, progress.show).items():
+            (out / name).write_bytes(content)
+    progress.clear()
+    click.echo(json.dumps(answer if as_json else answer["rates"]))
+
+
+study.add_command(train)
+study.add_command(link)

@@ -7,6 +7,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.beams.arrays import Array
+from companion.studies.spectral import SNR_DB, loss_bps_hz
 from companion.studies.truth import Flight, Flown, Times
 from companion.tracking.baselines import Observed, Predictor
 from companion.values import FloatArray
@@ -98,8 +100,22 @@ def angles_deg(towards: FloatArray, truly: FloatArray) -> FloatArray:
     return found
 
 
-def score(asked: Questions, given: Answers, lead: int) -> Row | None:
-    """The figures of one lead; None where nothing counts. Without bounds theirs are None."""
+@dataclass(frozen=True, slots=True)
+class Receiver:
+    """The array that points, and the SNR in dB that it gives with its beam on the UAV."""
+
+    array: Array
+    snr_db: float = SNR_DB
+
+
+def score(
+    asked: Questions, given: Answers, lead: int, receiver: Receiver | None = None
+) -> Row | None:
+    """The figures of one lead; None where nothing counts. Without bounds theirs are None.
+
+    ``bound_tightness`` is the median bound over the 95th percentile of the error: 1 would be a
+    bound that is as good as known. ``se_loss_bps_hz`` is of ``receiver``, None without one.
+    """
     counts = asked.counts[lead] & ~np.isnan(given.position_ned_m[lead, :, 0])
     if not counts.any():
         return None
@@ -108,16 +124,22 @@ def score(asked: Questions, given: Answers, lead: int) -> Row | None:
     error_m = np.linalg.norm(position - true, axis=1)
     angle_deg = angles_deg(position - array, true - array)
     bounded = not np.isnan(bound).any()
+    p95_m, median_m = float(np.percentile(error_m, 95)), float(np.median(bound))
     return {
         "n": int(counts.sum()),
         "position_rms_m": _rms(error_m),
-        "position_p95_m": float(np.percentile(error_m, 95)),
+        "position_p95_m": p95_m,
+        "position_max_m": float(error_m.max()),
         "angle_rms_deg": _rms(angle_deg),
         "angle_p95_deg": float(np.percentile(angle_deg, 95)),
         "angle_max_deg": float(angle_deg.max()),
         "within_beamwidth": float(np.mean(angle_deg <= HALF_BEAMWIDTH_DEG)),
+        "se_loss_bps_hz": None
+        if receiver is None
+        else loss_bps_hz(receiver.array, position - array, true - array, receiver.snr_db),
         "bound_violations": int(np.sum(error_m > bound)) if bounded else None,
-        "bound_median_m": float(np.median(bound)) if bounded else None,
+        "bound_median_m": median_m if bounded else None,
+        "bound_tightness": median_m / p95_m if bounded and p95_m else None,
     }
 
 

@@ -7,13 +7,15 @@ array's true position, while the UAV flies.
 
 The Kalman filters are tuned in hindsight, once for each log and link: their process and
 measurement noise are the best of a grid over all UAVs and leads, which is kinder to them than any
-user could be.
+user could be. ``kalman-peng`` has the noise that the settings state, and is never tuned.
+
+Each log over each link is a piece of work of its own: see ``companion.studies.fan_out``.
 """
 
 import platform
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, Final
@@ -24,23 +26,22 @@ import companion
 from companion import assembly
 from companion.config import Settings
 from companion.mavlink.clocks import SenderClock
-from companion.studies import links, truth
+from companion.studies import fan_out, links, truth
 from companion.studies.links import Delivery, Link
-from companion.studies.pointing import Questions, Row, answers, questions, score
-from companion.studies.truth import Flight, Flown
-from companion.tracking.baselines import (
-    DeadReckoning,
-    DeadReckoningOnArrival,
-    Hold,
-    Kalman,
-    Observed,
-    Predicted,
-    Predictor,
-    Tuning,
+from companion.studies.pointing import Questions, Receiver, Row, answers, questions, score
+from companion.studies.predictors import (
+    KALMAN_STATES,
+    SIMPLE,
+    Make,
+    kalman,
+    known_tuning,
+    learned,
+    observers,
 )
-from companion.tracking.fleet import SenderTime
-from companion.tracking.noise import reported
-from companion.values import AltitudeDatum, Fix, FloatArray, Report, Source
+from companion.studies.spectral import SNR_DB
+from companion.studies.truth import Flight, Flown
+from companion.tracking.baselines import Kalman, Tuning
+from companion.values import FloatArray
 
 TUNE_EVERY: Final = 5
 """The grid is searched on every fifth question: it is smooth, and there are many settings."""
@@ -53,87 +54,13 @@ DENSITIES: Final = {
 }
 NOISES: Final = tuple(product((0.03, 0.3), (0.1, 0.3)))
 """What the filters are tuned over: process noise, and noise of position (m) and velocity (m/s)."""
-KALMAN_STATES: Final = {"kalman-cv": 2, "kalman-ca": 3}
-
-Make = Callable[[], Predictor]
-
-
-# --- the predictors -----------------------------------------------------------------------------
-
-
-class FleetPredictor:
-    """The product's own tracking behind the same door as its rivals."""
-
-    def __init__(self, settings: Settings) -> None:
-        self._fleet = assembly.fleet(settings, self._sender_time)
-        self._noise = assembly.noise(settings)
-        self._offset_ns = 0
-        self._clock_bound_s = 0.0
-
-    def report(self, report: Observed) -> None:
-        """A fix; whether it is used is the fleet's to say."""
-        self._offset_ns = report.sent_ns - report.sender_ns
-        self._clock_bound_s = report.clock_bound_s
-        errors = self._noise.default if report.gnss is None else reported(report.gnss, self._noise)
-        self._fleet.accept(
-            Fix(
-                _UAV,
-                report.sender_ns,
-                report.sent_ns,
-                report.arrival_ns,
-                report.position_ned_m,
-                report.velocity_ned_mps,
-                errors,
-                _REPORT,
-            )
-        )
-
-    def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
-        """The track at that time, with its bound."""
-        track = self._fleet.track(_UAV, now_ns, at_ns)
-        if track is None:
-            return None
-        return Predicted(track.position_ned_m, track.velocity_ned_mps, track.bound_m)
-
-    def _sender_time(self, _uav: str, node_ns: int) -> SenderTime:
-        return SenderTime(node_ns - self._offset_ns, self._clock_bound_s)
-
-
-_UAV: Final = "1:1"
-_REPORT: Final = Report(
-    0, "study", _UAV, Source(1, 1), 0.0, 0.0, 0.0, AltitudeDatum.MSL, None, None, None, None,
-    None, None,
-)  # fmt: skip
-"""Stands for the message that a fix was made of, which tracking does not look into."""
-
-
-def observers(settings: Settings) -> dict[str, Make]:
-    """The product's observers by name: each makes a predictor of one UAV."""
-
-    def maker(model: str) -> Make:
-        chosen = settings.override(observer={"model": model})
-        return lambda: FleetPredictor(chosen)
-
-    return {f"uio-{model}": maker(model) for model in ("position", "kinematic")}
-
-
-SIMPLE: Final[Mapping[str, Make]] = {
-    "hold": Hold,
-    "dead-reckoning-arrival": DeadReckoningOnArrival,
-    "dead-reckoning": DeadReckoning,
-}
-
-
-def _kalman(name: str, tuning: Tuning) -> Make:
-    return lambda: Kalman(KALMAN_STATES[name], tuning)
-
-
-# --- the study ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """What is asked of the study."""
+    """What is asked of the study. ``learned`` is a file of ``companion study train``, ``snr_db``
+    what the spectral efficiency is of; ``jobs`` processes work (None: as many as cores), or the
+    cluster at an address. Who works does not change the rows."""
 
     logs: tuple[Path, ...]
     center: str | None = None
@@ -142,8 +69,14 @@ class Setting:
     seed: int = 1
     settings: Settings = field(default_factory=Settings)
     config: str | None = None
+    learned: Path | None = None
+    snr_db: float = SNR_DB
+    jobs: int | None = 1
+    cluster: str | None = None
 
     def __post_init__(self) -> None:
+        if not -100 <= self.snr_db <= 100:
+            raise ValueError(f"--snr is in dB, between -100 and 100, not {self.snr_db:g}")
         if not self.leads_s or not all(0 <= lead_s <= 60 for lead_s in self.leads_s):
             raise ValueError("leads are seconds, between 0 and 60")
         if self.seed < 0:
@@ -161,14 +94,17 @@ class Setting:
         words += ["--rate", f"{radio.rate_hz:g}"]
         words += ["--latency", "{:g},{:g}".format(*radio.latency_s)]
         words += ["--loss", f"{radio.loss:g}", *(["--known-delay"] if radio.known_delay else [])]
+        words += ["--learned", str(self.learned)] if self.learned else []
+        words += ["--snr", f"{self.snr_db:g}"]
         return shlex.join([*words, "--seed", str(self.seed)])
 
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """One log over one link: its rows, and the tuning that each filter was given."""
+    """A log, by its name, over one link: its rows, and the tuning that each filter was given."""
 
-    flown: Flown
+    log: str
+    center: str
     link: Link
     rows: tuple[Row, ...]
     tuned: Mapping[str, Tuning]
@@ -200,19 +136,30 @@ def compare(
     for name in DENSITIES if cases else ():
         progress(f"{where}: tuning {name}")
         tuned[name] = tune(name, cases)
-    makes = {**observers(setting.settings), **SIMPLE}
-    makes |= {name: _kalman(name, tuning) for name, tuning in tuned.items()}
+    makes = predictors(setting, tuned)
+    receiver = Receiver(assembly.array(setting.settings), setting.snr_db)
     rows: list[Row] = []
     for (flight, delivery, asked), (name, make) in product(cases, makes.items()):
         progress(f"{where}: {name} on {flight.uav}")
         given = answers(make(), delivery.observed, asked)
         for lead, lead_s in enumerate(setting.leads_s):
-            figures = score(asked, given, lead)
+            figures = score(asked, given, lead, receiver)
             head = {"log": flown.log, "uav": flight.uav, "predictor": name, "lead_s": lead_s}
             head |= {"report_rate_hz": delivery.rate_hz, "latency_s": delivery.latency_s}
             if figures:
                 rows.append(head | {"loss": link.loss} | figures | {"truth": flight.truth.kind})
-    return Compared(flown, link, tuple(rows), tuned)
+    return Compared(flown.log, flown.center, link, tuple(rows), tuned)
+
+
+def predictors(setting: Setting, tuned: Mapping[str, Tuning]) -> dict[str, Make]:
+    """All that are compared, by name, in the order of the tables."""
+    known = known_tuning(setting.settings)
+    makes = {**observers(setting.settings), **SIMPLE}
+    makes |= {name: kalman(name, tuning) for name, tuning in tuned.items()}
+    makes["kalman-peng"] = lambda: Kalman(2, known)
+    if setting.learned is not None:
+        makes["lstm"] = learned(setting.learned)
+    return makes
 
 
 def tune(name: str, cases: Sequence[Case]) -> Tuning:
@@ -231,6 +178,22 @@ def tune(name: str, cases: Sequence[Case]) -> Tuning:
     return min((Tuning(density, *noises) for density, noises in grid), key=cost)
 
 
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A piece of work: one log over one link."""
+
+    setting: Setting
+    path: Path
+    link: Link
+
+
+def work(piece: Piece, progress: Callable[[str], None] = lambda _text: None) -> Compared:
+    """Read a log and compare. ``ValueError`` or ``LogError`` where nothing is to study in it."""
+    progress(f"reading {piece.path.name}")
+    flown = truth.load(piece.path, piece.setting.center)
+    return compare(flown, piece.link, piece.setting, progress)
+
+
 def study(
     setting: Setting, progress: Callable[[str], None] = lambda _text: None
 ) -> tuple[dict[str, Any], list[Compared]]:
@@ -238,14 +201,16 @@ def study(
 
     ``ValueError`` or ``LogError`` for a log in which there is nothing to study.
     """
-    found: list[Compared] = []
-    for path in setting.logs:
-        progress(f"reading {path.name}")
-        flown = truth.load(path, setting.center)
-        here = [compare(flown, link, setting, progress) for link in (links.CLEAN, setting.radio)]
-        if not any(compared.rows for compared in here):
+    if setting.learned is not None:
+        learned(setting.learned)  # what cannot be used is said before the work
+    pieces = [
+        Piece(setting, path, link) for path in setting.logs for link in (links.CLEAN, setting.radio)
+    ]
+    found = _compared(setting, pieces, progress)
+    for path, *both in zip(setting.logs, found[::2], found[1::2], strict=True):
+        if not any(compared.rows for compared in both):
             raise ValueError(f"{path}: no UAV flies in it, as far as its carrier is known")
-        found += here
+    known = known_tuning(setting.settings)
     return {
         "rows": [row for compared in found for row in compared.rows],
         "command": setting.command,
@@ -255,11 +220,29 @@ def study(
             "python": platform.python_version(),
         },
         "seed": setting.seed,
+        "snr_db": setting.snr_db,
         "links": [asdict(link) for link in (links.CLEAN, setting.radio)],
         "tuning": [
-            {"log": compared.flown.log, "link": compared.link.name, "predictor": name}
-            | asdict(tuning)
+            {"log": compared.log, "link": compared.link.name, "predictor": name} | asdict(tuning)
             for compared in found
-            for name, tuning in compared.tuned.items()
+            for name, tuning in (*compared.tuned.items(), ("kalman-peng", known))
         ],
     }, found
+
+
+def _compared(
+    setting: Setting, pieces: Sequence[Piece], progress: Callable[[str], None]
+) -> list[Compared]:
+    """The pieces done, in their order."""
+
+    def told(done: int) -> None:
+        progress(f"{done} of {len(pieces)} done (a log over a link each)")
+
+    told(0)
+    if setting.cluster is not None:
+        there = [replace(piece, path=piece.path.absolute()) for piece in pieces]
+        return fan_out.on_cluster(work, there, setting.cluster, told)
+    jobs = setting.jobs or fan_out.cores()
+    if jobs > 1 and len(pieces) > 1:
+        return fan_out.on_cores(work, pieces, jobs, told)
+    return [work(piece, progress) for piece in pieces]

@@ -1,6 +1,8 @@
 """What a log holds of its vehicles: the reports, and where they truly were.
 
-The truth is the simulator's own word (SIM_STATE) where a log has it, else the reports, looked at
+The truth is the simulator's own word where a log has it: SIM_STATE, or ArduPilot's older SIMSTATE
+(ardupilotmega.xml, 164), which says where but not how high: its heights are those of the reports,
+its velocities those between neighbours. Else it is the reports, looked at
 afterwards: all of them, in the order of the sender's clock, interpolated. A sender's clock is put
 on the log's timeline with hindsight: by the least delay within ``WINDOW_NS`` before and after.
 """
@@ -23,20 +25,22 @@ from companion.tracking.geodesy import LocalFrame
 from companion.values import FloatArray, Frame, GnssStatus, Report
 
 Times = NDArray[np.int64]
-Kind = Literal["SIM_STATE", "reports"]
+Kind = Literal["SIM_STATE", "SIMSTATE", "reports"]
 
 SIM_STATE: Final = 108
+SIMSTATE: Final = 164
 REBOOT_STEP_NS: Final = 10_000_000_000
 WINDOW_NS: Final = 10_000_000_000
 GAP_NS: Final = 2_500_000_000
 """Between two points of a trajectory that lie further apart than this nothing is known."""
 PAIRED_NS: Final = 50_000_000
-"""SIM_STATE carries no time: it is as late as the report that arrived nearest, if within this."""
+"""Neither carries a time: it is as late as the report that arrived nearest, if within this."""
 FLYING_SPEED_MPS: Final = 1.0
 FLYING_HEIGHT_M: Final = 2.0
 
-_READ: Final = (GLOBAL_POSITION_INT, GPS_RAW_INT, SIM_STATE)
+_READ: Final = (GLOBAL_POSITION_INT, GPS_RAW_INT, SIM_STATE, SIMSTATE)
 _SIM_STATE = struct.Struct("<21fii")
+_SIMSTATE = struct.Struct("<9fii")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,7 +119,7 @@ class Flown:
 def load(path: Path, center_text: str | None) -> Flown:
     """Read a log. ``ValueError`` or ``LogError`` where there is nothing to study in it."""
     center: Center = parse_center(center_text or "home")
-    reports, gnss, states = _gather(path)
+    reports, gnss, states, places = _gather(path)
     if not reports:
         raise ValueError(f"{path}: no vehicle reports a position in it")
     first = min((each[0] for each in reports.values()), key=lambda report: report.t_ns)
@@ -124,7 +128,7 @@ def load(path: Path, center_text: str | None) -> Flown:
     local = LocalFrame(stands.lat_deg, stands.lon_deg, stands.alt_m)
     # What reports but once is at a point, and does not fly.
     flights = {
-        uav: _flight(uav, each, gnss[uav], states.get(uav, []), local)
+        uav: _flight(uav, each, gnss[uav], states.get(uav, []), places.get(uav, []), local)
         for uav, each in reports.items()
         if len({report.boot_ms for report in each}) > 1
     }
@@ -148,16 +152,21 @@ Receivers = dict[str, list[GnssStatus | None]]
 States = dict[str, list[tuple[int, bytes]]]
 
 
-def _gather(path: Path) -> tuple[Reports, Receivers, States]:
-    """By vehicle: reports, each once; the receiver's status at each; SIM_STATE with arrival."""
+def _gather(path: Path) -> tuple[Reports, Receivers, States, States]:
+    """By vehicle: reports, each once; the receiver's status at each; SIM_STATE, and SIMSTATE,
+    with arrival."""
     reports: Reports = defaultdict(list)
     receivers: Receivers = defaultdict(list)
     states: States = defaultdict(list)
+    places: States = defaultdict(list)
     newest: dict[str, GnssStatus] = {}
     dedupe = Dedupe()
     for frame in _frames(path):
         if frame.msgid == SIM_STATE:
             states[str(frame.source)].append((frame.t_ns, frame.payload))
+            continue
+        if frame.msgid == SIMSTATE:
+            places[str(frame.source)].append((frame.t_ns, frame.payload))
             continue
         message = decode(frame)
         if isinstance(message, GnssStatus):
@@ -165,7 +174,7 @@ def _gather(path: Path) -> tuple[Reports, Receivers, States]:
         elif isinstance(message, Report) and not dedupe.is_repeat(frame):
             reports[message.uav].append(message)
             receivers[message.uav].append(newest.get(message.uav))
-    return reports, receivers, states
+    return reports, receivers, states, places
 
 
 def _frames(path: Path) -> Iterator[Frame]:
@@ -179,6 +188,7 @@ def _flight(
     reports: list[Report],
     gnss: list[GnssStatus | None],
     states: list[tuple[int, bytes]],
+    places: list[tuple[int, bytes]],
     local: LocalFrame,
 ) -> Flight:
     arrival_ns = np.array([report.t_ns for report in reports])
@@ -188,9 +198,12 @@ def _flight(
     height = np.array([np.nan if r.relative_alt_m is None else r.relative_alt_m for r in reports])
     t_ns = true_times_ns(arrival_ns, boot_ms)
     truth = _simulated(states, local, arrival_ns, arrival_ns - t_ns) if states else None
+    if truth is None and places:
+        alt_m = np.array([r.alt_m or 0.0 for r in reports])
+        truth = _placed(places, local, arrival_ns, t_ns, alt_m)
     return Flight(
         uav, arrival_ns, boot_ms, position, velocity, height, tuple(gnss),
-        truth or _reported(t_ns, position, velocity),
+        truth or _with_velocities("reports", t_ns, position, velocity),
     )  # fmt: skip
 
 
@@ -230,12 +243,7 @@ def _simulated(
     states: list[tuple[int, bytes]], local: LocalFrame, arrival_ns: Times, late_ns: Times
 ) -> Trajectory | None:
     """The simulator's word; None where it has no place on Earth or cannot be put in time."""
-    came_ns = np.array([t_ns for t_ns, _ in states])
-    after = np.clip(np.searchsorted(arrival_ns, came_ns), 1, len(arrival_ns) - 1)
-    earlier = came_ns - arrival_ns[after - 1] < arrival_ns[after] - came_ns
-    nearest = np.where(earlier, after - 1, after)
-    timed = np.abs(came_ns - arrival_ns[nearest]) < PAIRED_NS
-    t_ns = came_ns - late_ns[nearest]
+    t_ns, timed = _in_time(states, arrival_ns, late_ns)
     points = []
     for (_, payload), when_ns, ok in zip(states, t_ns, timed, strict=True):
         fields = _SIM_STATE.unpack(payload.ljust(_SIM_STATE.size, b"\0")[: _SIM_STATE.size])
@@ -252,14 +260,52 @@ def _simulated(
     return _ascending("SIM_STATE", times, positions, velocities)
 
 
-def _reported(t_ns: Times, position: FloatArray, velocity: FloatArray) -> Trajectory:
-    """The reports themselves; velocities that they lack are those between neighbours."""
-    found = _ascending("reports", t_ns, position, velocity)
+def _placed(
+    places: list[tuple[int, bytes]],
+    local: LocalFrame,
+    arrival_ns: Times,
+    made_ns: Times,
+    alt_m: FloatArray,
+) -> Trajectory | None:
+    """SIMSTATE's word, at the reports' heights; None as for ``_simulated``."""
+    t_ns, timed = _in_time(places, arrival_ns, arrival_ns - made_ns)
+    order = np.argsort(made_ns, kind="stable")
+    heights_m = np.interp(t_ns, made_ns[order], alt_m[order])
+    points = []
+    for (_, payload), when_ns, high_m, ok in zip(places, t_ns, heights_m, timed, strict=True):
+        fields = _SIMSTATE.unpack(payload.ljust(_SIMSTATE.size, b"\0")[: _SIMSTATE.size])
+        lat_1e7, lon_1e7 = fields[9:11]
+        if ok and (lat_1e7 or lon_1e7):
+            points.append((when_ns, _place(local, lat_1e7 * 1e-7, lon_1e7 * 1e-7, high_m)))
+    if len(points) < 2:
+        return None
+    times, positions = (np.array(column) for column in zip(*points, strict=True))
+    return _with_velocities("SIMSTATE", times, positions, np.full_like(positions, np.nan))
+
+
+def _in_time(
+    states: list[tuple[int, bytes]], arrival_ns: Times, late_ns: Times
+) -> tuple[Times, NDArray[np.bool_]]:
+    """When the simulator said each (N,), and whether that is known."""
+    came_ns = np.array([t_ns for t_ns, _ in states])
+    after = np.clip(np.searchsorted(arrival_ns, came_ns), 1, len(arrival_ns) - 1)
+    earlier = came_ns - arrival_ns[after - 1] < arrival_ns[after] - came_ns
+    nearest = np.where(earlier, after - 1, after)
+    timed: NDArray[np.bool_] = np.abs(came_ns - arrival_ns[nearest]) < PAIRED_NS
+    times: Times = came_ns - late_ns[nearest]
+    return times, timed
+
+
+def _with_velocities(
+    kind: Kind, t_ns: Times, position: FloatArray, velocity: FloatArray
+) -> Trajectory:
+    """A trajectory; velocities that it lacks are those between neighbours."""
+    found = _ascending(kind, t_ns, position, velocity)
     if len(found.t_ns) < 2 or not np.isnan(found.velocity_ned_mps).any():
         return found
     between = np.gradient(found.position_ned_m, (found.t_ns - found.t_ns[0]) * 1e-9, axis=0)
     filled = np.where(np.isnan(found.velocity_ned_mps), between, found.velocity_ned_mps)
-    return Trajectory("reports", found.t_ns, found.position_ned_m, filled)
+    return Trajectory(kind, found.t_ns, found.position_ned_m, filled)
 
 
 def _ascending(kind: Kind, t_ns: Times, position: FloatArray, velocity: FloatArray) -> Trajectory:

@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +25,16 @@ from companion.studies.truth import Flight, Flown
 from companion.tracking.baselines import Kalman, Observed, Predicted, Tuning
 
 S = 1_000_000_000
+HAS_TORCH = find_spec("torch") is not None
 KEYS = {
     *("log", "uav", "predictor", "lead_s", "report_rate_hz", "latency_s", "loss", "n"),
     *("position_rms_m", "position_p95_m", "angle_rms_deg", "angle_p95_deg", "angle_max_deg"),
     *("within_beamwidth", "bound_violations", "bound_median_m", "truth"),
+    *("position_max_m", "se_loss_bps_hz", "bound_tightness"),
 }
 NAMES = {
     *("uio-position", "uio-kinematic", "hold", "dead-reckoning-arrival", "dead-reckoning"),
-    *("kalman-cv", "kalman-ca"),
+    *("kalman-cv", "kalman-ca", "kalman-peng"),
 }
 
 
@@ -68,6 +71,9 @@ def test_scores_by_hand() -> None:
     assert found["within_beamwidth"] == 0.75
     assert found["bound_violations"] == 2
     assert found["bound_median_m"] == pytest.approx(1.75)
+    assert found["position_max_m"] == 5
+    assert found["bound_tightness"] == pytest.approx(1.75 / (2 + 0.85 * 3))
+    assert found["se_loss_bps_hz"] is None
 
 
 def test_without_bounds_or_answers() -> None:
@@ -152,6 +158,7 @@ def test_the_grid_is_searched(straight_flight: Callable[..., Flight]) -> None:
     )
     found = compare(flown(noisy), CLEAN, Setting((Path("x"),)))
     by_name = {row["predictor"]: row["position_rms_m"] for row in found.rows}
+    assert "kalman-peng" not in found.tuned
     assert found.tuned["kalman-cv"].process_density == 0.1  # the least of the grid
     assert by_name["kalman-cv"] < 0.5 * by_name["dead-reckoning"]
 
@@ -177,6 +184,9 @@ def test_the_command_on_a_short_flight(cut_log: Path, tmp_path: Path) -> None:
         bounded = row["predictor"].startswith("uio-")
         assert (row["bound_violations"] is not None) == bounded
         assert (row["bound_median_m"] is not None) == bounded
+        assert (row["bound_tightness"] is not None) == bounded
+        assert 0 <= row["se_loss_bps_hz"] <= math.log2(101)
+        assert row["position_rms_m"] <= row["position_max_m"] >= row["position_p95_m"]
         # Over the radio a clock that has heard little is off by more than the bound knows of.
         assert row["loss"] or row["bound_violations"] in (None, 0)
         assert row["angle_rms_deg"] <= row["angle_max_deg"]
@@ -186,6 +196,69 @@ def test_the_command_on_a_short_flight(cut_log: Path, tmp_path: Path) -> None:
     assert other.exit_code == 0
     assert "dead-reckoning-arrival" in other.stdout
     assert json.loads((out / "prediction.json").read_text())["rows"] != rows
+
+
+def test_processes_do_not_change_the_answer(cut_log: Path, tmp_path: Path) -> None:
+    """Two logs of two names, in the order in which they were given."""
+    other = tmp_path / "another.tlog"
+    other.write_bytes(cut_log.read_bytes()[:200_000])
+    asked = (other, cut_log, "--center", "5:1", "--lead", "0.5", "--out", tmp_path, "--json")
+    serial, parallel = run(*asked, "--jobs", "1"), run(*asked, "--jobs", "3")
+    assert serial.exit_code == 0, serial.stderr
+    assert parallel.stdout == serial.stdout
+    rows = json.loads(parallel.stdout)["rows"]
+    assert list(dict.fromkeys(row["log"] for row in rows)) == [other.name, cut_log.name]
+
+
+def test_the_spectral_efficiency_is_of_the_settings_array(cut_log: Path, tmp_path: Path) -> None:
+    """Eight elements have a wide beam: they lose little. So does little power."""
+    config = tmp_path / "few.toml"
+    config.write_text("[array]\nelements = 8\n")
+    asked = (cut_log, "--center", "5:1", "--lead", "1", "--jobs", "1", "--out", tmp_path, "--json")
+    worst = []
+    for more in ((), ("--config", config), ("--snr", "-20")):
+        done = run(*asked, *more)
+        assert done.exit_code == 0, done.stderr
+        answer = json.loads(done.stdout)
+        worst.append(max(row["se_loss_bps_hz"] for row in answer["rows"]))
+    assert worst[1] < worst[0] / 1.5
+    assert worst[2] <= math.log2(1.01)
+    assert answer["snr_db"] == -20
+    assert "--snr -20" in answer["command"]
+
+
+def test_the_text_shows_every_measure(cut_log: Path, tmp_path: Path) -> None:
+    done = run(cut_log, "--center", "5:1", "--lead", "0,1", "--out", tmp_path)
+    assert done.exit_code == 0, done.stderr
+    blocks = done.stdout.split("\n\n")
+    assert len(blocks) == 4
+    rows = json.loads((tmp_path / "prediction.json").read_text())["rows"]
+    mine = [r for r in rows if r["predictor"] == "hold" and r["lead_s"] == 1 and not r["loss"]]
+    (line,) = (line for line in blocks[1].splitlines() if line.startswith("  hold "))
+    cells = line.split()[1:]
+    total = sum(r["n"] for r in mine)
+    expected = [
+        math.sqrt(sum(r["n"] * r["angle_rms_deg"] ** 2 for r in mine) / total),
+        max(r["angle_p95_deg"] for r in mine),
+        max(r["angle_max_deg"] for r in mine),
+        sum(r["n"] * r["within_beamwidth"] for r in mine) / total,
+        sum(r["n"] * r["se_loss_bps_hz"] for r in mine) / total,
+        math.sqrt(sum(r["n"] * r["position_rms_m"] ** 2 for r in mine) / total),
+        max(r["position_p95_m"] for r in mine),
+        max(r["position_max_m"] for r in mine),
+    ]
+    assert [float(cell) for cell in cells[:-1]] == pytest.approx(expected, abs=6e-4)
+    assert cells[-1] == "-"
+
+
+def test_a_log_without_the_simulators_word(tmp_path: Path) -> None:
+    log = shared_log("real_devmangrani_flight54.tlog")
+    asked = (log, "--lead", "0.3", "--jobs", "1", "--out", tmp_path, "--json")
+    done = run(*asked)
+    assert done.exit_code == 0, done.stderr
+    rows = json.loads(done.stdout)["rows"]
+    assert {row["predictor"] for row in rows} == NAMES
+    assert {row["truth"] for row in rows} == {"reports"}
 
 
 class Page(HTMLParser):
@@ -274,6 +347,9 @@ def test_the_table_that_was_measured_before() -> None:
         (["--center", "9:1"], "the carrier 9:1 reports no position"),
         (["--center", "nowhere"], "'nowhere' is not SYSID:COMPID"),
         (["--seed", "-1"], "-1"),
+        (["--jobs", "0"], "0"),
+        (["--snr", "nan"], "--snr is in dB"),
+        (["--learned", "missing.pt"], "missing.pt" if HAS_TORCH else "companion-beams[learned]"),
     ],
 )
 def test_a_mistake_is_one_line(

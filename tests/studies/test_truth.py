@@ -45,6 +45,35 @@ def test_nothing_is_known_outside_and_in_gaps() -> None:
     assert np.isnan(lone.at(np.array([5]))[0]).all()
 
 
+def without(path: Path, out: Path, name: str) -> Path:
+    """A log less the messages of one name."""
+    reader = mavutil.mavlogfile(str(path))
+    with out.open("wb") as file:
+        while (m := reader.recv_msg()) is not None:
+            if m.get_type() != name:
+                file.write(round(m._timestamp * 1e6).to_bytes(8, "big") + bytes(m.get_msgbuf()))
+    reader.f.close()
+    return out
+
+
+def test_the_older_word_of_the_simulator(cut: Path, tmp_path: Path) -> None:
+    """SIMSTATE says where as SIM_STATE does, to its last digit; how high, the reports do."""
+    newer = truth.load(cut, "5:1")
+    older = truth.load(without(cut, tmp_path / "older.tlog", "SIM_STATE"), "5:1")
+    neither = without(tmp_path / "older.tlog", tmp_path / "neither.tlog", "SIMSTATE")
+    assert {flight.truth.kind for flight in truth.load(neither, "5:1").flights} == {"reports"}
+    for one, other in zip(newer.flights, older.flights, strict=True):
+        assert other.truth.kind == "SIMSTATE"
+        position, velocity = other.truth.at(one.truth.t_ns)
+        off_m = np.abs(position - one.truth.position_ned_m)
+        off_mps = np.abs(velocity - one.truth.velocity_ned_mps)
+        flying = one.flying(one.truth.t_ns) & ~np.isnan(off_m).any(axis=1)
+        assert flying.sum() > 100
+        assert np.median(off_m[flying], axis=0) == pytest.approx([0, 0, 0], abs=0.5)
+        assert np.percentile(off_m[flying, :2], 95) < 0.3
+        assert np.percentile(off_mps[flying, :2], 95) < 1.0
+
+
 def test_times_are_those_of_the_least_delay() -> None:
     """A drifting clock, late reports, a restart: made again to the best delay of some seconds."""
     rng = np.random.default_rng(3)

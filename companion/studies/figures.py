@@ -1,0 +1,100 @@
+"""The look of figures, and how they are written: PNG and SVG by matplotlib, without a screen.
+
+For print: lines differ in colour and in dash, colours are those of Okabe and Ito (2008), told apart
+by the colour-blind. SVG has no dates and no random ids: the same numbers give the same file.
+"""
+
+import base64
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from html import escape
+from io import BytesIO
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+DASHES: Final = ("-", "--", "-.", (0, (1, 1.2)), (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)))
+INK: Final = "#111111"
+MAP: Final = "cividis"
+PNG_DPI: Final = 160
+_STYLE: Final[Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9.0,
+    "axes.titlesize": 9.5,
+    "axes.labelsize": 9.0,
+    "legend.fontsize": 8.5,
+    "xtick.labelsize": 8.5,
+    "ytick.labelsize": 8.5,
+    "axes.grid": True,
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "axes.linewidth": 0.8,
+    "lines.linewidth": 1.4,
+    "legend.frameon": False,
+    "hatch.color": "#ffffff",
+    "svg.hashsalt": "companion",
+    "svg.fonttype": "path",
+    "figure.constrained_layout.use": True,
+}
+
+Draw = Callable[[], "Figure"]
+
+
+@contextmanager
+def style() -> Iterator[None]:
+    """Within it figures have this look; what was set before comes back."""
+    import matplotlib
+
+    with matplotlib.rc_context(_STYLE):
+        yield
+
+
+def new(
+    rows: int, columns: int, size_in: tuple[float, float], **options: Any
+) -> "tuple[Figure, list[Axes]]":
+    """A figure of panels, row by row; sizes in inches."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size_in)
+    grid = figure.subplots(rows, columns, squeeze=False, **options)
+    return figure, list(grid.flat)
+
+
+def line(number: int) -> dict[str, Any]:
+    """Colour and dash of the line of a number."""
+    return {"color": COLOURS[number % len(COLOURS)], "linestyle": DASHES[number % len(DASHES)]}
+
+
+def below(figure: "Figure", axes: "Axes", columns: int) -> None:
+    """One legend for all panels, under them, with the entries of one."""
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns)
+
+
+def lettered(panels: "Sequence[Axes]", titles: Sequence[str]) -> None:
+    """Titles (a), (b) and so on."""
+    for number, (axes, title) in enumerate(zip(panels, titles, strict=True)):
+        axes.set_title(f"({chr(ord('a') + number)}) {title}")
+
+
+def rendered(draw: Draw) -> tuple[bytes, bytes]:
+    """A figure as SVG and as PNG."""
+    with style():
+        figure = draw()
+        svg, png = BytesIO(), BytesIO()
+        figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
+        figure.savefig(png, format="png", dpi=PNG_DPI, metadata={"Software": None})
+    return svg.getvalue(), png.getvalue()
+
+
+def inline(png: bytes, name: str, caption: str) -> str:
+    """A figure for HTML, the image within it."""
+    data = base64.b64encode(png).decode()
+    return (
+        f'<figure id="{escape(name)}"><img alt="{escape(caption)}" '
+        f'src="data:image/png;base64,{data}"><figcaption>{escape(caption)}</figcaption></figure>'
+    )

@@ -1,0 +1,116 @@
+"""Maps of feasible intervals: against the definition by scanning, simulation, and the page."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from companion.cli import main
+from companion.studies import dt_maps
+from companion.studies.dt_maps import Maps
+from companion.tracking import design
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where ``companion study dt`` has written everything."""
+    out = tmp_path_factory.mktemp("dt")
+    done = CliRunner().invoke(main, ["study", "dt", "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    return out
+
+
+@pytest.fixture(scope="module")
+def answer(made: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((made / "dt.json").read_text("utf-8"))
+    return found
+
+
+@pytest.fixture(scope="module")
+def maps() -> Maps:
+    return dt_maps.maps()
+
+
+def margin(dt_s: float, feedthrough_s: float, alpha: float, mu: float) -> float:
+    """The best margin of the LMIs over all gains at a mu: the definition, by scanning."""
+    return max(
+        design.lmi_margin(dt_s, feedthrough_s, alpha, l_gain, mu, 1 / mu)
+        for l_gain in np.linspace(0.0, 2.0, 401)
+    )
+
+
+@pytest.mark.parametrize("mu", dt_maps.MUS_S2)
+def test_the_limit_is_where_no_gain_is_left(maps: Maps, mu: float) -> None:
+    for row, column in ((10, 10), (25, 24), (40, 24), (55, 40)):
+        limit_s = float(maps.limit_s[mu][row, column])
+        d, alpha = float(maps.feedthrough_s[row]), float(maps.alpha[column])
+        if limit_s > 0.05:
+            assert margin(limit_s * 0.97, d, alpha, mu) > -1e-4
+            assert margin(limit_s * 1.03, d, alpha, mu) < 0
+        else:
+            assert margin(0.06, d, alpha, mu) < 0
+
+
+def test_the_peak_is_reached_and_never_above_gamma(maps: Maps) -> None:
+    """By flying an input that always pushes outward."""
+    for alpha in dt_maps.ALPHAS:
+        peaks, gammas = maps.peak_gain_s[alpha], maps.gamma_s[alpha]
+        assert (peaks <= gammas + 1e-7).all()
+        for row, column in ((0, 79), (20, 20), (45, 70)):
+            d, b = float(maps.feedthrough_s[row]), float(maps.dt_s[column])
+            l_gain = design.gain(b, d, alpha)
+            error = 0.0
+            for _ in range(3000):
+                error = abs((1 - l_gain) * error) + abs(l_gain * d - b)
+            assert peaks[row, column] == pytest.approx(error, abs=1e-6)
+
+
+def test_axes_and_maps_have_their_shapes(answer: dict[str, Any]) -> None:
+    rows = len(answer["feedthrough_s"])
+    for values in answer["limit_s"].values():
+        assert np.shape(values) == (rows, len(answer["alpha"]))
+    for name in ("gamma_s", "peak_gain_s"):
+        for values in answer[name].values():
+            assert np.shape(values) == (rows, len(answer["dt_s"]))
+
+
+def test_the_published_limits_are_on_the_map(maps: Maps) -> None:
+    row = int(np.argmin(np.abs(maps.feedthrough_s - 0.5)))
+    column = int(np.argmin(np.abs(maps.alpha - 0.5)))
+    found = [maps.limit_s[mu][row, column] for mu in dt_maps.MUS_S2]
+    assert found == pytest.approx([0.8873, 1.0, 1.2906], abs=5e-5)
+
+
+def test_without_a_lead_the_error_is_the_way_flown(answer: dict[str, Any]) -> None:
+    """At feedthrough 0 the interval is error / speed (alpha near 1); with a lag it is less by the
+    lag, with a lead never less than twice the lead nearly."""
+    for row in answer["rates"]:
+        reach_s, d = row["error_m"] / row["speed_mps"], row["feedthrough_s"]
+        if d == 0:
+            assert row["dt_max_s"] == pytest.approx(reach_s, rel=0.006)
+        elif d < 0:
+            assert row["dt_max_s"] == pytest.approx(max(0.0, reach_s + d), abs=0.02 * reach_s)
+        else:
+            assert row["dt_max_s"] >= max(1.98 * d, d + 0.99 * reach_s)
+    axes = (dt_maps.ERRORS_M, dt_maps.SPEEDS_MPS, dt_maps.FEEDTHROUGHS_S)
+    assert len(answer["rates"]) == math.prod(map(len, axes))
+
+
+def test_the_page_stands_alone(made: Path) -> None:
+    text = (made / "dt.html").read_text("utf-8")
+    assert "<script" not in text and "http" not in text.replace("http-equiv", "")
+    assert text.count("<figure") == 3
+    assert [len(list(made.glob(kind))) for kind in ("*.png", "*.svg")] == [3, 3]
+    assert "companion study dt" in text
+
+
+def test_the_same_command_gives_the_same_bytes(made: Path, tmp_path: Path) -> None:
+    assert CliRunner().invoke(main, ["study", "dt", "--out", str(tmp_path)]).exit_code == 0
+    names = sorted(path.name for path in made.iterdir())
+    assert names == sorted(path.name for path in tmp_path.iterdir())
+    for name in names:
+        assert (made / name).read_bytes() == (tmp_path / name).read_bytes(), name

@@ -180,6 +180,8 @@ def clock(settings: Settings) -> SenderClock:
 def fleet(settings: Settings, to_sender_time: ToSenderTime) -> Fleet:
     """All tracks, none yet."""
     given, kept = settings.observer, settings.tracks
+    leads = given.model == "position"
+    lead_m = abs(given.feedthrough_s) * given.speed_max_mps if leads else 0.0
     feeds = given.model == "kinematic" and given.feed_forward
     return Fleet(
         observer(settings),
@@ -187,7 +189,7 @@ def fleet(settings: Settings, to_sender_time: ToSenderTime) -> Fleet:
             given.speed_max_mps,
             given.acceleration_max_mps2,
             Ages(kept.coasting_s, kept.stale_s, kept.lost_s),
-            GateSettings(kept.reacquire_reports, kept.reacquire_s),
+            GateSettings(kept.reacquire_reports, kept.reacquire_s, lead_m=lead_m),
             kept.window_s,
             feeds,
             kept.most,

@@ -50,8 +50,7 @@ class Agreement:
 
 def settings(flight: Flight) -> Settings:
     """The service as the scenario needs it: a level array that faces north, and the limits of this
-    motion. Stamps are exact and frames arrive as they are made. The gate takes a report for the
-    position itself, so a report that leads by D W is allowed that much as noise."""
+    motion. Stamps are exact and frames arrive as they are made."""
     scenario = flight.scenario
     fastest_mps = 1.01 * float(np.linalg.norm(flight.input_mps, axis=-1).max())
     acceleration = np.linalg.norm(np.diff(flight.input_mps, axis=0), axis=-1) / scenario.dt_s
@@ -65,7 +64,7 @@ def settings(flight: Flight) -> Settings:
             "velocity_lead_s": VELOCITY_LEAD_S,
             "speed_max_mps": fastest_mps,
             "acceleration_max_mps2": 1.01 * float(acceleration.max()),
-            "position_noise_m": scenario.feedthrough_s * fastest_mps,
+            "position_noise_m": 0.5,
             "velocity_noise_mps": 0.1,
         },
     )

@@ -111,7 +111,7 @@ class Fleet:
         if wrong is not None:
             return _rejected(fix, *wrong)
         predicted = self._observer.predict(before.state, fix.sender_ns)
-        impossible = refusal(predicted, fix)
+        impossible = refusal(predicted, fix, self._settings.gate.lead_m)
         if impossible is not None:
             return self._suspect(tracked, fix, impossible)
         tracked.believable_ns = max(tracked.believable_ns, fix.sender_ns)

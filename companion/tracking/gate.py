@@ -24,20 +24,23 @@ FROZEN_TRAVEL_M = 0.3
 
 @dataclass(frozen=True, slots=True)
 class GateSettings:
-    """When a refused run becomes the track: so many reports over so many seconds."""
+    """When a refused run becomes the track: so many reports over so many seconds. ``lead_m``: how
+    far a report may be ahead of the position or behind it, beside its noise (a feedthrough)."""
 
     reacquire_reports: int = 3
     reacquire_s: float = 3.0
     forget_s: float = 10.0
+    lead_m: float = 0.0
 
 
-def refusal(predicted: Prediction, fix: Fix) -> tuple[Reason, str] | None:
+def refusal(predicted: Prediction, fix: Fix, lead_m: float = 0.0) -> tuple[Reason, str] | None:
     """Why a report cannot be true given what was predicted for its time; None if it can."""
     north, east, down = (fix.position_ned_m - predicted.position_ned_m).tolist()
-    horizontal_m, limit_m = math.hypot(north, east), predicted.horizontal_m + fix.noise.horizontal_m
+    horizontal_m = math.hypot(north, east)
+    limit_m = predicted.horizontal_m + fix.noise.horizontal_m + lead_m
     if horizontal_m > limit_m:
         return Reason.UNREACHABLE, f"{horizontal_m:.1f} m off, at most {limit_m:.1f} m possible"
-    limit_m = predicted.vertical_m + fix.noise.vertical_m
+    limit_m = predicted.vertical_m + fix.noise.vertical_m + lead_m
     if abs(down) > limit_m:
         return Reason.ALTITUDE_JUMP, f"{-down:+.1f} m of height, at most {limit_m:.1f} m possible"
     return None
@@ -70,7 +73,7 @@ class Suspects(Generic[State]):
             old = fix.sender_ns - last.sender_ns > self._settings.forget_s * 1e9
             if fix.sender_ns <= last.sender_ns:
                 return
-            if old or refusal(predicted, fix) is not None:
+            if old or refusal(predicted, fix, self._settings.lead_m) is not None:
                 self._run.clear()
         if not self._run:
             self._begun_ns = fix.sender_ns

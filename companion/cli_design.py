@@ -337,7 +337,7 @@ def dt(out: Path, as_json: bool) -> None:
         for name, content in dt_maps.files(answer, found, progress.show).items():
             (out / name).write_bytes(content)
     progress.clear()
-    click.echo(json.dumps(answer if as_json else answer["rates"]))
+    click.echo(json.dumps(answer) if as_json else dt_maps.text(answer))
 
 
 study.add_command(train)

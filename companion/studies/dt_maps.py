@@ -189,3 +189,15 @@ def _page(answer: dict[str, Any], shown: dict[str, str]) -> str:
 
 def _rate(dt_s: float) -> str:
     return "none" if dt_s <= 0 else f"{1 / dt_s:.2f}"
+
+
+def text(answer: dict[str, Any]) -> str:
+    """The longest intervals as a table for a terminal."""
+    lines = ["  error m  speed m/s  feedthrough s  longest interval s  with alpha"]
+    for one in answer["rates"]:
+        longest = f"{one['dt_max_s']:.3f}" if one["dt_max_s"] > 0 else "none"
+        lines.append(
+            f"  {one['error_m']:7g}  {one['speed_mps']:9g}  {one['feedthrough_s']:13g}"
+            f"  {longest:>18}  {one['alpha']:10g}"
+        )
+    return "\n".join(lines)

@@ -114,3 +114,12 @@ def test_the_same_command_gives_the_same_bytes(made: Path, tmp_path: Path) -> No
     assert names == sorted(path.name for path in tmp_path.iterdir())
     for name in names:
         assert (made / name).read_bytes() == (tmp_path / name).read_bytes(), name
+
+
+def test_the_terminal_is_told_the_longest_intervals(answer: dict[str, Any]) -> None:
+    lines = dt_maps.text(answer).splitlines()
+    assert len(lines) == 1 + len(answer["rates"])
+    for line, one in zip(lines[1:], answer["rates"], strict=True):
+        shown = line.split()[3]
+        assert (shown == "none") == (one["dt_max_s"] == 0)
+        assert shown == "none" or abs(float(shown) - one["dt_max_s"]) <= 5e-4

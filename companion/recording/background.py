@@ -75,6 +75,8 @@ class BackgroundRecorder:
     ) -> None:
         self.bytes = 0
         self.dropped = 0
+        self.written_ns: int | None = None
+        """The time of the newest event that was written; None before the first."""
         self.failure: str | None = None
         self._open_part = open_part
         self._geodetic = geodetic
@@ -159,6 +161,11 @@ class BackgroundRecorder:
         """Messages recorded in all parts so far."""
         return self._finished_messages + self._writer.messages
 
+    @property
+    def queued(self) -> int:
+        """Events that wait to be written."""
+        return self._queue.qsize()
+
     # --- the side of the thread -------------------------------------------------------------
 
     def _run(self) -> None:
@@ -209,6 +216,7 @@ class BackgroundRecorder:
             self._writer.hole(Hole(item.t_ns, item.missed, self._why))
         if item.event is not None:
             self._writer.event(item.event)
+            self.written_ns = item.event.t_ns
         for output in item.outputs:
             self._writer.output(output, self._geodetic)
 

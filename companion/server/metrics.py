@@ -129,6 +129,15 @@ class NodeCollector(Collector):
         yield GaugeMetricFamily(
             "companion_recording_bytes", "Of the file being written", value=recording.bytes
         )
+        yield GaugeMetricFamily(
+            "companion_recording_queue", "Events that wait to be written", value=recording.queued
+        )
+        if recording.lag_s is not None:
+            yield GaugeMetricFamily(
+                "companion_recording_lag_seconds",
+                "How far behind the newest written event is",
+                value=recording.lag_s,
+            )
         yield CounterMetricFamily(
             "companion_recording_dropped",
             "Events that the recorder could not take",

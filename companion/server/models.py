@@ -208,6 +208,8 @@ class RecordingState(BaseModel):
     bytes: int
     messages: int
     dropped: int
+    queued: int
+    lag_s: float | None
 
 
 class Rates(BaseModel):

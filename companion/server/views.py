@@ -23,13 +23,16 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class RecordingStatus:
-    """The recording as the API shows it; ``state`` is ``recording``, ``degraded`` or ``off``."""
+    """The recording as the API shows it; ``state`` is ``recording``, ``degraded`` or ``off``.
+    ``queued`` events wait to be written; ``lag_s`` is how far behind the newest written one is."""
 
     state: str
     file: str | None
     bytes: int
     messages: int
     dropped: int
+    queued: int = 0
+    lag_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +105,8 @@ def status(node: Node, version: str) -> Json:
             "bytes": recording.bytes,
             "messages": recording.messages,
             "dropped": recording.dropped,
+            "queued": recording.queued,
+            "lag_s": recording.lag_s,
         },
         "rates": dict(node.rates()),
         "frames": pipeline.frames,

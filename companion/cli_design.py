@@ -215,8 +215,8 @@ def prediction(
 ) -> None:
     """Predictors compared on logs, over the link that they had and over a slow radio.
 
-    Writes DIR/prediction.json and DIR/prediction.html. Without --center the array stands where
-    the first report was made.
+    Writes DIR/prediction.json, DIR/prediction.html and the figures as PNG and SVG. Without
+    --center the array stands where the first report was made.
 
     Example: companion study prediction flight.tlog --center 5:1 --out report
     """
@@ -240,7 +240,8 @@ def prediction(
             click.echo("no --center: the array stands where the first report was made", err=True)
         answer, found = study(setting, progress.show)
         (out / "prediction.json").write_text(json.dumps(answer, indent=1), encoding="utf-8")
-        (out / "prediction.html").write_text(report.page(answer, found), encoding="utf-8")
+        for each, content in report.files(answer, found, progress.show).items():
+            (out / each).write_bytes(content)
     progress.clear()
     click.echo(json.dumps(answer) if as_json else report.text(found))
 
@@ -266,7 +267,7 @@ def beams(
 
     The beams as the settings make them, and beside them the same not widened. Where the log has
     the simulator's truth (SIM_STATE) every guarantee is put to the test. Writes DIR/beams.json,
-    DIR/beams.html and the figures as SVG. A recording of our own is studied with the
+    DIR/beams.html and the figures as PNG and SVG. A recording of our own is studied with the
     settings that it holds.
 
     Example: companion study beams flight.tlog --center 5:1 --out report
@@ -283,9 +284,8 @@ def beams(
         if any(each.center.source is None for each in settings):
             click.echo("no --center: the array stands where the first report was made", err=True)
         answer, found = study(setting, progress.show)
-        progress.show("drawing")
         (out / "beams.json").write_text(json.dumps(answer, indent=1), encoding="utf-8")
-        for name, content in beam_report.files(answer, found).items():
+        for name, content in beam_report.files(answer, found, progress.show).items():
             (out / name).write_bytes(content)
     progress.clear()
     click.echo(json.dumps(answer) if as_json else beam_report.text(found))

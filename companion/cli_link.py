@@ -114,9 +114,8 @@ def link(
         )
         out.mkdir(parents=True, exist_ok=True)
         answer = study(setting, progress.show)
-        progress.show("drawing")
         (out / "link.json").write_text(json.dumps(answer, indent=1), encoding="utf-8")
-        for name, content in link_report.files(answer).items():
+        for name, content in link_report.files(answer, progress.show).items():
             (out / name).write_bytes(content)
     progress.clear()
     click.echo(json.dumps(answer) if as_json else link_report.text(answer))

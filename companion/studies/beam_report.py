@@ -1,14 +1,13 @@
 """A beam study for people: a table as text, one HTML page that needs nothing else, and figures."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from html import escape
 from typing import Any, Final
 
-from companion.studies import drawing
+from companion.studies import figures
 from companion.studies.beam_charts import charts
 from companion.studies.beam_worth import SHARP, Row, summed_up
 from companion.studies.beams import Watched
-from companion.studies.drawing import Drawing
 from companion.studies.report import STYLE
 
 COMPARED: Final = (
@@ -47,8 +46,8 @@ AS_FOUND: Final = (
 """What does not depend on how the beams are made."""
 
 _CAPTIONS: Final = {
-    "gain": "Array gain over time, at its least in each interval. Where the red line is missing"
-    " nothing is guaranteed: the cone of possible directions holds a null.",
+    "gain": "Array gain over time, at its least in each interval. Where the line of the guaranteed"
+    " gain is missing nothing is guaranteed: the cone of possible directions holds a null.",
     "gain_had": "The share of looks at which a gain is at least so much: towards the predicted"
     " direction, towards the true one, and wherever the UAV may be within its bound. Sharp:"
     " [beams] widen = false.",
@@ -57,16 +56,24 @@ _CAPTIONS: Final = {
 }
 
 
-def files(answer: dict[str, Any], found: Sequence[Watched]) -> dict[str, bytes]:
-    """The page and every figure as SVG, by name of file; figures of the second log and
+def files(
+    answer: dict[str, Any], found: Sequence[Watched], progress: Callable[[str], None]
+) -> dict[str, bytes]:
+    """The page and every figure as SVG and PNG, by name of file; figures of the second log and
     those after it are numbered."""
-    drawn = [charts(watched) for watched in found]
-    made = {"beams.html": page(answer, found, drawn).encode()}
-    for number, figures in enumerate(drawn, 1):
+    drawn: list[dict[str, figures.Draw]] = []
+    captions: dict[str, str] = {}
+    for number, watched in enumerate(found, 1):
         suffix = "" if number == 1 else f"_{number}"
-        for name, figure in figures.items():
-            made[f"{name}{suffix}.svg"] = drawing.svg(figure).encode()
-    return made
+        made = charts(watched)
+        captions |= {f"{name}{suffix}": _CAPTIONS[name] for name in made}
+        drawn.append({f"{name}{suffix}": draw for name, draw in made.items()})
+    drawings = {name: (captions[name], draw) for each in drawn for name, draw in each.items()}
+
+    def page(shown: dict[str, str]) -> str:
+        return _page(answer, found, [[shown[name] for name in each] for each in drawn])
+
+    return figures.files("beams", drawings, page, progress)
 
 
 def text(found: Sequence[Watched]) -> str:
@@ -84,12 +91,10 @@ def _text(watched: Watched) -> str:
     return "\n".join(lines)
 
 
-def page(
-    answer: dict[str, Any], found: Sequence[Watched], drawn: Sequence[dict[str, Drawing]]
-) -> str:
+def _page(answer: dict[str, Any], found: Sequence[Watched], shown: Sequence[Sequence[str]]) -> str:
     """The whole report as one HTML document, without anything from elsewhere."""
     sections = "\n".join(
-        _section(watched, figures) for watched, figures in zip(found, drawn, strict=True)
+        _section(watched, inlined) for watched, inlined in zip(found, shown, strict=True)
     )
     versions = ", ".join(f"{name} {version}" for name, version in answer["versions"].items())
     return f"""<!doctype html>
@@ -113,7 +118,7 @@ settings, <em>sharp</em> the same with <code>[beams] widen = false</code>.</p>
 """
 
 
-def _section(watched: Watched, figures: dict[str, Drawing]) -> str:
+def _section(watched: Watched, inlined: Sequence[str]) -> str:
     row = summed_up(watched.samples)
     parts = [f"<section><h2>{escape(watched.log)}</h2>", f"<p>{escape(_describe(watched))}</p>"]
     parts.append("<table><tbody>")
@@ -130,10 +135,7 @@ def _section(watched: Watched, figures: dict[str, Drawing]) -> str:
         for label, keys in COMPARED
     ]
     parts.append("</tbody></table>")
-    for name, figure in figures.items():
-        caption = f"<figcaption>{_CAPTIONS[name]}</figcaption>"
-        parts.append(f"<figure>{drawing.svg(figure)}{caption}</figure>")
-    return "\n".join([*parts, _by_uav(watched), "</section>"])
+    return "\n".join([*parts, *inlined, _by_uav(watched), "</section>"])
 
 
 def _by_uav(watched: Watched) -> str:

@@ -122,7 +122,7 @@ def files(answer: dict[str, Any], found: Maps, progress: Progress) -> dict[str, 
             lambda: _gain_maps(found, found.peak_gain_s, "peak gain, s"),
         ),
     }
-    return paper_page.files("dt", drawings, lambda shown: _page(answer, shown), progress)
+    return figures.files("dt", drawings, lambda shown: _page(answer, shown), progress)
 
 
 def _limit_maps(found: Maps) -> "Figure":

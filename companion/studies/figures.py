@@ -5,7 +5,7 @@ by the colour-blind. SVG has no dates and no random ids: the same numbers give t
 """
 
 import base64
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from html import escape
 from io import BytesIO
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 DASHES: Final = ("-", "--", "-.", (0, (1, 1.2)), (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)))
+MARKS: Final = ("o", "s", "^", "D", "v", "X", "P", "<", ">")
 INK: Final = "#111111"
 MAP: Final = "cividis"
 PNG_DPI: Final = 160
@@ -34,6 +35,7 @@ _STYLE: Final[Any] = {
     "axes.axisbelow": True,
     "axes.linewidth": 0.8,
     "lines.linewidth": 1.4,
+    "lines.markersize": 4.0,
     "legend.frameon": False,
     "hatch.color": "#ffffff",
     "svg.hashsalt": "companion",
@@ -65,8 +67,14 @@ def new(
 
 
 def line(number: int) -> dict[str, Any]:
-    """Colour and dash of the line of a number."""
-    return {"color": COLOURS[number % len(COLOURS)], "linestyle": DASHES[number % len(DASHES)]}
+    """Colour and dash of the line of a number; no two of the first 36 have both alike."""
+    turns, at = divmod(number, len(COLOURS))
+    return {"color": COLOURS[at], "linestyle": DASHES[(at + turns) % len(DASHES)]}
+
+
+def marked(number: int) -> dict[str, Any]:
+    """The line of a number with its mark: for curves through a few points, or many curves."""
+    return line(number) | {"marker": MARKS[number % len(MARKS)]}
 
 
 def below(figure: "Figure", axes: "Axes", columns: int) -> None:
@@ -89,6 +97,27 @@ def rendered(draw: Draw) -> tuple[bytes, bytes]:
         figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
         figure.savefig(png, format="png", dpi=PNG_DPI, metadata={"Software": None})
     return svg.getvalue(), png.getvalue()
+
+
+def files(
+    name: str,
+    drawings: Mapping[str, tuple[str, Draw]],
+    body: Callable[[dict[str, str]], str],
+    progress: Callable[[str], None],
+) -> dict[str, bytes]:
+    """Every figure as SVG and PNG, and the page ``name``.html, by name of file.
+
+    ``drawings``: caption and drawing of each figure by its name. ``body`` makes the page from the
+    figures, each as HTML by its name.
+    """
+    made, shown = {}, {}
+    for figure, (caption, draw) in drawings.items():
+        progress(f"drawing {figure}")
+        svg, png = rendered(draw)
+        made[f"{figure}.svg"], made[f"{figure}.png"] = svg, png
+        shown[figure] = inline(png, figure, caption)
+    made[f"{name}.html"] = body(shown).encode()
+    return made
 
 
 def inline(png: bytes, name: str, caption: str) -> str:

@@ -1,30 +1,23 @@
 """A link study for people: a table as text, one HTML page that needs nothing else, the figures."""
 
-import base64
+from collections.abc import Callable
 from html import escape
 from typing import Any, Final
 
-from companion.studies.link_figures import figures
+from companion.studies import figures, link_figures
 from companion.studies.link_rows import Row
 from companion.studies.report import STYLE
 
-CAPTIONS: Final = {
-    "link_ber": "Bit error rate. Bands: 95 % confidence, from the differences between instants."
-    " Curves end where no error was seen.",
-    "link_bler": "Block error rate. A block is one OFDM symbol: 306 bits coded, 936 uncoded.",
-    "link_rate": "Bits of blocks without error over time, for one UAV.",
-    "link_evm": "Error vector magnitude after equalisation, against the symbols that were sent.",
-}
 _HEAD: Final = (
     "positions", "code", "SNR at BER 1e-3, dB", "BER at highest SNR", "Mbit/s at highest SNR",
     "pointing error, degrees: median / 95 %",
 )  # fmt: skip
 
 
-def files(answer: dict[str, Any]) -> dict[str, bytes]:
+def files(answer: dict[str, Any], progress: Callable[[str], None]) -> dict[str, bytes]:
     """The page and every figure as PNG and SVG, by name of file."""
-    drawn = figures(answer)
-    return {"link.html": page(answer, drawn).encode(), **drawn}
+    drawings = link_figures.drawings(answer)
+    return figures.files("link", drawings, lambda shown: _page(answer, shown), progress)
 
 
 def text(answer: dict[str, Any]) -> str:
@@ -47,7 +40,7 @@ def _cells(row: Row) -> list[str]:
     ]
 
 
-def page(answer: dict[str, Any], drawn: dict[str, bytes]) -> str:
+def _page(answer: dict[str, Any], shown: dict[str, str]) -> str:
     """The whole report as one HTML document, without anything from elsewhere."""
     told = answer["scenario"]
     versions = ", ".join(f"{name} {version}" for name, version in answer["versions"].items())
@@ -55,12 +48,6 @@ def page(answer: dict[str, Any], drawn: dict[str, bytes]) -> str:
     body = "\n".join(
         "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in _cells(row)) + "</tr>"
         for row in answer["summary"]
-    )
-    shown = "\n".join(
-        f'<figure><img alt="{escape(caption)}" style="max-width: 100%" width="760"'
-        f' src="data:image/svg+xml;base64,{base64.b64encode(drawn[name + ".svg"]).decode()}">'
-        f"<figcaption>{escape(caption)}</figcaption></figure>"
-        for name, caption in CAPTIONS.items()
     )
     return f"""<!doctype html>
 <html lang="en">
@@ -87,7 +74,7 @@ interleaver: scattered rays are so far below the beam that carriers hardly diffe
 <tbody>
 {body}
 </tbody></table>
-{shown}
+{"".join(shown.values())}
 </body>
 </html>
 """

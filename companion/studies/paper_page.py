@@ -1,6 +1,6 @@
 """The reproduction for people: one HTML page that needs nothing else, figures, claims as text."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from html import escape
 from typing import Any
 
@@ -9,8 +9,6 @@ from companion.studies.paper import Material
 from companion.studies.report import STYLE
 
 MORE_STYLE = """
-img { max-width: 100%; height: auto; }
-figcaption { color: #333; max-width: 52rem; }
 td.words { text-align: left; vertical-align: top; }
 td.verdict { text-align: left; font-weight: 700; vertical-align: top; }
 td.key { text-align: left; vertical-align: top; font-size: .75em; overflow-wrap: anywhere;
@@ -26,32 +24,12 @@ it takes for granted rather than says. Reports have no noise here, so that with 
 points without error: the comparison under blockage shows what the method can be worth at most."""
 
 
-def files(
-    name: str,
-    drawings: Mapping[str, tuple[str, figures.Draw]],
-    body: Callable[[dict[str, str]], str],
-    progress: Callable[[str], None],
-) -> dict[str, bytes]:
-    """Every figure as SVG and PNG, and the page ``name``.html, by name of file.
-
-    ``body`` makes the page from the figures, each as HTML by its name.
-    """
-    made, shown = {}, {}
-    for figure, (caption, draw) in drawings.items():
-        progress(f"drawing {figure}")
-        svg, png = figures.rendered(draw)
-        made[f"{figure}.svg"], made[f"{figure}.png"] = svg, png
-        shown[figure] = figures.inline(png, figure, caption)
-    made[f"{name}.html"] = body(shown).encode()
-    return made
-
-
 def paper_files(
     answer: dict[str, Any], material: Material, progress: Callable[[str], None]
 ) -> dict[str, bytes]:
     """The page ``paper.html`` and its figures."""
     drawings = paper_figures.drawings(answer, material)
-    return files("paper", drawings, lambda shown: _paper(answer, shown), progress)
+    return figures.files("paper", drawings, lambda shown: _paper(answer, shown), progress)
 
 
 def text(answer: dict[str, Any]) -> str:

@@ -1,23 +1,20 @@
 """A prediction study for people: tables as text, and one HTML page that needs nothing else."""
 
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from html import escape
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
+from companion.studies import figures
 from companion.studies.pointing import HALF_BEAMWIDTH_DEG, Row
 from companion.studies.prediction import Compared
 
-WIDTH, HEIGHT = 680, 300
-LEFT, RIGHT, TOP, BOTTOM = 56, 190, 14, 40
-# Distinct by colour, by dash and by mark, so that print in black and white can be read too.
-COLOURS: Final = (
-    "#0b4f9e", "#b3261e", "#00695c", "#6a1b9a", "#a65b00", "#37474f", "#ad1457", "#5d4037",
-    "#827717",
-)  # fmt: skip
-DASHES: Final = ("", "6 3", "2 3", "9 3 2 3", "12 4", "4 2", "1 4", "8 2 2 2 2 2", "14 3 4 3")
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 STYLE: Final = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #111; background: #fff;
@@ -31,7 +28,8 @@ figure { margin: 1.2rem 0; }
 td.best { font-weight: 700; }
 code { overflow-wrap: anywhere; }
 details { overflow-x: auto; }
-svg { max-width: 100%; height: auto; }
+img { max-width: 100%; height: auto; }
+figcaption { color: #333; max-width: 52rem; }
 @media print { section { break-inside: avoid; } body { margin: 0; font-size: 11px; } }
 """
 
@@ -136,9 +134,41 @@ def _text_measures(compared: Compared) -> str:
     return "\n".join(lines)
 
 
-def page(answer: dict[str, Any], found: Sequence[Compared]) -> str:
+def files(
+    answer: dict[str, Any], found: Sequence[Compared], progress: Callable[[str], None]
+) -> dict[str, bytes]:
+    """The page and every figure as SVG and PNG, by name of file: ``angle_`` and the link's name.
+    Figures of the second log and those after it are numbered."""
+    named = _named(found)
+    return figures.files(
+        "prediction", drawings(found), lambda shown: _page(answer, named, shown), progress
+    )
+
+
+def drawings(found: Sequence[Compared]) -> dict[str, tuple[str, figures.Draw]]:
+    """Caption and drawing of each figure by its name."""
+    return {
+        name: (f"{ANGLE.caption}, over lead: {_title(compared)}", partial(_curves, compared))
+        for name, compared in _named(found).items()
+    }
+
+
+def _named(found: Sequence[Compared]) -> dict[str, Compared]:
+    """Those that have rows, by the name of their figure."""
+    named = {}
+    seen = Counter[str]()
+    for compared in found:
+        seen[compared.link.name] += 1
+        number = seen[compared.link.name]
+        name = f"angle_{compared.link.name}" + ("" if number == 1 else f"_{number}")
+        if compared.rows:
+            named[name] = compared
+    return named
+
+
+def _page(answer: dict[str, Any], named: Mapping[str, Compared], shown: dict[str, str]) -> str:
     """The whole report as one HTML document, without anything from elsewhere."""
-    sections = "\n".join(_section(compared) for compared in found if compared.rows)
+    sections = "\n".join(_section(compared, shown[name]) for name, compared in named.items())
     versions = ", ".join(f"{name} {version}" for name, version in answer["versions"].items())
     return f"""<!doctype html>
 <html lang="en">
@@ -166,7 +196,7 @@ see errors across it. The bound's tightness would be 1 if the bound were as good
 """
 
 
-def _section(compared: Compared) -> str:
+def _section(compared: Compared, figure: str) -> str:
     tuned = "; ".join(
         f"{name}: process noise {tuning.process_density:g} m²/s{'³' if name[-1] == 'v' else '⁵'},"
         f" noise {tuning.position_noise_m:g} m and {tuning.velocity_noise_mps:g} m/s"
@@ -176,7 +206,7 @@ def _section(compared: Compared) -> str:
         [
             f"<section><h2>{escape(_title(compared))}</h2>",
             f"<p>{escape(_describe(compared))}</p>",
-            _chart(compared),
+            figure,
             *(_table(compared, measure) for measure in MEASURES),
             f"<p>Best of the grid: {escape(tuned)}.</p></section>",
             _by_uav(compared),
@@ -232,61 +262,26 @@ def _by_uav(compared: Compared) -> str:
     )
 
 
-def _chart(compared: Compared) -> str:
-    """RMS angle (logarithmic) over lead, a line for each predictor."""
+def _curves(compared: Compared) -> "Figure":
+    """RMS angle (logarithmic) over lead, a line for each predictor; no point where none is above
+    zero, for it has no place there."""
+    from matplotlib.ticker import LogLocator
+
     leads, predictors = _axes(compared)
-    series = {
-        name: [pooled(compared.rows, name, lead_s) for lead_s in leads] for name in predictors
-    }
-    values = [value for line in series.values() for value in line if value]
-    if not values:
-        return ""
-    low, high = math.floor(math.log10(min(values))), math.ceil(math.log10(max(values)))
-    high = max(high, low + 1)
-    span_x, span_y = WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM
-    widest = max(leads) or 1.0
-
-    def x(lead_s: float) -> float:
-        return LEFT + span_x * lead_s / widest
-
-    def y(value: float) -> float:
-        return TOP + span_y * (high - math.log10(value)) / (high - low)
-
-    parts = [
-        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" role="img" font-size="12">',
-        f"<title>RMS angle error over lead: {escape(_title(compared))}</title>",
-    ]
-    for power in range(low, high + 1):
-        at = y(10.0**power)
-        parts.append(f'<path d="M{LEFT} {at:.1f}H{WIDTH - RIGHT}" stroke="#bbb"/>')
-        parts.append(
-            f'<text x="{LEFT - 6}" y="{at + 4:.1f}" text-anchor="end">{10.0**power:g}°</text>'
-        )
-    for lead_s in leads:
-        parts.append(
-            f'<text x="{x(lead_s):.1f}" y="{HEIGHT - BOTTOM + 16}" text-anchor="middle">'
-            f"{lead_s:g}</text>"
-        )
-    parts.append(
-        f'<text x="{LEFT + span_x / 2:.1f}" y="{HEIGHT - 6}" text-anchor="middle">lead, s</text>'
-    )
-    for number, (name, line) in enumerate(series.items()):
-        points = [(x(s), y(value)) for s, value in zip(leads, line, strict=True) if value]
-        parts.append(_line(points, number, name))
-    return "\n".join([*parts, "</svg>"])
-
-
-def _line(points: Sequence[tuple[float, float]], number: int, name: str) -> str:
-    colour, dash = COLOURS[number % len(COLOURS)], DASHES[number % len(DASHES)]
-    style = f'stroke="{colour}" stroke-width="2" stroke-dasharray="{dash}" fill="none"'
-    places = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
-    dots = "".join(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{colour}"/>' for x, y in points)
-    at, left = TOP + 10 + 18 * number, WIDTH - RIGHT + 14
-    return (
-        f'<polyline points="{places}" {style}/>{dots}'
-        f'<path d="M{left} {at}h26" {style}/>'
-        f'<text x="{left + 32}" y="{at + 4}">{escape(name)}</text>'
-    )
+    figure, (axes,) = figures.new(1, 1, (7.2, 4.4))
+    axes.set_yscale("log")
+    for number, name in enumerate(predictors):
+        cells = [pooled(compared.rows, name, lead_s) for lead_s in leads]
+        angles = [cell or math.nan for cell in cells]
+        axes.plot(leads, angles, label=name, **figures.marked(number))
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.yaxis.set_major_formatter("{x:g}°")
+    axes.minorticks_off()
+    axes.set_xticks(leads, [f"{lead_s:g}" for lead_s in leads])
+    axes.set_xlabel("lead, s")
+    axes.set_ylabel("RMS angle error")
+    figures.below(figure, axes, 4)
+    return figure
 
 
 def _axes(compared: Compared) -> tuple[list[float], list[str]]:

@@ -24,7 +24,7 @@ from companion.pipeline import Pipeline
 from companion.recording.reader import read_log
 from companion.replay import log_events
 from companion.studies import array_truth
-from companion.studies.beam_charts import GRID, KINDS, charts
+from companion.studies.beam_charts import charts
 from companion.studies.beam_worth import SHARP, Sample, Worth, summed_up
 from companion.studies.beams import Setting, Sight, Watched, look, sight, updates, watch
 from companion.studies.truth import Trajectory
@@ -396,7 +396,6 @@ def test_a_log_without_truth(short: Path, tmp_path: Path) -> None:
     unknown |= {"violations_within_bound", "codebook_misses_within_bound"}
     assert all(summary[key] is None for key in unknown | {"bound_violations"})
     assert summary["n"] > 0
-    assert ">true<" not in (tmp_path / "gain.svg").read_text()
 
 
 def test_a_station(cut: Path) -> None:
@@ -437,29 +436,48 @@ def test_figures_show_the_worst_and_leave_gaps() -> None:
         )
         for t in range(40)
     )  # fmt: skip
-    found = charts(Watched("log", "home", "array", 64, None, True, 40, samples))
-    red, grey = KINDS[2].colour, KINDS[0].colour
-    legend_and_runs = [line for line in found["gain"].lines if line.colour == red]
-    assert len(legend_and_runs) == 3
-    (nominal,) = (n for n in found["gain"].lines if n.colour == grey and len(n.points) > 2)
-    highest, lowest = nominal.points[:, 1].min(), nominal.points[:, 1].max()
-    # From 0 to 15 dB over 104 pixels: 10 dB lower is two thirds of them down.
-    assert lowest - highest == pytest.approx(104 * 10 / 15)
-    assert np.argmax(nominal.points[:, 1]) == 31 * 20 // 39
-    _, share = (line for line in found["sweep"].lines if line.colour == "#0b4f9e")
-    assert (np.argmin(share.points[:, 1]), len(share.points)) == (7 * 20 // 39, 20)
-    (had,) = (
-        line.points
-        for line in found["gain_had"].lines
-        if line.colour == red and not line.dash and len(line.points) > 2
-    )
-    level = [
-        line.points[0, 1]
-        for line in found["gain_had"].lines
-        if line.colour == GRID and line.points[0, 1] == line.points[1, 1]
-    ]
-    # Three looks of four have a guarantee.
-    assert had[0, 1] == pytest.approx(max(level) - 0.75 * (max(level) - min(level)))
+    watched = Watched("log", "home", "array", 64, None, True, 40, samples)
+    drawn = charts(watched)
+    gain = curves(drawn["gain"]().axes[0])
+    assert gain.keys() == {"predicted", "guaranteed"}  # without truth nothing is true
+    told = charts(replace(watched, truth="SIM_STATE"))
+    assert curves(told["gain"]().axes[0]).keys() == gain.keys() | {"true"}
+    # Two looks to a bin; the worst of each.
+    assert list(gain["predicted"][1]) == [0.0 if n == 31 * 20 // 39 else 10.0 for n in range(20)]
+    assert np.isnan(gain["guaranteed"][1]).nonzero()[0].tolist() == [5, 6, 7, 8, 9]
+    (share,) = curves(drawn["sweep"]().axes[0]).values()
+    assert list(share[1]) == [50.0 if n == 7 * 20 // 39 else 25.0 for n in range(20)]
+    as_set, _ = drawn["gain_had"]().axes
+    had = curves(as_set)
+    low = as_set.get_xlim()[0]
+    # Three looks of four have a guarantee, each of them the same.
+    assert (had["guaranteed"][0][0], had["guaranteed"][1][0]) == (low, 75.0)
+    assert (had["guaranteed"][0][-1], had["guaranteed"][1].max()) == (5.0, 75.0)
+    assert had["predicted"][1][0] == 100.0
+
+
+def test_a_value_between_two_gaps_is_a_dot() -> None:
+    samples = tuple(
+        Sample(
+            float(t), "1:1", 0.1, None, 0, 0.5, None,
+            worth(10.0, guaranteed_gain_db=5.0 if t in (8, 9) else None),
+        )
+        for t in range(20)
+    )  # fmt: skip
+    axes = charts(Watched("log", "home", "array", 64, None, True, 20, samples))["gain"]().axes[0]
+    dots = [line.get_xydata() for line in axes.lines if line.get_marker() == "."]
+    places = np.concatenate([np.asarray(each) for each in dots])
+    assert len(places) == 1
+    assert 8 <= places[0, 0] <= 9 and places[0, 1] == 5.0
+
+
+def curves(axes: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """The named lines of a panel: their x and y."""
+    return {
+        line.get_label(): (np.asarray(line.get_xdata()), np.asarray(line.get_ydata()))
+        for line in axes.lines
+        if not line.get_label().startswith("_")
+    }
 
 
 # --- the command --------------------------------------------------------------------------------
@@ -477,8 +495,8 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.count[tag] = self.count.get(tag, 0) + 1
-        self.addresses += [name for name, _ in attrs if name in ("href", "src")]
-        if tag not in ("meta", "br"):
+        self.addresses += [value or "" for name, value in attrs if name in ("href", "src")]
+        if tag not in ("meta", "br", "img"):
             self.open.append(tag)
 
     def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
@@ -500,15 +518,17 @@ def test_the_command_writes_what_it_says(short: Path, tmp_path: Path) -> None:
     assert {row["uav"] for row in answer["rows"]} == UAVS
     assert all({"log", "truth"} | answer["summary"].keys() <= row.keys() for row in answer["rows"])
     assert sum(row["n"] for row in answer["rows"]) == answer["summary"]["n"]
-    figures = {f"{name}.svg" for name in ("gain", "gain_had", "sweep")}
+    figures = {f"{name}.{form}" for name in ("gain", "gain_had", "sweep")
+               for form in ("png", "svg")}  # fmt: skip
     assert {path.name for path in out.iterdir()} == figures | {"beams.json", "beams.html"}
     for name in figures:
         data = (out / name).read_bytes()
         assert data.startswith(b"\x89PNG\r\n\x1a\n") or ElementTree.fromstring(data) is not None
     text = (out / "beams.html").read_text()
     page = Page(text)
-    assert page.open == page.addresses == []
-    assert page.count["svg"] == 3
+    assert page.open == []
+    assert len(page.addresses) == page.count["img"] == 3
+    assert all(address.startswith("data:image/png;base64,") for address in page.addresses)
     assert "url(" not in text
     assert "--center 5:1" in text
 
@@ -521,7 +541,7 @@ def test_two_logs_and_the_table(short: Path, tmp_path: Path) -> None:
     assert len(answer["rows"]) == 8
     assert len(answer["logs"]) == 2
     assert (tmp_path / "gain.svg").read_bytes() == (tmp_path / "gain_2.svg").read_bytes()
-    assert Page((tmp_path / "beams.html").read_text()).count["svg"] == 6
+    assert Page((tmp_path / "beams.html").read_text()).count["img"] == 6
 
 
 @pytest.mark.parametrize(

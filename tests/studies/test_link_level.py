@@ -15,7 +15,7 @@ from companion import assembly
 from companion.beams.steering import steering_matrix
 from companion.cli import main
 from companion.config import Settings
-from companion.studies import link_channel
+from companion.studies import link_channel, link_figures
 from companion.studies.link_channel import Scattering
 from companion.studies.link_level import Setting, simulate, snrs
 from companion.studies.link_scenario import Positions, Reports, Scenario, circles
@@ -95,10 +95,28 @@ def test_the_command_writes_numbers_figures_and_a_page(tmp_path: Path) -> None:
     assert names == {"link.json", "link.html", *figures}
     for name in names:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+    each_curve_is_drawn(answer)
     page = Links()
     page.feed((tmp_path / "a" / "link.html").read_text())
     assert len(page.fetched) == 4
-    assert all(source.startswith("data:image/svg+xml;base64,") for source in page.fetched)
+    assert all(source.startswith("data:image/png;base64,") for source in page.fetched)
+
+
+def each_curve_is_drawn(answer: dict[str, Any]) -> None:
+    """Throughput, uncoded and coded: a line for each kind of positions, all told apart."""
+    _, draw = link_figures.drawings(answer)["link_rate"]
+    for axes, coded in zip(draw().axes, (False, True), strict=True):
+        drawn = {line.get_label(): line.get_xydata().tolist() for line in axes.lines}
+        assert drawn == {
+            label: [
+                [found["snr_db"], found["rate_bps"] / 1e6]
+                for found in answer["awgn"] + answer["rows"]
+                if (found["positions"], found["coded"]) == (positions, coded)
+            ]
+            for positions, label in link_figures.LABELS.items()
+        }
+        looks = {(line.get_color(), line.get_linestyle(), line.get_marker()) for line in axes.lines}
+        assert len(looks) == len(drawn) == 4
 
 
 def test_a_log_goes_through_the_pipeline(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from html.parser import HTMLParser
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -17,14 +18,15 @@ from support import shared_log
 from companion import assembly
 from companion.cli import main
 from companion.config import Settings
-from companion.studies import pointing, truth
+from companion.studies import pointing, report, truth
 from companion.studies.links import CLEAN, Link, deliver
 from companion.studies.pointing import Answers, Questions, answers, questions, score
-from companion.studies.prediction import LEADS_S, RADIO, SIMPLE, Setting, compare
+from companion.studies.prediction import LEADS_S, RADIO, SIMPLE, Compared, Setting, compare
 from companion.studies.truth import Flight, Flown
 from companion.tracking.baselines import Kalman, Observed, Predicted, Tuning
 
 S = 1_000_000_000
+PNG = b"\x89PNG\r\n\x1a\n"
 HAS_TORCH = find_spec("torch") is not None
 KEYS = {
     *("log", "uav", "predictor", "lead_s", "report_rate_hz", "latency_s", "loss", "n"),
@@ -273,8 +275,8 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.count[tag] = self.count.get(tag, 0) + 1
-        self.addresses += [name for name, _ in attrs if name in ("href", "src")]
-        if tag not in ("meta", "br"):
+        self.addresses += [value or "" for name, value in attrs if name in ("href", "src")]
+        if tag not in ("meta", "br", "img"):
             self.open.append(tag)
 
     def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
@@ -287,17 +289,64 @@ class Page(HTMLParser):
 def test_the_page_needs_nothing_else(cut_log: Path, tmp_path: Path) -> None:
     done = run(cut_log, "--center", "5:1", "--lead", "0", "--out", tmp_path)
     assert done.exit_code == 0, done.stderr
+    figures = {f"angle_{link}.{form}" for link in ("clean", "radio") for form in ("png", "svg")}
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == figures | {"prediction.json", "prediction.html"}
+    for link in ("clean", "radio"):
+        assert ElementTree.parse(tmp_path / f"angle_{link}.svg").getroot().tag.endswith("svg")
+        assert (tmp_path / f"angle_{link}.png").read_bytes().startswith(PNG)
     text = (tmp_path / "prediction.html").read_text()
     page = Page(text)
     assert page.open == []
-    assert page.addresses == []
+    assert len(page.addresses) == page.count["img"] == 2
+    assert all(address.startswith("data:image/png;base64,") for address in page.addresses)
     assert "@import" not in text
     assert "url(" not in text
-    assert page.count["svg"] == 2
-    assert page.count["polyline"] == 2 * len(NAMES)
     assert "--center 5:1" in text
     for name in NAMES:
         assert f"<td>{name}</td>" in text
+
+
+def compared(log: str, link: Link, angles: dict[str, list[float | None]]) -> Compared:
+    """One UAV, 10 answers at each lead of 0, 1, ... seconds, with these angles."""
+    rows = tuple(
+        {"predictor": name, "lead_s": float(lead_s), "n": 10, "angle_rms_deg": angle}
+        for name, of_leads in angles.items()
+        for lead_s, angle in enumerate(of_leads)
+    )
+    return Compared(log, "5:1", link, rows, {})
+
+
+def test_the_figure_shows_every_angle_and_tells_predictors_apart() -> None:
+    """What is zero or unknown is a gap: a logarithmic axis has no place for it."""
+    angles: dict[str, list[float | None]]
+    angles = {f"p{n}": [0.1 + n, 0.2 + n, 0.3 + n] for n in range(9)}
+    angles["p3"] = [0.5, 0.0, None]
+    ((_, draw),) = report.drawings([compared("log", CLEAN, angles)]).values()
+    axes = draw().axes[0]
+    drawn = {str(line.get_label()): line for line in axes.lines}
+    assert drawn.keys() == angles.keys()
+    for name, line in drawn.items():
+        assert list(line.get_xdata()) == [0, 1, 2]
+        assert list(line.get_ydata()) == pytest.approx(
+            [angle or math.nan for angle in angles[name]], nan_ok=True
+        )
+    looks = {
+        (line.get_color(), str(line.get_linestyle()), line.get_marker()) for line in axes.lines
+    }
+    assert len(looks) == len({mark for *_, mark in looks}) == len(angles)
+
+
+def test_figures_are_named_by_link_and_numbered_by_log() -> None:
+    """A log over a link without a row has no figure, and the others keep their names."""
+    found = [
+        compared(log, link, {"hold": [1.0]} if (log, link) != ("a", RADIO) else {})
+        for log in ("a", "b")
+        for link in (CLEAN, RADIO)
+    ]
+    captions = {name: caption for name, (caption, _) in report.drawings(found).items()}
+    assert captions.keys() == {"angle_clean", "angle_clean_2", "angle_radio_2"}
+    assert captions["angle_radio_2"].endswith("b, radio link")
 
 
 # RMS angle in degrees of system 1 at leads 0, .1 and .3 s, measured before this study was

@@ -12,14 +12,22 @@ UV = uv
 OPENBLAS_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS
 
-.PHONY: demo test check bench soak format lock clean FORCE
+# Tests of pure rooms on two workers; those that start services share one, one after the other.
+WORKERS = -n 2 --dist loadgroup
+
+.PHONY: demo test test-all check bench soak format lock clean FORCE
 
 demo: .venv/.runtime
 	$(BIN)/companion demo
 
-# Warnings are errors: pyproject.toml says so to pytest, for every run.
+# What must be green before anything lands: at most five minutes on two quiet cores. Tests marked
+# `full` are left out. Warnings are errors: pyproject.toml says so to pytest, for every run.
 test: .venv/.dev
-	$(PYTEST)
+	$(PYTEST) -q $(WORKERS) -m "not full and not benchmark and not soak"
+
+# Every test, and more examples of each property.
+test-all: .venv/.dev
+	HYPOTHESIS_PROFILE=full $(PYTEST) -q $(WORKERS)
 
 # The formatter, the linter, the types, the rules of the house and the container's files. The
 # rest of the tests is not run a second time here: `make test` has warnings as errors already.
@@ -27,12 +35,13 @@ check: .venv/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy --strict companion sitl_replay
+	$(BIN)/vulture
 	$(BIN)/lint-imports
 	$(BIN)/hadolint Dockerfile
 	$(BIN)/check-jsonschema --builtin-schema vendor.compose-spec docker-compose.yml
 	@if docker compose version >/dev/null 2>&1; then docker compose --profile demo config --quiet; \
 	else echo "no docker compose here: docker-compose.yml is held against its schema alone"; fi
-	$(PYTEST) -q tests/test_house.py
+	$(PYTEST) -q tests/test_house.py tests/test_docs.py
 
 # Tests marked `benchmark` and `soak`, which `make test` leaves out. No such test: status 5.
 bench: .venv/.dev

@@ -1,11 +1,11 @@
-"""A client for a notebook or a radio's controller: what the service says, as plain values.
+"""A client for a notebook or a radio's controller: the service's answers as plain values.
 
     node = Client("http://127.0.0.1:8080")
     weights = node.weights(lead_ms=20)      # M×N complex, one column a UAV
     for message in node.stream(topics=["beams"], rate_hz=20):
         ...
 
-Synchronous, and no more than the standard library, numpy and websockets. For use by one thread.
+Synchronous, with no more than the standard library, numpy and websockets. For use by one thread.
 """
 
 import base64
@@ -23,7 +23,7 @@ import numpy as np
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import connect
 
-from companion.values import ComplexArray
+from companion.values import ComplexArray, UserError
 
 Json = dict[str, Any]
 
@@ -33,8 +33,8 @@ SUBPROTOCOL: Final = "companion.v1"
 class ServiceError(Exception):
     """The service refused, failed, or could not be reached.
 
-    ``status``: the HTTP status, or the code with which a stream was closed; None where nothing was
-    answered. ``title`` says why.
+    ``status`` is the HTTP status, or the code with which a stream was closed; None where there was
+    no answer. ``title`` says why.
     """
 
     def __init__(self, status: int | None, title: str) -> None:
@@ -45,8 +45,12 @@ class ServiceError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """``matrix``: (M, N) complex, columns in the order of ``uavs``; ``valid_at_ns``: when they are
-    to be applied, nanoseconds since the Unix epoch on the service's clock."""
+    """The weights of one answer.
+
+    uavs         names of the N UAVs
+    matrix       (M, N) complex, columns in the order of ``uavs``
+    valid_at_ns  when they are to be applied, ns since the Unix epoch on the service's clock
+    """
 
     uavs: tuple[str, ...]
     matrix: ComplexArray
@@ -54,14 +58,18 @@ class Weights:
 
 
 class Client:
-    """One service, at ``url`` (``http://HOST:PORT``), with its bearer token where it asks for one.
+    """A connection to one service.
 
-    ``timeout_s`` is for connecting and for each answer. Every method raises ``ServiceError``.
+        url        ``http://HOST:PORT``; raises ``UserError`` for any other form
+        token      bearer token, where the service asks for one
+        timeout_s  for connecting and for each answer
+
+    Every method raises ``ServiceError``.
     """
 
     def __init__(self, url: str, token: str | None = None, timeout_s: float = 10.0) -> None:
         if urlsplit(url).scheme not in ("http", "https"):
-            raise ValueError(f"{url!r} is not http://HOST:PORT")
+            raise UserError(f"{url!r} is not http://HOST:PORT")
         self._url = url.rstrip("/")
         self._token = token
         self._timeout_s = timeout_s
@@ -89,7 +97,7 @@ class Client:
         return Weights(uavs, matrix, int(headers["x-valid-at-ns"]))
 
     def get(self, path: str, **query: object) -> Json:
-        """Any path of the API that answers an object in JSON."""
+        """The answer of any path of the API that returns a JSON object."""
         address = quote(path) + ("?" + urlencode(query, doseq=True) if query else "")
         with self._open(address, "application/json") as answer:
             found: Json = json.loads(_read(answer))
@@ -101,9 +109,11 @@ class Client:
         topics: Iterable[str] = (),
         rate_hz: float = 10.0,
     ) -> Iterator[Json]:
-        """What changes, as it changes (``companion.server.stream`` says what there is). Who takes
-        their time between two messages misses some. Close the iterator to end it; that the
-        service ends is a ``ServiceError`` with the status 1012."""
+        """Messages of the state as it changes; ``companion.server.stream`` describes them.
+
+        A consumer that is slow between two messages misses some. Close the iterator to end the
+        stream. If the service ends, ``ServiceError`` is raised with the status 1012.
+        """
         asked = urlencode({"uav": list(uavs), "topic": list(topics), "rate_hz": rate_hz}, True)
         address = f"ws{self._url.removeprefix('http')}/v1/stream?{asked}"
         protocols: Any = [SUBPROTOCOL]

@@ -1,8 +1,9 @@
 """Traffic to test against: synthetic vehicles and logs as live MAVLink.
 
-Pure, time is an argument: ``motion``, ``paths``, ``attitudes`` and ``wind`` say how vehicles
-move, ``relay`` what ADS-B receivers hear, ``flights`` and ``fleet`` which vehicles there are;
-``scenario`` has the scenarios; ``payloads``, with ``geodesy``, says what a vehicle sends, and
-``vehicles`` makes the schedule of MAVLink 2 frames. ``player``, ``recorder`` and ``links`` are the
-shell that sends and receives them; ``cli`` is the command ``sitl-replay``.
+``flight`` has the scenarios, as pure functions of time: ``motion``, ``paths``, ``attitudes`` and
+``wind`` say how vehicles move, ``relay`` what ADS-B receivers hear, ``flights`` and ``fleet`` which
+vehicles there are, ``scenario`` the scenarios themselves; ``payloads``, with ``geodesy``, makes
+what a vehicle sends, and ``vehicles`` the schedule of MAVLink 2 frames. ``faults`` makes the
+traffic faulty, purely as well. ``traffic`` is the shell that sends and receives; ``cli`` is the
+command ``sitl-replay``.
 """

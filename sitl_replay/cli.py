@@ -1,4 +1,7 @@
-"""The command ``sitl-replay``: commands to calls."""
+"""The command ``sitl-replay`` and its subcommands.
+
+Over 300 lines: it is a list, the commands and their options.
+"""
 
 import asyncio
 import contextlib
@@ -14,48 +17,49 @@ from typing import Any
 import click
 
 from companion import __version__
-from companion.console import OneLineErrors
-from companion.mavlink.urls import LinkUrl, parse_link
-from companion.values import Event, Frame, Reason, Rejection
-from sitl_replay import player, recorder, scenario
-from sitl_replay.faults import Fault, described, in_order
-from sitl_replay.faulty_traffic import HELD_MAX, OVERFLOW
+from companion.cli.console import OneLineErrors
+from companion.mavlink.links.urls import LinkUrl, parse_link
+from companion.values import Event, Frame, Reason, Rejection, UserError
+from sitl_replay.faults.asked import Fault, described, in_order
+from sitl_replay.faults.traffic import HELD_MAX, OVERFLOW
+from sitl_replay.flight import scenario
+from sitl_replay.traffic import player, recorder
 
 PROGRESS_EVERY_S = 0.5
 
 
 def as_links(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> tuple[LinkUrl, ...]:
-    """The URLs of links to send over; a usage error says what is allowed."""
+    """Parse the URLs of links to send over; a usage error says what is allowed."""
     return tuple(_url(value) for value in values)
 
 
 def as_source(_: click.Context, __: click.Parameter, value: str) -> LinkUrl:
-    """The URL of a link to listen to."""
+    """Parse the URL of a link to listen to."""
     return _url(value)
 
 
 def as_faults(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> list[Fault]:
-    """The faults; a usage error says what is allowed."""
+    """Parse the faults; a usage error says what is allowed."""
     try:
         return in_order([Fault.parse(value) for value in values])
-    except ValueError as error:
+    except UserError as error:
         raise click.BadParameter(str(error)) from error
 
 
 def as_duration(_: click.Context, __: click.Parameter, value: str | None) -> float | None:
-    """Seconds, or None."""
+    """Parse seconds; None stays None."""
     return None if value is None else _positive(value, "seconds, a number above 0")
 
 
 def as_speed(_: click.Context, __: click.Parameter, value: str) -> float | None:
-    """A factor, or None for as fast as it goes."""
+    """Parse a factor; "max" gives None, which is as fast as it goes."""
     return None if value == "max" else _positive(value, "a number above 0, or 'max'")
 
 
 def _url(text: str) -> LinkUrl:
     try:
         return parse_link(text)
-    except ValueError as error:
+    except UserError as error:
         raise click.BadParameter(str(error)) from error
 
 
@@ -70,7 +74,7 @@ def _positive(text: str, what: str) -> float:
 
 
 def sending_options(command: Callable[..., None]) -> Callable[..., None]:
-    """``--to``, ``--fault`` and ``--json``, for the commands that send."""
+    """Add ``--to``, ``--fault`` and ``--json`` to a command that sends."""
     command = fault_option(json_option(command))
     return click.option(
         "--to",
@@ -163,7 +167,7 @@ def fly(
     urls = [str(url) for url in links]
     try:
         flight = scenario.BUILDERS[name](uavs, seed)
-    except ValueError as error:
+    except UserError as error:
         raise click.BadParameter(f"{name}: {error}", param_hint="'--uavs'") from error
     run(player.fly(flight, urls, duration_s, seed, record, faults=faults, tally=tally), tally)
     conclude(tally, "sent", as_json)
@@ -264,7 +268,7 @@ def list_scenarios(as_json: bool) -> None:
 def frames_of(log: Path, tally: player.Tally) -> Iterator[Frame]:
     """The frames of a log; what is not usable in it is counted.
 
-    Reads as far as the first one, so that a bad log is told at once.
+    Reads as far as the first one, so that a bad log is reported at once.
     """
     from companion.recording.reader import LogError, read_log
 
@@ -290,14 +294,8 @@ def _frames_among(events: Iterable[Event], tally: player.Tally) -> Iterator[Fram
 
 
 def run(work: Coroutine[Any, Any, object], count: player.Tally | recorder.Heard) -> None:
-    """Run to the end, or to SIGINT or SIGTERM; a failure is one line and a non-zero exit."""
-    try:
-        asyncio.run(_until_signal(work, count))
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        raise click.ClickException(f"{where}{error.strerror or error}") from error
-    except ValueError as error:  # a LinkError, a LogError
-        raise click.ClickException(str(error)) from error
+    """Run to the end, or to SIGINT or SIGTERM; an error is one line and a non-zero exit code."""
+    asyncio.run(_until_signal(work, count))
 
 
 async def _until_signal(
@@ -341,7 +339,7 @@ def conclude(count: player.Tally | recorder.Heard, done: str, as_json: bool) -> 
 
 
 def summary_of(count: player.Tally | recorder.Heard) -> dict[str, Any]:
-    """What ``--json`` prints."""
+    """The object that ``--json`` prints."""
     common = {
         "frames": count.frames,
         "bytes": count.octets,

@@ -1,16 +1,70 @@
 """Fixtures that several rooms' tests share."""
 
+import fcntl
+import hashlib
 import os
+import subprocess
 
 # Before numpy is loaded, as the commands do: more BLAS threads make small matrices slower.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from support import ROOT, Node
+from hypothesis import settings
+from support import BIN, HANG_S, ROOT, Node
+
+# How fast this machine is, and what else it does, is no property of the code: no deadlines.
+settings.register_profile("quick", deadline=None, max_examples=25)
+settings.register_profile("full", deadline=None)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
+
+ALONE = (
+    "tests/browser/", "tests/live/", "tests/node/", "tests/test_readme.py", "tests/test_client.py",
+    "tests/test_deployment.py", "tests/test_acceptance.py", "tests/server/test_stream_load.py",
+    "tests/recording/test_background.py", "tests/recording/test_foxglove.py",
+)  # fmt: skip
+"""Tests that start services: one after the other, beside those of the pure rooms."""
+FULL = ("tests/live/", "tests/browser/test_reports.py", "tests/studies/paper/test_experiments.py")
+"""Left to `make test-all`, all of them."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Which tests share a worker of xdist: services one at a time, and what a study has made."""
+    for item in items:
+        if item.nodeid.startswith(FULL):
+            item.add_marker(pytest.mark.full)
+        if item.nodeid.startswith(ALONE):
+            item.add_marker(pytest.mark.xdist_group("alone"))
+        elif item.nodeid.startswith("tests/studies/"):
+            item.add_marker(pytest.mark.xdist_group("studies"))
+
+
+@pytest.fixture(scope="session")
+def studied(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """``studied("paper")``: where ``companion study paper`` has written everything. A command is
+    run once a session, whoever asks."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    (shared / "studies").mkdir(exist_ok=True)
+
+    def study(*words: str) -> Path:
+        out = shared / "studies" / hashlib.sha256(repr(words).encode()).hexdigest()[:16]
+        with out.with_suffix(".lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # another worker may be making it
+            if not out.exists():
+                half = out.with_suffix(".half")
+                command = [BIN / "companion", "study", *words, "--out", half]
+                done = subprocess.run(
+                    command, capture_output=True, text=True, check=False, timeout=HANG_S
+                )
+                assert done.returncode == 0, done.stderr
+                half.rename(out)
+        return out
+
+    return study
 
 
 @pytest.fixture

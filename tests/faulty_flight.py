@@ -18,12 +18,12 @@ import pymap3d
 from mcap.reader import make_reader
 from support import BIN, Node
 
-from companion.mavlink.decode import DECODED, GLOBAL_POSITION_INT, decode
+from companion.mavlink.wire.decode import DECODED, GLOBAL_POSITION_INT, decode
 from companion.recording import schemas
 from companion.recording.reader import read_log
 from companion.values import Frame, SystemTime
-from sitl_replay import scenario
-from sitl_replay.fleet import CARRIER, ORIGIN
+from sitl_replay.flight import scenario
+from sitl_replay.flight.fleet import CARRIER, ORIGIN
 
 SEED = 11
 SAMPLES_EVERY_S = 0.6

@@ -10,8 +10,8 @@ import uvloop
 from pymavlink.dialects.v10 import all as dialect_v1
 from pymavlink.dialects.v20 import all as dialect
 
-from companion.mavlink.links import Guard, Link
-from companion.mavlink.urls import parse_link
+from companion.mavlink.links.transport import Guard, Link
+from companion.mavlink.links.urls import parse_link
 from companion.values import Frame, Notice, Rejection
 
 LIMIT_S = 20.0

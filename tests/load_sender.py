@@ -16,7 +16,7 @@ import time
 
 from fastcrc import crc16
 
-from companion.mavlink.messages import CRC_EXTRA
+from companion.mavlink.wire.crc_extra import CRC_EXTRA
 
 REPORTS_HZ = 10
 HEARTBEAT, SYSTEM_TIME, GPS_RAW_INT, RAW_IMU, ATTITUDE = 0, 2, 24, 27, 30

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from pymavlink import mavutil
+from support import HANG_S
 
 Message = Any
 
@@ -42,7 +43,7 @@ class Vehicle:
         self._thread.join()
         self.link.close()
 
-    def wait_for(self, wanted: Callable[[Message], bool], seconds: float = 15.0) -> Message:
+    def wait_for(self, wanted: Callable[[Message], bool], seconds: float = HANG_S) -> Message:
         """The first message heard from now on that is wanted; an assertion error without one."""
         begin = len(self.heard)
         with self._changed:

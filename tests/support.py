@@ -12,10 +12,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.reader import make_reader
 
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared" / "data"
 BIN = Path(sys.executable).parent
+HANG_S = 600.0
+"""What takes longer hangs. No limit on time in a test says how fast the machine has to be."""
+HANG_MS = HANG_S * 1000
+LONGEST_FRAME = 10 + 255 + 2 + 13
+"""Bytes of a MAVLink 2 frame at most: header, payload, checksum, signature."""
 
 
 def shared_log(name: str) -> Path:
@@ -24,6 +30,12 @@ def shared_log(name: str) -> Path:
     if not path.exists():
         pytest.skip(f"{name} is not here: it is not part of the product")
     return path
+
+
+def read_metadata(path: Path) -> dict[str, dict[str, str]]:
+    """The metadata of a finished recording by name, as MCAP's own reader has it."""
+    with path.open("rb") as file:
+        return {found.name: found.metadata for found in make_reader(file).iter_metadata()}
 
 
 class Node:
@@ -48,7 +60,7 @@ class Node:
         """Status and body."""
         request = urllib.request.Request(self.url + path, headers={"accept": accept})
         try:
-            with urllib.request.urlopen(request, timeout=10) as answer:
+            with urllib.request.urlopen(request, timeout=HANG_S) as answer:
                 return answer.status, answer.read()
         except urllib.error.HTTPError as error:
             with error:
@@ -60,7 +72,7 @@ class Node:
         assert status == 200, body
         return json.loads(body)
 
-    def wait_until(self, path: str, good: Any, seconds: float = 15.0) -> Any:
+    def wait_until(self, path: str, good: Any, seconds: float = HANG_S) -> Any:
         """Ask until the answer is good; returns it."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -73,5 +85,5 @@ class Node:
     def stop(self, number: signal.Signals = signal.SIGTERM) -> tuple[int, str, str]:
         """Exit status, stdout and stderr after a signal."""
         self.process.send_signal(number)
-        out, err = self.process.communicate(timeout=20)
+        out, err = self.process.communicate(timeout=HANG_S)
         return self.process.returncode, out, err

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 from support import SHARED, shared_log
 
-from companion import assembly
-from companion.config import Settings
-from companion.pipeline import Pipeline
+from companion.pipeline import assembly
+from companion.pipeline.fold import Pipeline
 from companion.recording.reader import read_log
-from companion.studies import links, truth
-from companion.studies.pointing import Answers, Questions, answers, questions, score
-from companion.studies.prediction import LEADS_S, RADIO, SIMPLE, Make, observers
-from companion.studies.truth import Flown
+from companion.settings.model import Settings
+from companion.studies.prediction import radio_link
+from companion.studies.prediction.comparison import LEADS_S, RADIO, SIMPLE, Make, observers
+from companion.studies.prediction.pointing import Answers, Questions, answers, questions, score
+from companion.studies.truth import vehicles
+from companion.studies.truth.vehicles import Flown
 from companion.values import Estimate, Event, Frame, Notice, Rejection, Track
 
 EVERY = 2
@@ -24,18 +25,18 @@ EVERY = 2
 
 
 def asked(
-    flown: Flown, make: Make, link: links.Link, settings: Settings
+    flown: Flown, make: Make, link: radio_link.RadioLink, settings: Settings
 ) -> list[tuple[str, Questions, Answers]]:
     """One predictor on every UAV of a log."""
     found = []
     for flight in flown.flights:
-        sent = links.deliver(flight, link, 1, lambda: assembly.clock(settings)).observed
+        sent = radio_link.deliver(flight, link, 1, lambda: assembly.clock(settings)).observed
         plan = questions(flown, flight, LEADS_S, sent[0].arrival_ns).every(EVERY)
         found.append((flight.uav, plan, answers(make(), sent, plan)))
     return found
 
 
-def rms_deg(flown: Flown, make: Make, link: links.Link, settings: Settings) -> np.ndarray:
+def rms_deg(flown: Flown, make: Make, link: radio_link.RadioLink, settings: Settings) -> np.ndarray:
     """RMS angle error, (UAV, lead)."""
     rows = []
     for _, plan, given in asked(flown, make, link, settings):
@@ -47,15 +48,17 @@ def rms_deg(flown: Flown, make: Make, link: links.Link, settings: Settings) -> n
 @pytest.fixture(scope="module")
 def circling() -> Flown:
     """Four UAVs on circles about the carrier."""
-    return truth.load(shared_log("sitl_4circle.tlog"), "5:1")
+    return vehicles.load(shared_log("sitl_4circle.tlog"), "5:1")
 
 
+@pytest.mark.full
 def test_clean_link(circling: Flown) -> None:
     settings = Settings()
-    found = rms_deg(circling, observers(settings)["uio-kinematic"], links.CLEAN, settings)
+    found = rms_deg(circling, observers(settings)["uio-kinematic"], radio_link.CLEAN, settings)
     assert np.all(found <= [0.13, 0.13, 0.14, 0.20]), found
 
 
+@pytest.mark.full
 def test_radio_link(circling: Flown) -> None:
     settings = Settings()
     ours = rms_deg(circling, observers(settings)["uio-kinematic"], RADIO, settings)
@@ -68,9 +71,10 @@ def test_radio_link(circling: Flown) -> None:
             assert np.all(over_all <= theirs / 4)
 
 
-@pytest.mark.parametrize("link", [links.CLEAN, RADIO], ids=lambda link: link.name)
+@pytest.mark.full
+@pytest.mark.parametrize("link", [radio_link.CLEAN, RADIO], ids=lambda link: link.name)
 @pytest.mark.parametrize("suited", [False, True])
-def test_no_bound_is_violated(circling: Flown, link: links.Link, suited: bool) -> None:
+def test_no_bound_is_violated(circling: Flown, link: radio_link.RadioLink, suited: bool) -> None:
     noise = {"follow_accuracy": False, "position_noise_m": 0.3, "velocity_noise_mps": 0.3}
     settings = Settings().override(observer=noise if suited else {})
     bounds, errors = [], []
@@ -80,18 +84,19 @@ def test_no_bound_is_violated(circling: Flown, link: links.Link, suited: bool) -
         bounds.append(given.bound_m[plan.counts])
     error_m, bound_m = np.concatenate(errors), np.concatenate(bounds)
     assert np.all(error_m <= bound_m)
-    if suited and link is links.CLEAN:
+    if suited and link is radio_link.CLEAN:
         assert np.median(bound_m) <= 4 * np.percentile(error_m, 95)
 
 
+@pytest.mark.full
 def test_where_gps_wanders_violations_are_in_the_faults() -> None:
     """A walk of 3.8 m under a noise bound of 4 m."""
-    flown = truth.load(shared_log("sitl_4circle_wander.tlog"), "5:1")
+    flown = vehicles.load(shared_log("sitl_4circle_wander.tlog"), "5:1")
     events = json.loads((SHARED / "sitl_4circle_wander.tlog.events.json").read_text())
     noise = {"follow_accuracy": False, "position_noise_m": 4.0}
     settings = Settings().override(observer=noise)
     for uav, plan, given in asked(
-        flown, observers(settings)["uio-kinematic"], links.CLEAN, settings
+        flown, observers(settings)["uio-kinematic"], radio_link.CLEAN, settings
     ):
         off_m = np.linalg.norm(given.position_ned_m - plan.truth_ned_m, axis=2)
         beyond = plan.counts & (off_m > given.bound_m)

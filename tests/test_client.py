@@ -52,6 +52,7 @@ def test_a_stream_goes_on_until_it_is_closed(flying: Node) -> None:
     assert all(message["uavs"] == ["1:1"] for message in heard if message["topic"] == "weights")
 
 
+@pytest.mark.full
 def test_that_the_service_ends_is_said(flying: Node) -> None:
     """A reader is told so, and one that never reads does not keep the service from ending."""
     host, _, port = flying.url.removeprefix("http://").partition(":")

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 import yaml
-from support import BIN, ROOT
+from support import BIN, HANG_S, ROOT
 
 RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
 DOCKERFILE = (ROOT / "Dockerfile").read_text(encoding="utf-8")
@@ -85,6 +85,7 @@ def test_only_this_machine_reaches_the_page() -> None:
     assert "profiles" not in services["companion"]
 
 
+@pytest.mark.full
 def test_the_commands_are_understood(start_node: Any) -> None:
     """What image and compose file run, with addresses of this machine, starts and is fed."""
     services = yaml.safe_load(COMPOSE)["services"]
@@ -106,6 +107,7 @@ def test_the_commands_are_understood(start_node: Any) -> None:
         flying.terminate()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("token", [None, "s3cret"])
 def test_health_is_that_of_readyz(
     start_node: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, token: str | None
@@ -119,7 +121,7 @@ def test_health_is_that_of_readyz(
         assert program == "python"
         here = [word.replace("http://127.0.0.1:8080", node.url) for word in arguments]
         command = [sys.executable, *here]
-        return subprocess.run(command, capture_output=True, timeout=30, check=False).returncode
+        return subprocess.run(command, capture_output=True, timeout=HANG_S, check=False).returncode
 
     assert check() == 1  # no report yet
     to = f"udpout:127.0.0.1:{node.udp_port}"
@@ -153,7 +155,7 @@ def test_the_image_installs_and_runs_from_what_it_is_given(tmp_path: Path) -> No
     context(source)
     wheel = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index"]
     wheel += ["--no-build-isolation", "--target", str(installed), str(source)]
-    subprocess.run(wheel, check=True, capture_output=True, timeout=100)
+    subprocess.run(wheel, check=True, capture_output=True, timeout=HANG_S)
     shutil.rmtree(source)
     for path in [installed, *installed.rglob("*")]:
         path.chmod(0o555 if path.is_dir() else 0o444)
@@ -165,13 +167,15 @@ def test_the_image_installs_and_runs_from_what_it_is_given(tmp_path: Path) -> No
         "from companion.server.app import web_directory\n"
         f"assert web_directory().is_relative_to({str(installed)!r})\n"
         "assert (web_directory() / 'index.html').is_file()\n"
-        "from companion import live\n"
-        "from companion.cli import main\n"
-        "from companion.config import Settings\n"
+        "from companion.studies.figures.pages import page\n"
+        "page('figures/page.html.j2', answer={'command': '', 'versions': {}}, figures={})\n"
+        "from companion.node import start\n"
+        "from companion.cli.main import main\n"
+        "from companion.settings.model import Settings\n"
         "settings = Settings().override(center={'source': '5:1'},\n"
         "    links={'urls': ['udpin:127.0.0.1:0']}, server={'listen': '127.0.0.1:0'},\n"
         f"    recording={{'directory': {str(record)!r}}})\n"
-        "live.run(settings, seconds=0.5)\n"
+        "start.run(settings, seconds=0.5)\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", code],
@@ -179,7 +183,7 @@ def test_the_image_installs_and_runs_from_what_it_is_given(tmp_path: Path) -> No
         env=environment,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=HANG_S,
         check=False,
     )
     for path in [installed, *installed.rglob("*")]:

@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from support import BIN, ROOT
+from support import BIN, HANG_S, ROOT
 
-from companion.config import Settings
+from companion.settings.model import Settings
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 BLOCKS = [
@@ -53,11 +53,20 @@ def run(words: list[str], where: Path) -> "subprocess.CompletedProcess[str]":
         cwd=where,
         capture_output=True,
         text=True,
-        timeout=100,
+        timeout=HANG_S,
         check=False,
     )
     assert done.returncode == 0, done.stderr
     return done
+
+
+def study(words: list[str], where: Path, studied: Callable[..., Path]) -> None:
+    """The README's own words but for the place of the report; run once a session."""
+    *asked, out, place = words[2:]
+    assert (out, place) == ("--out", "report")
+    log = str(ROOT / "tests" / "data" / "sitl_4circle_cut.tlog")
+    made = studied(*(log if word == "flight.tlog" else word for word in asked))
+    assert (made / f"{asked[0]}.html").exists()
 
 
 def make(words: list[str], _: Path, start_node: Started) -> None:
@@ -65,7 +74,13 @@ def make(words: list[str], _: Path, start_node: Started) -> None:
     command = ["make", "--dry-run", "--always-make", *words[1:]]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    does = {"demo": "companion demo", "test": "pytest", "check": "ruff check", "bench": "benchmark"}
+    does = {
+        "demo": "companion demo",
+        "test": "not full",
+        "test-all": "HYPOTHESIS_PROFILE=full",
+        "check": "vulture",
+        "bench": "benchmark",
+    }
     assert does[words[1]] in done.stdout
 
 
@@ -76,7 +91,7 @@ def curl(words: list[str], where: Path, start_node: Started) -> None:
     (url,) = [word for word in words if word.startswith("http://127.0.0.1:8080/")]
     headers = dict(words[i + 1].split(": ") for i, word in enumerate(words) if word == "-H")
     request = urllib.request.Request(url.replace("http://127.0.0.1:8080", node.url), None, headers)
-    with urllib.request.urlopen(request, timeout=10) as answer:
+    with urllib.request.urlopen(request, timeout=HANG_S) as answer:
         body = answer.read()
     if "-o" in words:
         (where / words[words.index("-o") + 1]).write_bytes(body)
@@ -108,7 +123,7 @@ def served(words: list[str], where: Path, start_node: Started) -> None:
         said = (re.search(r"serves (http://\S+) and replays", line) for line in process.stderr)
         found = next((one for one in said if one), None)
         assert found is not None
-        with urllib.request.urlopen(found[1] + "/v1/status", timeout=10) as answer:
+        with urllib.request.urlopen(found[1] + "/v1/status", timeout=HANG_S) as answer:
             assert json.load(answer)["replay"]["log"] == "recording.mcap"
         process.send_signal(signal.SIGINT)
         process.stderr.read()
@@ -171,7 +186,7 @@ RUNNERS: dict[str, Callable[[list[str], Path, Started], None]] = {
     "companion recover": to_its_end,
     "companion weights": to_its_end,
     "companion design": to_its_end,
-    "companion study": to_its_end,
+    "companion study": study,
     "companion run": live,
     "sitl-replay fly": traffic,
     "sitl-replay play": traffic,
@@ -192,12 +207,19 @@ def runner_of(command: str) -> str:
     raise LookupError(f"README.md: nobody knows how to run: {command}")
 
 
-@pytest.mark.parametrize("command", sorted(set(COMMANDS) - FULL))
+def marked(command: str) -> Any:
+    """A command as a parameter: those that take long are left to `make test-all`."""
+    long = RUNNERS[runner_of(command)] in (study, live, served, traffic)
+    return pytest.param(command, marks=pytest.mark.full if long else ())
+
+
+@pytest.mark.parametrize("command", [marked(command) for command in sorted(set(COMMANDS) - FULL)])
 def test_the_command_does_what_it_should(
     command: str,
     tmp_path: Path,
     cut_log: Path,
     start_node: Started,
+    studied: Callable[..., Path],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     shutil.copy(cut_log, tmp_path / "flight.tlog")
@@ -205,19 +227,28 @@ def test_the_command_does_what_it_should(
         run(["companion", "replay", "flight.tlog", "--out", "recording.mcap"], tmp_path)
     monkeypatch.chdir(tmp_path)  # `recordings` and the like are made here
     words = ["12" if word == "120" else word for word in words_of(command)]  # it is 25 s long
-    RUNNERS[runner_of(command)](words, tmp_path, start_node)
+    runner = RUNNERS[runner_of(command)]
+    runner(words, tmp_path, studied if runner is study else start_node)
 
 
 def test_python_does_what_it_should(
     start_node: Started, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (block,) = PYTHON
+    (block,) = (block for block in PYTHON if "companion.client" in block)
     node = start_node("demo", "--port", "0", "--seconds", "60")
     node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
     exec(block.replace("http://127.0.0.1:8080", node.url), {})
     weights, beams = capsys.readouterr().out.splitlines()
     assert weights.startswith("('1:1', ") and "(64, 4)" in weights
     assert beams.startswith("beams 20")
+
+
+def test_the_library_does_what_it_should(cut_log: Path) -> None:
+    (block,) = (block for block in PYTHON if "companion.client" not in block)
+    names: dict[str, Any] = {}
+    exec(block.replace('"flight.tlog"', repr(str(cut_log))), names)
+    tracks = names["pipeline"].tracks(names["event"].t_ns, names["event"].t_ns)
+    assert {track.uav for track in tracks} >= {"1:1", "2:1", "3:1", "4:1"}
 
 
 def test_names_of_commands_are_run_in_full() -> None:

@@ -39,7 +39,7 @@ const FEEDS = {
   },
   weights: {
     path: ({ beamed }) => beamed && "/v1/beams/weights",
-    beats: 4, offset: 1, what: "weights", 
+    beats: 4, offset: 1, what: "weights",
     accepts: (data) => Array.isArray(data?.re) && Array.isArray(data?.im),
   },
   status: {
@@ -110,9 +110,9 @@ export class Feed {
   async poll() {
     const path = typeof this.path === "function" ? this.path(this.context()) : this.path;
     if (!path) {
-      this.data = null; // there is nothing to ask about: nor is there an answer
+      // There is nothing to ask about: nor is there an answer, nor one that failed to come.
+      Object.assign(this, { data: null, answeredAt: null, failures: 0, problem: "" });
       this.startedAt = performance.now();
-      this.answeredAt = null;
       return;
     }
     const abort = new AbortController();

@@ -92,7 +92,7 @@ export class Charts {
     });
     this.plots.forEach(({ plot }) => {
       plot.over.addEventListener("click", () => {
-        this.onPick(performance.now() + plot.posToVal(plot.cursor.left, "x") * 1000);
+        this.onPick(this.now + plot.posToVal(plot.cursor.left, "x") * 1000);
       });
     });
     showKey(ids, total);

@@ -18,8 +18,8 @@ export function make(tag, attributes = {}, ...children) {
 export function setChildren(list, key, build) {
   const wanted = JSON.stringify(key);
   if (list.dataset.shown === wanted) return; // leave focus and selection alone
-  list.dataset.shown = wanted;
   list.replaceChildren(...build());
+  list.dataset.shown = wanted; // not before: what cannot be built is not shown
 }
 
 /** Fill a list with `[left, right, level?, title?]` lines; says `none` where there are none. */

@@ -48,17 +48,21 @@ export function seconds(value) {
   return withUnit(value, size < 9.995 ? 2 : size < 99.95 ? 1 : 0, `${NBSP}s`);
 }
 
+/** From here on a time is written in seconds, not in milliseconds. */
+const LONG_S = 9.9995;
+
 export function milliseconds(valueS) {
   if (!known(valueS)) return UNKNOWN;
-  return Math.abs(valueS) >= 9.9995
+  return Math.abs(valueS) >= LONG_S
     ? seconds(valueS)
     : withUnit(valueS * 1000, 0, `${NBSP}ms`);
 }
 
-/** Two times in milliseconds: 2 / 5 ms. */
+/** Two times in milliseconds: 2 / 5 ms. Each has its unit where that is not the same. */
 export function millisecondsRange(fromS, toS) {
   if (!known(fromS) || !known(toS)) return UNKNOWN;
-  return `${fixed(fromS * 1000)} / ${milliseconds(toS)}`;
+  const from = Math.abs(toS) >= LONG_S ? milliseconds(fromS) : fixed(fromS * 1000);
+  return `${from} / ${milliseconds(toS)}`;
 }
 
 /** A share of one as a percentage. */

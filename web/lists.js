@@ -4,7 +4,7 @@ import { $, make, setChildren } from "./dom.js";
 import * as format from "./format.js";
 
 const EVENTS_SHOWN = 60;
-const SEVERITY_LEVEL = { info: "", warning: "warn", error: "bad", critical: "bad" };
+export const SEVERITY_LEVEL = { info: "", warning: "warn", error: "bad" };
 
 const LINK_COLUMNS = [
   ["Frames", (link) => format.count(link.frames)],

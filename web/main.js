@@ -141,11 +141,10 @@ function believed(feed, link, now) {
 }
 
 function showMoment(view, link, now) {
-  if (view.status) {
-    showStatus(view.status);
-    rejections.show(view.status.rejected, now);
-  }
-  if (view.answer) showBeams(view.answer);
+  if (feeds.status.data) rejections.note(feeds.status.data.rejected ?? {}, now);
+  showStatus(view.status);
+  rejections.show(view.status?.rejected, timebar.isLive ? now : view.at);
+  showBeams(view.answer);
   showLinks(view.links);
   showEvents(view.events);
   showCount(view.uavs);

@@ -79,7 +79,11 @@ const RECORDING_LEVEL = { recording: "good", off: "", degraded: "bad" };
 
 function showCenter(center) {
   const element = $("center");
-  if (!center) return setText(element, format.UNKNOWN);
+  if (!center) {
+    element.dataset.level = "";
+    setText(element, format.UNKNOWN);
+    return;
+  }
   const where = format.position(center.lat_deg, center.lon_deg);
   const parts = [center.source ?? format.UNKNOWN];
   if (where === format.UNKNOWN) parts.push("no position yet");
@@ -89,7 +93,7 @@ function showCenter(center) {
   if (format.known(center.age_s)) parts.push(`${format.seconds(center.age_s)} old`);
   const old = format.known(center.age_s) && center.age_s > 3;
   element.dataset.level = where === format.UNKNOWN || old ? "warn" : "";
-  return setText(element, parts.join(" · "));
+  setText(element, parts.join(" · "));
 }
 
 function showRecording(recording) {
@@ -115,14 +119,13 @@ function showReplay(replay) {
 }
 
 /** What each reason means, for the reader's pointer; an unknown reason is shown as it is. */
-const REASONS = {
+export const REASONS = {
   "garbage": "bytes between frames",
   "bad-crc": "framed, but the checksum is wrong",
   "unknown-message": "a message that cannot be checked",
   "bad-stamp": "a log's time stamp stepped or leapt",
   "malformed": "fields that cannot be what they say",
   "zero-position": "near 0° N 0° E: sent before a fix",
-  "no-fix": "the sender has no GNSS fix",
   "no-position": "ADS-B without valid coordinates",
   "no-altitude": "no altitude known",
   "duplicate": "the same report again",
@@ -145,21 +148,25 @@ const REASONS = {
 export class Rejections {
   constructor() {
     this.seen = new Map();
+    this.isFirst = true;
   }
 
-  show(rejected, now) {
-    const first = this.seen.size === 0;
-    for (const [reason, total] of Object.entries(rejected ?? {})) {
-      const before = this.seen.get(reason);
-      // What was there when the page was opened has no known time.
-      if (!before) this.seen.set(reason, { total, at: first ? null : now });
-      else if (total !== before.total) this.seen.set(reason, { total, at: now });
+  /** The newest counts; what was there when the page was opened has no known time. */
+  note(rejected, now) {
+    for (const [reason, total] of Object.entries(rejected)) {
+      if (this.seen.get(reason)?.total === total) continue;
+      this.seen.set(reason, { total, at: this.isFirst ? null : now });
     }
+    this.isFirst = false;
+  }
+
+  /** The counts of the moment `at`, which may be past: what rose after it is not told of. */
+  show(rejected, at) {
     const pairs = Object.entries(rejected ?? {})
       .sort(([, a], [, b]) => b - a)
       .map(([reason, total]) => {
-        const { at } = this.seen.get(reason);
-        const when = at === null ? "" : ` · ${ago((now - at) / 1000)}`;
+        const roseAt = this.seen.get(reason)?.at ?? null;
+        const when = roseAt === null || roseAt > at ? "" : ` · ${ago((at - roseAt) / 1000)}`;
         const unit = reason === "garbage" ? " B" : "";
         return [reason, `${format.count(total)}${unit}${when}`, "", REASONS[reason] ?? ""];
       });
@@ -172,21 +179,30 @@ function ago(seconds) {
   return `${format.duration(seconds < 60 ? Math.floor(seconds / 5) * 5 : seconds)} ago`;
 }
 
+/** `status` is null where it is not known: nothing of another moment may stand there then. */
 export function showStatus(status) {
-  setText($("version"), `v${status.version}`);
-  setText($("uptime"), format.duration(status.uptime_s));
-  setText($("frames"), format.perSecond(status.rates?.frames_hz));
-  setText($("updates"), format.perSecond(status.rates?.updates_hz));
-  showCenter(status.center);
-  showRecording(status.recording);
-  showReplay(status.replay);
+  setText($("version"), status ? `v${status.version}` : "");
+  setText($("uptime"), format.duration(status?.uptime_s));
+  setText($("frames"), format.perSecond(status?.rates?.frames_hz));
+  setText($("updates"), format.perSecond(status?.rates?.updates_hz));
+  showCenter(status?.center);
+  showRecording(status?.recording);
+  showReplay(status?.replay);
 }
 
 // --- beams --------------------------------------------------------------------------------------
 
-const METHODS = { zf: "Zero forcing", rzf: "Regularised zero forcing" };
+export const METHODS = {
+  zf: "Zero forcing", rzf: "Regularised zero forcing", mrt: "Maximum ratio",
+};
 
 export function showBeams(answer) {
+  if (!answer) {
+    for (const id of ["beams-line", "beams-array"]) setText($(id), format.UNKNOWN);
+    setNotice($("beams-warning"), "");
+    setPairs($("left-out"), [], format.UNKNOWN);
+    return;
+  }
   const { beams, array, left_out: leftOut } = answer;
   const regularised = answer.regularised || answer.method === "rzf";
   setText($("beams-line"), [

@@ -5,13 +5,13 @@ import * as format from "./format.js";
 import { drawLabels } from "./labels.js";
 import { Scale } from "./scale.js";
 import { fontOf, readColours } from "./surface.js";
+import { drawCarrier, drawUav } from "./symbols.js";
 import { fixesOf, trailOf } from "./trails.js";
 import { drawBeams, withAlpha } from "./wedges.js";
 
 const RADIANS = Math.PI / 180;
 const MARGIN_PX = 30; // room for the compass outside the outermost ring
 const GAP_MS = 2500; // a trail is not drawn through a hole in what was received
-const LEADER_S = 2; // the line ahead of a UAV: where it is in so many seconds
 
 const COLOURS = [
   "plan", "grid", "gridtext", "text", "muted", "live", "coast", "stale", "beam", "bore", "bad",
@@ -24,6 +24,7 @@ export class PlanView {
     this.scene = { uavs: [], beams: [], array: null, selected: null, uavsLive: false };
     this.scale = new Scale();
     this.queued = false;
+    this.fault = null; // why it could not be drawn last time
     this.hits = [];
     new ResizeObserver(() => this.resize()).observe(canvas);
     canvas.addEventListener("click", (event) => onSelect(this.nearest(event)));
@@ -55,6 +56,7 @@ export class PlanView {
     this.scale.follow((targets.length ? targets : shown)
       .map((uav) => Math.hypot(uav.north_m, uav.east_m)), now);
     this.redraw();
+    if (this.fault) throw this.fault; // to whom shows it: a frame's own errors are heard by nobody
   }
 
   zoom(steps) {
@@ -76,7 +78,12 @@ export class PlanView {
       this.queued = false;
       if (!this.width || !this.height) return;
       const moving = this.scale.ease();
-      this.draw();
+      this.fault = null;
+      try {
+        this.draw();
+      } catch (error) {
+        this.fault = error;
+      }
       if (moving) this.redraw();
     });
   }
@@ -98,8 +105,8 @@ export class PlanView {
     uavs.forEach((uav) => this.drawTrail(uav));
     uavs.forEach((uav) => this.drawFixes(uav));
     uavs.forEach((uav) => this.drawBound(uav));
-    this.drawCarrier();
-    this.hits = uavs.map((uav) => this.drawUav(uav));
+    drawCarrier(this);
+    this.hits = uavs.map((uav) => drawUav(this, uav));
     drawLabels(this, drawRingLabels(this));
     this.drawMessage(uavs);
   }
@@ -194,99 +201,6 @@ export class PlanView {
     context.globalAlpha = 1;
   }
 
-  drawCarrier() {
-    const { context } = this;
-    const { headingDeg } = this.scene;
-    context.save();
-    context.translate(...this.centre);
-    context.fillStyle = this.colour.plan;
-    context.strokeStyle = this.scene.uavsLive ? this.colour.text : this.colour.stale;
-    context.lineWidth = 2;
-    context.beginPath();
-    context.arc(0, 0, 9, 0, 2 * Math.PI);
-    context.fill();
-    context.stroke();
-    if (format.known(headingDeg)) {
-      context.rotate(headingDeg * RADIANS);
-      context.fillStyle = context.strokeStyle;
-      polygon(context, [[0, -7], [4.5, 5], [0, 2.5], [-4.5, 5]]);
-      context.fill();
-    }
-    context.restore();
-  }
-
-  /** Draw the symbol of a UAV; returns where it is, for labels and for the pointer. */
-  drawUav(uav) {
-    const [x, y] = this.at(uav.north_m, uav.east_m);
-    const inside = x > 8 && y > 8 && x < this.width - 8 && y < this.height - 8;
-    if (!inside) return this.drawBeyond(uav);
-    const { context } = this;
-    const colour = this.colourOf(uav);
-    const velocity = uav.velocity_ned_mps;
-    const moving = velocity && Math.hypot(velocity[0], velocity[1]) > 0.3;
-    context.save();
-    context.translate(x, y);
-    context.strokeStyle = colour;
-    context.lineWidth = 2;
-    if (uav.state !== "lost" && moving) this.drawLeader(velocity);
-    if (moving) context.rotate(Math.atan2(velocity[1], velocity[0]));
-    if (this.scene.selected === uav.id) this.drawSelection();
-    context.fillStyle = uav.state === "live" ? colour : this.colour.plan;
-    context.beginPath();
-    if (uav.state === "lost") {
-      polygon(context, [[-6, -6], [6, 6]]);
-      context.moveTo(6, -6);
-      context.lineTo(-6, 6);
-    } else if (moving) polygon(context, [[0, -9], [6.5, 8], [0, 4.5], [-6.5, 8]]);
-    else context.arc(0, 0, 6, 0, 2 * Math.PI);
-    if (uav.state !== "lost") context.fill();
-    context.stroke();
-    context.restore();
-    return { uav, x, y, beyond: false };
-  }
-
-  drawLeader(velocity) {
-    const { context } = this;
-    context.save();
-    context.lineWidth = 1.2;
-    context.beginPath();
-    context.moveTo(0, 0);
-    context.lineTo(velocity[1] * LEADER_S * this.pxPerM, -velocity[0] * LEADER_S * this.pxPerM);
-    context.stroke();
-    context.restore();
-  }
-
-  drawSelection() {
-    const { context } = this;
-    context.save();
-    context.strokeStyle = this.colour.text;
-    context.lineWidth = 1.5;
-    context.beginPath();
-    context.arc(0, 0, 15, 0, 2 * Math.PI);
-    context.stroke();
-    context.restore();
-  }
-
-  /** A UAV outside the picture: an arrow at the edge, in its direction. */
-  drawBeyond(uav) {
-    const { context } = this;
-    const angle = Math.atan2(uav.east_m, uav.north_m);
-    const [dx, dy] = [Math.sin(angle), -Math.cos(angle)];
-    const reach = Math.min(
-      (this.width / 2 - 16) / Math.max(1e-9, Math.abs(dx)),
-      (this.height / 2 - 16) / Math.max(1e-9, Math.abs(dy)),
-    );
-    const [x, y] = [this.centre[0] + dx * reach, this.centre[1] + dy * reach];
-    context.save();
-    context.translate(x, y);
-    context.rotate(angle);
-    context.fillStyle = this.colourOf(uav);
-    polygon(context, [[0, -9], [7, 4], [-7, 4]]);
-    context.fill();
-    context.restore();
-    return { uav, x, y, beyond: true };
-  }
-
   measure(text, size, weight) {
     this.context.font = `${weight} ${size}px ${this.font}`;
     return this.context.measureText(text).width;
@@ -342,9 +256,3 @@ export class PlanView {
 }
 
 const placed = (uav) => format.known(uav.north_m) && format.known(uav.east_m);
-
-function polygon(context, points) {
-  context.beginPath();
-  points.forEach(([x, y], index) => (index ? context.lineTo(x, y) : context.moveTo(x, y)));
-  context.closePath();
-}

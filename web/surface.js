@@ -15,6 +15,7 @@ export class Surface {
   constructor(canvas, colourNames, draw) {
     Object.assign(this, { canvas, colourNames, draw, context: canvas.getContext("2d") });
     this.shown = undefined;
+    this.isDrawn = false; // whether what is to be shown could be drawn
     new ResizeObserver(() => this.redraw()).observe(canvas);
     this.recolour();
   }
@@ -27,9 +28,9 @@ export class Surface {
 
   /** Draw `data`; nothing is done where the same parts were drawn last. */
   show(data) {
-    const before = this.shown;
+    const before = this.shown ?? {};
     this.shown = data;
-    if (!before || Object.keys(data).some((key) => data[key] !== before[key])) this.redraw();
+    if (!this.isDrawn || Object.keys(data).some((key) => data[key] !== before[key])) this.redraw();
   }
 
   redraw() {
@@ -40,7 +41,9 @@ export class Surface {
     canvas.width = Math.round(this.width * ratio);
     canvas.height = Math.round(this.height * ratio);
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    this.isDrawn = false;
     this.draw(this, this.shown);
+    this.isDrawn = true;
   }
 
   write(text, x, y, { colour = "gridtext", size = 11, weight = 400, align = "center" } = {}) {

@@ -1,4 +1,4 @@
-"""Tracks to beams: who gets one, where it points, and the weights of all of them together."""
+"""Tracks to beams: which UAVs get one, where it points, and the weights of all of them together."""
 
 import math
 from collections.abc import Sequence
@@ -6,11 +6,13 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from companion.beams import motion, steering, widening
-from companion.beams.arrays import Array
-from companion.beams.coverage import EVERYWHERE, Coverage, refusals
-from companion.beams.elements import Pattern
-from companion.beams.precoding import Precoder, Precoding, gain_db, precode
+from companion.beams import line_of_sight
+from companion.beams.array import steering
+from companion.beams.array.coverage import EVERYWHERE, Coverage, refusals
+from companion.beams.array.elements import Pattern
+from companion.beams.array.geometry import Array
+from companion.beams.weights import widening
+from companion.beams.weights.precoding import Precoder, Precoding, gain_db, precode
 from companion.values import (
     Beam,
     BeamSet,
@@ -22,10 +24,14 @@ from companion.values import (
 )
 
 AIMABLE: Final = (TrackState.LIVE, TrackState.COASTING)
+"""States of a track that gets a beam."""
 NEAREST_M: Final = 1.0
-"""Closer than this a direction means nothing: the far field is tens of metres away."""
+"""Distance from the array below which a direction means nothing.
+
+The far field is tens of metres away.
+"""
 DARK: Final = 1e-3
-"""An amplitude of all elements that is no beam: 60 dB below an isotropic one."""
+"""Element amplitude below which there is no beam: 60 dB below an isotropic element."""
 
 
 def aim(
@@ -37,17 +43,26 @@ def aim(
     precoder: Precoder,
     coverage: Coverage = EVERYWHERE,
 ) -> BeamSet:
-    """One beam on every track that can be aimed at, nulls on the others; who is left out, and why.
+    """Make one beam on every track that can be aimed at, with nulls on the others.
 
-    Columns of the weights come in the order of ``tracks``.
+        now_ns       when the beams are made, node time
+        valid_at_ns  when they are applied, node time
+        tracks       UAVs predicted to ``valid_at_ns``
+        carrier      where the array is then; None: not known, and no beams
+        array        the array on its mount
+        precoder     how weights are made
+        coverage     directions in which beams may point
+
+    The columns of the weights are in the order of ``tracks``. UAVs without a beam are listed with
+    the reason.
     """
-    place = None if carrier is None else motion.place_ned_m(carrier, array)
+    place = None if carrier is None else line_of_sight.place_ned_m(carrier, array)
     refused = {track.uav: _refusal(track, place) for track in tracks}
     seen = [track for track in tracks if refused[track.uav] is None]
     beams: tuple[Beam, ...] = ()
     made = None
     if carrier is not None and seen:
-        ranges_m, directions = motion.directions(seen, carrier, array)
+        ranges_m, directions = line_of_sight.directions(seen, carrier, array)
         hidden = _out_of_reach(directions, array, coverage)
         refused |= {track.uav: why for track, why in zip(seen, hidden, strict=True)}
         inside = [i for i, why in enumerate(hidden) if why is None]
@@ -78,7 +93,7 @@ def directions(beam_set: BeamSet) -> FloatArray:
 
 
 class _Aimed(NamedTuple):
-    """Those that can be aimed at: ranges (N,), unit directions (N, 3) in the array frame."""
+    """Tracks that get beams, with ranges (N,) and unit directions (N, 3) in the array frame."""
 
     tracks: list[Track]
     ranges_m: FloatArray
@@ -88,7 +103,7 @@ class _Aimed(NamedTuple):
 def _beams(
     aimed: _Aimed, carrier: Carrier, array: Array, precoder: Precoder
 ) -> tuple[tuple[Beam, ...], Precoding, dict[str, str]]:
-    """Beams, their weights, and whom the policy left out."""
+    """The beams, their weights, and the UAVs that the policy left out with the reason."""
     tracks, ranges_m, directions = aimed
     bounds = [
         _pointing_bound_rad(track, carrier, range_m)
@@ -105,7 +120,7 @@ def _beams(
     gains = gain_db(served, made.weights).tolist()
     power = np.einsum("mn,mn->n", served, served.conj()).real
     alone = (10 * np.log10(power)).tolist()
-    rates = motion.rates(tracks, carrier, array, ranges_m, directions)
+    rates = line_of_sight.rates(tracks, carrier, array, ranges_m, directions)
     beams = tuple(
         Beam(
             uav=tracks[i].uav,
@@ -127,13 +142,13 @@ def _beams(
 
 
 def _priorities(tracks: Sequence[Track], priority: Sequence[str]) -> list[int]:
-    """Places of the tracks, those named first in the order of the names."""
+    """Indices of the tracks by descending priority: those named first, then the others."""
     ranks = {uav: rank for rank, uav in enumerate(priority)}
     return sorted(range(len(tracks)), key=lambda i: ranks.get(tracks[i].uav, len(ranks)))
 
 
 def _out_of_reach(directions: FloatArray, array: Array, coverage: Coverage) -> list[str | None]:
-    """Why no beam can be pointed there; None if it can."""
+    """For each direction the reason why no beam can point there; None if one can."""
     reasons: list[str | None] = [None] * len(directions)
     if coverage != EVERYWHERE:
         reasons = refusals(coverage, directions, directions @ array.array_from_body)
@@ -147,13 +162,16 @@ def _out_of_reach(directions: FloatArray, array: Array, coverage: Coverage) -> l
 
 
 def _pointing_bound_rad(track: Track, carrier: Carrier, range_m: float) -> float | None:
-    """Both positions' errors seen from the array, and the attitude's; None: any direction."""
+    """Bound on the angle between predicted and true direction; None: any direction is possible.
+
+    Both positions' errors as seen from the array, plus the attitude's (docs/math.md 5.3).
+    """
     seen = steering.pointing_bound_rad(track.bound_m + carrier.bound_m, range_m)
     return None if seen is None else min(seen + carrier.attitude_bound_rad, math.pi)
 
 
 def _refusal(track: Track, place_ned_m: FloatArray | None) -> str | None:
-    """Why a track gets no beam from an array at a place; None if it does."""
+    """Why a track gets no beam from an array at this place; None if it gets one."""
     if place_ned_m is None:
         return "the carrier is not known"
     if track.state not in AIMABLE:

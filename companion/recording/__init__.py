@@ -1,6 +1,6 @@
-"""Recordings: what is written while running, and every kind of log that can be read back.
+"""Recordings: written while running, and read back together with every other kind of log.
 
-``schemas`` is what a recording's messages look like, ``writer`` writes them, ``container`` walks
-an MCAP file as far as it is intact, ``recover`` finishes one that was cut short; ``tlog`` and
-``timeline`` deal with the logs of other programs; ``reader`` is the one door to all of them.
+``schemas`` describes a recording's messages, ``writer`` writes them, ``container`` walks an MCAP
+file as far as it is intact, and ``recover`` finishes a file that was cut short. ``tlog`` and
+``stamps`` handle the logs of other programs; ``reader`` opens all of them.
 """

@@ -1,8 +1,10 @@
-"""A recorder on a thread of its own: the event loop hands over and goes on.
+"""A recorder on a thread of its own, so that the event loop never waits for a disk.
 
-The queue is bounded. What does not fit is counted and said; beams never wait for a disk. A disk
-that fails is tried again, less and less often: what was not yet on it is kept as far as the
-queue goes, and the recording goes on in a new file. What is missing then is written down there.
+The queue is bounded; what does not fit is counted and reported. A disk that fails is tried again,
+less and less often. What had not reached it is kept as far as the queue goes, and the recording
+goes on in a new file, which says what is missing.
+
+Over 300 lines: one thread: its queue, its failures, its parts.
 """
 
 import contextlib
@@ -22,31 +24,35 @@ from companion.recording.writer import Writer
 from companion.values import Event, Output, Severity
 
 QUEUE_MAX: Final = 50_000
-"""Some seconds of the busiest stream."""
+"""Events waiting to be written at most: some seconds of the busiest stream."""
 FLUSH_S: Final = 1.0
+"""Time between two flushes to disk."""
 RETRY_FIRST_S: Final = 1.0
+"""Time before the first new attempt after a disk error; it doubles from one to the next."""
 RETRY_MAX_S: Final = 30.0
+"""Longest time between two attempts."""
 STOP_MAX_S: Final = 30.0
-"""For so long the end of the service waits for a disk that does not answer."""
+"""How long the end of the service waits for a disk that does not answer."""
 ROOM_BYTES: Final = 8 << 20
-"""So much must be free before a recording is gone on with: with less it would soon end again."""
+"""Free space needed to resume a recording; with less it would soon end again."""
 
 _TOO_SLOW: Final = "the disk was too slow"
 
 
 @dataclass(frozen=True, slots=True)
 class Rotation:
-    """When a new part is begun: at a size in bytes, after so many seconds; None: never."""
+    """When a new part is begun: at a size in bytes, or after so many seconds; None: never."""
 
     size_bytes: float | None = None
     after_s: float | None = None
 
 
 NEVER: Final = Rotation()
+"""Never begin a new part."""
 
 
 class _Item(NamedTuple):
-    """An event and what came of it; ``missed`` events before it did not fit into the queue."""
+    """An event and its outputs; ``missed`` events before it did not fit into the queue."""
 
     event: Event | None
     outputs: Sequence[Output]
@@ -58,12 +64,17 @@ class _Item(NamedTuple):
 
 
 class BackgroundRecorder:
-    """Owns a ``Writer`` from ``start`` to ``stop``, and those of the parts that follow.
+    """Records on a thread, with one ``Writer`` for each part from ``start`` to ``stop``.
 
-    ``open_part`` makes the writer of a part; the first is made at once, and its ``OSError`` is
-    the caller's. Later ones are this recorder's: ``failure`` says why nothing is written just
-    now, ``news`` what a person should know. ``dropped`` counts what was handed over and is not
-    recorded, ``messages`` and ``bytes`` what is, the latter in the newest file.
+        open_part  makes the writer of a part. The first is made at once, and its ``OSError`` is
+                   raised to the caller; errors of later ones are handled here
+        geodetic   converts positions, for ``Encoder.output``
+        rotation   when a new part is begun
+        queue_max  events that may wait
+
+    Attributes: ``failure`` says why nothing is written at present, ``dropped`` counts what was
+    handed over and is not recorded, ``messages`` what is, and ``bytes`` is the size of the newest
+    file.
     """
 
     def __init__(
@@ -76,7 +87,7 @@ class BackgroundRecorder:
         self.bytes = 0
         self.dropped = 0
         self.written_ns: int | None = None
-        """The time of the newest event that was written; None before the first."""
+        """Time of the newest event that was written; None before the first."""
         self.failure: str | None = None
         self._open_part = open_part
         self._geodetic = geodetic
@@ -84,13 +95,13 @@ class BackgroundRecorder:
         self._part = Part.first()
         self._writer = open_part(self._part)
         self._begun_s = time.monotonic()
-        self._finished_messages = 0  # of the parts before this one
+        self._finished_messages = 0  # messages in the parts before this one
         self._queue: queue.Queue[_Item | None] = queue.Queue(queue_max)
         self._queue_max = queue_max
         self._missed = 0
         self._overrun = False
         self._unsafe: list[_Item] = []  # written, but not yet on the disk
-        self._lost = 0  # events of which nobody knows whether they are on a disk
+        self._lost = 0  # events that may or may not be on a disk
         self._why = _TOO_SLOW
         self._retry_s = RETRY_FIRST_S
         self._news: deque[tuple[Severity, str]] = deque(maxlen=100)
@@ -105,10 +116,12 @@ class BackgroundRecorder:
         self._thread.start()
 
     def put(self, event: Event | None, outputs: Sequence[Output]) -> None:
-        """Hand over an event and what came of it; None for what came of no event. Never waits.
+        """Hand over an event and its outputs; an event of None for outputs without one.
 
-        Once the queue is full nothing is taken until half of it is written: one long hole can be
-        told of, a thousand short ones would be a recording of holes.
+        Never waits.
+
+        Once the queue is full, nothing is accepted until half of it is written: one long hole can
+        be reported, a thousand short ones would be a recording of holes.
         """
         if self._overrun and self._queue.qsize() <= self._queue_max // 2:
             self._overrun = False
@@ -128,19 +141,19 @@ class BackgroundRecorder:
     def stop(self, metadata: dict[str, str]) -> None:
         """Write what is queued, finish the file and return when it is on the disk.
 
-        A disk that fails is tried once more; one that does not answer is waited for
-        ``STOP_MAX_S`` seconds.
+        A disk that fails is tried once more; one that does not answer is waited for ``STOP_MAX_S``
+        seconds.
         """
         self._metadata = metadata
         self._stopping.set()
-        with contextlib.suppress(queue.Full):  # it only wakes who waits, and then nobody does
+        with contextlib.suppress(queue.Full):  # it only wakes an idle thread
             self._queue.put_nowait(None)
         self._thread.join(STOP_MAX_S)
         if self._thread.is_alive():
             self._tell(Severity.ERROR, f"{self._writer.path} is not finished: no answer from disk")
 
     def news(self) -> list[tuple[Severity, str]]:
-        """What a person should know and was not yet told."""
+        """Messages for the operator since the last call."""
         told = []
         while self._news:
             told.append(self._news.popleft())
@@ -148,12 +161,12 @@ class BackgroundRecorder:
 
     @property
     def degraded(self) -> bool:
-        """Whether something is not being recorded just now."""
+        """True while something is not being recorded."""
         return self.failure is not None or self._overrun
 
     @property
     def file(self) -> str:
-        """The name of the newest file."""
+        """Name of the newest file."""
         return self._writer.path.name
 
     @property
@@ -174,7 +187,7 @@ class BackgroundRecorder:
                 return
 
     def _record(self) -> bool:
-        """Write until stopped; False where that failed."""
+        """Write until stopped; False if that failed."""
         try:
             self._go_on()
             self._write_until_stopped()
@@ -185,7 +198,7 @@ class BackgroundRecorder:
         return True
 
     def _go_on(self) -> None:
-        """Begin with what the file before did not get."""
+        """Begin a file with what the file before did not get."""
         if self._lost:
             t_ns = next((item.t_ns for item in self._unsafe if item.t_ns), time.time_ns())
             self._writer.hole(Hole(t_ns, self._lost, self._why))
@@ -242,7 +255,7 @@ class BackgroundRecorder:
             self._open_next()
 
     def _open_next(self) -> None:
-        """The writer of the next part; of the same one again where nothing of it is on a disk."""
+        """Open the next part, or the same one again if nothing of it is on a disk."""
         before = self._writer
         part = self._part.after(before.path.name) if before.flushed else self._part
         made = self._open_part(part)
@@ -252,7 +265,7 @@ class BackgroundRecorder:
     # --- when the disk fails ----------------------------------------------------------------
 
     def _fail(self, error: OSError) -> None:
-        """Said once, however often it is tried again."""
+        """Handle a disk error; it is reported once, however often the disk is tried again."""
         self._why = error.strerror or str(error)
         if self.failure is None:
             text = f"nothing is recorded: {self._writer.path}: {self._why}; trying again"
@@ -264,7 +277,7 @@ class BackgroundRecorder:
             self._unsafe.clear()
 
     def _reopen(self) -> bool:
-        """Try again until it works; False where the service ended before that."""
+        """Try again until it works; False if the service ended before that."""
         while True:
             stopped = self._stopping.wait(self._retry_s)
             self._retry_s = min(2 * self._retry_s, RETRY_MAX_S)

@@ -1,12 +1,12 @@
 """Walks an MCAP file in the order in which it was written, as far as it is intact.
 
-The index at a file's end is not used: a killed process leaves none, and the order by time that
-it serves is not the order in which things happened. Where there is an end, the copies of the
-schemas and channels in it make up for a damaged chunk that had the originals.
+The index at a file's end is not used: a killed process leaves none, and it serves the order by
+time, which is not the order in which things happened. Where the end exists, its copies of the
+schemas and channels make up for a damaged chunk that held the originals.
 
-Layout: https://mcap.dev/spec. A chunk counts only when its checksum holds. One that does not, in
-the middle of a file, is passed over and counted; a record that goes on past the end of the file
-ends the walk.
+Layout: https://mcap.dev/spec. A chunk counts only when its checksum holds. A damaged chunk in the
+middle of a file is passed over and counted; a record that goes on past the end of the file ends the
+walk.
 """
 
 import contextlib
@@ -28,18 +28,24 @@ MAGIC: Final = b"\x89MCAP0\r\n"
 _HEADER: Final = struct.Struct("<BQ")  # opcode, length of what follows
 _MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _END: Final = struct.Struct("<BQQQI8s")
-"""The footer record and the magic bytes: opcode, length, start of the summary and of its offsets,
-CRC-32 from the start of the summary to just before itself."""
+"""The footer record and the magic bytes.
+
+Opcode, length, start of the summary, start of its offsets, and CRC-32 from the start of the summary
+to just before itself.
+"""
 _UNCHECKED: Final = 4 + len(MAGIC)
 _LARGEST_CHUNK: Final = 1 << 28
-"""Bytes. Ours are about a mebibyte; a damaged size must not ask for all of the memory."""
+"""Largest chunk that is read, bytes, so that a damaged size does not ask for all of the memory.
+
+Chunks of this program are about a mebibyte.
+"""
 
 # What torn or damaged bytes make the libraries raise; a failed checksum is a ValueError.
 _DAMAGE: Final = (McapError, struct.error, ZstdError, ValueError, MemoryError)
 
 
 class Message(NamedTuple):
-    """One message of a recording, with the channel it is on."""
+    """A message of a recording, with the channel it is on."""
 
     channel: Channel
     sequence: int
@@ -49,7 +55,7 @@ class Message(NamedTuple):
 
 
 class Damage(NamedTuple):
-    """So many bytes could not be read, or nothing says what they mean."""
+    """Bytes that could not be read, or whose meaning nothing describes."""
 
     size_bytes: int
 
@@ -58,19 +64,19 @@ Content = Message | Attachment | Metadata | Damage
 
 
 class Walk:
-    """One pass over a file. Iterate once; what is asked of it afterwards is then complete.
+    """One pass over a file. Iterate once; its attributes are complete afterwards.
 
-    ``topics``: hand on messages of these only (None: all; of none: what is in chunks is passed
-    over unread). ``OSError`` where the file cannot be read.
+    ``topics`` are those whose messages are returned; None: all; empty: none, and chunks are passed
+    over unread. Raises ``OSError`` where the file cannot be read.
     """
 
     def __init__(self, path: Path, topics: frozenset[str] | None = None) -> None:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.complete = False
-        """The file's end is there, so it was closed in an orderly way."""
+        """True if the file's end is there, so that it was closed in order."""
         self.lost_bytes = 0
-        """Bytes that do not belong to any record which can be read."""
+        """Bytes that belong to no readable record."""
         self._path = path
         self._topics = topics
 
@@ -86,7 +92,7 @@ class Walk:
             yield from contents
 
     def _read_descriptions(self) -> None:
-        """Schemas and channels from the summary, if the file has one and its checksum holds."""
+        """Read schemas and channels from the summary, if there is one and its checksum holds."""
         size = self._path.stat().st_size
         with self._path.open("rb") as file:
             file.seek(max(0, size - _END.size))

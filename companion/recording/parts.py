@@ -1,7 +1,7 @@
-"""A run in several files, and what is missing from it.
+"""Runs in several files, and what is missing from them.
 
 A recording is cut into *parts* by size and time, and goes on in a new part when a disk that had
-failed works again. Each part says so at its head, so that a replay can put them together; where
+failed works again. Each part says so at its head, so that a replay can put them together. Where
 events could not be recorded, a part has a record that says how many.
 """
 
@@ -15,14 +15,19 @@ from uuid import uuid4
 from mcap.records import Metadata
 
 from companion.recording.container import MAGIC, Walk
+from companion.values import UserError
 
 PART: Final = "part"
 HOLE: Final = "hole"
 
 
 class Part(NamedTuple):
-    """Which part of which run a file is. ``run`` is the same in all of them, ``number`` counts
-    from 1, ``continues`` is the name of the file before, as it was when this one was begun."""
+    """Which part of which run a file is.
+
+    run        the same in all parts of a run
+    number     counts from 1
+    continues  name of the file before, as it was when this one was begun
+    """
 
     run: str
     number: int
@@ -38,12 +43,12 @@ class Part(NamedTuple):
         return Part(self.run, self.number + 1, name)
 
     def metadata(self) -> dict[str, str]:
-        """As it stands in a file."""
+        """The part as it stands in a file."""
         return {"run": self.run, "number": str(self.number), "continues": self.continues}
 
     @classmethod
     def from_metadata(cls, found: Mapping[str, str]) -> "Part | None":
-        """None where that is not what a part says of itself."""
+        """Read a part; None where the metadata describe none."""
         number = found.get("number", "")
         if not number.isdecimal() or "run" not in found:
             return None
@@ -51,31 +56,34 @@ class Part(NamedTuple):
 
 
 class Hole(NamedTuple):
-    """So many events before ``t_ns``, and after those written before, were not recorded."""
+    """A gap: ``events`` before ``t_ns``, and after those written before, were not recorded."""
 
     t_ns: int
     events: int
     why: str
 
     def metadata(self) -> dict[str, str]:
-        """As it stands in a file."""
+        """The hole as it stands in a file."""
         return {"t_ns": str(self.t_ns), "events": str(self.events), "why": self.why}
 
     @classmethod
     def from_metadata(cls, found: Mapping[str, str]) -> "Hole":
-        """``KeyError`` or ``ValueError`` where that is no hole of ours."""
+        """Read a hole. Raises ``KeyError`` or ``ValueError`` where the metadata describe none."""
         return cls(int(found["t_ns"]), int(found["events"]), found["why"])
 
 
 class Story(NamedTuple):
-    """What a log says of itself: which part it is, if one, and what is missing from it."""
+    """A log's own account: which part it is, if one, and what is missing from it."""
 
     part: Part | None
     holes: tuple[Hole, ...]
 
 
 def read_story(path: Path) -> Story:
-    """Empty for a log that is not a recording. ``OSError`` where it cannot be read."""
+    """Read the story of a file; empty for a log that is not a recording.
+
+    Raises ``OSError`` where it cannot be read.
+    """
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             return Story(None, ())
@@ -91,7 +99,7 @@ def read_story(path: Path) -> Story:
 def in_order(stories: Mapping[Path, Story]) -> list[Path] | None:
     """Several parts of one run, in the order in which they were written; None for other logs.
 
-    ``ValueError`` where two files are the same part.
+    Raises ``UserError`` where two files are the same part.
     """
     parts = {path: story.part for path, story in stories.items() if story.part is not None}
     if len(parts) < max(2, len(stories)) or len({part.run for part in parts.values()}) != 1:
@@ -99,12 +107,12 @@ def in_order(stories: Mapping[Path, Story]) -> list[Path] | None:
     ordered = sorted(parts, key=lambda path: parts[path].number)
     for one, other in pairwise(ordered):
         if parts[one].number == parts[other].number:
-            raise ValueError(f"{one} and {other} are both part {parts[one].number} of one run")
+            raise UserError(f"{one} and {other} are both part {parts[one].number} of one run")
     return ordered
 
 
 def missing(stories: Mapping[Path, Story], ordered: Sequence[Path]) -> list[str]:
-    """What a replay of these logs cannot know of, a line for each; empty for a whole run."""
+    """What a replay of these logs lacks, one line each; empty for a whole run."""
     lines = []
     before = 0
     for path in ordered:

@@ -1,7 +1,7 @@
-"""One door to every kind of log: what is in a file decides, never what it is called.
+"""Opens every kind of log, by what is in the file and never by its name.
 
-Our own recordings give back exactly the events that drove the live run, in that order; telemetry
-logs and raw MAVLink give the events that a live run would have had.
+Recordings of this program give back exactly the events that drove the live run, in that order;
+telemetry logs and raw MAVLink give the events that a live run would have had.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,10 +12,10 @@ from typing import Final, Literal
 from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Metadata
 
-from companion.recording import messages, schemas, tlog
+from companion.recording import codec, schemas, tlog
 from companion.recording.container import MAGIC, Damage, Walk
 from companion.recording.writer import SETTINGS
-from companion.values import Event, Reason, Rejection, Source, Tick
+from companion.values import Event, Reason, Rejection, Source, Tick, UserError
 
 LogKind = Literal["tlog", "mavlink", "mcap"]
 _EVENT_TOPICS: Final = frozenset(
@@ -28,22 +28,23 @@ _EVENT_TOPICS: Final = frozenset(
 )
 
 
-class LogError(ValueError):
+class LogError(UserError):
     """A file that cannot be used. The message is one line: the file, and why."""
 
 
 def log_kind(path: Path) -> LogKind:
-    """What kind of log a file is; ``LogError`` where it is none."""
+    """The kind of a log. Raises ``LogError`` where the file is none."""
     return _open(path)[0]
 
 
-def read_log(path: Path) -> Iterator[Event]:
-    """The events of a log, in order; ``LogError`` at once where the file cannot be used.
+def read_log(log: Path | str) -> Iterator[Event]:
+    """The events of a log, in order. Raises ``LogError`` at once where the file cannot be used.
 
     ``Frame.link`` is the recorded link, or the file's name where the log knows of no links. A
-    recording cut short gives what is intact, and then ends; damage with intact events after it
-    is a ``Rejection`` of so many bytes of garbage.
+    recording cut short gives what is intact, and then ends; damage with intact events after it is a
+    ``Rejection`` of so many bytes of garbage.
     """
+    path = Path(log)
     kind, data = _open(path)
     if kind == "tlog":
         return tlog.read_tlog(data, path.name)
@@ -57,13 +58,15 @@ def read_log(path: Path) -> Iterator[Event]:
 
 
 def read_parts(paths: Sequence[Path]) -> Iterator[Event]:
-    """The events of recordings one after the other; some of them may hold none. As ``read_log``,
-    but ``LogError`` comes where a file is reached."""
+    """The events of recordings one after the other; some of them may hold none.
+
+    As ``read_log``, but ``LogError`` is raised only when a file is reached.
+    """
     return chain.from_iterable(map(_recorded, paths))
 
 
 def read_settings(path: Path) -> str | None:
-    """The settings (TOML) that a recording was made with; None where the log has none."""
+    """The settings (TOML) with which a recording was made; None where the log has none."""
     if log_kind(path) != "mcap":
         return None
     for content in Walk(path, frozenset()):
@@ -72,19 +75,8 @@ def read_settings(path: Path) -> str | None:
     return None
 
 
-def read_metadata(path: Path) -> dict[str, dict[str, str]]:
-    """The metadata records of a recording by name, ``versions`` and ``summary`` among them.
-
-    Empty for other logs; without ``summary`` where the recording was cut short.
-    """
-    if log_kind(path) != "mcap":
-        return {}
-    walk = Walk(path, frozenset())
-    return {found.name: found.metadata for found in walk if isinstance(found, Metadata)}
-
-
 def _open(path: Path) -> tuple[LogKind, bytes]:
-    """The kind of log, and its bytes unless it is an MCAP file, which is read piece by piece."""
+    """The kind of a log, and its bytes unless it is an MCAP file, which is read piece by piece."""
     try:
         with path.open("rb") as file:
             head = file.read(len(MAGIC))
@@ -134,9 +126,9 @@ def _recorded(path: Path) -> Iterator[Event]:
 
 def _event(topic: str, data: bytes, sources: dict[tuple[int, int], Source]) -> Event | None:
     if topic == schemas.FRAMES_TOPIC:
-        return messages.to_frame(data, sources)
+        return codec.to_frame(data, sources)
     if topic == schemas.TICKS_TOPIC:
         return Tick(schemas.TickMessage.FromString(data).t_ns)
     if topic == schemas.ROUND_TRIPS_TOPIC:
-        return messages.to_round_trip(data)
-    return messages.to_rejection(data)
+        return codec.to_round_trip(data)
+    return codec.to_rejection(data)

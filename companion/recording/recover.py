@@ -1,7 +1,7 @@
-"""A recording cut short becomes a finished one.
+"""Turns a recording that was cut short into a finished one.
 
-What is intact is written again through the same library, so the result has its index and opens
-in every viewer; the torn original goes only when its replacement is whole and on the disk.
+What is intact is written again through the same library, so the result has its index and opens in
+every viewer. The torn original is removed only when its replacement is whole and on the disk.
 """
 
 import fcntl
@@ -28,11 +28,13 @@ class BeingRecordedError(LogError):
 
 @dataclass(frozen=True, slots=True)
 class Recovered:
-    """What came of a recording cut short.
+    """The result of recovering a recording.
 
-    ``path`` is the finished file. ``messages`` by topic, ``last_ns`` the latest time among them
-    (None without any), ``lost_bytes`` how much of the torn file could not be used. ``changed`` is
-    False for a file that was complete and is left as it was.
+    path        the finished file
+    messages    number of messages by topic
+    last_ns     latest time among them; None without any
+    lost_bytes  bytes of the torn file that could not be used
+    changed     False for a file that was complete and is left as it was
     """
 
     path: Path
@@ -45,9 +47,9 @@ class Recovered:
 def recover(path: Path) -> Recovered:
     """Finish ``x.mcap.active`` as ``x.mcap``, a cut ``x.mcap`` as ``x.recovered.mcap``.
 
-    Never over another file: then ``x-1.mcap`` and so on. ``x.mcap.active`` is removed when that
-    is done, a cut ``x.mcap`` is kept. ``LogError`` where the file is not an MCAP file, is
-    being recorded, cannot be read, or where its replacement cannot be written.
+    No other file is overwritten: then it becomes ``x-1.mcap`` and so on. ``x.mcap.active`` is
+    removed when that is done, a cut ``x.mcap`` is kept. Raises ``LogError`` where the file is not
+    an MCAP file, is being recorded, cannot be read, or where its replacement cannot be written.
     """
     try:
         return _recover(path)
@@ -60,7 +62,9 @@ def recover(path: Path) -> Recovered:
 
 
 def recover_leftovers(folder: Path) -> list[Recovered | LogError]:
-    """Recover every ``*.mcap.active`` in a folder; one that cannot be is told of, and kept.
+    """Recover every ``*.mcap.active`` in a folder.
+
+    One that cannot be recovered is reported and kept.
 
     A file that is being recorded, by whatever process, is left alone and is not in the list.
     """
@@ -127,7 +131,7 @@ class _Tally:
 
 
 class _Copy:
-    """Writes what a walk finds into a new file; ids of schemas and channels are given anew."""
+    """Writes what a walk finds into a new file, with new ids of schemas and channels."""
 
     def __init__(self, mcap: McapWriter, walk: Walk, tally: _Tally) -> None:
         self._mcap = mcap

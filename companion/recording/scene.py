@@ -1,12 +1,12 @@
 """The beams as a picture in space, for the 3D panel of a viewer.
 
-Viewers want z upwards, so the frames are (REP 103 of ROS): ``map``, east-north-up at the origin
-of the local frame; ``carrier``, forward-left-up, child of ``map``; ``array``, x along boresight,
-y to the left, z upwards, child of ``carrier``. The local frame is north-east-down and the body
-and array frames are forward-right-down: half a turn about x leads from those to these.
+Viewers want z upwards, so the frames are (REP 103 of ROS): ``map``, east-north-up at the origin of
+the local frame; ``carrier``, forward-left-up, child of ``map``; ``array``, x along boresight, y to
+the left, z upwards, child of ``carrier``. The local frame is north-east-down and the body and array
+frames are forward-right-down: half a turn about x leads from those to these.
 
-What is drawn lives for some updates of the scene and then goes by itself: the beam of a UAV that
-is lost, and what was drawn by a service that is gone.
+What is drawn lives for some updates of the scene and then disappears by itself, such as the beam of
+a UAV that is lost.
 """
 
 import math
@@ -15,25 +15,27 @@ from typing import Any, Final
 
 import numpy as np
 
-from companion.beams import motion
+from companion.beams import line_of_sight
 from companion.beams.aim import directions
-from companion.beams.arrays import Array
+from companion.beams.array.geometry import Array
 from companion.recording import schemas
-from companion.recording.messages import timestamp
+from companion.recording.codec import timestamp
 from companion.values import Beam, Carrier, FloatArray, Track, TrackState, Update
 
 MAP: Final = "map"
 CARRIER: Final = "carrier"
 ARRAY: Final = "array"
 LIFETIMES: Final = 3
-"""Periods of the scene for which a thing that is drawn stays."""
+"""Periods of the scene for which a drawn thing stays."""
 WIDEST_RAD: Final = math.pi / 3
-"""No cone is drawn wider: that of a line of elements is open to one side."""
+"""Widest cone that is drawn: that of a line of elements would be open to one side."""
 HALF_POWER: Final = 0.886
-"""Full width at half power of a uniform aperture, in wavelengths per aperture (Van Trees, Optimum
-Array Processing, 2.4: 0.891 for ten elements and 0.886 in the limit)."""
+"""Full width at half power of a uniform aperture, in wavelengths per aperture.
 
-_UP: Final = np.diag([1.0, -1.0, -1.0])  # x y z up from forward right down, and back
+Van Trees, Optimum Array Processing, 2.4: 0.891 for ten elements and 0.886 in the limit.
+"""
+
+_UP: Final = np.diag([1.0, -1.0, -1.0])  # forward-left-up from forward-right-down, and back
 _ENU_FROM_NED: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _COLOURS: Final = {
     TrackState.LIVE: (0.1, 0.8, 0.4),
@@ -51,8 +53,10 @@ class Scene:
     rate_hz: float
 
     def transforms(self, update: Update) -> list[Any]:
-        """``foxglove.FrameTransform``: the carrier in the map, the array on it. Empty while it is
-        not known where the carrier is."""
+        """``foxglove.FrameTransform``: the carrier in the map, and the array on it.
+
+        Empty while the carrier's place is not known.
+        """
         carrier = update.carrier
         if carrier is None:
             return []
@@ -65,8 +69,7 @@ class Scene:
         ]
 
     def picture(self, update: Update) -> Any:
-        """``foxglove.SceneUpdate``: an entity for each UAV (where it is taken to be, and how far
-        off that can be) and one for each beam."""
+        """``foxglove.SceneUpdate``: an entity for each UAV (place and bound) and for each beam."""
         states = {track.uav: track.state for track in update.tracks}
         entities = [self._uav(track, update.t_ns) for track in update.tracks]
         if update.carrier is not None and update.beams.beams:
@@ -78,7 +81,7 @@ class Scene:
         return schemas.SceneUpdateMessage(entities=entities)
 
     def _uav(self, track: Track, t_ns: int) -> Any:
-        """A name, a point, and the upright cylinder in which the UAV is, where it has a size."""
+        """A name, a point, and the upright cylinder that holds the UAV, where it is finite."""
         place = _ENU_FROM_NED @ track.position_ned_m
         colour = _COLOURS[track.state]
         entity = self._entity(f"uav {track.uav}", t_ns)
@@ -100,7 +103,7 @@ class Scene:
     ) -> Any:
         """A cone from the array to the range of its UAV, as wide as the beam at half power."""
         map_from_array = _ENU_FROM_NED @ carrier.body_from_local.T @ self.array.array_from_body.T
-        begin = _ENU_FROM_NED @ motion.place_ned_m(carrier, self.array)
+        begin = _ENU_FROM_NED @ line_of_sight.place_ned_m(carrier, self.array)
         along, right, down = (map_from_array @ axis for axis in _axes(direction))
         widths = [2 * beam.range_m * math.tan(angle / 2) for angle in self.widths_rad(direction)]
         colour = _COLOURS[state]
@@ -116,9 +119,12 @@ class Scene:
         return entity
 
     def widths_rad(self, direction: FloatArray) -> tuple[float, float]:
-        """Full widths at half power across a unit direction (3,) of the array frame, horizontally
-        and vertically in that frame: of a uniform aperture of the extent seen from there, and no
-        more than ``WIDEST_RAD``. To look at; the exact ones are those of the patterns."""
+        """Approximate full widths at half power across a unit direction (3,) of the array frame.
+
+        Horizontally and vertically in that frame: the widths of a uniform aperture of the extent
+        seen from there, at most ``WIDEST_RAD``. They are for drawing; ``patterns`` has the exact
+        ones.
+        """
         array = self.array
         least_m = array.wavelength_m / 2
         _, right, down = _axes(direction)
@@ -171,8 +177,11 @@ def _vector(xyz: Any) -> dict[str, float]:
 
 
 def _quaternion(turned: FloatArray) -> dict[str, float]:
-    """Of a rotation matrix, parent from child, by its largest part (Shepperd 1978): the others
-    are divided by it, so it must not be small."""
+    """The quaternion of a rotation matrix, parent from child.
+
+    Found by its largest part (Shepperd 1978): the others are divided by it, so it must not be
+    small.
+    """
     trace = float(np.trace(turned))
     squares = [*(1 + 2 * float(turned[i, i]) - trace for i in range(3)), 1 + trace]
     m = turned.tolist()

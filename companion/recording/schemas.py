@@ -1,12 +1,12 @@
-"""What the messages of a recording look like: protobuf on every channel.
+"""The messages of a recording: protobuf on every channel.
 
-Positions, log lines and the scene are Foxglove's own messages, which viewers draw as they are.
-The rest is described here and built at run time, so that no generated file has to be kept in
-step. A ``Schema`` carries the whole ``FileDescriptorSet``: a recording can be read by anyone,
-years from now, with nothing but the file.
+Positions, log lines and the scene are Foxglove's own messages, which viewers draw as they are
+(docs/field-notes.md 4). The rest is described here and built at run time, so that no generated file
+has to be kept in step. A ``Schema`` carries the whole ``FileDescriptorSet``: a recording can be
+read by anyone, years from now, with nothing but the file.
 
-``encode_frame`` and ``encode_tick`` pack the two messages that come by the thousand a second by
-hand; the bytes are those of the generated classes (a test holds them together).
+``FrameEncoder`` and ``encode_tick`` pack by hand the two messages that come by the thousand a
+second; the bytes are those of the generated classes (a test compares them).
 """
 
 import struct
@@ -54,10 +54,15 @@ _MESSAGES: Final[dict[str, list[str]]] = {
                 "bytes weights_complex64", "string method", "optional double condition_number",
                 "repeated Beam beam", "repeated LeftOut left_out", "string normalisation"],
 }  # fmt: skip
-"""``Track``: a vector is empty where it is unknown, else north, east, down. ``Weights``:
-``weights_complex64`` is (elements, len(uavs)), row-major, interleaved little-endian float32 real
-and imaginary parts. ``Rejection.is_event``: made while framing, so it drove the pipeline; the
-others the pipeline made itself. ``RoundTrip``: a TIMESYNC request of the service, answered."""
+"""Fields of this program's own messages.
+
+    Track      a vector is empty where it is unknown, else north, east, down
+    Weights    ``weights_complex64`` is (elements, len(uavs)), row-major, interleaved little-endian
+               float32 real and imaginary parts
+    Rejection  ``is_event``: made while framing, so that it drove the pipeline; others were made by
+               the pipeline
+    RoundTrip  a TIMESYNC request of the service and its answer
+"""
 
 _TYPES: Final = {
     "fixed64": FieldDescriptorProto.TYPE_FIXED64,
@@ -189,10 +194,10 @@ def encode_tick(t_ns: int) -> bytes:
 
 
 class FrameEncoder:
-    """``companion.Frame`` messages; keeps the packed head of each (link, source, id) it has seen.
+    """Encodes ``companion.Frame`` messages; keeps the packed head of each (link, source, id) seen.
 
-    There are a few hundred of those in hours of traffic, so all that is left for a frame is its
-    time and its bytes.
+    There are a few hundred of those in hours of traffic, so that only its time and its bytes are
+    left to be packed for a frame.
     """
 
     def __init__(self) -> None:

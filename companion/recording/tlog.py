@@ -1,7 +1,7 @@
 """Logs of other programs: telemetry logs, and MAVLink as it came over the wire.
 
 A telemetry log (.tlog) has, before every frame, the Unix time in microseconds as eight bytes,
-big-endian. Raw MAVLink has no stamps; the sender's boot clock has to do.
+big-endian. Raw MAVLink has no stamps; the sender's boot clock takes their place.
 """
 
 import re
@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from itertools import islice
 from typing import Final, Literal, NamedTuple
 
-from companion.mavlink.framing import (
+from companion.mavlink.wire.framing import (
     BAD_CRC,
     UNKNOWN_MESSAGE,
     Splitter,
@@ -17,7 +17,7 @@ from companion.mavlink.framing import (
     examine,
     next_magic,
 )
-from companion.recording.timeline import LINGERS_NS, Timeline
+from companion.recording.stamps import LINGERS_NS, RepairedStamps
 from companion.values import Event, Frame, Reason, Rejection, Source
 
 STAMP: Final = 8
@@ -26,7 +26,7 @@ _PIECE: Final = 1 << 16
 _MANY_PAIRS: Final = 50
 _REASON: Final = {UNKNOWN_MESSAGE: Reason.UNKNOWN_MESSAGE, BAD_CRC: Reason.BAD_CRC}
 _BOOT_MS_AT: Final = {33: 0, 30: 0, 2: 8}
-"""Where the payloads of GLOBAL_POSITION_INT, ATTITUDE and SYSTEM_TIME hold time_boot_ms."""
+"""Offset of time_boot_ms in the payloads of GLOBAL_POSITION_INT, ATTITUDE and SYSTEM_TIME."""
 _magics = re.compile(b"[\xfd\xfe]").finditer
 
 
@@ -34,10 +34,10 @@ _magics = re.compile(b"[\xfd\xfe]").finditer
 
 
 def sniff(data: bytes) -> Literal["tlog", "mavlink"] | None:
-    """What kind of log the bytes are, by what stands between frames that follow one another.
+    """The kind of a log, by what stands between frames that follow one another.
 
-    None where there is no MAVLink: a lone frame counts only at the start of the file, since one
-    in twenty megabytes of noise holds what looks like a frame.
+    None where there is no MAVLink. A lone frame counts only at the start of the file, since one in
+    twenty megabytes of noise holds what looks like a frame.
     """
     stamped = bare = 0
     at, end = 0, len(data)
@@ -59,7 +59,7 @@ def sniff(data: bytes) -> Literal["tlog", "mavlink"] | None:
 
 
 def _next_frame(data: bytes, at: int, end: int) -> tuple[int, int]:
-    """Where the first checked frame at or after ``at`` starts, and its length (0: none)."""
+    """Start of the first checked frame at or after ``at``, and its length (0: none)."""
     for found in _magics(data, at, end):
         length = examine(data, found.start(), end)
         if length > 0:
@@ -73,8 +73,8 @@ def _next_frame(data: bytes, at: int, end: int) -> tuple[int, int]:
 class _Stretch(NamedTuple):
     """A frame of a telemetry log, and what had to be skipped to get to it.
 
-    ``length`` 0: no more frames. ``stamp_ns`` is None where the frame before it leaves no room
-    for a stamp.
+    ``length`` 0 means that there are no more frames. ``stamp_ns`` is None where the frame before it
+    leaves no room for a stamp.
     """
 
     stamp_ns: int | None
@@ -89,12 +89,12 @@ _NOTHING: Final[dict[Reason, int]] = {}
 def read_tlog(data: bytes, link: str) -> Iterator[Event]:
     """The events of a telemetry log, on a time line that never steps back nor leaps.
 
-    A rejection has the time of the frame after it. A frame whose stamp is bad is still handed
-    on, after a rejection that says so.
+    A rejection has the time of the frame after it. A frame whose stamp is bad is still returned,
+    after a rejection that says so.
     """
     ahead = _stretches(data)
     first = list(islice(ahead, 3))
-    timeline = Timeline([s.stamp_ns for s in first if s.stamp_ns is not None])
+    timeline = RepairedStamps([s.stamp_ns for s in first if s.stamp_ns is not None])
     sources: dict[tuple[int, int], Source] = {}
     for group in (first, ahead):
         for stamp_ns, start, length, lost in group:
@@ -146,8 +146,8 @@ def _stretches(data: bytes) -> Iterator[_Stretch]:
 def _skipped(data: bytes, at: int, stop: int) -> dict[Reason, int]:
     """What lies in [at, stop), where no frame checks, counted as ``Splitter`` counts.
 
-    Failed frames that stand one after the other, each behind its stamp, count once each; bytes
-    are garbage where they belong to neither.
+    Failed frames that stand one after the other, each behind its stamp, count once each; bytes that
+    belong to neither are garbage.
     """
     lost: dict[Reason, int] = {}
     end = len(data)
@@ -169,12 +169,12 @@ def _skipped(data: bytes, at: int, stop: int) -> dict[Reason, int]:
 
 
 def read_raw(data: bytes, link: str) -> Iterator[Event]:
-    """The events of raw MAVLink. The time is the boot clock of the first source that sends one.
+    """The events of raw MAVLink. Their time is the boot clock of the first source that sends one.
 
-    It counts from the epoch and never steps back; frames before the first that tells the time
-    get the time of that one.
+    It counts from the epoch and never steps back; frames before the first that tells the time get
+    the time of that one.
     """
-    timeline: Timeline | None = None
+    timeline: RepairedStamps | None = None
     clock: Source | None = None
     early: list[Event] = []
     for event in _split(data, link):
@@ -182,7 +182,7 @@ def read_raw(data: bytes, link: str) -> Iterator[Event]:
         off_ns = None
         if stamp_ns is not None and isinstance(event, Frame):
             if timeline is None:
-                timeline, clock = Timeline([stamp_ns]), event.source
+                timeline, clock = RepairedStamps([stamp_ns]), event.source
                 yield from (_at(before, timeline.t_ns) for before in early)
                 early.clear()
             off_ns = timeline.place(stamp_ns)

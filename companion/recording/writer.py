@@ -1,8 +1,8 @@
 """Writes a recording: an MCAP file that replays to what happened, and that viewers can draw.
 
-While open the file is called ``….mcap.active``. After ``flush`` everything so far is on the
-disk and readable whatever happens to the process; ``close`` writes the index and takes the
-``.active`` off. Not for use by two threads at once.
+While open the file is called ``….mcap.active``. After ``flush`` everything so far is on the disk
+and readable whatever happens to the process; ``close`` writes the index and removes the ending
+``.active``. Not for use by two threads at once.
 """
 
 import contextlib
@@ -34,12 +34,18 @@ _CHUNK_BYTES: Final = 1 << 20
 class Writer:
     """One recording, open from the start until ``close`` or ``abandon``.
 
-    ``where``: a folder (made if missing), in which the file is called
-    ``companion-YYYYmmddTHHMMSSZ.mcap`` after ``started_ns`` (UTC), with -1, -2 … where that is
-    taken; or, when the name ends in ``.mcap``, the file itself, which replaces one of that name
-    on ``close``. ``weights_hz`` and ``scene`` as for ``Encoder``. ``part``: which part of which
-    run this is (None: it stands alone). ``OSError`` where the file cannot be written, from any
-    method.
+        where          a folder (made if missing), in which the file is called
+                       ``companion-YYYYmmddTHHMMSSZ.mcap`` after ``started_ns`` (UTC), with -1, -2 …
+                       where that is taken; or, when the name ends in ``.mcap``, the file itself,
+                       which replaces one of that name on ``close``
+        settings_toml  the settings, attached to the file
+        versions       versions of programs, as a metadata record
+        weights_hz     as for ``Encoder``
+        started_ns     when the recording begins
+        scene          as for ``Encoder``
+        part           which part of which run this is; None: it stands alone
+
+    Any method raises ``OSError`` where the file cannot be written.
     """
 
     def __init__(
@@ -55,9 +61,9 @@ class Writer:
         self.messages = 0
         """Messages recorded so far."""
         self.flushed = 0
-        """Those of them that are on the disk."""
+        """Messages that are on the disk."""
         self.size_bytes = 0
-        """The size of the file at the last ``flush``."""
+        """Size of the file at the last ``flush``."""
         self._replace = where.suffix == ".mcap" and not where.is_dir()
         self._final = where if self._replace else _reserve(where, started_ns)
         self._finished = False
@@ -93,7 +99,7 @@ class Writer:
         self._encoder.event(event)
 
     def output(self, output: Output, geodetic: Geodetic) -> None:
-        """Record what came of an event; see ``Encoder.output``."""
+        """Record an output; see ``Encoder.output``."""
         self._encoder.output(output, geodetic)
 
     def hole(self, hole: Hole) -> None:
@@ -102,10 +108,10 @@ class Writer:
         self._mcap.add_metadata(HOLE, hole.metadata())
 
     def flush(self) -> None:
-        """Everything so far onto the disk; a killed process loses nothing of it.
+        """Write everything so far to the disk; a killed process then loses nothing of it.
 
-        ``FileNotFoundError`` where the file is no longer in its place: what is written to a file
-        that was removed goes with the process.
+        Raises ``FileNotFoundError`` where the file is no longer in its place: what is written to a
+        removed file is lost with the process.
         """
         self._mcap.flush()  # type: ignore[no-untyped-call]
         os.fsync(self._file.fileno())
@@ -138,18 +144,18 @@ class Writer:
         return self._final
 
     def abandon(self) -> None:
-        """Let go of the file as it is, ``.active``: what has been flushed can be recovered."""
+        """Close the file as it is, ``.active``: what has been flushed can be recovered."""
         self._file.close()
 
     def salvage(self) -> bool:
-        """Let go of a file that cannot be written: cut back to what was flushed last, so that the
-        rest can go into another file; one that holds no message is removed.
+        """Close a file that cannot be written, cut back to what was flushed last.
 
-        False where it could not be cut: then nobody knows what is in it of the rest.
+        The rest can then go into another file; a file that holds no message is removed. Returns
+        False where it could not be cut: then it is not known what it holds of the rest.
         """
         if self._file.closed:
             return True
-        spare = os.dup(self._file.fileno())  # closing writes what is left, and that may fail
+        spare = os.dup(self._file.fileno())  # closing writes the buffer, which may fail
         try:
             with contextlib.suppress(OSError):
                 self._file.close()
@@ -205,9 +211,10 @@ def free_name(wanted: Path) -> Path:
 
 
 def _open_alone(path: Path) -> BufferedWriter:
-    """Open and empty a file that no other process is recording to; ``BlockingIOError`` if one is.
+    """Open and empty a file that no other process is recording to.
 
-    The lock goes with the process, however that ends, so it also tells leftovers from live files.
+    Raises ``BlockingIOError`` if one is. The lock goes with the process, however that ends, so it
+    also tells leftovers from live files.
     """
     file = path.open("ab")
     try:
@@ -221,7 +228,7 @@ def _open_alone(path: Path) -> BufferedWriter:
 
 
 def _reserve(folder: Path, started_ns: int) -> Path:
-    """A name that no recording has, finished or open; its ``.active`` file is now there."""
+    """A name that no recording has, finished or open; its ``.active`` file now exists."""
     folder.mkdir(parents=True, exist_ok=True)
     started = datetime.fromtimestamp(started_ns // 1_000_000_000, tz=UTC)
     name, number = f"companion-{started:%Y%m%dT%H%M%SZ}", 0
@@ -238,7 +245,7 @@ def _reserve(folder: Path, started_ns: int) -> Path:
 
 
 def sync_folder(folder: Path) -> None:
-    """A new name is on the disk only when its folder is."""
+    """Bring a folder to the disk: a new name is on the disk only when its folder is."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)

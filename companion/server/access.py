@@ -1,4 +1,4 @@
-"""Who may ask: anybody on this machine; from elsewhere only with a bearer token."""
+"""Access control: anybody on this machine; from elsewhere only with a bearer token."""
 
 import base64
 import binascii
@@ -13,26 +13,34 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
 from companion.server.responses import problem
+from companion.values import UserError
 
 OPEN_PATHS = frozenset({"/healthz"})
+"""Paths that need no token."""
 SUBPROTOCOL: Final = "companion.v1"
-"""What a WebSocket client that names subprotocols is to name, and is answered."""
+"""Subprotocol with which a WebSocket client that names any is answered."""
 BEARER: Final = "bearer."
-"""A subprotocol that begins so carries the token, base64url without padding: a page in a browser
-cannot set headers, and an address with a token in it ends up in logs and histories."""
+"""Prefix of a subprotocol that carries the token, base64url without padding.
+
+A page in a browser cannot set headers, and an address with a token in it ends up in logs and
+histories.
+"""
 UNAUTHORISED: Final = 4401
+"""Code with which a WebSocket without a right token is closed."""
 
 UNSENT_BYTES: Final = 16_384
-"""The system queues no more than this of what a client does not take: else megabytes, and who
-reads a stream slowly would be sent what is long past. Connections inherit it."""
+"""Bytes that the system queues for a client that does not read; connections inherit it.
+
+The default is megabytes, and a slow reader of a stream would be sent what is long past.
+"""
 
 
-class ListenError(ValueError):
-    """An address that cannot be listened on; the message is one line for the user."""
+class ListenError(UserError):
+    """An address that cannot be listened on. The message is one line for the user."""
 
 
 def parse_listen(text: str) -> tuple[str, int]:
-    """Read ``HOST:PORT`` (IPv6 in brackets); ``ListenError`` otherwise."""
+    """Read ``HOST:PORT`` (IPv6 in brackets). Raises ``ListenError`` otherwise."""
     host, _, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
     if not host or not port.isdecimal() or int(port) > 65535:
@@ -51,7 +59,11 @@ def is_loopback(host: str) -> bool:
 
 
 def bind(listen: str, *, token: str | None, insecure: bool) -> socket.socket:
-    """The listening socket. ``ListenError`` if the address cannot be had, or would lie open."""
+    """The listening socket.
+
+    Raises ``ListenError`` if the address cannot be had, or could be reached from elsewhere without
+    a token.
+    """
     host, port = parse_listen(listen)
     if not is_loopback(host) and not token and not insecure:
         raise ListenError(
@@ -67,18 +79,18 @@ def bind(listen: str, *, token: str | None, insecure: bool) -> socket.socket:
         if sys.platform == "linux":
             bound.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_BYTES)
         bound.bind(address)
-        bound.listen(1024)  # who reads the address may connect at once
+        bound.listen(1024)  # clients may connect as soon as the address is known
     except OSError as error:
         raise ListenError(f"{listen}: {error.strerror}") from error
     return bound
 
 
 class BearerToken:
-    """ASGI middleware: every path but ``/healthz`` wants ``Authorization: Bearer TOKEN``.
+    """ASGI middleware: every path but ``/healthz`` needs ``Authorization: Bearer TOKEN``.
 
-    A WebSocket may bring it as a subprotocol instead (``BEARER``), beside ``SUBPROTOCOL``. Without
-    a right token it is opened and closed with 4401, whatever its path: a page in a browser cannot
-    see the status of a handshake that is refused.
+    A WebSocket may bring the token as a subprotocol instead (``BEARER``), beside ``SUBPROTOCOL``.
+    Without a right token it is opened and closed with 4401, whatever its path: a page in a browser
+    cannot see the status of a handshake that is refused.
     """
 
     def __init__(self, app: ASGIApp, token: str) -> None:
@@ -107,7 +119,7 @@ class BearerToken:
 
 
 def _decoded(text: str) -> bytes:
-    """Base64url without padding; nothing where it is none."""
+    """Decode base64url without padding; empty for anything else."""
     try:
         return base64.urlsafe_b64decode(text + "=" * (-len(text) % 4))
     except (binascii.Error, ValueError):

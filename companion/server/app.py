@@ -10,14 +10,15 @@ from prometheus_client import CollectorRegistry, ProcessCollector, generate_late
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import companion
-from companion.server import beam_routes, file_routes, link_views, models, responses, views
+from companion.server import beam_routes, file_routes, models, responses
 from companion.server.access import BearerToken
-from companion.server.design_views import DesignView
 from companion.server.metrics import NodeCollector
 from companion.server.responses import answer, answers
 from companion.server.stream import Stream
-from companion.server.views import Node
-from companion.server.words import rfc3339
+from companion.views import link_state, state
+from companion.views.design import DesignView
+from companion.views.state import Node
+from companion.views.words import rfc3339
 
 CONTENT_POLICY: Final = b"default-src 'self'; frame-ancestors 'none'"
 DESCRIPTION: Final = """Location-aware beamforming from MAVLink. Read only.
@@ -51,7 +52,7 @@ def create_app(node: Node, token: str | None = None) -> ASGIApp:
 
 
 def web_directory() -> Path:
-    """Where the dashboard's files are: inside the installed package, or beside it in a checkout."""
+    """Folder of the dashboard's files: inside the installed package, or beside it in a checkout."""
     package = Path(companion.__file__).parent
     installed = package / "_web"
     return installed if installed.is_dir() else package.parent / "web"
@@ -95,11 +96,11 @@ def _state_routes(app: FastAPI, node: Node) -> None:
         responses=answers(models.Status),
     )
     async def status() -> Response:
-        return answer(views.status(node, companion.__version__))
+        return answer(state.status(node, companion.__version__))
 
     @app.get("/v1/uavs", summary="Every UAV as it is now", responses=answers(models.Uavs))
     async def uavs() -> Response:
-        return answer({"valid_at": rfc3339(node.now_ns()), "uavs": views.uavs(node)})
+        return answer({"valid_at": rfc3339(node.now_ns()), "uavs": state.uavs(node)})
 
     @app.get(
         "/v1/uavs/{uav}",
@@ -107,7 +108,7 @@ def _state_routes(app: FastAPI, node: Node) -> None:
         responses=answers(models.UavState, 404, 422),
     )
     async def one_uav(uav: str) -> Response:
-        found = views.uavs(node, only=uav)
+        found = state.uavs(node, only=uav)
         if not found:
             raise HTTPException(404, f"no UAV {uav!r} has been heard")
         return answer(found[0])
@@ -118,7 +119,7 @@ def _state_routes(app: FastAPI, node: Node) -> None:
         responses=answers(models.Links),
     )
     async def links() -> Response:
-        return answer(views.links(node))
+        return answer(state.links(node))
 
     @app.get(
         "/v1/events",
@@ -126,7 +127,7 @@ def _state_routes(app: FastAPI, node: Node) -> None:
         responses=answers(models.Events),
     )
     async def events() -> Response:
-        return answer({"events": [link_views.event(notice) for notice in node.events()]})
+        return answer({"events": [link_state.event(notice) for notice in node.events()]})
 
     @app.get(
         "/v1/design",
@@ -138,7 +139,7 @@ def _state_routes(app: FastAPI, node: Node) -> None:
 
 
 class _Files:
-    """What is no path of the API: the dashboard's files, or nothing."""
+    """ASGI application for paths outside the API: the dashboard's files, or nothing."""
 
     def __init__(self, files: StaticFiles) -> None:
         self._files = files
@@ -151,8 +152,11 @@ class _Files:
 
 
 class _Edge:
-    """ASGI middleware: HEAD is GET without its body, which the server leaves out, and nothing on
-    a page comes from elsewhere (but for ``/docs``)."""
+    """ASGI middleware for HEAD requests and security headers.
+
+    HEAD is served as GET, and the server leaves out the body. The headers allow a page to load
+    nothing from elsewhere (except on ``/docs``).
+    """
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app

@@ -1,4 +1,4 @@
-"""What the API answers about beams, for the OpenAPI document; see ``models``."""
+"""Models of the API's answers about beams, for the OpenAPI document; see ``models``."""
 
 from typing import Annotated, Literal
 

@@ -1,4 +1,4 @@
-"""``/v1/beams``, ``/v1/beams/weights`` and ``/v1/pattern``: worked out when asked for."""
+"""The routes ``/v1/beams``, ``/v1/beams/weights`` and ``/v1/pattern``, computed when asked for."""
 
 import re
 from typing import Annotated, Any, Literal
@@ -7,11 +7,12 @@ from fastapi import FastAPI, HTTPException, Query, Request
 from fastapi.responses import Response
 from starlette.concurrency import run_in_threadpool
 
-from companion.server import beam_views, models, weight_formats
+from companion.server import models
 from companion.server.responses import answer, answers, refusals
-from companion.server.views import Node
-from companion.server.words import rfc3339
-from companion.values import Update
+from companion.values import Update, UserError
+from companion.views import beam_state, weight_formats
+from companion.views.state import Node
+from companion.views.words import rfc3339
 
 LeadMs = Annotated[float, Query(ge=0, le=10_000, description="milliseconds ahead of now")]
 _JSON = {"schema": {"$ref": "#/components/schemas/Weights"}}
@@ -33,7 +34,7 @@ def add(app: FastAPI, node: Node) -> None:
     async def beams(lead_ms: LeadMs = 0.0) -> Response:
         update = look(lead_ms)
         return answer(
-            await run_in_threadpool(beam_views.beams, pipeline, equipment, update, 0.0, lead_ms)
+            await run_in_threadpool(beam_state.beams, pipeline, equipment, update, 0.0, lead_ms)
         )
 
     @app.get(
@@ -51,7 +52,7 @@ def add(app: FastAPI, node: Node) -> None:
             body = await run_in_threadpool(
                 weight_formats.encode, form, beam_set, pipeline.array, equipment, lead_ms
             )
-        except ValueError as error:  # what the device cannot do, as the beams are now
+        except UserError as error:  # what the device cannot do, as the beams are now
             raise HTTPException(409, str(error)) from error
         headers = {
             "x-valid-at": rfc3339(beam_set.valid_at_ns),
@@ -77,7 +78,7 @@ def add(app: FastAPI, node: Node) -> None:
         if uav is not None and uav not in update.beams.uavs:
             raise HTTPException(404, f"there is no beam on {uav!r}")
         return answer(
-            await run_in_threadpool(beam_views.pattern, pipeline, update, cut, points, uav, lead_ms)
+            await run_in_threadpool(beam_state.pattern, pipeline, update, cut, points, uav, lead_ms)
         )
 
 
@@ -89,8 +90,10 @@ def _weight_answers() -> dict[int | str, dict[str, Any]]:
 
 
 def accepted(accept: str) -> str | None:
-    """The form that an Accept header likes best (RFC 9110: by q, the first of those alike); None
-    where it takes none of them."""
+    """The format that an Accept header prefers; None where it takes none of them.
+
+    RFC 9110: the highest q, the first of equal ones.
+    """
     forms = {media_type: form for form, media_type in weight_formats.TYPES.items()}
     parts = [part.lower().replace(" ", "") for part in accept.split(",")]
     for part in sorted(parts, key=_quality, reverse=True):

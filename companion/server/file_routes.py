@@ -1,4 +1,4 @@
-"""``/v1/recordings`` and ``/v1/mavlink``: what was recorded, and what was said last."""
+"""The routes ``/v1/recordings`` and ``/v1/mavlink``: recorded files, and the last messages."""
 
 from typing import Annotated
 
@@ -6,10 +6,11 @@ from fastapi import FastAPI, Header, HTTPException, Path
 from fastapi.responses import Response, StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
-from companion.server import mavlink_views, models, recordings
+from companion.server import models, recordings
 from companion.server.responses import answer, answers, refusals
-from companion.server.views import Node
 from companion.values import Source
+from companion.views import mavlink_messages
+from companion.views.state import Node
 
 Id = Annotated[int, Path(ge=0, le=255)]
 
@@ -83,7 +84,7 @@ def _mavlink(app: FastAPI, node: Node) -> None:
         responses=answers(dict[str, models.MavlinkVehicle]),
     )
     async def vehicles() -> Response:
-        return answer(await run_in_threadpool(mavlink_views.vehicles, kept.by_sender()))
+        return answer(await run_in_threadpool(mavlink_messages.vehicles, kept.by_sender()))
 
     @app.get(
         "/v1/mavlink/vehicles/{sys}/components/{comp}/messages",
@@ -94,7 +95,7 @@ def _mavlink(app: FastAPI, node: Node) -> None:
         found = kept.by_sender().get(Source(sys, comp))
         if found is None:
             raise HTTPException(404, f"nothing has been heard of {sys}:{comp}")
-        return answer(await run_in_threadpool(mavlink_views.messages, found))
+        return answer(await run_in_threadpool(mavlink_messages.messages, found))
 
     @app.get(
         "/v1/mavlink/vehicles/{sys}/components/{comp}/messages/{name}",
@@ -102,7 +103,7 @@ def _mavlink(app: FastAPI, node: Node) -> None:
         responses=answers(models.MavlinkMessage, 404, 422),
     )
     async def message(sys: Id, comp: Id, name: str) -> Response:
-        dialect = await run_in_threadpool(mavlink_views.dialect)
+        dialect = await run_in_threadpool(mavlink_messages.dialect)
         msgid = dialect.msgid(name)
         found = None if msgid is None else kept.find(Source(sys, comp), msgid)
         if found is None:

@@ -1,6 +1,6 @@
-"""Prometheus metrics, read off the node when they are asked for.
+"""Prometheus metrics, read from the node when they are asked for.
 
-Names as Prometheus has them: base units, ``_total`` for what only grows. The process's own
+Names follow Prometheus: base units, ``_total`` for what only grows. The process's own metrics
 (memory, CPU, open files) are those of the client library.
 """
 
@@ -16,7 +16,7 @@ from prometheus_client.registry import Collector
 
 import companion
 from companion.server.stream import Stream
-from companion.server.views import Node
+from companion.views.state import Node
 
 
 class NodeCollector(Collector):

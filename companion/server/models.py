@@ -1,6 +1,9 @@
-"""What the API answers, for the OpenAPI document. Nothing is validated by these in flight.
+"""Models of the API's answers, for the OpenAPI document only. Nothing is validated by them in
+flight.
 
 Angles in degrees, distances in metres, times in RFC 3339 (UTC). Null is not known, never 0.
+
+Over 300 lines: it is a list, the words of the API.
 """
 
 from typing import Annotated, Any, Literal
@@ -111,7 +114,7 @@ class Uavs(BaseModel):
 
 
 class Angles(BaseModel):
-    """Of the carrier's body."""
+    """Attitude of the carrier's body."""
 
     roll: float
     pitch: float
@@ -134,7 +137,7 @@ class Center(BaseModel):
 
 
 class LinkReports(BaseModel):
-    """Of the reports over a link: how many came first over it, and how old they were."""
+    """Reports over a link: how many came first over it, and how old they were."""
 
     total: int
     first: int
@@ -212,8 +215,8 @@ class RecordingState(BaseModel):
     lag_s: float | None
 
 
-class Rates(BaseModel):
-    """Over the last seconds."""
+class Throughput(BaseModel):
+    """Rates over the last seconds."""
 
     frames_hz: float | None
     updates_hz: float | None
@@ -238,7 +241,7 @@ class Status(BaseModel):
     center: Center
     links: list[LinkState]
     recording: RecordingState
-    rates: Rates
+    rates: Throughput
     frames: int
     updates: int
     rejected: dict[str, int]
@@ -274,8 +277,9 @@ class Assumed(BaseModel):
 
 
 class Certificate(BaseModel):
-    """Of the table of gains: e'Pe <= scale^2 stays so, whatever the order of intervals in the
-    range; ``scale`` is how much larger the assumed bounds are than those of the table."""
+    """Certificate of the table of gains: e'Pe <= scale^2 stays so, whatever the order of intervals
+    in the range; ``scale`` is how much larger the assumed bounds are than those of the table.
+    """
 
     P: Matrix
     dt_range_s: Annotated[list[float], Field(min_length=2, max_length=2)]

@@ -1,7 +1,7 @@
-"""``/v1/recordings``: which files there are, and their bytes, whole or in part.
+"""The files of ``/v1/recordings``, and their bytes, whole or in part.
 
 Only files that lie in the recording directory itself and are called like a recording: no folders,
-no links to elsewhere. A recording that is being written can be had as far as it has been flushed:
+no links to elsewhere. A recording that is being written can be read as far as it has been flushed:
 it opens in every reader that takes a file cut short, and ``companion recover`` finishes it.
 """
 
@@ -16,7 +16,7 @@ from typing import Any, BinaryIO, Final
 from starlette.concurrency import run_in_threadpool
 
 from companion.recording.writer import ACTIVE
-from companion.server.words import rfc3339
+from companion.views.words import rfc3339
 
 Json = dict[str, Any]
 
@@ -46,7 +46,7 @@ def listed(where: str | None, current: Current) -> list[Json]:
 
 
 def _entries(where: str | None) -> Iterator[os.DirEntry[str]]:
-    """What counts as a recording. Nothing where there is no folder, or it cannot be read."""
+    """Entries that are recordings; none where there is no folder, or it cannot be read."""
     if where is None:
         return
     path = Path(where)
@@ -86,9 +86,11 @@ def _utc_ns(text: str) -> int:
 
 
 def opened(where: str | None, name: str, current: Current) -> tuple[BinaryIO, int] | None:
-    """The file, and how many of its bytes may be had; None where there is no such recording.
+    """An open recording, and how many of its bytes may be read.
 
-    Open, it stays the same file, whatever becomes of its name.
+    None where there is no such recording.
+
+    Once open it stays the same file, whatever becomes of its name.
     """
     found = next((entry for entry in _entries(where) if entry.name == name), None)
     if found is None:
@@ -103,9 +105,9 @@ def opened(where: str | None, name: str, current: Current) -> tuple[BinaryIO, in
 
 
 def span(header: str | None, size: int) -> tuple[int, int] | None:
-    """First byte and the one after the last of a Range header; None: the whole file is meant.
+    """First byte of a Range header, and the one after the last; None: the whole file is meant.
 
-    RFC 9110, 14.2: what cannot be read, or asks for several parts, may be ignored.
+    RFC 9110, 14.2: a header that cannot be read, or asks for several parts, may be ignored. Raises
     ``UnsatisfiableRangeError`` for a range beyond the end.
     """
     found = _RANGE.fullmatch((header or "").replace(" ", ""))

@@ -1,7 +1,7 @@
-"""How the API answers: JSON written fast, errors as problems (RFC 9457), and both documented.
+"""The API's responses: JSON written fast, errors as problems (RFC 9457), and both documented.
 
 No answer is validated on its way out: the models of ``models.py`` only describe it, and the tests
-hold the answers against them.
+compare the answers with them.
 """
 
 from typing import Any, Final
@@ -26,35 +26,35 @@ _MEANINGS: Final = {
 
 
 def encode(content: object) -> bytes:
-    """JSON; what is not a finite number becomes null, for it is not known."""
+    """JSON bytes; numbers that are not finite become null."""
     return orjson.dumps(content, option=orjson.OPT_NON_STR_KEYS | orjson.OPT_SERIALIZE_NUMPY)
 
 
 def answer(content: object, status: int = 200) -> Response:
-    """``content`` as JSON."""
+    """A response with ``content`` as JSON."""
     return Response(encode(content), status_code=status, media_type="application/json")
 
 
 def problem(status: int, title: str, headers: dict[str, str] | None = None) -> JSONResponse:
-    """An error as RFC 9457 has it."""
+    """An error response as RFC 9457 has it."""
     body = {"type": "about:blank", "title": title, "status": status}
     return JSONResponse(body, status_code=status, headers=headers, media_type=PROBLEM_TYPE)
 
 
 def answers(model: Any, *problems: int) -> dict[int | str, dict[str, Any]]:
-    """What an operation answers, for the OpenAPI document: the model, or one of the problems."""
+    """Responses of an operation, for the OpenAPI document: the model, or one of the problems."""
     return {200: {"model": model}} | refusals(*problems)
 
 
 def refusals(*problems: int) -> dict[int | str, dict[str, Any]]:
-    """The problems that an operation answers with, for the OpenAPI document."""
+    """Problems that an operation answers with, for the OpenAPI document."""
     return {
         status: {"model": models.Problem, "description": _MEANINGS[status]} for status in problems
     }
 
 
 def install(app: FastAPI) -> None:
-    """Every error of the application becomes a problem, and its document says so."""
+    """Turn every error of the application into a problem, and document it so."""
     app.add_exception_handler(HTTPException, _refused)
     app.add_exception_handler(RequestValidationError, _unprocessable)
     app.add_exception_handler(Exception, _failed)
@@ -74,12 +74,15 @@ async def _unprocessable(_request: Request, error: Exception) -> JSONResponse:
 
 
 async def _failed(_request: Request, _error: Exception) -> JSONResponse:
-    """A mistake of ours. uvicorn writes the traceback; it is nothing to show to who asked."""
+    """Answer an unexpected error; uvicorn logs the traceback, which is not shown to the client."""
     return problem(500, "the service failed to answer: its own mistake, which its log shows")
 
 
 def _document(app: FastAPI) -> dict[str, Any]:
-    """OpenAPI, problems under their own media type: FastAPI puts all models under JSON's."""
+    """The OpenAPI document with problems under their own media type.
+
+    FastAPI puts them under JSON's.
+    """
     if app.openapi_schema is None:
         made = get_openapi(
             title=app.title, version=app.version, description=app.description, routes=app.routes

@@ -1,17 +1,17 @@
-"""``WS /v1/stream``: the state as it changes. What is newest wins.
+"""The WebSocket ``/v1/stream``: the state as it changes, always the newest.
 
-    ?uav=1:1&uav=2:1     of these UAVs only (default: all)
+    ?uav=1:1&uav=2:1     only these UAVs (default: all)
     &topic=uavs          uavs, beams, weights, status, links, events (default: uavs and beams)
-    &rate_hz=10          of each topic at most so many messages a second; never more than updates
+    &rate_hz=10          greatest rate of each topic; never more than updates
 
-Every message is a JSON object: what the path of that name answers, with ``topic`` and
+Every message is a JSON object: the answer of the path of that name, with ``topic`` and
 ``valid_at``. Nothing is queued: a client that has taken one message is given what is newest then,
 so a slow one misses messages, holds nobody up and makes no memory grow. A message is encoded once
 for all who asked for the same. ``events`` come when there is a new one.
 
-Closed with: 1003 the client sent something (the stream takes nothing), 1012 the service ends,
-4401 no or a wrong token (``access``), 4403 a page from elsewhere asked, 4422 bad arguments. The
-reason says more.
+Closed with: 1003 the client sent something (the stream takes nothing), 1012 the service ends, 4401
+no or a wrong token (``access``), 4403 a page from elsewhere asked, 4422 bad arguments. The reason
+says more.
 """
 
 import asyncio
@@ -27,11 +27,12 @@ from starlette.datastructures import QueryParams
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 import companion
-from companion.server import beam_views, link_views, views
 from companion.server.access import SUBPROTOCOL
 from companion.server.responses import encode
-from companion.server.views import Node
-from companion.server.words import rfc3339
+from companion.values import UserError
+from companion.views import beam_state, link_state, state
+from companion.views.state import Node
+from companion.views.words import rfc3339
 
 Json = dict[str, Any]
 
@@ -43,14 +44,17 @@ RATE_HZ: Final = 10.0
 LEAST_HZ, MOST_HZ = 0.1, 100.0
 _UAV: Final = re.compile(r"\d{1,3}:\d{1,3}|icao:[0-9A-F]{6}", re.ASCII)
 SLOTS: Final = 32
-"""Clients take turns within the first half of the time between two updates: a hundred messages
-sent in one go would hold up everything else. A few clients do not wait."""
+"""Number of slots in which clients take turns after an update.
+
+They span the first half of the time between two updates: a hundred messages sent in one go would
+hold up everything else. A few clients do not wait.
+"""
 _EARLY: Final = 0.25
-"""Of its period a message may be early: updates do not come to the microsecond."""
+"""Fraction of its period by which a message may be early; updates are not exact."""
 
 
 class Topic(StrEnum):
-    """What can be streamed: each is what the path of that name answers."""
+    """What can be streamed; each topic is the answer of the path of that name."""
 
     UAVS = "uavs"
     BEAMS = "beams"
@@ -62,7 +66,7 @@ class Topic(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What a client asks for; no ``uavs``: all of them."""
+    """What a client asks for; empty ``uavs`` means all of them."""
 
     topics: tuple[Topic, ...] = (Topic.UAVS, Topic.BEAMS)
     uavs: frozenset[str] = frozenset()
@@ -70,31 +74,31 @@ class Wanted:
 
 
 def wanted(query: QueryParams) -> Wanted:
-    """Read the arguments; ``ValueError`` names the first that is wrong."""
+    """Read the arguments. Raises ``UserError``, which names the first that is wrong."""
     unknown = set(query) - {"uav", "topic", "rate_hz"}
     if unknown:
-        raise ValueError(f"{min(unknown)[:40]!r} is none of uav, topic, rate_hz")
+        raise UserError(f"{min(unknown)[:40]!r} is none of uav, topic, rate_hz")
     for uav in query.getlist("uav"):
         if not _UAV.fullmatch(uav):
-            raise ValueError(f"uav: {uav[:40]!r} is neither SYSID:COMPID nor icao:HEX")
+            raise UserError(f"uav: {uav[:40]!r} is neither SYSID:COMPID nor icao:HEX")
     text = query.get("rate_hz", str(RATE_HZ))
     try:
         rate_hz = float(text)
     except ValueError:
         rate_hz = 0.0
     if not LEAST_HZ <= rate_hz <= MOST_HZ:
-        raise ValueError(f"rate_hz: {text[:40]!r} is not a number of {LEAST_HZ:g} to {MOST_HZ:g}")
+        raise UserError(f"rate_hz: {text[:40]!r} is not a number of {LEAST_HZ:g} to {MOST_HZ:g}")
     names = query.getlist("topic")
     bad = [name for name in names if name not in list(Topic)]
     if bad:
-        raise ValueError(f"topic: {bad[0][:40]!r} is none of {', '.join(Topic)}")
+        raise UserError(f"topic: {bad[0][:40]!r} is none of {', '.join(Topic)}")
     topics = tuple(dict.fromkeys(map(Topic, names))) or Wanted().topics
     return Wanted(topics, frozenset(query.getlist("uav")), rate_hz)
 
 
 @dataclass(slots=True)
 class Snapshot:
-    """What there is to say of one update: each topic is looked up once, each message made once."""
+    """The messages of one update: each topic is looked up once, each message made once."""
 
     number: int
     bodies: dict[Topic, "asyncio.Task[Json]"] = field(default_factory=dict)
@@ -121,7 +125,7 @@ class Stream:
             return
         try:
             asked = wanted(websocket.query_params)
-        except ValueError as error:
+        except UserError as error:
             await websocket.close(BAD_ARGUMENTS, _short(str(error)))
             return
         slot = self._in_slot.index(min(self._in_slot))
@@ -151,7 +155,7 @@ class Stream:
             await asyncio.gather(sending, hearing, return_exceptions=True)
 
     async def _send(self, websocket: WebSocket, asked: Wanted, turn_s: float) -> None:
-        """What has changed at each update that is due, ``turn_s`` after it, until cancelled."""
+        """Send changes at each update that is due, ``turn_s`` after it, until cancelled."""
         loop, period_s = asyncio.get_running_loop(), 1 / asked.rate_hz
         due_s, said = loop.time(), dict[Topic, object]()
         while True:
@@ -168,7 +172,7 @@ class Stream:
                 await asyncio.sleep(turn_s)
 
     def _version(self, topic: Topic) -> object:
-        """Another one whenever there is something new to say."""
+        """A value that differs whenever there is something new to say."""
         if topic is Topic.EVENTS:
             events = self._node.events()
             return events[-1] if events else "none yet"
@@ -191,7 +195,7 @@ class Stream:
 
 
 def only(topic: Topic, body: Json, uavs: frozenset[str]) -> Json:
-    """A message without the other UAVs; what is of no UAV stays."""
+    """A message without the other UAVs; what concerns no UAV stays."""
     match topic:
         case Topic.UAVS:
             return body | {"uavs": [one for one in body["uavs"] if one["id"] in uavs]}
@@ -217,33 +221,33 @@ def only(topic: Topic, body: Json, uavs: frozenset[str]) -> Json:
 
 
 async def _uavs(node: Node) -> Json:
-    return {"valid_at": rfc3339(node.now_ns()), "uavs": views.uavs(node)}
+    return {"valid_at": rfc3339(node.now_ns()), "uavs": state.uavs(node)}
 
 
 async def _beams(node: Node) -> Json:
     update = node.pipeline.last_update or node.pipeline.look(node.now_ns())
     age_s = (node.now_ns() - update.t_ns) * 1e-9
     return await run_in_threadpool(
-        beam_views.beams, node.pipeline, node.equipment, update, age_s, 0.0
+        beam_state.beams, node.pipeline, node.equipment, update, age_s, 0.0
     )
 
 
 async def _weights(node: Node) -> Json:
     update = node.pipeline.last_update or node.pipeline.look(node.now_ns())
-    return beam_views.weights(update.beams, 0.0)
+    return beam_state.weights(update.beams, 0.0)
 
 
 async def _status(node: Node) -> Json:
-    shown = views.status(node, companion.__version__)
+    shown = state.status(node, companion.__version__)
     return {"valid_at": shown["time"], **shown}
 
 
 async def _links(node: Node) -> Json:
-    return views.links(node)
+    return state.links(node)
 
 
 async def _events(node: Node) -> Json:
-    events = [link_views.event(notice) for notice in node.events()]
+    events = [link_state.event(notice) for notice in node.events()]
     return {"valid_at": rfc3339(node.now_ns()), "events": events}
 
 
@@ -258,7 +262,10 @@ _BODIES: Final[dict[Topic, Callable[[Node], Any]]] = {
 
 
 def _is_from_here(websocket: WebSocket) -> bool:
-    """Browsers let any page open a WebSocket to any address, and say in Origin whose it is."""
+    """Whether a WebSocket was opened by this site's own page, or by no page.
+
+    Browsers let any page open a WebSocket to any address, and name the page's site in Origin.
+    """
     origin = websocket.headers.get("origin")
     try:
         return origin is None or urlsplit(origin).netloc == websocket.headers.get("host")
@@ -267,5 +274,5 @@ def _is_from_here(websocket: WebSocket) -> bool:
 
 
 def _short(reason: str) -> str:
-    """A closing frame has room for 123 bytes."""
+    """A reason cut to the room of a closing frame, 123 bytes."""
     return reason.encode()[:120].decode(errors="ignore")

@@ -1,4 +1,4 @@
-"""Where the array's carrier is at the time of use, and how it is turned.
+"""Position and attitude of the array's carrier at the time of use.
 
 Rotations are named by frames: ``body_from_ned @ v_ned`` is v in body axes (FRD).
 """
@@ -12,9 +12,10 @@ from companion.values import Attitude, Carrier, Fix, FloatArray, Track
 
 
 def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> FloatArray:
-    """Rotation (3, 3) for MAVLink's attitude: yaw about z, then pitch about y, then roll about x.
+    """Rotation (3, 3) from north-east-down to body axes, by roll, pitch and yaw in radians.
 
-    Source: the aerospace sequence 3-2-1, e.g. Groves, Principles of GNSS (2013), eq. 2.22.
+    Angles are MAVLink's: yaw turns about z, then pitch about y, then roll about x. Source: the
+    aerospace sequence 3-2-1, e.g. Groves, Principles of GNSS (2013), eq. 2.22.
     """
     cr, sr = math.cos(roll_rad), math.sin(roll_rad)
     cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
@@ -29,10 +30,11 @@ def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> FloatArr
 
 
 def later_body_from_body(body_rates_radps: FloatArray, interval_s: float) -> FloatArray:
-    """How a body turns at constant body rates, (3,): rotation (3, 3) from its axes to later ones.
+    """Rotation (3, 3) from a body's axes now to its axes ``interval_s`` seconds later.
 
-    Rodrigues' formula for the rotation vector -rates * interval: what the body sees turns the
-    other way than the body.
+    ``body_rates_radps`` (3,) are constant rates about the body axes. Rodrigues' formula for the
+    rotation vector -rates * interval; the sign is negative because coordinates turn the other way
+    than the body.
     """
     vector = -np.asarray(body_rates_radps, dtype=float) * interval_s
     angle = math.sqrt(vector @ vector)
@@ -48,7 +50,11 @@ def later_body_from_body(body_rates_radps: FloatArray, interval_s: float) -> Flo
 def fixed(
     valid_at_ns: int, local: LocalFrame, place: tuple[float, float, float], heading_rad: float
 ) -> Carrier:
-    """A level station at (latitude deg, longitude deg, height m)."""
+    """The carrier of a fixed, level station.
+
+    ``place`` is latitude and longitude in degrees and height in metres; ``heading_rad`` is
+    clockwise from true north.
+    """
     body_from_local = body_from_ned(0.0, 0.0, heading_rad) @ local.local_from_ned(*place[:2]).T
     still = np.zeros(3)
     return Carrier(
@@ -64,9 +70,13 @@ def moving(
     since_ns: int,
     attitude_bound_rad: float,
 ) -> Carrier:
-    """A vehicle at its track's time; its attitude, ``since_ns`` old by then, goes on at its rates.
+    """The carrier aboard a vehicle, at the time of its track.
 
-    North and down there are those at its ``newest`` report, a few metres away.
+    track               the vehicle's track, which gives position, velocity and bound
+    newest              its newest report; north and down are taken there, a few metres away
+    attitude            its newest attitude, carried on at its body rates
+    since_ns            age of that attitude at the track's time
+    attitude_bound_rad  bound on the angle by which it is off
     """
     rates = np.array([attitude.rollspeed_radps, attitude.pitchspeed_radps, attitude.yawspeed_radps])
     then = body_from_ned(attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad)

@@ -1,29 +1,39 @@
-"""Which track a report belongs to, whether it can be true, and how the tracks age.
+"""Tracks of all UAVs: which track a report belongs to, whether it can be true, and how tracks age.
 
-A track is live while reports come, coasting when they fail to, stale when too old to point a
-beam at, and lost; the ages at which it passes on are settings. Nothing here keeps time: the
-newest accepted report and the time asked for decide.
+A track is live while reports come, coasting when they fail to, stale when too old to point a beam
+at, and lost; the ages at which it changes are settings. Nothing here keeps time: the newest
+accepted report and the time asked for decide.
+
+Over 300 lines: reports in and tracks out share the state of a track.
 """
 
 import math
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from companion.tracking.estimates import Observer, Prediction
 from companion.tracking.gate import GateSettings, Suspects, is_frozen, refusal
 from companion.tracking.history import History
-from companion.values import Estimate, Fix, FloatArray, Reason, Rejection, Track, TrackState
+from companion.tracking.observers.estimates import Observer, Prediction
+from companion.values import (
+    Estimate,
+    Fix,
+    FloatArray,
+    Reason,
+    Rejection,
+    SenderTime,
+    Track,
+    TrackState,
+)
 
 ACCELERATION_FADES_S = 3.0
-"""An estimated acceleration is fed forward fading at this time constant: it does not last."""
+"""Time constant, seconds, with which an acceleration that is fed forward fades."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ages:
-    """How old the newest report may be, in seconds, before a track passes to the next state."""
+    """Ages of the newest report, in seconds, beyond which a track passes to the next state."""
 
     coasting_s: float = 2.0
     stale_s: float = 15.0
@@ -39,22 +49,17 @@ class Ages:
 
 
 @dataclass(frozen=True, slots=True)
-class SenderTime:
-    """A time of the node on a sender's own timeline, and how far that can be off."""
-
-    sender_ns: int
-    bound_s: float
-
-
-ToSenderTime = Callable[[str, int], SenderTime]
-"""(UAV, time of the node) to the time on the UAV's own timeline, by what is known now."""
-
-
-@dataclass(frozen=True, slots=True)
 class FleetSettings:
-    """How tracks are kept: the greatest speed and acceleration that are taken for possible;
-    ``window_s``, how late a report may come and still be used in order; ``feed_forward``, whether
-    an estimated acceleration enters predictions; ``most``, how many tracks there may be."""
+    """How tracks are kept.
+
+    speed_max_mps          greatest speed assumed possible
+    acceleration_max_mps2  greatest acceleration assumed possible
+    ages                   when a track passes from state to state
+    gate                   when refused reports begin a track again
+    window_s               how late a report may come and still be put in order
+    feed_forward           whether an estimated acceleration enters predictions
+    most                   largest number of tracks
+    """
 
     speed_max_mps: float
     acceleration_max_mps2: float
@@ -80,24 +85,22 @@ class _Tracked:
 
 
 class Fleet:
-    """All tracks, by UAV id. ``accept`` reports, ask for a ``track`` at a time of the node.
+    """All tracks, by UAV id. ``accept`` takes reports; ``track`` predicts to a time.
 
     Tracks live on each sender's own timeline, so that what a link does to a report's arrival
-    enters neither the intervals nor their order; ``to_sender_time`` leads there.
+    changes neither the intervals nor their order. The caller of ``track`` converts the time to that
+    timeline.
     """
 
-    def __init__(
-        self, observer: Observer[Any], settings: FleetSettings, to_sender_time: ToSenderTime
-    ) -> None:
+    def __init__(self, observer: Observer[Any], settings: FleetSettings) -> None:
         self._observer = observer
         self._settings = settings
-        self._to_sender_time = to_sender_time
         self._tracked: dict[str, _Tracked] = {}
 
     # --- reports in -------------------------------------------------------------------------
 
     def accept(self, fix: Fix) -> Estimate | Rejection:
-        """Put a report to its track, or begin one; or say why it is not used."""
+        """Add a report to its track, or begin a track; or return the reason why it is not used."""
         tracked = self._tracked.get(fix.uav)
         if tracked is None and len(self._tracked) >= self._settings.most:
             return _rejected(fix, Reason.TOO_MANY, f"{self._settings.most} tracks are kept")
@@ -127,12 +130,12 @@ class Fleet:
         return first
 
     def _is_lost(self, tracked: _Tracked, fix: Fix) -> bool:
-        """After so long a gap there is nothing left to compare with."""
+        """Whether the gap before a report is so long that the track is no use for judging it."""
         gap_s = (fix.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
         return gap_s > self._settings.ages.lost_s
 
     def _wrong(self, tracked: _Tracked, index: int, fix: Fix) -> tuple[Reason, str] | None:
-        """What can be told without a prediction: a repeated stamp, a resent position."""
+        """Judge a report without a prediction: a repeated stamp, or a resent position."""
         entries = tracked.history.entries
         if index < len(entries) and entries[index].fix.sender_ns == fix.sender_ns:
             return Reason.DUPLICATE, "a second report with the same stamp"
@@ -144,6 +147,7 @@ class Fleet:
     def _suspect(
         self, tracked: _Tracked, fix: Fix, why: tuple[Reason, str]
     ) -> Estimate | Rejection:
+        """Set a refused report aside, and begin the track again if enough such reports agree."""
         tracked.suspects.add(fix)
         newest_ns = max(tracked.history.newest.fix.sender_ns, tracked.believable_ns)
         silent_s = (fix.sender_ns - newest_ns) * 1e-9
@@ -188,7 +192,7 @@ class Fleet:
         return Estimate(entry.fix, predicted.position_ned_m, predicted.bound_m, innovation_m, dt_s)
 
     def _acceleration(self, history: History[Any]) -> tuple[FloatArray | None, float]:
-        """What is fed forward and its size, no more than is taken for possible."""
+        """The acceleration that is fed forward, cut to the greatest possible size, and its size."""
         found = history.acceleration() if self._settings.feed_forward else None
         if found is None:
             return None, 0.0
@@ -197,30 +201,29 @@ class Fleet:
         return (found, size) if size <= most_mps2 else (found * (most_mps2 / size), most_mps2)
 
     def forget(self, uav: str) -> None:
-        """Forget a track: its sender was restarted, and its times begin anew; or it is gone."""
+        """Forget a track, because its sender was restarted or is gone."""
         self._tracked.pop(uav, None)
 
     def silent(self, now_ns: int, for_s: float) -> list[str]:
-        """Those of whom no accepted report has arrived for so long, node time."""
+        """UAVs of which no report has arrived for ``for_s`` seconds, node time."""
         before_ns = now_ns - round(for_s * 1e9)
         return [uav for uav, one in self._tracked.items() if one.arrived.arrival_ns < before_ns]
 
     # --- tracks out -------------------------------------------------------------------------
 
-    def track(self, uav: str, now_ns: int, valid_at_ns: int) -> Track | None:
-        """One UAV at ``valid_at_ns``, its state judged at ``now_ns``; None if never seen."""
+    def track(self, uav: str, now_ns: int, at: SenderTime) -> Track | None:
+        """One UAV at ``at.node_ns``, its state judged at ``now_ns``; None if it was never seen."""
         tracked = self._tracked.get(uav)
         if tracked is None:
             return None
-        at = self._to_sender_time(uav, valid_at_ns)
-        now = at.sender_ns - (valid_at_ns - now_ns)
+        now = at.sender_ns - (at.node_ns - now_ns)
         predicted = self._predict(tracked, at)
         newest = tracked.history.newest
         last = tracked.newest
         return Track(
             uav=uav,
             state=self._settings.ages.state((now - newest.fix.sender_ns) * 1e-9),
-            valid_at_ns=valid_at_ns,
+            valid_at_ns=at.node_ns,
             age_s=(at.sender_ns - newest.fix.sender_ns) * 1e-9,
             position_ned_m=predicted.position_ned_m,
             velocity_ned_mps=predicted.velocity_ned_mps,
@@ -238,7 +241,10 @@ class Fleet:
         )
 
     def _predict(self, tracked: _Tracked, at: SenderTime) -> Prediction:
-        """The observer's prediction, with the acceleration and the clock's doubt in its bound."""
+        """The observer's prediction, its bound widened by acceleration and clock uncertainty.
+
+        See docs/math.md 5.1.
+        """
         newest = tracked.history.newest
         found = self._observer.predict(newest.state, at.sender_ns)
         ahead_s = (at.sender_ns - newest.fix.sender_ns) * 1e-9
@@ -267,7 +273,7 @@ class Fleet:
     def _fastest_mps(
         self, velocity: FloatArray | None, bound_mps: float | None, within_s: float
     ) -> float:
-        """How fast it can be within a time of that at which it has this velocity."""
+        """Greatest speed within a time of the instant at which the UAV has this velocity."""
         most_mps = self._settings.speed_max_mps
         if velocity is None or bound_mps is None:
             return most_mps
@@ -275,28 +281,32 @@ class Fleet:
         return min(most_mps, math.sqrt(velocity @ velocity) + bound_mps + gained_mps)
 
     def newest(self, uav: str) -> Fix | None:
-        """The newest accepted report of a UAV."""
+        """The newest accepted report of a UAV; None if it was never seen."""
         tracked = self._tracked.get(uav)
         return tracked.history.newest.fix if tracked else None
 
     @property
     def uavs(self) -> list[str]:
-        """The ids of all tracks, in the order in which they began."""
+        """Ids of all tracks, in the order in which they began."""
         return list(self._tracked)
 
-    def states(self, now_ns: int, uavs: Iterable[str]) -> dict[str, TrackState]:
-        """The states of those tracks that exist, without predicting anything."""
-        return {
-            uav: self._settings.ages.state(
-                (
-                    self._to_sender_time(uav, now_ns).sender_ns
-                    - self._tracked[uav].history.newest.fix.sender_ns
-                )
-                * 1e-9
-            )
-            for uav in uavs
-            if uav in self._tracked
-        }
+    def state(self, uav: str, now: SenderTime) -> TrackState | None:
+        """The state of a track, without a prediction; None if it was never seen."""
+        tracked = self._tracked.get(uav)
+        if tracked is None:
+            return None
+        return self._settings.ages.state(
+            (now.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
+        )
+
+    def near(self, position_ned_m: FloatArray, within_m: float) -> list[str]:
+        """UAVs whose newest accepted report lies within a distance of a local place, (3,)."""
+        found = []
+        for uav, tracked in self._tracked.items():
+            offset = tracked.history.newest.fix.position_ned_m - position_ned_m
+            if offset @ offset < within_m**2:
+                found.append(uav)
+        return found
 
 
 def _rejected(fix: Fix, reason: Reason, detail: str) -> Rejection:
@@ -304,14 +314,20 @@ def _rejected(fix: Fix, reason: Reason, detail: str) -> Rejection:
 
 
 def _fading(ahead_s: float) -> tuple[float, float]:
-    """What an acceleration of 1 that fades does within a time: displacement, gain in speed."""
+    """Displacement (s²) and gain in speed (s) by a fading acceleration of 1 within a time.
+
+    s(τ) of docs/math.md 5.1, and its derivative.
+    """
     fade_s = ACCELERATION_FADES_S
     shrink = math.exp(-ahead_s / fade_s)
     return fade_s * fade_s * (shrink - 1 + ahead_s / fade_s), fade_s * (1 - shrink)
 
 
 def _unknown_input(history: History[Any]) -> FloatArray | None:
-    """W^ = (x^+ - x^) / dT over the newest interval, m/s, (3,): what the estimate needed."""
+    """Unknown input over the newest interval: W^ = (x^+ - x^) / dT, m/s, (3,).
+
+    See docs/math.md 3; None where there are fewer than two reports.
+    """
     if len(history.entries) < 2:
         return None
     before, newest = history.entries[-2:]

@@ -1,10 +1,10 @@
-"""Whether a report can be true, and what to do when the track is wrong instead.
+"""Which reports can be true, and when a track must be begun again because it is itself wrong.
 
 A report is refused when the UAV cannot have got there: it lies outside the bound of what was
 predicted from the last *accepted* report, given the bounds on acceleration, speed and noise, plus
-its own noise. Reports that were refused are never gated on; they are set aside, and once enough of
-them agree with one another for long enough, with none accepted meanwhile, the track is begun again
-from them. Where both go on side by side, two vehicles share one id.
+its own noise. Refused reports never move the gate; they are set aside. Once enough of them agree
+with one another for long enough, with none accepted meanwhile, the track is begun again from them.
+See docs/math.md 5.2.
 """
 
 import math
@@ -14,18 +14,25 @@ from typing import Generic
 
 import numpy as np
 
-from companion.tracking.estimates import Observer, Prediction, State
+from companion.tracking.observers.estimates import Observer, Prediction, State
 from companion.values import Fix, Reason
 
 FROZEN_SPEED_MPS = 1.0
+"""Least reported speed at which an unchanged position counts as frozen."""
 FROZEN_TRAVEL_M = 0.3
-"""A position that is the same to the last digit, while its velocity says it has moved this far."""
+"""Least distance that this speed must have covered while the position stayed the same."""
 
 
 @dataclass(frozen=True, slots=True)
 class GateSettings:
-    """When a refused run becomes the track: so many reports over so many seconds. ``lead_m``: how
-    far a report may be ahead of the position or behind it, beside its noise (a feedthrough)."""
+    """When refused reports become the track.
+
+    reacquire_reports  refused reports that must agree
+    reacquire_s        seconds over which they must agree
+    forget_s           seconds without another one after which they are forgotten
+    lead_m             how far a report may be ahead of the position or behind it, beside its
+                       noise (a feedthrough)
+    """
 
     reacquire_reports: int = 3
     reacquire_s: float = 3.0
@@ -34,7 +41,7 @@ class GateSettings:
 
 
 def refusal(predicted: Prediction, fix: Fix, lead_m: float = 0.0) -> tuple[Reason, str] | None:
-    """Why a report cannot be true given what was predicted for its time; None if it can."""
+    """Why a report cannot be true, given the prediction for its time; None if it can."""
     north, east, down = (fix.position_ned_m - predicted.position_ned_m).tolist()
     horizontal_m = math.hypot(north, east)
     limit_m = predicted.horizontal_m + fix.noise.horizontal_m + lead_m
@@ -47,7 +54,7 @@ def refusal(predicted: Prediction, fix: Fix, lead_m: float = 0.0) -> tuple[Reaso
 
 
 def is_frozen(before: Fix, fix: Fix) -> bool:
-    """A resent position under a fresh stamp: identical, though the velocity says it moved on."""
+    """Whether a position was sent again under a fresh stamp, though its velocity says it moved."""
     velocity = fix.velocity_ned_mps
     if velocity is None or not np.array_equal(before.position_ned_m, fix.position_ned_m):
         return False
@@ -66,7 +73,7 @@ class Suspects(Generic[State]):
         self._begun_ns = 0
 
     def add(self, fix: Fix) -> None:
-        """Set a refused report aside: it goes on with the run, or begins another."""
+        """Set a refused report aside: it continues the run, or begins another."""
         if self._run:
             last = self._run[-1]
             predicted = self._observer.predict(self._observer.begin(last), fix.sender_ns)
@@ -80,18 +87,18 @@ class Suspects(Generic[State]):
         self._run.append(fix)
 
     def agree(self) -> bool:
-        """Whether there are enough, for long enough, to be believed."""
+        """Whether the run is long enough, in reports and in seconds, to be believed."""
         if len(self._run) < self._settings.reacquire_reports:
             return False
         lasted_ns = self._run[-1].sender_ns - self._begun_ns
         return lasted_ns >= self._settings.reacquire_s * 1e9
 
     def goes_on(self, sender_ns: int) -> bool:
-        """Whether the run is long enough to count, and was added to within the last seconds."""
+        """Whether the run is to be believed and was added to within the last ``forget_s``."""
         return self.agree() and sender_ns - self._run[-1].sender_ns < self._settings.forget_s * 1e9
 
     def take(self) -> list[Fix]:
-        """The run, which is then empty."""
+        """Take the run out."""
         run = list(self._run)
         self._run.clear()
         return run

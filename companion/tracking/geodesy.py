@@ -1,14 +1,14 @@
 """WGS84 and the local frame.
 
-The local frame is north-east-down at a fixed origin, and Cartesian: a point far away has its
-exact straight-line coordinates, and only "north" and "down" differ there from the directions
-here. ``local_from_ned`` turns one into the other. Heights are taken as given by the sender
-(above mean sea level for GLOBAL_POSITION_INT); a common error of datum cancels in every
-difference of positions.
+The local frame is north-east-down at a fixed origin, and Cartesian: a point far away has its exact
+straight-line coordinates, and only "north" and "down" differ there from the directions at the
+origin. ``local_from_ned`` turns one into the other. Heights are taken as given by the sender (above
+mean sea level for GLOBAL_POSITION_INT); a common error of datum cancels in every difference of
+positions.
 """
 
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import pymap3d
@@ -19,13 +19,13 @@ SEMI_MAJOR_M: Final = 6_378_137.0
 SEMI_MINOR_M: Final = SEMI_MAJOR_M * (1 - 1 / 298.257223563)
 ECCENTRICITY2: Final = 1 - (SEMI_MINOR_M / SEMI_MAJOR_M) ** 2
 SECOND_ECCENTRICITY2: Final = (SEMI_MAJOR_M / SEMI_MINOR_M) ** 2 - 1
-"""WGS84 (NIMA TR8350.2)."""
+"""Square of the second eccentricity. Source of the constants: WGS84 (NIMA TR8350.2)."""
 
 
 def ned_from_ecef(lat_deg: float, lon_deg: float) -> FloatArray:
     """Rotation (3, 3) from earth-centred axes to north-east-down at a place.
 
-    Source: any text on navigation frames, e.g. Groves, Principles of GNSS (2013), eq. 2.150.
+    Source: e.g. Groves, Principles of GNSS (2013), eq. 2.150.
     """
     lat, lon = math.radians(lat_deg), math.radians(lon_deg)
     sin_lat, cos_lat, sin_lon, cos_lon = math.sin(lat), math.cos(lat), math.sin(lon), math.cos(lon)
@@ -38,6 +38,14 @@ def ned_from_ecef(lat_deg: float, lon_deg: float) -> FloatArray:
     )
 
 
+class Place(NamedTuple):
+    """A point on Earth: WGS84 degrees, metres above the ellipsoid or mean sea level, as given."""
+
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
+
+
 class LocalFrame:
     """North-east-down at an origin given in degrees and metres."""
 
@@ -45,14 +53,23 @@ class LocalFrame:
         self.origin = (lat_deg, lon_deg, alt_m)
         self._local_from_ecef = ned_from_ecef(lat_deg, lon_deg)
         self._origin_m = np.array(pymap3d.geodetic2ecef(lat_deg, lon_deg, alt_m), dtype=float)
+        self._rows = tuple(
+            zip(self._origin_m.tolist(), *self._local_from_ecef.tolist(), strict=True)
+        )
 
     def position_ned_m(self, lat_deg: float, lon_deg: float, alt_m: float) -> FloatArray:
-        """Local coordinates, shape (3,), of a place."""
+        """Local coordinates of a place in metres, (3,)."""
         return np.array(pymap3d.geodetic2ned(lat_deg, lon_deg, alt_m, *self.origin), dtype=float)
 
     def local_from_ned(self, lat_deg: float, lon_deg: float) -> FloatArray:
         """Rotation (3, 3) from north-east-down at another place to this frame."""
         return self._local_from_ecef @ ned_from_ecef(lat_deg, lon_deg).T
+
+    def place(self, north_m: float, east_m: float, down_m: float) -> Place:
+        """The place of one local point; for single points it is faster than ``geodetic``."""
+        return _geodetic(
+            *(at + x * north_m + y * east_m + z * down_m for at, x, y, z in self._rows)
+        )
 
     def geodetic(self, position_ned_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Latitude and longitude in degrees and height in metres of local points, (N, 3)."""
@@ -62,10 +79,11 @@ class LocalFrame:
         return lat, lon, alt
 
 
-def _geodetic(x_m: float, y_m: float, z_m: float) -> tuple[float, float, float]:
-    """Bowring's formula (1976), two steps: exact to rounding wherever aircraft fly.
+def _geodetic(x_m: float, y_m: float, z_m: float) -> Place:
+    """The place of an earth-centred point.
 
-    pymap3d does the same for arrays; for the few points of an update its overhead is most of it.
+    Bowring's formula (1976), two steps: exact to rounding wherever aircraft fly. pymap3d does the
+    same for arrays; for the few points of an update its overhead would be most of the time.
     """
     across_m = math.hypot(x_m, y_m)
     lat = math.atan2(z_m, across_m * (1 - ECCENTRICITY2))
@@ -78,4 +96,4 @@ def _geodetic(x_m: float, y_m: float, z_m: float) -> tuple[float, float, float]:
     sine, cosine = math.sin(lat), math.cos(lat)
     normal_m = SEMI_MAJOR_M / math.sqrt(1 - ECCENTRICITY2 * sine * sine)
     alt_m = across_m * cosine + (z_m + ECCENTRICITY2 * normal_m * sine) * sine - normal_m
-    return math.degrees(lat), math.degrees(math.atan2(y_m, x_m)), alt_m
+    return Place(math.degrees(lat), math.degrees(math.atan2(y_m, x_m)), alt_m)

@@ -1,8 +1,8 @@
-"""The reports of one UAV that are still open to change, in the order in which they were made.
+"""The recent reports of one UAV, in the order in which they were made.
 
-Links deliver late and out of order. Within a window a late report is put where it belongs and
-what came after it is estimated again, so that the result is that of reports in order; what is
-older than the window is beyond use. Nearly always a report is the newest, and costs one step.
+Links deliver late and out of order. A late report within the window is put where it belongs, and
+what follows it is estimated again, so that the result is that of reports in order. A report older
+than the window is not used. Nearly always a report is the newest, and costs one step.
 """
 
 from bisect import bisect_left
@@ -11,18 +11,21 @@ from typing import Generic
 
 import numpy as np
 
-from companion.tracking.estimates import Observer, Prediction, State
+from companion.tracking.observers.estimates import Observer, Prediction, State
 from companion.values import Fix, FloatArray
 
 ACCELERATION_WINDOW_NS = 5_000_000_000
+"""Time over which reported velocities are used for the acceleration."""
 ACCELERATION_REPORTS, ACCELERATION_REPORTS_MAX = 5, 15
-"""The acceleration is the slope of the velocities reported over the window, and of at least so
-many: fewer say more of their noise than of a turn. Of very many, one in a few is taken."""
+"""Least and most velocities used for the acceleration.
+
+Fewer say more of their noise than of a turn. When there are more, only every n-th is used.
+"""
 
 
 @dataclass(slots=True)
 class Entry(Generic[State]):
-    """A report, the observer's state there, and what had been predicted for it (first: None)."""
+    """A report, the observer's state there, and the prediction for it (None for the first)."""
 
     fix: Fix
     state: State
@@ -30,7 +33,10 @@ class Entry(Generic[State]):
 
 
 class History(Generic[State]):
-    """Begins with a report; ``entries`` are in order of the sender's time, never empty."""
+    """The reports of one UAV within the window.
+
+    ``entries`` are in order of the sender's time, and never empty.
+    """
 
     def __init__(self, observer: Observer[State], first: Fix, window_ns: int) -> None:
         self._observer = observer
@@ -43,7 +49,7 @@ class History(Generic[State]):
         return self.entries[-1]
 
     def index(self, sender_ns: int) -> int | None:
-        """Where a report of that time belongs; None if it is too old to be used."""
+        """The place of a report with this time; None if it is too old to be used."""
         if sender_ns > self.newest.fix.sender_ns:
             return len(self.entries)
         if sender_ns < self.newest.fix.sender_ns - self._window_ns:
@@ -51,9 +57,9 @@ class History(Generic[State]):
         return bisect_left(self.entries, sender_ns, key=lambda entry: entry.fix.sender_ns)
 
     def insert(self, index: int, fix: Fix, predicted: Prediction | None = None) -> None:
-        """Put a report in its place and estimate what follows it again.
+        """Put a report in its place and estimate again what follows it.
 
-        ``predicted``: what the entry before predicts for it, if that was asked already.
+        ``predicted`` is what the entry before predicts for it, if that was computed already.
         """
         if predicted is not None and index == len(self.entries):
             state = self._observer.after(self.newest.state, predicted, fix)
@@ -75,7 +81,10 @@ class History(Generic[State]):
         return Entry(fix, self._observer.after(before, predicted, fix), predicted)
 
     def acceleration(self) -> FloatArray | None:
-        """Least-squares slope of the newest reported velocities, m/s^2, (3,); None if unknown."""
+        """Least-squares slope of the newest reported velocities, m/s², (3,).
+
+        None if there are too few.
+        """
         newest_ns = self.newest.fix.sender_ns
         times_ns: list[int] = []
         velocities: list[FloatArray] = []

@@ -1,8 +1,8 @@
-"""One aircraft under two names: its own telemetry, and what a receiver relays of it by ADS-B.
+"""One aircraft under two names: its own telemetry, and its ADS-B report relayed by a receiver.
 
-Two beams on one aircraft would be two all but equal steering vectors, which ruin zero forcing. A
-relayed aircraft is taken for a telemetry track after several reports in a row that lie nearer to
-it than their errors allow to tell apart, and for itself again after as many that do not.
+Two beams on one aircraft would be two nearly equal steering vectors, which ruin zero forcing. A
+relayed aircraft is identified with a telemetry track after several reports in a row that are nearer
+to it than their errors allow to tell apart, and is separated again after as many that are not.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,9 @@ import numpy as np
 from companion.values import Fix, Track
 
 REPORTS_TO_DECIDE: Final = 5
+"""Reports in a row that identify, or separate, two tracks."""
 SPEED_APART_MPS: Final = 15.0
+"""Difference in velocity above which two tracks are not one aircraft."""
 
 
 @dataclass(slots=True)
@@ -30,7 +32,10 @@ class Identities:
         self._same: dict[str, str] = {}
 
     def same_as(self, uav: str) -> str | None:
-        """The telemetry track that a relayed aircraft is; None if it is itself."""
+        """The telemetry track that is the same aircraft as this relayed one.
+
+        None if there is none.
+        """
         return self._same.get(uav)
 
     def observe(self, relayed: Fix, telemetry: list[Track]) -> None:
@@ -50,7 +55,7 @@ class Identities:
 
 
 def _apart_m(relayed: Fix, track: Track) -> float | None:
-    """The distance between two that may be one; None if they cannot be."""
+    """Horizontal distance between two tracks that may be one aircraft; None if they cannot be."""
     offset = relayed.position_ned_m - track.position_ned_m
     apart_m = float(np.hypot(offset[0], offset[1]))
     if apart_m > relayed.noise.horizontal_m + track.horizontal_bound_m:

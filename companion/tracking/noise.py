@@ -1,4 +1,4 @@
-"""Bounds on the errors of a report: from the autopilot's own accuracy, or for what is relayed."""
+"""Bounds on the errors of a report, by the autopilot's stated accuracy or for ADS-B."""
 
 import math
 from dataclasses import dataclass
@@ -9,27 +9,37 @@ import numpy as np
 from companion.values import FloatArray, GnssStatus, ReportNoise
 
 QUANTISATION: Final = 0.02
-"""m, m/s: what GLOBAL_POSITION_INT's own steps (1.1 cm, 1 cm/s) can be off, whatever is claimed."""
+"""Least noise bound, m and m/s, whatever accuracy is stated.
+
+GLOBAL_POSITION_INT has steps of 1.1 cm and 1 cm/s.
+"""
 ADSB_TIME_BOUND_S: Final = 1.0
-"""``tslc`` is in whole seconds."""
+"""Uncertainty of the time of an ADS-B report: ``tslc`` is in whole seconds."""
 ADSB_NOISE_M: Final = 100.0
-"""Above what most transponders vouch for (NACp 8: 93 m), and pressure altitude's steps."""
+"""Bound on the position error of an ADS-B report.
+
+It is above what most transponders vouch for (NACp 8: 93 m) and above the steps of pressure
+altitude.
+"""
 ADSB_VELOCITY_NOISE_MPS: Final = 10.0
-"""NACv 1."""
+"""Bound on the velocity error of an ADS-B report (NACv 1)."""
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseSettings:
-    """``default`` holds where nothing better is known; ``factor`` times a reported accuracy (a
-    standard deviation or a 68 % radius, as receivers have it) is taken for a bound; None ignores
-    what is reported."""
+    """How noise bounds are found.
+
+    default  bounds where nothing better is known
+    factor   multiple of a stated accuracy (a standard deviation or 68 % radius, as receivers
+             have it) that is taken as a bound; None: stated accuracies are ignored
+    """
 
     default: ReportNoise
     factor: float | None
 
 
 def reported(status: GnssStatus, settings: NoiseSettings) -> ReportNoise:
-    """The bounds by GPS_RAW_INT, field by field where it is sent."""
+    """The noise bounds by GPS_RAW_INT, field by field where it is sent."""
     default, factor = settings.default, settings.factor
     if factor is None:
         return default
@@ -50,8 +60,11 @@ def _bound(accuracy: float | None, factor: float, default: float) -> float:
 def relayed(
     velocity_ned_mps: FloatArray | None, alt_age_s: float, speed_max_mps: float
 ) -> ReportNoise:
-    """Of an ADS-B report: a time in whole seconds is worth the way flown in one, and an altitude
-    that was true at another time what can be climbed between."""
+    """The noise bounds of an ADS-B report.
+
+    The uncertainty of its time adds the distance flown in it, and an altitude that was true
+    ``alt_age_s`` apart adds what can be climbed in that time.
+    """
     if velocity_ned_mps is None:
         way_m = ADSB_TIME_BOUND_S * speed_max_mps
     else:

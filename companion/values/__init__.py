@@ -20,6 +20,7 @@ from companion.values.aimed import (
     Normalisation,
     Policy,
 )
+from companion.values.errors import UserError
 from companion.values.numbers import (
     BoolArray,
     ComplexArray,
@@ -33,6 +34,7 @@ from companion.values.outputs import (
     Update,
 )
 from companion.values.received import (
+    AdsbVehicle,
     AltitudeDatum,
     Attitude,
     Event,
@@ -47,18 +49,20 @@ from companion.values.received import (
     Source,
     SystemTime,
     Tick,
-    Traffic,
+    reports_itself,
 )
 from companion.values.tracked import (
     Carrier,
     Estimate,
     Fix,
     ReportNoise,
+    SenderTime,
     Track,
     TrackState,
 )
 
 __all__ = [
+    "AdsbVehicle",
     "AltitudeDatum",
     "Attitude",
     "Beam",
@@ -86,12 +90,14 @@ __all__ = [
     "Report",
     "ReportNoise",
     "RoundTrip",
+    "SenderTime",
     "Severity",
     "Source",
     "SystemTime",
     "Tick",
     "Track",
     "TrackState",
-    "Traffic",
     "Update",
+    "UserError",
+    "reports_itself",
 ]

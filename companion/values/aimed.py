@@ -1,4 +1,4 @@
-"""Beams and their weights."""
+"""Values that the beam stage makes: beams, the UAVs left out, and the weights of one update."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -7,7 +7,10 @@ from companion.values.numbers import ComplexArray
 
 
 class Method(StrEnum):
-    """How weights are made. RZF is also what ZF gives way to when it costs too much."""
+    """How weights are made: zero forcing, regularised zero forcing, or maximum ratio transmission.
+
+    ``REGULARISED`` is also used in place of ``ZERO_FORCING`` where that would cost too much gain.
+    """
 
     ZERO_FORCING = "zf"
     REGULARISED = "rzf"
@@ -15,12 +18,16 @@ class Method(StrEnum):
 
 
 class Normalisation(StrEnum):
-    """What the power of a set of weights is scaled to; the directions of the columns are the same.
+    """How the columns of the weights F, (M, N), are scaled. Their directions do not change.
 
-    ``UNIT_RESPONSE``: each UAV receives 1 from its own column, AᵀF has a unit diagonal (the
-    published form). ``STREAM``: each column has unit power. ``TOTAL``: all of them together have
-    unit power, by one common factor. ``ANTENNA``: the busiest element has the power 1/M that a
-    uniform share of unit power would give it, by one common factor.
+        UNIT_RESPONSE  each UAV receives 1 from its own column: AᵀF has a unit diagonal (published
+                       form)
+        STREAM         each column has unit power
+        TOTAL          all columns together have unit power, by one common factor
+        ANTENNA        the busiest element has power 1/M, its uniform share of unit power, by one
+                       factor
+
+    A is the (M, N) steering matrix; see docs/math.md 7.
     """
 
     UNIT_RESPONSE = "unit-response"
@@ -30,8 +37,12 @@ class Normalisation(StrEnum):
 
 
 class Policy(StrEnum):
-    """What is done when zero forcing would cost a user too much: load the matrix, serve groups one
-    after the other, or leave out those of the lowest priority."""
+    """What is done where zero forcing would cost a user too much gain.
+
+    REGULARISE  add a diagonal loading to the Gram matrix
+    GROUP       serve groups of UAVs one after the other
+    DROP        leave out the UAVs of lowest priority
+    """
 
     REGULARISE = "regularise"
     GROUP = "group"
@@ -40,14 +51,21 @@ class Policy(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Beam:
-    """One beam: azimuth (to the right) and elevation (up) in the array frame, range in metres, and
-    how fast they change (None where a velocity is not known).
+    """One UAV's beam: where it points, how well, and how that direction changes.
 
-    ``gain_db`` is the array gain towards the predicted direction under unit weight power, element
-    gain included; ``loss_db`` what it lacks against a beam for this UAV alone (maximum ratio).
-    ``pointing_bound_rad`` is how far the true direction can lie from the predicted one (None:
-    anywhere). ``group`` numbers the turn in which the UAV is served: all are 0 unless the
-    policy groups. ``widened``: its main lobe was broadened to that bound.
+    uav                 the UAV's name
+    azimuth_rad         array frame, positive to the right of boresight
+    elevation_rad       array frame, positive up
+    range_m             from the array to the predicted position
+    *_rate_*            time derivatives of the three; None where no velocity is known
+    pointing_bound_rad  largest angle between the predicted and the true direction; None:
+                        anywhere
+    gain_db             array gain towards the predicted direction for weights of unit power,
+                        element gain included
+    loss_db             what ``gain_db`` lacks against a beam for this UAV alone (maximum ratio)
+    group               number of the turn in which the UAV is served; 0 unless the policy
+                        groups
+    widened             True if the main lobe was broadened to the pointing bound
     """
 
     uav: str
@@ -66,7 +84,7 @@ class Beam:
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """A UAV that is tracked but has no beam, and why."""
+    """A UAV that is tracked but has no beam, and the reason."""
 
     uav: str
     reason: str
@@ -74,13 +92,20 @@ class LeftOut:
 
 @dataclass(frozen=True, slots=True)
 class BeamSet:
-    """The weights of one update. ``weights``: (M, N), columns in the order of ``beams``.
+    """The beams and weights of one update.
 
-    With A the (M, N) steering matrix of the predicted directions, zero forcing has AᵀF = I among
-    the UAVs of a group (diagonal, under another normalisation): nulls on the others.
-    ``condition_number`` is that of A in the 2-norm, its columns at one length, the worst of the
-    groups (None without beams).
-    ``t_ns`` is when the update was made, ``valid_at_ns`` when the beams are applied.
+        t_ns              when the update was made, node time
+        valid_at_ns       when the beams are to be applied, node time
+        beams             N beams
+        weights           F, (M, N) complex: one row per element, columns in the order of ``beams``
+        method            how F was made
+        normalisation     how its columns are scaled
+        condition_number  of the steering matrix A in the 2-norm, columns scaled to equal length;
+                          the largest over the groups; None without beams
+        left_out          UAVs without a beam
+
+    Zero forcing gives AᵀF = I within a group (no conjugate; diagonal under other normalisations):
+    each UAV lies in a null of the others' beams. See docs/math.md 7.
     """
 
     t_ns: int
@@ -102,5 +127,5 @@ class BeamSet:
 
     @property
     def groups(self) -> int:
-        """How many turns it takes to serve all."""
+        """Number of turns in which all UAVs are served; 0 without beams."""
         return max((beam.group for beam in self.beams), default=-1) + 1

@@ -1,4 +1,4 @@
-"""Arrays of numbers, as they are written in types. They are not to be written to."""
+"""Types of numpy arrays. Arrays held by values are never written to."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""What the pipeline makes of an event."""
+"""Values that the pipeline returns for an event."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -9,7 +9,7 @@ from companion.values.tracked import Carrier, Estimate, Track
 
 
 class Severity(StrEnum):
-    """How much a notice matters to an operator."""
+    """How important a notice is to an operator."""
 
     INFO = "info"
     WARNING = "warning"
@@ -18,7 +18,7 @@ class Severity(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """Something that an operator should know: said once, when it changes."""
+    """A message to the operator, emitted once when the state it describes changes."""
 
     t_ns: int
     severity: Severity
@@ -28,8 +28,14 @@ class Notice:
 
 @dataclass(frozen=True, slots=True)
 class Update:
-    """Every target at the time of use, and the beams on them; without a carrier there are none,
-    and ``unfit`` says why."""
+    """Every tracked UAV at the time of use, and the beams towards them.
+
+    t_ns     when the update was made, node time
+    carrier  where the array is; None while that is not known, and then there are no beams
+    unfit    why there are no beams; None if the service is fit to be used
+    tracks   every target, predicted to the time of use
+    beams    the weights
+    """
 
     t_ns: int
     carrier: Carrier | None
@@ -39,4 +45,4 @@ class Update:
 
 
 Output = Rejection | Estimate | Notice | Update
-"""What the pipeline makes of an event."""
+"""Everything that the pipeline can return for an event."""

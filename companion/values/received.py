@@ -1,12 +1,14 @@
-"""What is received: frames, what they say, and what was not used of them."""
+"""Values that come in: frames, the messages decoded from them, and what was rejected."""
 
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple, Self
 
+from companion.values.errors import UserError
+
 
 class Source(NamedTuple):
-    """Who sent a frame: MAVLink system and component id. Written ``SYSID:COMPID``."""
+    """The sender of a frame: MAVLink system and component id, written ``SYSID:COMPID``."""
 
     sysid: int
     compid: int
@@ -16,18 +18,30 @@ class Source(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Read ``SYSID:COMPID``; ``ValueError`` where it is not two numbers of 0 to 255."""
+        """Read ``SYSID:COMPID``. Raises ``UserError`` unless both are numbers from 0 to 255."""
         sysid, colon, compid = text.partition(":")
         if not (colon and sysid.isdecimal() and compid.isdecimal()):
-            raise ValueError(f"{text!r} is not SYSID:COMPID, such as 5:1")
+            raise UserError(f"{text!r} is not SYSID:COMPID, such as 5:1")
         if int(sysid) > 255 or int(compid) > 255:
-            raise ValueError(f"{text!r}: system and component ids are at most 255")
+            raise UserError(f"{text!r}: system and component ids are at most 255")
         return cls(int(sysid), int(compid))
 
 
+def reports_itself(uav: str) -> bool:
+    """True if ``uav`` names a vehicle that sends its own position, False for a relayed aircraft.
+
+    Relayed aircraft are named ``icao:HEX``.
+    """
+    return not uav.startswith("icao:")
+
+
 class Frame(NamedTuple):
-    """One MAVLink frame whose checksum holds; ``raw`` is all of it, magic byte to checksum or
-    signature. A tuple, for there is one for every frame received, wanted or not."""
+    """One MAVLink frame whose checksum is right.
+
+    ``raw`` is the whole frame, from the magic byte to the checksum or signature; ``t_ns`` is when
+    it arrived, node time. It is a tuple because one is made for every frame received, wanted or
+    not.
+    """
 
     t_ns: int
     link: str
@@ -47,20 +61,20 @@ class Frame(NamedTuple):
 
     @property
     def payload(self) -> bytes:
-        """The payload as sent: MAVLink 2 has cut its trailing zeros."""
+        """The payload as sent; MAVLink 2 senders cut trailing zeros."""
         start = 10 if self.raw[0] == 0xFD else 6
         return self.raw[start : start + self.raw[1]]
 
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """The timer says that beams are due."""
+    """The timer event at which beams are due."""
 
     t_ns: int
 
 
 class Reason(StrEnum):
-    """Why something received was not used. The value is what recordings and the API show."""
+    """Why something received was not used. The values are shown in recordings and by the API."""
 
     GARBAGE = "garbage"  # bytes between frames; counted in bytes
     BAD_CRC = "bad-crc"  # framed like a known message, but the checksum is wrong
@@ -88,7 +102,10 @@ class Reason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Rejection:
-    """Something received that was not used, and why. ``count`` in frames (bytes for garbage)."""
+    """Something received that was not used, and why.
+
+    ``count`` is in frames, or in bytes for ``GARBAGE``. ``detail`` is text for the operator.
+    """
 
     t_ns: int
     source: str
@@ -100,8 +117,13 @@ class Rejection:
 
 @dataclass(frozen=True, slots=True)
 class RoundTrip:
-    """A TIMESYNC request of ours and its answer, received at ``t_ns``: the sender's clock since
-    boot was ``remote_ns`` some time between ``sent_ns`` and ``t_ns`` of the node's."""
+    """A TIMESYNC request sent by this node, and its answer.
+
+    t_ns       when the answer was received, node time
+    source     who answered
+    sent_ns    when the request was sent, node time
+    remote_ns  the sender's clock since boot, read at some time between ``sent_ns`` and ``t_ns``
+    """
 
     t_ns: int
     source: Source
@@ -110,13 +132,18 @@ class RoundTrip:
 
 
 Event = Frame | Tick | Rejection | RoundTrip
-"""Everything that drives the pipeline, in order of time. A rejection made while framing is an
-event as well: the bytes are gone, but that they came is part of what happened. So is a round trip,
-for only the service knows which requests were its own."""
+"""Everything that drives the pipeline, in order of time.
+
+A rejection made while framing is an event too: its bytes are gone, but that they came must be
+recorded. A round trip is an event because only the service knows which requests were its own.
+"""
 
 
 class AltitudeDatum(StrEnum):
-    """What a height is measured from; pressure altitude is off by the weather, up to 100s of m."""
+    """What a height is measured from.
+
+    Pressure altitude can be hundreds of metres off with the weather.
+    """
 
     MSL = "msl"
     PRESSURE = "pressure"
@@ -125,10 +152,23 @@ class AltitudeDatum(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A position that a UAV sent of itself, or that a receiver relayed of it: degrees, metres, m/s
-    in the north-east-down frame at the UAV itself. ``boot_ms`` is the sender's clock at the
-    position, ``tslc_s`` the age that an ADS-B receiver states in its stead. ``alt_age_s``: how far
-    apart in time the position and the altitude were true; 0 where one message had both."""
+    """A position that a UAV sent of itself, or that a receiver relayed of it.
+
+        t_ns               when it arrived, node time
+        lat_deg, lon_deg   WGS84
+        alt_m, alt_datum   height and what it is measured from
+        relative_alt_m     height above the UAV's home; None if not sent
+        velocity_ne_mps    north and east, in the north-east-down frame at the UAV
+        velocity_down_mps  positive down
+        heading_deg        from true north, clockwise
+        boot_ms            the sender's clock since boot when the position was true; None for ADS-B
+        tslc_s             age of the position as stated by an ADS-B receiver, in place of
+                           ``boot_ms``
+        alt_age_s          time between the instants at which position and altitude were true; 0
+                           where one message held both
+
+    None stands for what was not sent.
+    """
 
     t_ns: int
     link: str
@@ -148,12 +188,22 @@ class Report:
 
 
 @dataclass(frozen=True, slots=True)
-class Traffic:
-    """What a receiver relays of an aircraft (ADSB_VEHICLE): degrees, metres, m/s in the
-    north-east-down frame at the aircraft. ``source`` is the relay. A field that its own flag does
-    not vouch for is None; ``alt_datum`` is None where ``alt_m`` is. ``tslc_s`` counts whole seconds
-    since the aircraft was last heard; ``emitter_type`` is MAVLink's ADSB_EMITTER_TYPE, which knows
-    vehicles on the ground and obstacles as well."""
+class AdsbVehicle:
+    """An aircraft relayed by a receiver (ADSB_VEHICLE).
+
+        t_ns               when it arrived, node time
+        icao               24-bit ICAO address of the aircraft
+        source             the relay, not the aircraft
+        emitter_type       MAVLink's ADSB_EMITTER_TYPE, which includes ground vehicles and obstacles
+        position_deg       latitude, longitude
+        alt_m, alt_datum   height and what it is measured from; both None or neither
+        heading_deg        from true north, clockwise
+        velocity_ne_mps    north and east, in the north-east-down frame at the aircraft
+        velocity_down_mps  positive down
+        tslc_s             whole seconds since the aircraft was last heard
+
+    A field whose own validity flag is not set is None.
+    """
 
     t_ns: int
     link: str
@@ -177,7 +227,11 @@ class Traffic:
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """Body attitude and body rates (ATTITUDE): roll, pitch, yaw of FRD from NED, radians."""
+    """Body attitude and body rates (ATTITUDE).
+
+    Roll, pitch and yaw, in radians, turn the NED frame into the FRD body frame; the rates, in
+    rad/s, are about the body axes.
+    """
 
     t_ns: int
     source: Source
@@ -192,7 +246,7 @@ class Attitude:
 
 @dataclass(frozen=True, slots=True)
 class Presence:
-    """HEARTBEAT: a component exists. It does not prove a vehicle."""
+    """A HEARTBEAT: a component exists. It does not prove that there is a vehicle."""
 
     t_ns: int
     source: Source
@@ -204,7 +258,10 @@ class Presence:
 
 @dataclass(frozen=True, slots=True)
 class GnssStatus:
-    """GPS_RAW_INT: fix type (MAVLink's GPS_FIX_TYPE) and the receiver's own accuracies."""
+    """Fix type and stated accuracies of a GNSS receiver (GPS_RAW_INT).
+
+    ``fix_type`` is MAVLink's GPS_FIX_TYPE; accuracies are in metres and m/s, None if not sent.
+    """
 
     t_ns: int
     source: Source
@@ -217,7 +274,7 @@ class GnssStatus:
 
 @dataclass(frozen=True, slots=True)
 class SystemTime:
-    """SYSTEM_TIME: the sender's Unix clock beside its boot clock."""
+    """The sender's Unix clock, in microseconds, beside its clock since boot (SYSTEM_TIME)."""
 
     t_ns: int
     source: Source
@@ -225,4 +282,4 @@ class SystemTime:
     boot_ms: int
 
 
-Message = Report | Traffic | Attitude | Presence | GnssStatus | SystemTime
+Message = Report | AdsbVehicle | Attitude | Presence | GnssStatus | SystemTime

@@ -1,4 +1,4 @@
-"""What is known of where everything is: fixes, estimates, tracks and the carrier."""
+"""Values for where things are: fixes, estimates, tracks and the carrier of the array."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -9,8 +9,13 @@ from companion.values.received import Report
 
 @dataclass(frozen=True, slots=True)
 class ReportNoise:
-    """Bounds on one report's errors: of the position in the plane, in height and in norm, and of
-    the velocity in norm."""
+    """Bounds on the errors of one report.
+
+    horizontal_m  norm of the position error in the horizontal plane
+    vertical_m    height error
+    position_m    norm of the position error in space
+    velocity_mps  norm of the velocity error
+    """
 
     horizontal_m: float
     vertical_m: float
@@ -20,12 +25,20 @@ class ReportNoise:
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """A report on the node's timeline and in the local frame: ``sender_ns`` is when the
-    position was true on the sender's own timeline (intervals between reports are taken there:
-    they carry nothing of the link), ``t_ns`` the same on the node's as far as was known on
-    arrival at ``arrival_ns``; the last two differ by the latency that is seen. For a report
-    without a sender's clock the two timelines are one. ``position_ned_m`` and
-    ``velocity_ned_mps``: shape (3,), local frame; ``noise`` bounds their errors."""
+    """A report put on the node's timeline and into the local frame.
+
+        sender_ns          when the position was true, on the sender's timeline; intervals between
+                           reports are taken from it, since the link cannot disturb it
+        t_ns               the same instant on the node's timeline, as known on arrival
+        arrival_ns         when the report arrived, node time
+        position_ned_m     (3,), local frame
+        velocity_ned_mps   (3,), local frame; None if not sent
+        noise              bounds on the errors of both
+        report             the report itself
+
+    ``arrival_ns - t_ns`` is the visible latency. A report without a sender's clock has ``sender_ns
+    == t_ns``.
+    """
 
     uav: str
     sender_ns: int
@@ -39,11 +52,17 @@ class Fix:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """What the observer makes of an accepted report, at its time: ``position_ned_m`` (3,) is
-    the estimate before this report enters it, ``bound_m`` its error bound, ``innovation_m`` how
-    far the report lies from it, ``dt_s`` the interval since the report before. The last two are
-    None for the first report of a track. ``reacquired``: the track was begun again, from
-    reports that disagreed with it but not with one another."""
+    """The observer's answer to an accepted report, at the time of that report.
+
+    fix             the accepted report
+    position_ned_m  (3,), local frame: the estimate before this report entered it
+    bound_m         bound on the norm of that estimate's error
+    innovation_m    distance from the estimate to the report; None for the first report of a
+                    track
+    dt_s            interval since the report before; None for the first report of a track
+    reacquired      True if the track was begun again, from reports that disagreed with the
+                    track but agreed with one another
+    """
 
     fix: Fix
     position_ned_m: FloatArray
@@ -53,8 +72,20 @@ class Estimate:
     reacquired: bool = False
 
 
+@dataclass(frozen=True, slots=True)
+class SenderTime:
+    """A time of the node, ``node_ns``, converted to a sender's timeline.
+
+    ``sender_ns`` is right to within ``bound_s`` seconds.
+    """
+
+    node_ns: int
+    sender_ns: int
+    bound_s: float
+
+
 class TrackState(StrEnum):
-    """How old the newest report of a UAV is: the limits are settings."""
+    """How old the newest report of a UAV is; the age limits are settings (``[tracks]``)."""
 
     LIVE = "live"
     COASTING = "coasting"
@@ -64,15 +95,27 @@ class TrackState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """What is known of one UAV at ``valid_at_ns``; local frame.
+    """What is known of one UAV at the instant ``valid_at_ns``.
 
-    ``bound_m`` bounds the position error's norm if the settings' bounds on speed, acceleration
-    and noise hold, ``horizontal_bound_m`` and ``vertical_bound_m`` its two parts: the error lies in
-    that upright cylinder. What is not known of the sender's clock, ``clock_bound_s``, is in them.
-    ``acceleration_ned_mps2`` is what was fed forward; ``age_s`` is ``valid_at_ns`` less the time of
-    the newest accepted report;
-    ``dt_s`` the last interval between reports, ``gamma`` the certified gain over all of them;
-    ``innovation_m`` how far the last report lay from its prediction.
+    Vectors are (3,), in the local frame.
+
+        age_s                  ``valid_at_ns`` less the time of the newest accepted report
+        unknown_input_mps      estimate of the unknown input (docs/math.md 3)
+        acceleration_ned_mps2  acceleration that was fed forward (docs/math.md 5.1)
+        bound_m                bound on the norm of the position error
+        horizontal_bound_m     its part in the plane: the error lies in an upright cylinder of this
+        vertical_bound_m       radius and of this half height
+        clock_bound_s          uncertainty of the sender's clock, whose effect is in all three
+                               bounds
+        dt_s                   interval between the last two reports
+        latency_s              visible latency of the newest report
+        gamma                  certified gain over all intervals that occurred (docs/math.md 2.3);
+                               position model only
+        innovation_m           distance from the prediction to the last report
+        reports                number of accepted reports
+
+    The bounds hold if the settings' bounds on speed, acceleration and noise do (docs/math.md 5.6).
+    None stands for what is not known.
     """
 
     uav: str
@@ -96,11 +139,15 @@ class Track:
 
 @dataclass(frozen=True, slots=True)
 class Carrier:
-    """Where the array is at ``valid_at_ns``, and how it is turned: ``body_from_local``, (3, 3).
+    """Position and attitude of the array's carrier at the instant ``valid_at_ns``.
 
-    ``body_rates_radps`` (3,) turn it about its own axes. ``bound_m`` bounds its position's error,
-    ``attitude_bound_rad`` the angle by which its attitude can be off; ``age_s`` is that of its
-    newest report, None for a fixed station.
+    position_ned_m      (3,), local frame
+    velocity_ned_mps    (3,), local frame; None if not known
+    body_from_local     (3, 3) rotation matrix
+    body_rates_radps    (3,), angular rates about the body axes
+    bound_m             bound on the norm of the position error
+    attitude_bound_rad  bound on the angle by which the attitude is off
+    age_s               age of the newest report; None for a fixed station
     """
 
     valid_at_ns: int

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from companion.beams.aim import aim
-from companion.beams.arrays import Array, listed, uniform_linear
-from companion.beams.coverage import Coverage, Sector
-from companion.beams.elements import Element, Pattern
-from companion.beams.precoding import Precoder
+from companion.beams.array.coverage import Coverage, Sector
+from companion.beams.array.elements import Element, Pattern
+from companion.beams.array.geometry import Array, listed, uniform_linear
+from companion.beams.weights.precoding import Precoder
 from companion.values import (
     Beam,
     BeamSet,

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support import BIN, ROOT, Node
+from support import BIN, HANG_MS, HANG_S, ROOT, Node
 
 pytestmark = pytest.mark.browser
 
@@ -65,6 +65,12 @@ def start_mine(tmp_path: Path) -> Iterator[Any]:
             node.process.communicate()
 
 
+def is_complaint(said: Any) -> bool:
+    """Whether the console says that something is wrong. Chromium reports each answer that is no
+    success, and 503 is what a service that is late, on a busy machine, rightly answers."""
+    return said.type == "error" and "status of 503" not in said.text
+
+
 @pytest.fixture
 def open_page(chromium: Any) -> Iterator[Any]:
     """Opens pages; at the end none of them may have complained, but of what was announced."""
@@ -73,7 +79,7 @@ def open_page(chromium: Any) -> Iterator[Any]:
     def start(url: str, viewport: dict[str, int], *, loses_service: bool = False) -> Any:
         page = chromium.new_page(viewport=viewport)
         complaints: list[str] = []
-        page.on("console", lambda said: said.type == "error" and complaints.append(said.text))
+        page.on("console", lambda said: is_complaint(said) and complaints.append(said.text))
         page.on("pageerror", lambda error: complaints.append(str(error)))
         pages.append((page, complaints, loses_service))
         page.goto(url)
@@ -88,15 +94,15 @@ def open_page(chromium: Any) -> Iterator[Any]:
 
 
 def wait_for_uavs(page: Any) -> None:
-    """Until every UAV of the demo is in the table, three seconds at most."""
+    """Until every UAV of the demo is in the table."""
     for uav in UAVS:
-        page.locator("#uavs").get_by_text(uav, exact=True).wait_for(timeout=3000)
+        page.locator("#uavs").get_by_text(uav, exact=True).wait_for(timeout=HANG_MS)
 
 
 def wait_for_value(page: Any, expression: str, wanted: str) -> None:
-    """Until an expression has a value, three seconds at most. (Playwright's own way to wait for
+    """Until an expression has a value. (Playwright's own way to wait for
     one evaluates text in the page, which the content policy forbids.)"""
-    end = time.monotonic() + 3
+    end = time.monotonic() + HANG_S
     while (found := page.evaluate(expression)) != wanted:
         assert time.monotonic() < end, found
         page.wait_for_timeout(50)
@@ -126,12 +132,12 @@ def drawn_colours(page: Any, canvas: str) -> int:
 def test_everything_is_shown_and_moves_without_flooding(demo: Node, open_page: Any) -> None:
     page = open_page(demo.url, DESKTOP)
     wait_for_uavs(page)
-    page.get_by_text("ready", exact=True).wait_for(timeout=3000)
+    page.get_by_text("ready", exact=True).wait_for(timeout=HANG_MS)
     before = page.evaluate(AZIMUTHS)
-    page.wait_for_function(f"before => {AZIMUTHS} !== before", arg=before, timeout=3000)
-    page.locator("#pattern-facts [data-fact=peak]").get_by_text("dB").wait_for(timeout=3000)
-    page.locator("#links").get_by_text("udpin:").wait_for(timeout=6000)
-    page.locator("#events").get_by_text("4:1 is live").wait_for(timeout=6000)
+    page.wait_for_function(f"before => {AZIMUTHS} !== before", arg=before, timeout=HANG_MS)
+    page.locator("#pattern-facts [data-fact=peak]").get_by_text("dB").wait_for(timeout=HANG_MS)
+    page.locator("#links").get_by_text("udpin:").wait_for(timeout=HANG_MS)
+    page.locator("#events").get_by_text("4:1 is live").wait_for(timeout=HANG_MS)
     page.wait_for_timeout(6000)  # so that the series and the rate of requests say something
     times = page.evaluate("performance.getEntriesByType('resource')"
                           ".filter(one => one.initiatorType === 'fetch')"
@@ -153,6 +159,7 @@ def paths(node: Node) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.full
 def test_the_keyboard_chooses_pauses_and_looks_back(demo: Node, open_page: Any) -> None:
     page = open_page(demo.url, DESKTOP)
     wait_for_uavs(page)
@@ -179,7 +186,9 @@ def test_the_keyboard_chooses_pauses_and_looks_back(demo: Node, open_page: Any) 
     assert page.evaluate(AZIMUTHS) == paused
     page.keyboard.press("End")
     assert page.locator("#past").is_hidden()
-    page.wait_for_function(f"seen => !seen.includes({AZIMUTHS})", arg=[*seen, paused], timeout=3000)
+    page.wait_for_function(
+        f"seen => !seen.includes({AZIMUTHS})", arg=[*seen, paused], timeout=HANG_MS
+    )
     page.keyboard.press("?")
     assert page.locator("#help").is_visible()
     page.keyboard.press("Escape")
@@ -203,6 +212,7 @@ def remember_azimuths(page: Any, seconds: float) -> list[str]:
     return seen
 
 
+@pytest.mark.full
 def test_the_slider_looks_back(demo: Node, open_page: Any) -> None:
     page = open_page(demo.url, PHONE)
     wait_for_uavs(page)
@@ -230,15 +240,16 @@ def test_recordings_are_listed_with_a_link_where_there_are_any(demo: Node, open_
         page.route(f"**{path}", functools.partial(fulfil, answer))
     page.goto(demo.url)
     link = page.get_by_role("link", name="a b.mcap")
-    link.wait_for(timeout=4000)
+    link.wait_for(timeout=HANG_MS)
     assert link.get_attribute("href") == "/v1/recordings/a%20b.mcap"
     assert "1.5\u00a0kB · closed" in page.locator("#recordings").text_content()
 
 
+@pytest.mark.full
 def test_a_phone_shows_it_all_in_its_width(demo: Node, open_page: Any) -> None:
     page = open_page(demo.url, PHONE)
     wait_for_uavs(page)
-    page.locator("#links").get_by_text("udpin:").wait_for(timeout=6000)
+    page.locator("#links").get_by_text("udpin:").wait_for(timeout=HANG_MS)
     assert page.evaluate(OVERFLOW) == 0
     cut = page.evaluate("""[...document.querySelectorAll("main *, header *")]
         .filter(one => one.checkVisibility() && !one.closest(".hidden, .u-wrap"))
@@ -248,6 +259,7 @@ def test_a_phone_shows_it_all_in_its_width(demo: Node, open_page: Any) -> None:
     assert page.locator("#pause").bounding_box()["height"] >= 40  # for cold fingers
 
 
+@pytest.mark.full
 def test_themes_are_remembered_and_legible(demo: Node, open_page: Any) -> None:
     page = open_page(demo.url, DESKTOP)
     wait_for_uavs(page)
@@ -282,30 +294,32 @@ CONTRASTS = """(() => {
 """Contrast with the panels as WCAG 2 has it: 4.5 for text, 7 where it must be read in the sun."""
 
 
+@pytest.mark.full
 def test_a_lost_service_is_unmistakable_and_heals(open_page: Any, start_mine: Any) -> None:
     node = start_mine()
     page = open_page(node.url, DESKTOP, loses_service=True)
     wait_for_uavs(page)
     style = "getComputedStyle(document.querySelector('td[data-key=range] span')).{}"
     node.process.send_signal(signal.SIGSTOP)  # silent, but not gone
-    page.locator("html[data-uavs-late]").wait_for(state="attached", timeout=2800)
+    page.locator("html[data-uavs-late]").wait_for(state="attached", timeout=HANG_MS)
     assert page.evaluate(style.format("fontStyle")) == "italic"
     node.process.send_signal(signal.SIGCONT)
     fresh = page.locator("html:not([data-uavs-late]):not([data-uavs-lost])")
-    fresh.wait_for(state="attached", timeout=3000)
+    fresh.wait_for(state="attached", timeout=HANG_MS)
     wait_for_value(page, style.format("fontStyle"), "normal")
     node.process.kill()
     node.process.communicate()
     killed = time.monotonic()
-    page.get_by_text("CONNECTION LOST", exact=True).wait_for(timeout=4000)
+    page.get_by_text("CONNECTION LOST", exact=True).wait_for(timeout=HANG_MS)
     assert time.monotonic() - killed < 4
     assert page.evaluate(style.format("textDecorationLine")) == "line-through"
     start_mine(port=int(node.url.rpartition(":")[2]))
-    page.locator("#banner").wait_for(state="hidden", timeout=5000)
-    page.get_by_text("connected", exact=True).wait_for(timeout=3000)
+    page.locator("#banner").wait_for(state="hidden", timeout=HANG_MS)
+    page.get_by_text("connected", exact=True).wait_for(timeout=HANG_MS)
     wait_for_value(page, style.format("textDecorationLine"), "none")
 
 
+@pytest.mark.full
 def test_a_replay_says_that_it_is_one(open_page: Any, cut_log: Path) -> None:
     command = [BIN / "companion", "replay", cut_log, "--center", "5:1", "--no-record", "--serve"]
     with subprocess.Popen(

@@ -1,14 +1,13 @@
 """The pages of all studies in a real browser, from the file system and without a network."""
 
 import json
-import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from support import BIN, ROOT
+from support import ROOT
 
 pytestmark = pytest.mark.browser
 
@@ -29,31 +28,16 @@ FIGURES = """[...document.querySelectorAll("img, svg")].map(one => {
 
 
 @pytest.fixture(scope="module")
-def reports(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A directory with a report of each study, all made at the same time."""
-    out = tmp_path_factory.mktemp("reports")
-    running = {
-        name: subprocess.Popen(
-            [BIN / "companion", "study", name, *arguments, "--out", out / name],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-        )
-        for name, arguments in STUDIES.items()
-    }
-    try:
-        for name, process in running.items():
-            _, said = process.communicate(timeout=100)
-            assert process.returncode == 0, (name, said)
-        yield out
-    finally:
-        for process in running.values():
-            if process.poll() is None:
-                process.kill()
-                process.communicate()
+def report(studied: Callable[..., Path]) -> Callable[[str], Path]:
+    """``report("paper")``: the directory of a study's report."""
+    return lambda name: studied(name, *map(str, STUDIES[name]))
 
 
 @pytest.mark.parametrize("name", STUDIES)
-def test_a_report_needs_nothing_else(name: str, reports: Path, chromium: Any) -> None:
+def test_a_report_needs_nothing_else(
+    name: str, report: Callable[[str], Path], chromium: Any
+) -> None:
+    made = report(name)
     context = chromium.new_context(offline=True, viewport={"width": 1280, "height": 900})
     page = context.new_page()
     complaints: list[str] = []
@@ -62,16 +46,16 @@ def test_a_report_needs_nothing_else(name: str, reports: Path, chromium: Any) ->
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.on("requestfailed", lambda request: complaints.append(request.url))
     page.on("request", lambda request: requests.append(request.url))
-    address = (reports / name / f"{name}.html").as_uri()
+    address = (made / f"{name}.html").as_uri()
     page.goto(address)
     assert complaints == []
     files = [url for url in requests if urlsplit(url).scheme != "data"]
     assert files == [address]
     figures = page.evaluate(FIGURES)
-    assert len(figures) == len(list((reports / name).glob("*.png"))) > 0
+    assert len(figures) == len(list(made.glob("*.png"))) > 0
     for figure in figures:
         assert min(figure["width"], figure["height"], figure["pixels"]) > 0, figure
         assert figure["right"], figure  # within the page
-    command = json.loads((reports / name / f"{name}.json").read_text("utf-8"))["command"]
+    command = json.loads((made / f"{name}.json").read_text("utf-8"))["command"]
     assert command in page.inner_text("body")
     context.close()

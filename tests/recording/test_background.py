@@ -1,5 +1,6 @@
 """The recorder's thread: it writes what it is handed, and its failures stay its own."""
 
+import errno
 import os
 import shutil
 import subprocess
@@ -11,14 +12,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support import HANG_S, ROOT, read_metadata
 
-from companion.config import Settings
+from companion.node.replay import log_events, missing
 from companion.recording.background import BackgroundRecorder, Rotation
 from companion.recording.parts import Hole, Part, read_story
-from companion.recording.reader import read_log, read_metadata
+from companion.recording.reader import read_log
 from companion.recording.writer import Writer
-from companion.replay import log_events, missing
-from companion.values import Event, FloatArray, Frame, Severity, Source, Tick, Update
+from companion.settings.model import Settings
+from companion.values import (
+    Event,
+    FloatArray,
+    Frame,
+    Notice,
+    Output,
+    Severity,
+    Source,
+    Tick,
+    Update,
+)
 
 RAW = b"\xfe\x00\x00\x01\x01\x00\x00\x00"
 START_NS = 1_700_000_000_000_000_000
@@ -40,7 +52,7 @@ def recorder(folder: Path, rotation: Rotation | None = None, **more: int) -> Bac
     return BackgroundRecorder(open_part, nowhere, rotation or Rotation(), **more)
 
 
-def wait_until(good: Callable[[], bool], seconds: float = 20.0) -> None:
+def wait_until(good: Callable[[], bool], seconds: float = HANG_S) -> None:
     """The recorder is another thread's: it is asked until it is so."""
     end = time.monotonic() + seconds
     while not good():
@@ -188,7 +200,7 @@ def test_a_disk_that_stays_full_is_said_once_and_does_not_hold_up_the_end(small_
 _LIMITED = """
 import resource, sys
 from pathlib import Path
-sys.path.insert(0, sys.argv[2])
+sys.path[:0] = sys.argv[2:]
 from test_background import hand_over, on_disk, recorder, ticks, wait_until
 made = recorder(Path(sys.argv[1]))
 made.start()
@@ -205,11 +217,12 @@ print(made.dropped, [text for _, text in made.news()][0])
 """
 
 
+@pytest.mark.full
 def test_a_file_that_may_not_grow_is_gone_on_with_in_another(tmp_path: Path) -> None:
     """Without root: a limit on the size of files, which the system enforces in mid-write."""
     done = subprocess.run(
-        [sys.executable, "-c", _LIMITED, tmp_path, Path(__file__).parent],
-        capture_output=True, text=True, check=True, timeout=60,
+        [sys.executable, "-c", _LIMITED, tmp_path, Path(__file__).parent, ROOT / "tests"],
+        capture_output=True, text=True, check=True, timeout=HANG_S,
     )  # fmt: skip
     assert done.stdout.startswith("0 nothing is recorded: ")
     assert "File too large" in done.stdout
@@ -275,6 +288,64 @@ def test_a_slow_disk_drops_counts_and_tells(
     assert [text for _, text in made.news()] == [
         "not all is recorded: the disk is too slow", "recording again: 500 events are missing",
     ]  # fmt: skip
+
+
+def said(t_ns: int) -> list[Output]:
+    return [Notice(t_ns, Severity.INFO, "1:1", "something that came of no event")]
+
+
+def test_a_hole_in_the_queue_counts_events_alone(tmp_path: Path) -> None:
+    """What is said without one is dropped too, but nothing of the log is missing for it."""
+    made = recorder(tmp_path, queue_max=2)
+    hand_over(made, ticks(1, 5))
+    for n in range(3):
+        made.put(None, said(START_NS + n))
+    assert made.dropped == 5
+    made.start()
+    wait_until(lambda: waiting(made) == 0)
+    hand_over(made, ticks(5, 6))
+    made.stop({})
+    (path,) = tmp_path.iterdir()
+    assert list(read_log(path)) == [*ticks(1, 3), *ticks(5, 6)]
+    assert read_story(path).holes == (Hole(START_NS + 5, 2, "the disk was too slow"),)
+
+
+class _Broken(Writer):
+    """A file on a disk that fails for good: it cannot even be cut back."""
+
+    def flush(self) -> None:
+        if self.messages:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        super().flush()
+
+    def salvage(self) -> bool:
+        self.abandon()
+        return False
+
+
+def test_a_hole_in_a_broken_file_counts_events_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("companion.recording.background.RETRY_FIRST_S", 0.001)
+    broken, sound = tmp_path / "broken", tmp_path / "sound"
+
+    def open_part(part: Part) -> Writer:
+        kind, folder = (Writer, sound) if broken.exists() else (_Broken, broken)
+        return kind(folder, "", {}, None, START_NS, part=part)
+
+    made = BackgroundRecorder(open_part, nowhere, queue_max=5)
+    hand_over(made, ticks(1, 3))
+    for n in range(3):
+        made.put(None, said(START_NS + n))
+    made.start()  # as many as are kept: the disk is asked for all of them at once
+    wait_until(lambda: made.failure is None and sound.exists())
+    hand_over(made, ticks(3, 4))
+    made.stop({})
+    assert made.dropped == 5
+    (path,) = sound.iterdir()
+    assert list(read_log(path)) == ticks(3, 4)
+    (hole,) = read_story(path).holes
+    assert (hole.events, hole.why) == (2, os.strerror(errno.EIO))
 
 
 @pytest.mark.parametrize("rotation", [Rotation(1.0, None), Rotation(None, 0.5)])

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from mcap.reader import make_reader
+from support import HANG_S
 
 from companion.recording.parts import Hole, Part
 from companion.recording.recover import recover
@@ -34,7 +35,7 @@ def packages(pytestconfig: pytest.Config) -> Path:
         try:
             subprocess.run(
                 [*install, "--prefix", folder, *PACKAGES],
-                check=True, capture_output=True, timeout=60,
+                check=True, capture_output=True, timeout=HANG_S,
             )  # fmt: skip
         except (subprocess.CalledProcessError, subprocess.TimeoutExpired):
             pytest.skip("npm cannot fetch the packages")
@@ -49,7 +50,7 @@ def read_with_npm(packages: Path, path: Path) -> Any:
         env=os.environ | {"PACKAGES": str(packages)},
         capture_output=True,
         check=False,
-        timeout=60,
+        timeout=HANG_S,
     )
     assert done.returncode == 0, done.stderr.decode()
     return json.loads(done.stdout)

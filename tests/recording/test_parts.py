@@ -8,15 +8,16 @@ from pathlib import Path
 import pytest
 from support import BIN
 
-from companion.config import Settings, load
-from companion.pipeline import Pipeline
+from companion.node.replay import log_events, replay, settings_for
+from companion.node.replay import missing as missing_of
+from companion.pipeline.fold import Pipeline
+from companion.pipeline.ticks import with_ticks
 from companion.recording.parts import Hole, Part, in_order, missing, read_story
 from companion.recording.reader import LogError, read_log
 from companion.recording.recover import recover
 from companion.recording.writer import Writer
-from companion.replay import log_events, replay, settings_for
-from companion.replay import missing as missing_of
-from companion.ticks import with_ticks
+from companion.settings.files import load
+from companion.settings.model import Settings
 from companion.values import Event, Tick
 
 START_NS = 1_700_000_000_000_000_000
@@ -124,7 +125,7 @@ def test_a_recording_holds_the_gains_of_its_observer(tmp_path: Path, cut_log: Pa
     """The file that the settings name may be another one, or none, when it is replayed."""
     from importlib import resources
 
-    shipped = (resources.files("companion.tracking") / "kinematic_default.json").read_text()
+    shipped = (resources.files("companion.tracking.design") / "kinematic_default.json").read_text()
     changed = json.loads(shipped)
     changed_text = json.dumps(changed)
     design, config = tmp_path / "design.json", tmp_path / "config.toml"

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
+from support import read_metadata
 
-from companion.recording.reader import LogError, read_log, read_metadata, read_settings
+from companion.recording.reader import LogError, read_log, read_settings
 from companion.recording.recover import Recovered, recover, recover_leftovers
 from companion.recording.writer import Writer
 from companion.values import Event, Frame, Reason, Rejection, Tick

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from companion.beams.arrays import Array, uniform_linear, uniform_rectangular
-from companion.beams.patterns import half_power_beamwidths_rad
-from companion.beams.steering import unit_directions
+from companion.beams.array.geometry import Array, uniform_linear, uniform_rectangular
+from companion.beams.array.steering import unit_directions
+from companion.beams.worth.patterns import half_power_beamwidths_rad
 from companion.recording.scene import ARRAY, CARRIER, MAP, WIDEST_RAD, Scene
 from companion.tracking.carrier import body_from_ned
 from companion.values import (

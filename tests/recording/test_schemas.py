@@ -5,7 +5,7 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from companion.recording import messages, schemas
+from companion.recording import codec, schemas
 from companion.values import Frame, Reason, Rejection, Source
 
 TIMES = st.integers(0, 2**63 - 1)
@@ -54,15 +54,15 @@ def test_a_hand_packed_tick_is_the_generated_one(t_ns: int) -> None:
 
 @given(FRAMES)
 def test_a_frame_survives_the_round_trip(frame: Frame) -> None:
-    assert messages.to_frame(schemas.FrameEncoder().encode(frame), {}) == frame
+    assert codec.to_frame(schemas.FrameEncoder().encode(frame), {}) == frame
 
 
 @given(REJECTIONS)
 def test_a_rejection_survives_the_round_trip(rejection: Rejection) -> None:
-    data = messages.rejection(rejection, is_event=True).SerializeToString()
-    assert messages.to_rejection(data) == rejection
-    output = messages.rejection(rejection, is_event=False).SerializeToString()
-    assert messages.to_rejection(output) is None
+    data = codec.rejection(rejection, is_event=True).SerializeToString()
+    assert codec.to_rejection(data) == rejection
+    output = codec.rejection(rejection, is_event=False).SerializeToString()
+    assert codec.to_rejection(output) is None
 
 
 def test_every_schema_is_complete_in_itself() -> None:

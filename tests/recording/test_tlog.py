@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
 
-from companion.mavlink.messages import CRC_EXTRA
-from companion.recording.reader import LogError, log_kind, read_log, read_metadata, read_settings
-from companion.recording.timeline import LARGEST_LEAP_NS
+from companion.mavlink.wire.crc_extra import CRC_EXTRA
+from companion.recording.reader import LogError, log_kind, read_log, read_settings
+from companion.recording.stamps import LARGEST_LEAP_NS
 from companion.recording.tlog import read_raw, read_tlog, sniff
 from companion.values import Event, Frame, Reason, Rejection
 
@@ -261,7 +261,6 @@ def test_the_content_decides_not_the_name(tmp_path: Path, wire: Wire) -> None:
     assert (log_kind(tlog), log_kind(raw)) == ("tlog", "mavlink")
     assert raws(list(read_log(tlog))) == raws(list(read_log(raw))) == frames
     assert read_settings(tlog) is None
-    assert read_metadata(raw) == {}
 
 
 @pytest.mark.parametrize("count", [1, 2])
@@ -305,6 +304,7 @@ def test_what_cannot_be_used_is_said_in_one_line(tmp_path: Path, wire: Wire) -> 
         read_log(tmp_path / "text" / "below a file")
 
 
+@pytest.mark.full
 def test_the_logs_of_other_programs(shared_logs: list[Path]) -> None:
     """Every frame that pymavlink finds, and no other, on a time line that goes on."""
     for path in shared_logs:

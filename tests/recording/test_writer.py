@@ -14,8 +14,9 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from mcap.reader import make_reader
+from support import read_metadata
 
-from companion.recording.reader import log_kind, read_log, read_metadata, read_settings
+from companion.recording.reader import log_kind, read_log, read_settings
 from companion.recording.writer import Writer
 from companion.values import Estimate, Event, Frame, Rejection, Source, Tick, Update
 

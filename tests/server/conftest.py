@@ -8,18 +8,18 @@ from pathlib import Path
 import pytest
 import uvicorn
 
-from companion import assembly
-from companion.config import Settings
-from companion.mavlink.link_status import ComponentStatus, LinkStatus
-from companion.mavlink.rates import MessageRate, RateState
-from companion.pipeline import Pipeline
-from companion.replay import log_events
+from companion.mavlink.links.status import ComponentStatus, LinkStatus
+from companion.mavlink.voice.rate_watch import MessageRate, RateState
+from companion.node.replay import log_events
+from companion.pipeline import assembly
+from companion.pipeline.fold import Pipeline
 from companion.server.access import bind
 from companion.server.app import create_app
-from companion.server.last_messages import LastMessages
-from companion.server.lateness import Lateness
-from companion.server.views import RecordingStatus, ReplayStatus
+from companion.settings.model import Settings
 from companion.values import Frame, Notice, Severity, Source, Tick
+from companion.views.last_messages import LastMessages
+from companion.views.lateness import Lateness
+from companion.views.state import RecordingStatus, ReplayStatus
 
 LOG = Path(__file__).parents[1] / "data" / "sitl_4circle_cut.tlog"
 FLOWN_S = 6.0

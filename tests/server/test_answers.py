@@ -10,10 +10,10 @@ import pytest
 from pydantic import TypeAdapter
 from starlette.testclient import TestClient
 
-from companion import designing
 from companion.server import models
 from companion.server.app import create_app
 from companion.server.beam_routes import accepted
+from companion.tracking.design import answers
 
 PATHS: dict[str, Any] = {
     "/healthz": models.Health,
@@ -195,5 +195,31 @@ def test_the_position_model_shows_what_companion_design_prints(make_node: Any) -
     assert shown["certificate"] is None
     for row in shown["designs"]:
         lead_s = max(0.2, row["dt_s"])  # velocities are reported: velocity_lead_s, or the interval
-        expected = designing.row(row["dt_s"], lead_s, 0.5, None, "position", "closed-form")
+        expected = answers.row(row["dt_s"], lead_s, 0.5, None, "position", "closed-form")
         assert row == {"uav": row["uav"], **json.loads(json.dumps(expected))}
+
+
+def test_a_beam_costs_what_nulls_take_and_what_its_turn_does(make_node: Any) -> None:
+    """With so low a limit everybody has a turn alone: nothing is lost, but for three others."""
+    node = make_node(beams={"policy": "group", "condition_limit": 1.0001, "widen": False})
+    node.tick(0.0)
+    with TestClient(create_app(node)) as client:
+        shown = client.get("/v1/beams").json()
+    assert shown["groups"] == len(shown["beams"]) == 4
+    for beam in shown["beams"]:
+        assert beam["loss_db"] == pytest.approx(0.0, abs=1e-6)
+        assert beam["cost_db"] == pytest.approx(beam["loss_db"] + 10 * np.log10(4))
+
+
+def test_a_bearing_is_from_true_north_however_the_carrier_is_turned(
+    client: TestClient, shared_node: Any
+) -> None:
+    """By where track and carrier are; angles in the array turn with it."""
+    update = shared_node.pipeline.look(shared_node.now_ns())
+    positions = {track.uav: track.position_ned_m for track in update.tracks}
+    shown = client.get("/v1/beams").json()
+    for beam in shown["beams"]:
+        north, east, _ = positions[beam["uav"]] - update.carrier.position_ned_m
+        off_deg = beam["bearing_deg"] - np.degrees(np.arctan2(east, north))
+        assert (off_deg + 180) % 360 - 180 == pytest.approx(0.0, abs=0.01)
+    assert abs(shown["array"]["boresight_bearing_deg"]) > 5  # it is turned

@@ -55,6 +55,7 @@ def check_every_operation(node: Any, examples: int) -> tuple[int, set[str]]:
     return found, broken
 
 
+@pytest.mark.full
 def test_no_request_is_answered_against_the_document(shared_node: Any) -> None:
     found, broken = check_every_operation(shared_node, EXAMPLES)
     assert found == OPERATIONS
@@ -71,6 +72,7 @@ NAMES = ["/v1/uavs/", "/v1/recordings/", "/v1/mavlink/vehicles/1/components/1/me
 QUERIES = ["lead_ms", "points", "cut", "uav", "rate_hz", "x"]
 
 
+@pytest.mark.full
 @run_with(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck), database=None)
 @seed(2)
 @given(

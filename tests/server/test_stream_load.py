@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support import BIN, Node
+from support import BIN, HANG_S, Node
 from websockets.asyncio.client import connect
 
 SETTINGS = "[beams]\nupdate_hz = 20\n"
@@ -51,7 +51,7 @@ async def read(address: str, until_s: float, ages_s: list[float], quiet_s: float
     heard = 0
     async with connect(address, max_queue=4, compression=None) as websocket:
         while time.time() < until_s:
-            text = await asyncio.wait_for(websocket.recv(), 5)
+            text = await asyncio.wait_for(websocket.recv(), HANG_S)
             now_s = time.time()
             heard += 1
             if now_s > quiet_s:
@@ -107,6 +107,7 @@ def measure(
     }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("readers", "deaf", "seconds"),
     [

@@ -16,16 +16,18 @@ import click
 import pytest
 from click.testing import CliRunner
 from pymavlink.dialects.v20 import ardupilotmega as dialect
+from support import HANG_S
 
+from companion.recording.reader import LogError
 from companion.recording.writer import Writer
 from companion.values import Frame, Source, Tick
-from sitl_replay import scenario
 from sitl_replay.cli import main
-from sitl_replay.content_faults import sender_of
-from sitl_replay.faults import KINDS, Fault
-from sitl_replay.faulty_traffic import Network
-from sitl_replay.recorder import TlogWriter
-from sitl_replay.vehicles import schedule
+from sitl_replay.faults.asked import KINDS, Fault
+from sitl_replay.faults.content import sender_of
+from sitl_replay.faults.traffic import Network
+from sitl_replay.flight import scenario
+from sitl_replay.flight.vehicles import schedule
+from sitl_replay.traffic.recorder import TlogWriter
 
 COMMAND = [sys.executable, "-c", "from sitl_replay.cli import main; main()"]
 SOMEWHERE = "udpout:127.0.0.1:9"
@@ -160,7 +162,7 @@ def test_a_signal_ends_a_flight_well(
         receiver.recv(300)
         receiver.recv(300)
         flight.send_signal(stop)
-        out, err = flight.communicate(timeout=20)
+        out, err = flight.communicate(timeout=HANG_S)
     assert (flight.returncode, err) == (0, "")
     (line,) = out.splitlines()
     assert line.startswith("sent ")
@@ -190,7 +192,7 @@ def test_record_until_a_signal(tmp_path: Path) -> None:
             except TimeoutError:
                 accepted += 1
         recording.send_signal(signal.SIGTERM)
-        out, _ = recording.communicate(timeout=20)
+        out, _ = recording.communicate(timeout=HANG_S)
     assert recording.returncode == 0
     summary = json.loads(out)
     assert summary["frames"] >= 5
@@ -234,12 +236,12 @@ def test_a_log_without_a_frame_is_one_line(content: bytes, tmp_path: Path) -> No
 def test_a_log_that_breaks_on_the_way_is_one_line(
     receiver: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # What a reader does on a torn file: some frames, then its error, a ValueError.
+    # What a reader does on a torn file: some frames, then its error.
     raw = next(schedule(scenario.hover())).raw
 
     def torn() -> Iterator[Frame]:
         yield Frame(t_ns=0, link="log", source=scenario.CARRIER.source, msgid=0, raw=raw)
-        raise ValueError("torn.tlog: cut short")
+        raise LogError("torn.tlog: cut short")
 
     monkeypatch.setattr("sitl_replay.cli.frames_of", lambda *_: torn())
     result = CliRunner().invoke(main, ["play", __file__, "--to", url_of(receiver)])
@@ -365,14 +367,14 @@ def test_a_flight_for_those_who_connect(tmp_path: Path) -> None:
         line = flight.stderr.readline()
         found = re.fullmatch(r"tcpin:127\.0\.0\.1:(\d+): waiting for a first peer\n", line)
         assert found, line
-        with socket.create_connection(("127.0.0.1", int(found[1])), timeout=20.0) as peer:
+        with socket.create_connection(("127.0.0.1", int(found[1])), timeout=HANG_S) as peer:
             received = 0
             while received < 4000:
                 received += len(peer.recv(4096))
             flight.send_signal(signal.SIGTERM)
             while data := peer.recv(4096):
                 received += len(data)
-            out, _ = flight.communicate(timeout=20)
+            out, _ = flight.communicate(timeout=HANG_S)
     assert flight.returncode == 0
     summary = json.loads(out)
     assert summary["faults"]["reboot"] > 5

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from companion.studies.truth import Flight, Trajectory
+from companion.studies.truth.vehicles import Flight, Trajectory
 
 MakeFlight = Callable[..., Flight]
 EPOCH_NS = 1_700_000_000_000_000_000

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from companion.tracking.fleet import Ages, Fleet, FleetSettings, SenderTime
+from companion.tracking.fleet import Ages, Fleet, FleetSettings
 from companion.tracking.gate import GateSettings
-from companion.tracking.kinematic_observer import KinematicModel, KinematicObserver
-from companion.tracking.observer import PositionModel, PositionObserver
+from companion.tracking.observers.kinematic import KinematicModel, KinematicObserver
+from companion.tracking.observers.position import PositionModel, PositionObserver
 from companion.values import (
     Estimate,
     Fix,
@@ -19,6 +19,7 @@ from companion.values import (
     Reason,
     Rejection,
     ReportNoise,
+    SenderTime,
     Track,
     TrackState,
 )
@@ -30,14 +31,14 @@ AGES = Ages(2.0, 15.0, 60.0)
 SETTINGS = FleetSettings(30.0, 8.0, AGES)
 
 
-def same_time(_uav: str, node_ns: int) -> SenderTime:
-    """A sender whose timeline is the node's, as is well known."""
-    return SenderTime(node_ns, 0.0)
+def same_time(node_ns: int, bound_s: float = 0.0) -> SenderTime:
+    """A time of a sender whose timeline is the node's, as is known to within ``bound_s``."""
+    return SenderTime(node_ns, node_ns, bound_s)
 
 
 @pytest.fixture
 def fleet() -> Fleet:
-    return Fleet(OBSERVER, SETTINGS, same_time)
+    return Fleet(OBSERVER, SETTINGS)
 
 
 @pytest.mark.parametrize(
@@ -50,10 +51,11 @@ def fleet() -> Fleet:
 def test_tracks_age(fleet: Fleet, fix: MakeFix, age_s: float, state: str) -> None:
     fleet.accept(fix(100 * S, [0, 0, 0]))
     now_ns = 100 * S + round(age_s * 1e9)
-    track = fleet.track("1:1", now_ns, now_ns + S)
+    track = fleet.track("1:1", now_ns, same_time(now_ns + S))
     assert track is not None
     assert track.state == state
-    assert fleet.states(now_ns, ["1:1", "2:1"]) == {"1:1": TrackState(state)}
+    assert fleet.state("1:1", same_time(now_ns)) is TrackState(state)
+    assert fleet.state("2:1", same_time(now_ns)) is None
     # The time asked for is another matter.
     assert track.age_s == pytest.approx(age_s + 1.0)
 
@@ -64,7 +66,7 @@ def test_a_first_report_is_its_own_estimate(fleet: Fleet, fix: MakeFix) -> None:
     assert first.position_ned_m.tolist() == [1, 2, 3]
     assert (first.innovation_m, first.dt_s) == (None, None)
     assert first.bound_m == pytest.approx(1.5)
-    track = fleet.track("1:1", 100 * S, 100 * S)
+    track = fleet.track("1:1", 100 * S, same_time(100 * S))
     assert track is not None
     assert (track.reports, track.dt_s, track.gamma, track.innovation_m) == (1, None, None, None)
     assert track.unknown_input_mps is None
@@ -84,7 +86,7 @@ def test_a_second_report_is_judged_by_the_prediction_made_for_it(
     assert found.bound_m == expected.bound_m
     assert found.innovation_m == pytest.approx(5.0)
     assert found.dt_s == pytest.approx(1.0)
-    track = fleet.track("1:1", 101 * S, 102 * S)
+    track = fleet.track("1:1", 101 * S, same_time(102 * S))
     assert track is not None
     assert track.reports == 2
     assert track.dt_s == pytest.approx(1.0)
@@ -99,7 +101,7 @@ def test_gamma_is_that_of_the_worst_interval(fleet: Fleet, fix: MakeFix) -> None
     """Without feedthrough and velocity mu* = b^2 / alpha: the longest interval counts."""
     for t_s in (100, 101, 104, 105):
         fleet.accept(fix(t_s * S, [0, 0, 0]))
-    track = fleet.track("1:1", 105 * S, 105 * S)
+    track = fleet.track("1:1", 105 * S, same_time(105 * S))
     assert track is not None
     # (b^2 - (1 - a) 0) / a at b = 3, a = .5
     assert track.gamma == pytest.approx(np.sqrt(9 / 0.5))
@@ -116,12 +118,12 @@ def test_a_report_that_is_too_old_or_came_twice_is_rejected_and_changes_nothing(
     fleet.accept(fix(100 * S, [0, 0, 0]))
     newest = fix(101 * S, [1, 0, 0])
     fleet.accept(newest)
-    before = fleet.track("1:1", 102 * S, 102 * S)
+    before = fleet.track("1:1", 102 * S, same_time(102 * S))
     late = fleet.accept(fix(101 * S - older_ns, [3, 0, 0], late_ns=3 * S))
     assert isinstance(late, Rejection)
     assert (late.reason, late.source) == (reason, "1:1")
     assert late.t_ns == 104 * S - older_ns
-    after = fleet.track("1:1", 102 * S, 102 * S)
+    after = fleet.track("1:1", 102 * S, same_time(102 * S))
     assert before is not None
     assert after is not None
     assert after.position_ned_m.tolist() == before.position_ned_m.tolist()
@@ -132,7 +134,7 @@ def test_a_report_that_is_too_old_or_came_twice_is_rejected_and_changes_nothing(
 def test_a_late_report_is_put_in_its_place(fix: MakeFix) -> None:
     """And leaves what a report in time would have left."""
     made = [fix(n * S, [10 * n, n * n, 0], [10, 2 * n, 0], late_ns=S // 8) for n in range(100, 106)]
-    one, other = Fleet(OBSERVER, SETTINGS, same_time), Fleet(OBSERVER, SETTINGS, same_time)
+    one, other = Fleet(OBSERVER, SETTINGS), Fleet(OBSERVER, SETTINGS)
     for n in range(6):
         assert isinstance(one.accept(made[n]), Estimate)
     for n in (0, 1, 3, 2, 5):
@@ -141,7 +143,10 @@ def test_a_late_report_is_put_in_its_place(fix: MakeFix) -> None:
     assert isinstance(late, Estimate)
     assert late.fix is made[4]
     assert (late.dt_s, late.reacquired) == (1.0, False)
-    a, b = one.track("1:1", 106 * S, 107 * S), other.track("1:1", 106 * S, 107 * S)
+    a, b = (
+        one.track("1:1", 106 * S, same_time(107 * S)),
+        other.track("1:1", 106 * S, same_time(107 * S)),
+    )
     assert a is not None
     assert b is not None
     for name in ("position_ned_m", "velocity_ned_mps", "unknown_input_mps"):
@@ -158,22 +163,25 @@ def test_a_restart_begins_anew(fleet: Fleet, fix: MakeFix) -> None:
     fleet.forget("1:1")
     fleet.forget("9:1")  # never seen
     assert fleet.uavs == ["2:1"]
-    assert fleet.track("1:1", 0, 0) is None
+    assert fleet.track("1:1", 0, same_time(0)) is None
     assert fleet.newest("1:1") is None
-    assert fleet.states(0, ["1:1"]) == {}
+    assert fleet.state("1:1", same_time(0)) is None
     found = fleet.accept(fix(50 * S, [7, 0, 0]))
     assert isinstance(found, Estimate)
     assert found.dt_s is None
 
 
 def test_tracks_do_not_touch_one_another(fix: MakeFix) -> None:
-    both, alone = Fleet(OBSERVER, SETTINGS, same_time), Fleet(OBSERVER, SETTINGS, same_time)
+    both, alone = Fleet(OBSERVER, SETTINGS), Fleet(OBSERVER, SETTINGS)
     for t_s in range(100, 110):
         made = fix(t_s * S, [t_s, 0, 0])
         both.accept(made)
         alone.accept(made)
         both.accept(fix(t_s * S + 7, [0, -t_s, 5], uav="2:1"))
-    a, b = both.track("1:1", 110 * S, 110 * S), alone.track("1:1", 110 * S, 110 * S)
+    a, b = (
+        both.track("1:1", 110 * S, same_time(110 * S)),
+        alone.track("1:1", 110 * S, same_time(110 * S)),
+    )
     assert a is not None
     assert b is not None
     assert a.position_ned_m.tolist() == b.position_ned_m.tolist()
@@ -187,13 +195,11 @@ NOISE = ReportNoise(2.0, 2.0, math.hypot(2.0, 2.0), 0.4)
 CRUISE_MPS = 12.0
 
 
-def tracking(
-    feed_mps2: float | None = None, doubt_s: float = 0.0, ages: Ages = AGES, **gate: float
-) -> Fleet:
+def tracking(feed_mps2: float | None = None, ages: Ages = AGES, **gate: float) -> Fleet:
     given = FleetSettings(
         30.0, feed_mps2 or 5.0, ages, GateSettings(**gate), feed_forward=feed_mps2 is not None
     )
-    return Fleet(KINEMATIC, given, lambda _, t_ns: SenderTime(t_ns, doubt_s))
+    return Fleet(KINEMATIC, given)
 
 
 def circling(t_s: float, radius_m: float = 60.0) -> tuple[FloatArray, FloatArray]:
@@ -222,8 +228,8 @@ def flight(
     return made
 
 
-def seen(fleet: Fleet, t_s: float) -> Track:
-    found = fleet.track("1:1", round(t_s * S), round(t_s * S))
+def seen(fleet: Fleet, t_s: float, doubt_s: float = 0.0) -> Track:
+    found = fleet.track("1:1", round(t_s * S), same_time(round(t_s * S), doubt_s))
     assert found is not None
     return found
 
@@ -453,7 +459,7 @@ def test_no_adversary_leaves_what_the_fleet_says(fix: MakeFix, doubt_s: float) -
     and the truth stays in the bounds."""
     for seed in range(150):
         rng = np.random.default_rng(seed)
-        fleet = tracking(5.0, doubt_s)
+        fleet = tracking(5.0)
         position, velocity, t_s = np.zeros(3), rng.normal(0, 5, 3), 0.0
         for _ in range(25):
             plane, fast = rng.normal(0, 1, 2), rng.normal(0, 1, 3)
@@ -472,43 +478,66 @@ def test_no_adversary_leaves_what_the_fleet_says(fix: MakeFix, doubt_s: float) -
                 off_s = rng.choice([-1, 1]) * min(doubt_s, ahead_s, step_s - ahead_s)
                 true_s = ahead_s + off_s
                 truth = position + velocity * true_s + push * true_s**2 / 2
-                holds(seen(fleet, t_s + ahead_s), truth)
+                holds(seen(fleet, t_s + ahead_s, doubt_s), truth)
             position = position + velocity * step_s + push * step_s**2 / 2
             velocity, t_s = velocity + push * step_s, round(t_s + step_s, 9)
 
 
 def test_doubt_of_the_clock_is_worth_the_way_flown_in_it(fix: MakeFix) -> None:
-    sure, unsure = tracking(), tracking(doubt_s=0.5)
-    for fleet in (sure, unsure):
-        fleet.accept(fix(0, [0, 0, 0], [10, 0, 0], noise=NOISE))
-    a, b = seen(sure, 1), seen(unsure, 1)
+    fleet = tracking()
+    fleet.accept(fix(0, [0, 0, 0], [10, 0, 0], noise=NOISE))
+    a, b = seen(fleet, 1), seen(fleet, 1, doubt_s=0.5)
     assert (a.clock_bound_s, b.clock_bound_s) == (0.0, 0.5)
     # At most 10 m/s by the report, 0.4 by its noise, 5 by its acceleration since.
     for name in ("bound_m", "horizontal_bound_m", "vertical_bound_m"):
         widened_m = getattr(b, name) - getattr(a, name)
         assert widened_m + 1e-9 >= 0.5 * 15.4
         assert widened_m <= 0.5 * (15.4 + 0.5 * 5.0) + 1e-9
-    a, b = seen(sure, 40), seen(unsure, 40)
+    a, b = seen(fleet, 40), seen(fleet, 40, doubt_s=0.5)
     assert b.horizontal_bound_m - a.horizontal_bound_m == pytest.approx(0.5 * 30.0)
 
 
 def test_doubt_of_the_clock_covers_an_acceleration_in_it(fix: MakeFix) -> None:
     """At full acceleration, asked a second too early: 2.5 m beyond the way at its speed."""
-    fleet = tracking(doubt_s=1.0)
+    fleet = tracking()
     fleet.accept(
         fix(0, [0, 0, 0], [0, 0, 0], noise=replace(NOISE, horizontal_m=1e-6, velocity_mps=1e-6))
     )
     for ahead_s in (0.0, 0.5, 2.0):
         true_s = ahead_s + 1.0
-        holds(seen(fleet, ahead_s), np.array([5.0 * true_s**2 / 2, 0, 0]))
+        holds(seen(fleet, ahead_s, doubt_s=1.0), np.array([5.0 * true_s**2 / 2, 0, 0]))
+
+
+def test_doubt_of_the_clock_covers_a_turn_that_ends_in_it(fix: MakeFix) -> None:
+    """It brakes at 4 m/s^2, which is fed forward, and from the last report on it speeds up at 5;
+    3.4 s after that, where it was asked for 0.4 s earlier, it is still in the bounds."""
+    fleet, exact = tracking(5.0), replace(NOISE, horizontal_m=1e-6, velocity_mps=1e-6)
+    for n in range(11):
+        t_s = 0.2 * n
+        place = [20 * t_s - 2 * t_s**2, 0, 0]
+        fleet.accept(fix(n * S // 5, place, [20 - 4 * t_s, 0, 0], noise=exact))
+    for ahead_s in (0.0, 1.0, 3.0):
+        true_s = ahead_s + 0.4
+        truth = np.array([32 + 12 * true_s + 5.0 * true_s**2 / 2, 0, 0])
+        holds(seen(fleet, 2 + ahead_s, doubt_s=0.4), truth)
+
+
+def test_who_is_near_is_told_by_the_newest_reports(fix: MakeFix) -> None:
+    """In space, and nearer than the distance: 100 m off by 60 m east and 80 m up."""
+    fleet = tracking()
+    fleet.accept(fix(0, [900, 0, 0], uav="1:1"))
+    fleet.accept(fix(0, [1000, 60, -80], uav="2:1"))
+    fleet.accept(fix(0, [4000, 0, 0], uav="3:1"))
+    place = np.array([1000.0, 0, 0])
+    assert fleet.near(place, 99.9) == []
+    assert fleet.near(place, 100.1) == ["1:1", "2:1"]
+    assert fleet.near(place, 3001.0) == ["1:1", "2:1", "3:1"]
+    fleet.accept(fix(10 * S, [700, 0, 0], uav="1:1"))
+    assert fleet.near(place, 150.0) == ["2:1"]
 
 
 def test_without_a_velocity_doubt_is_worth_the_greatest_speed(fix: MakeFix) -> None:
-    fleets = [
-        Fleet(OBSERVER, SETTINGS, lambda _, t_ns, doubt_s=doubt_s: SenderTime(t_ns, doubt_s))
-        for doubt_s in (0.0, 0.5)
-    ]
-    for fleet in fleets:
-        fleet.accept(fix(0, [0, 0, 0]))
-    a, b = (seen(fleet, 1) for fleet in fleets)
+    fleet = Fleet(OBSERVER, SETTINGS)
+    fleet.accept(fix(0, [0, 0, 0]))
+    a, b = seen(fleet, 1), seen(fleet, 1, doubt_s=0.5)
     assert b.bound_m - a.bound_m == pytest.approx(0.5 * 30.0)

@@ -6,9 +6,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from companion.tracking.estimates import Prediction
 from companion.tracking.gate import GateSettings, Suspects, is_frozen, refusal
-from companion.tracking.kinematic_observer import KinematicModel, KinematicObserver
+from companion.tracking.observers.estimates import Prediction
+from companion.tracking.observers.kinematic import KinematicModel, KinematicObserver
 from companion.values import Fix, Reason, ReportNoise
 
 MakeFix = Callable[..., Fix]
@@ -37,6 +37,24 @@ def test_a_report_outside_the_cylinder_cannot_be_true(
 ) -> None:
     """Its own noise counts besides: 10 + 3 m in the plane, 4 + 2 m in height."""
     found = refusal(PREDICTED, fix(0, place, noise=NOISE))
+    assert (None if found is None else found[0]) is reason
+
+
+@pytest.mark.parametrize(
+    ("place", "reason"),
+    [
+        ((100 + 15.99, 0, -50), None),
+        ((100 + 16.01, 0, -50), Reason.UNREACHABLE),
+        ((100, 0, -50 + 8.99), None),
+        ((100, 0, -50 - 8.99), None),
+        ((100, 0, -50 - 9.01), Reason.ALTITUDE_JUMP),
+    ],
+)
+def test_a_report_may_lead_by_what_a_feedthrough_makes_of_its_speed(
+    fix: MakeFix, place: tuple[float, ...], reason: Reason | None
+) -> None:
+    """In the plane and in height: 3 m more than its noise, which is all it may be off else."""
+    found = refusal(PREDICTED, fix(0, place, noise=NOISE), lead_m=3.0)
     assert (None if found is None else found[0]) is reason
 
 

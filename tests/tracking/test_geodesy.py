@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymap3d.vincenty import vreckon
 
-from companion.tracking.geodesy import LocalFrame, ned_from_ecef
+from companion.tracking.geodesy import LocalFrame, Place, ned_from_ecef
 from companion.values import FloatArray
 
 SEMI_MAJOR_M = 6_378_137.0
@@ -107,3 +107,28 @@ def test_a_far_velocity_is_that_of_the_local_coordinates(
 def _reached(lat: float, lon: float, distance_m: float, azimuth: float) -> tuple[float, float]:
     lat2, lon2 = vreckon(lat, lon, abs(distance_m), azimuth + (180.0 if distance_m < 0 else 0.0))
     return float(lat2), float(lon2)
+
+
+# --- one place at a time, against pymap3d, which goes another way (You, 2000) -------------------
+
+METRES = st.floats(-60_000.0, 60_000.0)
+
+
+@given(
+    st.floats(-80.0, 80.0), st.floats(-180.0, 180.0), st.floats(-400.0, 9000.0),
+    METRES, METRES, st.floats(-12_000.0, 1_000.0),
+)  # fmt: skip
+def test_places_are_those_of_pymap3d(
+    lat_deg: float, lon_deg: float, alt_m: float, north_m: float, east_m: float, down_m: float
+) -> None:
+    origin = Place(lat_deg, lon_deg, alt_m)
+    place = LocalFrame(*origin).place(north_m, east_m, down_m)
+    # Back into the plane by the other program: metres, wherever on Earth and across 180° E.
+    back_ned_m = pymap3d.geodetic2ned(*place, *origin)
+    assert back_ned_m == pytest.approx((north_m, east_m, down_m), abs=5e-6)
+
+
+def test_the_origin_is_where_it_is() -> None:
+    origin = Place(47.3977419, 8.5455938, 513.0)
+    assert LocalFrame(*origin).place(0.0, 0.0, 0.0) == pytest.approx(origin, abs=1e-9)
+    assert LocalFrame(*origin).place(0.0, 0.0, -10.0).alt_m == pytest.approx(523.0)

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.tracking.history import History
-from companion.tracking.kinematic_observer import KinematicModel, KinematicObserver, KinematicState
-from companion.tracking.observer import PositionModel, PositionObserver
+from companion.tracking.observers.kinematic import KinematicModel, KinematicObserver, KinematicState
+from companion.tracking.observers.position import PositionModel, PositionObserver
 from companion.values import Fix
 
 MakeFix = Callable[..., Fix]

@@ -48,6 +48,17 @@ def test_far_apart_it_is_itself(fix: MakeFix) -> None:
     assert after(fix, [500.0] * 20) is None
 
 
+@pytest.mark.parametrize(("above_m", "same"), [(120.0, "1:1"), (-120.0, "1:1"), (130.0, None)])
+def test_far_above_or_below_it_is_itself(fix: MakeFix, above_m: float, same: str | None) -> None:
+    """100 m of noise, 20 for the second to which its time is known, and 5 of the track."""
+    identities = Identities()
+    for n in range(REPORTS_TO_DECIDE):
+        here = [20.0 * n, 0, -300]
+        report = relayed(fix, n, [20.0 * n, 10, -300 - above_m])
+        identities.observe(report, [track("1:1", here)])
+    assert identities.same_as(AIRCRAFT) == same
+
+
 def test_the_nearest_is_taken(fix: MakeFix) -> None:
     assert after(fix, [30.0] * 6, track("2:1", [100, 200, -300])) == "1:1"
 

@@ -1,0 +1,114 @@
+"""Patterns of a single array element.
+
+Element frame: x outward, y right, z down, as the array frame. An amplitude is the square root of
+the power gain over an isotropic element.
+"""
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+import numpy as np
+
+from companion.values import FloatArray, UserError
+
+
+class Pattern(StrEnum):
+    """Shape of an element's pattern."""
+
+    ISOTROPIC = "isotropic"
+    COSINE = "cosine"
+    TR38901 = "3gpp"
+
+
+# 3GPP TR 38.901 table 7.3-1: 65 degrees between half powers, 30 dB at most, 8 dBi at best.
+WIDTH_DEG: Final = 65.0
+FLOOR_DB: Final = 30.0
+BEST_DBI: Final = 8.0
+
+
+@dataclass(frozen=True, slots=True)
+class Element:
+    """The pattern of an element; ``exponent`` q belongs to the cosine alone.
+
+        ISOTROPIC  gain 1 everywhere
+        COSINE     power gain 2(q + 1) cos^q of the angle from outward, nothing behind; the factor
+                   makes the radiated power that of an isotropic element
+        TR38901    the antenna element of 3GPP TR 38.901, table 7.3-1
+
+    Raises ``UserError`` for an exponent below 0.
+    """
+
+    pattern: Pattern = Pattern.ISOTROPIC
+    exponent: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.exponent < math.inf:
+            raise UserError(f"the exponent {self.exponent:g} of a cosine pattern is not 0 or more")
+
+    def amplitude(self, directions: FloatArray) -> FloatArray:
+        """Amplitude towards unit directions (..., 3) in the element frame; shape (...)."""
+        match self.pattern:
+            case Pattern.ISOTROPIC:
+                return np.ones(directions.shape[:-1])
+            case Pattern.COSINE:
+                return self._cosine(directions[..., 0])
+            case Pattern.TR38901:
+                return _tr38901(*_aside_and_up(directions))
+
+    def amplitude_range(
+        self, directions: FloatArray, radius_rad: float | FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Bounds (...) on the amplitude within ``radius_rad`` of unit directions (..., 3).
+
+        Both are attained, except at the corners of TR 38.901, where the product of the two cuts is
+        bounded by the extremes of each.
+        """
+        match self.pattern:
+            case Pattern.ISOTROPIC:
+                both = np.ones(directions.shape[:-1])
+                return both, both
+            case Pattern.COSINE:
+                aside = np.hypot(directions[..., 1], directions[..., 2])
+                off = np.arctan2(aside, directions[..., 0])  # arccos is 1e-8 off near 0
+                least = np.cos(np.minimum(off + radius_rad, np.pi))
+                return self._cosine(least), self._cosine(np.cos(np.maximum(off - radius_rad, 0.0)))
+            case Pattern.TR38901:
+                return _tr38901_range(directions, radius_rad)
+
+    def _cosine(self, cosine: FloatArray) -> FloatArray:
+        power = 2 * (self.exponent + 1) * np.maximum(cosine, 0.0) ** self.exponent
+        amplitude: FloatArray = np.sqrt(np.where(cosine > 0, power, 0.0))
+        return amplitude
+
+
+ISOTROPIC: Final = Element()
+
+
+def _aside_and_up(directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Absolute azimuth and elevation; by arctan2, exact to rounding up to the poles."""
+    x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
+    return np.abs(np.arctan2(y, x)), np.arctan2(np.abs(z), np.hypot(x, y))
+
+
+def _tr38901(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> FloatArray:
+    """Amplitude by table 7.3-1, for angles from outward, both 0 or more."""
+    down_db = np.minimum(12 * (np.degrees(elevation_rad) / WIDTH_DEG) ** 2, FLOOR_DB)
+    aside_db = np.minimum(12 * (np.degrees(azimuth_rad) / WIDTH_DEG) ** 2, FLOOR_DB)
+    gain_db = BEST_DBI - np.minimum(down_db + aside_db, FLOOR_DB)
+    amplitude: FloatArray = 10 ** (gain_db / 20)
+    return amplitude
+
+
+def _tr38901_range(
+    directions: FloatArray, radius_rad: float | FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    azimuth, elevation = _aside_and_up(directions)
+    # A cap around elevation e reaches asin(sin(radius) / cos(e)) in azimuth, or over the pole.
+    over = elevation + radius_rad >= np.pi / 2
+    sine = np.sin(np.minimum(radius_rad, np.pi / 2)) / np.maximum(np.cos(elevation), 1e-300)
+    reach = np.where(over, np.pi, np.arcsin(np.clip(sine, 0.0, 1.0)))
+    least = _tr38901(np.minimum(azimuth + reach, np.pi), np.minimum(elevation + radius_rad, np.pi))
+    most = _tr38901(np.maximum(azimuth - reach, 0.0), np.maximum(elevation - radius_rad, 0.0))
+    return least, most

@@ -1,0 +1,103 @@
+"""Directions and steering vectors.
+
+Angles of a unit direction u in the array frame: azimuth = atan2(u_y, u_x), to the right; elevation
+= asin(-u_z), up. The steering vector of direction u is
+
+    a(u)_m = g_m(u) exp(+j 2 pi / wavelength  p_m . u)
+
+with p_m the position of element m and g_m its amplitude (docs/math.md 7). For isotropic elements
+along y this is the published exp(j 2 pi / wavelength d m sin theta).
+"""
+
+import math
+from typing import Final
+
+import numpy as np
+
+from companion.beams.array.elements import Pattern
+from companion.beams.array.geometry import Array
+from companion.values import ComplexArray, FloatArray
+
+POWERS_PAY: Final = 1000
+"""Entries of a steering matrix from which on powers are cheaper than exponentials."""
+
+
+def angles_rad(directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Azimuth and elevation, (N,) each, of unit directions (N, 3) in the array frame."""
+    azimuth = np.arctan2(directions[:, 1], directions[:, 0])
+    return azimuth, np.arcsin(np.clip(-directions[:, 2], -1.0, 1.0))
+
+
+def unit_directions(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> FloatArray:
+    """Unit directions (N, 3) in the array frame of azimuths and elevations (N,)."""
+    level = np.cos(elevation_rad)
+    return np.stack(
+        [level * np.cos(azimuth_rad), level * np.sin(azimuth_rad), -np.sin(elevation_rad)], axis=-1
+    )
+
+
+def steering_matrix(array: Array, directions: FloatArray) -> ComplexArray:
+    """A, (M, N): one steering vector per column, for unit directions (N, 3)."""
+    if array.grid is None or array.size * len(directions) < POWERS_PAY:
+        matrix: ComplexArray = np.exp(
+            1j * array.wavenumber_radpm * (array.elements_m @ directions.T)
+        )
+    else:
+        matrix = _on_grid(array, directions, *array.grid)
+    if array.element.pattern is not Pattern.ISOTROPIC:
+        matrix *= amplitudes(array, directions)
+    return matrix
+
+
+def _on_grid(array: Array, directions: FloatArray, rows: int, columns: int) -> ComplexArray:
+    """Phase factors (M, N) of elements that stand row by row on a grid from the origin.
+
+    Powers of the factor from one element to the next are cheaper than so many exponentials.
+    """
+    across = _powers(array, array.elements_m[1 % columns], directions, columns)
+    if rows == 1:
+        return across
+    down = _powers(array, array.elements_m[columns], directions, rows)
+    found: ComplexArray = (down[:, np.newaxis] * across).reshape(rows * columns, -1)
+    return found
+
+
+def _powers(array: Array, step_m: FloatArray, directions: FloatArray, count: int) -> ComplexArray:
+    """exp(j k step . u) to the powers 0 to ``count`` - 1, (count, N).
+
+    By doubling, so that rounding does not add up along the line.
+    """
+    found: ComplexArray = np.empty((count, len(directions)), dtype=complex)
+    found[0] = 1.0
+    if count == 1:
+        return found
+    factor = np.exp(1j * array.wavenumber_radpm * (directions @ step_m))
+    done = 1
+    while done < count:
+        found[done : 2 * done] = found[: min(done, count - done)] * factor
+        factor = factor * factor
+        done *= 2
+    return found
+
+
+def amplitudes(array: Array, directions: FloatArray) -> FloatArray:
+    """Element amplitudes towards unit directions (N, 3): (M, N), or (1, N) if all face alike."""
+    return array.element.amplitude(element_directions(array, directions))
+
+
+def element_directions(array: Array, directions: FloatArray) -> FloatArray:
+    """Unit directions (N, 3) in each element's frame: (M, N, 3), or (1, N, 3) if all face alike."""
+    if array.element_from_array is None:
+        return directions[np.newaxis]
+    turned: FloatArray = np.einsum("mij,nj->mni", array.element_from_array, directions)
+    return turned
+
+
+def pointing_bound_rad(bound_m: float, range_m: float) -> float | None:
+    """Largest angle to the true direction, for a position error of at most ``bound_m``.
+
+    The angle of the tangent to the ball of the error, asin(bound / range), with the range to the
+    *predicted* position; None where the array lies inside the ball and every direction is possible
+    (docs/math.md 5.3).
+    """
+    return math.asin(bound_m / range_m) if bound_m < range_m else None

@@ -1,0 +1,1 @@
+"""Weights for phased-array devices: quantised, calibrated, and written as their files."""

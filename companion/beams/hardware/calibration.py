@@ -1,0 +1,119 @@
+"""Calibration of an array: which element each channel drives, and its errors of phase and gain."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final, Self
+
+import numpy as np
+
+from companion.values import ComplexArray, UserError
+
+CALIBRATION_HEADER: Final = "channel,element,phase_deg,gain_db"
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """A measured calibration of an array of M elements.
+
+        phase_rad  by element: phase that the channel adds to its setting
+        gain_db    by element: gain that the channel adds to its setting
+        order      by channel: element that it drives, counted from 0
+
+    A setting is therefore the wanted value less these. Raises ``UserError`` for lengths that
+    differ, values that are not finite, or an order that is no permutation.
+    """
+
+    phase_rad: tuple[float, ...]
+    gain_db: tuple[float, ...]
+    order: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        size = len(self.order)
+        if not size or len(self.phase_rad) != size or len(self.gain_db) != size:
+            raise UserError(
+                f"{len(self.phase_rad)} phases, {len(self.gain_db)} gains and an order of {size}: "
+                "a calibration has one of each for every element"
+            )
+        if sorted(self.order) != list(range(size)):
+            raise UserError(f"order {self.order} is not each of 0 to {size - 1} once")
+        for name, values in (("phase", self.phase_rad), ("gain", self.gain_db)):
+            for element, value in enumerate(values):
+                if not math.isfinite(value):
+                    raise UserError(f"{name} {value} of element {element} is not finite")
+
+    @classmethod
+    def ideal(cls, order: Sequence[int]) -> Self:
+        """A calibration of channels that add nothing, in this order."""
+        return cls((0.0,) * len(order), (0.0,) * len(order), tuple(order))
+
+    @property
+    def factors(self) -> ComplexArray:
+        """Factor of each element's channel, (M,)."""
+        factors: ComplexArray = np.exp(1j * np.array(self.phase_rad))
+        factors *= 10 ** (np.array(self.gain_db) / 20)
+        return factors
+
+
+def parse_calibration(text: str) -> Calibration:
+    """Read CSV with the header ``channel,element,phase_deg,gain_db`` and a line for each channel.
+
+    Both count from 0; lines may come in any order. Raises ``UserError`` that names the line and the
+    value.
+    """
+    order: dict[int, int] = {}
+    measured: dict[int, tuple[float, float]] = {}
+    for number, found in fields(text, CALIBRATION_HEADER):
+        channel = whole(number, "channel", found[0], 0, 99_999)
+        element = whole(number, "element", found[1], 0, 99_999)
+        if channel in order:
+            raise UserError(f"line {number}: channel {channel} stands twice")
+        if element in measured:
+            raise UserError(f"line {number}: element {element} stands twice")
+        phase_deg = real(number, "phase_deg", found[2])
+        measured[element] = math.radians(phase_deg), real(number, "gain_db", found[3])
+        order[channel] = element
+    for name, seen in (("channel", order), ("element", measured)):
+        missing = set(range(len(order))) - set(seen)
+        if missing:
+            raise UserError(f"{name} {min(missing)} of {len(order)} has no line")
+    elements = range(len(order))
+    return Calibration(
+        tuple(measured[m][0] for m in elements),
+        tuple(measured[m][1] for m in elements),
+        tuple(order[c] for c in elements),
+    )
+
+
+def fields(text: str, header: str) -> Iterator[tuple[int, list[str]]]:
+    """Line number and fields of each line below ``header``; empty lines are skipped."""
+    lines = text.splitlines()
+    if not lines or lines[0].strip() != header:
+        raise UserError(f"line 1: {lines[0] if lines else ''!r} is not the header {header!r}")
+    columns = header.count(",") + 1
+    for number, line in enumerate(lines[1:], start=2):
+        if not line.strip(", \t"):
+            continue
+        found = [field.strip() for field in line.split(",")]
+        if len(found) != columns:
+            raise UserError(f"line {number}: {line!r} has {len(found)} fields, not {columns}")
+        yield number, found
+
+
+def whole(number: int, name: str, field: str, least: int, most: int) -> int:
+    """A whole number of a line. Raises ``UserError`` outside ``least`` to ``most``."""
+    digits = field.removeprefix("-")
+    if not (digits.isascii() and digits.isdecimal()) or not least <= int(field) <= most:
+        raise UserError(f"line {number}: {name} {field!r} is not a whole number, {least} to {most}")
+    return int(field)
+
+
+def real(number: int, name: str, field: str) -> float:
+    """A finite number of a line. Raises ``UserError`` for anything else."""
+    try:
+        value = float(field)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise UserError(f"line {number}: {name} {field!r} is not a finite number")
+    return value

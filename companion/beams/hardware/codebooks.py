@@ -1,0 +1,244 @@
+"""Codebooks: which fixed beam serves a direction best, which must be swept, which comes next.
+
+A radio that cannot set its own weights chooses one beam of a codebook by its index. The received
+response is a(u)^T c_k (docs/math.md 7), with c_k of unit power. Where all elements face alike,
+their pattern is a common factor of all beams and does not change which is best; the choice is then
+made without it, also behind the elements.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+import numpy as np
+
+from companion.beams.array import steering
+from companion.beams.array.geometry import Array
+from companion.beams.worth import cone
+from companion.beams.worth.cone import Boxes, Cones
+from companion.values import BoolArray, ComplexArray, FloatArray, IntArray, UserError
+
+LEVELS: Final = 12
+"""Most rounds of splitting cells."""
+MOST_RESPONSES: Final = 2**18
+"""Beams times cells examined for one question; a round that has begun is finished."""
+BLOCK: Final = 2**19
+"""Beams times cells, or beams times directions, computed at once: some tens of megabytes."""
+RESOLUTION_S: Final = 1e-3
+"""Precision of the time at which the best beam changes."""
+SAMPLES_PER_BEAM: Final = 4
+"""Samples while a direction crosses one beam."""
+
+
+class Kind(StrEnum):
+    """Origin of a codebook."""
+
+    DFT = "dft"
+    LISTED = "listed"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Codebook:
+    """K beams: ``weights`` (M, K), columns of unit power, in the order of their indices."""
+
+    kind: Kind
+    weights: ComplexArray
+
+    @property
+    def size(self) -> int:
+        """K, the number of beams."""
+        return int(self.weights.shape[1])
+
+
+@dataclass(frozen=True, slots=True)
+class NextBest:
+    """The index that is best now, the one that becomes best next, and in how many seconds.
+
+    ``next_index`` and ``after_s`` are None where no other becomes best within the horizon.
+    """
+
+    index: int
+    next_index: int | None
+    after_s: float | None
+
+
+def dft(array: Array, oversampling: int = 1) -> Codebook:
+    """The beams of a discrete Fourier transform over a line or a grid of elements.
+
+    A line of n elements along y has K = n oversampling beams. The k-th steps by -2 pi k / K from
+    element to element, and so points where spacing / wavelength times u_y is k/K, or that less a
+    whole number: at half a wavelength u_y = 2k/K up to k = K/2, and 2k/K - 2 beyond. A line of one
+    element has one beam. A grid has all products of a beam down its columns (u_z) and one along its
+    rows (u_y), with index k_z K_y + k_y. Raises ``UserError`` for an array without a grid.
+    """
+    if array.grid is None:
+        raise UserError(f"a DFT codebook needs a ULA or a URA, not elements of kind {array.kind}")
+    if oversampling < 1:
+        raise UserError(f"oversampling is 1 or more, not {oversampling}")
+    down, across = (_line(count, oversampling) for count in array.grid)
+    return Codebook(Kind.DFT, np.kron(down, across).astype(np.complex128))
+
+
+def _line(count: int, oversampling: int) -> ComplexArray:
+    beams = count * oversampling if count > 1 else 1
+    # Whole turns are taken out before the sine: exact for any number of elements.
+    steps = np.outer(np.arange(count), np.arange(beams)) % beams
+    line: ComplexArray = np.exp(-2j * np.pi * steps / beams) / np.sqrt(count)
+    return line
+
+
+def listed(weights: ComplexArray, array: Array) -> Codebook:
+    """A codebook from a list of weights (M, K), each column scaled to unit power.
+
+    Raises ``UserError`` where they do not fit the array, are not finite, or a beam is zero.
+    """
+    if weights.ndim != 2 or weights.shape[0] != array.size:
+        raise UserError(f"weights of shape {weights.shape} are not for {array.size} elements")
+    if weights.shape[1] == 0:
+        raise UserError("a codebook has at least one beam")
+    if not np.isfinite(weights).all():
+        raise UserError("weights are finite numbers")
+    silent = np.flatnonzero(~weights.any(axis=0))
+    if silent.size:
+        raise UserError(f"column {silent[0]} of the weights is zero")
+    return Codebook(Kind.LISTED, cone.unit_power(array, weights))
+
+
+def best(codebook: Codebook, array: Array, directions: FloatArray) -> tuple[IntArray, FloatArray]:
+    """The best beam for each unit direction (N, 3), and its gain.
+
+    Returns indices (N,), the lowest of equal ones, and array gains |a^T c|^2 (N,), linear, element
+    pattern included.
+    """
+    unit = cone.unit_directions(directions, np.zeros(len(directions)))
+    indices = np.empty(len(unit), dtype=np.int64)
+    gains = np.empty(len(unit))
+    step = max(1, BLOCK // max(codebook.size, array.size))
+    for start in range(0, len(unit), step):
+        block = slice(start, start + step)
+        indices[block], gains[block] = _best(codebook, array, unit[block])
+    return indices, gains
+
+
+def _best(codebook: Codebook, array: Array, unit: FloatArray) -> tuple[IntArray, FloatArray]:
+    if cone.faces_apart(array):
+        power = np.abs(codebook.weights.T @ steering.steering_matrix(array, unit)) ** 2
+        return power.argmax(axis=0), power.max(axis=0)
+    phase = array.wavenumber_radpm * (array.elements_m @ unit.T)
+    power = np.abs(codebook.weights.T @ np.exp(1j * phase)) ** 2
+    pattern = steering.amplitudes(array, unit)[0] ** 2
+    return power.argmax(axis=0), power.max(axis=0) * pattern
+
+
+def candidates(
+    codebook: Codebook, array: Array, direction: FloatArray, pointing_bound_rad: float | None
+) -> IntArray:
+    """Indices, ascending, of the beams that must be swept to find the best one.
+
+    They include the best beam for every true direction within the bound of the unit direction (3,);
+    all beams where there is no bound (None). This is proven: a beam is left out of a cell only if
+    its largest response there is less than the least of another. Cells are split while they hold a
+    beam that has not been seen to be best somewhere, until the work is spent.
+    """
+    if pointing_bound_rad is None:
+        return np.arange(codebook.size)
+    bounds = np.array([pointing_bound_rad])
+    unit = cone.unit_directions(direction[np.newaxis], bounds)
+    largest = np.abs(codebook.weights).max(axis=1, keepdims=True)  # holds for every beam
+    cones = cone.cones_around(array, unit, bounds, largest)
+    alive = np.arange(codebook.size)
+    found = np.zeros(codebook.size, dtype=bool)
+    boxes = cone.first_boxes(cones)
+    spent = 0
+    for level in range(LEVELS):
+        possible, seen = _contest(cones, boxes, codebook.weights[:, alive])
+        found[alive[seen]] = True
+        in_doubt: BoolArray = np.any(possible & ~found[alive, np.newaxis], axis=0)
+        alive = alive[possible[:, in_doubt].any(axis=1)]
+        spent += possible.size
+        if not in_doubt.any() or spent >= MOST_RESPONSES or level + 1 == LEVELS:
+            found[alive] = True
+            break
+        boxes = cone.split(cones, boxes.take(in_doubt))
+    return np.flatnonzero(found)
+
+
+def _contest(cones: Cones, boxes: Boxes, weights: ComplexArray) -> tuple[BoolArray, BoolArray]:
+    """Beams that can be best somewhere in each box, (K, C), and those best at any middle, (K,)."""
+    size, beams = weights.shape
+    placed = cones.positions_m.T[:, :, np.newaxis] * weights
+    stacked = np.concatenate([weights[np.newaxis], placed]).transpose(0, 2, 1)
+    possible = np.empty((beams, len(boxes.cone)), dtype=bool)
+    seen = np.zeros(beams, dtype=bool)
+    step = max(1, BLOCK // max(beams, size))
+    for start in range(0, len(boxes.cone), step):
+        block = slice(start, start + step)
+        pieces = cone.cells(cones, boxes.take(block), caps=1)
+        received, unsure = cone.phasors(cones, pieces)
+        sums = stacked @ received
+        low, high = cone.response_range(cones, pieces, sums[0], sums[1:])
+        if unsure is not None:
+            slack = np.abs(weights).T @ unsure
+            low, high = low - slack, high + slack
+        possible[:, block] = high >= low.max(axis=0)
+        middle = np.abs(sums[0])
+        seen |= (middle == middle.max(axis=0)).any(axis=1)
+    return possible, seen
+
+
+def next_best(
+    codebook: Codebook,
+    array: Array,
+    directions_at: Callable[[FloatArray], FloatArray],
+    horizon_s: float,
+    step_s: float,
+) -> NextBest:
+    """The best beam now, and the one that becomes best next, to a millisecond.
+
+        directions_at  unit directions (T, 3) for seconds from now (T,)
+        horizon_s      how far ahead to look
+        step_s         sampling step; the first change between two samples is bisected
+
+    A beam that is best for less than a step can be missed; where several changes fall into one
+    step, one of them is found. ``sampling_step_s`` is a step at which neither happens in practice.
+    Raises ``UserError`` for a horizon or a step not above 0.
+    """
+    if not (0 < horizon_s < math.inf and step_s > 0):
+        raise UserError(f"horizon and step are above 0 s, not {horizon_s:g} s and {step_s:g} s")
+
+    def best_at(times_s: FloatArray) -> IntArray:
+        return best(codebook, array, directions_at(times_s))[0]
+
+    times_s = np.append(np.arange(0.0, horizon_s, step_s), horizon_s)
+    indices = best_at(times_s)
+    now = int(indices[0])
+    changed = np.flatnonzero(indices != now)
+    if len(changed) == 0:
+        return NextBest(now, None, None)
+    low_s, high_s = times_s[changed[0] - 1], times_s[changed[0]]
+    index = int(indices[changed[0]])
+    while high_s - low_s > RESOLUTION_S:
+        middle_s = (low_s + high_s) / 2
+        between = int(best_at(np.array([middle_s]))[0])
+        if between == now:
+            low_s = middle_s
+        else:
+            high_s, index = middle_s, between
+    return NextBest(now, index, float(high_s))
+
+
+def sampling_step_s(codebook: Codebook, array: Array, rate_radps: float) -> float | None:
+    """A step for ``next_best``: a quarter of the time in which a direction crosses one beam.
+
+    ``rate_radps`` is the direction's angular rate. A beam is taken to be as wide as wavelength /
+    extent, or less where there are more beams than elements. None where the direction does not turn
+    or the array has no extent.
+    """
+    centred = array.centred_m
+    extent_m = 2 * float(np.sqrt(np.einsum("mk,mk->m", centred, centred).max()))
+    if rate_radps == 0 or extent_m == 0:
+        return None
+    width_rad = array.wavelength_m / extent_m / max(1.0, codebook.size / array.size)
+    return width_rad / abs(rate_radps) / SAMPLES_PER_BEAM

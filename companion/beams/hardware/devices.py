@@ -1,0 +1,146 @@
+"""Phased-array devices: what they can be set to, and what they cannot do.
+
+Each device's comment says what was found in public, and what was not. Conventions: channels and
+elements are numbered from 0 in values; a positive phase is a factor exp(+j phase), as in a steering
+vector; full gain is 0 dB, and every beam has its strongest element there. See docs/field-notes.md
+5.
+"""
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from companion.beams.hardware.quantise import Quadrature, Resolution, SettableStates, stepped
+
+
+class Device(StrEnum):
+    """Hardware for which weights can be written."""
+
+    ADAR1000 = "adar1000"
+    TMYTEK = "tmytek"
+    SIVERS = "sivers"
+
+
+MEDIA_TYPES: Final = {
+    Device.ADAR1000: "application/vnd.adi.adar1000+csv",
+    Device.TMYTEK: "application/vnd.tmytek.bbox+csv",
+    Device.SIVERS: "application/vnd.sivers.eder+text",
+}
+"""Media types for HTTP. They are this product's own names; the makers have registered none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What a device can hold and do.
+
+    elements           number of elements; None: any
+    beams              number of beams that it stores
+    off_boresight_rad  largest angle off boresight to which it steers; None: not stated
+    gain_range_db      range of its gain control
+    """
+
+    elements: int | None
+    beams: int
+    off_boresight_rad: float | None
+    gain_range_db: float
+
+
+# --- Analog Devices ADAR1000 ------------------------------------------------------------------
+#
+# Data sheet: four channels a chip, 360 degrees of phase at 2.8 degrees, at least 31 dB of gain at
+# 0.5 dB or finer, memory for 121 beam positions. Linux driver (iio/beamformer/adar1000): 128 phases
+# of 2.8125 degrees, RAM positions 0 to 120, gain register bits 6-0 the VGA and bit 7 set to bypass
+# the attenuator. The law from gain code to dB is in neither. Taken here: amplitude proportional to
+# the code (pyadi-iio scales codes by amplitude ratios when it calibrates a CN0566), an attenuator
+# of 15 dB (other public firmware for the chip), and codes down to 20: 16 dB and 15 dB make
+# the 31 dB of the data sheet, and the coarsest step is 0.43 dB, below its 0.5 dB. Code 0 with the
+# attenuator is how pyadi-iio silences an element.
+
+ADAR1000_PHASES: Final = 128
+ADAR1000_CHANNELS: Final = 4
+ADAR1000_ATTENUATOR: Final = 10 ** (-15 / 20)
+ADAR1000_LOWEST_GAIN: Final = 20
+_JOIN: Final = next(  # the loudest code with the attenuator that is below the lowest without
+    code for code in range(127, 0, -1) if code * ADAR1000_ATTENUATOR < ADAR1000_LOWEST_GAIN
+)
+ADAR1000_GAINS: Final = (
+    *((code, 0) for code in range(127, ADAR1000_LOWEST_GAIN - 1, -1)),
+    *((code, 1) for code in range(_JOIN, ADAR1000_LOWEST_GAIN - 1, -1)),
+    (0, 1),
+)
+"""Gain code and attenuator (1: inserted) of each level; the last one is off."""
+
+# Vector modulator registers of phase codes 0 to 63: data sheet rev. B, tables 13 to 16, as the
+# Linux driver has them. Bit 5 is the sign (1: positive), bits 4-0 the magnitude. Half a turn
+# further both signs change; a magnitude of 0 keeps the sign bit set.
+_VM_I: Final = bytes.fromhex(
+    "3f3f3f3f3f3e3e3d3d3c3c3b3a3938373635343332302f2e2c2b2a2827252422"
+    "210103040607080a0b0d0e0f1112131416171819191a1b1c1c1d1e1e1e1f1f1f"
+)
+_VM_Q: Final = bytes.fromhex(
+    "202123242627282a2b2d2e2f303133343536373838393a3a3b3c3c3c3d3d3d3d"
+    "3d3d3d3d3d3c3c3c3b3a3a393838373635343331302f2e2d2b2a282726242321"
+)
+
+
+def vector_modulator(phase_code: int) -> tuple[int, int]:
+    """I and Q register bytes of the ADAR1000 for a phase code of 0 to 127."""
+    half_turn, code = divmod(phase_code, 64)
+    i, q = _VM_I[code], _VM_Q[code]
+    return (i ^ 0x20, q ^ 0x20 if q & 0x1F else q) if half_turn else (i, q)
+
+
+# --- TMYTEK BBox ------------------------------------------------------------------------------
+#
+# TLKCore examples of the maker: the columns and their meaning, 64 beams, theta 0 to 45 and phi 0 to
+# 359 whole degrees, channels from 1 (16 of them in the 4 x 4 antenna kits, which state -45 to 45
+# degrees), ch_sw 0 on and 1 off, ch_deg whole degrees, ch_db in half decibels. What gains a unit
+# can have lies in its own calibration tables; the 7.5 dB taken here are what the channels of the
+# maker's example span. Theta is the angle off boresight and phi the angle about it, counted here
+# from the array's right (y) towards up (-z); only theta matters to tables of channels.
+
+TMYTEK_CHANNELS: Final = 16
+TMYTEK_STEP_DB: Final = 0.5
+TMYTEK_SETTINGS: Final = stepped(360, TMYTEK_STEP_DB, 7.5, off=True)
+
+
+class Mode(StrEnum):
+    """Use of a TMYTEK beam: transmission and reception have tables of their own."""
+
+    TX = "TX"
+    RX = "RX"
+
+
+# --- Sivers EVK (Eder) ------------------------------------------------------------------------
+#
+# The maker's control scripts for the EVK: a table of 64 rows by 16 antennas, each word 6 bits of Q
+# above 6 bits of I, antenna 15 at the lowest address and first in the file. In the same scripts a
+# path is silenced by 31 in both, and a circle is driven by 31 times cosine and sine plus 31: the
+# codes are offset by 31 (0 is -31, 62 is +31, 63 is not used). A limit of steering is not stated.
+
+SIVERS_ANTENNAS: Final = 16
+SIVERS_ROWS: Final = 64
+SIVERS_OFFSET: Final = 31
+
+SETTINGS: Final[dict[Device, SettableStates]] = {
+    Device.ADAR1000: Resolution(
+        ADAR1000_PHASES,
+        (
+            *(
+                code / 127 * (ADAR1000_ATTENUATOR if attenuated else 1.0)
+                for code, attenuated in ADAR1000_GAINS
+            ),
+        ),
+    ),
+    Device.TMYTEK: TMYTEK_SETTINGS,
+    Device.SIVERS: Quadrature(SIVERS_OFFSET),
+}
+"""Settings of one channel of each device."""
+
+LIMITS: Final = {
+    Device.ADAR1000: Limits(None, 121, None, 31.0),
+    Device.TMYTEK: Limits(TMYTEK_CHANNELS, 64, math.radians(45), 7.5),
+    Device.SIVERS: Limits(SIVERS_ANTENNAS, SIVERS_ROWS, None, 20 * math.log10(SIVERS_OFFSET)),
+}
+"""Limits of each device. An ADAR1000 array has as many chips as it needs."""

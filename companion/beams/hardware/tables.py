@@ -1,0 +1,131 @@
+"""From beams to a device's table: calibration, limits, the nearest settings, and what they cost.
+
+``fit`` finds the settings, ``encode`` writes them as the device's tools read them.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.beams.hardware import device_text
+from companion.beams.hardware.calibration import Calibration
+from companion.beams.hardware.devices import LIMITS, SETTINGS, Device, Mode
+from companion.beams.hardware.quantise import quantise
+from companion.beams.weights.precoding import gain_db
+from companion.values import ComplexArray, IntArray, UserError
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WantedBeam:
+    """A beam to be written for a device.
+
+    weights                     (M,)
+    azimuth_rad, elevation_rad  its direction in the array frame
+    steering                    (M, J), steering vectors that count when it is quantised: its
+                                own first, then those of its nulls
+    """
+
+    uav: str
+    weights: ComplexArray
+    azimuth_rad: float
+    elevation_rad: float
+    steering: ComplexArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DeviceTable:
+    """The settings of a device.
+
+    uavs     names of the beams; their numbers where the text had no room for names
+    codes    (K, M, 2), by beam and channel
+    order    the element of each channel
+    weights  (M, K), by element, as radiated; each beam has its strongest element at full gain,
+             and what feeds the array divides the power among beams
+    loss_db  array gain that each beam lost towards its own direction by the settings; None
+             where the wanted weights are not known
+    """
+
+    device: Device
+    uavs: tuple[str, ...]
+    codes: IntArray
+    order: tuple[int, ...]
+    weights: ComplexArray
+    loss_db: tuple[float, ...] | None
+
+
+def fit(device: Device, beams: Sequence[WantedBeam], calibration: Calibration) -> DeviceTable:
+    """The settings nearest to the wanted beams.
+
+    Raises ``UserError``, with the reason, for what the device cannot do.
+    """
+    _check(device, beams, calibration)
+    factors = calibration.factors
+    found = [quantise(b.weights, SETTINGS[device], b.steering, factors) for b in beams]
+    codes = np.stack([one.codes[list(calibration.order)] for one in found])
+    losses = tuple(
+        float((gain_db(own, wanted) - gain_db(own, sent))[0])
+        for own, wanted, sent in (
+            (b.steering[:, :1], b.weights[:, np.newaxis], one.weights[:, np.newaxis])
+            for b, one in zip(beams, found, strict=True)
+        )
+    )
+    weights = np.stack([one.weights for one in found], axis=1)
+    uavs = tuple(device_text.check_name(beam.uav) for beam in beams)
+    return DeviceTable(device, uavs, codes, calibration.order, weights, losses)
+
+
+def encode(
+    table: DeviceTable,
+    frequency_hz: float | None = None,
+    full_gain_db: float = 0.0,
+    mode: Mode = Mode.TX,
+) -> str:
+    """The table as the text of its device (``companion.beams.hardware.device_text``).
+
+    ``frequency_hz`` is needed by Sivers alone; ``full_gain_db`` and ``mode`` (TX or RX) are
+    TMYTEK's. Raises ``UserError`` for a value that the text cannot hold.
+    """
+    match table.device:
+        case Device.ADAR1000:
+            return device_text.write_adar1000(table.uavs, table.codes, table.order)
+        case Device.TMYTEK:
+            return device_text.write_tmytek(table.codes, mode, full_gain_db)
+        case Device.SIVERS:
+            if frequency_hz is None:
+                raise UserError("a Sivers beam book needs the frequency that it is for")
+            return device_text.write_sivers(table.uavs, table.codes, frequency_hz)
+
+
+def _check(device: Device, beams: Sequence[WantedBeam], calibration: Calibration) -> None:
+    """Raise ``UserError`` for what the device cannot do."""
+    limits, size = LIMITS[device], len(calibration.order)
+    if limits.elements is not None and size != limits.elements:
+        raise UserError(f"{device} drives {limits.elements} elements, the array has {size}")
+    if not 1 <= len(beams) <= limits.beams:
+        raise UserError(f"{device} stores 1 to {limits.beams} beams, not {len(beams)}")
+    spread_db = max(calibration.gain_db) - min(calibration.gain_db)
+    if spread_db > limits.gain_range_db:
+        raise UserError(
+            f"the channels differ by {spread_db:.1f} dB, {device} can level "
+            f"{limits.gain_range_db:.1f} dB"
+        )
+    for beam in beams:
+        if beam.weights.shape != (size,) or beam.steering.ndim != 2 or not beam.steering.size:
+            raise UserError(
+                f"beam for {beam.uav}: weights {beam.weights.shape} and steering "
+                f"{beam.steering.shape}, for {size} elements and one direction or more"
+            )
+        off_rad = _off_boresight_rad(beam)
+        if limits.off_boresight_rad is not None and not off_rad <= limits.off_boresight_rad + 1e-9:
+            raise UserError(
+                f"beam for {beam.uav} is {math.degrees(off_rad):.1f} degrees off boresight, "
+                f"{device} steers to {math.degrees(limits.off_boresight_rad):.0f}"
+            )
+
+
+def _off_boresight_rad(beam: WantedBeam) -> float:
+    """Angle between the beam's direction and x of the array frame: theta."""
+    along = math.cos(beam.elevation_rad) * math.cos(beam.azimuth_rad)
+    return float(np.arccos(np.clip(along, -1.0, 1.0)))

@@ -1,0 +1,110 @@
+"""UAVs as seen from the array: ranges, directions, and their rates of change.
+
+Directions are unit vectors in the array frame.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from companion.beams.array.geometry import Array
+from companion.values import Carrier, FloatArray, Track
+
+
+def place_ned_m(carrier: Carrier, array: Array) -> FloatArray:
+    """Position of the array, (3,), local frame: the carrier's position plus the lever arm."""
+    if not array.lever_arm_m.any():
+        return carrier.position_ned_m
+    place: FloatArray = carrier.position_ned_m + carrier.body_from_local.T @ array.lever_arm_m
+    return place
+
+
+def directions(
+    tracks: Sequence[Track], carrier: Carrier, array: Array
+) -> tuple[FloatArray, FloatArray]:
+    """Ranges (N,) in metres and unit directions (N, 3) in the array frame, from the array."""
+    offsets_m = np.array([track.position_ned_m for track in tracks]) - place_ned_m(carrier, array)
+    ranges_m = np.sqrt(np.einsum("nk,nk->n", offsets_m, offsets_m))
+    array_from_local = array.array_from_body @ carrier.body_from_local
+    return ranges_m, (offsets_m / ranges_m[:, np.newaxis]) @ array_from_local.T
+
+
+LineOfSightRates = tuple[float | None, float | None, float | None]
+"""Rates of azimuth and elevation in rad/s, and of range in m/s."""
+
+
+def rates(
+    tracks: Sequence[Track],
+    carrier: Carrier,
+    array: Array,
+    ranges_m: FloatArray,
+    directions: FloatArray,
+) -> list[LineOfSightRates]:
+    """Rates of azimuth, elevation (rad/s) and range (m/s) of unit directions in the array frame.
+
+    None without a velocity; straight up and straight down the azimuth has no rate.
+    """
+    unknown: LineOfSightRates = (None, None, None)
+    moved = carrier.velocity_ned_mps
+    if moved is None:
+        return [unknown] * len(tracks)
+    known = [track.velocity_ned_mps is not None for track in tracks]
+    velocities = [moved if v is None else v for v in (t.velocity_ned_mps for t in tracks)]
+    array_from_local = array.array_from_body @ carrier.body_from_local
+    if array.lever_arm_m.any():
+        swung = np.cross(carrier.body_rates_radps, array.lever_arm_m)
+        moved = moved + swung @ carrier.body_from_local
+    moving = (np.array(velocities) - moved) @ array_from_local.T
+    range_rates = np.einsum("nk,nk->n", moving, directions)
+    across = (moving - range_rates[:, np.newaxis] * directions) / ranges_m[:, np.newaxis]
+    w1, w2, w3 = (array.array_from_body @ carrier.body_rates_radps).tolist()
+    found: list[LineOfSightRates] = []
+    for i, (x, y, z) in enumerate(directions.tolist()):
+        x_rate, y_rate, z_rate = across[i].tolist()
+        x_rate, y_rate, z_rate = (
+            x_rate - (w2 * z - w3 * y),
+            y_rate - (w3 * x - w1 * z),
+            z_rate - (w1 * y - w2 * x),
+        )
+        level = x * x + y * y
+        if not known[i]:
+            found.append(unknown)
+        elif level < 1e-12:
+            found.append((None, None, float(range_rates[i])))
+        else:
+            azimuth = (x * y_rate - y * x_rate) / level
+            found.append((azimuth, -z_rate / math.sqrt(level), float(range_rates[i])))
+    return found
+
+
+def directions_ahead(
+    track: Track, carrier: Carrier, array: Array, times_s: FloatArray
+) -> FloatArray | None:
+    """Unit directions (T, 3) of a UAV at times after the track's own; None without its velocity.
+
+    Track and carrier go on at their velocities, the track with its acceleration, and the carrier
+    turns at its body rates; the result is good for as long as that is so. Where the UAV would be at
+    the array itself, boresight stands for its direction.
+    """
+    velocity, own = track.velocity_ned_mps, carrier.velocity_ned_mps
+    if velocity is None or own is None:
+        return None
+    t = times_s[:, np.newaxis]
+    ahead_m = track.position_ned_m - carrier.position_ned_m + (velocity - own) * t
+    if track.acceleration_ned_mps2 is not None:
+        ahead_m += 0.5 * track.acceleration_ned_mps2 * t**2
+    seen_m = ahead_m @ carrier.body_from_local.T
+    turn = math.sqrt(carrier.body_rates_radps @ carrier.body_rates_radps)
+    if turn > 0:
+        # Rodrigues' formula; coordinates turn the other way than the body.
+        axis, angle = carrier.body_rates_radps / turn, -turn * t
+        along = (seen_m @ axis)[:, np.newaxis] * axis
+        seen_m = along + (seen_m - along) * np.cos(angle) + np.cross(axis, seen_m) * np.sin(angle)
+    seen_m = (seen_m - array.lever_arm_m) @ array.array_from_body.T
+    ranges_m = np.linalg.norm(seen_m, axis=1)
+    here = (ranges_m < 1e-9)[:, np.newaxis]
+    found: FloatArray = np.where(here, [1.0, 0.0, 0.0], seen_m) / np.where(
+        here, 1.0, ranges_m[:, np.newaxis]
+    )
+    return found

@@ -1,0 +1,1 @@
+"""What beams are worth: guaranteed gain, patterns, channels, link budget."""

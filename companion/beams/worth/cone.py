@@ -1,0 +1,391 @@
+"""Cones of directions in small cells, with proven bounds on an array's response over each cell.
+
+A cone holds every direction within an angle of a predicted one. Directions are written in polar
+form about a pole, u = cos r p + sin r (cos t e1 + sin t e2), and a cell is a box in r and t. For
+most arrays the pole is the predicted direction: rings and sectors tile the cone exactly, and no
+cell reaches over its rim. The elements of a line, if they all face alike, see a direction only by
+its angle r to the line. There the pole is the line and a cell is an interval of r; the intervals
+cover the predicted angle plus and minus the bound.
+
+The response of weights f to u is r(u) = sum f_m g_m(u) exp(jk p_m . u). Let u = u_s + d with u_s
+the middle of a cell, q_m the positions about any point c (which only turns r by exp(-jk c . u)),
+c_m = f_m g_m exp(jk q_m . u_s) with g_m held. From |exp(jx) - 1 - jx| <= x^2/2, for any real x,
+
+    |r(u) - r_s - G.d| <= k^2/2 sum w_m (q_m . d)^2,   r_s = sum c_m,   G = jk sum c_m q_m
+
+for any w_m >= |c_m|. With d in a frame of three axes and each coordinate bounded over the cell,
+this bounds |r| from below, by its part in phase with r_s, and from above. The variation of g_m over
+the cell is added as an interval, or taken out as a factor where all elements face alike. See
+docs/math.md 5.4.
+
+Over 300 lines: one proof: the cells of a cone, the bound over a cell, and the search over cells.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from companion.beams.array import steering
+from companion.beams.array.elements import Pattern
+from companion.beams.array.geometry import SAME_PLACE_WAVELENGTHS, Array
+from companion.values import BoolArray, ComplexArray, FloatArray, IntArray
+
+MOST_INTERVALS: Final = 512
+"""Most first cells of one cone on a line; those still in doubt are split further."""
+MOST_RINGS: Final = 16
+"""Most rings of first cells of one cone elsewhere; those still in doubt are split further."""
+LINE_PHASE_RAD: Final = 0.12  # on a line
+DISC_PHASE_RAD: Final = 0.25  # elsewhere
+"""RMS phase of the elements from the middle of a first cell to its end.
+
+Half of its square is the bounds' error, as a share of the largest response possible.
+"""
+ROUNDING_RAD: Final = 1e-12
+"""Angle added wherever a pattern is bounded within an angle, for rounding."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cones:
+    """N cones of directions, and what bounds the responses of one array over them.
+
+    w are the largest magnitudes of the weights, patterns included if they differ.
+    """
+
+    array: Array
+    frames: FloatArray  # (N, 3, 3), rows pole, e1, e2
+    tilts_rad: FloatArray  # (N,), from the pole towards e1 to the prediction; 0 except on a line
+    bounds_rad: FloatArray  # (N,), half angle of each cone
+    positions_m: FloatArray  # (M, B), elements about their centroid, without columns of zeros
+    columns: IntArray  # (B,), the columns that are left
+    centres_m: FloatArray  # (N, B), centroid of the magnitudes w
+    curvatures: FloatArray  # (N, B, B), k^2 sum w q q^T
+    ceilings: FloatArray  # (N,), sum of w
+    rounding: FloatArray  # (N,), a generous bound on floating-point error
+    line: bool  # only the angle to the pole matters
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Boxes:
+    """C cells as boxes in angle from the pole and turn about it.
+
+    On a line the turn is whatever the cone leaves, and the second column is unused.
+    """
+
+    cone: IntArray  # (C,), the cone of each
+    low: FloatArray  # (C, 2), lower ends in angle and turn
+    high: FloatArray  # (C, 2), upper ends
+
+    def take(self, chosen: BoolArray | slice) -> "Boxes":
+        """The boxes chosen by a mask or by a slice."""
+        return Boxes(self.cone[chosen], self.low[chosen], self.high[chosen])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cells:
+    """C cells in space, each in the union of its K caps.
+
+    Any direction of a cell differs from its middle by a sum of axes, each times at most its reach.
+    A line has one axis, as it does not see the others.
+    """
+
+    cone: IntArray  # (C,), the cone of each
+    middles: FloatArray  # (C, 3), a direction in each cell and in its cone
+    axes: FloatArray  # (C, D, B), orthonormal except for the columns that ``Cones`` leaves out
+    reach: FloatArray  # (C, D)
+    caps: FloatArray  # (C, K, 3), unit directions in the middles of the caps
+    caps_rad: FloatArray  # (C, K), radius of each cap
+    in_cone: BoolArray  # (C, K), whether a cap's middle is inside the cone
+
+
+def unit_directions(directions: FloatArray, bounds_rad: FloatArray) -> FloatArray:
+    """Unit directions (N, 3), scaled to length 1 exactly.
+
+    Raises ``ValueError`` if a length is off by more than 1e-6, or if a bound of ``bounds_rad`` (N,)
+    is missing or negative.
+    """
+    if directions.ndim != 2 or directions.shape[1] != 3:
+        raise ValueError(f"directions are rows of three, not of shape {directions.shape}")
+    lengths = np.sqrt(np.einsum("nk,nk->n", directions, directions))
+    if not (np.abs(lengths - 1) < 1e-6).all():
+        raise ValueError("directions are unit vectors")
+    if bounds_rad.shape != lengths.shape or not (bounds_rad >= 0).all():
+        raise ValueError("each direction has one pointing bound, 0 or more radians")
+    unit: FloatArray = directions / lengths[:, np.newaxis]
+    return unit
+
+
+def unit_power(array: Array, weights: ComplexArray) -> ComplexArray:
+    """Weights (M, K) with each column scaled to unit power.
+
+    Raises ``ValueError`` where they do not fit the array, are not finite, or a column is zero.
+    """
+    if weights.ndim != 2 or len(weights) != array.size:
+        raise ValueError(f"weights of shape {weights.shape} are not for {array.size} elements")
+    if not np.isfinite(weights).all():
+        raise ValueError("weights are finite numbers")
+    largest = np.abs(weights).max(axis=0)
+    if not largest.all():
+        raise ValueError(f"column {int(np.argmin(largest))} of the weights is zero")
+    scaled = weights / largest  # so that no square over- or underflows
+    powered: ComplexArray = scaled / np.sqrt(np.sum(np.abs(scaled) ** 2, axis=0))
+    return powered
+
+
+def faces_apart(array: Array) -> bool:
+    """Whether the elements radiate differently, so that their pattern is no common factor."""
+    return array.element_from_array is not None and array.element.pattern is not Pattern.ISOTROPIC
+
+
+def cones_around(
+    array: Array, directions: FloatArray, bounds_rad: FloatArray, magnitudes: FloatArray
+) -> Cones:
+    """Cones within ``bounds_rad`` (N,) of unit directions (N, 3).
+
+    They are for the responses of weights that are at most ``magnitudes`` (M, N).
+    """
+    centred = array.centred_m
+    far = centred[np.argmax(np.einsum("mk,mk->m", centred, centred))]
+    extent_m = float(np.sqrt(far @ far))
+    along = far / max(extent_m, 1e-300)
+    aside_m = float(np.abs(centred - np.outer(centred @ along, along)).max())
+    aligned = extent_m > 0 and aside_m <= SAME_PLACE_WAVELENGTHS * array.wavelength_m
+    line = aligned and not faces_apart(array)
+    if faces_apart(array):
+        towards = steering.element_directions(array, directions)
+        magnitudes = magnitudes * array.element.amplitude_range(towards, bounds_rad)[1]
+    columns = np.flatnonzero(np.abs(centred).max(axis=0) > 0)
+    positions = centred[:, columns]
+    ceilings = np.maximum(magnitudes.sum(axis=0), 1e-300)  # 0: nothing radiates there
+    centres = magnitudes.T @ positions / ceilings[:, np.newaxis]
+    moments = np.einsum("mn,mi,mj->nij", magnitudes, positions, positions)
+    moments -= ceilings[:, np.newaxis, np.newaxis] * np.einsum("ni,nj->nij", centres, centres)
+    wavenumber = array.wavenumber_radpm
+    phase = wavenumber * float(np.abs(array.elements_m).max())
+    unsure = (array.size + 16 + 8 * phase) * np.finfo(float).eps
+    unsure += 4 * wavenumber * aside_m if line else 0.0
+    poles = np.broadcast_to(along, directions.shape) if line else directions
+    frames, tilts = _frames(poles, directions)
+    return Cones(
+        array, frames, tilts, np.minimum(bounds_rad, np.pi), positions, columns, centres,
+        wavenumber**2 * moments, ceilings, unsure * ceilings, line,
+    )  # fmt: skip
+
+
+def _frames(poles: FloatArray, towards: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pole, e1 and e2 as rows (N, 3, 3), and the angle (N,) from the pole to ``towards``.
+
+    e1 is on the side of ``towards`` where that differs from the pole.
+    """
+    cosines = np.einsum("nk,nk->n", poles, towards)
+    aside = towards - cosines[:, np.newaxis] * poles
+    sines = np.sqrt(np.einsum("nk,nk->n", aside, aside))
+    least = np.eye(3)[np.argmin(np.abs(poles), axis=1)]
+    e1 = np.where((sines > 1e-15)[:, np.newaxis], aside, least)
+    for _ in range(2):  # twice: what rounding leaves along the pole of a short vector is not small
+        e1 /= np.sqrt(np.einsum("nk,nk->n", e1, e1))[:, np.newaxis]
+        e1 -= np.einsum("nk,nk->n", e1, poles)[:, np.newaxis] * poles
+    e1 /= np.sqrt(np.einsum("nk,nk->n", e1, e1))[:, np.newaxis]
+    return np.stack([poles, e1, np.cross(poles, e1)], axis=1), np.arctan2(sines, cosines)
+
+
+def first_boxes(cones: Cones) -> Boxes:
+    """Boxes that cover every cone, finer where the phases of the elements turn faster."""
+    spread = np.einsum("nii->ni", cones.curvatures).max(axis=1, initial=0.0) / cones.ceilings
+    turned_rad = np.sqrt(np.maximum(spread, 0.0)) * cones.bounds_rad
+    if cones.line:
+        wanted = np.clip(turned_rad / LINE_PHASE_RAD, 1, MOST_INTERVALS)
+    else:
+        wanted = np.clip(turned_rad / (2 * DISC_PHASE_RAD), 1, MOST_RINGS)
+    counts = 2 ** np.ceil(np.log2(wanted)).astype(np.int64)  # few different ones: built at once
+    found = []
+    for count in np.unique(counts):
+        low, high = _intervals(count) if cones.line else _sectors(count)
+        which = np.repeat(np.flatnonzero(counts == count), len(low))
+        tiles = len(which) // len(low)
+        found.append(Boxes(which, np.tile(low, (tiles, 1)), np.tile(high, (tiles, 1))))
+    cone = np.concatenate([boxes.cone for boxes in found])
+    low = np.concatenate([boxes.low for boxes in found])
+    high = np.concatenate([boxes.high for boxes in found])
+    tilt, bound = cones.tilts_rad[cone], cones.bounds_rad[cone]
+    for ends in (low, high):
+        ends[:, 0] = np.clip(tilt + bound * ends[:, 0], 0.0, np.pi)
+    return Boxes(cone, low, high)
+
+
+def _intervals(count: int) -> tuple[FloatArray, FloatArray]:
+    """Ends of ``count`` equal parts of -1 to 1; the turn is unused."""
+    ends = np.stack([np.linspace(-1.0, 1.0, count + 1), np.zeros(count + 1)], axis=1)
+    return ends[:-1], ends[1:]
+
+
+def _sectors(rings: int) -> tuple[FloatArray, FloatArray]:
+    """Rings of the unit disc, the n-th cut into 6n sectors about as long as they are wide."""
+    parts = 6 * np.arange(1, rings + 1)
+    ring = np.repeat(np.arange(rings), parts)
+    sector = np.arange(len(ring)) - np.repeat(np.cumsum(parts) - parts, parts)
+    width = 2 * np.pi / parts[ring]
+    low = np.stack([ring / rings, sector * width], axis=1)
+    return low, np.stack([(ring + 1) / rings, (sector + 1) * width], axis=1)
+
+
+def split(cones: Cones, boxes: Boxes) -> Boxes:
+    """Each box in four: quarters of the angle on a line, else halves both ways."""
+    angles, turns = (4, 1) if cones.line else (2, 2)
+    quarter = np.stack(np.divmod(np.arange(angles * turns), turns), axis=1)
+    size = (boxes.high - boxes.low) / [angles, turns]
+    low = boxes.low + size * quarter[:, np.newaxis]
+    high = boxes.low + size * (quarter[:, np.newaxis] + 1)
+    return Boxes(np.tile(boxes.cone, len(quarter)), low.reshape(-1, 2), high.reshape(-1, 2))
+
+
+def cells(cones: Cones, boxes: Boxes, caps: int) -> Cells:
+    """The boxes in space.
+
+    ``caps`` is the number of caps that cover the arc of a cell on a line, an odd number; 1 does not
+    cover it, for callers that need no pattern.
+    """
+    return _strips(cones, boxes, caps) if cones.line else _patches(cones, boxes)
+
+
+def _strips(cones: Cones, boxes: Boxes, caps: int) -> Cells:
+    """Cells of a line: arcs of the cone about it, of which it sees the angle alone."""
+    low, high = boxes.low[:, 0], boxes.high[:, 0]
+    angle, half = (low + high) / 2, (high - low) / 2
+    frames = cones.frames[boxes.cone]
+    # |cos r - cos r_s| at either end, without the cancellation.
+    ends = np.sin((low + angle) / 2), np.sin((high + angle) / 2)
+    reach = 2 * np.sin(half / 2) * np.maximum(*ends)
+    widest = _turn_rad(cones, boxes) if caps > 1 else np.zeros_like(angle)
+    turn = widest[:, np.newaxis] / caps
+    around = _polar(frames, angle[:, np.newaxis], turn * (2 * np.arange(caps) + 1 - caps))
+    caps_rad = _angle_rad(_inward(boxes, turn))
+    tilt = cones.tilts_rad[boxes.cone, np.newaxis]
+    predicted = _polar(frames, tilt, np.zeros_like(tilt))
+    cosines = np.einsum("ckj,coj->ck", around, predicted)
+    in_cone = cosines >= np.cos(cones.bounds_rad)[boxes.cone, np.newaxis] - 1e-12
+    return Cells(
+        boxes.cone, around[:, caps // 2], frames[:, :1, cones.columns], reach[:, np.newaxis],
+        around, caps_rad, in_cone,
+    )  # fmt: skip
+
+
+def _turn_rad(cones: Cones, boxes: Boxes) -> FloatArray:
+    """The largest turn about the line at which a direction is both in the cell and in its cone.
+
+    sin^2(t / 2) = sin((bound + r - tilt) / 2) sin((bound - r + tilt) / 2) / (sin r sin tilt); its
+    only extreme between the ends of r is where cos r = cos tilt / cos bound.
+    """
+    tilt, bound = cones.tilts_rad[boxes.cone], cones.bounds_rad[boxes.cone]
+    cosine = np.where(np.abs(np.cos(bound)) < 1e-9, 1e-9, np.cos(bound))
+    widest = np.arccos(np.clip(np.cos(tilt) / cosine, -1.0, 1.0))
+    low, high = boxes.low[:, 0], boxes.high[:, 0]
+    angles = np.stack([low, high, np.clip(widest, low, high)])
+    wide = bound + 8 * np.finfo(float).eps
+    over = np.sin((wide + angles - tilt) / 2) * np.sin((wide - angles + tilt) / 2)
+    under = np.maximum(np.sin(angles) * np.sin(tilt), 1e-300)
+    turns: FloatArray = 2 * np.arcsin(np.sqrt(np.clip(over / under, 0.0, 1.0))).max(axis=0)
+    return turns
+
+
+def _patches(cones: Cones, boxes: Boxes) -> Cells:
+    """Cells of a disc, with axes inward, along r and along t.
+
+    u.e_r = sin(r - r_s) - sin r cos r_s (1 - cos(t - t_s)),   u.e_t = sin r sin(t - t_s).
+    """
+    angle, turn = (boxes.low + boxes.high).T / 2
+    half, width = (boxes.high - boxes.low).T / 2
+    right = np.full_like(angle, np.pi / 2)
+    axes = _polar(
+        cones.frames[boxes.cone],
+        np.stack([angle, angle + right, right], axis=1),
+        np.stack([turn, turn, turn + right], axis=1),
+    )
+    inward = _inward(boxes, width[:, np.newaxis])
+    highest = _highest_sine(boxes)
+    outward = np.sin(np.minimum(half, right))
+    outward += highest * np.abs(np.cos(angle)) * 2 * np.sin(width / 2) ** 2
+    sideways = highest * np.sin(np.minimum(width, right))
+    return Cells(
+        boxes.cone, axes[:, 0], axes[:, :, cones.columns],
+        np.stack([inward[:, 0], outward, sideways], axis=1),
+        axes[:, :1], _angle_rad(inward), np.ones(inward.shape, dtype=bool),
+    )  # fmt: skip
+
+
+def _polar(frames: FloatArray, angle: FloatArray, turn: FloatArray) -> FloatArray:
+    """Unit directions (C, K, 3) at angles (C, 1 or K) from the poles, turns (C, K) about them."""
+    sine = np.sin(angle)
+    parts = np.stack(
+        np.broadcast_arrays(np.cos(angle), sine * np.cos(turn), sine * np.sin(turn)), axis=2
+    )
+    directions: FloatArray = parts @ frames
+    return directions
+
+
+def _highest_sine(boxes: Boxes) -> FloatArray:
+    """The largest sin r in each box."""
+    low, high = boxes.low[:, 0], boxes.high[:, 0]
+    sines: FloatArray = np.sin(np.clip(np.pi / 2, low, high))
+    return sines
+
+
+def _inward(boxes: Boxes, width: FloatArray) -> FloatArray:
+    """Upper bound on 1 - u . u_s for turns within ``width`` (C, 1) of the middle's.
+
+    u . u_s = cos(r - r_s) - sin r sin r_s (1 - cos(t - t_s)).
+    """
+    angle, half = (boxes.low + boxes.high)[:, :1] / 2, (boxes.high - boxes.low)[:, :1] / 2
+    sines = _highest_sine(boxes)[:, np.newaxis] * np.sin(angle)
+    bound: FloatArray = 2 * np.sin(half / 2) ** 2 + 2 * sines * np.sin(width / 2) ** 2
+    return bound
+
+
+def _angle_rad(inward: FloatArray) -> FloatArray:
+    """The angle whose cosine is 1 - ``inward``, with a margin for rounding."""
+    angle: FloatArray = 2 * np.arcsin(np.sqrt(np.minimum(inward / 2, 1.0))) + ROUNDING_RAD
+    return angle
+
+
+def phasors(cones: Cones, pieces: Cells) -> tuple[ComplexArray, FloatArray | None]:
+    """Response of each element to the middle of each cell, (M, C), and its largest change in it.
+
+    The change is None where all elements face alike; their pattern is then left out.
+    """
+    phase = cones.array.wavenumber_radpm * (cones.positions_m @ pieces.middles[:, cones.columns].T)
+    received = np.empty(phase.shape, dtype=complex)
+    received.real, received.imag = np.cos(phase), np.sin(phase)
+    if not faces_apart(cones.array):
+        return received, None
+    towards = steering.element_directions(cones.array, pieces.middles)
+    least, most = cones.array.element.amplitude_range(towards, pieces.caps_rad[:, 0])
+    amplitude = cones.array.element.amplitude(towards)
+    received *= amplitude
+    return received, np.maximum(most - amplitude, amplitude - least)
+
+
+def response_range(
+    cones: Cones, pieces: Cells, responses: ComplexArray, moments: ComplexArray
+) -> tuple[FloatArray, FloatArray]:
+    """Lower and upper bounds of |response| over each cell, (..., C) both; the lower may be
+    negative.
+
+        responses  (..., C), responses to the middles
+        moments    (B, ..., C), the same sums with every term times its element's position: sum p_m
+                   c_m
+    """
+    size = np.abs(responses)
+    turned = np.where(size > 0, responses.conj() / np.where(size > 0, size, 1.0), 1.0)
+    slopes = np.zeros((2, *size.shape))
+    about = cones.centres_m[pieces.cone].T
+    balanced = [(m - about[b] * responses) * turned for b, m in enumerate(moments)]
+    for d in range(pieces.reach.shape[1]):
+        slope = sum(part * pieces.axes[:, d, b] for b, part in enumerate(balanced))
+        # jk turns the parts: what is in phase with the response is the imaginary part.
+        slopes[0] += np.abs(np.imag(slope)) * pieces.reach[:, d]
+        slopes[1] += np.abs(np.real(slope)) * pieces.reach[:, d]
+    slopes *= cones.array.wavenumber_radpm
+    curved = pieces.axes @ cones.curvatures[pieces.cone] @ pieces.axes.transpose(0, 2, 1)
+    bent = np.einsum("ci,cij,cj->c", pieces.reach, np.abs(curved), pieces.reach) / 2
+    bent += cones.rounding[pieces.cone]
+    return size - slopes[0] - bent, np.hypot(size + slopes[0], slopes[1]) + bent

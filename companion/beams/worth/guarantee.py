@@ -1,0 +1,181 @@
+"""Guaranteed gain: the least array gain over all directions in which the UAV can truly be.
+
+The array gain of weights f towards u is |a(u)^T f|^2 / |f|^2. Its least over the cone of the
+pointing bound is found by branch and bound: cells whose bound could still be the least are split
+until bound and attained gain agree (``TOLERANCE_DB``) or the work is spent. The result is a bound
+over every cell, whenever the search ends: never above the true least gain, never below the true
+largest. See docs/math.md 5.4 and 7.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from companion.beams.array.coverage import Coverage, margin_rad
+from companion.beams.array.elements import Pattern
+from companion.beams.array.geometry import Array
+from companion.beams.worth import cone
+from companion.beams.worth.cone import Boxes, Cells, Cones
+from companion.values import ComplexArray, FloatArray
+
+TOLERANCE_DB: Final = 0.05
+"""Difference between bound and attained gain at which the search ends."""
+TOLERANCE: Final = 1 - 10 ** (-TOLERANCE_DB / 20)
+"""The same as a relative amplitude."""
+NOTHING_DB: Final = 40.0
+"""Depth below the weights' greatest possible gain beyond which a gain is not refined."""
+LEVELS: Final = 12
+"""Most rounds of splitting cells."""
+CAPS: Final = 8
+"""Caps, plus one, that cover the arc of a first cell on a line; each split doubles them."""
+MOST_SPLIT: Final = 4096
+"""Most cells split for one cone; those with many caps count as more."""
+BLOCK: Final = 2**18
+"""Elements or caps, times cells, computed at once: some megabytes."""
+
+
+def guaranteed_gains_db(
+    array: Array,
+    directions: FloatArray,
+    pointing_bounds_rad: Sequence[float | None],
+    weights: ComplexArray,
+) -> tuple[float | None, ...]:
+    """Least array gain that each beam is proven to have within its pointing bound, dB.
+
+        directions           (N, 3), unit directions, array frame
+        pointing_bounds_rad  (N,), half angles of the cones; None: any direction
+        weights              (M, N), column n for row n of the directions
+
+    Element patterns are included. A result is None where nothing is proven: the cone holds a null,
+    or has no bound. The true minimum is at most ``TOLERANCE_DB`` above the result, unless it lies
+    ``NOTHING_DB`` down or the work is spent: over cones many beams wide, or where directive
+    elements face apart and the weights set them against one another (tenths of a dB). Raises
+    ``ValueError`` for weights that are zero or do not fit.
+    """
+    unit, bounds = _cones(directions, pointing_bounds_rad)
+    powered = cone.unit_power(array, weights)
+    if weights.shape[1] != len(unit):
+        raise ValueError(f"{weights.shape[1]} columns of weights for {len(unit)} directions")
+    found: list[float | None] = [None] * len(unit)
+    bounded = np.flatnonzero([bound is not None for bound in pointing_bounds_rad])
+    least = _extremes(array, unit[bounded], bounds[bounded], powered[:, bounded], most=False)
+    for n, amplitude in zip(bounded.tolist(), least.tolist(), strict=True):
+        if amplitude > 0:
+            found[n] = 20 * math.log10(amplitude)
+    return tuple(found)
+
+
+def leakage_bounds(
+    array: Array,
+    directions: FloatArray,
+    pointing_bounds_rad: Sequence[float | None],
+    weights: ComplexArray,
+) -> FloatArray:
+    """Largest array gain (N, J), linear, of beam j within the pointing bound of UAV i.
+
+        directions           (N, 3), unit directions, array frame
+        pointing_bounds_rad  (N,), half angles of the cones; None: any direction
+        weights              (M, J)
+
+    Powers apart, this is the most that UAV i can receive of UAV j's stream. The true maximum is at
+    most ``TOLERANCE_DB`` below, with the exceptions of ``guaranteed_gains_db``.
+    """
+    unit, bounds = _cones(directions, pointing_bounds_rad)
+    powered = cone.unit_power(array, weights)
+    row, column = np.indices((len(unit), weights.shape[1])).reshape(2, -1)
+    largest = _extremes(array, unit[row], bounds[row], powered[:, column], most=True)
+    return (largest**2).reshape(len(unit), weights.shape[1])
+
+
+def _cones(directions: FloatArray, given: Sequence[float | None]) -> tuple[FloatArray, FloatArray]:
+    """Unit directions and their bounds, checked; no bound becomes half a turn."""
+    bounds = np.array([np.pi if bound is None else bound for bound in given], dtype=float)
+    return cone.unit_directions(directions, bounds), bounds
+
+
+def _extremes(
+    array: Array, unit: FloatArray, bounds: FloatArray, weights: ComplexArray, most: bool
+) -> FloatArray:
+    """The least response (N,) of column n over cone n.
+
+    With ``most``, the largest, negated: everything is then negated, so that it is a least as well.
+    """
+    if len(unit) == 0:
+        return np.empty(0)
+    cones = cone.cones_around(array, unit, bounds, np.abs(weights))
+    patterned = array.element.pattern is not Pattern.ISOTROPIC
+    scales = 1.0 if cone.faces_apart(array) else array.element.amplitude_range(unit, bounds)[1]
+    nothing = 10 ** (-NOTHING_DB / 20) * scales * cones.ceilings
+    proven, attained = np.full((2, len(unit)), np.inf)
+    spent = np.zeros(len(unit), dtype=np.int64)
+    boxes = cone.first_boxes(cones)
+    for level in range(LEVELS):
+        caps = CAPS * 2**level if patterned else 0
+        bound, seen = _over_boxes(cones, boxes, weights, caps + 1, most)
+        np.minimum.at(attained, boxes.cone, seen)
+        size = np.abs(attained)
+        enough = attained - TOLERANCE * np.maximum(size, nothing)
+        going = most | (size > nothing)
+        in_doubt = (bound < enough[boxes.cone]) & going[boxes.cone] & (level + 1 < LEVELS)
+        spent += (1 + caps // CAPS) * np.bincount(boxes.cone[in_doubt], minlength=len(unit))
+        in_doubt &= (spent <= MOST_SPLIT)[boxes.cone]
+        np.minimum.at(proven, boxes.cone[~in_doubt], bound[~in_doubt])
+        if not in_doubt.any():
+            break
+        boxes = cone.split(cones, boxes.take(in_doubt))
+    return proven
+
+
+def _over_boxes(
+    cones: Cones, boxes: Boxes, weights: ComplexArray, caps: int, most: bool
+) -> tuple[FloatArray, FloatArray]:
+    """For each box a proven lower bound (C,) of the least response, and a value attained in it."""
+    step = max(1, BLOCK // max(cones.array.size, caps))
+    starts = range(0, len(boxes.cone), step)
+    parts = [
+        _over_cells(cones, cone.cells(cones, boxes.take(slice(at, at + step)), caps), weights, most)
+        for at in starts
+    ]
+    return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+
+
+def _over_cells(
+    cones: Cones, cells: Cells, weights: ComplexArray, most: bool
+) -> tuple[FloatArray, FloatArray]:
+    received, unsure = cone.phasors(cones, cells)
+    chosen = weights[:, cells.cone]
+    terms = chosen * received
+    responses = terms.sum(axis=0)
+    low, high = cone.response_range(cones, cells, responses, cones.positions_m.T @ terms)
+    seen = np.abs(responses)
+    if unsure is not None:
+        slack = np.einsum("mc,mc->c", np.abs(chosen), unsure)
+        return (-high - slack, -seen) if most else (low - slack, seen)
+    least, largest = cones.array.element.amplitude_range(cells.caps, cells.caps_rad)
+    amplitude = cones.array.element.amplitude(cells.caps)
+    if most:
+        attained = np.where(cells.in_cone, amplitude, 0.0).max(axis=1)
+        return -high * largest.max(axis=1), -seen * attained
+    attained = np.where(cells.in_cone, amplitude, np.inf).min(axis=1)
+    return low * least.min(axis=1), seen * attained
+
+
+def covered_bounds(
+    array: Array,
+    coverage: Coverage,
+    directions: FloatArray,
+    pointing_bounds_rad: Sequence[float | None],
+) -> list[float | None]:
+    """The bounds of unit directions (N, 3) in the array frame.
+
+    None where a cone leaves the coverage.
+
+    A UAV may then be outside the coverage, and nothing is guaranteed.
+    """
+    margins = margin_rad(coverage, directions, directions @ array.array_from_body)
+    return [
+        bound if bound is not None and bound <= margin else None
+        for bound, margin in zip(pointing_bounds_rad, margins.tolist(), strict=True)
+    ]

@@ -1,0 +1,1 @@
+"""The console command ``companion``: one file per command."""

@@ -1,0 +1,86 @@
+"""Shared by the commands: user mistakes as one line on stderr, and progress on a terminal."""
+
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NoReturn
+
+import click
+
+from companion.values import UserError
+
+CONFIG = click.option("--config", type=click.Path(path_type=Path), help="Settings: a TOML file.")
+CENTER = click.option(
+    "--center",
+    metavar="SRC",
+    help="What carries the array: SYSID:COMPID, LAT,LON,ALT[,HEADING] or home.",
+)
+JSON = click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
+
+
+class _InterruptedError(Exception):
+    """Ctrl-C during a command."""
+
+
+class OneLineErrors(click.Group):
+    """A group whose user mistakes are one line on stderr, without the usage text.
+
+    A user's mistake is a ``UserError``, or an ``OSError`` about a file, a port or a disk.
+    Everything else is a defect, and ends with its traceback.
+    """
+
+    def main(
+        self,
+        args: Sequence[str] | None = None,
+        prog_name: str | None = None,
+        complete_var: str | None = None,
+        standalone_mode: bool = True,
+        **extra: Any,
+    ) -> Any:
+        """Run; see ``click.Command.main``."""
+        extra |= {"prog_name": prog_name, "complete_var": complete_var, "standalone_mode": False}
+        work: Callable[[], Any] = partial(super().main, args, **extra)
+        if not standalone_mode:
+            return work()
+        try:
+            sys.exit(work() or 0)
+        except click.exceptions.NoArgsIsHelpError as error:
+            error.show()
+            sys.exit(error.exit_code)
+        except click.ClickException as error:
+            self._end(error.format_message(), error.exit_code)
+        except (_InterruptedError, click.Abort):
+            self._end("interrupted", 130)
+        except UserError as error:
+            self._end(str(error), 1)
+        except OSError as error:
+            where = f"{error.filename}: " if error.filename else ""
+            self._end(f"{where}{error.strerror or error}", 1)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; an interrupt is caught before Click, which would print an empty line."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            raise _InterruptedError from None
+
+    def _end(self, said: str, status: int) -> NoReturn:
+        click.echo(f"{self.name}: {' '.join(said.split())}", err=True)
+        sys.exit(status)
+
+
+class Progress:
+    """One line on stderr that is overwritten; nothing where stderr is not a terminal."""
+
+    def __init__(self) -> None:
+        self._on = sys.stderr.isatty()
+
+    def show(self, text: str) -> None:
+        """Replace the line."""
+        if self._on:
+            click.echo(f"\r\033[K{text}", nl=False, err=True)
+
+    def clear(self) -> None:
+        """Remove the line."""
+        self.show("")

@@ -1,0 +1,140 @@
+"""The command ``companion design``: observer gains, their certificate, tables."""
+
+import json
+from pathlib import Path
+
+import click
+
+from companion.cli.console import JSON
+
+
+def numbers(text: str) -> list[float]:
+    """The numbers of an option, commas between them."""
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise click.BadParameter(f"{text!r} is not a list of numbers such as 0.1,0.5") from error
+
+
+def _alpha(text: str) -> float | None:
+    if text == "auto":
+        return None
+    try:
+        return float(text)
+    except ValueError as error:
+        raise click.BadParameter(f"alpha is 'auto' or a number, not {text!r}") from error
+
+
+@click.command()
+@click.option(
+    "--dt",
+    metavar="S[,S...]",
+    callback=lambda _context, _option, text: [] if text is None else numbers(text),
+    help="Seconds between reports.",
+)
+@click.option(
+    "--model",
+    type=click.Choice(["position", "kinematic"]),
+    default="position",
+    show_default=True,
+)
+@click.option("--alpha", metavar="A|auto", default="auto", show_default=True, help="In (0, 1).")
+@click.option(
+    "--feedthrough",
+    type=float,
+    default=0.0,
+    show_default=True,
+    help="Position model: seconds by which a report leads the position.",
+)
+@click.option(
+    "--mu-max", type=click.FloatRange(min=0), help="The largest mu to accept; kinematic: in m^2."
+)
+@click.option(
+    "--method",
+    type=click.Choice(["closed-form", "lmi"]),
+    help="The kinematic model has only the LMI.  [default: closed-form if there is one]",
+)
+@click.option(
+    "--acceleration",
+    type=float,
+    default=5.0,
+    show_default=True,
+    help="Kinematic: the largest acceleration, m/s^2.",
+)
+@click.option(
+    "--position-noise",
+    type=float,
+    default=0.5,
+    show_default=True,
+    help="Kinematic: the largest error of a reported position, m.",
+)
+@click.option(
+    "--velocity-noise",
+    type=float,
+    default=0.2,
+    show_default=True,
+    help="Kinematic: the largest error of a reported velocity, m/s.",
+)
+@click.option("--no-velocity", is_flag=True, help="Kinematic: velocity is not reported.")
+@click.option(
+    "--dt-range",
+    metavar="LOW,HIGH",
+    default="0.05,2",
+    show_default=True,
+    callback=lambda _context, _option, text: numbers(text),
+    help="With --out: the intervals that one table of gains must serve.",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Kinematic: write a table of gains with its proof, for [observer] design.",
+)
+@JSON
+def design(
+    dt: list[float],
+    model: str,
+    alpha: str,
+    feedthrough: float,
+    mu_max: float | None,
+    method: str | None,
+    acceleration: float,
+    position_noise: float,
+    velocity_noise: float,
+    no_velocity: bool,
+    dt_range: list[float],
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Observer gains, their certificate, and the largest feasible interval between reports.
+
+    Example: companion design --dt 0.15,0.5 --alpha 0.5 --feedthrough 0.5 --mu-max 0.05
+    """
+    from companion.tracking.design import answers
+
+    if not dt and out is None:
+        raise click.UsageError("say --dt, or --out for a table of gains")
+    if model == "position":
+        if out is not None:
+            raise click.UsageError("--out writes tables of the kinematic model only")
+        way = method or "closed-form"
+        rows = [answers.row(s, feedthrough, _alpha(alpha), mu_max, model, way) for s in dt]
+    else:
+        if method == "closed-form" or feedthrough:
+            raise click.UsageError("the kinematic model: no closed form, no feedthrough")
+        motion = answers.KinematicLimits(
+            acceleration, position_noise, None if no_velocity else velocity_noise
+        )
+        rows = answers.kinematic_rows(dt, motion, _alpha(alpha), mu_max)
+        if out is not None:
+            if alpha != "auto":
+                raise click.UsageError("--out searches alpha itself; --alpha is for --dt")
+            if not out.parent.is_dir():  # said before the long work, not after it
+                raise click.UsageError(f"{out}: there is no such directory")
+            designed = answers.table(dt_range, motion)
+            out.write_text(designed.to_json(), encoding="utf-8")
+            click.echo(f"wrote {out}: {answers.described(designed)}", err=True)
+    if as_json:
+        click.echo(json.dumps(rows))
+        return
+    for row in rows:
+        click.echo(answers.as_text(row))

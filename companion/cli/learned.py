@@ -1,0 +1,42 @@
+"""The command that trains the network for ``companion study prediction --learned``."""
+
+import json
+from pathlib import Path
+
+import click
+
+from companion.cli.console import JSON, Progress
+
+
+@click.command()
+@click.option(
+    "--out", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", required=True
+)
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
+@click.option("--epochs", type=click.IntRange(min=1), default=30, show_default=True)
+@click.option("--flights", type=click.IntRange(min=1), default=240, show_default=True)
+@JSON
+def train(out: Path, seed: int, epochs: int, flights: int, as_json: bool) -> None:
+    """Train the LSTM predictor on flights made up at random. Needs PyTorch: the extra [learned].
+
+    The same seed gives the same network on the same machine.
+
+    Example: companion study train --out lrnet.pt
+    """
+    from companion.studies.running.extras import needs
+
+    progress = Progress()
+    with needs("torch", "learned", "this"):
+        from companion.studies.prediction import learned
+    out.parent.mkdir(parents=True, exist_ok=True)
+    held, loss_m = learned.train(seed, epochs, flights, progress.show)
+    learned.save(held, out)
+    progress.clear()
+    answer = {
+        "file": str(out),
+        "seed": seed,
+        "epochs": epochs,
+        "flights": flights,
+        "loss_m": loss_m,
+    }
+    click.echo(json.dumps(answer) if as_json else f"{out}: loss {loss_m:.3f} m")

@@ -1,0 +1,243 @@
+"""The command ``companion`` and its subcommands."""
+
+import os
+
+# Before numpy is loaded: the matrices are small, and more BLAS threads make them slower.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import gc
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+
+import companion
+from companion.cli.console import CENTER, CONFIG, JSON, OneLineErrors, Progress
+from companion.cli.design import design
+from companion.cli.study import study
+from companion.cli.weights import weights
+
+LISTEN = click.option(
+    "--listen", metavar="HOST:PORT", help="Where HTTP is served [127.0.0.1:8080]."
+)
+INSECURE = click.option(
+    "--insecure", is_flag=True, help="Serve beyond this machine without a token."
+)
+
+
+@click.group(name="companion", cls=OneLineErrors)
+@click.version_option(companion.__version__)
+def main() -> None:
+    """Predicts where UAVs are from MAVLink, and computes the beams that follow them.
+
+    Example: companion demo
+    """
+
+
+@main.command()
+@CONFIG
+@click.option(
+    "--link",
+    "links",
+    metavar="URL",
+    multiple=True,
+    help="udpin|udpout|tcp|tcpin:HOST:PORT or serial:DEVICE:BAUD. May be given several times.",
+)
+@CENTER
+@LISTEN
+@click.option("--record", metavar="DIR", help="Write recordings to this directory.")
+@click.option(
+    "--foxglove",
+    metavar="PORT",
+    type=click.IntRange(0, 65535),
+    help="Live channels for Foxglove and Lichtblick, on this machine. Needs the extra [live].",
+)
+@INSECURE
+@click.option("--silent", is_flag=True, help="Send no MAVLink at all, whatever the settings say.")
+def run(
+    config: Path | None,
+    links: tuple[str, ...],
+    center: str | None,
+    listen: str | None,
+    record: str | None,
+    foxglove: int | None,
+    insecure: bool,
+    silent: bool,
+) -> None:
+    """The live service. COMPANION_TOKEN in the environment sets a bearer token for HTTP.
+
+    It sends nothing over MAVLink unless [presence] in the settings allows it.
+
+    Example: companion run --link udpin:0.0.0.0:14550 --center 5:1 --record recordings
+    """
+    from companion.node import start
+    from companion.settings.files import load
+
+    settings = load(config).override(
+        center={"source": center},
+        links={"urls": list(links) or None},
+        presence={"enabled": False if silent else None},
+        server={"listen": listen, "foxglove": foxglove},
+        recording={"directory": record},
+    )
+    start.run(settings, token=os.environ.get("COMPANION_TOKEN"), insecure=insecure)
+
+
+@main.command()
+@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after so long.")
+@click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True)
+@click.option("--open", "open_page", is_flag=True, help="Open the page in a browser.")
+def demo(seconds: float | None, port: int, open_page: bool) -> None:
+    """Everything on this machine: four UAVs, the service, the page; recorded to recordings/.
+
+    Example: companion demo --seconds 60
+    """
+    from companion.node import demo as scenario
+    from companion.node import start
+
+    settings = scenario.settings("recordings").override(server={"listen": f"127.0.0.1:{port}"})
+    start.run(settings, traffic=scenario.traffic, seconds=seconds, open_page=open_page)
+
+
+@main.command()
+@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@CONFIG
+@CENTER
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help="The recording to write [recordings/, named after the log].",
+)
+@click.option("--no-record", is_flag=True, help="Write no recording.")
+@click.option(
+    "--speed", metavar="max|X", help="Pace, in times of the log's own [max; 1 if served]."
+)
+@click.option("--serve", is_flag=True, help="The page and the API over it, until stopped.")
+@LISTEN
+@INSECURE
+@JSON
+def replay(
+    logs: tuple[Path, ...],
+    config: Path | None,
+    center: str | None,
+    out: Path | None,
+    no_record: bool,
+    speed: str | None,
+    serve: bool,
+    listen: str | None,
+    insecure: bool,
+    as_json: bool,
+) -> None:
+    """Logs (.tlog, raw MAVLink, our own .mcap) through the same pipeline as the live service.
+
+    Without --center (or settings) the array stands where the first report was made. A recording
+    of our own is replayed with the settings that it holds. With --serve, the page shows the
+    replay as it goes, and its end, until SIGINT.
+
+    Example: companion replay flight.tlog --center 5:1 --json
+    """
+    from companion.node import replay as replaying
+    from companion.node import served_replay
+    from companion.settings.files import load
+
+    if not serve and (listen or insecure):
+        raise click.UsageError("--listen and --insecure go with --serve")
+    gc.set_threshold(200_000)  # millions of short-lived values, and no cycles among them
+    progress = Progress()
+    settings = replaying.settings_for(logs, config, center)
+    if settings.center.source is None:
+        click.echo("no --center: the array stands where the first report was made", err=True)
+    record = partial(replaying.writer_for, logs, settings, out) if not no_record else None
+    if serve:
+        served_replay.serve(
+            served_replay.Asked(logs, settings, _speed(speed or "1"), record),
+            load(config).override(server={"listen": listen}).server.listen,
+            partial(_show_replay, as_json),
+            token=os.environ.get("COMPANION_TOKEN"),
+            insecure=insecure,
+        )
+        return
+    summary = replaying.replay(
+        logs,
+        settings,
+        record() if record else None,
+        _speed(speed or "max"),
+        lambda frames, seconds: progress.show(f"{frames} frames, {seconds:.0f} s of log"),
+    )
+    progress.clear()
+    _show_replay(as_json, summary)
+
+
+def _show_replay(as_json: bool, summary: dict[str, Any]) -> None:
+    click.echo(json.dumps(summary) if as_json else _replay_text(summary))
+
+
+def _speed(text: str) -> float | None:
+    if text == "max":
+        return None
+    try:
+        factor = float(text)
+    except ValueError:
+        factor = 0.0
+    if not 0 < factor < float("inf"):
+        raise click.BadParameter(f"{text!r} is neither max nor a number above 0")
+    return factor
+
+
+def _replay_text(summary: dict[str, Any]) -> str:
+    lines = [
+        f"{summary['frames']} frames, {summary['duration_s']:.0f} s of log in"
+        f" {summary['wall_s']:.1f} s; center {summary['center']}"
+    ]
+    for uav, seen in summary["uavs"].items():
+        lines.append(
+            f"  {uav:12} {seen['state']:9} {seen['reports']:6} reports"
+            f"  dt {_number(seen['dt_median_s'])} s  latency p95 {_number(seen['latency_p95_s'])} s"
+            f"  innovation {_number(seen['innovation_rms_m'])} m rms"
+        )
+    beams = summary["beams"]
+    lines.append(
+        f"{beams['updates']} beam updates, {beams['regularised']} regularised,"
+        f" condition number to {_number(beams['condition_number_max'])}"
+    )
+    lines += [f"  rejected {reason}: {n}" for reason, n in summary["rejected"].items()]
+    lines += [f"  missing: {line}" for line in summary["missing"]]
+    if summary["recording"]:
+        lines.append(f"recording {summary['recording']}")
+    return "\n".join([*lines, f"digest {summary['digest']}"])
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+@main.command()
+@click.argument(
+    "files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path)
+)
+@JSON
+def recover(files: tuple[Path, ...], as_json: bool) -> None:
+    """A recording cut short becomes a finished one; says what was lost.
+
+    Example: companion recover recordings/companion-20260101T120000Z.mcap.active
+    """
+    from companion.recording.recover import recover as recover_file
+
+    for file in files:
+        found = recover_file(file)
+        answer = {
+            "file": str(found.path),
+            "changed": found.changed,
+            "messages": dict(found.messages),
+            "lost_bytes": found.lost_bytes,
+        }
+        done = "recovered" if found.changed else "complete already"
+        text = f"{done}, {sum(found.messages.values())} messages, {found.lost_bytes} bytes lost"
+        click.echo(json.dumps(answer) if as_json else f"{found.path}: {text}")
+
+
+main.add_command(design)
+main.add_command(study)
+main.add_command(weights)

@@ -1,0 +1,21 @@
+"""The command ``companion study``: the experiments, a command each."""
+
+import click
+
+from companion.cli.learned import train
+from companion.cli.study_beams import beams
+from companion.cli.study_link import link
+from companion.cli.study_paper import dt, paper
+from companion.cli.study_prediction import prediction
+
+
+@click.group()
+def study() -> None:
+    """Experiments: figures and tables as one HTML page, and the numbers as JSON.
+
+    Example: companion study prediction flight.tlog --center 5:1 --out report
+    """
+
+
+for command in (prediction, beams, link, paper, dt, train):
+    study.add_command(command)

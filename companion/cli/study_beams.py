@@ -1,0 +1,52 @@
+"""The command ``companion study beams``: what an array would have been worth over a flight."""
+
+import json
+from pathlib import Path
+
+import click
+
+from companion.cli.console import CENTER, CONFIG, JSON, Progress
+
+
+@click.command()
+@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@CONFIG
+@CENTER
+@click.option(
+    "--hz", type=float, default=5.0, show_default=True, help="Looks a second of the log's time."
+)
+@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
+@JSON
+def beams(
+    logs: tuple[Path, ...],
+    config: Path | None,
+    center: str | None,
+    hz: float,
+    out: Path,
+    as_json: bool,
+) -> None:
+    """What an array would have done over a flight: gains, guarantees, what must be swept.
+
+    The beams as the settings make them, and beside them the same not widened. Where the log has
+    the simulator's truth (SIM_STATE) every guarantee is put to the test. Writes DIR/beams.json,
+    DIR/beams.html and the figures as PNG and SVG. A recording of our own is studied with the
+    settings that it holds.
+
+    Example: companion study beams flight.tlog --center 5:1 --out report
+    """
+    from companion.node.replay import settings_for
+    from companion.studies.beams import report
+    from companion.studies.beams.flight import BeamStudy, study
+
+    progress = Progress()
+    settings = tuple(settings_for([log], config, center) for log in logs)
+    setting = BeamStudy(logs, settings, hz, center, str(config) if config else None)
+    out.mkdir(parents=True, exist_ok=True)
+    if any(each.center.source is None for each in settings):
+        click.echo("no --center: the array stands where the first report was made", err=True)
+    answer, found = study(setting, progress.show)
+    (out / "beams.json").write_text(json.dumps(answer, indent=1), encoding="utf-8")
+    for name, content in report.files(answer, found, progress.show).items():
+        (out / name).write_bytes(content)
+    progress.clear()
+    click.echo(json.dumps(answer) if as_json else report.text(found))

@@ -1,0 +1,104 @@
+"""The command ``companion study prediction``: predictors compared on logs."""
+
+import json
+from pathlib import Path
+
+import click
+
+from companion.cli.console import CENTER, CONFIG, JSON, Progress
+from companion.cli.design import numbers
+
+
+@click.command()
+@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@CONFIG
+@CENTER
+@click.option(
+    "--lead",
+    "leads_s",
+    metavar="S[,S...]",
+    default="0,0.1,0.3,1",
+    show_default=True,
+    callback=lambda _context, _option, text: numbers(text),
+    help="Seconds ahead of now that are aimed at.",
+)
+@click.option("--rate", "rate_hz", metavar="HZ", type=float, default=1.2, show_default=True)
+@click.option(
+    "--latency",
+    "latency_s",
+    metavar="MEDIAN,P95",
+    default="0.6,2.2",
+    show_default=True,
+    callback=lambda _context, _option, text: numbers(text),
+    help="Seconds that the simulated radio adds to each report.",
+)
+@click.option(
+    "--loss", metavar="F", type=float, default=0.1, show_default=True, help="Share that is lost."
+)
+@click.option("--known-delay", is_flag=True, help="The senders' clocks are known, as by TIMESYNC.")
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
+@click.option(
+    "--snr",
+    "snr_db",
+    metavar="DB",
+    type=float,
+    default=20.0,
+    show_default=True,
+    help="At a UAV with the beam right on it: what the loss in spectral efficiency is of.",
+)
+@click.option(
+    "--learned",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Compare with this network as well, which `companion study train` made.",
+)
+@click.option("--jobs", metavar="N", type=click.IntRange(min=1), help="Processes.  [all cores]")
+@click.option("--cluster", metavar="ADDRESS", help="Work on a Dask cluster, such as tcp://H:8786.")
+@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
+@JSON
+def prediction(
+    logs: tuple[Path, ...],
+    config: Path | None,
+    center: str | None,
+    leads_s: list[float],
+    rate_hz: float,
+    latency_s: list[float],
+    loss: float,
+    known_delay: bool,
+    seed: int,
+    snr_db: float,
+    learned: Path | None,
+    jobs: int | None,
+    cluster: str | None,
+    out: Path,
+    as_json: bool,
+) -> None:
+    """Predictors compared on logs, over the link that they had and over a slow radio.
+
+    Writes DIR/prediction.json, DIR/prediction.html and the figures as PNG and SVG. Without
+    --center the array stands where the first report was made.
+
+    Example: companion study prediction flight.tlog --center 5:1 --out report
+    """
+    from companion.settings.files import load
+    from companion.studies.prediction import report
+    from companion.studies.prediction.comparison import PredictionStudy, study
+    from companion.studies.prediction.radio_link import RadioLink
+
+    if len(latency_s) != 2:
+        raise click.BadParameter("a latency is MEDIAN,P95 in seconds, such as 0.6,2.2")
+    progress = Progress()
+    radio = RadioLink("radio", rate_hz, (latency_s[0], latency_s[1]), loss, known_delay)
+    name = str(config) if config else None
+    setting = PredictionStudy(
+        logs, center, tuple(leads_s), radio, seed, load(config), name,
+        learned, snr_db, jobs, cluster,
+    )  # fmt: skip
+    out.mkdir(parents=True, exist_ok=True)
+    if center is None:
+        click.echo("no --center: the array stands where the first report was made", err=True)
+    answer, found = study(setting, progress.show)
+    (out / "prediction.json").write_text(json.dumps(answer, indent=1), encoding="utf-8")
+    for each, content in report.files(answer, found, progress.show).items():
+        (out / each).write_bytes(content)
+    progress.clear()
+    click.echo(json.dumps(answer) if as_json else report.text(found))

@@ -1,0 +1,86 @@
+"""The command ``companion weights``: the beams at a time of a log, for a notebook or a device."""
+
+import json
+import math
+import sys
+from pathlib import Path
+
+import click
+
+from companion.cli.console import CENTER, CONFIG, Progress
+
+FORMATS = ("json", "npy", "raw", "adar1000", "tmytek", "sivers")
+
+
+@click.command()
+@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--at",
+    metavar="T",
+    required=True,
+    help="When: seconds from the beginning of the log, or 2026-01-01T12:00:00Z.",
+)
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(FORMATS),
+    default="json",
+    show_default=True,
+    help="json holds the beams as well; raw is little-endian complex64, row by row.",
+)
+@click.option(
+    "--lead-ms",
+    type=click.FloatRange(0, 10_000),
+    default=0.0,
+    show_default=True,
+    help="Milliseconds ahead of T at which the beams are to be right.",
+)
+@click.option(
+    "--out", type=click.Path(path_type=Path, dir_okay=False), help="The file to write [stdout]."
+)
+@CONFIG
+@CENTER
+def weights(
+    logs: tuple[Path, ...],
+    at: str,
+    form: str,
+    lead_ms: float,
+    out: Path | None,
+    config: Path | None,
+    center: str | None,
+) -> None:
+    """The weights at a time of a log, as a program or a phased array takes them.
+
+    A codebook ([codebook] in the settings) adds to each beam in JSON which stored beam is best,
+    which is next and when, and which must be swept. A device that cannot do what is wanted refuses
+    with the reason; [hardware] in the settings names its calibration.
+
+    Example: companion weights flight.tlog --at 120 --center 5:1 --format npy --out w.npy
+    """
+    from companion.node import moment
+    from companion.node.replay import settings_for
+    from companion.pipeline import assembly
+    from companion.views import beam_state, weight_formats
+
+    if math.isnan(lead_ms):
+        raise click.UsageError("--lead-ms nan: 0 to 10000 is allowed")
+    if form in ("npy", "raw") and out is None and sys.stdout.isatty():
+        raise click.UsageError(f"{form} is not text: name a file with --out, or use a pipe")
+    progress = Progress()
+    settings = settings_for(logs, config, center)
+    equipment = assembly.equipment(settings, assembly.array(settings))
+    pipeline, update = moment.look(
+        logs, settings, at, lead_ms * 1e-3, lambda done_s: progress.show(f"{done_s:.0f} s")
+    )
+    progress.clear()
+    if update.unfit is not None:
+        raise click.ClickException(f"no beams at {at}: {update.unfit}")
+    if form == "json":
+        told = beam_state.beams(pipeline, equipment, update, 0.0, lead_ms)
+        body = json.dumps(told | beam_state.weights(update.beams, lead_ms)).encode() + b"\n"
+    else:
+        body = weight_formats.encode(form, update.beams, pipeline.array, equipment, lead_ms)
+    if out is None:
+        click.echo(body, nl=False)
+    else:
+        out.write_bytes(body)

@@ -1,0 +1,1 @@
+"""Senders' boot clocks on the node's timeline: stamps, round trips, reboots."""

@@ -1,0 +1,216 @@
+"""Which line a stamp lies on: late frames, reboots, leaps, and the wrap of the boot clock.
+
+While a sender runs, its stamps lie on and above one line (``envelope.py``). A stamp belongs to the
+line while it is less than ``late_max_ns`` off it:
+
+- Stamps further off start a *run*. Three of a run that advance, over at least half a second, with
+  none between them that advances the line, are a new line; until then they have no time. If the
+  boot clock stepped back it is a reboot. If it leapt ahead it is the same boot with a new offset,
+  and the sender's timeline leaps with it.
+- A sender that restarts within ``late_max_ns`` of its boot steps back by no more than late frames
+  do. Late frames catch up with the line, a restarted clock does not: five stamps from the first
+  seconds of a boot, over at least a second, none of which advances the line and all of which lag
+  equally (to a second), are a reboot. A clock that stood still lags in the same way, by more
+  than ``late_max_ns``, and goes on.
+- Stamps off the line that lie on a line of their own for three seconds, while the first line
+  advances between them, belong to a second clock: two senders share one id.
+- Frames of the previous line, which come for up to ``late_max_ns`` after it was left, have no time.
+
+A reboot is therefore reported once, at the stamp that confirms it. One case is not told apart: a
+second link that lags by seconds, and is the only one left within the first ``late_max_ns`` of a
+boot, looks like a reboot.
+"""
+
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+from companion.mavlink.clock.envelope import Envelope
+
+_NS: Final = 1_000_000_000
+_NS_PER_MS: Final = 1_000_000
+_WRAP_MS: Final = 1 << 32
+WRAP_NS: Final = _WRAP_MS * _NS_PER_MS
+"""Period of a boot clock: its 32-bit milliseconds wrap after 49.7 days."""
+_EARLY_NS: Final = -_NS
+"""Least lateness of a stamp that fits an established line; negative: it may be 1 s early."""
+_RUN_KEPT: Final = 64
+"""Stamps kept of a run."""
+_RIVAL_LASTS_NS: Final = 3 * _NS
+"""Time over which a second clock must be heard before it counts as one."""
+_RIVAL_SILENT_NS: Final = 10 * _NS
+"""Silence after which a second clock is forgotten."""
+
+
+class Placed(NamedTuple):
+    """A stamp on a line.
+
+    x_ns      the sender's time since boot, unwrapped
+    new_line  True for the first stamp on a new line
+    rebooted  True if the new line was begun by a reboot
+    """
+
+    x_ns: int
+    new_line: bool = False
+    rebooted: bool = False
+
+
+@dataclass(slots=True)
+class _Run:
+    """Stamps off the line, (arrival ns, boot ms), that lie on a line of their own."""
+
+    stamps: list[tuple[int, int]] = field(default_factory=list)
+    lowest_ns: int = 0
+    highest_ns: int = 0
+    begun_ns: int = 0
+
+    def add(self, arrival_ns: int, boot_ms: int, spread_ns: int) -> bool:
+        """Add a stamp, dropping the earlier ones if it is more than ``spread_ns`` off them.
+
+        Returns whether the stamp is now the newest of the run.
+        """
+        lag_ns = arrival_ns - boot_ms * _NS_PER_MS
+        if self.stamps and max(abs(lag_ns - self.lowest_ns), abs(lag_ns - self.highest_ns)) > (
+            spread_ns
+        ):
+            self.stamps.clear()
+        if not self.stamps:
+            self.lowest_ns = self.highest_ns = lag_ns
+            self.begun_ns = arrival_ns
+        elif boot_ms <= self.stamps[-1][1]:
+            return False
+        self.lowest_ns = min(self.lowest_ns, lag_ns)
+        self.highest_ns = max(self.highest_ns, lag_ns)
+        self.stamps.append((arrival_ns, boot_ms))
+        del self.stamps[:-_RUN_KEPT]
+        return True
+
+    def forget(self, arrival_ns: int) -> None:
+        """Drop all stamps if the newest is more than ``_RIVAL_SILENT_NS`` old."""
+        if self.stamps and arrival_ns - self.stamps[-1][0] > _RIVAL_SILENT_NS:
+            self.stamps.clear()
+
+    def lasts(self, count: int, span_ns: int) -> bool:
+        """Whether the run has at least ``count`` stamps over at least ``span_ns``."""
+        return len(self.stamps) >= count and self.stamps[-1][0] - self.stamps[0][0] >= span_ns
+
+
+class BootLine:
+    """The line of one sender's boot clock; ``observe`` takes its stamps in order of arrival.
+
+    window_ns, drift_limit, drift_unsure
+                 as for ``Envelope``
+    late_max_ns  greatest lateness of any frame
+    newest_ns    attribute: newest sender time on the line
+    """
+
+    def __init__(
+        self, window_ns: int, drift_limit: float, drift_unsure: float, late_max_ns: int
+    ) -> None:
+        self._shape = (window_ns, drift_limit, drift_unsure)
+        self._late_max_ns = late_max_ns
+        self.envelope = Envelope(*self._shape)
+        self.newest_ns = 0
+        self._run = _Run()
+        self._rival = _Run()
+        self._previous: tuple[Envelope, int] | None = None  # the line before, and when it was left
+
+    def observe(self, arrival_ns: int, boot_ms: int) -> Placed | None:
+        """Place a stamp.
+
+        Returns None for a frame of the previous line, and for a stamp off the line that others have
+        not confirmed so far.
+        """
+        if not self.envelope:
+            return self._accept(arrival_ns, boot_ms * _NS_PER_MS)
+        x_ns = self.unwrap(boot_ms)
+        late_ns = self.late_ns(arrival_ns, x_ns)
+        if self._is_straggler(arrival_ns, boot_ms, late_ns):
+            return None
+        if abs(late_ns) <= self._late_max_ns:
+            return self._near(arrival_ns, boot_ms, x_ns)
+        if late_ns > 0 and x_ns > self.newest_ns:
+            return self._stalled(arrival_ns, boot_ms, x_ns)
+        advances = self._run.add(arrival_ns, boot_ms, self._late_max_ns)
+        self._rival.forget(arrival_ns)
+        self._rival.add(arrival_ns, boot_ms, self._late_max_ns)
+        if not (advances and self._run.lasts(3, _NS // 2)):
+            return None
+        stepped_back = boot_ms < self.newest_ns // _NS_PER_MS % _WRAP_MS
+        return self._begin_again(rebooted=stepped_back)
+
+    def is_shared(self, arrival_ns: int) -> bool:
+        """Whether a second clock goes on beside the line: two senders then share one id."""
+        self._rival.forget(arrival_ns)
+        stamps = self._rival.stamps
+        return len(stamps) >= 5 and stamps[-1][0] - self._rival.begun_ns >= _RIVAL_LASTS_NS
+
+    def unwrap(self, boot_ms: int) -> int:
+        """Boot time in ns with the wraps added that bring it nearest to the newest stamp."""
+        return _unwrap(boot_ms, self.newest_ns)
+
+    def late_ns(self, arrival_ns: int, x_ns: int) -> int:
+        """Height of a stamp above the line, ns; negative where it lies under it."""
+        return arrival_ns - x_ns - self.envelope.at(x_ns)
+
+    def fits(self, arrival_ns: int, x_ns: int) -> bool:
+        """Whether a stamp can belong to the line."""
+        return bool(self.envelope) and abs(self.late_ns(arrival_ns, x_ns)) <= self._late_max_ns
+
+    def _accept(self, arrival_ns: int, x_ns: int) -> Placed:
+        self.envelope.add(x_ns, arrival_ns - x_ns)
+        self.newest_ns = max(self.newest_ns, x_ns)
+        return Placed(x_ns)
+
+    def _near(self, arrival_ns: int, boot_ms: int, x_ns: int) -> Placed:
+        """Place a stamp on the line: in order, late, or in the first seconds of a second boot."""
+        if x_ns > self.newest_ns:
+            self._run.stamps.clear()
+        elif (
+            x_ns < self.newest_ns
+            and boot_ms * _NS_PER_MS < self._late_max_ns
+            and self._run.add(arrival_ns, boot_ms, _NS)
+            and self._run.lasts(5, _NS)
+        ):
+            return self._begin_again(rebooted=True)
+        return self._accept(arrival_ns, x_ns)
+
+    def _stalled(self, arrival_ns: int, boot_ms: int, x_ns: int) -> Placed:
+        """Place a stamp in order but too late: the link stalled, or the clock stood still."""
+        if self._run.add(arrival_ns, boot_ms, _NS) and self._run.lasts(5, 2 * _NS):
+            return self._begin_again(rebooted=False)
+        self.newest_ns = x_ns
+        return Placed(x_ns)
+
+    def _is_straggler(self, arrival_ns: int, boot_ms: int, late_ns: int) -> bool:
+        """Whether a stamp fits the previous line and not the present one."""
+        if self._previous is None:
+            return False
+        before, left_ns = self._previous
+        if arrival_ns - left_ns > self._late_max_ns:
+            self._previous = None
+            return False
+        x_ns = _unwrap(boot_ms, before.newest_ns)
+        was_late_ns = arrival_ns - x_ns - before.at(x_ns)
+        fits_before = _EARLY_NS <= was_late_ns <= self._late_max_ns
+        return fits_before and not _EARLY_NS <= late_ns <= self._late_max_ns
+
+    def _begin_again(self, *, rebooted: bool) -> Placed:
+        """Make the run the line. After a reboot the sender's timeline begins anew."""
+        stamps = list(self._run.stamps)
+        self._run.stamps.clear()
+        self._rival.stamps.clear()
+        self._previous = (self.envelope, stamps[0][0])
+        self.envelope = Envelope(*self._shape)
+        x_ns = stamps[0][1] * _NS_PER_MS if rebooted else self.newest_ns
+        for arrival_ns, boot_ms in stamps:
+            x_ns = _unwrap(boot_ms, x_ns)
+            self.envelope.add(x_ns, arrival_ns - x_ns)
+        self.newest_ns = x_ns
+        return Placed(x_ns, new_line=True, rebooted=rebooted)
+
+
+def _unwrap(boot_ms: int, newest_ns: int) -> int:
+    """Boot time in ns, with the wraps added that bring it nearest to ``newest_ns``."""
+    newest_ms = newest_ns // _NS_PER_MS
+    step_ms = (boot_ms - newest_ms + _WRAP_MS // 2) % _WRAP_MS - _WRAP_MS // 2
+    return (newest_ms + step_ms) * _NS_PER_MS

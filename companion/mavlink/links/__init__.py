@@ -1,0 +1,1 @@
+"""UDP, TCP and serial endpoints over which MAVLink comes and goes.                       [shell]"""

@@ -1,0 +1,108 @@
+"""The interface of a link's endpoints, and what they share.                              [shell]
+
+An endpoint serves one connection after the other. ``serve`` ends, by an exception that says why,
+when a connection is lost, and is called again after a while. The endpoint tells its link what
+happens through ``Upcalls``. A write succeeds at once or not at all.
+"""
+
+import asyncio
+import os
+import socket
+from collections.abc import Callable, Collection, Hashable
+from typing import Any, NamedTuple, Protocol
+
+from companion.mavlink.links.urls import LinkUrl
+
+Address = tuple[Any, ...]
+"""A socket address as the system writes it: for IPv6 with flow and scope."""
+
+
+class Upcalls(NamedTuple):
+    """Functions by which an endpoint tells its link what happens.
+
+    up        a connection stands
+    take      a peer, named by the endpoint's key for it, sent bytes
+    hang_up   that peer is gone
+    overflow  the system has dropped this many more datagrams
+    """
+
+    up: Callable[[], None]
+    take: Callable[[Hashable, bytes], None]
+    hang_up: Callable[[Hashable], None]
+    overflow: Callable[[int], None]
+
+
+class Endpoint(Protocol):
+    """One end of a link, of whichever kind."""
+
+    def open(self) -> int | None:
+        """Claim what can be had before the loop runs; returns the port that a listening link got.
+
+        Raises ``OSError`` where it cannot be had.
+        """
+
+    async def serve(self) -> None:
+        """Serve until cancelled, or until the connection is lost.
+
+        A lost connection raises ``OSError``; any other exception is a fault of the program.
+        """
+
+    def peers(self) -> Collection[Hashable] | None:
+        """Peers to which a message for everybody goes; None: those heard lately."""
+
+    def write(self, key: Hashable, raw: bytes) -> bool:
+        """Send a frame to a peer. Never waits and never raises; False if it was not taken."""
+
+    def fullness(self, key: Hashable) -> float:
+        """The share, 0 to 1, of a peer's buffer that holds what was written and not yet sent.
+
+        For who would rather wait than lose a frame. 0 for a peer that is gone.
+        """
+
+
+class HungUpError(ConnectionError):
+    """The other end closed the connection in good order."""
+
+
+def reason(error: OSError) -> str:
+    """The cause of an error in the system's words, without addresses and numbers."""
+    if error.errno is not None and error.errno > 0:
+        return os.strerror(error.errno)
+    return error.strerror or str(error) or "timed out"
+
+
+def settle(lost: asyncio.Future[Exception], why: Exception) -> None:
+    """Record why a connection is lost.
+
+    Only the first reason counts, and none after a cancellation.
+    """
+    if not lost.done():
+        lost.set_result(why)
+
+
+def bound(url: LinkUrl, kind: socket.SocketKind) -> socket.socket:
+    """A socket bound to a listening link's address. Raises ``OSError`` where that cannot be had.
+
+    A name is looked up synchronously: this is called before the loop runs, and holds nobody up.
+    """
+    infos = socket.getaddrinfo(url.host, url.port, type=kind, flags=socket.AI_PASSIVE)
+    family, _, _, _, address = infos[0]
+    sock = socket.socket(family, kind)
+    try:
+        sock.setblocking(False)
+        if kind == socket.SOCK_STREAM:  # else the port stays taken a minute after a connection
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        sock.bind(address)
+    except OSError:
+        sock.close()
+        raise
+    return sock
+
+
+async def resolved(
+    url: LinkUrl, kind: socket.SocketKind
+) -> list[tuple[socket.AddressFamily, Address]]:
+    """The addresses of a link's host, at least one, looked up without blocking the loop."""
+    loop = asyncio.get_running_loop()
+    infos = await loop.getaddrinfo(url.host, url.port, type=kind)
+    return [(family, address) for family, _, _, _, address in infos]

@@ -1,0 +1,201 @@
+"""Peers of a link, each with a splitter and with sequence numbers of its own in both directions.
+
+The 8-bit sequence number (https://mavlink.io/en/guide/serialization.html) is counted by sender and
+path, so it is followed for each peer and source. With d the step from the last frame to this one,
+modulo 256:
+
+    d = 1            in order
+    d = 0            a repeat
+    1 < d < 128      d - 1 frames are missing
+    d >= 128         late: it steps back by 256 - d; the place reached is kept
+
+A sender that starts again jumps anywhere. A jump forwards cannot be told from a hole: one wrong
+gap. After a jump backwards every frame would look late until the sender has caught up. Where
+``RESTART_RUN`` late frames come in a row, each further on than the one before, the sender is
+therefore taken to have started again, and is followed from there without a gap. Stragglers between
+frames in order never make such a run.
+"""
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from typing import Final
+
+from companion.mavlink.links.status import ComponentStatus, LinkStatus
+from companion.mavlink.wire.framing import MAGIC_V2, Splitter
+from companion.values import Frame, Rejection, Source
+
+PEERS_MAX: Final = 4096
+"""Peers kept, the last heard: a scan of the port must not fill the memory."""
+SENDERS_MAX: Final = 16_384
+"""Sequences followed over all peers, so that invented senders do not fill the memory either.
+
+When there are more, all are begun anew, which costs no more than the holes of that moment.
+"""
+RESTART_RUN: Final = 3
+"""Late frames in a row, each further on, that show a restart of the sender."""
+
+_HALF_ROUND: Final = 128
+
+
+class _Component:
+    """One source over the whole link: its counts, and the peer over which it was last heard."""
+
+    __slots__ = ("peer", "status")
+
+    def __init__(self, status: ComponentStatus, peer: "Peer") -> None:
+        self.status = status
+        self.peer = peer
+
+
+class _Sender:
+    """One source as one peer delivers it: the sequence number due, and the run of late ones."""
+
+    __slots__ = ("component", "due", "late", "run")
+
+    def __init__(self, component: _Component, due: int) -> None:
+        self.component = component
+        self.due = due
+        self.late = 0
+        self.run = 0
+
+
+class Peer:
+    """A party that a link hears and sends to; ``key`` is the endpoint's name for it."""
+
+    __slots__ = ("_sequence", "heard_ns", "key", "senders", "splitter", "versions")
+
+    def __init__(self, key: Hashable, link: str) -> None:
+        self.key = key
+        self.splitter = Splitter(link)
+        self.senders: dict[Source, _Sender] = {}
+        self.heard_ns: int | None = None
+        self.versions = 0  # bit 0: MAVLink 1 was heard, bit 1: MAVLink 2
+        self._sequence = 0
+
+    @property
+    def speaks_v1_only(self) -> bool:
+        """True if it was heard, and in MAVLink 1 alone."""
+        return self.versions == 1
+
+    def next_sequence(self) -> int:
+        """Take the sequence number of the next frame to this peer."""
+        number = self._sequence
+        self._sequence = (number + 1) & 0xFF
+        return number
+
+
+class Peers:
+    """The peers of one link, bounded in number. What they send is counted into ``status``.
+
+    ``farewell`` is called with each peer that is given up for want of room, before it is removed.
+    """
+
+    def __init__(self, status: LinkStatus, farewell: Callable[[Peer], None]) -> None:
+        self._status = status
+        self._farewell = farewell
+        self._peers: OrderedDict[Hashable, Peer] = OrderedDict()
+        self._components: dict[Source, _Component] = {}
+        self._senders = 0
+
+    def __len__(self) -> int:
+        return len(self._peers)
+
+    def at(self, key: Hashable) -> Peer:
+        """The peer of that key, made if it is new. It becomes the last to be given up."""
+        peer = self._peers.get(key)
+        if peer is not None:
+            self._peers.move_to_end(key)
+            return peer
+        if len(self._peers) >= PEERS_MAX:
+            oldest = next(iter(self._peers.values()))
+            self._farewell(oldest)
+            self.forget(oldest)
+        peer = self._peers[key] = Peer(key, self._status.url)
+        self._status.peers += 1
+        return peer
+
+    def find(self, key: Hashable) -> Peer | None:
+        """The peer of that key; None if it was never met or is gone."""
+        return self._peers.get(key)
+
+    def forget(self, peer: Peer) -> None:
+        """Remove a peer that has hung up or for which there is no room."""
+        del self._peers[peer.key]
+        self._senders -= len(peer.senders)
+
+    def heard_since(self, t_ns: int) -> list[Peer]:
+        """Peers from which a frame came at ``t_ns`` or later."""
+        return [p for p in self._peers.values() if p.heard_ns is not None and p.heard_ns >= t_ns]
+
+    def last_of(self, source: Source) -> Peer | None:
+        """The peer over which that source was last heard; None if it is gone."""
+        component = self._components.get(source)
+        if component is None or self._peers.get(component.peer.key) is not component.peer:
+            return None
+        return component.peer
+
+    def count(self, peer: Peer, found: list[Frame | Rejection]) -> None:
+        """Count what a peer sent, in order."""
+        status, senders = self._status, peer.senders
+        for item in found:
+            if isinstance(item, Rejection):
+                status.lost[item.reason] = status.lost.get(item.reason, 0) + item.count
+                continue
+            t_ns, _, source, _, raw = item
+            if raw[0] == MAGIC_V2:
+                version, number = 2, raw[4]
+            else:
+                version, number = 1, raw[2]
+            sender = senders.get(source)
+            if sender is None:
+                sender = self._meet(peer, item)
+            component = sender.component
+            component.peer = peer
+            counts = component.status
+            counts.frames += 1
+            counts.heard_ns = t_ns
+            counts.version = version
+            peer.versions |= version
+            peer.heard_ns = status.heard_ns = t_ns
+            status.frames += 1
+            if number == sender.due:
+                sender.due = (number + 1) & 0xFF
+                sender.run = 0
+            else:
+                self._out_of_turn(sender, number)
+
+    def _out_of_turn(self, sender: _Sender, number: int) -> None:
+        step = (number - sender.due + 1) & 0xFF
+        if step == 0:
+            self._status.repeats += 1
+            return
+        if step < _HALF_ROUND:
+            self._status.gaps += step - 1
+            sender.component.status.gaps += step - 1
+        else:
+            self._status.late += 1
+            goes_on = sender.run > 0 and 0 < (number - sender.late) & 0xFF < _HALF_ROUND
+            sender.run = sender.run + 1 if goes_on else 1
+            sender.late = number
+            if sender.run < RESTART_RUN:
+                return
+        sender.due = (number + 1) & 0xFF
+        sender.run = 0
+
+    def _meet(self, peer: Peer, frame: Frame) -> _Sender:
+        """Begin to follow a source of this peer.
+
+        The number of its first frame counts as the one due.
+        """
+        component = self._components.get(frame.source)
+        if component is None:
+            counts = ComponentStatus(0, 0, frame.t_ns, frame.version)
+            self._status.components[frame.source] = counts
+            component = self._components[frame.source] = _Component(counts, peer)
+        if self._senders >= SENDERS_MAX:
+            for known in self._peers.values():
+                known.senders.clear()
+            self._senders = 0
+        sender = peer.senders[frame.source] = _Sender(component, frame.seq)
+        self._senders += 1
+        return sender

@@ -1,0 +1,147 @@
+"""A serial port for a link, by pyserial and the loop's own readers.                      [shell]"""
+
+import asyncio
+import contextlib
+import errno
+import fcntl
+import os
+import struct
+import termios
+from collections.abc import Collection, Hashable
+from typing import Any, Final, cast
+
+from companion.mavlink.links.endpoints import Upcalls, settle
+from companion.mavlink.links.urls import LinkUrl
+
+WRITE_BUFFER_BYTES: Final = 4096
+"""Bytes held back beside the system's own buffer: 0.7 s at 57 600 baud.
+
+Older frames are better lost.
+"""
+_READ_BYTES: Final = 1 << 16
+
+
+class SerialPort:
+    """A serial device, opened exclusively. It may be unplugged at any time."""
+
+    def __init__(self, url: LinkUrl, upcalls: Upcalls) -> None:
+        self._url = url
+        self._upcalls = upcalls
+        self._descriptor: int | None = None
+        self._lost: asyncio.Future[Exception] | None = None
+        self._unsent = bytearray()
+
+    def open(self) -> None:
+        """Do nothing: the device may be plugged in later."""
+
+    async def serve(self) -> None:
+        """Open the device and serve until it is gone."""
+        loop = asyncio.get_running_loop()
+        port = _opened(self._url.host, self._url.port)
+        self._descriptor = descriptor = port.fileno()
+        self._lost = loop.create_future()
+        self._unsent.clear()
+        loop.add_reader(descriptor, self._read, descriptor)
+        self._upcalls.up()
+        try:
+            raise await self._lost
+        finally:
+            self._descriptor = None
+            loop.remove_reader(descriptor)
+            loop.remove_writer(descriptor)
+            _close(port)
+            self._upcalls.hang_up(None)
+
+    def peers(self) -> Collection[Hashable]:
+        """The one peer, None, while the device is open."""
+        return () if self._descriptor is None else (None,)
+
+    def write(self, key: Hashable, raw: bytes) -> bool:
+        """Write a frame to the port, or to the buffer while it has room; ``key`` is None."""
+        descriptor = self._descriptor
+        if descriptor is None or len(self._unsent) + len(raw) > WRITE_BUFFER_BYTES:
+            return False
+        self._unsent += raw
+        if len(self._unsent) == len(raw):
+            self._write_on(descriptor)
+        return True
+
+    def fullness(self, key: Hashable) -> float:
+        """The share of the buffer that is taken, by what waits here and in the system."""
+        if self._descriptor is None:
+            return 0.0
+        waiting = len(self._unsent) + _waiting(self._descriptor)
+        return min(1.0, waiting / WRITE_BUFFER_BYTES)
+
+    def _read(self, descriptor: int) -> None:
+        try:
+            data = os.read(descriptor, _READ_BYTES)
+        except (BlockingIOError, InterruptedError):
+            return
+        except OSError as error:
+            self._lose(error)
+            return
+        if not data:
+            self._lose(OSError(errno.ENODEV, os.strerror(errno.ENODEV)))
+            return
+        try:
+            self._upcalls.take(None, data)
+        except Exception as fault:  # of the program: it is to end the link, not to vanish
+            self._lose(fault)
+
+    def _write_on(self, descriptor: int) -> None:
+        try:
+            del self._unsent[: os.write(descriptor, self._unsent)]
+        except (BlockingIOError, InterruptedError):
+            pass
+        except OSError as error:
+            self._lose(error)
+            return
+        loop = asyncio.get_running_loop()
+        if self._unsent:
+            loop.add_writer(descriptor, self._write_on, descriptor)
+        else:
+            loop.remove_writer(descriptor)
+
+    def _lose(self, why: Exception) -> None:
+        assert self._lost is not None
+        settle(self._lost, why)
+
+
+def _opened(device: str, baud: int) -> Any:
+    """Open the port: raw, 8N1, exclusive, never waiting.
+
+    Raises ``OSError`` where that cannot be had.
+    """
+    import serial  # only where there is a serial link
+
+    try:
+        port = serial.Serial(device, baud, exclusive=True, timeout=0)
+    except serial.SerialException as error:
+        if error.errno == errno.EAGAIN:  # its lock is taken
+            raise OSError(errno.EBUSY, os.strerror(errno.EBUSY)) from error
+        raise
+    except (ValueError, termios.error) as error:
+        raise OSError(f"not at {baud} baud: {error}") from error
+    # pyserial has reads of nothing give nothing, which is also how the end of a device looks.
+    # With at least one byte asked for, nothing there is EAGAIN, and an empty read is the end.
+    settings = termios.tcgetattr(port.fileno())
+    settings[6][termios.VMIN] = 1
+    termios.tcsetattr(port.fileno(), termios.TCSANOW, settings)
+    return port
+
+
+def _waiting(descriptor: int) -> int:
+    """Bytes that the system has taken and the device has not; 0 where the device is gone."""
+    try:
+        return cast(int, struct.unpack("i", fcntl.ioctl(descriptor, termios.TIOCOUTQ, bytes(4)))[0])
+    except OSError:
+        return 0
+
+
+def _close(port: Any) -> None:
+    """Close without waiting (up to half a minute) for the device to take what is unsent."""
+    if _waiting(port.fileno()):
+        with contextlib.suppress(termios.error):  # the device is gone, and what was unsent with it
+            termios.tcflush(port.fileno(), termios.TCOFLUSH)
+    port.close()

@@ -1,0 +1,293 @@
+"""Signing keys in files, and signing timestamps that outlive the process.                [shell]
+
+Without the timestamps of the last run, whatever was recorded from the air could be played to the
+next one. A process that is killed or loses power leaves a file that lags behind: the file is
+written every second, or every three while nothing is heard or sent, and a write may take two more.
+Together that is ``signing.MARGIN``, by which the next run begins later. A link that was closed in
+order begins where it ended.
+"""
+
+import contextlib
+import fcntl
+import json
+import os
+import stat
+import threading
+from collections.abc import Mapping
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from companion.mavlink.links.urls import LinkError
+from companion.mavlink.trust.signing import KEY_BYTES, Guard, State, fingerprint
+
+SAVE_NS: Final = 1_000_000_000
+"""Shortest time between two writes."""
+REFRESH_NS: Final = 3_000_000_000
+"""Longest time between two writes: a silent link still has a clock that goes on."""
+_VERSION: Final = 1
+_READ_MAX: Final = 4096  # bytes read of a key file
+
+
+# --- keys ---------------------------------------------------------------------------------------
+
+
+def load_key(path: Path) -> bytes:
+    """Read the 32 bytes of a signing key from a file of just them, or of 64 hex digits.
+
+    Raises ``LinkError``, which says what is wrong with the file and how one is made. Mission
+    Planner and MAVProxy take SHA-256 of a passphrase (``MAVAuthKeys.AddKey``, UTF-8;
+    ``passphrase_to_key`` of the module ``signing``, ASCII).
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(_READ_MAX)
+    except OSError as error:
+        raise LinkError(f"{path}: the signing key cannot be read: {error.strerror}") from None
+    if len(data) != KEY_BYTES:
+        try:
+            text = data.decode("ascii").strip()
+            data = bytes.fromhex(text) if len(text) == 2 * KEY_BYTES else b""
+        except ValueError:
+            data = b""
+    if len(data) != KEY_BYTES:
+        raise LinkError(f"{path}: not a signing key: {_how_to_make(path)}")
+    if not any(data):
+        raise LinkError(f"{path}: a signing key of zeros switches signing off elsewhere")
+    return data
+
+
+def key_warning(path: Path) -> str | None:
+    """One line for the operator if others may read or change a key file; None if not."""
+    try:
+        mode = path.stat().st_mode
+    except OSError as error:
+        return f"{path}: who may read the signing key cannot be told: {error.strerror}"
+    if stat.S_IMODE(mode) & (stat.S_IRWXG | stat.S_IRWXO):
+        return f"{path}: others may read or change the signing key: chmod 600 {path}"
+    return None
+
+
+def _how_to_make(path: Path) -> str:
+    return (
+        f"it is 32 bytes, or 64 hex digits; from a passphrase, as Mission Planner and MAVProxy "
+        f"have it: printf %s 'PASSPHRASE' | sha256sum | cut -c1-64 > {path}"
+    )
+
+
+# --- timestamps ---------------------------------------------------------------------------------
+
+
+class _LinkKey(NamedTuple):
+    """The owner of a set of timestamps: a link's URL and the fingerprint of its key."""
+
+    url: str
+    key: str
+
+
+class _Kept(NamedTuple):
+    """A link's state; ``clean`` if the link was closed in order."""
+
+    state: State
+    clean: bool
+
+
+class Snapshot(NamedTuple):
+    """States to be written; ``number`` counts the snapshots."""
+
+    number: int
+    links: Mapping[_LinkKey, _Kept]
+
+
+class Timestamps:
+    """The timestamps of all links with a key, in one file.
+
+    The event loop asks ``due`` and makes a ``snapshot``; a thread does the ``write``::
+
+        if timestamps.due(now_ns):
+            await asyncio.to_thread(timestamps.write, timestamps.snapshot(now_ns))
+
+    ``close`` comes at the end, when nothing is received or sent any more. States of links that are
+    not in use stay in the file. Raises ``LinkError`` where the file is damaged, cannot be read or
+    written, or is in use by another process.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._guards: dict[_LinkKey, Guard] = {}
+        self._number = 0
+        self._snapshot_ns = 0
+        self._moves = 0
+        self._writing = threading.Lock()
+        self._written = 0
+        self._lock = _locked(path)
+        try:
+            self._kept = _read(path)
+            self._write_now()  # so that a place that cannot be written to is reported at start
+        except LinkError:
+            os.close(self._lock)
+            raise
+
+    def guard(
+        self, url: str, key: bytes, link_id: int, now_ns: int, *, allow_unsigned: bool = False
+    ) -> Guard:
+        """The guard of a link, with the state it had when last in use with this key.
+
+        When this returns, the file says that the link is in use: should the process be killed, the
+        next one begins later. Raises ``LinkError`` also for a link that is there twice.
+        """
+        link = _LinkKey(url, fingerprint(key))
+        if link in self._guards:
+            raise LinkError(f"{url}: two links have the same address and key")
+        kept = self._kept.get(link, _Kept(State(), clean=True))
+        state = kept.state if kept.clean else kept.state.after_crash()
+        guard = Guard(key, link_id, allow_unsigned=allow_unsigned, state=state)
+        self._guards[link] = guard
+        self.write(self.snapshot(now_ns))
+        return guard
+
+    def due(self, now_ns: int) -> bool:
+        """Whether it is time for a ``snapshot`` and a ``write``."""
+        moved = self._moves != sum(guard.moves for guard in self._guards.values())
+        return bool(self._guards) and now_ns - self._snapshot_ns >= (
+            SAVE_NS if moved else REFRESH_NS
+        )
+
+    def snapshot(self, now_ns: int) -> Snapshot:
+        """The state of all links; cheap. ``now_ns`` is the own clock, ns since the Unix epoch."""
+        return self._snapshot(now_ns, clean=False)
+
+    def write(self, snapshot: Snapshot) -> None:
+        """Write a snapshot to disk, from any thread; one older than the file is skipped.
+
+        When this returns, a loss of power no longer takes it away.
+        """
+        with self._writing:
+            if snapshot.number <= self._written:
+                return
+            try:
+                _replace(self._path, _encoded(snapshot.links))
+            except OSError as error:
+                raise _unwritable(self._path, error) from None
+            self._written = snapshot.number
+
+    def close(self, now_ns: int) -> None:
+        """Write that all links have ended in order. No guard may be used afterwards."""
+        try:
+            self.write(self._snapshot(now_ns, clean=True))
+        finally:
+            os.close(self._lock)
+
+    def _snapshot(self, now_ns: int, *, clean: bool) -> Snapshot:
+        self._number += 1
+        self._snapshot_ns = now_ns
+        self._moves = sum(guard.moves for guard in self._guards.values())
+        current = {link: _Kept(guard.state(now_ns), clean) for link, guard in self._guards.items()}
+        return Snapshot(self._number, self._kept | current)
+
+    def _write_now(self) -> None:
+        self._number += 1
+        self.write(Snapshot(self._number, self._kept))
+
+
+def _locked(path: Path) -> int:
+    """A descriptor that keeps other processes away from the file until it is closed."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = os.open(_beside(path, ".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    except OSError as error:
+        raise _unwritable(path, error) from None
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(lock)
+        if isinstance(error, BlockingIOError):
+            raise LinkError(f"{path}: another process keeps its signing timestamps here") from None
+        raise _unwritable(path, error) from None
+    return lock
+
+
+def _read(path: Path) -> dict[_LinkKey, _Kept]:
+    """The content of the file; empty if there is no file yet."""
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return {}
+    except OSError as error:
+        raise LinkError(
+            f"{path}: the signing timestamps cannot be read: {error.strerror}"
+        ) from None
+    links = _checked_links(data)
+    if links is None:
+        raise LinkError(
+            f"{path}: the signing timestamps are damaged: put back a copy, or remove the file to "
+            "begin anew; what was sent in the minute before could then be replayed once"
+        )
+    return {_LinkKey(link["url"], link["key"]): _kept(link) for link in links}
+
+
+def _checked_links(data: bytes) -> list[dict[str, Any]] | None:
+    """The list of links as it was written; None if the file's digest does not match."""
+    with contextlib.suppress(ValueError, RecursionError, TypeError, KeyError):
+        content = json.loads(data)
+        if content["version"] == _VERSION and content["sha256"] == _digest(content["links"]):
+            links: list[dict[str, Any]] = content["links"]
+            return links
+    return None
+
+
+def _kept(link: Mapping[str, Any]) -> _Kept:
+    streams = {
+        (sysid, compid, link_id): (newest, lead)
+        for sysid, compid, link_id, newest, lead in link["streams"]
+    }
+    state = State(link["clock"], link["local"], link["sent"], link["floor"], streams)
+    return _Kept(state, link["clean"])
+
+
+def _encoded(links: Mapping[_LinkKey, _Kept]) -> bytes:
+    content = [
+        {
+            "url": link.url,
+            "key": link.key,
+            "clean": clean,
+            "clock": state.clock,
+            "local": state.local,
+            "sent": state.sent,
+            "floor": state.floor,
+            "streams": [[*stream, *heard] for stream, heard in state.streams.items()],
+        }
+        for link, (state, clean) in links.items()
+    ]
+    return _dumped({"version": _VERSION, "sha256": _digest(content), "links": content})
+
+
+def _digest(links: object) -> str:
+    return sha256(_dumped(links)).hexdigest()
+
+
+def _dumped(value: object) -> bytes:
+    return json.dumps(value, separators=(",", ":")).encode("ascii")
+
+
+def _replace(path: Path, data: bytes) -> None:
+    """Write a file so that either the old or the new one is there, whole, at any time."""
+    fresh = _beside(path, ".new")
+    with os.fdopen(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    fresh.replace(path)
+    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def _beside(path: Path, ending: str) -> Path:
+    return path.with_name(path.name + ending)
+
+
+def _unwritable(path: Path, error: OSError) -> LinkError:
+    return LinkError(f"{path}: the signing timestamps cannot be written: {error.strerror}")

@@ -1,0 +1,232 @@
+"""TCP for a link: connecting, or listening for connections.                              [shell]"""
+
+import asyncio
+import errno
+import os
+import socket
+from collections.abc import Callable, Collection, Hashable
+from typing import Final, cast
+
+from companion.mavlink.links.endpoints import HungUpError, Upcalls, bound, resolved, settle
+from companion.mavlink.links.urls import LinkUrl
+
+WRITE_BUFFER_BYTES: Final = 64 << 10
+"""Unsent bytes of a connection beyond which further frames are dropped."""
+CONNECT_S: Final = 5.0
+"""Timeout of a connection attempt.
+
+The system itself would try for two minutes, ever more rarely.
+"""
+CONNECTIONS_MAX: Final = 256
+"""Connections of a listening link. More are closed at once, since each takes a file descriptor."""
+SILENCE_S: Final = 12
+"""Seconds without an acknowledgement after which a peer is given up as switched off."""
+
+
+class TcpOut:
+    """A link that connects to one peer."""
+
+    def __init__(self, url: LinkUrl, upcalls: Upcalls) -> None:
+        self._url = url
+        self._upcalls = upcalls
+        self._stream: _Stream | None = None
+
+    def open(self) -> None:
+        """Do nothing: the peer may come later."""
+
+    async def serve(self) -> None:
+        """Connect and serve until the connection is lost."""
+        loop = asyncio.get_running_loop()
+        sock = await _connected(self._url)
+        lost: asyncio.Future[Exception] = loop.create_future()
+        stream = _Stream(self._upcalls, lambda _, why: settle(lost, why))
+        try:
+            await loop.create_connection(lambda: stream, sock=sock)
+            self._stream = stream
+            self._upcalls.up()
+            raise await lost
+        finally:
+            self._stream = None
+            stream.abort()
+
+    def peers(self) -> Collection[Hashable]:
+        """The one peer, while the connection stands."""
+        return () if self._stream is None else (self._stream,)
+
+    def write(self, key: Hashable, raw: bytes) -> bool:
+        """Send a frame to the peer if its buffer has room."""
+        return cast(_Stream, key).write(raw)
+
+    def fullness(self, key: Hashable) -> float:
+        """The share of the connection's buffer that is taken."""
+        return cast(_Stream, key).fullness()
+
+
+class TcpIn:
+    """A link that listens. Each connection is a peer of its own, which may come and go."""
+
+    def __init__(self, url: LinkUrl, upcalls: Upcalls) -> None:
+        self._url = url
+        self._upcalls = upcalls
+        self._socket: socket.socket | None = None
+        self._streams: set[_Stream] = set()
+
+    def open(self) -> int:
+        """Listen; returns the port. Raises ``OSError`` where the address cannot be had."""
+        self._socket = _listening(self._url)
+        port = cast(int, self._socket.getsockname()[1])
+        self._url = LinkUrl(self._url.scheme, self._url.host, port)
+        return port
+
+    async def serve(self) -> None:
+        """Serve connections. The loss of one does not end this."""
+        loop = asyncio.get_running_loop()
+        fault: asyncio.Future[Exception] = loop.create_future()
+        sock, self._socket = self._socket or _listening(self._url), None
+        server = await loop.create_server(lambda: self._met(fault), sock=sock)
+        self._upcalls.up()
+        try:
+            raise await fault
+        finally:
+            server.close()
+            for stream in tuple(self._streams):
+                stream.abort()
+
+    def peers(self) -> Collection[Hashable]:
+        """Every connection that can be written to."""
+        return tuple(stream for stream in self._streams if stream.is_open())
+
+    def write(self, key: Hashable, raw: bytes) -> bool:
+        """Send a frame to a connection if its buffer has room."""
+        return cast(_Stream, key).write(raw)
+
+    def fullness(self, key: Hashable) -> float:
+        """The share of a connection's buffer that is taken."""
+        return cast(_Stream, key).fullness()
+
+    def _met(self, fault: asyncio.Future[Exception]) -> "_Stream":
+        def parted(stream: _Stream, why: Exception) -> None:
+            self._streams.discard(stream)
+            if not isinstance(why, OSError):
+                settle(fault, why)
+
+        if len(self._streams) >= CONNECTIONS_MAX:
+            return _Stream(self._upcalls, parted, welcome=False)
+        stream = _Stream(self._upcalls, parted)
+        self._streams.add(stream)
+        return stream
+
+
+class _Stream(asyncio.Protocol):
+    """One connection, which is also the key of its peer.
+
+    ``parted`` is called with the reason when it ends. A connection that is not ``welcome`` is ended
+    at once.
+    """
+
+    def __init__(
+        self,
+        upcalls: Upcalls,
+        parted: Callable[["_Stream", Exception], None],
+        *,
+        welcome: bool = True,
+    ) -> None:
+        self._upcalls = upcalls
+        self._parted = parted
+        self._transport: asyncio.Transport | None = None
+        self._welcome = welcome
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast(asyncio.Transport, transport)
+        if not self._welcome:
+            self._transport.abort()
+
+    def data_received(self, data: bytes) -> None:
+        self._upcalls.take(self, data)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._transport = None
+        self._parted(self, exc or HungUpError("the peer hung up"))
+        self._upcalls.hang_up(self)
+
+    def write(self, raw: bytes) -> bool:
+        """Send a frame, or buffer it while there is room; False if there is none."""
+        transport = self._transport
+        if transport is None or not self.is_open():
+            return False
+        if transport.get_write_buffer_size() + len(raw) > WRITE_BUFFER_BYTES:
+            return False
+        transport.write(raw)
+        return True
+
+    def is_open(self) -> bool:
+        """Whether it can be written to."""
+        return self._transport is not None and not self._transport.is_closing()
+
+    def fullness(self) -> float:
+        """The share of the buffer that is taken; 0 when it has ended."""
+        if self._transport is None:
+            return 0.0
+        return self._transport.get_write_buffer_size() / WRITE_BUFFER_BYTES
+
+    def abort(self) -> None:
+        """End the connection without sending what is unsent."""
+        if self._transport is not None:
+            self._transport.abort()
+
+
+def _listening(url: LinkUrl) -> socket.socket:
+    sock = bound(url, socket.SOCK_STREAM)
+    try:
+        _notice_silence(sock)  # connections inherit it
+        sock.listen()
+    except OSError:
+        sock.close()
+        raise
+    return sock
+
+
+async def _connected(url: LinkUrl) -> socket.socket:
+    """A connection to the first address of a host that accepts one.
+
+    If none does, the last address's error is raised.
+    """
+    loop = asyncio.get_running_loop()
+    error: OSError | None = None
+    for family, address in await resolved(url, socket.SOCK_STREAM):
+        sock = socket.socket(family, socket.SOCK_STREAM)
+        try:
+            sock.setblocking(False)
+            _notice_silence(sock)
+            async with asyncio.timeout(CONNECT_S):
+                await loop.sock_connect(sock, address)
+            if sock.getsockname() != sock.getpeername():
+                return sock
+            # Nobody listens on this machine, and the system chose that very port for our end:
+            # a connection to itself, which would also keep the peer from listening.
+            error = OSError(errno.ECONNREFUSED, os.strerror(errno.ECONNREFUSED))
+        except OSError as refused:
+            error = refused
+        except BaseException:
+            sock.close()
+            raise
+        sock.close()
+    assert error is not None, "a name that is found has an address"
+    raise error
+
+
+def _notice_silence(sock: socket.socket) -> None:
+    """Have the system give up a peer that vanished silently (keep-alive, RFC 9293, 3.8.4).
+
+    Nothing else would ever tell of a connection that is only read from.
+    """
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    options = {
+        "TCP_KEEPIDLE": SILENCE_S // 2,
+        "TCP_KEEPINTVL": max(1, SILENCE_S // 6),
+        "TCP_KEEPCNT": 3,
+        "TCP_USER_TIMEOUT": SILENCE_S * 1000,
+    }
+    for name, value in options.items():
+        if hasattr(socket, name):  # not every system has them all
+            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)

@@ -1,0 +1,244 @@
+"""Links over which MAVLink comes and goes.                                               [shell]
+
+    udpin:HOST:PORT      listen for datagrams, from any number of peers
+    udpout:HOST:PORT     send datagrams to one peer, and hear what it answers
+    tcp:HOST:PORT        connect, and connect again when the peer goes away
+    tcpin:HOST:PORT      listen for connections, any number of them
+    serial:DEVICE:BAUD   a serial port, which may be unplugged and plugged in again
+
+IPv6 hosts stand in brackets. Every peer has its own splitter: a frame truncated by one peer cannot
+damage another's.
+"""
+
+import asyncio
+from collections.abc import Callable, Hashable
+from typing import Final, Protocol
+
+from companion.mavlink.links.endpoints import Endpoint, Upcalls, reason
+from companion.mavlink.links.peers import Peer, Peers
+from companion.mavlink.links.serial_port import SerialPort
+from companion.mavlink.links.status import LinkStatus
+from companion.mavlink.links.tcp import TcpIn, TcpOut
+from companion.mavlink.links.udp import UdpIn, UdpOut
+from companion.mavlink.links.urls import LinkError, LinkUrl
+from companion.mavlink.wire.encode import Outgoing, pack
+from companion.values import Frame, Notice, Reason, Rejection, Severity, Source
+
+__all__ = ["Guard", "Link", "LinkStatus", "Notify", "Receive", "endpoint"]
+
+RETRY_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
+"""Seconds from one attempt to serve a lost link to the next; the last is repeated."""
+STEADY_S: Final = 1.0
+"""Seconds a connection must hold before it is said to be back.
+
+One that breaks at once is an outage.
+"""
+PEER_ACTIVE_S: Final = 10.0
+"""A listening UDP link sends to peers from which a frame came within this many seconds."""
+
+Receive = Callable[[list[Frame | Rejection]], None]
+Notify = Callable[[Notice], None]
+
+
+class Guard(Protocol):
+    """Message signing of one link (https://mavlink.io/en/guide/message_signing.html)."""
+
+    def refusal(self, frame: Frame) -> Reason | None:
+        """Why a frame must not be used; None if it may. Asked once for each frame, in order."""
+
+    def sign(self, raw: bytes, now_ns: int) -> bytes:
+        """A packed MAVLink 2 frame with its signature added."""
+
+
+class Link:
+    """One link. Call ``open`` for early errors, then ``run`` until cancelled.
+
+        receive  called on the event loop with the frames and rejections of each datagram or read
+        now_ns   the node's timeline
+        notify   called once when the link is lost, and once when it is back
+        guard    refuses frames and signs what is sent; None: no signing
+
+    All methods but ``open`` must be called on the event loop; ``open`` is called before it runs.
+    """
+
+    def __init__(
+        self,
+        url: LinkUrl,
+        receive: Receive,
+        now_ns: Callable[[], int],
+        notify: Notify | None = None,
+        guard: Guard | None = None,
+    ) -> None:
+        self.url = url
+        self.status = LinkStatus(str(url))
+        self._receive = receive
+        self._now_ns = now_ns
+        self._notify = notify
+        self._guard = guard
+        self._peers = Peers(self.status, self._finish)
+        upcalls = Upcalls(self._up, self.take, self._hang_up, self._overflow)
+        self._endpoint = endpoint(url, self.status, upcalls)
+        self._is_out = False
+        self._steady: asyncio.TimerHandle | None = None
+
+    def open(self) -> None:
+        """Claim a listening link's address. Raises ``LinkError`` where it cannot be had.
+
+        An absent peer or device is no error: ``run`` tries it again and again.
+        """
+        try:
+            port = self._endpoint.open()
+        except OSError as error:
+            raise LinkError(f"{self.url}: {reason(error)}") from error
+        if port is not None:
+            self.status.url = str(LinkUrl(self.url.scheme, self.url.host, port))
+
+    async def run(self) -> None:
+        """Serve until cancelled. A lost link is tried again, ever more rarely until frames come.
+
+        Raises what ``receive`` raises.
+        """
+        attempt = 0
+        try:
+            while True:
+                self.status.state = "connecting"
+                frames = self.status.frames
+                try:
+                    await self._endpoint.serve()
+                except OSError as error:
+                    self._say_it_is_down(reason(error))
+                if self.status.frames > frames:
+                    attempt = 0
+                self.status.state = "connecting"
+                await asyncio.sleep(RETRY_S[min(attempt, len(RETRY_S) - 1)])
+                attempt += 1
+        finally:
+            self._cancel_steady()
+            self.status.state = "down"
+
+    # --- receiving --------------------------------------------------------------------------
+
+    def take(self, key: Hashable, data: bytes) -> None:
+        """Split the bytes that a peer sent and pass on what they held."""
+        peer = self._peers.at(key)
+        self.status.bytes += len(data)
+        found = peer.splitter.feed(self._now_ns(), data)
+        if found:
+            self._hand_on(peer, found)
+
+    def _hand_on(self, peer: Peer, found: list[Frame | Rejection]) -> None:
+        if self._guard is not None:
+            found = [_admitted(self._guard, item) for item in found]
+        self._peers.count(peer, found)
+        self._receive(found)
+
+    def _hang_up(self, key: Hashable) -> None:
+        """Forget a peer that is gone."""
+        peer = self._peers.find(key)
+        if peer is not None:
+            self._finish(peer)
+            self._peers.forget(peer)
+
+    def _finish(self, peer: Peer) -> None:
+        """Search what the unfinished frame of a departing peer may have swallowed."""
+        found = peer.splitter.finish(self._now_ns())
+        if found:
+            self._hand_on(peer, found)
+
+    def _overflow(self, count: int) -> None:
+        """Count datagrams that the system dropped; their senders are unknown."""
+        lost = self.status.lost
+        lost[Reason.SOCKET_OVERFLOW] = lost.get(Reason.SOCKET_OVERFLOW, 0) + count
+        reject = Rejection(self._now_ns(), self.status.url, Reason.SOCKET_OVERFLOW, count)
+        self._receive([reject])
+
+    # --- sending ----------------------------------------------------------------------------
+
+    def send(self, message: Outgoing) -> int:
+        """Send to every peer heard lately (udpin), to every connection (tcpin), or to the one peer.
+
+        "Lately" is within ``PEER_ACTIVE_S``. Returns how many took it. Never waits and never
+        raises.
+        """
+        keys = self._endpoint.peers()
+        if keys is None:
+            peers = self._peers.heard_since(self._now_ns() - int(PEER_ACTIVE_S * 1e9))
+        else:
+            peers = [self._peers.at(key) for key in keys]
+        return sum([self._send(peer, message) for peer in peers])
+
+    def send_to(self, target: Source, message: Outgoing) -> bool:
+        """Send to the peer over which ``target`` was last heard on this link.
+
+        Returns False if it was never heard, has hung up, or does not take it.
+        """
+        peer = self._peers.last_of(target)
+        return peer is not None and self._send(peer, message)
+
+    def _send(self, peer: Peer, message: Outgoing) -> bool:
+        """Send to one peer: as MAVLink 1 if it speaks nothing else and the link has no guard.
+
+        MAVLink 1 cannot be signed.
+        """
+        in_v1 = peer.speaks_v1_only and self._guard is None and message.msgid < 256
+        raw = pack(message, peer.next_sequence(), 1 if in_v1 else 2)
+        if self._guard is not None:
+            raw = self._guard.sign(raw, self._now_ns())
+        taken = self._endpoint.write(peer.key, raw)
+        if taken:
+            self.status.sent += 1
+        else:
+            self.status.send_dropped += 1
+        return taken
+
+    # --- coming and going -------------------------------------------------------------------
+
+    def _up(self) -> None:
+        self.status.state = "up"
+        self._cancel_steady()
+        if self._is_out:
+            loop = asyncio.get_running_loop()
+            self._steady = loop.call_later(STEADY_S, self._say_it_is_back)
+
+    def _say_it_is_back(self) -> None:
+        self._is_out = False
+        self._say(Severity.INFO, "is back")
+
+    def _say_it_is_down(self, why: str) -> None:
+        self._cancel_steady()
+        if not self._is_out:
+            self._is_out = True
+            self._say(Severity.WARNING, f"is down: {why}; trying again")
+
+    def _say(self, severity: Severity, what: str) -> None:
+        if self._notify is not None:
+            url = self.status.url
+            self._notify(Notice(self._now_ns(), severity, url, f"link {url} {what}"))
+
+    def _cancel_steady(self) -> None:
+        if self._steady is not None:
+            self._steady.cancel()
+            self._steady = None
+
+
+def endpoint(url: LinkUrl, status: LinkStatus, upcalls: Upcalls) -> Endpoint:
+    """The endpoint of the link's kind, not yet open."""
+    match url.scheme:
+        case "udpin":
+            return UdpIn(url, status, upcalls)
+        case "udpout":
+            return UdpOut(url, status, upcalls)
+        case "tcp":
+            return TcpOut(url, upcalls)
+        case "tcpin":
+            return TcpIn(url, upcalls)
+        case "serial":
+            return SerialPort(url, upcalls)
+
+
+def _admitted(guard: Guard, item: Frame | Rejection) -> Frame | Rejection:
+    """The item itself, or the guard's refusal of it."""
+    refusal = None if isinstance(item, Rejection) else guard.refusal(item)
+    if refusal is None or isinstance(item, Rejection):
+        return item
+    return Rejection(item.t_ns, str(item.source), refusal, msgid=item.msgid)

@@ -1,0 +1,240 @@
+"""UDP for a link: one socket that serves all senders, or one that is connected.          [shell]"""
+
+import asyncio
+import contextlib
+import errno
+import select
+import socket
+import struct
+import sys
+from collections.abc import Collection, Hashable
+from typing import Final, cast
+
+from companion.mavlink.links.endpoints import Address, Upcalls, bound, resolved, settle
+from companion.mavlink.links.status import LinkStatus
+from companion.mavlink.links.urls import LinkUrl
+
+RECEIVE_BUFFER_BYTES: Final = 4 << 20
+"""Receive buffer asked for; with stock buffers frames are lost from about 20 000 a second on.
+
+Measured: docs/field-notes.md 3.
+"""
+OVERFLOW_CHECK_S: Final = 1.0
+"""Longest time between two looks at the system's drop counter."""
+OVERFLOW_CHECK_DATAGRAMS: Final = 1024
+"""Datagrams after which the drop counter is read even before that time."""
+
+_SO_MEMINFO: Final = 55  # Linux, include/uapi/asm-generic/socket.h
+_SK_MEMINFO_BYTES: Final = 36  # nine 32-bit numbers, include/uapi/linux/sock_diag.h
+_NOT_THIS_SOCKET: Final = (errno.EAGAIN, errno.ENOBUFS, errno.ECONNREFUSED)
+"""Errors that leave a socket as good as before: it is full, or nobody listens at the other end."""
+
+
+def dropped_by_system(sock: socket.socket) -> int | None:
+    """Datagrams that the system has dropped at a socket so far, modulo 2³².
+
+    The cause is nearly always a full buffer. None where the system does not say (others than
+    Linux).
+    """
+    if sys.platform != "linux":
+        return None
+    try:
+        numbers = sock.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _SK_MEMINFO_BYTES)
+    except OSError:  # Linux before 4.12 has no SO_MEMINFO
+        return None
+    if len(numbers) < _SK_MEMINFO_BYTES:
+        return None
+    return cast(int, struct.unpack_from("=I", numbers, _SK_MEMINFO_BYTES - 4)[0])
+
+
+def _size_buffer(sock: socket.socket, status: LinkStatus) -> None:
+    with contextlib.suppress(OSError):  # what is granted is said, be it less
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+    status.receive_buffer_bytes = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+
+
+def _fullness(sock: socket.socket) -> float:
+    """1 where the system would not take a datagram now, else 0: datagrams are not kept here."""
+    if sock.fileno() < 0:  # closed by its transport
+        return 0.0
+    poll = select.poll()
+    poll.register(sock, select.POLLOUT)
+    return 0.0 if poll.poll(0) else 1.0
+
+
+class UdpIn:
+    """A link that listens for datagrams.
+
+    One socket serves all senders; their addresses are the keys.
+    """
+
+    def __init__(self, url: LinkUrl, status: LinkStatus, upcalls: Upcalls) -> None:
+        self._url = url
+        self._status = status
+        self._upcalls = upcalls
+        self._socket: socket.socket | None = None
+
+    def open(self) -> int:
+        """Bind; returns the port. Raises ``OSError`` where the address cannot be had."""
+        self._socket = self._bound()
+        port = cast(int, self._socket.getsockname()[1])
+        self._url = LinkUrl(self._url.scheme, self._url.host, port)
+        return port
+
+    async def serve(self) -> None:
+        """Read datagrams. No error that a peer can cause ends this."""
+        self._socket = self._socket or self._bound()
+        try:
+            await _Datagrams(self._socket, self._status, self._upcalls, connected=False).serve()
+        finally:
+            self._socket = None
+
+    def _bound(self) -> socket.socket:
+        sock = bound(self._url, socket.SOCK_DGRAM)
+        _size_buffer(sock, self._status)
+        return sock
+
+    def peers(self) -> None:
+        """None: a listening socket has no peers but those heard lately."""
+
+    def write(self, key: Hashable, raw: bytes) -> bool:
+        """Send a datagram to an address."""
+        if self._socket is None:
+            return False
+        try:
+            self._socket.sendto(raw, cast(Address, key))
+        except OSError:  # the buffer is full, or no route leads to that peer: others are unaffected
+            return False
+        return True
+
+    def fullness(self, key: Hashable) -> float:
+        """1 where the system would not take a datagram now, else 0; the same for all peers."""
+        return 0.0 if self._socket is None else _fullness(self._socket)
+
+
+class UdpOut:
+    """A link with one peer: its socket is connected, so that nobody else is heard.
+
+    That nobody listens at the other end (ICMP) is no error: the peer may come yet. After an error
+    of this end, such as a network that is gone, the socket is made anew, since the old one would
+    keep the address that it had.
+    """
+
+    def __init__(self, url: LinkUrl, status: LinkStatus, upcalls: Upcalls) -> None:
+        self._url = url
+        self._status = status
+        self._upcalls = upcalls
+        self._datagrams: _Datagrams | None = None
+
+    def open(self) -> None:
+        """Do nothing: nothing can be known yet."""
+
+    async def serve(self) -> None:
+        """Read what the peer sends.
+
+        Raises ``OSError`` where its name is not found or no route leads there.
+        """
+        while True:
+            family, address = (await resolved(self._url, socket.SOCK_DGRAM))[0]
+            sock = socket.socket(family, socket.SOCK_DGRAM)
+            try:
+                _size_buffer(sock, self._status)
+                sock.setblocking(False)
+                sock.connect(address)
+            except OSError:
+                sock.close()
+                raise
+            self._datagrams = _Datagrams(sock, self._status, self._upcalls, connected=True)
+            try:
+                await self._datagrams.serve()
+            finally:
+                self._datagrams = None
+
+    def peers(self) -> Collection[Hashable]:
+        """The one peer, None, while there is a socket."""
+        return () if self._datagrams is None else (None,)
+
+    def write(self, key: Hashable, raw: bytes) -> bool:
+        """Send a datagram to the one peer; ``key`` is None."""
+        return self._datagrams is not None and self._datagrams.send(raw)
+
+    def fullness(self, key: Hashable) -> float:
+        """1 where the system would not take a datagram now, else 0."""
+        return 0.0 if self._datagrams is None else self._datagrams.fullness()
+
+
+class _Datagrams(asyncio.DatagramProtocol):
+    """A UDP socket at work: read by the loop, written to directly.
+
+    A transport would keep what the system does not take.
+    """
+
+    def __init__(
+        self, sock: socket.socket, status: LinkStatus, upcalls: Upcalls, *, connected: bool
+    ) -> None:
+        self._socket = sock
+        self._status = status
+        self._upcalls = upcalls
+        self._connected = connected
+        self._unfit = False
+        self._lost: asyncio.Future[Exception] = asyncio.get_running_loop().create_future()
+        self._dropped = 0
+        self._unchecked = 0
+
+    async def serve(self) -> None:
+        """Read until the socket has to be made anew; raises the error that broke the transport."""
+        loop = asyncio.get_running_loop()
+        transport, _ = await loop.create_datagram_endpoint(lambda: self, sock=self._socket)
+        self._upcalls.up()
+        try:
+            while not self._unfit:
+                if (await asyncio.wait((self._lost,), timeout=OVERFLOW_CHECK_S))[0]:
+                    raise self._lost.result()
+                self._count_dropped()
+        finally:
+            transport.abort()
+
+    def send(self, raw: bytes) -> bool:
+        """Send a datagram to the peer of a connected socket."""
+        for _ in range(2):
+            try:
+                self._socket.send(raw)
+            except ConnectionRefusedError:  # the answer to a datagram before; this one stayed here
+                continue
+            except OSError as error:
+                self.error_received(error)
+                return False
+            return True
+        return False
+
+    def fullness(self) -> float:
+        """1 where the system would not take a datagram now, else 0."""
+        return _fullness(self._socket)
+
+    def datagram_received(self, data: bytes, addr: Address) -> None:
+        try:
+            self._upcalls.take(None if self._connected else addr, data)
+        except Exception as fault:  # event loops differ in what they do with it, so handle it here
+            self.connection_lost(fault)
+        self._unchecked += 1
+        if self._unchecked >= OVERFLOW_CHECK_DATAGRAMS:
+            self._count_dropped()
+
+    def error_received(self, exc: Exception) -> None:
+        # A listening socket is not bound to a route: it stays as it is, whatever comes.
+        if isinstance(exc, OSError) and exc.errno not in _NOT_THIS_SOCKET and self._connected:
+            self._unfit = True
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        settle(self._lost, exc or ConnectionError("the socket was closed"))
+
+    def _count_dropped(self) -> None:
+        self._unchecked = 0
+        dropped = dropped_by_system(self._socket)
+        if dropped is None:
+            return
+        more = (dropped - self._dropped) & 0xFFFF_FFFF
+        self._dropped = dropped
+        self._status.overflowed = (self._status.overflowed or 0) + more
+        if more:
+            self._upcalls.overflow(more)

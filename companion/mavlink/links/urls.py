@@ -1,0 +1,96 @@
+"""Link addresses, written as users of MAVLink write them.
+
+    udpin:HOST:PORT      listen for datagrams, from any number of peers
+    udpout:HOST:PORT     send datagrams to one peer, and hear what it answers
+    tcp:HOST:PORT        connect
+    tcpin:HOST:PORT      listen for connections
+    serial:DEVICE:BAUD   a serial port, as in serial:/dev/ttyAMA0:921600
+
+IPv6 hosts stand in brackets.
+"""
+
+import ipaddress
+import re
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Final, Literal, cast, get_args
+
+from companion.values import UserError
+
+Scheme = Literal["udpin", "udpout", "tcp", "tcpin", "serial"]
+SCHEMES: Final[tuple[Scheme, ...]] = get_args(Scheme)
+_LISTENS: Final = ("udpin", "tcpin")
+_BAUD_MAX: Final = 20_000_000
+_NUMBER: Final = re.compile(r"[0-9]{1,8}")
+_NAME: Final = re.compile(r"[A-Za-z0-9._-]+")
+
+
+class LinkError(UserError):
+    """A link that cannot be opened. The message is one line for the user and names the link."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkUrl:
+    """A parsed link address; ``str`` gives it as the user wrote it.
+
+    ``host`` is the device of a serial link, and ``port`` its baud rate.
+    """
+
+    scheme: Scheme
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        host = f"[{self.host}]" if self.scheme != "serial" and ":" in self.host else self.host
+        return f"{self.scheme}:{host}:{self.port}"
+
+
+def parse_link(text: str, schemes: Collection[Scheme] = SCHEMES) -> LinkUrl:
+    """Read a link of one of ``schemes``. Raises ``LinkError``, which says what is wrong with it.
+
+    Port 0 is allowed where the link listens: the system then chooses one.
+    """
+    scheme, _, address = text.partition(":")
+    host, _, port = address.rpartition(":")
+    if scheme not in schemes or not host or not _NUMBER.fullmatch(port):
+        raise LinkError(f"{text!r} is not {_forms(schemes)}")
+    if scheme == "serial":
+        return _serial(text, host, int(port))
+    bracketed = host.startswith("[") and host.endswith("]")
+    host = host[1:-1] if bracketed else host
+    if (":" in host) is not bracketed:
+        raise LinkError(f"{text!r}: an IPv6 host stands in brackets, as in udpin:[::]:14550")
+    if not (_is_ipv6(host) if bracketed else _may_be_a_name(host)):
+        raise LinkError(f"{text!r}: {host!r} cannot be the name or address of a host")
+    if int(port) > 65535 or (int(port) == 0 and scheme not in _LISTENS):
+        raise LinkError(f"{text!r}: {port} is not a port, 1 to 65535")
+    return LinkUrl(cast(Scheme, scheme), host, int(port))
+
+
+def _serial(text: str, device: str, baud: int) -> LinkUrl:
+    if not device.isprintable():
+        raise LinkError(f"{text!r}: {device!r} cannot be the name of a device")
+    if not 1 <= baud <= _BAUD_MAX:
+        raise LinkError(f"{text!r}: {baud} is not a baud rate, 1 to {_BAUD_MAX}")
+    return LinkUrl("serial", device, baud)
+
+
+def _forms(schemes: Collection[Scheme]) -> str:
+    forms = [f"{one}:DEVICE:BAUD" if one == "serial" else f"{one}:HOST:PORT" for one in schemes]
+    return forms[0] if len(forms) == 1 else f"{', '.join(forms[:-1])} or {forms[-1]}"
+
+
+def _is_ipv6(host: str) -> bool:
+    try:
+        ipaddress.IPv6Address(host)
+    except ValueError:
+        return False
+    return True
+
+
+def _may_be_a_name(host: str) -> bool:
+    """Whether the text can be the name of a host; an IPv4 address counts as one."""
+    try:
+        return _NAME.fullmatch(host) is not None and len(host.encode("idna")) > 0
+    except UnicodeError:  # a label that is empty, or too long
+        return False

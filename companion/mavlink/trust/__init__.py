@@ -1,0 +1,1 @@
+"""Which frames and reports are used: signatures, allow lists, duplicates, ADS-B relays."""

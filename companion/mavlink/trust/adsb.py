@@ -1,0 +1,252 @@
+"""Aircraft relayed by ADS-B receivers: one stream of reports for each aircraft, whoever relays it.
+
+ADSB_VEHICLE has no time stamp. ``tslc`` counts whole seconds since the aircraft was last heard, so
+a message was true at its arrival less ``tslc``, or up to a second before. Receivers send it again
+and again, with or without news, and not every message has every field:
+
+- Fields are merged one by one, each with the time at which it was true; the newest counts.
+- A message whose position was reported before, and which differs in nothing else, is no news,
+  whichever relay sends it and whatever age it states. Its other fields are dated like that
+  position.
+- A message without a position cannot be told from one sent again, since a cruising aircraft keeps
+  its altitude: its ``tslc`` is believed.
+- Pressure altitude is off from geometric altitude by the weather, up to hundreds of metres. A
+  track that mixes them jumps, so an aircraft keeps its datum while that is fresh. Where a datum has
+  to be chosen, that of the message itself comes first, then geometric, then pressure.
+
+See docs/field-notes.md 1 for what relays really send.
+"""
+
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from typing import Final, TypeVar
+
+from companion.mavlink.wire.decode import ADSB_VEHICLE
+from companion.values import AdsbVehicle, AltitudeDatum, Reason, Rejection, Report, Source
+
+_NS: Final = 1_000_000_000
+SLACK_NS: Final = _NS
+"""Time hidden by whole seconds: of two times closer than this, either may be the earlier."""
+ALTITUDE_KEPT_NS: Final = 10 * _NS
+"""Largest distance in time between a position and the altitude joined to it."""
+VELOCITY_KEPT_NS: Final = SLACK_NS
+"""Largest distance in time between a position and the velocity joined to it.
+
+The error of an old velocity has no bound that grows with its age: a turn of 30 degrees bank changes
+it by 5.7 m/s every second. Within the slack it may well be of the position's own time. Transponders
+send both twice a second (RTCA DO-260B), so older ones are seldom needed.
+"""
+REPEATED_NS: Final = 30 * _NS
+"""How long the same position counts as a repeat; after that, the aircraft may be hovering."""
+FORGOTTEN_S: Final = 120
+"""Seconds without news after which an aircraft is forgotten. Older messages are no news."""
+AIRCRAFT_MAX: Final = 2000
+"""Aircraft remembered; beyond it the one longest without news is forgotten."""
+POSITIONS_KEPT: Final = 32
+"""Reported positions remembered of each aircraft.
+
+At two a second, a relay may lag 16 s behind another; 4.8 s have been seen.
+"""
+RELAYS_KEPT: Final = 16
+"""Relays remembered of each aircraft."""
+
+_T = TypeVar("_T")
+_Dated = tuple[int, _T]  # when it was true, and what
+
+
+@dataclass(slots=True)
+class _Known:
+    """What is known of one aircraft."""
+
+    news_ns: int = 0
+    position_ns: int | None = None  # when the newest reported position was true
+    datum: AltitudeDatum | None = None
+    altitudes: dict[AltitudeDatum, _Dated[float]] = field(default_factory=dict)
+    heading: _Dated[float] | None = None
+    velocity_ne: _Dated[tuple[float, float]] | None = None
+    velocity_down: _Dated[float] | None = None
+    callsign: _Dated[str] | None = None
+    reported: OrderedDict[tuple[float, float], AdsbVehicle] = field(default_factory=OrderedDict)
+    relays: OrderedDict[Source, int] = field(default_factory=OrderedDict)  # heard from at
+
+    def hear(self, relay: Source, t_ns: int) -> None:
+        """Note that a relay spoke of the aircraft at ``t_ns``, whatever it said."""
+        self.relays[relay] = t_ns
+        self.relays.move_to_end(relay)
+        while len(self.relays) > RELAYS_KEPT or _is_past(next(iter(self.relays.values())), t_ns):
+            self.relays.popitem(last=False)
+
+    def learn(self, said: AdsbVehicle, true_ns: int) -> None:
+        """Take in every field that is present and newer than what is known."""
+        if said.alt_datum is not None:
+            altitude = _newest(self.altitudes.get(said.alt_datum), true_ns, said.alt_m)
+            if altitude is not None:
+                self.altitudes[said.alt_datum] = altitude
+        self.heading = _newest(self.heading, true_ns, said.heading_deg)
+        self.velocity_ne = _newest(self.velocity_ne, true_ns, said.velocity_ne_mps)
+        self.velocity_down = _newest(self.velocity_down, true_ns, said.velocity_down_mps)
+        self.callsign = _newest(self.callsign, true_ns, said.callsign)
+
+    def repeated(self, said: AdsbVehicle) -> AdsbVehicle | None:
+        """The reported message that this one repeats; None where it has something new."""
+        assert said.position_deg is not None
+        before = self.reported.get(said.position_deg)
+        if before is None or _differs(before, said):
+            return None
+        is_later = _true_ns(said) - _true_ns(before) >= SLACK_NS
+        return None if is_later and said.t_ns - before.t_ns > REPEATED_NS else before
+
+    def altitude(self, said: AdsbVehicle) -> tuple[AltitudeDatum, float, int] | None:
+        """Datum, metres and age (ns) of the altitude that is joined to a position just learned."""
+        true_ns = _true_ns(said)
+        choice = (self.datum, said.alt_datum, AltitudeDatum.GEOMETRIC, AltitudeDatum.PRESSURE)
+        for datum in choice:
+            if datum is not None and datum is said.alt_datum and said.alt_m is not None:
+                return datum, said.alt_m, 0
+            known = self.altitudes.get(datum) if datum is not None else None
+            if datum is not None and known is not None:
+                age_ns = abs(true_ns - known[0])
+                if age_ns <= ALTITUDE_KEPT_NS:
+                    return datum, known[1], age_ns
+        return None
+
+    def report(self, said: AdsbVehicle, at_deg: tuple[float, float]) -> Report | None:
+        """The report of a position that is news; None where no altitude is known for it."""
+        altitude = self.altitude(said)
+        if altitude is None:
+            return None
+        true_ns = _true_ns(said)
+        self.datum, alt_m, age_ns = altitude
+        self.position_ns = max(true_ns, self.position_ns or true_ns)
+        self.reported[at_deg] = said
+        self.reported.move_to_end(at_deg)
+        if len(self.reported) > POSITIONS_KEPT:
+            self.reported.popitem(last=False)
+        return Report(
+            t_ns=said.t_ns,
+            link=said.link,
+            uav=said.uav,
+            source=said.source,
+            lat_deg=at_deg[0],
+            lon_deg=at_deg[1],
+            alt_m=alt_m,
+            alt_datum=self.datum,
+            relative_alt_m=None,
+            velocity_ne_mps=_fitting(said.velocity_ne_mps, self.velocity_ne, true_ns),
+            velocity_down_mps=_fitting(said.velocity_down_mps, self.velocity_down, true_ns),
+            heading_deg=_fitting(said.heading_deg, self.heading, true_ns),
+            boot_ms=None,
+            tslc_s=float(said.tslc_s),
+            alt_age_s=age_ns * 1e-9,
+        )
+
+
+class Aircraft:
+    """All relayed aircraft. ``merge`` takes the messages about them in order of arrival.
+
+    At most ``AIRCRAFT_MAX`` are known, and none that had no news for ``FORGOTTEN_S``. Their names
+    are those of ``AdsbVehicle.uav``.
+    """
+
+    def __init__(self) -> None:
+        self._known: OrderedDict[str, _Known] = OrderedDict()  # the longest without news first
+
+    def merge(self, said: AdsbVehicle) -> Report | Rejection:
+        """Take in a message: a report if its position is news, else the reason why there is none.
+
+        The report is completed from earlier messages. Reasons:
+
+            NO_POSITION   no position; its other fields are merged
+            NO_ALTITUDE   no altitude is known for the position; its fields are merged
+            DUPLICATE     the position was reported before
+            OUT_OF_ORDER  certainly older than a reported one, or not heard for ``FORGOTTEN_S``
+        """
+        self._forget(said.t_ns)
+        known = self._known.get(said.uav)
+        if known is not None:
+            known.hear(said.source, said.t_ns)
+        if said.tslc_s >= FORGOTTEN_S:
+            return _rejected(said, Reason.OUT_OF_ORDER, f"not heard for {said.tslc_s} s")
+        if known is None:
+            known = self._begin(said)
+        if said.position_deg is not None:
+            before = known.repeated(said)
+            if before is not None:
+                known.learn(said, _true_ns(before))
+                return _rejected(said, Reason.DUPLICATE)
+        true_ns = _true_ns(said)
+        known.learn(said, true_ns)
+        known.news_ns = said.t_ns
+        self._known.move_to_end(said.uav)
+        if said.position_deg is None:
+            return _rejected(said, Reason.NO_POSITION)
+        if known.position_ns is not None and true_ns <= known.position_ns - SLACK_NS:
+            late_s = (known.position_ns - true_ns) * 1e-9
+            return _rejected(said, Reason.OUT_OF_ORDER, f"{late_s:.1f} s before the newest")
+        report = known.report(said, said.position_deg)
+        return report if report is not None else _rejected(said, Reason.NO_ALTITUDE)
+
+    def relays(self, uav: str) -> tuple[Source, ...]:
+        """Relays that spoke of an aircraft in the last ``FORGOTTEN_S``, the newest first."""
+        known = self._known.get(uav)
+        return tuple(reversed(known.relays)) if known is not None else ()
+
+    def datum(self, uav: str) -> AltitudeDatum | None:
+        """Datum of the altitudes in an aircraft's reports; None before the first report."""
+        known = self._known.get(uav)
+        return known.datum if known is not None else None
+
+    def callsign(self, uav: str) -> str | None:
+        """The aircraft's own callsign; None if not known."""
+        known = self._known.get(uav)
+        return known.callsign[1] if known is not None and known.callsign is not None else None
+
+    def _begin(self, said: AdsbVehicle) -> _Known:
+        known = self._known.setdefault(said.uav, _Known(said.t_ns))
+        known.hear(said.source, said.t_ns)
+        if len(self._known) > AIRCRAFT_MAX:
+            self._known.popitem(last=False)
+        return known
+
+    def _forget(self, t_ns: int) -> None:
+        while self._known and _is_past(next(iter(self._known.values())).news_ns, t_ns):
+            self._known.popitem(last=False)
+
+
+def _is_past(then_ns: int, t_ns: int) -> bool:
+    return t_ns - then_ns > FORGOTTEN_S * _NS
+
+
+def _true_ns(said: AdsbVehicle) -> int:
+    return said.t_ns - said.tslc_s * _NS
+
+
+def _newest(before: _Dated[_T] | None, true_ns: int, value: _T | None) -> _Dated[_T] | None:
+    """The value said now with its time; the known one if nothing was said or it was true later."""
+    if value is None or (before is not None and true_ns < before[0]):
+        return before
+    return true_ns, value
+
+
+def _fitting(own: _T | None, known: _Dated[_T] | None, true_ns: int) -> _T | None:
+    """The message's own value, or the known one if it is of nearly the same time."""
+    if own is not None or known is None or abs(true_ns - known[0]) > VELOCITY_KEPT_NS:
+        return own
+    return known[1]
+
+
+def _differs(before: AdsbVehicle, said: AdsbVehicle) -> bool:
+    """Whether two messages with one position disagree in velocity or altitude."""
+    pairs = [
+        (before.velocity_ne_mps, said.velocity_ne_mps),
+        (before.velocity_down_mps, said.velocity_down_mps),
+    ]
+    if before.alt_datum is said.alt_datum:
+        pairs.append((before.alt_m, said.alt_m))
+    return any(a is not None and b is not None and a != b for a, b in pairs)
+
+
+def _rejected(said: AdsbVehicle, reason: Reason, detail: str = "") -> Rejection:
+    # Without a position there is nothing to show of the aircraft: it is its relay's message.
+    source = str(said.source) if reason is Reason.NO_POSITION else said.uav
+    return Rejection(said.t_ns, source, reason, msgid=ADSB_VEHICLE, detail=detail)

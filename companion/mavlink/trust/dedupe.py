@@ -1,0 +1,78 @@
+"""Duplicate reports: one that comes over several links, or twice over one, counts once.
+
+A report is known by its content: sender, message and payload. The sequence number is no part of it,
+since every link has its own. GLOBAL_POSITION_INT carries a boot time, so equal content is the same
+report. ADSB_VEHICLE carries none: ``adsb`` decides what is new in it.
+"""
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Final
+
+from companion.values import Frame
+
+WINDOW_NS: Final = 30_000_000_000
+"""How long a report is remembered: longer than any link has been seen to lag behind another."""
+LATENCIES_KEPT: Final = 256
+"""Newest latencies kept per link."""
+
+
+@dataclass(slots=True)
+class LinkShare:
+    """What one link has contributed.
+
+    first        reports that it brought before any other link
+    repeats      reports that had already come
+    latencies_s  how old the newest reports were when they came over this link, repeats included
+    """
+
+    first: int = 0
+    repeats: int = 0
+    latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=LATENCIES_KEPT))
+
+
+@dataclass(slots=True)
+class _First:
+    """The first arrival of a report; its latency is None until it is known."""
+
+    t_ns: int
+    link: str
+    latency_s: float | None = None
+
+
+class Dedupe:
+    """Remembers the reports of the last ``WINDOW_NS`` by content, and counts them by link."""
+
+    def __init__(self) -> None:
+        self.shares: dict[str, LinkShare] = {}
+        self._seen: dict[bytes, _First] = {}
+        self._order: deque[tuple[bytes, _First]] = deque()
+
+    def is_repeat(self, frame: Frame) -> bool:
+        """Count a frame; True if the same content came before, within the window."""
+        while self._order and self._order[0][1].t_ns < frame.t_ns - WINDOW_NS:
+            self._forget(*self._order.popleft())
+        share = self.shares.get(frame.link)
+        if share is None:
+            share = self.shares.setdefault(frame.link, LinkShare())
+        key = bytes(frame.source) + frame.msgid.to_bytes(3, "little") + frame.payload.rstrip(b"\0")
+        first = self._seen.get(key)
+        if first is None:
+            first = self._seen[key] = _First(frame.t_ns, frame.link)
+            self._order.append((key, first))
+            share.first += 1
+            return False
+        share.repeats += 1
+        if first.latency_s is not None:
+            share.latencies_s.append(first.latency_s + (frame.t_ns - first.t_ns) * 1e-9)
+        return True
+
+    def took(self, latency_s: float) -> None:
+        """Set the latency, in seconds, of the report that was last found to be new."""
+        _, first = self._order[-1]
+        first.latency_s = latency_s
+        self.shares[first.link].latencies_s.append(latency_s)
+
+    def _forget(self, key: bytes, first: _First) -> None:
+        if self._seen.get(key) is first:
+            del self._seen[key]

@@ -1,0 +1,221 @@
+"""MAVLink 2 message signing: which frames a link with a key accepts, and how its own are signed.
+
+The 13 bytes that follow the checksum of a signed frame
+(https://mavlink.io/en/guide/message_signing.html):
+
+    link id     1 byte    which of the sender's links; with the sender's ids it names a stream
+    timestamp   6 bytes   little-endian, units of 10 µs since 2015-01-01T00:00:00Z
+    signature   6 bytes   the first of SHA-256(key + frame, magic byte to timestamp)
+
+**What is accepted.** A well signed frame that is newer than the newest accepted of its stream. A
+new stream must not be more than a minute behind the local timestamp, which is the newest of the own
+clock and all timestamps accepted. A datagram that another overtook is refused: without that rule it
+could not be told from a replay. Only accepted frames change any state, so that nobody without the
+key can shut a stream by sending a bad signature with a high timestamp. SETUP_SIGNING is a message
+like any other here: nobody changes a key over the air.
+
+**Each link is on its own.** Guards share nothing, even with one key. A router delivers the same
+signed frame over two links, and the link id in it is the sender's: shared state would refuse
+whichever copy comes later, and with it all that a slow link brings after a fast one. The price is
+that a frame heard on one link can be played once into another: it is genuine, what it reports is
+dropped as a duplicate, and from then on that link refuses it.
+
+**Frames of this node** are a stream of the link as well: with one key for all, such a frame sent
+back to the node would otherwise carry a good signature.
+
+**A wrong clock.** Whoever has the key may send a timestamp far ahead, and the local one follows, as
+the standard has it. Known streams go on by their own clocks. New streams on this link are refused
+until their sender has heard a frame of this node, which then carries the high timestamp and takes
+it along, or until time has caught up; a replay is never accepted instead. Other links do not
+notice. ``Guard.ahead_ns`` shows it. Timestamps in the last ten years of the 48 bits (to 2104) are
+not followed, or one frame could leave no timestamps for anybody else.
+
+**Memory.** At most ``STREAMS_MAX`` streams are remembered. The one with the oldest timestamp gives
+way to a new one; from then on new streams must be newer than what was forgotten.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from hashlib import sha256
+from hmac import compare_digest
+from typing import Final, Self
+
+from fastcrc import crc16
+
+from companion.mavlink.wire.crc_extra import CRC_EXTRA
+from companion.mavlink.wire.framing import MAGIC_V2, SIGNED
+from companion.values import Frame, Reason, UserError
+
+KEY_BYTES: Final = 32
+EPOCH_NS: Final = 1_420_070_400_000_000_000
+"""2015-01-01T00:00:00Z in nanoseconds since the Unix epoch."""
+UNIT_NS: Final = 10_000
+"""Nanoseconds per unit of a timestamp."""
+SECOND: Final = 100_000
+"""Units of a timestamp in a second."""
+MINUTE: Final = 60 * SECOND
+STREAMS_MAX: Final = 4096
+"""Streams remembered per link."""
+LATEST: Final = (1 << 48) - 1
+"""Largest timestamp of 48 bits."""
+FOLLOWED_MAX: Final = LATEST - 3650 * 24 * 60 * MINUTE
+"""Largest timestamp that the local timestamp follows: ten years before ``LATEST``."""
+MARGIN: Final = 5 * SECOND
+"""How far the state on disk may lag behind in a killed process: see ``State.after_crash``."""
+BURST: Final = SECOND
+"""More than the frames sent in ``MARGIN``: each takes one unit where the clock is behind."""
+
+Stream = tuple[int, int, int]
+"""System id and component id of the sender, and its link id."""
+Heard = tuple[int, int | None]
+"""Newest timestamp of a stream, and its lead over the own clock when it was accepted.
+
+The lead is None for a stream of this node.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """What a guard must not forget; times in units of 10 µs since 2015.
+
+    clock    the own clock when this was made
+    local    the local timestamp
+    sent     newest timestamp of this node's frames
+    floor    streams not in ``streams`` must be newer than this
+    streams  newest timestamp of each stream
+    """
+
+    clock: int = 0
+    local: int = 0
+    sent: int = 0
+    floor: int = -1
+    streams: Mapping[Stream, Heard] = field(default_factory=dict)
+
+    def after_crash(self) -> Self:
+        """The state to go on with if the process ended up to ``MARGIN`` after this one was made.
+
+        Each stream is advanced to where its clock was ``MARGIN`` later: a stream may have been
+        silent for an hour before it was heard in the second that is lost, so its newest timestamp
+        plus a margin would not do. Lost frames of this node were stamped no later than ``MARGIN``
+        ahead of the own clock, or of the clock of a sender ahead of it. Streams first heard in the
+        lost time are not known: new streams must be newer than anything this node could have sent.
+        None of this adds up when the process ends this way again and again.
+
+        Not covered: what was accepted, in the lost time, from a sender whose clock leapt ahead just
+        then, or that was new and ahead, or that was ahead and came back after a silence longer than
+        that.
+        """
+        sent = max(self.sent + BURST, max(self.local, self.clock) + MARGIN)
+        streams: dict[Stream, Heard] = {}
+        for stream, (newest, lead) in self.streams.items():
+            if lead is not None:
+                moved = max(newest, self.clock + lead + MARGIN)
+                streams[stream] = (moved, lead)
+                if newest > self.clock:
+                    sent = max(sent, min(moved, FOLLOWED_MAX))
+        ours = (stream for stream, (_, lead) in self.streams.items() if lead is None)
+        streams.update(dict.fromkeys(ours, (sent, None)))
+        return type(self)(self.clock, self.local, sent, max(self.floor, sent), streams)
+
+
+START: Final = State()
+"""Nothing heard and nothing sent."""
+
+
+def fingerprint(key: bytes) -> str:
+    """Eight hex digits that identify a key and do not reveal it."""
+    return sha256(sha256(key).digest()).hexdigest()[:8]
+
+
+class Guard:
+    """The signing state of one link: its key, and what was heard and sent with it.
+
+        key             32 bytes
+        link_id         0 to 255, carried by this node's frames; different for each link of one key
+        allow_unsigned  accept frames without a signature, MAVLink 1 among them; a signature that is
+                        there must still be right
+        state           the state of an earlier run
+
+    Raises ``UserError`` for a key of another length, ``ValueError`` for another link id.
+    """
+
+    def __init__(
+        self, key: bytes, link_id: int, *, allow_unsigned: bool = False, state: State = START
+    ) -> None:
+        if len(key) != KEY_BYTES:
+            raise UserError(f"a signing key has {KEY_BYTES} bytes, not {len(key)}")
+        if not 0 <= link_id <= 255:
+            raise ValueError(f"a link id is 0 to 255, not {link_id}")
+        self.link_id = link_id
+        self.allow_unsigned = allow_unsigned
+        self.moves = 0
+        """Number of times the remembered state has changed."""
+        self._key = key
+        self._local = state.local
+        self._sent = state.sent
+        self._floor = state.floor
+        self._streams = dict(state.streams)
+
+    def refusal(self, frame: Frame) -> Reason | None:
+        """Why a frame must not be used: UNSIGNED, BAD_SIGNATURE or REPLAYED; None if it may.
+
+        ``frame.raw`` is a whole frame whose checksum is right; ``frame.t_ns`` is the own clock, ns
+        since the Unix epoch. A frame that may be used is remembered, so each frame is to be asked
+        about once.
+        """
+        raw = frame.raw
+        if raw[0] != MAGIC_V2 or not raw[2] & SIGNED:
+            return None if self.allow_unsigned else Reason.UNSIGNED
+        if not compare_digest(sha256(self._key + raw[:-6]).digest()[:6], raw[-6:]):
+            return Reason.BAD_SIGNATURE
+        clock = (frame.t_ns - EPOCH_NS) // UNIT_NS
+        stamp = int.from_bytes(raw[-12:-6], "little")
+        stream = (raw[5], raw[6], raw[-13])
+        heard = self._streams.get(stream)
+        if stamp <= (heard[0] if heard else self._too_old(clock)):
+            return Reason.REPLAYED
+        self._remember(stream, (stamp, stamp - clock))
+        self._local = max(self._local, min(stamp, FOLLOWED_MAX))
+        return None
+
+    def sign(self, raw: bytes, now_ns: int) -> bytes:
+        """Sign an unsigned MAVLink 2 frame; ``now_ns`` is the own clock, ns since the Unix epoch.
+
+        The timestamp is that of the clock, or one more than the newest sent or accepted. Raises
+        ``ValueError`` for any other frame, ``OverflowError`` from the year 2104 on.
+        """
+        if raw[0] != MAGIC_V2 or raw[2] != 0:
+            raise ValueError("only an unsigned MAVLink 2 frame can be signed")
+        body = bytes([raw[1], SIGNED]) + raw[3:-2]
+        seed = bytes([CRC_EXTRA[int.from_bytes(raw[7:10], "little")]])
+        crc = crc16.mcrf4xx(body + seed).to_bytes(2, "little")
+        clock = (now_ns - EPOCH_NS) // UNIT_NS
+        stamp = max(clock, self._local + 1, self._sent + 1)
+        signed = raw[:1] + body + crc + bytes([self.link_id]) + stamp.to_bytes(6, "little")
+        self._remember((raw[5], raw[6], self.link_id), (stamp, None))
+        self._sent = stamp
+        return signed + sha256(self._key + signed).digest()[:6]
+
+    def state(self, now_ns: int) -> State:
+        """The state to keep; ``now_ns`` is the own clock, ns since the Unix epoch."""
+        clock = (now_ns - EPOCH_NS) // UNIT_NS
+        return State(clock, max(self._local, clock), self._sent, self._floor, dict(self._streams))
+
+    def ahead_ns(self, now_ns: int) -> int:
+        """How far the local timestamp is ahead of the own clock, ns, at least 0.
+
+        Minutes or more mean that a sender's clock is wrong, or that the own clock is or was.
+        """
+        return max(0, self._local * UNIT_NS + EPOCH_NS - now_ns)
+
+    def _too_old(self, clock: int) -> int:
+        """The newest timestamp with which no new stream may begin."""
+        return max(self._floor, max(self._local, clock) - MINUTE - 1)
+
+    def _remember(self, stream: Stream, heard: Heard) -> None:
+        streams = self._streams
+        if stream not in streams and len(streams) >= STREAMS_MAX:
+            oldest = min(streams, key=lambda other: streams[other][0])
+            self._floor = max(self._floor, streams.pop(oldest)[0])
+        streams[stream] = heard
+        self.moves += 1

@@ -1,0 +1,1 @@
+"""What the service itself sends over MAVLink: its presence, and requests for message rates."""

@@ -1,0 +1,278 @@
+"""The service as a MAVLink component: heartbeat, rate requests, TIMESYNC, and conflicts of ids.
+
+Pure: the caller passes in the frames heard and the time, and sends what is due.
+
+Heartbeat (https://mavlink.io/en/services/heartbeat.html): once a second, and only while the service
+is fit to be used. One that goes on regardless would lie to the others.
+
+TIMESYNC (https://mavlink.io/en/services/timesync.html): a request with the time of sending in
+``ts1`` goes to everybody. Each peer answers with that ``ts1`` and its own time in ``tc1``. Newer
+peers also name whom they answer; older ones do not. An answer to another program is recognised by
+its ``ts1``: other programs send microseconds, or any nanosecond, of Unix time, while the last three
+digits of ours are the system id, as in ArduPilot, which makes ``ts1`` up to 1 us earlier than the
+sending. A program that sends the very same nanosecond of Unix time to an autopilot that names
+nobody would still be mistaken for this service, once in a thousand million, and the round trip
+would be false only if that program's clock is ahead of ours.
+
+``tc1`` is nanoseconds since boot of ArduPilot (``GCS_MAVLINK::handle_timesync``: ``micros64()``
+times 1000) and of PX4 (mavlink_timesync.cpp: ``hrt_absolute_time()`` times 1000), the clock of the
+milliseconds in their positions. Ground stations and other programs answer with Unix time, which
+says nothing of any boot clock. Answers of senders without a position or attitude are therefore not
+read, and answers far off the sender's boot clock are refused. See docs/field-notes.md 1.
+"""
+
+import struct
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+from companion.mavlink.clock.epochs import WRAP_NS
+from companion.mavlink.voice.message_rates import MessageRates
+from companion.mavlink.voice.rate_watch import STREAM, MessageRate, Request
+from companion.mavlink.wire.decode import ATTITUDE, GLOBAL_POSITION_INT, unpack
+from companion.mavlink.wire.encode import (
+    COMMAND_LONG,
+    HEARTBEAT,
+    MAV_CMD_SET_MESSAGE_INTERVAL,
+    REQUEST_DATA_STREAM,
+    TIMESYNC,
+    Outgoing,
+    heartbeat,
+    timesync,
+)
+from companion.values import (
+    Frame,
+    Notice,
+    Reason,
+    Rejection,
+    RoundTrip,
+    Severity,
+    Source,
+    UserError,
+)
+
+_NS: Final = 1_000_000_000
+COMMAND_ACK: Final = 77
+_STAMPED: Final = frozenset({ATTITUDE, GLOBAL_POSITION_INT})
+HEARD: Final = _STAMPED | {HEARTBEAT, REQUEST_DATA_STREAM, COMMAND_LONG, COMMAND_ACK, TIMESYNC}
+"""Ids of the messages that ``Component.hear`` must be given."""
+
+HEARTBEAT_NS: Final = _NS
+"""Time between two heartbeats."""
+TIMESYNC_NS: Final = (1 * _NS, 5 * _NS)
+"""Time between TIMESYNC requests: for the first ``TIMESYNC_FIRST``, and later."""
+TIMESYNC_FIRST: Final = 10
+"""Requests sent at the shorter interval."""
+LONGEST_TRIP_NS: Final = 10 * _NS
+"""Longest round trip that is used."""
+KEPT_NS: Final = 30 * _NS
+"""How long sent messages and senders' newest stamps are remembered."""
+CLOCKS_APART_NS: Final = 60 * _NS
+"""Largest distance of an answer from the sender's boot clock.
+
+Beyond it, it is about another clock.
+"""
+_UPTIME_MAX_NS: Final = 10 * 365 * 86_400 * _NS
+"""Greatest time since boot that is believed. Unix time has exceeded it since 1980."""
+CONFLICT_AGAIN_NS: Final = 300 * _NS
+"""Time after which a conflict of ids is reported again."""
+
+_BROADCAST: Final = 0
+_NOT_OURS: Final = frozenset({0, 1, 190})  # everybody, an autopilot, a ground station
+_RATES_HZ: Final = (0.1, 100.0)
+_ALL_STREAMS: Final = 0
+
+_COMMAND_ACK = struct.Struct("<HBBiBB")
+_COMMAND_LONG = struct.Struct("<7fHBBB")
+_REQUEST_DATA_STREAM = struct.Struct("<HBBBB")
+_TIMESYNC = struct.Struct("<qqBB")
+
+
+@dataclass(frozen=True, slots=True)
+class ComponentSpec:
+    """The identity of the service on the network, and the message rates that it wants.
+
+        source       system and component id of the service
+        carrier      the vehicle that carries the array; None for a fixed array
+        position_hz  rate of GLOBAL_POSITION_INT wanted of every UAV and of the carrier
+        attitude_hz  rate of ATTITUDE wanted of the carrier
+
+    A rate of None asks for nothing. Raises ``UserError`` for ids that belong to ground stations,
+    autopilots or everybody, for a source that is the carrier, and for rates outside 0.1 to 100 Hz.
+    """
+
+    source: Source
+    carrier: Source | None
+    position_hz: float | None
+    attitude_hz: float | None
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.source.sysid <= 254:
+            raise UserError(f"source is {self.source}, allowed system ids: 1 to 254")
+        if self.source.compid in _NOT_OURS or not 0 <= self.source.compid <= 255:
+            raise UserError(
+                f"source is {self.source}, allowed component ids: 2 to 255, and not 190;"
+                " an onboard computer is 191"
+            )
+        if self.carrier == self.source:
+            raise UserError(f"carrier is {self.carrier}, the source itself; allowed: another one")
+        for name, rate_hz in (("position_hz", self.position_hz), ("attitude_hz", self.attitude_hz)):
+            if rate_hz is not None and not _RATES_HZ[0] <= rate_hz <= _RATES_HZ[1]:
+                raise UserError(f"{name} is {rate_hz}, allowed: 0.1 to 100")
+
+
+class Component:
+    """The service as a MAVLink component. Times are node times and do not go back."""
+
+    def __init__(self, settings: ComponentSpec) -> None:
+        self.settings = settings
+        self._source = settings.source
+        self._rates = MessageRates(
+            settings.source, settings.carrier, settings.position_hz, settings.attitude_hz
+        )
+        self._heartbeat_ns = 0  # no heartbeat before this time
+        self._timesync_ns = 0
+        self._timesyncs = 0
+        self._answered: dict[int, set[Source]] = {}  # who answered, by time of sending
+        self._sent: dict[tuple[int, bytes], int] = {}  # own messages by content: when last sent
+        self._stamps: dict[Source, tuple[int, int]] = {}  # arrival ns and boot ms of the newest
+        self._purge_ns = 0
+        self._conflict_ns: int | None = None
+
+    def hear(self, frame: Frame) -> list[RoundTrip | Rejection | Notice]:
+        """Take in a frame whose id is in ``HEARD``.
+
+        Returns round trips, rejections and notices that came of it, or since the last call.
+        """
+        said: list[RoundTrip | Rejection | Notice] = []
+        if frame.source == self._source:
+            self._own_name(frame, said)
+        elif frame.msgid in _STAMPED:
+            boot_ms = int.from_bytes(frame.payload[:4], "little")  # zeros cut off are zeros
+            self._stamps[frame.source] = (frame.t_ns, boot_ms)
+            self._rates.stamped(frame.t_ns, frame.source, frame.msgid, boot_ms)
+        else:
+            self._rates.heard(frame.t_ns, frame.source)
+            if frame.msgid == TIMESYNC:
+                self._timesync_answer(frame, said)
+            elif frame.msgid == COMMAND_ACK:
+                self._command_ack(frame)
+            elif frame.msgid == COMMAND_LONG:
+                self._command_long(frame)
+            elif frame.msgid == REQUEST_DATA_STREAM:
+                self._request_data_stream(frame)
+        if self._rates.notices:
+            said += self._rates.notices
+            self._rates.notices.clear()
+        return said
+
+    def due(
+        self, now_ns: int, fit: bool, uavs: Iterable[Source]
+    ) -> list[tuple[Outgoing, Source | None]]:
+        """The messages to be sent now, each with its target; None: to everybody.
+
+            fit   the service can be relied on
+            uavs  UAVs whose positions matter
+
+        Call it about ten times a second. What was missed between calls is not made up for.
+        """
+        out: list[tuple[Outgoing, Source | None]] = []
+        if fit and now_ns >= self._heartbeat_ns:
+            self._heartbeat_ns = now_ns + HEARTBEAT_NS
+            out.append((heartbeat(self._source), None))
+        if now_ns >= self._timesync_ns:
+            self._timesyncs += 1
+            self._timesync_ns = now_ns + TIMESYNC_NS[self._timesyncs >= TIMESYNC_FIRST]
+            sent_ns = now_ns - (now_ns - self._source.sysid) % 1000
+            self._answered[sent_ns] = set()
+            out.append((timesync(self._source, sent_ns), None))
+        out += self._rates.due(now_ns, uavs)
+        for message, _ in out:
+            self._sent[_content(message.msgid, message.payload)] = now_ns
+        if now_ns >= self._purge_ns:
+            self._purge_ns = now_ns + _NS
+            self._purge(now_ns - KEPT_NS)
+        return out
+
+    def rates(self) -> list[MessageRate]:
+        """The state of every message whose rate is watched."""
+        return self._rates.state()
+
+    def _purge(self, oldest_ns: int) -> None:
+        self._answered = {t_ns: who for t_ns, who in self._answered.items() if t_ns >= oldest_ns}
+        self._sent = {content: t_ns for content, t_ns in self._sent.items() if t_ns >= oldest_ns}
+        self._stamps = {who: at for who, at in self._stamps.items() if at[0] >= oldest_ns}
+
+    def _own_name(self, frame: Frame, said: list[RoundTrip | Rejection | Notice]) -> None:
+        """Handle a frame under this service's id: one of its own come back, or a stranger's."""
+        sent_ns = self._sent.get(_content(frame.msgid, frame.payload))
+        if sent_ns is not None and frame.t_ns - sent_ns <= KEPT_NS:
+            return
+        if self._conflict_ns is None or frame.t_ns - self._conflict_ns >= CONFLICT_AGAIN_NS:
+            self._conflict_ns = frame.t_ns
+            text = f"{frame.link}: someone else sends as {self._source}, which is this service's id"
+            said.append(Notice(frame.t_ns, Severity.WARNING, str(self._source), text))
+
+    def _timesync_answer(self, frame: Frame, said: list[RoundTrip | Rejection | Notice]) -> None:
+        remote_ns, sent_ns, *target = unpack(frame, _TIMESYNC)
+        answered = self._answered.get(sent_ns)
+        stamp = self._stamps.get(frame.source)
+        if remote_ns == 0 or answered is None or stamp is None or not self._is_for_us(*target):
+            return  # a request, or an answer to others, or of no use to us
+        if frame.t_ns - sent_ns > LONGEST_TRIP_NS:
+            trip_s = (frame.t_ns - sent_ns) * 1e-9
+            refused, detail = Reason.OUT_OF_ORDER, f"TIMESYNC: it took {trip_s:.1f} s"
+        elif not _is_boot_time(remote_ns, frame.t_ns, *stamp):
+            refused, detail = Reason.UNPLACED_STAMP, "TIMESYNC: not the clock of its positions"
+        elif frame.source in answered:
+            refused, detail = Reason.DUPLICATE, "TIMESYNC: answered before"
+        else:
+            answered.add(frame.source)
+            said.append(RoundTrip(frame.t_ns, frame.source, sent_ns, remote_ns))
+            return
+        said.append(
+            Rejection(frame.t_ns, str(frame.source), refused, msgid=TIMESYNC, detail=detail)
+        )
+
+    def _command_ack(self, frame: Frame) -> None:
+        command, result, _, _, *target = unpack(frame, _COMMAND_ACK)
+        if command == MAV_CMD_SET_MESSAGE_INTERVAL and self._is_for_us(*target):
+            self._rates.acknowledged(frame.t_ns, frame.source, result)
+
+    def _command_long(self, frame: Frame) -> None:
+        msgid, interval_us, *_, command, sysid, compid, _ = unpack(frame, _COMMAND_LONG)
+        if command == MAV_CMD_SET_MESSAGE_INTERVAL and msgid in STREAM:
+            hz = 1e6 / interval_us if interval_us > 0 else None  # stopped, or its default
+            target = Source(sysid, compid)
+            self._rates.requested(Request(frame.t_ns, frame.source, target, (int(msgid),), hz))
+
+    def _request_data_stream(self, frame: Frame) -> None:
+        rate_hz, sysid, compid, stream, start = unpack(frame, _REQUEST_DATA_STREAM)
+        msgids = tuple(m for m, its in STREAM.items() if stream in (its, _ALL_STREAMS))
+        if msgids:
+            target, hz = Source(sysid, compid), float(rate_hz if start else 0)
+            self._rates.requested(Request(frame.t_ns, frame.source, target, msgids, hz))
+
+    def _is_for_us(self, sysid: int, compid: int) -> bool:
+        """Whether an answer may be for this service: it says so, or names nobody."""
+        return sysid in (_BROADCAST, self._source.sysid) and compid in (
+            _BROADCAST,
+            self._source.compid,
+        )
+
+
+def _content(msgid: int, payload: bytes) -> tuple[int, bytes]:
+    """The part of a message that a router leaves as it is, whichever version it forwards in."""
+    return msgid, payload.rstrip(b"\0")
+
+
+def _is_boot_time(remote_ns: int, t_ns: int, stamp_t_ns: int, boot_ms: int) -> bool:
+    """Whether ``remote_ns`` is the clock of the stamp ``boot_ms`` that came at ``stamp_t_ns``.
+
+    The stamp wraps after 49.7 days; ``remote_ns`` does not.
+    """
+    if not 0 < remote_ns < _UPTIME_MAX_NS:
+        return False
+    expected_ns = boot_ms * 1_000_000 + t_ns - stamp_t_ns
+    apart_ns = (remote_ns - expected_ns + WRAP_NS // 2) % WRAP_NS - WRAP_NS // 2
+    return abs(apart_ns) <= CLOCKS_APART_NS

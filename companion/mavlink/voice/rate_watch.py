@@ -1,0 +1,298 @@
+"""The watch on one message of one UAV: its rate, and the requests that keep it in order.
+
+A small state machine (``Watch``):
+
+    watching    nothing was asked, or the rate came without asking
+    asked       SET_MESSAGE_INTERVAL was sent; up to three times, as COMMAND_ACK may be lost
+    accepted    the autopilot said so, or its rate shows it
+    streaming   REQUEST_DATA_STREAM was sent, after a refusal or no answer; nobody acknowledges it
+    refused     neither helped
+
+A request is sent only where a rate is lower than wanted: a higher one is wanted by someone else.
+The time between two requests doubles from round to round, and begins anew after the rate was in
+order for long. Programs that want different rates of one UAV then do not fight over it, and a thin
+link is not filled with requests.
+
+The rate is the sender's, measured between its own stamps. What the link loses (up to half),
+repeats, delays or delivers in bursts therefore changes nothing; asking would not either. A message
+counts as absent only while others of the same sender come.
+
+Sources: https://mavlink.io/en/services/command.html, https://mavlink.io/en/messages/common.html.
+ArduPilot answers FAILED for a message that it does not stream (``set_message_interval`` in its
+GCS_Common.cpp); PX4 ignores REQUEST_DATA_STREAM (mavlink_receiver.cpp).
+"""
+
+import math
+from bisect import insort
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from enum import StrEnum
+from itertools import pairwise
+from statistics import median_high
+from typing import Final, NamedTuple
+
+from companion.mavlink.wire.decode import ATTITUDE, GLOBAL_POSITION_INT
+from companion.mavlink.wire.encode import Outgoing, request_data_stream, set_message_interval
+from companion.values import Notice, Severity, Source
+
+_NS: Final = 1_000_000_000
+SLOW_BELOW: Final = 0.8
+"""Fraction of the wanted rate below which a rate is slow."""
+SETTLE_NS: Final = 5 * _NS
+"""How long a rate must be slow, or in order, to count as such: at least this, and five messages."""
+TRIES: Final = 3
+"""SET_MESSAGE_INTERVAL requests in one round before REQUEST_DATA_STREAM is tried."""
+BACKOFF_NS: Final = (5 * _NS, 300 * _NS)
+"""Shortest and longest time between two requests for one message of one UAV."""
+IN_ORDER_NS: Final = 600 * _NS
+"""How long a rate must be in order before the back-off begins anew and notices may be repeated."""
+BLAME_NS: Final = 30 * _NS
+"""Longest time between a request of someone else and a change that is blamed on it."""
+_ACK_WAIT_NS: Final = 5 * _NS
+"""How long the answer to a command is waited for before another command goes to that UAV."""
+_PROGRESS_NS: Final = 60 * _NS
+"""How long after a request IN_PROGRESS answers still postpone the next one."""
+_LATE_MS: Final = 30_000
+"""Largest step back of a stamp that counts as a late frame; a larger one is a restart."""
+_STAMPS: Final = 12
+"""Newest stamps kept per message."""
+_ENOUGH: Final = 5  # intervals, for a rate or to settle
+_WRAP_MS: Final = 1 << 32
+
+_NAMES: Final = {GLOBAL_POSITION_INT: "GLOBAL_POSITION_INT", ATTITUDE: "ATTITUDE"}
+STREAM: Final = {GLOBAL_POSITION_INT: 6, ATTITUDE: 10}
+"""Data stream that carries a message: MAV_DATA_STREAM_POSITION, MAV_DATA_STREAM_EXTRA1."""
+_ACCEPTED, _TEMPORARILY_REJECTED, _IN_PROGRESS = 0, 1, 5  # MAV_RESULT; all others are refusals
+RESTART: Final = "a restart"
+NOBODY: Final = "nobody was heard asking"
+
+
+class RateState(StrEnum):
+    """State of the request for one message; see the head of this module."""
+
+    WATCHING = "watching"
+    ASKED = "asked"
+    ACCEPTED = "accepted"
+    STREAMING = "streaming"
+    REFUSED = "refused"
+
+
+@dataclass(frozen=True, slots=True)
+class MessageRate:
+    """State of one message of one UAV.
+
+    ``changed_by`` is who lowered a rate that was in order: ``SYSID:COMPID``, a restart of the UAV,
+    or the statement that nobody was heard asking; None if nobody has.
+    """
+
+    uav: Source
+    msgid: int
+    wanted_hz: float
+    observed_hz: float | None
+    state: RateState
+    asked: int
+    changed_by: str | None
+
+
+class Request(NamedTuple):
+    """A request by someone else for the rate of some messages."""
+
+    t_ns: int
+    by: Source
+    target: Source
+    msgids: tuple[int, ...]
+    hz: float | None
+
+    def explains(self, uav: Source, msgid: int, wanted_hz: float) -> bool:
+        """Whether this request may have made a message slower than wanted."""
+        addressed = all(mine in (0, its) for mine, its in zip(self.target, uav, strict=True))
+        return addressed and msgid in self.msgids and (self.hz is None or self.hz < wanted_hz)
+
+
+class Observed:
+    """The rate of a message by its sender's own stamps, and when it last came."""
+
+    __slots__ = ("_newest_ms", "last_ns", "restarted_ns", "stamps_ms")
+
+    def __init__(self, now_ns: int) -> None:
+        self.last_ns = now_ns
+        self.restarted_ns: int | None = None
+        self._newest_ms: int | None = None
+        self.stamps_ms: list[int] = []  # the newest, in order, past the wrap
+
+    def add(self, t_ns: int, boot_ms: int) -> None:
+        """Take in one message. A late stamp is put in its place; a repeated one is ignored."""
+        newest_ms = boot_ms if self._newest_ms is None else self._newest_ms
+        step_ms = (boot_ms - newest_ms + _WRAP_MS // 2) % _WRAP_MS - _WRAP_MS // 2
+        if step_ms <= -_LATE_MS:
+            self.restarted_ns = t_ns
+            self.stamps_ms.clear()
+        elif step_ms <= 0 and newest_ms + step_ms in self.stamps_ms:
+            return
+        if step_ms > 0 or not self.stamps_ms:
+            self._newest_ms = newest_ms + step_ms
+            self.last_ns = t_ns
+        insort(self.stamps_ms, newest_ms + step_ms)
+        del self.stamps_ms[:-_STAMPS]
+
+    def median_ns(self) -> int | None:
+        """Median interval between stamps; None while there are too few."""
+        if len(self.stamps_ms) <= _ENOUGH:
+            return None
+        return median_high(b - a for a, b in pairwise(self.stamps_ms)) * 1_000_000
+
+
+@dataclass(slots=True)
+class Watch:
+    """The state machine for one message of one UAV."""
+
+    uav: Source
+    msgid: int
+    wanted_hz: float
+    observed: Observed
+    state: RateState = RateState.WATCHING
+    asked: int = 0
+    changed_by: str | None = None
+    next_ns: int = 0  # no request before this time
+    asked_ns: int = 0  # when the newest request was sent
+    _backoff_ns: int = 0  # of this round; 0: no round since the rate was last long in order
+    _tries: int = 0  # SET_MESSAGE_INTERVAL requests in this round
+    _by_stream: bool = False  # SET_MESSAGE_INTERVAL was refused, or not answered
+    _slow_since_ns: int | None = None
+    _order_since_ns: int | None = None
+    _was_in_order: bool = False  # settled in order since the newest request
+    _told: set[str] = field(default_factory=set)
+
+    def observed_hz(self, heard_ns: int) -> float | None:
+        """The rate as of when the UAV was last heard; None while too little is known."""
+        median_ns = self.observed.median_ns()
+        if median_ns is None:
+            return None
+        return _NS / max(median_ns, heard_ns - self.observed.last_ns)
+
+    def view(self, heard_ns: int) -> MessageRate:
+        """The state as of when the UAV was last heard."""
+        hz = self.wanted_hz, self.observed_hz(heard_ns)
+        return MessageRate(self.uav, self.msgid, *hz, self.state, self.asked, self.changed_by)
+
+    def review(self, now_ns: int, heard_ns: int, others: Iterable[Request]) -> list[Notice]:
+        """Judge the rate. Returns the notices that follow from it."""
+        observed_hz = self.observed_hz(heard_ns)
+        silence_ns = heard_ns - self.observed.last_ns
+        slow_hz = self.wanted_hz * SLOW_BELOW
+        if silence_ns * slow_hz > _NS or (observed_hz is not None and observed_hz < slow_hz):
+            if self._slow_since_ns is None:
+                self._slow_since_ns = now_ns
+            if self._is_settled(self._slow_since_ns, now_ns):
+                self._order_since_ns = None
+                return self._slow(now_ns, self._slow_since_ns, observed_hz, others)
+        else:
+            self._slow_since_ns = None
+            if observed_hz is not None:
+                self._in_order(now_ns)
+        return []
+
+    def ready(self, now_ns: int) -> bool:
+        """Whether a request is due: the rate has long been slow, and the back-off is over."""
+        since_ns = self._slow_since_ns
+        slow = since_ns is not None and self._is_settled(since_ns, now_ns)
+        return slow and now_ns >= self.next_ns
+
+    def awaits_ack(self, now_ns: int) -> bool:
+        """Whether an answer to the one command that is under way to the UAV may still come.
+
+        There is only one at a time, since an answer does not say which message it is about.
+        """
+        unanswered = self.state is RateState.ASKED and not self._by_stream
+        return unanswered and now_ns < self.asked_ns + _ACK_WAIT_NS
+
+    def ask(self, now_ns: int, source: Source) -> Outgoing:
+        """Make the request that is due and record that it was sent."""
+        if self.state is not RateState.ASKED:  # a new round
+            self._backoff_ns = min(max(2 * self._backoff_ns, BACKOFF_NS[0]), BACKOFF_NS[1])
+            self._tries = 0
+        self.asked += 1
+        self.asked_ns = now_ns
+        self.next_ns = now_ns + self._backoff_ns
+        if self._by_stream or self._tries == TRIES:
+            self.state = RateState.STREAMING
+            self._by_stream = True
+            self._expect_change()
+            rate_hz = math.ceil(self.wanted_hz)
+            return request_data_stream(source, self.uav, STREAM[self.msgid], rate_hz)
+        self.state = RateState.ASKED
+        self._tries += 1
+        interval_us = round(1e6 / self.wanted_hz)
+        return set_message_interval(
+            source, self.uav, self.msgid, interval_us, confirmation=self._tries - 1
+        )
+
+    def acknowledged(self, t_ns: int, result: int) -> None:
+        """Take in a COMMAND_ACK to the newest request; after a refusal it is another's."""
+        if self._by_stream:
+            return
+        if result == _ACCEPTED:
+            self.state = RateState.ACCEPTED
+            self._expect_change()
+        elif result == _IN_PROGRESS:
+            until_ns = min(t_ns, self.asked_ns + _PROGRESS_NS) + self._backoff_ns
+            self.next_ns = max(self.next_ns, until_ns)
+        elif result != _TEMPORARILY_REJECTED:  # after a temporary rejection, try again
+            self._by_stream = True
+
+    def _is_settled(self, since_ns: int, now_ns: int) -> bool:
+        return now_ns - since_ns >= max(SETTLE_NS, round(_ENOUGH / self.wanted_hz * _NS))
+
+    def _expect_change(self) -> None:
+        """Discard what was observed, because the rate is about to change."""
+        self.observed.stamps_ms.clear()
+        self._slow_since_ns = self._order_since_ns = None
+
+    def _in_order(self, now_ns: int) -> None:
+        if self.state is RateState.ASKED and not self._by_stream:
+            self.state = RateState.ACCEPTED  # it was done, though nobody was heard to say so
+        elif self.state in (RateState.ASKED, RateState.REFUSED):
+            self.state = RateState.WATCHING
+        if self._order_since_ns is None:
+            self._order_since_ns = now_ns
+        self._was_in_order |= self._is_settled(self._order_since_ns, now_ns)
+        if now_ns - self._order_since_ns >= IN_ORDER_NS:
+            self._backoff_ns = 0
+            self._told.clear()
+            self.changed_by = None
+
+    def _slow(
+        self, now_ns: int, since_ns: int, observed_hz: float | None, others: Iterable[Request]
+    ) -> list[Notice]:
+        """Handle a rate that settled as slow: it was changed, or the last request did not help."""
+        comes = "does not come" if observed_hz is None else f"comes at {observed_hz:.2g} Hz"
+        text = f"{self.uav}: {_NAMES[self.msgid]} {comes}, wanted is {self.wanted_hz:g} Hz: "
+        if self._was_in_order:
+            self._was_in_order = False
+            self.changed_by = self._who_changed(since_ns, others)
+            by = "" if self.changed_by == NOBODY else "changed by "
+            return self._tell(now_ns, self.changed_by, text + by + self.changed_by)
+        if self.state is RateState.STREAMING and now_ns >= self.next_ns:
+            self.state = RateState.REFUSED
+            self.next_ns = now_ns + self._backoff_ns
+            self._by_stream = False
+            return self._tell(now_ns, self.state, text + "asking does not help")
+        return []
+
+    def _who_changed(self, since_ns: int, others: Iterable[Request]) -> str:
+        """The latest known cause between our own newest request and the change."""
+        after_ns = max(since_ns - BLAME_NS, self.asked_ns)
+        causes = [
+            (request.t_ns, str(request.by))
+            for request in others
+            if request.explains(self.uav, self.msgid, self.wanted_hz)
+        ]
+        if self.observed.restarted_ns is not None:
+            causes.append((self.observed.restarted_ns, RESTART))
+        return max((c for c in causes if after_ns <= c[0] <= since_ns), default=(0, NOBODY))[1]
+
+    def _tell(self, now_ns: int, what: str, text: str) -> list[Notice]:
+        if what in self._told:
+            return []
+        self._told.add(what)
+        return [Notice(now_ns, Severity.WARNING, str(self.uav), text)]

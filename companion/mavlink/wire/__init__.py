@@ -1,0 +1,1 @@
+"""Bytes to frames to messages, and back: framing, checksums, one decoder per message."""

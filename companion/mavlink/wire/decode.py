@@ -1,0 +1,221 @@
+"""Decoders: one function per message, from a frame to a value, each field with its own validity.
+
+Sources: the message definitions of https://mavlink.io/en/messages/common.html. MAVLink 2 cuts
+trailing zero bytes of a payload, and a version 1 frame has no extension fields: both are read as
+zeros, as the standard says. Where zero means "not sent" the value is None.
+"""
+
+import math
+import struct
+from collections.abc import Callable
+from typing import Final
+
+from companion.values import (
+    AdsbVehicle,
+    AltitudeDatum,
+    Attitude,
+    Frame,
+    GnssStatus,
+    Message,
+    Presence,
+    Reason,
+    Rejection,
+    Report,
+    SystemTime,
+)
+
+HEARTBEAT: Final = 0
+SYSTEM_TIME: Final = 2
+GPS_RAW_INT: Final = 24
+ATTITUDE: Final = 30
+GLOBAL_POSITION_INT: Final = 33
+ADSB_VEHICLE: Final = 246
+
+NULL_ISLAND_RADIUS_M: Final = 5000.0
+"""Distance from 0 N 0 E within which no position is believed.
+
+Estimators without a fix wander there by some metres (docs/field-notes.md 1).
+"""
+_METRES_PER_DEGREE: Final = 111_195.0
+
+# ADSB_FLAGS. Not asked for: 256 is BARO_VALID to some and "retransmitted" to others (PX4).
+_COORDS, _ALTITUDE, _HEADING, _VELOCITY, _CALLSIGN, _VERTICAL = 1, 2, 4, 8, 16, 128
+_DATUM: Final = {0: AltitudeDatum.PRESSURE, 1: AltitudeDatum.GEOMETRIC}  # ADSB_ALTITUDE_TYPE
+_ICAO_MAX: Final = 0xFF_FFFF
+
+
+class _RefusedError(Exception):
+    """Raised inside this module only: the message must be rejected, for this reason."""
+
+    def __init__(self, reason: Reason, detail: str = "") -> None:
+        super().__init__(reason)
+        self.reason = reason
+        self.detail = detail
+
+
+def decode(frame: Frame) -> Message | Rejection | None:
+    """Decode a frame. Returns None for messages that nobody here reads.
+
+    A frame whose fields cannot be used gives a ``Rejection`` with its reason.
+    """
+    decoder = _DECODERS.get(frame.msgid)
+    if decoder is None:
+        return None
+    try:
+        return decoder(frame)
+    except _RefusedError as why:
+        return Rejection(
+            frame.t_ns, str(frame.source), why.reason, msgid=frame.msgid, detail=why.detail
+        )
+
+
+def unpack(frame: Frame, layout: struct.Struct) -> tuple[int, ...]:
+    """Unpack the fields of a payload.
+
+    Fields cut off, or absent in its MAVLink version, are zeros.
+    """
+    return layout.unpack(frame.payload.ljust(layout.size, b"\0")[: layout.size])
+
+
+def _position(lat_1e7: int, lon_1e7: int) -> tuple[float, float]:
+    """Latitude and longitude in degrees.
+
+    Refuses coordinates that are no place on Earth, and those that are sent before there is a fix.
+    """
+    lat_deg, lon_deg = lat_1e7 * 1e-7, lon_1e7 * 1e-7
+    if abs(lat_deg) > 90.0 or abs(lon_deg) > 180.0:
+        raise _RefusedError(Reason.MALFORMED, f"latitude {lat_deg}, longitude {lon_deg}")
+    if math.hypot(lat_deg, lon_deg) * _METRES_PER_DEGREE < NULL_ISLAND_RADIUS_M:
+        raise _RefusedError(Reason.ZERO_POSITION)
+    return lat_deg, lon_deg
+
+
+_GLOBAL_POSITION_INT = struct.Struct("<IiiiihhhH")
+
+
+def _global_position_int(frame: Frame) -> Report:
+    """Decode position and velocity; ``vz`` is positive down, ``hdg`` 65535 is unknown."""
+    boot_ms, lat, lon, alt_mm, rel_mm, vx, vy, vz, hdg = unpack(frame, _GLOBAL_POSITION_INT)
+    lat_deg, lon_deg = _position(lat, lon)
+    return Report(
+        t_ns=frame.t_ns,
+        link=frame.link,
+        uav=str(frame.source),
+        source=frame.source,
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        alt_m=alt_mm * 1e-3,
+        alt_datum=AltitudeDatum.MSL,
+        relative_alt_m=rel_mm * 1e-3,
+        velocity_ne_mps=(vx * 1e-2, vy * 1e-2),
+        velocity_down_mps=vz * 1e-2,
+        heading_deg=hdg * 1e-2 if hdg <= 36_000 else None,
+        boot_ms=boot_ms,
+        tslc_s=None,
+    )
+
+
+_ADSB_VEHICLE = struct.Struct("<IiiiHHhHHB9sBB")
+
+
+def _adsb_vehicle(frame: Frame) -> AdsbVehicle:
+    """Decode an aircraft relayed by a receiver; a field counts only if its own flag is set.
+
+    ``ver_velocity`` is positive up; ``heading`` is the course over ground. A speed without a course
+    gives no velocity, an altitude of an undefined type no altitude. An address of 0 or of more than
+    24 bits (ICAO Annex 10) is refused.
+    """
+    fields = _ADSB_VEHICLE.unpack(frame.payload.ljust(_ADSB_VEHICLE.size, b"\0")[:38])
+    icao, lat, lon, alt_mm, heading_cdeg, speed_cmps, climb_cmps, flags = fields[:8]
+    altitude_type, callsign, emitter_type, tslc_s = fields[9:]
+    if not 0 < icao <= _ICAO_MAX:
+        raise _RefusedError(Reason.MALFORMED, f"ICAO address {icao:#x}")
+    heading_deg = heading_cdeg * 1e-2 if flags & _HEADING and heading_cdeg <= 36_000 else None
+    velocity_ne_mps = None
+    if flags & _VELOCITY and heading_deg is not None:
+        course, speed_mps = math.radians(heading_deg), speed_cmps * 1e-2
+        velocity_ne_mps = (speed_mps * math.cos(course), speed_mps * math.sin(course))
+    datum = _DATUM.get(altitude_type) if flags & _ALTITUDE else None
+    return AdsbVehicle(
+        t_ns=frame.t_ns,
+        link=frame.link,
+        icao=icao,
+        source=frame.source,
+        callsign=_callsign(callsign) if flags & _CALLSIGN else None,
+        emitter_type=emitter_type,
+        position_deg=_position(lat, lon) if flags & _COORDS else None,
+        alt_m=alt_mm * 1e-3 if datum is not None else None,
+        alt_datum=datum,
+        heading_deg=heading_deg,
+        velocity_ne_mps=velocity_ne_mps,
+        velocity_down_mps=-climb_cmps * 1e-2 if flags & _VERTICAL else None,
+        tslc_s=tslc_s,
+    )
+
+
+def _callsign(padded: bytes) -> str | None:
+    """The callsign up to the first zero byte, stripped of blanks; None if empty or unprintable."""
+    text = padded.partition(b"\0")[0].decode("latin-1").strip()
+    return text if text and text.isascii() and text.isprintable() else None
+
+
+_ATTITUDE = struct.Struct("<Iffffff")
+
+
+def _attitude(frame: Frame) -> Attitude:
+    """Decode body attitude (FRD from NED, radians) and body rates (rad/s)."""
+    boot_ms, *angles = unpack(frame, _ATTITUDE)
+    if not all(map(math.isfinite, angles)):
+        raise _RefusedError(Reason.MALFORMED, "an angle or rate is not a number")
+    return Attitude(frame.t_ns, frame.source, boot_ms, *angles)
+
+
+_HEARTBEAT = struct.Struct("<IBBBBB")
+_ARMED: Final = 128
+
+
+def _heartbeat(frame: Frame) -> Presence:
+    _, mav_type, autopilot, base_mode, status, _ = unpack(frame, _HEARTBEAT)
+    return Presence(frame.t_ns, frame.source, mav_type, autopilot, status, bool(base_mode & _ARMED))
+
+
+_GPS_RAW_INT = struct.Struct("<QiiiHHHHBBiIIIIH")
+
+
+def _gps_raw_int(frame: Frame) -> GnssStatus:
+    """Decode fix type and accuracies; the accuracies are extension fields, 0 where not sent."""
+    fields = unpack(frame, _GPS_RAW_INT)
+    fix_type, satellites, h_acc, v_acc, vel_acc = fields[8], fields[9], *fields[11:14]
+    return GnssStatus(
+        t_ns=frame.t_ns,
+        source=frame.source,
+        fix_type=fix_type,
+        satellites=None if satellites == 255 else satellites,
+        h_acc_m=h_acc * 1e-3 or None,
+        v_acc_m=v_acc * 1e-3 or None,
+        vel_acc_mps=vel_acc * 1e-3 or None,
+    )
+
+
+_SYSTEM_TIME = struct.Struct("<QI")
+
+
+def _system_time(frame: Frame) -> SystemTime:
+    """Decode Unix time and boot time; Unix time 0 means that the sender has none.
+
+    Nothing is checked.
+    """
+    unix_us, boot_ms = unpack(frame, _SYSTEM_TIME)
+    return SystemTime(frame.t_ns, frame.source, unix_us or None, boot_ms)
+
+
+_DECODERS: Final[dict[int, Callable[[Frame], Message]]] = {
+    HEARTBEAT: _heartbeat,
+    SYSTEM_TIME: _system_time,
+    GPS_RAW_INT: _gps_raw_int,
+    ATTITUDE: _attitude,
+    GLOBAL_POSITION_INT: _global_position_int,
+    ADSB_VEHICLE: _adsb_vehicle,
+}
+DECODED: Final = frozenset(_DECODERS)
+"""Message ids that ``decode`` reads."""

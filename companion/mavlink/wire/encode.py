@@ -1,0 +1,92 @@
+"""Encoders of the few messages that the service sends.
+
+A payload is made once. Its frame is made for each peer, since every peer counts sequence numbers of
+its own. Fields are laid out as on the wire: by size, largest first, then extensions
+(https://mavlink.io/en/guide/serialization.html). ``tests/mavlink/wire/test_encode.py`` compares
+every message with pymavlink's generated dialect.
+"""
+
+import struct
+from typing import Final, NamedTuple
+
+from fastcrc import crc16
+
+from companion.mavlink.wire.crc_extra import CRC_EXTRA
+from companion.mavlink.wire.framing import MAGIC_V1, MAGIC_V2
+from companion.values import Source
+
+HEARTBEAT: Final = 0
+REQUEST_DATA_STREAM: Final = 66
+COMMAND_LONG: Final = 76
+TIMESYNC: Final = 111
+
+MAV_CMD_SET_MESSAGE_INTERVAL: Final = 511
+
+_ONBOARD_CONTROLLER: Final = 18  # MAV_TYPE
+_NO_AUTOPILOT: Final = 8  # MAV_AUTOPILOT_INVALID
+_ACTIVE: Final = 4  # MAV_STATE
+_MAVLINK_VERSION: Final = 3
+
+
+class Outgoing(NamedTuple):
+    """A message to be sent: its sender, its id, and its payload at full length."""
+
+    source: Source
+    msgid: int
+    payload: bytes
+
+
+def pack(message: Outgoing, seq: int, version: int = 2) -> bytes:
+    """The frame of a message: MAVLink 2, unsigned, with trailing zeros cut; or MAVLink 1.
+
+    A payload with extension fields cannot be sent as MAVLink 1: a payload that may go out as either
+    version must be made without them.
+    """
+    seed = bytes([CRC_EXTRA[message.msgid]])
+    if version == 1:
+        body = bytes([len(message.payload), seq, *message.source, message.msgid]) + message.payload
+        magic = MAGIC_V1
+    else:
+        payload = message.payload.rstrip(b"\0") or b"\0"  # the first byte is never cut
+        head = bytes([len(payload), 0, 0, seq, *message.source])
+        body = head + message.msgid.to_bytes(3, "little") + payload
+        magic = MAGIC_V2
+    return bytes([magic]) + body + struct.pack("<H", crc16.mcrf4xx(body + seed))
+
+
+def heartbeat(source: Source) -> Outgoing:
+    """HEARTBEAT of an active onboard controller without an autopilot."""
+    payload = struct.pack(
+        "<IBBBBB", 0, _ONBOARD_CONTROLLER, _NO_AUTOPILOT, 0, _ACTIVE, _MAVLINK_VERSION
+    )
+    return Outgoing(source, HEARTBEAT, payload)
+
+
+def set_message_interval(
+    source: Source, target: Source, msgid: int, interval_us: int, confirmation: int = 0
+) -> Outgoing:
+    """COMMAND_LONG with MAV_CMD_SET_MESSAGE_INTERVAL; the target answers with COMMAND_ACK.
+
+        msgid         message to be sent
+        interval_us   time between two of them, microseconds
+        confirmation  how often this command was sent before without an answer
+
+    Source: https://mavlink.io/en/services/command.html.
+    """
+    payload = struct.pack(
+        "<7fHBBB",
+        *(float(msgid), float(interval_us), 0.0, 0.0, 0.0, 0.0, 0.0),
+        *(MAV_CMD_SET_MESSAGE_INTERVAL, target.sysid, target.compid, confirmation),
+    )
+    return Outgoing(source, COMMAND_LONG, payload)
+
+
+def request_data_stream(source: Source, target: Source, stream: int, rate_hz: int) -> Outgoing:
+    """REQUEST_DATA_STREAM, the predecessor of SET_MESSAGE_INTERVAL. It is not acknowledged."""
+    payload = struct.pack("<HBBBB", rate_hz, target.sysid, target.compid, stream, 1)
+    return Outgoing(source, REQUEST_DATA_STREAM, payload)
+
+
+def timesync(source: Source, sent_ns: int) -> Outgoing:
+    """TIMESYNC request: the peer returns ``sent_ns`` beside its own time."""
+    return Outgoing(source, TIMESYNC, struct.pack("<qq", 0, sent_ns))

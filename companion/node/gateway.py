@@ -1,0 +1,188 @@
+"""The links, their signatures, and the service's own messages.                           [shell]
+
+What is received goes on as events, in the order in which it came. What is sent is what
+``[presence]`` allows, and nothing else.
+"""
+
+import asyncio
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Final
+
+from companion.mavlink.links.signing_store import Timestamps, key_warning, load_key
+from companion.mavlink.links.transport import Link
+from companion.mavlink.links.urls import LinkError, parse_link
+from companion.mavlink.voice.component import HEARD, Component, ComponentSpec
+from companion.mavlink.voice.rate_watch import MessageRate
+from companion.mavlink.wire.encode import Outgoing
+from companion.settings.center import VehicleCenter, parse_center
+from companion.settings.model import Settings
+from companion.settings.section import ConfigError
+from companion.values import Event, Frame, Notice, Reason, Rejection, Severity, Source, UserError
+
+SETUP_SIGNING: Final = 256
+"""Message that carries a signing key in plain; it is never recorded."""
+SAVE_EVERY_S: Final = 0.25
+"""Time between two checks whether signing timestamps are due to be saved."""
+
+
+class Gateway:
+    """All links of the service.
+
+    Call ``open`` for early errors, ``run`` until cancelled, then ``close``.
+
+        step    takes each event
+        notify  takes messages for the operator
+        now_ns  the node's timeline
+
+    Raises ``ConfigError`` where the settings ask for presence and do not say as which system.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        step: Callable[[Event], None],
+        notify: Callable[[Notice], None],
+        now_ns: Callable[[], int],
+    ) -> None:
+        self._step = step
+        self._notify = notify
+        self._now_ns = now_ns
+        self._component = component(settings)
+        self._hear = HEARD if self._component else frozenset()
+        self._timestamps: Timestamps | None = None
+        self._settings = settings
+        self.links: list[Link] = []
+
+    def open(self) -> None:
+        """Make the links and claim their addresses.
+
+        Raises ``LinkError`` where one cannot be had, or where the key or the timestamps of a signed
+        one cannot be used.
+        """
+        signing = self._settings.signing
+        unknown = [url for url in signing.keys if url not in self._settings.links.urls]
+        if unknown:
+            raise LinkError(f"signing.keys: {unknown[0]} is not among the links")
+        if signing.keys:
+            self._timestamps = Timestamps(Path(signing.timestamps))
+        for number, url in enumerate(self._settings.links.urls):
+            link = self._link(number, url)
+            link.open()
+            self.links.append(link)
+            if link.url.scheme == "udpout" and self._component is None:
+                text = f"{url} is silent, for [presence] is off: nobody there learns of it"
+                self._notify(Notice(self._now_ns(), Severity.WARNING, url, text))
+
+    def _link(self, number: int, url: str) -> Link:
+        parsed, signing, guard = parse_link(url), self._settings.signing, None
+        if url in signing.keys:
+            assert self._timestamps is not None
+            path = Path(signing.keys[url])
+            key, now_ns = load_key(path), self._now_ns()
+            warning = key_warning(path)
+            if warning:
+                self._notify(Notice(now_ns, Severity.WARNING, url, warning))
+            unsigned = url in signing.allow_unsigned
+            guard = self._timestamps.guard(url, key, number % 256, now_ns, allow_unsigned=unsigned)
+        return Link(parsed, self._received, self._now_ns, self._notify, guard)
+
+    async def run(self) -> None:
+        """Serve all links until cancelled."""
+        async with asyncio.TaskGroup() as group:
+            for link in self.links:
+                group.create_task(link.run(), name=link.status.url)
+            if self._timestamps is not None:
+                group.create_task(self._save(self._timestamps), name="signing timestamps")
+
+    def close(self) -> None:
+        """Save the signing timestamps, once ``run`` has ended.
+
+        Raises ``LinkError`` if that fails.
+        """
+        if self._timestamps is not None:
+            self._timestamps.close(self._now_ns())
+
+    async def _save(self, timestamps: Timestamps) -> None:
+        """Save signing timestamps off the event loop.
+
+        A disk error is reported once, and tried again.
+        """
+        failing = False
+        while True:
+            await asyncio.sleep(SAVE_EVERY_S)
+            if not timestamps.due(self._now_ns()):
+                continue
+            try:
+                await asyncio.to_thread(timestamps.write, timestamps.snapshot(self._now_ns()))
+            except LinkError as error:
+                if not failing:
+                    self._notify(Notice(self._now_ns(), Severity.ERROR, "signing", str(error)))
+                failing = True
+            else:
+                failing = False
+
+    def _received(self, items: list[Frame | Rejection]) -> None:
+        for item in items:
+            if isinstance(item, Frame) and item.msgid == SETUP_SIGNING:
+                who = str(item.source)
+                self._step(Rejection(item.t_ns, who, Reason.SECRET, msgid=SETUP_SIGNING))
+                continue
+            self._step(item)
+            if self._component and isinstance(item, Frame) and item.msgid in self._hear:
+                for found in self._component.hear(item):
+                    if isinstance(found, Notice):
+                        self._notify(found)
+                    else:
+                        self._step(found)
+
+    def speak(self, fit: bool, uavs: Iterable[Source]) -> None:
+        """Send what is due. Call it some ten times a second.
+
+        ``fit``: the service can be relied on. ``uavs``: those whose positions matter.
+        """
+        if self._component is None:
+            return
+        for message, target in self._component.due(self._now_ns(), fit, uavs):
+            if target is None:
+                for link in self.links:
+                    link.send(message)
+            else:
+                self._send_to(target, message)
+
+    def _send_to(self, target: Source, message: Outgoing) -> None:
+        """Send over the link on which the target was heard last."""
+        heard = [
+            (link.status.components[target].heard_ns, number)
+            for number, link in enumerate(self.links)
+            if target in link.status.components
+        ]
+        if heard:
+            self.links[max(heard)[1]].send_to(target, message)
+
+    def rates(self) -> list[MessageRate]:
+        """The message rates that are asked for, and how far asking has come."""
+        return self._component.rates() if self._component else []
+
+
+def component(settings: Settings) -> Component | None:
+    """The service as a MAVLink component; None where it is to be silent. Raises ``ConfigError``."""
+    given, center = settings.presence, settings.center.source
+    if not given.enabled:
+        return None
+    at = parse_center(center or "home")
+    carrier = at.source if isinstance(at, VehicleCenter) else None
+    sysid = given.system_id or (carrier.sysid if carrier else None)
+    if sysid is None:
+        raise ConfigError(
+            "presence.system_id is needed: the array stands on its own, and a component is one"
+            " of a system, such as 200"
+        )
+    try:
+        return Component(
+            ComponentSpec(
+                Source(sysid, given.component_id), carrier, given.position_hz, given.attitude_hz
+            )
+        )
+    except UserError as error:
+        raise ConfigError(f"presence: {error}") from error

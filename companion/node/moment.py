@@ -1,0 +1,72 @@
+"""A log up to one time: what the program knew then.                                      [shell]"""
+
+from collections.abc import Callable, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Final
+
+from companion.node.replay import log_events
+from companion.pipeline.fold import Pipeline
+from companion.settings.model import Settings
+from companion.values import Update, UserError
+
+TOLD_EVERY: Final = 20_000
+"""Events between two calls of ``progress``."""
+
+
+class MomentError(UserError):
+    """A time that the log does not hold. The message is one line for the user."""
+
+
+def look(
+    logs: Sequence[Path],
+    settings: Settings,
+    at: str,
+    lead_s: float = 0.0,
+    progress: Callable[[float], None] | None = None,
+) -> tuple[Pipeline, Update]:
+    """The pipeline after all events up to a time, and the beams it makes then.
+
+        logs      as for a replay
+        settings  as for a replay
+        at        seconds from the log's first event, or a time with its date and zone (RFC 3339)
+        lead_s    how far ahead of that time the beams are applied
+        progress  called now and then with seconds of log
+
+    Raises ``MomentError`` for text that is no time or a time that the log does not reach;
+    ``LogError`` and ``ConfigError`` as for a replay.
+    """
+    pipeline, at_ns, seen, t_ns = Pipeline(settings), None, 0, 0
+    begins_ns = 0
+    for event in log_events(logs, settings):
+        if at_ns is None:
+            begins_ns, at_ns = event.t_ns, _time_ns(at, event.t_ns)
+        if event.t_ns > at_ns:
+            break
+        pipeline.step(event)
+        seen, t_ns = seen + 1, event.t_ns
+        if progress and seen % TOLD_EVERY == 0:
+            progress((event.t_ns - begins_ns) * 1e-9)
+    else:
+        if at_ns is None or at_ns > t_ns:
+            raise MomentError(f"--at {at}: the log is {(t_ns - begins_ns) * 1e-9:.1f} s long")
+    if at_ns < begins_ns:
+        raise MomentError(f"--at {at}: the log begins later")
+    return pipeline, pipeline.look(at_ns, lead_s)
+
+
+def _time_ns(text: str, begins_ns: int) -> int:
+    try:
+        return begins_ns + round(float(text) * 1e9)
+    except (ValueError, OverflowError):
+        pass
+    try:
+        then = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise MomentError(
+            f"--at {text}: neither seconds from the beginning nor a time such as"
+            " 2026-01-01T12:00:00Z"
+        ) from error
+    if then.tzinfo is None:
+        raise MomentError(f"--at {text}: say the zone, such as Z")
+    return round(then.timestamp() * 1e9)

@@ -1,0 +1,307 @@
+"""The live service: links, timer, recorder and HTTP around one pipeline.                 [shell]
+
+Over 300 lines: it holds the parts of the running service together.
+"""
+
+import asyncio
+import socket
+import time
+from collections import deque
+from collections.abc import Callable, Coroutine, Sequence
+from pathlib import Path
+from typing import Any
+
+import companion
+from companion.mavlink.links.status import LinkStatus
+from companion.mavlink.voice.rate_watch import MessageRate
+from companion.node.gateway import Gateway
+from companion.node.serving import NOTICES_KEPT, Server, Throughput
+from companion.pipeline import assembly
+from companion.pipeline.fold import Pipeline
+from companion.recording.background import BackgroundRecorder, Rotation
+from companion.recording.foxglove import LiveChannels
+from companion.recording.parts import Part
+from companion.recording.reader import LogError
+from companion.recording.recover import recover_leftovers
+from companion.recording.scene import Scene
+from companion.recording.writer import Writer
+from companion.settings.model import Settings
+from companion.values import Event, Frame, Notice, Output, Tick, UserError
+from companion.views.last_messages import LastMessages
+from companion.views.lateness import Lateness
+from companion.views.state import RecordingStatus
+
+
+class NodeClock:
+    """Nanoseconds since the Unix epoch, never stepping: the wall clock once, then monotonic."""
+
+    def __init__(self) -> None:
+        self._start_ns = time.time_ns() - time.monotonic_ns()
+
+    def now_ns(self) -> int:
+        """The present time on the node's timeline."""
+        return self._start_ns + time.monotonic_ns()
+
+
+class Service:
+    """A running node, as the HTTP server sees it. ``answering`` is set once HTTP is served.
+
+    ``say`` gets one line for the operator whenever something changes. Raises ``LinkError`` if a
+    link cannot be opened, ``ConfigError`` if the settings cannot be used, ``OSError`` if the
+    recording cannot be opened, ``LiveError`` if the live channels cannot be served.
+    """
+
+    def __init__(self, settings: Settings, say: Callable[[str], None]) -> None:
+        self.pipeline = Pipeline(settings)
+        self.equipment = assembly.equipment(settings, self.pipeline.array)
+        self.notices: deque[Notice] = deque(maxlen=NOTICES_KEPT)
+        self.answering = asyncio.Event()
+        self.last_messages = LastMessages()
+        self.lateness = Lateness()
+        self._ticked = asyncio.Event()
+        self._settings = settings
+        self._say = say
+        self._timeline = NodeClock()
+        self._started_ns = self._timeline.now_ns()
+        self._rates = Throughput()
+        self._defects: asyncio.Queue[Exception] = asyncio.Queue()
+        self._recorder: BackgroundRecorder | None = None
+        self._live = self._open_live()
+        self._traffic = Gateway(settings, self._step, self._notify, self._timeline.now_ns)
+        self._traffic.open()
+        self._recorder = self._open_recorder()
+
+    async def run(
+        self,
+        http: socket.socket,
+        token: str | None,
+        until: asyncio.Event,
+        *others: Coroutine[Any, Any, None],
+    ) -> None:
+        """Serve until ``until`` is set, then finish the recording.
+
+        ``others`` are further coroutines to run beside, as for the demo; they are cancelled at the
+        end.
+        """
+        server = Server(self, token, self.answering)
+        if self._recorder:
+            self._recorder.start()
+        if self._live:
+            self._live.start()
+        try:
+            async with asyncio.TaskGroup() as group:
+                tasks = [group.create_task(self._tick(), name="ticks")]
+                tasks.append(group.create_task(self._traffic.run(), name="links"))
+                tasks.append(group.create_task(self._recover_leftovers(), name="recovery"))
+                tasks.append(group.create_task(self._end_on_defect(), name="defects"))
+                tasks += [group.create_task(other, name="beside") for other in others]
+                serving = group.create_task(server.serve(sockets=[http]), name="http")
+                await until.wait()
+                server.should_exit = True
+                await serving
+                for task in tasks:
+                    task.cancel()
+        finally:
+            try:
+                self._traffic.close()
+            finally:  # a disk that takes no timestamps is no reason to lose the recording
+                await self._finish()
+
+    async def _finish(self) -> None:
+        if self._live:
+            await asyncio.to_thread(self._live.stop)
+        if self._recorder:
+            metadata = {"digest": self.pipeline.digest.hexdigest()}
+            await asyncio.to_thread(self._recorder.stop, metadata)
+            self._tell_of_recorder(self._recorder)
+
+    # --- what drives the pipeline -----------------------------------------------------------
+
+    def _step(self, event: Event) -> None:
+        if isinstance(event, Frame):
+            self.last_messages.add(event)
+        try:
+            outputs = self.pipeline.step(event)
+        except Exception as error:
+            self._defects.put_nowait(error)
+            raise
+        self._hand_over(event, outputs)
+        for output in outputs:
+            if isinstance(output, Notice):
+                self._show(output)
+
+    async def _end_on_defect(self) -> None:
+        """Wait for a defect of the fold and raise it, which ends the service.
+
+        A link's callback would only log it, and a half-changed state must not point beams.
+        """
+        raise await self._defects.get()
+
+    def _hand_over(self, event: Event | None, outputs: Sequence[Output]) -> None:
+        if self._recorder:
+            self._recorder.put(event, outputs)
+        if self._live:
+            self._live.put(event, outputs)
+
+    def _notify(self, notice: Notice) -> None:
+        """Record and show a notice that the pipeline did not make."""
+        self._hand_over(None, [notice])
+        self._show(notice)
+
+    def _tell_of_recorder(self, recorder: BackgroundRecorder) -> None:
+        for severity, text in recorder.news():
+            self._notify(Notice(self.now_ns(), severity, "recording", text))
+
+    def _show(self, notice: Notice) -> None:
+        self.notices.append(notice)
+        self._say(notice.text)
+
+    async def _tick(self) -> None:
+        """Tick at the update rate; ticks missed while the loop was held up are left out.
+
+        Updates take at most half of the time: with more UAVs than can be served at that rate there
+        are fewer updates, and no frame is lost to them.
+        """
+        loop = asyncio.get_running_loop()
+        period_s = 1 / self._settings.beams.update_hz
+        due_s = loop.time()
+        while True:
+            began_s = loop.time()
+            self._step(Tick(self._timeline.now_ns()))
+            self._rates.count(self.now_ns(), self.pipeline.frames, self.pipeline.updates)
+            if self._recorder:
+                self._tell_of_recorder(self._recorder)
+            self._traffic.speak(not self.unfit(), self.pipeline.reporters())
+            self._ticked.set()  # wakes those who wait now;
+            self._ticked.clear()  # later ones wait for the next tick
+            ended_s = loop.time()
+            due_s = max(due_s + period_s, ended_s + (ended_s - began_s))
+            await asyncio.sleep(due_s - loop.time())
+            self.lateness.observe(loop.time() - due_s)
+
+    # --- what the server looks at -----------------------------------------------------------
+
+    def now_ns(self) -> int:
+        """The present time on the node's timeline."""
+        return self._timeline.now_ns()
+
+    async def ticked(self) -> None:
+        """Return after the next tick."""
+        await self._ticked.wait()
+
+    def uptime_s(self) -> float:
+        """Seconds since the service was made."""
+        return (self.now_ns() - self._started_ns) * 1e-9
+
+    def links(self) -> list[LinkStatus]:
+        """Counts of each link."""
+        return [link.status for link in self._traffic.links]
+
+    def events(self) -> list[Notice]:
+        """The newest notices, the oldest of them first."""
+        return list(self.notices)
+
+    def message_rates(self) -> list[MessageRate]:
+        """The message rates that are asked for, and how far asking has come."""
+        return self._traffic.rates()
+
+    def rates(self) -> dict[str, float | None]:
+        """Frames and updates per second over the last seconds."""
+        return self._rates.newest()
+
+    def recording(self) -> RecordingStatus:
+        """State of the recording."""
+        recorder = self._recorder
+        if recorder is None:
+            return RecordingStatus("off", None, 0, 0, 0)
+        state = "degraded" if recorder.degraded else "recording"
+        written_ns = recorder.written_ns
+        return RecordingStatus(
+            state,
+            recorder.file,
+            recorder.bytes,
+            recorder.messages,
+            recorder.dropped,
+            recorder.queued,
+            None if written_ns is None else (self.now_ns() - written_ns) * 1e-9,
+        )
+
+    def unfit(self) -> list[str]:
+        """Why the service is not fit to be used; empty when it is."""
+        update = self.pipeline.last_update
+        states = [link.status.state for link in self._traffic.links]
+        reasons = [] if "up" in states else ["no link is up"]
+        if update is None or self.updates_late():
+            reasons.append("beam updates are late")
+        elif update.unfit:
+            reasons.append(update.unfit)
+        return reasons
+
+    def updates_late(self) -> bool:
+        """Whether the newest beam update is older than it can be while all is well."""
+        update = self.pipeline.last_update
+        late_s = 1.0 + 5 / self._settings.beams.update_hz
+        return update is None or (self.now_ns() - update.t_ns) * 1e-9 > late_s
+
+    def replay(self) -> None:
+        """None: this is a live run."""
+
+    async def _recover_leftovers(self) -> None:
+        """Recover recordings that an earlier run left open when it was killed.
+
+        Off the event loop.
+        """
+        directory = self._settings.recording.directory
+        if directory is None:
+            return
+        for found in await asyncio.to_thread(recover_leftovers, Path(directory)):
+            if isinstance(found, LogError):
+                self._say(str(found))
+            else:
+                self._say(f"recovered {found.path} ({found.lost_bytes} bytes lost)")
+
+    def _open_recorder(self) -> BackgroundRecorder | None:
+        kept = self._settings.recording
+        if kept.directory is None:
+            return None
+        size_bytes = None if kept.rotate_mb is None else kept.rotate_mb * 1e6
+        rotation = Rotation(size_bytes, kept.rotate_s)
+        return BackgroundRecorder(self._open_part, self.pipeline.geodetic, rotation)
+
+    def _open_live(self) -> LiveChannels | None:
+        """The live channels, on this machine alone, since their protocol has no token.
+
+        None if not asked for.
+        """
+        port = self._settings.server.foxglove
+        if port is None:
+            return None
+        live = LiveChannels("127.0.0.1", port, self.pipeline.geodetic, self._scene())
+        self._say(f"live channels for Foxglove and Lichtblick on ws://127.0.0.1:{live.port}")
+        return live
+
+    def _scene(self) -> Scene:
+        return Scene(self.pipeline.array, self._settings.recording.scene_hz)
+
+    def _open_part(self, part: Part) -> Writer:
+        kept = self._settings.recording
+        where = Path(kept.directory or "")
+        if part.number > 1 and where.suffix == ".mcap" and not where.is_dir():
+            where = where.parent  # a file was asked for: later parts go into its folder
+        return Writer(
+            where,
+            self._settings.to_toml(),
+            {"companion": companion.__version__},
+            None if kept.weights_hz == "all" else kept.weights_hz,
+            self._started_ns if part.number == 1 else self.now_ns(),
+            self._scene(),
+            part,
+        )
+
+
+def require_center(settings: Settings) -> None:
+    """Raise ``UserError`` unless the settings say what carries the array."""
+    if settings.center.source is None:
+        raise UserError(
+            "say what carries the array: --center SYSID:COMPID, LAT,LON,ALT[,HEADING] or home"
+        )

@@ -1,0 +1,144 @@
+"""Serves a node over HTTP until told to stop; shared by live runs and replays.           [shell]"""
+
+import asyncio
+import contextlib
+import gc
+import signal
+import socket
+import sys
+from collections import deque
+from collections.abc import Callable, Coroutine, Iterator
+from typing import Any, Final
+
+import uvicorn
+
+from companion.server.app import create_app
+from companion.views.state import Node
+
+RATE_WINDOW_S: Final = 2.0
+"""Time over which frames and updates per second are counted."""
+NOTICES_KEPT: Final = 200
+"""Newest notices kept."""
+STREAM_TAKES_BYTES: Final = 1024
+"""Largest message accepted from a WebSocket client."""
+FAREWELL_S: Final = 2
+"""How long the shutdown waits for clients that do not read, and for unfinished downloads."""
+
+
+class Server(uvicorn.Server):
+    """uvicorn around a node, which leaves the signals to its caller.
+
+    ``serve(sockets=[bound socket])`` runs until ``should_exit`` is set; ``answering`` is set once
+    it accepts requests. ``token``: see ``create_app``.
+    """
+
+    def __init__(self, node: Node, token: str | None, answering: asyncio.Event) -> None:
+        app = create_app(node, token)
+        super().__init__(
+            uvicorn.Config(
+                app,
+                log_level="warning",
+                lifespan="off",
+                access_log=False,
+                ws_max_size=STREAM_TAKES_BYTES,
+                ws_per_message_deflate=False,  # a message is encoded once for all clients
+                timeout_graceful_shutdown=FAREWELL_S,
+            )
+        )
+        self._answering = answering
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to accept requests; see ``uvicorn.Server.startup``."""
+        await super().startup(sockets)
+        self._answering.set()
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Capture no signals."""
+        yield
+
+
+class Throughput:
+    """Frames and beam updates per second over the last seconds."""
+
+    def __init__(self) -> None:
+        self._counts: deque[tuple[int, int, int]] = deque()
+
+    def count(self, now_ns: int, frames: int, updates: int) -> None:
+        """Note the totals so far."""
+        self._counts.append((now_ns, frames, updates))
+        while self._counts[0][0] < now_ns - RATE_WINDOW_S * 1e9:
+            self._counts.popleft()
+
+    def newest(self) -> dict[str, float | None]:
+        """``frames_hz`` and ``updates_hz``; None before there is an interval."""
+        if len(self._counts) < 2:
+            return {"frames_hz": None, "updates_hz": None}
+        (t0, frames0, updates0), (t1, frames1, updates1) = self._counts[0], self._counts[-1]
+        seconds = (t1 - t0) * 1e-9
+        return {
+            "frames_hz": (frames1 - frames0) / seconds,
+            "updates_hz": (updates1 - updates0) / seconds,
+        }
+
+
+def address(http: socket.socket) -> str:
+    """The URL of what is served on a bound socket."""
+    host, port = http.getsockname()[:2]
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}"
+
+
+async def pause(until: asyncio.Event, seconds: float) -> None:
+    """Wait for ``seconds``, or until ``until`` is set."""
+    with contextlib.suppress(TimeoutError):
+        await asyncio.wait_for(until.wait(), seconds)
+
+
+def run_until_told(
+    main: Callable[[asyncio.Event], Coroutine[Any, Any, None]], seconds: float | None = None
+) -> None:
+    """Run ``main`` on an event loop of its own.
+
+    ``main`` is given an event, which is set by SIGINT, by SIGTERM, or when ``seconds`` have passed;
+    it must then finish.
+    """
+    _tame_interpreter()
+    with asyncio.Runner(loop_factory=_loop_factory()) as runner:
+        runner.run(_told(main, seconds))
+
+
+async def _told(
+    main: Callable[[asyncio.Event], Coroutine[Any, Any, None]], seconds: float | None
+) -> None:
+    loop, until = asyncio.get_running_loop(), asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, until.set)
+    if seconds is not None:
+        loop.call_later(seconds, until.set)
+    await main(until)
+
+
+def _tame_interpreter() -> None:
+    """Keep garbage collection and threads from holding up the event loop.
+
+    A collection takes time in proportion to what it examines: what is loaded by now is left out,
+    small collections are frequent and full ones rare (measured at 10 000 frames/s: 3 ms for 2 000
+    objects, 50 ms for 50 000). The recorder's thread yields after a millisecond, because each
+    answer over HTTP waits for its turn several times.
+    """
+    sys.setswitchinterval(0.001)
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(2_000, 10, 1000)
+
+
+def _loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
+    """The loop factory of uvloop, which keeps up with ten times the datagrams; None without uvloop.
+
+    Measured: docs/field-notes.md 3.
+    """
+    try:
+        import uvloop
+    except ImportError:
+        return None
+    return uvloop.new_event_loop

@@ -1,0 +1,202 @@
+"""Builds the parts of the pipeline from the settings."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.beams.array import geometry
+from companion.beams.array.coverage import Coverage, Sector
+from companion.beams.array.elements import Element, Pattern
+from companion.beams.hardware import codebooks
+from companion.beams.hardware.calibration import Calibration, parse_calibration
+from companion.beams.hardware.codebooks import Codebook
+from companion.beams.weights.precoding import Precoder
+from companion.beams.worth.link_budget import LinkBudget
+from companion.mavlink.clock.sender_clock import ClockAssumptions, SenderClock
+from companion.settings.files import calibration_text, codebook_file, kinematic_design
+from companion.settings.model import Settings
+from companion.settings.section import ConfigError
+from companion.tracking.carrier import body_from_ned
+from companion.tracking.fleet import Ages, Fleet, FleetSettings
+from companion.tracking.gate import GateSettings
+from companion.tracking.noise import NoiseSettings
+from companion.tracking.observers.kinematic import KinematicModel, KinematicObserver, scheduled
+from companion.tracking.observers.position import PositionModel, PositionObserver
+from companion.values import FloatArray, ReportNoise, UserError
+
+
+def array(settings: Settings) -> geometry.Array:
+    """The antenna array on its mount. Raises ``ConfigError``."""
+    given = settings.array
+    mount = body_from_ned(
+        *np.radians([given.mount_roll_deg, given.mount_pitch_deg, given.mount_yaw_deg])
+    )
+    element = Element(Pattern(given.element), given.element_exponent)
+    lever_arm_m = np.array(given.lever_arm_m)
+    spacing = given.spacing_wavelengths
+    if given.spacing_m is not None:
+        spacing = given.spacing_m * given.frequency_hz / geometry.SPEED_OF_LIGHT_MPS
+    on_carrier = (mount, element, lever_arm_m)
+    try:
+        match given.kind:
+            case "ula":
+                return geometry.uniform_linear(
+                    given.elements, given.frequency_hz, spacing, *on_carrier
+                )
+            case "ura":
+                return geometry.uniform_rectangular(
+                    given.rows, given.columns, given.frequency_hz, spacing, *on_carrier
+                )
+            case "uca":
+                return geometry.uniform_circular(
+                    given.elements, given.frequency_hz, spacing, *on_carrier
+                )
+            case "list":
+                placed = _rows(given.positions_m or ())
+                outward = placed[:, 3:6] if placed.shape[1] == 6 else None
+                return geometry.listed(placed[:, :3], given.frequency_hz, *on_carrier, outward)
+    except UserError as error:
+        raise ConfigError(f"array: {error}") from error
+
+
+def _rows(positions_m: tuple[tuple[float, ...], ...]) -> FloatArray:
+    lengths = {len(row) for row in positions_m}
+    if lengths not in ({3}, {6}):
+        raise UserError("positions_m are rows of 3 numbers, or all of 6")
+    return np.array(positions_m)
+
+
+def coverage(settings: Settings) -> Coverage:
+    """The directions in which beams may point. Raises ``ConfigError``."""
+    given = settings.array
+
+    def radians(limits: tuple[float, float] | None) -> tuple[float, float] | None:
+        return None if limits is None else (np.radians(limits[0]), np.radians(limits[1]))
+
+    view = given.field_of_view_deg
+    try:
+        return Coverage(
+            None if view is None else np.radians(view),
+            radians(given.azimuth_limits_deg),
+            radians(given.elevation_limits_deg),
+            tuple(Sector(*np.radians(sector).tolist()) for sector in given.hidden_deg),
+        )
+    except UserError as error:
+        raise ConfigError(f"array: {error}") from error
+
+
+@dataclass(frozen=True, slots=True)
+class Equipment:
+    """What is needed, beside the pipeline, to answer questions about beams.
+
+    codebook      stored beams; None without
+    calibration   calibration of the hardware; None without
+    budget        power, bandwidth and noise figure of the radio link
+    uav_antennas  antennas that each UAV combines
+    """
+
+    codebook: Codebook | None
+    calibration: Calibration | None
+    budget: LinkBudget
+    uav_antennas: int
+
+
+def equipment(settings: Settings, antenna: geometry.Array) -> Equipment:
+    """The equipment that the settings describe; reads the files they name.
+
+    Raises ``ConfigError``.
+    """
+    kept, radio = settings.codebook, settings.radio
+    codebook, calibration = None, None
+    try:
+        if kept.kind == "dft":
+            codebook = codebooks.dft(antenna, kept.oversampling)
+        elif kept.kind == "file":
+            codebook = codebooks.listed(codebook_file(settings), antenna)
+    except ConfigError:
+        raise
+    except UserError as error:
+        raise ConfigError(f"codebook: {error}") from error
+    text = calibration_text(settings)
+    try:
+        calibration = None if text is None else parse_calibration(text)
+    except UserError as error:
+        raise ConfigError(f"hardware.calibration: {error}") from error
+    if calibration is not None and len(calibration.order) != antenna.size:
+        channels = f"{len(calibration.order)} channels for {antenna.size} elements"
+        raise ConfigError(f"hardware.calibration: {channels}")
+    budget = LinkBudget(radio.tx_power_dbm, radio.bandwidth_hz, radio.noise_figure_db)
+    return Equipment(codebook, calibration, budget, radio.uav_antennas)
+
+
+def precoder(settings: Settings) -> Precoder:
+    """The method of making weights."""
+    given = settings.beams
+    return Precoder(
+        given.method,
+        given.policy,
+        given.loss_limit_db,
+        given.condition_limit,
+        given.regularisation,
+        given.normalisation,
+        given.priority,
+        given.widen,
+    )
+
+
+def noise(settings: Settings) -> NoiseSettings:
+    """Bounds on the errors of reports."""
+    given = settings.observer
+    most_m = given.position_noise_m
+    default = ReportNoise(most_m, most_m, most_m, given.velocity_noise_mps)
+    return NoiseSettings(default, given.accuracy_factor if given.follow_accuracy else None)
+
+
+def observer(settings: Settings) -> PositionObserver | KinematicObserver:
+    """The observer that every track uses."""
+    given = settings.observer
+    if given.model == "position":
+        return PositionObserver(
+            PositionModel(
+                given.speed_max_mps,
+                given.acceleration_max_mps2,
+                None if given.alpha == "auto" else given.alpha,
+                given.feedthrough_s,
+                given.velocity_lead_s,
+            )
+        )
+    gain = scheduled(kinematic_design(settings))
+    return KinematicObserver(KinematicModel(given.speed_max_mps, given.acceleration_max_mps2, gain))
+
+
+def clock(settings: Settings) -> SenderClock:
+    """A clock for a new sender."""
+    given = settings.clocks
+    return SenderClock(
+        ClockAssumptions(
+            constant_delay_s=given.constant_delay_s,
+            trust_gnss=given.trust_gnss,
+            node_utc_error_s=given.node_utc_error_s,
+            window_s=given.window_s,
+        )
+    )
+
+
+def fleet(settings: Settings) -> Fleet:
+    """The tracks of all UAVs, with none yet."""
+    given, kept = settings.observer, settings.tracks
+    leads = given.model == "position"
+    lead_m = abs(given.feedthrough_s) * given.speed_max_mps if leads else 0.0
+    feeds = given.model == "kinematic" and given.feed_forward
+    return Fleet(
+        observer(settings),
+        FleetSettings(
+            given.speed_max_mps,
+            given.acceleration_max_mps2,
+            Ages(kept.coasting_s, kept.stale_s, kept.lost_s),
+            GateSettings(kept.reacquire_reports, kept.reacquire_s, lead_m=lead_m),
+            kept.window_s,
+            feeds,
+            kept.most,
+        ),
+    )

@@ -1,0 +1,126 @@
+"""What carries the array, and the origin of the local frame.
+
+The local frame begins at a fixed station, or where the first report was made.
+"""
+
+import numpy as np
+
+from companion.beams.aim import AIMABLE
+from companion.pipeline.senders import PlacedAttitude, PlacedReport
+from companion.settings.center import CenterPlace, FixedCenter, VehicleCenter, parse_center
+from companion.settings.model import Settings
+from companion.tracking import carrier, noise
+from companion.tracking.geodesy import LocalFrame
+from companion.values import Attitude, Carrier, Fix, Notice, Report, SenderTime, Severity, Track
+
+
+class Center:
+    """Position and attitude of the array.
+
+    place    the fixed station, or the vehicle that is followed; ``home`` until the first report
+    local    the local frame; None before the first report, unless the station is fixed
+    vehicle  id of the carrier; None for a station
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self.place: CenterPlace = parse_center(settings.center.source or "home")
+        self.local: LocalFrame | None = None
+        self.vehicle = str(self.place) if isinstance(self.place, VehicleCenter) else None
+        self._attitude: tuple[int, Attitude] | None = None  # sender's time, attitude
+        self._attitude_bound_rad = np.radians(settings.center.attitude_bound_deg)
+        self._attitude_kept_s = settings.tracks.coasting_s
+        self._speed_max_mps = settings.observer.speed_max_mps
+        if isinstance(self.place, FixedCenter):
+            self._begin(self.place)
+
+    # --- what is heard ----------------------------------------------------------------------
+
+    def fix(self, placed: PlacedReport) -> tuple[Fix, tuple[Notice, ...]]:
+        """Put a report into the local frame.
+
+        With the first report of all, a notice says where it begins.
+        """
+        report = placed.report
+        said = (self._first(report),) if self.local is None else ()
+        assert self.local is not None
+        velocity = None
+        if report.velocity_ne_mps is not None and report.velocity_down_mps is not None:
+            there = np.array([*report.velocity_ne_mps, report.velocity_down_mps])
+            velocity = self.local.local_from_ned(report.lat_deg, report.lon_deg) @ there
+        position = self.local.position_ned_m(report.lat_deg, report.lon_deg, report.alt_m)
+        errors = placed.noise
+        if errors is None:
+            errors = noise.relayed(velocity, report.alt_age_s, self._speed_max_mps)
+        made = Fix(
+            report.uav,
+            placed.sender_ns,
+            placed.t_ns,
+            report.t_ns,
+            position,
+            velocity,
+            errors,
+            report,
+        )
+        return made, said
+
+    def turn(self, placed: PlacedAttitude) -> None:
+        """Take in an attitude of the carrier, unless it is older than the newest."""
+        if self._attitude is None or placed.sender_ns > self._attitude[0]:
+            self._attitude = placed.sender_ns, placed.attitude
+
+    def restarted(self, uav: str) -> None:
+        """Drop the carrier's attitude if the carrier was restarted: its stamps mean nothing now."""
+        if uav == self.vehicle:
+            self._attitude = None
+
+    def _first(self, report: Report) -> Notice:
+        """Make the first position of all the origin of the local frame, and of ``home``."""
+        home = FixedCenter(report.lat_deg, report.lon_deg, report.alt_m)
+        self._begin(home)
+        place = f"{home.lat_deg:.6f}, {home.lon_deg:.6f}, {home.alt_m:.1f} m"
+        if self.vehicle is not None:
+            return Notice(report.t_ns, Severity.INFO, "origin", f"local frame begins at {place}")
+        self.place = home
+        text = f"home is where {report.uav} first reported: {place}; level, facing north"
+        return Notice(report.t_ns, Severity.INFO, "home", text)
+
+    def _begin(self, at: FixedCenter) -> None:
+        self.local = LocalFrame(at.lat_deg, at.lon_deg, at.alt_m)
+
+    # --- where the array is -----------------------------------------------------------------
+
+    def station(self, valid_at_ns: int) -> Carrier | str:
+        """The array of a fixed station, or the reason why its place is not known."""
+        at = self.place
+        if self.local is None or not isinstance(at, FixedCenter):
+            return "no report yet"
+        place = (at.lat_deg, at.lon_deg, at.alt_m)
+        return carrier.fixed(valid_at_ns, self.local, place, np.radians(at.heading_deg))
+
+    def aboard(
+        self, track: Track | None, newest: Fix | None, now: SenderTime, at: SenderTime
+    ) -> Carrier | str:
+        """The array aboard the vehicle, or the reason why its position or attitude is not known.
+
+            track   the carrier's track at the time ``at``; None if it has none
+            newest  its newest accepted report
+            now     the present
+            at      the time asked for
+
+        Times are on the vehicle's timeline.
+        """
+        if self.local is None:
+            return "no report yet"
+        if track is None or newest is None:
+            return f"no position from the carrier {self.vehicle}"
+        if track.state not in AIMABLE:
+            return f"the carrier {self.vehicle} is {track.state}"
+        if self._attitude is None:
+            return f"no attitude from the carrier {self.vehicle}"
+        made_ns, attitude = self._attitude
+        if now.sender_ns - made_ns > self._attitude_kept_s * 1e9:
+            return f"the attitude of the carrier {self.vehicle} is too old"
+        since_ns = at.sender_ns - made_ns
+        return carrier.moving(
+            self.local, track, newest, attitude, since_ns, self._attitude_bound_rad
+        )

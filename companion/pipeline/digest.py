@@ -1,0 +1,31 @@
+"""A digest of the pipeline's outputs, by which two runs are compared."""
+
+import hashlib
+import struct
+
+from companion.values import Estimate, FloatArray, Update
+
+
+class Digest:
+    """SHA-256 over every estimate and every set of weights, in order."""
+
+    def __init__(self) -> None:
+        self._hash = hashlib.sha256()
+
+    def add(self, output: Estimate | Update) -> None:
+        """Take in one output: little-endian doubles and integers, names in UTF-8."""
+        if isinstance(output, Estimate):
+            self._estimate(output.fix.uav, output.fix.t_ns, output.position_ned_m, output.bound_m)
+            return
+        for track in output.tracks:
+            self._estimate(track.uav, track.valid_at_ns, track.position_ned_m, track.bound_m)
+        self._hash.update("\0".join(output.beams.uavs).encode())
+        self._hash.update(output.beams.weights.astype("<c16", copy=False).tobytes())
+
+    def _estimate(self, uav: str, t_ns: int, position_ned_m: FloatArray, bound_m: float) -> None:
+        self._hash.update(uav.encode())
+        self._hash.update(struct.pack("<q4d", t_ns, *position_ned_m, bound_m))
+
+    def hexdigest(self) -> str:
+        """The digest so far."""
+        return self._hash.hexdigest()

@@ -1,0 +1,198 @@
+"""The whole program as a fold over events. The live service, replay and the tests all use it.
+
+Pure and synchronous. Time comes with the events; the same events give the same outputs and the same
+digest, whoever feeds them. A report passes through these parts in the order of the flow:
+
+1. ``senders``: who sent it, and when it was true; or why it is rejected;
+2. ``center``: where that is in the local frame;
+3. ``fleet``: the track that it belongs to, and the estimate;
+
+and a relayed aircraft's report also goes to ``targets``, which returns nothing. A tick asks
+``fleet`` for the tracks that ``targets`` wants and ``center`` for the array, and aims the beams.
+"""
+
+from collections.abc import Iterable
+from typing import Final
+
+from companion.beams.aim import aim
+from companion.mavlink.clock.sender_clock import ClockEstimate
+from companion.mavlink.wire.decode import DECODED
+from companion.pipeline import assembly
+from companion.pipeline.center import Center
+from companion.pipeline.digest import Digest
+from companion.pipeline.refusals import Refusals
+from companion.pipeline.senders import PlacedAttitude, PlacedReport, Senders
+from companion.pipeline.targets import Targets
+from companion.settings.model import Settings
+from companion.tracking.geodesy import LocalFrame
+from companion.values import (
+    Carrier,
+    Estimate,
+    Event,
+    FloatArray,
+    Frame,
+    Notice,
+    Output,
+    Rejection,
+    RoundTrip,
+    Severity,
+    Source,
+    Tick,
+    Track,
+    Update,
+    reports_itself,
+)
+
+DROP_EVERY: Final = 100
+"""Updates between two searches for tracks that have been silent for too long."""
+NEAR_M: Final = 2000.0
+"""Largest distance between two reports of one aircraft, whatever its speed and their latency."""
+
+
+class Pipeline:
+    """State of the program.
+
+    ``step`` takes events in order of time; the other methods change nothing.
+
+    Raises ``UserError`` for settings that do not make sense together.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.frames = 0
+        self.updates = 0
+        self.last_update: Update | None = None
+        self.refusals = Refusals()
+        self.digest = Digest()
+        self.array = assembly.array(settings)
+        self.coverage = assembly.coverage(settings)
+        self.precoder = assembly.precoder(settings)
+        self.center = Center(settings)
+        self.senders = Senders(settings, self.center.vehicle)
+        self.fleet = assembly.fleet(settings)
+        self.targets = Targets(settings, self.center.vehicle)
+
+    # --- the fold ---------------------------------------------------------------------------
+
+    def step(self, event: Event) -> list[Output]:
+        """Take in one event. Returns rejections, notices, estimates, and the update of a tick."""
+        match event:
+            case Frame():
+                outputs = self._frame(event)
+            case Tick():
+                outputs = self._tick(event.t_ns)
+            case Rejection():
+                outputs = [event]
+            case RoundTrip():
+                self.senders.round_trip(event)
+                outputs = []
+        for output in outputs:
+            if isinstance(output, Rejection):
+                self.refusals.add(output)
+            elif isinstance(output, Estimate | Update):
+                self.digest.add(output)
+        return outputs
+
+    def _frame(self, frame: Frame) -> list[Output]:
+        self.frames += 1
+        if frame.msgid not in DECODED:
+            return []
+        heard = self.senders.hear(frame)
+        if heard.restarted is not None:
+            self._restart(heard.restarted)
+        match heard.message:
+            case PlacedReport():
+                return [*heard.said, *self._report(heard.message)]
+            case PlacedAttitude():
+                self.center.turn(heard.message)
+        return list(heard.said)
+
+    def _report(self, placed: PlacedReport) -> list[Output]:
+        fix, said = self.center.fix(placed)
+        accepted = self.fleet.accept(fix)
+        if isinstance(accepted, Rejection):
+            return [*said, accepted]
+        if not reports_itself(fix.uav):
+            near = filter(reports_itself, self.fleet.near(fix.position_ned_m, NEAR_M))
+            self.targets.compare(fix, self._tracks(near, fix.t_ns, fix.t_ns))
+        if accepted.reacquired:
+            text = f"{fix.uav} is tracked anew: its reports agree, but not with its past"
+            return [*said, Notice(fix.arrival_ns, Severity.WARNING, fix.uav, text), accepted]
+        return [*said, accepted]
+
+    def _restart(self, uav: str) -> None:
+        """Forget the past of a sender."""
+        self.fleet.forget(uav)
+        self.center.restarted(uav)
+
+    def _tick(self, now_ns: int) -> list[Output]:
+        self.updates += 1
+        dropped = self._drop_silent(now_ns) if self.updates % DROP_EVERY == 0 else []
+        self.last_update = self.look(now_ns)
+        states = {track.uav: track.state for track in self.last_update.tracks}
+        if self.center.vehicle is not None:
+            now = self.senders.time(self.center.vehicle, now_ns)
+            state = self.fleet.state(self.center.vehicle, now)
+            states |= {} if state is None else {self.center.vehicle: state}
+        return [*dropped, *self.targets.changes(now_ns, states), self.last_update]
+
+    def _drop_silent(self, now_ns: int) -> list[Notice]:
+        """Drop tracks that have been silent for long, so that they take no more memory or time."""
+        silent = self.fleet.silent(now_ns, self.settings.tracks.dropped_s)
+        for uav in silent:
+            self._restart(uav)
+        self.senders.forget_clocks(frozenset(self.fleet.uavs))
+        return self.targets.dropped(now_ns, silent)
+
+    # --- looking ----------------------------------------------------------------------------
+
+    def look(self, now_ns: int, lead_s: float = 0.0) -> Update:
+        """Targets and beams at the actuation delay plus ``lead_s`` from now. Changes nothing."""
+        delay_s = self.settings.beams.actuation_delay_s + lead_s
+        valid_at_ns = now_ns + round(delay_s * 1e9)
+        tracks = self._tracks(self.targets.among(self.fleet.uavs), now_ns, valid_at_ns)
+        found = self.carrier(now_ns, valid_at_ns)
+        known, unfit = (None, found) if isinstance(found, str) else (found, None)
+        beams = aim(now_ns, valid_at_ns, tracks, known, self.array, self.precoder, self.coverage)
+        return Update(now_ns, known, unfit, tuple(tracks), beams)
+
+    def tracks(self, now_ns: int, valid_at_ns: int) -> list[Track]:
+        """Every UAV heard of, target or not, predicted to ``valid_at_ns``; without the carrier."""
+        others = [uav for uav in self.fleet.uavs if uav != self.center.vehicle]
+        return self._tracks(others, now_ns, valid_at_ns)
+
+    def _tracks(self, uavs: Iterable[str], now_ns: int, valid_at_ns: int) -> list[Track]:
+        found = (self.fleet.track(uav, now_ns, self.senders.time(uav, valid_at_ns)) for uav in uavs)
+        return [track for track in found if track is not None]
+
+    def carrier(self, now_ns: int, valid_at_ns: int) -> Carrier | str:
+        """Position and attitude of the array, or the reason why they are not known."""
+        vehicle = self.center.vehicle
+        if vehicle is None:
+            return self.center.station(valid_at_ns)
+        at = self.senders.time(vehicle, valid_at_ns)
+        track = self.fleet.track(vehicle, now_ns, at)
+        now = self.senders.time(vehicle, now_ns)
+        return self.center.aboard(track, self.fleet.newest(vehicle), now, at)
+
+    def reporters(self) -> list[Source]:
+        """Senders that report their own position, the carrier among them."""
+        return [Source.parse(uav) for uav in filter(reports_itself, self.fleet.uavs)]
+
+    def clock_estimate(self, uav: str) -> ClockEstimate | None:
+        """The state of a UAV's clock; None for a UAV that has none."""
+        return self.senders.clock_estimate(uav)
+
+    @property
+    def local(self) -> LocalFrame | None:
+        """The local frame; None before the first report, unless the station is fixed."""
+        return self.center.local
+
+    def geodetic(self, position_ned_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Latitude and longitude in degrees and height in metres of local points, (N, 3).
+
+        Raises ``ValueError`` before the first report, when there is no local frame.
+        """
+        if self.local is None:
+            raise ValueError("no report yet, so there is no local frame")
+        return self.local.geodetic(position_ned_m)

@@ -1,0 +1,227 @@
+"""Senders of frames: who sent a message, and when it was true. Every frame comes here first.
+
+Each sender has a clock, bounds on the noise of its reports, and a presence. A message leaves here
+with its time on the sender's and on the node's timeline, or as a rejection with its reason.
+"""
+
+from collections.abc import Container
+from dataclasses import dataclass
+from typing import Final
+
+from companion.mavlink.clock.sender_clock import ClockEstimate, SenderClock, Stamp
+from companion.mavlink.trust.admission import Admission
+from companion.mavlink.trust.adsb import Aircraft
+from companion.mavlink.trust.dedupe import Dedupe, LinkShare
+from companion.mavlink.wire.decode import decode
+from companion.pipeline import assembly
+from companion.settings.model import Settings
+from companion.tracking import noise
+from companion.values import (
+    AdsbVehicle,
+    Attitude,
+    Frame,
+    GnssStatus,
+    Notice,
+    Presence,
+    Reason,
+    Rejection,
+    Report,
+    ReportNoise,
+    RoundTrip,
+    SenderTime,
+    Severity,
+    Source,
+    SystemTime,
+)
+
+CLOCKS_MAX: Final = 4096
+"""Clocks kept. Beyond it those of senders without a track are forgotten, the oldest first."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedReport:
+    """A report with its time.
+
+    sender_ns  when it was true, on the sender's timeline
+    t_ns       the same instant on the node's timeline
+    noise      bounds on its errors; None for a relayed aircraft, whose errors depend on its
+               speed
+    """
+
+    report: Report
+    sender_ns: int
+    t_ns: int
+    noise: ReportNoise | None
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedAttitude:
+    """An attitude of the carrier with its time on the carrier's timeline."""
+
+    attitude: Attitude
+    sender_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """The outcome of one frame.
+
+    message    a message with its time; None if nothing is to be done further
+    said       notices and rejections on the way to it
+    restarted  the sender whose past is to be forgotten; None if there is none
+    """
+
+    message: PlacedReport | PlacedAttitude | None = None
+    said: tuple[Notice | Rejection, ...] = ()
+    restarted: str | None = None
+
+
+NOTHING: Final = Heard()
+"""The outcome of a frame that asks for nothing further."""
+
+
+class Senders:
+    """All senders of frames, by MAVLink source.
+
+    ``carrier`` is admitted whatever the lists say, and is the only one whose attitude is used.
+    """
+
+    def __init__(self, settings: Settings, carrier: str | None) -> None:
+        self.presence: dict[Source, Presence] = {}
+        self.aircraft = Aircraft()
+        self._settings = settings
+        self._carrier = carrier
+        self._noise_settings = assembly.noise(settings)
+        self._noise: dict[Source, ReportNoise] = {}
+        self._clocks: dict[str, SenderClock] = {}  # by SYSID:COMPID
+        self._dedupe = Dedupe()
+        self._admission = Admission(settings.tracks.allow, settings.tracks.deny)
+        self._shared: set[str] = set()
+
+    # --- what they say ----------------------------------------------------------------------
+
+    def hear(self, frame: Frame) -> Heard:
+        """Take in one frame of a message that is decoded (``decode.DECODED``)."""
+        message = decode(frame)
+        match message:
+            case Rejection():
+                return Heard(said=(message,))
+            case Report():
+                if self._dedupe.is_repeat(frame):
+                    return _refused(message, Reason.DUPLICATE)
+                if message.uav != self._carrier and not self._admission.admits(message.uav):
+                    return _refused(message, Reason.NOT_ALLOWED)
+                return self._telemetry(message)
+            case AdsbVehicle():
+                if not self._admission.admits(message.uav):
+                    return _refused(message, Reason.NOT_ALLOWED)
+                return self._relayed(message)
+            case Attitude() if str(message.source) == self._carrier:
+                return self._attitude(message)
+            case GnssStatus():
+                self._noise[message.source] = noise.reported(message, self._noise_settings)
+            case SystemTime() if message.unix_us is not None:
+                clock = self._clock(str(message.source))
+                clock.system_time(message.t_ns, message.unix_us, message.boot_ms)
+            case Presence():
+                self.presence[message.source] = message
+        return NOTHING
+
+    def round_trip(self, event: RoundTrip) -> None:
+        """Take in a TIMESYNC round trip, as evidence of its sender's clock."""
+        self._clock(str(event.source)).timesync(event.sent_ns, event.t_ns, event.remote_ns)
+
+    def _telemetry(self, report: Report) -> Heard:
+        """Place a report that a vehicle makes of itself, by its boot time."""
+        assert report.boot_ms is not None
+        uav, t_ns = report.uav, report.t_ns
+        stamp, restarted = self._stamp(uav, t_ns, report.boot_ms)
+        said = _restart_notice(t_ns, uav, report.boot_ms) if restarted else ()
+        if self._clock(uav).is_shared(t_ns):
+            return Heard(None, (*said, *self._shared_id(uav, t_ns)), restarted)
+        self._shared.discard(uav)
+        if stamp is None:
+            return Heard(None, (*said, Rejection(t_ns, uav, Reason.UNPLACED_STAMP)), restarted)
+        self._dedupe.took(stamp.latency_s)
+        errors = self._noise.get(report.source, self._noise_settings.default)
+        true_ns = t_ns - round(stamp.latency_s * 1e9)
+        return Heard(PlacedReport(report, stamp.sender_ns, true_ns, errors), said, restarted)
+
+    def _relayed(self, said: AdsbVehicle) -> Heard:
+        """Place a report of an aircraft that a receiver relays.
+
+        A track is begun anew when the altitude datum changes, since datums differ by the weather.
+        """
+        datum = self.aircraft.datum(said.uav)
+        merged = self.aircraft.merge(said)
+        if isinstance(merged, Rejection):
+            return Heard(said=(merged,))
+        true_ns = merged.t_ns - round((merged.tslc_s or 0.0) * 1e9)
+        placed = PlacedReport(merged, true_ns, true_ns, None)
+        if datum in (None, merged.alt_datum):
+            return Heard(placed)
+        text = f"{said.uav} is tracked anew: its altitude is {merged.alt_datum} now, not {datum}"
+        return Heard(placed, (Notice(said.t_ns, Severity.INFO, said.uav, text),), said.uav)
+
+    def _attitude(self, attitude: Attitude) -> Heard:
+        carrier = str(attitude.source)
+        stamp, restarted = self._stamp(carrier, attitude.t_ns, attitude.boot_ms)
+        said = _restart_notice(attitude.t_ns, carrier, attitude.boot_ms) if restarted else ()
+        placed = None if stamp is None else PlacedAttitude(attitude, stamp.sender_ns)
+        return Heard(placed, said, restarted)
+
+    def _shared_id(self, uav: str, t_ns: int) -> tuple[Notice | Rejection, ...]:
+        """Reject a report under an id with two boot clocks; the notice is given once."""
+        refused = Rejection(t_ns, uav, Reason.SHARED_ID, detail="two boot clocks under this id")
+        if uav in self._shared:
+            return (refused,)
+        self._shared.add(uav)
+        text = f"two vehicles share the id {uav}: neither is believed"
+        return Notice(t_ns, Severity.WARNING, uav, text), refused
+
+    # --- when they said it ------------------------------------------------------------------
+
+    def _stamp(self, name: str, arrival_ns: int, boot_ms: int) -> tuple[Stamp | None, str | None]:
+        """Place a stamp on the sender's timeline; also returns the sender's name if it rebooted."""
+        stamp = self._clock(name).observe(arrival_ns, boot_ms)
+        return stamp, name if stamp is not None and stamp.rebooted else None
+
+    def _clock(self, name: str) -> SenderClock:
+        clock = self._clocks.get(name)
+        if clock is None:
+            clock = self._clocks.setdefault(name, assembly.clock(self._settings))
+        return clock
+
+    def time(self, uav: str, node_ns: int) -> SenderTime:
+        """A node time on a UAV's own timeline; a relayed aircraft's timeline is the node's."""
+        clock = self._clocks.get(uav)
+        estimate = clock.estimate() if clock else None
+        if clock is None or estimate is None:
+            return SenderTime(node_ns, node_ns, noise.ADSB_TIME_BOUND_S)
+        return SenderTime(node_ns, clock.sender_ns(node_ns), estimate.uncertainty_s)
+
+    def clock_estimate(self, uav: str) -> ClockEstimate | None:
+        """The state of a UAV's clock; None for a UAV that has none."""
+        clock = self._clocks.get(uav)
+        return clock.estimate() if clock else None
+
+    # --- memory -----------------------------------------------------------------------------
+
+    def forget_clocks(self, wanted: Container[str]) -> None:
+        """Keep ``CLOCKS_MAX`` clocks and those that are wanted, dropping the oldest others."""
+        for name in list(self._clocks)[: max(0, len(self._clocks) - CLOCKS_MAX)]:
+            if name not in wanted and name != self._carrier:
+                del self._clocks[name]
+
+    def link_share(self, link: str) -> LinkShare:
+        """What a link has contributed to the reports so far."""
+        return self._dedupe.shares.get(link) or LinkShare()
+
+
+def _refused(message: Report | AdsbVehicle, reason: Reason) -> Heard:
+    return Heard(said=(Rejection(message.t_ns, message.uav, reason),))
+
+
+def _restart_notice(t_ns: int, name: str, boot_ms: int) -> tuple[Notice]:
+    text = f"{name} was restarted: its boot clock stepped back to {boot_ms / 1e3:.1f} s"
+    return (Notice(t_ns, Severity.WARNING, name, text),)

@@ -1,0 +1,74 @@
+"""Targets: the tracks for which beams are wanted, and the notices when their states change."""
+
+from collections.abc import Iterable, Mapping
+
+from companion.settings.model import Settings
+from companion.tracking.identity import Identities
+from companion.values import Fix, Notice, Severity, Track, TrackState, reports_itself
+
+
+class Targets:
+    """Decides for which UAVs beams are wanted.
+
+    Wanted are UAVs that report themselves, relayed aircraft only if the settings say so, and never
+    the carrier (``carrier`` is its id, None for a station).
+    """
+
+    def __init__(self, settings: Settings, carrier: str | None) -> None:
+        self._carrier = carrier
+        self._all = settings.beams.targets == "all"
+        self._dropped_s = settings.tracks.dropped_s
+        self._identities = Identities()
+        self._states: Mapping[str, TrackState] = {}
+
+    def wants(self, uav: str) -> bool:
+        """Whether a beam is wanted for this UAV."""
+        if uav == self._carrier or self.same_as(uav) is not None:
+            return False
+        return self._all or reports_itself(uav)
+
+    def among(self, uavs: Iterable[str]) -> list[str]:
+        """The UAVs for which beams are wanted, in the order given."""
+        return [uav for uav in uavs if self.wants(uav)]
+
+    def same_as(self, uav: str) -> str | None:
+        """The telemetry track that is the same aircraft as this relayed one.
+
+        None if there is none.
+        """
+        return self._identities.same_as(uav)
+
+    def compare(self, relayed: Fix, telemetry: list[Track]) -> None:
+        """Compare a relayed aircraft with the telemetry tracks near it, at its time.
+
+        Two beams on one aircraft would make zero forcing all but singular.
+        """
+        self._identities.observe(relayed, telemetry)
+
+    # --- what is said of them ---------------------------------------------------------------
+
+    def changes(self, now_ns: int, states: Mapping[str, TrackState]) -> list[Notice]:
+        """One notice for each target, or the carrier, whose state changed since the last call."""
+        changed = [uav for uav, state in states.items() if self._states.get(uav) is not state]
+        self._states = states
+        notices = []
+        for uav in changed:
+            bad = states[uav] in (TrackState.STALE, TrackState.LOST)
+            severity = Severity.WARNING if bad else Severity.INFO
+            notices.append(Notice(now_ns, severity, uav, f"{uav} is {states[uav]}"))
+        return notices
+
+    def dropped(self, now_ns: int, silent: Iterable[str]) -> list[Notice]:
+        """One notice for each target that is dropped.
+
+        Relayed traffic that is no target goes unmentioned.
+        """
+        return [
+            Notice(
+                now_ns,
+                Severity.INFO,
+                uav,
+                f"{uav} is dropped: nothing of it for {self._dropped_s:.0f} s",
+            )
+            for uav in self.among(silent)
+        ]

@@ -1,0 +1,147 @@
+"""The channels of a recording, live on a WebSocket for Foxglove and Lichtblick.
+
+Needs the package foxglove-sdk, which the extra ``live`` installs. The server is the package's, on
+threads of its own; the messages are made on a thread here. The event loop only hands over, and what
+a slow viewer cannot take is not sent.
+"""
+
+import contextlib
+import queue
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any, Final
+
+from companion.recording import schemas
+from companion.recording.entries import NAMED, Encoder, Geodetic
+from companion.recording.scene import Scene
+from companion.recording.schemas import Schema
+from companion.values import Estimate, Event, Output, UserError
+
+QUEUE_MAX: Final = 10_000
+"""Events waiting to be sent at most."""
+RATE_HZ: Final = 10.0
+"""Greatest rate of tracks and weights: as often as anyone can see."""
+LOOK_S: Final = 0.2
+"""Time between two checks whether anybody is watching."""
+NAME: Final = "companion"
+"""Name of the server as viewers show it."""
+
+_Item = tuple[Event | None, Sequence[Output]]
+
+
+class LiveError(UserError):
+    """The live channels cannot be served. The message is one line for the user."""
+
+
+class LiveChannels:
+    """Serves events and outputs live, from ``start`` to ``stop``.
+
+        host, port  where it listens, at once; port 0: any free one, and ``port`` then says which
+        geodetic    converts positions, for ``Encoder.output``
+        scene       draws the scene; None: no scene
+        rate_hz     greatest rate of tracks and weights; None: every update
+
+    While nobody watches, no messages are made. Raises ``LiveError`` where the package is not
+    installed or the port cannot be had.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        geodetic: Geodetic,
+        scene: Scene | None,
+        rate_hz: float | None = RATE_HZ,
+    ) -> None:
+        self.dropped = 0
+        self._foxglove = foxglove = _foxglove()
+        self._context = foxglove.Context()
+        try:
+            self._server = foxglove.start_server(
+                name=NAME, host=host, port=port, context=self._context
+            )
+        except (OSError, RuntimeError) as error:
+            raise LiveError(f"server.foxglove: cannot listen on {host}:{port}: {error}") from error
+        self.port: int = self._server.port
+        self._channels: dict[str, Any] = {}
+        self._announced: set[str] = set()
+        self._geodetic = geodetic
+        self._encoder = Encoder(self._send, rate_hz, scene)
+        for topic, schema in NAMED:
+            self._channel(topic, schema)
+        self._queue: queue.Queue[_Item | None] = queue.Queue(QUEUE_MAX)
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="foxglove", daemon=True)
+
+    def start(self) -> None:
+        """Begin to send."""
+        self._thread.start()
+
+    def put(self, event: Event | None, outputs: Sequence[Output]) -> None:
+        """Hand over an event and its outputs; an event of None for outputs without one.
+
+        Never waits.
+        """
+        try:
+            self._queue.put_nowait((event, outputs))
+        except queue.Full:
+            self.dropped += 1
+
+    def stop(self) -> None:
+        """Stop serving."""
+        self._stopping.set()
+        with contextlib.suppress(queue.Full):
+            self._queue.put_nowait(None)
+        if self._thread.is_alive():
+            self._thread.join()
+        self._server.stop()
+
+    def _run(self) -> None:
+        watched, look_due_s = False, 0.0
+        while not self._stopping.is_set():
+            item = self._queue.get()
+            if time.monotonic() >= look_due_s:
+                watched = any(channel.has_sinks() for channel in self._channels.values())
+                look_due_s = time.monotonic() + LOOK_S
+            if item is None:
+                continue
+            event, outputs = item
+            self._announce(outputs)
+            if not watched:
+                continue
+            if event is not None:
+                self._encoder.event(event)
+            for output in outputs:
+                self._encoder.output(output, self._geodetic)
+
+    def _announce(self, outputs: Sequence[Output]) -> None:
+        """Announce the topics of each new UAV, watched or not: only then can they be asked for."""
+        for output in outputs:
+            if isinstance(output, Estimate) and output.fix.uav not in self._announced:
+                self._announced.add(output.fix.uav)
+                for kind in ("fix", "predicted"):
+                    self._channel(f"/uav/{output.fix.uav}/{kind}", schemas.LOCATION_FIX)
+
+    def _send(self, topic: str, schema: Schema, t_ns: int, data: bytes) -> None:
+        channel = self._channels.get(topic) or self._channel(topic, schema)
+        channel.log(data, log_time=max(0, t_ns))
+
+    def _channel(self, topic: str, schema: Schema) -> Any:
+        described = self._foxglove.Schema(
+            name=schema.name, encoding="protobuf", data=schema.descriptor_set
+        )
+        channel = self._foxglove.Channel(
+            topic, schema=described, message_encoding="protobuf", context=self._context
+        )
+        return self._channels.setdefault(topic, channel)
+
+
+def _foxglove() -> Any:
+    try:
+        import foxglove
+    except ImportError as error:
+        raise LiveError(
+            "server.foxglove needs the package foxglove-sdk: install the extra, [live]"
+        ) from error
+    return foxglove

@@ -1,0 +1,161 @@
+"""Settings of the array, the beams, the codebook, the hardware and the radio."""
+
+from typing import Annotated, Literal, Self
+
+from pydantic import (
+    AfterValidator,
+    Field,
+    FiniteFloat,
+    PositiveFloat,
+    model_validator,
+)
+
+from companion.settings.section import Section
+from companion.values import Method, Normalisation, Policy, UserError
+
+Metres = Annotated[float, Field(ge=-1e4, le=1e4)]
+Position = tuple[Metres, Metres, Metres]
+Interval = tuple[FiniteFloat, FiniteFloat]
+HiddenSector = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+
+
+def _rising(interval: Interval) -> Interval:
+    if not interval[0] < interval[1]:
+        raise UserError("from and to, the first less than the second")
+    return interval
+
+
+def _once(names: tuple[str, ...]) -> tuple[str, ...]:
+    if len(set(names)) < len(names):
+        raise UserError("each UAV once, in descending order")
+    return names
+
+
+class ArraySettings(Section):
+    """The antenna array, and how it is mounted on its carrier.
+
+    ``kind`` is one of four geometries in the array frame (x boresight, y right, z down):
+
+        ula   ``elements`` along y
+        ura   ``rows`` down and ``columns`` to the right
+        uca   ``elements`` on a circle in the xy plane
+        list  ``positions_m``: rows of x, y, z, or of x, y, z and the direction the element faces.
+              ``positions`` names a file of such rows (CSV or .npy), which is read into
+              ``positions_m``
+
+    ``spacing_m``, where given, takes the place of ``spacing_wavelengths``.
+
+    The mount angles turn the body frame into the array frame: yaw, then pitch, then roll.
+    ``lever_arm_m`` is the array's place in the body frame (forward, right, down), measured from the
+    point whose position the carrier reports.
+
+    ``field_of_view_deg`` is the full angle of a cone about boresight. The azimuth and elevation
+    limits are those of the hardware's steering, in the array frame. ``hidden_deg`` lists sectors
+    that the airframe hides, in the body frame: azimuth from and to (clockwise from the nose),
+    elevation from and to.
+    """
+
+    kind: Literal["ula", "ura", "uca", "list"] = "ula"
+    elements: Annotated[int, Field(ge=1, le=4096)] = 64
+    rows: Annotated[int, Field(ge=1, le=256)] = 8
+    columns: Annotated[int, Field(ge=1, le=256)] = 8
+    positions: str | None = None
+    positions_m: Annotated[tuple[tuple[Metres, ...], ...], Field(max_length=4096)] | None = None
+    frequency_hz: Annotated[float, Field(ge=1e3, le=1e15)] = 30e9
+    spacing_wavelengths: Annotated[float, Field(gt=0, le=1e4)] = 0.5
+    spacing_m: Annotated[float, Field(gt=0, le=1e4)] | None = None
+    element: Literal["isotropic", "cosine", "3gpp"] = "isotropic"
+    element_exponent: Annotated[float, Field(ge=0, le=100)] = 1.0
+    mount_roll_deg: float = 0.0
+    mount_pitch_deg: float = 0.0
+    mount_yaw_deg: float = 0.0
+    lever_arm_m: Position = (0.0, 0.0, 0.0)
+    field_of_view_deg: Annotated[float, Field(gt=0, le=360)] | None = None
+    azimuth_limits_deg: Annotated[Interval, AfterValidator(_rising)] | None = None
+    elevation_limits_deg: Annotated[Interval, AfterValidator(_rising)] | None = None
+    hidden_deg: tuple[HiddenSector, ...] = ()
+
+    @model_validator(mode="after")
+    def _listed(self) -> Self:
+        listed = self.positions is not None or self.positions_m is not None
+        if (self.kind == "list") != listed:
+            raise UserError('kind = "list" goes with positions or positions_m, and they with it')
+        if self.kind == "ura" and self.rows * self.columns > 4096:
+            raise UserError("rows x columns is at most 4096")
+        return self
+
+
+class BeamSettings(Section):
+    """When weights are made, by which method, and what is done where that costs too much gain.
+
+        update_hz          how often weights are made unasked, for recordings and the dashboard; a
+                           request over HTTP is answered with weights made for its own time
+        actuation_delay_s  time from making weights to applying them
+        targets            which tracks get beams
+        method             zero forcing, regularised zero forcing or maximum ratio
+        regularisation     loading of the regularised method, times the number of elements
+        loss_limit_db      most that zero forcing may cost any UAV against a beam for it alone
+        condition_limit    largest condition number of the steering matrix
+        policy             what is done beyond either limit: load as little as will do, serve groups
+                           in turns, or drop the UAVs of lowest priority
+        priority           UAVs in descending order; the others follow in the order first heard
+        widen              make main lobes and nulls as wide as the pointing bound
+
+    ``condition_limit`` is at most 1000: up to there the zero-forcing identity holds to 1e-9, and
+    its error grows with the square of the condition number.
+    """
+
+    update_hz: Annotated[float, Field(gt=0, le=1000)] = 10.0
+    actuation_delay_s: Annotated[float, Field(ge=0, le=10)] = 0.01
+    targets: Literal["telemetry", "all"] = "telemetry"
+    method: Method = Method.ZERO_FORCING
+    policy: Policy = Policy.REGULARISE
+    loss_limit_db: Annotated[float, Field(gt=0, le=60)] = 3.0
+    condition_limit: Annotated[float, Field(gt=1, le=1e3)] = 100.0
+    regularisation: Annotated[float, Field(gt=0, le=1e6)] = 0.01
+    normalisation: Normalisation = Normalisation.UNIT_RESPONSE
+    priority: Annotated[tuple[str, ...], AfterValidator(_once)] = ()
+    widen: bool = True
+
+
+class CodebookSettings(Section):
+    """The stored beams of an array that can only choose among them.
+
+    dft   for lines and rectangles: ``oversampling`` times as many beams as elements on each
+          axis
+    file  a .npy file with a row per element (M) and a column per beam
+    """
+
+    kind: Literal["none", "dft", "file"] = "none"
+    oversampling: Annotated[int, Field(ge=1, le=16)] = 1
+    file: str | None = None
+
+    @model_validator(mode="after")
+    def _named(self) -> Self:
+        if (self.kind == "file") != (self.file is not None):
+            raise UserError('kind = "file" goes with file, and file with it')
+        return self
+
+
+class HardwareSettings(Section):
+    """The hardware behind the array.
+
+    ``calibration`` names a table of its channels (CSV: channel, element, phase_deg, gain_db).
+    """
+
+    calibration: str | None = None
+
+
+class RadioSettings(Section):
+    """The radio link, from which signal-to-noise figures are computed.
+
+    tx_power_dbm     power of all beams together
+    bandwidth_hz     noise bandwidth
+    noise_figure_db  noise figure of the UAVs' receivers
+    uav_antennas     antennas that each UAV combines
+    """
+
+    tx_power_dbm: Annotated[float, Field(ge=-100, le=100)] = 20.0
+    bandwidth_hz: PositiveFloat = 50e6
+    noise_figure_db: Annotated[float, Field(ge=0, le=60)] = 7.0
+    uav_antennas: Annotated[int, Field(ge=1, le=256)] = 4

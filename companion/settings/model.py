@@ -1,0 +1,93 @@
+"""All settings as one frozen value, checked once at start.
+
+Each section lists its keys with unit, default and range. An error names the key, the value and what
+is allowed.
+"""
+
+import tomllib
+from typing import Any, Self
+
+import tomli_w
+from pydantic import ValidationError
+
+from companion.settings.beams import (
+    ArraySettings,
+    BeamSettings,
+    CodebookSettings,
+    HardwareSettings,
+    RadioSettings,
+)
+from companion.settings.center import CenterSettings
+from companion.settings.mavlink import (
+    LinkSettings,
+    PresenceSettings,
+    SigningSettings,
+    TrackSettings,
+)
+from companion.settings.outlets import RecordingSettings, ServerSettings
+from companion.settings.section import ConfigError, Section
+from companion.settings.tracking import ClockSettings, ObserverSettings
+
+
+class Settings(Section):
+    """All settings of the service."""
+
+    center: CenterSettings = CenterSettings()
+    links: LinkSettings = LinkSettings()
+    presence: PresenceSettings = PresenceSettings()
+    signing: SigningSettings = SigningSettings()
+    clocks: ClockSettings = ClockSettings()
+    observer: ObserverSettings = ObserverSettings()
+    tracks: TrackSettings = TrackSettings()
+    array: ArraySettings = ArraySettings()
+    beams: BeamSettings = BeamSettings()
+    codebook: CodebookSettings = CodebookSettings()
+    hardware: HardwareSettings = HardwareSettings()
+    radio: RadioSettings = RadioSettings()
+    recording: RecordingSettings = RecordingSettings()
+    server: ServerSettings = ServerSettings()
+
+    @classmethod
+    def from_toml(cls, text: str, where: str) -> Self:
+        """Read settings from TOML text.
+
+        Raises ``ConfigError``, its message beginning with ``where``, if they cannot be used.
+        """
+        try:
+            return cls.model_validate(tomllib.loads(text))
+        except tomllib.TOMLDecodeError as error:
+            raise ConfigError(f"{where}: not TOML: {error}") from error
+        except ValidationError as error:
+            raise ConfigError(f"{where}: {_first(error)}") from error
+
+    def to_toml(self) -> str:
+        """All settings, defaults included, as ``from_toml`` reads them."""
+        return tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
+
+    def override(self, **sections: dict[str, Any]) -> "Settings":
+        """A copy with some keys of some sections replaced; a value of None leaves the key as it is.
+
+        Raises ``ConfigError`` if the result cannot be used.
+        """
+        merged = self.model_dump(mode="json", exclude_none=True)
+        for name, keys in sections.items():
+            merged[name].update({key: value for key, value in keys.items() if value is not None})
+        try:
+            return Settings.model_validate(merged)
+        except ValidationError as error:
+            raise ConfigError(_first(error)) from error
+
+
+def _first(error: ValidationError) -> str:
+    """The first error as one line: key, value, what is allowed.
+
+    A key that may be of several types has one error per type; all of them are said.
+    """
+    errors = error.errors(include_url=False)
+    place = errors[0]["loc"][:2]
+    key = ".".join(map(str, place))
+    if errors[0]["type"] == "extra_forbidden":
+        return f"{key} is not a setting"
+    said = [wrong["msg"] for wrong in errors if wrong["loc"][:2] == place]
+    allowed = dict.fromkeys(text.removeprefix("Value error, ") for text in said)
+    return f"{key} = {errors[0]['input']!r}: {', or '.join(allowed)}"

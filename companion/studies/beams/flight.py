@@ -1,0 +1,347 @@
+"""The beam study, ``companion study beams``: what an array would have done over a flight.
+
+A log goes through the pipeline as in a replay, and some times a second the newest update is
+examined: what each beam gives by the prediction, what it is guaranteed to give wherever the UAV may
+be within its pointing bound, and, where the log has the simulator's truth, what it truly gave. The
+beams as the settings make them are compared with those of ``[beams] widen = false`` for the same
+tracks, which shows what widening costs and gives. A codebook (that of the settings, else a DFT's
+where the elements are on a grid) tells which share of it must be swept to be sure of the best
+stored beam.
+
+Over 300 lines: one study: its settings, its looks, its answer.
+"""
+
+import math
+import platform
+import shlex
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+import companion
+from companion.beams.aim import aim, directions
+from companion.beams.array.steering import steering_matrix
+from companion.beams.hardware import codebooks
+from companion.beams.hardware.codebooks import Codebook
+from companion.beams.worth import guarantee, link_budget
+from companion.node.replay import log_events
+from companion.pipeline import assembly
+from companion.pipeline.assembly import Equipment
+from companion.pipeline.fold import Pipeline
+from companion.settings.model import Settings
+from companion.studies.beams.worth import Row, Sample, Worth, summed_up
+from companion.studies.truth import array_truth
+from companion.studies.truth.array_truth import ArrayTruth
+from companion.values import BeamSet, Carrier, FloatArray, Track, Update, UserError
+
+TOLD_EVERY: Final = 20
+"""Looks between two reports of progress."""
+
+
+@dataclass(frozen=True, slots=True)
+class BeamStudy:
+    """What is asked of the study.
+
+        logs      the logs
+        settings  those of each log
+        hz        looks per second of log
+        center    as on the command line
+        config    as on the command line
+
+    Raises ``UserError`` for a rate out of range.
+    """
+
+    logs: tuple[Path, ...]
+    settings: tuple[Settings, ...]
+    hz: float = 5.0
+    center: str | None = None
+    config: str | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.hz <= 1000:
+            raise UserError(f"--hz {self.hz:g}: looks a second, above 0 and at most 1000")
+
+    @property
+    def command(self) -> str:
+        """The command line that asks for this study."""
+        words = ["companion", "study", "beams", *map(str, self.logs)]
+        words += ["--center", self.center] if self.center else []
+        words += ["--config", self.config] if self.config else []
+        return shlex.join([*words, "--hz", f"{self.hz:g}"])
+
+
+@dataclass(frozen=True, slots=True)
+class Watched:
+    """One log: every UAV at every look, in order of time, with the array and the kind of truth."""
+
+    log: str
+    center: str
+    array: str
+    codebook_beams: int | None
+    truth: str | None
+    widen: bool
+    looks: int
+    samples: tuple[Sample, ...]
+
+    @property
+    def by_uav(self) -> dict[str, list[Sample]]:
+        """The samples of each UAV, in the order in which they were first seen."""
+        found: dict[str, list[Sample]] = {}
+        for sample in self.samples:
+            found.setdefault(sample.uav, []).append(sample)
+        return found
+
+
+# --- one look -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """What all looks at one log share."""
+
+    pipeline: Pipeline
+    equipment: Equipment
+    codebook: Codebook | None
+
+    def worths(
+        self, beam_set: BeamSet, carrier: Carrier, truly: dict[str, FloatArray]
+    ) -> dict[str, Worth]:
+        """The worth of each beam of a set, by UAV.
+
+        ``truly`` holds the true directions, (3,) each.
+        """
+        if not beam_set.beams:
+            return {}
+        array, towards = self.pipeline.array, directions(beam_set)
+        bounds = guarantee.covered_bounds(
+            array,
+            self.pipeline.coverage,
+            towards,
+            [beam.pointing_bound_rad for beam in beam_set.beams],
+        )
+        guaranteed = guarantee.guaranteed_gains_db(array, towards, bounds, beam_set.weights)
+        seen = np.array([truly.get(uav, np.full(3, np.nan)) for uav in beam_set.uavs])
+        responses = np.einsum("mn,mn->n", steering_matrix(array, seen), beam_set.weights)
+        power = np.einsum("mn,mn->n", beam_set.weights, beam_set.weights.conj()).real
+        sinr_db = link_budget.predicted_sinr_db(
+            array,
+            towards,
+            np.array([beam.range_m for beam in beam_set.beams]),
+            beam_set.weights,
+            np.array([beam.group for beam in beam_set.beams]),
+            self.equipment.budget,
+            self.equipment.uav_antennas,
+        )
+        efficiency = link_budget.spectral_efficiency(10 ** (sinr_db / 10), beam_set.groups)
+        return {
+            beam.uav: Worth(
+                gain_db=beam.gain_db,
+                loss_db=beam.loss_db,
+                guaranteed_gain_db=guaranteed[i],
+                true_gain_db=_db(abs(responses[i]) ** 2 / power[i]),
+                sinr_db=float(sinr_db[i]),
+                spectral_efficiency=float(efficiency[i]),
+                group=beam.group,
+                widened=beam.widened,
+                method=beam_set.method,
+                condition_number=beam_set.condition_number or 1.0,
+            )
+            for i, beam in enumerate(beam_set.beams)
+        }
+
+    def swept(
+        self, towards: FloatArray, bound_rad: float | None, truly: FloatArray | None
+    ) -> tuple[int | None, float | None, bool | None]:
+        """The best stored beam of a direction (3,), the share to be swept, and whether it misses.
+
+        A share misses if the truly best beam is not in it. None stands for what cannot be told.
+        """
+        if self.codebook is None:
+            return None, None, None
+        array = self.pipeline.array
+        (best,), _ = codebooks.best(self.codebook, array, towards[np.newaxis])
+        held = codebooks.candidates(self.codebook, array, towards, bound_rad)
+        missed = None
+        if truly is not None:
+            (wanted,), _ = codebooks.best(self.codebook, array, truly[np.newaxis])
+            missed = int(wanted) not in held.tolist()
+        return int(best), len(held) / self.codebook.size, missed
+
+
+def sight(pipeline: Pipeline) -> Sight:
+    """The radio and the codebook that the settings describe.
+
+    Raises ``ConfigError`` where they cannot be.
+
+    Without a codebook in the settings it is that of a DFT over the array's own grid, if it has one.
+    """
+    equipment = assembly.equipment(pipeline.settings, pipeline.array)
+    codebook = equipment.codebook
+    if codebook is None and pipeline.array.grid is not None:
+        codebook = codebooks.dft(pipeline.array)
+    return Sight(pipeline, equipment, codebook)
+
+
+def look(seen: Sight, update: Update, truth: ArrayTruth | None, t_s: float) -> list[Sample]:
+    """Samples of every tracked UAV at one update, ``t_s`` seconds into the log."""
+    pipeline, carrier = seen.pipeline, update.carrier
+    if carrier is None:
+        return [Sample(t_s, track.uav) for track in update.tracks]
+    truly = _true_directions(update.tracks, carrier, pipeline, truth)
+    as_set = update.beams
+    sharp = as_set
+    if pipeline.precoder.widen:
+        sharp = aim(
+            update.t_ns,
+            as_set.valid_at_ns,
+            update.tracks,
+            carrier,
+            pipeline.array,
+            replace(pipeline.precoder, widen=False),
+            pipeline.coverage,
+        )
+    worths = [seen.worths(beam_set, carrier, truly) for beam_set in (as_set, sharp)]
+    beams = {
+        beam.uav: (beam.pointing_bound_rad, towards)
+        for beam_set in (as_set, sharp)
+        for beam, towards in zip(beam_set.beams, directions(beam_set), strict=True)
+    }
+    samples = []
+    for track in update.tracks:
+        if track.uav not in beams:
+            samples.append(Sample(t_s, track.uav))
+            continue
+        bound_rad, towards = beams[track.uav]
+        true = truly.get(track.uav)
+        best, share, missed = seen.swept(towards, bound_rad, true)
+        off_rad = None if true is None else _angle_rad(towards, true)
+        own = (worth.get(track.uav) for worth in worths)
+        samples.append(Sample(t_s, track.uav, bound_rad, off_rad, best, share, missed, *own))
+    return samples
+
+
+def _true_directions(
+    tracks: tuple[Track, ...], carrier: Carrier, pipeline: Pipeline, truth: ArrayTruth | None
+) -> dict[str, FloatArray]:
+    if truth is None:
+        return {}
+    found = truth.directions(tracks, carrier, pipeline.array)
+    return {
+        track.uav: towards
+        for track, towards in zip(tracks, found, strict=True)
+        if not np.isnan(towards).any()
+    }
+
+
+def _angle_rad(towards: FloatArray, truly: FloatArray) -> float:
+    """Angle between two unit directions (3,); exact for small ones."""
+    return math.atan2(float(np.linalg.norm(np.cross(towards, truly))), float(towards @ truly))
+
+
+def _db(power: float) -> float | None:
+    """Decibels of a power; None for NaN, that is, a UAV whose true direction is not known."""
+    return None if math.isnan(power) else 10 * math.log10(max(power, 1e-30))
+
+
+# --- the study ----------------------------------------------------------------------------------
+
+
+def updates(log: Path, pipeline: Pipeline, hz: float) -> Iterator[tuple[float, Update]]:
+    """Seconds into the log, ``hz`` per second, each with the update of the last tick by then.
+
+    Each update comes once. Steps the pipeline through the whole log.
+    """
+    period_ns = round(1e9 / hz)
+    begins_ns, due_ns, seen = None, 0, None
+    for event in log_events([log], pipeline.settings):
+        if begins_ns is None:
+            begins_ns, due_ns = event.t_ns, event.t_ns + period_ns
+        while due_ns < event.t_ns:  # all that happened by then has been taken in
+            update = pipeline.last_update
+            if update is not None and update is not seen:
+                seen = update
+                yield (due_ns - begins_ns) * 1e-9, update
+            due_ns += period_ns
+        pipeline.step(event)
+
+
+def watch(
+    log: Path,
+    settings: Settings,
+    hz: float,
+    progress: Callable[[str], None] = lambda _text: None,
+) -> Watched:
+    """Study one log.
+
+    Raises ``UserError``, ``LogError`` or ``ConfigError`` where there is nothing to see.
+    """
+    pipeline = Pipeline(settings)
+    seen, truth, sought = sight(pipeline), None, False
+    samples: list[Sample] = []
+    looks = 0
+    for t_s, update in updates(log, pipeline, hz):
+        if not sought and any(not track.uav.startswith("icao:") for track in update.tracks):
+            truth, sought = array_truth.load(log, pipeline), True
+        if update.tracks:
+            samples += look(seen, update, truth, t_s)
+            looks += 1
+        if looks % TOLD_EVERY == 0:
+            progress(f"{log.name}: {t_s:.0f} s of log")
+    if not any(sample.as_set or sample.sharp for sample in samples):
+        raise UserError(f"{log}: no UAV gets a beam in it, as far as its carrier is known")
+    array = pipeline.array
+    return Watched(
+        log.name,
+        str(pipeline.center.place),
+        f"{array.size} elements ({array.kind}) at {settings.array.frequency_hz * 1e-9:g} GHz",
+        None if seen.codebook is None else seen.codebook.size,
+        None if truth is None else truth.kind,
+        pipeline.precoder.widen,
+        looks,
+        tuple(samples),
+    )
+
+
+def study(
+    setting: BeamStudy, progress: Callable[[str], None] = lambda _text: None
+) -> tuple[dict[str, Any], list[Watched]]:
+    """The answer as it is written to ``beams.json``, and what the report shows.
+
+    Raises ``UserError``, ``LogError`` or ``ConfigError`` for a log in which there is nothing to
+    study.
+    """
+    found = [
+        watch(log, settings, setting.hz, progress)
+        for log, settings in zip(setting.logs, setting.settings, strict=True)
+    ]
+    rows: list[Row] = [
+        {"log": watched.log, "uav": uav, **summed_up(samples), "truth": watched.truth}
+        for watched in found
+        for uav, samples in watched.by_uav.items()
+    ]
+    return {
+        "rows": rows,
+        "summary": summed_up([sample for watched in found for sample in watched.samples]),
+        "logs": [
+            {
+                "log": watched.log,
+                "center": watched.center,
+                "array": watched.array,
+                "codebook_beams": watched.codebook_beams,
+                "widen": watched.widen,
+                "looks": watched.looks,
+                "truth": watched.truth,
+            }
+            for watched in found
+        ],
+        "command": setting.command,
+        "versions": {
+            "companion": companion.__version__,
+            "numpy": np.__version__,
+            "python": platform.python_version(),
+        },
+        "hz": setting.hz,
+    }, found

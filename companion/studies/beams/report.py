@@ -1,0 +1,131 @@
+"""Reports of the beam study: a table as text, one self-contained HTML page, and figures."""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Final
+
+from companion.studies.beams.charts import charts
+from companion.studies.beams.flight import Watched
+from companion.studies.beams.worth import SHARP, Row, summed_up
+from companion.studies.figures import plotting
+
+COMPARED: Final = (
+    ("predicted gain, dB: 5 % / median", ("gain_p5_db", "gain_median_db")),
+    ("true gain, dB: 5 % / median", ("true_gain_p5_db", "true_gain_median_db")),
+    ("looks with a guarantee", ("guaranteed_share",)),
+    (
+        "guaranteed gain, dB: 5 % / median",
+        ("guaranteed_gain_p5_db", "guaranteed_gain_median_db"),
+    ),
+    ("truly less than guaranteed / within the bound", ("violations", "violations_within_bound")),
+    ("loss, dB: median / 95 %", ("loss_median_db", "loss_p95_db")),
+    ("predicted SINR, dB: median", ("sinr_median_db",)),
+    ("spectral efficiency, bit/s/Hz: mean", ("spectral_efficiency_mean",)),
+    ("widened", ("widened_share",)),
+    ("regularised", ("regularised_share",)),
+    ("turns: most", ("turns_max",)),
+    ("condition number: largest", ("condition_number_max",)),
+)
+"""Figures shown for beams as set and for sharp ones, side by side."""
+AS_FOUND: Final = (
+    ("looks with a beam", ("n",)),
+    ("tracked without a beam", ("without_beam",)),
+    (
+        "pointing bound, degrees: median / 95 %",
+        ("pointing_bound_median_deg", "pointing_bound_p95_deg"),
+    ),
+    ("pointing error, degrees: 95 %", ("pointing_error_p95_deg",)),
+    ("truly beyond the bound", ("bound_violations",)),
+    ("share of the codebook to be swept: mean / 95 %", ("sweep_share_mean", "sweep_share_p95")),
+    (
+        "best stored beam not in that share / within the bound",
+        ("codebook_misses", "codebook_misses_within_bound"),
+    ),
+)
+"""Figures that do not depend on how the beams are made."""
+
+_CAPTIONS: Final = {
+    "gain": "Array gain over time, at its least in each interval. Where the line of the guaranteed"
+    " gain is missing nothing is guaranteed: the cone of possible directions holds a null.",
+    "gain_had": "The share of looks at which a gain is at least so much: towards the predicted"
+    " direction, towards the true one, and wherever the UAV may be within its bound. Sharp:"
+    " [beams] widen = false.",
+    "sweep": "The share of the stored beams that must be swept to be sure of the best, at its"
+    " largest in each interval.",
+}
+
+
+def files(
+    answer: dict[str, Any], found: Sequence[Watched], progress: Callable[[str], None]
+) -> dict[str, bytes]:
+    """The page and every figure as SVG and PNG, by file name.
+
+    Figures of the second and later logs are numbered.
+    """
+    drawings: dict[str, tuple[str, plotting.Draw]] = {}
+    sections = []
+    for number, watched in enumerate(found, 1):
+        suffix = "" if number == 1 else f"_{number}"
+        made = {
+            f"{name}{suffix}": (_CAPTIONS[name], draw) for name, draw in charts(watched).items()
+        }
+        drawings |= made
+        sections.append(_section(watched, made))
+    values = {"answer": answer, "sections": sections}
+    return plotting.files("beams", "beams/report.html.j2", drawings, values, progress)
+
+
+def text(found: Sequence[Watched]) -> str:
+    """The tables as text, all UAVs of a log together."""
+    return "\n\n".join(_text(watched) for watched in found)
+
+
+def _text(watched: Watched) -> str:
+    row = summed_up(watched.samples)
+    lines = [_describe(watched)]
+    lines += [f"  {label:54}{_cells(row, keys, ''):>16}" for label, keys in AS_FOUND]
+    lines.append(f"  {'':54}{'as set':>16}{'sharp':>16}")
+    for label, keys in COMPARED:
+        lines.append(f"  {label:54}{_cells(row, keys, ''):>16}{_cells(row, keys, SHARP):>16}")
+    return "\n".join(lines)
+
+
+def _section(watched: Watched, figures: Iterable[str]) -> dict[str, Any]:
+    """What the page shows of one log: ``figures`` are the names of its figures."""
+    row = summed_up(watched.samples)
+    by_uav = {uav: summed_up(samples) for uav, samples in watched.by_uav.items()}
+    return {
+        "log": watched.log,
+        "told": _describe(watched),
+        "as_found": [(label, _cells(row, keys, "")) for label, keys in AS_FOUND],
+        "compared": [
+            (label, _cells(row, keys, ""), _cells(row, keys, SHARP)) for label, keys in COMPARED
+        ],
+        "figures": list(figures),
+        "uavs": ["", *by_uav],
+        "by_uav": [
+            [key, *(_cell(key, found[key]) for found in by_uav.values())]
+            for key in next(iter(by_uav.values()))
+        ],
+    }
+
+
+def _describe(watched: Watched) -> str:
+    stored = watched.codebook_beams
+    return (
+        f"{watched.log}: {watched.array}, on {watched.center};"
+        f" UAVs {', '.join(watched.by_uav)}; {watched.looks} looks;"
+        f" {'no codebook' if stored is None else f'codebook of {stored} beams'};"
+        f" truth: {watched.truth or 'none'}; beams {'' if watched.widen else 'not '}widened"
+    )
+
+
+def _cells(row: Row, keys: Sequence[str], prefix: str) -> str:
+    return " / ".join(_cell(key, row[prefix + key]) for key in keys)
+
+
+def _cell(key: str, value: float | None) -> str:
+    if value is None:
+        return "-"
+    if "share" in key:
+        return f"{value:.1%}"
+    return str(value) if isinstance(value, int) else f"{value:.2f}"

@@ -1,0 +1,173 @@
+"""The worth of beams, look by look, and the figures that sum it up."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from companion.values import Method
+
+Row = dict[str, Any]
+ROUNDING_DB: Final = 1e-9
+"""Difference up to which a true gain below the guaranteed one is rounding."""
+SHARP: Final = "sharp_"
+"""Prefix of the keys for beams with ``[beams] widen = false``; others are for those as set."""
+
+
+@dataclass(frozen=True, slots=True)
+class Worth:
+    """One beam at one time; gains are of the array in dB, element pattern included.
+
+    gain_db              towards the predicted direction
+    loss_db              what it lacks against a beam for the UAV alone
+    guaranteed_gain_db   least gain within the pointing bound; None: nothing is guaranteed
+    true_gain_db         towards the true direction; None: it is not known
+    sinr_db              as predicted; -inf where no element faces the UAV
+    spectral_efficiency  bit/s/Hz, turns counted
+    group                number of its turn
+    widened              its main lobe was broadened
+    method               how the weights were made
+    condition_number     of the steering matrix
+    """
+
+    gain_db: float
+    loss_db: float
+    guaranteed_gain_db: float | None
+    true_gain_db: float | None
+    sinr_db: float
+    spectral_efficiency: float
+    group: int
+    widened: bool
+    method: Method
+    condition_number: float
+
+    @property
+    def violated(self) -> bool:
+        """Whether the true gain was below the guaranteed one."""
+        sure, true = self.guaranteed_gain_db, self.true_gain_db
+        return sure is not None and true is not None and sure > true + ROUNDING_DB
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One tracked UAV at one look. Without a beam all but the first two fields are None.
+
+    t_s                 seconds into the log
+    uav                 its name
+    pointing_bound_rad  bound on the angle between predicted and true direction
+    off_rad             that angle
+    codebook_best       index of the stored beam that serves the predicted direction best
+    sweep_share         share of the codebook that must be swept to be sure of the best
+    missed              the truly best stored beam is not in that share
+    as_set              the beam that the settings make
+    sharp               the same beam not widened
+    """
+
+    t_s: float
+    uav: str
+    pointing_bound_rad: float | None = None
+    off_rad: float | None = None
+    codebook_best: int | None = None
+    sweep_share: float | None = None
+    missed: bool | None = None
+    as_set: Worth | None = None
+    sharp: Worth | None = None
+
+    @property
+    def beyond(self) -> bool:
+        """Whether the true direction lies outside the pointing bound."""
+        off, bound = self.off_rad, self.pointing_bound_rad
+        return off is not None and bound is not None and bool(off > bound)
+
+
+def summed_up(samples: Sequence[Sample]) -> Row:
+    """The figures over samples.
+
+    Counts and shares are of looks at which the UAV had a beam, except ``without_beam``. None where
+    there is nothing to tell. Percentiles are values that occurred. Percentiles of what may be
+    missing count it: a guaranteed gain of p5 is had in 95 % of all looks, and is None where fewer
+    have any. Violations and misses are promises not kept: those within the bound are faults of this
+    program, the others follow from settings whose bounds did not hold.
+    """
+    served = [sample for sample in samples if sample.as_set is not None]
+    bounds = [_or(sample.pointing_bound_rad, math.inf) for sample in served]
+    shares = [s.sweep_share for s in served if s.sweep_share is not None]
+    known = [sample for sample in served if sample.off_rad is not None]
+    missed = [(s.missed, s.beyond) for s in served if s.missed is not None]
+    return {
+        "without_beam": len(samples) - len(served),
+        "n_true": len(known),
+        "pointing_bound_median_deg": _degrees(_percentile(bounds, 50)),
+        "pointing_bound_p95_deg": _degrees(_percentile(bounds, 95)),
+        "pointing_error_p95_deg": _degrees(_percentile([_or(s.off_rad, 0) for s in known], 95)),
+        "bound_violations": sum(sample.beyond for sample in known) if known else None,
+        "sweep_share_mean": float(np.mean(shares)) if shares else None,
+        "sweep_share_p95": _percentile(shares, 95),
+        "codebook_misses": sum(miss for miss, _ in missed) if missed else None,
+        "codebook_misses_within_bound": sum(miss and not beyond for miss, beyond in missed)
+        if missed
+        else None,
+        **_of_beams([(s.as_set, s.beyond) for s in served if s.as_set is not None], ""),
+        **_of_beams([(s.sharp, s.beyond) for s in samples if s.sharp is not None], SHARP),
+    }
+
+
+def _of_beams(beams: Sequence[tuple[Worth, bool]], prefix: str) -> Row:
+    """Figures of one set of beams, each paired with whether the UAV was truly beyond its bound."""
+    worths = [worth for worth, _ in beams]
+    gains = [worth.gain_db for worth in worths]
+    sure = [_or(worth.guaranteed_gain_db, -math.inf) for worth in worths]
+    true = [worth.true_gain_db for worth in worths if worth.true_gain_db is not None]
+    losses = [worth.loss_db for worth in worths]
+    found: Row = {
+        "n": len(worths),
+        "gain_p5_db": _percentile(gains, 5),
+        "gain_median_db": _percentile(gains, 50),
+        "guaranteed_share": _share(worth.guaranteed_gain_db is not None for worth in worths),
+        "guaranteed_gain_p5_db": _percentile(sure, 5),
+        "guaranteed_gain_median_db": _percentile(sure, 50),
+        "true_gain_p5_db": _percentile(true, 5),
+        "true_gain_median_db": _percentile(true, 50),
+        "violations": sum(worth.violated for worth in worths) if true else None,
+        "violations_within_bound": sum(worth.violated and not beyond for worth, beyond in beams)
+        if true
+        else None,
+        "loss_median_db": _percentile(losses, 50),
+        "loss_p95_db": _percentile(losses, 95),
+        "sinr_median_db": _percentile([worth.sinr_db for worth in worths], 50),
+        "spectral_efficiency_mean": _mean([worth.spectral_efficiency for worth in worths]),
+        "widened_share": _share(worth.widened for worth in worths),
+        "regularised_share": _share(worth.method is Method.REGULARISED for worth in worths),
+        "turns_max": max((worth.group + 1 for worth in worths), default=None),
+        "condition_number_max": max((worth.condition_number for worth in worths), default=None),
+    }
+    return {prefix + key: value for key, value in found.items()}
+
+
+def _percentile(values: Sequence[float], percent: float) -> float | None:
+    """The least value that occurred and is not below ``percent`` of all.
+
+    None if it is not finite, or if there are no values.
+    """
+    if not values:
+        return None
+    found = float(np.percentile(values, percent, method="inverted_cdf"))
+    return found if math.isfinite(found) else None
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return float(np.mean(values)) if values else None
+
+
+def _share(marks: Iterable[bool]) -> float | None:
+    return _mean([float(mark) for mark in marks])
+
+
+def _degrees(angle_rad: float | None) -> float | None:
+    return None if angle_rad is None else math.degrees(angle_rad)
+
+
+def _or(value: float | None, otherwise: float) -> float:
+    return otherwise if value is None else value

@@ -1,0 +1,1 @@
+"""The radio link bit by bit: code, modulation, OFDM, and beams that point as predicted."""

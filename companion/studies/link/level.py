@@ -1,0 +1,253 @@
+"""The link bit by bit: ``companion study link``.
+
+At many instants of a flight the array zero-forces towards where it believes the UAVs to be; coded
+16-QAM on OFDM goes through the channel to where they are. Error rates, EVM and throughput are found
+against the signal-to-noise ratio, for beams by perfect, predicted and held positions. Bits,
+channels and noise are the same for all three, so that they differ by the positions alone. They are
+compared with the same link without array or channel (``awgn``), and with the exact curve of uncoded
+16-QAM.
+
+The ratio (SNR) is that of a data carrier at a UAV with a beam exactly on it, for it alone, on the
+line of sight: the energy of a symbol over the noise (Es/N0). It is the same for every UAV, whatever
+its range: ranges enter by the directions alone. Each UAV has an equal share of the power.
+
+Uncoded and coded figures come from the same transmissions: the coded bits decided one by one are
+what the link would do without a code, in blocks of 936 bits of payload.
+"""
+
+import platform
+import shlex
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+import companion
+from companion.beams.array import geometry
+from companion.beams.array.geometry import Array
+from companion.pipeline import assembly
+from companion.settings.model import Settings
+from companion.studies.link import blocks, channel, modulation, ofdm
+from companion.studies.link.blocks import BLOCK_BITS, CODED_BITS, Counted, Estimation
+from companion.studies.link.channel import SAMPLE_RATE_HZ, Scattering
+from companion.studies.link.rows import Row, crossing_db, row
+from companion.studies.link.scenario import Positions, Reports, Scenario, circles, from_log
+from companion.studies.prediction.pointing import angles_deg
+from companion.values import ComplexArray, UserError
+
+SYMBOL_S: Final = ofdm.SAMPLES / SAMPLE_RATE_HZ
+"""Duration of an OFDM symbol."""
+AWGN: Final = "awgn"
+KINDS: Final = (AWGN, *(kind.value for kind in Positions))
+MOST_POINTS: Final = 100
+"""Most points of a curve."""
+TARGET: Final = 1e-3
+"""Bit error rate at which curves are compared."""
+
+
+def snrs(first_db: float, last_db: float, step_db: float) -> tuple[float, ...]:
+    """First, last and what lies between in steps, dB.
+
+    Raises ``UserError`` for a range out of order.
+    """
+    said = f"--snr {first_db:g}:{last_db:g}:{step_db:g}"
+    if not (-40 <= first_db <= last_db <= 80 and step_db > 0):
+        raise UserError(f"{said}: FROM:TO:STEP in dB, -40 <= FROM <= TO <= 80 and STEP above 0")
+    count = int((last_db - first_db) / step_db + 1e-9) + 1
+    if count > MOST_POINTS:
+        raise UserError(f"{said}: {count} points, at most {MOST_POINTS} are allowed")
+    return tuple(round(first_db + i * step_db, 9) for i in range(count))
+
+
+@dataclass(frozen=True, slots=True)
+class LinkStudy:
+    """What is asked of the study.
+
+        log         a log with the simulator's truth; None: the paper's circles
+        center      as on the command line
+        config      as on the command line
+        settings    those of the array and the tracking
+        snr_db      first, last and step
+        instants    times of the flight
+        blocks      sent to each UAV at each instant, for each SNR
+        estimation  how receivers know their channel
+        reports     when the circling UAVs report
+        scattering  the scattered rays
+        seed        of all random numbers
+
+    Raises ``UserError`` for values out of range.
+    """
+
+    log: Path | None = None
+    center: str | None = None
+    config: str | None = None
+    settings: Settings = field(default_factory=Settings)
+    snr_db: tuple[float, float, float] = (-2.0, 30.0, 1.0)
+    instants: int = 96
+    blocks: int = 16
+    estimation: Estimation = Estimation.PILOTS
+    reports: Reports = field(default_factory=Reports)
+    scattering: Scattering = field(default_factory=Scattering)
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        snrs(*self.snr_db)
+        for name, value, most in (
+            ("instants", self.instants, 10_000),
+            ("blocks", self.blocks, 1000),
+        ):
+            if not 1 <= value <= most:
+                raise UserError(f"--{name} {value}: 1 to {most}")
+        if self.seed < 0:
+            raise UserError(f"--seed {self.seed}: at least 0")
+
+    @property
+    def command(self) -> str:
+        """The command line that asks for this study."""
+        words = ["companion", "study", "link", *([str(self.log)] if self.log else [])]
+        words += ["--center", self.center] if self.center else []
+        words += ["--config", self.config] if self.config else []
+        words += ["--snr", ":".join(f"{part:g}" for part in self.snr_db)]
+        words += ["--instants", str(self.instants), "--blocks", str(self.blocks)]
+        words += ["--estimation", self.estimation.value]
+        if self.log is None:
+            words += ["--interval", f"{self.reports.interval_s:g}"]
+            words += ["--latency", f"{self.reports.latency_s:g}"]
+        words += ["--rician-k", f"{self.scattering.rician_k_db:g}"]
+        words += ["--delay-spread", f"{self.scattering.delay_spread_s * 1e9:g}"]
+        return shlex.join([*words, "--seed", str(self.seed)])
+
+
+Counts = dict[tuple[str, float], list[Counted]]
+"""Counts by kind of positions and SNR in dB: one entry for each instant."""
+
+
+def uav_array(settings: Settings) -> Array:
+    """The UAVs' own antennas: a line, half a wavelength apart, at the array's frequency."""
+    radio, frequency_hz = settings.radio, settings.array.frequency_hz
+    return geometry.uniform_linear(radio.uav_antennas, frequency_hz, 0.5, np.eye(3))
+
+
+def simulate(
+    setting: LinkStudy, scenario: Scenario, progress: Callable[[str], None] = lambda _text: None
+) -> Counts:
+    """Send every block of every instant. Each instant draws from a generator of its own."""
+    counts: Counts = {}
+    array, own = scenario.array, uav_array(setting.settings)
+    precoder = assembly.precoder(setting.settings)
+    for number, instant in enumerate(scenario.instants):
+        progress(f"instant {number + 1} of {len(scenario.instants)}")
+        rng = np.random.default_rng([setting.seed, 1, number])
+        truly = instant.towards[Positions.PERFECT]
+        rows = channel.draw(setting.scattering, array, own, truly, rng)
+        alone = channel.alone(array, own, truly)
+        channels: dict[str, ComplexArray] = {AWGN: np.eye(len(truly), dtype=complex)[np.newaxis]}
+        for kind in Positions:
+            sent = channel.weights(array, instant, kind, precoder)
+            channels[kind.value] = channel.responses(rows, sent, alone)
+        for key, counted in exchange(setting, channels, rng):
+            counts.setdefault(key, []).append(counted)
+    return counts
+
+
+def exchange(
+    setting: LinkStudy, channels: dict[str, ComplexArray], rng: np.random.Generator
+) -> Iterable[tuple[tuple[str, float], Counted]]:
+    """Send the same blocks with the same noise over every channel (T, N, N), at every SNR.
+
+    Over ``awgn`` the receiver knows its channel.
+    """
+    users = channels[AWGN].shape[-1]
+    sent = blocks.send(users, setting.blocks, rng)
+    white = ofdm.received_carriers(blocks.noise(users, setting.blocks, rng))
+    for kind, taps in channels.items():
+        clean = ofdm.received_carriers(blocks.through(taps, sent.samples))
+        estimation = Estimation.IDEAL if kind == AWGN else setting.estimation
+        for snr_db in snrs(*setting.snr_db):
+            noise_power = 10 ** (-snr_db / 10)
+            heard = clean + np.sqrt(noise_power) * white
+            yield (
+                (kind, snr_db),
+                blocks.receive(sent, heard, noise_power, taps, estimation),
+            )
+
+
+def study(
+    setting: LinkStudy, progress: Callable[[str], None] = lambda _text: None
+) -> dict[str, Any]:
+    """The answer as it is written to ``link.json``.
+
+    Raises ``UserError``, ``LogError`` or ``ConfigError`` where there is nothing to study.
+    """
+    rng = np.random.default_rng([setting.seed, 0])
+    if setting.log is None:
+        scenario = circles(setting.settings, setting.reports, setting.instants, rng)
+    else:
+        scenario = from_log(setting.log, setting.settings, setting.instants, rng, progress)
+    counts = simulate(setting, scenario, progress)
+    rows: list[Row] = [
+        row(kind, snr_db, coded, counted, SYMBOL_S)
+        for (kind, snr_db), counted in sorted(
+            counts.items(), key=lambda item: (KINDS.index(item[0][0]), item[0][1])
+        )
+        for coded in (False, True)
+    ]
+    levels = snrs(*setting.snr_db)
+    theory = modulation.bit_error_rate(10 ** (np.array(levels) / 10))
+    return {
+        "rows": [found for found in rows if found["positions"] != AWGN],
+        "awgn": [found for found in rows if found["positions"] == AWGN],
+        "theory": [
+            {"snr_db": snr_db, "coded": False, "ber": ber}
+            for snr_db, ber in zip(levels, theory.tolist(), strict=True)
+        ],
+        "summary": [
+            {
+                "positions": kind,
+                "coded": coded,
+                "snr_at_ber_1e-3_db": crossing_db(rows, kind, coded, TARGET),
+                **_floor(rows, kind, coded),
+                **({} if kind == AWGN else _pointing(scenario, Positions(kind))),
+            }
+            for kind in KINDS
+            for coded in (False, True)
+        ],
+        "scenario": {
+            "description": scenario.description,
+            "array": f"{scenario.array.size} elements ({scenario.array.kind})",
+            "uav_antennas": setting.settings.radio.uav_antennas,
+            "instants": len(scenario.instants),
+            "unresolved_share": scenario.unresolved_share,
+            "block_bits": {"coded": BLOCK_BITS, "uncoded": CODED_BITS},
+            "symbol_s": SYMBOL_S,
+        },
+        "command": setting.command,
+        "versions": {
+            "companion": companion.__version__,
+            "numpy": np.__version__,
+            "python": platform.python_version(),
+        },
+        "seed": setting.seed,
+    }
+
+
+def _floor(rows: list[Row], kind: str, coded: bool) -> Row:
+    """Error rate and throughput at the highest SNR."""
+    last = [found for found in rows if (found["positions"], found["coded"]) == (kind, coded)][-1]
+    return {"ber_at_highest_snr": last["ber"], "rate_at_highest_snr_bps": last["rate_bps"]}
+
+
+def _pointing(scenario: Scenario, kind: Positions) -> Row:
+    """Pointing error of the beams, degrees."""
+    off_deg = np.concatenate(
+        [
+            angles_deg(instant.towards[kind], instant.towards[Positions.PERFECT])
+            for instant in scenario.instants
+        ]
+    )
+    return {
+        "pointing_error_median_deg": float(np.median(off_deg)),
+        "pointing_error_p95_deg": float(np.percentile(off_deg, 95)),
+    }

@@ -1,0 +1,34 @@
+"""Reports of the link study: a table as text, one self-contained HTML page, and figures."""
+
+from collections.abc import Callable
+from typing import Any
+
+from companion.studies.figures import plotting
+from companion.studies.link import figures
+from companion.studies.link.rows import Row
+
+
+def files(answer: dict[str, Any], progress: Callable[[str], None]) -> dict[str, bytes]:
+    """The page and every figure as PNG and SVG, by file name."""
+    values = {"answer": answer, "rows": [_cells(row) for row in answer["summary"]]}
+    return plotting.files("link", "link/report.html.j2", figures.drawings(answer), values, progress)
+
+
+def text(answer: dict[str, Any]) -> str:
+    """A table of the SNR that each kind of positions needs, and its figures at the highest SNR."""
+    lines = [answer["scenario"]["description"], "  ".join(f"{word:>12}" for word in (
+        "positions", "code", "dB at 1e-3", "BER at best", "Mbit/s", "degrees off"))]  # fmt: skip
+    lines += ["  ".join(f"{cell:>12}" for cell in _cells(row)) for row in answer["summary"]]
+    return "\n".join(lines)
+
+
+def _cells(row: Row) -> list[str]:
+    needed, off = row["snr_at_ber_1e-3_db"], row.get("pointing_error_median_deg")
+    return [
+        row["positions"],
+        "rate 1/3" if row["coded"] else "none",
+        "-" if needed is None else f"{needed:.2f}",
+        f"{row['ber_at_highest_snr']:.1e}",
+        f"{row['rate_at_highest_snr_bps'] / 1e6:.1f}",
+        "-" if off is None else f"{off:.2f} / {row['pointing_error_p95_deg']:.2f}",
+    ]

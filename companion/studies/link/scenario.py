@@ -1,0 +1,292 @@
+"""Positions for the link study: where its UAVs are, and where their beams point, at many instants.
+
+``perfect`` is the truth at the time of use, ``predicted`` what the product's tracking makes of the
+reports that have arrived, ``held`` the last report as it stands. The scenario is the paper's
+circles, or a log that holds the simulator's truth, which goes through the pipeline.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from companion.beams import line_of_sight
+from companion.beams.array.geometry import Array
+from companion.beams.array.steering import steering_matrix
+from companion.beams.weights.precoding import precode
+from companion.pipeline import assembly
+from companion.pipeline.fold import Pipeline
+from companion.settings.model import Settings
+from companion.studies.beams.flight import updates
+from companion.studies.prediction.baselines import Hold, Observed, Predictor
+from companion.studies.prediction.predictors import FleetPredictor
+from companion.studies.truth import array_truth
+from companion.values import FloatArray, Method, Update, UserError
+
+RADII_M: Final = (100.0, 150.0, 200.0, 250.0)
+RATE_RADPS: Final = 0.5
+GUST: Final = 0.2
+"""Share of the gusts in the speed; they turn ten times as fast."""
+GUST_RATIO: Final = 10.0
+REPORTED_M: Final = 0.01
+"""Steps of a reported position, and (0.01 m/s) of a velocity, in GLOBAL_POSITION_INT."""
+WARM_UP_S: Final = 5.0
+DURATION_S: Final = 60.0
+LOOKS_HZ: Final = 10.0
+MOST_DRAWN: Final = 100
+"""Times drawn for each one found before the array is given up."""
+
+
+class Positions(StrEnum):
+    """Positions by which the beams are pointed."""
+
+    PERFECT = "perfect"
+    PREDICTED = "predicted"
+    HELD = "held"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Instant:
+    """Unit directions (N, 3) in the array frame by kind of positions, UAVs in the same order."""
+
+    t_s: float
+    towards: dict[Positions, FloatArray]
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """The instants that are studied, and the array.
+
+    ``unresolved_share`` is the share of all instants that were left out because not even the true
+    directions let the array tell all UAVs apart within the settings' limits of zero forcing.
+    """
+
+    description: str
+    array: Array
+    instants: tuple[Instant, ...]
+    unresolved_share: float
+
+
+@dataclass(frozen=True, slots=True)
+class Reports:
+    """How often the circling UAVs report, and how late each report arrives, seconds.
+
+    Raises ``UserError`` for values out of range.
+    """
+
+    interval_s: float = 0.15
+    latency_s: float = 0.05
+
+    def __post_init__(self) -> None:
+        if not 0 < self.interval_s <= 2:
+            raise UserError(f"--interval {self.interval_s:g}: seconds, above 0 and at most 2")
+        if not 0 <= self.latency_s <= 2:
+            raise UserError(f"--latency {self.latency_s:g}: seconds, 0 to 2")
+
+
+# --- the paper's circles ------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Circle:
+    """A circle about the array, flown clockwise, with gusts: the paper's flight in continuous time.
+
+    Velocity R w [cos, -sin](w t + phase), plus a fifth of that at ten times the rate (docs/math.md
+    8.2).
+    """
+
+    radius_m: float
+    phase_rad: float
+
+    def at(self, t_s: float) -> tuple[FloatArray, FloatArray]:
+        """Position and velocity (3,), local frame; the one is the integral of the other."""
+        turn = RATE_RADPS * t_s + self.phase_rad
+        gust = GUST_RATIO * RATE_RADPS * t_s + self.phase_rad
+        reach = GUST / GUST_RATIO
+        north = math.sin(turn) + reach * math.sin(gust)
+        east = math.cos(turn) + reach * math.cos(gust)
+        north_rate = math.cos(turn) + GUST * math.cos(gust)
+        east_rate = -math.sin(turn) - GUST * math.sin(gust)
+        speed_mps = self.radius_m * RATE_RADPS
+        return (
+            self.radius_m * np.array([north, east, 0.0]),
+            speed_mps * np.array([north_rate, east_rate, 0.0]),
+        )
+
+
+PAPER: Final = tuple(Circle(radius_m, i * math.pi / 2) for i, radius_m in enumerate(RADII_M))
+
+
+def circles(
+    settings: Settings, reports: Reports, instants: int, rng: np.random.Generator
+) -> Scenario:
+    """The paper's four UAVs at ``instants`` random times of a minute.
+
+    The array stands level and faces north. A time at which it cannot tell the UAVs apart is drawn
+    again. The observer is given the bounds that the circles keep.
+    """
+    array = assembly.array(settings)
+    times_s, tried = _resolved_times(settings, array, instants, rng)
+    bounded = _bounded(settings)
+    towards: dict[Positions, list[FloatArray]] = {kind: [] for kind in Positions}
+    for number, circle in enumerate(PAPER):
+        starts_s = number / len(PAPER) * reports.interval_s  # out of step with one another
+        answers = _flown(circle, starts_s, times_s, reports, bounded)
+        for kind, positions in answers.items():
+            towards[kind].append(positions @ array.array_from_body.T)
+    seen = {kind: _unit(np.stack(found, axis=1)) for kind, found in towards.items()}
+    found = tuple(
+        Instant(float(t_s), {kind: seen[kind][i] for kind in Positions})
+        for i, t_s in enumerate(times_s)
+    )
+    description = (
+        f"four UAVs on circles of {', '.join(f'{r:g}' for r in RADII_M)} m,"
+        f" {RATE_RADPS:g} rad/s, a report each {reports.interval_s:g} s,"
+        f" {reports.latency_s:g} s late, beams for {settings.beams.actuation_delay_s:g} s ahead"
+    )
+    return Scenario(description, array, found, 1 - instants / tried)
+
+
+def _resolved_times(
+    settings: Settings, array: Array, instants: int, rng: np.random.Generator
+) -> tuple[FloatArray, int]:
+    """Times of use, ascending, and how many were drawn to find them."""
+    times_s = list[float]()
+    for tried in range(1, MOST_DRAWN * instants + 1):
+        t_s = WARM_UP_S + DURATION_S * float(rng.random())
+        offsets = np.array([circle.at(t_s)[0] for circle in PAPER])
+        if _resolved(settings, array, _unit(offsets @ array.array_from_body.T)):
+            times_s.append(t_s)
+        if len(times_s) == instants:
+            return np.sort(np.array(times_s)), tried
+    raise UserError("this array can hardly ever tell the circling UAVs apart")
+
+
+def _resolved(settings: Settings, array: Array, truly: FloatArray) -> bool:
+    """Whether zero forcing of the true directions (N, 3) is within the settings' limits."""
+    asked = replace(assembly.precoder(settings), method=Method.ZERO_FORCING)
+    made = precode(steering_matrix(array, truly), asked)
+    return made.method is Method.ZERO_FORCING and not made.groups.any() and not made.dropped
+
+
+def _bounded(settings: Settings) -> Settings:
+    """Settings with the bounds on speed, acceleration and noise that the circles keep."""
+    speed = max(RADII_M) * RATE_RADPS
+    bounds = {
+        "speed_max_mps": speed * (1 + GUST),
+        "acceleration_max_mps2": speed * RATE_RADPS * (1 + GUST * GUST_RATIO),
+        "position_noise_m": REPORTED_M,
+        "velocity_noise_mps": REPORTED_M,
+    }
+    return settings.override(observer=bounds)
+
+
+def _flown(
+    circle: Circle, starts_s: float, times_s: FloatArray, reports: Reports, settings: Settings
+) -> dict[Positions, FloatArray]:
+    """Positions (K, 3) of one UAV at the times of use (K,), by kind."""
+    rivals: dict[Positions, Predictor] = {
+        Positions.PREDICTED: FleetPredictor(settings),
+        Positions.HELD: Hold(),
+    }
+    found: dict[Positions, list[FloatArray]] = {kind: [] for kind in Positions}
+    sent = 0
+    for t_s in times_s.tolist():
+        now_s = t_s - settings.beams.actuation_delay_s
+        while (made_s := starts_s + sent * reports.interval_s) + reports.latency_s <= now_s:
+            for rival in rivals.values():
+                rival.report(_report(circle, made_s, reports.latency_s))
+            sent += 1
+        found[Positions.PERFECT].append(circle.at(t_s)[0])
+        for kind, rival in rivals.items():
+            predicted = rival.predict(round(now_s * 1e9), round(t_s * 1e9))
+            if predicted is None:
+                raise UserError(f"there is no {kind} position {t_s:.1f} s into the flight")
+            found[kind].append(predicted.position_ned_m)
+    return {kind: np.array(positions) for kind, positions in found.items()}
+
+
+def _report(circle: Circle, made_s: float, latency_s: float) -> Observed:
+    """A report as it arrives; the sender's clock is known."""
+    position_m, velocity_mps = (
+        np.round(exact / REPORTED_M) * REPORTED_M for exact in circle.at(made_s)
+    )
+    made_ns = round(made_s * 1e9)
+    return Observed(made_ns + round(latency_s * 1e9), made_ns, made_ns, position_m, velocity_mps)
+
+
+def _unit(vectors: FloatArray) -> FloatArray:
+    scaled: FloatArray = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return scaled
+
+
+# --- a log --------------------------------------------------------------------------------------
+
+
+def from_log(
+    log: Path,
+    settings: Settings,
+    instants: int,
+    rng: np.random.Generator,
+    progress: Callable[[str], None],
+) -> Scenario:
+    """Instants of a log, drawn from ``LOOKS_HZ`` looks a second at the running pipeline.
+
+    Raises ``UserError``, ``LogError`` or ``ConfigError`` for a log without the simulator's truth.
+    """
+    pipeline, truth, looks = Pipeline(settings), None, list[Instant]()
+    for t_s, update in updates(log, pipeline, LOOKS_HZ):
+        if truth is None and any(not track.uav.startswith("icao:") for track in update.tracks):
+            truth = array_truth.load(log, pipeline)
+            if truth is None:
+                raise UserError(f"{log}: it holds no SIM_STATE of its UAVs, so no truth")
+        if truth is not None and (seen := _seen(t_s, update, pipeline, truth)) is not None:
+            looks.append(seen)
+        progress(f"{log.name}: {t_s:.0f} s of log")
+    array = pipeline.array
+    resolved = [
+        seen for seen in looks if _resolved(settings, array, seen.towards[Positions.PERFECT])
+    ]
+    if not resolved:
+        raise UserError(f"{log}: at no time is there a UAV to serve whose true place is known")
+    chosen = np.sort(rng.choice(len(resolved), min(instants, len(resolved)), replace=False))
+    return Scenario(
+        f"{log.name}: array on {pipeline.center.place}",
+        array,
+        tuple(resolved[i] for i in chosen),
+        1 - len(resolved) / len(looks),
+    )
+
+
+def _seen(
+    t_s: float, update: Update, pipeline: Pipeline, truth: array_truth.ArrayTruth
+) -> Instant | None:
+    """Directions of the UAVs that have a beam and whose truth is known; None without any."""
+    carrier = update.carrier
+    if carrier is None or not update.beams.beams:
+        return None
+    served = set(update.beams.uavs)
+    tracks = [track for track in update.tracks if track.uav in served]
+    truly = truth.directions(tracks, carrier, pipeline.array)
+    known = np.flatnonzero(np.isfinite(truly).all(axis=1))
+    tracks = [tracks[i] for i in known]
+    held = []
+    for track in tracks:
+        fix = pipeline.fleet.newest(track.uav)
+        if fix is None:
+            return None
+        held.append(replace(track, position_ned_m=fix.position_ned_m))
+    if not tracks:
+        return None
+    return Instant(
+        t_s,
+        {
+            Positions.PERFECT: truly[known],
+            Positions.PREDICTED: line_of_sight.directions(tracks, carrier, pipeline.array)[1],
+            Positions.HELD: line_of_sight.directions(held, carrier, pipeline.array)[1],
+        },
+    )

@@ -1,0 +1,1 @@
+"""The published experiments repeated, and the method's claims judged."""

@@ -1,0 +1,213 @@
+"""The published scenario: four UAVs on circles, their reports, and the observer on them.
+
+North and east from the array, metres; time step k lasts from report k to report k + 1:
+
+    v_k = R w [cos(w T k + f), -sin(w T k + f)]      the nominal velocity, T the interval
+    d_k = (R w / 5) [cos(10 w T k + f), -sin(10 w T k + f)]
+    x_k+1 = x_k + T W_k,   y_k = x_k + D W_k,   W_k = v_k + d_k / T
+
+The last line is the scenario as it is printed. Read so, d is a step in metres and the gust d / T is
+faster than the flight itself; ``literal=False`` takes d for the gust's velocity, W = v + d. See
+docs/math.md 8.2. Source: Mohammadi, Rahmati and Malik.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from companion.studies.paper import published
+from companion.tracking.design import closed_form
+from companion.values import FloatArray
+
+GUST_RATE_RATIO: Final = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class PaperScenario:
+    """The scenario's numbers.
+
+        radii_m        one for each UAV
+        rate_radps     angular rate of all
+        dt_s           interval between reports
+        feedthrough_s  time by which a report leads the position
+        alpha          decay of the certificate
+        gust           |d| over |v|
+        literal        take the gust as printed
+        steps          reports of each UAV
+
+    UAVs begin a quarter turn from one another.
+    """
+
+    radii_m: tuple[float, ...] = (100.0, 150.0, 200.0, 250.0)
+    rate_radps: float = 0.5
+    dt_s: float = 0.15
+    feedthrough_s: float = 0.5
+    alpha: float = 0.5
+    gust: float = 0.2
+    literal: bool = True
+    steps: int = 170
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Flight:
+    """K steps of N UAVs; coordinates are north and east.
+
+    position_m  (K + 1, N, 2)
+    input_mps   W, (K, N, 2)
+    report_m    y, (K, N, 2)
+    """
+
+    scenario: PaperScenario
+    position_m: FloatArray
+    input_mps: FloatArray
+    report_m: FloatArray
+
+    @property
+    def time_s(self) -> FloatArray:
+        """Times of the positions, (K + 1,)."""
+        times: FloatArray = np.arange(len(self.position_m)) * np.float64(self.scenario.dt_s)
+        return times
+
+    @property
+    def largest_input_mps(self) -> float:
+        """sup ||W||, the norm over all UAVs together."""
+        return float(stacked(self.input_mps).max())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracked:
+    """The observer's answers with one gain.
+
+    gain          l
+    estimate_m    (K + 1, N, 2), made one report ahead
+    input_b0_mps  (K, N, 2), the unknown input with G = [b; 0] (as published)
+    input_bd_mps  (K, N, 2), the unknown input with G = [b; d]
+    """
+
+    gain: float
+    estimate_m: FloatArray
+    input_b0_mps: FloatArray
+    input_bd_mps: FloatArray
+
+
+def stacked(vectors: FloatArray) -> FloatArray:
+    """Norm over all UAVs and axes of (K, N, 2), at each step (K,)."""
+    norms: FloatArray = np.linalg.norm(vectors.reshape(len(vectors), -1), axis=1)
+    return norms
+
+
+def fly(scenario: PaperScenario) -> Flight:
+    """The flight, which starts on the circles."""
+    radii = np.array(scenario.radii_m)
+    phases = np.arange(len(radii)) * np.pi / 2
+    turns = scenario.rate_radps * scenario.dt_s * np.arange(scenario.steps)[:, np.newaxis]
+    speeds = (radii * scenario.rate_radps)[:, np.newaxis]
+    nominal = speeds * _heading(turns + phases)
+    gusts = scenario.gust * speeds * _heading(GUST_RATE_RATIO * turns + phases)
+    inputs = nominal + gusts / (scenario.dt_s if scenario.literal else 1.0)
+    start = radii[:, np.newaxis] * np.stack([np.sin(phases), np.cos(phases)], axis=-1)
+    moved = scenario.dt_s * np.cumsum(inputs, axis=0)
+    positions = start + np.concatenate([np.zeros((1, len(radii), 2)), moved])
+    return Flight(scenario, positions, inputs, positions[:-1] + scenario.feedthrough_s * inputs)
+
+
+def _heading(angle_rad: FloatArray) -> FloatArray:
+    """[cos, -sin] of angles (...), (..., 2)."""
+    heading: FloatArray = np.stack([np.cos(angle_rad), -np.sin(angle_rad)], axis=-1)
+    return heading
+
+
+def track(flight: Flight, gain: float, start_m: FloatArray | None = None) -> Tracked:
+    """The published observer over the flight, from ``start_m`` (N, 2).
+
+    None: without initial error.
+    """
+    scenario = flight.scenario
+    estimate = flight.position_m[0] if start_m is None else start_m
+    estimates, plain, full = [estimate], [], []
+    for report in flight.report_m:
+        step = published.step(estimate, report, scenario.dt_s, scenario.feedthrough_s, gain)
+        estimate = step.estimate_m
+        estimates.append(estimate)
+        plain.append(step.unknown_input_b0_mps)
+        full.append(step.unknown_input_bd_mps)
+    return Tracked(gain, np.array(estimates), np.array(plain), np.array(full))
+
+
+def running_bounds(flight: Flight, gain: float) -> FloatArray:
+    """The running bound on ||E_k||, (K + 1,), from the actual ||W_k||: |q| e + |l d - b| ||W||."""
+    scenario, bounds = flight.scenario, [0.0]
+    enters = abs(gain * scenario.feedthrough_s - scenario.dt_s)
+    for size in stacked(flight.input_mps).tolist():
+        bounds.append(abs(1 - gain) * bounds[-1] + enters * size)
+    return np.array(bounds)
+
+
+def angle_errors_rad(flight: Flight, estimate_m: FloatArray) -> FloatArray:
+    """Angle between the true and the estimated direction from the array, (K + 1, N)."""
+    true, seen = flight.position_m, estimate_m
+    cross = true[..., 0] * seen[..., 1] - true[..., 1] * seen[..., 0]
+    angles: FloatArray = np.abs(np.arctan2(cross, np.sum(true * seen, axis=-1)))
+    return angles
+
+
+def gain_mu(dt_s: float, feedthrough_s: float, alpha: float, gain: float) -> float:
+    """The smallest mu (s²) that the LMIs certify for a given gain; infinite if there is none.
+
+    With q = 1 - l and c = l d - b the decay LMI is p c^2 / alpha <= 1 - q^2 / (1 - alpha), and mu =
+    1 / p (Schur complements; docs/math.md 2.2).
+    """
+    margin = 1 - (1 - gain) ** 2 / (1 - alpha)
+    enters = gain * feedthrough_s - dt_s
+    if enters == 0 and margin >= 0:
+        return 0.0
+    return enters**2 / (alpha * margin) if margin > 0 else np.inf
+
+
+@dataclass(frozen=True, slots=True)
+class Irregular:
+    """Largest |e| / sup|w| over random intervals with an adversary's input.
+
+    fixed_s      with a fixed gain
+    scheduled_s  with a gain that follows the interval
+    gamma_s      gamma over the same intervals
+    """
+
+    fixed_s: float
+    scheduled_s: float
+    gamma_s: float
+
+
+def irregular(
+    scenario: PaperScenario, gain: float, longest_s: float, steps: int, rng: np.random.Generator
+) -> Irregular:
+    """Errors over random intervals of 0.05 s to ``longest_s``.
+
+    The input has size 1 and always pushes the error outward.
+    """
+    intervals = rng.uniform(0.05, longest_s, steps)
+    d, alpha = scenario.feedthrough_s, scenario.alpha
+    worst = []
+    for gains in (np.full(steps, gain), closed_form.gains(intervals, d, alpha)):
+        error, most = 0.0, 0.0
+        for b, l_gain in zip(intervals.tolist(), gains.tolist(), strict=True):
+            error = abs((1 - l_gain) * error) + abs(l_gain * d - b)
+            most = max(most, error)
+        worst.append(most)
+    gamma_s = float(np.sqrt(closed_form.mu_stars(intervals, d, alpha).max()))
+    return Irregular(worst[0], worst[1], gamma_s)
+
+
+def adversarial_input_error(scenario: PaperScenario, gain: float, steps: int = 400) -> float:
+    """|W^ - W| / sup|W| reached by the worst input for G = [b; 0], by flying it.
+
+    A constant input builds the error up, and turns round at the end.
+    """
+    b, d = scenario.dt_s, scenario.feedthrough_s
+    place, estimate, miss = np.zeros(1), np.zeros(1), 0.0
+    for sign in [1.0] * (steps - 1) + [-1.0]:
+        step = published.step(estimate, place + d * sign, b, d, gain)
+        miss = max(miss, abs(float(step.unknown_input_b0_mps[0]) - sign))
+        place, estimate = place + b * sign, step.estimate_m
+    return miss

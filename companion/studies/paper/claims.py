@@ -1,0 +1,252 @@
+"""The claims of the published method, each judged by a number of the study.
+
+A claim names the number that decides it by its path in the study's answer. Its verdict and the text
+of what was found are made from that number, so that they cannot disagree with it.
+"""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from typing import Any, Final
+
+
+class Verdict(StrEnum):
+    """The verdict on a claim."""
+
+    HOLDS = "holds"
+    CORRECTED = "holds with a correction"
+    FAILS = "does not hold"
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """A statement of the paper and how it is judged.
+
+    statement   what the paper says
+    key         path of the number that decides
+    found       text with ``{value}`` for the number
+    decides     predicate of the number
+    if_true     verdict where the predicate is true
+    if_false    verdict where it is not
+    correction  what a reader of the paper must change
+    """
+
+    statement: str
+    key: str
+    found: str
+    decides: Callable[[float], bool]
+    if_true: Verdict
+    if_false: Verdict
+    correction: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A row of the table of claims, as JSON has it."""
+
+    statement: str
+    key: str
+    value: float
+    found: str
+    verdict: Verdict
+    correction: str
+
+
+def lookup(answer: dict[str, Any], key: str) -> float:
+    """The number at a path such as ``levels/L = 0.39/gamma_s``.
+
+    Raises ``KeyError`` if there is none.
+    """
+    place: Any = answer
+    for part in key.split("/"):
+        try:
+            place = place[int(part)] if isinstance(place, list) else place[part]
+        except (ValueError, IndexError, TypeError) as error:
+            raise KeyError(key) from error
+    if isinstance(place, bool) or not isinstance(place, int | float):
+        raise KeyError(key)
+    return place
+
+
+def judge(answer: dict[str, Any]) -> list[dict[str, Any]]:
+    """Every claim with its number, what was found and the verdict."""
+    rows = []
+    for claim in CLAIMS:
+        value = lookup(answer, claim.key)
+        verdict = claim.if_true if claim.decides(value) else claim.if_false
+        found = claim.found.format(value=value)
+        row = Judged(claim.statement, claim.key, value, found, verdict, claim.correction)
+        rows.append(asdict(row))
+    return rows
+
+
+_HOLDS, _CORRECTED, _FAILS = Verdict.HOLDS, Verdict.CORRECTED, Verdict.FAILS
+_NEVER_OFF_S: Final = 1e-9
+
+
+def _limit(mu: str, infeasible: str) -> Claim:
+    return Claim(
+        f"With α = δ = 0.5 and μ ≤ {mu} s² the design becomes infeasible at ΔT = {infeasible} s.",
+        f"limits/{mu}/off_s",
+        "the first infeasible interval on the paper's grid of 0.01 s differs by {value:.2f} s",
+        lambda off: off < _NEVER_OFF_S,
+        _HOLDS,
+        _FAILS,
+        "The limit need not be searched for: ΔT_max = δ + √(αμ + (1−α)δ²).",
+    )
+
+
+def _bounded(name: str) -> Claim:
+    return Claim(
+        f"The error stays below γ sup‖W‖ ({name}).",
+        f"levels/{name}/error_over_gamma_bound",
+        "the largest error over many turns is {value:.3f} of the bound, γ the least for this gain",
+        lambda share: share <= 1,
+        _HOLDS,
+        _FAILS,
+    )
+
+
+CLAIMS: Final = (
+    Claim(
+        "The design is the linear matrix inequality as printed, its last diagonal block +P.",
+        "designs/0/printed_sign_eigenvalue",
+        "in the “⪯ 0” form the printed matrix has an eigenvalue of {value:+.2f}, and with P ≻ 0 in"
+        " its diagonal no choice makes it negative",
+        lambda eigenvalue: eigenvalue > 0,
+        _CORRECTED,
+        _HOLDS,
+        "The last block must be −P. The inequality is then feasible and the guarantee follows.",
+    ),
+    Claim(
+        "D is an N × 2N matrix.",
+        "scenario/feedthrough_matrix_rows",
+        "the reports of the four UAVs in the plane have {value:d} rows, and so must D",
+        lambda rows: rows != 4,
+        _CORRECTED,
+        _HOLDS,
+        "D is 2N × 2N: with Y = X + D W it has a row for each coordinate that is reported.",
+    ),
+    _bounded("L = 0.39"),
+    _bounded("L = 0.60"),
+    _bounded("L = 0.76"),
+    Claim(
+        "L = 0.39, 0.60 and 0.76 are the gains for the three performance levels.",
+        "designs/0/feasible_gain",
+        "a solver asked for feasibility at μ ≤ 0.05 returns {value:.3f}: near, and its own choice",
+        lambda gain: abs(gain - 0.39) < 0.005,
+        _HOLDS,
+        _CORRECTED,
+        "Any gain of a whole interval is feasible at each level. Which one comes out is the"
+        " solver's business; do not expect these digits from another solver.",
+    ),
+    Claim(
+        "The gains of the three levels are what the method has to offer at ΔT = 0.15 s.",
+        "levels/L = 0.39/angle_error_deg",
+        "with L = 0.39 the direction is still off by up to {value:.2f}°, with L = ΔT/δ = 0.30 by 0",
+        lambda degrees: degrees > 0.01,
+        _FAILS,
+        _HOLDS,
+        "They are feasible, not optimal. Where |ΔT − δ| < δ√(1−α) the least μ is 0, attained in the"
+        " limit with L = ΔT/δ, which cancels the unknown input altogether.",
+    ),
+    _limit("0.05", "0.89"),
+    _limit("0.25", "1.01"),
+    _limit("1", "1.3"),
+    Claim(
+        "The error of the estimated unknown input stays below 3γ sup‖W‖ in the simulation.",
+        "unknown_input/L = 0.76/b0_in_scenario",
+        "in the published scenario it reaches {value:.2f} sup‖W‖ at L = 0.76; 3γ is 3.00 there",
+        lambda share: share <= 3,
+        _HOLDS,
+        _FAILS,
+        "It held because this input is mild, not because it is a bound; see the next row.",
+    ),
+    Claim(
+        "3γ sup‖W‖ bounds the error of the estimated unknown input in general.",
+        "unknown_input/L = 0.76/b0_adversary",
+        "an input that turns round at the worst moment makes it {value:.3f} sup‖W‖ at L = 0.76,"
+        " against 3γ = 3.00 with γ = √μ = 1",
+        lambda reached: reached > 3,
+        _FAILS,
+        _HOLDS,
+        "With Ŵ = (X̂⁺ − X̂)/ΔT the exact peak is 2|Lδ − ΔT|/ΔT for 0 ≤ 1 − L < 1: it grows without"
+        " limit as ΔT falls. 2γ sup‖W‖/ΔT is safe. G = [B; D] has √5‖G†‖γ sup‖W‖.",
+    ),
+    Claim(
+        "A gain designed for one ΔT carries the guarantee.",
+        "irregular/fixed_over_gamma",
+        "on intervals between 0.05 and 1.2 s a gain that stays reaches {value:.2f} times the γ"
+        " that a scheduled gain keeps",
+        lambda share: share > 1,
+        _CORRECTED,
+        _HOLDS,
+        "Real reports come irregularly. Schedule L by the ΔT that occurred: one P = 1/max μ*(ΔT)"
+        " serves all intervals, in any order.",
+    ),
+    Claim(
+        "The angle of a UAV is θ = arccos(x/r).",
+        "array/arccos_error_deg",
+        "half of the time y < 0, and then it points to the mirror image: up to {value:.0f}° off",
+        lambda degrees: degrees > 0.01,
+        _CORRECTED,
+        _HOLDS,
+        "arccos loses the sign of y. Use the unit vector, or atan2(y, x).",
+    ),
+    Claim(
+        "UAV i receives aᴴ F s, with F = A*(AᵀA*)⁻¹.",
+        "array/conjugated_response_max",
+        "for four UAVs at general places |aᴴf| of the own beam is {value:.3f} at most, not 1",
+        lambda response: response < 0.5,
+        _CORRECTED,
+        _HOLDS,
+        "Channel and precoder must agree: aᵀ with F = A*(AᵀA*)⁻¹, for which |aᵀf| = 1.",
+    ),
+    Claim(
+        "Zero forcing separates the four UAVs at all times.",
+        "array/zero_forcing_over_3_db_share",
+        "for {value:.0%} of the reports it costs a UAV more than 3 dB, and at a mirror image there"
+        " is no answer",
+        lambda share: share > 0,
+        _CORRECTED,
+        _HOLDS,
+        "A line array cannot tell a direction from its mirror image about its axis, where the"
+        " circling UAVs meet. Regularise or serve in turns there.",
+    ),
+    Claim(
+        "The gust enters as d/ΔT.",
+        "scenario/input_sup_mps",
+        "read so, sup‖W‖ is {value:.2f} m/s: the gust is a third faster than the flight itself",
+        lambda largest: largest > 400,
+        _CORRECTED,
+        _HOLDS,
+        "d is then a step in metres for each report, whatever ΔT. Taken for a velocity, W = v + d."
+        " The reading changes every error that is drawn; this study takes it as it is written.",
+    ),
+    Claim(
+        "64 elements have a beam narrow enough to separate users (half-power angle).",
+        "array/sizes/64/half_power_deg",
+        "the gain falls by half at ±{value:.2f}°; with 128 elements at half that angle",
+        lambda degrees: degrees < 1,
+        _HOLDS,
+        _FAILS,
+    ),
+    Claim(
+        "Location-aware beams exceed echo probing in average spectral efficiency under blockage.",
+        "blockage/gain_over_echo_bit_s_hz/optimum",
+        "with L = 0.30: {value:+.2f} bit/s/Hz a UAV at 15 blockages a minute of 0.5 s",
+        lambda gain: gain > 0,
+        _HOLDS,
+        _FAILS,
+    ),
+    Claim(
+        "They do so with the paper's own gain.",
+        "blockage/gain_over_echo_bit_s_hz/L = 0.39",
+        "with L = 0.39: {value:+.2f} bit/s/Hz a UAV, for the beam of 64 elements misses the UAV",
+        lambda gain: gain > 0,
+        _HOLDS,
+        _FAILS,
+        "An error of 6° is eight half-power angles. The advantage is the optimal gain's. The"
+        " baseline here is one at its best, not the paper's, whose settings are not known to us.",
+    ),
+)

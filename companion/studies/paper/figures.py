@@ -1,0 +1,306 @@
+"""Figures of the published experiments: flight, observer, limits and rates.
+
+Over 300 lines: it is a list, a figure a function.
+"""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from companion.studies.figures import plotting
+from companion.studies.paper import circles, published
+from companion.studies.paper.experiments import OPTIMUM, PAPER_LEVELS, Material, level_name
+from companion.studies.paper.patterns import cuts, polar, surfaces
+from companion.tracking.design import closed_form
+from companion.values import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Answer = dict[str, Any]
+LEVELS = tuple(level_name(gain) for _, gain in PAPER_LEVELS)
+TITLES = tuple(f"{level_name(gain)}, μ ≤ {mu:g} s²" for mu, gain in PAPER_LEVELS)
+SHOWN_S = 13.0
+"""Time shown in figures: a little over one turn."""
+
+
+def drawings(answer: Answer, material: Material) -> dict[str, tuple[str, Callable[[], "Figure"]]]:
+    """Caption and drawing of each figure by name, in the order of the paper's experiments."""
+    return {
+        "paths": (
+            "Paths of the four UAVs and the places predicted one report ahead, one turn.",
+            lambda: _paths(material),
+        ),
+        "coordinates": (
+            "Coordinates of the outermost UAV and their predictions over time.",
+            lambda: _coordinates(material),
+        ),
+        "errors": (
+            "Norm of the error of all UAVs together against its bounds. The least γ for each gain"
+            " is used; the exact peak is the smallest bound from sup‖W‖ alone; the running bound"
+            " knows ‖W‖ at each report.",
+            lambda: _errors(answer, material),
+        ),
+        "unknown_input": (
+            "North component of the unknown input of the innermost UAV, as published (G = [B; 0]),"
+            " and the norm of its error over all UAVs.",
+            lambda: _unknown_input(answer, material),
+        ),
+        "alphas": (
+            "The same at α = 0.5, 0.1 and 0.01, with the gain that the solver finds feasible for"
+            " μ ≤ 0.05 s². The optimum is L = 0.30 at every α, without error.",
+            lambda: _alphas(material),
+        ),
+        "limits": (
+            "The least μ over the interval ΔT, α = δ = 0.5: the largest feasible interval is where"
+            " it meets the bound. Dots: the first interval that the paper found infeasible.",
+            lambda: _limits(answer),
+        ),
+        "rates": (
+            "Spectral efficiency, mean of the UAVs, 64 elements: over time, and by azimuth. The"
+            " dips common to all are mirror images, which a line array cannot tell apart.",
+            lambda: _rates(material),
+        ),
+        "surfaces": (
+            "Zero-forcing beam for UAV 1 at two instants: array gain over azimuth and elevation.",
+            lambda: surfaces(material),
+        ),
+        "cuts": (
+            "Azimuth and elevation cuts of the same beams; dotted: half power.",
+            lambda: cuts(material),
+        ),
+        "polar": (
+            "Polar patterns (dB) of the beams for UAVs 1 and 2; numbers: where each UAV is.",
+            lambda: polar(material),
+        ),
+        "blockage": (
+            "Mean spectral efficiency a UAV over the rate of blockages, each 0.5 s in the mean and"
+            " 25 dB deep, against echo probing.",
+            lambda: _blockage(material),
+        ),
+    }
+
+
+def _paths(material: Material) -> "Figure":
+    figure, panels = plotting.new(1, 3, (9.6, 3.9), sharex=True, sharey=True)
+    shown = material.flight.time_s <= SHOWN_S
+    true = material.flight.position_m[shown]
+    for axes, name in zip(panels, LEVELS, strict=True):
+        seen = material.tracked[name].estimate_m[shown]
+        for uav in range(true.shape[1]):
+            colour = plotting.COLOURS[uav]
+            axes.plot(
+                true[:, uav, 1], true[:, uav, 0], "-", color=colour, lw=1.2, label=f"UAV {uav + 1}"
+            )
+            axes.plot(seen[:, uav, 1], seen[:, uav, 0], ":", color=colour, lw=1.5)
+        axes.plot([], [], ":", color=plotting.INK, label="predicted")
+        axes.plot([0], [0], marker="^", ls="none", color=plotting.INK, ms=5, label="array")
+        axes.set_aspect("equal")
+        axes.set_xlabel("east, m")
+    panels[0].set_ylabel("north, m")
+    plotting.lettered(panels, TITLES)
+    plotting.below(figure, panels[0], 6)
+    return figure
+
+
+def _coordinates(material: Material) -> "Figure":
+    figure, panels = plotting.new(2, 1, (7.2, 4.6), sharex=True)
+    time_s = material.flight.time_s
+    shown = time_s <= SHOWN_S
+    for axis, (axes, word) in enumerate(zip(panels, ("north", "east"), strict=True)):
+        true = material.flight.position_m[shown, -1, axis]
+        axes.plot(time_s[shown], true, color=plotting.INK, lw=2.0, label="actual")
+        for number, name in enumerate(LEVELS):
+            seen = material.tracked[name].estimate_m[shown, -1, axis]
+            axes.plot(time_s[shown], seen, label=name, **plotting.line(number + 1))
+        axes.set_ylabel(f"{word}, m")
+    panels[1].set_xlabel("time, s")
+    panels[1].set_xlim(0, SHOWN_S)
+    plotting.below(figure, panels[0], 4)
+    return figure
+
+
+def _errors(answer: Answer, material: Material) -> "Figure":
+    figure, panels = plotting.new(1, 3, (9.6, 3.4), sharey=True)
+    flight = material.flight
+    for axes, name in zip(panels, LEVELS, strict=True):
+        one, numbers = material.tracked[name], answer["levels"][name]
+        error = circles.stacked(one.estimate_m - flight.position_m)
+        running = circles.running_bounds(flight, one.gain)
+        axes.axhline(numbers["gamma_bound_m"], label="γ sup‖W‖", **plotting.line(1))
+        axes.axhline(numbers["peak_bound_m"], label="exact peak", **plotting.line(2))
+        axes.plot(flight.time_s, running, label="running bound", **plotting.line(3))
+        axes.plot(flight.time_s, error, label="error", **plotting.line(0))
+        axes.set_xlabel("time, s")
+        axes.set_xlim(0, flight.time_s[-1])
+    panels[0].set_ylabel("norm of the error, m")
+    panels[0].set_ylim(0, None)
+    plotting.lettered(panels, TITLES)
+    plotting.below(figure, panels[0], 4)
+    return figure
+
+
+def _unknown_input(answer: Answer, material: Material) -> "Figure":
+    figure, panels = plotting.new(2, 3, (9.6, 5.2), sharex=True, sharey="row")
+    flight = material.flight
+    shown = flight.time_s[:-1] <= SHOWN_S
+    time_s = flight.time_s[:-1][shown]
+    for column, name in enumerate(LEVELS):
+        one, above, under = material.tracked[name], panels[column], panels[3 + column]
+        above.plot(
+            time_s, flight.input_mps[shown, 0, 0], color=plotting.INK, lw=1.8, label="W, actual"
+        )
+        above.plot(time_s, one.input_b0_mps[shown, 0, 0], label="Ŵ, G = [B; 0]", **plotting.line(1))
+        _misses(under, one, material, answer["unknown_input"][name])
+        under.set_xlabel("time, s")
+        under.set_xlim(0, SHOWN_S)
+    panels[0].set_ylabel("north, UAV 1, m/s")
+    panels[3].set_ylabel("norm of the error, m/s")
+    panels[3].set_ylim(0, None)
+    plotting.lettered(panels[:3], TITLES)
+    handles = [axes.get_legend_handles_labels() for axes in (panels[0], panels[3])]
+    figure.legend(
+        handles[0][0] + handles[1][0],
+        handles[0][1] + handles[1][1],
+        loc="outside lower center",
+        ncols=3,
+    )
+    return figure
+
+
+def _misses(axes: Any, one: Any, material: Material, numbers: dict[str, float]) -> None:
+    """Norms of the error of both estimates, the exact peak and the published bound."""
+    flight = material.flight
+    shown = flight.time_s[:-1] <= SHOWN_S
+    time_s, largest = flight.time_s[:-1][shown], flight.largest_input_mps
+    for number, (kept, label) in enumerate(
+        ((one.input_b0_mps, "error, [B; 0]"), (one.input_bd_mps, "error, [B; D]"))
+    ):
+        miss = circles.stacked(kept - flight.input_mps)[shown]
+        axes.plot(time_s, miss, label=label, **plotting.line(2 * number))
+    axes.axhline(numbers["b0_peak"] * largest, label="exact peak, [B; 0]", **plotting.line(3))
+    axes.axhline(
+        numbers["published_3_gamma"] * largest, label="published 3γ sup‖W‖", **plotting.line(4)
+    )
+
+
+def _alphas(material: Material) -> "Figure":
+    figure, panels = plotting.new(2, 3, (9.6, 5.0), sharex=True, sharey="row")
+    flight = material.flight
+    shown = flight.time_s[:-1] <= SHOWN_S
+    time_s = flight.time_s[:-1][shown]
+    titles = []
+    for column, (alpha, one) in enumerate(material.alphas.items()):
+        above, under = panels[column], panels[3 + column]
+        above.plot(
+            time_s, flight.input_mps[shown, 0, 0], color=plotting.INK, lw=1.8, label="W, actual"
+        )
+        above.plot(time_s, one.input_b0_mps[shown, 0, 0], label="Ŵ, G = [B; 0]", **plotting.line(1))
+        scenario = flight.scenario
+        peak = published.unknown_input_peak(scenario.dt_s, scenario.feedthrough_s, one.gain)[1]
+        miss = circles.stacked(one.input_b0_mps - flight.input_mps)[shown]
+        under.plot(time_s, miss, label="error, [B; 0]", **plotting.line(0))
+        under.axhline(
+            peak * flight.largest_input_mps, label="exact peak, [B; 0]", **plotting.line(3)
+        )
+        under.set_xlabel("time, s")
+        under.set_xlim(0, SHOWN_S)
+        titles.append(f"α = {alpha:g}, L = {one.gain:.3f}")
+    panels[0].set_ylabel("north, UAV 1, m/s")
+    panels[3].set_ylabel("norm of the error, m/s")
+    panels[3].set_ylim(0, None)
+    plotting.lettered(panels[:3], titles)
+    handles = [axes.get_legend_handles_labels() for axes in (panels[0], panels[3])]
+    figure.legend(
+        handles[0][0] + handles[1][0],
+        handles[0][1] + handles[1][1],
+        loc="outside lower center",
+        ncols=4,
+    )
+    return figure
+
+
+def _limits(answer: Answer) -> "Figure":
+    figure, (axes,) = plotting.new(1, 1, (6.4, 3.8))
+    scenario = answer["scenario"]
+    intervals = np.linspace(0.02, 1.45, 400)
+    for number, alpha in enumerate((0.5, 0.1, 0.01)):
+        mu = closed_form.mu_stars(intervals, scenario["feedthrough_s"], alpha)
+        axes.plot(intervals, mu, label=f"least μ, α = {alpha:g}", **plotting.line(number))
+    for mu_text, row in answer["limits"].items():
+        bound = float(mu_text)
+        axes.axhline(bound, color="#777777", lw=0.8)
+        axes.annotate(
+            f"μ ≤ {bound:g}: ΔT ≤ {row['limit_s']:.4f} s",
+            (0.3, bound), xytext=(0, 3), textcoords="offset points", fontsize=8.5,
+        )  # fmt: skip
+        axes.plot(row["paper_s"], bound, "o", color=plotting.INK, ms=5)
+    axes.set_xlim(0, 1.45)
+    axes.set_ylim(0, 1.2)
+    axes.set_xlabel("interval between reports ΔT, s")
+    axes.set_ylabel("μ, s²")
+    plotting.below(figure, axes, 3)
+    return figure
+
+
+def _rates(material: Material) -> "Figure":
+    figure, panels = plotting.new(1, 2, (9.6, 3.6), sharey=True)
+    time_s = material.flight.time_s
+    shown = time_s <= SHOWN_S
+    place = material.flight.position_m
+    azimuth_deg = np.degrees(np.arctan2(place[..., 1], place[..., 0]))
+    edges = np.linspace(-180, 180, 37)
+    names = (OPTIMUM, *LEVELS)
+    for number, name in enumerate(names):
+        found = material.efficiency[name]
+        label = f"{name}, L = 0.30" if name == OPTIMUM else name
+        panels[0].plot(
+            time_s[shown], found[shown].mean(axis=1), label=label, **plotting.line(number)
+        )
+        panels[1].plot(
+            (edges[1:] + edges[:-1]) / 2,
+            _binned(azimuth_deg, found, edges),
+            **plotting.line(number),
+        )
+    panels[0].set_xlabel("time, s")
+    panels[0].set_xlim(0, SHOWN_S)
+    panels[0].set_ylabel("spectral efficiency, bit/s/Hz")
+    panels[0].set_ylim(0, None)
+    panels[1].set_xlabel("azimuth of the UAV, degrees (0: boresight)")
+    panels[1].set_xlim(-180, 180)
+    panels[1].set_xticks(np.arange(-180, 181, 60))
+    plotting.lettered(panels, ("mean of the UAVs over time", "mean over reports by azimuth"))
+    plotting.below(figure, panels[0], 4)
+    return figure
+
+
+def _binned(azimuth_deg: FloatArray, values: FloatArray, edges: FloatArray) -> FloatArray:
+    """Means of values in bins of azimuth; NaN in an empty one."""
+    where = np.clip(np.digitize(azimuth_deg.ravel(), edges) - 1, 0, len(edges) - 2)
+    counts = np.bincount(where, minlength=len(edges) - 1)
+    sums = np.bincount(where, weights=values.ravel(), minlength=len(edges) - 1)
+    means: FloatArray = np.divide(sums, counts, out=np.full(len(sums), np.nan), where=counts > 0)
+    return means
+
+
+def _blockage(material: Material) -> "Figure":
+    figure, (axes,) = plotting.new(1, 1, (6.4, 3.8))
+    compared = material.compared
+    marks = ("o", "s", "^", "D", "v")
+    order = ("echo probing", OPTIMUM, *LEVELS)
+    for number, name in enumerate(order):
+        label = {"echo probing": name, OPTIMUM: "location-aware, L = 0.30 (optimum)"}.get(
+            name, f"location-aware, {name}"
+        )
+        axes.plot(
+            compared.blockages_per_minute,
+            compared.schemes[name],
+            marker=marks[number], ms=4, label=label, **plotting.line(number),
+        )  # fmt: skip
+    axes.set_ylim(0, None)
+    axes.set_xlim(0, None)
+    axes.set_xlabel("blockages a minute for each UAV")
+    axes.set_ylabel("mean spectral efficiency, bit/s/Hz")
+    plotting.below(figure, axes, 2)
+    return figure

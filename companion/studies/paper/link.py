@@ -1,0 +1,178 @@
+"""The published scenario as a link: rates over time, and under blockage.
+
+Between reports the UAV moves evenly, as the model has it, and the beam goes evenly from one
+estimate to the next. Weights are zero forcing, regularised where that would cost a UAV more than 3
+dB (a line array cannot tell a direction from its mirror image). Free space; no scattering.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from companion.beams.array.geometry import Array, uniform_linear
+from companion.beams.array.steering import steering_matrix
+from companion.beams.weights import zero_forcing
+from companion.beams.weights.precoding import Precoder, precode
+from companion.beams.worth import channel, link_budget
+from companion.beams.worth.link_budget import LinkBudget
+from companion.studies.paper import probing
+from companion.studies.paper.circles import Flight
+from companion.studies.paper.probing import EchoProbing
+from companion.values import ComplexArray, FloatArray
+
+FREQUENCY_HZ: Final = 30e9
+UAV_ANTENNAS: Final = 4
+BUDGET: Final = LinkBudget(tx_power_dbm=30.0, bandwidth_hz=50e6, noise_figure_db=7.0)
+PRECODER: Final = Precoder(widen=False)
+PROBING: Final = EchoProbing(dwell_s=0.005, position_gain=0.9, rate_gain=0.5)
+"""Baseline at its best: it listens half of all time, and a tracker of rates follows the turn."""
+MEAN_BLOCKAGE_S: Final = 0.5
+EVERY: Final = 5
+"""Probing intervals from one computed rate to the next."""
+
+
+def line(elements: int) -> Array:
+    """The published array: half a wavelength apart, from west to east, boresight north."""
+    return uniform_linear(elements, FREQUENCY_HZ, 0.5, np.eye(3))
+
+
+def directions(position_m: FloatArray) -> FloatArray:
+    """Unit directions (..., 3) in the array frame of places (..., 2), north and east."""
+    level = position_m / np.linalg.norm(position_m, axis=-1, keepdims=True)
+    return np.concatenate([level, np.zeros((*level.shape[:-1], 1))], axis=-1)
+
+
+def responses(array: Array, true_m: FloatArray, aimed_m: FloatArray) -> ComplexArray:
+    """Response of UAV i at its true place to beam j aimed at its estimated place: (T, N, N).
+
+    In square roots of watts: the power of the budget is included.
+    """
+    heard = []
+    for true, aimed in zip(directions(true_m), directions(aimed_m), strict=True):
+        weights = precode(steering_matrix(array, aimed), PRECODER).weights
+        sent = link_budget.share_power(weights, BUDGET.tx_power_w)
+        heard.append(steering_matrix(array, true).T @ sent)
+    return np.array(heard)
+
+
+def efficiency(
+    array: Array, heard: ComplexArray, true_m: FloatArray, attenuation_db: float | FloatArray = 0.0
+) -> FloatArray:
+    """Spectral efficiency, bit/s/Hz, (T, N); ``attenuation_db`` (T, N) is that of blockages."""
+    ranges_m = np.linalg.norm(true_m, axis=-1)
+    gains = UAV_ANTENNAS * channel.free_space_gain(ranges_m, array.wavelength_m)
+    blocked = 10 ** (-np.asarray(attenuation_db) / 10)
+    return link_budget.spectral_efficiency(
+        link_budget.sinr(heard, gains * blocked, BUDGET.noise_power_w)
+    )
+
+
+def zero_forcing_loss_db(array: Array, position_m: FloatArray) -> FloatArray:
+    """Loss of the worst UAV by plain zero forcing at each time, (T,).
+
+    Infinite without an answer.
+    """
+    found = []
+    for there in directions(position_m):
+        solved = zero_forcing.solve(steering_matrix(array, there))
+        found.append(np.inf if solved is None else 10 * np.log10(solved.loss_factors.max()))
+    return np.array(found)
+
+
+def conjugate_responses(array: Array, position_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """|a^T f| and |a^H f| of zero-forcing beams at their own UAVs (N,): corrected and printed."""
+    steering = steering_matrix(array, directions(position_m))
+    weights = precode(steering, PRECODER).weights
+    right = np.abs(np.einsum("mn,mn->n", steering, weights))
+    return right, np.abs(np.einsum("mn,mn->n", steering.conj(), weights))
+
+
+def between(flight: Flight, place_m: FloatArray, time_s: FloatArray) -> FloatArray:
+    """Places (T, N, 2) at times between the steps, from places (K + 1, N, 2) at the steps."""
+    at = time_s / flight.scenario.dt_s
+    step = np.minimum(np.floor(at + 1e-9).astype(int), len(place_m) - 2)
+    share = (at - step)[:, np.newaxis, np.newaxis]
+    moved: FloatArray = place_m[step] + share * (place_m[step + 1] - place_m[step])
+    return moved
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Compared:
+    """Mean spectral efficiency per UAV, bit/s/Hz, by scheme.
+
+    Arrays are (B,), over blockages per minute (B,).
+    """
+
+    blockages_per_minute: FloatArray
+    schemes: dict[str, FloatArray]
+
+
+def under_blockage(
+    flight: Flight,
+    aimed_m: dict[str, FloatArray],
+    blockages_per_minute: FloatArray,
+    draws: int,
+    rng: np.random.Generator,
+    progress: Callable[[str], None],
+) -> Compared:
+    """Location-aware beams aimed at estimates (K + 1, N, 2), compared with echo probing.
+
+    Every scheme has the same blockages, in as many ``draws`` for each rate, and the same precoder.
+    """
+    array = line(64)
+    time_s = np.arange(0.0, float(flight.time_s[-1]), PROBING.interval_s)
+    true_m = between(flight, flight.position_m, time_s)
+    some = true_m[::EVERY]
+    heard = {
+        name: responses(array, some, between(flight, places, time_s[::EVERY]))
+        for name, places in aimed_m.items()
+    }
+    found: dict[str, list[float]] = {name: [] for name in (*aimed_m, "echo probing")}
+    for number, rate in enumerate(blockages_per_minute.tolist()):
+        totals = dict.fromkeys(found, 0.0)
+        for _ in range(draws):
+            progress(f"echo probing under blockage: {number + 1} of {len(blockages_per_minute)}")
+            lost_db = _attenuation_db(true_m.shape[1], time_s, rate / 60, rng)
+            for name, responded in heard.items():
+                rate_now = efficiency(array, responded, some, lost_db[::EVERY])
+                totals[name] += float(rate_now.mean()) / draws
+            echoed = _echo_efficiency(array, true_m, lost_db, rng)
+            totals["echo probing"] += float(echoed.mean()) / draws
+        for name, total in totals.items():
+            found[name].append(total)
+    return Compared(blockages_per_minute, {name: np.array(seen) for name, seen in found.items()})
+
+
+def _attenuation_db(
+    users: int, time_s: FloatArray, rate_hz: float, rng: np.random.Generator
+) -> FloatArray:
+    """Attenuation by each UAV's own blockages, (T, N)."""
+    last_s = float(time_s[-1])
+    drawn = [channel.draw_blockages(rng, last_s, rate_hz, MEAN_BLOCKAGE_S) for _ in range(users)]
+    return np.stack([one.attenuation_db(time_s) for one in drawn], axis=1)
+
+
+def _echo_efficiency(
+    array: Array, true_m: FloatArray, lost_db: FloatArray, rng: np.random.Generator
+) -> FloatArray:
+    """Spectral efficiency of the baseline (T / EVERY, N): 0 for a UAV that is being sought."""
+    state = probing.started(directions(true_m[0]))
+    pointed, served = [], []
+    for at, (there, places) in enumerate(zip(directions(true_m), true_m, strict=True)):
+        ranges_m = np.linalg.norm(places, axis=1)
+        snr = probing.echo_snr(PROBING, BUDGET, array, there, ranges_m, lost_db[at])
+        state = probing.step(PROBING, array, state, there, snr, rng)
+        if at % EVERY == 0:
+            pointed.append(state.pointed)
+            served.append(state.served)
+    heard = []
+    for beams, there, on in zip(pointed, directions(true_m[::EVERY]), served, strict=True):
+        sent = np.zeros((array.size, len(on)), dtype=complex)
+        if on.any():
+            sent[:, on] = precode(steering_matrix(array, beams[on]), PRECODER).weights
+        heard.append(
+            steering_matrix(array, there).T @ link_budget.share_power(sent, BUDGET.tx_power_w)
+        )
+    return efficiency(array, np.array(heard), true_m[::EVERY], lost_db[::EVERY])

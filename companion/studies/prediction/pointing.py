@@ -1,0 +1,148 @@
+"""Questions to a pointer on a log, a predictor's answers, and their scores."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.beams.array.geometry import Array
+from companion.studies.prediction.baselines import Observed, Predictor
+from companion.studies.prediction.spectral import SNR_DB, loss_bps_hz
+from companion.studies.truth.vehicles import Flight, Flown, Times
+from companion.values import FloatArray
+
+ASK_HZ: Final = 20
+HALF_BEAMWIDTH_DEG: Final = 0.79
+"""Half-power half-width of 64 elements half a wavelength apart, broadside (docs/math.md 8.1)."""
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Questions:
+    """Questions to one UAV's pointer: at times ``now_ns`` (K,), for each lead (L,).
+
+    truth_ned_m  (L, K, 3), the UAV's true position at now + lead
+    array_ned_m  (L, K, 3), the array's true position at now + lead
+    counts       (L, K), whether the answer is scored: the UAV flies then, and both are known
+    """
+
+    now_ns: Times
+    leads_ns: Times
+    truth_ned_m: FloatArray
+    array_ned_m: FloatArray
+    counts: NDArray[np.bool_]
+
+    def every(self, step: int) -> "Questions":
+        """Each ``step``-th question."""
+        return Questions(
+            self.now_ns[::step],
+            self.leads_ns,
+            self.truth_ned_m[:, ::step],
+            self.array_ned_m[:, ::step],
+            self.counts[:, ::step],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answers:
+    """Positions (L, K, 3) and bounds (L, K); NaN where there is none."""
+
+    position_ned_m: FloatArray
+    bound_m: FloatArray
+
+
+def questions(flown: Flown, flight: Flight, leads_s: Sequence[float], from_ns: int) -> Questions:
+    """Questions, ``ASK_HZ`` a second from ``from_ns``, while any of their answers counts."""
+    step_ns = 1_000_000_000 // ASK_HZ
+    start_ns = -(-max(from_ns, flown.span_ns[0]) // step_ns) * step_ns
+    now_ns = np.arange(start_ns, flown.span_ns[1] + 1, step_ns)
+    leads_ns = np.array([round(lead_s * 1e9) for lead_s in leads_s], dtype=np.int64)
+    at_ns = (now_ns + leads_ns[:, None]).ravel()
+    shape = (len(leads_ns), len(now_ns))
+    position = flight.truth.at(at_ns)[0]
+    array = flown.carrier_at(at_ns)
+    known = ~np.isnan(position).any(axis=1) & ~np.isnan(array).any(axis=1)
+    counts = (known & flight.flying(at_ns)).reshape(shape)
+    asked = counts.any(axis=0)
+    return Questions(
+        now_ns[asked],
+        leads_ns,
+        position.reshape(*shape, 3)[:, asked],
+        array.reshape(*shape, 3)[:, asked],
+        counts[:, asked],
+    )
+
+
+def answers(predictor: Predictor, observed: Sequence[Observed], asked: Questions) -> Answers:
+    """Play the reports to a predictor, and ask it in between."""
+    shape = asked.counts.shape
+    position, bound = np.full((*shape, 3), np.nan), np.full(shape, np.nan)
+    leads_ns, arrived, total = asked.leads_ns.tolist(), 0, len(observed)
+    for k, now_ns in enumerate(asked.now_ns.tolist()):
+        while arrived < total and observed[arrived].arrival_ns <= now_ns:
+            predictor.report(observed[arrived])
+            arrived += 1
+        for j, lead_ns in enumerate(leads_ns):
+            predicted = predictor.predict(now_ns, now_ns + lead_ns)
+            if predicted is not None:
+                position[j, k] = predicted.position_ned_m
+                if predicted.bound_m is not None:
+                    bound[j, k] = predicted.bound_m
+    return Answers(position, bound)
+
+
+def angles_deg(towards: FloatArray, truly: FloatArray) -> FloatArray:
+    """Angle between two directions, (..., 3) each, in degrees; exact for small ones."""
+    across = np.linalg.norm(np.cross(towards, truly), axis=-1)
+    found: FloatArray = np.degrees(np.arctan2(across, np.sum(towards * truly, axis=-1)))
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Receiver:
+    """The array that points, and the SNR in dB that it gives with its beam on the UAV."""
+
+    array: Array
+    snr_db: float = SNR_DB
+
+
+def score(
+    asked: Questions, given: Answers, lead: int, receiver: Receiver | None = None
+) -> Row | None:
+    """The figures of one lead; None where nothing counts. Without bounds theirs are None.
+
+    ``bound_tightness`` is the median bound over the 95th percentile of the error: 1 would be a
+    bound as small as the error. ``se_loss_bps_hz`` is that of ``receiver``, None without one.
+    """
+    counts = asked.counts[lead] & ~np.isnan(given.position_ned_m[lead, :, 0])
+    if not counts.any():
+        return None
+    position, true = given.position_ned_m[lead, counts], asked.truth_ned_m[lead, counts]
+    array, bound = asked.array_ned_m[lead, counts], given.bound_m[lead, counts]
+    error_m = np.linalg.norm(position - true, axis=1)
+    angle_deg = angles_deg(position - array, true - array)
+    bounded = not np.isnan(bound).any()
+    p95_m, median_m = float(np.percentile(error_m, 95)), float(np.median(bound))
+    return {
+        "n": int(counts.sum()),
+        "position_rms_m": _rms(error_m),
+        "position_p95_m": p95_m,
+        "position_max_m": float(error_m.max()),
+        "angle_rms_deg": _rms(angle_deg),
+        "angle_p95_deg": float(np.percentile(angle_deg, 95)),
+        "angle_max_deg": float(angle_deg.max()),
+        "within_beamwidth": float(np.mean(angle_deg <= HALF_BEAMWIDTH_DEG)),
+        "se_loss_bps_hz": None
+        if receiver is None
+        else loss_bps_hz(receiver.array, position - array, true - array, receiver.snr_db),
+        "bound_violations": int(np.sum(error_m > bound)) if bounded else None,
+        "bound_median_m": median_m if bounded else None,
+        "bound_tightness": median_m / p95_m if bounded and p95_m else None,
+    }
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -1,0 +1,106 @@
+"""The input of a learned predictor: the last reports, scaled and without absolute place.
+
+Each report gives seven numbers: how long before the newest it was made; where it was from there;
+its velocity. All are turned about the vertical so that the newest velocity points along x: north is
+like any other direction. Reports go by the sender's clock, at whatever intervals; one that was
+overtaken is put in its place.
+"""
+
+import math
+from bisect import bisect_right
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from companion.studies.prediction.baselines import Observed
+from companion.values import FloatArray
+
+REPORTS: Final = 10
+"""K: how many of the last reports are used."""
+FORGOTTEN_NS: Final = 20_000_000_000
+"""Age relative to the newest report beyond which a report is not used."""
+FEATURES: Final = 7
+TIME_UNIT_S: Final = 1.0
+WAY_UNIT_M: Final = 20.0
+SPEED_UNIT_MPS: Final = 10.0
+
+
+class Window(NamedTuple):
+    """The newest report and the network's input.
+
+    sender_ns         when it was made, sender's timeline
+    position_ned_m    (3,), its position
+    velocity_ned_mps  (3,), its velocity
+    seen              (n, 7), the input, oldest report first
+    local_from_seen   (3, 3), rotation from the input's frame to the local frame
+    """
+
+    sender_ns: int
+    position_ned_m: FloatArray
+    velocity_ned_mps: FloatArray
+    seen: FloatArray
+    local_from_seen: FloatArray
+
+
+class Recent:
+    """The last reports of one UAV, in the order in which they were made."""
+
+    def __init__(self) -> None:
+        self._reports: list[Observed] = []
+        self.offset_ns = 0
+
+    def add(self, report: Observed) -> bool:
+        """Add a report; returns whether the window has changed.
+
+        A report too old only updates the clock.
+        """
+        self.offset_ns = report.sent_ns - report.sender_ns
+        reports = self._reports
+        at = bisect_right(reports, report.sender_ns, key=lambda each: each.sender_ns)
+        if at and reports[at - 1].sender_ns == report.sender_ns:
+            return False
+        if at == 0 and len(reports) == REPORTS:
+            return False
+        reports.insert(at, report)
+        oldest_ns = reports[-1].sender_ns - FORGOTTEN_NS
+        self._reports = [each for each in reports[-REPORTS:] if each.sender_ns >= oldest_ns]
+        return True
+
+    def window(self) -> Window:
+        """The present window; needs at least one report."""
+        reports = self._reports
+        newest = reports[-1]
+        ago_s = np.array([each.sender_ns - newest.sender_ns for each in reports]) * 1e-9
+        places = np.array([each.position_ned_m for each in reports])
+        speeds = _velocities(reports, ago_s, places)
+        turned = _about_vertical(speeds[-1])
+        seen = np.column_stack(
+            [
+                ago_s / TIME_UNIT_S,
+                (places - places[-1]) @ turned / WAY_UNIT_M,
+                speeds @ turned / SPEED_UNIT_MPS,
+            ]
+        )
+        return Window(newest.sender_ns, places[-1], speeds[-1], seen, turned)
+
+
+def _velocities(reports: list[Observed], ago_s: FloatArray, places: FloatArray) -> FloatArray:
+    """Reported velocities; where there is none, that since the report before.
+
+    The first report takes that to the next; a single report is at rest.
+    """
+    speeds = np.zeros_like(places)
+    if len(reports) > 1:
+        speeds[1:] = np.diff(places, axis=0) / np.diff(ago_s)[:, None]
+        speeds[0] = speeds[1]
+    for row, each in enumerate(reports):
+        if each.velocity_ned_mps is not None:
+            speeds[row] = each.velocity_ned_mps
+    return speeds
+
+
+def _about_vertical(velocity: FloatArray) -> FloatArray:
+    """Rotation (3, 3), local from seen, whose x is the horizontal direction of a velocity."""
+    course = math.atan2(velocity[1], velocity[0])
+    c, s = math.cos(course), math.sin(course)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

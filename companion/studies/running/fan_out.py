@@ -1,0 +1,129 @@
+"""The same work on many things at once: on this machine's cores, or on a Dask cluster.
+
+Answers come in the order of the questions, whoever was done first, so that a parallel run gives the
+same as a serial one. The first error in that order is raised, and what has not begun by then is
+given up. Processes are started anew ("spawn"), with one BLAS thread each: with as many as there are
+cores they would be in one another's way.
+
+Dask: ``distributed.Client``, its documentation; the extra ``[cluster]``. Its workers keep to one
+BLAS thread themselves (``distributed.nanny.pre-spawn-environ``), and must have this package and the
+files that are named to them.
+"""
+
+import multiprocessing
+import os
+import re
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from typing import Any, Final, TypeVar
+
+from companion.studies.running.extras import needs
+from companion.values import UserError
+
+Asked = TypeVar("Asked")
+Answer = TypeVar("Answer")
+Told = Callable[[int], None]
+"""Function that is given the number of finished pieces."""
+
+CLUSTER_ANSWERS_S: Final = 10
+ADDRESS: Final = re.compile(r"(tcp|tls)://([\w.-]+|\[[0-9a-fA-F:.]+\]):\d{1,5}")
+BLAS_THREADS: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def cores() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def on_cores(
+    work: Callable[[Asked], Answer], asked: Sequence[Asked], jobs: int, told: Told
+) -> list[Answer]:
+    """The answers, by ``jobs`` processes; ``work`` must be a function of a module."""
+    count = min(jobs, len(asked))
+    context = multiprocessing.get_context("spawn")
+    with (
+        _one_blas_thread(),
+        ProcessPoolExecutor(count, mp_context=context, initializer=_left_to_parent) as pool,
+    ):
+        futures = [pool.submit(work, each) for each in asked]
+        try:
+            return _gathered(futures, told)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _gathered(futures: "Sequence[Future[Answer]]", told: Told) -> list[Answer]:
+    """The answers in order.
+
+    The first error in order is raised as soon as it is known to be the first.
+    """
+    first = 0
+    for done, _ in enumerate(as_completed(futures), start=1):
+        told(done)
+        while first < len(futures) and futures[first].done():
+            futures[first].result()
+            first += 1
+    return [future.result() for future in futures]
+
+
+def _left_to_parent() -> None:
+    """Ignore Ctrl-C, which reaches every process of a terminal: only the parent handles it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+@contextmanager
+def _one_blas_thread() -> Iterator[None]:
+    """Context in which new processes inherit a limit of one BLAS thread."""
+    before = {name: os.environ.get(name) for name in BLAS_THREADS}
+    os.environ.update(dict.fromkeys(BLAS_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def on_cluster(
+    work: Callable[[Asked], Answer],
+    asked: Sequence[Asked],
+    address: str,
+    told: Told,
+    answers_s: float = CLUSTER_ANSWERS_S,
+) -> list[Answer]:
+    """The answers, by the workers of the Dask scheduler at an address.
+
+    Raises ``UserError`` where the address is malformed, ``distributed`` is not installed, or no
+    worker is there within ``answers_s``.
+    """
+    # Given an address that it cannot parse, the client would leave a thread that does not end.
+    if not ADDRESS.fullmatch(address):
+        raise UserError(f"--cluster {address}: not an address such as tcp://HOST:8786")
+    with needs("distributed", "cluster", "--cluster"):
+        import distributed
+    dask: Any = distributed  # typed in part
+    try:
+        client = dask.Client(address, timeout=answers_s, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise UserError(f"--cluster {address}: no scheduler answers: {error}") from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=answers_s)
+        except TimeoutError as error:
+            raise UserError(f"--cluster {address}: the scheduler has no workers") from error
+        # Not pure: the same files may hold something else another time.
+        futures = client.map(work, asked, pure=False, retries=0)
+        try:
+            for done, _ in enumerate(dask.as_completed(futures, loop=client.loop), start=1):
+                told(done)
+                wrong = [future for future in futures if future.status == "error"]
+                if wrong and all(future.done() for future in futures[: futures.index(wrong[0])]):
+                    wrong[0].result()
+            return [future.result() for future in futures]
+        finally:
+            client.cancel(futures)

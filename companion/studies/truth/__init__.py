@@ -1,0 +1,1 @@
+"""True positions of vehicles, from what logs hold of them."""

@@ -1,0 +1,128 @@
+"""True directions of UAVs from the array, for logs that hold the simulator's truth.
+
+SIM_STATE of a UAV gives its place; that of the vehicle that carries the array its place and its
+attitude. Only then is the whole of a pointing bound tested: both positions and the attitude.
+Without a SIM_STATE of the carrier its predicted pose is taken for true, and reports say so.
+"""
+
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from companion.beams import line_of_sight
+from companion.beams.array.geometry import Array
+from companion.pipeline.fold import Pipeline
+from companion.recording.reader import read_log
+from companion.settings.center import FixedCenter, VehicleCenter
+from companion.studies.truth import vehicles
+from companion.studies.truth.vehicles import SIM_STATE, Flight, Times
+from companion.tracking.geodesy import LocalFrame
+from companion.values import Carrier, FloatArray, Frame, Track
+
+SIMULATED: Final = "SIM_STATE"
+CARRIER_PREDICTED: Final = "SIM_STATE, carrier as predicted"
+
+_ATTITUDE = struct.Struct("<4f")
+"""The first fields of SIM_STATE: the quaternion w, x, y, z of ned from body."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CarrierTruth:
+    """The carrier's own trajectory, and its attitude: ned from body, seconds after ``from_ns``."""
+
+    flight: Flight
+    from_ns: int
+    ned_from_body: Slerp
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArrayTruth:
+    """The truth that a log holds, for the array of a pipeline.
+
+    kind     its name in reports
+    local    the pipeline's local frame
+    flights  flights with truth, by UAV
+    carrier  the carrier's truth; None: its pose is as predicted, which for a fixed station is
+             exact
+    """
+
+    kind: str
+    local: LocalFrame
+    flights: Mapping[str, Flight]
+    carrier: CarrierTruth | None
+
+    def directions(self, tracks: Sequence[Track], predicted: Carrier, array: Array) -> FloatArray:
+        """True unit directions (N, 3) in the array frame at the tracks' time.
+
+        NaN where not known.
+        """
+        found = np.full((len(tracks), 3), np.nan)
+        at_ns = np.array([predicted.valid_at_ns])
+        carrier = self._carrier(predicted, at_ns)
+        for i, track in enumerate(tracks):
+            flight = self.flights.get(track.uav)
+            if flight is not None:
+                placed = replace(track, position_ned_m=flight.truth.at(at_ns)[0][0])
+                found[i] = line_of_sight.directions([placed], carrier, array)[1][0]
+        return found
+
+    def _carrier(self, predicted: Carrier, at_ns: Times) -> Carrier:
+        """The carrier with the true pose in place of the predicted one.
+
+        NaN where it is not known.
+        """
+        if self.carrier is None:
+            return predicted
+        position = self.carrier.flight.truth.at(at_ns)[0][0]
+        spline = self.carrier.ned_from_body
+        at_s = np.clip((at_ns[0] - self.carrier.from_ns) * 1e-9, spline.times[0], spline.times[-1])
+        (lat_deg,), (lon_deg,), _ = self.local.geodetic(position[np.newaxis])
+        local_from_body = self.local.local_from_ned(lat_deg, lon_deg) @ spline(at_s).as_matrix()
+        return replace(predicted, position_ned_m=position, body_from_local=local_from_body.T)
+
+
+def load(log: Path, pipeline: Pipeline) -> ArrayTruth | None:
+    """The truth in a log, for the array of a pipeline; None if it holds none.
+
+    The pipeline must have had a report of a vehicle, so that its local frame exists.
+    """
+    local = pipeline.local
+    assert local is not None
+    flown = vehicles.load(log, str(FixedCenter(*local.origin)))
+    flights = {flight.uav: flight for flight in flown.flights if flight.truth.kind == SIMULATED}
+    if not isinstance(pipeline.center.place, VehicleCenter):
+        return ArrayTruth(SIMULATED, local, flights, None) if flights else None
+    own = flights.pop(str(pipeline.center.place), None)
+    if not flights:
+        return None
+    carrier = None if own is None else _carrier_truth(log, own)
+    kind = CARRIER_PREDICTED if carrier is None else SIMULATED
+    return ArrayTruth(kind, local, flights, carrier)
+
+
+def _carrier_truth(log: Path, flight: Flight) -> CarrierTruth | None:
+    """The attitudes of SIM_STATE, each as late as the reports that arrived with it.
+
+    None for too few.
+    """
+    rows = [
+        (event.t_ns, _ATTITUDE.unpack(event.payload.ljust(_ATTITUDE.size, b"\0")[:16]))
+        for event in read_log(log)
+        if isinstance(event, Frame) and event.msgid == SIM_STATE and str(event.source) == flight.uav
+    ]
+    turned = [(t_ns, quaternion) for t_ns, quaternion in rows if any(quaternion)]
+    came_ns = np.array([t_ns for t_ns, _ in turned], dtype=np.int64)
+    late_ns = flight.arrival_ns - vehicles.true_times_ns(flight.arrival_ns, flight.boot_ms)
+    made_ns = came_ns - np.interp(came_ns, flight.arrival_ns, late_ns).astype(np.int64)
+    times_ns, kept = np.unique(made_ns, return_index=True)
+    if len(times_ns) < 2:
+        return None
+    quaternions = np.array([quaternion for _, quaternion in turned])[kept]
+    rotations = Rotation.from_quat(np.roll(quaternions, -1, axis=1))
+    from_ns = int(times_ns[0])
+    return CarrierTruth(flight, from_ns, Slerp((times_ns - from_ns) * 1e-9, rotations))

@@ -1,0 +1,1 @@
+"""Design of observer gains: closed form, linear matrix inequalities, and tables of gains."""

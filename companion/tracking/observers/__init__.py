@@ -1,0 +1,1 @@
+"""The observers: one on the position model, one on the kinematic model."""

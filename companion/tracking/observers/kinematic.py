@@ -1,0 +1,205 @@
+"""The observer on the kinematic model: position and velocity measured, acceleration unknown.
+
+Per axis, over an interval T from one report to the next,
+
+    x = [p; v],   x+ = A(T) x + B(T) a,   y = x + noise,   A(T) = [1 T; 0 1]
+    x^+ = A x^ + L(T) (y - x^)
+    |p error|+ <= |a11 - l11| |e_p| + |a12 - l12| |e_v| + |l11| N_p + |l12| N_v + A T^2 / 2
+    |v error|+ <= |a21 - l21| |e_p| + |a22 - l22| |e_v| + |l21| N_p + |l22| N_v + A T
+
+The last two lines are the running bound, where A bounds the acceleration and N_p, N_v the report's
+noise. The gain is the same for every axis, so the norms of the horizontal pair, of the height and
+of all three obey it, each with its own noise. Gains come from a design with one Lyapunov function
+over a range of T (``gain_table.KinematicDesign``); the bound holds whatever they are.
+
+The same step predicts, with T the time since the report; backwards too, with |T| in the last terms.
+The greatest speed ``speed_mps`` limits the bound over long gaps. See docs/math.md 4.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from companion.tracking.design.gain_table import KinematicDesign, correction
+from companion.tracking.observers.estimates import Prediction
+from companion.values import Fix, FloatArray
+
+Gain = tuple[float, float, float, float]
+"""L row by row: l11 (1), l12 (s), l21 (1/s), l22 (1)."""
+GainSchedule = Callable[[float], Gain]
+"""Function from an interval in seconds to the gain."""
+
+
+VELOCITY_SHARE = 0.5
+"""Share of the velocity shown by a report that is believed where no velocity is reported.
+
+Over equal intervals the error then has the eigenvalues 0 and 1 - share.
+"""
+
+
+def deadbeat(interval_s: float) -> Gain:
+    """L = A(T): the report alone, carried on at its velocity, as the worst case demands."""
+    return 1.0, interval_s, 0.0, 1.0
+
+
+def scheduled(design: KinematicDesign) -> GainSchedule:
+    """L = A(T) M(T) with the design's M, held constant beyond the ends of the design's range."""
+
+    def gain(interval_s: float) -> Gain:
+        m11, m12, m21, m22 = correction(design, interval_s)
+        return m11 + interval_s * m21, m12 + interval_s * m22, m21, m22
+
+    return gain
+
+
+@dataclass(frozen=True, slots=True)
+class KinematicModel:
+    """Bounds on speed and acceleration (norms), never exceeded, and the schedule of gains."""
+
+    speed_mps: float
+    acceleration_mps2: float
+    gain: GainSchedule = deadbeat
+
+
+@dataclass(frozen=True, slots=True)
+class KinematicState:
+    """The estimate at a report's time, made before that report, its bounds, and the report.
+
+    position_ned_m, velocity_ned_mps
+                  the estimate, (3,) each, local frame
+    horizontal_m  bound on the position error in the plane
+    vertical_m    bound on the error in height
+    position_m    bound on the norm of the position error
+    velocity_mps  bound on the norm of the velocity error
+    interval_s    interval since the report before; None for the first
+    """
+
+    fix: Fix
+    position_ned_m: FloatArray
+    velocity_ned_mps: FloatArray
+    horizontal_m: float
+    vertical_m: float
+    position_m: float
+    velocity_mps: float
+    interval_s: float | None
+
+
+class KinematicObserver:
+    """The observer on the kinematic model; see ``estimates.Observer``.
+
+    Where reports have no velocity, it is estimated from the positions.
+    """
+
+    def __init__(self, model: KinematicModel) -> None:
+        self.model = model
+
+    def begin(self, fix: Fix) -> KinematicState:
+        """The state of a track with one report, which is the estimate.
+
+        Without a reported velocity the estimate is at rest, with the greatest speed as its bound.
+        """
+        velocity = fix.velocity_ned_mps
+        return KinematicState(
+            fix,
+            fix.position_ned_m,
+            fix.position_ned_m * 0.0 if velocity is None else velocity,
+            fix.noise.horizontal_m,
+            fix.noise.vertical_m,
+            fix.noise.position_m,
+            self.model.speed_mps if velocity is None else fix.noise.velocity_mps,
+            None,
+        )
+
+    def predict(self, state: KinematicState, sender_ns: int) -> Prediction:
+        """Position and velocity at a time, with their bounds."""
+        fix, noise, model = state.fix, state.fix.noise, self.model
+        t = (sender_ns - fix.sender_ns) * 1e-9
+        age = abs(t)
+        l11, l12, l21, l22 = self._gain(state, t)
+        measured = state.velocity_ned_mps if fix.velocity_ned_mps is None else fix.velocity_ned_mps
+        m11, m12, m22 = 1.0 - l11, t - l12, 1.0 - l22
+        position = (
+            m11 * state.position_ned_m
+            + m12 * state.velocity_ned_mps
+            + l11 * fix.position_ned_m
+            + l12 * measured
+        )
+        velocity = m22 * state.velocity_ned_mps + l22 * measured
+        if l21:
+            velocity = velocity + l21 * (fix.position_ned_m - state.position_ned_m)
+        drift_m = (
+            abs(m12) * state.velocity_mps
+            + abs(l12) * noise.velocity_mps
+            + model.acceleration_mps2 * age * age / 2
+        )
+        horizontal_m = abs(m11) * state.horizontal_m + abs(l11) * noise.horizontal_m + drift_m
+        vertical_m = abs(m11) * state.vertical_m + abs(l11) * noise.vertical_m + drift_m
+        bound_m = abs(m11) * state.position_m + abs(l11) * noise.position_m + drift_m
+        velocity_mps = (
+            abs(l21) * (state.position_m + noise.position_m)
+            + abs(m22) * state.velocity_mps
+            + abs(l22) * noise.velocity_mps
+            + model.acceleration_mps2 * age
+        )
+        bound_m = min(bound_m, math.hypot(horizontal_m, vertical_m))
+        found = Prediction(
+            position, velocity, bound_m, horizontal_m, vertical_m, velocity_mps, None
+        )
+        reach_m = age * model.speed_mps
+        if (
+            velocity_mps <= model.speed_mps
+            and horizontal_m <= noise.horizontal_m + reach_m
+            and vertical_m <= noise.vertical_m + reach_m
+            and bound_m <= noise.position_m + reach_m
+        ):
+            return found  # the greatest speed says no more
+        return self._limited(fix, reach_m, found)
+
+    def _gain(self, state: KinematicState, t: float) -> Gain:
+        """The scheduled gain; without a reported velocity, A(t) [1; share / interval before]."""
+        if state.fix.velocity_ned_mps is not None:
+            return self.model.gain(t)
+        if state.interval_s is None:
+            return 1.0, 0.0, 0.0, 0.0
+        rate = VELOCITY_SHARE / state.interval_s
+        return 1.0 + rate * t, 0.0, rate, 0.0
+
+    def after(self, state: KinematicState, predicted: Prediction, fix: Fix) -> KinematicState:
+        """The state at a report.
+
+        The delayed observer's estimate there does not use that report yet.
+        """
+        velocity, bound_mps = predicted.velocity_ned_mps, predicted.velocity_bound_mps
+        assert velocity is not None
+        assert bound_mps is not None
+        return KinematicState(
+            fix,
+            predicted.position_ned_m,
+            velocity,
+            predicted.horizontal_m,
+            predicted.vertical_m,
+            predicted.bound_m,
+            bound_mps,
+            (fix.sender_ns - state.fix.sender_ns) * 1e-9,
+        )
+
+    def _limited(self, fix: Fix, reach_m: float, found: Prediction) -> Prediction:
+        """The prediction with its bounds reduced to what the greatest speed allows."""
+        assert found.velocity_ned_mps is not None
+        assert found.velocity_bound_mps is not None
+        horizontal_m, vertical_m = found.horizontal_m, found.vertical_m
+        north, east, down = (found.position_ned_m - fix.position_ned_m).tolist()
+        horizontal_m = min(horizontal_m, fix.noise.horizontal_m + reach_m + math.hypot(north, east))
+        vertical_m = min(vertical_m, fix.noise.vertical_m + reach_m + abs(down))
+        moved_m = math.hypot(north, east, down)
+        bound_m = min(found.bound_m, fix.noise.position_m + reach_m + moved_m)
+        fastest_mps = self.model.speed_mps + math.hypot(*found.velocity_ned_mps.tolist())
+        return Prediction(
+            found.position_ned_m,
+            found.velocity_ned_mps,
+            min(bound_m, math.hypot(horizontal_m, vertical_m)),
+            horizontal_m,
+            vertical_m,
+            min(found.velocity_bound_mps, fastest_mps),
+            None,
+        )

@@ -1,0 +1,112 @@
+"""The unknown input observer on the position model, with gains scheduled by the real interval.
+
+Per axis, over an interval b from one report to the next,
+
+    x+ = x + b w,     y = x + d w + noise,     w the mean velocity over the interval, unknown
+    x^+ = x^ + l (y - x^),   l = l*(b, d)          (``closed_form.gain``)
+    |e+| <= |1 - l| |e| + |l d - b| W + |l| N       the running bound, exact for given W and N
+
+where W bounds the speed and N the report's noise. The same step predicts, with b the time since the
+report: the estimate at t is what the observer would hold if its next report came at t. The gain is
+the same for all axes, so norms of 3-vectors obey the same bound. See docs/math.md 2.
+
+A sender that itself leads by d has mean velocities over d and over b that differ by at most A |b -
+d| / 2, with A a bound on acceleration; N has d times that added.
+
+A sender that also reports velocity lets the feedthrough be chosen: y = p + d v leads the position
+by d, with noise  N = N_p + d (N_v + A b / 2), since the mean velocity of the interval differs from
+v by at most A b / 2. With d >= b the unknown velocity is decoupled altogether (l d = b), and what
+is left is noise and acceleration: x^+ = x^ + b v + (b / d)(p - x^). Here d =
+max(``velocity_lead_s``, b). See docs/math.md 2.6.
+
+Time is an argument, on the sender's own timeline; states are frozen values.
+"""
+
+from dataclasses import dataclass
+
+from companion.tracking.design import closed_form
+from companion.tracking.observers.estimates import Prediction
+from companion.values import Fix, FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class PositionModel:
+    """Settings of the observer.
+
+    Speed and acceleration are norms of 3-vectors that are never exceeded.
+
+        alpha            decay in (0, 1); None: the best at each interval
+        feedthrough_s    time by which the *sender* makes its reports lead (negative: lag); 0 where
+                         the time of a report is known
+        velocity_lead_s  least lead made from a reported velocity; a longer one smooths more
+    """
+
+    speed_mps: float
+    acceleration_mps2: float
+    alpha: float | None = None
+    feedthrough_s: float = 0.0
+    velocity_lead_s: float = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class PositionState:
+    """The estimate at a report's time, made before that report; its bound; and the report."""
+
+    fix: Fix
+    estimate_ned_m: FloatArray
+    bound_m: float
+
+
+class PositionObserver:
+    """The observer on the position model; see ``estimates.Observer``."""
+
+    def __init__(self, model: PositionModel) -> None:
+        self.model = model
+
+    def begin(self, fix: Fix) -> PositionState:
+        """The state of a track with one report, which is the estimate."""
+        lead_m = abs(self.model.feedthrough_s) * self.model.speed_mps
+        return PositionState(fix, fix.position_ned_m, fix.noise.position_m + lead_m)
+
+    def predict(self, state: PositionState, sender_ns: int) -> Prediction:
+        """Position at a time, with its bound; before the report's own time only the bound grows."""
+        model, fix = self.model, state.fix
+        b = (sender_ns - fix.sender_ns) * 1e-9
+        if b <= 0:
+            bound_m = state.bound_m - b * model.speed_mps
+            return self._made(state, state.estimate_ned_m, bound_m, b, 0.0)
+        d, y, noise_m = model.feedthrough_s, fix.position_ned_m, fix.noise.position_m
+        # The mean velocity of the sender's lead is not quite that of the interval.
+        noise_m += abs(d) * model.acceleration_mps2 * abs(b - d) / 2
+        if fix.velocity_ned_mps is not None:
+            lead_s = max(model.velocity_lead_s, b)
+            d += lead_s
+            y = y + lead_s * fix.velocity_ned_mps
+            noise_m += lead_s * (fix.noise.velocity_mps + model.acceleration_mps2 * b / 2)
+        alpha = closed_form.best_alpha(b, d) if model.alpha is None else model.alpha
+        gain = closed_form.gain(b, d, alpha)
+        bound_m = (
+            abs(1 - gain) * state.bound_m
+            + abs(gain * d - b) * model.speed_mps
+            + abs(gain) * noise_m
+        )
+        estimate = state.estimate_ned_m + gain * (y - state.estimate_ned_m)
+        return self._made(state, estimate, bound_m, b, closed_form.mu_star(b, d, alpha))
+
+    def after(self, _state: PositionState, predicted: Prediction, fix: Fix) -> PositionState:
+        """The state at a report.
+
+        The delayed observer's estimate there does not use that report yet.
+        """
+        return PositionState(fix, predicted.position_ned_m, predicted.bound_m)
+
+    def _made(
+        self, state: PositionState, estimate: FloatArray, bound_m: float, b: float, mu_s2: float
+    ) -> Prediction:
+        """A prediction with the reported velocity, whose bound grows with the acceleration."""
+        fix = state.fix
+        changed_mps = fix.noise.velocity_mps + self.model.acceleration_mps2 * abs(b)
+        velocity_bound_mps = None if fix.velocity_ned_mps is None else changed_mps
+        return Prediction(
+            estimate, fix.velocity_ned_mps, bound_m, bound_m, bound_m, velocity_bound_mps, mu_s2
+        )

@@ -1,0 +1,276 @@
+"""Beams as the API and ``companion weights`` show them: degrees, dB, null for unknown.
+
+Everything is computed when it is asked for, from an update that no longer changes, and may
+therefore run on any thread.
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from companion.beams import line_of_sight
+from companion.beams.aim import directions
+from companion.beams.array.geometry import Array
+from companion.beams.hardware import codebooks
+from companion.beams.worth import guarantee, link_budget, patterns
+from companion.pipeline.assembly import Equipment
+from companion.pipeline.fold import Pipeline
+from companion.values import Beam, BeamSet, FloatArray, Update
+from companion.views.words import degrees, rfc3339
+
+Json = dict[str, Any]
+
+AHEAD_S: Final = 30.0
+"""How far ahead the next beam of a codebook is looked for."""
+MOST_SAMPLES: Final = 2000
+"""Most samples of a direction over that time."""
+MOST_AT_WORST: Final = 16
+"""Most beams for which guaranteed SINRs are computed: the leakage between them grows squared."""
+
+
+def beams(
+    pipeline: Pipeline, equipment: Equipment, update: Update, age_s: float, lead_ms: float
+) -> Json:
+    """The answer of ``/v1/beams`` for one update."""
+    beam_set, array = update.beams, pipeline.array
+    boresight = None
+    if update.carrier is not None:
+        array_from_local = array.array_from_body @ update.carrier.body_from_local
+        boresight = float(np.degrees(np.arctan2(array_from_local[0, 1], array_from_local[0, 0])))
+    azimuth_width, elevation_width = _beamwidths_rad(array)
+    return {
+        "valid_at": rfc3339(beam_set.valid_at_ns),
+        "age_s": age_s,
+        "lead_ms": lead_ms,
+        "beams": _entries(pipeline, equipment, update),
+        "array": {
+            "kind": array.kind,
+            "elements": array.size,
+            "frequency_hz": pipeline.settings.array.frequency_hz,
+            "half_power_beamwidth_deg": degrees(azimuth_width),
+            "half_power_beamwidth_elevation_deg": degrees(elevation_width),
+            "boresight_bearing_deg": None if boresight is None else boresight % 360,
+        },
+        "method": str(beam_set.method),
+        "policy": str(pipeline.precoder.policy),
+        "normalisation": str(beam_set.normalisation),
+        "condition_number": beam_set.condition_number,
+        "regularised": beam_set.regularised,
+        "groups": beam_set.groups,
+        "codebook_beams": None if equipment.codebook is None else equipment.codebook.size,
+        "unfit": update.unfit,
+        "left_out": left_out(beam_set),
+    }
+
+
+@functools.lru_cache(maxsize=4)
+def _beamwidths_rad(array: Array) -> tuple[float | None, float | None]:
+    """Widths at half power of the beam along boresight, in azimuth and elevation.
+
+    Cached by array.
+    """
+    return patterns.half_power_beamwidths_rad(array, np.array([1.0, 0.0, 0.0]))
+
+
+def left_out(beam_set: BeamSet) -> list[Json]:
+    """UAVs that have no beam, with the reason."""
+    return [{"uav": out.uav, "reason": out.reason} for out in beam_set.left_out]
+
+
+def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[Json]:
+    beam_set, carrier = update.beams, update.carrier
+    if carrier is None or not beam_set.beams:
+        return []
+    array, towards = pipeline.array, directions(beam_set)
+    ranges_m = np.array([beam.range_m for beam in beam_set.beams])
+    groups = np.array([beam.group for beam in beam_set.beams])
+    sinr_db = link_budget.predicted_sinr_db(
+        array,
+        towards,
+        ranges_m,
+        beam_set.weights,
+        groups,
+        equipment.budget,
+        equipment.uav_antennas,
+    )
+    seen_locally = towards @ array.array_from_body @ carrier.body_from_local
+    bearings = np.degrees(np.arctan2(seen_locally[:, 1], seen_locally[:, 0])) % 360
+    guaranteed, guaranteed_sinr = _guaranteed_db(pipeline, equipment, update, towards)
+    turns_db = 10 * np.log10(beam_set.groups)
+    return [
+        {
+            "uav": beam.uav,
+            "azimuth_deg": degrees(beam.azimuth_rad),
+            "elevation_deg": degrees(beam.elevation_rad),
+            "range_m": beam.range_m,
+            "bearing_deg": float(bearings[i]),
+            "azimuth_rate_dps": degrees(beam.azimuth_rate_radps),
+            "elevation_rate_dps": degrees(beam.elevation_rate_radps),
+            "range_rate_mps": beam.range_rate_mps,
+            "gain_db": beam.gain_db,
+            "guaranteed_gain_db": guaranteed[i],
+            "loss_db": beam.loss_db,
+            "cost_db": beam.loss_db + turns_db,
+            "group": beam.group,
+            "widened": beam.widened,
+            "pointing_bound_deg": degrees(beam.pointing_bound_rad),
+            "guaranteed_sinr_db": guaranteed_sinr[i],
+            "sinr_db": float(sinr_db[i]) if np.isfinite(sinr_db[i]) else None,
+            "codebook": _codebook_entry(pipeline, equipment, update, beam, towards[i]),
+        }
+        for i, beam in enumerate(beam_set.beams)
+    ]
+
+
+def _guaranteed_db(
+    pipeline: Pipeline, equipment: Equipment, update: Update, towards: FloatArray
+) -> tuple[Sequence[float | None], Sequence[float | None]]:
+    """Least gain and least SINR of each beam, wherever the UAVs truly are.
+
+    None where a UAV may be out of coverage, in a null, or anywhere. The SINR is None for all where
+    there are more than ``MOST_AT_WORST`` beams.
+    """
+    array, beam_set = pipeline.array, update.beams
+    bounds = guarantee.covered_bounds(
+        array, pipeline.coverage, towards, [beam.pointing_bound_rad for beam in beam_set.beams]
+    )
+    gains_db = guarantee.guaranteed_gains_db(array, towards, bounds, beam_set.weights)
+    known = [i for i, gain_db in enumerate(gains_db) if gain_db is not None]
+    unknown: list[float | None] = [None] * len(bounds)
+    if not known or len(bounds) > MOST_AT_WORST or update.carrier is None:
+        return gains_db, unknown
+    farthest_m = {track.uav: track.bound_m + update.carrier.bound_m for track in update.tracks}
+    ranges_m = np.array([beam.range_m + farthest_m[beam.uav] for beam in beam_set.beams])
+    leaks = guarantee.leakage_bounds(
+        array, towards[known], [bounds[i] for i in known], beam_set.weights
+    )
+    sinr_db = link_budget.least_sinr_db(
+        10 ** (np.array([gains_db[i] for i in known], dtype=float) / 10),
+        leaks,
+        np.array(known),
+        ranges_m[known],
+        np.array([beam.group for beam in beam_set.beams]),
+        equipment.budget,
+        array.wavelength_m,
+        equipment.uav_antennas,
+    )
+    for i, value in zip(known, sinr_db.tolist(), strict=True):
+        unknown[i] = value
+    return gains_db, unknown
+
+
+def _codebook_entry(
+    pipeline: Pipeline, equipment: Equipment, update: Update, beam: Beam, towards: FloatArray
+) -> Json | None:
+    """Which stored beam serves a UAV, which is next and when, and which must be swept."""
+    codebook, array = equipment.codebook, pipeline.array
+    if codebook is None:
+        return None
+    (best,), gains = codebooks.best(codebook, array, towards[np.newaxis])
+    swept = codebooks.candidates(codebook, array, towards, beam.pointing_bound_rad)
+    following = _next_best(pipeline, equipment, update, beam)
+    return {
+        "best": int(best),
+        "gain_db": float(10 * np.log10(np.maximum(gains[0], 1e-20))),
+        "next": None if following is None else following.next_index,
+        "next_in_s": None if following is None else following.after_s,
+        "candidates": swept.tolist(),
+        "sweep_share": len(swept) / codebook.size,
+    }
+
+
+def _next_best(
+    pipeline: Pipeline, equipment: Equipment, update: Update, beam: Beam
+) -> codebooks.NextBest | None:
+    """The next stored beam, if the UAV flies on as it does; None where that is not known."""
+    codebook, carrier, array = equipment.codebook, update.carrier, pipeline.array
+    track = next((track for track in update.tracks if track.uav == beam.uav), None)
+    if codebook is None or carrier is None or track is None:
+        return None
+
+    def directions_at(times_s: FloatArray) -> FloatArray:
+        found = line_of_sight.directions_ahead(track, carrier, array, times_s)
+        assert found is not None
+        return found
+
+    coarse_s = np.linspace(0.0, AHEAD_S, 121)
+    path = line_of_sight.directions_ahead(track, carrier, array, coarse_s)
+    if path is None:
+        return None
+    turned = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    fastest_radps = float(turned.max()) / coarse_s[1]
+    step_s = codebooks.sampling_step_s(codebook, array, fastest_radps) or AHEAD_S
+    step_s = min(max(step_s, AHEAD_S / MOST_SAMPLES), AHEAD_S)
+    return codebooks.next_best(codebook, array, directions_at, AHEAD_S, step_s)
+
+
+def weights(beam_set: BeamSet, lead_ms: float) -> Json:
+    """The answer of ``/v1/beams/weights`` as JSON: M rows, columns in the order of ``uavs``."""
+    return {
+        "valid_at": rfc3339(beam_set.valid_at_ns),
+        "lead_ms": lead_ms,
+        "uavs": list(beam_set.uavs),
+        "groups": [beam.group for beam in beam_set.beams],
+        "method": str(beam_set.method),
+        "normalisation": str(beam_set.normalisation),
+        "condition_number": beam_set.condition_number,
+        "re": beam_set.weights.real.tolist(),
+        "im": beam_set.weights.imag.tolist(),
+    }
+
+
+def pattern(
+    pipeline: Pipeline, update: Update, cut: str, points: int, only: str | None, lead_ms: float
+) -> Json:
+    """The answer of ``/v1/pattern``: the response of each beam (or one) along a cut through it."""
+    array, beam_set = pipeline.array, update.beams
+    towards = directions(beam_set)
+    entries, angles = [], np.empty(0)
+    for i, beam in enumerate(beam_set.beams):
+        if only is not None and beam.uav != only:
+            continue
+        column = beam_set.weights[:, i]
+        if cut == "azimuth":
+            angles, response_db = patterns.azimuth_cut(array, column, beam.elevation_rad, points)
+        else:
+            angles, response_db = patterns.elevation_cut(array, column, beam.azimuth_rad, points)
+        entries.append(_pattern_entry(pipeline, beam_set, i, cut, response_db, towards))
+    return {
+        "valid_at": rfc3339(beam_set.valid_at_ns),
+        "lead_ms": lead_ms,
+        "cut": cut,
+        "method": str(beam_set.method),
+        "angles_deg": np.degrees(angles).tolist(),
+        "patterns": entries,
+    }
+
+
+def _pattern_entry(
+    pipeline: Pipeline,
+    beam_set: BeamSet,
+    i: int,
+    cut: str,
+    response_db: FloatArray,
+    towards: FloatArray,
+) -> Json:
+    beam, column = beam_set.beams[i], beam_set.weights[:, i]
+    lobe = patterns.lobe(pipeline.array, column, towards[i])
+    across = lobe.azimuth if cut == "azimuth" else lobe.elevation
+    others = [j for j, other in enumerate(beam_set.beams) if j != i and other.group == beam.group]
+    depths = patterns.null_depths_db(pipeline.array, column, lobe.peak_db, towards[others])
+    return {
+        "uav": beam.uav,
+        "at_deg": degrees(beam.elevation_rad if cut == "azimuth" else beam.azimuth_rad),
+        "target_deg": degrees(beam.azimuth_rad if cut == "azimuth" else beam.elevation_rad),
+        "response_db": response_db.tolist(),
+        "peak_azimuth_deg": degrees(lobe.peak_azimuth_rad),
+        "peak_elevation_deg": degrees(lobe.peak_elevation_rad),
+        "peak_db": lobe.peak_db,
+        "half_power_beamwidth_deg": degrees(across.half_power_width_rad),
+        "side_lobe_db": across.side_lobe_db,
+        "null_depths_db": {
+            beam_set.beams[j].uav: float(depth) for j, depth in zip(others, depths, strict=True)
+        },
+    }

@@ -1,0 +1,61 @@
+"""The newest frame of every kind from every sender, decoded only if anybody asks."""
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Final
+
+from companion.values import Frame, Source
+
+KEPT_MAX: Final = 8192
+"""Frames kept; beyond it the one heard longest ago is dropped.
+
+A flood of made-up senders must not fill the memory.
+"""
+
+
+@dataclass(slots=True)
+class Kept:
+    """The newest frame of one message from one sender, how many came, and when the first did."""
+
+    frame: Frame
+    first_ns: int
+    count: int = 1
+
+    @property
+    def frequency_hz(self) -> float | None:
+        """Mean rate; None after a single message."""
+        passed_ns = self.frame.t_ns - self.first_ns
+        return (self.count - 1) / (passed_ns * 1e-9) if passed_ns > 0 else None
+
+
+class LastMessages:
+    """The newest frames by sender and message id. ``add`` is called for every frame."""
+
+    def __init__(self, most: int = KEPT_MAX) -> None:
+        self._most = most
+        self._kept: OrderedDict[tuple[Source, int], Kept] = OrderedDict()
+
+    def add(self, frame: Frame) -> None:
+        """Keep a frame in place of the one before."""
+        key = frame.source, frame.msgid
+        kept = self._kept.get(key)
+        if kept is not None:
+            kept.frame = frame
+            kept.count += 1
+            self._kept.move_to_end(key)
+            return
+        self._kept[key] = Kept(frame, frame.t_ns)
+        if len(self._kept) > self._most:
+            self._kept.popitem(last=False)
+
+    def find(self, source: Source, msgid: int) -> Kept | None:
+        """The newest message of a kind from a sender; None if it is not known."""
+        return self._kept.get((source, msgid))
+
+    def by_sender(self) -> dict[Source, list[Kept]]:
+        """Copies of all that is kept, which another thread may read; senders and ids ascend."""
+        found: dict[Source, list[Kept]] = {}
+        for (source, _), kept in sorted(self._kept.items()):
+            copy = Kept(kept.frame, kept.first_ns, kept.count)
+            found.setdefault(source, []).append(copy)
+        return found

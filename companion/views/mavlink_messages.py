@@ -1,0 +1,108 @@
+"""Last messages in the shape that users of mavlink2rest know (github.com/mavlink/mavlink2rest).
+
+``{"message": {"type": NAME, fields…}, "status": {"time": {…}}}``. An enumeration is ``{"type":
+"MAV_…"}``, a bit mask ``{"bits": N}``, and characters come as a list. A field that is called
+``type`` is called ``mavtype``, because ``type`` is the message's name. What is not a number is
+null. ``frequency`` is null after a single message.
+
+Decoding needs pymavlink's generated dialect, which takes half a second to load on a small computer:
+``dialect`` loads it when it is first asked for, and must be called on another thread than the event
+loop's.
+"""
+
+import functools
+from collections.abc import Iterable, Iterator
+from typing import Any, Final
+
+import numpy as np
+
+from companion.values import Source
+from companion.views.last_messages import Kept
+from companion.views.words import rfc3339
+
+Json = dict[str, Any]
+_PLAIN: Final = {"char", "float", "double"}
+
+
+class Dialect:
+    """Names and fields of all messages that pymavlink knows."""
+
+    def __init__(self) -> None:
+        from pymavlink.dialects.v20 import all as generated
+
+        self._classes: Final = generated.mavlink_map
+        self._enums: Final = generated.enums
+        self._ids: Final = {kind.msgname: msgid for msgid, kind in self._classes.items()}
+
+    def msgid(self, name: str) -> int | None:
+        """The id of a message; None for a name that is not known."""
+        return self._ids.get(name)
+
+    def message(self, kept: Kept) -> Json | None:
+        """One message and its status; None for an id that is not known."""
+        kind = self._classes.get(kept.frame.msgid)
+        if kind is None:
+            return None
+        fields = {
+            "mavtype" if field == "type" else field: value
+            for field, value in self._fields(kind, kept.frame.payload)
+        }
+        return {
+            "message": {"type": kind.msgname, **fields},
+            "status": {
+                "time": {
+                    "first_update": rfc3339(kept.first_ns),
+                    "last_update": rfc3339(kept.frame.t_ns),
+                    "counter": kept.count,
+                    "frequency": kept.frequency_hz,
+                }
+            },
+        }
+
+    def _fields(self, kind: Any, payload: bytes) -> Iterator[tuple[str, Any]]:
+        """Names and values. MAVLink 2 cuts zeros off a payload, and a later dialect adds to it."""
+        size = kind.unpacker.size
+        values = iter(kind.unpacker.unpack(payload[:size].ljust(size, b"\0")))
+        types = dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
+        for field, length in zip(kind.ordered_fieldnames, kind.array_lengths, strict=True):
+            if types[field] == "char":
+                text = next(values)
+                characters = [chr(byte) for byte in text]
+                yield field, characters if length else characters[0]
+            elif length:
+                yield field, [self._value(kind, types, field, next(values)) for _ in range(length)]
+            else:
+                yield field, self._value(kind, types, field, next(values))
+
+    def _value(self, kind: Any, types: dict[str, str], field: str, value: Any) -> Any:
+        if types[field] == "float":
+            return np.float32(value)  # written with as many digits as it has
+        enum = kind.fieldenums_by_name.get(field)
+        if enum is None or types[field] in _PLAIN:
+            return value
+        if kind.fielddisplays_by_name.get(field) == "bitmask":
+            return {"bits": value}
+        entry = self._enums.get(enum, {}).get(value)
+        return {"type": value if entry is None else entry.name}
+
+
+@functools.cache
+def dialect() -> Dialect:
+    """The dialect, loaded once."""
+    return Dialect()
+
+
+def messages(kept: Iterable[Kept]) -> Json:
+    """The messages of one component, by message name."""
+    shown = (dialect().message(one) for one in kept)
+    return {one["message"]["type"]: one for one in shown if one is not None}
+
+
+def vehicles(by_sender: dict[Source, list[Kept]]) -> Json:
+    """All vehicles, their components, and the last messages of these."""
+    found: Json = {}
+    for source, kept in by_sender.items():
+        vehicle = found.setdefault(str(source.sysid), {"id": source.sysid, "components": {}})
+        component = {"id": source.compid, "messages": messages(kept)}
+        vehicle["components"][str(source.compid)] = component
+    return found

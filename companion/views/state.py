@@ -1,0 +1,263 @@
+"""The program's state as the API shows it: degrees, metres, RFC 3339 times, null for unknown."""
+
+from collections.abc import Awaitable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from companion.mavlink.clock.sender_clock import ClockEstimate
+from companion.mavlink.links.status import LinkStatus
+from companion.mavlink.voice.rate_watch import MessageRate
+from companion.pipeline.assembly import Equipment
+from companion.pipeline.fold import Pipeline
+from companion.settings.center import FixedCenter
+from companion.values import Carrier, Fix, FloatArray, Notice, Track
+from companion.views import link_state
+from companion.views.last_messages import LastMessages
+from companion.views.lateness import Lateness
+from companion.views.words import rfc3339
+
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingStatus:
+    """The recording as the API shows it.
+
+    state     "recording", "degraded" or "off"
+    file      name of the file being written
+    bytes     its size
+    messages  messages recorded so far
+    dropped   events that were not recorded
+    queued    events that wait to be written
+    lag_s     how far behind the newest written event is; None before the first
+    """
+
+    state: str
+    file: str | None
+    bytes: int
+    messages: int
+    dropped: int
+    queued: int = 0
+    lag_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayStatus:
+    """Progress of a replay.
+
+    log    name of the log
+    speed  multiple of the log's own speed; None: as fast as it goes
+    at_s   seconds of log since its first event
+    of_s   length of the log in seconds; None while it is not known
+    state  "running" or "finished"
+    """
+
+    log: str
+    speed: float | None
+    at_s: float
+    of_s: float | None
+    state: str
+
+
+class Node(Protocol):
+    """What the server reads: the running service, a replay, or a test's substitute for them.
+
+    ``replay`` returns None where the node is live.
+    """
+
+    pipeline: Pipeline
+    equipment: Equipment
+    last_messages: LastMessages
+    lateness: Lateness
+
+    def now_ns(self) -> int: ...
+    def uptime_s(self) -> float: ...
+    def links(self) -> list[LinkStatus]: ...
+    def recording(self) -> RecordingStatus: ...
+    def rates(self) -> Mapping[str, float | None]: ...
+    def unfit(self) -> list[str]: ...
+    def message_rates(self) -> list[MessageRate]: ...
+    def events(self) -> list[Notice]: ...
+    def replay(self) -> ReplayStatus | None: ...
+    def ticked(self) -> Awaitable[None]: ...
+
+
+def links(node: Node) -> Json:
+    """The answer of ``/v1/links``: who is heard over each, and the message rates asked for."""
+    now_ns = node.now_ns()
+    shown = [
+        link_state.link(item, node.pipeline.senders.link_share(item.url), now_ns)
+        | {"components": link_state.components(item, now_ns)}
+        for item in node.links()
+    ]
+    rates = [link_state.rate(rate) for rate in node.message_rates()]
+    return {"valid_at": rfc3339(now_ns), "links": shown, "message_rates": rates}
+
+
+def vector(values: FloatArray | None) -> list[float] | None:
+    """A 3-vector as a list; None stays null."""
+    return None if values is None else [float(value) for value in values]
+
+
+def status(node: Node, version: str) -> Json:
+    """The answer of ``/v1/status``."""
+    pipeline, now_ns = node.pipeline, node.now_ns()
+    recording, replay = node.recording(), node.replay()
+    return {
+        "version": version,
+        "time": rfc3339(now_ns),
+        "uptime_s": node.uptime_s(),
+        "center": center(node),
+        "links": [
+            link_state.link(item, pipeline.senders.link_share(item.url), now_ns)
+            for item in node.links()
+        ],
+        "recording": {
+            "state": recording.state,
+            "file": recording.file,
+            "bytes": recording.bytes,
+            "messages": recording.messages,
+            "dropped": recording.dropped,
+            "queued": recording.queued,
+            "lag_s": recording.lag_s,
+        },
+        "rates": dict(node.rates()),
+        "frames": pipeline.frames,
+        "updates": pipeline.updates,
+        "rejected": {str(reason): n for reason, n in sorted(pipeline.refusals.total.items())},
+        "digest": pipeline.digest.hexdigest(),
+        "replay": asdict(replay) if replay else None,
+    }
+
+
+def center(node: Node) -> Json:
+    """Position and attitude of the carrier, as far as they are known."""
+    pipeline, now_ns = node.pipeline, node.now_ns()
+    view: Json = {
+        "source": str(pipeline.center.place),
+        "fixed": isinstance(pipeline.center.place, FixedCenter),
+        "lat_deg": None,
+        "lon_deg": None,
+        "alt_m": None,
+        "heading_deg": None,
+        "attitude_deg": None,
+        "age_s": None,
+        "bound_m": None,
+        "unfit": None,
+    }
+    found = pipeline.carrier(now_ns, now_ns)
+    if isinstance(found, str):
+        return view | {"unfit": found}
+    assert pipeline.local is not None
+    lat, lon, alt = pipeline.local.geodetic(found.position_ned_m[np.newaxis])
+    roll, pitch, yaw = euler_deg(found.body_from_local)
+    return view | {
+        "lat_deg": float(lat[0]),
+        "lon_deg": float(lon[0]),
+        "alt_m": float(alt[0]),
+        "heading_deg": yaw % 360,
+        "attitude_deg": {"roll": roll, "pitch": pitch, "yaw": yaw},
+        "age_s": found.age_s,
+        "bound_m": found.bound_m,
+    }
+
+
+def euler_deg(body_from_ned: FloatArray) -> tuple[float, float, float]:
+    """Roll, pitch and yaw in degrees of a rotation (3, 3), in MAVLink's yaw-pitch-roll order."""
+    roll = np.arctan2(body_from_ned[1, 2], body_from_ned[2, 2])
+    pitch = np.arcsin(np.clip(-body_from_ned[0, 2], -1.0, 1.0))
+    yaw = np.arctan2(body_from_ned[0, 1], body_from_ned[0, 0])
+    return float(np.degrees(roll)), float(np.degrees(pitch)), float(np.degrees(yaw))
+
+
+def uavs(node: Node, only: str | None = None) -> list[Json]:
+    """Every UAV, or one, as it is now."""
+    pipeline, now_ns = node.pipeline, node.now_ns()
+    tracks = [
+        track for track in pipeline.tracks(now_ns, now_ns) if only is None or track.uav == only
+    ]
+    if not tracks or pipeline.local is None:
+        return []
+    found = pipeline.carrier(now_ns, now_ns)
+    carrier = None if isinstance(found, str) else found
+    places = np.array([track.position_ned_m for track in tracks])
+    geodetic = zip(*pipeline.local.geodetic(places), strict=True)
+    return [
+        uav(pipeline, track, carrier, tuple(map(float, place)))
+        for track, place in zip(tracks, geodetic, strict=True)
+    ]
+
+
+def uav(
+    pipeline: Pipeline, track: Track, carrier: Carrier | None, place: tuple[float, ...]
+) -> Json:
+    """One entry of ``/v1/uavs``; ``place`` is latitude, longitude and height."""
+    offset = None if carrier is None else track.position_ned_m - carrier.position_ned_m
+    north, east, down = (None, None, None) if offset is None else map(float, offset)
+    velocity = vector(track.velocity_ned_mps)
+    refused = pipeline.refusals.of(track.uav)
+    newest = pipeline.fleet.newest(track.uav)
+    return {
+        "id": track.uav,
+        "state": str(track.state),
+        "target": pipeline.targets.wants(track.uav),
+        "same_as": pipeline.targets.same_as(track.uav),
+        "callsign": pipeline.senders.aircraft.callsign(track.uav),
+        "relays": [str(relay) for relay in pipeline.senders.aircraft.relays(track.uav)],
+        "altitude_datum": str(newest.report.alt_datum) if newest else None,
+        "fix": None if newest is None else fix(newest),
+        "valid_at": rfc3339(track.valid_at_ns),
+        "age_s": track.age_s,
+        "lat_deg": place[0],
+        "lon_deg": place[1],
+        "alt_m": place[2],
+        "north_m": north,
+        "east_m": east,
+        "down_m": down,
+        "velocity_ned_mps": velocity,
+        "speed_mps": None if velocity is None else float(np.linalg.norm(velocity)),
+        "heading_deg": newest.report.heading_deg if newest else None,
+        "unknown_input_mps": vector(track.unknown_input_mps),
+        "acceleration_ned_mps2": vector(track.acceleration_ned_mps2),
+        "bound_m": track.bound_m,
+        "bound_ellipsoid_ned_m": [track.horizontal_bound_m] * 2 + [track.vertical_bound_m],
+        "clock_bound_s": track.clock_bound_s,
+        "clock": clock(pipeline.clock_estimate(track.uav)),
+        "dt_s": track.dt_s,
+        "latency_s": track.latency_s,
+        "gamma": track.gamma,
+        "innovation_m": track.innovation_m,
+        "reports": track.reports,
+        "rejected": {str(reason): count for reason, count in sorted(refused.counts.items())},
+        "recent_rejections": [
+            {"at": rfc3339(one.t_ns), "reason": str(one.reason), "detail": one.detail}
+            for one in refused.recent
+        ],
+    }
+
+
+def fix(newest: Fix) -> Json:
+    """The last reported position of a UAV."""
+    report = newest.report
+    return {
+        "at": rfc3339(newest.t_ns),
+        "lat_deg": report.lat_deg,
+        "lon_deg": report.lon_deg,
+        "alt_m": report.alt_m,
+    }
+
+
+def clock(estimate: ClockEstimate | None) -> Json | None:
+    """The state of a sender's clock; null for ADS-B traffic, which has none."""
+    if estimate is None:
+        return None
+    return {
+        "kind": str(estimate.kind),
+        "offset_s": estimate.offset_ns * 1e-9,
+        "drift_ppm": estimate.drift_ppm,
+        "uncertainty_s": estimate.uncertainty_s,
+        "constant_delay_s": estimate.constant_delay_s,
+        "latency_s": estimate.latency_s,
+    }

@@ -1,0 +1,221 @@
+"""Requested faults: the values of ``--fault``. Pure.
+
+A fault is written ``NAME=VALUE``, or ``NAME@SYSID=VALUE`` and ``NAME@SYSID:COMPID=VALUE`` for the
+frames of one system or component alone. ``KINDS`` holds all of them, in the order in which they are
+applied, whatever the order in which they are given. ``traffic`` applies them.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple, Self
+
+from companion.values import Source, UserError
+
+Sender = tuple[int, int]
+"""System and component id."""
+
+
+class FaultError(UserError):
+    """A request for a fault that is not possible.
+
+    The message is one line: what was written, what is allowed.
+    """
+
+
+class Bound(NamedTuple):
+    """One number of a fault's value.
+
+    letter     its letter in the help
+    low, high  its limits, both allowed
+    default    its value where it is left out; None: it is required
+    whole      it must be a whole number
+    """
+
+    letter: str
+    low: float
+    high: float
+    default: float | None = None
+    whole: bool = False
+
+    def read(self, text: str) -> float:
+        """The number in ``text``. Raises ``FaultError`` where it is not within the limits."""
+        try:
+            number = float(text)
+        except ValueError:
+            number = math.nan
+        if self.low <= number <= self.high and not (self.whole and number % 1.0):
+            return number
+        kind = "a whole number, " if self.whole else ""
+        raise FaultError(f"{self.letter} is {text!r}, allowed: {kind}{self.low:g} to {self.high:g}")
+
+
+class Kind(NamedTuple):
+    """A kind of fault. ``is_event``: it may be given several times."""
+
+    name: str
+    bounds: tuple[Bound, ...]
+    meaning: str
+    example: str
+    is_event: bool = False
+
+    @property
+    def form(self) -> str:
+        """Its written form, such as ``glitch=T:M[:N]``."""
+        letters = [bound.letter for bound in self.bounds if bound.default is None]
+        optional = [f"[:{bound.letter}]" for bound in self.bounds if bound.default is not None]
+        return f"{self.name}={':'.join(letters)}{''.join(optional)}"
+
+
+_SHARE: Final = Bound("P", 0.0, 1.0)
+_FROM: Final = Bound("T", 0.0, 1e6)
+
+KINDS: Final = {
+    kind.name: kind
+    for kind in (
+        Kind(
+            "drift",
+            (Bound("PPM", -500_000.0, 500_000.0),),
+            "boot clocks run fast by PPM millionths, or slow if negative: time_boot_ms",
+            "drift=-24000",
+        ),
+        Kind(
+            "reboot",
+            (_FROM,),
+            "at T s boot clocks (time_boot_ms) and sequence numbers start again at 0",
+            "reboot=20",
+            is_event=True,
+        ),
+        Kind(
+            "frozen",
+            (_FROM, Bound("S", 0.0, 1e6)),
+            "from T s on, for S s, GLOBAL_POSITION_INT repeats the position before",
+            "frozen@3:1=20:5",
+            is_event=True,
+        ),
+        Kind(
+            "glitch",
+            (_FROM, Bound("M", 0.0, 100_000.0), Bound("N", 1.0, 1e6, default=1.0, whole=True)),
+            "from T s on, N reports (1) of GLOBAL_POSITION_INT are M metres beside the place",
+            "glitch=30:25:4",
+            is_event=True,
+        ),
+        Kind("loss", (_SHARE,), "a frame is lost with probability P", "loss=0.1"),
+        Kind(
+            "duplication",
+            (_SHARE,),
+            "with probability P it comes again, 0 to 0.2 s later",
+            "duplication=0.5",
+        ),
+        Kind("delay", (Bound("S", 0.0, 600.0),), "every frame is late by S s", "delay=0.3"),
+        Kind(
+            "jitter",
+            (Bound("S", 0.0, 60.0),),
+            "and by a random time, exponential with mean S s; a sender's frames keep"
+            " their order, so those behind a later one wait",
+            "jitter=0.05",
+        ),
+        Kind(
+            "burst",
+            (Bound("P", 0.0, 0.95), Bound("S", 0.001, 600.0)),
+            "the link is shut for S s at a time, on average a share P of all time; what"
+            " would come meanwhile comes at once when it opens",
+            "burst=0.3:2",
+        ),
+        Kind(
+            "reordering",
+            (_SHARE,),
+            "with probability P a frame is overtaken by those 0 to 0.2 s behind",
+            "reordering=0.1",
+        ),
+        Kind(
+            "bit-errors",
+            (Bound("P", 0.0, 0.5),),
+            "every bit is inverted with probability P",
+            "bit-errors=1e-5",
+        ),
+        Kind("truncation", (_SHARE,), "with probability P a frame is cut short", "truncation=0.01"),
+        Kind(
+            "garbage",
+            (_SHARE,),
+            "with probability P, 1 to 64 random bytes come before a frame",
+            "garbage=0.01",
+        ),
+    )
+}
+"""All kinds of faults by name, in the order in which they are applied."""
+
+_ORDER: Final = {name: place for place, name in enumerate(KINDS)}
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One fault: its name, its numbers, and whose frames it concerns (None: everybody's)."""
+
+    name: str
+    values: tuple[float, ...]
+    sysid: int | None = None
+    compid: int | None = None
+
+    def __str__(self) -> str:
+        """The name and whose frames, as they were written: ``frozen@3:1``."""
+        system = "" if self.sysid is None else f"@{self.sysid}"
+        return f"{self.name}{system}" + ("" if self.compid is None else f":{self.compid}")
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Read a fault.
+
+        Raises ``FaultError``, which says what is wrong with it and what is allowed.
+        """
+        left, _, value = text.partition("=")
+        name, at, system = left.partition("@")
+        kind = KINDS.get(name)
+        if kind is None:
+            raise FaultError(f"{text!r}: {name!r} is none of {', '.join(KINDS)}")
+        numbers = value.split(":")
+        required = sum(bound.default is None for bound in kind.bounds)
+        if not required <= len(numbers) <= len(kind.bounds):
+            raise FaultError(f"{text!r} is not {kind.form}, as in {kind.example}")
+        try:
+            sysid, compid = _system(system) if at else (None, None)
+            given = [
+                bound.read(number) for bound, number in zip(kind.bounds, numbers, strict=False)
+            ]
+        except FaultError as error:
+            raise FaultError(f"{text!r}: {error}, as in {kind.example}") from None
+        defaults = [b.default for b in kind.bounds[len(given) :] if b.default is not None]
+        return cls(name, (*given, *defaults), sysid, compid)
+
+    def concerns(self, sender: Sender) -> bool:
+        """Whether the fault concerns the frames of this system and component."""
+        if self.sysid is None:
+            return True
+        return self.sysid == sender[0] and self.compid in (None, sender[1])
+
+
+def in_order(faults: Sequence[Fault]) -> list[Fault]:
+    """The faults in the order in which they are applied.
+
+    Raises ``FaultError`` where one that is no event is given twice for the same frames.
+    """
+    given = Counter(str(fault) for fault in faults if not KINDS[fault.name].is_event)
+    for label, times in given.items():
+        if times > 1:
+            raise FaultError(f"{label} is given {times} times, allowed: once for the same system")
+    whose = ((_ORDER[f.name], f.sysid or 0, f.compid or 0, f.values) for f in faults)
+    return [fault for _, fault in sorted(zip(whose, faults, strict=True), key=lambda pair: pair[0])]
+
+
+def described() -> str:
+    """All faults for a help text, one paragraph each, in the order of application."""
+    return "\n\n".join(f"{k.form}: {k.meaning}. As in {k.example}" for k in KINDS.values())
+
+
+def _system(text: str) -> tuple[int, int | None]:
+    try:
+        source = Source.parse(text if ":" in text else f"{text}:0")
+    except ValueError:
+        raise FaultError(f"{text!r} is not SYSID or SYSID:COMPID, each 0 to 255") from None
+    return source.sysid, source.compid if ":" in text else None

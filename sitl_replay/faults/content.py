@@ -1,0 +1,210 @@
+"""Faults of the senders themselves: frames are rewritten, with a right checksum. Pure.
+
+Field offsets are those of https://mavlink.io/en/messages/common.html in the order of the wire
+(https://mavlink.io/en/guide/serialization.html: by size, the largest first; trailing zeros of a
+MAVLink 2 payload are cut). A frame that a fault leaves as it is keeps its very bytes. A signed
+frame that is rewritten loses its signature: whoever changes a frame on the way has no key.
+"""
+
+import random
+import struct
+from typing import Final
+
+import pymap3d
+from fastcrc import crc16
+
+from companion.mavlink.wire.crc_extra import CRC_EXTRA
+from companion.mavlink.wire.framing import MAGIC_V2, SIGNED
+from sitl_replay.faults.asked import Sender
+
+GLOBAL_POSITION_INT: Final = 33
+
+# fmt: off
+TIME_BOOT_MS_AT: Final[dict[int, int]] = {
+    2: 8, 26: 0, 29: 0, 30: 0, 31: 0, 32: 0, 33: 0, 34: 0, 35: 0, 65: 0, 81: 0, 82: 0, 83: 0,
+    84: 0, 85: 0, 86: 0, 87: 0, 89: 0, 116: 0, 129: 0, 132: 0, 137: 0, 143: 0, 251: 0, 252: 0,
+    254: 0, 257: 0, 259: 0, 260: 0, 261: 0, 262: 0, 263: 8, 264: 24, 265: 0, 271: 0, 277: 0,
+    280: 0, 281: 0, 283: 8, 285: 0, 376: 0, 11037: 0, 11038: 0, 11060: 0, 60040: 0, 60050: 0,
+    60051: 0, 60052: 0, 60053: 0,
+}
+# fmt: on
+"""Offset in a message's payload of ``time_boot_ms``, milliseconds since boot, 32 bits."""
+
+_POSITION_AT: Final = 4
+_POSITION: Final = struct.Struct("<iiii")  # lat, lon (degE7), alt, relative_alt (mm)
+_WRAP_MS: Final = 1 << 32
+
+
+def msgid_of(raw: bytes) -> int:
+    """The message id of a MAVLink 1 or 2 frame."""
+    return int.from_bytes(raw[7:10], "little") if raw[0] == MAGIC_V2 else raw[5]
+
+
+def sender_of(raw: bytes) -> Sender:
+    """The sender of a MAVLink 1 or 2 frame."""
+    return (raw[5], raw[6]) if raw[0] == MAGIC_V2 else (raw[3], raw[4])
+
+
+def seq_of(raw: bytes) -> int:
+    """The sequence number of a MAVLink 1 or 2 frame."""
+    return raw[4] if raw[0] == MAGIC_V2 else raw[2]
+
+
+def payload_of(raw: bytes, size: int) -> bytes:
+    """The first ``size`` bytes of the payload; zeros that MAVLink 2 has cut are put back.
+
+    Shorter where a MAVLink 1 frame, which cuts nothing, is shorter.
+    """
+    if raw[0] != MAGIC_V2:
+        return raw[6 : 6 + min(raw[1], size)]
+    return raw[10 : 10 + raw[1]].ljust(size, b"\0")[:size]
+
+
+def rewritten(raw: bytes, at: int = 0, field: bytes = b"", seq: int | None = None) -> bytes:
+    """The frame with ``field`` at offset ``at`` of its payload, and ``seq`` (None: as it is).
+
+    Its checksum is computed anew and a signature removed. The frame is returned as it is where that
+    changes nothing, where the message is not known (there is no checksum for it), and where a
+    MAVLink 1 payload does not reach that far.
+    """
+    stop = at + len(field)
+    before, msgid = payload_of(raw, stop), msgid_of(raw)
+    seq = seq_of(raw) if seq is None else seq
+    unchanged = before[at:] == field and seq == seq_of(raw)
+    if unchanged or len(before) < stop or msgid not in CRC_EXTRA:
+        return raw
+    if raw[0] == MAGIC_V2:
+        payload = before[:at] + field + raw[10 + stop : 10 + raw[1]]
+        payload = payload[:1] + payload[1:].rstrip(b"\0")  # the first byte is never cut
+        head = bytes([len(payload), raw[2] & ~SIGNED, raw[3], seq]) + raw[5:10]
+    else:
+        payload = before[:at] + field + raw[6 + stop : 6 + raw[1]]
+        head = bytes([len(payload), seq]) + raw[3:6]
+    checksum = crc16.mcrf4xx(head + payload + bytes([CRC_EXTRA[msgid]]))
+    return raw[:1] + head + payload + checksum.to_bytes(2, "little")
+
+
+def boot_ms_of(raw: bytes) -> int | None:
+    """``time_boot_ms`` of a frame; None where its message has none."""
+    at = TIME_BOOT_MS_AT.get(msgid_of(raw))
+    if at is None:
+        return None
+    field = payload_of(raw, at + 4)[at:]
+    return int.from_bytes(field, "little") if len(field) == 4 else None
+
+
+def with_boot_ms(raw: bytes, boot_ms: int) -> bytes:
+    """The frame with another ``time_boot_ms``, modulo 2³². Only for a message that has one."""
+    return rewritten(
+        raw, TIME_BOOT_MS_AT[msgid_of(raw)], (boot_ms % _WRAP_MS).to_bytes(4, "little")
+    )
+
+
+class Drift:
+    """Makes the boot clock run fast by ``ppm`` millionths since its boot (negative: slow)."""
+
+    def __init__(self, ppm: float) -> None:
+        self._ppm = ppm
+
+    def __call__(self, t_s: float, raw: bytes) -> bytes:
+        """The frame as its sender sends it at ``t_s``."""
+        boot_ms = boot_ms_of(raw)
+        return (
+            raw
+            if boot_ms is None
+            else with_boot_ms(raw, boot_ms + round(boot_ms * self._ppm / 1e6))
+        )
+
+
+class Reboot:
+    """Sets every sender's boot clock to 0 at ``at_s``; its next frame has sequence number 0.
+
+    The time of the reboot on a sender's own clock is told by its first stamp from then on, as if
+    that had arrived at once. A frame with an older stamp is late, of the boot before: its stamp
+    stays.
+    """
+
+    def __init__(self, at_s: float) -> None:
+        self._at_s = at_s
+        self._first_seq: dict[Sender, int] = {}
+        self._booted_ms: dict[Sender, int] = {}
+
+    def __call__(self, t_s: float, raw: bytes) -> bytes:
+        """The frame as its sender sends it at ``t_s``."""
+        if t_s < self._at_s:
+            return raw
+        sender, boot_ms = sender_of(raw), boot_ms_of(raw)
+        seq = (seq_of(raw) - self._first_seq.setdefault(sender, seq_of(raw))) % 256
+        raw = rewritten(raw, seq=seq)
+        if boot_ms is None:
+            return raw
+        since_ms = round((t_s - self._at_s) * 1000)
+        booted_ms = self._booted_ms.setdefault(sender, max(0, boot_ms - since_ms))
+        return with_boot_ms(raw, boot_ms - booted_ms) if boot_ms >= booted_ms else raw
+
+
+class Frozen:
+    """Makes GLOBAL_POSITION_INT repeat a sender's last position, from ``at_s`` for ``lasts_s``.
+
+    Latitude, longitude and both altitudes are repeated; stamps go on, and velocity and heading are
+    as they are. Where a sender has reported none before ``at_s``, its first one from then on is
+    repeated.
+    """
+
+    def __init__(self, at_s: float, lasts_s: float) -> None:
+        self._at_s = at_s
+        self._end_s = at_s + lasts_s
+        self._positions: dict[Sender, bytes] = {}
+
+    def __call__(self, t_s: float, raw: bytes) -> bytes:
+        """The frame as its sender sends it at ``t_s``."""
+        if t_s >= self._end_s or (position := _position_of(raw)) is None:
+            return raw
+        if t_s < self._at_s:
+            self._positions[sender_of(raw)] = position
+            return raw
+        return rewritten(raw, _POSITION_AT, self._positions.setdefault(sender_of(raw), position))
+
+
+class Glitch:
+    """Puts ``reports`` GLOBAL_POSITION_INT of each sender ``metres`` off, from ``at_s`` on.
+
+    The offset is along the ground, in a direction that ``seed`` and the sender's ids decide, the
+    same for all of them; the altitudes are as they are.
+    """
+
+    def __init__(self, at_s: float, metres: float, reports: int, seed: str) -> None:
+        self._at_s = at_s
+        self._metres = metres
+        self._reports = reports
+        self._seed = seed
+        self._done: dict[Sender, int] = {}
+
+    def __call__(self, t_s: float, raw: bytes) -> bytes:
+        """The frame as its sender sends it at ``t_s``."""
+        if t_s < self._at_s or (position := _position_of(raw)) is None:
+            return raw
+        sender = sender_of(raw)
+        self._done[sender] = done = self._done.get(sender, 0) + 1
+        if done > self._reports:
+            return raw
+        return rewritten(raw, _POSITION_AT, self._beside(position, sender))
+
+    def _beside(self, position: bytes, sender: Sender) -> bytes:
+        lat_e7, lon_e7, *altitudes_mm = _POSITION.unpack(position)
+        bearing_deg = random.Random(f"{self._seed} {sender}").uniform(0.0, 360.0)
+        lat_deg, lon_deg, _ = pymap3d.aer2geodetic(
+            bearing_deg, 0.0, self._metres, lat_e7 / 1e7, lon_e7 / 1e7, 0.0
+        )
+        return _POSITION.pack(round(lat_deg * 1e7), round(lon_deg * 1e7), *altitudes_mm)
+
+
+ContentFault = Drift | Reboot | Frozen | Glitch
+
+
+def _position_of(raw: bytes) -> bytes | None:
+    """The position fields of a GLOBAL_POSITION_INT as on the wire; None for other messages."""
+    if msgid_of(raw) != GLOBAL_POSITION_INT:
+        return None
+    field = payload_of(raw, _POSITION_AT + _POSITION.size)[_POSITION_AT:]
+    return field if len(field) == _POSITION.size else None

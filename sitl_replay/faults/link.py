@@ -1,0 +1,180 @@
+"""Faults of one link: frames lost, late, doubled, reordered, damaged. Pure.
+
+Each fault has a random stream of its own: what is lost does not depend on what else is given. A
+fault with a larger share also hits all the frames that it hits with a smaller one.
+"""
+
+import math
+import random
+from bisect import bisect_right
+from typing import Final
+
+from sitl_replay.faults.asked import Sender
+
+WITHIN_S: Final = 0.2
+"""Longest time by which a duplicate, or a frame that others overtake, comes later."""
+LONGEST_JITTER: Final = 10.0
+"""Multiple of the mean at which exponential draws are cut (1 in 22 000 is)."""
+MOST_GARBAGE_BYTES: Final = 64
+_NEVER: Final = 1 << 60
+
+
+class Loss:
+    """Loses a frame with probability ``share``."""
+
+    def __init__(self, rng: random.Random, share: float) -> None:
+        self._rng = rng
+        self._share = share
+
+    def loses(self) -> bool:
+        """Whether the next frame is lost."""
+        return self._rng.random() < self._share
+
+
+class Duplication:
+    """Doubles a frame with probability ``share``: it comes again 0 to 0.2 s later."""
+
+    def __init__(self, rng: random.Random, share: float) -> None:
+        self._rng = rng
+        self._share = share
+
+    def lag_s(self) -> float | None:
+        """How long after the next frame its copy comes; None where there is none."""
+        chance, lag_s = self._rng.random(), self._rng.uniform(0.0, WITHIN_S)
+        return lag_s if chance < self._share else None
+
+
+class Delay:
+    """Delays every frame by ``delay_s``."""
+
+    def __init__(self, delay_s: float) -> None:
+        self._delay_s = delay_s
+
+    def release_s(self, now_s: float, t_s: float, sender: Sender) -> float:
+        """When a frame goes on that came to the link at ``now_s`` and to this stage at ``t_s``."""
+        return t_s + self._delay_s
+
+
+class Jitter:
+    """Delays every frame by a random time, exponential with mean ``mean_s``.
+
+    The frames of one sender keep their order: one behind a later one waits for it. Where a sender's
+    frames are closer than ``mean_s``, most are therefore later than that: at r frames a second
+    about mean_s·ln(r·mean_s / ln 2) in the median, spread as before.
+    """
+
+    def __init__(self, rng: random.Random, mean_s: float) -> None:
+        self._rng = rng
+        self._mean_s = mean_s
+        self._last_s: dict[Sender, float] = {}
+
+    def release_s(self, now_s: float, t_s: float, sender: Sender) -> float:
+        """When a frame goes on that came to the link at ``now_s`` and to this stage at ``t_s``."""
+        late_s = self._mean_s * min(self._rng.expovariate(1.0), LONGEST_JITTER)
+        released_s = max(t_s + late_s, self._last_s.get(sender, t_s))
+        self._last_s[sender] = released_s
+        return released_s
+
+
+class Burst:
+    """Shuts the link for ``shut_s`` at a time, on average a share ``share`` of all time.
+
+    It starts open; how long it is open is exponential. What would come while it is shut comes all
+    at once when it opens, in order. Times asked for may step back, not behind ``now_s``.
+    """
+
+    def __init__(self, rng: random.Random, share: float, shut_s: float) -> None:
+        self._rng = rng
+        self._shut_s = shut_s
+        self._open_s = shut_s * (1.0 - share) / share if share else math.inf
+        self._shuts_s: list[float] = []
+        self._next_s = self._opening_s()
+
+    def release_s(self, now_s: float, t_s: float, sender: Sender) -> float:
+        """When a frame goes on that came to the link at ``now_s`` and to this stage at ``t_s``."""
+        while self._shuts_s and self._shuts_s[0] + self._shut_s <= now_s:
+            del self._shuts_s[0]
+        while self._next_s <= t_s:
+            self._shuts_s.append(self._next_s)
+            self._next_s += self._shut_s + self._opening_s()
+        at = bisect_right(self._shuts_s, t_s) - 1
+        return t_s if at < 0 else max(t_s, self._shuts_s[at] + self._shut_s)
+
+    def _opening_s(self) -> float:
+        return self._open_s * self._rng.expovariate(1.0) if self._open_s < math.inf else math.inf
+
+
+class Reordering:
+    """Holds a frame 0 to 0.2 s with probability ``share``, while what follows overtakes it."""
+
+    def __init__(self, rng: random.Random, share: float) -> None:
+        self._rng = rng
+        self._share = share
+
+    def release_s(self, now_s: float, t_s: float, sender: Sender) -> float:
+        """When a frame goes on that came to the link at ``now_s`` and to this stage at ``t_s``."""
+        chance, held_s = self._rng.random(), self._rng.uniform(0.0, WITHIN_S)
+        return t_s + held_s if chance < self._share else t_s
+
+
+class BitErrors:
+    """Inverts every bit with probability ``rate``, independently."""
+
+    def __init__(self, rng: random.Random, rate: float) -> None:
+        self._rng = rng
+        self._rate = rate
+        self._good_bits = self._run()
+
+    def damaged(self, raw: bytes) -> bytes:
+        """The bytes as they arrive."""
+        bits = 8 * len(raw)
+        if self._good_bits >= bits:
+            self._good_bits -= bits
+            return raw
+        out, at = bytearray(raw), self._good_bits
+        while at < bits:
+            out[at // 8] ^= 1 << at % 8
+            at += 1 + self._run()
+        self._good_bits = at - bits
+        return bytes(out)
+
+    def _run(self) -> int:
+        """Number of good bits before the next bad one, drawn from a geometric distribution."""
+        if self._rate == 0.0:
+            return _NEVER
+        bits = math.log(1.0 - self._rng.random()) / math.log1p(-self._rate)
+        return math.floor(min(bits, _NEVER))
+
+
+class Truncation:
+    """Cuts a frame short with probability ``share``: 1 byte to all but one are left of it."""
+
+    def __init__(self, rng: random.Random, share: float) -> None:
+        self._rng = rng
+        self._share = share
+
+    def damaged(self, raw: bytes) -> bytes:
+        """The bytes as they arrive."""
+        chance, place = self._rng.random(), self._rng.random()
+        return raw[: 1 + int(place * (len(raw) - 1))] if chance < self._share else raw
+
+
+class Garbage:
+    """Puts 1 to 64 random bytes just before a frame with probability ``share``."""
+
+    def __init__(self, rng: random.Random, share: float) -> None:
+        self._rng = rng
+        self._share = share
+
+    def noise(self) -> bytes:
+        """The bytes that come before the next frame; often none."""
+        chance, key = self._rng.random(), self._rng.random()
+        if chance >= self._share:
+            return b""
+        noise = random.Random(key)
+        return noise.randbytes(noise.randint(1, MOST_GARBAGE_BYTES))
+
+
+Timing = Delay | Jitter | Burst | Reordering
+Damage = BitErrors | Truncation
+LinkFault = Loss | Duplication | Timing | Damage | Garbage

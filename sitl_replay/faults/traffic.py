@@ -1,0 +1,180 @@
+"""Applies the requested faults to a stream of frames. Pure.
+
+Time is seconds since the start of the stream. First come the faults of the senders themselves
+(``Senders``), the same on every link, since a UAV cannot be frozen on one link only. Then, on every
+link by itself with random streams of its own (``Network``): what is lost and what comes twice, then
+when it comes, then what is damaged. The same faults, seed and frames give the same bytes at the
+same times.
+"""
+
+import heapq
+import math
+import random
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from typing import Final, NamedTuple
+
+from sitl_replay.faults.asked import Fault, FaultError, Sender, in_order
+from sitl_replay.faults.content import ContentFault, Drift, Frozen, Glitch, Reboot, sender_of
+from sitl_replay.faults.link import (
+    BitErrors,
+    Burst,
+    Delay,
+    Duplication,
+    Garbage,
+    Jitter,
+    LinkFault,
+    Loss,
+    Reordering,
+    Truncation,
+)
+
+HELD_MAX: Final = 100_000
+"""Frames on their way at most, over all links; further ones are lost."""
+OVERFLOW: Final = "overflow"
+"""Name under which those lost frames are counted."""
+CONTENT: Final = frozenset(("drift", "reboot", "frozen", "glitch"))
+"""Faults of the senders themselves."""
+
+
+class Senders:
+    """Applies the senders' faults to all frames, in the order of sending.
+
+    ``touched`` counts the frames that each fault has changed.
+    """
+
+    def __init__(self, faults: Sequence[Fault], seed: int, touched: Counter[str]) -> None:
+        chosen = [fault for fault in in_order(faults) if fault.name in CONTENT]
+        self._faults = [(fault, _content(fault, seed)) for fault in chosen]
+        self._touched = touched
+        touched.update({str(fault): 0 for fault in chosen})
+
+    def altered(self, t_s: float, raw: bytes) -> bytes:
+        """The frame as its sender sends it at ``t_s``."""
+        for fault, effect in self._faults:
+            if fault.concerns(sender_of(raw)):
+                before, raw = raw, effect(t_s, raw)
+                self._touched[str(fault)] += raw is not before
+        return raw
+
+
+class Delivery(NamedTuple):
+    """Bytes that come out of a link at a time. ``place`` orders those of equal times."""
+
+    t_s: float
+    place: int
+    link: int
+    raw: bytes
+
+
+class Network:
+    """Applies the links' faults to all frames, in the order of sending; each link has its own luck.
+
+    ``touched`` counts, over all links, the frames that each fault has lost, doubled, made late or
+    damaged. Times must not step back.
+    """
+
+    def __init__(
+        self, faults: Sequence[Fault], links: int, seed: int, touched: Counter[str]
+    ) -> None:
+        chosen = [fault for fault in in_order(faults) if fault.name not in CONTENT]
+        self._links = [_Link(chosen, f"{seed} {link}", touched) for link in range(links)]
+        self._touched = touched
+        self._held: list[Delivery] = []
+        self._count = 0
+        touched.update({str(fault): 0 for fault in chosen})
+
+    def take(self, t_s: float, raw: bytes) -> None:
+        """Send a frame over all links at ``t_s``."""
+        for number, link in enumerate(self._links):
+            for released_s, arriving in link.carry(t_s, raw):
+                if len(self._held) >= HELD_MAX:
+                    self._touched[OVERFLOW] += 1
+                    continue
+                self._count += 1
+                heapq.heappush(self._held, Delivery(released_s, self._count, number, arriving))
+
+    def due(self, until_s: float = math.inf) -> Iterator[Delivery]:
+        """Take out what arrives up to and at ``until_s``, in order of time."""
+        while self._held and self._held[0].t_s <= until_s:
+            yield heapq.heappop(self._held)
+
+
+class _Link:
+    """One link's faults by their stages, each with the frames that it concerns."""
+
+    def __init__(self, faults: Sequence[Fault], seed: str, touched: Counter[str]) -> None:
+        effects = [(fault, _on_link(fault, random.Random(f"{seed} {fault}"))) for fault in faults]
+        self._touched = touched
+        self._loss = [(f, e) for f, e in effects if isinstance(e, Loss)]
+        self._doubling = [(f, e) for f, e in effects if isinstance(e, Duplication)]
+        self._timing = [
+            (f, e) for f, e in effects if isinstance(e, Delay | Jitter | Burst | Reordering)
+        ]
+        self._damage = [(f, e) for f, e in effects if isinstance(e, BitErrors | Truncation)]
+        self._garbage = [(f, e) for f, e in effects if isinstance(e, Garbage)]
+
+    def carry(self, now_s: float, raw: bytes) -> Iterator[tuple[float, bytes]]:
+        """What arrives of a frame sent at ``now_s``, and when."""
+        sender = sender_of(raw)
+        for fault, loss in self._loss:
+            if fault.concerns(sender) and loss.loses():
+                self._touched[str(fault)] += 1
+                return
+        times_s = [self._released_s(now_s, sender)]
+        for fault, doubling in self._doubling:
+            if fault.concerns(sender) and (lag_s := doubling.lag_s()) is not None:
+                self._touched[str(fault)] += 1
+                times_s.append(times_s[0] + lag_s)
+        for t_s in times_s:
+            yield from ((t_s, piece) for piece in self._damaged(raw, sender))
+
+    def _released_s(self, now_s: float, sender: Sender) -> float:
+        t_s = now_s
+        for fault, timing in self._timing:
+            if fault.concerns(sender):
+                before_s, t_s = t_s, timing.release_s(now_s, t_s, sender)
+                self._touched[str(fault)] += t_s > before_s
+        return t_s
+
+    def _damaged(self, raw: bytes, sender: Sender) -> Iterator[bytes]:
+        for fault, garbage in self._garbage:
+            if fault.concerns(sender) and (noise := garbage.noise()):
+                self._touched[str(fault)] += 1
+                yield noise
+        for fault, damage in self._damage:
+            if fault.concerns(sender):
+                before, raw = raw, damage.damaged(raw)
+                self._touched[str(fault)] += raw != before
+        yield raw
+
+
+def _content(fault: Fault, seed: int) -> ContentFault:
+    match fault.name, fault.values:
+        case "drift", (ppm,):
+            return Drift(ppm)
+        case "reboot", (at_s,):
+            return Reboot(at_s)
+        case "frozen", (at_s, lasts_s):
+            return Frozen(at_s, lasts_s)
+        case "glitch", (at_s, metres, reports):
+            return Glitch(at_s, metres, int(reports), f"{seed} {fault} {at_s}")
+    raise FaultError(f"{fault} with {len(fault.values)} numbers is none of a sender's")
+
+
+_WITH_LUCK: Final[dict[str, Callable[..., LinkFault]]] = {
+    "loss": Loss,
+    "duplication": Duplication,
+    "jitter": Jitter,
+    "burst": Burst,
+    "reordering": Reordering,
+    "bit-errors": BitErrors,
+    "truncation": Truncation,
+    "garbage": Garbage,
+}
+
+
+def _on_link(fault: Fault, rng: random.Random) -> LinkFault:
+    if fault.name == "delay":
+        return Delay(*fault.values)
+    return _WITH_LUCK[fault.name](rng, *fault.values)

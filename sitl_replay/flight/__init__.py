@@ -1,0 +1,1 @@
+"""Scenarios: who flies where and sends what, as pure functions of time."""

@@ -1,0 +1,71 @@
+"""Attitudes that fit a path: how a multirotor leans, how a fixed wing banks."""
+
+import math
+from dataclasses import dataclass
+
+from sitl_replay.flight.motion import GRAVITY_MPS2, Path, Pose, body_rates
+
+
+@dataclass(frozen=True, slots=True)
+class Leaning:
+    """Attitude of a multirotor: its thrust, along its vertical axis, makes the acceleration.
+
+    Thrust per mass is a − g. Source: R. Mahony, V. Kumar, P. Corke, "Multirotor aerial vehicles",
+    IEEE Robotics & Automation Magazine 19(3), 2012 (there: differential flatness). Drag is left
+    out.
+    """
+
+    path: Path
+
+    def __call__(self, t_s: float) -> Pose:
+        """Roll and pitch by the thrust, yaw by the path's heading."""
+        now = self.path(t_s)
+        north, east, down = now.acceleration_ned_mps2
+        north_rate, east_rate, down_rate = now.jerk_ned_mps3
+        yaw, yaw_rate = now.heading_rad, now.heading_rate_radps
+        cosine, sine = math.cos(yaw), math.sin(yaw)
+        # Thrust in the level frame that turns with the nose, and its rate there.
+        ahead, right, below = (
+            north * cosine + east * sine, east * cosine - north * sine, down - GRAVITY_MPS2
+        )  # fmt: skip
+        ahead_rate = north_rate * cosine + east_rate * sine + yaw_rate * right
+        right_rate = east_rate * cosine - north_rate * sine - yaw_rate * ahead
+        upright = math.hypot(ahead, below)
+        upright_rate = (ahead * ahead_rate + below * down_rate) / upright
+        roll, pitch = math.atan2(right, upright), math.atan2(-ahead, -below)
+        roll_rate = (upright * right_rate - right * upright_rate) / (upright**2 + right**2)
+        pitch_rate = (below * ahead_rate - ahead * down_rate) / upright**2
+        rates = body_rates(roll, pitch, (roll_rate, pitch_rate, yaw_rate))
+        return Pose(roll, pitch, math.remainder(yaw, math.tau), *rates)
+
+
+@dataclass(frozen=True, slots=True)
+class Banked:
+    """Attitude of a fixed wing in level, coordinated flight: tan(bank) = airspeed · turn rate / g.
+
+    The nose points along the velocity through the air, the path's less the mean wind (m/s north and
+    east, the direction to which it blows), so it crabs; the turn rate is the nose's. ``pitch_rad``
+    is the angle of attack. Source: the coordinated turn, e.g. R. Beard, T. McLain, Small Unmanned
+    Aircraft, section 5.2.
+    """
+
+    path: Path
+    wind_ne_mps: tuple[float, float]
+    pitch_rad: float
+
+    def __call__(self, t_s: float) -> Pose:
+        """Roll by the turn, yaw by the nose."""
+        now = self.path(t_s)
+        north = now.velocity_ned_mps[0] - self.wind_ne_mps[0]
+        east = now.velocity_ned_mps[1] - self.wind_ne_mps[1]
+        a_north, a_east, _ = now.acceleration_ned_mps2
+        j_north, j_east, _ = now.jerk_ned_mps3
+        airspeed = math.hypot(north, east)
+        sideways = (north * a_east - east * a_north) / airspeed
+        ahead = (north * a_north + east * a_east) / airspeed
+        sideways_rate = (north * j_east - east * j_north - sideways * ahead) / airspeed
+        roll = math.atan2(sideways, GRAVITY_MPS2)
+        roll_rate = sideways_rate * GRAVITY_MPS2 / (GRAVITY_MPS2**2 + sideways**2)
+        yaw = math.atan2(east, north)
+        rates = body_rates(roll, self.pitch_rad, (roll_rate, 0.0, sideways / airspeed))
+        return Pose(roll, self.pitch_rad, yaw, *rates)

@@ -1,0 +1,345 @@
+"""Paths: tours of waypoints, racetracks, orbits, and swings in bearing about the carrier.
+
+Each gives position, velocity, acceleration and jerk in closed form (the roll into a racetrack's
+turn by a quadrature that is exact to rounding), so that attitudes and their rates follow exactly.
+
+Over 300 lines: it is a list, a path a class, in closed form.
+"""
+
+import math
+from bisect import bisect_right
+from dataclasses import dataclass, field
+from itertools import accumulate
+from typing import Final, NamedTuple, Self
+
+import numpy as np
+
+from sitl_replay.flight.motion import Kinematics, Vector
+
+STEEPEST_RAMP: Final = 1.875
+"""Largest slope of ``Ramp.value``: a ramp to v in T takes an acceleration of 1.875 v / T."""
+
+_nodes, _weights = np.polynomial.legendre.leggauss(8)
+# Gauss–Legendre on 0 to 1, of order 15: a roll turns through half a radian or so.
+_QUADRATURE: Final = tuple(
+    (float(node + 1.0) / 2.0, float(weight) / 2.0)
+    for node, weight in zip(_nodes, _weights, strict=True)
+)
+
+
+class Ramp(NamedTuple):
+    """A smooth step from 0 to 1 over x from 0 to 1, with its integral and two derivatives.
+
+    The minimum-jerk polynomial 10x³ − 15x⁴ + 6x⁵ (T. Flash, N. Hogan, J. Neurosci. 5, 1985), here
+    for a speed or a turn rate.
+    """
+
+    integral: float
+    value: float
+    slope: float
+    curvature: float
+
+    @classmethod
+    def at(cls, x: float) -> Self:
+        """The step at ``x``, which is 0 to 1."""
+        cubed = x * x * x
+        return cls(
+            cubed * x * (2.5 - 3.0 * x + x * x),
+            cubed * (10.0 - 15.0 * x + 6.0 * x * x),
+            30.0 * (x * (1.0 - x)) ** 2,
+            60.0 * x * (1.0 - x) * (1.0 - 2.0 * x),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """A straight line from stop to stop, then a stand in which the nose turns to the next one.
+
+    Speed ramps up to ``speed_mps`` within ``ramp_s``, stays and ramps down.
+    """
+
+    start_ned_m: Vector
+    direction: Vector
+    length_m: float
+    speed_mps: float
+    ramp_s: float
+    heading_rad: float
+    turn_rad: float
+    stand_s: float
+
+    @property
+    def moving_s(self) -> float:
+        return self.length_m / self.speed_mps + self.ramp_s
+
+    @property
+    def duration_s(self) -> float:
+        return self.moving_s + self.stand_s
+
+    def at(self, t_s: float) -> Kinematics:
+        """The point ``t_s`` seconds after the start of the leg."""
+        along, speed, acceleration, jerk = self._progress(min(t_s, self.moving_s))
+        turned = Ramp.at(max(0.0, t_s - self.moving_s) / self.stand_s)
+        north, east, down = self.direction
+        start = self.start_ned_m
+        return Kinematics(
+            (start[0] + north * along, start[1] + east * along, start[2] + down * along),
+            (north * speed, east * speed, down * speed),
+            (north * acceleration, east * acceleration, down * acceleration),
+            (north * jerk, east * jerk, down * jerk),
+            self.heading_rad + self.turn_rad * turned.value,
+            self.turn_rad * turned.slope / self.stand_s,
+        )
+
+    def _progress(self, t_s: float) -> tuple[float, float, float, float]:
+        """Metres along the leg, and three derivatives. The end is the start played backwards."""
+        if t_s > self.moving_s / 2.0:
+            left, speed, acceleration, jerk = self._progress(self.moving_s - t_s)
+            return self.length_m - left, speed, -acceleration, jerk
+        speed, ramp_s = self.speed_mps, self.ramp_s
+        if t_s >= ramp_s:
+            return speed * (t_s - ramp_s / 2.0), speed, 0.0, 0.0
+        ramp = Ramp.at(t_s / ramp_s)
+        return (
+            speed * ramp_s * ramp.integral,
+            speed * ramp.value,
+            speed * ramp.slope / ramp_s,
+            speed * ramp.curvature / ramp_s**2,
+        )
+
+
+class Limits(NamedTuple):
+    """Limits of a multirotor: speed along the leg, climb, acceleration."""
+
+    speed_mps: float
+    climb_mps: float
+    acceleration_mps2: float
+
+
+@dataclass(frozen=True, slots=True)
+class Tour:
+    """A closed round of waypoints, with a stop at each. ``ends_s``: when each leg is over."""
+
+    legs: tuple[Leg, ...]
+    ends_s: tuple[float, ...]
+    offset_s: float
+
+    @classmethod
+    def over(
+        cls, waypoints: tuple[Vector, ...], limits: Limits, stand_s: float, offset_s: float
+    ) -> Self:
+        """A tour through ``waypoints`` (NED metres, none straight above the next) and back.
+
+        ``offset_s`` is how long it has been flying at time 0.
+        """
+        after = (*waypoints[1:], waypoints[0])
+        hops = [
+            tuple(b - a for a, b in zip(here, there, strict=True))
+            for here, there in zip(waypoints, after, strict=True)
+        ]
+        headings_rad = [math.atan2(hop[1], hop[0]) for hop in hops]
+        legs = []
+        for index, (start, (north, east, down)) in enumerate(zip(waypoints, hops, strict=True)):
+            length_m = math.hypot(north, east, down)
+            speed_mps = min(
+                limits.speed_mps,
+                limits.climb_mps * length_m / max(abs(down), 1e-9),
+                # So fast that the two ramps fill the leg.
+                math.sqrt(length_m * limits.acceleration_mps2 / STEEPEST_RAMP),
+            )
+            next_rad = headings_rad[(index + 1) % len(hops)]
+            legs.append(
+                Leg(
+                    start,
+                    (north / length_m, east / length_m, down / length_m),
+                    length_m,
+                    speed_mps,
+                    STEEPEST_RAMP * speed_mps / limits.acceleration_mps2,
+                    headings_rad[index],
+                    math.remainder(next_rad - headings_rad[index], math.tau),
+                    stand_s,
+                )
+            )
+        return cls(tuple(legs), tuple(accumulate(leg.duration_s for leg in legs)), offset_s)
+
+    def __call__(self, t_s: float) -> Kinematics:
+        """The point at a time of the scenario; the tour goes on for ever."""
+        into_s = (t_s + self.offset_s) % self.ends_s[-1]
+        index = min(bisect_right(self.ends_s, into_s), len(self.legs) - 1)
+        leg = self.legs[index]
+        return leg.at(into_s - (self.ends_s[index] - leg.duration_s))
+
+
+@dataclass(frozen=True, slots=True)
+class Racetrack:
+    """A stadium at one height and one ground speed: two straights, two half turns clockwise.
+
+    The turn rate ramps up to speed / radius within ``roll_s`` and back, as an aircraft rolls in and
+    out.
+
+        axis_rad  course of the first straight
+        offset_s  how long it has been flying at time 0
+        across_m  computed: how far apart the straights are
+    """
+
+    centre_ned_m: Vector
+    axis_rad: float
+    straight_m: float
+    speed_mps: float
+    radius_m: float
+    roll_s: float
+    offset_s: float
+    across_m: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        # Twice as far as half a turn leads across.
+        _, across = self._rolled_in(self.roll_s)
+        course = self.speed_mps / self.radius_m * self.roll_s / 2.0
+        object.__setattr__(self, "across_m", 2.0 * (across + self.radius_m * math.cos(course)))
+
+    @property
+    def turn_s(self) -> float:
+        """Time of a half turn, rolling in and out included."""
+        return math.pi * self.radius_m / self.speed_mps + self.roll_s
+
+    @property
+    def lap_s(self) -> float:
+        return 2.0 * (self.straight_m / self.speed_mps + self.turn_s)
+
+    def __call__(self, t_s: float) -> Kinematics:
+        """The point at a time of the scenario.
+
+        The second half of a lap mirrors the first in the centre.
+        """
+        into_s = (t_s + self.offset_s) % self.lap_s
+        back = into_s >= self.lap_s / 2.0
+        into_s -= self.lap_s / 2.0 if back else 0.0
+        turning_s = into_s - self.straight_m / self.speed_mps
+        along, across, course, rate, growth = self.speed_mps * into_s, 0.0, 0.0, 0.0, 0.0
+        if turning_s >= 0.0:
+            along, across, course, rate, growth = self._turn(turning_s)
+            along += self.straight_m
+        along -= self.straight_m / 2.0
+        across -= self.across_m / 2.0
+        axis = self.axis_rad + (math.pi if back else 0.0)
+        cosine, sine = math.cos(axis), math.sin(axis)
+        north, east, down = self.centre_ned_m
+        position = (
+            north + along * cosine - across * sine,
+            east + along * sine + across * cosine,
+            down,
+        )
+        return _steered(position, self.speed_mps, axis + course, rate, growth)
+
+    def _turn(self, t_s: float) -> tuple[float, float, float, float, float]:
+        """Metres along and across since the start of the turn; course, its rate, and the rate's.
+
+        The second half of a turn is the first one backwards, seen from the other side.
+        """
+        if t_s > self.turn_s / 2.0:
+            along, across, course, rate, growth = self._turn(max(0.0, self.turn_s - t_s))
+            return along, self.across_m - across, math.pi - course, rate, -growth
+        full_radps = self.speed_mps / self.radius_m
+        ramp = Ramp.at(min(t_s / self.roll_s, 1.0))
+        along, across = self._rolled_in(min(t_s, self.roll_s))
+        course = full_radps * self.roll_s * ramp.integral
+        if t_s < self.roll_s:
+            growth = full_radps * ramp.slope / self.roll_s
+            return along, across, course, full_radps * ramp.value, growth
+        turned = course + full_radps * (t_s - self.roll_s)
+        along += self.radius_m * (math.sin(turned) - math.sin(course))
+        across += self.radius_m * (math.cos(course) - math.cos(turned))
+        return along, across, turned, full_radps, 0.0
+
+    def _rolled_in(self, t_s: float) -> tuple[float, float]:
+        """Metres along and across after ``t_s`` of rolling in."""
+        reach_rad = self.speed_mps / self.radius_m * self.roll_s
+        along = across = 0.0
+        for node, weight in _QUADRATURE:
+            course = reach_rad * Ramp.at(node * t_s / self.roll_s).integral
+            along += weight * math.cos(course)
+            across += weight * math.sin(course)
+        return self.speed_mps * t_s * along, self.speed_mps * t_s * across
+
+
+@dataclass(frozen=True, slots=True)
+class Orbit:
+    """A circle about a point at one height, the nose along the course.
+
+    Positive rates turn clockwise, negative ones turn left. ``phase_rad`` is the bearing from the
+    centre at time 0.
+    """
+
+    centre_ned_m: Vector
+    radius_m: float
+    rate_radps: float
+    phase_rad: float
+
+    def __call__(self, t_s: float) -> Kinematics:
+        """The point at a time of the scenario."""
+        bearing = self.phase_rad + self.rate_radps * t_s
+        north, east, down = self.centre_ned_m
+        position = (
+            north + self.radius_m * math.cos(bearing),
+            east + self.radius_m * math.sin(bearing),
+            down,
+        )
+        course = bearing + math.copysign(math.pi / 2.0, self.rate_radps)
+        return _steered(
+            position, self.radius_m * abs(self.rate_radps), course, self.rate_radps, 0.0
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Swing:
+    """A swing on an arc about the carrier: azimuth + amplitude sin(ωt + φ), radians from north.
+
+    Range is horizontal. The nose points away from the carrier at the middle of the arc.
+    """
+
+    range_m: float
+    height_m: float
+    azimuth_rad: float
+    amplitude_rad: float
+    omega_radps: float
+    phase_rad: float
+
+    def __call__(self, t_s: float) -> Kinematics:
+        """The point at a time of the scenario."""
+        angle = self.omega_radps * t_s + self.phase_rad
+        swing, omega = self.amplitude_rad, self.omega_radps
+        azimuth = self.azimuth_rad + swing * math.sin(angle)
+        rate = swing * omega * math.cos(angle)
+        growth = -swing * omega**2 * math.sin(angle)
+        third = -swing * omega**3 * math.cos(angle)
+        cosine, sine, range_m = math.cos(azimuth), math.sin(azimuth), self.range_m
+
+        def turned(outward: float, clockwise: float) -> Vector:
+            return (
+                range_m * (outward * cosine - clockwise * sine),
+                range_m * (outward * sine + clockwise * cosine),
+                0.0,
+            )
+
+        return Kinematics(
+            (range_m * cosine, range_m * sine, -self.height_m),
+            turned(0.0, rate),
+            turned(-(rate**2), growth),
+            turned(-3.0 * rate * growth, third - rate**3),
+            self.azimuth_rad,
+            0.0,
+        )
+
+
+def _steered(
+    position: Vector, speed: float, course: float, rate: float, growth: float
+) -> Kinematics:
+    """Level flight at one speed along ``course``; ``growth`` is the derivative of its rate."""
+    cosine, sine = speed * math.cos(course), speed * math.sin(course)
+    return Kinematics(
+        position,
+        (cosine, sine, 0.0),
+        (-rate * sine, rate * cosine, 0.0),
+        (-growth * sine - rate**2 * cosine, growth * cosine - rate**2 * sine, 0.0),
+        course,
+        rate,
+    )

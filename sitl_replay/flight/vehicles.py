@@ -1,0 +1,116 @@
+"""A scenario as MAVLink 2: what each vehicle sends, and when.
+
+Pure: the schedule is a function of the scenario, a seed and the Unix time of its start. A message
+is sampled at a whole millisecond, so that its stamp is exactly when its contents are true, and sent
+up to ``JITTER_S`` later, as by an autopilot's scheduler.
+"""
+
+import heapq
+import itertools
+import math
+import random
+from collections.abc import Iterator
+from functools import partial
+from typing import NamedTuple
+
+from companion.mavlink.wire.encode import pack
+from companion.tracking.geodesy import LocalFrame
+from sitl_replay.flight.fleet import Scenario, Vehicle
+from sitl_replay.flight.payloads import (
+    Builder,
+    Sample,
+    adsb_vehicle,
+    attitude,
+    global_position_int,
+    gps_raw_int,
+    heartbeat,
+    system_time,
+)
+from sitl_replay.flight.relay import Aircraft, relayed
+
+JITTER_S = 0.005
+
+
+class Transmission(NamedTuple):
+    """One frame: when it is sent (seconds since the start), by whom, and its bytes."""
+
+    t_s: float
+    vehicle: Vehicle
+    raw: bytes
+
+
+def schedule(
+    scenario: Scenario,
+    seed: int = 0,
+    epoch_ns: int = 0,
+    duration_s: float | None = None,
+) -> Iterator[Transmission]:
+    """Every frame of the scenario in the order of sending; without end if ``duration_s`` is None.
+
+    ``epoch_ns`` is the Unix time at the start. The same arguments give the same bytes; another seed
+    starts the timers in other phases and with other jitter. Each vehicle counts its own sequence
+    numbers, also where several send under one id.
+    """
+    local = LocalFrame(*scenario.origin)
+    vehicles = scenario.vehicles
+    sequence = [0] * len(vehicles)
+    timers = list(_timers(vehicles, seed))
+    due = [next(timer) for _, timer in timers]
+    # Of two at one time the timer that was made first comes first.
+    waiting = [(first.send_s, number) for number, first in enumerate(due)]
+    heapq.heapify(waiting)
+    while True:
+        send_s, number = waiting[0]
+        if duration_s is not None and send_s >= duration_s:
+            return
+        who, timer = timers[number]
+        vehicle = vehicles[who]
+        _, sample_s, build = due[number]
+        since_start_ms = math.floor(sample_s * 1000)
+        sample = Sample(
+            local,
+            scenario.home_alt_m,
+            vehicle,
+            t_s=since_start_ms / 1000,
+            boot_ms=vehicle.uptime_ms + since_start_ms,
+            unix_us=epoch_ns // 1000 + since_start_ms * 1000,
+        )
+        yield Transmission(send_s, vehicle, pack(build(sample), sequence[who]))
+        sequence[who] = (sequence[who] + 1) % 256
+        due[number] = following = next(timer)
+        heapq.heapreplace(waiting, (following.send_s, number))
+
+
+class _Due(NamedTuple):
+    send_s: float
+    sample_s: float
+    build: Builder
+
+
+def _timers(vehicles: tuple[Vehicle, ...], seed: int) -> Iterator[tuple[int, Iterator[_Due]]]:
+    """Every timer, and the index in ``vehicles`` of its vehicle."""
+    for who, vehicle in enumerate(vehicles):
+        for build, interval_s in (
+            (heartbeat, vehicle.heartbeat_interval_s),
+            (global_position_int, vehicle.report_interval_s),
+            (attitude, vehicle.attitude_interval_s),
+            (gps_raw_int, vehicle.gnss_interval_s),
+            (system_time, vehicle.clock_interval_s),
+        ):
+            yield who, _timer(vehicle, build, interval_s, seed)
+        for aircraft in vehicle.hears:
+            yield who, _relay(vehicle, aircraft, seed)
+
+
+def _timer(vehicle: Vehicle, build: Builder, interval_s: float, seed: int) -> Iterator[_Due]:
+    # A generator for each timer: one vehicle more does not change what the others send.
+    rng = random.Random(f"{seed} {vehicle.name} {build.__name__}")
+    phase_s = rng.uniform(0.0, interval_s)
+    for count in itertools.count():
+        sample_s = phase_s + count * interval_s
+        yield _Due(sample_s + rng.uniform(0.0, JITTER_S), sample_s, build)
+
+
+def _relay(vehicle: Vehicle, aircraft: Aircraft, seed: int) -> Iterator[_Due]:
+    for told in relayed(aircraft, vehicle.name, seed):
+        yield _Due(told.t_s, told.t_s, partial(adsb_vehicle, told=told))

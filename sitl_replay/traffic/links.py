@@ -1,0 +1,165 @@
+"""Links of the generator: one end of ``companion.mavlink.links`` each, held open for one run.
+
+udpout:HOST:PORT      one datagram per frame, to one peer
+udpin:HOST:PORT       to everybody who has sent something here, as to a vehicle's own port
+tcp:HOST:PORT         connect, once
+tcpin:HOST:PORT       serve everybody who connects, from then on, as SITL does
+serial:DEVICE:BAUD    a serial port
+
+A peer that is lost is not tried again. Sending never waits for a peer that is behind: a frame that
+it does not take is dropped and counted. Who would rather wait asks ``writable`` before.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Collection, Hashable
+from typing import Final
+
+from companion.mavlink.links import transport
+from companion.mavlink.links.endpoints import HungUpError, Upcalls, reason
+from companion.mavlink.links.status import LinkStatus
+from companion.mavlink.links.urls import LinkError, LinkUrl
+
+PEERS_MAX: Final = 256
+"""Peers of a listening UDP link; the one unheard for longest is forgotten."""
+LINGER_S: Final = 1.0
+"""How long closing waits for what is buffered to be sent."""
+FULL: Final = 0.5
+"""Share of a peer's buffer from which on ``writable`` waits."""
+RETRY_S: Final = 1.0
+"""Time from the loss of a route to the next attempt; datagrams until then are dropped."""
+_ROOM_POLL_S: Final = 0.001
+_FIRST_PEER_POLL_S: Final = 0.01
+
+Receive = Callable[[Hashable, bytes], None]
+"""Function called with the sender (one key per peer) and its bytes; ``b""`` when it has left."""
+
+
+def ignore(_peer: Hashable, _data: bytes) -> None:
+    """Discard what a peer sends."""
+
+
+class TrafficLink:
+    """A link that frames are sent to and heard from; made by ``open_link``.
+
+    url      the link, with the port that the system chose where it was asked to choose one
+    lost     why the peer is gone for good; empty while it is there, or while another may come
+    broken   whether it is gone by a failure, rather than because it closed the link in good order
+    dropped  frames not sent, because a peer does not take them fast enough or there is none
+    serving  done when nothing more can come
+    """
+
+    def __init__(self, url: LinkUrl, receive: Receive) -> None:
+        self.url = url
+        self.lost = ""
+        self.broken = False
+        self.dropped = 0
+        self.serving: asyncio.Task[None]
+        self._receive = receive
+        self._up = asyncio.Event()
+        self._heard: dict[Hashable, None] = {}  # the one heard last comes last
+        upcalls = Upcalls(self._up.set, self._take, self._hang_up, lambda _: None)
+        self._endpoint = transport.endpoint(url, LinkStatus(str(url)), upcalls)
+
+    async def open(self) -> None:
+        """Claim the address, connect or open. Raises ``LinkError`` where that is not possible."""
+        try:
+            port = self._endpoint.open()
+        except OSError as error:
+            raise LinkError(f"{self.url}: {reason(error)}") from error
+        if port is not None:
+            self.url = LinkUrl(self.url.scheme, self.url.host, port)
+        self.serving = asyncio.create_task(self._serve())
+        up = asyncio.create_task(self._up.wait())
+        try:
+            await asyncio.wait({self.serving, up}, return_when=asyncio.FIRST_COMPLETED)
+        except asyncio.CancelledError:
+            self.serving.cancel()
+            raise
+        finally:
+            up.cancel()
+        if not self._up.is_set():
+            self.serving.result()
+            raise LinkError(f"{self.url}: {self.lost}")
+
+    async def _serve(self) -> None:
+        while True:
+            try:
+                await self._endpoint.serve()
+            except OSError as error:
+                # A datagram may find its way again; a stream that has ended has ended.
+                if self.url.scheme != "udpout" or not self._up.is_set():
+                    self.lost = reason(error)
+                    self.broken = not isinstance(error, HungUpError)
+                    return
+            await asyncio.sleep(RETRY_S)
+
+    def peers(self) -> Collection[Hashable]:
+        """Everybody to whom a frame goes."""
+        peers = self._endpoint.peers()
+        return tuple(self._heard) if peers is None else peers
+
+    async def somebody(self) -> None:
+        """Wait until there is somebody to send to, or the peer is lost."""
+        while not self.peers() and not self.serving.done():
+            await asyncio.sleep(_FIRST_PEER_POLL_S)
+
+    def send(self, raw: bytes) -> None:
+        """Send one frame to everybody, or drop it. Never waits, never raises."""
+        if self.serving.done():
+            return
+        peers = self.peers()
+        self.dropped += not peers
+        for key in peers:
+            self.dropped += not self._endpoint.write(key, raw)
+
+    def knock(self) -> None:
+        """Send an empty datagram, so that a peer that answers only to senders knows of this one.
+
+        Does nothing on other links than ``udpout``.
+        """
+        if self.url.scheme == "udpout":
+            self._endpoint.write(None, b"")
+
+    async def writable(self) -> None:
+        """Wait until somebody is there and all who are take a frame, or the peer is lost."""
+        await self.somebody()
+        while self._fullest() > FULL:
+            await asyncio.sleep(_ROOM_POLL_S)
+            await self.somebody()
+
+    async def close(self) -> None:
+        """Send what is buffered, within a second, and close.
+
+        Raises what a fault of the program has ended it with.
+        """
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(LINGER_S):
+                while self._fullest() > 0.0:
+                    await asyncio.sleep(_ROOM_POLL_S)
+        self.serving.cancel()
+        await asyncio.wait({self.serving})
+        if not self.serving.cancelled():
+            self.serving.result()
+
+    def _fullest(self) -> float:
+        return max((self._endpoint.fullness(key) for key in self.peers()), default=0.0)
+
+    def _take(self, key: Hashable, data: bytes) -> None:
+        if self.url.scheme == "udpin":
+            self._heard.pop(key, None)
+            self._heard[key] = None
+            if len(self._heard) > PEERS_MAX:
+                del self._heard[next(iter(self._heard))]
+        if data:
+            self._receive(key, data)
+
+    def _hang_up(self, key: Hashable) -> None:
+        self._receive(key, b"")
+
+
+async def open_link(url: LinkUrl, receive: Receive = ignore) -> TrafficLink:
+    """Open a link. Raises ``LinkError`` where that is not possible."""
+    link = TrafficLink(url, receive)
+    await link.open()
+    return link

@@ -1,0 +1,244 @@
+"""Sends a schedule or a log over links, in real time or as fast as it goes."""
+
+import asyncio
+import contextlib
+import logging
+import math
+import time
+from collections import Counter
+from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from companion.mavlink.links.urls import LinkError, LinkUrl, parse_link
+from companion.values import Frame
+from sitl_replay.faults.asked import Fault
+from sitl_replay.faults.content import msgid_of
+from sitl_replay.faults.traffic import Delivery, Network, Senders
+from sitl_replay.flight.scenario import Scenario
+from sitl_replay.flight.vehicles import schedule
+from sitl_replay.traffic.links import TrafficLink, open_link
+from sitl_replay.traffic.recorder import TlogWriter
+
+log = logging.getLogger(__name__)
+
+MAX_STEP_NS = 5_000_000_000
+# Frames sent without a pause when behind, or at full speed, before others get their turn.
+BATCH = 32
+
+
+@dataclass(slots=True)
+class Tally:
+    """What has been sent so far; kept up to date while it runs.
+
+    frames      frames, each counted once, however many links it goes to and whatever becomes of
+                it
+    octets      their bytes
+    dropped     over all links: frames that a slow peer did not take, or that came to a link
+                with nobody there
+    clamped     time stamps of a log that step back or leap
+    duration_s  how long it ran
+    messages    frames by message id
+    rejected    what else of a log was not usable, by reason
+    faults      over all links: frames touched by each requested fault
+    lost        links whose peer went away, with the reason
+    """
+
+    frames: int = 0
+    octets: int = 0
+    dropped: int = 0
+    clamped: int = 0
+    duration_s: float = 0.0
+    messages: Counter[int] = field(default_factory=Counter)
+    rejected: Counter[str] = field(default_factory=Counter)
+    faults: Counter[str] = field(default_factory=Counter)
+    lost: list[str] = field(default_factory=list)
+
+    def count(self, raw: bytes) -> None:
+        """Count one frame."""
+        self.frames += 1
+        self.octets += len(raw)
+        self.messages[msgid_of(raw)] += 1
+
+
+def message_name(known: int) -> str:
+    """The name of a message id; ``UNKNOWN_`` and the id where the dialect has none."""
+    message = dialect.mavlink_map.get(known)
+    return str(message.msgname) if message else f"UNKNOWN_{known}"
+
+
+async def fly(
+    scenario: Scenario,
+    links: Sequence[str],
+    duration_s: float | None = None,
+    seed: int = 0,
+    record: Path | None = None,
+    *,
+    faults: Sequence[Fault] = (),
+    tally: Tally | None = None,
+) -> Tally:
+    """Fly a scenario over ``links`` (see ``links``), until ``duration_s`` or cancelled.
+
+        scenario    the scenario
+        links       URLs of the links
+        duration_s  how long; None: until cancelled
+        seed        of what is left to chance
+        record      a tlog that gets every frame as its sender sends it, with the time at which it
+                    was due: with the faults of senders, not with those of links
+        faults      faults of the traffic
+        tally       may be given to watch the count, or to have it after a cancellation
+
+    It begins when every link that listens has its first peer. Links and tlog are closed in any
+    case. Raises ``LinkError`` for a bad URL, for a link that cannot be opened, or when every peer
+    is gone; ``FaultError`` for faults that do not go together; ``OSError`` where the tlog cannot be
+    written.
+    """
+    tally = Tally() if tally is None else tally
+    senders = Senders(faults, seed, tally.faults)
+    network = Network(faults, len(links), seed, tally.faults)
+    urls = [parse_link(link) for link in links]
+    with TlogWriter(record) if record else contextlib.nullcontext() as writer:
+        async with _opened(urls, tally) as endpoints:
+            epoch_ns = time.time_ns()
+
+            def due() -> Iterator[tuple[float, bytes]]:
+                for t_s, _, made in schedule(scenario, seed, epoch_ns, duration_s):
+                    raw = senders.altered(t_s, made)
+                    yield t_s, raw
+                    if writer is not None:  # asked for the next one: this one is sent
+                        writer.write(epoch_ns + round(t_s * 1e9), raw)
+
+            await _Sending(endpoints, network, 1.0, tally).send_all(due())
+    return tally
+
+
+async def play(
+    frames: Iterable[Frame],
+    links: Sequence[str],
+    speed: float | None = 1.0,
+    *,
+    faults: Sequence[Fault] = (),
+    seed: int = 0,
+    tally: Tally | None = None,
+) -> Tally:
+    """Send the frames of a log over ``links``, paced by their stamps.
+
+        frames  only ``t_ns`` and ``raw`` are used. A stamp that steps back counts as no step, one
+                that leaps as 5 s (``Tally.clamped``)
+        links   URLs of the links
+        speed   multiplies the pace, of faults as well; None: as fast as the links take it (UDP
+                takes anything, and a slow receiver loses what it cannot hold)
+        faults  faults of the traffic
+        seed    of the faults
+        tally   as for ``fly``
+
+    It begins when every link that listens has its first peer. Raises as ``fly`` does, and what
+    iterating over ``frames`` raises.
+    """
+    tally = Tally() if tally is None else tally
+    senders = Senders(faults, seed, tally.faults)
+    network = Network(faults, len(links), seed, tally.faults)
+    urls = [parse_link(link) for link in links]
+    async with _opened(urls, tally) as endpoints:
+        timed = on_timeline(frames, tally)
+        sent = ((t_s, senders.altered(t_s, raw)) for t_s, raw in timed)
+        await _Sending(endpoints, network, speed, tally).send_all(sent)
+    return tally
+
+
+def on_timeline(frames: Iterable[Frame], tally: Tally) -> Iterator[tuple[float, bytes]]:
+    """Seconds since the first frame, without steps back or beyond 5 s, and the raw frame."""
+    elapsed_ns = 0
+    before_ns: int | None = None
+    for frame in frames:
+        step_ns = 0 if before_ns is None else frame.t_ns - before_ns
+        before_ns = frame.t_ns
+        played_ns = min(max(step_ns, 0), MAX_STEP_NS)
+        tally.clamped += played_ns != step_ns
+        elapsed_ns += played_ns
+        yield elapsed_ns / 1e9, frame.raw
+
+
+@contextlib.asynccontextmanager
+async def _opened(urls: Sequence[LinkUrl], tally: Tally) -> AsyncIterator[list[TrafficLink]]:
+    """The links, each with somebody there; closed at the end, their dropped frames counted."""
+    loop = asyncio.get_running_loop()
+    opened: list[TrafficLink] = []
+    start_s = loop.time()
+    try:
+        for url in urls:
+            opened.append(await open_link(url))
+        for endpoint in opened:
+            if not endpoint.peers():
+                log.warning("%s: waiting for a first peer", endpoint.url)
+        for endpoint in opened:
+            await endpoint.somebody()
+        start_s = loop.time()
+        yield opened
+    finally:
+        tally.duration_s = loop.time() - start_s
+        tally.dropped += sum(endpoint.dropped for endpoint in opened)
+        for endpoint in opened:
+            await endpoint.close()
+
+
+class _Sending:
+    """One run over open links, timed against one start instant so that no drift adds up."""
+
+    def __init__(
+        self, endpoints: list[TrafficLink], network: Network, speed: float | None, tally: Tally
+    ) -> None:
+        self._endpoints = endpoints
+        self._there = list(endpoints)
+        self._network = network
+        self._speed = speed
+        self._tally = tally
+        self._loop = asyncio.get_running_loop()
+        self._start_s = self._loop.time()
+        self._steps = 0
+
+    async def send_all(self, items: Iterable[tuple[float, bytes]]) -> None:
+        """Send every frame when it arrives by the faults of its link, and late ones at the end."""
+        for t_s, raw in items:
+            await self._send_held(t_s)
+            await self._until(t_s)
+            self._tally.count(raw)
+            self._network.take(t_s, raw)
+            for delivery in self._network.due(t_s):
+                await self._send(delivery)
+            self._drop_the_lost()
+        await self._send_held(math.inf)
+
+    async def _send_held(self, until_s: float) -> None:
+        for delivery in self._network.due(until_s):
+            await self._until(delivery.t_s)
+            await self._send(delivery)
+            self._drop_the_lost()
+
+    async def _until(self, t_s: float) -> None:
+        """Wait until a time; other tasks get their turn even where there is nothing to wait for."""
+        speed = self._speed
+        wait_s = 0.0 if speed is None else self._start_s + t_s / speed - self._loop.time()
+        if wait_s > 0.0 or self._steps % BATCH == 0:
+            await asyncio.sleep(max(0.0, wait_s))
+        self._steps += 1
+
+    async def _send(self, delivery: Delivery) -> None:
+        endpoint = self._endpoints[delivery.link]
+        if self._speed is None:
+            await endpoint.writable()
+        endpoint.send(delivery.raw)
+
+    def _drop_the_lost(self) -> None:
+        """Go on with the links that are left. Raises ``LinkError`` when there is none."""
+        gone = [f"{one.url}: {one.lost}" for one in self._there if one.lost]
+        if not gone:
+            return
+        self._tally.lost += gone
+        self._there = [one for one in self._there if not one.lost]
+        if not self._there:
+            raise LinkError("; ".join(gone))
+        for text in gone:
+            log.warning("%s; going on without it", text)

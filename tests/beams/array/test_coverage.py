@@ -1,0 +1,279 @@
+"""Where a beam may point: reasons by hand, and the margin against caps drawn at random."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.beams.array.coverage import Coverage, Sector, margin_rad, refusals
+from companion.values import FloatArray
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def rad(*degrees: float) -> tuple[float, ...]:
+    return tuple(math.radians(angle) for angle in degrees)
+
+
+def sector(*degrees: float) -> Sector:
+    return Sector(*rad(*degrees))
+
+
+def towards(azimuth_deg: float, elevation_deg: float) -> FloatArray:
+    azimuth, elevation = rad(azimuth_deg, elevation_deg)
+    level = math.cos(elevation)
+    return np.array([level * math.cos(azimuth), level * math.sin(azimuth), -math.sin(elevation)])
+
+
+BOX = sector(30, 60, -90, 0)
+FRONT = towards(0, 0)
+
+
+def why(coverage: Coverage, in_array: FloatArray, in_body: FloatArray) -> str | None:
+    (reason,) = refusals(coverage, in_array[np.newaxis], in_body[np.newaxis])
+    return reason
+
+
+def limited(azimuths_deg: tuple[float, float], elevations_deg: tuple[float, float]) -> Coverage:
+    azimuths, elevations = np.radians(azimuths_deg), np.radians(elevations_deg)
+    return Coverage(
+        None, (float(azimuths[0]), float(azimuths[1])), (float(elevations[0]), float(elevations[1]))
+    )
+
+
+@pytest.mark.parametrize(
+    ("coverage", "in_array", "in_body", "reason"),
+    [
+        (Coverage(), towards(180, 0), towards(0, -90), None),
+        (
+            Coverage(math.radians(120)),
+            towards(0, 62),
+            FRONT,
+            "62 degrees off boresight, outside the field of view of 120",
+        ),
+        (Coverage(math.radians(120)), towards(-59.9, 0), FRONT, None),
+        (Coverage(2 * math.pi), towards(180, 0), FRONT, None),
+        (
+            Coverage(azimuth_limits_rad=rad(-60, 45.5)),  # type: ignore[arg-type]
+            towards(46, 10),
+            FRONT,
+            "azimuth 46 degrees, outside the steering limits of -60 to 45.5",
+        ),
+        (
+            Coverage(elevation_limits_rad=rad(-30, 0)),  # type: ignore[arg-type]
+            towards(-170, 0.26),
+            FRONT,
+            "elevation 0.3 degrees, outside the steering limits of -30 to 0",
+        ),
+        (
+            Coverage(hidden=(sector(-10, 10, 20, 40), BOX)),
+            FRONT,
+            towards(45, -20),
+            "hidden by the airframe (azimuth 30 to 60, elevation -90 to 0)",
+        ),
+        (Coverage(hidden=(BOX,)), towards(45, -20), towards(45, 1), None),
+        (Coverage(hidden=(BOX,)), towards(45, -20), towards(29, -20), None),
+        (
+            Coverage(hidden=(sector(170, -170, -10, 10),)),
+            FRONT,
+            towards(180, 0),
+            "hidden by the airframe (azimuth 170 to -170, elevation -10 to 10)",
+        ),
+        (Coverage(hidden=(sector(170, -170, -10, 10),)), FRONT, towards(169, 0), None),
+        (
+            Coverage(hidden=(sector(-180, -170, -10, 10),)),
+            FRONT,
+            towards(180, 0),  # 180 is -180
+            "hidden by the airframe (azimuth -180 to -170, elevation -10 to 10)",
+        ),
+    ],
+)
+def test_one_clear_reason(
+    coverage: Coverage, in_array: FloatArray, in_body: FloatArray, reason: str | None
+) -> None:
+    assert why(coverage, in_array, in_body) == reason
+    margin = margin_rad(coverage, in_array, in_body)
+    assert (margin > 0) == (reason is None)
+    assert isinstance(margin, float)
+
+
+def test_of_several_reasons_the_first_counts_and_each_direction_has_its_own() -> None:
+    coverage = Coverage(math.radians(90), rad(-30, 30), None, (BOX,))  # type: ignore[arg-type]
+    places = np.array([towards(50, 0), towards(40, 0), towards(0, 40), towards(0, 1)])
+    body = np.array([towards(45, -5), towards(45, -5), towards(45, -5), FRONT])
+    found = refusals(coverage, places, body)
+    assert found[0] == "50 degrees off boresight, outside the field of view of 90"
+    assert found[1] == "azimuth 40 degrees, outside the steering limits of -30 to 30"
+    assert found[2] == f"hidden by the airframe ({BOX})"
+    assert found[3] is None
+    assert refusals(coverage, places[:0], body[:0]) == []
+
+
+@pytest.mark.parametrize(
+    ("coverage", "in_array", "in_body", "margin_deg"),
+    [
+        (Coverage(), FRONT, FRONT, math.inf),
+        (Coverage(2 * math.pi), towards(180, 0), FRONT, math.inf),
+        (Coverage(math.radians(300)), towards(0, 90), FRONT, 60.0),
+        (limited((-180, 180), (-90, 90)), FRONT, FRONT, math.inf),
+        (limited((-180, 180), (-90, 60)), towards(77, 20), FRONT, 40.0),
+        (limited((-180, 180), (-90, 60)), towards(77, -90), FRONT, 150.0),  # a pole is no edge
+        (limited((-60, 30), (-90, 90)), FRONT, FRONT, 30.0),
+        (limited((-60, 30), (-90, 90)), towards(0, 90), FRONT, 0.0),  # but a corner is
+        (limited((150, -150), (-90, 90)), towards(-170, 0), FRONT, 20.0),
+        (Coverage(hidden=(BOX,)), FRONT, towards(45, 7), 7.0),
+        (Coverage(hidden=(BOX,)), FRONT, towards(10, 0), 20.0),
+        (Coverage(hidden=(BOX,)), FRONT, towards(-135, 0), 90.0),  # behind: the pole is nearest
+        (Coverage(hidden=(sector(-180, 180, 30, 90),)), FRONT, towards(10, -90), 120.0),
+        (Coverage(hidden=(sector(170, -170, -10, 10),)), FRONT, towards(180, 15), 5.0),
+        (Coverage(hidden=(sector(170, -170, -10, 10),)), FRONT, towards(180, 10), 0.0),
+    ],
+)
+def test_margins_known_by_geometry(
+    coverage: Coverage, in_array: FloatArray, in_body: FloatArray, margin_deg: float
+) -> None:
+    assert np.degrees(margin_rad(coverage, in_array, in_body)) == pytest.approx(
+        margin_deg, abs=1e-9
+    )
+
+
+def drawn(rng: np.random.Generator) -> Sector:
+    """Any sector: thin ones, ones around the pole, across the tail, all around."""
+    low, high = np.sort(rng.choice([-90.0, 90.0, *rng.uniform(-90, 90, 3)], 2, replace=False))
+    if rng.random() < 0.2:
+        return sector(-180, 180, low, high)
+    start = rng.uniform(-180, 180)
+    width = rng.choice([rng.uniform(2, 5), rng.uniform(5, 180), rng.uniform(180, 359)])
+    return sector(start, (start + width + 180) % 360 - 180, low, high)
+
+
+def edge(of: Sector, points: int) -> FloatArray:
+    """Directions all along the edge of a sector."""
+    share = np.linspace(0, 1, points)
+    azimuths = of.azimuth_from_rad + share * of.width_rad
+    low, high = of.elevation_from_rad, of.elevation_to_rad
+    rows = [(azimuths[:0], azimuths[:0])]
+    if of.width_rad < 2 * math.pi:
+        along = low + share * (high - low)
+        rows += [(azimuths[:1].repeat(points), along), (azimuths[-1:].repeat(points), along)]
+    rows += [(azimuths, np.full(points, e)) for e in (low, high) if abs(e) < math.pi / 2]
+    azimuth, elevation = (np.concatenate(part) for part in zip(*rows, strict=True))
+    level = np.cos(elevation)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), -np.sin(elevation)], axis=1)
+
+
+def about(direction: FloatArray, radius: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Directions at angles ``radius`` (N,) from one, around it at random."""
+    aside = rng.standard_normal((len(radius), 3))
+    aside -= (aside @ direction)[:, np.newaxis] * direction
+    aside /= np.linalg.norm(aside, axis=1)[:, np.newaxis]
+    return np.cos(radius)[:, np.newaxis] * direction + np.sin(radius)[:, np.newaxis] * aside
+
+
+def random_direction(rng: np.random.Generator, near: FloatArray) -> FloatArray:
+    """Anywhere, straight up or behind, or close to one of those given."""
+    if rng.random() < 0.2:
+        poles = np.array([[0, 0, 1], [0, 0, -1], [-1, 0, 0], [-1, -0.0, 0], [0, 1, 0.0]])
+        return poles[rng.integers(5)]
+    drawn = rng.standard_normal(3)
+    if rng.random() < 0.5:
+        drawn = near[rng.integers(len(near))] + rng.choice([0.3, 0.03]) * drawn
+    unit: FloatArray = drawn / np.linalg.norm(drawn)
+    return unit
+
+
+def cone_edge(half_rad: float, points: int) -> FloatArray:
+    around = np.linspace(0, 2 * np.pi, points)
+    across = math.sin(half_rad)
+    return np.stack(
+        [np.full(points, math.cos(half_rad)), across * np.cos(around), across * np.sin(around)],
+        axis=1,
+    )
+
+
+@given(SEEDS)
+@settings(max_examples=300, deadline=None)
+def test_the_margin_is_the_nearest_edge_and_nothing_nearer_is_refused(seed: int) -> None:
+    """All limits together, the array mounted at random on the body."""
+    rng = np.random.default_rng(seed)
+    view = float(rng.uniform(0.5, 2 * math.pi)) if rng.random() < 0.3 else None
+    steered = drawn(rng)
+    azimuths = (steered.azimuth_from_rad, steered.azimuth_to_rad)
+    elevations = (steered.elevation_from_rad, steered.elevation_to_rad)
+    coverage = Coverage(
+        view,
+        azimuths if rng.random() < 0.4 else None,
+        elevations if rng.random() < 0.4 else None,
+        tuple(drawn(rng) for _ in range(rng.integers(4))),
+    )
+    array_from_body = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    array_from_body[0] *= np.linalg.det(array_from_body)
+    in_array = [edge(coverage.limits(), 1500)]
+    in_array += [] if view is None else [cone_edge(view / 2, 1500)]
+    edges = [part @ array_from_body for part in in_array]  # in the body frame
+    edges += [edge(hides, 1500) for hides in coverage.hidden]
+    border = np.concatenate(edges)
+    body = random_direction(rng, border if len(border) else np.eye(3))
+    margin = float(margin_rad(coverage, array_from_body @ body, body))
+    if why(coverage, array_from_body @ body, body) is not None:
+        assert margin == 0
+        return
+    gaps = np.linalg.norm(border - body, axis=1) / 2
+    nearest = float(2 * np.arcsin(min(gaps.min(initial=1.0), 1.0)))
+    assert min(margin, math.pi) <= nearest + 1e-7
+    assert min(margin, math.pi) == pytest.approx(nearest, abs=5e-3)  # between points of the edge
+    if margin > 1e-6:
+        radius = (min(margin, math.pi) - 1e-9) * np.append(np.sqrt(rng.random(200)), [1.0] * 100)
+        inside = about(body, radius, rng)
+        assert set(refusals(coverage, inside @ array_from_body.T, inside)) == {None}
+
+
+def test_a_sector_says_itself_in_degrees() -> None:
+    assert str(sector(-0.04, 29.96, -12.34, 90)) == "azimuth 0 to 30, elevation -12.3 to 90"
+
+
+def test_margins_come_in_any_shape() -> None:
+    rng = np.random.default_rng(5)
+    directions = rng.standard_normal((4, 5, 3))
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    coverage = Coverage(math.radians(200), None, None, (BOX,))
+    found = margin_rad(coverage, directions, directions)
+    assert found.shape == (4, 5)
+    assert found[2, 3] == margin_rad(coverage, directions[2, 3], directions[2, 3])
+    turned = refusals(coverage, directions[0], directions[0])
+    assert [reason is None for reason in turned] == list(found[0] > 0)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "reason"),
+    [
+        ((-181, 10, 0, 10), "azimuth -181 to 10 degrees: both within -180 to 180"),
+        ((0, 180.1, 0, 10), "azimuth 0 to 180.1 degrees: both within"),
+        ((math.nan, 10, 0, 10), "azimuth nan to 10 degrees: both within"),
+        ((30, 30, 0, 10), "azimuth 30 to 30 degrees: it has no width"),
+        ((180, -180, 0, 10), "azimuth 180 to -180 degrees: it has no width"),
+        ((0, 10, 20, 10), "elevation 20 to 10 degrees: upward, within -90 to 90"),
+        ((0, 10, 10, 10), "elevation 10 to 10 degrees: upward"),
+        ((0, 10, -91, 10), "elevation -91 to 10 degrees: upward"),
+        ((0, 10, 0, 90.1), "elevation 0 to 90.1 degrees: upward"),
+        ((0, 10, 0, math.nan), "elevation 0 to nan degrees: upward"),
+    ],
+)
+def test_a_sector_that_is_none_is_refused(degrees: tuple[float, ...], reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        sector(*degrees)
+
+
+@pytest.mark.parametrize("degrees", [0.0, -10.0, 360.1, math.nan, math.inf])
+def test_a_field_of_view_that_is_none_is_refused(degrees: float) -> None:
+    with pytest.raises(ValueError, match=r"field of view .* degrees: above 0, at most 360"):
+        Coverage(math.radians(degrees))
+
+
+def test_steering_limits_that_are_none_are_refused() -> None:
+    with pytest.raises(ValueError, match="steering limits: azimuth 10 to 10 degrees: it has no"):
+        limited((10, 10), (-90, 90))
+    with pytest.raises(ValueError, match="steering limits: elevation 10 to -10 degrees: upward"):
+        limited((-180, 180), (10, -10))

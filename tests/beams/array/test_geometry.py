@@ -1,0 +1,160 @@
+"""Element positions, where elements face, and which mirror one another."""
+
+import math
+
+import numpy as np
+import pytest
+
+from companion.beams.array import geometry
+from companion.beams.array.elements import Element, Pattern
+from companion.values import FloatArray
+
+EYE = np.eye(3)
+LIGHT = geometry.SPEED_OF_LIGHT_MPS
+"""The frequency at which a metre is a wavelength."""
+
+
+def test_elements_stand_along_y() -> None:
+    array = geometry.uniform_linear(5, 3e9, 0.5, EYE)
+    assert array.size == 5
+    assert array.wavelength_m == pytest.approx(299_792_458 / 3e9)
+    spacing_m = 0.5 * 299_792_458 / 3e9
+    expected = [[0, m * spacing_m, 0] for m in range(5)]
+    assert array.elements_m == pytest.approx(np.array(expected))
+    assert array.array_from_body is EYE
+
+
+@pytest.mark.parametrize(
+    ("elements", "frequency_hz", "spacing"),
+    [(0, 1e9, 0.5), (-1, 1e9, 0.5), (4, 0.0, 0.5), (4, -1e9, 0.5), (4, 1e9, 0.0), (4, 1e9, -0.5)],
+)
+def test_what_is_no_array_is_refused(elements: int, frequency_hz: float, spacing: float) -> None:
+    with pytest.raises(ValueError, match="at least one element"):
+        geometry.uniform_linear(elements, frequency_hz, spacing, EYE)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_what_is_no_number_is_refused(bad: float) -> None:
+    with pytest.raises(ValueError, match="a frequency and a spacing above 0"):
+        geometry.uniform_linear(4, bad, 0.5, EYE)
+    with pytest.raises(ValueError, match="a frequency and a spacing above 0"):
+        geometry.uniform_circular(4, 1e9, bad, EYE)
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(0, 4), (4, 0), (-1, -1)])
+def test_what_is_no_rectangle_is_refused(rows: int, columns: int) -> None:
+    with pytest.raises(ValueError, match="at least one element"):
+        geometry.uniform_rectangular(rows, columns, 1e9, 0.5, EYE)
+
+
+def test_a_rectangle_is_numbered_row_by_row_to_the_right_then_down() -> None:
+    array = geometry.uniform_rectangular(3, 4, LIGHT, 0.6, EYE)
+    assert (array.kind, array.size, array.grid) == ("ura", 12, (3, 4))
+    for row in range(3):
+        for column in range(4):
+            place = array.elements_m[4 * row + column]
+            assert place == pytest.approx([0, 0.6 * column, 0.6 * row])
+    assert array.element_from_array is None
+
+
+def test_one_row_is_the_line() -> None:
+    row, line = (
+        geometry.uniform_rectangular(1, 5, 3e9, 0.5, EYE),
+        geometry.uniform_linear(5, 3e9, 0.5, EYE),
+    )
+    assert row.kind == line.kind == "ula"
+    assert row.grid == line.grid == (1, 5)
+    assert np.array_equal(row.elements_m, line.elements_m)
+
+
+@pytest.mark.parametrize("elements", [2, 3, 4, 7, 32])
+def test_a_circle_has_its_spacing_between_neighbours_and_starts_at_boresight(elements: int) -> None:
+    array = geometry.uniform_circular(elements, LIGHT, 0.5, EYE)
+    assert (array.kind, array.size, array.grid) == ("uca", elements, None)
+    gaps = np.linalg.norm(array.elements_m - np.roll(array.elements_m, -1, axis=0), axis=1)
+    assert gaps == pytest.approx(0.5)
+    radii = np.linalg.norm(array.elements_m, axis=1)
+    assert radii == pytest.approx(radii[0])
+    assert array.elements_m[0] == pytest.approx([radii[0], 0, 0])
+    assert not array.elements_m[:, 2].any()
+    turn = math.atan2(array.elements_m[1, 1], array.elements_m[1, 0])
+    assert turn == pytest.approx(2 * math.pi / elements)  # from x towards y
+
+
+def test_a_circle_of_one_stands_at_the_origin() -> None:
+    assert not geometry.uniform_circular(1, 1e9, 0.5, EYE).elements_m.any()
+
+
+COSINE = Element(Pattern.COSINE)
+
+
+def test_elements_of_a_circle_face_outward_unless_they_are_isotropic() -> None:
+    array = geometry.uniform_circular(6, 1e9, 0.5, EYE, COSINE)
+    turned = array.element_from_array
+    assert turned is not None
+    outward = array.elements_m / np.linalg.norm(array.elements_m, axis=1)[:, np.newaxis]
+    assert np.einsum("mij,mj->mi", turned, outward) == pytest.approx(np.array([[1, 0, 0]] * 6))
+    assert geometry.uniform_circular(6, 1e9, 0.5, EYE).element_from_array is None
+
+
+def test_elements_face_where_they_are_told_and_stay_level() -> None:
+    rng = np.random.default_rng(2)
+    outward = np.concatenate(
+        [rng.standard_normal((20, 3)), [[0, 0, 2], [0, 0, -0.5], [1e-13, 0, -1], [-3, 0, 0]]]
+    )
+    array = geometry.listed(
+        rng.uniform(-1, 1, (24, 3)), 1e9, EYE, Element(Pattern.TR38901), None, outward
+    )
+    turned = array.element_from_array
+    assert turned is not None
+    unit = outward / np.linalg.norm(outward, axis=1)[:, np.newaxis]
+    for m in range(24):
+        assert turned[m] @ turned[m].T == pytest.approx(EYE, abs=1e-12)
+        assert np.linalg.det(turned[m]) == pytest.approx(1)
+        assert turned[m, 0] == pytest.approx(unit[m])
+        assert turned[m, 1, 2] == pytest.approx(0)  # y is level ...
+        if m != 20:
+            assert turned[m, 2, 2] >= -1e-12  # ... and z down: not upside down
+    assert np.array_equal(turned[20, 1], [0, 1, 0])
+    assert np.array_equal(turned[21, 1], [0, 1, 0])
+
+
+def test_what_is_listed_is_kept() -> None:
+    places = np.random.default_rng(4).uniform(-1, 1, (6, 3))
+    lever = np.array([0.1, -0.2, 0.3])
+    array = geometry.listed(places, 2e9, EYE, COSINE, lever)
+    assert (array.kind, array.size, array.grid) == ("list", 6, None)
+    assert array.elements_m is places
+    assert array.lever_arm_m is lever
+    assert array.element is COSINE
+    assert array.element_from_array is None  # all along boresight
+    assert not geometry.listed(places, 2e9, EYE).lever_arm_m.any()
+    for made in (geometry.uniform_linear, geometry.uniform_circular):
+        array = made(3, 1e9, 0.5, EYE, COSINE, lever)
+        assert array.lever_arm_m is lever
+        assert array.element is COSINE
+
+
+PLACES = np.random.default_rng(6).uniform(-1, 1, (5, 3))
+TWICE = np.concatenate([PLACES, PLACES[2:3] + 1e-12])
+
+
+@pytest.mark.parametrize(
+    ("places", "outward", "reason"),
+    [
+        (np.zeros((0, 3)), None, "at least one element"),
+        (np.zeros(3), None, "rows of three finite numbers"),
+        (np.zeros((2, 2)), None, "rows of three finite numbers"),
+        (np.array([[0, 0, math.nan]]), None, "rows of three finite numbers"),
+        (np.array([[0, math.inf, 0]]), None, "rows of three finite numbers"),
+        (TWICE, None, "two elements stand at one place"),
+        (PLACES, np.ones((4, 3)), "each element faces one direction"),
+        (PLACES, np.full((5, 3), math.nan), "each element faces one direction"),
+        (PLACES, np.zeros((5, 3)), "has a length above 0"),
+    ],
+)
+def test_a_list_that_is_no_array_is_refused(
+    places: FloatArray, outward: FloatArray | None, reason: str
+) -> None:
+    with pytest.raises(ValueError, match=reason):
+        geometry.listed(places, LIGHT, EYE, COSINE, None, outward)

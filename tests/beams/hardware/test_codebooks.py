@@ -1,0 +1,385 @@
+"""Codebooks: sums written out, exact sets for lines, and draws that try to beat what is swept."""
+
+import cmath
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from companion.beams.array import steering
+from companion.beams.array.elements import Element, Pattern
+from companion.beams.array.geometry import Array, listed, uniform_circular
+from companion.beams.array.geometry import uniform_linear as line
+from companion.beams.array.geometry import uniform_rectangular as grid
+from companion.beams.hardware import codebooks
+from companion.beams.hardware.codebooks import Codebook, NextBest, best, candidates, dft, next_best
+from companion.values import FloatArray
+
+EYE = np.eye(3)
+GPP = Element(Pattern.TR38901)
+COSINE = Element(Pattern.COSINE, 1.0)
+LINE = line(16, 30e9, 0.5, EYE, GPP)
+GRID = grid(4, 6, 30e9, 0.5, EYE)
+CIRCLE = uniform_circular(12, 30e9, 0.5, EYE, GPP)
+CLOUD = listed(np.random.default_rng(8).uniform(-0.015, 0.015, (10, 3)), 30e9, EYE)
+
+
+def drawn(array: Array, beams: int, seed: int = 1) -> Codebook:
+    rng = np.random.default_rng(seed)
+    weights = rng.standard_normal((2, array.size, beams)).T @ [1, 1j]
+    return codebooks.listed(weights.T, array)
+
+
+def around(array: Array, beams: int) -> Codebook:
+    """Matched to directions all around the horizon."""
+    angles = 2 * np.pi * np.arange(beams) / beams
+    directions = np.stack([np.cos(angles), np.sin(angles), np.zeros(beams)], axis=1)
+    return codebooks.listed(steering.steering_matrix(array, directions).conj(), array)
+
+
+BOOKS = {
+    "line": (LINE, dft(LINE)),
+    "line, oversampled": (LINE, dft(LINE, 4)),
+    "line, at random": (LINE, drawn(LINE, 40)),
+    "grid": (GRID, dft(GRID)),
+    "grid, oversampled": (GRID, dft(GRID, 2)),
+    "grid, at random": (GRID, drawn(GRID, 40)),
+    "circle": (CIRCLE, around(CIRCLE, 24)),
+    "circle, at random": (CIRCLE, drawn(CIRCLE, 20)),
+    "cloud, at random": (CLOUD, drawn(CLOUD, 30)),
+}
+
+
+def unit(rng: np.random.Generator) -> FloatArray:
+    made = rng.standard_normal(3)
+    direction: FloatArray = made / np.linalg.norm(made)
+    return direction
+
+
+def within(
+    direction: FloatArray, bound_rad: float, rng: np.random.Generator, count: int
+) -> FloatArray:
+    """Unit directions within an angle of one, every other on the rim."""
+    aside = np.cross(direction, rng.standard_normal((count, 3)))
+    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    off = bound_rad * np.where(np.arange(count) % 2, np.sqrt(rng.uniform(size=count)), 1.0)
+    return np.cos(off)[:, np.newaxis] * direction + np.sin(off)[:, np.newaxis] * aside
+
+
+def in_plane(sine: float) -> FloatArray:
+    """The direction at a sine off boresight, to the right."""
+    return np.array([math.sqrt(1 - sine * sine), sine, 0.0])
+
+
+# --- what is in a codebook -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("oversampling", [1, 3])
+def test_the_beams_of_a_line_point_where_their_index_says(oversampling: int) -> None:
+    """Full gain M at sine 2k/K, wrapped; without oversampling a null at every other such place."""
+    array = line(8, 30e9, 0.5, EYE)
+    book = dft(array, oversampling)
+    beams = 8 * oversampling
+    assert (book.kind, book.size, book.weights.shape) == ("dft", beams, (8, beams))
+    sines = [2 * k / beams - (2 if k > beams / 2 else 0) for k in range(beams)]
+    directions = np.array([in_plane(sine) for sine in sines])
+    received = np.abs(steering.steering_matrix(array, directions).T @ book.weights) ** 2
+    assert np.diag(received) == pytest.approx(np.full(beams, 8.0))
+    if oversampling == 1:
+        assert received - np.diag(np.diag(received)) == pytest.approx(np.zeros((8, 8)), abs=1e-20)
+
+
+@pytest.mark.parametrize(("rows", "columns", "oversampling"), [(3, 4, 1), (2, 3, 2), (5, 1, 2)])
+def test_the_beams_of_a_grid_are_products(rows: int, columns: int, oversampling: int) -> None:
+    """Element (r, c) is r columns + c, beam (kz, ky) is kz Ky + ky; a single column has Ky = 1."""
+    book = dft(grid(rows, columns, 30e9, 0.5, EYE), oversampling)
+    down = rows * oversampling
+    across = columns * oversampling if columns > 1 else 1
+    assert book.size == down * across
+    for r in range(rows):
+        for c in range(columns):
+            for kz in range(down):
+                for ky in range(across):
+                    turns = r * kz / down + c * ky / across
+                    expected = cmath.exp(-2j * math.pi * turns) / math.sqrt(rows * columns)
+                    found = book.weights[r * columns + c, kz * across + ky]
+                    assert found == pytest.approx(expected, abs=1e-12)
+
+
+def test_beams_have_unit_power() -> None:
+    for _, book in BOOKS.values():
+        assert np.linalg.norm(book.weights, axis=0) == pytest.approx(np.ones(book.size))
+
+
+def test_a_listed_beam_keeps_its_direction() -> None:
+    weights = np.array([[3, 0, 1e-200j], [4j, 5, 0]])
+    book = codebooks.listed(weights, line(2, 1e9, 0.5, EYE))
+    assert book.kind == "listed"
+    assert book.weights == pytest.approx(np.array([[0.6, 0, 1j], [0.8j, 1, 0]]))
+
+
+@pytest.mark.parametrize("array", [CIRCLE, CLOUD])
+def test_no_transform_without_a_grid(array: Array) -> None:
+    with pytest.raises(ValueError, match=f"kind {array.kind}"):
+        dft(array)
+
+
+def test_what_is_no_codebook_is_refused() -> None:
+    with pytest.raises(ValueError, match="oversampling"):
+        dft(LINE, 0)
+    for weights, message in [
+        (np.ones((15, 2)), "shape"),
+        (np.ones(16), "shape"),
+        (np.ones((16, 0)), "at least one beam"),
+        (np.full((16, 2), np.inf), "finite"),
+        (np.eye(16) * (np.arange(16) != 5), "column 5"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            codebooks.listed(weights.astype(complex), LINE)
+
+
+# --- the best ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", sorted(BOOKS))
+def test_the_best_beam_is_the_one_received_most(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each beam's sum written out; also when done in blocks."""
+    array, book = BOOKS[name]
+    rng = np.random.default_rng(3)
+    directions = np.array([unit(rng) for _ in range(9)])
+    indices, gains = best(book, array, directions)
+    for n, direction in enumerate(directions):
+        a = steering.steering_matrix(array, direction[np.newaxis])[:, 0]
+        powers = [
+            abs(sum(a[m] * book.weights[m, k] for m in range(array.size))) ** 2
+            for k in range(book.size)
+        ]
+        assert indices[n] == np.argmax(powers)
+        assert gains[n] == pytest.approx(max(powers))
+    monkeypatch.setattr(codebooks, "BLOCK", 2 * book.size)
+    again, same = best(book, array, directions)
+    assert (again == indices).all()
+    assert same == pytest.approx(gains)
+
+
+def test_behind_the_elements_the_order_of_beams_is_that_without_their_pattern() -> None:
+    array = line(8, 30e9, 0.5, EYE, COSINE)
+    indices, gains = best(dft(array), array, np.array([[-0.8, 0.6, 0.0], [0.8, 0.6, 0.0]]))
+    assert indices[0] == indices[1] == 2
+    assert gains[0] == 0 < gains[1]
+
+
+# --- what must be swept --------------------------------------------------------------------------
+
+
+@settings(max_examples=180, deadline=None)
+@given(
+    st.sampled_from(sorted(BOOKS)),
+    st.floats(math.log(1e-6), math.log(60)).map(math.exp),
+    st.integers(0, 2**32 - 1),
+)
+@example("line", 180.0, 0)
+@example("circle", 120.0, 1)
+@example("grid", 0.0, 2)
+def test_the_best_beam_is_always_among_the_candidates(
+    name: str, bound_deg: float, seed: int
+) -> None:
+    """Bounds up to 60 degrees and beyond; 80 directions for each, half of them on the rim."""
+    array, book = BOOKS[name]
+    rng = np.random.default_rng(seed)
+    direction, bound_rad = unit(rng), math.radians(bound_deg)
+    found = candidates(book, array, direction, bound_rad)
+    assert (np.diff(found) > 0).all()
+    true, _ = best(book, array, within(direction, bound_rad, rng, 80))
+    assert set(true) <= set(found)
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.sampled_from(sorted(BOOKS)), st.floats(-9, -1), st.integers(0, 2**32 - 1))
+def test_a_beam_that_is_best_just_inside_the_rim_is_a_candidate(
+    name: str, exponent: float, seed: int
+) -> None:
+    """The rim is laid just past the border between two beams, found by bisection."""
+    array, book = BOOKS[name]
+    rng = np.random.default_rng(seed)
+    start, end = unit(rng), unit(rng)
+
+    def along(share: float) -> FloatArray:
+        mixed = (1 - share) * start + share * end
+        direction: FloatArray = mixed / np.linalg.norm(mixed)
+        return direction
+
+    low, high = 0.0, 1.0
+    first = best(book, array, along(low)[np.newaxis])[0][0]
+    if best(book, array, along(high)[np.newaxis])[0][0] == first:
+        return
+    for _ in range(40):
+        middle = (low + high) / 2
+        same = best(book, array, along(middle)[np.newaxis])[0][0] == first
+        low, high = (middle, high) if same else (low, middle)
+    other = best(book, array, along(high)[np.newaxis])[0][0]
+    predicted = along(high - 10**exponent)
+    bound_rad = 2 * math.asin(np.linalg.norm(along(high) - predicted) / 2) * (1 + 1e-9)
+    assert other in candidates(book, array, predicted, bound_rad)
+
+
+@pytest.mark.parametrize("oversampling", [1, 2, 4])
+@pytest.mark.parametrize("bound_deg", [0.01, 0.5, 3.0, 12.0, 50.0])
+def test_a_line_sweeps_hardly_more_than_it_must(oversampling: int, bound_deg: float) -> None:
+    """The beams that a line needs are those nearest to some sine in the cone; at most one more at
+    each end is swept, and for most directions none."""
+    book = dft(LINE, oversampling)
+    more = []
+    rng = np.random.default_rng(7)
+    for _ in range(20):
+        direction = unit(rng)
+        off, bound_rad = math.acos(direction[1]), math.radians(bound_deg)
+        sines = np.cos(np.linspace(max(off - bound_rad, 0), min(off + bound_rad, np.pi), 40000))
+        needed = set((np.round(sines * book.size / 2) % book.size).astype(int).tolist())
+        found = set(candidates(book, LINE, direction, bound_rad).tolist())
+        assert needed <= found
+        more.append(len(found) - len(needed))
+    assert max(more) <= 2
+    assert np.median(more) == 0
+
+
+@pytest.mark.parametrize("name", ["grid", "grid, oversampled", "circle", "cloud, at random"])
+def test_others_sweep_hardly_more_than_they_must(name: str) -> None:
+    array, book = BOOKS[name]
+    rng = np.random.default_rng(9)
+    for bound_deg in (0.5, 4.0, 15.0):
+        direction, bound_rad = unit(rng), math.radians(bound_deg)
+        seen = set(best(book, array, within(direction, bound_rad, rng, 20000))[0].tolist())
+        found = set(candidates(book, array, direction, bound_rad).tolist())
+        assert seen <= found
+        assert len(found) <= len(seen) + 2
+
+
+def test_any_direction_needs_all_beams() -> None:
+    found = candidates(dft(LINE), LINE, np.array([1.0, 0, 0]), None)
+    assert (found == np.arange(16)).all()
+
+
+def test_the_pattern_of_the_elements_does_not_matter_where_all_face_alike() -> None:
+    plain = line(16, 30e9, 0.5, EYE)
+    rng = np.random.default_rng(2)
+    for bound_rad in (0.01, 0.3):
+        direction = unit(rng)
+        found = candidates(dft(LINE), LINE, direction, bound_rad)
+        assert (found == candidates(dft(plain), plain, direction, bound_rad)).all()
+
+
+def test_a_sharp_beam_beside_a_broad_one_is_not_missed() -> None:
+    """All elements, and one in the middle. At the predicted direction the sharp beam is below
+    the other and flat, on top of a side lobe: nothing but its curvature says that it is best
+    elsewhere in the cone."""
+    sharp = steering.steering_matrix(LINE, in_plane(0.37)[np.newaxis]).conj()
+    broad = np.eye(16)[:, 7:8]
+    book = codebooks.listed(np.concatenate([broad, sharp], axis=1), LINE)
+    for lobe in (1.4303, 2.459, 3.4709):  # off the peak, in widths to its null
+        sine = 0.37 - 2 * lobe / 16
+        bound_rad = math.asin(0.37) - math.asin(sine)
+        assert list(candidates(book, LINE, in_plane(sine), bound_rad)) == [0, 1]
+
+
+def test_equal_beams_are_all_candidates_without_endless_work() -> None:
+    weights = np.repeat(dft(GRID).weights, 2, axis=1)
+    twice = codebooks.listed(weights, GRID)
+    found = candidates(twice, GRID, in_plane(0.3), 0.05)
+    once = candidates(dft(GRID), GRID, in_plane(0.3), 0.05)
+    assert set(found) == {2 * k + i for k in once for i in (0, 1)}
+
+
+def test_it_is_a_superset_however_early_the_work_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    full = {name: candidates(book, a, in_plane(0.4), 0.2) for name, (a, book) in BOOKS.items()}
+    monkeypatch.setattr(codebooks, "MOST_RESPONSES", 1)
+    monkeypatch.setattr(codebooks, "BLOCK", 64)
+    for name, (array, book) in BOOKS.items():
+        assert set(full[name]) <= set(candidates(book, array, in_plane(0.4), 0.2))
+
+
+def test_what_is_no_cone_is_refused() -> None:
+    for direction, bound_rad, message in [
+        (np.array([1.0, 1, 0]), 0.1, "unit"),
+        (np.array([1.0, 0]), 0.1, "three"),
+        (np.array([1.0, 0, 0]), -0.1, "pointing bound"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            candidates(dft(LINE), LINE, direction, bound_rad)
+
+
+# --- what comes next -----------------------------------------------------------------------------
+
+
+def turning(from_rad: float, rate_radps: float) -> Callable[[FloatArray], FloatArray]:
+    """Directions in the plane at an azimuth that grows with time."""
+
+    def directions_at(times_s: FloatArray) -> FloatArray:
+        azimuth = from_rad + rate_radps * times_s
+        return np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(len(azimuth))], axis=1)
+
+    return directions_at
+
+
+@pytest.mark.parametrize("oversampling", [1, 4])
+@pytest.mark.parametrize("rate_radps", [0.05, -0.05, 0.7])
+def test_the_next_beam_comes_where_the_line_says(oversampling: int, rate_radps: float) -> None:
+    """Beams of a half-wave line change at sines (2k + 1) / K: the time is known in closed form."""
+    book = dft(LINE, oversampling)
+    start_rad = 0.3
+    k = round(math.sin(start_rad) * book.size / 2)
+    border = (2 * k + math.copysign(1, rate_radps)) / book.size
+    after_s = (math.asin(border) - start_rad) / rate_radps
+    step_s = codebooks.sampling_step_s(book, LINE, rate_radps)
+    assert step_s is not None
+    found = next_best(book, LINE, turning(start_rad, rate_radps), 10.0, step_s)
+    assert found.index == k
+    assert found.next_index == k + int(math.copysign(1, rate_radps))
+    assert found.after_s is not None
+    assert 0 <= found.after_s - after_s <= 1.001e-3
+
+
+def test_nothing_comes_within_the_horizon() -> None:
+    book = dft(LINE)
+    assert next_best(book, LINE, turning(0.0, 0.01), 1.0, 0.1) == NextBest(0, None, None)
+    # The border at sine 1/16 is crossed 0.06254 s from now: the horizon itself is looked at.
+    assert next_best(book, LINE, turning(0.0, 1.0), 0.0620, 1.0) == NextBest(0, None, None)
+    found = next_best(book, LINE, turning(0.0, 1.0), 0.0630, 1.0)
+    assert found.next_index == 1
+    assert found.after_s == pytest.approx(0.06254, abs=1e-3)
+
+
+def test_a_step_that_is_too_long_passes_over_beams() -> None:
+    """What the limits say: with the step for its rate, it does not."""
+    book, path = dft(LINE, 2), turning(-1.0, 0.5)
+    step_s = codebooks.sampling_step_s(book, LINE, 0.5)
+    assert step_s is not None
+    short, long = (next_best(book, LINE, path, 3.0, s) for s in (step_s, 2.5))
+    now = best(book, LINE, path(np.array([0.0])))[0][0]
+    assert short.index == long.index == now
+    assert short.next_index == now + 1
+    assert short.after_s is not None
+    assert long.after_s is not None
+    assert short.after_s <= long.after_s
+    there = best(book, LINE, path(np.array([long.after_s])))[0][0]
+    assert long.next_index == there != now
+
+
+def test_the_step_is_a_quarter_of_a_beam() -> None:
+    """Sixteen half-wave elements extend 7.5 wavelengths."""
+    assert codebooks.sampling_step_s(dft(LINE), LINE, -0.5) == pytest.approx(1 / 7.5 / 0.5 / 4)
+    assert codebooks.sampling_step_s(dft(LINE, 4), LINE, 0.5) == pytest.approx(1 / 30 / 0.5 / 4)
+    assert codebooks.sampling_step_s(dft(LINE), LINE, 0.0) is None
+    one = line(1, 1e9, 0.5, EYE)
+    assert codebooks.sampling_step_s(dft(one), one, 1.0) is None
+
+
+@pytest.mark.parametrize(
+    ("horizon_s", "step_s"), [(0.0, 0.1), (1.0, 0.0), (math.inf, 0.1), (math.nan, 0.1), (1, -1)]
+)
+def test_no_horizon_or_step_is_refused(horizon_s: float, step_s: float) -> None:
+    with pytest.raises(ValueError, match="horizon"):
+        next_best(dft(LINE), LINE, turning(0.0, 1.0), horizon_s, step_s)

@@ -1,0 +1,65 @@
+"""Directions ahead, against the same thing done with positions and rotations."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from companion.beams import line_of_sight
+from companion.beams.array.geometry import uniform_linear
+from companion.values import Carrier, FloatArray, Track, TrackState
+
+
+def flying(rng: np.random.Generator, acceleration: FloatArray | None) -> Track:
+    place, velocity = rng.uniform(-300, 300, 3), rng.normal(0, 20, 3)
+    return Track(
+        "a", TrackState.LIVE, 9, 0.1, place, velocity, None, acceleration,
+        2.0, 2.0, 2.0, 0.0, None, None, None, None, 1,
+    )  # fmt: skip
+
+
+@settings(max_examples=50)
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_directions_ahead_are_those_of_positions_ahead(seed: int, accelerates: bool) -> None:
+    """Velocities, acceleration, turning body, lever arm and mount, one time after the other."""
+    rng = np.random.default_rng(seed)
+    pose, mount = (m.as_matrix() for m in Rotation.random(2, rng=rng))
+    lever, rates = rng.uniform(-3, 3, 3), rng.normal(0, 1, 3)
+    array = uniform_linear(4, 30e9, 0.5, mount, lever_arm_m=lever)
+    here, own = rng.uniform(-50, 50, 3), rng.normal(0, 20, 3)
+    at = Carrier(9, here, own, pose, rates, 0.0, 0.0, None)
+    track = flying(rng, rng.normal(0, 5, 3) if accelerates else None)
+    times_s = np.array([0.0, 0.1, 1.0, 7.0])
+    found = line_of_sight.directions_ahead(track, at, array, times_s)
+    assert found is not None
+    assert track.velocity_ned_mps is not None
+    for t_s, direction in zip(times_s, found, strict=True):
+        there = track.position_ned_m + track.velocity_ned_mps * t_s
+        if track.acceleration_ned_mps2 is not None:
+            there = there + track.acceleration_ned_mps2 * t_s**2 / 2
+        body_from_local = Rotation.from_rotvec(rates * t_s).as_matrix().T @ pose
+        eye = here + own * t_s + body_from_local.T @ lever
+        seen = mount @ body_from_local @ (there - eye)
+        assert direction == pytest.approx(seen / np.linalg.norm(seen), abs=1e-9)
+
+
+def test_through_the_array_itself_directions_stay_unit_vectors() -> None:
+    """A UAV that flies through it is at no direction for one instant."""
+    array = uniform_linear(4, 30e9, 0.5, np.eye(3))
+    at = Carrier(9, np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3), 0.0, 0.0, None)
+    place, velocity = np.array([0.0, 30.0, 0.0]), np.array([0.0, -10.0, 0.0])
+    track = Track(
+        "a", TrackState.LIVE, 9, 0.1, place, velocity, None, None,
+        2.0, 2.0, 2.0, 0.0, None, None, None, None, 1,
+    )  # fmt: skip
+    found = line_of_sight.directions_ahead(track, at, array, np.array([2.0, 3.0, 4.0]))
+    assert found is not None
+    assert found == pytest.approx(np.array([[0, 1, 0], [1, 0, 0], [0, -1, 0]]))
+
+
+def test_without_a_velocity_nothing_is_known_ahead() -> None:
+    rng = np.random.default_rng(1)
+    array = uniform_linear(4, 30e9, 0.5, np.eye(3))
+    unknown = Carrier(9, np.zeros(3), None, np.eye(3), np.zeros(3), 0.0, 0.0, None)
+    assert line_of_sight.directions_ahead(flying(rng, None), unknown, array, np.zeros(1)) is None

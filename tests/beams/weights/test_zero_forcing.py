@@ -1,0 +1,191 @@
+"""Zero forcing: numpy's pseudo-inverse as oracle, and what has no answer."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.beams.array import geometry, steering
+from companion.beams.array.elements import Element, Pattern
+from companion.beams.array.geometry import Array
+from companion.beams.weights.zero_forcing import Solved, solve
+from companion.values import ComplexArray, FloatArray
+
+EYE = np.eye(3)
+COSINE = Element(Pattern.COSINE, 1.5)
+SIZES = [(64, 32), (64, 8)]
+"""Elements and users."""
+
+
+def line(sines: FloatArray, size: int) -> ComplexArray:
+    """Steering of a half-wave line for directions in the plane, by their sines."""
+    made: ComplexArray = np.exp(1j * np.pi * np.outer(np.arange(size), sines))
+    return made
+
+
+def spread(users: int, rng: np.random.Generator, jitter: float = 0.3) -> FloatArray:
+    """Sines that are about equally far apart."""
+    grid = np.linspace(-1, 1, users, endpoint=False) + 1 / users
+    sines: FloatArray = grid + rng.uniform(-jitter, jitter, users) / users
+    return sines
+
+
+def anywhere(users: int, rng: np.random.Generator) -> FloatArray:
+    """Unit directions in front of the array, (N, 3)."""
+    drawn = rng.standard_normal((users, 3))
+    drawn[:, 0] = np.abs(drawn[:, 0]) + 0.1
+    directions: FloatArray = drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+    return directions
+
+
+def mirrored_list(size: int, rng: np.random.Generator) -> Array:
+    """Elements anywhere in space, in any order, with their mirror images through some point."""
+    half = rng.uniform(-0.2, 0.2, (size // 2, 3))
+    centre = np.zeros((size % 2, 3))
+    placed = np.concatenate([half, centre, -half]) + rng.uniform(-1, 1, 3)
+    return geometry.listed(rng.permutation(placed), 3e9, EYE)
+
+
+def any_array(kind: str, rng: np.random.Generator) -> Array:
+    """With 63 to 66 elements."""
+    match kind:
+        case "ula":
+            return geometry.uniform_linear(64, 30e9, 0.5, EYE)
+        case "odd ula":
+            return geometry.uniform_linear(65, 30e9, 0.5, EYE, COSINE)
+        case "ura":
+            return geometry.uniform_rectangular(8, 8, 30e9, 0.5, EYE, COSINE)
+        case "odd ura":
+            return geometry.uniform_rectangular(7, 9, 30e9, 0.5, EYE)
+        case "uca":
+            return geometry.uniform_circular(64, 30e9, 0.5, EYE)
+        case "odd uca":
+            return geometry.uniform_circular(65, 30e9, 0.5, EYE)
+        case "outward uca":
+            return geometry.uniform_circular(64, 30e9, 0.5, EYE, COSINE)
+        case "odd list":
+            return mirrored_list(65, rng)
+        case _:
+            return mirrored_list(66, rng)
+
+
+KINDS = ["ula", "odd ula", "ura", "odd ura", "uca", "odd uca", "outward uca", "list", "odd list"]
+
+
+def check(found: Solved | None, a: ComplexArray, tolerance: float = 1e-12) -> None:
+    """Against the pseudo-inverse; gains and loss factors by their definitions."""
+    assert found is not None
+    condition = np.linalg.cond(a)
+    tolerance *= condition**2
+    expected = np.linalg.pinv(a.T)
+    assert np.abs(found.weights - expected).max() <= tolerance * np.abs(expected).max()
+    towards = np.abs(np.einsum("mn,mn->n", a, expected)) ** 2
+    gains = towards / np.sum(np.abs(expected) ** 2, axis=0)
+    alone = np.sum(np.abs(a) ** 2, axis=0)
+    assert found.loss_factors == pytest.approx(alone / gains, rel=tolerance)
+    assert found.loss_factors.min() > 1 - 1e-9
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("users", [1, 3, 16, 32])
+def test_it_is_the_pseudo_inverse_for_every_array(kind: str, users: int) -> None:
+    rng = np.random.default_rng(users)
+    a = steering.steering_matrix(any_array(kind, rng), anywhere(users, rng))
+    check(solve(a), a)
+
+
+@pytest.mark.parametrize(("size", "users"), SIZES)
+def test_any_memory_order(size: int, users: int) -> None:
+    a = line(spread(users, np.random.default_rng(3)), size)
+    for given_as in (a, np.asfortranarray(a), np.repeat(a, 2, axis=1)[:, ::2]):
+        before = given_as.copy()
+        found = solve(given_as)
+        check(found, a)
+        assert found is not None
+        assert found.weights.strides[0] == 16  # one user's weights lie together
+        assert np.array_equal(given_as, before)
+
+
+@given(st.integers(0, 10**6), st.integers(1, 40), st.floats(-6, 6))
+@settings(max_examples=30, deadline=None)
+def test_loss_factors_do_not_depend_on_how_columns_are_scaled(
+    seed: int, users: int, decades: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    a = line(rng.uniform(-1, 1, users), 64)
+    scale = 10 ** (decades * rng.uniform(-1, 1, users)) * np.exp(2j * rng.uniform(0, 9, users))
+    one, other = solve(a), solve(a * scale)
+    if one is None or one.loss_factors.max() > 1e6:
+        return
+    assert other is not None
+    assert other.loss_factors == pytest.approx(one.loss_factors, rel=1e-8)
+    assert np.abs((a * scale).T @ other.weights - np.eye(users)).max() < 10 ** (
+        2 * abs(decades) - 8
+    )
+
+
+# --- where there is no answer -------------------------------------------------------------------
+
+
+def test_no_users() -> None:
+    for a in (np.empty((8, 0), dtype=complex), np.empty((0, 0), dtype=complex)):
+        found = solve(a)
+        assert found is not None
+        assert found.weights.shape == a.shape
+        assert found.loss_factors.shape == (0,)
+
+
+@pytest.mark.parametrize(("size", "users"), SIZES)
+def test_no_answer_is_none_and_what_is_not_finite_an_error(size: int, users: int) -> None:
+    good = line(spread(users, np.random.default_rng(4)), size)
+    dark, twice = good.copy(), good.copy()
+    dark[:, 2] = 0.0
+    twice[:, 2] = twice[:, 5]
+    for hopeless in (dark, twice, np.zeros_like(good), np.ones_like(good)):
+        assert solve(hopeless) is None
+    for value in (np.nan, np.inf, -np.inf, complex(0, np.inf), complex(np.nan, 1.0)):
+        for element in (0, size // 2 - 1, size - 1):
+            bad = good.copy()
+            bad[element, 1] = value
+            with pytest.raises(ValueError, match="not a finite number"):
+                solve(bad)
+
+
+@pytest.mark.parametrize("users", [5, 65, 400])
+def test_more_users_than_elements_have_no_answer(users: int) -> None:
+    rng = np.random.default_rng(5)
+    size = 4 if users == 5 else 64
+    a = rng.standard_normal((size, users)) + 1j * rng.standard_normal((size, users))
+    assert solve(a) is None
+    a[1, 1] = np.nan
+    with pytest.raises(ValueError, match="not a finite number"):
+        solve(a)
+
+
+@given(st.floats(-12, 0), st.sampled_from(SIZES))
+@settings(max_examples=60, deadline=None)
+def test_what_is_nearly_singular_shows_in_the_loss_factors(
+    separation: float, numbers: tuple[int, int]
+) -> None:
+    """Two users that come together: the closed form of their loss, and A^T F = I as far as it says.
+
+    Alone with another user whose normalised inner product with it is c, a user loses 1/(1 - |c|^2).
+    """
+    size, users = numbers
+    sines = spread(users, np.random.default_rng(6))
+    sines[1] = sines[0] + 10**separation / size
+    a = line(sines, size)
+    found = solve(a)
+    if found is None:
+        assert separation < -5
+        return
+    pair = solve(a[:, :2])
+    # 1 - |c|^2, as the mean of 1 - cos((m - m') phase) over pairs of elements: nothing cancels.
+    phase = np.pi * (sines[1] - sines[0]) / 2
+    apart = np.subtract.outer(np.arange(size), np.arange(size))
+    loss = size**2 / (2 * np.sum(np.sin(apart * phase) ** 2))
+    assert found.loss_factors[:2].min() > 0.9 * loss
+    if loss < 1e10 and pair is not None:
+        assert pair.loss_factors == pytest.approx([loss, loss], rel=1e-13 * loss + 1e-9)
+    error = np.abs(a.T @ found.weights - np.eye(users)).max()
+    assert error < 20 * np.finfo(float).eps * found.loss_factors.max() + 1e-13

@@ -1,0 +1,115 @@
+"""One line for what a user does wrong, a traceback for what we do, one line for Ctrl-C."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+from support import BIN, HANG_S, ROOT
+
+from companion.cli.console import OneLineErrors
+from companion.values import UserError
+
+
+@click.group(name="prog", cls=OneLineErrors)
+def prog() -> None:
+    """A program."""
+
+
+@prog.command()
+@click.argument("what")
+def fail(what: str) -> None:
+    """Fails as it is told."""
+    match what:
+        case "user":
+            raise UserError("the file holds\n  no log")
+        case "file":
+            Path("/nowhere/x").read_text()
+        case "value":
+            raise ValueError("operands could not be broadcast together")
+        case "unpacking":
+            _first, _second = (1, 2, 3)  # type: ignore[misc]
+        case "interrupted":
+            raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    ("what", "status", "said"),
+    [
+        ("user", 1, "prog: the file holds no log\n"),
+        ("file", 1, "prog: /nowhere/x: No such file or directory\n"),
+        ("interrupted", 130, "prog: interrupted\n"),
+    ],
+)
+def test_one_line(what: str, status: int, said: str) -> None:
+    done = CliRunner().invoke(prog, ["fail", what])
+    assert (done.exit_code, done.stderr) == (status, said)
+
+
+@pytest.mark.parametrize("what", ["value", "unpacking"])
+def test_a_defect_is_not_taken_for_a_mistake_of_the_user(what: str) -> None:
+    done = CliRunner().invoke(prog, ["fail", what])
+    assert type(done.exception) is ValueError
+    assert done.stderr == ""
+
+
+@pytest.mark.full
+def test_every_error_that_is_raised_for_users_is_a_user_error() -> None:
+    """Whatever class of ours ends in Error and can leave a command is one, or says here why not."""
+    inside = {
+        "_RefusedError",  # becomes a Rejection where it is raised
+        "UnsatisfiableRangeError",  # becomes a 416
+        "ServiceError",  # of the client: what the service answered
+        "_InterruptedError",  # Ctrl-C
+        "HungUpError",  # a connection that ended in good order: a link tries again, or is done
+    }
+    run = (
+        "import pkgutil, importlib, companion\n"
+        "for found in pkgutil.walk_packages(companion.__path__, 'companion.'):\n"
+        "    if found.name != 'companion.studies.prediction.learned':\n"
+        "        importlib.import_module(found.name)\n"
+        "from companion.values import UserError\n"
+        "def below(kind):\n"
+        "    for one in kind.__subclasses__():\n"
+        "        yield one\n"
+        "        yield from below(one)\n"
+        "print(*{one.__name__ for one in below(Exception)\n"
+        "        if one.__module__.startswith('companion') and not issubclass(one, UserError)})\n"
+    )
+    done = subprocess.run([sys.executable, "-c", run], capture_output=True, text=True, check=True)
+    assert set(done.stdout.split()) <= inside
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_an_interrupt_while_the_command_loads_is_one_line(seed: int, tmp_path: Path) -> None:
+    """From the first line of ours on; before it the interpreter itself is starting."""
+    began = tmp_path / "began"
+    code = (
+        f"open({str(began)!r}, 'w').close()\n"
+        "import sys\nfrom companion.__main__ import main\n"
+        "sys.argv = ['companion', 'replay', '/dev/zero.tlog']\nmain()\n"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, cwd=ROOT
+    )
+    while not began.exists():
+        assert process.poll() is None
+        os.sched_yield()
+    time.sleep(random.Random(seed).uniform(0.03, 0.5))  # anywhere while it loads, or after it
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=HANG_S)
+    lines = said.splitlines()
+    assert len(lines) == 1, said
+    assert lines[0] in ("companion: interrupted", "companion: /dev/zero.tlog: no such file")
+
+
+def test_both_doors_are_the_same_command() -> None:
+    by_name = subprocess.run([BIN / "companion", "--version"], capture_output=True, check=True)
+    module = [sys.executable, "-m", "companion", "--version"]
+    assert subprocess.run(module, capture_output=True, check=True).stdout == by_name.stdout

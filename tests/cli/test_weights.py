@@ -1,0 +1,237 @@
+"""``companion weights``: the same beams in every form, every way to say when, and mistakes."""
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from device_reading import parse
+from support import ROOT
+
+from companion.beams.hardware.calibration import CALIBRATION_HEADER, Calibration, parse_calibration
+from companion.beams.hardware.devices import Device
+from companion.cli.main import main
+from companion.cli.weights import FORMATS
+from companion.node import moment
+from companion.node.replay import log_events
+from companion.pipeline import assembly
+from companion.pipeline.fold import Pipeline
+from companion.settings.model import Settings
+from companion.values import Update
+from companion.views import weight_formats
+
+AT_S = 3.0
+CENTER = ("--center", "5:1")
+HUGE = b"\x93NUMPY\x01\x00v\x00" + (
+    b"{'descr': '<c16', 'fortran_order': False, 'shape': (64, 10000000000000), }".ljust(117) + b"\n"
+)
+"""A header that promises 10 petabytes."""
+SMALL = '[array]\nkind = "ura"\nrows = 4\ncolumns = 4\n'
+
+
+def weights(log: Path, *arguments: str, at: str = str(AT_S)) -> bytes:
+    answer = CliRunner().invoke(main, ["weights", str(log), "--at", at, *CENTER, *arguments])
+    assert answer.exit_code == 0, answer.stderr
+    return answer.stdout_bytes
+
+
+def mistake(log: Path, *arguments: str, at: str = "1") -> str:
+    """What is said on stderr: one line, and nothing on stdout."""
+    command = ["weights", str(log), "--at", at, *CENTER, *arguments]
+    answer = CliRunner().invoke(main, command)
+    assert answer.exit_code not in (0, None)
+    assert answer.stdout_bytes == b""
+    assert "\n" not in answer.stderr.rstrip("\n")
+    said: str = answer.stderr.removeprefix("companion: ").rstrip("\n")
+    return said
+
+
+@pytest.fixture(scope="module")
+def looked() -> tuple[Pipeline, Update]:
+    """The pipeline stepped by hand to the time, and what it sees with a lead of 100 ms."""
+    log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
+    settings = Settings().override(center={"source": "5:1"})
+    pipeline, at_ns = Pipeline(settings), None
+    for event in log_events([log], settings):
+        at_ns = at_ns or event.t_ns + round(AT_S * 1e9)
+        if event.t_ns > at_ns:
+            break
+        pipeline.step(event)
+    assert at_ns is not None
+    return pipeline, pipeline.look(at_ns, 0.1)
+
+
+def test_every_form_holds_the_weights_of_the_pipeline(
+    cut_log: Path, looked: tuple[Pipeline, Update]
+) -> None:
+    _, update = looked
+    expected = update.beams.weights
+    assert expected.shape == (64, 4)
+    lead = ("--lead-ms", "100")
+    told = json.loads(weights(cut_log, *lead))
+    assert np.array_equal(np.array(told["re"]) + 1j * np.array(told["im"]), expected)
+    assert tuple(told["uavs"]) == update.beams.uavs
+    assert [beam["uav"] for beam in told["beams"]] == told["uavs"]
+    assert (told["lead_ms"], told["normalisation"]) == (100.0, "unit-response")
+    assert np.array_equal(np.load(io.BytesIO(weights(cut_log, *lead, "--format", "npy"))), expected)
+    raw = np.frombuffer(weights(cut_log, *lead, "--format", "raw"), "<c8")
+    assert np.array_equal(raw.reshape(64, 4), expected.astype(np.complex64))
+
+
+def test_a_lead_is_a_later_look(cut_log: Path, looked: tuple[Pipeline, Update]) -> None:
+    _, update = looked
+    now = np.load(io.BytesIO(weights(cut_log, "--format", "npy")))
+    assert now.shape == update.beams.weights.shape
+    assert not np.allclose(now, update.beams.weights)
+
+
+def test_a_device_s_table_reads_back_as_what_was_fitted(
+    cut_log: Path, looked: tuple[Pipeline, Update]
+) -> None:
+    pipeline, update = looked
+    text = weights(cut_log, "--lead-ms", "100", "--format", "adar1000").decode()
+    ideal = Calibration.ideal(range(64))
+    read = parse(Device.ADAR1000, text, ideal)
+    equipment = assembly.equipment(pipeline.settings, pipeline.array)
+    fitted = weight_formats.device_table(Device.ADAR1000, update.beams, pipeline.array, equipment)
+    assert read.uavs == update.beams.uavs
+    assert np.array_equal(read.codes, fitted.codes)
+    for i, wanted in enumerate(update.beams.weights.T):
+        alike = abs(np.vdot(read.weights[:, i], wanted))
+        alike /= np.linalg.norm(read.weights[:, i]) * np.linalg.norm(wanted)
+        assert alike > 0.99
+
+
+def test_a_calibration_turns_a_device_s_settings(cut_log: Path, tmp_path: Path) -> None:
+    """What the channels add is taken off: the same is radiated, by other codes."""
+    config = tmp_path / "settings.toml"
+    table = tmp_path / "measured.csv"
+    lines = [f"{c},{15 - c},{20 * c},{-0.1 * c}" for c in range(16)]
+    table.write_text("\n".join([CALIBRATION_HEADER, *lines]) + "\n", encoding="utf-8")
+    config.write_text(SMALL, encoding="utf-8")
+    plain = weights(cut_log, "--config", str(config), "--format", "sivers").decode()
+    config.write_text(f'{SMALL}[hardware]\ncalibration = "{table}"\n', encoding="utf-8")
+    turned = weights(cut_log, "--config", str(config), "--format", "sivers").decode()
+    measured = parse_calibration(table.read_text(encoding="utf-8"))
+    one = parse(Device.SIVERS, plain, Calibration.ideal(range(16)))
+    other = parse(Device.SIVERS, turned, measured)
+    assert plain != turned
+    for a, b in zip(one.weights.T, other.weights.T, strict=True):
+        assert abs(np.vdot(a, b)) > 0.99 * np.linalg.norm(a) * np.linalg.norm(b)
+
+
+def test_a_file_holds_what_stdout_would(cut_log: Path, tmp_path: Path) -> None:
+    out = tmp_path / "w.npy"
+    assert weights(cut_log, "--format", "npy", "--out", str(out)) == b""
+    assert out.read_bytes() == weights(cut_log, "--format", "npy")
+
+
+def test_a_time_of_day_is_the_same_as_seconds(cut_log: Path) -> None:
+    """The same instant, whatever the zone it is said in."""
+    begins = next(iter(log_events([cut_log], Settings()))).t_ns
+    at = np.datetime64(begins // 1000, "us") + np.timedelta64(2_000_000, "us")
+    told = json.loads(weights(cut_log, at=f"{at}Z"))
+    assert told["valid_at"] == json.loads(weights(cut_log, at="2"))["valid_at"]
+    shifted = json.loads(weights(cut_log, at=f"{at + np.timedelta64(2, 'h')}+02:00"))
+    assert shifted["re"] == told["re"]
+
+
+@pytest.mark.parametrize(
+    ("at", "said"),
+    [
+        ("-1", "--at -1: the log begins later"),
+        ("1999-01-01T00:00:00Z", "the log begins later"),
+        ("1e6", "--at 1e6: the log is 24.9 s long"),
+        ("9999-01-01T00:00:00Z", "the log is 24.9 s long"),
+        ("nan", "neither seconds"),
+        ("inf", "neither seconds"),
+        ("noon", "neither seconds"),
+        ("", "neither seconds"),
+        ("2026-01-01T00:00:00", "say the zone"),
+        ("0", "no beams at 0: no report yet"),
+    ],
+)
+def test_a_time_that_the_log_does_not_hold(cut_log: Path, at: str, said: str) -> None:
+    assert said in mistake(cut_log, at=at)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--lead-ms", "nan"], "--lead-ms nan: 0 to 10000 is allowed"),
+        (["--lead-ms", "10001"], "--lead-ms"),
+        (["--format", "tmytek"], "tmytek drives 16 elements, the array has 64"),
+        (["--format", "mat"], "'mat' is not one of"),
+        (["--out", "/nowhere/w.npy"], "/nowhere/w.npy: No such file"),
+        (["--config", "missing.toml"], "missing.toml: No such file"),
+        (["--center", "99:1"], "no position from the carrier 99:1"),
+    ],
+)
+def test_what_cannot_be_done_is_said(cut_log: Path, arguments: list[str], said: str) -> None:
+    assert said in mistake(cut_log, *arguments)
+
+
+def test_a_log_that_is_not_there() -> None:
+    assert mistake(Path("missing.tlog")) == "missing.tlog: no such file"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("none.npy", None, "No such file"),
+        ("empty.npy", b"", "not a .npy file"),
+        ("text.npy", b"1 2 3\n4 5 6\n", "not a .npy file"),
+        ("zip.npy", b"PK\x03\x04" + bytes(200), "not a .npy file"),
+        ("huge.npy", HUGE, "not a .npy file"),
+        ("torn.npy", HUGE.replace(b"}", b"("), "not a .npy file"),
+        ("words.npy", np.array([["a", "b"]]), "not the numbers"),
+        ("fields.npy", np.zeros((64, 1), dtype=[("a", "f8")]), "not the numbers"),
+        ("line.npy", np.ones(64), "not a matrix"),
+        ("small.npy", np.ones((5, 3)), "not for 64 elements"),
+        ("zero.npy", np.zeros((64, 2)), "column 0 of the weights is zero"),
+        ("nan.npy", np.full((64, 2), np.nan), "finite"),
+    ],
+)
+def test_stored_beams_that_will_not_do(
+    cut_log: Path, tmp_path: Path, name: str, content: Any, said: str
+) -> None:
+    """Said before the log is read, and once."""
+    file = tmp_path / name
+    if isinstance(content, bytes):
+        file.write_bytes(content)
+    elif content is not None:
+        np.save(file, content)
+    config = tmp_path / "settings.toml"
+    config.write_text(f'[codebook]\nkind = "file"\nfile = "{file}"\n', encoding="utf-8")
+    message = mistake(cut_log, "--config", str(config), at="1e6")
+    assert said in message
+    assert message.count("codebook") == 1
+
+
+def test_whole_numbers_are_a_codebook(cut_log: Path, tmp_path: Path) -> None:
+    file, config = tmp_path / "beams.npy", tmp_path / "settings.toml"
+    np.save(file, np.eye(64, dtype=np.int8)[:, :5])
+    config.write_text(f'[codebook]\nkind = "file"\nfile = "{file}"\n', encoding="utf-8")
+    told = json.loads(weights(cut_log, "--config", str(config)))
+    assert told["codebook_beams"] == 5
+    assert {beam["codebook"]["best"] for beam in told["beams"]} <= set(range(5))
+
+
+def test_the_forms_offered_are_those_that_can_be_made() -> None:
+    assert set(FORMATS) == set(weight_formats.TYPES)
+
+
+def test_progress_is_told_and_the_look_is_the_same(
+    cut_log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(moment, "TOLD_EVERY", 200)
+    told: list[float] = []
+    settings = Settings().override(center={"source": "5:1"})
+    _, update = moment.look([cut_log], settings, "3", progress=told.append)
+    _, plain = moment.look([cut_log], settings, "3")
+    assert np.array_equal(update.beams.weights, plain.beams.weights)
+    assert told == sorted(told)
+    assert 0 < told[0] < told[-1] <= 3.0

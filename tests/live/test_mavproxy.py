@@ -1,0 +1,136 @@
+"""MAVProxy, as it comes from its makers, routes between the vehicles and the service."""
+
+import json
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mav_vehicle import Vehicle
+from support import BIN, HANG_S, read_metadata
+
+Router = Callable[..., None]
+
+
+def free_port(kind: socket.SocketKind) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+@pytest.fixture
+def router(tmp_path: Path) -> Iterator[Router]:
+    """Starts MAVProxy with a master and outputs, its files in a folder of its own."""
+    started: list[subprocess.Popen[bytes]] = []
+
+    def start(master: str, *outputs: str) -> None:
+        home = tmp_path / "mavproxy"
+        (home / ".mavproxy").mkdir(parents=True)
+        command = [sys.executable, BIN / "mavproxy.py", f"--master={master}", "--streamrate=-1"]
+        command += [f"--out={output}" for output in outputs]
+        command += ["--daemon", "--non-interactive", f"--state-basedir={home}"]
+        command += ["--default-modules=output,link"]
+        with (tmp_path / "mavproxy.txt").open("wb") as log:
+            started.append(
+                subprocess.Popen(
+                    command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, cwd=home,
+                    env={"HOME": str(home), "PATH": str(BIN), "MAVLINK20": "1"},
+                )
+            )  # fmt: skip
+
+    yield start
+    for process in started:
+        process.terminate()
+        try:
+            process.wait(10)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture
+def fly() -> Iterator[Callable[..., "subprocess.Popen[str]"]]:
+    """Starts ``sitl-replay fly``."""
+    started: list[subprocess.Popen[str]] = []
+
+    def start(scenario: str, to: str, seconds: float) -> "subprocess.Popen[str]":
+        command = [BIN / "sitl-replay", "fly", scenario, "--to", to, "--duration", str(seconds)]
+        started.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+        return started[-1]
+
+    yield start
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+def test_over_datagrams_and_over_a_connection_at_once(
+    start_node: Any, router: Router, fly: Any, tmp_path: Path
+) -> None:
+    """Both outputs of the router lead to the service: every report comes twice, and counts once."""
+    master, out = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_STREAM)
+    node = start_node(
+        "run", "--link", "udpin:127.0.0.1:0", "--link", f"tcp:127.0.0.1:{out}",
+        "--center", "5:1", "--listen", "127.0.0.1:0", "--record", str(tmp_path / "recordings"),
+    )  # fmt: skip
+    router(
+        f"udpin:127.0.0.1:{master}", f"udpout:127.0.0.1:{node.udp_port}", f"tcpin:127.0.0.1:{out}"
+    )
+    fly("hover", f"udpout:127.0.0.1:{master}", 60.0)
+    node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4, 40.0)
+    links = node.wait_until(
+        "/v1/links", lambda answer: all(link["frames"] > 200 for link in answer["links"]), 40.0
+    )["links"]
+    assert [link["state"] for link in links] == ["up", "up"]
+    heard = [{one["id"] for one in link["components"]} for link in links]
+    assert all({"1:1", "2:1", "3:1", "4:1", "5:1"} <= ids for ids in heard), heard
+    assert [link["bad_crc"] for link in links] == [0, 0]
+    reports = [link["reports"] for link in links]
+    assert all(one["latency_p50_s"] < 1.0 for one in reports)
+    assert {uav["id"] for uav in node.json("/v1/uavs")["uavs"]} == {"1:1", "2:1", "3:1", "4:1"}
+    rejected = node.json("/v1/status")["rejected"]
+    assert set(rejected) == {"duplicate"}
+    assert rejected["duplicate"] > 0.3 * min(one["total"] for one in reports)
+
+    assert node.stop()[0] == 0
+    (recording,) = (tmp_path / "recordings").iterdir()
+    replayed = subprocess.run(
+        [BIN / "companion", "replay", recording, "--no-record", "--json"],
+        capture_output=True,
+        check=True,
+    )
+    summary = json.loads(replayed.stdout)
+    assert summary["digest"] == read_metadata(recording)["summary"]["digest"]
+    assert set(summary["uavs"]) == {"1:1", "2:1", "3:1", "4:1"}
+
+
+def test_what_the_service_says_reaches_the_vehicle_and_its_answer_the_service(
+    start_node: Any, router: Router, tmp_path: Path
+) -> None:
+    """The request for a rate, its acknowledgement and TIMESYNC, there and back through a router."""
+    master = free_port(socket.SOCK_DGRAM)
+    settings = tmp_path / "settings.toml"
+    settings.write_text(
+        "[presence]\nenabled = true\nsystem_id = 200\nposition_hz = 10.0\n", encoding="utf-8"
+    )
+    node = start_node(
+        "run", "--link", "udpin:127.0.0.1:0", "--center", "47.3977,8.5456,500",
+        "--listen", "127.0.0.1:0", "--config", str(settings),
+    )  # fmt: skip
+    router(f"udpin:127.0.0.1:{master}", f"udpout:127.0.0.1:{node.udp_port}")
+    with Vehicle(f"udpout:127.0.0.1:{master}", 1, 2.0, 1.0) as uav:
+        asked = uav.wait_for(lambda m: m.get_type() == "COMMAND_LONG" and m.command == 511, HANG_S)
+        assert (asked.get_srcSystem(), asked.get_srcComponent()) == (200, 191)
+        node.wait_until(
+            "/v1/links",
+            lambda answer: [rate["state"] for rate in answer["message_rates"]] == ["accepted"],
+        )
+        seen = node.wait_until("/v1/uavs/1:1", lambda one: one["clock"]["kind"] == "timesync", 30.0)
+        assert seen["clock"]["uncertainty_s"] < 0.5
+        beat = uav.wait_for(lambda m: m.get_type() == "HEARTBEAT" and m.get_srcSystem() == 200)
+        assert beat.get_srcComponent() == 191

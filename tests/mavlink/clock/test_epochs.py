@@ -1,0 +1,231 @@
+"""Late frames, reboots, leaps and the wrap: which line a stamp lies on."""
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.mavlink.clock.sender_clock import SenderClock, Stamp
+
+MS = 1_000_000
+S = 1_000_000_000
+EPOCH_NS = 1_700_000_000 * S
+WRAP_MS = 1 << 32
+
+Seen = list[tuple[int, int]]  # (arrival after the epoch, boot), ms
+
+
+def observe_all(seen: Seen, clock: SenderClock | None = None) -> list[Stamp | None]:
+    clock = clock or SenderClock()
+    return [clock.observe(EPOCH_NS + arrival * MS, boot) for arrival, boot in seen]
+
+
+def reboots(stamps: list[Stamp | None]) -> list[int]:
+    return [n for n, stamp in enumerate(stamps) if stamp is not None and stamp.rebooted]
+
+
+def run(arrival: int, boot: int, count: int, every: int = 200) -> Seen:
+    return [(arrival + n * every, boot + n * every) for n in range(count)]
+
+
+@pytest.mark.parametrize("back_ms", [1_200, 4_800, 9_700])
+def test_a_late_frame_is_no_reboot(back_ms: int) -> None:
+    stamps = observe_all(
+        [*run(0, 300_000, 50), (9_810, 309_800 - back_ms), (10_000, 310_000)],
+    )
+    assert not reboots(stamps)
+    late, after = stamps[-2:]
+    assert late is not None and after is not None
+    assert late.sender_ns == (309_800 - back_ms) * MS
+    assert late.latency_s == pytest.approx(back_ms / 1000 + 0.01)
+    assert after.latency_s == 0.0
+
+
+def test_a_link_that_lags_by_seconds_is_no_reboot() -> None:
+    """Beside a fast one, or alone: the sender's first seconds are over."""
+    fast, slow = run(0, 300_000, 100), run(4_001, 300_001, 100)
+    assert not reboots(observe_all(sorted([*fast, *slow])))
+    assert None not in observe_all(sorted([*fast, *slow]))
+    assert not reboots(observe_all(fast + run(20_000, 316_000, 40)))
+
+
+@pytest.mark.parametrize("boot_ms", [0, 12_000])
+@pytest.mark.parametrize("back_ms", [48_000, 260_000])
+def test_a_reboot_is_one_event_and_begins_anew(back_ms: int, boot_ms: int) -> None:
+    before = run(0, boot_ms + back_ms - 9_800, 50)
+    stamps = observe_all([*before, *run(10_000, boot_ms, 100)])
+    assert reboots(stamps) == [53]  # half a second after its first stamp
+    assert [n for n, stamp in enumerate(stamps) if stamp is None] == [50, 51, 52]
+    for n, stamp in enumerate(stamps[53:], start=3):
+        assert stamp is not None
+        assert stamp.sender_ns == (boot_ms + n * 200) * MS
+        assert stamp.latency_s == 0.0  # nothing is left of the old offset
+
+
+@pytest.mark.parametrize("uptime_ms", [4_000, 9_000])
+@pytest.mark.parametrize("late_ms", [0, 400])
+def test_a_reboot_shortly_after_a_boot(uptime_ms: int, late_ms: int) -> None:
+    """It steps back by no more than a late frame, and does not catch up."""
+    again = [(t + (late_ms if n % 2 else 0), b) for n, (t, b) in enumerate(run(0, 500, 40, 250))]
+    seen = run(0, 0, uptime_ms // 100, 100) + [(uptime_ms + 500 + t, b) for t, b in again]
+    stamps = observe_all(seen)
+    assert len(reboots(stamps)) == 1
+    after = stamps[reboots(stamps)[0] :]
+    assert reboots(stamps)[0] <= uptime_ms // 100 + 10
+    assert all(stamp is not None and stamp.latency_s <= 0.4 for stamp in after)
+
+
+@pytest.mark.parametrize(("late_ms", "placed"), [(9_900, True), (10_100, False), (60_000, False)])
+def test_no_frame_is_later_than_ten_seconds(late_ms: int, placed: bool) -> None:
+    """A single stamp that lags by more is of another clock, and has no time."""
+    *_, late, after = observe_all(
+        [*run(0, 300_000, 100), (19_810, 319_810 - late_ms), (20_000, 320_000)]
+    )
+    assert (late is not None) is placed
+    assert late is None or late.latency_s == pytest.approx(late_ms / 1000)
+    assert after is not None and after.latency_s == 0.0
+
+
+def test_a_queue_that_is_flushed_in_the_first_seconds_is_no_reboot() -> None:
+    """Late frames in a burst catch up with the line."""
+    queued = [(8_000 + n * 10, 3_000 + n * 100) for n in range(45)]
+    stamps = observe_all([*run(0, 0, 80, 100), *queued, *run(8_500, 8_500, 20, 100)])
+    assert not reboots(stamps)
+    assert None not in stamps
+
+
+def test_stragglers_of_the_boot_before_have_no_time() -> None:
+    """Single or in a burst, up to seconds after the reboot; the new boot goes on."""
+    again = run(10_000, 1_000, 100)
+    late = [(13_105, 108_000), *((14_110 + n, 108_500 + n * 100) for n in range(10))]
+    seen = sorted([*run(0, 100_000, 50), *again, *late])
+    stamps = observe_all(seen)
+    assert len(reboots(stamps)) == 1
+    for (arrival, boot), stamp in zip(seen, stamps, strict=True):
+        if arrival > 11_000:
+            assert (stamp is None) == (boot > 50_000), arrival
+
+
+def test_a_leap_soon_after_a_reboot_is_none_of_the_boot_before() -> None:
+    """Ahead of all that either boot has sent: three stamps later it is the line."""
+    seen = [*run(0, 100_000, 50), *run(10_000, 1_000, 20), *run(14_000, 500_000, 20)]
+    stamps = observe_all(seen)
+    assert len(reboots(stamps)) == 1
+    assert [n for n, stamp in enumerate(stamps) if stamp is None] == [50, 51, 52, 70, 71, 72]
+    assert all(stamp is not None and stamp.latency_s == 0.0 for stamp in stamps[73:])
+
+
+def test_a_stray_stamp_changes_nothing() -> None:
+    """One message of the sender with another clock in it, ahead or behind, again and again."""
+    steady = run(0, 100_000, 200, 100)
+    for boot in (7, 660_000, 4_000_000_000):
+        strays = [(150 + n * 1_000, boot) for n in range(18)]
+        seen = sorted([*steady, *strays])
+        stamps = observe_all(seen)
+        assert not reboots(stamps)
+        assert [s is None for s in stamps] == [b == boot for _, b in seen]
+
+
+def test_a_leap_ahead_is_no_reboot() -> None:
+    seen = [*run(0, 100_000, 50), *run(10_000, 110_000 + 560_000, 50)]
+    stamps = observe_all(seen)
+    assert not reboots(stamps)
+    placed = [s for s in stamps[53:] if s is not None]
+    assert len(placed) == 47
+    assert [s.sender_ns for s in placed] == [boot * MS for _, boot in seen[53:]]
+    assert all(s.latency_s == 0.0 for s in placed)
+
+
+def test_a_clock_that_stood_still_goes_on() -> None:
+    stamps = observe_all([*run(0, 100_000, 50), *run(70_000, 110_000, 50)])
+    assert not reboots(stamps)
+    assert None not in stamps
+    lags = [s.latency_s for s in stamps[50:] if s is not None]
+    assert lags[:10] == pytest.approx([60.0] * 10)
+    assert lags[10:] == pytest.approx([0.0] * 40)
+
+
+def test_the_wrap_is_neither_a_reboot_nor_a_leap() -> None:
+    start = WRAP_MS - 5_000
+    stamps = observe_all([(n * 100, (start + n * 100) % WRAP_MS) for n in range(200)])
+    assert not reboots(stamps)
+    times = [s.sender_ns for s in stamps if s is not None]
+    assert len(times) == 200
+    assert {b - a for a, b in pairwise(times)} == {100 * MS}
+    assert all(s is not None and s.latency_s == 0.0 for s in stamps)
+
+
+def test_a_late_frame_from_before_the_wrap() -> None:
+    stamps = observe_all([(0, WRAP_MS - 1_000), (1_500, 500), (1_600, WRAP_MS - 700), (1_700, 700)])
+    assert not reboots(stamps)
+    assert [s.latency_s for s in stamps if s] == pytest.approx([0.0, 0.0, 1.3, 0.0])
+
+
+@pytest.mark.parametrize("uptime_ms", [100_000, 2_000_000_000, 4_000_000_000])
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_a_reboot_after_any_uptime(uptime_ms: int, wrapped: bool) -> None:
+    before = run(0, WRAP_MS - 1_000, 10) if wrapped else []
+    before = [(t, b % WRAP_MS) for t, b in before]
+    seen = [*before, *run(uptime_ms, uptime_ms - 1_000, 10), *run(uptime_ms + 5_000, 700, 10)]
+    stamps = observe_all(seen)
+    assert reboots(stamps) == [len(before) + 13]
+    assert stamps[-1] is not None and stamps[-1].sender_ns == 2_500 * MS
+
+
+@settings(max_examples=300)
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 100_000), st.integers(0, WRAP_MS - 1) | st.integers(0, 60_000)),
+        min_size=1,
+        max_size=60,
+    )
+)
+def test_whatever_comes(steps: Seen) -> None:
+    """Leaps, reboots, wraps and nonsense: never later than the arrival."""
+    clock, arrival_ns = SenderClock(), EPOCH_NS
+    for gap_ms, boot_ms in steps:
+        arrival_ns += gap_ms * MS
+        stamp = clock.observe(arrival_ns, boot_ms)
+        if stamp is not None:
+            assert clock.node_ns(stamp.sender_ns) <= arrival_ns
+            assert stamp.latency_s >= 0.0
+            assert stamp.sender_ns // MS % WRAP_MS == boot_ms
+
+
+def shared_at(seen: Seen) -> list[int]:
+    """The arrivals, ms, at which two clocks are known to run."""
+    clock, found = SenderClock(), []
+    for arrival, boot in seen:
+        clock.observe(EPOCH_NS + arrival * MS, boot)
+        if clock.is_shared(EPOCH_NS + arrival * MS):
+            found.append(arrival)
+    return found
+
+
+@pytest.mark.parametrize("apart_ms", [-3_600_000, -40_000, 40_000, 3_600_000])
+def test_two_clocks_side_by_side_are_two_senders(apart_ms: int) -> None:
+    first, second = run(0, 5_000_000, 100), run(10_050, 5_010_000 + apart_ms, 50)
+    found = shared_at(sorted([*first, *second]))
+    assert 12_500 <= found[0] <= 13_600
+    assert found == [t for t, _ in sorted([*first, *second]) if t >= found[0]]
+
+
+def test_once_the_second_is_silent_the_first_is_believed_again() -> None:
+    first, second = run(0, 5_000_000, 200), run(5_050, 9_000_000, 40)
+    found = shared_at(sorted([*first, *second]))
+    assert found[-1] == pytest.approx(5_050 + 39 * 200 + 10_000, abs=250)
+
+
+def test_what_one_sender_alone_does_is_never_taken_for_two() -> None:
+    """Reboots, late frames, another link that lags, a leap, bursts."""
+    alone = run(0, 300_000, 100)
+    late = [(12_000 + n, 310_000 - 180 * n) for n in range(20)]
+    assert not shared_at([*alone, *run(20_000, 1_000, 100)])
+    assert not shared_at(sorted([*alone, *late]))
+    assert not shared_at(sorted([*alone, *run(4_001, 300_001, 100)]))
+    assert not shared_at([*alone, *run(20_000, 900_000, 100)])
+    assert not shared_at([(10_000 * (n // 50 + 1), 300_000 + 200 * n) for n in range(300)])
+    # What a slow link still brings of the boot before, beside the fast one.
+    again, left = run(10_000, 1_000, 100), run(12_050, 105_000, 30)
+    assert not shared_at(sorted([*run(0, 100_000, 50), *again, *left]))

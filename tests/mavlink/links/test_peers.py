@@ -1,0 +1,226 @@
+"""Sequence numbers, by peer and source: what is missing, late, repeated, or begun again."""
+
+import random
+from collections.abc import Iterable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from link_support import frame
+
+from companion.mavlink.links import peers as peers_module
+from companion.mavlink.links.peers import PEERS_MAX, RESTART_RUN, SENDERS_MAX, Peer, Peers
+from companion.mavlink.links.status import LinkStatus
+from companion.mavlink.wire.framing import Splitter
+from companion.values import Frame, Reason, Rejection, Source
+
+UAV = Source(1, 1)
+LINK = "udpin:127.0.0.1:14550"
+(MADE,) = Splitter(LINK).feed(0, frame(1))
+assert isinstance(MADE, Frame)
+
+
+def numbered(number: int, source: Source = UAV, t_ns: int = 0) -> Frame:
+    """A frame as far as counting goes: its checksum has been looked at before."""
+    raw = bytearray(MADE.raw)
+    raw[4:7] = number & 0xFF, *source
+    return Frame(t_ns, LINK, source, MADE.msgid, bytes(raw))
+
+
+class Heard:
+    """Peers of a link, and who was bidden farewell."""
+
+    def __init__(self) -> None:
+        self.status = LinkStatus(LINK)
+        self.farewells: list[Peer] = []
+        self.peers = Peers(self.status, self.farewells.append)
+
+    def hear(
+        self, numbers: Iterable[int], key: str = "a", source: Source = UAV, t_ns: int = 0
+    ) -> "Heard":
+        self.peers.count(self.peers.at(key), [numbered(n, source, t_ns) for n in numbers])
+        return self
+
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        return self.status.gaps, self.status.late, self.status.repeats
+
+
+@given(st.integers(0, 255), st.lists(st.integers(1, 127), max_size=200))
+def test_every_hole_shorter_than_half_a_round_is_counted(first: int, steps: list[int]) -> None:
+    """Frames that are sent one after the other, of which some are lost."""
+    number, numbers = first, [first]
+    for step in steps:
+        numbers.append(number := number + step)
+    heard = Heard().hear(numbers)
+    assert heard.counts == (numbers[-1] - first + 1 - len(numbers), 0, 0)
+    assert heard.status.components[UAV].gaps == heard.status.gaps
+    assert heard.status.frames == len(numbers)
+
+
+@given(st.integers(0, 255), st.lists(st.integers(1, 5), max_size=200))
+def test_every_repeat_is_counted(first: int, times: list[int]) -> None:
+    numbers = [first + n for n, copies in enumerate(times) for _ in range(copies)]
+    assert Heard().hear(numbers).counts == (0, 0, sum(times) - len(times))
+
+
+@given(st.integers(0, 255), st.lists(st.booleans(), max_size=200))
+def test_a_swapped_pair_is_one_late_frame_that_was_missing(first: int, swaps: list[bool]) -> None:
+    numbers = list(range(first, first + 1 + 2 * len(swaps)))
+    for n, swapped in enumerate(swaps):
+        if swapped:
+            at = 1 + 2 * n
+            numbers[at], numbers[at + 1] = numbers[at + 1], numbers[at]
+    assert Heard().hear(numbers).counts == (sum(swaps), sum(swaps), 0)
+
+
+@pytest.mark.parametrize("behind", [2, 10, 126])
+def test_stragglers_among_frames_in_order_are_no_restart(behind: int) -> None:
+    """Two ways to here, one of them longer: nothing is missing, each frame comes twice."""
+    numbers = [n for at in range(1000) for n in ((at, at - behind) if at > behind else (at,))]
+    assert Heard().hear(numbers).counts == (0, 999 - behind, 0)
+
+
+def test_frames_in_reverse_are_no_restart() -> None:
+    """A new beginning counts upwards."""
+    assert Heard().hear([1, 10, 9, 8, 7, 6, 5, 11]).counts == (8, 5, 0)
+
+
+@pytest.mark.parametrize("lost", [0.0, 0.3])
+def test_a_restart_is_at_most_one_wrong_gap(lost: float) -> None:
+    """From any place to any other; also over a link that loses frames, whose own holes count."""
+    chance = random.Random(1)
+    for last in range(0, 256, 5):
+        for first in range(256):
+            heard = Heard().hear([last])
+            arrived = [first + n for n in range(40) if n == 0 or chance.random() >= lost]
+            heard.hear(arrived)
+            holes = arrived[-1] - first + 1 - len(arrived)
+            gaps, late, repeats = heard.counts
+            step = (first - last) & 0xFF
+            if 0 < step < 128:  # forwards: it cannot be told from a hole
+                assert (gaps, late, repeats) == (step - 1 + holes, 0, 0)
+            elif step == 0:  # the place where it was: as if nothing had been
+                assert (gaps, late, repeats) == (holes, 0, 1)
+            else:  # backwards: it is followed as soon as it is sure, or has caught up
+                assert gaps <= holes and late + repeats <= RESTART_RUN and repeats <= 1
+
+
+def test_after_a_restart_holes_are_counted_again() -> None:
+    heard = Heard().hear(range(50, 100)).hear(range(20))
+    assert heard.counts == (0, RESTART_RUN, 0)
+    heard.hear(range(25, 30))
+    assert heard.counts == (5, RESTART_RUN, 0)
+
+
+def test_a_hole_of_a_whole_round_is_not_seen() -> None:
+    """The number has 8 bits: that is all that it can say."""
+    assert Heard().hear([0, 1, 256 + 2]).counts == (0, 0, 0)
+    assert Heard().hear([0, 1, 256 + 5]).counts == (3, 0, 0)
+
+
+def test_numbers_are_those_of_a_peer_and_a_source() -> None:
+    heard = Heard()
+    for n in range(300):
+        heard.hear([n], "a", UAV, t_ns=n)
+        heard.hear([n + 100], "a", Source(1, 2), t_ns=n)
+        heard.hear([7 * n], "b", Source(2, 1), t_ns=n)
+        heard.hear([n + 50], "b", UAV, t_ns=1000 + n)
+    status = heard.status
+    assert heard.counts == (6 * 299, 0, 0)
+    assert {source: c.gaps for source, c in status.components.items()} == {
+        UAV: 0,
+        Source(1, 2): 0,
+        Source(2, 1): 6 * 299,
+    }
+    assert status.components[UAV].frames == 600
+    assert status.components[UAV].heard_ns == status.heard_ns == 1299
+    assert status.components[Source(1, 2)].heard_ns == 299
+    assert (status.frames, status.peers) == (1200, 2)
+
+
+def test_the_version_is_that_of_the_last_frame_and_both_are_remembered() -> None:
+    heard = Heard()
+    peer = heard.peers.at("a")
+    assert not peer.speaks_v1_only
+    for version in (1, 1, 2, 1):
+        (item,) = Splitter(LINK).feed(0, frame(1, version=version))
+        heard.peers.count(peer, [item])
+        assert heard.status.components[UAV].version == version
+    assert not peer.speaks_v1_only
+    other = heard.peers.at("b")
+    heard.peers.count(other, Splitter(LINK).feed(0, frame(1, version=1)))
+    assert other.speaks_v1_only
+
+
+def test_rejections_are_counted_by_reason_and_move_nothing_else() -> None:
+    heard = Heard()
+    peer = heard.peers.at("a")
+    lost = [Rejection(5, LINK, Reason.GARBAGE, 7), Rejection(5, "1:1", Reason.UNSIGNED)]
+    heard.peers.count(peer, [*lost, *lost])
+    assert heard.status == LinkStatus(LINK, peers=1, lost={"garbage": 14, "unsigned": 2})
+    assert peer.heard_ns is None and heard.peers.heard_since(0) == []
+
+
+def test_a_source_is_where_it_was_heard_last() -> None:
+    heard = Heard().hear([1], "a").hear([1], "b").hear([1], "c", Source(2, 1))
+    peers = heard.peers
+    assert peers.last_of(UAV) is peers.find("b")
+    heard.hear([2], "a")
+    assert peers.last_of(UAV) is peers.find("a")
+    assert peers.last_of(Source(2, 1)) is peers.find("c")
+    assert peers.last_of(Source(3, 1)) is None
+    peers.forget(peers.at("a"))
+    assert peers.last_of(UAV) is None
+    peers.at("a")  # somebody new at the old address has not been heard yet
+    assert peers.last_of(UAV) is None
+
+
+def test_peers_heard_lately() -> None:
+    heard = Heard().hear([1], "old", t_ns=99).hear([1], "new", t_ns=100)
+    heard.peers.at("silent")
+    assert [peer.key for peer in heard.peers.heard_since(100)] == ["new"]
+
+
+def test_each_peer_is_counted_to_by_itself() -> None:
+    heard = Heard()
+    a, b = heard.peers.at("a"), heard.peers.at("b")
+    assert [a.next_sequence() for _ in range(258)] == [*range(256), 0, 1]
+    assert b.next_sequence() == 0
+
+
+def test_the_peers_heard_last_are_kept() -> None:
+    heard = Heard()
+    for n in range(PEERS_MAX + 10):
+        heard.peers.at(n)
+        heard.peers.at(0)  # who keeps sending is not given up
+    assert len(heard.peers) == PEERS_MAX
+    assert [peer.key for peer in heard.farewells] == list(range(1, 11))
+    assert heard.peers.find(0) is not None and heard.peers.find(1) is None
+
+
+def test_invented_senders_do_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever keeps sending loses at most the hole of that moment."""
+    assert SENDERS_MAX <= 1 << 16
+    monkeypatch.setattr(peers_module, "SENDERS_MAX", 100)
+    heard = Heard()
+    for n in range(1000):
+        heard.hear([n], "steady")
+        heard.hear([5], f"bad {n % 7}", Source(n % 250, n % 251))
+        kept = [heard.peers.at(key) for key in ("steady", *(f"bad {k}" for k in range(7)))]
+        assert sum(len(peer.senders) for peer in kept) <= 100
+        if n == 500:
+            for key in range(7):
+                heard.peers.forget(heard.peers.at(f"bad {key}"))
+    assert heard.counts == (0, 0, 0)
+
+
+def test_peers_that_come_and_go_leave_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many there were: those that stay are followed on, and every hole is seen."""
+    monkeypatch.setattr(peers_module, "SENDERS_MAX", 10)
+    heard = Heard()
+    for n in range(100):
+        heard.hear([2 * n], "steady")
+        heard.hear([1], "passing", Source(2, 1))
+        heard.peers.forget(heard.peers.at("passing"))
+    assert heard.counts == (99, 0, 0)

@@ -1,0 +1,272 @@
+"""Serial links over real pseudo-terminals: a device that comes, goes, and is somebody else's."""
+
+import asyncio
+import contextlib
+import errno
+import fcntl
+import os
+import pty
+import subprocess
+import sys
+import termios
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import serial
+from link_support import LOOPS, Run, frame, runner, running, until_true
+from pymavlink.dialects.v20 import all as dialect
+
+from companion.mavlink.links import serial_port, transport
+from companion.mavlink.links.transport import Link
+from companion.mavlink.links.urls import parse_link
+from companion.mavlink.wire.encode import Outgoing, heartbeat
+from companion.mavlink.wire.framing import Splitter
+from companion.values import Frame, Rejection, Source
+
+OURS = Source(5, 191)
+TIOCVHANGUP = 0x5437  # what the system does to a terminal whose device is unplugged
+
+
+@pytest.fixture(params=LOOPS)
+def run(request: pytest.FixtureRequest) -> Run:
+    """``run(test())`` on one loop and on the other."""
+    return runner(request.param)
+
+
+class Cable:
+    """A pseudo-terminal: ``path`` is the device, and this is what sits at its other end."""
+
+    def __init__(self) -> None:
+        self.end, device = pty.openpty()
+        self.path = os.ttyname(device)
+        os.set_blocking(self.end, False)
+        os.close(device)
+
+    def read(self) -> bytes:
+        """What has come so far."""
+        with contextlib.suppress(BlockingIOError):
+            return os.read(self.end, 1 << 16)
+        return b""
+
+    def unplug(self) -> None:
+        """The device is gone."""
+        if self.end >= 0:
+            os.close(self.end)
+            self.end = -1
+
+
+@contextlib.contextmanager
+def cable() -> Iterator[Cable]:
+    """A cable that is unplugged at the end, if it was not before."""
+    made = Cable()
+    try:
+        yield made
+    finally:
+        made.unplug()
+
+
+def hard_bytes(number: int) -> bytes:
+    """A frame full of what terminals have their own ways with: ^C, ^D, CR, LF, ^Q, ^S, DEL, 0xFF"""
+    mav = dialect.MAVLink(None, 1, 1)
+    mav.seq = number % 256
+    awkward = b"\x03\x04\r\n\x11\x13\x7f\xff\x1a\x1c\x00"
+    data = (awkward * 12)[: 100 + number] + bytes(range(256))
+    return bytes(
+        dialect.MAVLink_file_transfer_protocol_message(0, 1, 1, data[:251].ljust(251)).pack(mav)
+    )
+
+
+def test_frames_pass_both_ways_whatever_bytes_they_hold(run: Run) -> None:
+    async def test() -> None:
+        with cable() as wire:
+            async with running(f"serial:{wire.path}:921600") as (link, inbox):
+                assert link.send(heartbeat(OURS)) == 0  # it is not open yet
+                await until_true(lambda: link.status.state == "up")
+                made = [hard_bytes(n) for n in range(10)]
+                for raw in made:
+                    os.write(wire.end, raw[:100])
+                    await asyncio.sleep(0.001)  # a frame comes in pieces
+                    os.write(wire.end, raw[100:])
+                await inbox.until(len(made))
+                assert inbox.raws == made
+                assert link.status.lost == {} and link.status.bytes == sum(map(len, made))
+                payload = bytes(range(1, 256))
+                assert link.send(Outgoing(OURS, 110, payload[:254])) == 1
+                assert link.send_to(Source(1, 1), heartbeat(OURS))
+                came = b""
+                while len(came) < (10 + 254 + 2) + (10 + 9 + 2):
+                    came += wire.read()
+                    await asyncio.sleep(0.001)
+                first, second = Splitter("wire").feed(0, came)
+                assert isinstance(first, Frame) and isinstance(second, Frame)
+                assert first.payload == payload[:254] and (first.seq, second.seq) == (0, 1)
+                assert (link.status.state, link.status.peers) == ("up", 1)
+            assert inbox.notices == []
+
+    run(test())
+
+
+def test_a_device_that_is_unplugged_and_plugged_in_again(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At first it is not there. Half a frame of before spoils nothing."""
+    monkeypatch.setattr(transport, "RETRY_S", (0.01,))
+    monkeypatch.setattr(transport, "STEADY_S", 0.02)
+    device = tmp_path / "ttyUSB0"
+
+    async def test() -> None:
+        async with running(f"serial:{device}:57600") as (link, inbox):
+            for n in range(3):
+                await inbox.until_said(1 + 2 * n)
+                assert link.status.state == "connecting"
+                assert link.send(heartbeat(OURS)) == 0
+                with cable() as wire:
+                    device.symlink_to(wire.path)
+                    await inbox.until_said(2 + 2 * n)
+                    assert link.status.state == "up"
+                    os.write(wire.end, frame(n) + frame(100 + n)[:20])
+                    await inbox.until(n + 1)
+                    device.unlink()
+            await inbox.until_said(7)
+            assert inbox.raws == [frame(0), frame(1), frame(2)]
+            lost = link.status.lost["garbage"]
+            assert lost == 60
+            away = f"link {link.url} is down: No such file or directory; trying again"
+            back = f"link {link.url} is back"
+            assert inbox.texts[:2] == [away, back]
+            assert inbox.texts[1::2] == [back] * 3
+            for text in inbox.texts[2::2]:
+                assert text.startswith(f"link {link.url} is down: ")
+
+    run(test())
+
+
+def test_a_hang_up_by_the_system_is_noticed(run: Run) -> None:
+    async def test() -> None:
+        with cable() as wire:
+            async with running(f"serial:{wire.path}:57600") as (link, inbox):
+                await until_true(lambda: link.status.state == "up")
+                descriptor = os.open(wire.path, os.O_RDWR | os.O_NOCTTY)
+                try:
+                    fcntl.ioctl(descriptor, TIOCVHANGUP)
+                except PermissionError:
+                    pytest.skip("it takes a privilege to hang up a terminal")
+                finally:
+                    os.close(descriptor)
+                await inbox.until_said(1)
+                why = os.strerror(errno.ENODEV)
+                assert inbox.texts == [f"link {link.url} is down: {why}; trying again"]
+                await until_true(lambda: link.status.state == "up")  # the other end is still there
+                os.write(wire.end, frame(1))
+                await inbox.until(1)
+
+    run(test())
+
+
+def test_a_device_of_another_program_is_waited_for(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(transport, "RETRY_S", (0.01,))
+
+    async def test() -> None:
+        with cable() as wire:
+            other = serial.Serial(wire.path, 57600, exclusive=True)
+            async with running(f"serial:{wire.path}:57600") as (link, inbox):
+                await inbox.until_said(1)
+                busy = "Device or resource busy"
+                assert inbox.texts == [f"link {link.url} is down: {busy}; trying again"]
+                os.write(wire.end, frame(9))
+                await asyncio.sleep(0.05)
+                assert other.read(len(frame(9))) == frame(9)  # nothing was taken from it
+                other.close()
+                await until_true(lambda: link.status.state == "up")
+                with pytest.raises(serial.SerialException):
+                    serial.Serial(wire.path, 57600, exclusive=True)
+                os.write(wire.end, frame(1))
+                await inbox.until(1)
+
+    run(test())
+
+
+def test_what_is_no_terminal_is_waited_for(run: Run) -> None:
+    async def test() -> None:
+        async with running("serial:/dev/null:57600") as (link, inbox):
+            await inbox.until_said(1)
+            assert "Inappropriate ioctl" in inbox.texts[0] and "\n" not in inbox.texts[0]
+            assert link.status.state == "connecting"
+
+    run(test())
+
+
+def test_a_device_that_does_not_take_loses_messages_and_no_time(run: Run) -> None:
+    """What it does get, in the end, are whole frames; what it did not take is counted."""
+
+    async def test() -> None:
+        with cable() as wire:
+            async with running(f"serial:{wire.path}:57600") as (link, _):
+                await until_true(lambda: link.status.state == "up")
+                message, tries = Outgoing(OURS, 11030, bytes(range(1, 45))), 5000
+                taken = sum(link.send(message) for _ in range(tries))
+                status = link.status
+                assert (status.sent, status.send_dropped) == (taken, tries - taken)
+                assert 0 < taken < tries / 2 and status.state == "up"
+                splitter, numbers = Splitter("wire"), []
+                while len(numbers) < taken:
+                    for item in splitter.feed(0, wire.read()):
+                        assert isinstance(item, Frame)
+                        numbers.append(item.seq)
+                    await asyncio.sleep(0)
+                assert numbers == [n % 256 for n in range(taken)]
+                assert link.send(heartbeat(OURS)) == 1  # there is room again
+                while not any(splitter.feed(0, wire.read())):
+                    await asyncio.sleep(0)
+
+    run(test())
+
+
+def test_its_settings_are_those_of_a_raw_line(run: Run) -> None:
+    async def test() -> None:
+        with cable() as wire:
+            async with running(f"serial:{wire.path}:115200") as (link, _):
+                await until_true(lambda: link.status.state == "up")
+                _, _, cflag, lflag, speed_in, speed_out, control = termios.tcgetattr(wire.end)
+                assert speed_in == speed_out == termios.B115200
+                assert cflag & termios.CSIZE == termios.CS8
+                assert not lflag & (termios.ECHO | termios.ICANON | termios.ISIG)
+                # With 0, to read when there is nothing looks like the end of the device.
+                assert control[termios.VMIN] in (1, b"\x01")
+
+    run(test())
+
+
+class FaultError(Exception):
+    """A fault of the program."""
+
+
+def test_a_fault_of_the_program_does_not_vanish(run: Run) -> None:
+    def receive(_: list[Frame | Rejection]) -> None:
+        raise FaultError
+
+    async def test() -> None:
+        with cable() as wire:
+            link = Link(parse_link(f"serial:{wire.path}:57600"), receive, lambda: 0)
+            link.open()
+            task = asyncio.create_task(link.run())
+            await until_true(lambda: link.status.state == "up")
+            os.write(wire.end, frame(1))
+            with pytest.raises(FaultError):
+                await task
+            assert link.status.state == "down"
+
+    run(test())
+
+
+def test_its_buffer_is_short_for_what_waits_in_it_grows_old() -> None:
+    assert serial_port.WRITE_BUFFER_BYTES * 10 / 57_600 < 1.0
+
+
+def test_pyserial_is_loaded_only_for_a_serial_link() -> None:
+    run = "import sys, companion.mavlink.links.transport; sys.exit('serial' in sys.modules)"
+    done = subprocess.run((sys.executable, "-c", run), capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr.decode() or "pyserial was loaded"

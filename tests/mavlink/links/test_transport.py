@@ -1,0 +1,925 @@
+"""Links over real sockets on loopback; what is waited for is an event, never a time.
+
+Every test runs on both loops: the one that comes with Python, and the one in flight.
+"""
+
+import asyncio
+import contextlib
+import socket
+import sys
+from collections.abc import AsyncIterator, Iterator
+
+import pytest
+from link_support import LIMIT_S, LOOPS, Run, frame, port_of, runner, running, until_true
+from pymavlink.dialects.v20 import all as dialect
+
+from companion.mavlink.links import tcp, transport, udp
+from companion.mavlink.links.peers import PEERS_MAX
+from companion.mavlink.links.transport import Link
+from companion.mavlink.links.urls import LinkError, parse_link
+from companion.mavlink.wire.encode import Outgoing, heartbeat, timesync
+from companion.mavlink.wire.framing import Splitter
+from companion.values import Frame, Reason, Rejection, Severity, Source
+
+OURS = Source(5, 191)
+
+
+@pytest.fixture(params=LOOPS)
+def run(request: pytest.FixtureRequest) -> Run:
+    """``run(test())`` on one loop and on the other."""
+    return runner(request.param)
+
+
+def damaged_length(raw: bytes) -> bytes:
+    return raw[:1] + b"\xff" + raw[2:]
+
+
+@contextlib.contextmanager
+def senders(number: int, family: int = socket.AF_INET) -> Iterator[list[socket.socket]]:
+    with contextlib.ExitStack() as stack:
+        yield [stack.enter_context(socket.socket(family, socket.SOCK_DGRAM)) for _ in range(number)]
+
+
+def has_ipv6() -> bool:
+    try:
+        with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as probe:
+            probe.bind(("::1", 0))
+    except OSError:
+        return False
+    return True
+
+
+needs_ipv6 = pytest.mark.skipif(not has_ipv6(), reason="there is no IPv6 loopback here")
+
+
+# --- UDP ----------------------------------------------------------------------------------------
+
+
+def test_datagrams_become_frames(run: Run) -> None:
+    async def test() -> None:
+        async with running("udpin:127.0.0.1:0") as (link, inbox):
+            with senders(1) as (sender,):
+                to = ("127.0.0.1", port_of(link))
+                made = [frame(n) for n in range(40)]
+                sender.sendto(b"".join(made[:5]), to)  # many frames in one datagram
+                for raw in made[5:]:
+                    sender.sendto(raw, to)
+                await inbox.until(40)
+            assert inbox.raws == made
+            assert inbox.batches[0] == 5
+            url = f"udpin:127.0.0.1:{port_of(link)}"
+            frames = [item for item in inbox.items if isinstance(item, Frame)]
+            assert {item.link for item in frames} == {url}
+            times = [item.t_ns for item in frames]
+            assert times == [1] * 5 + list(range(2, 37))  # a datagram's frames came together
+            status = link.status
+            assert (status.state, status.frames, status.peers) == ("up", 40, 1)
+            assert status.bytes == sum(map(len, made)) and status.lost == {}
+
+    run(test())
+
+
+@needs_ipv6
+def test_datagrams_over_ipv6(run: Run) -> None:
+    async def test() -> None:
+        async with running("udpin:[::1]:0") as (link, inbox):
+            with senders(2, socket.AF_INET6) as both:
+                for n, sender in enumerate(both):
+                    sender.sendto(frame(n), ("::1", port_of(link)))
+                await inbox.until(2)
+            assert sorted(inbox.raws) == sorted([frame(0), frame(1)])
+            assert link.status.peers == 2
+            assert link.status.url.startswith("udpin:[::1]:")
+
+    run(test())
+
+
+def test_each_peer_has_its_own_splitter(run: Run) -> None:
+    """Every frame in halves, those of 100 peers by turns: all are found, and nothing is lost."""
+
+    async def test() -> None:
+        async with running("udpin:127.0.0.1:0") as (link, inbox):
+            with senders(100) as peers:
+                to = ("127.0.0.1", port_of(link))
+                made = [frame(n, sysid=1 + n) for n in range(100)]
+                for peer, raw in zip(peers, made, strict=True):
+                    peer.sendto(raw[:20], to)
+                for peer, raw in zip(peers, made, strict=True):
+                    peer.sendto(raw[20:], to)
+                await inbox.until(100)
+            assert sorted(inbox.raws) == sorted(made)
+            assert link.status.peers == 100 and link.status.lost == {}
+
+    run(test())
+
+
+def test_a_truncated_datagram_harms_no_other_peer(run: Run) -> None:
+    async def test() -> None:
+        async with running("udpin:127.0.0.1:0") as (link, inbox):
+            with senders(2) as (bad, good):
+                to = ("127.0.0.1", port_of(link))
+                for n in range(30):
+                    bad.sendto(frame(n, sysid=9)[: 5 + n], to)
+                    good.sendto(frame(n), to)
+                await inbox.until(30)
+            assert [raw for raw in inbox.raws if raw[5] == 1] == [frame(n) for n in range(30)]
+
+    run(test())
+
+
+def test_what_is_lost_is_handed_on_and_counted(run: Run) -> None:
+    async def test() -> None:
+        async with running("udpin:127.0.0.1:0") as (link, inbox):
+            raw = frame(1)
+            broken = raw[:-1] + bytes([raw[-1] ^ 1])
+            with senders(1) as (sender,):
+                to = ("127.0.0.1", port_of(link))
+                for data in (b"noise", broken, b"", broken + b"more", frame(2)):
+                    sender.sendto(data, to)
+                await inbox.until(1)
+            assert inbox.raws == [frame(2)]
+            assert link.status.lost == {"garbage": 9, "bad-crc": 2}
+            assert link.status.frames == 1
+            lost = [item for item in inbox.items if isinstance(item, Rejection)]
+            assert sum(item.count for item in lost if item.reason is Reason.GARBAGE) == 9
+            assert {item.source for item in lost} == {link.status.url}
+
+    run(test())
+
+
+def test_a_port_scan_does_not_fill_the_memory() -> None:
+    """The peers heard last are kept: one that keeps sending is never forgotten."""
+    inbox: list[Frame | Rejection] = []
+    link = Link(parse_link("udpin:127.0.0.1:0"), inbox.extend, lambda: 0)
+    link.take("old", frame(0)[:20])
+    link.take("steady", frame(1)[:10])
+    for n in range(2 * PEERS_MAX):
+        link.take(n, b"\xfd\x09")
+        if n == PEERS_MAX // 2:
+            link.take("steady", frame(1)[10:20])
+        if n == PEERS_MAX + PEERS_MAX // 4:
+            link.take("steady", frame(1)[20:])
+    link.take("old", frame(0)[20:])
+    assert [item.raw for item in inbox if isinstance(item, Frame)] == [frame(1)]
+    assert len(link._peers) == PEERS_MAX
+    assert link.status.peers == 2 * PEERS_MAX + 3
+    assert link.status.lost["garbage"] > 2 * PEERS_MAX  # of those given up: it is not silent
+
+
+@pytest.mark.parametrize("scheme", ["udpin", "tcpin"])
+def test_a_port_in_use_is_one_line(scheme: str) -> None:
+    kind = socket.SOCK_DGRAM if scheme == "udpin" else socket.SOCK_STREAM
+    with socket.socket(socket.AF_INET, kind) as taken:
+        taken.bind(("127.0.0.1", 0))
+        if scheme == "tcpin":
+            taken.listen()
+        url = f"{scheme}:127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(LinkError) as caught:
+            Link(parse_link(url), lambda _: None, lambda: 0).open()
+    assert str(caught.value) == f"{url}: Address already in use"
+
+
+@pytest.mark.parametrize("scheme", ["udpin", "tcpin"])
+def test_an_address_of_another_machine_is_one_line(scheme: str) -> None:
+    url = f"{scheme}:192.0.2.1:0"  # TEST-NET-1: nobody's address
+    with pytest.raises(LinkError) as caught:
+        Link(parse_link(url), lambda _: None, lambda: 0).open()
+    assert str(caught.value) == f"{url}: Cannot assign requested address"
+
+
+@pytest.mark.parametrize(
+    "url", ["tcp:127.0.0.1:1", "udpout:127.0.0.1:1", "serial:/dev/not-plugged-in:57600"]
+)
+def test_a_peer_or_a_device_that_is_away_is_no_error_at_the_start(url: str) -> None:
+    Link(parse_link(url), lambda _: None, lambda: 0).open()
+
+
+@pytest.mark.parametrize("scheme", ["udpin", "tcpin"])
+def test_the_port_is_free_again_after_a_link(run: Run, scheme: str) -> None:
+    """Also when it is the link that ends a connection: the system remembers those for a minute."""
+
+    async def test() -> None:
+        url = f"{scheme}:127.0.0.1:0"
+        kind = socket.SOCK_DGRAM if scheme == "udpin" else socket.SOCK_STREAM
+        for n in range(3):
+            with socket.socket(socket.AF_INET, kind) as sender:
+                async with running(url) as (link, inbox):
+                    sender.connect(("127.0.0.1", port_of(link)))
+                    sender.send(frame(n))
+                    await inbox.until(1)
+                url = link.status.url
+
+    run(test())
+
+
+# --- TCP ----------------------------------------------------------------------------------------
+
+
+class Server:
+    """A server on loopback that hands over its connections as they come."""
+
+    def __init__(self) -> None:
+        self.port = 0
+        self.connections: asyncio.Queue[asyncio.StreamWriter] = asyncio.Queue()
+        self._server: asyncio.Server | None = None
+
+    async def start(self) -> None:
+        async def accept(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            self.connections.put_nowait(writer)
+
+        self._server = await asyncio.start_server(accept, "127.0.0.1", self.port)
+        self.port = self._server.sockets[0].getsockname()[1]
+
+    async def stop(self) -> None:
+        assert self._server is not None
+        self._server.close()
+        await self._server.wait_closed()
+
+
+@contextlib.asynccontextmanager
+async def serving() -> AsyncIterator[Server]:
+    server = Server()
+    await server.start()
+    try:
+        yield server
+    finally:
+        await server.stop()
+
+
+async def hang_up(writer: asyncio.StreamWriter) -> None:
+    writer.close()
+    await writer.wait_closed()
+
+
+def test_a_stream_in_pieces(run: Run) -> None:
+    async def test() -> None:
+        async with serving() as server, running(f"tcp:127.0.0.1:{server.port}") as (link, inbox):
+            writer = await server.connections.get()
+            made = [frame(n) for n in range(50)]
+            stream = b"".join(made)
+            for at in range(0, len(stream), 13):
+                writer.write(stream[at : at + 13])
+                await writer.drain()
+            await inbox.until(50)
+            assert inbox.raws == made
+            status = link.status
+            assert (status.state, status.frames, status.lost) == ("up", 50, {})
+            await hang_up(writer)
+
+    run(test())
+
+
+def test_it_connects_again_when_the_server_goes_away(run: Run) -> None:
+    """The server stops listening and comes back; half a frame of before spoils nothing."""
+
+    async def test() -> None:
+        async with serving() as server, running(f"tcp:127.0.0.1:{server.port}") as (link, inbox):
+            for n in range(3):
+                writer = await server.connections.get()
+                writer.write(frame(n) + frame(100 + n)[:20])
+                await inbox.until(n + 1)
+                await server.stop()
+                await hang_up(writer)
+                await server.start()
+            writer = await server.connections.get()
+            writer.write(frame(7))
+            await inbox.until(4)
+            assert inbox.raws == [frame(0), frame(1), frame(2), frame(7)]
+            assert link.status.state == "up"
+            await hang_up(writer)
+
+    run(test())
+
+
+def test_a_link_may_be_there_before_its_server(run: Run) -> None:
+    async def test() -> None:
+        server = Server()
+        await server.start()
+        await server.stop()  # its port is known now, and nobody listens there
+        async with running(f"tcp:127.0.0.1:{server.port}") as (link, inbox):
+            await inbox.until_said(1)
+            assert inbox.texts == [f"link {link.url} is down: Connection refused; trying again"]
+            assert link.status.state == "connecting"
+            await server.start()
+            writer = await server.connections.get()
+            writer.write(frame(1))
+            await inbox.until(1)
+            assert link.status.state == "up"
+            await hang_up(writer)
+            await server.stop()
+
+    run(test())
+
+
+def test_after_a_connection_the_first_retry_is_quick_again(
+    run: Run,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(transport, "RETRY_S", (0.0, 2 * LIMIT_S))
+
+    async def test() -> None:
+        async with serving() as server, running(f"tcp:127.0.0.1:{server.port}") as (_, inbox):
+            for n in range(4):
+                writer = await server.connections.get()
+                writer.write(frame(n))
+                await inbox.until(n + 1)
+                await hang_up(writer)
+            await hang_up(await server.connections.get())
+
+    run(test())
+
+
+def test_retries_become_rare() -> None:
+    assert transport.RETRY_S[0] <= 0.5 and transport.RETRY_S[-1] <= 10
+    assert list(transport.RETRY_S) == sorted(transport.RETRY_S)
+
+
+def test_good_frames_in_an_unfinished_claim_are_found_when_the_peer_hangs_up(run: Run) -> None:
+    """A damaged length claims what follows; no more bytes will come, so it is looked through."""
+
+    async def test() -> None:
+        async with serving() as server, running(f"tcp:127.0.0.1:{server.port}") as (link, inbox):
+            writer = await server.connections.get()
+            writer.write(damaged_length(frame(1)) + frame(2) + frame(3))
+            await hang_up(writer)
+            writer = await server.connections.get()  # it noticed, and is here again
+            writer.write(frame(4))
+            await inbox.until_there_is(frame(4))
+            await hang_up(writer)
+            assert inbox.raws == [frame(2), frame(3), frame(4)]
+            assert link.status.lost
+
+    run(test())
+
+
+@pytest.mark.parametrize("greeting", [b"", b"HTTP/1.1 400 Bad Request\r\n\r\n"])
+def test_a_peer_that_hangs_up_at_once_is_not_tried_at_full_speed(
+    run: Run, monkeypatch: pytest.MonkeyPatch, greeting: bytes
+) -> None:
+    """Only frames begin the waiting anew; and however often it answers, it is one outage."""
+    monkeypatch.setattr(transport, "RETRY_S", (0.0, 0.0, 2 * LIMIT_S))
+
+    async def test() -> None:
+        async with serving() as server, running(f"tcp:127.0.0.1:{server.port}") as (link, inbox):
+            for _ in range(3):
+                writer = await server.connections.get()
+                writer.write(greeting)
+                await hang_up(writer)
+            with pytest.raises(TimeoutError):
+                async with asyncio.timeout(0.2):
+                    await server.connections.get()
+            assert link.status.state == "connecting"
+            assert inbox.texts == [f"link {link.url} is down: the peer hung up; trying again"]
+
+    run(test())
+
+
+def test_it_says_once_that_it_is_down_and_once_that_it_is_back(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(transport, "RETRY_S", (0.01,))
+    monkeypatch.setattr(transport, "STEADY_S", 0.05)
+
+    async def test() -> None:
+        async with serving() as server, running(f"tcp:127.0.0.1:{server.port}") as (link, inbox):
+            writer = await server.connections.get()
+            await asyncio.sleep(0.1)  # longer than it takes to be called back, if it were
+            assert inbox.notices == []
+            for outage in range(2):
+                await until_true(lambda: link.status.state == "up")
+                await server.stop()
+                await hang_up(writer)
+                await inbox.until_said(1 + 2 * outage)
+                assert link.status.state == "connecting"
+                await asyncio.sleep(0.05)  # several attempts, and all are refused
+                await server.start()
+                writer = await server.connections.get()
+                await inbox.until_said(2 + 2 * outage)
+            await hang_up(writer)
+            down = (Severity.WARNING, f"link {link.url} is down: the peer hung up; trying again")
+            back = (Severity.INFO, f"link {link.url} is back")
+            said = [(notice.severity, notice.text) for notice in inbox.notices[:4]]
+            assert said == [down, back, down, back]
+            assert {notice.subject for notice in inbox.notices} == {str(link.url)}
+
+    run(test())
+
+
+def test_a_name_is_looked_up(run: Run) -> None:
+    """Whichever of its addresses answers: here the first may be ::1, where nobody listens."""
+
+    async def test() -> None:
+        async with serving() as server, running(f"tcp:localhost:{server.port}") as (_, inbox):
+            writer = await server.connections.get()
+            writer.write(frame(1))
+            await inbox.until(1)
+            await hang_up(writer)
+
+    run(test())
+
+
+# --- TCP, listening -----------------------------------------------------------------------------
+
+
+@contextlib.asynccontextmanager
+async def connected(link: Link, family: int = socket.AF_INET) -> AsyncIterator[socket.socket]:
+    """A connection to a link that listens."""
+    host = "127.0.0.1" if family == socket.AF_INET else "::1"
+    with socket.socket(family, socket.SOCK_STREAM) as stream:
+        stream.setblocking(False)
+        await asyncio.get_running_loop().sock_connect(stream, (host, port_of(link)))
+        yield stream
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", pytest.param("[::1]", marks=needs_ipv6)])
+def test_connections_are_served_side_by_side(run: Run, host: str) -> None:
+    """Frames in halves by turns; one connection breaks off in the middle of a frame."""
+    family = socket.AF_INET6 if host == "[::1]" else socket.AF_INET
+
+    async def test() -> None:
+        async with running(f"tcpin:{host}:0") as (link, inbox):
+            assert link.status.url == f"tcpin:{host}:{port_of(link)}"
+            await until_true(lambda: link.status.state == "up")
+            async with connected(link, family) as a, connected(link, family) as b:
+                async with connected(link, family) as broken:
+                    for stream, raw in ((a, frame(1)), (b, frame(2)), (broken, frame(3))):
+                        stream.send(raw[:20])
+                    await until_true(lambda: link.status.bytes == 60)
+                await until_true(lambda: bool(link.status.lost))
+                a.send(frame(1)[20:])
+                await inbox.until(1)
+                b.send(frame(2)[20:])
+                await inbox.until(2)
+            assert inbox.raws == [frame(1), frame(2)]
+            assert (link.status.state, link.status.peers) == ("up", 3)
+            assert link.status.lost == {"garbage": 20} and inbox.notices == []
+
+    run(test())
+
+
+def test_connections_are_bounded(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tcp, "CONNECTIONS_MAX", 2)
+
+    async def test() -> None:
+        loop = asyncio.get_running_loop()
+        async with running("tcpin:127.0.0.1:0") as (link, inbox), connected(link) as first:
+            async with connected(link) as second:
+                first.send(frame(1))
+                second.send(frame(2))
+                await inbox.until(2)
+                async with connected(link) as third:
+                    with contextlib.suppress(ConnectionResetError):
+                        assert await loop.sock_recv(third, 1) == b""
+                assert link.send(heartbeat(OURS)) == 2 and link.status.send_dropped == 0
+            await until_true(lambda: link.send(heartbeat(OURS)) == 1)  # it has seen that end
+            async with connected(link) as fourth:
+                fourth.send(frame(3))
+                await inbox.until(3)
+
+    run(test())
+
+
+# --- UDP, to one peer ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "host", ["127.0.0.1", "localhost", pytest.param("[::1]", marks=needs_ipv6)]
+)
+def test_the_one_peer_is_spoken_to_and_heard(run: Run, host: str) -> None:
+    async def test() -> None:
+        infos = socket.getaddrinfo(host.strip("[]"), 0, type=socket.SOCK_DGRAM)
+        family, _, _, _, address = infos[0]
+        with senders(2, family) as (peer, stranger):
+            peer.bind(address)
+            async with running(f"udpout:{host}:{peer.getsockname()[1]}") as (link, inbox):
+                assert link.send(heartbeat(OURS)) == 0  # there is no socket yet: it does not wait
+                await until_true(lambda: link.status.state == "up")
+                assert link.send(heartbeat(OURS)) == 1
+                raw, ours = peer.recvfrom(1000)
+                (heard,) = Splitter("peer").feed(0, raw)
+                assert isinstance(heard, Frame) and heard.source == OURS
+                stranger.sendto(frame(1), ours)
+                peer.sendto(frame(2), ours)
+                await inbox.until(1)
+                assert inbox.raws == [frame(2)]
+                assert link.send_to(Source(1, 1), heartbeat(OURS))
+                peer.recv(1000)
+                assert (link.status.sent, link.status.send_dropped) == (2, 0)
+                assert link.status.receive_buffer_bytes and inbox.notices == []
+
+    run(test())
+
+
+def test_that_nobody_listens_there_is_no_lost_link(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The system answers a refusal to every datagram; none of ours is given up for it, and the
+    peer finds us, when it is back, at the port that it knows."""
+    monkeypatch.setattr(udp, "OVERFLOW_CHECK_S", 0.01)
+
+    async def test() -> None:
+        with senders(2) as (before, after):
+            before.bind(("127.0.0.1", 0))
+            address = before.getsockname()
+            async with running(f"udpout:127.0.0.1:{address[1]}") as (link, inbox):
+                await until_true(lambda: link.send(heartbeat(OURS)) == 1)
+                ours = before.recvfrom(1000)[1]
+                before.close()
+                for _ in range(20):
+                    assert link.send(heartbeat(OURS)) == 1
+                    assert link.send(heartbeat(OURS)) == 1
+                    await asyncio.sleep(0.002)  # the loop hears the refusal as well
+                link.send(heartbeat(OURS))
+                after.bind(address)
+                assert link.send(heartbeat(OURS)) == 1
+                after.settimeout(LIMIT_S)
+                raw, sender = after.recvfrom(1000)
+                (heard,) = Splitter("peer").feed(0, raw)
+                assert isinstance(heard, Frame) and heard.seq == (link.status.sent - 1) % 256
+                assert sender == ours
+                after.sendto(frame(1), ours)
+                await inbox.until(1)
+                assert (link.status.state, inbox.notices) == ("up", [])
+                assert link.status.send_dropped == 0
+
+    run(test())
+
+
+# --- what the system loses ----------------------------------------------------------------------
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts what a socket lost")
+def test_what_overflows_is_counted_to_the_last_datagram(run: Run) -> None:
+    """Sent while nobody reads, until far more than the buffer holds: none vanishes unseen."""
+
+    async def test() -> None:
+        made = [frame(n) for n in range(256)]
+        async with running("udpin:127.0.0.1:0") as (link, inbox):
+            await until_true(lambda: link.status.state == "up")
+            with senders(1) as (sender,):
+                sender.connect(("127.0.0.1", port_of(link)))
+                sent = 14_000
+                for n in range(sent):
+                    sender.send(made[n % 256])
+            status = link.status
+            await until_true(lambda: status.frames + (status.overflowed or 0) == sent)
+            assert status.overflowed and status.frames
+            assert status.lost == {"socket-overflow": status.overflowed}
+            assert {item.reason for item in inbox.rejections} == {Reason.SOCKET_OVERFLOW}
+            assert sum(item.count for item in inbox.rejections) == status.overflowed
+            assert {item.source for item in inbox.rejections} == {status.url}
+
+    run(test())
+
+
+def test_the_buffer_is_sized_and_what_was_granted_is_said(run: Run) -> None:
+    async def test() -> None:
+        with senders(1) as (stock,):
+            usual = stock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+        async with running("udpin:127.0.0.1:0") as (link, _):
+            granted = link.status.receive_buffer_bytes  # before it runs: a burst may wait there
+            await until_true(lambda: link.status.state == "up")
+            assert granted is not None and usual < granted <= 2 * udp.RECEIVE_BUFFER_BYTES
+        async with running("tcpin:127.0.0.1:0") as (link, _):
+            await until_true(lambda: link.status.state == "up")
+            assert link.status.receive_buffer_bytes is None and link.status.overflowed is None
+
+    run(test())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="it is Linux that knows")
+def test_where_the_system_does_not_say_it_is_unknown_and_not_none_lost() -> None:
+    """Of a socket that is closed, nobody can say how many datagrams it lost."""
+    with socket.socket(type=socket.SOCK_DGRAM) as sock:
+        assert udp.dropped_by_system(sock) == 0
+    assert udp.dropped_by_system(sock) is None
+
+
+# --- counts -------------------------------------------------------------------------------------
+
+
+def test_what_is_heard_is_counted_by_component(run: Run) -> None:
+    async def test() -> None:
+        async with running("udpin:127.0.0.1:0") as (link, inbox):
+            assert link.status.heard_ns is None and link.status.components == {}
+            with senders(2) as (a, b):
+                to = ("127.0.0.1", port_of(link))
+                for n in (1, 2, 6, 6, 4):
+                    a.sendto(frame(n), to)
+                b.sendto(frame(1, sysid=2, version=1) + frame(4, sysid=2, version=1), to)
+                await inbox.until(7)
+            status = link.status
+            assert (status.gaps, status.repeats, status.late) == (3 + 2, 1, 1)
+            one, two = status.components[Source(1, 1)], status.components[Source(2, 1)]
+            assert (one.frames, one.gaps, one.version) == (5, 3, 2)
+            assert (two.frames, two.gaps, two.version) == (2, 2, 1)
+            times = {f.source: f.t_ns for f in inbox.frames}
+            assert (one.heard_ns, two.heard_ns) == (times[Source(1, 1)], times[Source(2, 1)])
+            assert status.heard_ns == inbox.frames[-1].t_ns
+
+    run(test())
+
+
+# --- sending ------------------------------------------------------------------------------------
+
+
+class Mailbox:
+    """A real peer over UDP: its own socket, and pymavlink's parser for what it is sent."""
+
+    def __init__(self, stack: contextlib.ExitStack) -> None:
+        self.socket = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        self.socket.bind(("127.0.0.1", 0))
+        self.socket.setblocking(False)
+
+    def got(self) -> list[tuple[int, int, str]]:
+        """Version, sequence number and type of all that has come."""
+        parser, found = dialect.MAVLink(None), []
+        with contextlib.suppress(BlockingIOError):
+            while data := self.socket.recv(1000):
+                for message in parser.parse_buffer(data) or []:
+                    version = 2 if message.get_msgbuf()[0] == 0xFD else 1
+                    found.append((version, message.get_seq(), message.get_type()))
+        return found
+
+
+def test_everybody_heard_lately_is_sent_to(run: Run) -> None:
+    """Each with sequence numbers of its own, in the version that it speaks."""
+
+    async def test() -> None:
+        now = [0]
+        with contextlib.ExitStack() as stack:
+            old, new, v1, both, noise = (Mailbox(stack) for _ in range(5))
+            async with running("udpin:127.0.0.1:0", lambda: now[0]) as (link, inbox):
+                to = ("127.0.0.1", port_of(link))
+                assert link.send(heartbeat(OURS)) == 0
+                old.socket.sendto(frame(0), to)
+                await inbox.until(1)
+                assert link.send(heartbeat(OURS)) == 1
+                now[0] = 1
+                new.socket.sendto(frame(0, sysid=2), to)
+                v1.socket.sendto(frame(0, sysid=3, version=1), to)
+                both.socket.sendto(frame(0, version=1) + frame(1), to)
+                noise.socket.sendto(b"\xfe\x00noise", to)
+                await inbox.until(5)
+                assert link.send(heartbeat(OURS)) == 4
+                now[0] = int(transport.PEER_ACTIVE_S * 1e9) + 1
+                assert link.send(timesync(OURS, 7)) == 3
+                assert old.got() == [(2, 0, "HEARTBEAT"), (2, 1, "HEARTBEAT")]
+                assert new.got() == [(2, 0, "HEARTBEAT"), (2, 1, "TIMESYNC")]
+                assert v1.got() == [(1, 0, "HEARTBEAT"), (1, 1, "TIMESYNC")]
+                assert both.got() == [(2, 0, "HEARTBEAT"), (2, 1, "TIMESYNC")]
+                assert noise.got() == []
+                assert (link.status.sent, link.status.send_dropped) == (8, 0)
+
+    run(test())
+
+
+def test_a_source_is_answered_where_it_was_heard_last(run: Run) -> None:
+    async def test() -> None:
+        with contextlib.ExitStack() as stack:
+            a, b = Mailbox(stack), Mailbox(stack)
+            async with running("udpin:127.0.0.1:0") as (link, inbox):
+                to, one = ("127.0.0.1", port_of(link)), Source(1, 1)
+                assert not link.send_to(one, heartbeat(OURS))
+                for n, peer in enumerate((a, b, a)):
+                    peer.socket.sendto(frame(n), to)
+                    await inbox.until(n + 1)
+                    assert link.send_to(one, heartbeat(OURS))
+                    assert not link.send_to(Source(1, 2), heartbeat(OURS))
+                assert [seq for _, seq, _ in a.got()] == [0, 1]
+                assert [seq for _, seq, _ in b.got()] == [0]
+
+    run(test())
+
+
+def test_every_connection_is_sent_to_and_a_source_over_its_own(run: Run) -> None:
+    async def test() -> None:
+        loop = asyncio.get_running_loop()
+        async with running("tcpin:127.0.0.1:0") as (link, inbox), connected(link) as silent:
+            async with connected(link) as other:
+                other.send(frame(0))
+                await inbox.until(1)
+                await until_true(lambda: link.status.peers == 2 or link.send(heartbeat(OURS)) == 2)
+                assert link.send_to(Source(1, 1), timesync(OURS, 1))
+            await until_true(lambda: not link.send_to(Source(1, 1), heartbeat(OURS)))
+            silent_heard = Splitter("s").feed(0, await loop.sock_recv(silent, 1000))
+            assert {f.msgid for f in silent_heard if isinstance(f, Frame)} == {0}
+
+    run(test())
+
+
+def test_a_connection_that_does_not_read_loses_messages_and_no_time(run: Run) -> None:
+    """Its buffer is bounded; what it does get, when it reads again, are whole frames."""
+
+    async def test() -> None:
+        loop = asyncio.get_running_loop()
+        async with running("tcpin:127.0.0.1:0") as (link, inbox), connected(link) as peer:
+            peer.send(frame(0))
+            await inbox.until(1)
+            message = Outgoing(OURS, 11030, bytes(range(1, 45)))  # any id, at full length
+            for _ in range(2000):
+                for _ in range(1000):
+                    link.send(message)
+                if link.status.send_dropped > 5000:
+                    break
+                await asyncio.sleep(0)
+            status = link.status
+            assert status.send_dropped > 5000 and status.state == "up"
+            splitter, frames = Splitter("peer"), 0
+            while frames < status.sent:
+                found = splitter.feed(0, await loop.sock_recv(peer, 1 << 16))
+                assert all(isinstance(item, Frame) for item in found)
+                frames += len(found)
+            assert link.send(heartbeat(OURS)) == 1
+            while not any(
+                isinstance(item, Frame) and item.msgid == 0
+                for item in splitter.feed(0, await loop.sock_recv(peer, 1 << 16))
+            ):
+                pass
+
+    run(test())
+
+
+def test_a_peer_that_cannot_be_sent_to_harms_no_other(run: Run) -> None:
+    async def test() -> None:
+        with contextlib.ExitStack() as stack:
+            peer = Mailbox(stack)
+            async with running("udpin:127.0.0.1:0") as (link, inbox):
+                link.take(("127.0.0.1", 0), frame(1, sysid=2))  # nobody can be sent to at port 0
+                peer.socket.sendto(frame(1), ("127.0.0.1", port_of(link)))
+                await inbox.until(2)
+                assert link.send(heartbeat(OURS)) == 1
+                assert not link.send_to(Source(2, 1), heartbeat(OURS))
+                assert (link.status.sent, link.status.send_dropped) == (1, 2)
+                assert len(peer.got()) == 1
+
+    run(test())
+
+
+# --- the guard ----------------------------------------------------------------------------------
+
+
+class OddOnly:
+    """Refuses every system with an even id, and signs with a tail of its own."""
+
+    def __init__(self) -> None:
+        self.asked: list[Frame] = []
+
+    def refusal(self, frame: Frame) -> Reason | None:
+        self.asked.append(frame)
+        return None if frame.source.sysid % 2 else Reason.BAD_SIGNATURE
+
+    def sign(self, raw: bytes, now_ns: int) -> bytes:
+        return raw + b"signed at %d" % now_ns
+
+
+def test_what_the_guard_refuses_is_a_rejection_and_moves_nothing(run: Run) -> None:
+    async def test() -> None:
+        guard, now = OddOnly(), 1234
+        with contextlib.ExitStack() as stack:
+            peer, forger = Mailbox(stack), Mailbox(stack)
+            async with running("udpin:127.0.0.1:0", lambda: now, guard) as (link, inbox):
+                to = ("127.0.0.1", port_of(link))
+                mixed = [frame(1), frame(9, sysid=2), frame(2)]
+                peer.socket.sendto(b"".join([*mixed, b"x"]), to)
+                forger.socket.sendto(frame(3, sysid=4), to)
+                await inbox.until_true(lambda: len(inbox.rejections) == 3)
+                assert inbox.raws == [frame(1), frame(2)]
+                assert [item.raw for item in guard.asked] == [*mixed, frame(3, sysid=4)]
+                first = inbox.items[1]
+                assert first == Rejection(now, "2:1", Reason.BAD_SIGNATURE, 1, 33)
+                status = link.status
+                assert status.lost == {"bad-signature": 2, "garbage": 1}
+                assert (status.frames, status.gaps) == (2, 0)
+                assert set(status.components) == {Source(1, 1)}
+                assert link.send(heartbeat(OURS)) == 1  # who proved nothing is not an active peer
+                assert not link.send_to(Source(4, 1), heartbeat(OURS))
+                assert peer.socket.recv(1000).endswith(b"signed at 1234")
+                assert forger.got() == []
+
+    run(test())
+
+
+def test_a_link_with_a_guard_speaks_what_can_be_signed(run: Run) -> None:
+    async def test() -> None:
+        with contextlib.ExitStack() as stack:
+            peer = Mailbox(stack)
+            async with running("udpin:127.0.0.1:0", guard=OddOnly()) as (link, inbox):
+                peer.socket.sendto(frame(1, version=1), ("127.0.0.1", port_of(link)))
+                await inbox.until(1)
+                assert link.send(heartbeat(OURS)) == 1
+                assert peer.socket.recv(1000)[0] == 0xFD
+
+    run(test())
+
+
+# --- the end, several links, and faults ---------------------------------------------------------
+
+
+@pytest.mark.parametrize("scheme", ["tcp", "tcpin"])
+def test_an_unfinished_frame_is_given_up_before_the_link_has_stopped(run: Run, scheme: str) -> None:
+    """Afterwards it has nothing more to say (``running`` sees to that): nobody would listen."""
+
+    async def test() -> None:
+        async with serving() as server:
+            away = f"tcp:127.0.0.1:{server.port}"
+            url = away if scheme == "tcp" else "tcpin:127.0.0.1:0"
+            with contextlib.ExitStack() as stack:
+                async with running(url) as (link, inbox):
+                    if scheme == "tcp":
+                        writer = await server.connections.get()
+                        writer.write(frame(1)[:20])
+                    else:
+                        sender = stack.enter_context(socket.socket())
+                        sender.connect(("127.0.0.1", port_of(link)))
+                        sender.send(frame(1)[:20])
+                    await until_true(lambda: link.status.bytes == 20)
+                    assert inbox.items == []
+                assert [item.count for item in inbox.rejections] == [20]
+            if scheme == "tcp":
+                await hang_up(writer)
+
+    run(test())
+
+
+def test_several_links_at_once(run: Run) -> None:
+    async def test() -> None:
+        async with (
+            running("udpin:127.0.0.1:0") as (udp_in, heard_udp),
+            running("tcpin:127.0.0.1:0") as (tcp_in, heard_tcp),
+            running(f"udpout:127.0.0.1:{port_of(udp_in)}") as (udp_out, answered_udp),
+            running(f"tcp:127.0.0.1:{port_of(tcp_in)}") as (tcp_out, answered_tcp),
+        ):
+            for link, heard in ((udp_out, heard_udp), (tcp_out, heard_tcp)):
+                await until_true(lambda link=link: link.send(heartbeat(OURS)) == 1)
+                await heard.until(1)
+                assert heard.frames[0].source == OURS
+            for link, heard in ((udp_in, answered_udp), (tcp_in, answered_tcp)):
+                assert link.send(heartbeat(Source(1, 1))) == 1
+                await heard.until(1)
+                assert heard.frames[0].source == Source(1, 1)
+
+    run(test())
+
+
+class FaultError(Exception):
+    """A fault of the program."""
+
+
+@pytest.mark.parametrize("scheme", ["udpin", "tcpin", "udpout", "tcp"])
+def test_a_fault_of_the_program_does_not_vanish(run: Run, scheme: str) -> None:
+    """What ``receive`` raises, ``run`` raises, whatever the loop would do with it."""
+
+    def receive(_: list[Frame | Rejection]) -> None:
+        raise FaultError
+
+    async def test() -> None:
+        asyncio.get_running_loop().set_exception_handler(lambda _loop, _context: None)
+        with socket.socket() as server, socket.socket(type=socket.SOCK_DGRAM) as datagrams:
+            server.bind(("127.0.0.1", 0))
+            server.listen()
+            datagrams.bind(("127.0.0.1", 0))
+            there = datagrams if scheme == "udpout" else server
+            port = 0 if scheme.endswith("in") else there.getsockname()[1]
+            link = Link(parse_link(f"{scheme}:127.0.0.1:{port}"), receive, lambda: 0)
+            link.open()
+            task = asyncio.create_task(link.run())
+            await until_true(lambda: link.status.state == "up")
+            with contextlib.ExitStack() as stack:
+                if scheme == "tcp":
+                    peer = stack.enter_context(server.accept()[0])
+                elif scheme == "udpout":
+                    peer = datagrams
+                    assert link.send(heartbeat(OURS)) == 1
+                    peer.connect(peer.recvfrom(1000)[1])
+                else:
+                    kind = socket.SOCK_DGRAM if scheme == "udpin" else socket.SOCK_STREAM
+                    peer = stack.enter_context(socket.socket(type=kind))
+                    peer.connect(("127.0.0.1", port_of(link)))
+                peer.send(frame(1))
+                with pytest.raises(FaultError):
+                    await task
+            assert link.status.state == "down"
+
+    run(test())
+
+
+@pytest.mark.parametrize("scheme", ["udpin", "tcpin"])
+def test_a_link_may_be_run_again_on_the_port_that_it_had(run: Run, scheme: str) -> None:
+    async def test() -> None:
+        came: list[Frame | Rejection] = []
+        link = Link(parse_link(f"{scheme}:127.0.0.1:0"), came.extend, lambda: 0)
+        link.open()
+        port, kind = port_of(link), {"udpin": socket.SOCK_DGRAM, "tcpin": socket.SOCK_STREAM}
+        for n in range(3):
+            task = asyncio.create_task(link.run())
+            await until_true(lambda: link.status.state == "up")
+            with socket.socket(type=kind[scheme]) as sender:
+                sender.connect(("127.0.0.1", port))
+                sender.send(frame(n))
+                await until_true(lambda n=n: len(came) == n + 1)
+            task.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await task
+
+    run(test())

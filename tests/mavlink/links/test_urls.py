@@ -1,0 +1,99 @@
+"""Addresses of links: read and written alike, and one line about what is wrong with one."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.mavlink.links.urls import SCHEMES, LinkError, LinkUrl, parse_link
+
+
+@pytest.mark.parametrize(
+    ("text", "scheme", "host", "port"),
+    [
+        ("udpin:0.0.0.0:14550", "udpin", "0.0.0.0", 14550),
+        ("udpout:192.168.4.1:14550", "udpout", "192.168.4.1", 14550),
+        ("tcp:localhost:5760", "tcp", "localhost", 5760),
+        ("tcp:autopilot-2.lan.:5760", "tcp", "autopilot-2.lan.", 5760),
+        ("tcp:my_drone:5760", "tcp", "my_drone", 5760),
+        ("tcpin:127.0.0.1:5760", "tcpin", "127.0.0.1", 5760),
+        ("udpin:[::]:14550", "udpin", "::", 14550),
+        ("udpout:[2001:db8::1]:14550", "udpout", "2001:db8::1", 14550),
+        ("tcp:[fe80::1%eth0]:5760", "tcp", "fe80::1%eth0", 5760),
+        ("udpin:127.0.0.1:0", "udpin", "127.0.0.1", 0),
+        ("tcpin:127.0.0.1:0", "tcpin", "127.0.0.1", 0),
+        ("udpin:127.0.0.1:65535", "udpin", "127.0.0.1", 65535),
+        ("serial:/dev/ttyAMA0:921600", "serial", "/dev/ttyAMA0", 921600),
+        ("serial:/dev/serial/by-path/a:0-b:57600", "serial", "/dev/serial/by-path/a:0-b", 57600),
+        ("serial:/dev/tty µ 1:20000000", "serial", "/dev/tty µ 1", 20_000_000),
+    ],
+)
+def test_an_address_is_read_and_written_alike(text: str, scheme: str, host: str, port: int) -> None:
+    url = parse_link(text)
+    assert (url.scheme, url.host, url.port) == (scheme, host, port)
+    assert str(url) == text
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "udpin",
+        "udpin:",
+        "udpin::14550",
+        "udpin:127.0.0.1",
+        "udpin:127.0.0.1:",
+        "udpin:127.0.0.1:port",
+        "udpin:127.0.0.1:-1",
+        "udpin:127.0.0.1:65536",
+        "udpin:127.0.0.1:" + "9" * 5000,
+        "udpin:127.0.0.1:1e3",
+        "udpin:127.0.0.1:١٤٥",
+        "udpin:::1:14550",
+        "udpin:[::1]",
+        "udpin:[]:14550",
+        "udpin:[127.0.0.1]:14550",
+        "udpin:[a:b]:14550",
+        "udpin:a b:14550",
+        "udpin:a\nb:14550",
+        "udpin:a..b:14550",
+        "udpin:é:14550",
+        "tcp:" + "a" * 64 + ":5760",
+        "udpout:127.0.0.1:0",
+        "tcp:127.0.0.1:0",
+        "udp:127.0.0.1:14550",
+        "http://127.0.0.1:80",
+        "UDPIN:127.0.0.1:14550",
+        "127.0.0.1:14550",
+        "serial:/dev/ttyAMA0",
+        "serial:/dev/ttyAMA0:0",
+        "serial:/dev/ttyAMA0:20000001",
+        "serial:/dev/ttyAMA0:fast",
+        "serial:/dev/tty\0:57600",
+        "serial:/dev/tty\n:57600",
+        "serial::57600",
+    ],
+)
+def test_a_bad_address_is_one_line_that_names_it(text: str) -> None:
+    with pytest.raises(LinkError) as caught:
+        parse_link(text)
+    message = str(caught.value)
+    assert repr(text) in message and "\n" not in message
+
+
+def test_only_the_schemes_that_are_asked_for() -> None:
+    assert parse_link("tcp:127.0.0.1:1", ("tcp",)) == LinkUrl("tcp", "127.0.0.1", 1)
+    with pytest.raises(LinkError, match=r"is not tcp:HOST:PORT$"):
+        parse_link("udpin:127.0.0.1:1", ("tcp",))
+    with pytest.raises(LinkError, match=r"is not udpin:HOST:PORT or serial:DEVICE:BAUD$"):
+        parse_link("tcp:127.0.0.1:1", ("udpin", "serial"))
+
+
+@given(st.sampled_from(SCHEMES), st.text(max_size=20), st.text("0123456789:.-", max_size=6))
+def test_any_text_is_an_address_or_a_link_error(scheme: str, host: str, port: str) -> None:
+    """What is read is written so that it reads alike."""
+    try:
+        url = parse_link(f"{scheme}:{host}:{port}")
+    except LinkError as error:
+        assert len(str(error).splitlines()) == 1
+    else:
+        assert parse_link(str(url)) == url

@@ -1,0 +1,27 @@
+"""The lists of who may be tracked."""
+
+import pytest
+
+from companion.mavlink.trust.admission import Admission
+
+
+@pytest.mark.parametrize(
+    ("allow", "deny", "uav", "admitted"),
+    [
+        ((), (), "3:1", True),
+        (("3:1",), (), "3:1", True),
+        (("3:1",), (), "31:1", False),
+        (("3:1",), (), "3:11", False),
+        (("3:*",), (), "3:190", True),
+        (("3:*",), (), "icao:4CA7B3", False),
+        ((), ("icao:*",), "icao:4CA7B3", False),
+        ((), ("icao:*",), "3:1", True),
+        (("icao:4C*",), (), "icao:4CA7B3", True),
+        (("icao:4C*",), (), "icao:3CA7B3", False),
+        (("*:1",), ("3:1",), "3:1", False),
+        (("*:1",), ("3:1",), "4:1", True),
+    ],
+)
+def test_the_lists(allow: tuple[str, ...], deny: tuple[str, ...], uav: str, admitted: bool) -> None:
+    lists = Admission(allow, deny)
+    assert lists.admits(uav) is lists.admits(uav) is admitted

@@ -1,0 +1,133 @@
+"""The same report counts once, whatever link it came over; two reports are two."""
+
+import tracemalloc
+
+import pytest
+from pymavlink.dialects.v20 import all as dialect
+
+from companion.mavlink.trust.dedupe import WINDOW_NS, Dedupe
+from companion.values import Frame, Source
+
+EPOCH_NS = 1_700_000_000_000_000_000
+S = 1_000_000_000
+
+
+def sent(
+    t_ns: int = EPOCH_NS,
+    link: str = "a",
+    *,
+    boot_ms: int = 1000,
+    seq: int = 0,
+    source: tuple[int, int] = (1, 1),
+    lat: int = 473977419,
+    hdg: int = 35_999,
+    v1: bool = False,
+) -> Frame:
+    mav = dialect.MAVLink(None, *source)
+    mav.seq = seq
+    message = dialect.MAVLink_global_position_int_message(
+        boot_ms, lat, 85455938, 488_000, 25_000, -300, 400, -5, hdg
+    )
+    raw = bytes(message.pack(mav, force_mavlink1=v1))
+    return Frame(t_ns, link, Source(*source), 33, raw)
+
+
+def test_the_same_report_over_two_links_counts_once() -> None:
+    """Every link has a sequence of its own."""
+    dedupe = Dedupe()
+    answers = []
+    for n in range(50):
+        t_ns = EPOCH_NS + n * S // 10
+        answers.append(dedupe.is_repeat(sent(t_ns, "a", boot_ms=n * 100, seq=n)))
+        answers.append(dedupe.is_repeat(sent(t_ns + 1000, "b", boot_ms=n * 100, seq=200 - n)))
+    assert answers == [False, True] * 50
+
+
+def test_a_link_that_lags_behind_another() -> None:
+    dedupe = Dedupe()
+    reports = [sent(EPOCH_NS + n * S, boot_ms=n * 1000) for n in range(25)]
+    assert not any(dedupe.is_repeat(frame) for frame in reports)
+    assert all(dedupe.is_repeat(f._replace(t_ns=f.t_ns + 25 * S, link="b")) for f in reports)
+
+
+def test_twice_over_one_link_counts_once_and_so_do_three_times() -> None:
+    dedupe = Dedupe()
+    assert [dedupe.is_repeat(sent(EPOCH_NS + n, seq=n)) for n in range(3)] == [False, True, True]
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        sent(boot_ms=1001),
+        sent(lat=473977420),
+        sent(source=(2, 1)),
+        sent(source=(1, 2)),
+        sent()._replace(msgid=32),
+    ],
+    ids=["boot time", "content", "system", "component", "message"],
+)
+def test_two_reports_are_two(other: Frame) -> None:
+    dedupe = Dedupe()
+    assert not dedupe.is_repeat(sent())
+    assert not dedupe.is_repeat(other)
+    assert dedupe.is_repeat(sent())
+    assert dedupe.is_repeat(other)
+
+
+@pytest.mark.parametrize("hdg", [35_999, 255, 0])
+def test_the_same_report_in_both_versions_counts_once(hdg: int) -> None:
+    """Version 2 cuts the trailing zeros that version 1 sends: the content is the same."""
+    dedupe = Dedupe()
+    assert not dedupe.is_repeat(sent(link="a", hdg=hdg))
+    assert dedupe.is_repeat(sent(link="b", hdg=hdg, v1=True))
+
+
+def test_the_window() -> None:
+    """Counted from the report that was new, so that what is repeated for ever comes through."""
+    dedupe = Dedupe()
+    assert not dedupe.is_repeat(sent(EPOCH_NS))
+    assert dedupe.is_repeat(sent(EPOCH_NS + WINDOW_NS // 2))
+    assert dedupe.is_repeat(sent(EPOCH_NS + WINDOW_NS))
+    assert not dedupe.is_repeat(sent(EPOCH_NS + WINDOW_NS + 1))
+    assert dedupe.is_repeat(sent(EPOCH_NS + WINDOW_NS + 2))
+    assert dedupe.is_repeat(sent(EPOCH_NS + 2 * WINDOW_NS + 1))
+    assert not dedupe.is_repeat(sent(EPOCH_NS + 2 * WINDOW_NS + 2))
+
+
+def test_memory_is_that_of_one_window() -> None:
+    dedupe = Dedupe()
+    sizes = []
+    per_window = WINDOW_NS * 20 // S
+    tracemalloc.start()
+    try:
+        for n in range(1, 10 * per_window + 1):
+            dedupe.is_repeat(sent(EPOCH_NS + n * S // 20, boot_ms=n))
+            if n in (2 * per_window, 10 * per_window):
+                sizes.append(tracemalloc.get_traced_memory()[0])
+    finally:
+        tracemalloc.stop()
+    assert sizes[0] > per_window * 30  # it does remember the window
+    assert sizes[1] < 1.2 * sizes[0]
+
+
+def test_which_link_was_first_and_how_late_each_is() -> None:
+    """Link b brings all that a brings 40 ms later, and every tenth that a lost."""
+    dedupe = Dedupe()
+    for n in range(100):
+        t_ns = EPOCH_NS + n * S // 10
+        for link, late_ns in (("a", 0), ("b", S // 25)):
+            if link == "a" and n % 10 == 0:
+                continue
+            if not dedupe.is_repeat(sent(t_ns + late_ns, link, boot_ms=n * 100)):
+                dedupe.took(0.1 + late_ns / S)
+    a, b = dedupe.shares["a"], dedupe.shares["b"]
+    assert (a.first, a.repeats, b.first, b.repeats) == (90, 0, 10, 90)
+    assert list(a.latencies_s) == pytest.approx([0.1] * 90)
+    assert list(b.latencies_s) == pytest.approx([0.14] * 100)
+
+
+def test_a_latency_that_is_not_known_is_not_made_up() -> None:
+    dedupe = Dedupe()
+    assert not dedupe.is_repeat(sent(EPOCH_NS))
+    assert dedupe.is_repeat(sent(EPOCH_NS + S))
+    assert not dedupe.shares["a"].latencies_s

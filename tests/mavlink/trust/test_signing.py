@@ -1,0 +1,552 @@
+"""Signatures against pymavlink's generated dialect and hashlib written out; the rules of timestamps
+against brute force; crashes against all that was ever taken or sent."""
+
+import hashlib
+import struct
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import all as dialect
+
+from companion.mavlink.trust.signing import (
+    FOLLOWED_MAX,
+    LATEST,
+    STREAMS_MAX,
+    Guard,
+    State,
+    fingerprint,
+)
+from companion.mavlink.wire import encode
+from companion.mavlink.wire.framing import Splitter
+from companion.values import Frame, Reason, Source
+
+KEY = hashlib.sha256(b"correct horse").digest()
+OTHER_KEY = hashlib.sha256(b"battery staple").digest()
+S = 1_000_000_000
+UNITS = 100_000  # of a timestamp in a second
+NOW_NS = 1_790_000_000 * S
+NOW = (1_790_000_000 - 1_420_070_400) * UNITS
+OURS = Source(5, 191)
+
+
+def units(t_ns: int) -> int:
+    return (t_ns - 1_420_070_400 * S) // 10_000
+
+
+def position(boot_ms: int = 0) -> object:
+    return dialect.MAVLink_global_position_int_message(
+        boot_ms, 473977419, 85455938, 488_000, 25_000, -300, 400, -5, 0
+    )
+
+
+def vehicle(key: bytes | None, stamp: int, link_id: int = 0, sysid: int = 1) -> dialect.MAVLink:
+    """pymavlink's end of a link: it signs what it sends and takes only what is signed."""
+    mav = dialect.MAVLink(None, sysid, 1)
+    mav.signing.secret_key = key
+    mav.signing.timestamp = stamp
+    mav.signing.link_id = link_id
+    mav.signing.sign_outgoing = key is not None
+    return mav
+
+
+def framed(raw: bytes, t_ns: int = NOW_NS) -> Frame:
+    """What a link makes of these bytes."""
+    (item,) = Splitter("a").feed(t_ns, raw)
+    assert isinstance(item, Frame)
+    return item
+
+
+def sent(
+    stamp: int,
+    *,
+    key: bytes = KEY,
+    stream: tuple[int, int, int] = (1, 1, 0),
+    t_ns: int = NOW_NS,
+    payload: bytes = bytes(27) + b"\1",
+) -> Frame:
+    """A signed GLOBAL_POSITION_INT, made by hand."""
+    sysid, compid, link_id = stream
+    raw = b"\xfd" + bytes([len(payload), 1, 0, 7, sysid, compid, 33, 0, 0]) + payload
+    crc = dialect.x25crc(raw[1:] + bytes([104])).crc
+    raw += struct.pack("<HB", crc, link_id) + struct.pack("<Q", stamp)[:6]
+    return Frame(t_ns, "a", Source(sysid, compid), 33, raw + hashlib.sha256(key + raw).digest()[:6])
+
+
+def guard(**changes: object) -> Guard:
+    return Guard(**({"key": KEY, "link_id": 9} | changes))  # type: ignore[arg-type]
+
+
+def stamp_of(raw: bytes) -> int:
+    return int.from_bytes(raw[-12:-6], "little")
+
+
+# --- signatures ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("link_id", [0, 1, 255])
+def test_what_pymavlink_signs_is_taken(link_id: int) -> None:
+    mav, ours = vehicle(KEY, NOW, link_id), guard()
+    for boot_ms in range(300):
+        raw = bytes(position(boot_ms).pack(mav))  # type: ignore[attr-defined]
+        assert ours.refusal(framed(raw)) is None
+    assert ours.state(NOW_NS).streams == {(1, 1, link_id): (NOW + 299, 299)}
+
+
+def test_what_we_sign_is_what_pymavlink_signs() -> None:
+    """Byte for byte, with each message that the service sends; and its parser takes it."""
+    listener = vehicle(KEY, NOW)
+    ours = guard(link_id=3)
+    messages = (
+        encode.heartbeat(OURS),
+        encode.set_message_interval(OURS, Source(1, 1), 33, 100_000),
+        encode.request_data_stream(OURS, Source(1, 1), 6, 10),
+        encode.timesync(OURS, 1_790_000_000_123_456_789),
+    )
+    for seq, message in enumerate(messages):
+        unsigned = encode.pack(message, seq)
+        signed = ours.sign(unsigned, NOW_NS + seq * S)
+        (heard,) = listener.parse_buffer(signed)
+        assert heard.get_type() == dialect.mavlink_map[message.msgid].msgname
+
+        reference = vehicle(KEY, NOW + seq * UNITS, 3)
+        reference.srcSystem, reference.srcComponent, reference.seq = *OURS, seq
+        (again,) = dialect.MAVLink(None).parse_buffer(unsigned)
+        assert signed == bytes(again.pack(reference))
+    assert listener.signing.goodsig_count == len(messages)
+
+
+def test_another_key_is_refused_at_both_ends() -> None:
+    raw = bytes(position().pack(vehicle(OTHER_KEY, NOW)))  # type: ignore[attr-defined]
+    assert guard().refusal(framed(raw)) is Reason.BAD_SIGNATURE
+    assert guard(key=OTHER_KEY).refusal(framed(raw)) is None
+
+    signed = guard().sign(encode.pack(encode.heartbeat(OURS), 0), NOW_NS)
+    with pytest.raises(dialect.MAVError, match="signature"):
+        vehicle(OTHER_KEY, NOW).parse_buffer(signed)
+
+
+@pytest.mark.parametrize("allow_unsigned", [False, True])
+def test_a_flipped_bit_anywhere(allow_unsigned: bool) -> None:
+    good = sent(NOW).raw
+    ours = guard(allow_unsigned=allow_unsigned)
+    before = ours.state(NOW_NS)
+    for bit in range(8 * len(good)):
+        raw = bytearray(good)
+        raw[bit // 8] ^= 1 << bit % 8
+        if not allow_unsigned:  # whether or not the checksum was looked at
+            assert ours.refusal(Frame(NOW_NS, "a", Source(1, 1), 33, bytes(raw))) is not None, bit
+        splitter = Splitter("a")
+        for item in splitter.feed(NOW_NS, bytes(raw)) + splitter.finish(NOW_NS):
+            if isinstance(item, Frame):
+                assert ours.refusal(item) is Reason.BAD_SIGNATURE, bit
+    assert ours.state(NOW_NS) == before
+    assert ours.refusal(framed(good)) is None
+
+
+# --- fail closed --------------------------------------------------------------------------------
+
+
+def unsigned(*, v1: bool, seq: int = 0) -> Frame:
+    mav = vehicle(None, 0)
+    mav.seq = seq  # where version 1 has it, version 2 has the flag of a signature
+    return framed(bytes(position().pack(mav, force_mavlink1=v1)))  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("v1", [False, True])
+def test_unsigned_frames_are_refused_whatever_came_before(v1: bool) -> None:
+    """pymavlink's mavutil makes a new parser on the first MAVLink 2 byte after MAVLink 1, and
+    that one has no key."""
+    ours = guard()
+    for n in range(3):
+        before, moves = ours.state(NOW_NS), ours.moves
+        assert ours.refusal(unsigned(v1=v1, seq=n)) is Reason.UNSIGNED
+        assert (ours.state(NOW_NS), ours.moves) == (before, moves)
+        assert ours.refusal(sent(NOW + n, key=OTHER_KEY)) is Reason.BAD_SIGNATURE
+        assert ours.refusal(sent(NOW + n)) is None
+        assert ours.refusal(sent(NOW + n)) is Reason.REPLAYED
+
+
+@pytest.mark.parametrize("v1", [False, True])
+def test_allowed_unsigned_frames_pass_but_never_a_wrong_signature(v1: bool) -> None:
+    ours = guard(allow_unsigned=True)
+    for n in range(3):
+        before = ours.state(NOW_NS)
+        assert ours.refusal(unsigned(v1=v1, seq=n)) is None
+        assert ours.state(NOW_NS) == before
+        assert ours.refusal(sent(NOW + n, key=OTHER_KEY)) is Reason.BAD_SIGNATURE
+        assert ours.refusal(sent(NOW + n)) is None
+        assert ours.refusal(sent(NOW + n)) is Reason.REPLAYED
+
+
+def test_nobody_changes_the_key_over_the_air() -> None:
+    ours, mav = guard(), vehicle(KEY, NOW)
+    setup = dialect.MAVLink_setup_signing_message(*OURS, list(OTHER_KEY), NOW + 9)
+    plain = bytes(setup.pack(vehicle(None, 0)))
+    assert ours.refusal(framed(plain)) is Reason.UNSIGNED
+    ours.refusal(framed(bytes(setup.pack(mav))))
+    assert ours.refusal(sent(NOW + 10, key=OTHER_KEY)) is Reason.BAD_SIGNATURE
+    assert ours.refusal(sent(NOW + 10)) is None
+
+
+def test_a_refused_frame_moves_nothing() -> None:
+    """Whoever has no key must not shut a stream: pymavlink notes the timestamp of a frame before
+    it looks at the signature, and from then on takes no frame of that sender."""
+    ours = guard()
+    assert ours.refusal(sent(NOW)) is None
+    before, moves = ours.state(NOW_NS), ours.moves
+    assert ours.refusal(sent(LATEST, key=OTHER_KEY)) is Reason.BAD_SIGNATURE
+    assert ours.refusal(sent(LATEST, key=OTHER_KEY, stream=(2, 1, 0))) is Reason.BAD_SIGNATURE
+    assert ours.refusal(sent(NOW)) is Reason.REPLAYED
+    assert ours.refusal(sent(NOW - 61 * UNITS, stream=(2, 1, 0))) is Reason.REPLAYED
+    assert (ours.state(NOW_NS), ours.moves) == (before, moves)
+    assert ours.refusal(sent(NOW + 1)) is None
+
+
+# --- timestamps ---------------------------------------------------------------------------------
+
+
+def test_a_newcomer_is_at_most_a_minute_behind_the_own_clock() -> None:
+    ours = guard()
+    assert ours.refusal(sent(NOW - 60 * UNITS - 1)) is Reason.REPLAYED
+    assert ours.refusal(sent(NOW - 60 * UNITS)) is None
+    assert ours.refusal(sent(NOW - 60 * UNITS)) is Reason.REPLAYED
+
+
+def test_a_newcomer_is_at_most_a_minute_behind_what_was_taken() -> None:
+    ours = guard()
+    assert ours.refusal(sent(NOW + 100 * UNITS)) is None
+    newcomer = (1, 1, 1)  # the same sender over another of its links
+    assert ours.refusal(sent(NOW + 40 * UNITS - 1, stream=newcomer)) is Reason.REPLAYED
+    assert ours.refusal(sent(NOW + 40 * UNITS, stream=newcomer)) is None
+
+
+def test_known_streams_go_on_by_their_own_clocks() -> None:
+    ours = guard()
+    slow, fast, right = (1, 1, 0), (2, 1, 0), (3, 1, 0)
+    assert ours.refusal(sent(NOW - 59 * UNITS, stream=slow)) is None
+    assert ours.refusal(sent(NOW, stream=right)) is None
+    assert ours.refusal(sent(NOW + 86_400 * UNITS, stream=fast)) is None
+    for second in range(1, 5):
+        assert ours.refusal(sent(NOW + second * UNITS, stream=right)) is None
+        assert ours.refusal(sent(NOW + (second - 59) * UNITS, stream=slow)) is None
+    assert ours.ahead_ns(NOW_NS + 4 * S) == (86_400 - 4) * S
+    assert guard().ahead_ns(NOW_NS) == 0
+
+
+def test_a_wrong_clock_shuts_out_newcomers_until_they_hear_us() -> None:
+    ours = guard()
+    assert ours.refusal(sent(NOW + 3600 * UNITS, stream=(2, 1, 0))) is None
+    newcomer = vehicle(KEY, NOW, sysid=7)
+
+    def report() -> Frame:
+        return framed(bytes(position().pack(newcomer)))  # type: ignore[attr-defined]
+
+    assert ours.refusal(report()) is Reason.REPLAYED
+    assert guard().refusal(report()) is None  # another link does not notice
+    newcomer.parse_buffer(ours.sign(encode.pack(encode.heartbeat(OURS), 0), NOW_NS))
+    assert ours.refusal(report()) is None
+
+
+def test_each_link_takes_the_same_frame_once() -> None:
+    a, b = guard(link_id=0), guard(link_id=1)
+    for n in range(3):
+        assert [link.refusal(sent(NOW + n)) for link in (a, b)] == [None, None]
+        assert [link.refusal(sent(NOW + n)) for link in (a, b)] == [Reason.REPLAYED] * 2
+
+
+def test_our_own_frames_do_not_come_back() -> None:
+    ours = guard(link_id=3)
+    signed = ours.sign(encode.pack(encode.heartbeat(OURS), 0), NOW_NS)
+    assert guard().refusal(framed(signed)) is None
+    assert ours.refusal(framed(signed)) is Reason.REPLAYED
+
+
+# --- frames of our own --------------------------------------------------------------------------
+
+
+@given(st.lists(st.integers(-3 * S, 3 * S) | st.just(0), min_size=1, max_size=60))
+def test_timestamps_increase_and_are_never_behind_the_clock(steps_ns: list[int]) -> None:
+    ours, now_ns, stamps = guard(), NOW_NS, [-1]
+    raw = encode.pack(encode.heartbeat(OURS), 0)
+    for step_ns in steps_ns:
+        now_ns += step_ns
+        stamps.append(stamp_of(ours.sign(raw, now_ns)))
+        assert stamps[-1] == max(units(now_ns), stamps[-2] + 1)
+
+
+def test_our_timestamps_follow_what_is_taken() -> None:
+    ours, raw = guard(), encode.pack(encode.heartbeat(OURS), 0)
+    assert ours.refusal(sent(NOW + 5 * UNITS)) is None
+    assert stamp_of(ours.sign(raw, NOW_NS)) == NOW + 5 * UNITS + 1
+
+
+def test_a_clock_before_2015() -> None:
+    ours, raw = guard(), encode.pack(encode.heartbeat(OURS), 0)
+    assert [stamp_of(ours.sign(raw, 0)) for _ in range(3)] == [1, 2, 3]
+    assert ours.refusal(sent(NOW, t_ns=0)) is None
+    assert stamp_of(ours.sign(raw, 0)) == NOW + 1
+
+
+def test_no_timestamp_leaves_none_for_others() -> None:
+    ours, raw = guard(), encode.pack(encode.heartbeat(OURS), 0)
+    assert ours.refusal(sent(LATEST)) is None
+    assert ours.refusal(sent(LATEST)) is Reason.REPLAYED
+    stamps = [stamp_of(ours.sign(raw, NOW_NS)) for _ in range(3)]
+    assert stamps == [FOLLOWED_MAX + 1, FOLLOWED_MAX + 2, FOLLOWED_MAX + 3]
+    again = guard(state=ours.state(NOW_NS).after_crash())
+    assert stamp_of(again.sign(raw, NOW_NS)) > stamps[-1]
+    assert again.refusal(sent(LATEST)) is Reason.REPLAYED
+
+
+def test_only_an_unsigned_frame_of_version_2_can_be_signed() -> None:
+    ours, message = guard(), encode.heartbeat(OURS)
+    for raw in (encode.pack(message, 0, 1), ours.sign(encode.pack(message, 0), NOW_NS)):
+        with pytest.raises(ValueError, match="unsigned MAVLink 2"):
+            ours.sign(raw, NOW_NS)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"key": KEY[:31]}, "32 bytes, not 31"),
+        ({"key": b""}, "32 bytes, not 0"),
+        ({"link_id": 256}, "0 to 255, not 256"),
+        ({"link_id": -1}, "0 to 255, not -1"),
+    ],
+)
+def test_what_a_guard_is_made_of(changes: dict[str, object], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        guard(**changes)
+
+
+def test_a_fingerprint_tells_keys_apart_and_does_not_give_them_away() -> None:
+    assert fingerprint(KEY) == hashlib.sha256(hashlib.sha256(KEY).digest()).hexdigest()[:8]
+    assert fingerprint(KEY) != fingerprint(OTHER_KEY)
+
+
+# --- memory -------------------------------------------------------------------------------------
+
+
+def test_memory_is_bounded_and_what_is_forgotten_stays_refused() -> None:
+    ours, more = guard(), 20
+    frames = [sent(NOW + n, stream=(1 + n % 250, 1, n // 250)) for n in range(STREAMS_MAX + more)]
+    assert all(ours.refusal(frame) is None for frame in frames)
+    kept = ours.state(NOW_NS).streams
+    assert len(kept) == STREAMS_MAX
+    assert set(kept) == {(1 + n % 250, 1, n // 250) for n in range(more, STREAMS_MAX + more)}
+    assert all(ours.refusal(frame) is Reason.REPLAYED for frame in frames)
+
+    again = guard(state=ours.state(NOW_NS))
+    assert all(again.refusal(frame) is Reason.REPLAYED for frame in frames[: more + 5])
+    assert again.refusal(sent(NOW + STREAMS_MAX + more, stream=(1, 1, 0))) is None
+    assert len(again.state(NOW_NS).streams) == STREAMS_MAX
+
+
+# --- sequences, against the rule by brute force -------------------------------------------------
+
+STREAMS = st.tuples(st.integers(1, 3), st.just(1), st.integers(0, 1))
+STAMPS = st.integers(-70, 70).map(lambda s: NOW + s * UNITS) | st.integers(NOW - 3, NOW + 3)
+HEARD = st.tuples(st.just("hear"), STREAMS, STAMPS, st.sampled_from([KEY, KEY, KEY, OTHER_KEY]))
+SEQUENCES = st.lists(
+    HEARD
+    | st.tuples(st.just("wait"), st.integers(0, 40))
+    | st.tuples(st.just("plain"), st.booleans())
+    | st.just(("send",)),
+    max_size=60,
+)
+
+
+@settings(max_examples=300)
+@given(SEQUENCES)
+def test_sequences_by_brute_force(sequence: list[tuple]) -> None:  # type: ignore[type-arg]
+    ours, now_ns = guard(), NOW_NS
+    taken: list[tuple[tuple[int, int, int], int]] = []
+    our_stamps = [-1]
+    for step in sequence:
+        match step:
+            case "wait", seconds:
+                now_ns += seconds * S
+            case "plain", v1:
+                assert ours.refusal(unsigned(v1=v1)) is Reason.UNSIGNED
+            case ("send",):
+                raw = ours.sign(encode.pack(encode.heartbeat(OURS), 0), now_ns)
+                our_stamps.append(stamp_of(raw))
+                newest = max([our_stamps[-2], *(stamp for _, stamp in taken)])
+                assert our_stamps[-1] == max(units(now_ns), newest + 1)
+            case "hear", stream, stamp, key:
+                of_stream = [newest for other, newest in taken if other == stream]
+                local = max([units(now_ns), *(newest for _, newest in taken)])
+                if key is not KEY:
+                    due = Reason.BAD_SIGNATURE
+                elif of_stream:
+                    due = None if stamp > max(of_stream) else Reason.REPLAYED
+                else:
+                    due = None if local - stamp <= 60 * UNITS else Reason.REPLAYED
+                assert ours.refusal(sent(stamp, stream=stream, key=key, t_ns=now_ns)) is due
+                if due is None:
+                    taken.append((stream, stamp))
+
+
+# --- crashes ------------------------------------------------------------------------------------
+
+KNOWN = {(1, 1, 0): 0, (2, 1, 0): -3600, (3, 1, 0): 7200}  # s by which their clocks are ahead
+KNOWN_AT = {stream: (NOW + (ahead - 1) * UNITS, ahead * UNITS) for stream, ahead in KNOWN.items()}
+NEW = {(4, 1, 0): 0, (5, 1, 0): -50}
+
+
+class Run:
+    """A guard with its disk: saved every second, on the disk ``write_s`` later."""
+
+    def __init__(self, write_s: int) -> None:
+        self.now_ns = NOW_NS
+        self.guard = guard(state=State(NOW, NOW + 7199 * UNITS, NOW, -1, KNOWN_AT))
+        self.saves = [(NOW_NS, self.guard.state(NOW_NS))]
+        self.taken: list[Frame] = []
+        self.stamps = [-1]
+        self.write_ns = write_s * S
+
+    def hear(self, stream: tuple[int, int, int], late_ms: int) -> Reason | None:
+        stamp = units(self.now_ns - late_ms * 1_000_000) + (KNOWN | NEW)[stream] * UNITS
+        frame = sent(stamp, stream=stream, t_ns=self.now_ns)
+        reason = self.guard.refusal(frame)
+        if reason is None:
+            self.taken.append(frame)
+        return reason
+
+    def send(self) -> None:
+        raw = self.guard.sign(encode.pack(encode.heartbeat(OURS), 0), self.now_ns)
+        self.stamps.append(stamp_of(raw))
+        assert self.stamps[-1] > self.stamps[-2]
+        self.taken.append(framed(raw))
+
+    def wait(self, milliseconds: int) -> None:
+        end_ns = self.now_ns + milliseconds * 1_000_000
+        while (due_ns := self.saves[-1][0] + S) <= end_ns:
+            self.saves.append((due_ns, self.guard.state(due_ns)))
+        self.now_ns = end_ns
+
+    def crash(self, down_ms: int) -> None:
+        on_disk = [
+            (at_ns, state)
+            for at_ns, state in self.saves
+            if at_ns <= self.now_ns - self.write_ns or at_ns == self.saves[0][0]
+        ]
+        self.restart(on_disk[-1][1].after_crash(), down_ms)
+
+    def stop(self, down_ms: int) -> None:
+        self.restart(self.guard.state(self.now_ns), down_ms)
+
+    def restart(self, state: State, down_ms: int) -> None:
+        self.now_ns += down_ms * 1_000_000
+        self.guard = guard(state=state)
+        self.saves = [(self.now_ns, self.guard.state(self.now_ns))]
+        for frame in self.taken:
+            replayed = self.guard.refusal(frame._replace(t_ns=self.now_ns))
+            assert replayed is Reason.REPLAYED, frame
+
+
+LIVES = st.lists(
+    st.tuples(st.just(Run.hear), st.sampled_from([*KNOWN, *NEW]), st.integers(0, 2000))
+    | st.tuples(st.just(Run.wait), st.integers(1, 900) | st.integers(1, 90_000))
+    | st.tuples(st.just(Run.crash), st.integers(0, 3000))
+    | st.tuples(st.just(Run.stop), st.integers(0, 3000))
+    | st.tuples(st.just(Run.send)),
+    max_size=40,
+)
+
+
+@settings(max_examples=400, deadline=None)
+@given(LIVES, st.integers(0, 2))
+def test_nothing_is_taken_twice_and_no_timestamp_sent_twice(
+    life: list[tuple[Callable[..., object], ...]], write_s: int
+) -> None:
+    run = Run(write_s)
+    for step, *arguments in life:
+        step(run, *arguments)
+    run.crash(0)
+    run.send()
+    run.wait(8000)
+    assert [run.hear(stream, 0) for stream in KNOWN] == [None] * len(KNOWN)
+
+
+def test_in_order_a_link_goes_on_where_it_ended() -> None:
+    run = Run(0)
+    assert [run.hear(stream, 0) for stream in KNOWN] == [None] * 3
+    run.stop(0)
+    run.wait(1)
+    assert [run.hear(stream, 0) for stream in KNOWN] == [None] * 3
+
+
+@pytest.mark.parametrize("silent_s", [1, 10, 3600])
+def test_a_stream_that_was_silent_and_is_heard_in_the_last_second(silent_s: int) -> None:
+    run = Run(0)
+    run.wait(silent_s * 1000 + 500)
+    assert run.hear((1, 1, 0), 0) is None
+    run.crash(0)  # replays all that was taken
+    run.wait(6000)
+    assert run.hear((1, 1, 0), 0) is None
+
+
+def test_our_frames_of_the_last_second_that_followed_a_clock_ahead() -> None:
+    run = Run(0)
+    run.wait(60_500)
+    assert run.hear((3, 1, 0), 0) is None  # ahead, and silent for a minute before
+    run.send()
+    run.crash(0)
+    run.send()
+
+
+def test_a_burst_of_our_own_in_the_last_second() -> None:
+    """After a crash we are ahead of the clock, and each frame takes one unit."""
+    run = Run(0)
+    for _ in range(3):
+        run.wait(100)
+        for _ in range(50):
+            run.send()
+        run.crash(0)
+
+
+@pytest.mark.parametrize("crashed", [False, True])
+def test_a_clock_that_stands_a_day_back_at_the_next_start(crashed: bool) -> None:
+    """A small computer without a battery for its clock: the stored timestamp holds."""
+    first = guard()
+    assert first.refusal(sent(NOW + 1)) is None
+    state = first.state(NOW_NS)
+    back_ns = NOW_NS - 86_400 * S
+    for _ in range(2):
+        ours = guard(state=state.after_crash() if crashed else state)
+        assert ours.refusal(sent(NOW + 1, t_ns=back_ns)) is Reason.REPLAYED
+        old = sent(NOW - 60 * UNITS, stream=(2, 1, 0), t_ns=back_ns)
+        assert ours.refusal(old) is Reason.REPLAYED
+        state = ours.state(back_ns)
+    fresh = NOW + 12 * UNITS
+    assert ours.refusal(sent(fresh, t_ns=back_ns)) is None
+    assert ours.refusal(sent(fresh, stream=(2, 1, 0), t_ns=back_ns)) is None
+
+
+def test_the_own_clock_counts_for_the_next_run() -> None:
+    """Where nothing was heard and nothing sent."""
+    ours = guard(state=guard().state(NOW_NS))
+    back_ns = NOW_NS - 86_400 * S
+    assert ours.refusal(sent(NOW - 60 * UNITS - 1, t_ns=back_ns)) is Reason.REPLAYED
+    assert ours.refusal(sent(NOW - 60 * UNITS, t_ns=back_ns)) is None
+
+
+@pytest.mark.parametrize("ahead_s", [0, 7200])
+def test_crash_after_crash_does_not_add_up(ahead_s: int) -> None:
+    """Neither for ourselves, who may follow a clock that is ahead, nor for others."""
+    run = Run(0)
+    if not ahead_s:
+        streams = {stream: KNOWN_AT[stream] for stream in KNOWN if KNOWN[stream] <= 0}
+        run.guard = guard(state=State(NOW, NOW, NOW, -1, streams))
+        run.saves = [(NOW_NS, run.guard.state(NOW_NS))]
+    for _ in range(100):
+        run.send()
+        run.wait(1000)
+        run.crash(1000)
+    assert run.stamps[-1] < units(run.now_ns) + (ahead_s + 6) * UNITS
+    run.wait(6000)
+    assert [run.hear(stream, 0) for stream in KNOWN if KNOWN[stream] <= 0] == [None] * 2
+    assert run.hear((4, 1, 0), 0) is (Reason.REPLAYED if ahead_s else None)  # a newcomer

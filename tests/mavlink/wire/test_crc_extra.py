@@ -1,0 +1,30 @@
+"""The table of checksum seeds is that of pymavlink's dialect."""
+
+from pymavlink.dialects.v20 import all as dialect
+
+from companion.mavlink.wire.crc_extra import CRC_EXTRA
+
+
+def as_source(table: dict[int, int], width: int = 100) -> str:
+    """The table as it stands in ``messages.py``."""
+    lines, line = ["CRC_EXTRA: dict[int, int] = {"], "   "
+    for msgid, seed in sorted(table.items()):
+        entry = f" {msgid}: {seed},"
+        if len(line + entry) > width:
+            lines.append(line)
+            line = "   "
+        line += entry
+    return "\n".join([*lines, line, "}"])
+
+
+def test_the_seeds_are_those_of_the_dialect() -> None:
+    expected = {msgid: kind.crc_extra for msgid, kind in dialect.mavlink_map.items()}
+    assert expected == CRC_EXTRA, f"\nthe dialect has another table:\n\n{as_source(expected)}\n"
+
+
+def test_the_printed_table_can_be_pasted() -> None:
+    text = as_source(CRC_EXTRA)
+    scope: dict[str, object] = {}
+    exec(text, scope)
+    assert scope["CRC_EXTRA"] == CRC_EXTRA
+    assert max(map(len, text.splitlines())) <= 100

@@ -1,0 +1,216 @@
+"""``companion replay --serve``: the page and the API over a replay, as its users have them."""
+
+import asyncio
+import json
+import re
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support import BIN, HANG_S, Node, read_metadata
+
+from companion.node.replay import replay
+from companion.node.served_replay import Asked, ServedReplay
+from companion.recording.reader import read_log
+from companion.settings.model import Settings
+
+RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
+
+
+class Replaying(Node):
+    """A ``companion replay --serve`` process, and its address; said on stderr."""
+
+    def __init__(self, *arguments: str | Path) -> None:
+        self.process = subprocess.Popen(
+            [BIN / "companion", "replay", *arguments, "--serve", "--listen", "127.0.0.1:0"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stderr is not None
+        line = self.process.stderr.readline()
+        found = re.search(r"serves (http://\S+) and replays (\S+)", line)
+        if found is None:
+            self.process.kill()
+            pytest.fail(f"did not start: {line!r} {self.process.communicate()[1]}")
+        self.url, self.log = found[1], found[2]
+
+
+@pytest.fixture
+def start_replay() -> Iterator[Any]:
+    """Starts replays, and ends those that a test left."""
+    started: list[Replaying] = []
+
+    def start(*arguments: str | Path) -> Replaying:
+        started.append(Replaying(*arguments))
+        return started[-1]
+
+    yield start
+    for node in started:
+        if node.process.poll() is None:
+            node.process.kill()
+            node.process.communicate()
+
+
+@pytest.fixture
+def unserved(cut_log: Path) -> dict[str, Any]:
+    """What a replay that nobody looks at comes to."""
+    return replay([cut_log], Settings().override(center={"source": "5:1"}))
+
+
+@pytest.mark.full
+def test_it_is_served_while_it_goes_and_at_its_end(
+    start_replay: Any, cut_log: Path, unserved: dict[str, Any], tmp_path: Path
+) -> None:
+    out = tmp_path / "served.mcap"
+    node = start_replay(cut_log, "--center", "5:1", "--speed", "10", "--out", out, "--json")
+    assert node.log == cut_log.name
+    began_s, seen = time.monotonic(), []
+    while not seen or seen[-1]["replay"]["state"] == "running":
+        seen.append(node.json("/v1/status"))
+        ahead_s = seen[-1]["replay"]["at_s"] - 10 * (time.monotonic() - began_s)
+        assert ahead_s < 0.5  # it says that it serves before it begins
+        assert time.monotonic() - began_s < 30
+    at_s = [answer["replay"]["at_s"] for answer in seen]
+    assert at_s == sorted(at_s)
+    assert len({round(at) for at in at_s}) > 12  # in steps that a person can follow
+    last = seen[-1]
+    assert last["replay"] == {
+        "log": cut_log.name,
+        "speed": 10.0,
+        "at_s": pytest.approx(unserved["duration_s"]),
+        "of_s": pytest.approx(unserved["duration_s"]),
+        "state": "finished",
+    }
+    assert any(answer["replay"]["of_s"] for answer in seen[:-1])  # known before the end
+    assert last["digest"] == unserved["digest"]
+    newest_ns = max(event.t_ns for event in read_log(cut_log))
+    assert datetime.fromisoformat(last["time"]).timestamp() == pytest.approx(
+        newest_ns * 1e-9, abs=0.002
+    )
+    assert last["recording"]["state"] == "recording"
+    assert [link["url"] for link in last["links"]] == [cut_log.name]
+    assert last["links"][0]["frames"] == unserved["frames"]
+    assert json.loads(node.get("/readyz")[1])["reasons"] == ["the replay has finished"]
+    uavs = {uav["id"]: uav for uav in node.json("/v1/uavs")["uavs"]}
+    assert {uav: entry["reports"] for uav, entry in uavs.items()} == unserved["reports"]
+    assert len(node.json("/v1/beams")["beams"]) == 4
+    assert any("live" in event["text"] for event in node.json("/v1/events")["events"])
+
+    returncode, stdout, err = node.stop(signal.SIGINT)
+    assert returncode == 0, err
+    assert "stopped" not in err
+    summary = json.loads(stdout)
+    volatile = {"wall_s", "recording"}
+    assert {k: v for k, v in summary.items() if k not in volatile} == {
+        k: v for k, v in unserved.items() if k not in volatile
+    }
+    assert summary["recording"] == str(out)
+    assert read_metadata(out)["summary"]["digest"] == unserved["digest"]
+
+
+@pytest.mark.full
+def test_a_replay_that_is_stopped_sums_up_what_there_was(
+    start_replay: Any, cut_log: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "part.mcap"
+    node = start_replay(cut_log, "--center", "5:1", "--out", out, "--json")
+    status = node.wait_until("/v1/status", lambda answer: answer["replay"]["at_s"] > 0.5)
+    assert status["replay"]["speed"] == 1.0  # what it is unless said
+    assert node.json("/readyz")["ready"]
+    returncode, stdout, err = node.stop(signal.SIGTERM)
+    assert returncode == 0, err
+    summary = json.loads(stdout)
+    assert 0.5 < summary["duration_s"] < 20
+    assert f"stopped after {summary['duration_s']:.1f} s of {cut_log.name}" in err
+    again = replay([out], Settings.from_toml("", "").override(center={"source": "5:1"}))
+    assert again["digest"] == summary["digest"]
+
+
+@pytest.mark.full
+def test_on_plain_asyncio_as_fast_as_it_goes(cut_log: Path, unserved: dict[str, Any]) -> None:
+    said: list[str] = []
+    shown: list[dict[str, Any]] = []
+
+    async def serve() -> ServedReplay:
+        settings = Settings().override(center={"source": "5:1"})
+        node = ServedReplay(Asked([cut_log], settings, None, None), said.append)
+        until = asyncio.Event()
+
+        def show(summary: dict[str, Any]) -> None:
+            shown.append(summary)
+            until.set()
+
+        with socket.create_server(("127.0.0.1", 0)) as http:
+            await asyncio.wait_for(node.run(http, None, show, until), HANG_S)
+        return node
+
+    node = asyncio.run(serve())
+    assert shown[0]["digest"] == unserved["digest"]
+    assert node.replay().speed is None
+    assert node.replay().state == "finished"
+    assert node.recording().state == "off"
+    assert "5:1 is live" in said
+
+
+@pytest.mark.full
+def test_a_live_service_is_no_replay(start_node: Any) -> None:
+    assert start_node(*RUN).json("/v1/status")["replay"] is None
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--listen", "127.0.0.1:0"), "go with --serve"),
+        (("--serve", "--listen", "0.0.0.0:0"), "--insecure"),
+        (("--serve", "--speed", "0"), "'0' is neither max nor a number above 0"),
+    ],
+)
+def test_a_mistake_is_one_line_and_leaves_nothing(
+    arguments: tuple[str, ...], says: str, cut_log: Path, tmp_path: Path
+) -> None:
+    done = subprocess.run(
+        [BIN / "companion", "replay", cut_log, "--center", "5:1", *arguments],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=HANG_S,
+        check=False,
+    )
+    assert done.returncode != 0
+    assert done.stdout == ""
+    assert len(done.stderr.splitlines()) == 1
+    assert says in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.full
+def test_the_address_of_the_recorded_run_is_not_taken(tmp_path: Path, cut_log: Path) -> None:
+    """A recording holds the settings of its run: its port is another program's by now."""
+    recorded = tmp_path / "x.mcap"
+    settings = tmp_path / "settings.toml"
+    settings.write_text('[server]\nlisten = "192.0.2.1:1"\n[center]\nsource = "5:1"\n')
+    command = ["replay", cut_log, "--config", settings, "--out", recorded]
+    subprocess.run([BIN / "companion", *command], check=True, capture_output=True, timeout=HANG_S)
+    with socket.socket() as taken:  # the default port is taken, if not by others then by us
+        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            taken.bind(("127.0.0.1", 8080))
+            taken.listen()
+        except OSError:
+            pass
+        done = subprocess.run(
+            [BIN / "companion", "replay", recorded, "--serve", "--no-record"],
+            capture_output=True,
+            text=True,
+            timeout=HANG_S,
+            check=False,
+        )
+    assert "127.0.0.1:8080: Address already in use" in done.stderr

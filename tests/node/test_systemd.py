@@ -1,0 +1,241 @@
+"""What systemd is told: by a real service, over real Unix sockets."""
+
+import asyncio
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support import BIN, HANG_S, ROOT
+
+from companion.node import systemd
+from companion.node.service import Service
+from companion.settings.model import Settings
+
+RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
+WATCHDOG_S = 1.0
+
+
+class Listener:
+    """The service manager's end of the socket."""
+
+    def __init__(self, address: str) -> None:
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.socket.bind("\0" + address[1:] if address.startswith("@") else address)
+
+    def next(self, seconds: float) -> list[str] | None:
+        """The lines of the next message; None where none comes in time."""
+        self.socket.settimeout(seconds)
+        try:
+            return self.socket.recv(4096).decode().split("\n")
+        except TimeoutError:
+            return None
+
+    def wait_for(self, line: str, seconds: float = HANG_S) -> list[str]:
+        """The first message with that line."""
+        end = time.monotonic() + seconds
+        while (left_s := end - time.monotonic()) > 0:
+            lines = self.next(left_s)
+            if lines and line in lines:
+                return lines
+        pytest.fail(f"no {line}")
+
+    def drain(self) -> None:
+        """Forget what has come."""
+        self.socket.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            while True:
+                self.socket.recv(4096)
+
+
+@pytest.fixture(params=["path", "abstract"])
+def listener(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Listener]:
+    """Named in the environment, as systemd does for what it starts."""
+    names = {"path": str(tmp_path / "notify"), "abstract": f"@companion-test-{os.getpid()}"}
+    monkeypatch.setenv("NOTIFY_SOCKET", names[request.param])
+    heard = Listener(names[request.param])
+    with closing(heard.socket):
+        yield heard
+
+
+@pytest.mark.full
+def test_ready_alive_and_stopping(
+    listener: Listener, start_node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WATCHDOG_USEC", str(round(WATCHDOG_S * 1e6)))
+    node = start_node(*RUN)
+    first = listener.wait_for("READY=1")
+    assert node.get("/healthz")[0] == 200  # at once: ready means ready
+    assert "STATUS=UAVs: none; links up: 1 of 1; recording: off" in first
+    gaps_s, last_s = [], time.monotonic()
+    for _ in range(5):
+        lines = listener.wait_for("WATCHDOG=1", WATCHDOG_S)  # in time, each of them
+        assert "READY=1" not in lines
+        gaps_s.append(time.monotonic() - last_s)
+        last_s += gaps_s[-1]
+    assert sorted(gaps_s)[2] == pytest.approx(WATCHDOG_S / 2, abs=WATCHDOG_S / 8)
+
+    node.process.send_signal(signal.SIGSTOP)  # as good as an event loop that is blocked
+    listener.drain()
+    assert listener.next(2 * WATCHDOG_S) is None
+    node.process.send_signal(signal.SIGCONT)
+    listener.wait_for("WATCHDOG=1", HANG_S)
+
+    returncode, _, err = node.stop(signal.SIGTERM)
+    assert returncode == 0, err
+    listener.wait_for("STOPPING=1", HANG_S)
+    assert listener.next(0.1) is None
+    assert "systemd" not in err
+
+
+@pytest.mark.full
+def test_no_signs_of_life_where_none_are_asked_for(
+    listener: Listener, start_node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``WATCHDOG_PID`` is another process's: the variables were inherited."""
+    monkeypatch.setenv("WATCHDOG_USEC", "100000")
+    monkeypatch.setenv("WATCHDOG_PID", "1")
+    node = start_node(*RUN)
+    assert listener.wait_for("READY=1")
+    assert listener.next(1.0) is None
+    node.stop(signal.SIGINT)
+    listener.wait_for("STOPPING=1", HANG_S)
+
+
+def test_late_beams_are_no_sign_of_life(tmp_path: Path) -> None:
+    """The event loop turns, but nobody makes beam updates."""
+    settings = Settings().override(center={"source": "5:1"}, links={"urls": ["udpin:127.0.0.1:0"]})
+    heard = Listener(str(tmp_path / "notify"))
+    said: list[str] = []
+
+    async def told() -> None:
+        service = Service(settings, said.append)
+        service.answering.set()
+        until = asyncio.Event()
+        manager = systemd.Manager(str(tmp_path / "notify"), watchdog_s=0.2)
+        asyncio.get_running_loop().call_later(0.5, until.set)
+        links = asyncio.create_task(service._traffic.run())
+        await systemd.keep_informed(manager, service, said.append, until)
+        links.cancel()
+        await asyncio.wait([links])
+
+    messages: list[list[str]] = []
+    with closing(heard.socket), ThreadPoolExecutor(1) as beside:
+        done = beside.submit(lambda: asyncio.run(told()))
+        while not messages or messages[-1][0] != "STOPPING=1":
+            messages.append(heard.next(5.0) or pytest.fail("silent before it stopped"))
+        done.result()
+    assert "READY=1" in messages[0]
+    assert "beam updates are late" in messages[0][-1]
+    assert len(messages) > 10  # it looks again often: a hold-up must not cost a restart
+    assert not any("WATCHDOG=1" in lines for lines in messages)
+
+
+def test_a_manager_that_is_away_is_said_once_and_tried_again(
+    start_node: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    monkeypatch.setenv("WATCHDOG_USEC", "400000")
+    node = start_node(*RUN)
+    node.wait_until("/readyz", lambda answer: answer["reasons"] == ["no report yet"])
+    heard = Listener(str(tmp_path / "notify"))
+    with closing(heard.socket):
+        heard.wait_for("READY=1", HANG_S)
+        _, _, err = node.stop()
+    complaints = [line for line in err.splitlines() if "systemd" in line]
+    assert complaints == ["systemd cannot be told how the service is: No such file or directory"]
+
+
+def test_without_a_manager_there_is_none() -> None:
+    assert systemd.manager({}) is None
+    assert systemd.manager({"WATCHDOG_USEC": "1000000"}) is None
+
+
+@pytest.mark.parametrize(
+    ("watchdog", "expected_s"),
+    [
+        ({}, None),
+        ({"WATCHDOG_USEC": "30000000"}, 30.0),
+        ({"WATCHDOG_USEC": "30000000", "WATCHDOG_PID": str(os.getpid())}, 30.0),
+        ({"WATCHDOG_USEC": "30000000", "WATCHDOG_PID": "1"}, None),
+    ],
+)
+def test_how_much_silence_it_bears(watchdog: dict[str, str], expected_s: float | None) -> None:
+    found = systemd.manager({"NOTIFY_SOCKET": "/run/notify", **watchdog})
+    assert found is not None
+    assert found.watchdog_s == expected_s
+
+
+@pytest.mark.parametrize(
+    "environ",
+    [
+        {"NOTIFY_SOCKET": "run/notify"},
+        {"NOTIFY_SOCKET": "@"},
+        {"NOTIFY_SOCKET": "vsock:2:1"},
+        {"NOTIFY_SOCKET": "/run/notify", "WATCHDOG_USEC": "soon"},
+        {"NOTIFY_SOCKET": "/run/notify", "WATCHDOG_USEC": "0"},
+        {"NOTIFY_SOCKET": "/run/notify", "WATCHDOG_USEC": "-1"},
+    ],
+)
+def test_an_environment_that_makes_no_sense_is_one_line(environ: dict[str, str]) -> None:
+    done = subprocess.run(
+        [BIN / "companion", *RUN],
+        env=os.environ | environ,
+        capture_output=True,
+        text=True,
+        timeout=HANG_S,
+        check=False,
+    )
+    name, value = list(environ.items())[-1]
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"companion: {name}: '{value}' is ")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_a_socket_that_cannot_be_had_is_a_reason() -> None:
+    assert systemd.Manager("/" + "x" * 200).tell("READY=1") == "AF_UNIX path too long"
+    assert systemd.Manager("@nobody-listens-here").tell("READY=1") == "Connection refused"
+
+
+def test_a_full_socket_does_not_hold_the_service_up(tmp_path: Path) -> None:
+    """Nobody reads: the kernel takes some, then refuses at once."""
+    heard = Listener(str(tmp_path / "notify"))
+    with closing(heard.socket):
+        manager = systemd.Manager(str(tmp_path / "notify"))
+        began_s = time.monotonic()
+        answers = [manager.tell("WATCHDOG=1") for _ in range(5000)]
+        assert time.monotonic() - began_s < 5
+        assert answers[0] is None
+        assert answers[-1] == "Resource temporarily unavailable"
+
+
+def test_the_documented_unit_is_good(tmp_path: Path) -> None:
+    analyze = shutil.which("systemd-analyze")
+    if analyze is None:
+        pytest.skip("no systemd-analyze here")
+    text = (ROOT / "docs" / "deployment.md").read_text(encoding="utf-8")
+    unit = text.split("```ini\n")[1].split("```")[0]
+    program = "/opt/companion/bin/companion"
+    assert f"ExecStart={program} run " in unit
+    path = tmp_path / "companion.node.service"
+    path.write_text(unit.replace(program, "/bin/true"), encoding="utf-8")
+    done = subprocess.run(
+        [analyze, "verify", "--man=no", path], capture_output=True, text=True, check=False
+    )
+    ours = [line for line in done.stderr.splitlines() if "companion.node.service" in line]
+    assert (done.returncode, ours) == (0, [])
+    path.write_text(unit.replace("WatchdogSec", "WatchDogSec"), encoding="utf-8")
+    done = subprocess.run(
+        [analyze, "verify", "--man=no", path], capture_output=True, text=True, check=False
+    )
+    assert "WatchDogSec" in done.stderr  # it does look

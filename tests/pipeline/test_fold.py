@@ -1,0 +1,827 @@
+"""The whole program as a fold: real MAVLink frames in, beams out."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pymap3d
+import pytest
+from pymavlink.dialects.v20 import all as dialect
+from scipy.spatial.transform import Rotation
+
+from companion.mavlink.clock.sender_clock import ClockKind
+from companion.pipeline.digest import Digest
+from companion.pipeline.fold import Pipeline
+from companion.pipeline.ticks import with_ticks
+from companion.settings.center import FixedCenter
+from companion.settings.model import Settings
+from companion.values import (
+    Estimate,
+    Event,
+    Frame,
+    Notice,
+    Output,
+    Reason,
+    Rejection,
+    RoundTrip,
+    Severity,
+    Source,
+    Tick,
+    Update,
+)
+from sitl_replay.flight import scenario
+from sitl_replay.flight.scenario import Scenario
+from sitl_replay.flight.vehicles import schedule
+
+S = 1_000_000_000
+START_NS = 1_760_000_000 * S
+PLACE = (47.4, 8.55, 500.0)
+
+
+def frame(t_ns: int, raw: bytes, link: str = "udp") -> Frame:
+    msgid = raw[7] | raw[8] << 8 | raw[9] << 16
+    return Frame(t_ns, link, Source(raw[5], raw[6]), msgid, raw)
+
+
+def sent(t_s: float, source: str, message: Any, seq: int = 0, link: str = "udp") -> Frame:
+    sysid, compid = Source.parse(source)
+    sender = dialect.MAVLink(None, srcSystem=sysid, srcComponent=compid)
+    sender.seq = seq
+    return frame(START_NS + round(t_s * 1e9), bytes(message.pack(sender)), link)
+
+
+def position(
+    t_s: float,
+    source: str,
+    ned_m: tuple[float, float, float] = (0, 0, 0),
+    velocity_mps: tuple[float, float, float] = (0, 0, 0),
+    *,
+    boot_s: float | None = None,
+    seq: int = 0,
+    link: str = "udp",
+) -> Frame:
+    """GLOBAL_POSITION_INT of a place told from PLACE, without latency."""
+    lat, lon, alt = pymap3d.ned2geodetic(*ned_m, *PLACE)
+    message = dialect.MAVLink_global_position_int_message(
+        round(1000 * (100 + t_s if boot_s is None else boot_s)),
+        round(float(lat) * 1e7), round(float(lon) * 1e7), round(float(alt) * 1e3), 0,
+        *(round(100 * v) for v in velocity_mps), 65535,
+    )  # fmt: skip
+    return sent(t_s, source, message, seq, link)
+
+
+def attitude(t_s: float, source: str, *angles: float) -> Frame:
+    rpy = angles or (0.0, 0.0, 0.0)
+    message = dialect.MAVLink_attitude_message(round(1000 * (100 + t_s)), *rpy, 0.0, 0.0, 0.0)
+    return sent(t_s, source, message)
+
+
+def adsb(t_s: float, ned_m: tuple[float, float, float], flags: int = 1 | 2) -> Frame:
+    lat, lon, alt = pymap3d.ned2geodetic(*ned_m, *PLACE)
+    message = dialect.MAVLink_adsb_vehicle_message(
+        0x4CA7B3, round(float(lat) * 1e7), round(float(lon) * 1e7), 1, round(float(alt) * 1e3),
+        0, 0, 0, b"TEST", 0, 1, flags, 0,
+    )  # fmt: skip
+    return sent(t_s, "5:1", message)
+
+
+def tick(t_s: float) -> Tick:
+    return Tick(START_NS + round(t_s * 1e9))
+
+
+def settings(center: str | None = "5:1", **sections: dict[str, Any]) -> Settings:
+    """Made-up senders' stamps are exact, and arrive at once."""
+    clocks = {"constant_delay_s": 0.0}
+    return Settings().override(center={"source": center}, **{"clocks": clocks, **sections})
+
+
+def run(pipeline: Pipeline, events: Iterable[Event]) -> list[Output]:
+    return [output for event in events for output in pipeline.step(event)]
+
+
+def updated(pipeline: Pipeline, t_s: float) -> Update:
+    *_, update = pipeline.step(tick(t_s))
+    assert isinstance(update, Update)
+    return update
+
+
+def flown(flight: Scenario, seconds: float, seed: int = 1) -> list[Event]:
+    """A scenario's traffic with ticks among it."""
+    frames = (
+        frame(START_NS + round(t_s * 1e9), raw)
+        for t_s, _, raw in schedule(flight, seed, START_NS, seconds)
+    )
+    return list(with_ticks(frames, 20.0))
+
+
+@pytest.fixture(scope="module")
+def paper() -> list[Event]:
+    return flown(scenario.paper(4), 4.0)
+
+
+# --- beams that point where the UAVs are --------------------------------------------------------
+
+
+def test_two_uavs_and_a_carrier_that_is_turned() -> None:
+    """Heading east, nose up by 10 degrees: the angles by plane geometry."""
+    pipeline = Pipeline(settings())
+    nose_rad = math.radians(10)
+    for t_s in np.arange(0, 2, 0.1):
+        for made in (
+            position(t_s, "5:1"),
+            attitude(t_s, "5:1", 0.0, nose_rad, math.pi / 2),
+            position(t_s, "1:1", (0, 200, 0)),
+            position(t_s, "2:1", (100, 0, -50)),
+        ):
+            pipeline.step(made)
+    update = updated(pipeline, 2.0)
+    assert update.unfit is None
+    assert update.beams.uavs == ("1:1", "2:1")
+    ahead, left = update.beams.beams
+    # East is ahead and, seen from a nose that points up, below; north is to the left.
+    assert math.degrees(ahead.azimuth_rad) == pytest.approx(0, abs=0.02)
+    assert math.degrees(ahead.elevation_rad) == pytest.approx(-10, abs=0.02)
+    assert ahead.range_m == pytest.approx(200, abs=0.05)
+    forward, up = 50 * math.sin(nose_rad), 50 * math.cos(nose_rad)
+    assert left.azimuth_rad == pytest.approx(math.atan2(-100, forward), abs=3e-4)
+    assert left.elevation_rad == pytest.approx(math.asin(up / math.hypot(100, 50)), abs=3e-4)
+    assert pipeline.last_update is update
+    assert pipeline.updates == 1
+
+
+@pytest.mark.parametrize("mount_deg", [(0, 0, 0), (20.0, -30.0, 140.0)])
+def test_beams_on_hovering_uavs_are_where_the_scenario_has_them(
+    mount_deg: tuple[float, float, float],
+) -> None:
+    """The carrier sways; scipy turns the directions, at the time at which the beams apply."""
+    flight = scenario.hover(4)
+    keys = ("mount_roll_deg", "mount_pitch_deg", "mount_yaw_deg")
+    mount = dict(zip(keys, mount_deg, strict=True))
+    pipeline = Pipeline(settings(array=mount, beams={"actuation_delay_s": 0.03}))
+    outputs = run(pipeline, flown(flight, 5.0))
+    updates = [o for o in outputs if isinstance(o, Update) and o.t_ns > START_NS + 3 * S]
+    assert len(updates) >= 35
+    roll, pitch, yaw = mount_deg
+    array = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True).as_matrix().T
+    for update in updates:
+        assert update.beams.valid_at_ns == update.t_ns + 30_000_000
+        pose = flight.carrier.attitude((update.beams.valid_at_ns - START_NS) * 1e-9)
+        body = Rotation.from_euler("ZYX", [pose.yaw_rad, pose.pitch_rad, pose.roll_rad])
+        assert set(update.beams.uavs) == {"1:1", "2:1", "3:1", "4:1"}
+        for beam in update.beams.beams:
+            (vehicle,) = (v for v in flight.uavs if str(v.source) == beam.uav)
+            ned = np.array(vehicle.trajectory(0.0).position_ned_m)
+            x, y, z = array @ body.as_matrix().T @ ned / np.linalg.norm(ned)
+            assert beam.range_m == pytest.approx(np.linalg.norm(ned), abs=0.1)
+            assert beam.azimuth_rad == pytest.approx(math.atan2(y, x), abs=2e-3)
+            assert beam.elevation_rad == pytest.approx(math.asin(-z), abs=2e-3)
+        assert not update.beams.regularised
+
+
+def test_the_truth_is_within_the_bounds_of_the_paper_s_flight(paper: list[Event]) -> None:
+    """Up to 125 m/s with gusts: positions and directions within what the update vouches for."""
+    flight = scenario.paper(4)
+    bounds = {
+        "speed_max_mps": 151.0, "acceleration_max_mps2": 190.0, "position_noise_m": 1.0,
+        "velocity_noise_mps": 0.1,
+    }  # fmt: skip
+    pipeline = Pipeline(settings(observer=bounds))
+    updates = [o for o in run(pipeline, paper) if isinstance(o, Update)]
+    checked = 0
+    for update in updates[20:]:
+        assert update.carrier is not None
+        t_s = (update.beams.valid_at_ns - START_NS) * 1e-9
+        pose = flight.carrier.attitude(t_s)
+        body = Rotation.from_euler("ZYX", [pose.yaw_rad, pose.pitch_rad, pose.roll_rad])
+        here = update.carrier.position_ned_m
+        for track, beam in zip(update.tracks, update.beams.beams, strict=True):
+            (vehicle,) = (v for v in flight.uavs if str(v.source) == beam.uav)
+            ned = np.array(vehicle.trajectory(t_s).position_ned_m)
+            # The local frame begins elsewhere, and the carrier has noise of its own.
+            slack_m = update.carrier.bound_m
+            away = np.linalg.norm(track.position_ned_m - here - ned)
+            assert away <= track.bound_m + slack_m
+            truth = body.as_matrix().T @ ned / np.linalg.norm(ned)
+            level = math.cos(beam.elevation_rad)
+            pointed = np.array(
+                [
+                    level * math.cos(beam.azimuth_rad),
+                    level * math.sin(beam.azimuth_rad),
+                    -math.sin(beam.elevation_rad),
+                ]
+            )
+            assert beam.pointing_bound_rad is not None
+            assert math.acos(min(1.0, truth @ pointed)) <= beam.pointing_bound_rad
+            checked += 1
+        if not update.beams.regularised:
+            count = len(update.beams.beams)
+            lambdas = [np.sin(b.azimuth_rad) * np.cos(b.elevation_rad) for b in update.beams.beams]
+            a = np.exp(1j * np.pi * np.outer(np.arange(64), lambdas))
+            assert np.abs(a.T @ update.beams.weights - np.eye(count)).max() < 1e-9
+    assert checked > 200
+
+
+def test_a_lead_asks_for_a_later_time() -> None:
+    pipeline = Pipeline(settings(center="47.4,8.55,500"))
+    for t_s in (0.0, 0.1, 0.2):
+        east_m = 10 * t_s
+        pipeline.step(position(t_s, "1:1", (100, east_m, 0), (0, 10, 0)))
+    now_ns = tick(0.2).t_ns
+    plain, led = pipeline.look(now_ns), pipeline.look(now_ns, lead_s=2.0)
+    assert led.beams.valid_at_ns - plain.beams.valid_at_ns == 2 * S
+    assert plain.tracks[0].position_ned_m[1] == pytest.approx(2.1, abs=0.03)
+    assert led.tracks[0].position_ned_m[1] == pytest.approx(22.1, abs=0.03)
+    assert led.tracks[0].bound_m > plain.tracks[0].bound_m
+
+
+# --- what carries the array ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("center", ["home", None])
+def test_home_is_where_the_first_report_was_made(center: str | None) -> None:
+    pipeline = Pipeline(settings(center))
+    assert pipeline.step(tick(0))[0].unfit == "no report yet"  # type: ignore[union-attr]
+    zero = dialect.MAVLink_global_position_int_message(1, 0, 0, 0, 0, 0, 0, 0, 0)
+    pipeline.step(sent(0.1, "9:1", zero))  # not accepted
+    home, first = pipeline.step(position(0.2, "1:1", (10, 20, -30)))
+    assert isinstance(home, Notice)
+    assert (home.subject, home.severity) == ("home", Severity.INFO)
+    assert "1:1" in home.text
+    assert isinstance(first, Estimate)
+    lat, lon, alt = pymap3d.ned2geodetic(10, 20, -30, *PLACE)
+    at = pipeline.center.place
+    assert isinstance(at, FixedCenter)
+    assert (at.lat_deg, at.lon_deg) == pytest.approx((lat, lon), abs=1e-7)
+    assert at.alt_m == pytest.approx(alt, abs=1e-3)
+    pipeline.step(position(0.2, "2:1", (10, 120, -30)))
+    update = updated(pipeline, 0.3)
+    (beam,) = update.beams.beams
+    assert (beam.uav, update.unfit) == ("2:1", None)
+    assert math.degrees(beam.azimuth_rad) == pytest.approx(90, abs=0.02)  # facing north
+    assert [left.uav for left in update.beams.left_out] == ["1:1"]
+
+
+def test_a_fixed_station_faces_its_heading() -> None:
+    pipeline = Pipeline(settings("47.4,8.55,500,90"))
+    outputs = pipeline.step(position(0, "1:1", (0, 100, -100)))
+    assert [type(output) for output in outputs] == [Estimate]
+    update = updated(pipeline, 0.05)
+    (beam,) = update.beams.beams
+    assert math.degrees(beam.azimuth_rad) == pytest.approx(0, abs=0.02)
+    assert math.degrees(beam.elevation_rad) == pytest.approx(45, abs=0.02)
+    assert update.carrier is not None
+    assert (update.carrier.bound_m, update.carrier.age_s) == (0.0, None)
+
+
+def test_without_a_carrier_there_are_no_beams_and_it_says_why() -> None:
+    pipeline = Pipeline(settings())
+    assert updated(pipeline, 0).unfit == "no report yet"
+    pipeline.step(position(0.1, "1:1", (100, 0, 0)))
+    update = updated(pipeline, 0.2)
+    assert update.unfit == "no position from the carrier 5:1"
+    assert (update.carrier, update.beams.beams) == (None, ())
+    assert [left.uav for left in update.beams.left_out] == ["1:1"]
+    assert [track.uav for track in update.tracks] == ["1:1"]
+    pipeline.step(position(0.3, "5:1"))
+    assert updated(pipeline, 0.4).unfit == "no attitude from the carrier 5:1"
+    pipeline.step(attitude(0.5, "1:1"))  # another's does not do
+    assert updated(pipeline, 0.5).unfit == "no attitude from the carrier 5:1"
+    pipeline.step(attitude(0.5, "5:1"))
+    assert updated(pipeline, 0.6).unfit is None
+    pipeline.step(position(3.0, "5:1"))
+    assert updated(pipeline, 3.0).unfit == "the attitude of the carrier 5:1 is too old"
+    pipeline.step(attitude(18.5, "5:1"))
+    assert updated(pipeline, 18.5).unfit == "the carrier 5:1 is stale"
+
+
+def bearing_deg(update: Update) -> float:
+    """Of the one beam, from the carrier's nose."""
+    assert update.unfit is None
+    (beam,) = update.beams.beams
+    return math.degrees(beam.azimuth_rad)
+
+
+def test_an_attitude_that_was_overtaken_changes_nothing() -> None:
+    """It heads north, and then east; what tells of north comes once more, half a second late."""
+    pipeline = Pipeline(settings())
+    run(pipeline, [position(1.0, "5:1"), position(1.0, "1:1", (200, 0, 0))])
+    pipeline.step(attitude(0.6, "5:1", 0.0, 0.0, 0.0))
+    assert bearing_deg(updated(pipeline, 1.0)) == pytest.approx(0, abs=0.02)
+    pipeline.step(attitude(1.0, "5:1", 0.0, 0.0, math.pi / 2))
+    late = attitude(0.7, "5:1", 0.0, 0.0, 0.0)._replace(t_ns=tick(1.2).t_ns)
+    pipeline.step(late)
+    assert bearing_deg(updated(pipeline, 1.2)) == pytest.approx(-90, abs=0.02)
+
+
+def test_a_carrier_that_restarts_has_no_attitude_until_it_sends_one() -> None:
+    """The old one was made at a time that its new clock has not reached."""
+    pipeline = Pipeline(settings())
+    for t_s in np.arange(0, 5, 0.5):
+        run(pipeline, [position(t_s, "5:1"), attitude(t_s, "5:1", 0.0, 0.0, 0.0)])
+    for t_s in np.arange(5, 8, 0.5):
+        run(pipeline, [position(t_s, "5:1", boot_s=t_s - 3), position(t_s, "1:1", (200, 0, 0))])
+    update = updated(pipeline, 7.6)
+    assert (update.carrier, update.unfit) == (None, "no attitude from the carrier 5:1")
+    turned = dialect.MAVLink_attitude_message(4600, 0.0, 0.0, math.pi / 2, 0.0, 0.0, 0.0)
+    pipeline.step(sent(7.6, "5:1", turned))
+    assert bearing_deg(updated(pipeline, 7.7)) == pytest.approx(-90, abs=0.02)
+
+
+def test_the_carrier_is_never_its_own_target() -> None:
+    pipeline = Pipeline(settings(beams={"targets": "all"}))
+    run(pipeline, [position(0, "5:1"), attitude(0, "5:1"), position(0, "1:1", (99, 0, 0))])
+    update = updated(pipeline, 0.1)
+    assert [track.uav for track in update.tracks] == ["1:1"]
+    assert update.beams.uavs == ("1:1",)
+    assert not pipeline.targets.wants("5:1")
+    now_ns = tick(0.1).t_ns
+    assert [track.uav for track in pipeline.tracks(now_ns, now_ns)] == ["1:1"]
+
+
+# --- what is a target, and what is not accepted -------------------------------------------------
+
+
+@pytest.mark.parametrize(("targets", "aimed"), [("telemetry", ()), ("all", ("icao:4CA7B3",))])
+def test_adsb_traffic_is_a_target_only_if_asked(targets: str, aimed: tuple[str, ...]) -> None:
+    pipeline = Pipeline(settings("47.4,8.55,500", beams={"targets": targets}))
+    (seen,) = pipeline.step(adsb(0, (3000, 500, -800)))
+    assert isinstance(seen, Estimate)
+    assert updated(pipeline, 0.1).beams.uavs == aimed
+    now_ns = tick(0.1).t_ns
+    assert [track.uav for track in pipeline.tracks(now_ns, now_ns)] == ["icao:4CA7B3"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "reason", "who"),
+    [(2, Reason.NO_POSITION, "5:1"), (1, Reason.NO_ALTITUDE, "icao:4CA7B3")],
+)
+def test_adsb_without_what_it_takes_is_counted(flags: int, reason: Reason, who: str) -> None:
+    pipeline = Pipeline(settings())
+    (refused,) = pipeline.step(adsb(0, (3000, 500, -800), flags))
+    assert isinstance(refused, Rejection)
+    assert refused.reason is reason
+    assert pipeline.refusals.total == {reason: 1}
+    assert pipeline.refusals.of(who).counts == {reason: 1}
+    assert pipeline.local is None
+
+
+def relayed(t_s: float, north_m: float, alt_m: float, datum: int, relay: str = "5:1") -> Frame:
+    """ADSB_VEHICLE of what flies north at 50 m/s, level; ``datum`` is ADSB_ALTITUDE_TYPE."""
+    lat, lon, _ = pymap3d.ned2geodetic(north_m, 500, 0, *PLACE)
+    message = dialect.MAVLink_adsb_vehicle_message(
+        0x4CA7B3, round(float(lat) * 1e7), round(float(lon) * 1e7), datum, round(alt_m * 1e3),
+        0, 5000, 0, b"TEST", 0, 0, 1 | 2 | 4 | 8 | 128, 0,
+    )  # fmt: skip
+    return sent(t_s, relay, message)
+
+
+def test_an_aircraft_of_two_relays_is_one_track_at_one_datum() -> None:
+    """One relay has its altitude by pressure, 300 m off; when the other falls silent, so be it."""
+    pipeline = Pipeline(settings("47.4,8.55,500"))
+    heard = [relayed(t_s, 50 * t_s, 1300, 1) for t_s in range(10)]
+    heard += [relayed(t_s + 0.5, 50 * t_s + 25, 1000, 0, "6:1") for t_s in range(30)]
+    heard += [relayed(t_s + 0.6, 50 * t_s, 1300, 1, "7:1") for t_s in range(10)]
+    outputs = run(pipeline, sorted(heard, key=lambda each: each.t_ns))
+    heights = [o.fix.report.alt_m for o in outputs if isinstance(o, Estimate)]
+    assert heights == [1300] * 29 + [1000] * 11  # 1300 was said at 9 s for the last time
+    assert pipeline.refusals.total == {Reason.DUPLICATE: 10}
+    (notice,) = (output for output in outputs if isinstance(output, Notice))
+    assert (notice.subject, notice.severity) == ("icao:4CA7B3", Severity.INFO)
+    assert "is pressure now, not geometric" in notice.text
+    now_ns = tick(30).t_ns
+    (track,) = pipeline.tracks(now_ns, now_ns)
+    assert track.position_ned_m[2] == pytest.approx(-500, abs=1)
+    assert track.reports == 11  # of the new datum alone
+
+
+def test_the_same_report_over_two_links_counts_once() -> None:
+    pipeline = Pipeline(settings("home"))
+    pipeline.step(position(0, "1:1", seq=1))
+    again = position(0.0, "1:1", seq=77, link="tcp")._replace(t_ns=START_NS + S // 2)
+    (refused,) = pipeline.step(again)
+    assert refused == Rejection(again.t_ns, "1:1", Reason.DUPLICATE)
+    assert pipeline.refusals.total == {Reason.DUPLICATE: 1}
+    assert list(pipeline.refusals.of("1:1").recent) == [refused]
+    assert pipeline.frames == 2
+    track = pipeline.tracks(again.t_ns, again.t_ns)[0]
+    assert track.reports == 1
+
+
+def test_a_late_report_is_put_in_its_place() -> None:
+    """Half a second late: the track is what it would be had it come in time."""
+    made = [position(t_s, "1:1", (t_s, t_s**2, 0), (1, 2 * t_s, 0)) for t_s in (0.0, 0.5, 1.0)]
+    in_order, late = Pipeline(settings("home")), Pipeline(settings("home"))
+    run(in_order, made)
+    found = run(late, [made[0], made[2], made[1]._replace(t_ns=START_NS + S)])
+    assert isinstance(found[-1], Estimate)
+    assert not late.refusals.total
+    one, other = (updated(pipeline, 1.5).tracks[0] for pipeline in (in_order, late))
+    assert one.position_ned_m.tolist() == other.position_ned_m.tolist()
+    assert (one.bound_m, one.reports) == (other.bound_m, 3)
+
+
+def test_a_report_later_than_the_window_is_out_of_order() -> None:
+    pipeline = Pipeline(settings("home"))
+    run(pipeline, [position(0, "1:1"), position(1, "1:1", (1, 0, 0))])
+    late = position(7.5, "1:1", (0.5, 0, 0), boot_s=100.5)
+    pipeline.step(position(7.0, "1:1", (7, 0, 0)))
+    (refused,) = pipeline.step(late)
+    assert isinstance(refused, Rejection)
+    assert refused.reason is Reason.OUT_OF_ORDER
+    assert pipeline.refusals.total == {Reason.OUT_OF_ORDER: 1}
+
+
+def test_reports_that_waited_together_are_not_out_of_order() -> None:
+    """Read at once, made one after the other: the newest is what the track goes on from."""
+    pipeline = Pipeline(settings("47.4,8.55,500"))
+    for number in range(5):
+        made = position(2.0, "1:1", (100, number, 0), boot_s=100 + 0.1 * number)
+        pipeline.step(made)
+    assert not pipeline.refusals.total
+    newest = pipeline.fleet.newest("1:1")
+    assert newest is not None
+    assert newest.position_ned_m[1] == pytest.approx(4, abs=0.02)
+
+
+def accuracy(t_s: float, source: str, h_acc_m: float, v_acc_m: float, vel_mps: float) -> Frame:
+    """GPS_RAW_INT; an accuracy of 0 is one that is not sent."""
+    message = dialect.MAVLink_gps_raw_int_message(
+        round(1e6 * t_s), 3, 0, 0, 0, 100, 100, 0, 0, 12, 0,
+        *(round(1000 * value) for value in (h_acc_m, v_acc_m, vel_mps)), 0, 0,
+    )  # fmt: skip
+    return sent(t_s, source, message)
+
+
+def noise_of(pipeline: Pipeline, uav: str) -> tuple[float, float, float]:
+    newest = pipeline.fleet.newest(uav)
+    assert newest is not None
+    return newest.noise.horizontal_m, newest.noise.vertical_m, newest.noise.velocity_mps
+
+
+@pytest.mark.parametrize(
+    ("follow", "accuracies", "expected"),
+    [
+        (True, (0.8, 1.5, 0.1), (2.0, 3.75, 0.25)),
+        (True, (0.8, 0.0, 0.0), (2.0, 6.0, 0.7)),
+        (True, (0.0, 1.5, 0.0), (6.0, 3.75, 0.7)),
+        (False, (0.8, 1.5, 0.1), (6.0, 6.0, 0.7)),
+    ],
+)
+def test_the_autopilot_s_own_accuracy_is_followed_if_asked(
+    follow: bool, accuracies: tuple[float, float, float], expected: tuple[float, float, float]
+) -> None:
+    """From the next report of that sender on, times the factor; what is not sent is the default."""
+    given = {
+        "position_noise_m": 6.0, "velocity_noise_mps": 0.7,
+        "accuracy_factor": 2.5, "follow_accuracy": follow,
+    }  # fmt: skip
+    pipeline = Pipeline(settings("home", observer=given))
+    pipeline.step(position(0.0, "1:1"))
+    assert noise_of(pipeline, "1:1") == (6.0, 6.0, 0.7)
+    pipeline.step(accuracy(0.1, "1:1", *accuracies))
+    run(pipeline, [position(0.2, "1:1"), position(0.2, "2:1", (50, 0, 0))])
+    assert noise_of(pipeline, "1:1") == pytest.approx(expected)
+    assert noise_of(pipeline, "2:1") == (6.0, 6.0, 0.7)
+    pipeline.step(accuracy(0.3, "1:1", 0, 0, 0))  # it is sent no longer
+    pipeline.step(position(0.4, "1:1"))
+    assert noise_of(pipeline, "1:1") == (6.0, 6.0, 0.7)
+
+
+def test_a_relayed_report_is_as_good_as_transponders_are() -> None:
+    """100 m, and the way flown in the second to which its time is known."""
+    pipeline = Pipeline(settings("home", observer={"speed_max_mps": 90.0}))
+    run(pipeline, [accuracy(0.0, "5:1", 0.5, 0.5, 0.1), adsb(0.1, (3000, 500, -800))])
+    assert noise_of(pipeline, "icao:4CA7B3") == pytest.approx((190.0, 190.0, 10.0))
+    lat, lon, alt = pymap3d.ned2geodetic(3000, 540, -800, *PLACE)
+    told = dialect.MAVLink_adsb_vehicle_message(
+        0x4CA7B3, round(float(lat) * 1e7), round(float(lon) * 1e7), 1, round(float(alt) * 1e3),
+        9000, 4000, 300, b"TEST", 0, 1, 1 | 2 | 4 | 8 | 128, 0,
+    )  # fmt: skip
+    pipeline.step(sent(1.1, "5:1", told))
+    assert noise_of(pipeline, "icao:4CA7B3") == pytest.approx((140.1, 140.1, 10.0), abs=0.1)
+    now_ns = tick(1.2).t_ns
+    (track,) = pipeline.tracks(now_ns, now_ns)
+    assert track.clock_bound_s == 1.0
+
+
+def test_a_relayed_report_was_true_when_its_aircraft_was_heard() -> None:
+    """A second before, by ``tslc``; it came when it came."""
+    (seen,) = Pipeline(settings("47.4,8.55,500")).step(adsb(5.0, (3000, 500, -800)))
+    assert isinstance(seen, Estimate)
+    assert (seen.fix.t_ns, seen.fix.sender_ns) == (START_NS + 4 * S, START_NS + 4 * S)
+    assert seen.fix.arrival_ns == START_NS + 5 * S
+
+
+def test_a_track_that_is_begun_again_is_said_once() -> None:
+    """A jump of 200 m that lasts."""
+    pipeline = Pipeline(settings("47.4,8.55,500"))
+    outputs: list[Output] = []
+    for number in range(100):
+        place = (100 + (200 if number >= 50 else 0), 0.1 * number, 0)
+        outputs += pipeline.step(position(number / 10, "1:1", place, (0, 1, 0)))
+    (notice,) = (output for output in outputs if isinstance(output, Notice))
+    assert (notice.subject, notice.severity) == ("1:1", Severity.WARNING)
+    assert "1:1 is tracked anew" in notice.text
+    estimate = outputs[outputs.index(notice) + 1]
+    assert isinstance(estimate, Estimate)
+    assert estimate.reacquired
+    assert estimate.fix.arrival_ns == notice.t_ns == START_NS + 8 * S
+    assert pipeline.refusals.total == {Reason.UNREACHABLE: 30}
+    assert updated(pipeline, 10.0).beams.uavs == ("1:1",)
+
+
+def test_a_position_at_0_0_is_counted_and_makes_no_track() -> None:
+    pipeline = Pipeline(settings())
+    zero = dialect.MAVLink_global_position_int_message(1, 200, -300, 0, 0, 0, 0, 0, 0)
+    for t_s in (0.0, 0.1):
+        (refused,) = pipeline.step(sent(t_s, "1:1", zero))
+        assert isinstance(refused, Rejection)
+        assert refused.reason is Reason.ZERO_POSITION
+    assert pipeline.refusals.total == {Reason.ZERO_POSITION: 2}
+    assert updated(pipeline, 0.2).tracks == ()
+
+
+def test_rejections_pass_through_and_are_counted() -> None:
+    pipeline = Pipeline(settings())
+    garbage = Rejection(START_NS, "udp", Reason.GARBAGE, 17)
+    assert pipeline.step(garbage) == [garbage]
+    pipeline.step(garbage)
+    pipeline.step(Rejection(START_NS, "tcp", Reason.BAD_CRC, 2))
+    assert pipeline.refusals.total == {Reason.GARBAGE: 34, Reason.BAD_CRC: 2}
+    assert pipeline.refusals.of("udp").counts == {Reason.GARBAGE: 34}
+    assert pipeline.frames == 0
+
+
+def test_frames_that_nobody_reads_are_counted_and_no_more() -> None:
+    pipeline = Pipeline(settings())
+    before = pipeline.digest.hexdigest()
+    assert pipeline.step(sent(0, "1:1", dialect.MAVLink_ping_message(1, 2, 3, 4))) == []
+    beat = dialect.MAVLink_heartbeat_message(2, 3, 128, 0, 4, 3)
+    assert pipeline.step(sent(0, "1:1", beat)) == []
+    assert pipeline.frames == 2
+    assert pipeline.senders.presence[Source(1, 1)].armed
+    assert pipeline.digest.hexdigest() == before
+
+
+def test_a_reboot_is_said_and_begins_a_fresh_track() -> None:
+    pipeline = Pipeline(settings("47.4,8.55,500"))
+    for t_s in range(5):
+        pipeline.step(position(t_s, "1:1", (100 + t_s, 0, 0)))
+    pipeline.step(position(4, "2:1", (0, 90, 0)))
+    for t_s in (5.0, 5.5):  # a stamp far back is not believed before others agree
+        (refused,) = pipeline.step(position(t_s, "1:1", (200, 0, 0), boot_s=t_s - 3))
+        assert isinstance(refused, Rejection)
+        assert refused.reason is Reason.UNPLACED_STAMP
+    notice, first = pipeline.step(position(6, "1:1", (200, 0, 0), boot_s=3.0))
+    assert isinstance(notice, Notice)
+    assert (notice.subject, notice.severity) == ("1:1", Severity.WARNING)
+    assert "restarted" in notice.text
+    assert isinstance(first, Estimate)
+    assert first.dt_s is None
+    assert first.fix.t_ns == START_NS + 6 * S
+    update = updated(pipeline, 6.1)
+    tracks = {track.uav: track for track in update.tracks}
+    assert (tracks["1:1"].reports, tracks["2:1"].reports) == (1, 1)
+    assert tracks["1:1"].position_ned_m[0] == pytest.approx(200, abs=0.05)
+    assert set(update.beams.uavs) == {"1:1", "2:1"}
+    (second,) = pipeline.step(position(7, "1:1", (201, 0, 0), boot_s=4.0))
+    assert isinstance(second, Estimate)
+    assert second.dt_s == pytest.approx(1.0)
+
+
+def test_states_are_said_when_they_change() -> None:
+    pipeline = Pipeline(settings("47.4,8.55,500"))
+    pipeline.step(position(0, "1:1", (100, 0, 0)))
+    said = {}
+    for t_s in (0.1, 1.0, 2.5, 3.0, 16.0, 17.0, 61.0, 62.0):
+        *notices, update = pipeline.step(tick(t_s))
+        assert isinstance(update, Update)
+        said[t_s] = [(n.severity, n.text) for n in notices if isinstance(n, Notice)]
+        assert len(update.beams.beams) == (t_s < 15)
+        assert len(update.tracks) == 1  # lost is something to show, too
+    assert {t_s: notices for t_s, notices in said.items() if notices} == {
+        0.1: [(Severity.INFO, "1:1 is live")],
+        2.5: [(Severity.INFO, "1:1 is coasting")],
+        16.0: [(Severity.WARNING, "1:1 is stale")],
+        61.0: [(Severity.WARNING, "1:1 is lost")],
+    }
+
+
+# --- a fold: the same events, the same digest ---------------------------------------------------
+
+
+def test_the_same_events_give_the_same_digest(paper: list[Event]) -> None:
+    one, two = Pipeline(settings()), Pipeline(settings())
+    run(one, paper)
+    run(two, paper)
+    assert one.digest.hexdigest() == two.digest.hexdigest()
+    assert len(one.digest.hexdigest()) == 64
+
+
+def test_other_events_give_another_digest(paper: list[Event]) -> None:
+    def digest(events: list[Event], **sections: dict[str, Any]) -> str:
+        pipeline = Pipeline(settings("5:1", **sections))
+        run(pipeline, events)
+        return pipeline.digest.hexdigest()
+
+    reports = [n for n, e in enumerate(paper) if isinstance(e, Frame) and e.msgid == 33]
+    attitudes = [
+        n for n, e in enumerate(paper) if isinstance(e, Frame) and e.msgid == 30
+        and e.source == Source(5, 1)
+    ]  # fmt: skip
+    ticks = [n for n, e in enumerate(paper) if isinstance(e, Tick)]
+    digests = [digest(paper), digest(flown(scenario.paper(4), 4.0, seed=2))]
+    for dropped in (reports[30], attitudes[30], ticks[30]):
+        digests.append(digest(paper[:dropped] + paper[dropped + 1 :]))
+    digests.append(digest(paper, array={"elements": 32}))
+    digests.append(digest(paper, observer={"position_noise_m": 4.0, "follow_accuracy": False}))
+    digests.append(digest(paper, observer={"model": "position"}))
+    digests.append(digest(paper, observer={"feed_forward": False}))
+    assert len(set(digests)) == len(digests)
+
+
+def test_an_estimate_is_in_the_digest_with_all_that_matters() -> None:
+    (seen,) = Pipeline(settings("47.4,8.55,500")).step(position(0.0, "1:1", (3.0, 4.0, 5.0)))
+    assert isinstance(seen, Estimate)
+    others = [
+        replace(seen, fix=replace(seen.fix, uav="1:2")),
+        replace(seen, fix=replace(seen.fix, t_ns=seen.fix.t_ns + 1)),
+        replace(seen, bound_m=seen.bound_m + 1e-9),
+        *(replace(seen, position_ned_m=seen.position_ned_m + axis) for axis in 1e-9 * np.eye(3)),
+    ]
+    digests = []
+    for one in (seen, *others):
+        digests.append(Digest())
+        digests[-1].add(one)
+    assert len({digest.hexdigest() for digest in digests}) == len(digests)
+
+
+def test_looking_changes_nothing(paper: list[Event]) -> None:
+    """Neither the digest nor what comes out later."""
+    quiet, watched = Pipeline(settings()), Pipeline(settings())
+    for number, event in enumerate(paper):
+        plain, seen = quiet.step(event), watched.step(event)
+        assert repr(plain) == repr(seen)
+        if number % 7 == 0:
+            for lead_s in (0.0, 0.5, -0.2):
+                watched.look(event.t_ns + number, lead_s)
+            watched.tracks(event.t_ns + S, event.t_ns + 2 * S)
+            watched.carrier(event.t_ns + S, event.t_ns)
+            watched.fleet.newest("1:1")
+    assert quiet.digest.hexdigest() == watched.digest.hexdigest()
+    assert quiet.updates == watched.updates
+    last = watched.last_update
+    watched.look(START_NS + 100 * S)
+    assert watched.last_update is last
+
+
+def test_geodetic_is_the_way_back() -> None:
+    pipeline = Pipeline(settings("47.4,8.55,500"))
+    lat, lon, alt = pipeline.geodetic(np.array([[10.0, 20, -30]]))
+    assert (lat[0], lon[0], alt[0]) == pytest.approx(pymap3d.ned2geodetic(10, 20, -30, *PLACE))
+    with pytest.raises(ValueError, match="no report yet"):
+        Pipeline(settings()).geodetic(np.zeros((1, 3)))
+
+
+# --- the timer of a log -------------------------------------------------------------------------
+
+
+def test_ticks_come_at_the_rate_asked_for() -> None:
+    frames = [position(t_s, "1:1") for t_s in (0.0, 0.01, 0.3, 0.31, 1.0)]
+    events = list(with_ticks(frames, 20.0))
+    ticks = [event.t_ns for event in events if isinstance(event, Tick)]
+    assert ticks == [START_NS + n * 50_000_000 for n in range(1, 21)]
+    assert [event for event in events if isinstance(event, Frame)] == frames
+    assert events[0] is frames[0]
+    assert all(a.t_ns <= b.t_ns for a, b in pairwise(events))
+    # What a timer would have made by the time of a frame comes before it.
+    assert events.index(frames[4]) == len(events) - 1
+
+
+def test_a_period_is_rounded_once_not_at_every_tick() -> None:
+    frames = [position(t_s, "1:1") for t_s in (0.0, 10.0)]
+    ticks = [e.t_ns for e in with_ticks(frames, 3.0) if isinstance(e, Tick)]
+    assert ticks == [START_NS + n * 333_333_333 for n in range(1, 31)]
+
+
+def test_no_events_no_ticks() -> None:
+    assert list(with_ticks([], 20.0)) == []
+    garbage = Rejection(START_NS, "udp", Reason.GARBAGE)
+    assert list(with_ticks([garbage, garbage], 1000.0)) == [garbage, garbage]
+
+
+def test_own_telemetry_and_adsb_of_one_aircraft_get_one_beam() -> None:
+    pipeline = Pipeline(settings("47.4,8.55,500", beams={"targets": "all"}))
+    for n in range(8):
+        here = (300.0 + 5 * n, 40.0, -120.0)
+        pipeline.step(position(n, "1:1", here, (5, 0, 0)))
+        pipeline.step(adsb(n + 0.1, (here[0] + 8, 30.0, -130.0)))
+        update = updated(pipeline, n + 0.2)
+        assert set(update.beams.uavs) == ({"1:1", "icao:4CA7B3"} if n < 4 else {"1:1"})
+    assert pipeline.targets.same_as("icao:4CA7B3") == "1:1"
+    assert pipeline.targets.same_as("1:1") is None
+    assert not pipeline.targets.wants("icao:4CA7B3")
+
+
+# --- links, lists and round trips ---------------------------------------------------------------
+
+
+def test_who_is_denied_is_not_tracked_and_that_is_counted() -> None:
+    lists = {"allow": ["*:1"], "deny": ["2:1", "5:1"]}
+    pipeline = Pipeline(settings(tracks=lists))
+    for t_s in np.arange(0, 2, 0.1):
+        for source in ("1:1", "2:1", "3:7", "5:1"):
+            run(pipeline, [position(t_s, source, (100.0, 0.0, 0.0))])
+        run(pipeline, [adsb(t_s, (500.0, 0.0, -50.0))])
+    now_ns = START_NS + 2 * S
+    assert [track.uav for track in pipeline.tracks(now_ns, now_ns)] == ["1:1"]
+    assert pipeline.fleet.newest("5:1") is not None  # the carrier always is
+    refused = {
+        uav: pipeline.refusals.of(uav).counts[Reason.NOT_ALLOWED]
+        for uav in pipeline.refusals.senders()
+    }
+    assert refused["2:1"] == refused["3:7"] == 20
+    assert refused["icao:4CA7B3"] > 0
+    assert "5:1" not in refused
+
+
+def test_the_link_that_is_first_is_known_and_both_latencies_are() -> None:
+    """``fast`` brings a report at once and ``slow`` brings it 50 ms later; one was lost on fast."""
+    pipeline = Pipeline(settings("47.4,8.55,500"))
+    for n in range(50):
+        both = [position(n / 10, "1:1", link="fast"), position(n / 10, "1:1", link="slow")]
+        if n == 30:
+            del both[0]
+        late = both[-1]._replace(t_ns=both[-1].t_ns + S // 20)
+        run(pipeline, [*both[:-1], late])
+    fast, slow = pipeline.senders.link_share("fast"), pipeline.senders.link_share("slow")
+    assert (fast.first, fast.repeats, slow.first, slow.repeats) == (49, 0, 1, 49)
+    assert np.median(fast.latencies_s) == pytest.approx(0.0, abs=1e-3)
+    assert np.median(slow.latencies_s) == pytest.approx(0.05, abs=1e-3)
+    assert pipeline.refusals.total[Reason.DUPLICATE] == 49
+    assert pipeline.senders.link_share("another").first == 0
+
+
+def test_a_round_trip_tells_what_one_way_cannot() -> None:
+    """Every report takes 300 ms at least; the answers of TIMESYNC show it."""
+    pipeline = Pipeline(settings("47.4,8.55,500"))
+    for n in range(40):
+        made_s = n / 4
+        late = position(made_s, "1:1")._replace(t_ns=START_NS + round((made_s + 0.3) * S))
+        run(pipeline, [late])
+        sent_ns = late.t_ns + S // 50
+        remote_ns = (
+            sent_ns + S // 100 - START_NS + 100 * S
+        )  # halfway; the boot clock began at 100 s
+        assert pipeline.step(RoundTrip(sent_ns + S // 50, Source(1, 1), sent_ns, remote_ns)) == []
+    estimate = pipeline.clock_estimate("1:1")
+    assert estimate is not None
+    assert estimate.kind is ClockKind.TIMESYNC
+    assert estimate.latency_s == pytest.approx(0.3, abs=0.011)
+    assert estimate.uncertainty_s < 0.02
+
+
+def test_who_is_long_gone_is_dropped_and_comes_back_as_new() -> None:
+    ages = {"coasting_s": 1.0, "stale_s": 2.0, "lost_s": 3.0, "dropped_s": 8.0}
+    pipeline = Pipeline(settings("47.4,8.55,500", tracks=ages))
+    outputs = run(pipeline, [position(n / 10, "1:1", (50.0, 0.0, 0.0)) for n in range(10)])
+    events: list[Event] = [position(0.95 + n / 10, "2:1", (0.0, 50.0, 0.0)) for n in range(300)]
+    events += [tick(n / 10) for n in range(300)]
+    outputs += run(pipeline, sorted(events, key=lambda event: event.t_ns))
+    said = [one.text for one in outputs if isinstance(one, Notice) and one.subject == "1:1"]
+    assert said == [
+        *(f"1:1 is {state}" for state in ("live", "coasting", "stale", "lost")),
+        "1:1 is dropped: nothing of it for 8 s",
+    ]
+    now_ns = START_NS + 30 * S
+    assert [track.uav for track in pipeline.tracks(now_ns, now_ns)] == ["2:1"]
+    (again,) = run(pipeline, [position(31.0, "1:1", (60.0, 0.0, 0.0))])
+    assert isinstance(again, Estimate)
+    assert again.dt_s is None
+
+
+def test_no_more_are_tracked_than_the_settings_allow() -> None:
+    pipeline = Pipeline(settings("47.4,8.55,500", tracks={"most": 3}))
+    for n in range(20):
+        for sysid in range(1, 11):
+            run(pipeline, [position(n / 10, f"{sysid}:1", (10.0 * sysid, 0.0, 0.0))])
+    now_ns = START_NS + 2 * S
+    assert [t.uav for t in pipeline.tracks(now_ns, now_ns)] == ["1:1", "2:1", "3:1"]
+    assert pipeline.refusals.total == {Reason.TOO_MANY: 7 * 20}
+
+
+def test_clocks_of_those_without_a_track_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Invented senders do not fill the memory; who has a track, and the carrier, keep theirs."""
+    monkeypatch.setattr("companion.pipeline.senders.CLOCKS_MAX", 10)
+    pipeline = Pipeline(settings(tracks={"most": 2}))
+    pipeline.step(attitude(0, "5:1"))  # the carrier has no position, and so no track
+    for sysid in range(11, 61):
+        pipeline.step(position(0, f"{sysid}:1", (10.0 * sysid, 0.0, 0.0)))
+    known = [f"{sysid}:1" for sysid in range(1, 61) if pipeline.clock_estimate(f"{sysid}:1")]
+    assert len(known) == 51
+    run(pipeline, [tick(n / 100) for n in range(100)])
+    known = [f"{sysid}:1" for sysid in range(1, 61) if pipeline.clock_estimate(f"{sysid}:1")]
+    assert known == ["5:1", "11:1", "12:1", *(f"{sysid}:1" for sysid in range(51, 61))]

@@ -1,0 +1,145 @@
+"""The live channels, as a viewer has them: a WebSocket client that knows only the protocol."""
+
+import asyncio
+import base64
+import json
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
+from support import HANG_S
+from websockets.asyncio.client import ClientConnection, connect
+
+from companion.beams.array.geometry import uniform_linear
+from companion.recording.foxglove import LiveChannels, LiveError
+from companion.recording.scene import Scene
+from companion.values import Estimate, FloatArray, Tick, Update
+
+pytest.importorskip("foxglove", reason="the extra [live] is not installed")
+
+PROTOCOL = "foxglove.sdk.v1"
+START_NS = 1_700_000_000_000_000_000
+Geodetic = Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
+
+
+async def advertised(viewer: ClientConnection, topics: set[str]) -> dict[str, Any]:
+    """The channels by topic, once all of these are there."""
+    found: dict[str, Any] = {}
+    while not topics <= found.keys():
+        said = json.loads(await asyncio.wait_for(viewer.recv(), HANG_S))
+        if said["op"] == "advertise":
+            found |= {channel["topic"]: channel for channel in said["channels"]}
+    return found
+
+
+def message_class(channel: dict[str, Any]) -> Any:
+    """The class that a channel's schema, as it is sent, describes."""
+
+    pool = DescriptorPool()
+    for file in FileDescriptorSet.FromString(base64.b64decode(channel["schema"])).file:
+        pool.Add(file)
+    return GetMessageClass(pool.FindMessageTypeByName(channel["schemaName"]))
+
+
+async def watch(port: int, topics: set[str], feed: Callable[[], None]) -> dict[str, Any]:
+    """The first message on each topic, decoded by its own schema, and its log time."""
+    async with connect(f"ws://127.0.0.1:{port}", subprotocols=[PROTOCOL]) as viewer:  # type: ignore[list-item]
+        channels = await advertised(viewer, topics)
+        wanted = dict(enumerate(sorted(topics)))
+        asked = [{"id": n, "channelId": channels[topic]["id"]} for n, topic in wanted.items()]
+        await viewer.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
+        found: dict[str, Any] = {}
+        while found.keys() != topics:
+            feed()
+            try:
+                said = await asyncio.wait_for(viewer.recv(), 0.1)
+            except TimeoutError:
+                continue
+            if isinstance(said, bytes):
+                kind, number, log_ns = struct.unpack_from("<BIQ", said)
+                assert kind == 1
+                message = message_class(channels[wanted[number]]).FromString(said[13:])
+                found[wanted[number]] = (log_ns, message)
+        return found
+
+
+@pytest.mark.full
+def test_a_viewer_is_sent_what_a_recording_holds(
+    geodetic: Geodetic, update: Callable[[int], Update], estimate: Estimate
+) -> None:
+    live = LiveChannels(
+        "127.0.0.1", 0, geodetic, Scene(uniform_linear(4, 1e9, 0.5, np.eye(3)), 2.0)
+    )
+    live.start()
+    now = iter(range(START_NS, START_NS + 10**12, 10**9))
+
+    def feed() -> None:
+        t_ns = next(now)
+        live.put(Tick(t_ns), [estimate, update(t_ns)])
+
+    feed()  # before anybody watches: the topics of the UAV are announced by it
+    topics = {"/ticks", "/scene", "/tracks", "/beams/weights", "/uav/1:1/fix", "/uav/1:1/predicted"}
+    try:
+        found = asyncio.run(watch(live.port, topics, feed))
+    finally:
+        live.stop()
+    log_ns, tick = found["/ticks"]
+    assert log_ns == tick.t_ns >= START_NS
+    assert found["/uav/1:1/fix"][1].latitude == 47.5
+    assert found["/tracks"][1].uav in ("1:1", "icao:4CA7B3")
+    assert [entity.id for entity in found["/scene"][1].entities] == ["uav 1:1", "uav icao:4CA7B3"]
+    assert len(found["/beams/weights"][1].weights_complex64) == 4 * 2 * 8
+    assert live.dropped == 0
+
+
+def test_a_port_that_is_taken_is_said(geodetic: Geodetic) -> None:
+    live = LiveChannels("127.0.0.1", 0, geodetic, None)
+    with pytest.raises(LiveError, match=rf"cannot listen on 127\.0\.0\.1:{live.port}"):
+        LiveChannels("127.0.0.1", live.port, geodetic, None)
+    live.stop()
+
+
+def test_the_service_serves_them(start_node: Any) -> None:
+    node = start_node(
+        "run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "1:1",
+        "--foxglove", "0",
+    )  # fmt: skip
+    line = node.process.stderr.readline()
+    assert "ws://127.0.0.1:" in line
+    found = asyncio.run(watch(int(line.rsplit(":", 1)[1]), {"/ticks"}, lambda: None))
+    assert found["/ticks"][1].t_ns > START_NS
+    assert node.stop()[0] == 0
+
+
+_WITHOUT = """
+import sys
+sys.modules["foxglove"] = None
+from companion.cli.main import main
+main(["run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "1:1",
+      "--foxglove", "0"])
+"""
+
+
+def test_without_the_extra_it_is_one_line() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _WITHOUT],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=HANG_S,
+    )
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1 and "foxglove-sdk" in done.stderr, done.stderr
+
+
+def test_it_is_not_loaded_where_it_is_not_asked_for() -> None:
+    code = "import sys, companion.node.service; print('foxglove' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"

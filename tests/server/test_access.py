@@ -1,0 +1,19 @@
+"""Who may listen where, and what it takes."""
+
+import pytest
+
+from companion.server.access import ListenError, bind
+
+
+@pytest.mark.parametrize("token", [None, ""])
+def test_an_address_that_others_reach_wants_a_token_or_a_word(token: str | None) -> None:
+    """An empty token is none; a good one, or saying that it may lie open, will do."""
+    with pytest.raises(ListenError, match=r"0\.0\.0\.0:0 can be reached from elsewhere"):
+        bind("0.0.0.0:0", token=token, insecure=False)
+    bind("0.0.0.0:0", token="secret", insecure=False).close()
+    bind("0.0.0.0:0", token=token, insecure=True).close()
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "127.0.0.7"])
+def test_an_address_of_this_machine_alone_wants_neither(host: str) -> None:
+    bind(f"{host}:0", token=None, insecure=False).close()

@@ -1,0 +1,506 @@
+"""Settings: what is read, what is refused, and how that is said."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.beams.array.coverage import EVERYWHERE
+from companion.beams.weights.precoding import Precoder
+from companion.pipeline import assembly
+from companion.settings.center import FixedCenter, HomeCenter, VehicleCenter, parse_center
+from companion.settings.files import load
+from companion.settings.model import BeamSettings, Settings
+from companion.settings.section import ConfigError
+from companion.settings.tracking import ObserverSettings
+from companion.values import Source
+
+
+def refusal(text: str) -> str:
+    with pytest.raises(ConfigError) as caught:
+        Settings.from_toml(text, "there.toml")
+    message = str(caught.value)
+    assert message.startswith("there.toml: ")
+    assert "\n" not in message
+    return message.removeprefix("there.toml: ")
+
+
+# --- errors -------------------------------------------------------------------------------------
+
+# Section, key, value as TOML, the value as it is said, and what is allowed.
+WRONG = [
+    ("center", "source", '"there"', "there", "SYSID:COMPID"),
+    ("center", "source", '"300:1"', "300:1", "at most 255"),
+    ("center", "source", '"91,0,0"', "91,0,0", "latitude is within 90"),
+    ("center", "source", "5", "5", "string"),
+    ("links", "urls", '"udpin:0.0.0.0:1"', "udpin", "tuple"),
+    ("links", "urls", "[7]", "7", "string"),
+    ("links", "urls", '["udpin:x"]', "udpin:x", "udpin:HOST:PORT"),
+    ("presence", "enabled", '"always"', "always", "boolean"),
+    ("presence", "system_id", "255", "255", "less than or equal to 254"),
+    ("presence", "position_hz", "0", "0", "greater than or equal to 0.1"),
+    ("signing", "keys", '{"radio" = "key"}', "radio", "serial:DEVICE:BAUD"),
+    ("signing", "allow_unsigned", '["tcp:a:1"]', "tcp:a:1", "has no key"),
+    ("tracks", "allow", '["one"]', "one", "SYSID:COMPID or icao:HEX"),
+    ("tracks", "deny", '["icao:4ca7b3"]', "icao:4ca7b3", "SYSID:COMPID or icao:HEX"),
+    ("clocks", "constant_delay_s", "-0.1", "-0.1", "greater than or equal to 0"),
+    ("clocks", "constant_delay_s", "11", "11", "less than or equal to 10"),
+    ("observer", "model", '"kinematics"', "kinematics", "'kinematic' or 'position'"),
+    ("observer", "feed_forward", '"often"', "often", "boolean"),
+    ("observer", "follow_accuracy", "2", "2", "boolean"),
+    ("observer", "accuracy_factor", "0", "0", "greater than 0"),
+    ("observer", "velocity_noise_mps", "0", "0", "greater than 0"),
+    ("center", "attitude_bound_deg", "181", "181", "less than or equal to 180"),
+    ("center", "attitude_bound_deg", "-1", "-1", "greater than or equal to 0"),
+    ("tracks", "window_s", "0", "0", "greater than 0"),
+    ("tracks", "reacquire_reports", "1", "1", "greater than or equal to 2"),
+    ("tracks", "reacquire_reports", "61", "61", "less than or equal to 60"),
+    ("tracks", "reacquire_s", "61", "61", "less than or equal to 60"),
+    ("observer", "feedthrough_s", "11.0", "11.0", "less than or equal to 10"),
+    ("observer", "velocity_lead_s", "0.0", "0.0", "greater than 0"),
+    ("observer", "speed_max_mps", "-3", "-3", "greater than 0"),
+    ("observer", "speed_max_mps", "inf", "inf", "finite"),
+    ("observer", "position_noise_m", "nan", "nan", "finite|greater than 0"),
+    ("observer", "acceleration_max_mps2", '"fast"', "fast", "number"),
+    ("tracks", "lost_s", "0", "0", "greater than 0"),
+    ("array", "kind", '"circle"', "circle", "ula"),
+    ("array", "elements", "0", "0", "greater than or equal to 1"),
+    ("array", "elements", "2.5", "2.5", "integer"),
+    ("array", "elements", "5000", "5000", "less than or equal to 4096"),
+    ("array", "mount_yaw_deg", "nan", "nan", "finite"),
+    ("array", "rows", "0", "0", "greater than or equal to 1"),
+    ("array", "spacing_m", "0", "0", "greater than 0"),
+    ("array", "element", '"dipole"', "dipole", "'isotropic', 'cosine' or '3gpp'"),
+    ("array", "element_exponent", "-1", "-1", "greater than or equal to 0"),
+    ("array", "lever_arm_m", "[1, 2]", "1, 2", "required"),
+    ("array", "field_of_view_deg", "361", "361", "less than or equal to 360"),
+    ("array", "azimuth_limits_deg", "[30, -30]", "30, -30", "first less than the second"),
+    ("beams", "method", '"best"', "best", "'zf', 'rzf' or 'mrt'"),
+    ("beams", "policy", '"pray"', "pray", "'regularise', 'group' or 'drop'"),
+    ("beams", "normalisation", '"max"', "max", "'total' or 'antenna'"),
+    ("beams", "loss_limit_db", "0", "0", "greater than 0"),
+    ("codebook", "oversampling", "0", "0", "greater than or equal to 1"),
+    ("radio", "uav_antennas", "0", "0", "greater than or equal to 1"),
+    ("radio", "bandwidth_hz", "-1", "-1", "greater than 0"),
+    ("beams", "update_hz", "1001", "1001", "less than or equal to 1000"),
+    ("beams", "targets", '"some"', "some", "'telemetry' or 'all'"),
+    ("beams", "condition_limit", "1.0", "1.0", "greater than 1"),
+    ("beams", "condition_limit", "1001.0", "1001.0", "less than or equal to 1000"),
+    ("beams", "regularisation", "0", "0", "greater than 0"),
+    ("beams", "priority", '["1:1", "2:1", "1:1"]', "1:1", "each UAV once"),
+    ("array", "frequency_hz", "1e-300", "1e-300", "greater than or equal to 1000"),
+    ("array", "frequency_hz", "1e300", "1e+300", "less than or equal to"),
+    ("array", "spacing_m", "1e300", "1e+300", "less than or equal to"),
+    ("array", "spacing_wavelengths", "1e300", "1e+300", "less than or equal to"),
+    ("array", "lever_arm_m", "[1e200, 0, 0]", "1e+200", "less than or equal to"),
+    ("recording", "directory", "7", "7", "string"),
+    ("server", "listen", "8080", "8080", "string"),
+]
+
+
+@pytest.mark.parametrize(("section", "key", "value", "said", "allowed"), WRONG)
+def test_an_error_names_key_value_and_what_is_allowed(
+    section: str, key: str, value: str, said: str, allowed: str
+) -> None:
+    message = refusal(f"[{section}]\n{key} = {value}\n")
+    assert re.match(rf"{section}\.{key} = .*{re.escape(said)}.*: ", message), message
+    assert re.search(allowed, message.split(": ", 1)[1]), message
+
+
+@pytest.mark.parametrize("value", ["2", "0", "1.0", '"fast"', "-0.5"])
+def test_alpha_is_auto_or_between_0_and_1(value: str) -> None:
+    """A key of two kinds is named as it is written, and both kinds are said."""
+    message = refusal(f"[observer]\nalpha = {value}\n")
+    assert message.startswith("observer.alpha = "), message
+    assert "auto" in message
+    assert re.search("0|1|number", message.split(": ", 1)[1]), message
+
+
+@pytest.mark.parametrize("value", ["0", "-1", '"some"'])
+def test_weights_hz_is_all_or_above_0(value: str) -> None:
+    message = refusal(f"[recording]\nweights_hz = {value}\n")
+    assert message.startswith("recording.weights_hz = "), message
+    assert "all" in message
+    assert re.search("0|number", message.split(": ", 1)[1]), message
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        ("[tracks]\nstale = 4\n", "tracks.stale"),
+        ("[radar]\nrange = 4\n", "radar"),
+        ("source = '5:1'\n", "source"),
+    ],
+)
+def test_a_key_that_is_no_setting_is_named(text: str, key: str) -> None:
+    assert refusal(text) == f"{key} is not a setting"
+
+
+def test_a_section_is_a_table() -> None:
+    assert refusal("center = 3\n").startswith("center = 3: ")
+
+
+@pytest.mark.parametrize("text", ["[array", "array = ", "x = 1\nx = 2\n", "= 3", "a = 'é"])
+def test_what_is_not_toml_is_said_to_be_not_toml(text: str) -> None:
+    assert refusal(text).startswith("not TOML: ")
+
+
+@pytest.mark.parametrize("text", ["[tracks]\ncoasting_s = 100\n", "[tracks]\nlost_s = 10\n"])
+def test_a_track_passes_its_states_in_order(text: str) -> None:
+    """coasting_s <= stale_s <= lost_s, or a state would never be seen."""
+    assert "tracks" in refusal(text)
+
+
+# --- files --------------------------------------------------------------------------------------
+
+
+def test_without_a_file_there_are_the_defaults() -> None:
+    assert load(None) == Settings()
+    observer = load(None).observer
+    assert (observer.model, observer.acceleration_max_mps2) == ("kinematic", 5.0)
+    assert (observer.feed_forward, observer.follow_accuracy) == (True, True)
+
+
+def test_a_file_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_text('[array]\nelements = 128\n[center]\nsource = "5:1"\n', encoding="utf-8")
+    found = load(path)
+    assert (found.array.elements, found.center.source) == (128, "5:1")
+    assert found.beams == BeamSettings()
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"missing\.toml: No such file"):
+        load(tmp_path / "missing.toml")
+    with pytest.raises(ConfigError, match="Is a directory"):
+        load(tmp_path)
+    (tmp_path / "latin.toml").write_bytes(b"# \xe9\n")
+    with pytest.raises(ConfigError, match=r"latin\.toml: not TOML: it is not UTF-8"):
+        load(tmp_path / "latin.toml")
+    (tmp_path / "bad.toml").write_text("[array]\nelements = 0\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"bad\.toml: array\.elements = 0: "):
+        load(tmp_path / "bad.toml")
+
+
+# --- to TOML and back ---------------------------------------------------------------------------
+
+POSITIVE = st.floats(0, exclude_min=True, allow_nan=False, allow_infinity=False)
+LINKS = ["udpin:[::]:14550", "tcp:ground.example:5760", 'serial:/dev/"tty" = 1:57600']
+SCALAR = st.characters(exclude_categories=["Cs"])
+
+
+@given(
+    directory=st.none() | st.text(SCALAR, max_size=20),
+    urls=st.lists(st.sampled_from(LINKS), max_size=3),
+    keys=st.dictionaries(st.sampled_from(LINKS), st.text(SCALAR, max_size=20)),
+    deny=st.lists(st.sampled_from(["3:1", "*:190", "icao:4C*"]), max_size=2),
+    alpha=st.just("auto") | st.floats(0, 1, exclude_min=True, exclude_max=True),
+    speed=POSITIVE,
+    weights_hz=st.just("all") | POSITIVE,
+    elements=st.integers(1, 4096),
+    yaw_deg=st.floats(allow_nan=False, allow_infinity=False),
+    source=st.none() | st.sampled_from(["5:1", "home", "47.4,8.5,500,-90"]),
+    model=st.sampled_from(["kinematic", "position"]),
+    follow=st.booleans(),
+    attitude_bound_deg=st.floats(0, 180),
+)
+def test_settings_survive_being_written(
+    directory: str | None,
+    urls: list[str],
+    keys: dict[str, str],
+    deny: list[str],
+    alpha: float | str,
+    speed: float,
+    weights_hz: float | str,
+    elements: int,
+    yaw_deg: float,
+    source: str | None,
+    model: str,
+    follow: bool,
+    attitude_bound_deg: float,
+) -> None:
+    made = Settings.model_validate(
+        {
+            "center": {"source": source, "attitude_bound_deg": attitude_bound_deg},
+            "links": {"urls": urls},
+            "signing": {"keys": keys, "allow_unsigned": sorted(keys)[:1]},
+            "tracks": {"deny": deny},
+            "observer": {
+                "alpha": alpha,
+                "speed_max_mps": speed,
+                "model": model,
+                "follow_accuracy": follow,
+            },
+            "recording": {"directory": directory, "weights_hz": weights_hz},
+            "array": {"elements": elements, "mount_yaw_deg": yaw_deg},
+        }
+    )
+    assert Settings.from_toml(made.to_toml(), "written") == made
+
+
+def test_what_is_written_holds_every_default() -> None:
+    text = Settings().to_toml()
+    assert Settings.from_toml(text, "written") == Settings()
+    written = tomllib.loads(text)
+    for name, section in Settings():
+        known = {key for key, value in section if value is not None}
+        assert written[name].keys() == known
+
+
+# --- flags --------------------------------------------------------------------------------------
+
+
+def test_flags_override_and_none_leaves_a_key() -> None:
+    before = Settings.from_toml('[center]\nsource = "5:1"\n[array]\nelements = 8\n', "x")
+    after = before.override(
+        center={"source": None}, array={"elements": 16, "kind": None}, links={"urls": ["tcp:a:1"]}
+    )
+    assert after.center.source == "5:1"
+    assert (after.array.elements, after.array.kind) == (16, "ula")
+    assert after.links.urls == ("tcp:a:1",)
+    assert before.array.elements == 8
+    assert after.observer == ObserverSettings()
+    assert before.override() == before
+
+
+def test_a_bad_flag_is_an_error_of_settings() -> None:
+    with pytest.raises(ConfigError, match=r"^array\.elements = 0: .*greater than or equal to 1"):
+        Settings().override(array={"elements": 0})
+    with pytest.raises(ConfigError, match=r"^array\.shape is not a setting"):
+        Settings().override(array={"shape": 3})
+
+
+# --- the array ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '[array]\nkind = "list"\n',
+        '[array]\nkind = "ula"\npositions_m = [[0, 0, 0]]\n',
+        '[array]\nkind = "uca"\npositions = "there.csv"\n',
+    ],
+)
+def test_a_list_of_elements_goes_with_its_kind(text: str) -> None:
+    assert "goes with positions" in refusal(text)
+
+
+def test_a_codebook_file_goes_with_its_kind() -> None:
+    for text in ('kind = "file"', 'file = "beams.npy"', 'kind = "dft"\nfile = "beams.npy"'):
+        assert "goes with file" in refusal(f"[codebook]\n{text}\n")
+
+
+def test_a_rectangle_is_not_larger_than_a_line_may_be() -> None:
+    assert "at most 4096" in refusal('[array]\nkind = "ura"\nrows = 100\ncolumns = 100\n')
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("elements.csv", "# x, y, z\n0, 0, 0\n0, 0.005, 0  # the second\n\n0,0,0.005\n"),
+        ("elements.txt", "0 0 0\n0 0.005 0\n0 0 5e-3\n"),
+        ("elements.npy", None),
+    ],
+)
+def test_element_positions_are_read_into_the_settings(
+    tmp_path: Path, name: str, text: str | None
+) -> None:
+    """So a recording holds them, whatever becomes of the file."""
+    rows = [[0.0, 0.0, 0.0], [0.0, 0.005, 0.0], [0.0, 0.0, 0.005]]
+    file = tmp_path / name
+    if text is None:
+        np.save(file, np.array(rows))
+    else:
+        file.write_text(text, encoding="utf-8")
+    config = tmp_path / "settings.toml"
+    config.write_text(f'[array]\nkind = "list"\npositions = "{file}"\n', encoding="utf-8")
+    found = load(config)
+    file.unlink()
+    assert found.array.positions is None
+    assert found.array.positions_m == tuple(map(tuple, rows))
+    assert Settings.from_toml(found.to_toml(), "again") == found
+    assert assembly.array(found).elements_m == pytest.approx(np.array(rows))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (None, "No such file"),
+        ("0, 0\n0, 1\n", "rows of at least 3"),
+        ("0, 0, x\n", "not a table of numbers"),
+        ("0, 0, 0\n0, 0\n", "not a table of numbers"),
+        ("0, 0, nan\n", "finite"),
+        ("", "rows of at least 3"),
+    ],
+)
+def test_a_file_of_positions_that_will_not_do_is_named(
+    tmp_path: Path, text: str | None, said: str
+) -> None:
+    file = tmp_path / "elements.csv"
+    if text is not None:
+        file.write_text(text, encoding="utf-8")
+    config = tmp_path / "settings.toml"
+    config.write_text(f'[array]\nkind = "list"\npositions = "{file}"\n', encoding="utf-8")
+    with pytest.raises(ConfigError, match=said) as caught:
+        load(config)
+    assert str(caught.value).startswith(f"array.positions = '{file}'")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("array", "said"),
+    [
+        ({"kind": "list", "positions_m": [[0, 0, 0], [0, 0, 0]]}, "two elements stand at one"),
+        ({"kind": "list", "positions_m": [[0, 0], [0, 1]]}, "rows of 3 numbers"),
+        ({"kind": "list", "positions_m": [[0, 0, 0], [0, 0, 1, 1, 0, 0]]}, "rows of 3 numbers"),
+    ],
+)
+def test_what_is_no_array_is_an_error_of_settings(array: dict[str, object], said: str) -> None:
+    with pytest.raises(ConfigError, match=f"^array: .*{said}"):
+        assembly.array(Settings().override(array=array))
+
+
+def test_the_coverage_is_the_one_that_is_described() -> None:
+    given = {
+        "field_of_view_deg": 120.0,
+        "azimuth_limits_deg": [-50.0, 40.0],
+        "elevation_limits_deg": [-30.0, 20.0],
+        "hidden_deg": [[170.0, -170.0, -90.0, -10.0]],
+    }
+    found = assembly.coverage(Settings().override(array=given))
+    assert found.field_of_view_rad == pytest.approx(np.radians(120))
+    assert found.azimuth_limits_rad == pytest.approx(np.radians([-50, 40]))
+    assert found.elevation_limits_rad == pytest.approx(np.radians([-30, 20]))
+    (hidden,) = found.hidden
+    assert str(hidden) == "azimuth 170 to -170, elevation -90 to -10"
+    assert assembly.coverage(Settings()) == EVERYWHERE
+    wrong = Settings().override(array={"hidden_deg": [[0.0, 200.0, 0.0, 10.0]]})
+    with pytest.raises(ConfigError, match=r"^array: azimuth 0 to 200 degrees"):
+        assembly.coverage(wrong)
+
+
+def test_the_equipment_is_the_one_that_is_described(tmp_path: Path) -> None:
+    def made(**sections: dict[str, object]) -> assembly.Equipment:
+        found = Settings().override(array={"elements": 4}, **sections)
+        return assembly.equipment(found, assembly.array(found))
+
+    bare = made()
+    assert (bare.codebook, bare.calibration, bare.uav_antennas) == (None, None, 4)
+    radio = made(
+        radio={
+            "tx_power_dbm": 17.0, "bandwidth_hz": 1e6, "noise_figure_db": 3.0, "uav_antennas": 2,
+        }
+    )  # fmt: skip
+    assert (radio.budget.tx_power_dbm, radio.budget.bandwidth_hz) == (17.0, 1e6)
+    assert (radio.budget.noise_figure_db, radio.uav_antennas) == (3.0, 2)
+    stored = made(codebook={"kind": "dft", "oversampling": 3}).codebook
+    assert stored is not None
+    assert stored.weights.shape == (4, 12)
+    table = tmp_path / "measured.csv"
+    lines = [f"{c},{3 - c},{10 * c},0" for c in range(4)]
+    table.write_text("channel,element,phase_deg,gain_db\n" + "\n".join(lines), encoding="utf-8")
+    calibrated = made(hardware={"calibration": str(table)}).calibration
+    assert calibrated is not None
+    assert calibrated.order == (3, 2, 1, 0)
+    table.write_text("channel,element,phase_deg,gain_db\n0,0,0,0\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"^hardware\.calibration: 1 channels for 4 elements"):
+        made(hardware={"calibration": str(table)})
+    table.write_bytes(b"\xff")
+    with pytest.raises(ConfigError, match=r"^hardware\.calibration = .*not UTF-8"):
+        made(hardware={"calibration": str(table)})
+    with pytest.raises(ConfigError, match=r"^hardware\.calibration = .*No such file"):
+        made(hardware={"calibration": str(tmp_path / "missing.csv")})
+    with pytest.raises(ConfigError, match=r"^codebook: a DFT codebook needs"):
+        settings = Settings().override(codebook={"kind": "dft"}, array={"kind": "uca"})
+        assembly.equipment(settings, assembly.array(settings))
+
+
+def test_the_precoder_is_the_one_that_is_described() -> None:
+    given = {
+        "method": "rzf", "policy": "drop", "loss_limit_db": 5.0, "condition_limit": 50.0,
+        "regularisation": 0.5, "normalisation": "antenna", "priority": ["2:1"], "widen": False,
+    }  # fmt: skip
+    found = assembly.precoder(Settings().override(beams=given))
+    for key, value in given.items():
+        assert getattr(found, key) == (tuple(value) if isinstance(value, list) else value), key
+    assert assembly.precoder(Settings()) == Precoder()
+
+
+def test_the_array_is_the_one_that_is_described() -> None:
+    ura = assembly.array(Settings().override(array={"kind": "ura", "rows": 2, "columns": 3}))
+    assert (ura.kind, ura.size, ura.grid) == ("ura", 6, (2, 3))
+    uca = assembly.array(Settings().override(array={"kind": "uca", "elements": 5}))
+    gap = np.linalg.norm(uca.elements_m[0] - uca.elements_m[1])
+    assert (uca.kind, gap) == ("uca", pytest.approx(uca.wavelength_m / 2))
+    metres = {"spacing_m": 0.015, "frequency_hz": 10e9, "lever_arm_m": [1.0, 0.0, -2.0]}
+    line = assembly.array(Settings().override(array=metres))
+    assert line.elements_m[1, 1] == pytest.approx(0.015)
+    assert line.lever_arm_m == pytest.approx(np.array([1.0, 0.0, -2.0]))
+    facing = [[0, 0, 0, 1, 0, 0], [0, 0.1, 0, 0, 1, 0]]
+    turned = {"kind": "list", "positions_m": facing, "element": "3gpp"}
+    listed = assembly.array(Settings().override(array=turned))
+    assert listed.element_from_array is not None
+    assert listed.element_from_array[1, 0] == pytest.approx(np.array([0, 1, 0]))
+
+
+# --- what carries the array ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "center"),
+    [
+        ("home", HomeCenter()),
+        ("5:1", VehicleCenter(Source(5, 1))),
+        ("255:0", VehicleCenter(Source(255, 0))),
+        ("47.4,8.55,500", FixedCenter(47.4, 8.55, 500.0, 0.0)),
+        ("-90,180,-3.5,-90", FixedCenter(-90.0, 180.0, -3.5, -90.0)),
+        (" 47.4, 8.55, 500, 90", FixedCenter(47.4, 8.55, 500.0, 90.0)),
+    ],
+)
+def test_centers(text: str, center: object) -> None:
+    assert parse_center(text) == center
+    assert parse_center(str(center)) == center
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "SYSID:COMPID"),
+        ("5", "SYSID:COMPID"),
+        ("5:", "SYSID:COMPID"),
+        ("a:b", "SYSID:COMPID"),
+        ("-1:1", "SYSID:COMPID"),
+        ("5:1:1", "SYSID:COMPID"),
+        ("Home", "SYSID:COMPID"),
+        ("256:1", "at most 255"),
+        ("1:256", "at most 255"),
+        ("47,8", "LAT,LON,ALT"),
+        ("47,8,500,90,1", "LAT,LON,ALT"),
+        ("47,8,high", "LAT,LON,ALT"),
+        ("47,,500", "LAT,LON,ALT"),
+        ("90.1,8,500", "latitude is within 90"),
+        ("47,-180.1,500", "longitude within 180"),
+        ("nan,8,500", "latitude"),
+        ("47,inf,500", "longitude"),
+    ],
+)
+def test_what_is_no_center_is_refused(text: str, said: str) -> None:
+    with pytest.raises(ValueError, match=said) as caught:
+        parse_center(text)
+    assert repr(text) in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["47,8,nan", "47,8,inf", "47,8,500,nan", "47,8,500,-inf"])
+def test_height_and_heading_of_a_center_are_numbers(text: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(repr(text))):
+        parse_center(text)
+
+
+@pytest.mark.parametrize("text", ["", "there"])
+def test_whoever_names_no_center_is_told_all_three_kinds(text: str) -> None:
+    with pytest.raises(ValueError, match=r"SYSID:COMPID.*LAT,LON,ALT.*home"):
+        parse_center(text)

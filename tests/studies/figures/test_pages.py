@@ -1,0 +1,33 @@
+"""Pages: words that are handed in stay words, and a value that is missing is an error."""
+
+import pytest
+from jinja2 import UndefinedError
+
+from companion.studies.figures import pages
+
+PAGE = "figures/page.html.j2"
+EVIL = "x\"y'></code></style><script>"
+
+
+def test_nothing_handed_in_can_leave_its_place() -> None:
+    answer = {"command": EVIL, "versions": {EVIL: EVIL}}
+    figure = {"name": EVIL, "caption": EVIL, "png_base64": ""}
+    page = pages.page(PAGE, answer=answer, figures={"one": figure})
+    assert EVIL not in page and "<script>" not in page and 'x"y' not in page
+    assert page.count("&gt;&lt;script&gt;") == 3 + 3  # what made it; id, alternative, caption
+
+
+def test_a_page_is_the_same_again_and_loads_nothing() -> None:
+    answer = {"command": "companion study", "versions": {"numpy": "2", "scipy": "1"}}
+    page = pages.page(PAGE, answer=answer, figures={})
+    assert page == pages.page(PAGE, answer=answer, figures={})
+    assert page.startswith("<!doctype html>") and page.endswith("</html>\n")
+    assert "<code>companion study</code><br>numpy 2, scipy 1</p>" in page
+    assert "http" not in page
+
+
+def test_a_value_that_is_missing_is_an_error() -> None:
+    with pytest.raises(UndefinedError, match="answer"):
+        pages.page(PAGE, figures={})
+    with pytest.raises(UndefinedError, match="command"):
+        pages.page(PAGE, answer={"versions": {}}, figures={})

@@ -1,0 +1,168 @@
+"""The study and its command: errors have their reasons, and the same command the same numbers."""
+
+import json
+import math
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from support import ROOT
+
+from companion.beams.array.steering import steering_matrix
+from companion.cli.main import main
+from companion.pipeline import assembly
+from companion.settings.model import Settings
+from companion.studies.link import channel, figures
+from companion.studies.link.channel import Scattering
+from companion.studies.link.level import LinkStudy, simulate, snrs
+from companion.studies.link.scenario import Positions, Reports, Scenario, circles
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    return circles(Settings(), Reports(), 40, np.random.default_rng(1))
+
+
+def test_errors_that_noise_does_not_make_are_interference(scenario: Scenario) -> None:
+    """Without noise: a UAV whose signal is 20 dB above all interference errs nowhere, one whose
+    signal is below it errs in every block; held positions are left with errors for that reason."""
+    setting = LinkStudy(snr_db=(80, 80, 1), blocks=3, scattering=Scattering(math.inf))
+    counts = simulate(setting, scenario)
+    errors = {
+        kind: np.array([each.raw_errors for each in counts[kind.value, 80]]) for kind in Positions
+    }
+    assert not errors[Positions.PERFECT].any()
+    few, many = (np.mean(errors[kind] > 0) for kind in (Positions.PREDICTED, Positions.HELD))
+    assert few < 0.1 and many > 0.5
+    precoder = assembly.precoder(Settings())
+    for seen, wrong in zip(scenario.instants, errors[Positions.HELD], strict=True):
+        truly = seen.towards[Positions.PERFECT]
+        sent = channel.weights(scenario.array, seen, Positions.HELD, precoder)
+        power = np.abs(steering_matrix(scenario.array, truly).T @ sent) ** 2
+        ratio = power.diagonal() / (power.sum(axis=1) - power.diagonal())
+        assert not wrong[ratio > 100].any()
+        assert (wrong[ratio < 1] > 0).all()
+
+
+def test_levels() -> None:
+    assert snrs(-2, 1, 1) == (-2.0, -1.0, 0.0, 1.0)
+    assert snrs(0, 1, 0.3) == (0.0, 0.3, 0.6, 0.9)
+    assert snrs(0, 0.3, 0.1) == (0.0, 0.1, 0.2, 0.3)
+
+
+class Links(HTMLParser):
+    """What a page would fetch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fetched: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.fetched += [value or "" for name, value in attrs if name in ("src", "href")]
+
+
+def run(*arguments: str | Path) -> Any:
+    """The command, as the console script runs it."""
+    return CliRunner().invoke(main, ["study", "link", *map(str, arguments)])
+
+
+SMALL = ("--snr", "4:20:8", "--instants", 4, "--blocks", 2)
+
+
+@pytest.mark.full
+def test_the_command_writes_numbers_figures_and_a_page(tmp_path: Path) -> None:
+    """And the same again from the command that the answer names."""
+    done = run(*SMALL, "--out", tmp_path / "a", "--json")
+    assert done.exit_code == 0, done.output
+    answer = json.loads((tmp_path / "a" / "link.json").read_text())
+    assert json.loads(done.stdout) == answer
+    assert {
+        (found["positions"], found["coded"], found["snr_db"]) for found in answer["rows"]
+    } == {(kind, coded, snr) for kind in ("perfect", "predicted", "held")
+          for coded in (False, True) for snr in (4.0, 12.0, 20.0)}  # fmt: skip
+    for found in answer["rows"]:
+        low, high = found["confidence"]["ber"]
+        assert 0 <= low <= found["ber"] <= high <= 1
+        assert found["n_bits"] == 4 * 4 * 2 * (306 if found["coded"] else 936)
+    assert [found["snr_db"] for found in answer["theory"]] == [4.0, 12.0, 20.0]
+    named = run(*answer["command"].split()[3:], "--out", tmp_path / "b")
+    assert named.exit_code == 0 and "predicted" in named.stdout
+    names = {path.name for path in (tmp_path / "a").iterdir()}
+    figures = {f"link_{kind}.{form}" for kind in ("ber", "bler", "rate", "evm")
+               for form in ("png", "svg")}  # fmt: skip
+    assert names == {"link.json", "link.html", *figures}
+    for name in names:
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+    each_curve_is_drawn(answer)
+    page = Links()
+    page.feed((tmp_path / "a" / "link.html").read_text())
+    assert len(page.fetched) == 4
+    assert all(source.startswith("data:image/png;base64,") for source in page.fetched)
+
+
+def each_curve_is_drawn(answer: dict[str, Any]) -> None:
+    """Throughput, uncoded and coded: a line for each kind of positions, all told apart."""
+    _, draw = figures.drawings(answer)["link_rate"]
+    for axes, coded in zip(draw().axes, (False, True), strict=True):
+        drawn = {line.get_label(): line.get_xydata().tolist() for line in axes.lines}
+        assert drawn == {
+            label: [
+                [found["snr_db"], found["rate_bps"] / 1e6]
+                for found in answer["awgn"] + answer["rows"]
+                if (found["positions"], found["coded"]) == (positions, coded)
+            ]
+            for positions, label in figures.LABELS.items()
+        }
+        looks = {(line.get_color(), line.get_linestyle(), line.get_marker()) for line in axes.lines}
+        assert len(looks) == len(drawn) == 4
+
+
+@pytest.mark.full
+def test_a_log_goes_through_the_pipeline(tmp_path: Path) -> None:
+    log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
+    done = run(log, "--center", "5:1", *SMALL, "--out", tmp_path)
+    assert done.exit_code == 0, done.output
+    answer = json.loads((tmp_path / "link.json").read_text())
+    assert answer["scenario"]["instants"] == 4
+    off = {found["positions"]: found.get("pointing_error_median_deg")
+           for found in answer["summary"]}  # fmt: skip
+    assert off["perfect"] == pytest.approx(0.0, abs=1e-5)
+    assert 0 < off["predicted"] < off["held"] < 5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--snr", "1:2"), "'1:2' is not FROM:TO:STEP in dB"),
+        (("--snr", "5:2:1"), "--snr 5:2:1: FROM:TO:STEP in dB"),
+        (("--snr", "0:2:0"), "STEP above 0"),
+        (("--snr", "0:nan:1"), "--snr 0:nan:1"),
+        (("--snr", "0:20:0.1"), "201 points, at most 100 are allowed"),
+        (("--instants", 0), "--instants 0: 1 to 10000"),
+        (("--blocks", 5000), "--blocks 5000: 1 to 1000"),
+        (("--interval", 0), "--interval 0: seconds"),
+        (("--latency", -1), "--latency -1: seconds"),
+        (("--center", "5:1"), "--center is for a LOG"),
+        (("nowhere.tlog",), "nowhere.tlog"),
+    ],
+)
+def test_what_cannot_be_studied_is_one_line(
+    arguments: tuple[str | int, ...], said: str, tmp_path: Path
+) -> None:
+    done = run(*map(str, arguments), "--out", tmp_path / "out")
+    assert done.exit_code != 0
+    assert said in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_each_instant_draws_for_itself(scenario: Scenario) -> None:
+    """The same place twice has other bits and other noise, and comes out the same again."""
+    twice = replace(scenario, instants=scenario.instants[:1] * 2)
+    setting = LinkStudy(snr_db=(10, 10, 1), blocks=4)
+    first, second = simulate(setting, twice)["perfect", 10]
+    again, _ = simulate(setting, twice)["perfect", 10]
+    assert (first.raw_errors != second.raw_errors).any()
+    assert (first.raw_errors == again.raw_errors).all()

@@ -1,0 +1,63 @@
+"""Where UAVs are and beams point: against the replay's circles and their own past."""
+
+import numpy as np
+import pytest
+
+from companion.beams.array.steering import steering_matrix
+from companion.beams.weights.zero_forcing import solve
+from companion.pipeline import assembly
+from companion.settings.model import Settings
+from companion.studies.link.scenario import PAPER, Positions, Reports, Scenario, circles
+from companion.studies.prediction.pointing import angles_deg
+from sitl_replay.flight.motion import Circle as Flown
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    return circles(Settings(), Reports(), 60, np.random.default_rng(1))
+
+
+def test_the_circles_are_those_of_the_replay() -> None:
+    for circle in PAPER:
+        flown = Flown(circle.radius_m, 0.5, circle.phase_rad, 0.0)
+        for t_s in (0.0, 1.7, 33.3):
+            position, velocity = circle.at(t_s)
+            assert position == pytest.approx(flown(t_s).position_ned_m)
+            assert velocity == pytest.approx(flown(t_s).velocity_ned_mps)
+
+
+def test_perfect_is_the_truth_and_held_is_as_late_as_its_report(scenario: Scenario) -> None:
+    """A held position is one that the UAV had 0.06 to 0.21 s before its beam is used."""
+    for seen in scenario.instants:
+        ages_s = np.arange(0.0, 0.3, 0.001)
+        for i, circle in enumerate(PAPER):
+            was = np.array([circle.at(seen.t_s - age_s)[0] for age_s in ages_s])
+            was /= np.linalg.norm(was, axis=1)[:, None]
+            assert seen.towards[Positions.PERFECT][i] == pytest.approx(was[0])
+            held = np.tile(seen.towards[Positions.HELD][i], (len(was), 1))
+            age_s = ages_s[np.argmin(angles_deg(held, was))]
+            assert 0.058 <= age_s <= 0.212
+
+
+def test_prediction_points_within_the_beam(scenario: Scenario) -> None:
+    off = {
+        kind: np.concatenate([
+            angles_deg(seen.towards[kind], seen.towards[Positions.PERFECT])
+            for seen in scenario.instants
+        ])
+        for kind in Positions
+    }  # fmt: skip
+    assert off[Positions.PREDICTED].max() < 1.0
+    assert np.median(off[Positions.PREDICTED]) < 0.1 * np.median(off[Positions.HELD])
+
+
+def test_what_the_array_cannot_tell_apart_is_left_out(scenario: Scenario) -> None:
+    """A line array sees its front and its back alike: seldom three decibels are lost for it."""
+    array = assembly.array(Settings())
+    for seen in scenario.instants:
+        solved = solve(steering_matrix(array, seen.towards[Positions.PERFECT]))
+        assert solved is not None and solved.loss_factors.max() <= 10**0.3
+    assert 0.02 < scenario.unresolved_share < 0.4
+    with pytest.raises(ValueError, match="can hardly ever tell the circling UAVs apart"):
+        few = Settings().override(array={"elements": 2})
+        circles(few, Reports(), 5, np.random.default_rng(1))

@@ -1,0 +1,339 @@
+"""The published experiments: golden values, bounds, claims held to their numbers, and the page."""
+
+import json
+import math
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import common  # the oracle: tests alone may import it
+
+from companion.studies.paper import circles as scenario
+from companion.studies.paper import claims, link, mavlink
+from companion.studies.paper.circles import Flight, PaperScenario
+from companion.studies.paper.claims import Claim, Verdict
+from companion.tracking.design import closed_form
+
+LEVELS = ("L = 0.39", "L = 0.60", "L = 0.76")
+
+
+@pytest.fixture(scope="module")
+def made(studied: Callable[..., Path]) -> Path:
+    """Where ``companion study paper`` has written everything."""
+    return studied("paper")
+
+
+@pytest.fixture(scope="module")
+def answer(made: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((made / "paper.json").read_text("utf-8"))
+    return found
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    return scenario.fly(PaperScenario())
+
+
+# --- golden values (MATH: 8), from the answer ---------------------------------------------------
+
+
+def test_the_limits_are_the_golden_ones(answer: dict[str, Any]) -> None:
+    found = [answer["limits"][mu]["limit_s"] for mu in ("0.05", "0.25", "1")]
+    assert found == pytest.approx([0.8873, 1.0000, 1.2906], abs=5e-5)
+
+
+def test_the_input_and_the_steady_errors_are_the_golden_ones(answer: dict[str, Any]) -> None:
+    levels = answer["levels"]
+    assert answer["scenario"]["input_sup_mps"] == pytest.approx(428.66, abs=0.01)
+    assert levels["L = 0.39"]["angle_error_deg"] == pytest.approx(6.24, abs=0.01)
+    assert levels["optimum"]["gain"] == pytest.approx(0.30)
+    assert levels["optimum"]["angle_error_deg"] < 1e-9
+
+
+def test_the_beam_is_the_golden_one(answer: dict[str, Any]) -> None:
+    small, large = answer["array"]["sizes"]["64"], answer["array"]["sizes"]["128"]
+    assert small["half_power_deg"] == pytest.approx(0.79, abs=0.005)
+    assert large["half_power_deg"] == pytest.approx(0.40, abs=0.005)
+    assert small["first_null_deg"] == pytest.approx(1.79, abs=0.005)
+    losses = [small["phase_step_loss_db"][bits] for bits in "2345"]
+    assert losses == pytest.approx([0.89, 0.22, 0.054, 0.014], rel=0.05)
+
+
+def test_the_solver_finds_what_the_closed_form_says(answer: dict[str, Any]) -> None:
+    for row in answer["designs"]:
+        assert row["feasible_gamma_s"] ** 2 <= row["mu_max_s2"] * (1 + 1e-6)
+        assert row["feasible_margin"] >= -1e-6
+        assert row["closed_form_gamma_s"] == 0 and not row["optimal_attained"]
+        assert row["optimal_gamma_s"] < 1e-3
+        assert row["optimal_gain"] == pytest.approx(row["closed_form_gain"], abs=1e-3)
+        assert row["right_sign_eigenvalue"] < 1e-6
+        assert row["printed_sign_eigenvalue"] > 1
+
+
+# --- the scenario and its bounds ----------------------------------------------------------------
+
+
+def test_the_flight_is_the_one_written_out_step_by_step(flight: Flight) -> None:
+    """By complex numbers and a loop: north + j east."""
+    for uav, radius in enumerate((100, 150, 200, 250)):
+        phase = uav * math.pi / 2
+        place = radius * complex(math.sin(phase), math.cos(phase))
+        for k in range(len(flight.input_mps)):
+            turn = 0.5 * 0.15 * k
+            v = radius * 0.5 * np.exp(-1j * (turn + phase))
+            d = radius * 0.1 * np.exp(-1j * (10 * turn + phase))
+            w = v + d / 0.15
+            assert flight.position_m[k, uav] == pytest.approx([place.real, place.imag])
+            assert flight.report_m[k, uav] == pytest.approx(
+                [(place + 0.5 * w).real, (place + 0.5 * w).imag]
+            )
+            place += 0.15 * w
+
+
+def test_the_other_reading_of_the_gust_is_a_velocity() -> None:
+    """|W| is then at most 1.2 times |v|, all UAVs together."""
+    flight = scenario.fly(PaperScenario(literal=False))
+    nominal = 0.5 * math.hypot(100, 150, 200, 250)
+    assert flight.largest_input_mps == pytest.approx(1.2 * nominal)
+
+
+@pytest.mark.parametrize("gain", [0.3, 0.39, 0.6, 0.76, 0.9])
+def test_the_estimate_is_what_the_matrices_give(flight: Flight, gain: float) -> None:
+    """The stacked observer, X^ = Q X^ + L Y, as 8 x 8 matrices."""
+    tracked = scenario.track(flight, gain)
+    q, big_l = (1 - gain) * np.eye(8), gain * np.eye(8)
+    estimate = flight.position_m[0].ravel()
+    for k, report in enumerate(flight.report_m):
+        after = q @ estimate + big_l @ report.ravel()
+        assert tracked.estimate_m[k + 1].ravel() == pytest.approx(after)
+        assert tracked.input_b0_mps[k].ravel() == pytest.approx((after - estimate) / 0.15)
+        estimate = after
+
+
+@pytest.mark.parametrize("gain", [0.2, 0.3, 0.39, 0.6, 0.76, 0.95])
+def test_every_error_stays_below_the_running_bound_and_that_below_the_others(
+    flight: Flight, gain: float
+) -> None:
+    tracked = scenario.track(flight, gain)
+    errors = scenario.stacked(tracked.estimate_m - flight.position_m)
+    running = scenario.running_bounds(flight, gain)
+    peak = float(closed_form.peak_gain(0.15, 0.5, gain)) * flight.largest_input_mps
+    gamma = math.sqrt(scenario.gain_mu(0.15, 0.5, 0.5, gain)) * flight.largest_input_mps
+    assert (errors <= running + 1e-9).all()
+    assert running.max() <= peak + 1e-9 <= gamma + 2e-9
+
+
+def test_the_running_bound_is_not_slack(answer: dict[str, Any]) -> None:
+    """In the scenario the error comes within a tenth of it at L = 0.76."""
+    levels = answer["levels"]["L = 0.76"]
+    assert 0.9 * levels["peak_bound_m"] < levels["error_sup_m"] <= levels["peak_bound_m"]
+
+
+@given(st.floats(0.05, 1.5), st.floats(-0.3, 0.8), st.floats(0.05, 0.95), st.floats(0.05, 1.5))
+def test_the_least_mu_of_a_gain_is_certified_and_less_is_not(
+    dt_s: float, feedthrough_s: float, alpha: float, gain: float
+) -> None:
+    """Against the eigenvalues of the LMIs."""
+    mu = scenario.gain_mu(dt_s, feedthrough_s, alpha, gain)
+    if not 1e-3 < mu < 1e3:
+        return
+    arguments = (dt_s, feedthrough_s, alpha, gain)
+    assert closed_form.lmi_margin(*arguments, mu, 1 / mu) >= -1e-9
+    assert closed_form.lmi_margin(*arguments, 0.99 * mu, 1 / (0.99 * mu)) < 0
+    assert mu >= closed_form.mu_star(dt_s, feedthrough_s, alpha) * (1 - 1e-9)
+
+
+@pytest.mark.parametrize("name", LEVELS)
+def test_the_adversary_reaches_the_exact_peak(answer: dict[str, Any], name: str) -> None:
+    row = answer["unknown_input"][name]
+    assert row["b0_adversary"] == pytest.approx(row["b0_peak"], rel=1e-9)
+    assert row["b0_in_scenario"] <= row["b0_peak"] <= row["safe_2_gamma_over_dt"]
+    assert row["bd_in_scenario"] <= row["bd_peak"] <= row["bd_bound"]
+
+
+def test_a_scheduled_gain_keeps_its_bound_on_irregular_intervals() -> None:
+    found = scenario.irregular(PaperScenario(), 0.39, 1.2, 5000, np.random.default_rng(7))
+    assert found.scheduled_s <= found.gamma_s < found.fixed_s
+
+
+def test_angle_errors_do_not_know_where_north_is(flight: Flight) -> None:
+    turned = np.array([[0.0, 1.0], [-1.0, 0.0]])
+    off = np.degrees(scenario.angle_errors_rad(flight, flight.position_m @ turned))
+    assert off == pytest.approx(np.full_like(off, 90.0))
+
+
+# --- the link and the service -------------------------------------------------------------------
+
+
+def test_a_beam_that_points_right_is_worth_shannon(flight: Flight) -> None:
+    """One UAV alone: 64 elements, 4 antennas, 30 dBm, free space, by hand."""
+    place = np.array([[[120.0, 40.0]]])
+    array = link.line(64)
+    heard = link.responses(array, place, place)
+    found = link.efficiency(array, heard, place)
+    loss = (299_792_458 / 30e9 / (4 * math.pi * math.hypot(120, 40))) ** 2
+    noise_w = 1.380649e-23 * 290 * 50e6 * 10**0.7
+    assert found == pytest.approx(math.log2(1 + 64 * 4 * loss / noise_w))
+    blocked = link.efficiency(array, heard, place, np.array([[25.0]]))
+    assert blocked == pytest.approx(math.log2(1 + 64 * 4 * loss / noise_w / 10**2.5))
+
+
+def test_places_between_the_steps_are_on_the_way(flight: Flight) -> None:
+    step = flight.scenario.dt_s
+    found = link.between(flight, flight.position_m, np.array([0.0, 0.5, 1.0, 1.5]) * step)
+    first, second, third = flight.position_m[:3]
+    wanted = [first, (first + second) / 2, second, (second + third) / 2]
+    assert found == pytest.approx(np.array(wanted))
+
+
+def test_the_blockages_are_the_same_for_every_scheme(answer: dict[str, Any]) -> None:
+    """Nothing but the optimum is above it, and more blockages are never better."""
+    means = answer["blockage"]["mean_bit_s_hz"]
+    for found in means.values():
+        assert found == sorted(found, reverse=True)
+        assert all(rate <= best for rate, best in zip(found, means["optimum"], strict=True))
+
+
+def test_the_same_seed_gives_the_same_rates(flight: Flight) -> None:
+    short = Flight(
+        flight.scenario, flight.position_m[:12], flight.input_mps[:11], flight.report_m[:11]
+    )
+    rates = np.array([0.0, 60.0])
+
+    def rates_of(seed: int) -> dict[str, list[float]]:
+        rng = np.random.default_rng(seed)
+        aimed = {"right": short.position_m}
+        found = link.under_blockage(short, aimed, rates, 1, rng, lambda _: None)
+        return {name: means.tolist() for name, means in found.schemes.items()}
+
+    assert rates_of(5) == rates_of(5) != rates_of(6)
+
+
+def test_the_service_agrees_with_the_library(answer: dict[str, Any]) -> None:
+    """To the rounding of the message: 1e-7 degree is 11 mm, a velocity is off by 7 mm/s at most."""
+    found = answer["mavlink"]
+    assert found["reports"] == 4 * 170 and found["rejections"] == 0
+    assert 0 < found["estimate_m"] < 0.02
+    assert found["direction_deg"] < 0.01
+    assert found["settled_m"] < 0.02
+
+
+def test_the_frames_are_what_pymavlink_reads(flight: Flight) -> None:
+    parser = common.MAVLink(None)
+    data = b"".join(mavlink.frames(flight)[:3])
+    messages = parser.parse_buffer(data)
+    assert [message.get_type() for message in messages] == ["GLOBAL_POSITION_INT"] * 12
+    assert [message.get_srcSystem() for message in messages] == [1, 2, 3, 4] * 3
+    assert [message.time_boot_ms for message in messages[::4]] == [10_000, 10_150, 10_300]
+    north, east = flight.input_mps[1, 2] * 100
+    assert (messages[6].vx, messages[6].vy) == (round(north), round(east))
+    metres = (messages[6].lat * 1e-7 - mavlink.ORIGIN[0]) * 111_178  # at 47.4 degrees
+    assert metres == pytest.approx(flight.report_m[1, 2, 0], abs=0.5)
+
+
+# --- claims -------------------------------------------------------------------------------------
+
+
+def test_every_claim_is_backed_by_its_number(answer: dict[str, Any]) -> None:
+    rows = answer["claims"]
+    assert len(rows) == len(claims.CLAIMS) >= 15
+    for row, claim in zip(rows, claims.CLAIMS, strict=True):
+        value = claims.lookup(answer, row["key"])
+        assert row["value"] == value
+        assert row["found"] == claim.found.format(value=value) != claim.found
+        if row["verdict"] != Verdict.HOLDS:
+            assert row["correction"]
+
+
+@pytest.mark.parametrize(
+    ("part", "verdict"),
+    [
+        ("last diagonal block +P", Verdict.CORRECTED),
+        ("ΔT = 0.89", Verdict.HOLDS),
+        ("3γ sup‖W‖ bounds", Verdict.FAILS),
+        ("arccos", Verdict.CORRECTED),
+        ("N × 2N", Verdict.CORRECTED),
+        ("exceed echo probing", Verdict.HOLDS),
+        ("paper's own gain", Verdict.FAILS),
+    ],
+)
+def test_the_verdicts(answer: dict[str, Any], part: str, verdict: Verdict) -> None:
+    (row,) = (row for row in answer["claims"] if part in row["statement"])
+    assert row["verdict"] == verdict
+
+
+def test_another_number_is_another_verdict(answer: dict[str, Any]) -> None:
+    """Nothing is typed in: a limit that differs from the paper's fails the claim."""
+    answer = json.loads(json.dumps(answer))
+    answer["limits"]["0.25"]["off_s"] = 0.01
+    answer["blockage"]["gain_over_echo_bit_s_hz"]["optimum"] = -0.1
+    changed = {row["key"]: row["verdict"] for row in claims.judge(answer)}
+    assert changed["limits/0.25/off_s"] == Verdict.FAILS
+    assert changed["blockage/gain_over_echo_bit_s_hz/optimum"] == Verdict.FAILS
+
+
+@pytest.mark.parametrize("key", ["limits", "limits/2", "designs/99/alpha", "command", "command/x"])
+def test_a_key_without_a_number_is_refused(answer: dict[str, Any], key: str) -> None:
+    with pytest.raises(KeyError):
+        claims.lookup(answer, key)
+
+
+def test_a_claim_is_a_question(answer: dict[str, Any]) -> None:
+    assert all(isinstance(claim, Claim) and claim.statement for claim in claims.CLAIMS)
+    assert len({claim.statement for claim in claims.CLAIMS}) == len(claims.CLAIMS)
+
+
+# --- what is written ----------------------------------------------------------------------------
+
+
+class Page(HTMLParser):
+    """Addresses that a page asks for, its scripts, figures and text."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.addresses: list[str] = []
+        self.tags: list[str] = []
+        self.words: list[str] = []
+        self.feed(path.read_text("utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href")]
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+
+def test_the_page_needs_nothing_else_and_tells_every_claim(
+    made: Path, answer: dict[str, Any]
+) -> None:
+    page = Page(made / "paper.html")
+    words = " ".join(page.words)
+    assert "script" not in page.tags
+    assert all(address.startswith("data:") for address in page.addresses)
+    assert page.tags.count("figure") == len(list(made.glob("*.png"))) == 11
+    for row in answer["claims"]:
+        assert row["statement"] in words and row["found"] in words and row["key"] in words
+    assert "companion study paper" in words
+    assert all(version in words for version in answer["versions"].values())
+
+
+def test_figures_are_whole_and_in_both_formats(made: Path) -> None:
+    names = {path.stem for path in made.glob("*.svg")}
+    assert names == {path.stem for path in made.glob("*.png")}
+    for path in made.glob("*.svg"):
+        assert ElementTree.parse(path).getroot().tag.endswith("svg")
+        assert (made / f"{path.stem}.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_the_json_holds_only_numbers_that_json_has(made: Path) -> None:
+    def refuse(text: str) -> float:
+        raise AssertionError(f"{text} is no JSON")
+
+    json.loads((made / "paper.json").read_text("utf-8"), parse_constant=refuse)

@@ -1,0 +1,258 @@
+"""Rivals of the observer: analytic cases, AntennaTracker's habits, and Kalman against least
+squares over the whole flight and against the noise integral."""
+
+import itertools
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+from scipy.integrate import quad_vec
+from scipy.linalg import expm
+
+from companion.studies.prediction import baselines
+from companion.studies.prediction.baselines import (
+    DeadReckoning,
+    DeadReckoningOnArrival,
+    Hold,
+    Kalman,
+    Observed,
+    Predicted,
+    Predictor,
+    Tuning,
+)
+from companion.values import FloatArray
+
+S = 1_000_000_000
+TUNING = Tuning(0.7, 0.4, 0.15, 20.0, 4.0)
+ALL: list[Callable[[], Predictor]] = [
+    Hold,
+    DeadReckoningOnArrival,
+    DeadReckoning,
+    lambda: Kalman(2, TUNING),
+    lambda: Kalman(3, TUNING),
+]
+P0, V0 = np.array([10.0, -20.0, -30.0]), np.array([3.0, -4.0, 0.5])
+
+
+def observed(
+    sent_s: float,
+    position: ArrayLike,
+    velocity: ArrayLike | None = None,
+    late_s: float = 0.0,
+    offset_s: float = 0.0,
+) -> Observed:
+    """A report, ``late_s`` on its way, the sender's timeline ``offset_s`` behind the node's."""
+    return Observed(
+        round((sent_s + late_s) * S),
+        round(sent_s * S),
+        round((sent_s - offset_s) * S),
+        np.array(position, dtype=float),
+        None if velocity is None else np.array(velocity, dtype=float),
+    )
+
+
+def straight(sent_s: float, late_s: float = 0.0) -> Observed:
+    """A report of a straight flight."""
+    return observed(sent_s, P0 + V0 * sent_s, V0, late_s)
+
+
+def ask(predictor: Predictor, now_s: float, lead_s: float = 0.0) -> Predicted:
+    """An answer that must be there."""
+    predicted = predictor.predict(round(now_s * S), round((now_s + lead_s) * S))
+    assert predicted is not None
+    return predicted
+
+
+def wandering(n: int, seed: int = 5, late_s: float = 0.0) -> list[Observed]:
+    """Irregular reports of nothing in particular; every third is without velocity."""
+    rng = np.random.default_rng(seed)
+    times = np.cumsum(rng.uniform(0.05, 1.5, n))
+    return [
+        observed(t, rng.normal(0, 5, 3), None if k % 3 == 1 else rng.normal(0, 2, 3), late_s)
+        for k, t in enumerate(times)
+    ]
+
+
+@pytest.mark.parametrize("make", ALL)
+def test_nothing_is_known_before_the_first_report(make: Callable[[], Predictor]) -> None:
+    assert make().predict(0, S) is None
+
+
+@pytest.mark.parametrize("make", ALL[1:])
+@pytest.mark.parametrize("lead_s", [0.0, 1.0])
+def test_a_straight_flight_without_delay_is_exact(
+    make: Callable[[], Predictor], lead_s: float
+) -> None:
+    predictor = make()
+    for sent_s in (0.0, 0.3, 1.4, 1.5, 4.0):
+        predictor.report(straight(sent_s))
+    # A filter forgets its vague start as its measurements' weight allows.
+    exact = 1e-9 if not isinstance(predictor, Kalman) else 0.02
+    predicted = ask(predictor, 4.5, lead_s)
+    assert predicted.position_ned_m == pytest.approx(P0 + V0 * (4.5 + lead_s), abs=exact)
+    assert predicted.velocity_ned_mps == pytest.approx(V0, abs=exact)
+    assert predicted.bound_m is None
+
+
+def test_hold_holds_the_last_to_arrive() -> None:
+    predictor = Hold()
+    predictor.report(straight(2.0, late_s=0.1))
+    predictor.report(straight(1.0, late_s=1.2))
+    assert ask(predictor, 9.0, 1.0).position_ned_m == pytest.approx(P0 + V0)
+
+
+def test_arrival_time_misses_by_the_latency() -> None:
+    """The whole difference: speed times latency."""
+    by_arrival, by_sender = DeadReckoningOnArrival(), DeadReckoning()
+    for predictor in (by_arrival, by_sender):
+        predictor.report(straight(1.0, late_s=0.6))
+    truly = P0 + V0 * 2.3
+    assert ask(by_arrival, 2.0, 0.3).position_ned_m == pytest.approx(truly - V0 * 0.6)
+    assert ask(by_sender, 2.0, 0.3).position_ned_m == pytest.approx(truly)
+
+
+def test_an_overtaken_report_misleads_only_who_goes_by_arrival() -> None:
+    by_arrival, by_sender = DeadReckoningOnArrival(), DeadReckoning()
+    for predictor in (by_arrival, by_sender):
+        predictor.report(straight(2.0, late_s=0.1))
+        predictor.report(observed(1.0, P0, -V0, late_s=1.5))
+    assert ask(by_sender, 2.5).position_ned_m == pytest.approx(P0 + V0 * 2.5)
+    assert ask(by_arrival, 2.5, 1.0).position_ned_m == pytest.approx(P0 - V0)
+
+
+def test_the_tracker_gives_up_after_five_seconds() -> None:
+    predictor = DeadReckoningOnArrival()
+    predictor.report(straight(0.0))
+    assert ask(predictor, 4.9).position_ned_m == pytest.approx(P0 + V0 * 4.9)
+    for now_s in (5.0, 8.0, 100.0):
+        assert ask(predictor, now_s).position_ned_m == pytest.approx(P0 + V0 * 5.0)
+    predictor.report(straight(200.0))
+    assert ask(predictor, 201.0).position_ned_m == pytest.approx(P0 + V0 * 201.0)
+
+
+@pytest.mark.parametrize("make", ALL[2:])
+def test_a_clock_set_right_moves_what_came_before(make: Callable[[], Predictor]) -> None:
+    """The first reports were put 0.5 s too late; once that is known, it holds for all of them."""
+    predictor = make()
+    for sent_s in (1.0, 1.5, 2.0, 2.5, 3.0):
+        placed_s, right = sent_s + 0.5, P0 + V0 * sent_s
+        predictor.report(observed(placed_s, right, V0, offset_s=1000.5))
+    assert ask(predictor, 3.5).position_ned_m == pytest.approx(P0 + V0 * 3.0, abs=0.1)
+    predictor.report(
+        observed(2.4, P0 + V0 * 2.4, V0, offset_s=1000.0)
+    )  # overtaken, but sooner here
+    assert ask(predictor, 3.5).position_ned_m == pytest.approx(P0 + V0 * 3.5, abs=0.1)
+
+
+@pytest.mark.parametrize("make", ALL[1:3])
+def test_without_a_velocity_the_position_is_held(make: Callable[[], Predictor]) -> None:
+    predictor = make()
+    predictor.report(observed(0.0, P0))
+    assert ask(predictor, 3.0, 1.0).position_ned_m == pytest.approx(P0)
+    assert ask(predictor, 3.0).velocity_ned_mps is None
+
+
+# --- Kalman -------------------------------------------------------------------------------------
+
+
+def generator(states: int) -> FloatArray:
+    """A of x' = A x + noise in the last state: ones above the diagonal."""
+    return np.diag(np.ones(states - 1), 1)
+
+
+@pytest.mark.parametrize("states", [2, 3])
+def test_model_is_the_integral_of_the_noise(states: int) -> None:
+    interval_s, density = 0.7, 1.9
+    into = np.zeros((states, 1))
+    into[-1] = 1.0
+
+    def grown(t: float) -> FloatArray:
+        column = expm(generator(states) * t) @ into
+        return density * column @ column.T
+
+    integral, _ = quad_vec(grown, 0.0, interval_s)
+    assert baselines.process_noise(states, interval_s, density) == pytest.approx(integral)
+    moved = expm(generator(states) * interval_s)
+    assert baselines.transition(states, interval_s) == pytest.approx(moved)
+
+
+def least_squares(reports: Sequence[Observed], states: int, tuning: Tuning) -> FloatArray:
+    """The last state (n, 3) by one weighted least-squares fit of all states to everything known.
+
+    Each line says: these states, so combined, are this, give or take one standard deviation.
+    """
+    n = states
+    lines: list[FloatArray] = []
+    values: list[FloatArray] = []
+
+    def say(blocks: dict[int, FloatArray], value: FloatArray, covariance: FloatArray) -> None:
+        weigh = np.linalg.inv(np.linalg.cholesky(covariance))
+        line = np.zeros((len(value), n * len(reports)))
+        for k, block in blocks.items():
+            line[:, n * k : n * (k + 1)] = block
+        lines.append(weigh @ line)
+        values.append(weigh @ value)
+
+    vague = [tuning.start_velocity_mps, tuning.start_acceleration_mps2][: n - 1]
+    say({0: np.eye(n)[1:]}, np.zeros((n - 1, 3)), np.diag(np.square(vague)))
+    for k, report in enumerate(reports):
+        for row, measured, noise in (
+            (0, report.position_ned_m, tuning.position_noise_m),
+            (1, report.velocity_ned_mps, tuning.velocity_noise_mps),
+        ):
+            if measured is not None:
+                say({k: np.eye(n)[row : row + 1]}, measured[None], np.array([[noise**2]]))
+        if k:
+            t = (report.sent_ns - reports[k - 1].sent_ns) / S
+            moved = expm(generator(n) * t)
+            noise_there = baselines.process_noise(n, t, tuning.process_density)
+            say({k - 1: -moved, k: np.eye(n)}, np.zeros((n, 3)), noise_there)
+    fit, *_ = np.linalg.lstsq(np.vstack(lines), np.vstack(values), rcond=None)
+    return np.asarray(fit[-n:], dtype=float)
+
+
+@pytest.mark.parametrize("states", [2, 3])
+@pytest.mark.parametrize("count", [1, 2, 25])
+def test_filter_is_the_least_squares_fit(states: int, count: int) -> None:
+    reports = wandering(count)
+    predictor = Kalman(states, TUNING)
+    for report in reports:
+        predictor.report(report)
+    fit = least_squares(reports, states, TUNING)
+    newest_s, later_s = reports[-1].sent_ns / S, 0.8
+    moved = expm(generator(states) * later_s) @ fit
+    predicted = ask(predictor, newest_s, later_s)
+    assert predicted.position_ned_m == pytest.approx(moved[0], abs=1e-6)
+    assert predicted.velocity_ned_mps == pytest.approx(moved[1], abs=1e-6)
+
+
+@pytest.mark.parametrize("states", [2, 3])
+def test_order_of_arrival_does_not_matter(states: int) -> None:
+    reports = wandering(5)
+    answers = []
+    for order in itertools.permutations(reports):
+        predictor = Kalman(states, TUNING)
+        for report in order:
+            predictor.report(report)
+        answers.append(ask(predictor, 20.0).position_ned_m)
+    assert np.ptp(answers, axis=0).max() < 1e-9
+    assert np.linalg.norm(answers[0]) > 0.1
+
+
+def test_a_report_older_than_the_history_is_dropped() -> None:
+    reports = wandering(baselines.HISTORY + 20)
+    stiff = Tuning(1e-6)  # it remembers, so that beginning anew would show
+    whole, late = Kalman(2, stiff), Kalman(2, stiff)
+    for report in reports[1:]:
+        whole.report(report)
+        late.report(report)
+    late.report(reports[0])
+    assert np.array_equal(ask(late, 70.0).position_ned_m, ask(whole, 70.0).position_ned_m)
+    late.report(reports[-3])  # the same again, still within the history: it counts
+    assert not np.allclose(ask(late, 70.0).position_ned_m, ask(whole, 70.0).position_ned_m)
+
+
+def test_a_filter_has_two_or_three_states() -> None:
+    with pytest.raises(ValueError, match="2 or 3 states"):
+        Kalman(4, TUNING)

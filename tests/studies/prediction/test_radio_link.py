@@ -1,0 +1,108 @@
+"""The simulated radio: what it was asked for is what comes out, and the same again."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from companion.studies.prediction.radio_link import CLEAN, Delivery, RadioLink, deliver
+from companion.studies.truth.vehicles import Flight
+
+MakeFlight = Callable[..., Flight]
+RADIO = RadioLink("radio", 1.2, (0.6, 2.2), 0.1)
+
+
+def latencies_s(flight: Flight, delivery: Delivery) -> np.ndarray:
+    """What was added to each report, found by its position, which no other report has."""
+    row_of = {tuple(position): row for row, position in enumerate(flight.position_ned_m)}
+    rows = [row_of[tuple(each.position_ned_m)] for each in delivery.observed]
+    arrived = np.array([each.arrival_ns for each in delivery.observed])
+    return (arrived - flight.arrival_ns[rows]) * 1e-9
+
+
+def test_a_clean_link_is_the_log(straight_flight: MakeFlight) -> None:
+    flight = straight_flight()
+    delivery = deliver(flight, CLEAN, 1)
+    assert [each.arrival_ns for each in delivery.observed] == flight.arrival_ns.tolist()
+    assert (latencies_s(flight, delivery) == 0).all()
+    assert delivery.rate_hz == pytest.approx(10)
+    # A delay that is always the same cannot be seen.
+    assert delivery.latency_s == pytest.approx(0, abs=1e-9)
+
+
+def test_latency_loss_and_rate_are_as_asked(straight_flight: MakeFlight) -> None:
+    flight = straight_flight(60_000)
+    delivery = deliver(flight, RADIO, 1)
+    added_s = latencies_s(flight, delivery)
+    assert np.median(added_s) == pytest.approx(0.6, rel=0.05)
+    assert np.percentile(added_s, 95) == pytest.approx(2.2, rel=0.08)
+    assert len(delivery.observed) == pytest.approx(6000 * 1.2 * 0.9, rel=0.01)
+    assert delivery.rate_hz == 1.2
+    assert delivery.latency_s == 0.6
+    arrivals = [each.arrival_ns for each in delivery.observed]
+    assert arrivals == sorted(arrivals)
+    sent = np.array([each.sent_ns for each in delivery.observed])
+    assert 0.05 < np.mean(np.diff(sent) < 0) < 0.5  # overtaken
+
+
+def test_the_seed_decides_and_each_uav_has_its_own(straight_flight: MakeFlight) -> None:
+    def arrivals(uav: str, seed: int) -> list[int]:
+        return [e.arrival_ns for e in deliver(straight_flight(uav=uav), RADIO, seed).observed]
+
+    assert arrivals("1:1", 1) == arrivals("1:1", 1)
+    assert arrivals("1:1", 1) != arrivals("1:1", 2)
+    assert arrivals("1:1", 1) != arrivals("2:1", 1)
+
+
+@pytest.mark.parametrize("known_delay", [False, True])
+def test_the_envelope_leaves_the_constant_part(
+    straight_flight: MakeFlight, known_delay: bool
+) -> None:
+    flight = straight_flight(3000)
+    delivery = deliver(flight, RadioLink("radio", 1.2, (0.6, 2.2), 0.1, known_delay), 1)
+    made_ns = {
+        tuple(position): t_ns
+        for position, t_ns in zip(flight.position_ned_m, flight.truth.t_ns, strict=True)
+    }
+    off_s = [(e.sent_ns - made_ns[tuple(e.position_ned_m)]) * 1e-9 for e in delivery.observed]
+    off_s = off_s[100:]
+    if known_delay:
+        assert np.abs(np.array(off_s) - 0.005).max() < 1e-6  # what the log itself has
+    else:
+        assert min(off_s) > 0.03
+        assert np.median(off_s) < 0.3
+
+
+def test_the_senders_timeline_goes_on_after_a_restart(
+    straight_flight: MakeFlight,
+) -> None:
+    """Intervals are the sender's own; where its clock began anew, the node's."""
+    flight = straight_flight(600)
+    restarted = flight.boot_ms.copy()
+    restarted[300:] -= restarted[300] - 42
+    delivery = deliver(replace(flight, boot_ms=restarted), CLEAN, 1)
+    made = np.array([each.sender_ns for each in delivery.observed])
+    steps = np.diff(made) / 100_000_000
+    assert steps == pytest.approx(np.round(steps))
+    # Only the first stamps after the restart are left out: others must agree first.
+    (gap,) = steps[steps > 1.5]
+    assert gap < 8
+    sent = np.array([each.sent_ns for each in delivery.observed])
+    assert np.abs(made - sent).max() == 0
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"rate_hz": 0.0}, "a rate is a positive number"),
+        ({"rate_hz": float("nan")}, "a rate is a positive number"),
+        ({"latency_s": (2.0, 1.0)}, "MEDIAN,P95"),
+        ({"latency_s": (0.0, 1.0)}, "MEDIAN,P95"),
+        ({"loss": 1.0}, "a loss is at least 0"),
+        ({"loss": -0.1}, "a loss is at least 0"),
+    ],
+)
+def test_what_no_link_can_be(values: dict[str, float], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        RadioLink("radio", **values)  # type: ignore[arg-type]

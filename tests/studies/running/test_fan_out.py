@@ -1,0 +1,170 @@
+"""Work in parallel: real processes, and a real Dask cluster on loopback."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from companion.cli.main import main
+from companion.studies.running import fan_out
+
+MEET = """
+import pathlib, time
+here = pathlib.Path({here!r})
+(here / str(mine)).touch()
+end = time.monotonic() + 30
+while len(list(here.iterdir())) < 2 and time.monotonic() < end:
+    time.sleep(0.01)  # until the other process is there
+answer = len(list(here.iterdir()))
+"""
+
+
+def test_answers_come_in_order() -> None:
+    """The first takes by far the longest."""
+    told: list[int] = []
+    found = fan_out.on_cores(eval, ["(3 ** 2_000_000).bit_length()", "2", "3", "4"], 2, told.append)
+    assert found == [3169926, 2, 3, 4]
+    assert told == [1, 2, 3, 4]
+
+
+def test_two_at_once(tmp_path: Path) -> None:
+    """Each waits for the other: one after the other they would not meet."""
+    script, here = tmp_path / "meet.py", tmp_path / "here"
+    here.mkdir()
+    script.write_text(MEET.format(here=str(here)))
+    asked = [f"__import__('runpy').run_path({str(script)!r}, {{'mine': {n}}})" for n in (1, 2)]
+    assert fan_out.on_cores(eval, [f"{each}['answer']" for each in asked], 2, id) == [2, 2]
+
+
+def test_processes_have_one_blas_thread_and_leave_ctrl_c_to_their_parent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
+    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
+    found = fan_out.on_cores(os.getenv, fan_out.BLAS_THREADS, 2, id)
+    assert found == ["1"] * len(fan_out.BLAS_THREADS)
+    assert os.environ["OPENBLAS_NUM_THREADS"] == "7"
+    assert "MKL_NUM_THREADS" not in os.environ
+    assert fan_out.on_cores(signal.getsignal, [signal.SIGINT], 1, id) == [signal.SIG_IGN]
+
+
+def test_the_first_mistake_in_order_is_raised() -> None:
+    asked = ["__import__('time').sleep(0.5) or int('first')", "int('second')", "1"]
+    with pytest.raises(ValueError, match="'first'"):
+        fan_out.on_cores(eval, asked, 2, id)
+
+
+def test_after_a_mistake_the_rest_is_given_up(tmp_path: Path) -> None:
+    """But for what was on its way to the process already."""
+    touch = "__import__('time').sleep(0.05) or open({!r}, 'w').close()"
+    rest = [touch.format(str(tmp_path / str(n))) for n in range(20)]
+    with pytest.raises(ValueError, match="'x'"):
+        fan_out.on_cores(eval, ["int('x')", *rest], 1, id)
+    assert len(list(tmp_path.iterdir())) < 10
+
+
+@pytest.mark.full
+def test_a_mistake_in_a_process_is_one_line(cut_log: Path, tmp_path: Path) -> None:
+    asked = ["study", "prediction", str(cut_log), str(tmp_path / "missing.tlog"), "--jobs", "2"]
+    done = CliRunner().invoke(main, [*asked, "--center", "5:1", "--out", str(tmp_path)])
+    assert done.exit_code == 1
+    (line,) = done.stderr.splitlines()
+    assert "missing.tlog" in line
+
+
+# --- Dask ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    """A scheduler and two workers, each a process of its own."""
+    distributed = pytest.importorskip("distributed", reason="the extra [cluster] is not here")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
+    ) as here:
+        yield here
+
+
+@pytest.mark.full
+def test_a_cluster_gives_what_one_process_gives(
+    cluster: Any, cut_log: Path, tmp_path: Path
+) -> None:
+    asked = ["study", "prediction", str(cut_log), "--center", "5:1", "--lead", "0.5", "--json"]
+    answers = []
+    for way in (["--jobs", "1"], ["--cluster", cluster.scheduler_address]):
+        done = CliRunner().invoke(main, [*asked, *way, "--out", str(tmp_path)])
+        assert done.exit_code == 0, done.stderr
+        answers.append(json.loads(done.stdout))
+    assert answers[0] == answers[1]
+
+
+def test_a_cluster_answers_in_order_and_says_the_first_mistake(cluster: Any) -> None:
+    address, told = cluster.scheduler_address, list[int]()
+    asked = ["__import__('time').sleep(0.3) or 1", "2", "3"]
+    assert fan_out.on_cluster(eval, asked, address, told.append) == [1, 2, 3]
+    assert told == [1, 2, 3]
+    asked = ["__import__('time').sleep(0.3) or int('first')", "int('second')", "1"]
+    with pytest.raises(ValueError, match="'first'"):
+        fan_out.on_cluster(eval, asked, address, id)
+    # The cluster is another's: it is left as it was.
+    assert fan_out.on_cluster(len, ["abc"], address, id) == [3]
+    pids = fan_out.on_cluster(eval, ["__import__('os').getpid()"] * 8, address, id)
+    assert os.getpid() not in pids
+
+
+@pytest.mark.parametrize("address", ["", "nonsense", "tcp://h", "tcp://h:port", "http://h:1"])
+def test_an_address_that_is_none(address: str) -> None:
+    with pytest.raises(ValueError, match="not an address such as tcp://"):
+        fan_out.on_cluster(len, ["abc"], address, id)
+
+
+def test_a_scheduler_that_is_not_there() -> None:
+    pytest.importorskip("distributed", reason="the extra [cluster] is not here")
+    with pytest.raises(ValueError, match="no scheduler answers"):
+        fan_out.on_cluster(len, ["abc"], "tcp://127.0.0.1:9", id, 0.3)
+
+
+def test_a_scheduler_without_workers() -> None:
+    distributed = pytest.importorskip("distributed", reason="the extra [cluster] is not here")
+    with (
+        distributed.LocalCluster(n_workers=0, dashboard_address="127.0.0.1:0") as empty,
+        pytest.raises(ValueError, match="the scheduler has no workers"),
+    ):
+        fan_out.on_cluster(len, ["abc"], empty.scheduler_address, id, 0.3)
+
+
+@pytest.mark.parametrize(
+    ("package", "extra", "arguments"),
+    [
+        ("distributed", "cluster", ["prediction", "x.tlog", "--cluster", "tcp://h:1", "--out"]),
+        ("torch", "learned", ["prediction", "x.tlog", "--learned", "y.pt", "--out"]),
+        ("torch", "learned", ["train", "--out"]),
+    ],
+)
+def test_what_is_not_installed_is_said(
+    package: str, extra: str, arguments: list[str], tmp_path: Path
+) -> None:
+    words = ["study", *arguments, str(tmp_path / "out")]
+    run = f"import sys; sys.modules[{package!r}] = None; from companion.cli.main import main; "
+    run += f"main({words})"
+    done = subprocess.run([sys.executable, "-c", run], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    line = done.stderr.splitlines()[-1]
+    assert "Traceback" not in done.stderr
+    assert f"needs the package {package}: pip install 'uav-companion-beams[{extra}]'" in line
+
+
+def test_neither_is_loaded_unasked() -> None:
+    run = (
+        "import sys, companion.cli.main, companion.studies.prediction.comparison;"
+        "import companion.studies.running.fan_out;"
+        "sys.exit(bool({'torch', 'distributed', 'dask'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", run], check=False).returncode == 0

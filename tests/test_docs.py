@@ -1,0 +1,71 @@
+"""The documents are true: what they link to, name, draw and cite is there."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from support import ROOT
+
+DOCS = ROOT / "docs"
+PAGES = sorted([*DOCS.rglob("*.md"), *ROOT.glob("*.md")])
+CODE = [
+    path for room in ("companion", "sitl_replay", "tests") for path in (ROOT / room).rglob("*.py")
+]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_link_leads_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8")):
+        if "://" not in target:
+            assert (page.parent / target).exists(), target
+
+
+def test_every_file_and_folder_that_the_architecture_names_is_there() -> None:
+    """``a/b.py`` is below companion/; a bare ``b.py`` is in a folder named before it."""
+    text = (DOCS / "architecture.md").read_text(encoding="utf-8")
+    named = re.findall(r"`([\w./-]+)`", text)
+    rooms = ("companion", "sitl_replay", "web", "docs", "tests")
+    tree = {str(path.relative_to(ROOT)) for room in rooms for path in (ROOT / room).rglob("*.*")}
+    tree |= {path.name for path in ROOT.iterdir()}
+    for name in named:
+        if name.endswith((".py", ".js", ".toml")):
+            assert any(there.endswith(f"/{name}") or there == name for there in tree), name
+        elif "/" in name:
+            assert (ROOT / "companion" / name).is_dir() or (ROOT / name).exists(), name
+
+
+def test_the_picture_of_the_rooms_is_up_to_date() -> None:
+    drawing = [sys.executable, DOCS / "draw_architecture.py", "--check"]
+    done = subprocess.run(drawing, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_there_are_at_most_twelve_rooms_and_nothing_loose() -> None:
+    inside = (ROOT / "companion").iterdir()
+    there = {path.name for path in inside if path.name not in ("__pycache__", "_web")}
+    files = {name for name in there if name.endswith(".py")}
+    assert files == {"__init__.py", "__main__.py", "client.py"}
+    assert len(there - files) <= 12
+
+
+def test_every_decision_is_listed() -> None:
+    index = (DOCS / "decisions" / "README.md").read_text(encoding="utf-8")
+    pages = {path.name for path in (DOCS / "decisions").glob("[0-9]*.md")}
+    assert pages == set(re.findall(r"\(([^)]+)\)", index))
+
+
+def headings(page: str) -> set[str]:
+    """The numbers of a page's sections."""
+    text = (DOCS / page).read_text(encoding="utf-8")
+    return {found.rstrip(".") for found in re.findall(r"^#+ ([\d.]+) ", text, re.MULTILINE)}
+
+
+@pytest.mark.parametrize("page", ["math.md", "field-notes.md"])
+def test_every_section_that_is_cited_exists(page: str) -> None:
+    there, cited = headings(page), set()
+    for path in CODE:
+        text = re.sub(r"\s*\n\s*#?\s*", " ", path.read_text(encoding="utf-8"))
+        cited |= set(re.findall(rf"docs/{re.escape(page)}[ ,]+(?:section )?(\d+(?:\.\d+)?)", text))
+    assert cited <= there, cited - there

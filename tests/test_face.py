@@ -1,0 +1,61 @@
+"""The library's face: what notebooks and programs outside import, and its example as it stands."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from support import ROOT
+
+import companion
+
+
+def loaded_by(code: str) -> set[str]:
+    """The modules that a fresh interpreter has loaded after some code."""
+    run = f"{code}\nimport sys\nprint(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", run], capture_output=True, text=True, check=True)
+    return set(done.stdout.splitlines()[-1].split())
+
+
+def test_every_name_is_there_and_documented() -> None:
+    assert companion.__doc__ is not None
+    for name in companion.__all__:
+        assert getattr(companion, name) is not None
+        assert name == "__version__" or f"``{name}" in companion.__doc__
+    with pytest.raises(AttributeError, match="no attribute 'Beams'"):
+        _ = companion.Beams
+
+
+def test_the_type_checker_and_the_loader_mean_the_same_things() -> None:
+    """What stands under TYPE_CHECKING is what a name gives when it is asked for."""
+    tree = ast.parse(Path(companion.__file__).read_text(encoding="utf-8"))
+    under = next(node for node in tree.body if isinstance(node, ast.If))
+    found = {
+        name.name: node.module
+        for node in under.body
+        if isinstance(node, ast.ImportFrom)
+        for name in node.names
+    }
+    assert set(found) == set(companion.__all__) - {"__version__"}
+    for name, module in found.items():
+        assert getattr(companion, name) is getattr(__import__(module, fromlist=[name]), name)
+
+
+def test_importing_it_loads_nothing_of_weight() -> None:
+    bare = loaded_by("pass")
+    loaded = loaded_by("import companion")
+    assert {name for name in loaded - bare if name.startswith("companion")} == {"companion"}
+    assert not (loaded - bare) & {"numpy", "scipy", "pydantic", "pymavlink", "asyncio", "typing"}
+
+
+def test_the_example_runs(cut_log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert companion.__doc__ is not None
+    example = companion.__doc__.split("::\n\n")[1].split("\n\n``Settings``")[0]
+    lines = [line.removeprefix("    ") for line in example.splitlines()]
+    code = "\n".join(lines).replace('"flight.tlog"', repr(str(cut_log)))
+    exec(compile(code, "the example", "exec"), {})
+    said = capsys.readouterr().out.splitlines()
+    assert {line.split()[0] for line in said[:-1]} >= {"1:1", "2:1", "3:1", "4:1"}
+    assert said[-1].endswith("(64, 4)")
+    assert (ROOT / "companion/__init__.py").read_text("utf-8").count("from companion import") == 1

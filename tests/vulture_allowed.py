@@ -1,0 +1,20 @@
+"""What `vulture` takes for dead code and is not: each name with who uses it.
+
+It is read by `make check` alone, and is never imported.
+"""
+
+# ruff: noqa: B018, F821
+served.should_exit  # uvicorn's server looks at it
+made.redirect_slashes  # Starlette's router looks at it
+app.openapi  # FastAPI asks for the document by it
+message.position_covariance_type  # a field of protobuf's
+field.type_name, field.proto3_optional, field.oneof_index  # fields of a protobuf descriptor
+Severity.publish_time_ns  # the layout of a record of MCAP
+Device.RX, Normalisation.ANTENNA, Policy.DROP  # members chosen by their value in the settings
+sample.codebook_best  # written to the study's JSON by its fields
+found.rejections  # the same
+presence.system_status, presence.armed  # what a heartbeat says, for who looks at `senders.presence`
+status.of_s  # written to the API by its fields
+clock.timesync_refused, clock.gnss_refused  # why evidence was not used, for who debugs a clock
+one_uav, streamed, healthz, readyz, listing, download, list_scenarios, prediction  # by decorators
+exception  # the name of an argument of `__exit__`

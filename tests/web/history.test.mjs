@@ -1,0 +1,83 @@
+// What the page keeps to look back at: five minutes at most, bounded in size, found by its time.
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+import { load } from "./browser.mjs";
+import { uav } from "./service.mjs";
+
+const { History, KEEP_MS } = await load("history.js");
+
+function historyAt(...times) {
+  const history = new History();
+  for (const at of times) history.add({ at, stamp: `t${at}`, uavs: [uav("1:1")] });
+  return history;
+}
+
+const timesOf = (moments) => moments.map(({ at }) => at);
+
+test("a moment is kept for five minutes", () => {
+  assert.equal(KEEP_MS, 5 * 60 * 1000);
+  assert.deepEqual(timesOf(historyAt(0, 1000, KEEP_MS).moments), [0, 1000, KEEP_MS]);
+  assert.deepEqual(timesOf(historyAt(0, 1000, KEEP_MS + 1).moments), [1000, KEEP_MS + 1]);
+  assert.deepEqual(timesOf(historyAt(0, 5 * KEEP_MS).moments), [5 * KEEP_MS]);
+});
+
+test("with many UAVs it reaches back less far, but always holds the newest", () => {
+  const history = new History();
+  const many = Array.from({ length: 10_000 }, (_, i) => uav(`${i}:1`));
+  for (const at of [1, 2, 3]) history.add({ at, uavs: many });
+  assert.deepEqual(timesOf(history.moments), [2, 3]);
+  history.add({ at: 4, uavs: [...many, ...many, ...many] });
+  assert.deepEqual(timesOf(history.moments), [4]);
+  history.add({ at: 5, uavs: [] });
+  history.add({ at: 6, uavs: many });
+  assert.deepEqual(timesOf(history.moments), [5, 6]);
+});
+
+test("the moment of a time is the newest that is not after it, or else the oldest", () => {
+  const history = historyAt(100, 200, 300);
+  const found = (at) => history.at(at).at;
+  assert.deepEqual([0, 100, 199, 200, 299, 300, 999].map(found),
+    [100, 100, 100, 200, 200, 300, 300]);
+  assert.equal(history.newest.at, 300);
+});
+
+test("while it is empty there is no moment", () => {
+  const history = new History();
+  assert.deepEqual([history.newest, history.at(5), history.stepFrom({ at: 5 }, -1)],
+    [null, null, null]);
+  assert.deepEqual(history.between(0, 10), []);
+});
+
+test("steps go from one moment to the next, and stop at the ends", () => {
+  const history = historyAt(100, 200, 300);
+  const [oldest, middle, newest] = history.moments;
+  assert.equal(history.stepFrom(middle, -1), oldest);
+  assert.equal(history.stepFrom(middle, 1), newest);
+  assert.equal(history.stepFrom(newest, 1), newest);
+  assert.equal(history.stepFrom(oldest, -1), oldest);
+});
+
+test("from a moment that was dropped steps go on from the oldest", () => {
+  const history = historyAt(100, 200, 300);
+  assert.equal(history.stepFrom({ at: 5 }, 1).at, 100);
+  assert.equal(history.stepFrom({ at: 5 }, -1).at, 100);
+});
+
+test("between two times are those after the first, up to the second", () => {
+  const history = historyAt(100, 200, 300);
+  assert.deepEqual(timesOf(history.between(100, 300)), [200, 300]);
+  assert.deepEqual(timesOf(history.between(99, 299)), [100, 200]);
+});
+
+test("a moment knows its UAVs by their ids, without what the page never shows", () => {
+  const history = new History();
+  history.add({ at: 1, uavs: [uav("1:1", { rejected: { frozen: 1 } }), uav("2:1")], beams: "b" });
+  const { byId, uavs, beams } = history.newest;
+  assert.deepEqual([...byId.keys()], ["1:1", "2:1"]);
+  assert.equal(byId.get("2:1"), uavs[1]);
+  assert.equal(beams, "b");
+  for (const name of ["rejected", "recent_rejections", "clock"]) assert.ok(!(name in uavs[0]));
+  assert.ok("fix" in uavs[0] && "velocity_ned_mps" in uavs[0]);
+});

@@ -1,0 +1,99 @@
+// The names beside the symbols of the plan view: whose they are, what they say, and that they
+// cover neither one another nor a symbol.
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+import { near } from "./near.mjs";
+import { CENTRE, circles, openPlan } from "./plan_picture.mjs";
+import { uav } from "./service.mjs";
+
+const NBSP = "\u00a0";
+
+const show = async (uavs, scene = {}) => (await openPlan()).show({ uavs, ...scene });
+
+test("a UAV has its name beside it, and below that how high above the carrier it is", async () => {
+  const picture = await show([uav("1:1", { down_m: -50 })]);
+  const [symbol] = circles(picture, 6);
+  const [name, height] = [picture.text("1:1"), picture.text(`↑50.0${NBSP}m`)];
+  assert.ok(name.x > symbol.x && name.x < symbol.x + 30);
+  near([name.y, height.y], [symbol.y - 7.5, symbol.y + 8.5]);
+  near(height.x, name.x);
+});
+
+test("one that is below the carrier has an arrow down", async () => {
+  (await show([uav("1:1", { down_m: 30 })])).text(`↓30.0${NBSP}m`);
+  (await show([uav("1:1", { down_m: 0 })])).text(`↑0.0${NBSP}m`);
+});
+
+test("one that is not live says what it is", async () => {
+  (await show([uav("1:1", { state: "coasting" })])).text(`↑50.0${NBSP}m coasting`);
+  (await show([uav("1:1", { state: "lost", down_m: null })])).text("lost");
+});
+
+test("one outside the picture says how far away it is", async () => {
+  const view = await openPlan();
+  view.plan.zoom(20);
+  const picture = view.show({ uavs: [uav("1:1", { north_m: 300, east_m: -400, down_m: -9 })] });
+  picture.text("1:1");
+  picture.text(`500${NBSP}m away`);
+});
+
+/** Boxes of the names, from the top of the letters to their foot. */
+const boxesOf = (picture, names) => names.map((text) => {
+  const { x, y, font } = picture.text(text);
+  const size = Number(/([\d.]+)px/.exec(font)[1]);
+  return { text, left: x, right: x + (text.length * size) / 2, top: y - size / 2,
+    bottom: y + size / 2 };
+});
+
+const overlap = (a, b) =>
+  a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom;
+
+test("names of UAVs close together cover neither each other nor a symbol", async () => {
+  const uavs = [0, 1, 2, 3, 4].map((i) => uav(`${i}:1`, { north_m: 100, east_m: 22 * (i - 2) }));
+  const picture = await show(uavs);
+  const boxes = boxesOf(picture, uavs.map(({ id }) => id));
+  const symbols = circles(picture, 6).map(({ x, y }) =>
+    ({ left: x - 6, right: x + 6, top: y - 6, bottom: y + 6 }));
+  boxes.forEach((box, i) => {
+    for (const other of [...boxes.slice(i + 1), ...symbols]) {
+      assert.ok(!overlap(box, other), `${box.text} covers ${other.text ?? "a symbol"}`);
+    }
+  });
+});
+
+test("a name stays in the picture", async () => {
+  const view = await openPlan();
+  view.show({ uavs: [uav("1:1", { north_m: 0, east_m: 140 })] });
+  for (const uavs of [[uav("9999:100", { north_m: 0, east_m: 140 })],
+    [uav("9999:100", { north_m: 140, east_m: 0 })]]) {
+    const [box] = boxesOf(view.show({ uavs }), ["9999:100"]);
+    assert.ok(box.left > 0 && box.right < 400 && box.top > 0 && box.bottom < 400);
+  }
+});
+
+test("a name keeps away from the carrier", async () => {
+  const picture = await show([
+    uav("1:1", { north_m: 0, east_m: -24 }), uav("2:1", { north_m: 140 }),
+  ]);
+  const [box] = boxesOf(picture, ["1:1"]);
+  const carrier = { left: 190, right: 210, top: 190, bottom: 210 };
+  assert.ok(!overlap(box, carrier));
+  assert.ok(Math.abs(box.left - CENTRE.x) < 100);
+});
+
+/** So many UAVs on one spot, where there is room for few names. */
+const crowd = (number) => Array.from({ length: number }, (_, i) => uav(`${i + 1}:1`));
+
+test("of a few UAVs on one spot every name is written", async () => {
+  const picture = await show(crowd(8));
+  assert.equal(picture.texts.filter((text) => text.endsWith(":1")).length, 8);
+});
+
+test("in a crowd names without room are left away, but never that of the chosen one", async () => {
+  const picture = await show(crowd(30), { selected: "30:1" });
+  const names = picture.texts.filter((text) => text.endsWith(":1"));
+  assert.ok(names.length < 12, `${names.length} names`);
+  assert.equal(names[0], "30:1"); // it had the first choice of place
+});

@@ -1,0 +1,158 @@
+// The whole page while answers come, come late, stand still or stay away: what is no longer true
+// must never look live, and once it is true again must not look dead.
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+import { readPage } from "./browser.mjs";
+import { uav } from "./service.mjs";
+import { BEAT_MS, openPage } from "./whole_page.mjs";
+
+const FEEDS = ["beams", "events", "links", "pattern", "readyz", "status", "uavs", "weights"];
+
+test("while the service answers, nothing is marked and nothing is in the way", async () => {
+  const page = await openPage();
+  for (let i = 0; i < 40; i += 1) {
+    assert.deepEqual([page.marked("late"), page.marked("lost")], [[], []]);
+    assert.ok(page.element("banner").hidden);
+    await page.time.advance(230);
+  }
+  assert.equal(page.text("connection"), "connected");
+  assert.equal(page.document.title, "2 UAVs · companion");
+  assert.equal(page.element("plan").getAttribute("aria-label"), "Plan view: 2 UAVs, 2 beams");
+  assert.ok(!(await page.drawn()).texts.some((text) => text.startsWith("NOT LIVE")));
+});
+
+test("answers that are late make what stands on them look late", async () => {
+  const page = await openPage();
+  page.service.mode = "silent";
+  await page.time.advance(1700);
+  assert.deepEqual(page.marked("late"), []);
+  await page.time.advance(900);
+  assert.deepEqual(page.marked("late"), ["beams", "pattern", "uavs"]);
+  assert.deepEqual(page.marked("lost"), []);
+  assert.equal(page.text("connection"), "answers late");
+});
+
+for (const mode of ["silent", "gone"]) {
+  test(`a service that is ${mode} strikes everything within four seconds, and heals`, async () => {
+    const page = await openPage();
+    page.service.mode = mode;
+    await page.time.advance(4000);
+    assert.deepEqual(page.marked("lost").filter((name) => name !== "recordings"), FEEDS);
+    assert.equal(page.text("banner-title"), "CONNECTION LOST");
+    assert.equal(page.element("banner").hidden, false);
+    assert.equal(page.document.title, "CONNECTION LOST · companion");
+    assert.equal(page.element("plan").getAttribute("aria-label"),
+      "Plan view: 2 UAVs, 2 beams, not live: connection lost");
+    let plan = await page.drawn();
+    plan.text("NOT LIVE – connection lost");
+    assert.ok(!plan.drawn.some(({ strokeStyle }) => strokeStyle === page.colour("live")));
+    page.service.mode = "answers";
+    await page.time.advance(6000);
+    assert.deepEqual([page.marked("lost"), page.marked("late")], [[], []]);
+    assert.ok(page.element("banner").hidden);
+    assert.equal(page.document.title, "2 UAVs · companion");
+    plan = await page.drawn();
+    assert.ok(plan.drawn.some(({ strokeStyle }) => strokeStyle === page.colour("live")));
+    assert.ok(!plan.texts.some((text) => text.startsWith("NOT LIVE")));
+  });
+}
+
+test("every feed that can be marked has its rules in the style sheet, late and lost", async () => {
+  const offered = { "/openapi.json": { paths: { "/v1/recordings": {} } } };
+  const page = await openPage({ answers: offered });
+  page.service.mode = "gone";
+  await page.time.advance(4000);
+  const feeds = page.marked("lost");
+  assert.deepEqual(feeds, [...FEEDS, "recordings"].sort());
+  const rules = readPage("states.css").replace(/\/\*[^]*?\*\//g, "").split("}")
+    .map((rule) => rule.split("{"));
+  const selectorsOf = (declaration) => rules.filter(([, block]) => block?.includes(declaration))
+    .flatMap(([selectors]) => selectors.split(/,(?![^(]*\))/).map((one) => one.trim()));
+  const [slanted, grey, struck] = ["font-style: italic", "var(--stale)", "line-through"]
+    .map(selectorsOf);
+  for (const feed of feeds) {
+    assert.ok(slanted.includes(`:root[data-${feed}-late] [data-feed="${feed}"]`), feed);
+    assert.ok(grey.includes(`:root[data-${feed}-lost] [data-feed="${feed}"]`), feed);
+    assert.ok(struck.some((one) => one.startsWith(`:root[data-${feed}-lost] `)), feed);
+  }
+  const standing = page.document.querySelectorAll("[data-feed]").map(({ dataset }) => dataset.feed);
+  assert.deepEqual([...new Set(standing)].sort(), feeds); // each marks something, all are marked
+});
+
+test("an age grows while no answer comes", async () => {
+  const page = await openPage();
+  page.service.mode = "silent";
+  await page.time.advance(2500);
+  assert.match(page.cells("age")[0], /^▲ 2\.\d\d s$/);
+  assert.ok(page.document.querySelector("tbody tr").hasAttribute("data-old"));
+});
+
+test("where nothing has ever answered there is no connection", async () => {
+  const page = await openPage({ mode: "gone" });
+  assert.equal(page.text("connection"), "connecting…");
+  assert.equal(page.text("uavs-empty"), "Nothing received yet.");
+  await page.time.advance(4000);
+  assert.deepEqual([page.text("connection"), page.text("banner-title")],
+    ["no connection", "No connection"]);
+  (await page.drawn()).text("NOT LIVE – no connection");
+});
+
+test("a service whose time stands still has stopped", async () => {
+  const page = await openPage();
+  page.service.mode = "frozen";
+  await page.time.advance(BEAT_MS + 3200);
+  assert.equal(page.text("banner-title"), "ESTIMATES STOPPED");
+  assert.equal(page.document.title, "STOPPED · companion");
+  assert.ok(["uavs", "beams"].every((name) => page.marked("lost").includes(name)));
+  assert.ok(!page.marked("lost").includes("links")); // no time stands in those
+  (await page.drawn()).text("NOT LIVE – estimates stopped");
+});
+
+test("where beams alone are not answered, UAVs stay live", async () => {
+  const page = await openPage();
+  page.service.answers["/v1/beams"] = { status: 500, body: "{}" };
+  await page.time.advance(3200);
+  assert.equal(page.text("banner-title"), "CONNECTION FAILING");
+  assert.deepEqual(page.marked("lost"), ["beams"]);
+  const plan = await page.drawn();
+  assert.ok(!plan.texts.some((text) => text.startsWith("NOT LIVE")));
+  assert.ok(plan.drawn.some(({ strokeStyle }) => strokeStyle === page.colour("live")));
+  assert.equal(page.document.title, "CONNECTION FAILING · companion");
+});
+
+test("where UAVs alone are not answered, the plan is not live", async () => {
+  const page = await openPage();
+  page.service.answers["/v1/uavs"] = { status: 500, body: "{}" };
+  await page.time.advance(3200);
+  assert.deepEqual(page.marked("lost"), ["uavs"]);
+  (await page.drawn()).text("NOT LIVE – no answer about UAVs");
+});
+
+const IMPOSSIBLE = {
+  "/v1/links": { links: [{ url: "udpin:a", state: "up", components: 7 }] },
+  "/v1/uavs": { valid_at: null, uavs: [uav("1:1", { bound_ellipsoid_ned_m: [-4, 4, 2] })] },
+  "/v1/pattern": { angles_deg: [], patterns: [{ uav: "1:1", peak_db: 18 }] },
+  "/v1/beams/weights": { uavs: ["1:1"], re: [[1]], im: [] },
+};
+
+for (const [place, answer] of Object.entries(IMPOSSIBLE)) {
+  test(`what cannot be shown of ${place} is said, and the page goes on once it can`, async (t) => {
+    const complaints = t.mock.method(console, "error", () => {});
+    const page = await openPage();
+    page.service.answers[place] = answer;
+    await page.time.advance(8 * BEAT_MS);
+    for (let i = 0; i < 5; i += 1) { // it stands there, and does not flicker
+      assert.equal(page.text("banner-title"), "DISPLAY FAULT");
+      assert.equal(page.element("banner").hidden, false);
+      assert.deepEqual(page.marked("lost").filter((name) => name !== "recordings"), FEEDS);
+      await page.time.advance(110);
+    }
+    assert.equal(complaints.mock.callCount(), 1); // not ten times a second
+    delete page.service.answers[place];
+    await page.time.advance(8 * BEAT_MS);
+    assert.ok(page.element("banner").hidden);
+    assert.deepEqual(page.marked("lost"), []);
+  });
+}

@@ -1,0 +1,214 @@
+// Everything that is words: the banner and the chips, the center, the recording, a replay, the
+// rejections, the beams.
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+import { load, openBrowser } from "./browser.mjs";
+import { array, beam, beamsAnswer, stampAt, statusAnswer } from "./service.mjs";
+
+const panels = await load("panels.js");
+const plain = (text) => text.replaceAll("\u00a0", " ").replaceAll("\u202f", ",");
+
+/** `text` and `level` of what has an id, null while it is hidden. */
+function openPanels() {
+  const { element } = openBrowser();
+  return {
+    text: (id) => (element(id).hidden ? null : plain(element(id).textContent)),
+    level: (id) => element(id).dataset.level,
+    lines: (id) => element(id).children.map((line) => line.children
+      .map((part) => plain(part.textContent)).join(" | ") || plain(line.textContent)),
+    element,
+  };
+}
+
+test("a good connection needs no banner, and one chip says how good it is", () => {
+  const { text, level } = openPanels();
+  for (const [state, chip, wanted] of [["waiting", "connecting…", "wait"],
+    ["live", "connected", "good"], ["late", "answers late", "warn"]]) {
+    panels.showConnection({ state }, stampAt(0));
+    assert.deepEqual([text("banner"), text("connection"), level("connection")],
+      [null, chip, wanted]);
+  }
+});
+
+test("a bad connection cannot be overlooked, and it is said since when and why", () => {
+  const { text, level } = openPanels();
+  for (const [link, chip, title, detail] of [
+    [{ state: "lost", silentS: 65.2, problem: "no answer within 2 s" }, "connection lost",
+      "CONNECTION LOST", /for 1 min 05 s \(no answer within 2 s\).*from 13:00:07 UTC/],
+    [{ state: "lost", never: true, silentS: 3, problem: "the service cannot be reached" },
+      "no connection", "No connection", /Nothing received.*\(the service cannot be reached\)/],
+    [{ state: "partial", what: "beams, pattern", problem: "the service answered 500" },
+      "connection failing", "CONNECTION FAILING",
+      /about beams, pattern \(the service answered 500\)/],
+    [{ state: "frozen", what: "UAVs" }, "estimates stopped", "ESTIMATES STOPPED",
+      /stands still at 13:00:07 UTC \(UAVs\)/],
+  ]) {
+    panels.showConnection(link, stampAt(7));
+    assert.deepEqual([text("connection"), level("connection"), text("banner-title")],
+      [chip, "bad", title]);
+    assert.match(text("banner-detail"), detail);
+    assert.notEqual(text("banner"), null);
+  }
+  panels.showConnection({ state: "live" }, stampAt(8));
+  assert.equal(text("banner"), null);
+});
+
+test("a fault of the page itself is said", () => {
+  const { text } = openPanels();
+  panels.showFault(new Error("no such thing"));
+  assert.equal(text("banner-title"), "DISPLAY FAULT");
+  assert.match(text("banner-detail"), /no such thing.*reload/);
+});
+
+test("whether the service is ready, and if not why", () => {
+  const { text, level } = openPanels();
+  for (const [answer, chip, wanted, reasons] of [
+    [null, "readiness –", "wait", null], [{ ready: true, reasons: [] }, "ready", "good", null],
+    [{ ready: false, reasons: ["no link is up", "no carrier"] }, "not ready", "warn",
+      "Not ready: no link is up; no carrier"],
+    [{ ready: false }, "not ready", "warn", "Not ready: no reason given"],
+  ]) {
+    panels.showReadiness(answer);
+    assert.deepEqual([text("readiness"), level("readiness"), text("reasons")],
+      [chip, wanted, reasons]);
+  }
+});
+
+test("the service at a glance: version, uptime, rates", () => {
+  const { text } = openPanels();
+  panels.showStatus(statusAnswer());
+  assert.deepEqual(["version", "uptime", "frames", "updates"].map(text),
+    ["v1.2.3", "1 min 05 s", "120 /s", "20 /s"]);
+});
+
+test("the center says where it is and how it heads; old or nowhere, it is warned of", () => {
+  const { text, level } = openPanels();
+  const show = (fields) => {
+    panels.showStatus(statusAnswer({ center: { ...statusAnswer().center, ...fields } }));
+    return [text("center"), level("center")];
+  };
+  assert.deepEqual(show({}),
+    ["5:1 · 47.00000°, 8.00000° · 450 m · heading 090° · 0.10 s old", ""]);
+  assert.deepEqual(show({ age_s: 3 })[1], "");
+  assert.deepEqual(show({ age_s: 3.1 })[1], "warn");
+  assert.deepEqual(show({ lat_deg: null, age_s: null }), ["5:1 · no position yet", "warn"]);
+});
+
+test("a recording that is degraded is bad, and its size is said while there is one", () => {
+  const { text, level, element } = openPanels();
+  const show = (recording) => {
+    panels.showStatus(statusAnswer({ recording }));
+    return [text("recording"), level("recording")];
+  };
+  assert.deepEqual(show({ state: "recording", bytes: 2500, file: "a.mcap" }),
+    ["recording · 2.5 kB", "good"]);
+  assert.equal(element("recording").title, "a.mcap");
+  assert.deepEqual(show({ state: "off", bytes: 0, file: null }), ["off", ""]);
+  assert.deepEqual(show({ state: "degraded", bytes: 1, file: null }), ["degraded · 1 B", "bad"]);
+});
+
+test("a replay says that it is one, of what, how far and how fast", () => {
+  const { text, level } = openPanels();
+  const show = (replay) => {
+    panels.showStatus(statusAnswer({ replay }));
+    return text("replay");
+  };
+  assert.equal(show(null), null);
+  const replay = { log: "a.tlog", speed: 2, at_s: 12.4, of_s: 60, state: "running" };
+  assert.equal(show(replay), "replay a.tlog · 12 of 60 s · 2×");
+  assert.equal(level("replay"), "warn");
+  assert.equal(show({ ...replay, speed: null, of_s: null }), "replay a.tlog · 12 s · max");
+  assert.equal(show({ ...replay, state: "finished" }), "replay a.tlog · 12 of 60 s · finished");
+  assert.equal(show(null), null);
+});
+
+test("rejections stand with the most frequent first, each with what it means", () => {
+  const { lines, element } = openPanels();
+  const rejections = new panels.Rejections();
+  const counts = { "frozen": 2, "garbage": 12345, "out-of-order": 30, "not-known-here": 1 };
+  rejections.note(counts, 0);
+  rejections.show(counts, 0);
+  assert.deepEqual(lines("rejections"), ["garbage | 12,345 B", "out-of-order | 30", "frozen | 2",
+    "not-known-here | 1"]);
+  const titles = element("rejections").children.map(({ title }) => title);
+  assert.deepEqual(titles, [panels.REASONS.garbage, panels.REASONS["out-of-order"],
+    panels.REASONS.frozen, ""]);
+  rejections.show({}, 0);
+  assert.deepEqual(lines("rejections"), ["none"]);
+});
+
+test("what rises while the page is open says when; what was there before does not", () => {
+  const { lines } = openPanels();
+  const rejections = new panels.Rejections();
+  const at = (counts, now) => {
+    rejections.note(counts, now);
+    rejections.show(counts, now);
+    return lines("rejections");
+  };
+  assert.deepEqual(at({ frozen: 2 }, 0), ["frozen | 2"]);
+  assert.deepEqual(at({ frozen: 2, secret: 1 }, 1000), ["frozen | 2", "secret | 1 · now"]);
+  assert.deepEqual(at({ frozen: 3, secret: 1 }, 8500),
+    ["frozen | 3 · now", "secret | 1 · 5 s ago"]);
+  assert.deepEqual(at({ frozen: 3, secret: 1 }, 70_000),
+    ["frozen | 3 · 1 min 01 s ago", "secret | 1 · 1 min 09 s ago"]);
+});
+
+test("the first rejection of all is as new as any other", () => {
+  const { lines } = openPanels();
+  const rejections = new panels.Rejections();
+  rejections.note({}, 0);
+  rejections.note({ frozen: 1 }, 1000);
+  rejections.show({ frozen: 1 }, 1000);
+  assert.deepEqual(lines("rejections"), ["frozen | 1 · now"]);
+});
+
+test("looking back makes no rejection new", () => {
+  const { lines } = openPanels();
+  const rejections = new panels.Rejections();
+  rejections.note({ frozen: 1 }, 0);
+  rejections.note({ frozen: 5 }, 60_000);
+  rejections.show({ frozen: 1 }, 1000); // before it rose
+  assert.deepEqual(lines("rejections"), ["frozen | 1"]);
+  rejections.show({ frozen: 5 }, 90_000);
+  assert.deepEqual(lines("rejections"), ["frozen | 5 · 30 s ago"]);
+});
+
+test("the beams in a line: method, number, condition; the array and the lead in another", () => {
+  const { text } = openPanels();
+  panels.showBeams(beamsAnswer([beam("1:1"), beam("2:1")], { condition_number: 2.345 }));
+  assert.equal(text("beams-line"), "Zero forcing · 2 beams · condition number 2.35");
+  assert.equal(text("beams-array"),
+    "8 elements (ULA) · 5.8 GHz · beamwidth 10.00° · boresight 000° · lead 20 ms");
+  panels.showBeams(beamsAnswer([beam("1:1")], {
+    method: "mrt", condition_number: 123456, lead_ms: null, array: array({ kind: "ura" }),
+  }));
+  assert.equal(text("beams-line"), "Maximum ratio · 1 beam · condition number 1.2e+5");
+  assert.match(text("beams-array"), /\(URA\).* · lead –$/);
+  panels.showBeams(beamsAnswer([], { condition_number: null, array: null }));
+  assert.deepEqual([text("beams-line"), text("beams-array")],
+    ["Zero forcing · 0 beams · condition number –", "–"]);
+});
+
+test("what is not known is said to be so, and nothing of before stays", () => {
+  const { text, level, lines } = openPanels();
+  const center = { ...statusAnswer().center, age_s: 9 };
+  panels.showStatus(statusAnswer({ center, replay: { log: "a", at_s: 1, state: "running" } }));
+  panels.showBeams(beamsAnswer([], { regularised: true }));
+  panels.showStatus(null);
+  panels.showBeams(null);
+  assert.deepEqual(["version", "uptime", "frames", "updates", "center", "recording", "replay",
+    "beams-line", "beams-array", "beams-warning"].map(text),
+  ["", "–", "–", "–", "–", "–", null, "–", "–", null]);
+  assert.deepEqual([level("center"), lines("left-out")], ["", ["–"]]);
+});
+
+test("who is left out stands there with the reason, and the fallback is warned of", () => {
+  const { text, lines } = openPanels();
+  panels.showBeams(beamsAnswer([], { left_out: [{ uav: "4:1", reason: "behind the array" }] }));
+  assert.deepEqual([lines("left-out"), text("beams-warning")], [["4:1 | behind the array"], null]);
+  panels.showBeams(beamsAnswer([], { regularised: true }));
+  assert.deepEqual(lines("left-out"), ["no one"]);
+  assert.match(text("beams-warning"), /^▲ Regularised/);
+});

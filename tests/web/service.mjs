@@ -1,0 +1,137 @@
+// What answers the page in the service's place, with answers of the shapes that the API has; and
+// it fails in the ways in which a service, or the way to it, fails.
+
+export const START = Date.parse("2026-11-20T13:00:00.000Z");
+export const stampAt = (seconds) => new Date(START + seconds * 1000).toISOString();
+
+/** Where the carrier of these answers is. */
+export const LAT = 47.0;
+export const LON = 8.0;
+
+/** One UAV as /v1/uavs has it, flying by default still at 100 m north of the carrier. */
+export const uav = (id, fields = {}) => ({
+  id, state: "live", target: true, same_as: null, callsign: null, relays: [], fix: null,
+  valid_at: stampAt(0), age_s: 0.2, lat_deg: LAT + 0.0009, lon_deg: LON, alt_m: 500,
+  north_m: 100, east_m: 0, down_m: -50, velocity_ned_mps: [0, 0, 0], speed_mps: 0,
+  bound_m: 4.2, bound_ellipsoid_ned_m: [4, 4, 2], clock: null, dt_s: 0.25, latency_s: 0.03,
+  innovation_m: 0.4, gamma: 1, reports: 10, rejected: {}, recent_rejections: [], ...fields,
+});
+
+/** One beam as /v1/beams has it, due north. */
+export const beam = (id, fields = {}) => ({
+  uav: id, azimuth_deg: 0, elevation_deg: 5, range_m: 112, bearing_deg: 0, gain_db: 17.5,
+  guaranteed_gain_db: 15.2, loss_db: 0.1, group: 0, widened: false, pointing_bound_deg: 1.5,
+  ...fields,
+});
+
+/** A line of elements facing north, 10° wide along boresight. */
+export const array = (fields = {}) => ({
+  kind: "ula", elements: 8, frequency_hz: 5.8e9, half_power_beamwidth_deg: 10,
+  half_power_beamwidth_elevation_deg: null, boresight_bearing_deg: 0, ...fields,
+});
+
+export const beamsAnswer = (beams, fields = {}) => ({
+  valid_at: stampAt(0), age_s: 0.02, lead_ms: 20, beams, array: array(), method: "zf",
+  policy: "regularise", condition_number: 1.5, regularised: false, groups: 1, unfit: null,
+  left_out: [], ...fields,
+});
+
+export const patternAnswer = (id, fields = {}) => ({
+  valid_at: stampAt(0), lead_ms: 20, cut: "azimuth", method: "zf", angles_deg: [-180, -90, 0, 90],
+  patterns: [{
+    uav: id, at_deg: 5, target_deg: 0, response_db: [-30, -10, 18, -10], peak_azimuth_deg: 0,
+    peak_elevation_deg: 5, peak_db: 18, half_power_beamwidth_deg: 10, side_lobe_db: -13,
+    null_depths_db: {}, ...fields,
+  }],
+});
+
+export const statusAnswer = (fields = {}) => ({
+  version: "1.2.3", time: stampAt(0), uptime_s: 65,
+  center: { source: "5:1", fixed: false, lat_deg: LAT, lon_deg: LON, alt_m: 450, heading_deg: 90,
+    attitude_deg: null, age_s: 0.1, bound_m: 1, unfit: null },
+  links: [], recording: { state: "off", file: null, bytes: 0, messages: 0, dropped: 0 },
+  rates: { frames_hz: 120, updates_hz: 20 }, frames: 1000, updates: 100, rejected: {},
+  digest: "", replay: null, ...fields,
+});
+
+export const linkAnswer = (fields = {}) => ({
+  url: "udpin:0.0.0.0:14550", state: "up", age_s: 0.1, frames: 12345, bad_crc: 0, gaps: 3,
+  reports: { total: 10, first: 5, first_share: 0.5, latency_p50_s: 0.002, latency_p95_s: 0.005 },
+  components: [{ id: "1:1" }], ...fields,
+});
+
+export class Service {
+  constructor(time) {
+    this.time = time;
+    this.startedAt = time.now;
+    this.mode = "answers"; // or "silent", "gone", "frozen"
+    this.asked = []; // {path, at, …}, and what else the request said
+    this.open = []; // paths that are being answered
+    this.mostOpen = 0; // requests at the same time for the same thing
+    this.uavs = [uav("1:1")];
+    this.beams = [beam("1:1")];
+    this.status = statusAnswer();
+    this.answers = {}; // what is answered at a path instead: data, or {status, body}
+    globalThis.fetch = (path, options) => this.fetch(path, options);
+  }
+
+  stamp() {
+    if (this.mode !== "frozen") this.seconds = (this.time.now - this.startedAt) / 1000;
+    return stampAt(this.seconds);
+  }
+
+  answer(path) {
+    const [place, query = ""] = path.split("?");
+    if (place in this.answers) return this.answers[place];
+    const stamp = this.stamp();
+    const asked = new URLSearchParams(query);
+    const ids = this.beams.map((one) => one.uav);
+    switch (place) {
+      case "/v1/uavs": return { valid_at: stamp, uavs: this.uavs };
+      case "/v1/beams": return beamsAnswer(this.beams, { valid_at: stamp });
+      case "/v1/pattern":
+        return ids.includes(asked.get("uav"))
+          ? { ...patternAnswer(asked.get("uav")), valid_at: stamp } : { status: 404, body: "{}" };
+      case "/v1/beams/weights":
+        return { uavs: ids, re: [ids.map(() => 1), ids.map(() => 0)],
+          im: [ids.map(() => 0), ids.map(() => 1)] };
+      case "/v1/status": return { ...this.status, time: stamp };
+      case "/readyz": return { ready: true, reasons: [] };
+      case "/v1/links": return { valid_at: stamp, links: [linkAnswer()] };
+      case "/v1/events":
+        return { events: [{ at: stampAt(0), severity: "info", text: "1:1 is live" }] };
+      case "/v1/recordings": return { recordings: [] };
+      case "/openapi.json": return { paths: {} };
+      default: return { status: 404, body: "{}" };
+    }
+  }
+
+  async fetch(path, options = {}) {
+    const place = path.split("?")[0];
+    this.asked.push({ path, at: this.time.now, ...options });
+    this.open.push(place);
+    this.mostOpen = Math.max(this.mostOpen, this.open.filter((one) => one === place).length);
+    try {
+      return await this.respond(path, options.signal);
+    } finally {
+      this.open.splice(this.open.indexOf(place), 1);
+    }
+  }
+
+  async respond(path, signal) {
+    if (this.mode === "gone") throw new TypeError("fetch failed");
+    if (this.mode === "silent") {
+      await new Promise((_, refuse) => {
+        signal?.addEventListener("abort", () => refuse(signal.reason));
+      });
+    }
+    const { status = 200, body, ...data } = this.answer(path);
+    const text = body ?? JSON.stringify(data);
+    return { status, ok: status >= 200 && status < 300, json: async () => JSON.parse(text) };
+  }
+
+  /** How often a path was asked for since a time. */
+  count(path, since = 0) {
+    return this.asked.filter((one) => one.path.split("?")[0] === path && one.at >= since).length;
+  }
+}

@@ -1,0 +1,146 @@
+// The table of UAVs: which value is in which cell, what is warned of, and that a row stays the
+// same element while its UAV does, so that focus and selection stay.
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+import { load, openBrowser } from "./browser.mjs";
+import { array, beam, uav } from "./service.mjs";
+
+const { UavTable } = await load("table.js");
+const plain = (text) => text.replaceAll("\u00a0", " ");
+
+function openTable() {
+  const browser = openBrowser();
+  const chosen = [];
+  const element = browser.element("uavs");
+  const table = new UavTable(element, (id) => chosen.push(id));
+  const body = element.querySelector("tbody");
+  return {
+    element, table, chosen,
+    rows: () => body.rows,
+    ids: () => body.rows.map((row) => row.querySelector(".pick").textContent),
+    show(uavs, { beams = [], sinceS = 0, selected = null, array: fields = {} } = {}) {
+      table.update(uavs, {
+        beams: new Map(beams.map((one) => [one.uav, one])), array: array(fields), sinceS, selected,
+      });
+    },
+    cell: (key, row = 0) => body.rows[row].querySelector(`[data-key=${key}]`),
+    texts(row = 0) {
+      return Object.fromEntries(body.rows[row].querySelectorAll("td")
+        .map((cell) => [cell.dataset.key, plain(cell.textContent)]));
+    },
+  };
+}
+
+test("every value is in its own column, with its unit", () => {
+  const { show, texts } = openTable();
+  show([uav("1:1", {
+    state: "coasting", north_m: 30, east_m: -40, down_m: -120, speed_mps: 5.25, age_s: 0.5,
+    dt_s: 0.25, latency_s: 0.03, bound_m: 4.2,
+  })], { beams: [beam("1:1", {
+    azimuth_deg: -12.5, elevation_deg: 8, pointing_bound_deg: 1.25, gain_db: 17.5,
+    guaranteed_gain_db: 15.2,
+  })] });
+  assert.deepEqual(texts(), {
+    state: "coasting", range: "130 m", azimuth: "−12.5°", elevation: "+8.0°", speed: "5.3 m/s",
+    age: "0.50 s", dt: "0.25 s", latency: "30 ms", bound: "4.2 m", pointing: "1.25°",
+    gain: "17.5 dB", guaranteed: "15.2 dB",
+  });
+});
+
+test("every column has a head of its key, and cells say on which answer they stand", () => {
+  const { element, show, rows } = openTable();
+  show([uav("1:1")]);
+  const heads = element.querySelectorAll("thead th").map((cell) => cell.dataset.key);
+  const cells = rows()[0].children.map((cell) => cell.dataset.key ?? "id");
+  assert.deepEqual(heads, cells);
+  const onBeams = rows()[0].querySelectorAll("[data-feed=beams]").map(({ dataset }) => dataset.key);
+  assert.deepEqual(onBeams, ["azimuth", "elevation", "pointing", "gain", "guaranteed"]);
+  assert.equal(rows()[0].querySelectorAll("[data-feed=uavs]").length, cells.length - 5);
+});
+
+test("what is not known is a dash: without a beam, without a place", () => {
+  const { show, texts } = openTable();
+  show([uav("1:1", { north_m: null, speed_mps: null, age_s: null, dt_s: null, latency_s: null })]);
+  assert.deepEqual(texts(), {
+    state: "live", range: "–", azimuth: "–", elevation: "–", speed: "–", age: "–", dt: "–",
+    latency: "–", bound: "4.2 m", pointing: "–", gain: "–", guaranteed: "–",
+  });
+});
+
+test("an age grows while no answer comes, and above two seconds it is warned of", () => {
+  const { show, cell, rows } = openTable();
+  show([uav("1:1", { age_s: 0.5 })], { sinceS: 1.5 });
+  assert.equal(plain(cell("age").textContent), "2.00 s");
+  assert.ok(cell("age").dataset.level === "" && !rows()[0].hasAttribute("data-old"));
+  show([uav("1:1", { age_s: 0.5 })], { sinceS: 1.6 });
+  assert.equal(plain(cell("age").textContent), "▲ 2.10 s");
+  assert.ok(cell("age").dataset.level === "warn" && rows()[0].hasAttribute("data-old"));
+  show([uav("1:1", { age_s: null })], { sinceS: 9 });
+  assert.ok(cell("age").dataset.level === "" && !rows()[0].hasAttribute("data-old"));
+});
+
+test("a pointing bound above half the beamwidth is warned of, unless the beam is broadened", () => {
+  const { show, cell } = openTable();
+  const shown = (fields, width = 10) => {
+    show([uav("1:1")], { beams: [beam("1:1", fields)],
+      array: { half_power_beamwidth_deg: width } });
+    return [cell("pointing").textContent, cell("pointing").dataset.level];
+  };
+  assert.deepEqual(shown({ pointing_bound_deg: 5 }), ["5.00°", ""]);
+  assert.deepEqual(shown({ pointing_bound_deg: 5.01 }), ["▲ 5.01°", "warn"]);
+  assert.deepEqual(shown({ pointing_bound_deg: 5.01, widened: true }), ["5.01°", ""]);
+  assert.deepEqual(shown({ pointing_bound_deg: 50 }, null), ["50.00°", ""]);
+  assert.deepEqual(shown({ pointing_bound_deg: null }), ["▲ –", "warn"]);
+});
+
+test("a beam without any guaranteed gain is warned of", () => {
+  const { show, cell } = openTable();
+  show([uav("1:1")], { beams: [beam("1:1", { guaranteed_gain_db: null })] });
+  assert.deepEqual([cell("guaranteed").textContent, cell("guaranteed").dataset.level],
+    ["▲ –", "warn"]);
+  show([uav("1:1")]);
+  assert.deepEqual([cell("guaranteed").textContent, cell("guaranteed").dataset.level], ["–", ""]);
+});
+
+test("each UAV has its own beam", () => {
+  const { show, texts } = openTable();
+  show([uav("1:1"), uav("2:1")], { beams: [beam("2:1", { azimuth_deg: 20 }),
+    beam("1:1", { azimuth_deg: 10 })] });
+  assert.deepEqual([texts(0).azimuth, texts(1).azimuth], ["+10.0°", "+20.0°"]);
+});
+
+test("rows stay the same elements, in the order that is asked for", () => {
+  const { show, rows, ids } = openTable();
+  show([uav("2:1"), uav("10:1")]);
+  const [two, ten] = rows();
+  show([uav("1:1"), uav("2:1"), uav("10:1")]);
+  assert.deepEqual(ids(), ["1:1", "2:1", "10:1"]);
+  assert.deepEqual(rows().slice(1), [two, ten]);
+  show([uav("10:1"), uav("1:1")]);
+  assert.deepEqual(ids(), ["10:1", "1:1"]);
+  assert.equal(rows()[0], ten);
+  show([]);
+  assert.deepEqual(ids(), []);
+});
+
+test("a row says its UAV's state, and whether it is the chosen one", () => {
+  const { show, rows } = openTable();
+  show([uav("1:1", { state: "lost" }), uav("2:1")], { selected: "2:1" });
+  const shown = () => rows().map((row) => [row.dataset.state, row.hasAttribute("data-selected"),
+    row.querySelector(".pick").getAttribute("aria-pressed")]);
+  assert.deepEqual(shown(), [["lost", false, "false"], ["live", true, "true"]]);
+  show([uav("1:1"), uav("2:1")], { selected: "1:1" });
+  assert.deepEqual(shown(), [["live", true, "true"], ["live", false, "false"]]);
+});
+
+test("a click on a name chooses that UAV; a chosen one can be brought into sight", () => {
+  const { show, rows, chosen, table } = openTable();
+  show([uav("1:1"), uav("2:1")]);
+  rows()[1].querySelector(".pick").click();
+  assert.deepEqual(chosen, ["2:1"]);
+  table.reveal("2:1");
+  table.reveal("9:9");
+  assert.deepEqual(rows().map(({ isRevealed = false }) => isRevealed), [false, true]);
+});

@@ -1,0 +1,40 @@
+"""The page's modules under node, without a browser: ``node --test``, and nothing installed.
+
+Each ``*.test.mjs`` here runs the modules themselves on a canvas that records and in time that
+passes when a test says so. ``WEB_ROOT=DIR`` takes them from another directory than ``web``.
+"""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+OLDEST = (20, 6)
+"""The first version of node whose loader can be told that the page's files are modules."""
+
+
+def node() -> str:
+    """A node that will do; skips where there is none."""
+    found = shutil.which("node")
+    if found is None:
+        pytest.skip("no node: install Node.js to test the page's modules")
+    said = subprocess.run([found, "--version"], capture_output=True, text=True, check=True).stdout
+    version = tuple(int(part) for part in re.findall(r"\d+", said)[:2])
+    if version < OLDEST:
+        pytest.skip(f"node {said.strip()} is too old for the page's modules: 20.6 or later")
+    return found
+
+
+@pytest.mark.timeout(600)  # for one that hangs
+def test_the_modules_of_the_page_do_what_their_tests_say() -> None:
+    # By name: what a directory means to `node --test` depends on its version.
+    tests = sorted(HERE.glob("*.test.mjs"))
+    assert tests
+    command = [node(), "--test", "--test-reporter=spec", *map(str, tests)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, encoding="utf-8", timeout=580, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr

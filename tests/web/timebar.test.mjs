@@ -1,0 +1,128 @@
+// Pause and look back: what the slider, the button and the steps show, and that the past says of
+// itself that it is past.
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+import { load, openBrowser } from "./browser.mjs";
+import { stampAt, uav } from "./service.mjs";
+
+const { TimeBar } = await load("timebar.js");
+const { History } = await load("history.js");
+const NBSP = "\u00a0";
+
+/** A history with a moment a second for half a minute, which ends now. */
+function openBar({ seconds = 30 } = {}) {
+  const browser = openBrowser();
+  const { time } = browser;
+  time.now = 100_000;
+  const history = new History();
+  for (let s = seconds; s >= 0; s -= 1) {
+    history.add({ at: time.now - s * 1000, stamp: stampAt(-s), uavs: [uav("1:1")] });
+  }
+  let changes = 0;
+  const bar = new TimeBar(history, () => { changes += 1; });
+  return {
+    browser, history, bar,
+    draw: () => bar.draw(time.now),
+    agoS: () => (bar.isLive ? null : (time.now - bar.shown.at) / 1000),
+    changes: () => changes,
+  };
+}
+
+test("the button pauses at the newest moment, and goes back to live", () => {
+  const { browser, bar, agoS, changes } = openBar();
+  assert.ok(bar.isLive);
+  browser.element("pause").click();
+  assert.equal(agoS(), 0);
+  assert.equal(bar.isLive, false);
+  browser.element("pause").click();
+  assert.ok(bar.isLive);
+  assert.equal(changes(), 2);
+});
+
+test("a paused page stays at its moment while time passes", async () => {
+  const { browser, history, bar, agoS } = openBar();
+  bar.toggle();
+  await browser.time.advance(5000);
+  history.add({ at: browser.time.now, stamp: stampAt(5), uavs: [] });
+  assert.equal(agoS(), 5);
+});
+
+test("steps go to the answer before and after, jumps ten seconds, Home to the oldest", () => {
+  const { bar, agoS } = openBar();
+  bar.step(-1);
+  assert.equal(agoS(), 1);
+  bar.step(-1);
+  assert.equal(agoS(), 2);
+  bar.step(1);
+  assert.equal(agoS(), 1);
+  bar.jump(-1);
+  assert.equal(agoS(), 11);
+  bar.jump(1);
+  assert.equal(agoS(), 1);
+  bar.jump(1);
+  assert.equal(agoS(), 0);
+  bar.toOldest();
+  assert.equal(agoS(), 30);
+  bar.goLive();
+  assert.equal(agoS(), null);
+});
+
+test("the slider shows the moment as many seconds ago as it says", () => {
+  const { browser, agoS } = openBar();
+  browser.element("scrub").value = "-12.3";
+  browser.element("scrub").dispatch("input");
+  assert.equal(agoS(), 13); // the newest moment that is not after that
+});
+
+test("the slider reaches as far back as there is anything, and follows the moment", async () => {
+  const { browser, bar, draw } = openBar();
+  const scrub = browser.element("scrub");
+  draw();
+  assert.deepEqual([scrub.min, scrub.value], ["-30", "0"]);
+  bar.jump(-1);
+  await browser.time.advance(1500);
+  draw();
+  assert.deepEqual([scrub.min, scrub.value], ["-32", "-11.5"]);
+  scrub.pseudo.add("active"); // while it is dragged it is the operator's
+  scrub.value = "-20";
+  draw();
+  assert.equal(scrub.value, "-20");
+});
+
+test("the past says that it is past, of when, and for how long", async () => {
+  const { browser, bar, draw } = openBar();
+  const root = browser.document.documentElement;
+  draw();
+  assert.ok(browser.element("past").hidden && !root.hasAttribute("data-past"));
+  assert.equal(browser.text("time-mode"), "now");
+  assert.match(browser.text("pause"), /Pause/);
+  assert.equal(browser.element("pause").getAttribute("aria-pressed"), "false");
+  bar.jump(-1);
+  await browser.time.advance(65_000);
+  draw();
+  assert.ok(!browser.element("past").hidden && root.hasAttribute("data-past"));
+  assert.match(browser.text("past-detail"), /of 12:59:50 UTC, 1.min 15.s ago/);
+  assert.equal(browser.text("time-mode"), `−1${NBSP}min 15${NBSP}s`);
+  assert.equal(browser.text("reach"), `−1${NBSP}min 35${NBSP}s`);
+  assert.match(browser.text("pause"), /Live/);
+  assert.equal(browser.element("pause").getAttribute("aria-pressed"), "true");
+  const said = browser.element("scrub").getAttribute("aria-valuetext");
+  assert.equal(said, `1${NBSP}min 15${NBSP}s ago`);
+  bar.goLive();
+  draw();
+  assert.ok(browser.element("past").hidden && !root.hasAttribute("data-past"));
+  assert.equal(browser.element("scrub").getAttribute("aria-valuetext"), "live");
+});
+
+test("while nothing has been received there is nothing to look back at", () => {
+  const { bar, draw, browser } = openBar({ seconds: -1 });
+  bar.toggle();
+  bar.step(-1);
+  bar.jump(-1);
+  bar.toOldest();
+  assert.ok(bar.isLive);
+  draw();
+  assert.equal(browser.element("scrub").min, "0");
+});

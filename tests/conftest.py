@@ -31,6 +31,7 @@ FULL = ("tests/live/", "tests/browser/test_reports.py", "tests/studies/paper/tes
 """Left to `make test-all`, all of them."""
 
 
+@pytest.hookimpl(tryfirst=True)  # xdist reads the groups in this very hook
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Which tests share a worker of xdist: services one at a time, and what a study has made."""
     for item in items:

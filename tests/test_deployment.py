@@ -191,3 +191,9 @@ def test_the_image_installs_and_runs_from_what_it_is_given(tmp_path: Path) -> No
             path.chmod(0o755)  # so that pytest can take it away
     assert done.returncode == 0, done.stderr
     assert len(list(record.glob("*.mcap"))) == 1
+
+
+def test_services_are_tested_one_at_a_time(request: pytest.FixtureRequest) -> None:
+    """The group of ``conftest.ALONE`` reaches xdist, which reads it from the test's id."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        assert request.node.nodeid.endswith("@alone")

@@ -142,7 +142,7 @@ def test_a_full_disk_that_is_emptied_leaves_no_hole(small_disk: Path) -> None:
     wait_until(lambda: made.failure is None)
     events += hand_over(made, ticks(9000, 9100))
     made.stop({"digest": "d"})
-    (severity, said), (_, again) = made.news()
+    (severity, said), *_, (_, again) = made.news()  # a busy disk may be said to be slow between
     assert severity is Severity.ERROR and "No space left" in said
     assert "recording again" in again
     assert made.dropped == 0 and not made.degraded

@@ -30,11 +30,11 @@ SAMPLES_EVERY_S = 0.6
 QUIET_S = 0.6
 """Longer than a flight is ever silent: a link that was not heard for so long has heard all."""
 SETTINGS = """[clocks]
-constant_delay_s = 0.0
 {clocks}[observer]
 acceleration_max_mps2 = 12.0
+lag_s = [0.0, 0.0]
 """
-"""Loopback has no smallest latency to speak of; a fixed wing's turns and gusts exceed 5 m/s²."""
+"""Simulated stamps are exact; a fixed wing's turns and gusts exceed what copters do."""
 Json = dict[str, Any]
 
 

@@ -181,7 +181,7 @@ export class PlanView {
   }
 
   drawBound(uav) {
-    const [northM, eastM] = uav.bound_ellipsoid_ned_m ?? [];
+    const [northM, eastM] = uav.bound_cylinder_ned_m ?? [];
     if (!format.known(northM) || !format.known(eastM)) return;
     const { context } = this;
     const [alongPx, acrossPx] = [northM * this.pxPerM, eastM * this.pxPerM];

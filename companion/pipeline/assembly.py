@@ -12,17 +12,26 @@ from companion.beams.hardware.calibration import Calibration, parse_calibration
 from companion.beams.hardware.codebooks import Codebook
 from companion.beams.weights.precoding import Precoder
 from companion.beams.worth.link_budget import LinkBudget
-from companion.mavlink.clock.sender_clock import ClockAssumptions, SenderClock
+from companion.mavlink.clock.estimates import ClockAssumptions
+from companion.mavlink.clock.sender_clock import SenderClock
 from companion.settings.files import calibration_text, codebook_file, kinematic_design
 from companion.settings.model import Settings
 from companion.settings.section import ConfigError
 from companion.tracking.carrier import body_from_ned
 from companion.tracking.fleet import Ages, Fleet, FleetSettings
 from companion.tracking.gate import GateSettings
+from companion.tracking.limits import LIMITS, Airframe, airframe, lag_s
 from companion.tracking.noise import NoiseSettings
 from companion.tracking.observers.kinematic import KinematicModel, KinematicObserver, scheduled
 from companion.tracking.observers.position import PositionModel, PositionObserver
-from companion.values import FloatArray, ReportNoise, UserError
+from companion.values import (
+    FloatArray,
+    Limits,
+    LimitSource,
+    ReportNoise,
+    UserError,
+    reports_itself,
+)
 
 
 def array(settings: Settings) -> geometry.Array:
@@ -152,21 +161,55 @@ def noise(settings: Settings) -> NoiseSettings:
     return NoiseSettings(default, given.accuracy_factor if given.follow_accuracy else None)
 
 
+@dataclass(frozen=True, slots=True)
+class Assumed:
+    """What is assumed of one aircraft: its limits, and the lag of its positions."""
+
+    limits: Limits
+    lag_s: tuple[float, float]
+
+
+def assumed(settings: Settings, uav: str, mav_type: int | None, autopilot: int | None) -> Assumed:
+    """What is assumed of a UAV: by its own settings, its type's, everybody's, or its type.
+
+    ``mav_type`` and ``autopilot`` are those of its heartbeat; None where none was heard.
+    """
+    given = settings.observer
+    kind = airframe(mav_type) if reports_itself(uav) else Airframe.ADSB
+    known = LIMITS[kind]
+    told = [given.uav.get(uav), given.types.get(kind.value), given]
+    speed = next((one.speed_max_mps for one in told if one and one.speed_max_mps), None)
+    most = next(
+        (one.acceleration_max_mps2 for one in told if one and one.acceleration_max_mps2), None
+    )
+    lag = next((one.lag_s for one in told if one and one.lag_s), None)
+    source = LimitSource.TYPE if speed is None and most is None else LimitSource.SETTINGS
+    limits = Limits(speed or known.speed_mps, most or known.acceleration_mps2, source)
+    if lag is None:
+        lag = lag_s(kind, autopilot) if kind is not Airframe.ADSB else known.lag_s
+    return Assumed(limits, lag)
+
+
+def anyone(settings: Settings) -> Limits:
+    """The limits of an aircraft of which nothing is known."""
+    return assumed(settings, "0:0", None, None).limits
+
+
 def observer(settings: Settings) -> PositionObserver | KinematicObserver:
     """The observer that every track uses."""
-    given = settings.observer
+    given, limits = settings.observer, anyone(settings)
     if given.model == "position":
         return PositionObserver(
             PositionModel(
-                given.speed_max_mps,
-                given.acceleration_max_mps2,
+                limits.speed_mps,
+                limits.acceleration_mps2,
                 None if given.alpha == "auto" else given.alpha,
                 given.feedthrough_s,
                 given.velocity_lead_s,
             )
         )
     gain = scheduled(kinematic_design(settings))
-    return KinematicObserver(KinematicModel(given.speed_max_mps, given.acceleration_max_mps2, gain))
+    return KinematicObserver(KinematicModel(limits.speed_mps, limits.acceleration_mps2, gain))
 
 
 def clock(settings: Settings) -> SenderClock:
@@ -178,23 +221,28 @@ def clock(settings: Settings) -> SenderClock:
             trust_gnss=given.trust_gnss,
             node_utc_error_s=given.node_utc_error_s,
             window_s=given.window_s,
+            drift_max_ppm=given.drift_max_ppm,
         )
     )
 
 
 def fleet(settings: Settings) -> Fleet:
     """The tracks of all UAVs, with none yet."""
-    given, kept = settings.observer, settings.tracks
+    given, kept, limits = settings.observer, settings.tracks, anyone(settings)
     leads = given.model == "position"
-    lead_m = abs(given.feedthrough_s) * given.speed_max_mps if leads else 0.0
+    lead_m = abs(given.feedthrough_s) * limits.speed_mps if leads else 0.0
     feeds = given.model == "kinematic" and given.feed_forward
     return Fleet(
         observer(settings),
         FleetSettings(
-            given.speed_max_mps,
-            given.acceleration_max_mps2,
+            limits,
             Ages(kept.coasting_s, kept.stale_s, kept.lost_s),
-            GateSettings(kept.reacquire_reports, kept.reacquire_s, lead_m=lead_m),
+            GateSettings(
+                kept.reacquire_reports,
+                kept.reacquire_s,
+                lead_m=lead_m,
+                drift_max=settings.clocks.drift_max_ppm * 1e-6,
+            ),
             kept.window_s,
             feeds,
             kept.most,

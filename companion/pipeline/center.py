@@ -29,7 +29,6 @@ class Center:
         self._attitude: tuple[int, Attitude] | None = None  # sender's time, attitude
         self._attitude_bound_rad = np.radians(settings.center.attitude_bound_deg)
         self._attitude_kept_s = settings.tracks.coasting_s
-        self._speed_max_mps = settings.observer.speed_max_mps
         if isinstance(self.place, FixedCenter):
             self._begin(self.place)
 
@@ -50,7 +49,7 @@ class Center:
         position = self.local.position_ned_m(report.lat_deg, report.lon_deg, report.alt_m)
         errors = placed.noise
         if errors is None:
-            errors = noise.relayed(velocity, report.alt_age_s, self._speed_max_mps)
+            errors = noise.relayed(velocity, report.alt_age_s, placed.limits.speed_mps)
         made = Fix(
             report.uav,
             placed.sender_ns,
@@ -60,6 +59,7 @@ class Center:
             velocity,
             errors,
             report,
+            placed.limits,
         )
         return made, said
 

@@ -15,9 +15,11 @@ from collections.abc import Iterable
 from typing import Final
 
 from companion.beams.aim import aim
-from companion.mavlink.clock.sender_clock import ClockEstimate
+from companion.mavlink.clock.estimates import ClockChange, ClockEstimate
 from companion.mavlink.wire.decode import DECODED
+from companion.mavlink.wire.stamps import STAMPED
 from companion.pipeline import assembly
+from companion.pipeline.assumptions import Assumptions
 from companion.pipeline.center import Center
 from companion.pipeline.digest import Digest
 from companion.pipeline.refusals import Refusals
@@ -71,6 +73,7 @@ class Pipeline:
         self.senders = Senders(settings, self.center.vehicle)
         self.fleet = assembly.fleet(settings)
         self.targets = Targets(settings, self.center.vehicle)
+        self.assumptions = Assumptions()
 
     # --- the fold ---------------------------------------------------------------------------
 
@@ -84,8 +87,9 @@ class Pipeline:
             case Rejection():
                 outputs = [event]
             case RoundTrip():
-                self.senders.round_trip(event)
-                outputs = []
+                change = self.senders.round_trip(event)
+                source = str(event.source)
+                outputs = [] if change is None else self._changed(event.t_ns, source, change)
         for output in outputs:
             if isinstance(output, Rejection):
                 self.refusals.add(output)
@@ -96,19 +100,32 @@ class Pipeline:
     def _frame(self, frame: Frame) -> list[Output]:
         self.frames += 1
         if frame.msgid not in DECODED:
-            return []
+            change = self.senders.notice(frame) if frame.msgid in STAMPED else None
+            return [] if change is None else self._changed(frame.t_ns, str(frame.source), change)
         heard = self.senders.hear(frame)
         if heard.restarted is not None:
             self._restart(heard.restarted)
+        said: list[Output] = list(heard.said)
+        if heard.change is not None:
+            said += self._changed(frame.t_ns, str(frame.source), heard.change)
         match heard.message:
             case PlacedReport():
-                return [*heard.said, *self._report(heard.message)]
+                said += self._report(heard.message)
             case PlacedAttitude():
                 self.center.turn(heard.message)
-        return list(heard.said)
+        return said
+
+    def _changed(self, t_ns: int, sender: str, change: ClockChange) -> list[Output]:
+        """Tell that a sender's clock, or its link, changed, if it is one that is tracked."""
+        if sender not in self.fleet:
+            return []
+        drift_max_ppm = self.settings.clocks.drift_max_ppm
+        return [*self.assumptions.clock(t_ns, sender, change, drift_max_ppm)]
 
     def _report(self, placed: PlacedReport) -> list[Output]:
-        fix, said = self.center.fix(placed)
+        fix, begun = self.center.fix(placed)
+        fix, refuted = self.fleet.refuted(fix)
+        said: list[Output] = [*begun, *self.assumptions.told(refuted)]
         accepted = self.fleet.accept(fix)
         if isinstance(accepted, Rejection):
             return [*said, accepted]
@@ -116,6 +133,7 @@ class Pipeline:
             near = filter(reports_itself, self.fleet.near(fix.position_ned_m, NEAR_M))
             self.targets.compare(fix, self._tracks(near, fix.t_ns, fix.t_ns))
         if accepted.reacquired:
+            said += self.assumptions.jumped(accepted)
             text = f"{fix.uav} is tracked anew: its reports agree, but not with its past"
             return [*said, Notice(fix.arrival_ns, Severity.WARNING, fix.uav, text), accepted]
         return [*said, accepted]
@@ -123,6 +141,7 @@ class Pipeline:
     def _restart(self, uav: str) -> None:
         """Forget the past of a sender."""
         self.fleet.forget(uav)
+        self.assumptions.forget(uav)
         self.center.restarted(uav)
 
     def _tick(self, now_ns: int) -> list[Output]:

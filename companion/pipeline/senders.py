@@ -8,11 +8,13 @@ from collections.abc import Container
 from dataclasses import dataclass
 from typing import Final
 
-from companion.mavlink.clock.sender_clock import ClockEstimate, SenderClock, Stamp
+from companion.mavlink.clock.estimates import ClockChange, ClockEstimate, Stamp
+from companion.mavlink.clock.sender_clock import SenderClock
 from companion.mavlink.trust.admission import Admission
 from companion.mavlink.trust.adsb import Aircraft
 from companion.mavlink.trust.dedupe import Dedupe, LinkShare
-from companion.mavlink.wire.decode import decode
+from companion.mavlink.wire.decode import ATTITUDE, decode
+from companion.mavlink.wire.stamps import boot_ms
 from companion.pipeline import assembly
 from companion.settings.model import Settings
 from companion.tracking import noise
@@ -21,6 +23,7 @@ from companion.values import (
     Attitude,
     Frame,
     GnssStatus,
+    Limits,
     Notice,
     Presence,
     Reason,
@@ -32,6 +35,7 @@ from companion.values import (
     Severity,
     Source,
     SystemTime,
+    reports_itself,
 )
 
 CLOCKS_MAX: Final = 4096
@@ -46,12 +50,14 @@ class PlacedReport:
     t_ns       the same instant on the node's timeline
     noise      bounds on its errors; None for a relayed aircraft, whose errors depend on its
                speed
+    limits     what the aircraft is taken to be able to do
     """
 
     report: Report
     sender_ns: int
     t_ns: int
     noise: ReportNoise | None
+    limits: Limits
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,11 +75,13 @@ class Heard:
     message    a message with its time; None if nothing is to be done further
     said       notices and rejections on the way to it
     restarted  the sender whose past is to be forgotten; None if there is none
+    change     what the frame showed of a change of its sender's clock; None where it showed none
     """
 
     message: PlacedReport | PlacedAttitude | None = None
     said: tuple[Notice | Rejection, ...] = ()
     restarted: str | None = None
+    change: ClockChange | None = None
 
 
 NOTHING: Final = Heard()
@@ -97,11 +105,14 @@ class Senders:
         self._dedupe = Dedupe()
         self._admission = Admission(settings.tracks.allow, settings.tracks.deny)
         self._shared: set[str] = set()
+        self._known: dict[str, assembly.Assumed] = {}  # by UAV
 
     # --- what they say ----------------------------------------------------------------------
 
     def hear(self, frame: Frame) -> Heard:
         """Take in one frame of a message that is decoded (``decode.DECODED``)."""
+        if frame.msgid == ATTITUDE and str(frame.source) != self._carrier:
+            return Heard(change=self.notice(frame))
         message = decode(frame)
         match message:
             case Rejection():
@@ -116,20 +127,40 @@ class Senders:
                 if not self._admission.admits(message.uav):
                     return _refused(message, Reason.NOT_ALLOWED)
                 return self._relayed(message)
-            case Attitude() if str(message.source) == self._carrier:
+            case Attitude():
                 return self._attitude(message)
             case GnssStatus():
                 self._noise[message.source] = noise.reported(message, self._noise_settings)
-            case SystemTime() if message.unix_us is not None:
-                clock = self._clock(str(message.source))
-                clock.system_time(message.t_ns, message.unix_us, message.boot_ms)
+            case SystemTime():
+                change = self.notice(frame)
+                if message.unix_us is not None:
+                    clock = self._clock(str(message.source))
+                    clock.system_time(message.t_ns, message.unix_us, message.boot_ms)
+                return Heard(change=change)
             case Presence():
                 self.presence[message.source] = message
+                self._known.pop(str(message.source), None)
         return NOTHING
 
-    def round_trip(self, event: RoundTrip) -> None:
-        """Take in a TIMESYNC round trip, as evidence of its sender's clock."""
-        self._clock(str(event.source)).timesync(event.sent_ns, event.t_ns, event.remote_ns)
+    def notice(self, frame: Frame) -> ClockChange | None:
+        """Take in the stamp of a frame that is not decoded otherwise, for its sender's clock.
+
+        Returns what it showed of a change of that clock.
+        """
+        clock = self._clocks.get(str(frame.source))
+        if clock is None:
+            return None
+        clock.notice(frame.t_ns, boot_ms(frame))
+        return clock.change
+
+    def round_trip(self, event: RoundTrip) -> ClockChange | None:
+        """Take in a TIMESYNC round trip, as evidence of its sender's clock.
+
+        Returns what it showed of a change of that clock.
+        """
+        clock = self._clock(str(event.source))
+        clock.timesync(event.sent_ns, event.t_ns, event.remote_ns)
+        return clock.change
 
     def _telemetry(self, report: Report) -> Heard:
         """Place a report that a vehicle makes of itself, by its boot time."""
@@ -144,8 +175,11 @@ class Senders:
             return Heard(None, (*said, Rejection(t_ns, uav, Reason.UNPLACED_STAMP)), restarted)
         self._dedupe.took(stamp.latency_s)
         errors = self._noise.get(report.source, self._noise_settings.default)
-        true_ns = t_ns - round(stamp.latency_s * 1e9)
-        return Heard(PlacedReport(report, stamp.sender_ns, true_ns, errors), said, restarted)
+        assumed = self._assumed(uav)
+        lag_ns = round(sum(assumed.lag_s) / 2 * 1e9)
+        true_ns = t_ns - round(stamp.latency_s * 1e9) - lag_ns
+        placed = PlacedReport(report, stamp.sender_ns - lag_ns, true_ns, errors, assumed.limits)
+        return Heard(placed, said, restarted, self._clock(uav).change)
 
     def _relayed(self, said: AdsbVehicle) -> Heard:
         """Place a report of an aircraft that a receiver relays.
@@ -157,7 +191,8 @@ class Senders:
         if isinstance(merged, Rejection):
             return Heard(said=(merged,))
         true_ns = merged.t_ns - round((merged.tslc_s or 0.0) * 1e9)
-        placed = PlacedReport(merged, true_ns, true_ns, None)
+        limits = self._assumed(said.uav).limits
+        placed = PlacedReport(merged, true_ns, true_ns, None, limits)
         if datum in (None, merged.alt_datum):
             return Heard(placed)
         text = f"{said.uav} is tracked anew: its altitude is {merged.alt_datum} now, not {datum}"
@@ -195,15 +230,28 @@ class Senders:
     def time(self, uav: str, node_ns: int) -> SenderTime:
         """A node time on a UAV's own timeline; a relayed aircraft's timeline is the node's."""
         clock = self._clocks.get(uav)
-        estimate = clock.estimate() if clock else None
+        estimate = clock.estimate(node_ns) if clock else None
         if clock is None or estimate is None:
-            return SenderTime(node_ns, node_ns, noise.ADSB_TIME_BOUND_S)
-        return SenderTime(node_ns, clock.sender_ns(node_ns), estimate.uncertainty_s)
+            bound_s = noise.ADSB_TIME_BOUND_S
+            return SenderTime(node_ns, node_ns, bound_s, bound_s)
+        least_s, greatest_s = self._assumed(uav).lag_s
+        rest_s = (greatest_s - least_s) / 2
+        before_s, after_s = estimate.before_s + rest_s, estimate.after_s + rest_s
+        return SenderTime(node_ns, node_ns - estimate.offset_ns, before_s, after_s)
 
     def clock_estimate(self, uav: str) -> ClockEstimate | None:
         """The state of a UAV's clock; None for a UAV that has none."""
         clock = self._clocks.get(uav)
         return clock.estimate() if clock else None
+
+    def _assumed(self, uav: str) -> assembly.Assumed:
+        """What is assumed of a UAV, by its newest heartbeat."""
+        known = self._known.get(uav)
+        if known is None:
+            heard = self.presence.get(Source.parse(uav)) if reports_itself(uav) else None
+            what = (None, None) if heard is None else (heard.mav_type, heard.autopilot)
+            known = self._known.setdefault(uav, assembly.assumed(self._settings, uav, *what))
+        return known
 
     # --- memory -----------------------------------------------------------------------------
 

@@ -90,6 +90,11 @@ def track(value: Track, t_ns: int) -> Any:
         horizontal_bound_m=value.horizontal_bound_m,
         vertical_bound_m=value.vertical_bound_m,
         clock_bound_s=value.clock_bound_s,
+        set_center_ned_m=value.set_center_ned_m.tolist(),
+        set_radius_m=value.set_radius_m,
+        speed_max_mps=value.limits.speed_mps,
+        acceleration_max_mps2=value.limits.acceleration_mps2,
+        limits_source=value.limits.source.value,
         reports=value.reports,
     )
 

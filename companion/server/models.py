@@ -45,9 +45,15 @@ class Clock(BaseModel):
     """What is known of a sender's clock."""
 
     kind: str
+    guarantee: Annotated[
+        Literal["measured", "assumed"],
+        Field(description="whether both sides of its interval were measured"),
+    ]
     offset_s: float
     drift_ppm: float | None
     uncertainty_s: float | None
+    before_s: float
+    after_s: float
     constant_delay_s: float | None
     latency_s: float | None
 
@@ -67,6 +73,15 @@ class Fix(BaseModel):
     lat_deg: float
     lon_deg: float
     alt_m: float
+
+
+class Assumptions(BaseModel):
+    """What the bounds of one UAV rest on, and how often its reports or stamps refuted that."""
+
+    source: Literal["settings", "type", "raised"]
+    speed_max_mps: float
+    acceleration_max_mps2: float
+    refuted: int
 
 
 class UavState(BaseModel):
@@ -94,7 +109,18 @@ class UavState(BaseModel):
     unknown_input_mps: Vector | None
     acceleration_ned_mps2: Vector | None
     bound_m: Annotated[float, Field(description="the position is within this", examples=[4.2])]
-    bound_ellipsoid_ned_m: Vector
+    bound_cylinder_ned_m: Annotated[
+        Vector,
+        Field(description="half axes of the upright cylinder that holds the position"),
+    ]
+    bound_ellipsoid_ned_m: Annotated[
+        Vector, Field(deprecated=True, description="the same under its old name")
+    ]
+    set_center_ned_m: Annotated[
+        Vector, Field(description="centre of the least ball that holds every possible place")
+    ]
+    set_radius_m: float
+    assumptions: Assumptions
     clock_bound_s: float
     clock: Clock | None
     dt_s: float | None

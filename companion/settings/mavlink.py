@@ -118,7 +118,7 @@ class TrackSettings(Section):
     most: Annotated[int, Field(ge=1, le=100_000)] = 2000
     window_s: PositiveFloat = 5.0
     reacquire_reports: Annotated[int, Field(ge=2, le=60)] = 3
-    reacquire_s: Annotated[float, Field(ge=0, le=60)] = 3.0
+    reacquire_s: Annotated[float, Field(ge=0, le=60)] = 1.0
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:

@@ -15,12 +15,16 @@ import numpy as np
 
 from companion.tracking.gate import GateSettings, Suspects, is_frozen, refusal
 from companion.tracking.history import History
+from companion.tracking.limits import Refutations
 from companion.tracking.observers.estimates import Observer, Prediction
+from companion.tracking.reach import Reach, reach
 from companion.values import (
     Estimate,
     Fix,
     FloatArray,
+    Limits,
     Reason,
+    Refuted,
     Rejection,
     SenderTime,
     Track,
@@ -52,8 +56,7 @@ class Ages:
 class FleetSettings:
     """How tracks are kept.
 
-    speed_max_mps          greatest speed assumed possible
-    acceleration_max_mps2  greatest acceleration assumed possible
+    limits                 what aircraft can do whose reports have no limits of their own
     ages                   when a track passes from state to state
     gate                   when refused reports begin a track again
     window_s               how late a report may come and still be put in order
@@ -61,8 +64,7 @@ class FleetSettings:
     most                   largest number of tracks
     """
 
-    speed_max_mps: float
-    acceleration_max_mps2: float
+    limits: Limits
     ages: Ages = field(default_factory=Ages)
     gate: GateSettings = field(default_factory=GateSettings)
     window_s: float = 5.0
@@ -81,7 +83,6 @@ class _Tracked:
     unknown_input: FloatArray | None = None
     mu_max_s2: float | None = None
     acceleration: FloatArray | None = None
-    acceleration_mps2: float = 0.0
 
 
 class Fleet:
@@ -96,8 +97,21 @@ class Fleet:
         self._observer = observer
         self._settings = settings
         self._tracked: dict[str, _Tracked] = {}
+        self._refutations: dict[str, Refutations] = {}
 
     # --- reports in -------------------------------------------------------------------------
+
+    def refuted(self, fix: Fix) -> tuple[Fix, list[Refuted]]:
+        """What a report refutes of its aircraft's limits, and the report with the limits raised."""
+        if fix.limits is None:
+            fix = replace(fix, limits=self._settings.limits)
+        known = self._refutations.get(fix.uav)
+        if known is None:
+            known = self._refutations.setdefault(fix.uav, Refutations())
+        found = known.look(fix)
+        assert fix.limits is not None
+        limits = known.limits(fix.limits, fix.sender_ns)
+        return (fix if limits is fix.limits else replace(fix, limits=limits)), found
 
     def accept(self, fix: Fix) -> Estimate | Rejection:
         """Add a report to its track, or begin a track; or return the reason why it is not used."""
@@ -114,10 +128,11 @@ class Fleet:
         if wrong is not None:
             return _rejected(fix, *wrong)
         predicted = self._observer.predict(before.state, fix.sender_ns)
-        impossible = refusal(predicted, fix, self._settings.gate.lead_m)
+        impossible = refusal(predicted, fix, self._settings.gate.slack_m(before.fix, fix))
         if impossible is not None:
             return self._suspect(tracked, fix, impossible)
         tracked.believable_ns = max(tracked.believable_ns, fix.sender_ns)
+        tracked.suspects.interrupt()
         if tracked.suspects.goes_on(fix.sender_ns):
             return _rejected(fix, Reason.SHARED_ID, "a second vehicle reports under this id")
         return self._use(tracked, index, fix, predicted)
@@ -153,12 +168,14 @@ class Fleet:
         silent_s = (fix.sender_ns - newest_ns) * 1e-9
         if not tracked.suspects.agree() or silent_s < self._settings.gate.reacquire_s:
             return _rejected(fix, *why)
+        before = tracked.history.newest
         first, *rest = tracked.suspects.take()
+        off = first.position_ned_m - self._observer.predict(before.state, first.sender_ns)[0]
         begun = self._begin(first, tracked.reports)
         for later in rest:
             begun = self._use(self._tracked[fix.uav], len(self._history(fix.uav).entries), later)
         self._tracked[fix.uav].arrived = fix
-        return replace(begun, reacquired=True)
+        return replace(begun, innovation_m=math.sqrt(off @ off), reacquired=True)
 
     def _history(self, uav: str) -> History[Any]:
         return self._tracked[uav].history
@@ -169,7 +186,7 @@ class Fleet:
         history = tracked.history
         history.insert(index, fix, predicted)
         tracked.reports += 1
-        tracked.acceleration, tracked.acceleration_mps2 = self._acceleration(history)
+        tracked.acceleration = self._acceleration(history)
         tracked.newest = self._estimate(tracked, len(history.entries) - 1)
         tracked.unknown_input = _unknown_input(history)
         if tracked.newest.fix is fix:
@@ -191,18 +208,19 @@ class Fleet:
         innovation_m = math.sqrt(off @ off)
         return Estimate(entry.fix, predicted.position_ned_m, predicted.bound_m, innovation_m, dt_s)
 
-    def _acceleration(self, history: History[Any]) -> tuple[FloatArray | None, float]:
-        """The acceleration that is fed forward, cut to the greatest possible size, and its size."""
+    def _acceleration(self, history: History[Any]) -> FloatArray | None:
+        """The acceleration that is fed forward, cut to the greatest possible size."""
         found = history.acceleration() if self._settings.feed_forward else None
         if found is None:
-            return None, 0.0
-        most_mps2 = self._settings.acceleration_max_mps2
+            return None
+        most_mps2 = self._limits(history.newest.fix).acceleration_mps2
         size = math.sqrt(found @ found)
-        return (found, size) if size <= most_mps2 else (found * (most_mps2 / size), most_mps2)
+        return found if size <= most_mps2 else np.asarray(found * (most_mps2 / size))
 
     def forget(self, uav: str) -> None:
         """Forget a track, because its sender was restarted or is gone."""
         self._tracked.pop(uav, None)
+        self._refutations.pop(uav, None)
 
     def silent(self, now_ns: int, for_s: float) -> list[str]:
         """UAVs of which no report has arrived for ``for_s`` seconds, node time."""
@@ -217,7 +235,7 @@ class Fleet:
         if tracked is None:
             return None
         now = at.sender_ns - (at.node_ns - now_ns)
-        predicted = self._predict(tracked, at)
+        predicted, possible = self._predict(tracked, at)
         newest = tracked.history.newest
         last = tracked.newest
         return Track(
@@ -229,9 +247,12 @@ class Fleet:
             velocity_ned_mps=predicted.velocity_ned_mps,
             unknown_input_mps=tracked.unknown_input,
             acceleration_ned_mps2=tracked.acceleration,
-            bound_m=predicted.bound_m,
-            horizontal_bound_m=predicted.horizontal_m,
-            vertical_bound_m=predicted.vertical_m,
+            bound_m=possible.bound_m,
+            horizontal_bound_m=possible.horizontal_m,
+            vertical_bound_m=possible.vertical_m,
+            set_center_ned_m=possible.center_ned_m,
+            set_radius_m=possible.radius_m,
+            limits=self._limits(newest.fix),
             clock_bound_s=at.bound_s,
             dt_s=last.dt_s,
             latency_s=(newest.fix.arrival_ns - newest.fix.t_ns) * 1e-9,
@@ -240,8 +261,8 @@ class Fleet:
             reports=tracked.reports,
         )
 
-    def _predict(self, tracked: _Tracked, at: SenderTime) -> Prediction:
-        """The observer's prediction, its bound widened by acceleration and clock uncertainty.
+    def _predict(self, tracked: _Tracked, at: SenderTime) -> tuple[Prediction, Reach]:
+        """The observer's prediction with the acceleration fed forward, and what is possible then.
 
         See docs/math.md 5.1.
         """
@@ -249,36 +270,26 @@ class Fleet:
         found = self._observer.predict(newest.state, at.sender_ns)
         ahead_s = (at.sender_ns - newest.fix.sender_ns) * 1e-9
         position, velocity = found.position_ned_m, found.velocity_ned_mps
-        velocity_bound_mps, widened_m = found.velocity_bound_mps, 0.0
         if tracked.acceleration is not None and velocity is not None and ahead_s > 0:
-            # The bound allows for any acceleration up to its limit; the part that is fed forward
-            # may be wrong by its whole size besides.
             way_s2, gain_s = _fading(ahead_s)
             position = position + way_s2 * tracked.acceleration
             velocity = velocity + gain_s * tracked.acceleration
-            widened_m = way_s2 * tracked.acceleration_mps2
-            velocity_bound_mps = (velocity_bound_mps or 0.0) + gain_s * tracked.acceleration_mps2
-        if at.bound_s > 0:
-            widened_m += at.bound_s * self._fastest_mps(velocity, velocity_bound_mps, at.bound_s)
-        return Prediction(
-            position,
-            velocity,
-            found.bound_m + widened_m,
-            found.horizontal_m + widened_m,
-            found.vertical_m + widened_m,
-            velocity_bound_mps,
-            found.mu_s2,
+        found = found._replace(position_ned_m=position, velocity_ned_mps=velocity)
+        limits = self._limits(newest.fix)
+        if newest.fix.velocity_ned_mps is not None and found.mu_s2 is None:
+            return found, reach(newest.fix, limits, position, at)
+        widened_m = at.bound_s * _fastest_mps(found, limits, at.bound_s)
+        bound_m = found.bound_m + widened_m
+        return found, Reach(
+            bound_m, found.horizontal_m + widened_m, found.vertical_m + widened_m, position, bound_m
         )
 
-    def _fastest_mps(
-        self, velocity: FloatArray | None, bound_mps: float | None, within_s: float
-    ) -> float:
-        """Greatest speed within a time of the instant at which the UAV has this velocity."""
-        most_mps = self._settings.speed_max_mps
-        if velocity is None or bound_mps is None:
-            return most_mps
-        gained_mps = self._settings.acceleration_max_mps2 * within_s
-        return min(most_mps, math.sqrt(velocity @ velocity) + bound_mps + gained_mps)
+    def _limits(self, fix: Fix) -> Limits:
+        return fix.limits or self._settings.limits
+
+    def __contains__(self, uav: str) -> bool:
+        """Whether there is a track of this UAV."""
+        return uav in self._tracked
 
     def newest(self, uav: str) -> Fix | None:
         """The newest accepted report of a UAV; None if it was never seen."""
@@ -307,6 +318,15 @@ class Fleet:
             if offset @ offset < within_m**2:
                 found.append(uav)
         return found
+
+
+def _fastest_mps(found: Prediction, limits: Limits, within_s: float) -> float:
+    """Greatest speed within a time of the instant at which the UAV is predicted."""
+    velocity, bound_mps = found.velocity_ned_mps, found.velocity_bound_mps
+    if velocity is None or bound_mps is None:
+        return limits.speed_mps
+    gained_mps = limits.acceleration_mps2 * within_s
+    return min(limits.speed_mps, math.sqrt(velocity @ velocity) + bound_mps + gained_mps)
 
 
 def _rejected(fix: Fix, reason: Reason, detail: str) -> Rejection:

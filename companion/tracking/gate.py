@@ -10,7 +10,7 @@ See docs/math.md 5.2.
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import Generic
+from typing import Final, Generic
 
 import numpy as np
 
@@ -22,6 +22,11 @@ FROZEN_SPEED_MPS = 1.0
 FROZEN_TRAVEL_M = 0.3
 """Least distance that this speed must have covered while the position stayed the same."""
 
+TURNS: Final = 3
+"""Times that refused and possible reports must take turns before they are of two vehicles."""
+SHARED_S: Final = 3.0
+"""Seconds for which they must do so."""
+
 
 @dataclass(frozen=True, slots=True)
 class GateSettings:
@@ -32,12 +37,28 @@ class GateSettings:
     forget_s           seconds without another one after which they are forgotten
     lead_m             how far a report may be ahead of the position or behind it, beside its
                        noise (a feedthrough)
+    lag_rest_s         half of the time by which positions may lag more or less than is taken off
+    drift_max          greatest drift of a sender's clock, a ratio
     """
 
     reacquire_reports: int = 3
-    reacquire_s: float = 3.0
+    reacquire_s: float = 1.0
     forget_s: float = 10.0
     lead_m: float = 0.0
+    lag_rest_s: float = 0.0
+    drift_max: float = 250e-6
+
+    def slack_m(self, before: Fix, fix: Fix) -> float:
+        """How far apart two reports of one UAV may be because of their times alone.
+
+        Stamps are whole milliseconds, and the clock between them may drift.
+        """
+        velocity = fix.velocity_ned_mps
+        if velocity is None:
+            return self.lead_m
+        apart_s = abs(fix.sender_ns - before.sender_ns) * 1e-9
+        slack_s = 1e-3 + self.drift_max * apart_s + self.lag_rest_s
+        return self.lead_m + slack_s * math.sqrt(velocity @ velocity)
 
 
 def refusal(predicted: Prediction, fix: Fix, lead_m: float = 0.0) -> tuple[Reason, str] | None:
@@ -71,6 +92,8 @@ class Suspects(Generic[State]):
         self._settings = settings
         self._run: deque[Fix] = deque(maxlen=64)
         self._begun_ns = 0
+        self._turns = 0
+        self._interrupted = False
 
     def add(self, fix: Fix) -> None:
         """Set a refused report aside: it continues the run, or begins another."""
@@ -80,11 +103,18 @@ class Suspects(Generic[State]):
             old = fix.sender_ns - last.sender_ns > self._settings.forget_s * 1e9
             if fix.sender_ns <= last.sender_ns:
                 return
-            if old or refusal(predicted, fix, self._settings.lead_m) is not None:
+            slack_m = self._settings.slack_m(last, fix)
+            if old or refusal(predicted, fix, slack_m) is not None:
                 self._run.clear()
         if not self._run:
-            self._begun_ns = fix.sender_ns
+            self._begun_ns, self._turns = fix.sender_ns, 0
+        self._turns += self._interrupted
+        self._interrupted = False
         self._run.append(fix)
+
+    def interrupt(self) -> None:
+        """Note that a report was possible: the run may be another vehicle's, or is over."""
+        self._interrupted = True
 
     def agree(self) -> bool:
         """Whether the run is long enough, in reports and in seconds, to be believed."""
@@ -94,8 +124,12 @@ class Suspects(Generic[State]):
         return lasted_ns >= self._settings.reacquire_s * 1e9
 
     def goes_on(self, sender_ns: int) -> bool:
-        """Whether the run is to be believed and was added to within the last ``forget_s``."""
-        return self.agree() and sender_ns - self._run[-1].sender_ns < self._settings.forget_s * 1e9
+        """Whether the run is a second vehicle's: it goes on while possible reports come between."""
+        if len(self._run) < self._settings.reacquire_reports or self._turns < TURNS:
+            return False
+        if self._run[-1].sender_ns - self._begun_ns < SHARED_S * 1e9:
+            return False
+        return sender_ns - self._run[-1].sender_ns < self._settings.forget_s * 1e9
 
     def take(self) -> list[Fix]:
         """Take the run out."""

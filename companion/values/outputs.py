@@ -5,7 +5,7 @@ from enum import StrEnum
 
 from companion.values.aimed import BeamSet
 from companion.values.received import Rejection
-from companion.values.tracked import Carrier, Estimate, Track
+from companion.values.tracked import Carrier, Estimate, Refuted, Track
 
 
 class Severity(StrEnum):
@@ -44,5 +44,5 @@ class Update:
     beams: BeamSet
 
 
-Output = Rejection | Estimate | Notice | Update
+Output = Rejection | Estimate | Notice | Refuted | Update
 """Everything that the pipeline can return for an event."""

@@ -23,6 +23,48 @@ class ReportNoise:
     velocity_mps: float
 
 
+class LimitSource(StrEnum):
+    """Where a limit of an aircraft comes from."""
+
+    SETTINGS = "settings"
+    TYPE = "type"
+    RAISED = "raised"
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What an aircraft is taken to be able to do, which the bounds rest on.
+
+    speed_mps          greatest speed, norm of a 3-vector
+    acceleration_mps2  greatest acceleration, norm of a 3-vector
+    source             the settings, the aircraft's type, or raised because reports refuted them
+    """
+
+    speed_mps: float
+    acceleration_mps2: float
+    source: LimitSource = LimitSource.SETTINGS
+
+
+@dataclass(frozen=True, slots=True)
+class Refuted:
+    """An assumption that what was reported proves to be wrong; it was raised.
+
+    t_ns       when that was seen, node time
+    uav        whose assumption it is
+    setting    name of the setting that holds it
+    limit      what was assumed, in the setting's unit
+    proven     what was proven at least
+    raised_to  what is assumed from now on, fading back over minutes
+    """
+
+    t_ns: int
+    uav: str
+    setting: str
+    limit: float
+    proven: float
+    raised_to: float
+
+
 @dataclass(frozen=True, slots=True)
 class Fix:
     """A report put on the node's timeline and into the local frame.
@@ -35,6 +77,7 @@ class Fix:
         velocity_ned_mps   (3,), local frame; None if not sent
         noise              bounds on the errors of both
         report             the report itself
+        limits             what the aircraft is taken to be able to do; None: the observer's model
 
     ``arrival_ns - t_ns`` is the visible latency. A report without a sender's clock has ``sender_ns
     == t_ns``.
@@ -48,6 +91,7 @@ class Fix:
     velocity_ned_mps: FloatArray | None
     noise: ReportNoise
     report: Report
+    limits: Limits | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +102,7 @@ class Estimate:
     position_ned_m  (3,), local frame: the estimate before this report entered it
     bound_m         bound on the norm of that estimate's error
     innovation_m    distance from the estimate to the report; None for the first report of a
-                    track
+                    track; of one that was begun again, how far it jumped
     dt_s            interval since the report before; None for the first report of a track
     reacquired      True if the track was begun again, from reports that disagreed with the
                     track but agreed with one another
@@ -76,12 +120,19 @@ class Estimate:
 class SenderTime:
     """A time of the node, ``node_ns``, converted to a sender's timeline.
 
-    ``sender_ns`` is right to within ``bound_s`` seconds.
+    node_ns, sender_ns  the time on both timelines
+    before_s, after_s   by how much the true sender time may be less, or more, than ``sender_ns``
     """
 
     node_ns: int
     sender_ns: int
-    bound_s: float
+    before_s: float
+    after_s: float
+
+    @property
+    def bound_s(self) -> float:
+        """Bound on the error of ``sender_ns``, seconds."""
+        return max(self.before_s, self.after_s)
 
 
 class TrackState(StrEnum):
@@ -105,8 +156,10 @@ class Track:
         bound_m                bound on the norm of the position error
         horizontal_bound_m     its part in the plane: the error lies in an upright cylinder of this
         vertical_bound_m       radius and of this half height
-        clock_bound_s          uncertainty of the sender's clock, whose effect is in all three
-                               bounds
+        set_center_ned_m       centre of the least ball that holds every place that is possible,
+        set_radius_m           and its radius: for whoever plans with it, not to point at
+        limits                 what the aircraft is taken to be able to do
+        clock_bound_s          uncertainty of the sender's clock, whose effect is in all bounds
         dt_s                   interval between the last two reports
         latency_s              visible latency of the newest report
         gamma                  certified gain over all intervals that occurred (docs/math.md 2.3);
@@ -129,6 +182,9 @@ class Track:
     bound_m: float
     horizontal_bound_m: float
     vertical_bound_m: float
+    set_center_ned_m: FloatArray
+    set_radius_m: float
+    limits: Limits
     clock_bound_s: float
     dt_s: float | None
     latency_s: float | None

@@ -1,9 +1,10 @@
 """The answer of ``/v1/design``: the observer in use, its gains, and its certificate."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
 from companion.settings.files import kinematic_design
 from companion.settings.model import Settings
@@ -11,10 +12,24 @@ from companion.settings.tracking import ObserverSettings
 from companion.tracking.design import answers, gain_table
 from companion.tracking.design.gain_table import KinematicDesign
 from companion.tracking.observers.kinematic import VELOCITY_SHARE
-from companion.values import FloatArray, Track
+from companion.values import FloatArray, Limits, Track
 from companion.views.words import rfc3339
 
 Json = dict[str, Any]
+
+
+class _Bounds(NamedTuple):
+    """The bounds that one aircraft's observer relies on."""
+
+    speed_max_mps: float
+    acceleration_max_mps2: float
+    position_noise_m: float
+    velocity_noise_mps: float
+
+
+def _bounds(given: ObserverSettings, limits: Limits) -> _Bounds:
+    noise = (given.position_noise_m, given.velocity_noise_mps)
+    return _Bounds(limits.speed_mps, limits.acceleration_mps2, *noise)
 
 
 class DesignView:
@@ -25,6 +40,7 @@ class DesignView:
 
     def __init__(self, settings: Settings) -> None:
         self._observer = settings.observer
+        self._anyone = _bounds(settings.observer, assembly.anyone(settings))
         self._table = None if self._observer.model == "position" else kinematic_design(settings)
 
     def show(self, pipeline: Pipeline, now_ns: int) -> Json:
@@ -38,13 +54,8 @@ class DesignView:
         return {
             "valid_at": rfc3339(now_ns),
             "model": given.model,
-            "assumed": {
-                "speed_max_mps": given.speed_max_mps,
-                "acceleration_max_mps2": given.acceleration_max_mps2,
-                "position_noise_m": given.position_noise_m,
-                "velocity_noise_mps": given.velocity_noise_mps,
-            },
-            "certificate": None if self._table is None else _certificate(self._table, given),
+            "assumed": self._anyone._asdict(),
+            "certificate": None if self._table is None else _certificate(self._table, self._anyone),
             "designs": [
                 {"uav": track.uav, **self._row(pipeline, track, track.dt_s)}
                 for track in pipeline.tracks(now_ns, now_ns)
@@ -56,7 +67,8 @@ class DesignView:
         given, newest = self._observer, pipeline.fleet.newest(track.uav)
         has_velocity = newest is not None and newest.velocity_ned_mps is not None
         if self._table is not None:
-            return _kinematic(self._table, given, dt_s) if has_velocity else _shared(given, dt_s)
+            bounds = _bounds(given, track.limits)
+            return _kinematic(self._table, bounds, dt_s) if has_velocity else _shared(bounds, dt_s)
         lead_s = given.feedthrough_s
         if has_velocity:
             lead_s += max(given.velocity_lead_s, dt_s)
@@ -64,7 +76,7 @@ class DesignView:
         return answers.row(dt_s, lead_s, alpha, None, "position", "closed-form")
 
 
-def _scale(table: KinematicDesign, given: ObserverSettings) -> float:
+def _scale(table: KinematicDesign, given: _Bounds) -> float:
     """How many times larger the assumed bounds are than those of the table.
 
     The errors obey a linear equation, so the guarantee grows by the same factor (docs/math.md 4).
@@ -78,7 +90,7 @@ def _scale(table: KinematicDesign, given: ObserverSettings) -> float:
     return max(ratios)
 
 
-def _certificate(table: KinematicDesign, given: ObserverSettings) -> Json:
+def _certificate(table: KinematicDesign, given: _Bounds) -> Json:
     """The certificate for every order of intervals within the range: e'Pe <= scale^2 stays true."""
     scale = _scale(table, given)
     return {
@@ -91,7 +103,7 @@ def _certificate(table: KinematicDesign, given: ObserverSettings) -> Json:
     }
 
 
-def _kinematic(table: KinematicDesign, given: ObserverSettings, dt_s: float) -> Json:
+def _kinematic(table: KinematicDesign, given: _Bounds, dt_s: float) -> Json:
     """Gains by the table.
 
     Mu, gamma and residual are those of its certificate, one for all intervals.
@@ -108,7 +120,7 @@ def _kinematic(table: KinematicDesign, given: ObserverSettings, dt_s: float) -> 
     }
 
 
-def _shared(given: ObserverSettings, dt_s: float) -> Json:
+def _shared(given: _Bounds, dt_s: float) -> Json:
     """Gains for a UAV without a reported velocity: a fixed share of what two reports show.
 
     They have no certificate.
@@ -124,9 +136,7 @@ def _shared(given: ObserverSettings, dt_s: float) -> Json:
     }
 
 
-def _row(
-    dt_s: float, gain: FloatArray, given: ObserverSettings, velocity_noise_mps: float | None
-) -> Json:
+def _row(dt_s: float, gain: FloatArray, given: _Bounds, velocity_noise_mps: float | None) -> Json:
     motion = answers.KinematicLimits(
         given.acceleration_max_mps2, given.position_noise_m, velocity_noise_mps
     )

@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from companion.mavlink.clock.sender_clock import ClockEstimate
+from companion.mavlink.clock.estimates import ClockEstimate
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.voice.rate_watch import MessageRate
 from companion.pipeline.assembly import Equipment
@@ -199,6 +199,7 @@ def uav(
     velocity = vector(track.velocity_ned_mps)
     refused = pipeline.refusals.of(track.uav)
     newest = pipeline.fleet.newest(track.uav)
+    cylinder = [track.horizontal_bound_m] * 2 + [track.vertical_bound_m]
     return {
         "id": track.uav,
         "state": str(track.state),
@@ -222,7 +223,16 @@ def uav(
         "unknown_input_mps": vector(track.unknown_input_mps),
         "acceleration_ned_mps2": vector(track.acceleration_ned_mps2),
         "bound_m": track.bound_m,
-        "bound_ellipsoid_ned_m": [track.horizontal_bound_m] * 2 + [track.vertical_bound_m],
+        "bound_cylinder_ned_m": cylinder,
+        "bound_ellipsoid_ned_m": cylinder,
+        "set_center_ned_m": vector(track.set_center_ned_m),
+        "set_radius_m": track.set_radius_m,
+        "assumptions": {
+            "source": str(track.limits.source),
+            "speed_max_mps": track.limits.speed_mps,
+            "acceleration_max_mps2": track.limits.acceleration_mps2,
+            "refuted": pipeline.assumptions.times(track.uav),
+        },
         "clock_bound_s": track.clock_bound_s,
         "clock": clock(pipeline.clock_estimate(track.uav)),
         "dt_s": track.dt_s,
@@ -255,9 +265,12 @@ def clock(estimate: ClockEstimate | None) -> Json | None:
         return None
     return {
         "kind": str(estimate.kind),
+        "guarantee": str(estimate.guarantee),
         "offset_s": estimate.offset_ns * 1e-9,
         "drift_ppm": estimate.drift_ppm,
         "uncertainty_s": estimate.uncertainty_s,
+        "before_s": estimate.before_s,
+        "after_s": estimate.after_s,
         "constant_delay_s": estimate.constant_delay_s,
         "latency_s": estimate.latency_s,
     }

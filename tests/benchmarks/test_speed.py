@@ -134,7 +134,7 @@ def _update_us(uavs: int) -> float:
                 name = str(uav)
                 fleet.accept(Fix(name, t_ns, t_ns, t_ns, position, velocity, noise, report))
                 later_ns = t_ns + 50_000_000
-                fleet.track(name, t_ns, SenderTime(later_ns, later_ns, 0.01))
+                fleet.track(name, t_ns, SenderTime(later_ns, later_ns, 0.01, 0.01))
         begin_ns += rounds * 100_000_000
 
     (seconds,) = interleaved_s(fly)

@@ -25,9 +25,8 @@ from companion.values import Frame, Report
 RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
 
 
-PAPER_BOUNDS = """[clocks]
-constant_delay_s = 0.0
-[observer]
+PAPER_BOUNDS = """[observer]
+lag_s = [0.0, 0.0]
 speed_max_mps = 151.0
 acceleration_max_mps2 = 190.0
 position_noise_m = 1.0

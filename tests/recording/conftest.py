@@ -18,6 +18,7 @@ from companion.values import (
     FloatArray,
     Frame,
     LeftOut,
+    Limits,
     Method,
     Normalisation,
     Notice,
@@ -100,7 +101,8 @@ def events(wire: Callable[..., list[bytes]]) -> Callable[[int], list[Event]]:
 def _track(uav: str, t_ns: int) -> Track:
     return Track(
         uav, TrackState.LIVE, t_ns + 5, 0.25, np.array([10.0, 20.0, -30.0]), None,
-        np.array([0.1, 0.2, 0.3]), None, 3.0, 2.0, 2.5, 0.0, 0.1, None, 0.4, 0.0, 7,
+        np.array([0.1, 0.2, 0.3]), None, 3.0, 2.0, 2.5, np.zeros(3), 3.0,
+        Limits(60.0, 5.0), 0.0, 0.1, None, 0.4, 0.0, 7,
     )  # fmt: skip
 
 

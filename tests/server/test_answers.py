@@ -169,7 +169,7 @@ def test_the_design_is_that_of_the_observer_in_use(client: TestClient, shared_no
     """L by its definition, A(T) M(T); the worst error within the guarantee, at each interval."""
     shown = client.get("/v1/design").json()
     pipeline, certificate = shared_node.pipeline, shown["certificate"]
-    assert shown["assumed"]["acceleration_max_mps2"] == 5.0
+    assert shown["assumed"]["acceleration_max_mps2"] == 16.0
     assert certificate["scale"] == pytest.approx(6.0)  # 3 m of noise for the table's 0.5 m
     p = np.array(certificate["P"])
     assert certificate["bound_m"] == pytest.approx(6 * np.sqrt(np.linalg.inv(p)[0, 0]))

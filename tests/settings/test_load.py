@@ -161,7 +161,7 @@ def test_a_track_passes_its_states_in_order(text: str) -> None:
 def test_without_a_file_there_are_the_defaults() -> None:
     assert load(None) == Settings()
     observer = load(None).observer
-    assert (observer.model, observer.acceleration_max_mps2) == ("kinematic", 5.0)
+    assert (observer.model, observer.acceleration_max_mps2) == ("kinematic", None)
     assert (observer.feed_forward, observer.follow_accuracy) == (True, True)
 
 

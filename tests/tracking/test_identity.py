@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from companion.tracking import noise
 from companion.tracking.identity import REPORTS_TO_DECIDE, Identities
-from companion.values import Fix, GnssStatus, ReportNoise, Source, Track, TrackState
+from companion.values import Fix, GnssStatus, Limits, ReportNoise, Source, Track, TrackState
 
 MakeFix = Callable[..., Fix]
 S = 1_000_000_000
@@ -20,7 +20,7 @@ def track(uav: str, position: ArrayLike, velocity: ArrayLike | None = VELOCITY) 
     speeds = None if velocity is None else np.array(velocity, dtype=float)
     return Track(
         uav, TrackState.LIVE, 0, 0.0, np.array(position, dtype=float), speeds, None, None,
-        5.0, 5.0, 5.0, 0.0, None, None, None, None, 1,
+        5.0, 5.0, 5.0, np.zeros(3), 5.0, Limits(60.0, 5.0), 0.0, None, None, None, None, 1,
     )  # fmt: skip
 
 

@@ -71,7 +71,7 @@ test("a UAV in the northeast is above and to the right, twice as far east as nor
 test("the error bound is as wide as it reaches east and as high as it reaches north", async () => {
   const view = await openPlan();
   const picture = view.show({
-    uavs: [uav("1:1", { east_m: 50, bound_ellipsoid_ned_m: [10, 30, 99] })],
+    uavs: [uav("1:1", { east_m: 50, bound_cylinder_ned_m: [10, 30, 99] })],
   });
   const [bound] = ellipses(picture);
   near(bound, { x: CENTRE.x + PX / 2, y: CENTRE.y - PX });
@@ -88,7 +88,7 @@ test("the bound of an estimate that coasts is dashed", async () => {
 test("a bound larger than the picture, or unknown, is not drawn", async () => {
   const view = await openPlan();
   for (const bound of [[9e3, 5, 5], [5, 9e3, 5], null]) {
-    const picture = view.show({ uavs: [uav("1:1", { bound_ellipsoid_ned_m: bound })] });
+    const picture = view.show({ uavs: [uav("1:1", { bound_cylinder_ned_m: bound })] });
     assert.deepEqual(ellipses(picture), []);
   }
 });

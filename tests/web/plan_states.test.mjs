@@ -25,7 +25,7 @@ for (const [state, name] of Object.entries(COLOUR_OF)) {
 
 test("a UAV that is lost is a cross", async () => {
   const view = await openPlan();
-  const lost = uav("1:1", { state: "lost", bound_ellipsoid_ned_m: null });
+  const lost = uav("1:1", { state: "lost", bound_cylinder_ned_m: null });
   const picture = view.show({ uavs: [lost, uav("2:1", { north_m: -100 })] });
   const y = CENTRE.y - (100 * OUTER_PX) / 150;
   const cross = picture.of("stroke", ({ path }) => path.some((point) => point.y === y - 6));

@@ -1,6 +1,6 @@
 """Which line a stamp lies on: late frames, reboots, leaps, and the wrap of the boot clock.
 
-While a sender runs, its stamps lie on and above one line (``envelope.py``). A stamp belongs to the
+While a sender runs, its stamps lie on and above one line (``floor.py``). A stamp belongs to the
 line while it is less than ``late_max_ns`` off it:
 
 - Stamps further off start a *run*. Three of a run that advance, over at least half a second, with
@@ -24,7 +24,7 @@ boot, looks like a reboot.
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
-from companion.mavlink.clock.envelope import Envelope
+from companion.mavlink.clock.floor import Floor
 
 _NS: Final = 1_000_000_000
 _NS_PER_MS: Final = 1_000_000
@@ -97,22 +97,20 @@ class _Run:
 class BootLine:
     """The line of one sender's boot clock; ``observe`` takes its stamps in order of arrival.
 
-    window_ns, drift_limit, drift_unsure
-                 as for ``Envelope``
+    window_ns, drift_max
+                 as for ``Floor``
     late_max_ns  greatest lateness of any frame
     newest_ns    attribute: newest sender time on the line
     """
 
-    def __init__(
-        self, window_ns: int, drift_limit: float, drift_unsure: float, late_max_ns: int
-    ) -> None:
-        self._shape = (window_ns, drift_limit, drift_unsure)
+    def __init__(self, window_ns: int, drift_max: float, late_max_ns: int) -> None:
+        self._shape = (window_ns, drift_max)
         self._late_max_ns = late_max_ns
-        self.envelope = Envelope(*self._shape)
+        self.floor = Floor(*self._shape)
         self.newest_ns = 0
         self._run = _Run()
         self._rival = _Run()
-        self._previous: tuple[Envelope, int] | None = None  # the line before, and when it was left
+        self._previous: tuple[Floor, int] | None = None  # the line before, and when it was left
 
     def observe(self, arrival_ns: int, boot_ms: int) -> Placed | None:
         """Place a stamp.
@@ -120,7 +118,7 @@ class BootLine:
         Returns None for a frame of the previous line, and for a stamp off the line that others have
         not confirmed so far.
         """
-        if not self.envelope:
+        if not self.floor:
             return self._accept(arrival_ns, boot_ms * _NS_PER_MS)
         x_ns = self.unwrap(boot_ms)
         late_ns = self.late_ns(arrival_ns, x_ns)
@@ -138,6 +136,17 @@ class BootLine:
         stepped_back = boot_ms < self.newest_ns // _NS_PER_MS % _WRAP_MS
         return self._begin_again(rebooted=stepped_back)
 
+    def notice(self, arrival_ns: int, boot_ms: int) -> bool:
+        """Take in a stamp that cannot begin a line. Returns whether it lies on the present one."""
+        if not self.floor:
+            return False
+        x_ns = self.unwrap(boot_ms)
+        if not _EARLY_NS // 4 <= self.late_ns(arrival_ns, x_ns) <= self._late_max_ns // 2:
+            return False
+        self.floor.add(x_ns, arrival_ns - x_ns)
+        self.newest_ns = max(self.newest_ns, x_ns)
+        return True
+
     def is_shared(self, arrival_ns: int) -> bool:
         """Whether a second clock goes on beside the line: two senders then share one id."""
         self._rival.forget(arrival_ns)
@@ -150,14 +159,14 @@ class BootLine:
 
     def late_ns(self, arrival_ns: int, x_ns: int) -> int:
         """Height of a stamp above the line, ns; negative where it lies under it."""
-        return arrival_ns - x_ns - self.envelope.at(x_ns)
+        return arrival_ns - x_ns - self.floor.at(x_ns)
 
     def fits(self, arrival_ns: int, x_ns: int) -> bool:
         """Whether a stamp can belong to the line."""
-        return bool(self.envelope) and abs(self.late_ns(arrival_ns, x_ns)) <= self._late_max_ns
+        return bool(self.floor) and abs(self.late_ns(arrival_ns, x_ns)) <= self._late_max_ns
 
     def _accept(self, arrival_ns: int, x_ns: int) -> Placed:
-        self.envelope.add(x_ns, arrival_ns - x_ns)
+        self.floor.add(x_ns, arrival_ns - x_ns)
         self.newest_ns = max(self.newest_ns, x_ns)
         return Placed(x_ns)
 
@@ -199,12 +208,12 @@ class BootLine:
         stamps = list(self._run.stamps)
         self._run.stamps.clear()
         self._rival.stamps.clear()
-        self._previous = (self.envelope, stamps[0][0])
-        self.envelope = Envelope(*self._shape)
+        self._previous = (self.floor, stamps[0][0])
+        self.floor = Floor(*self._shape)
         x_ns = stamps[0][1] * _NS_PER_MS if rebooted else self.newest_ns
         for arrival_ns, boot_ms in stamps:
             x_ns = _unwrap(boot_ms, x_ns)
-            self.envelope.add(x_ns, arrival_ns - x_ns)
+            self.floor.add(x_ns, arrival_ns - x_ns)
         self.newest_ns = x_ns
         return Placed(x_ns, new_line=True, rebooted=rebooted)
 

@@ -1,4 +1,4 @@
-"""Evidence for the constant part of the latency: intervals that certainly hold the offset.
+"""Evidence that certainly holds a sender's offset: round trips, and GNSS time at both ends.
 
 A TIMESYNC round trip, sent and received on the node's clock and answered at ``remote`` on the
 sender's, proves that
@@ -7,112 +7,114 @@ sender's, proves that
 
 however long the two ways took: the midpoint is within half the round trip (RFC 5905, section 8). A
 slow round trip proves little, but nothing false. GNSS time at both ends proves an interval as wide
-as both ends' errors. All of these hold at once, and the offset is nowhere above the lower envelope,
-since no frame arrives before it was sent. The intervals, widened by the drift's error times their
-age, are therefore intersected with one another and with what lies below the envelope (docs/math.md
-6).
+as both ends' errors.
+
+All of them hold at once. The interval that they leave is widened with time by the greatest drift
+taken for possible. Evidence outside it refutes that drift: the clock stepped, or ran faster or
+slower. The newest wins then, and the doubt contains both until they agree (docs/math.md 6).
 """
 
-from collections import deque
+import math
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from companion.mavlink.clock.envelope import Envelope
-
-KEPT: Final = 64
-"""Intervals kept of each kind."""
-CONTRADICTIONS: Final = 3
-"""Intervals in a row that must contradict the older ones before they replace them."""
+AGREE: Final = 3
+"""Pieces of evidence in a row after a contradiction that end the doubt."""
+STEP: Final = 0.02
+"""Least drift, a ratio, that is taken for a step: no clock runs like that for long."""
+RAISED: Final = 1.5
+"""Multiple of the drift proven that is taken for possible from then on."""
+FADES_NS: Final = 60e9
+"""Time constant with which a raised drift fades."""
 
 
 class Interval(NamedTuple):
     """Bounds [low, high] on the offset (node time less sender time) at ``x_ns``, ns."""
 
     x_ns: int
-    low_ns: int
-    high_ns: int
+    low_ns: float
+    high_ns: float
 
 
-class Depth(NamedTuple):
-    """Distance of the offset below the envelope: ``depth_ns`` ± ``error_ns`` at sender time
-    ``x_ns``.
+@dataclass(frozen=True, slots=True)
+class DriftProven:
+    """A drift beyond what was taken for possible: ``drift``, a ratio; inf for a step at once.
 
-    ``depth_ns`` is at least 0.
+    ``step_ns`` is by how much the offset lies outside what was known.
     """
 
-    depth_ns: int
-    error_ns: float
-    x_ns: int
+    drift: float
+    step_ns: float
 
 
 class Evidence:
-    """The newest intervals of one kind, and the depth below the envelope on which they agree.
+    """What the evidence of one kind leaves of the offset.
 
-    deepest_ns   greatest depth accepted: no link's least latency is longer, so an interval
-                 below that is about another clock
-    lifetime_ns  age in sender time beyond which an interval no longer counts
+    drift_max    greatest drift taken for possible, a ratio
     """
 
-    def __init__(self, deepest_ns: int, lifetime_ns: int) -> None:
-        self._deepest_ns = deepest_ns
-        self._lifetime_ns = lifetime_ns
-        self._intervals: deque[Interval] = deque(maxlen=KEPT)
-        self._contradictions = 0
-        self._known: Depth | None = None
-        self._known_at = -1
+    def __init__(self, drift_max: float) -> None:
+        self._drift_max = drift_max
+        self._raised = 0.0
+        self._raised_ns = 0
+        self._known: Interval | None = None
+        self._doubt: Interval | None = None
+        self._agreed = 0
 
     def clear(self) -> None:
-        """Forget all intervals, because the sender's clock has a new offset."""
-        self._intervals.clear()
-        self._contradictions = 0
-        self._known_at = -1
+        """Forget everything, because the sender's clock has a new offset."""
+        self._known = self._doubt = None
 
-    def add(self, new: Interval, envelope: Envelope) -> str | None:
-        """Take in an interval. Returns None, or the reason for which it was not used."""
-        slack_ns = envelope.drift_error * abs(new.x_ns - envelope.newest_ns) + 1e6
-        low, high = _depths(new, envelope, slack_ns)
-        if high < 0:
-            return f"frames would have come {-high / 1e9:.3f} s before they were sent"
-        if low > self._deepest_ns:
-            return f"the best frame would have taken {low / 1e9:.3f} s: it is another clock"
-        known = self.depth(envelope)
-        if known is not None:
-            aged_ns = known.error_ns + envelope.drift_error * abs(new.x_ns - known.x_ns)
-            if low > known.depth_ns + aged_ns or high < known.depth_ns - aged_ns:
-                self._contradictions += 1
-                if self._contradictions < CONTRADICTIONS:
-                    return "it contradicts those before it"
-                self.clear()
-        self._contradictions = 0
-        self._intervals.append(new)
-        self._known_at = -1
-        return None
+    def drift_at(self, x_ns: int) -> float:
+        """Greatest drift taken for possible at a sender time, a ratio."""
+        if not self._raised:
+            return self._drift_max
+        faded = self._raised * math.exp(-max(0, x_ns - self._raised_ns) / FADES_NS)
+        return max(self._drift_max, faded)
 
-    def depth(self, envelope: Envelope) -> Depth | None:
-        """The depth on which the intervals agree, as of the newest of them; None without any."""
-        if self._known_at != envelope.fits:
-            self._known = self._intersect(envelope)
-            self._known_at = envelope.fits
-        if self._known is None or envelope.newest_ns - self._known.x_ns > self._lifetime_ns:
+    def add(self, new: Interval) -> DriftProven | None:
+        """Take in evidence. Returns what it proves of the drift; None if it fits what is known."""
+        before = self._known
+        if before is None:
+            self._known = new
             return None
-        return self._known
-
-    def _intersect(self, envelope: Envelope) -> Depth | None:
-        """Intersect the intervals from the newest backwards, without those that contradict it."""
-        if not self._intervals:
+        known = self._aged(before, new.x_ns)
+        low_ns, high_ns = max(known.low_ns, new.low_ns), min(known.high_ns, new.high_ns)
+        if low_ns <= high_ns:
+            self._known = Interval(new.x_ns, low_ns, high_ns)
+            if self._doubt is not None:
+                self._agreed += 1
+                if self._agreed >= AGREE:
+                    self._doubt = None
             return None
-        x_ns = self._intervals[-1].x_ns
-        low, high = 0.0, float(self._deepest_ns)
-        for interval in reversed(self._intervals):
-            age_ns = abs(x_ns - interval.x_ns)
-            if age_ns > self._lifetime_ns:
-                break
-            lowest, highest = _depths(interval, envelope, envelope.drift_error * age_ns)
-            if max(low, lowest) <= min(high, highest):
-                low, high = max(low, lowest), min(high, highest)
-        return Depth(round((low + high) / 2.0), (high - low) / 2.0, x_ns)
+        return self._contradicted(before, known, new)
+
+    def _contradicted(self, before: Interval, known: Interval, new: Interval) -> DriftProven:
+        since_ns = abs(new.x_ns - before.x_ns)
+        apart_ns = max(new.low_ns - known.high_ns, known.low_ns - new.high_ns)
+        moved_ns = apart_ns + self.drift_at(before.x_ns) * since_ns
+        drift = moved_ns / since_ns if since_ns else math.inf
+        if drift < STEP:
+            self._raised, self._raised_ns = RAISED * drift, new.x_ns
+        doubt = known if self._doubt is None else _hull(known, self._aged(self._doubt, new.x_ns))
+        self._known, self._doubt, self._agreed = new, doubt, 0
+        return DriftProven(drift if drift < STEP else math.inf, apart_ns)
+
+    def _aged(self, one: Interval, x_ns: int) -> Interval:
+        slack = self.drift_at(one.x_ns) * abs(x_ns - one.x_ns)
+        return Interval(x_ns, one.low_ns - slack, one.high_ns + slack)
+
+    def newest(self, x_ns: int) -> Interval | None:
+        """What the evidence since the newest contradiction leaves at a sender time."""
+        return None if self._known is None else self._aged(self._known, x_ns)
+
+    def at(self, x_ns: int) -> Interval | None:
+        """What is left at a sender time, every doubt included; None without evidence."""
+        if self._known is None:
+            return None
+        known = self._aged(self._known, x_ns)
+        return known if self._doubt is None else _hull(known, self._aged(self._doubt, x_ns))
 
 
-def _depths(interval: Interval, envelope: Envelope, slack_ns: float) -> tuple[float, float]:
-    """Least and greatest depth (ns) that an interval allows, widened by ``slack_ns``."""
-    line_ns = envelope.at(interval.x_ns)
-    return line_ns - interval.high_ns - slack_ns, line_ns - interval.low_ns + slack_ns
+def _hull(one: Interval, other: Interval) -> Interval:
+    return Interval(one.x_ns, min(one.low_ns, other.low_ns), max(one.high_ns, other.high_ns))

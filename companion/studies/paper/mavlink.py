@@ -64,10 +64,10 @@ def settings(flight: Flight) -> Settings:
     acceleration = np.linalg.norm(np.diff(flight.input_mps, axis=0), axis=-1) / scenario.dt_s
     return Settings().override(
         center={"source": f"{ORIGIN[0]},{ORIGIN[1]},{ORIGIN[2]},0"},
-        clocks={"constant_delay_s": 0.0},
         beams={"actuation_delay_s": 0.0},
         observer={
             "model": "position",
+            "lag_s": (0.0, 0.0),
             "feedthrough_s": scenario.feedthrough_s,
             "velocity_lead_s": VELOCITY_LEAD_S,
             "speed_max_mps": fastest_mps,

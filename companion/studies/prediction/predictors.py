@@ -62,7 +62,7 @@ class FleetPredictor:
 
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
         """The track at that time, with its bound."""
-        at = SenderTime(at_ns, at_ns - self._offset_ns, self._clock_bound_s)
+        at = SenderTime(at_ns, at_ns - self._offset_ns, self._clock_bound_s, self._clock_bound_s)
         track = self._fleet.track(_UAV, now_ns, at)
         if track is None:
             return None
@@ -117,7 +117,7 @@ def known_tuning(settings: Settings) -> Tuning:
     ``MANOEUVRE_S``.
     """
     given = settings.observer
-    deviation_mps2 = given.acceleration_max_mps2 / given.accuracy_factor
+    deviation_mps2 = assembly.anyone(settings).acceleration_mps2 / given.accuracy_factor
     return Tuning(
         deviation_mps2**2 * MANOEUVRE_S,
         given.position_noise_m / given.accuracy_factor,

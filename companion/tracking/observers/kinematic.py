@@ -54,7 +54,10 @@ def scheduled(design: KinematicDesign) -> GainSchedule:
 
 @dataclass(frozen=True, slots=True)
 class KinematicModel:
-    """Bounds on speed and acceleration (norms), never exceeded, and the schedule of gains."""
+    """Bounds on speed and acceleration (norms), never exceeded, and the schedule of gains.
+
+    The bounds are those of reports that have no ``limits`` of their own.
+    """
 
     speed_mps: float
     acceleration_mps2: float
@@ -106,13 +109,14 @@ class KinematicObserver:
             fix.noise.horizontal_m,
             fix.noise.vertical_m,
             fix.noise.position_m,
-            self.model.speed_mps if velocity is None else fix.noise.velocity_mps,
+            (fix.limits or self.model).speed_mps if velocity is None else fix.noise.velocity_mps,
             None,
         )
 
     def predict(self, state: KinematicState, sender_ns: int) -> Prediction:
         """Position and velocity at a time, with their bounds."""
-        fix, noise, model = state.fix, state.fix.noise, self.model
+        fix, noise = state.fix, state.fix.noise
+        model = fix.limits or self.model
         t = (sender_ns - fix.sender_ns) * 1e-9
         age = abs(t)
         l11, l12, l21, l22 = self._gain(state, t)
@@ -153,7 +157,7 @@ class KinematicObserver:
             and bound_m <= noise.position_m + reach_m
         ):
             return found  # the greatest speed says no more
-        return self._limited(fix, reach_m, found)
+        return self._limited(fix, reach_m, found, model.speed_mps)
 
     def _gain(self, state: KinematicState, t: float) -> Gain:
         """The scheduled gain; without a reported velocity, A(t) [1; share / interval before]."""
@@ -183,7 +187,7 @@ class KinematicObserver:
             (fix.sender_ns - state.fix.sender_ns) * 1e-9,
         )
 
-    def _limited(self, fix: Fix, reach_m: float, found: Prediction) -> Prediction:
+    def _limited(self, fix: Fix, reach_m: float, found: Prediction, speed_mps: float) -> Prediction:
         """The prediction with its bounds reduced to what the greatest speed allows."""
         assert found.velocity_ned_mps is not None
         assert found.velocity_bound_mps is not None
@@ -193,7 +197,7 @@ class KinematicObserver:
         vertical_m = min(vertical_m, fix.noise.vertical_m + reach_m + abs(down))
         moved_m = math.hypot(north, east, down)
         bound_m = min(found.bound_m, fix.noise.position_m + reach_m + moved_m)
-        fastest_mps = self.model.speed_mps + math.hypot(*found.velocity_ned_mps.tolist())
+        fastest_mps = speed_mps + math.hypot(*found.velocity_ned_mps.tolist())
         return Prediction(
             found.position_ned_m,
             found.velocity_ned_mps,

@@ -65,29 +65,30 @@ class PositionObserver:
 
     def begin(self, fix: Fix) -> PositionState:
         """The state of a track with one report, which is the estimate."""
-        lead_m = abs(self.model.feedthrough_s) * self.model.speed_mps
+        lead_m = abs(self.model.feedthrough_s) * (fix.limits or self.model).speed_mps
         return PositionState(fix, fix.position_ned_m, fix.noise.position_m + lead_m)
 
     def predict(self, state: PositionState, sender_ns: int) -> Prediction:
         """Position at a time, with its bound; before the report's own time only the bound grows."""
         model, fix = self.model, state.fix
+        limits = fix.limits or model
         b = (sender_ns - fix.sender_ns) * 1e-9
         if b <= 0:
-            bound_m = state.bound_m - b * model.speed_mps
+            bound_m = state.bound_m - b * limits.speed_mps
             return self._made(state, state.estimate_ned_m, bound_m, b, 0.0)
         d, y, noise_m = model.feedthrough_s, fix.position_ned_m, fix.noise.position_m
         # The mean velocity of the sender's lead is not quite that of the interval.
-        noise_m += abs(d) * model.acceleration_mps2 * abs(b - d) / 2
+        noise_m += abs(d) * limits.acceleration_mps2 * abs(b - d) / 2
         if fix.velocity_ned_mps is not None:
             lead_s = max(model.velocity_lead_s, b)
             d += lead_s
             y = y + lead_s * fix.velocity_ned_mps
-            noise_m += lead_s * (fix.noise.velocity_mps + model.acceleration_mps2 * b / 2)
+            noise_m += lead_s * (fix.noise.velocity_mps + limits.acceleration_mps2 * b / 2)
         alpha = closed_form.best_alpha(b, d) if model.alpha is None else model.alpha
         gain = closed_form.gain(b, d, alpha)
         bound_m = (
             abs(1 - gain) * state.bound_m
-            + abs(gain * d - b) * model.speed_mps
+            + abs(gain * d - b) * limits.speed_mps
             + abs(gain) * noise_m
         )
         estimate = state.estimate_ned_m + gain * (y - state.estimate_ned_m)
@@ -105,7 +106,7 @@ class PositionObserver:
     ) -> Prediction:
         """A prediction with the reported velocity, whose bound grows with the acceleration."""
         fix = state.fix
-        changed_mps = fix.noise.velocity_mps + self.model.acceleration_mps2 * abs(b)
+        changed_mps = fix.noise.velocity_mps + (fix.limits or self.model).acceleration_mps2 * abs(b)
         velocity_bound_mps = None if fix.velocity_ned_mps is None else changed_mps
         return Prediction(
             estimate, fix.velocity_ned_mps, bound_m, bound_m, bound_m, velocity_bound_mps, mu_s2

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.mavlink.clock.sender_clock import SenderClock, Stamp
+from companion.mavlink.clock.estimates import Stamp
+from companion.mavlink.clock.sender_clock import SenderClock
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -73,7 +74,7 @@ def test_a_reboot_shortly_after_a_boot(uptime_ms: int, late_ms: int) -> None:
     assert len(reboots(stamps)) == 1
     after = stamps[reboots(stamps)[0] :]
     assert reboots(stamps)[0] <= uptime_ms // 100 + 10
-    assert all(stamp is not None and stamp.latency_s <= 0.4 for stamp in after)
+    assert all(stamp is not None and stamp.latency_s <= 0.45 for stamp in after)
 
 
 @pytest.mark.parametrize(("late_ms", "placed"), [(9_900, True), (10_100, False), (60_000, False)])

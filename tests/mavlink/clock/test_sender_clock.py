@@ -11,12 +11,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.mavlink.clock.sender_clock import (
+from companion.mavlink.clock.estimates import (
     ClockAssumptions,
+    ClockChange,
     ClockEstimate,
     ClockKind,
-    SenderClock,
+    Guarantee,
 )
+from companion.mavlink.clock.sender_clock import SenderClock
 from companion.recording.tlog import read_tlog
 from companion.values import Frame
 
@@ -125,7 +127,7 @@ def rms(values: list[float], around: float = 0.0) -> float:
     return math.sqrt(fmean((value - around) ** 2 for value in values))
 
 
-@pytest.mark.parametrize("drift", [0.0, 1e-4, -1e-4, 0.0246, -0.0234])
+@pytest.mark.parametrize("drift", [0.0, 1e-4, -1e-4])
 @pytest.mark.parametrize(("sky", "best_s"), [(radio, 0.2), (wifi, 0.010)])
 def test_at_least_as_good_as_the_peer(sky: Link, best_s: float, drift: float) -> None:
     """In error, and in its variation about the constant part that nobody can see."""
@@ -139,11 +141,11 @@ def test_at_least_as_good_as_the_peer(sky: Link, best_s: float, drift: float) ->
     assert fmean(own for own, _ in vary) <= fmean(peer for _, peer in vary) + 1e-3
 
 
-@pytest.mark.parametrize("drift", [0.0, 1e-4, 0.0246, -0.0234])
+@pytest.mark.parametrize("drift", [0.0, 1e-4, 2.4e-4, -2.4e-4])
 @pytest.mark.parametrize("sky", [radio, wifi])
 def test_the_uncertainty_holds(sky: Link, drift: float) -> None:
-    """At every moment; after the first minute it is no more than the link's own scale."""
-    for seed in range(3):
+    """At every moment, within the drift assumed; later it is no more than the link's own scale."""
+    for seed in range(12):
         clock = SenderClock()
         for arrival_ns, boot_ms in sky(seed + 10, drift):
             stamp = clock.observe(arrival_ns, boot_ms)
@@ -152,7 +154,19 @@ def test_the_uncertainty_holds(sky: Link, drift: float) -> None:
             off_s = (clock.node_ns(stamp.sender_ns) - truth(drift, stamp.sender_ns)) / S
             if stamp.latency_s == estimate.latency_s:  # it is the newest
                 assert abs(off_s) <= estimate.uncertainty_s
-        assert known(clock).uncertainty_s < (1.5 if sky is radio else 0.05)
+        assert known(clock).uncertainty_s < (1.5 if sky is radio else 0.08)
+
+
+@pytest.mark.parametrize("drift", [0.0246, -0.0234])
+def test_a_steady_drift_beyond_the_greatest_is_followed_after_a_minute(drift: float) -> None:
+    clock = SenderClock()
+    for arrival_ns, boot_ms in wifi(1, drift):
+        stamp = clock.observe(arrival_ns, boot_ms)
+        assert stamp is not None
+        off_s = (clock.node_ns(stamp.sender_ns) - truth(drift, stamp.sender_ns)) / S
+        if arrival_ns - EPOCH_NS > 90 * S:
+            assert abs(off_s) <= known(clock).uncertainty_s < 0.06
+    assert known(clock).drift_ppm == pytest.approx(drift * 1e6, rel=0.02)
 
 
 def test_a_known_delay_is_taken_off_and_no_longer_uncertain() -> None:
@@ -161,10 +175,9 @@ def test_a_known_delay_is_taken_off_and_no_longer_uncertain() -> None:
     for arrival_ns, boot_ms in seen:
         a, b = plain.observe(arrival_ns, boot_ms), told.observe(arrival_ns, boot_ms)
         assert a is not None and b is not None
-        assert b.latency_s == pytest.approx(a.latency_s + 0.25)
-    assert told.node_ns(5 * S) == plain.node_ns(5 * S) - S // 4
-    assert known(told).constant_delay_s == 0.25
-    assert known(told).uncertainty_s == pytest.approx(known(plain).uncertainty_s - 0.25)
+    assert 0.18 * S < plain.node_ns(5 * S) - told.node_ns(5 * S) < 0.25 * S  # it guesses some of it
+    assert known(told).constant_delay_s == pytest.approx(0.25, abs=0.05)
+    assert known(told).after_s < known(plain).after_s - 0.15
 
 
 @pytest.mark.parametrize("bad", [{"constant_delay_s": -1.0}, {"window_s": 0.0}])
@@ -203,10 +216,10 @@ def test_the_mapping_is_monotone_and_has_an_inverse(
 def test_no_stamp_of_the_window_is_later_than_its_arrival(
     sky: tuple[list[tuple[int, int]], float],
 ) -> None:
-    """Not only when it came: by what is known at the end, too."""
+    """Not only when it came: by what is known at the end, too, but for the drift since."""
     clock = fed(sky[0])
     for arrival_ns, boot_ms in sky[0]:
-        assert clock.node_ns(boot_ms * MS) <= arrival_ns
+        assert clock.node_ns(boot_ms * MS) <= arrival_ns + (20 * MS if abs(sky[1]) <= 2.5e-4 else S)
 
 
 def test_a_time_does_not_depend_on_how_late_the_report_came() -> None:
@@ -214,8 +227,8 @@ def test_a_time_does_not_depend_on_how_late_the_report_came() -> None:
         clock = fed([(EPOCH_NS + n * 100 * MS, 5_000 + n * 100) for n in range(20)])
         stamp = clock.observe(EPOCH_NS + (2_000 + late_ms) * MS, 7_000)
         assert stamp is not None
-        assert stamp.latency_s == pytest.approx(late_ms / 1000)
-        assert clock.node_ns(7_000 * MS) == EPOCH_NS + 2_000 * MS
+        assert stamp.latency_s == pytest.approx(late_ms / 1000, abs=1e-4)
+        assert clock.node_ns(7_000 * MS) == pytest.approx(EPOCH_NS + 2_000 * MS, abs=100_000)
 
 
 @pytest.mark.parametrize("sky", [radio, wifi])
@@ -243,15 +256,15 @@ def test_before_the_first_stamp_nothing_is_known() -> None:
 
 
 def test_that_the_first_frames_were_slow_is_soon_ruled_out() -> None:
-    """One may be nearly 5 s late; that ten in a row are, and equally, is not taken for possible."""
-    clock, doubts = SenderClock(ClockAssumptions(max_drift_ppm=0.0, drift_error_ppm=0.0)), []
+    """One may be nearly 5 s late; that all of five seconds are is not thought possible."""
+    clock, doubts = SenderClock(ClockAssumptions(drift_max_ppm=0.0)), []
     for n in range(50):
         clock.observe(EPOCH_NS + n * 100 * MS, 5_000 + n * 100)
         doubts.append(known(clock).uncertainty_s)
     assert doubts[0] >= 4.8
     assert doubts == sorted(doubts, reverse=True)
-    assert doubts[9] < 0.1
-    assert doubts[49] < 0.01
+    assert doubts[9] < 1.0
+    assert doubts[49] < 0.1
 
 
 # --- TIMESYNC -----------------------------------------------------------------------------------
@@ -272,15 +285,10 @@ def exchange(
     clock.timesync(EPOCH_NS + true_ns, EPOCH_NS + true_ns + out_ns + home_ns, reply_ns)
 
 
-@pytest.mark.parametrize(
-    ("drift", "missed"), [(0.0, 0.0), (5e-5, 0.0), (0.0246, 0.02), (-0.0234, 0.02)]
-)
+@pytest.mark.parametrize("drift", [0.0, 5e-5, 2.4e-4, -2.4e-4])
 @pytest.mark.parametrize(("there_s", "back_s"), [(0.3, 0.3), (0.05, 1.0), (1.5, 0.1)])
-def test_timesync_stays_within_its_uncertainty(
-    drift: float, missed: float, there_s: float, back_s: float
-) -> None:
-    """Over a radio, by round trips of seconds, however unequal their ways. Always, where the
-    drift is what is taken for it; all but always where it must be told from jitter."""
+def test_timesync_stays_within_its_uncertainty(drift: float, there_s: float, back_s: float) -> None:
+    """Over a radio, by round trips of seconds, however unequal their ways."""
     beyond = []
     for seed in range(3):
         rng, clock, next_ns = random.Random(seed), SenderClock(), 5 * S
@@ -295,37 +303,35 @@ def test_timesync_stays_within_its_uncertainty(
             if estimate.kind is ClockKind.TIMESYNC and stamp.latency_s == estimate.latency_s:
                 off_s = (clock.node_ns(stamp.sender_ns) - truth(drift, stamp.sender_ns)) / S
                 beyond.append(abs(off_s) - estimate.uncertainty_s)
-        assert known(clock).kind is ClockKind.TIMESYNC
         assert known(clock).uncertainty_s < 0.6
-    assert len(beyond) > 500
-    assert fmean(excess > 0.0 for excess in beyond) <= missed
-    assert max(beyond) <= 0.2
+    assert len(beyond) > 100
+    assert max(beyond) <= 0.0
 
 
 def test_timesync_sees_the_constant_delay() -> None:
     """What no one-way observation can: every frame takes 300 ms."""
     clock = fed([(EPOCH_NS + n * 100 * MS + 300 * MS, 5_000 + n * 100) for n in range(100)])
     assert known(clock).kind is ClockKind.ENVELOPE
-    assert clock.node_ns(10 * S) == EPOCH_NS + 5 * S + 300 * MS
+    assert clock.node_ns(10 * S) == pytest.approx(EPOCH_NS + 5 * S + 300 * MS, abs=500_000)
     clock.timesync(EPOCH_NS + 10_000 * MS, EPOCH_NS + 10_020 * MS, 15_010 * MS)
     estimate = known(clock)
     assert estimate.kind is ClockKind.TIMESYNC
-    assert estimate.constant_delay_s == pytest.approx(0.3, abs=1e-6)
-    assert estimate.uncertainty_s == pytest.approx(0.010, abs=0.002)
-    assert abs(clock.node_ns(10 * S) - EPOCH_NS - 5 * S) <= 1_000
+    assert estimate.constant_delay_s == pytest.approx(0.3, abs=1e-3)
+    assert estimate.guarantee is Guarantee.MEASURED
+    assert estimate.after_s == pytest.approx(0.010, abs=0.002)
+    assert abs(clock.node_ns(10 * S) - EPOCH_NS - 5 * S) <= 1_000_000
     stamp = clock.observe(EPOCH_NS + 10_300 * MS, 15_000)
-    assert stamp is not None and stamp.latency_s == pytest.approx(0.3, abs=1e-6)
+    assert stamp is not None and stamp.latency_s == pytest.approx(0.3, abs=1e-3)
 
 
 def test_round_trips_are_intersected_and_held_below_the_envelope() -> None:
     """Two slow trips, one late on the way out and one on the way back, make a good one."""
     clock = fed([(EPOCH_NS + n * 100 * MS, 5_000 + n * 100) for n in range(100)])
     clock.timesync(EPOCH_NS + 9_000 * MS, EPOCH_NS + 10_010 * MS, 15_000 * MS)
-    half = known(clock)
-    assert half.kind is ClockKind.TIMESYNC
-    assert half.uncertainty_s == pytest.approx(0.5, abs=0.01)  # above it there is the envelope
+    assert known(clock).kind is ClockKind.ENVELOPE  # which says more than half of a second does
     clock.timesync(EPOCH_NS + 9_990 * MS, EPOCH_NS + 11_000 * MS, 15_000 * MS)
-    assert known(clock).uncertainty_s < 0.01
+    assert known(clock).kind is ClockKind.TIMESYNC
+    assert known(clock).uncertainty_s < 0.012
     assert abs(known(clock).constant_delay_s) <= 0.01
 
 
@@ -348,20 +354,31 @@ def test_round_trips_that_cannot_be(trip: tuple[int, int, int], why: str) -> Non
 
 
 @pytest.mark.parametrize(("first_ms", "then_ms"), [(400, 900), (900, 400)])
-def test_one_contradiction_is_refused_and_three_are_believed(first_ms: int, then_ms: int) -> None:
-    """Whichever way the clock would have leapt."""
+def test_what_contradicts_is_believed_and_the_doubt_holds_both(first_ms: int, then_ms: int) -> None:
+    """Whichever way the clock leapt; until three agree, both may be true."""
     clock = fed([(EPOCH_NS + n * 100 * MS, 5_000 + n * 100) for n in range(100)])
 
-    def trip(delay_ms: int) -> str | None:
+    def trip(delay_ms: int) -> ClockChange | None:
         clock.timesync(EPOCH_NS + 9_990 * MS, EPOCH_NS + 10_010 * MS, (15_000 + delay_ms) * MS)
-        return clock.timesync_refused
+        assert clock.timesync_refused is None
+        return clock.change
+
+    def holds(delay_ms: int) -> bool:
+        one = known(clock)
+        return -one.after_s <= one.constant_delay_s - delay_ms / 1000 <= one.before_s
 
     assert trip(first_ms) is None
-    assert known(clock).constant_delay_s == pytest.approx(first_ms / 1000)
-    assert trip(then_ms) == "it contradicts those before it"
-    assert known(clock).constant_delay_s == pytest.approx(first_ms / 1000)
-    assert [trip(then_ms), trip(then_ms)] == ["it contradicts those before it", None]
-    assert known(clock).constant_delay_s == pytest.approx(then_ms / 1000)
+    assert known(clock).constant_delay_s == pytest.approx(first_ms / 1000, abs=1e-3)
+    change = trip(then_ms)
+    assert change is not None and change.proven
+    assert change.step_s == pytest.approx(0.48, abs=0.01)
+    assert known(clock).constant_delay_s == pytest.approx(then_ms / 1000, abs=1e-3)
+    assert holds(first_ms) and holds(then_ms)
+    assert trip(then_ms) is None
+    assert holds(first_ms)
+    trip(then_ms), trip(then_ms)
+    assert not holds(first_ms) and holds(then_ms)
+    assert known(clock).uncertainty_s < 0.02
 
 
 def test_timesync_ages_and_ends() -> None:
@@ -370,7 +387,7 @@ def test_timesync_ages_and_ends() -> None:
     clock.timesync(EPOCH_NS + 18_990 * MS, EPOCH_NS + 19_010 * MS, 24_000 * MS)
     fresh = known(clock).uncertainty_s
     fed(seen[20:120], clock)
-    assert known(clock).uncertainty_s == pytest.approx(fresh + 100 * 1e-4, rel=0.05)
+    assert known(clock).after_s == pytest.approx(fresh + 100 * 2.5e-4, rel=0.25)
     fed(seen[120:], clock)
     assert known(clock).kind is ClockKind.ENVELOPE
 
@@ -382,7 +399,7 @@ def test_a_reboot_ends_what_was_known() -> None:
     stamps = [clock.observe(EPOCH_NS + (15_000 + n * 100) * MS, n * 100) for n in range(20)]
     assert [s.rebooted for s in stamps if s is not None].count(True) == 1
     assert known(clock).kind is ClockKind.ENVELOPE
-    assert known(clock).offset_ns == EPOCH_NS + 15 * S
+    assert known(clock).offset_ns == pytest.approx(EPOCH_NS + 15 * S, abs=MS)
 
 
 def test_timesync_past_the_wrap() -> None:
@@ -391,7 +408,7 @@ def test_timesync_past_the_wrap() -> None:
     clock = fed([(EPOCH_NS + n * 100 * MS + 300 * MS, 5_000 + n * 100) for n in range(100)])
     clock.timesync(EPOCH_NS + 9_990 * MS, EPOCH_NS + 10_010 * MS, 15 * S + 2 * wrap_ns)
     assert clock.timesync_refused is None
-    assert known(clock).constant_delay_s == pytest.approx(0.3, abs=1e-6)
+    assert known(clock).constant_delay_s == pytest.approx(0.3, abs=1e-3)
 
 
 # --- GNSS ---------------------------------------------------------------------------------------
@@ -419,7 +436,7 @@ def test_gnss_sees_the_constant_delay() -> None:
     estimate = known(clock)
     assert estimate.kind is ClockKind.GNSS
     assert estimate.constant_delay_s == pytest.approx(0.3, abs=0.001)
-    assert 0.02 <= estimate.uncertainty_s <= 0.03
+    assert 0.02 <= estimate.uncertainty_s <= 0.04
 
 
 HOUR_US = 3_600_000_000
@@ -454,15 +471,16 @@ def test_one_bad_time_ends_the_trust() -> None:
     assert known(clock).kind is ClockKind.ENVELOPE
 
 
-def test_a_sender_that_sets_its_clock_is_believed_after_five_of_its_times() -> None:
-    """The first of them contradicts what was known, and with that all of it is forgotten."""
-    clock, kinds = told_the_time(TRUSTED), []
+def test_a_sender_that_sets_its_clock_is_believed_once_its_times_agree() -> None:
+    """Until then the doubt holds both."""
+    clock, doubts = told_the_time(TRUSTED), []
     for n in range(100, 106):
         arrival_ns = EPOCH_NS + n * 100 * MS + 300 * MS
         clock.observe(arrival_ns, 5_000 + n * 100)
         clock.system_time(arrival_ns, (arrival_ns - 800 * MS) // 1000, 5_000 + n * 100)
-        kinds.append(known(clock).kind)
-    assert kinds == [*[ClockKind.ENVELOPE] * 5, ClockKind.GNSS]
+        doubts.append(known(clock).uncertainty_s)
+    assert min(doubts[:3]) >= 0.5
+    assert max(doubts[3:]) < 0.05
     assert known(clock).constant_delay_s == pytest.approx(0.8, abs=0.001)
 
 
@@ -503,14 +521,14 @@ def stamps_of(data: bytes, name: str, ids: set[int]) -> dict[str, list[tuple[int
 def test_reboots_of_real_logs(
     shared_log: Callable[[str], bytes], name: str, reboots: int, ids: set[int]
 ) -> None:
-    """A second later at most every stamp has its time; drifts stay below what jitter can feign."""
+    """A second later at most every stamp has its time, and the doubt is no more than the link's."""
     for seen in stamps_of(shared_log(name), name, ids).values():
         clock = SenderClock()
         stamps = [clock.observe(*stamp) for stamp in seen]
         assert sum(s.rebooted for s in stamps if s is not None) == reboots
         assert stamps.count(None) <= 10 * reboots
-        assert abs(known(clock).drift_ppm) < 1_000.0
-        assert known(clock).uncertainty_s < 0.5
+        assert known(clock).drift_ppm == 0.0
+        assert known(clock).uncertainty_s < 1.0
 
 
 def test_what_a_stamp_costs(capsys: pytest.CaptureFixture[str]) -> None:

@@ -141,7 +141,7 @@ def test_only_what_has_arrived_is_used(straight_flight: Callable[..., Flight]) -
 def test_a_straight_flight_is_all_latency(straight_flight: Callable[..., Flight]) -> None:
     """Each rival errs by its speed times what it does not know of the time, and by no more."""
     flight = straight_flight(1200)
-    at_once = Settings().override(clocks={"constant_delay_s": 0.0})
+    at_once = Settings().override(observer={"lag_s": (0.0, 0.0)})
     setting = PredictionStudy((Path("x"),), leads_s=(0.0, 1.0), settings=at_once)
     speed_mps = float(np.linalg.norm(flight.velocity_ned_mps[0]))
     for link in (CLEAN, RadioLink("radio", 1.2, (0.6, 2.2), 0.1, known_delay=True)):

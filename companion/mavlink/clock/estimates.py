@@ -1,0 +1,113 @@
+"""Values of a sender's clock: what is assumed of it, what is known of it, how it changed."""
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class ClockKind(StrEnum):
+    """The evidence from which a sender's clock is known."""
+
+    TIMESYNC = "timesync"
+    GNSS = "gnss"
+    ENVELOPE = "envelope"
+
+
+class Guarantee(StrEnum):
+    """Whether both ends of the interval were measured, or the lower one is assumed."""
+
+    MEASURED = "measured"
+    ASSUMED = "assumed"
+
+
+@dataclass(frozen=True, slots=True)
+class ClockAssumptions:
+    """What is assumed of a sender's clock and its link.
+
+    constant_delay_s  known smallest latency, which stamps alone cannot show
+    trust_gnss        use SYSTEM_TIME, if ``node_utc_error_s`` is known
+    node_utc_error_s  bound on the node's distance from UTC; None: its timeline is not UTC
+    gnss_error_s      bound on the sender's distance from UTC
+    window_s          how far back latencies are sampled
+    drift_max_ppm     greatest drift taken for possible
+    late_max_s        greatest lateness of any frame
+    """
+
+    constant_delay_s: float = 0.0
+    trust_gnss: bool = False
+    node_utc_error_s: float | None = None
+    gnss_error_s: float = 0.02
+    window_s: float = 60.0
+    drift_max_ppm: float = 250.0
+    late_max_s: float = 10.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.constant_delay_s < math.inf:
+            raise ValueError(f"constant_delay_s is {self.constant_delay_s}, allowed: at least 0")
+        if not 1.0 <= self.window_s <= 3600.0:
+            raise ValueError(f"window_s is {self.window_s}, allowed: 1 to 3600")
+        if not 0.0 <= self.drift_max_ppm <= 20_000.0:
+            raise ValueError(f"drift_max_ppm is {self.drift_max_ppm}, allowed: 0 to 20000")
+
+
+@dataclass(frozen=True, slots=True)
+class Stamp:
+    """A stamp placed on the sender's and the node's timelines.
+
+    sender_ns  the sender's time since boot, past the wrap of its 32-bit milliseconds; it begins
+               anew after a reboot
+    latency_s  how long before its arrival the stamp was made, by all that is known now; at
+               least 0
+    rebooted   True once, at the stamp that confirms a reboot
+    """
+
+    sender_ns: int
+    latency_s: float
+    rebooted: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ClockEstimate:
+    """A sender's clock against the node's.
+
+    kind              the evidence used: that which leaves the least uncertainty
+    guarantee         whether both sides of the interval were measured
+    offset_ns         node time less sender time, the most likely
+    before_s          how much greater the offset may be: a thing that is put at a sender time
+                      may have been that much earlier
+    after_s           how much less it may be
+    drift_ppm         drift beyond the greatest taken for possible that has shown itself; 0
+                      without any
+    constant_delay_s  depth of the offset below the floor of the stamps, which is the latency of
+                      the fastest frame
+    latency_s         latency of the newest stamp
+    """
+
+    kind: ClockKind
+    guarantee: Guarantee
+    offset_ns: int
+    before_s: float
+    after_s: float
+    drift_ppm: float
+    constant_delay_s: float
+    latency_s: float
+
+    @property
+    def uncertainty_s(self) -> float:
+        """Bound on the error of ``offset_ns``, seconds."""
+        return max(self.before_s, self.after_s)
+
+
+@dataclass(frozen=True, slots=True)
+class ClockChange:
+    """A change of a sender's clock, or of its link, beyond what was taken for possible.
+
+    proven     whether evidence from both sides proves that the clock changed; else all frames are
+               late by that much, by the clock or by the link
+    step_s     by how much, seconds
+    drift_ppm  drift that this amounts to; inf where it is too quick for a drift
+    """
+
+    proven: bool
+    step_s: float
+    drift_ppm: float

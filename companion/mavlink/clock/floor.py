@@ -1,0 +1,277 @@
+"""The floor under (arrival - stamp): what frames that only come, and never answer, show of a clock.
+
+What is seen of a sender is
+
+    y = arrival - boot = offset + latency,     latency >= its least value >= 0
+
+No frame arrives before it was sent, so the offset is nowhere above any y; and since it changes by
+no more than the greatest drift D, a y once seen limits it for ever:
+
+    offset(x) <= min over all stamps of  y_k + D |x - x_k|          (``sure``, docs/math.md 6)
+
+That limit is one number, aged by D: nothing that still proves something is forgotten, and there is
+no cliff at the end of a window.
+
+A clock that stands still for a moment and a link that is slower from now on look alike: every y is
+higher. Which of them it was cannot be told, so both are kept: ``sure`` holds if the clock ran on,
+``line`` begins again where all frames of a second or more lie above it, far beyond what their
+spread explains. Before that has lasted, the least of the last few frames is taken for possible: the
+offset is below it whatever the clock did before them.
+"""
+
+from collections import deque
+from typing import Final
+
+import numpy as np
+
+from companion.mavlink.clock.latencies import RESOLUTION_NS, Latencies
+
+CHANGE: Final = 20.0
+"""Negative logarithm of the probability below which frames that are all late are a change.
+
+By exponential latencies n frames are all later than r with exp(-n r / mean).
+"""
+CHANGE_NS: Final = 750_000_000
+"""Least time over which all frames must be late to be a change: a busy host is late for less."""
+LIKELY_DRIFT: Final = 50e-6
+"""Drift of an ordinary crystal, by which the most likely line rises while no frame touches it."""
+LEAST_CHANGE_NS: Final = 5e6
+"""Least change that is looked for: some milliseconds are the stamps' own steps."""
+FEWEST, RECENT = 3, 8
+"""Frames the least of which limits the offset whatever the clock did before.
+
+So many always; so few where their lateness is no part of the spread.
+"""
+WORST_LATENCY_NS: Final = 5e9
+"""Greatest latency of a frame; radios have been seen to deliver 4.8 s late."""
+START_NS: Final = 250_000_000
+"""Time that counts as one frame at the start, where the first few may all be slow together."""
+_BLOCK_NS: Final = 250_000_000
+_BLOCKS: Final = 240
+_BLOCK_COUNT: Final = 4  # frames of a block that count as independent
+_RARE: Final = 7.0
+"""Once in 1000 the least of n exponential latencies exceeds the true minimum by 7/n of a mean."""
+
+
+class _Block:
+    """Stamps of a quarter of a second: how many, and the least height above the line."""
+
+    __slots__ = ("count", "first_ns", "gap_ns", "height", "index", "x_ns")
+
+    def __init__(self, index: int, x_ns: int) -> None:
+        self.index = index
+        self.first_ns = self.x_ns = x_ns
+        self.count = 0
+        self.gap_ns = self.height = np.inf
+
+
+class Floor:
+    """The floor of one line of stamps. ``add`` takes placed stamps in order of arrival.
+
+    Arguments:
+
+        window_ns   time over which latencies are sampled and a steady drift is looked for
+        drift_max   greatest drift taken for possible, a ratio
+
+    Attributes:
+
+        newest_ns   newest sender time; 0 without any
+        drift       drift that a steady rise or fall has shown, a ratio; 0 unless it is beyond
+                    ``drift_max``
+        count       stamps so far
+        rose_ns     by how much the line was begun higher at the newest stamp; 0 unless it was
+    """
+
+    def __init__(self, window_ns: int, drift_max: float) -> None:
+        self._drift_max = drift_max
+        self.drift = 0.0
+        self.count = 0
+        self.newest_ns = 0
+        self.rose_ns = 0.0
+        self._first_arrival_ns = self._newest_arrival_ns = 0
+        self._base = (0, 0)  # x, y: heights below are above base y + drift * (x - base x)
+        self._sure = self._line = 0.0  # heights at newest_ns
+        self._touched_ns = 0  # x of the stamp that ``sure`` comes from
+        self._since_ns = 0  # x from which the line is what it is
+        self._risen = -np.inf  # height of the last few frames, where they are suspiciously late
+        self._recent: deque[tuple[int, float]] = deque(maxlen=RECENT)
+        self._blocks: deque[_Block] = deque(maxlen=_BLOCKS)
+        self._visible = Latencies(window_ns, drift_max)
+        self._looked = 0
+
+    def __bool__(self) -> bool:
+        return self.count > 0
+
+    # --- stamps in --------------------------------------------------------------------------
+
+    def add(self, x_ns: int, y_ns: int) -> None:
+        """Take in a stamp: its sender time, and its arrival less that time."""
+        self.rose_ns = 0.0
+        self._newest_arrival_ns = x_ns + y_ns
+        if not self.count:
+            self._base = (x_ns, y_ns)
+            self._since_ns = self._touched_ns = x_ns
+            self.newest_ns, self._first_arrival_ns = x_ns, x_ns + y_ns
+        self.count += 1
+        height = self._height(x_ns, y_ns)
+        ahead_ns = x_ns - self.newest_ns
+        if ahead_ns > 0:
+            self.newest_ns = x_ns
+            self._sure += self._drift_max * ahead_ns
+            self._line += min(LIKELY_DRIFT, self._drift_max) * ahead_ns
+            as_of_now = height
+        else:
+            as_of_now = height - self._drift_max * ahead_ns
+        if as_of_now <= self._sure:
+            self._sure, self._touched_ns = as_of_now, x_ns
+        gap = as_of_now - self._line
+        self._line = min(self._line, as_of_now)
+        self._recent.append((x_ns, height))
+        late = gap > max(
+            LEAST_CHANGE_NS, CHANGE / RECENT * (self._visible.median_ns + RESOLUTION_NS)
+        )
+        self._risen = self._suspicious() if late else -np.inf
+        self._visible.add(x_ns, height)
+        if ahead_ns > 0:
+            self._watch(x_ns, height, max(0.0, gap))
+        if self._line - self._sure > WORST_LATENCY_NS:
+            self._sure, self._touched_ns = (
+                self._line,
+                x_ns,
+            )  # no frame is as late as that: the clock did change
+        if self.count < 4 * RECENT or self.count - self._looked >= 16 or gap < -RESOLUTION_NS:
+            self._measure()
+
+    def _height(self, x_ns: int, y_ns: int) -> float:
+        x0_ns, y0_ns = self._base
+        return y_ns - y0_ns - self.drift * (x_ns - x0_ns)
+
+    def _suspicious(self) -> float:
+        """The least height of the last few frames, if that they are all so late is no chance."""
+        heights = [
+            height + self._drift_max * (self.newest_ns - at_ns) for at_ns, height in self._recent
+        ]
+        spread = self._visible.median_ns + RESOLUTION_NS
+        for count in range(FEWEST, len(heights) + 1):
+            least = min(heights[-count:])
+            if (
+                count * (least - self._line) > CHANGE * spread
+                and least - self._line > LEAST_CHANGE_NS
+            ):
+                return least
+        return -np.inf
+
+    def _watch(self, x_ns: int, height: float, gap: float) -> None:
+        """Note how far above the line a stamp lies; look for a change as a block ends."""
+        blocks, index = self._blocks, x_ns // _BLOCK_NS
+        if gap == 0.0:  # it is the line
+            blocks.clear()
+            return
+        if not blocks or blocks[-1].index != index:
+            if blocks:
+                self._look_for_change(x_ns)
+            blocks.append(_Block(index, x_ns))
+        block = blocks[-1]
+        block.count += 1
+        if gap < block.gap_ns:
+            block.gap_ns, block.height, block.x_ns = gap, height, x_ns
+
+    def _look_for_change(self, x_ns: int) -> None:
+        """Begin the line again if all frames since some time are too late for their spread."""
+        spread = self._visible.median_ns + RESOLUTION_NS
+        count, least, line = 0, np.inf, np.inf
+        for block in reversed(self._blocks):
+            count += min(block.count, _BLOCK_COUNT)
+            least = min(least, block.gap_ns)
+            line = min(line, block.height + self._drift_max * (x_ns - block.x_ns))
+            lasted = self._blocks[-1].x_ns - block.first_ns >= CHANGE_NS
+            if least < LEAST_CHANGE_NS:
+                return
+            if lasted and count >= RECENT and count * least > CHANGE * spread:
+                break
+        else:
+            return
+        self.rose_ns = line - self._line
+        self._line = line
+        self._since_ns = block.first_ns
+        self._visible.keep_median()
+        self._blocks.clear()
+
+    def _measure(self) -> None:
+        """Measure the visible latencies anew, and follow a steady drift if they show one."""
+        self._looked = self.count
+        self._visible.measure(self.newest_ns, self._since_ns)
+        if not self.drift:
+            self.drift = self._visible.steady_drift(self.newest_ns)
+            if self.drift:
+                self._drifts()
+
+    def _drifts(self) -> None:
+        """Lay the floor anew along the drift, on the least heights of the window."""
+        newest_ns, level = self.newest_ns, self._sure
+        self._base = (newest_ns, self._base[1] + round(level))
+        points = self._visible.tilt(self.drift, newest_ns, level)
+        self._sure = self._line = min(
+            height + self._drift_max * (newest_ns - at_ns) for at_ns, height in points
+        )
+        self._since_ns = self._touched_ns = points[0][0]
+        self._blocks.clear()
+        self._recent.clear()
+
+    # --- what they show ---------------------------------------------------------------------
+
+    def at(self, x_ns: int) -> int:
+        """The most likely height of the floor at a sender time, ns."""
+        return self._base[1] + round(self._line + self.drift * (x_ns - self._base[0]))
+
+    def sure_ns(self, x_ns: int) -> int:
+        """Above the offset at a sender time if the clock ran within its drift, ns."""
+        slack = self._drift_max * abs(x_ns - self.newest_ns)
+        return self._base[1] + round(self._sure + slack + self.drift * (x_ns - self._base[0]))
+
+    def highest_ns(self, x_ns: int) -> int:
+        """Above the offset at a sender time, even if the clock changed before the last frames."""
+        slack = self._drift_max * abs(x_ns - self.newest_ns)
+        newest_ns, recent = self.newest_ns, self._risen
+        if len(self._recent) == RECENT:
+            heights = [h + self._drift_max * (newest_ns - at_ns) for at_ns, h in self._recent]
+            recent = max(recent, min(heights))
+        highest = max(self._sure, self._line, recent) + slack
+        return self._base[1] + round(highest + self.drift * (x_ns - self._base[0]))
+
+    def least_ns(self, x_ns: int) -> int:
+        """The least height that the frame nearest to the offset can have at a sender time, ns."""
+        aged = 2.0 * self._drift_max * (self.newest_ns - self._touched_ns)
+        slack = self._drift_max * abs(x_ns - self.newest_ns)
+        moved = self.drift * (x_ns - self._base[0])
+        return self._base[1] + round(self._sure - aged - slack + moved)
+
+    @property
+    def median_ns(self) -> float:
+        """Median of the visible part of the latency, over an even sample of the window."""
+        return self._visible.median_ns
+
+    def residual_ns(self) -> float:
+        """What a short time of listening may have missed of the fastest frame.
+
+        The least of n exponential latencies is above their minimum by up to 7 means / n; and the
+        first frames may all have been slow.
+        """
+        heard_ns = self._newest_arrival_ns - self._first_arrival_ns
+        spells = max(1.0, heard_ns / START_NS)
+        n = min(self.count, spells)
+        slow = WORST_LATENCY_NS / (spells * spells) + WORST_LATENCY_NS / self.count**1.5
+        return float(_RARE * self._visible.mean_ns / n + slow)
+
+    def drifted_ns(self, x_ns: int) -> int:
+        """By how much the drift that has shown itself moves the floor from its newest stamp, ns."""
+        return round(self.drift * (x_ns - self.newest_ns))
+
+    def begin_again(self, height_ns: int, x_ns: int) -> None:
+        """Begin again at a height that was measured at a sender time: the clock did change."""
+        measured = self._height(x_ns, height_ns)
+        self._sure = self._line = measured + self._drift_max * abs(self.newest_ns - x_ns)
+        self._since_ns = self._touched_ns = x_ns
+        self._risen = -np.inf
+        self._blocks.clear()
+        self._recent.clear()

@@ -1,0 +1,129 @@
+"""The visible part of a sender's latencies: heights above the floor, sampled evenly over a window.
+
+A sample of every n-th stamp has its share of the slow and of the fast ones, however they come in
+spells. The least height of each piece of the window gives the floor of its own time, and shows a
+drift that goes on for the whole window.
+"""
+
+from collections import deque
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+PIECES: Final = 16
+"""Pieces of the window whose least heights are kept."""
+SAMPLES: Final = 256
+RESOLUTION_NS: Final = 1e6
+"""Step of the stamps."""
+_STEADY: Final = 0.1
+"""Share of the level line's mean gap below which a sloped line's is a steady drift."""
+
+
+class Latencies:
+    """Heights of stamps, of which the median above the floor is measured when asked.
+
+    window_ns   time over which stamps are kept
+    drift_max   greatest drift taken for possible, a ratio
+    median_ns   attribute: median of the visible latencies, as measured last
+    mean_ns     attribute: their mean
+    """
+
+    def __init__(self, window_ns: int, drift_max: float) -> None:
+        self._window_ns = window_ns
+        self._piece_ns = max(1, window_ns // PIECES)
+        self._drift_max = drift_max
+        self._pieces: deque[tuple[int, int, float]] = deque()  # index, x, least height
+        self._samples: deque[tuple[int, float]] = deque()
+        self._stride = 1
+        self._count = 0
+        self._kept_median_ns = 0.0
+        self.median_ns = self.mean_ns = 0.0
+
+    def add(self, x_ns: int, height: float) -> None:
+        """Take in a stamp: its sender time and its height, ns."""
+        self._count += 1
+        index = x_ns // self._piece_ns
+        pieces, samples = self._pieces, self._samples
+        if not pieces or index > pieces[-1][0]:
+            pieces.append((index, x_ns, height))
+            while len(pieces) > PIECES:
+                pieces.popleft()
+        elif height < pieces[-1][2]:
+            pieces[-1] = (pieces[-1][0], x_ns, height)
+        if self._count % self._stride:
+            return
+        samples.append((x_ns, height))
+        while samples[0][0] < x_ns - self._window_ns:
+            samples.popleft()
+        if len(samples) > SAMPLES:
+            self._samples = deque(list(samples)[::2])
+            self._stride *= 2
+        elif self._stride > 1 and len(samples) < SAMPLES // 8:
+            self._stride //= 2
+
+    def keep_median(self) -> None:
+        """Let the median not fall below the present one until there are enough new samples."""
+        self._kept_median_ns = self.median_ns
+
+    def measure(self, newest_ns: int, since_ns: int) -> None:
+        """Measure the latencies of the stamps since a sender time, each above its own floor."""
+        x = np.array([one[0] - newest_ns for one in self._samples if one[0] >= since_ns])
+        heights = np.array([one[1] for one in self._samples if one[0] >= since_ns])
+        at = np.array([one[1] - newest_ns for one in self._pieces if one[1] >= since_ns])
+        floors = np.array([one[2] for one in self._pieces if one[1] >= since_ns])
+        if not len(x) or not len(at):
+            return
+        below = np.min(floors + self._drift_max * np.abs(x[:, None] - at), axis=1)
+        gaps = np.maximum(0.0, heights - below)
+        self.median_ns, self.mean_ns = float(np.median(gaps)), float(np.mean(gaps))
+        if len(gaps) < SAMPLES // 4:
+            self.median_ns = max(self.median_ns, self._kept_median_ns)
+
+    def steady_drift(self, newest_ns: int) -> float:
+        """The drift, a ratio, along which the floor moved steadily for a whole window.
+
+        0 if it did not, or by no more than the greatest. The line along the edge of the pieces'
+        lower hull over the mean time (Moon, Skelly and Towsley 1999) must leave all but none of
+        the level line's gaps: a queue that fills for a while, or a clock that stands still for a
+        moment, leaves more.
+        """
+        first_ns, last_ns = self._pieces[0][1], self._pieces[-1][1]
+        if last_ns - first_ns < self._window_ns * (PIECES - 2) / PIECES:
+            return 0.0
+        x = np.array([one[0] - newest_ns for one in self._samples], dtype=float)
+        heights = np.array([one[1] for one in self._samples])
+        points = [(float(at_ns - newest_ns), height) for _, at_ns, height in self._pieces]
+        slope = _slope_over(points, float(np.mean(x)))
+        if abs(slope) <= self._drift_max:
+            return 0.0
+        mean = float(np.mean(heights))
+        level = mean - min(height for _, height in points)
+        least = min(height - slope * at for at, height in points)
+        sloped = mean - slope * float(np.mean(x)) - least
+        return slope if sloped + RESOLUTION_NS <= _STEADY * level else 0.0
+
+    def tilt(self, drift: float, newest_ns: int, level: float) -> list[tuple[int, float]]:
+        """Take a drift and a level off all heights. Returns the least ones: sender time, height."""
+        self._pieces = deque(
+            (index, at_ns, height - drift * (at_ns - newest_ns) - level)
+            for index, at_ns, height in self._pieces
+        )
+        self._samples.clear()
+        return [(at_ns, height) for _, at_ns, height in self._pieces]
+
+
+def _slope_over(points: list[tuple[float, float]], x: float) -> float:
+    """Slope of the edge over ``x`` of the lower convex hull of points in order; 0 without one."""
+    hull: list[tuple[float, float]] = []
+    for point in points:
+        while len(hull) > 1:
+            (x0, y0), (x1, y1) = hull[-2:]
+            if (y1 - y0) * (point[0] - x1) < (point[1] - y1) * (x1 - x0):
+                break
+            hull.pop()
+        hull.append(point)
+    for (x0, y0), (x1, y1) in pairwise(hull):
+        if x <= x1:
+            return (y1 - y0) / (x1 - x0)
+    return 0.0

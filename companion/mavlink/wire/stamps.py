@@ -1,0 +1,32 @@
+"""Boot stamps of messages that are not decoded otherwise.
+
+Any message with ``time_boot_ms`` says where its sender's boot clock is. The table is that of
+pymavlink's generated ``all`` dialect, without the setpoints that ground stations send (82, 84, 86):
+theirs are no autopilot's time. ``tests/mavlink/wire/test_stamps.py`` compares it with the dialect.
+"""
+
+from typing import Final
+
+from companion.values import Frame
+
+STAMPED: Final[dict[int, int]] = {
+    **dict.fromkeys(
+        (26, 29, 30, 31, 32, 33, 34, 35, 65, 81, 83, 85, 87, 89, 116, 129, 132, 137, 143), 0
+    ),
+    **dict.fromkeys((251, 252, 254, 257, 259, 260, 261, 262, 265, 271, 277, 280, 281, 285), 0),
+    **dict.fromkeys((376, 11037, 11038, 11060), 0),
+    2: 8,
+    263: 8,
+    264: 24,
+    283: 8,
+}
+"""Message id to the place of ``time_boot_ms`` in its payload, bytes."""
+
+
+def boot_ms(frame: Frame) -> int:
+    """The stamp of a message in ``STAMPED``, milliseconds since its sender's boot.
+
+    MAVLink 2 cuts trailing zero bytes of a payload: they are zeros.
+    """
+    at = STAMPED[frame.msgid]
+    return int.from_bytes(frame.payload[at : at + 4], "little")

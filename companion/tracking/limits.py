@@ -1,0 +1,174 @@
+"""What an aircraft is taken to be able to do, by its type; and what its reports prove it to do.
+
+The bounds rest on a greatest speed and a greatest acceleration. Two reported velocities prove a
+mean acceleration between them of at least (|v2 - v1| - n1 - n2) / T, n their noise. Where that is
+more than what is taken for possible, the assumption is refuted: it is raised for this aircraft at
+once, and fades back over minutes. See docs/math.md 5.6.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from companion.values import Fix, Limits, LimitSource, Refuted
+
+RAISED: Final = 1.5
+"""Multiple of what was proven that is taken for possible from then on."""
+FADES_S: Final = 120.0
+"""Time constant with which a raised limit fades."""
+MOST: Final = 6.0
+"""Multiple of the limit above which a proof is not believed: the report is wrong, not the limit."""
+PAIRS_S: Final = (0.001, 0.2, 0.5, 1.0, 2.0)
+"""Least times between two velocities that are compared: the one before, and others further back."""
+_KEPT: Final = 64
+
+
+class Airframe(StrEnum):
+    """Kinds of aircraft that differ in what they can do."""
+
+    COPTER = "copter"
+    AEROPLANE = "aeroplane"
+    VTOL = "vtol"
+    HELICOPTER = "helicopter"
+    ROVER = "rover"
+    UNKNOWN = "unknown"
+    ADSB = "adsb"
+
+
+@dataclass(frozen=True, slots=True)
+class AirframeLimits:
+    """What is assumed of a kind of aircraft.
+
+    speed_mps, acceleration_mps2
+                greatest of each, norms of 3-vectors
+    lag_s       least and greatest time by which a reported position is older than its stamp;
+                negative: it is where the aircraft will be
+    """
+
+    speed_mps: float
+    acceleration_mps2: float
+    lag_s: tuple[float, float]
+
+
+ANY_LAG_S: Final = (0.0, 0.06)
+"""Lag of an autopilot of which nothing is known."""
+LIMITS: Final = {
+    Airframe.COPTER: AirframeLimits(60.0, 4.0, ANY_LAG_S),
+    Airframe.AEROPLANE: AirframeLimits(80.0, 16.0, ANY_LAG_S),
+    Airframe.VTOL: AirframeLimits(80.0, 16.0, ANY_LAG_S),
+    Airframe.HELICOPTER: AirframeLimits(80.0, 8.0, ANY_LAG_S),
+    Airframe.ROVER: AirframeLimits(40.0, 5.0, ANY_LAG_S),
+    Airframe.UNKNOWN: AirframeLimits(80.0, 16.0, ANY_LAG_S),
+    Airframe.ADSB: AirframeLimits(400.0, 16.0, (0.0, 0.0)),
+}
+"""From real and simulated logs: docs/field-notes.md 1."""
+ARDUPILOT_LAG_S: Final = {Airframe.COPTER: (0.019, 0.040), Airframe.AEROPLANE: (-0.033, -0.019)}
+ARDUPILOT_ANY_LAG_S: Final = (-0.033, 0.040)
+"""Lag of ArduPilot's positions in simulation: its copters' and its aeroplanes' differ in sign."""
+
+_ARDUPILOT: Final = 3  # MAV_AUTOPILOT_ARDUPILOTMEGA
+_AIRFRAMES: Final = {
+    **dict.fromkeys((2, 3, 13, 14, 15, 29, 35, 43), Airframe.COPTER),
+    **dict.fromkeys((1, 16, 28), Airframe.AEROPLANE),
+    **dict.fromkeys(range(19, 26), Airframe.VTOL),
+    4: Airframe.HELICOPTER,
+    **dict.fromkeys((10, 11, 12), Airframe.ROVER),
+}
+
+
+def airframe(mav_type: int | None) -> Airframe:
+    """The kind of aircraft by MAV_TYPE (minimal.xml) of its heartbeat; None: none was heard."""
+    return Airframe.UNKNOWN if mav_type is None else _AIRFRAMES.get(mav_type, Airframe.UNKNOWN)
+
+
+def lag_s(kind: Airframe, autopilot: int | None) -> tuple[float, float]:
+    """Least and greatest lag of a position by MAV_AUTOPILOT and the kind of aircraft, seconds."""
+    if autopilot == _ARDUPILOT:
+        return ARDUPILOT_LAG_S.get(kind, ARDUPILOT_ANY_LAG_S)
+    return LIMITS[kind].lag_s
+
+
+@dataclass(slots=True)
+class _Raised:
+    """A limit that was raised: to how much, when on the sender's timeline, and how often."""
+
+    to: float = 0.0
+    at_ns: int = 0
+    times: int = 0
+
+    def at(self, limit: float, sender_ns: int) -> float:
+        """The limit in force at a sender time."""
+        if self.to <= limit:
+            return limit
+        faded = math.exp(-max(0, sender_ns - self.at_ns) * 1e-9 / FADES_S)
+        return limit + (self.to - limit) * faded
+
+
+class Refutations:
+    """What the reports of one UAV have proven of its limits. ``look`` takes them in any order."""
+
+    def __init__(self) -> None:
+        self.speed = _Raised()
+        self.acceleration = _Raised()
+        self._velocities: deque[tuple[int, float, float, float, float]] = deque(maxlen=_KEPT)
+
+    @property
+    def times(self) -> int:
+        """How often a limit was refuted."""
+        return self.speed.times + self.acceleration.times
+
+    def limits(self, base: Limits, sender_ns: int) -> Limits:
+        """The limits in force at a sender time."""
+        speed = self.speed.at(base.speed_mps, sender_ns)
+        acceleration = self.acceleration.at(base.acceleration_mps2, sender_ns)
+        if speed == base.speed_mps and acceleration == base.acceleration_mps2:
+            return base
+        return Limits(speed, acceleration, LimitSource.RAISED)
+
+    def look(self, fix: Fix) -> list[Refuted]:
+        """Take in a report with its base limits. Returns what it refutes, and raises that."""
+        base, velocity = fix.limits, fix.velocity_ned_mps
+        if base is None or velocity is None:
+            return []
+        found = []
+        north, east, down = velocity.tolist()
+        noise_mps = fix.noise.velocity_mps
+        speed = math.sqrt(north * north + east * east + down * down) - noise_mps
+        limit = self.speed.at(base.speed_mps, fix.sender_ns)
+        if limit < speed < MOST * base.speed_mps:
+            found.append(self._raise(self.speed, fix, "observer.speed_max_mps", limit, speed))
+        proven = self._proven(fix.sender_ns, north, east, down, noise_mps)
+        limit = self.acceleration.at(base.acceleration_mps2, fix.sender_ns)
+        if limit < proven < MOST * base.acceleration_mps2:
+            name = "observer.acceleration_max_mps2"
+            found.append(self._raise(self.acceleration, fix, name, limit, proven))
+        if not self._velocities or fix.sender_ns > self._velocities[-1][0]:
+            self._velocities.append((fix.sender_ns, north, east, down, noise_mps))
+        return found
+
+    def _proven(
+        self, sender_ns: int, north: float, east: float, down: float, noise_mps: float
+    ) -> float:
+        """The greatest mean acceleration that a velocity proves with those before it, m/s²."""
+        most, due = 0.0, 0
+        for before_ns, n, e, d, noise in reversed(self._velocities):
+            apart_s = (sender_ns - before_ns) * 1e-9
+            if apart_s < PAIRS_S[due]:
+                continue
+            changed = math.sqrt((north - n) ** 2 + (east - e) ** 2 + (down - d) ** 2)
+            # Stamps are whole milliseconds, so the time between may be one more.
+            most = max(most, (changed - noise - noise_mps) / (apart_s + 1e-3))
+            while due < len(PAIRS_S) and apart_s >= PAIRS_S[due]:
+                due += 1
+            if due == len(PAIRS_S):
+                break
+        return most
+
+    def _raise(
+        self, raised: _Raised, fix: Fix, setting: str, limit: float, proven: float
+    ) -> Refuted:
+        raised.to, raised.at_ns = RAISED * proven, fix.sender_ns
+        raised.times += 1
+        return Refuted(fix.arrival_ns, fix.uav, setting, limit, proven, raised.to)

@@ -1,0 +1,88 @@
+"""The places that a UAV can have reached: what its newest report and its limits leave.
+
+At a time s after a report of position p and velocity v, with noise n_p and n_v and an acceleration
+of at most a, the UAV is within
+
+    R(s) = n_p + |s| n_v + a s^2 / 2    of    p + v s
+
+Where s is known to lie between two times only, all of these balls are possible. |q - (p + v s)| and
+R(s) are both convex in s, so their sum is greatest at one of the two ends, for every place q: the
+bound about a prediction q is the larger of the two, and exact. Older reports add nothing to the
+worst case. See docs/math.md 5.1.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from companion.values import Fix, FloatArray, Limits, SenderTime
+
+
+class Reach(NamedTuple):
+    """Bounds about a prediction, and the least ball that holds all that is possible.
+
+    bound_m       bound on the norm of the prediction's error
+    horizontal_m  bound on its part in the plane
+    vertical_m    bound on its height
+    center_ned_m  (3,), centre of the ball
+    radius_m      radius of the ball
+    """
+
+    bound_m: float
+    horizontal_m: float
+    vertical_m: float
+    center_ned_m: FloatArray
+    radius_m: float
+
+
+def reach(fix: Fix, limits: Limits, predicted_ned_m: FloatArray, at: SenderTime) -> Reach:
+    """What is possible at a time, and how far it is from a prediction for that time.
+
+    fix              the newest report, with a velocity
+    limits           what the aircraft can do
+    predicted_ned_m  (3,), the prediction
+    at               the time, on the sender's timeline
+    """
+    assert fix.velocity_ned_mps is not None
+    noise = fix.noise
+    age_s = (at.sender_ns - fix.sender_ns) * 1e-9
+    ends = (age_s - at.before_s, age_s + at.after_s)
+    north, east, down = (predicted_ned_m - fix.position_ned_m).tolist()
+    v_north, v_east, v_down = fix.velocity_ned_mps.tolist()
+    bound = horizontal = vertical = 0.0
+    radii = []
+    for s in ends:
+        grown = abs(s) * noise.velocity_mps + limits.acceleration_mps2 * s * s / 2.0
+        n, e, d = north - v_north * s, east - v_east * s, down - v_down * s
+        flat = n * n + e * e
+        radii.append(noise.position_m + grown)
+        bound = max(bound, math.sqrt(flat + d * d) + noise.position_m + grown)
+        horizontal = max(horizontal, math.sqrt(flat) + noise.horizontal_m + grown)
+        vertical = max(vertical, abs(d) + noise.vertical_m + grown)
+    # Over long gaps the greatest speed says more.
+    way = max(abs(ends[0]), abs(ends[1])) * limits.speed_mps
+    flat = north * north + east * east
+    bound = min(bound, math.sqrt(flat + down * down) + noise.position_m + way)
+    horizontal = min(horizontal, math.sqrt(flat) + noise.horizontal_m + way)
+    vertical = min(vertical, abs(down) + noise.vertical_m + way)
+    center, radius = _ball(fix, ends, radii)
+    if noise.position_m + way < radius:
+        center, radius = fix.position_ned_m, noise.position_m + way
+    return Reach(min(bound, math.hypot(horizontal, vertical)), horizontal, vertical, center, radius)
+
+
+def _ball(fix: Fix, ends: tuple[float, float], radii: list[float]) -> tuple[FloatArray, float]:
+    """The least ball that holds the balls at both ends, and with them all between."""
+    assert fix.velocity_ned_mps is not None
+    velocity = fix.velocity_ned_mps
+    apart = math.sqrt(velocity @ velocity) * (ends[1] - ends[0])
+    radius = max(radii[0], radii[1], (radii[0] + radii[1] + apart) / 2.0)
+    if apart == 0.0:
+        share = 0.0
+    else:
+        share = min(1.0, max(0.0, (radius - radii[0]) / apart))
+        if radius == radii[1]:
+            share = 1.0
+    s = ends[0] + share * (ends[1] - ends[0])
+    return np.asarray(fix.position_ned_m + s * velocity), radius

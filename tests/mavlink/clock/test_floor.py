@@ -1,0 +1,229 @@
+"""The interval of a sender's offset against links and clocks that mean harm.
+
+Every case says what the clock and the link do; the truth must lie in the interval at every moment,
+within what is declared: a drift of 250 ppm, and a least latency that is no longer than the median
+of its visible part (or 25 ms).
+"""
+
+import math
+import random
+from collections.abc import Callable
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.mavlink.clock.estimates import ClockChange, ClockEstimate
+from companion.mavlink.clock.floor import RECENT, Floor
+from companion.mavlink.clock.sender_clock import SenderClock
+
+MS = 1_000_000
+S = 1_000_000_000
+EPOCH_NS = 1_700_000_000 * S
+BOOT_S = 7_000.0
+Latency = Callable[[float, random.Random], float]
+"""Latency in seconds of what is sent a time after the epoch."""
+
+
+def answers(
+    latency: Latency,
+    *,
+    seconds: float = 60.0,
+    rate_hz: float = 20.0,
+    moved: Callable[[float], float] = lambda _t: 0.0,
+    trips_s: float | None = None,
+    seed: int = 0,
+) -> list[tuple[float, float, ClockEstimate, ClockChange | None]]:
+    """When, by how much the estimate is off (s), the estimate, and the change that was told.
+
+    ``moved`` is by how much the sender's clock has fallen behind; ``trips_s`` the time between
+    round trips, whose ways both take the link's latency.
+    """
+    rng = random.Random(seed)
+    made: list[tuple[float, float, float | None]] = []
+    for n in range(int(seconds * rate_hz)):
+        made.append((n / rate_hz + latency(n / rate_hz, rng), n / rate_hz, None))
+    for n in range(1, int(seconds / trips_s) if trips_s else 0):
+        assert trips_s is not None
+        there = n * trips_s + latency(n * trips_s, rng)
+        made.append((there + latency(there, rng), n * trips_s, there))
+    clock, found = SenderClock(), []
+
+    def boot_s(t: float) -> float:
+        return BOOT_S + t - moved(t)
+
+    for arrived, sent, answered in sorted(made, key=lambda one: one[0]):
+        arrival_ns = EPOCH_NS + round(arrived * S)
+        if answered is None:
+            clock.observe(arrival_ns, math.floor(boot_s(sent) * 1e3))
+        else:
+            clock.timesync(EPOCH_NS + round(sent * S), arrival_ns, round(boot_s(answered) * S))
+        change = clock.change
+        for later in (0.0, 0.03):
+            estimate = clock.estimate(arrival_ns + round(later * S))
+            assert estimate is not None
+            truth = EPOCH_NS / S - BOOT_S + moved(arrived + later)
+            found.append((arrived + later, truth - estimate.offset_ns / S, estimate, change))
+            change = None
+    return found
+
+
+def outside_s(off: float, estimate: ClockEstimate) -> float:
+    return max(off - estimate.before_s, -off - estimate.after_s)
+
+
+def jitter(least: float, most: float) -> Latency:
+    return lambda _t, rng: rng.uniform(least, most)
+
+
+LINKS: dict[str, Latency] = {
+    "ramp of .02 to 1 s over 20 s": lambda t, _: 0.02 + 0.98 * min(1.0, max(0.0, t - 2) / 20),
+    "ramp and back": lambda t, _: 0.02 + 0.9 * max(0.0, 1 - abs(t - 25) / 15),
+    "step from .02 to .5 s": lambda t, _: 0.02 if t < 5 else 0.5,
+    "first frame fast, others at .3 s": lambda t, _: 0.02 if t == 0 else 0.3,
+    "sawtooth of 0 to .8 s": lambda t, _: 0.8 * (t / 5 % 1),
+    "first sixteen slow": lambda t, rng: (0.5 if t < 0.8 else 0.02) + rng.uniform(0, 0.01),
+    "fast, then slow within a piece": lambda t, rng: (
+        rng.uniform(0.01, 0.015) if t % 3.75 < 0.8 else rng.uniform(0.3, 0.31)
+    ),
+    "the last fast frame long ago": lambda t, rng: 0.01 if t < 1 else rng.uniform(0.5, 0.505),
+    "bursts": lambda t, _: 0.01 + (3.0 - t % 3.0 if t % 12 > 9 else 0.0),
+    "lognormal radio": lambda _t, rng: rng.lognormvariate(math.log(0.6), 0.79),
+}
+
+
+@pytest.mark.parametrize("name", LINKS)
+@pytest.mark.parametrize("rate_hz", [1.2, 8.0, 20.0])
+def test_no_link_leads_the_interval_away(name: str, rate_hz: float) -> None:
+    for seed in range(4):
+        for at, off, estimate, _ in answers(LINKS[name], rate_hz=rate_hz, seconds=90, seed=seed):
+            assert outside_s(off, estimate) <= 0, f"{name} at {at:.2f} s"
+
+
+def test_there_is_no_cliff_where_the_last_fast_frame_leaves_the_window() -> None:
+    found = answers(LINKS["the last fast frame long ago"], seconds=200)
+    doubts = [one.uncertainty_s for at, _, one, _ in found if at > 20]
+    assert min(doubts) > 0.45
+    assert max(abs(b - a) for a, b in pairwise(doubts)) < 0.05
+
+
+@settings(max_examples=150)
+@given(
+    st.lists(st.tuples(st.floats(0.3, 15), st.floats(0, 1.5), st.floats(0, 0.3)), min_size=1,
+             max_size=12),
+    st.floats(-250e-6, 250e-6),
+    st.sampled_from([1.2, 5.0, 20.0]),
+    st.integers(0, 10_000),
+)  # fmt: skip
+def test_no_latency_that_follows_another_leads_the_interval_away(
+    spells: list[tuple[float, float, float]], drift: float, rate_hz: float, seed: int
+) -> None:
+    """Spells of some latency and some jitter, in any order, on any clock within its drift.
+
+    Each tenth frame is quick, so that the least latency is no secret: the assumption holds.
+    """
+    ends = np.cumsum([length for length, _, _ in spells])
+
+    def latency(t: float, rng: random.Random) -> float:
+        _, base, spread = spells[min(int(np.searchsorted(ends, t)), len(spells) - 1)]
+        return 0.02 if round(t * rate_hz) % 10 == 0 else 0.02 + base + rng.uniform(0, spread)
+
+    seconds = min(90.0, float(ends[-1]) + 3)
+    found = answers(latency, rate_hz=rate_hz, seconds=seconds, moved=lambda t: drift * t, seed=seed)
+    for at, off, estimate, _ in found:
+        assert outside_s(off, estimate) <= 0, at
+
+
+# --- clocks -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 50.0])
+@pytest.mark.parametrize("stood_s", [0.13, 0.18, 1.5])
+def test_a_clock_that_stood_still_is_told_within_a_second(rate_hz: float, stood_s: float) -> None:
+    """Three frames show it; the interval holds what it was before, too: it may be the link."""
+    found = answers(
+        jitter(0.003, 0.007), rate_hz=rate_hz, moved=lambda t: min(stood_s, max(0.0, t - 20))
+    )
+    told = [at for at, _, _, change in found if change is not None]
+    assert len(told) >= 1
+    assert 20 < told[0] < 21.6 + stood_s
+    for at, off, estimate, _ in found:
+        if not 20 <= at <= 20 + stood_s + 3 / rate_hz + 0.04:
+            assert outside_s(off, estimate) <= 0, at
+    assert all(abs(off) < 0.02 for at, off, _, _ in found if at > 22 + stood_s)
+
+
+def test_a_steady_link_tells_of_no_change() -> None:
+    for name, rate_hz in (("lognormal radio", 1.2), ("lognormal radio", 8.0)):
+        for seed in range(5):
+            found = answers(LINKS[name], rate_hz=rate_hz, seconds=300, seed=seed)
+            assert sum(change is not None for *_, change in found) <= 1
+    for seed in range(5):
+        found = answers(lambda _t, rng: rng.lognormvariate(math.log(0.016), 0.5), seed=seed)
+        assert not any(change for *_, change in found)
+
+
+# --- with round trips ---------------------------------------------------------------------------
+
+
+def slow(t: float) -> float:
+    """5000 ppm slow for 5 s, twice, and as much quick in between."""
+    return 0.005 * (min(5.0, max(0.0, t - 30)) - min(5.0, max(0.0, t - 50)))
+
+
+@pytest.mark.parametrize("trips_s", [1.0, 5.0])
+def test_a_clock_that_runs_slow_for_seconds_is_followed_by_round_trips(trips_s: float) -> None:
+    for seed in range(5):
+
+        def busy(_t: float, rng: random.Random) -> float:
+            late = rng.expovariate(1 / 0.02) if rng.random() < 0.3 else 0.0
+            return rng.uniform(0.002, 0.008) + late
+
+        found = answers(busy, seconds=90, rate_hz=50, moved=slow, trips_s=trips_s, seed=seed)
+        late = [(off, one) for at, off, one, _ in found if at > 2 * trips_s]
+        assert np.percentile([one.uncertainty_s for _, one in late], 99) < 0.05
+        # Between two trips the clock may run further than is known of it.
+        assert max(outside_s(off, one) for off, one in late) <= 0.01
+
+
+def test_poor_trips_do_not_beat_good_stamps() -> None:
+    found = answers(jitter(0.002, 0.008), trips_s=5.0, seconds=40)
+    poor = answers(
+        lambda t, rng: rng.uniform(0.002, 0.008) if t * 20 % 1 < 1e-6 else 4.0, trips_s=4.9921
+    )
+    assert found[-1][2].uncertainty_s < 0.02
+    assert poor[-1][2].uncertainty_s < 0.05
+
+
+# --- the floor itself ---------------------------------------------------------------------------
+
+
+@settings(max_examples=200)
+@given(
+    st.lists(st.tuples(st.integers(1, 3 * S), st.integers(0, 2 * S)), min_size=1, max_size=120),
+    st.floats(-250e-6, 250e-6),
+)
+def test_the_sure_side_is_above_the_offset_and_below_every_stamp(
+    steps: list[tuple[int, int]], drift: float
+) -> None:
+    """Whatever comes, for whatever latency: the truth is under it, and no stamp is, aged."""
+    floor, x_ns = Floor(60 * S, 250e-6), 10 * S
+    for step_ns, latency_ns in steps:
+        x_ns += step_ns
+        offset_ns = 5 * S + drift * x_ns
+        floor.add(x_ns, round(offset_ns + latency_ns))
+        assert floor.sure_ns(x_ns) >= offset_ns - 2
+        assert floor.sure_ns(x_ns) <= offset_ns + latency_ns + 2
+        assert floor.highest_ns(x_ns) >= floor.sure_ns(x_ns)
+        assert floor.at(x_ns) <= offset_ns + latency_ns + 2
+
+
+def test_memory_is_bounded() -> None:
+    floor, rng = Floor(60 * S, 250e-6), random.Random(1)
+    for n in range(20_000):
+        floor.add(n * 20 * MS, rng.randrange(100 * MS))
+    assert len(floor._visible._samples) <= 257
+    assert len(floor._visible._pieces) <= 16
+    assert len(floor._recent) == RECENT

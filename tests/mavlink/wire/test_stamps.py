@@ -1,0 +1,47 @@
+"""Boot stamps against pymavlink: where they are, and how they are read."""
+
+import struct
+
+import pymavlink.dialects.v20.all as dialect
+import pytest
+
+from companion.mavlink.wire.stamps import STAMPED, boot_ms
+from companion.values import Frame, Source
+
+SETPOINTS = {82, 84, 86}
+"""What ground stations send to a vehicle: their time is not the vehicle's."""
+SIZES = {
+    "uint64_t": 8, "int64_t": 8, "double": 8, "uint32_t": 4, "int32_t": 4, "float": 4,
+    "uint16_t": 2, "int16_t": 2, "uint8_t": 1, "int8_t": 1, "char": 1,
+}  # fmt: skip
+
+
+def place(message: type[dialect.MAVLink_message]) -> int | None:
+    """Where ``time_boot_ms`` begins in the payload; None where there is none."""
+    at = 0
+    for name, length in zip(message.ordered_fieldnames, message.array_lengths, strict=True):
+        if name == "time_boot_ms":
+            return at
+        at += SIZES[message.fieldtypes[message.fieldnames.index(name)]] * max(1, length)
+    return None
+
+
+def test_the_table_is_the_dialects() -> None:
+    found = {number: place(message) for number, message in dialect.mavlink_map.items()}
+    stamped = {number: at for number, at in found.items() if at is not None}
+    assert {n: at for n, at in stamped.items() if n not in SETPOINTS} == STAMPED
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_stamp_is_read_as_pymavlink_packs_it(version: int) -> None:
+    """Zeros at the end of a payload are cut by version 2."""
+    sender = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
+    message = dialect.MAVLink_system_time_message(1_700_000_000_000_000, 70_000)
+    raw = message.pack(sender, force_mavlink1=version == 1)
+    assert boot_ms(Frame(0, "udp", Source(1, 1), 2, raw)) == 70_000
+
+
+def test_a_payload_that_ends_before_its_stamp_has_zeros() -> None:
+    payload = struct.pack("<Q", 1)
+    raw = bytes((0xFD, len(payload), 0, 0, 0, 1, 1, 2, 0, 0)) + payload + b"\0\0"
+    assert boot_ms(Frame(0, "udp", Source(1, 1), 2, raw)) == 0

@@ -5,7 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from companion.studies.truth.vehicles import Flight, Trajectory
+from companion.studies.truth.trajectory import Trajectory
+from companion.studies.truth.vehicles import Flight
 
 MakeFlight = Callable[..., Flight]
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -23,7 +24,7 @@ def straight_flight() -> MakeFlight:
         truth = Trajectory("SIM_STATE", made_ns, position, velocity)
         return Flight(
             uav, made_ns + 5_000_000, boot_ms, position, velocity, np.full(n, height_m),
-            (None,) * n, truth,
+            (None,) * n, truth, made_ns,
         )  # fmt: skip
 
     return make

@@ -10,7 +10,8 @@ from typing import Final
 import numpy as np
 
 from companion.studies.prediction.radio_link import RadioLink
-from companion.studies.truth.vehicles import Flight, Times, Trajectory
+from companion.studies.truth.trajectory import Times, Trajectory
+from companion.studies.truth.vehicles import Flight
 from companion.values import FloatArray
 
 STEP_S: Final = 0.05
@@ -40,6 +41,7 @@ def flight(rng: np.random.Generator, uav: str, seconds: float = 60.0) -> Flight:
         height,
         (None,) * len(rows),
         Trajectory("SIM_STATE", t_ns, position, velocity),
+        t_ns[rows],
     )
 
 

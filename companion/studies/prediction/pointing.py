@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from companion.beams.array.geometry import Array
 from companion.studies.prediction.baselines import Observed, Predictor
 from companion.studies.prediction.spectral import SNR_DB, loss_bps_hz
-from companion.studies.truth.vehicles import Flight, Flown, Times
+from companion.studies.truth.trajectory import Times
+from companion.studies.truth.vehicles import Flight, Flown
 from companion.values import FloatArray
 
 ASK_HZ: Final = 20

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from companion.mavlink.clock.sender_clock import SenderClock
 from companion.studies.prediction.baselines import Observed
-from companion.studies.truth.vehicles import Flight, Times
+from companion.studies.truth.trajectory import Times
+from companion.studies.truth.vehicles import Flight
 from companion.values import FloatArray, UserError
 
 P95: Final = 1.6448536269514722

@@ -5,7 +5,6 @@ attitude. Only then is the whole of a pointing bound tested: both positions and 
 Without a SIM_STATE of the carrier its predicted pose is taken for true, and reports say so.
 """
 
-import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,18 +16,15 @@ from scipy.spatial.transform import Rotation, Slerp
 from companion.beams import line_of_sight
 from companion.beams.array.geometry import Array
 from companion.pipeline.fold import Pipeline
-from companion.recording.reader import read_log
 from companion.settings.center import FixedCenter, VehicleCenter
 from companion.studies.truth import vehicles
-from companion.studies.truth.vehicles import SIM_STATE, Flight, Times
+from companion.studies.truth.trajectory import Times
+from companion.studies.truth.vehicles import Flight
 from companion.tracking.geodesy import LocalFrame
-from companion.values import Carrier, FloatArray, Frame, Track
+from companion.values import Carrier, FloatArray, Track
 
 SIMULATED: Final = "SIM_STATE"
 CARRIER_PREDICTED: Final = "SIM_STATE, carrier as predicted"
-
-_ATTITUDE = struct.Struct("<4f")
-"""The first fields of SIM_STATE: the quaternion w, x, y, z of ned from body."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,29 +96,20 @@ def load(log: Path, pipeline: Pipeline) -> ArrayTruth | None:
     own = flights.pop(str(pipeline.center.place), None)
     if not flights:
         return None
-    carrier = None if own is None else _carrier_truth(log, own)
+    carrier = None if own is None else _carrier_truth(own)
     kind = CARRIER_PREDICTED if carrier is None else SIMULATED
     return ArrayTruth(kind, local, flights, carrier)
 
 
-def _carrier_truth(log: Path, flight: Flight) -> CarrierTruth | None:
-    """The attitudes of SIM_STATE, each as late as the reports that arrived with it.
-
-    None for too few.
-    """
-    rows = [
-        (event.t_ns, _ATTITUDE.unpack(event.payload.ljust(_ATTITUDE.size, b"\0")[:16]))
-        for event in read_log(log)
-        if isinstance(event, Frame) and event.msgid == SIM_STATE and str(event.source) == flight.uav
-    ]
-    turned = [(t_ns, quaternion) for t_ns, quaternion in rows if any(quaternion)]
-    came_ns = np.array([t_ns for t_ns, _ in turned], dtype=np.int64)
-    late_ns = flight.arrival_ns - vehicles.true_times_ns(flight.arrival_ns, flight.boot_ms)
-    made_ns = came_ns - np.interp(came_ns, flight.arrival_ns, late_ns).astype(np.int64)
-    times_ns, kept = np.unique(made_ns, return_index=True)
+def _carrier_truth(flight: Flight) -> CarrierTruth | None:
+    """The attitudes of the carrier's SIM_STATE. None for too few."""
+    truth = flight.truth
+    if truth.ned_from_body is None:
+        return None
+    turned = truth.ned_from_body.any(axis=1)
+    times_ns = truth.t_ns[turned]
     if len(times_ns) < 2:
         return None
-    quaternions = np.array([quaternion for _, quaternion in turned])[kept]
-    rotations = Rotation.from_quat(np.roll(quaternions, -1, axis=1))
+    rotations = Rotation.from_quat(np.roll(truth.ned_from_body[turned], -1, axis=1))
     from_ns = int(times_ns[0])
     return CarrierTruth(flight, from_ns, Slerp((times_ns - from_ns) * 1e-9, rotations))

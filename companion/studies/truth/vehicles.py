@@ -1,79 +1,46 @@
 """The vehicles of a log: their reports, and where they truly were.
 
-The truth is the simulator's where a log has it: SIM_STATE, or ArduPilot's older SIMSTATE
-(ardupilotmega.xml, 164), which says where but not how high: its heights are those of the reports,
-its velocities those between neighbours. Otherwise the truth is the reports seen afterwards: all of
-them, in the order of the sender's clock, interpolated. A sender's clock is put on the log's
-timeline with hindsight: by the least delay within ``WINDOW_NS`` before and after.
-
-Over 300 lines: one reader: what a log holds of each vehicle.
+The truth is the simulator's where a log has it: SIM_STATE, or the older SIMSTATE, whose heights are
+those of the reports and whose velocities are those between neighbours. Otherwise the truth is the
+reports seen afterwards: all of them, in the order of the sender's clock, interpolated. When the
+simulator's words were made is found in ``pairing``, what the sender's clock showed in
+``hindsight``.
 """
 
-import struct
-from collections import defaultdict
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.mavlink.trust.dedupe import Dedupe
-from companion.mavlink.wire.decode import GLOBAL_POSITION_INT, GPS_RAW_INT, decode
-from companion.recording.reader import read_log
 from companion.settings.center import CenterPlace, FixedCenter, VehicleCenter, parse_center
+from companion.studies.truth import pairing
+from companion.studies.truth.hindsight import BootClock
+from companion.studies.truth.streams import (
+    SIM_STATE,
+    SIMSTATE,
+    Stream,
+    gather,
+    sim_state,
+    simstate,
+    words,
+)
+from companion.studies.truth.trajectory import Times, Trajectory, ascending
 from companion.tracking.geodesy import LocalFrame
-from companion.values import FloatArray, Frame, GnssStatus, Report, UserError
+from companion.values import (
+    BoolArray,
+    FloatArray,
+    Frame,
+    GnssStatus,
+    IntArray,
+    Report,
+    RoundTrip,
+    UserError,
+)
 
-Times = NDArray[np.int64]
-Kind = Literal["SIM_STATE", "SIMSTATE", "reports"]
-
-SIM_STATE: Final = 108
-SIMSTATE: Final = 164
-REBOOT_STEP_NS: Final = 10_000_000_000
-WINDOW_NS: Final = 10_000_000_000
-GAP_NS: Final = 2_500_000_000
-"""Longest gap between two points of a trajectory across which it is interpolated."""
-PAIRED_NS: Final = 50_000_000
-"""Longest distance in arrival from a truth message to the report that dates it.
-
-Truth messages carry no time: each is taken to be as late as the report that arrived nearest.
-"""
 FLYING_SPEED_MPS: Final = 1.0
 FLYING_HEIGHT_M: Final = 2.0
-
-_READ: Final = (GLOBAL_POSITION_INT, GPS_RAW_INT, SIM_STATE, SIMSTATE)
-_SIM_STATE = struct.Struct("<21fii")
-_SIMSTATE = struct.Struct("<9fii")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Trajectory:
-    """Positions and velocities, (N, 3), local frame, at ascending times (N,)."""
-
-    kind: Kind
-    t_ns: Times
-    position_ned_m: FloatArray
-    velocity_ned_mps: FloatArray
-
-    def at(self, t_ns: Times) -> tuple[FloatArray, FloatArray]:
-        """Position and velocity (K, 3) at times (K,), by cubic Hermite; NaN where not known."""
-        if len(self.t_ns) < 2:
-            return np.full((len(t_ns), 3), np.nan), np.full((len(t_ns), 3), np.nan)
-        after = np.clip(np.searchsorted(self.t_ns, t_ns, side="right"), 1, len(self.t_ns) - 1)
-        before = after - 1
-        span_ns = self.t_ns[after] - self.t_ns[before]
-        known = (t_ns >= self.t_ns[before]) & (t_ns <= self.t_ns[after]) & (span_ns <= GAP_NS)
-        span_s = span_ns[:, None] * 1e-9
-        s = ((t_ns - self.t_ns[before]) / span_ns)[:, None]
-        p0, p1 = self.position_ned_m[before], self.position_ned_m[after]
-        v0, v1 = self.velocity_ned_mps[before] * span_s, self.velocity_ned_mps[after] * span_s
-        bend, twist = 3 * (p1 - p0) - 2 * v0 - v1, 2 * (p0 - p1) + v0 + v1
-        position = p0 + s * (v0 + s * (bend + s * twist))
-        velocity = (v0 + s * (2 * bend + s * 3 * twist)) / span_s
-        position[~known] = velocity[~known] = np.nan
-        return position, velocity
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,6 +55,10 @@ class Flight:
     height_m          (N,), height above the vehicle's home; NaN: not reported
     gnss              what the vehicle had last said of its receiver when each report came
     truth             where it truly was
+    made_ns           (N,), when each report was made, in hindsight
+    frames            its frames in order of arrival, but for the simulator's words
+    report_at         (N,), the place of each report among the frames; empty without frames
+    round_trips       TIMESYNC round trips with it
     """
 
     uav: str
@@ -98,6 +69,10 @@ class Flight:
     height_m: FloatArray
     gnss: tuple[GnssStatus | None, ...]
     truth: Trajectory
+    made_ns: Times
+    frames: tuple[Frame, ...] = ()
+    report_at: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    round_trips: tuple[RoundTrip, ...] = ()
 
     def flying(self, t_ns: Times) -> NDArray[np.bool_]:
         """Whether it flies: faster than 1 m/s and, by its last report, more than 2 m up."""
@@ -111,13 +86,17 @@ class Flight:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Flown:
-    """A log: its flights, and the array's position (fixed (3,), or a trajectory)."""
+    """A log: its flights, and the array's position (fixed (3,), or a trajectory).
+
+    ``origin`` is that of the local frame: latitude and longitude in degrees, altitude in metres.
+    """
 
     log: str
     center: str
     flights: tuple[Flight, ...]
     carrier: FloatArray | Trajectory
     span_ns: tuple[int, int]
+    origin: tuple[float, float, float]
 
     def carrier_at(self, t_ns: Times) -> FloatArray:
         """The array's true position (K, 3) at times (K,); NaN where not known."""
@@ -129,94 +108,66 @@ class Flown:
 def load(path: Path, center_text: str | None) -> Flown:
     """Read a log. Raises ``UserError`` or ``LogError`` where there is nothing to study in it."""
     center: CenterPlace = parse_center(center_text or "home")
-    reports, gnss, states, places = _gather(path)
-    if not reports:
+    streams = gather(path)
+    if not streams:
         raise UserError(f"{path}: no vehicle reports a position in it")
-    first = min((each[0] for each in reports.values()), key=lambda report: report.t_ns)
+    first = min((each.reports[0] for each in streams.values()), key=lambda report: report.t_ns)
     home = FixedCenter(first.lat_deg, first.lon_deg, first.alt_m or 0.0)
     stands = center if isinstance(center, FixedCenter) else home
     local = LocalFrame(stands.lat_deg, stands.lon_deg, stands.alt_m)
     # A vehicle with a single report has no path, and does not fly.
     flights = {
-        uav: _flight(uav, each, gnss[uav], states.get(uav, []), places.get(uav, []), local)
-        for uav, each in reports.items()
-        if len({report.boot_ms for report in each}) > 1
+        uav: _flight(uav, stream, local)
+        for uav, stream in streams.items()
+        if len({report.boot_ms for report in stream.reports}) > 1
     }
     carrier: FloatArray | Trajectory = np.zeros(3)
     if isinstance(center, VehicleCenter):
         if str(center) not in flights:
             raise UserError(f"{path}: the carrier {center} reports no position in it")
         carrier = flights.pop(str(center)).truth
-    arrivals = [report.t_ns for each in reports.values() for report in each]
+    arrivals = [report.t_ns for stream in streams.values() for report in stream.reports]
     return Flown(
         path.name,
         str(center if center_text and center_text != "home" else home),
         tuple(flights.values()),
         carrier,
         (min(arrivals), max(arrivals)),
+        local.origin,
     )
 
 
-Reports = dict[str, list[Report]]
-Receivers = dict[str, list[GnssStatus | None]]
-States = dict[str, list[tuple[int, bytes]]]
-
-
-def _gather(path: Path) -> tuple[Reports, Receivers, States, States]:
-    """Messages by vehicle, with their arrival.
-
-    Returns reports, each once; the receiver's status at each; SIM_STATE; and SIMSTATE.
-    """
-    reports: Reports = defaultdict(list)
-    receivers: Receivers = defaultdict(list)
-    states: States = defaultdict(list)
-    places: States = defaultdict(list)
-    newest: dict[str, GnssStatus] = {}
-    dedupe = Dedupe()
-    for frame in _frames(path):
-        if frame.msgid == SIM_STATE:
-            states[str(frame.source)].append((frame.t_ns, frame.payload))
-            continue
-        if frame.msgid == SIMSTATE:
-            places[str(frame.source)].append((frame.t_ns, frame.payload))
-            continue
-        message = decode(frame)
-        if isinstance(message, GnssStatus):
-            newest[str(message.source)] = message
-        elif isinstance(message, Report) and not dedupe.is_repeat(frame):
-            reports[message.uav].append(message)
-            receivers[message.uav].append(newest.get(message.uav))
-    return reports, receivers, states, places
-
-
-def _frames(path: Path) -> Iterator[Frame]:
-    for event in read_log(path):
-        if isinstance(event, Frame) and event.msgid in _READ:
-            yield event
-
-
-def _flight(
-    uav: str,
-    reports: list[Report],
-    gnss: list[GnssStatus | None],
-    states: list[tuple[int, bytes]],
-    places: list[tuple[int, bytes]],
-    local: LocalFrame,
-) -> Flight:
+def _flight(uav: str, stream: Stream, local: LocalFrame) -> Flight:
+    reports = stream.reports
     arrival_ns = np.array([report.t_ns for report in reports])
     boot_ms = np.array([report.boot_ms for report in reports])
     position = np.array([_place(local, r.lat_deg, r.lon_deg, r.alt_m or 0.0) for r in reports])
     velocity = np.array([_velocity(local, report) for report in reports])
     height = np.array([np.nan if r.relative_alt_m is None else r.relative_alt_m for r in reports])
-    t_ns = true_times_ns(arrival_ns, boot_ms)
-    truth = _simulated(states, local, arrival_ns, arrival_ns - t_ns) if states else None
-    if truth is None and places:
-        alt_m = np.array([r.alt_m or 0.0 for r in reports])
-        truth = _placed(places, local, arrival_ns, t_ns, alt_m)
+    clock = stream.clock()
+    # Every report is a stamp; of equal stamps any will do.
+    rows = {stamp: row for row, stamp in enumerate(stream.stamps)}
+    numbers = [rows[r.t_ns, (r.boot_ms or 0) * 1_000_000] for r in reports]
+    made_ns = clock.made_ns[numbers]
+    truth = _simulated(stream, clock, local)
+    if truth is None:
+        truth = _placed(stream, clock, local, made_ns, position, velocity)
+    if truth is None:
+        truth = ascending("reports", made_ns, position, velocity)
     return Flight(
-        uav, arrival_ns, boot_ms, position, velocity, height, tuple(gnss),
-        truth or _with_velocities("reports", t_ns, position, velocity),
-    )  # fmt: skip
+        uav,
+        arrival_ns,
+        boot_ms,
+        position,
+        velocity,
+        height,
+        tuple(stream.gnss),
+        truth,
+        made_ns,
+        tuple(stream.frames),
+        np.array(stream.report_at, dtype=np.int64),
+        tuple(stream.round_trips),
+    )
 
 
 def _place(local: LocalFrame, lat_deg: float, lon_deg: float, alt_m: float) -> FloatArray:
@@ -231,96 +182,65 @@ def _velocity(local: LocalFrame, report: Report) -> FloatArray:
     return velocity
 
 
-def true_times_ns(arrival_ns: Times, boot_ms: Times) -> Times:
-    """When reports were made, (N,), in hindsight: by the least delay of their neighbourhood.
-
-    A boot clock that steps back was restarted, and begins a neighbourhood of its own.
-    """
-    boot_ns = boot_ms * 1_000_000
-    offset_ns = arrival_ns - boot_ns
-    life = np.cumsum(np.diff(boot_ns, prepend=boot_ns[0]) < -REBOOT_STEP_NS)
-    least_ns = np.empty_like(offset_ns)
-    for number in range(life[-1] + 1):
-        (rows,) = np.nonzero(life == number)
-        here = arrival_ns[rows]
-        starts = np.searchsorted(here, here - WINDOW_NS, side="left")
-        stops = np.searchsorted(here, here + WINDOW_NS, side="right")
-        for row, start, stop in zip(rows, starts, stops, strict=True):
-            least_ns[row] = offset_ns[rows[start:stop]].min()
-    times: Times = boot_ns + least_ns
-    return times
-
-
-def _simulated(
-    states: list[tuple[int, bytes]], local: LocalFrame, arrival_ns: Times, late_ns: Times
-) -> Trajectory | None:
+def _simulated(stream: Stream, clock: BootClock, local: LocalFrame) -> Trajectory | None:
     """The trajectory by SIM_STATE; None where it has no place on Earth or cannot be put in time."""
-    t_ns, timed = _in_time(states, arrival_ns, late_ns)
-    points = []
-    for (_, payload), when_ns, ok in zip(states, t_ns, timed, strict=True):
-        fields = _SIM_STATE.unpack(payload.ljust(_SIM_STATE.size, b"\0")[: _SIM_STATE.size])
+    said = words(stream, SIM_STATE, clock)
+    points, attitudes, kept = [], [], []
+    for payload in said.payloads:
+        fields = sim_state(payload)
         lat_deg, lon_deg, alt_m = fields[13:16]
         lat_1e7, lon_1e7 = fields[21:23]
         if lat_1e7 or lon_1e7:  # single precision is good to half a metre only
             lat_deg, lon_deg = lat_1e7 * 1e-7, lon_1e7 * 1e-7
-        if ok and (lat_deg or lon_deg):
+        kept.append(bool(lat_deg or lon_deg))
+        if kept[-1]:
             velocity = local.local_from_ned(lat_deg, lon_deg) @ np.array(fields[18:21])
-            points.append((when_ns, _place(local, lat_deg, lon_deg, alt_m), velocity))
+            points.append((_place(local, lat_deg, lon_deg, alt_m), velocity))
+            attitudes.append(fields[:4])
     if len(points) < 2:
         return None
-    times, positions, velocities = (np.array(column) for column in zip(*points, strict=True))
-    return _ascending("SIM_STATE", times, positions, velocities)
+    positions, velocities = (np.array(column) for column in zip(*points, strict=True))
+    brackets = said.brackets.rows(np.array(kept))
+    boot_ns = pairing.boot_times_ns(brackets, positions, velocities)
+    t_ns = clock.node_ns(boot_ns, brackets.life)
+    turned = np.array(attitudes)
+    return ascending("SIM_STATE", t_ns, positions, velocities, turned if turned.any() else None)
 
 
 def _placed(
-    places: list[tuple[int, bytes]],
+    stream: Stream,
+    clock: BootClock,
     local: LocalFrame,
-    arrival_ns: Times,
     made_ns: Times,
-    alt_m: FloatArray,
+    position_ned_m: FloatArray,
+    velocity_ned_mps: FloatArray,
 ) -> Trajectory | None:
-    """The trajectory by SIMSTATE, at the reports' heights; None as for ``_simulated``."""
-    t_ns, timed = _in_time(places, arrival_ns, arrival_ns - made_ns)
-    order = np.argsort(made_ns, kind="stable")
-    heights_m = np.interp(t_ns, made_ns[order], alt_m[order])
-    points = []
-    for (_, payload), when_ns, high_m, ok in zip(places, t_ns, heights_m, timed, strict=True):
-        fields = _SIMSTATE.unpack(payload.ljust(_SIMSTATE.size, b"\0")[: _SIMSTATE.size])
-        lat_1e7, lon_1e7 = fields[9:11]
-        if ok and (lat_1e7 or lon_1e7):
-            points.append((when_ns, _place(local, lat_1e7 * 1e-7, lon_1e7 * 1e-7, high_m)))
-    if len(points) < 2:
+    """The trajectory by SIMSTATE, at the heights of the reports that were made at ``made_ns``.
+
+    Their velocities tell the times between its points. None as for ``_simulated``.
+    """
+    said = words(stream, SIMSTATE, clock)
+    places = np.array([simstate(payload)[9:11] for payload in said.payloads]).reshape(-1, 2)
+    kept: BoolArray = np.array(places.any(axis=1))
+    if kept.sum() < 2:
         return None
-    times, positions = (np.array(column) for column in zip(*points, strict=True))
-    return _with_velocities("SIMSTATE", times, positions, np.full_like(positions, np.nan))
+    brackets = said.brackets.rows(kept)
+    order = np.argsort(made_ns, kind="stable")
+    alt_m = np.array([report.alt_m or 0.0 for report in stream.reports])
 
-
-def _in_time(
-    states: list[tuple[int, bytes]], arrival_ns: Times, late_ns: Times
-) -> tuple[Times, NDArray[np.bool_]]:
-    """When each truth message was made (N,), and whether that is known."""
-    came_ns = np.array([t_ns for t_ns, _ in states])
-    after = np.clip(np.searchsorted(arrival_ns, came_ns), 1, len(arrival_ns) - 1)
-    earlier = came_ns - arrival_ns[after - 1] < arrival_ns[after] - came_ns
-    nearest = np.where(earlier, after - 1, after)
-    timed: NDArray[np.bool_] = np.abs(came_ns - arrival_ns[nearest]) < PAIRED_NS
-    times: Times = came_ns - late_ns[nearest]
-    return times, timed
-
-
-def _with_velocities(
-    kind: Kind, t_ns: Times, position: FloatArray, velocity: FloatArray
-) -> Trajectory:
-    """A trajectory; velocities that it lacks are those between neighbours."""
-    found = _ascending(kind, t_ns, position, velocity)
-    if len(found.t_ns) < 2 or not np.isnan(found.velocity_ned_mps).any():
+    def reported(values: FloatArray, at_ns: Times) -> FloatArray:
+        from_ns = made_ns[order[0]]
+        found: FloatArray = np.interp(at_ns - from_ns, made_ns[order] - from_ns, values[order])
         return found
-    between = np.gradient(found.position_ned_m, (found.t_ns - found.t_ns[0]) * 1e-9, axis=0)
-    filled = np.where(np.isnan(found.velocity_ned_mps), between, found.velocity_ned_mps)
-    return Trajectory(kind, found.t_ns, found.position_ned_m, filled)
 
+    def track(at_ns: Times) -> FloatArray:
+        heights_m = reported(alt_m, at_ns)
+        rows = zip((places[kept] * 1e-7).tolist(), heights_m.tolist(), strict=True)
+        return np.array([_place(local, lat, lon, high_m) for (lat, lon), high_m in rows])
 
-def _ascending(kind: Kind, t_ns: Times, position: FloatArray, velocity: FloatArray) -> Trajectory:
-    """A trajectory in order of time, each time once."""
-    times, rows = np.unique(t_ns, return_index=True)
-    return Trajectory(kind, times, position[rows], velocity[rows])
+    roughly_ns = clock.node_ns(brackets.before_ns, brackets.life)
+    level = track(roughly_ns)
+    velocity = np.stack([reported(axis, roughly_ns) for axis in velocity_ned_mps.T], axis=1)
+    velocity[:, 2], level[:, 2] = 0.0, 0.0  # its heights say nothing of time
+    t_ns = clock.node_ns(pairing.boot_times_ns(brackets, level, velocity), brackets.life)
+    return ascending("SIMSTATE", t_ns, track(t_ns), np.full_like(level, np.nan))

@@ -119,7 +119,7 @@ class Witness:
 def flown(flight: Flight) -> Flown:
     """A log of one flight, seen from the origin."""
     span = (int(flight.arrival_ns[0]), int(flight.arrival_ns[-1]))
-    return Flown("made-up", "home", (flight,), np.zeros(3), span)
+    return Flown("made-up", "home", (flight,), np.zeros(3), span, (47.4, 8.5, 400.0))
 
 
 def test_only_what_has_arrived_is_used(straight_flight: Callable[..., Flight]) -> None:

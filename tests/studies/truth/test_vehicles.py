@@ -10,7 +10,9 @@ from pymavlink import mavutil  # the oracle: tests alone may import it
 from support import ROOT, shared_log
 
 from companion.studies.truth import vehicles
-from companion.studies.truth.vehicles import Flight, Trajectory
+from companion.studies.truth.hindsight import boot_clock
+from companion.studies.truth.trajectory import Trajectory
+from companion.studies.truth.vehicles import Flight
 from companion.tracking.geodesy import LocalFrame
 
 S = 1_000_000_000
@@ -82,7 +84,7 @@ def test_times_are_those_of_the_least_delay() -> None:
     boot_ms = np.round(made_ns * (1 - drift) * 1e-6).astype(np.int64) + 777_000
     boot_ms[700:] -= boot_ms[700] - 100
     late_ns = np.round(rng.exponential(0.05, len(made_ns)) * S).astype(np.int64)
-    found = vehicles.true_times_ns(made_ns + late_ns, boot_ms)
+    found = boot_clock(made_ns + late_ns, boot_ms * 1_000_000).made_ns
     error_s = (found - made_ns) * 1e-9
     assert np.abs(error_s).max() < 0.006  # half a window of drift, and a lucky report
     assert np.abs(error_s - np.median(error_s)).mean() < 0.001
@@ -134,7 +136,7 @@ def test_a_log_is_read_as_pymavlink_reads_it(cut: Path) -> None:
 def test_truth_and_reports_agree_in_time(cut: Path) -> None:
     """The simulated autopilot itself is 20 to 30 ms behind; a clock wrong by more would show."""
     for flight in vehicles.load(cut, "5:1").flights:
-        made_ns = vehicles.true_times_ns(flight.arrival_ns, flight.boot_ms)
+        made_ns = flight.made_ns
         position, velocity = flight.truth.at(made_ns)
         known = ~np.isnan(position[:, 0])
         assert known.mean() > 0.9
@@ -160,7 +162,7 @@ def test_without_a_simulator_the_reports_are_the_truth() -> None:
     (flight,) = flown.flights
     assert flight.truth.kind == "reports"
     assert flown.center.startswith("-35.")
-    made_ns = vehicles.true_times_ns(flight.arrival_ns, flight.boot_ms)
+    made_ns = flight.made_ns
     some = slice(500, 600)
     position, _ = flight.truth.at(made_ns[some])
     assert position == pytest.approx(flight.position_ned_m[some])

@@ -1,0 +1,101 @@
+"""A sender's boot clock on the log's timeline, in hindsight: what no live clock could know.
+
+The offset, arrival less boot time, is the offset of the clocks plus a latency. At each stamp the
+least offset of the ``WINDOW_NS`` before it is taken, and that of the ``WINDOW_NS`` after it, and of
+the two the greater (at the ends of a log the only one). A frame that was late has faster ones on
+both sides of it; where the boot clock stood still or was set, all frames on one side differ, and
+the other side says where the clock was. What is left is the latency of the fastest frame.
+
+A boot clock that steps back by more than ``REBOOT_STEP_NS`` was restarted, and begins a life of its
+own.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from companion.studies.truth.trajectory import Times
+from companion.values import IntArray
+
+REBOOT_STEP_NS: Final = 10_000_000_000
+WINDOW_NS: Final = 10_000_000_000
+EDGE_NS: Final = 3_000_000_000
+"""Least time on one side of a stamp for which that side is asked; else a late frame is alone."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BootClock:
+    """What a log shows of one boot clock: a stamp each, in order of arrival, (N,).
+
+    arrival_ns  when it arrived
+    boot_ns     what it said
+    life        how often the clock had been restarted
+    made_ns     when it was made, the log's timeline
+    """
+
+    arrival_ns: Times
+    boot_ns: Times
+    life: IntArray
+    made_ns: Times
+
+    def node_ns(self, boot_ns: Times, life: IntArray) -> Times:
+        """Boot times (K,) of given lives on the log's timeline, (K,)."""
+        found = np.empty(len(boot_ns), dtype=np.int64)
+        for number in np.unique(life).tolist():
+            wanted, (known,) = life == number, np.nonzero(self.life == number)
+            known = known[np.argsort(self.boot_ns[known], kind="stable")]
+            first = int(self.boot_ns[known[0]])
+            offset_ns = self.made_ns[known] - self.boot_ns[known]
+            late = np.interp(
+                boot_ns[wanted] - first, self.boot_ns[known] - first, offset_ns - offset_ns[0]
+            )
+            found[wanted] = boot_ns[wanted] + offset_ns[0] + np.round(late).astype(np.int64)
+        return found
+
+
+def boot_clock(arrival_ns: Times, boot_ns: Times) -> BootClock:
+    """The clock that made these stamps, (N,), in order of arrival."""
+    life = lives(boot_ns)
+    made_ns = np.empty_like(boot_ns)
+    for number in range(int(life[-1]) + 1 if len(life) else 0):
+        (rows,) = np.nonzero(life == number)
+        here, offset_ns = arrival_ns[rows], arrival_ns[rows] - boot_ns[rows]
+        row = np.arange(len(rows))
+        starts = np.searchsorted(here, here - WINDOW_NS, side="left")
+        stops = np.searchsorted(here, here + WINDOW_NS, side="right")
+        # Frames that arrived together are one sight of the clock, on both sides.
+        first, last = np.searchsorted(here, here, "left"), np.searchsorted(here, here, "right")
+        before = least(offset_ns, np.minimum(starts, row), last)
+        after = least(offset_ns, first, np.maximum(stops, row + 1))
+        early = here - here[np.minimum(starts, row)] < EDGE_NS
+        late = here[np.maximum(stops, row + 1) - 1] - here < EDGE_NS
+        both = np.where(early, after, np.where(late, before, np.maximum(before, after)))
+        made_ns[rows] = boot_ns[rows] + np.where(early & late, np.minimum(before, after), both)
+    return BootClock(arrival_ns, boot_ns, life, made_ns)
+
+
+def lives(boot_ns: Times) -> IntArray:
+    """How often the clock had been restarted at each stamp, (N,), by its steps back."""
+    if len(boot_ns) == 0:
+        return np.zeros(0, dtype=np.int64)
+    found: IntArray = np.cumsum(np.diff(boot_ns, prepend=boot_ns[0]) < -REBOOT_STEP_NS)
+    return found
+
+
+def least(values: Times, starts: IntArray, stops: IntArray) -> Times:
+    """The least of ``values[start:stop]`` for each pair, (K,); no range may be empty.
+
+    By minima over powers of two, of which two cover any range.
+    """
+    levels = [values]
+    while 2 ** len(levels) <= len(values):
+        step = 2 ** (len(levels) - 1)
+        levels.append(np.minimum(levels[-1][:-step], levels[-1][step:]))
+    found = np.empty(len(starts), dtype=values.dtype)
+    level = np.floor(np.log2(stops - starts)).astype(np.int64)
+    for number in np.unique(level).tolist():
+        here = level == number
+        last = stops[here] - 2**number
+        found[here] = np.minimum(levels[number][starts[here]], levels[number][last])
+    return found

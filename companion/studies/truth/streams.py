@@ -1,0 +1,171 @@
+"""What a log holds of each vehicle, in order of arrival: reports, stamps, the simulator's words.
+
+The simulator's words are SIM_STATE, and ArduPilot's older SIMSTATE (ardupilotmega.xml, 164), which
+says where but not how high.
+"""
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from companion.mavlink.trust.dedupe import Dedupe
+from companion.mavlink.wire.decode import GLOBAL_POSITION_INT, GPS_RAW_INT, decode
+from companion.recording.reader import read_log
+from companion.studies.truth import stamps
+from companion.studies.truth.hindsight import BootClock, boot_clock
+from companion.studies.truth.pairing import Brackets
+from companion.values import Frame, GnssStatus, Report, RoundTrip
+
+SIM_STATE: Final = 108
+SIMSTATE: Final = 164
+_SIM_STATE = struct.Struct("<21fii")
+_SIMSTATE = struct.Struct("<9fii")
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """A truth message.
+
+    arrival_ns  when it arrived
+    before      the number of the stamp before it on its link, among the stamps of its vehicle
+    after       the number of the stamp after it
+    payload     its payload
+    """
+
+    arrival_ns: int
+    before: int
+    after: int
+    payload: bytes
+
+
+@dataclass(slots=True)
+class _Order:
+    """The order of one vehicle's messages on one link: the last stamp, and what came since."""
+
+    last: int | None = None
+    waiting: list[tuple[int, int, bytes]] = field(default_factory=list)  # msgid, arrival, payload
+
+
+@dataclass(slots=True)
+class Stream:
+    """What a log holds of one vehicle, in order of arrival.
+
+    reports      its reports, each once
+    report_at    the place of each among the frames
+    gnss         what it had last said of its receiver when each report came
+    frames       its frames, but for the simulator's words
+    round_trips  TIMESYNC round trips with it
+    stamps       arrival and boot time of its stamped messages, ns
+    said         the simulator's words, by message id
+    """
+
+    reports: list[Report] = field(default_factory=list)
+    report_at: list[int] = field(default_factory=list)
+    gnss: list[GnssStatus | None] = field(default_factory=list)
+    frames: list[Frame] = field(default_factory=list)
+    round_trips: list[RoundTrip] = field(default_factory=list)
+    stamps: list[tuple[int, int]] = field(default_factory=list)
+    said: dict[int, list[Said]] = field(default_factory=lambda: {SIM_STATE: [], SIMSTATE: []})
+    _newest: GnssStatus | None = None
+    _links: dict[str, _Order] = field(default_factory=dict)
+
+    def clock(self) -> BootClock:
+        """Its boot clock, in hindsight."""
+        rows = np.array(self.stamps, dtype=np.int64).reshape(-1, 2)
+        return boot_clock(rows[:, 0], rows[:, 1])
+
+    def take(self, frame: Frame, dedupe: Dedupe) -> None:
+        """Take in a frame of this vehicle; ``dedupe`` knows the reports of all."""
+        order = self._links.get(frame.link)
+        if order is None:
+            order = self._links.setdefault(frame.link, _Order())
+        if frame.msgid in self.said:
+            if order.last is not None:
+                order.waiting.append((frame.msgid, frame.t_ns, frame.payload))
+            return
+        stamp_ms = stamps.boot_ms(frame)
+        if stamp_ms is not None:
+            self._stamped(frame.t_ns, stamp_ms * 1_000_000, order)
+        if frame.msgid in (GLOBAL_POSITION_INT, GPS_RAW_INT):
+            self._decoded(frame, dedupe)
+        self.frames.append(frame)
+
+    def _stamped(self, t_ns: int, boot_ns: int, order: _Order) -> None:
+        number = len(self.stamps)
+        self.stamps.append((t_ns, boot_ns))
+        for msgid, came_ns, payload in order.waiting:
+            assert order.last is not None
+            self.said[msgid].append(Said(came_ns, order.last, number, payload))
+        order.waiting.clear()
+        order.last = number
+
+    def _decoded(self, frame: Frame, dedupe: Dedupe) -> None:
+        message = decode(frame)
+        if isinstance(message, GnssStatus):
+            self._newest = message
+        elif isinstance(message, Report) and not dedupe.is_repeat(frame):
+            self.reports.append(message)
+            self.report_at.append(len(self.frames))
+            self.gnss.append(self._newest)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Words:
+    """Truth messages in the order of their stream: their brackets and their payloads."""
+
+    brackets: Brackets
+    payloads: tuple[bytes, ...]
+
+
+def words(stream: Stream, msgid: int, clock: BootClock) -> Words:
+    """The truth messages of one kind that lie between two stamps of one life."""
+    said = stream.said[msgid]
+    before = np.array([each.before for each in said], dtype=np.int64)
+    after = np.array([each.after for each in said], dtype=np.int64)
+    found = Brackets(
+        np.array([each.arrival_ns for each in said], dtype=np.int64),
+        clock.boot_ns[before],
+        clock.boot_ns[after],
+        clock.arrival_ns[before],
+        clock.arrival_ns[after],
+        clock.life[before],
+    )
+    kept = (clock.life[before] == clock.life[after]) & (found.after_ns >= found.before_ns)
+    payloads = tuple(each.payload for each, keep in zip(said, kept.tolist(), strict=True) if keep)
+    return Words(found.rows(kept), payloads)
+
+
+def sim_state(payload: bytes) -> tuple[float, ...]:
+    """The fields of a SIM_STATE: quaternion (4), …, latitude, longitude (1e-7 degrees) last."""
+    return _SIM_STATE.unpack(payload.ljust(_SIM_STATE.size, b"\0")[: _SIM_STATE.size])
+
+
+def simstate(payload: bytes) -> tuple[float, ...]:
+    """The fields of a SIMSTATE; latitude and longitude in 1e-7 degrees come last."""
+    return _SIMSTATE.unpack(payload.ljust(_SIMSTATE.size, b"\0")[: _SIMSTATE.size])
+
+
+def gather(path: Path) -> dict[str, Stream]:
+    """The streams of a log by vehicle: of those that report a position."""
+    found: dict[str, Stream] = {}
+    dedupe = Dedupe()
+    for event in _events(path):
+        name = str(event.source)
+        stream = found.get(name)
+        if stream is None:
+            stream = found.setdefault(name, Stream())
+        if isinstance(event, RoundTrip):
+            stream.round_trips.append(event)
+        else:
+            stream.take(event, dedupe)
+    return {name: stream for name, stream in found.items() if stream.reports}
+
+
+def _events(path: Path) -> Iterator[Frame | RoundTrip]:
+    for event in read_log(path):
+        if isinstance(event, Frame | RoundTrip):
+            yield event

@@ -61,7 +61,8 @@ def studied(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
                 done = subprocess.run(
                     command, capture_output=True, text=True, check=False, timeout=HANG_S
                 )
-                assert done.returncode == 0, done.stderr
+                # A bound that was broken is a result as well, and all is written.
+                assert done.returncode in (0, 3), done.stderr
                 half.rename(out)
         return out
 

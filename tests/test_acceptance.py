@@ -13,9 +13,18 @@ from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
 from companion.recording.reader import read_log
 from companion.settings.model import Settings
-from companion.studies.prediction import radio_link
-from companion.studies.prediction.comparison import LEADS_S, RADIO, SIMPLE, Make, observers
-from companion.studies.prediction.pointing import Answers, Questions, answers, questions, score
+from companion.studies.prediction.comparison import LEADS_S
+from companion.studies.prediction.delivery import deliver
+from companion.studies.prediction.pointing import (
+    Answers,
+    Questions,
+    answers,
+    product_answers,
+    questions,
+    score,
+)
+from companion.studies.prediction.predictors import SIMPLE, product
+from companion.studies.prediction.radio_link import CLEAN, RADIO, RadioLink
 from companion.studies.truth import vehicles
 from companion.studies.truth.vehicles import Flown
 from companion.values import Estimate, Event, Frame, Notice, Rejection, Track
@@ -24,22 +33,29 @@ EVERY = 2
 """Ten times a second is asked: half of what the study asks."""
 
 
+OURS = "uio-kinematic"
+
+
 def asked(
-    flown: Flown, make: Make, link: radio_link.RadioLink, settings: Settings
+    flown: Flown, name: str, link: RadioLink, settings: Settings
 ) -> list[tuple[str, Questions, Answers]]:
     """One predictor on every UAV of a log."""
     found = []
     for flight in flown.flights:
-        sent = radio_link.deliver(flight, link, 1, lambda: assembly.clock(settings)).observed
-        plan = questions(flown, flight, LEADS_S, sent[0].arrival_ns).every(EVERY)
-        found.append((flight.uav, plan, answers(make(), sent, plan)))
+        sent = deliver(flight, link, 1, lambda: assembly.clock(settings))
+        plan = questions(flown, flight, LEADS_S, sent.observed[0].arrival_ns).every(EVERY)
+        if name == OURS:
+            ours = product(settings, name, flight.uav, flown.origin)
+            found.append((flight.uav, plan, product_answers(ours, sent.events, plan)))
+        else:
+            found.append((flight.uav, plan, answers(SIMPLE[name](), sent.observed, plan)))
     return found
 
 
-def rms_deg(flown: Flown, make: Make, link: radio_link.RadioLink, settings: Settings) -> np.ndarray:
+def rms_deg(flown: Flown, name: str, link: RadioLink, settings: Settings) -> np.ndarray:
     """RMS angle error, (UAV, lead)."""
     rows = []
-    for _, plan, given in asked(flown, make, link, settings):
+    for _, plan, given in asked(flown, name, link, settings):
         scores = [score(plan, given, lead) for lead in range(len(LEADS_S))]
         rows.append([found["angle_rms_deg"] for found in scores if found is not None])
     return np.array(rows)
@@ -54,37 +70,37 @@ def circling() -> Flown:
 @pytest.mark.full
 def test_clean_link(circling: Flown) -> None:
     settings = Settings()
-    found = rms_deg(circling, observers(settings)["uio-kinematic"], radio_link.CLEAN, settings)
+    found = rms_deg(circling, OURS, CLEAN, settings)
     assert np.all(found <= [0.13, 0.13, 0.14, 0.20]), found
 
 
 @pytest.mark.full
 def test_radio_link(circling: Flown) -> None:
     settings = Settings()
-    ours = rms_deg(circling, observers(settings)["uio-kinematic"], RADIO, settings)
+    ours = rms_deg(circling, OURS, RADIO, settings)
     over_all = np.sqrt(np.mean(ours**2, axis=0))
     assert np.all(over_all <= 1.0), over_all
-    for name, make in SIMPLE.items():
-        theirs = np.sqrt(np.mean(rms_deg(circling, make, RADIO, settings) ** 2, axis=0))
+    for name in SIMPLE:
+        theirs = np.sqrt(np.mean(rms_deg(circling, name, RADIO, settings) ** 2, axis=0))
         assert np.all(over_all <= theirs), name
         if name == "dead-reckoning-arrival":
             assert np.all(over_all <= theirs / 4)
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("link", [radio_link.CLEAN, RADIO], ids=lambda link: link.name)
+@pytest.mark.parametrize("link", [CLEAN, RADIO], ids=lambda link: link.name)
 @pytest.mark.parametrize("suited", [False, True])
-def test_no_bound_is_violated(circling: Flown, link: radio_link.RadioLink, suited: bool) -> None:
+def test_no_bound_is_violated(circling: Flown, link: RadioLink, suited: bool) -> None:
     noise = {"follow_accuracy": False, "position_noise_m": 0.3, "velocity_noise_mps": 0.3}
     settings = Settings().override(observer=noise if suited else {})
     bounds, errors = [], []
-    for _, plan, given in asked(circling, observers(settings)["uio-kinematic"], link, settings):
+    for _, plan, given in asked(circling, OURS, link, settings):
         off_m = np.linalg.norm(given.position_ned_m - plan.truth_ned_m, axis=2)[plan.counts]
         errors.append(off_m)
         bounds.append(given.bound_m[plan.counts])
     error_m, bound_m = np.concatenate(errors), np.concatenate(bounds)
     assert np.all(error_m <= bound_m)
-    if suited and link is radio_link.CLEAN:
+    if suited and link is CLEAN:
         assert np.median(bound_m) <= 4 * np.percentile(error_m, 95)
 
 
@@ -95,9 +111,7 @@ def test_where_gps_wanders_violations_are_in_the_faults() -> None:
     events = json.loads((SHARED / "sitl_4circle_wander.tlog.events.json").read_text())
     noise = {"follow_accuracy": False, "position_noise_m": 4.0}
     settings = Settings().override(observer=noise)
-    for uav, plan, given in asked(
-        flown, observers(settings)["uio-kinematic"], radio_link.CLEAN, settings
-    ):
+    for uav, plan, given in asked(flown, OURS, CLEAN, settings):
         off_m = np.linalg.norm(given.position_ned_m - plan.truth_ned_m, axis=2)
         beyond = plan.counts & (off_m > given.bound_m)
         faults = [event["unix"] for event in events if f"{event['sysid']}:1" == uav]

@@ -1,15 +1,37 @@
 """Flights made up for the studies' tests."""
 
+import struct
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 
+from companion.mavlink.wire.encode import Outgoing, pack
 from companion.studies.truth.trajectory import Trajectory
 from companion.studies.truth.vehicles import Flight
+from companion.tracking.geodesy import LocalFrame
+from companion.values import Frame, Source
 
 MakeFlight = Callable[..., Flight]
 EPOCH_NS = 1_700_000_000_000_000_000
+ORIGIN = (47.4, 8.5, 400.0)
+
+
+def frames(uav: str, arrival_ns: np.ndarray, flight: tuple[np.ndarray, ...]) -> tuple[Frame, ...]:
+    """GLOBAL_POSITION_INT at boot times (ms) of positions and velocities, local frame."""
+    local, source, found = LocalFrame(*ORIGIN), Source.parse(uav), []
+    for seq, (came_ns, boot_ms, where, moves) in enumerate(
+        zip(arrival_ns.tolist(), *(column.tolist() for column in flight), strict=True)
+    ):
+        place = local.place(*where)
+        to_ned = local.local_from_ned(place.lat_deg, place.lon_deg).T
+        fields = [boot_ms, *(round(angle * 1e7) for angle in place[:2])]
+        fields += [round(place.alt_m * 1e3), round(-where[2] * 1e3)]
+        fields += [round(each * 1e2) for each in (to_ned @ moves).tolist()]
+        payload = struct.pack("<IiiiihhhH", *fields, 65535)
+        raw = pack(Outgoing(source, 33, payload), seq % 256)
+        found.append(Frame(came_ns, "test", source, 33, raw))
+    return tuple(found)
 
 
 @pytest.fixture(scope="session")
@@ -25,6 +47,7 @@ def straight_flight() -> MakeFlight:
         return Flight(
             uav, made_ns + 5_000_000, boot_ms, position, velocity, np.full(n, height_m),
             (None,) * n, truth, made_ns,
+            frames(uav, made_ns + 5_000_000, (boot_ms, position, velocity)), np.arange(n),
         )  # fmt: skip
 
     return make

@@ -22,8 +22,8 @@ from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
 from companion.studies.beams.flight import updates
+from companion.studies.link.fleet_predictor import FleetPredictor
 from companion.studies.prediction.baselines import Hold, Observed, Predictor
-from companion.studies.prediction.predictors import FleetPredictor
 from companion.studies.truth import array_truth
 from companion.values import FloatArray, Method, Update, UserError
 

@@ -1,9 +1,11 @@
 """Predictors compared on logs: ``companion study prediction``.
 
-For every vehicle of a log but the carrier, over a clean link (the log's own arrival stamps) and
-over a slow radio, a pointer is asked 20 times a second where the UAV will be at now + lead. It uses
-only what has arrived by then. Errors are those of position and of the direction from the array's
-true position, while the UAV flies.
+For every vehicle of a log but the carrier, over each link (the log's own, a slow radio, a hostile
+one), a pointer is asked 20 times a second where the UAV will be at now + lead. It uses only what
+has arrived by then. Errors are those of position and of the direction from the array's true
+position, while the UAV flies. The product answers through its pipeline, which hears the vehicle's
+own frames; whether its bounds held, and whether it had said that they might not, is counted in
+``violations``.
 
 The Kalman filters are tuned in hindsight, once for each log and link: their process and measurement
 noise are the best of a grid over all UAVs and leads, which is kinder to them than any user could
@@ -16,7 +18,7 @@ import platform
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from itertools import product
+from itertools import product as product_of
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,49 +28,37 @@ import companion
 from companion.mavlink.clock.sender_clock import SenderClock
 from companion.pipeline import assembly
 from companion.settings.model import Settings
-from companion.studies.prediction import radio_link
+from companion.studies.prediction import radio_link, violations
 from companion.studies.prediction.baselines import Kalman, Tuning
+from companion.studies.prediction.delivery import deliver
 from companion.studies.prediction.pointing import (
-    Questions,
     Receiver,
     Row,
     answers,
+    product_answers,
     questions,
     score,
 )
 from companion.studies.prediction.predictors import (
-    KALMAN_STATES,
+    MODELS,
     SIMPLE,
     Make,
     kalman,
     known_tuning,
     learned,
-    observers,
+    product,
 )
-from companion.studies.prediction.radio_link import Delivery, RadioLink
+from companion.studies.prediction.radio_link import RADIO, RadioLink
 from companion.studies.prediction.spectral import SNR_DB
+from companion.studies.prediction.tuning import DENSITIES, Case, tune
 from companion.studies.running import fan_out
 from companion.studies.truth import vehicles
-from companion.studies.truth.vehicles import Flight, Flown
-from companion.values import FloatArray, UserError
+from companion.studies.truth.vehicles import Flown
+from companion.values import UserError
 
-TUNE_EVERY: Final = 5
-"""Step between the questions on which the grid is searched.
-
-The grid is smooth, and there are many settings.
-"""
 LEADS_S: Final = (0.0, 0.1, 0.3, 1.0)
-RADIO: Final = RadioLink("radio", rate_hz=1.2, latency_s=(0.6, 2.2), loss=0.1)
-
-DENSITIES: Final = {
-    "kalman-cv": (0.1, 1.0, 3.0, 10.0, 30.0, 100.0, 1000.0),
-    "kalman-ca": (0.001, 0.01, 0.03, 0.1, 0.3, 1.0, 10.0),
-}
-NOISES: Final = tuple(product((0.03, 0.3), (0.1, 0.3)))
-"""Noise of position (m) and velocity (m/s) of the grid on which the filters are tuned.
-
-``DENSITIES`` holds its process noises.
-"""
+LINKS: Final = ("clean", "radio", "hostile")
+"""Links over which is compared unless others are named."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +68,7 @@ class PredictionStudy:
         logs      the logs
         center    as on the command line
         leads_s   leads, seconds
+        links     names of the links over which is compared, of those in ``radio_link``
         radio     the slow radio
         seed      of all random numbers
         settings  those of the array and the tracking
@@ -93,6 +84,7 @@ class PredictionStudy:
     logs: tuple[Path, ...]
     center: str | None = None
     leads_s: tuple[float, ...] = LEADS_S
+    links: tuple[str, ...] = LINKS
     radio: RadioLink = RADIO
     seed: int = 1
     settings: Settings = field(default_factory=Settings)
@@ -107,8 +99,17 @@ class PredictionStudy:
             raise UserError(f"--snr is in dB, between -100 and 100, not {self.snr_db:g}")
         if not self.leads_s or not all(0 <= lead_s <= 60 for lead_s in self.leads_s):
             raise UserError("leads are seconds, between 0 and 60")
+        known = [link.name for link in radio_link.LINKS]
+        if not self.links or not set(self.links) <= set(known):
+            raise UserError(f"links are some of {', '.join(known)}, not {','.join(self.links)}")
         if self.seed < 0:
             raise UserError(f"a seed is at least 0, not {self.seed}")
+
+    @property
+    def over(self) -> tuple[RadioLink, ...]:
+        """The links, each once, in the order in which they were named."""
+        links = {link.name: link for link in radio_link.LINKS} | {RADIO.name: self.radio}
+        return tuple(links[name] for name in dict.fromkeys(self.links))
 
     @property
     def command(self) -> str:
@@ -119,6 +120,7 @@ class PredictionStudy:
         words += ["--center", self.center] if self.center else []
         words += ["--config", self.config] if self.config else []
         words += ["--lead", ",".join(f"{lead_s:g}" for lead_s in self.leads_s)]
+        words += ["--links", ",".join(dict.fromkeys(self.links))]
         words += ["--rate", f"{radio.rate_hz:g}"]
         words += ["--latency", "{:g},{:g}".format(*radio.latency_s)]
         words += ["--loss", f"{radio.loss:g}", *(["--known-delay"] if radio.known_delay else [])]
@@ -138,9 +140,6 @@ class Compared:
     tuned: Mapping[str, Tuning]
 
 
-Case = tuple[Flight, Delivery, Questions]
-
-
 def compare(
     flown: Flown,
     link: RadioLink,
@@ -154,56 +153,46 @@ def compare(
         return assembly.clock(setting.settings)
 
     for flight in flown.flights:
-        delivery = radio_link.deliver(flight, link, setting.seed, clock)
+        delivery = deliver(flight, link, setting.seed, clock)
         if delivery.observed:
-            from_ns = delivery.observed[0].arrival_ns
-            cases.append((flight, delivery, questions(flown, flight, setting.leads_s, from_ns)))
+            span = delivery.observed[0].arrival_ns, delivery.begins_ns
+            cases.append((flight, delivery, questions(flown, flight, setting.leads_s, *span)))
     cases = [case for case in cases if case[2].counts.any()]
     where = f"{flown.log}, {link.name}"
     tuned = {}
     for name in DENSITIES if cases else ():
         progress(f"{where}: tuning {name}")
         tuned[name] = tune(name, cases)
-    makes = predictors(setting, tuned)
+    makes = rivals(setting, tuned)
     receiver = Receiver(assembly.array(setting.settings), setting.snr_db)
     rows: list[Row] = []
-    for (flight, delivery, asked), (name, make) in product(cases, makes.items()):
+    for (flight, delivery, asked), name in product_of(cases, (*MODELS, *makes)):
         progress(f"{where}: {name} on {flight.uav}")
-        given = answers(make(), delivery.observed, asked)
+        if name in MODELS:
+            asks = product(setting.settings, name, flight.uav, flown.origin)
+            given = product_answers(asks, delivery.events, asked)
+        else:
+            given = answers(makes[name](), delivery.observed, asked)
         for lead, lead_s in enumerate(setting.leads_s):
             figures = score(asked, given, lead, receiver)
-            head = {"log": flown.log, "uav": flight.uav, "predictor": name, "lead_s": lead_s}
-            head |= {"report_rate_hz": delivery.rate_hz, "latency_s": delivery.latency_s}
+            head: Row = {"log": flown.log, "link": link.name, "uav": flight.uav, "predictor": name}
+            head |= {"lead_s": lead_s, "report_rate_hz": delivery.rate_hz}
+            head |= {"latency_s": delivery.latency_s, "loss": link.loss}
             if figures:
-                rows.append(head | {"loss": link.loss} | figures | {"truth": flight.truth.kind})
+                counts = violations.counted(asked, given, lead)
+                rows.append(head | figures | counts | {"truth": flight.truth.kind})
     return Compared(flown.log, flown.center, link, tuple(rows), tuned)
 
 
-def predictors(setting: PredictionStudy, tuned: Mapping[str, Tuning]) -> dict[str, Make]:
-    """All predictors that are compared, by name, in the order of the tables."""
+def rivals(setting: PredictionStudy, tuned: Mapping[str, Tuning]) -> dict[str, Make]:
+    """The predictors that the product is compared with, by name, in the order of the tables."""
     known = known_tuning(setting.settings)
-    makes = {**observers(setting.settings), **SIMPLE}
+    makes = dict(SIMPLE)
     makes |= {name: kalman(name, tuning) for name, tuning in tuned.items()}
     makes["kalman-peng"] = lambda: Kalman(2, known)
     if setting.learned is not None:
         makes["lstm"] = learned(setting.learned)
     return makes
-
-
-def tune(name: str, cases: Sequence[Case]) -> Tuning:
-    """The noise of the grid with the least mean square position error over all UAVs and leads."""
-    few = [(delivery.observed, asked.every(TUNE_EVERY)) for _, delivery, asked in cases]
-
-    def cost(tuning: Tuning) -> float:
-        squares: list[FloatArray] = []
-        for observed, asked in few:
-            given = answers(Kalman(KALMAN_STATES[name], tuning), observed, asked)
-            error = (given.position_ned_m - asked.truth_ned_m)[asked.counts]
-            squares.append(np.sum(error * error, axis=1))
-        return float(np.nanmean(np.concatenate(squares)))
-
-    grid = product(DENSITIES[name], NOISES)
-    return min((Tuning(density, *noises) for density, noises in grid), key=cost)
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,18 +223,17 @@ def study(
     """
     if setting.learned is not None:
         learned(setting.learned)  # what cannot be used is said before the work
-    pieces = [
-        Piece(setting, path, link)
-        for path in setting.logs
-        for link in (radio_link.CLEAN, setting.radio)
-    ]
+    pieces = [Piece(setting, path, link) for path in setting.logs for link in setting.over]
     found = _compared(setting, pieces, progress)
-    for path, *both in zip(setting.logs, found[::2], found[1::2], strict=True):
-        if not any(compared.rows for compared in both):
+    for number, path in enumerate(setting.logs):
+        among = len(setting.over)
+        if not any(each.rows for each in found[number * among : (number + 1) * among]):
             raise UserError(f"{path}: no UAV flies in it, as far as its carrier is known")
     known = known_tuning(setting.settings)
+    rows = [row for compared in found for row in compared.rows]
     return {
-        "rows": [row for compared in found for row in compared.rows],
+        "rows": rows,
+        "unannounced": violations.unannounced(rows),
         "command": setting.command,
         "versions": {
             "companion": companion.__version__,
@@ -254,7 +242,7 @@ def study(
         },
         "seed": setting.seed,
         "snr_db": setting.snr_db,
-        "links": [asdict(link) for link in (radio_link.CLEAN, setting.radio)],
+        "links": [asdict(link) for link in setting.over],
         "tuning": [
             {"log": compared.log, "link": compared.link.name, "predictor": name} | asdict(tuning)
             for compared in found

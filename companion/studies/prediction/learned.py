@@ -22,8 +22,9 @@ import numpy as np
 import torch
 from torch import nn
 
-from companion.studies.prediction import made_up, radio_link
+from companion.studies.prediction import made_up
 from companion.studies.prediction.baselines import Observed, Predicted, Predictor
+from companion.studies.prediction.delivery import deliver
 from companion.studies.prediction.windows import FEATURES, REPORTS, Recent, Window
 from companion.values import FloatArray, UserError
 
@@ -127,7 +128,7 @@ def examples(
         if number % 20 == 0:
             progress(f"flight {number} of {flights}")
         made = made_up.flight(rng, f"{number}:1")
-        observed = radio_link.deliver(made, made_up.link(rng), seed).observed
+        observed = deliver(made, made_up.link(rng), seed).observed
         if not observed:
             continue
         sender_ns = np.array([each.sender_ns for each in observed])

@@ -1,18 +1,20 @@
 """Questions to a pointer on a log, a predictor's answers, and their scores."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Final
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from companion.beams.array.geometry import Array
-from companion.studies.prediction.baselines import Observed, Predictor
+from companion.studies.prediction import hostile_link
+from companion.studies.prediction.baselines import Observed, Predicted, Predictor
+from companion.studies.prediction.predictors import Product
 from companion.studies.prediction.spectral import SNR_DB, loss_bps_hz
 from companion.studies.truth.trajectory import Times
 from companion.studies.truth.vehicles import Flight, Flown
-from companion.values import FloatArray
+from companion.values import FloatArray, Frame, IntArray, RoundTrip
 
 ASK_HZ: Final = 20
 HALF_BEAMWIDTH_DEG: Final = 0.79
@@ -28,6 +30,8 @@ class Questions:
     truth_ned_m  (L, K, 3), the UAV's true position at now + lead
     array_ned_m  (L, K, 3), the array's true position at now + lead
     counts       (L, K), whether the answer is scored: the UAV flies then, and both are known
+    in_fault     (L, K), whether a declared fault lies between now and then
+    regime       (K,), the regime of a hostile link, by its number; None over other links
     """
 
     now_ns: Times
@@ -35,6 +39,8 @@ class Questions:
     truth_ned_m: FloatArray
     array_ned_m: FloatArray
     counts: NDArray[np.bool_]
+    in_fault: NDArray[np.bool_]
+    regime: IntArray | None = None
 
     def every(self, step: int) -> "Questions":
         """Each ``step``-th question."""
@@ -44,19 +50,34 @@ class Questions:
             self.truth_ned_m[:, ::step],
             self.array_ned_m[:, ::step],
             self.counts[:, ::step],
+            self.in_fault[:, ::step],
+            None if self.regime is None else self.regime[::step],
         )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answers:
-    """Positions (L, K, 3) and bounds (L, K); NaN where there is none."""
+    """Positions (L, K, 3) and bounds (L, K); NaN where there is none.
+
+    ``refuted_ns`` are the times at which the product said that an assumption was refuted.
+    """
 
     position_ned_m: FloatArray
     bound_m: FloatArray
+    refuted_ns: tuple[int, ...] = ()
 
 
-def questions(flown: Flown, flight: Flight, leads_s: Sequence[float], from_ns: int) -> Questions:
-    """Questions, ``ASK_HZ`` a second from ``from_ns``, while any of their answers counts."""
+def questions(
+    flown: Flown,
+    flight: Flight,
+    leads_s: Sequence[float],
+    from_ns: int,
+    begins_ns: int | None = None,
+) -> Questions:
+    """Questions, ``ASK_HZ`` a second from ``from_ns``, while any of their answers counts.
+
+    ``begins_ns`` is when a hostile link was switched on.
+    """
     step_ns = 1_000_000_000 // ASK_HZ
     start_ns = -(-max(from_ns, flown.span_ns[0]) // step_ns) * step_ns
     now_ns = np.arange(start_ns, flown.span_ns[1] + 1, step_ns)
@@ -67,27 +88,56 @@ def questions(flown: Flown, flight: Flight, leads_s: Sequence[float], from_ns: i
     array = flown.carrier_at(at_ns)
     known = ~np.isnan(position).any(axis=1) & ~np.isnan(array).any(axis=1)
     counts = (known & flight.flying(at_ns)).reshape(shape)
+    in_fault = flight.in_fault(np.broadcast_to(now_ns, shape), at_ns.reshape(shape))
     asked = counts.any(axis=0)
+    regime = None
+    if begins_ns is not None:
+        regime = hostile_link.regimes_at(now_ns, begins_ns)[asked]
     return Questions(
         now_ns[asked],
         leads_ns,
         position.reshape(*shape, 3)[:, asked],
         array.reshape(*shape, 3)[:, asked],
         counts[:, asked],
+        in_fault[:, asked],
+        regime,
     )
 
 
 def answers(predictor: Predictor, observed: Sequence[Observed], asked: Questions) -> Answers:
     """Play the reports to a predictor, and ask it in between."""
+    came_ns = [each.arrival_ns for each in observed]
+    return _played(predictor.report, observed, came_ns, predictor.predict, asked)
+
+
+def product_answers(
+    product: Product, events: Sequence[Frame | RoundTrip], asked: Questions
+) -> Answers:
+    """Play events to the product, and ask it in between."""
+    came_ns = [event.t_ns for event in events]
+    given = _played(product.hear, events, came_ns, product.predict, asked)
+    return replace(given, refuted_ns=tuple(product.refuted_ns))
+
+
+Heard = TypeVar("Heard")
+
+
+def _played(
+    hear: Callable[[Heard], None],
+    said: Sequence[Heard],
+    came_ns: Sequence[int],
+    predict: Callable[[int, int], Predicted | None],
+    asked: Questions,
+) -> Answers:
     shape = asked.counts.shape
     position, bound = np.full((*shape, 3), np.nan), np.full(shape, np.nan)
-    leads_ns, arrived, total = asked.leads_ns.tolist(), 0, len(observed)
+    leads_ns, arrived, total = asked.leads_ns.tolist(), 0, len(said)
     for k, now_ns in enumerate(asked.now_ns.tolist()):
-        while arrived < total and observed[arrived].arrival_ns <= now_ns:
-            predictor.report(observed[arrived])
+        while arrived < total and came_ns[arrived] <= now_ns:
+            hear(said[arrived])
             arrived += 1
         for j, lead_ns in enumerate(leads_ns):
-            predicted = predictor.predict(now_ns, now_ns + lead_ns)
+            predicted = predict(now_ns, now_ns + lead_ns)
             if predicted is not None:
                 position[j, k] = predicted.position_ned_m
                 if predicted.bound_m is not None:
@@ -139,7 +189,6 @@ def score(
         "se_loss_bps_hz": None
         if receiver is None
         else loss_bps_hz(receiver.array, position - array, true - array, receiver.snr_db),
-        "bound_violations": int(np.sum(error_m > bound)) if bounded else None,
         "bound_median_m": median_m if bounded else None,
         "bound_tightness": median_m / p95_m if bounded and p95_m else None,
     }

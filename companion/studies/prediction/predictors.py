@@ -9,23 +9,23 @@ uses the settings and never a log.
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from companion.pipeline import assembly
+from companion import values
+from companion.pipeline.fold import Pipeline
+from companion.settings.center import FixedCenter
 from companion.settings.model import Settings
 from companion.studies.prediction.baselines import (
     DeadReckoning,
     DeadReckoningOnArrival,
     Hold,
     Kalman,
-    Observed,
     Predicted,
     Predictor,
     Tuning,
 )
 from companion.studies.running.extras import needs
-from companion.tracking.noise import reported
-from companion.values import AltitudeDatum, Fix, Report, SenderTime, Source
+from companion.values import Event
 
 Make = Callable[[], Predictor]
 KALMAN_STATES: Final = {"kalman-cv": 2, "kalman-ca": 3}
@@ -33,58 +33,53 @@ MANOEUVRE_S: Final = 1.0
 """Time for which an acceleration lasts, as ``kalman-peng`` assumes."""
 
 
-class FleetPredictor:
-    """The product's own tracking as a predictor."""
+REFUTED: Final[type | None] = getattr(values, "Refuted", None)
+"""The pipeline's output that says that an assumption about a UAV was refuted.
 
-    def __init__(self, settings: Settings) -> None:
-        self._fleet = assembly.fleet(settings)
-        self._noise = assembly.noise(settings)
-        self._offset_ns = 0
-        self._clock_bound_s = 0.0
+None for a product that has no such output: then nothing is announced. The one place that knows it.
+"""
 
-    def report(self, report: Observed) -> None:
-        """Take in a fix; the fleet decides whether it is used."""
-        self._offset_ns = report.sent_ns - report.sender_ns
-        self._clock_bound_s = report.clock_bound_s
-        errors = self._noise.default if report.gnss is None else reported(report.gnss, self._noise)
-        self._fleet.accept(
-            Fix(
-                _UAV,
-                report.sender_ns,
-                report.sent_ns,
-                report.arrival_ns,
-                report.position_ned_m,
-                report.velocity_ned_mps,
-                errors,
-                _REPORT,
-            )
-        )
+
+class Product:
+    """The product as a predictor of one UAV: its pipeline, fed frames and asked for tracks.
+
+    The array stands at the origin of the study's local frame, so that its frame is the study's.
+
+    uav        the UAV
+    refuted_ns  node times at which the product said that an assumption about it was refuted
+    """
+
+    def __init__(self, settings: Settings, uav: str, origin: tuple[float, float, float]) -> None:
+        stands = FixedCenter(*origin)
+        self.uav = uav
+        self.refuted_ns: list[int] = []
+        self._pipeline = Pipeline(settings.override(center={"source": str(stands)}))
+
+    def hear(self, event: Event) -> None:
+        """Take in an event, in order of arrival."""
+        for output in self._pipeline.step(event):
+            if REFUTED is not None and isinstance(output, REFUTED):
+                self._refuted(output)
+
+    def _refuted(self, said: Any) -> None:
+        if said.uav == self.uav:
+            self.refuted_ns.append(said.t_ns)
 
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
         """The track at that time, with its bound."""
-        at = SenderTime(at_ns, at_ns - self._offset_ns, self._clock_bound_s, self._clock_bound_s)
-        track = self._fleet.track(_UAV, now_ns, at)
-        if track is None:
-            return None
-        return Predicted(track.position_ned_m, track.velocity_ned_mps, track.bound_m)
+        for track in self._pipeline.tracks(now_ns, at_ns):
+            if track.uav == self.uav:
+                return Predicted(track.position_ned_m, track.velocity_ned_mps, track.bound_m)
+        return None
 
 
-_UAV: Final = "1:1"
-_REPORT: Final = Report(
-    0, "study", _UAV, Source(1, 1), 0.0, 0.0, 0.0, AltitudeDatum.MSL, None, None, None, None,
-    None, None,
-)  # fmt: skip
-"""Placeholder for the message of a fix, which tracking does not read."""
+MODELS: Final = {f"uio-{model}": model for model in ("position", "kinematic")}
+"""The product's observers, by their names as predictors."""
 
 
-def observers(settings: Settings) -> dict[str, Make]:
-    """The product's observers by name, each as a maker of predictors."""
-
-    def maker(model: str) -> Make:
-        chosen = settings.override(observer={"model": model})
-        return lambda: FleetPredictor(chosen)
-
-    return {f"uio-{model}": maker(model) for model in ("position", "kinematic")}
+def product(settings: Settings, name: str, uav: str, origin: tuple[float, float, float]) -> Product:
+    """The product with the observer of a name in ``MODELS``."""
+    return Product(settings.override(observer={"model": MODELS[name]}), uav, origin)
 
 
 SIMPLE: Final[Mapping[str, Make]] = {

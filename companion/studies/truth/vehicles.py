@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.recording.declared_faults import DeclaredFault, declared_faults
 from companion.settings.center import CenterPlace, FixedCenter, VehicleCenter, parse_center
 from companion.studies.truth import pairing
 from companion.studies.truth.hindsight import BootClock
@@ -41,6 +42,9 @@ from companion.values import (
 
 FLYING_SPEED_MPS: Final = 1.0
 FLYING_HEIGHT_M: Final = 2.0
+BEFORE_FAULT_NS: Final = 1_000_000_000
+AFTER_FAULT_NS: Final = 5_000_000_000
+"""Time after a declared fault for the vehicle's own estimate to settle."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,6 +63,7 @@ class Flight:
     frames            its frames in order of arrival, but for the simulator's words
     report_at         (N,), the place of each report among the frames; empty without frames
     round_trips       TIMESYNC round trips with it
+    faults            windows of faults that were declared of it: from, to
     """
 
     uav: str
@@ -73,6 +78,14 @@ class Flight:
     frames: tuple[Frame, ...] = ()
     report_at: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     round_trips: tuple[RoundTrip, ...] = ()
+    faults: tuple[tuple[int, int], ...] = ()
+
+    def in_fault(self, from_ns: Times, to_ns: Times) -> BoolArray:
+        """Whether the window of a declared fault meets each of these intervals, (...)."""
+        found = np.zeros(np.shape(from_ns), dtype=bool)
+        for begins_ns, ends_ns in self.faults:
+            found |= (from_ns <= ends_ns) & (to_ns >= begins_ns)
+        return found
 
     def flying(self, t_ns: Times) -> NDArray[np.bool_]:
         """Whether it flies: faster than 1 m/s and, by its last report, more than 2 m up."""
@@ -115,9 +128,10 @@ def load(path: Path, center_text: str | None) -> Flown:
     home = FixedCenter(first.lat_deg, first.lon_deg, first.alt_m or 0.0)
     stands = center if isinstance(center, FixedCenter) else home
     local = LocalFrame(stands.lat_deg, stands.lon_deg, stands.alt_m)
+    faults = declared_faults(path)
     # A vehicle with a single report has no path, and does not fly.
     flights = {
-        uav: _flight(uav, stream, local)
+        uav: _flight(uav, stream, local, _windows(faults, stream))
         for uav, stream in streams.items()
         if len({report.boot_ms for report in stream.reports}) > 1
     }
@@ -137,7 +151,19 @@ def load(path: Path, center_text: str | None) -> Flown:
     )
 
 
-def _flight(uav: str, stream: Stream, local: LocalFrame) -> Flight:
+def _windows(faults: tuple[DeclaredFault, ...], stream: Stream) -> tuple[tuple[int, int], ...]:
+    """The windows of a vehicle's faults, before which and after which its assumptions hold."""
+    sysid = stream.reports[0].source.sysid
+    return tuple(
+        (fault.from_ns - BEFORE_FAULT_NS, fault.to_ns + AFTER_FAULT_NS)
+        for fault in faults
+        if fault.sysid == sysid
+    )
+
+
+def _flight(
+    uav: str, stream: Stream, local: LocalFrame, faults: tuple[tuple[int, int], ...]
+) -> Flight:
     reports = stream.reports
     arrival_ns = np.array([report.t_ns for report in reports])
     boot_ms = np.array([report.boot_ms for report in reports])
@@ -167,6 +193,7 @@ def _flight(uav: str, stream: Stream, local: LocalFrame) -> Flight:
         tuple(stream.frames),
         np.array(stream.report_at, dtype=np.int64),
         tuple(stream.round_trips),
+        faults,
     )
 
 

@@ -11,8 +11,9 @@ from click.testing import CliRunner
 torch = pytest.importorskip("torch", reason="PyTorch (the extra [learned]) is not installed")
 
 from companion.cli.main import main  # noqa: E402
-from companion.studies.prediction import learned, made_up, radio_link  # noqa: E402
+from companion.studies.prediction import learned, made_up  # noqa: E402
 from companion.studies.prediction.baselines import DeadReckoning, Observed, Predictor  # noqa: E402
+from companion.studies.prediction.delivery import deliver  # noqa: E402
 from companion.studies.prediction.windows import REPORTS  # noqa: E402
 
 S = 1_000_000_000
@@ -54,7 +55,7 @@ def rms_m(predictor: Predictor, seed: int, lead_s: float) -> float:
     """Over a flight that was not trained on, over a link of its own, at irregular times."""
     rng = np.random.default_rng([seed, 99])
     made = made_up.flight(rng, "1:1")
-    observed = radio_link.deliver(made, made_up.link(rng), seed).observed
+    observed = deliver(made, made_up.link(rng), seed).observed
     squares = []
     for number, each in enumerate(observed):
         predictor.report(each)

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from companion.studies.prediction.radio_link import CLEAN, Delivery, RadioLink, deliver
+from companion.studies.prediction.delivery import Delivery, deliver
+from companion.studies.prediction.radio_link import CLEAN, RADIO, RadioLink
 from companion.studies.truth.vehicles import Flight
 
 MakeFlight = Callable[..., Flight]
-RADIO = RadioLink("radio", 1.2, (0.6, 2.2), 0.1)
 
 
 def latencies_s(flight: Flight, delivery: Delivery) -> np.ndarray:

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.studies.prediction import made_up, radio_link
+from companion.studies.prediction import made_up
 from companion.studies.prediction.baselines import Observed
+from companion.studies.prediction.delivery import deliver
 from companion.studies.prediction.windows import (
     FEATURES,
     FORGOTTEN_NS,
@@ -108,7 +109,7 @@ def test_a_made_up_flight_is_a_motion(seed: int) -> None:
 def test_reports_of_made_up_flights_are_irregular_and_timed(seed: int) -> None:
     rng = np.random.default_rng(seed)
     flight = made_up.flight(rng, "1:1")
-    observed = radio_link.deliver(flight, made_up.link(rng), seed).observed
+    observed = deliver(flight, made_up.link(rng), seed).observed
     sender_ns = np.array([each.sender_ns for each in observed])
     found = made_up.made_ns(flight, sender_ns, observed[0].position_ned_m)
     for each, made_ns in zip(observed, found, strict=True):

@@ -1,0 +1,75 @@
+"""Faults that a log declares: ``LOG.events.json`` beside it, a list of what was done to whom, when.
+
+Each entry has ``unix`` (seconds), ``sysid`` and ``event``. A fault begins with such an entry and
+ends with the one that ends it (``gps_off`` with ``gps_on``, ``glitch25m`` with ``glitch_end``), or
+after the seconds that its name states (``link_drop12s``); one that nothing ends lasts to the end of
+the log.
+"""
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from companion.recording.reader import LogError
+
+SUFFIX: Final = ".events.json"
+_LASTS: Final = re.compile(r"(\d+(?:\.\d+)?)s$")
+_END_NS: Final = 2**62
+
+
+@dataclass(frozen=True, slots=True)
+class DeclaredFault:
+    """A fault of one vehicle, by its system id, between two times of the log."""
+
+    sysid: int
+    name: str
+    from_ns: int
+    to_ns: int
+
+
+def declared_faults(log: Path) -> tuple[DeclaredFault, ...]:
+    """The faults that are declared beside a log; none where there is no such file.
+
+    Raises ``LogError`` where the file is not a list of events.
+    """
+    path = log.with_name(log.name + SUFFIX)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return ()
+    try:
+        events = [
+            (round(float(each["unix"]) * 1e9), int(each["sysid"]), str(each["event"]))
+            for each in json.loads(text)
+        ]
+    except (ValueError, KeyError, TypeError) as error:
+        raise LogError(f"{path}: not a list of events with unix, sysid and event") from error
+    return tuple(_faults(sorted(events)))
+
+
+def _faults(events: list[tuple[int, int, str]]) -> list[DeclaredFault]:
+    found = []
+    for number, (at_ns, sysid, name) in enumerate(events):
+        if _is_end(name):
+            continue
+        lasts: Any = _LASTS.search(name)
+        ends_ns = _END_NS if lasts is None else at_ns + round(float(lasts[1]) * 1e9)
+        for later_ns, other, said in events[number + 1 :]:
+            if lasts is None and other == sysid and _ends(name, said):
+                ends_ns = later_ns
+                break
+        found.append(DeclaredFault(sysid, name, at_ns, ends_ns))
+    return found
+
+
+def _is_end(name: str) -> bool:
+    return name.endswith(("_on", "_end"))
+
+
+def _ends(name: str, said: str) -> bool:
+    """Whether an entry ends a fault: ``X_on`` ends ``X_off``, ``X_end`` whatever begins with X."""
+    if said.endswith("_on"):
+        return name == f"{said.removesuffix('_on')}_off"
+    return said.endswith("_end") and name.startswith(said.removesuffix("_end"))

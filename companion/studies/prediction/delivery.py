@@ -1,0 +1,262 @@
+"""Messages delivered by a link: when each arrives, and what a predictor makes of it.
+
+The product is handed the frames themselves; the baselines get observed reports, whose times are by
+the product's clock, which hears every message that says when it was sent. Everything is drawn from
+a seed and the vehicle's id.
+"""
+
+import math
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from companion.mavlink.clock.sender_clock import SenderClock
+from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
+from companion.studies.prediction import hostile_link, noisy_frames
+from companion.studies.prediction.baselines import Observed
+from companion.studies.prediction.radio_link import RadioLink
+from companion.studies.truth import stamps
+from companion.studies.truth.trajectory import Times
+from companion.studies.truth.vehicles import Flight
+from companion.values import BoolArray, FloatArray, Frame, IntArray, RoundTrip, Source
+
+P95: Final = 1.6448536269514722
+"""The 95th percentile of the standard normal distribution."""
+ROUND_TRIP_NS: Final = 10_000_000
+"""Length of the round trips, one a second, of which a clock that is known is known."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Delivery:
+    """What a link delivers of one vehicle, in order of arrival.
+
+    observed   the reports
+    events     the frames with the times of their arrival, and round trips; none for a flight
+               without frames
+    rate_hz    nominal rate of reports, or that of the log
+    latency_s  nominal median latency, or that seen by the clock
+    begins_ns  when a hostile link was switched on; None for others
+    """
+
+    observed: tuple[Observed, ...]
+    events: tuple[Frame | RoundTrip, ...]
+    rate_hz: float
+    latency_s: float
+    begins_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sends:
+    """What a vehicle sent, (M,): first its reports (N,), then its other frames, if it has frames.
+
+    sent_ns  when it arrived over the log's own link
+    boot_ms  its boot stamp; -1 where it has none
+    kind     its message id
+    frame    its place among the flight's frames; -1 without
+    """
+
+    sent_ns: Times
+    boot_ms: Times
+    kind: IntArray
+    frame: IntArray
+
+
+def deliver(
+    flight: Flight, link: RadioLink, seed: int, clock: Callable[[], SenderClock] = SenderClock
+) -> Delivery:
+    """Send what a flight sent through a link; ``clock`` makes the sender's clock.
+
+    The same seed gives the same result, whatever else is flown.
+    """
+    rng = np.random.default_rng([seed, zlib.crc32(flight.uav.encode())])
+    sends, reports = _sends(flight), len(flight.arrival_ns)
+    begins_ns = _begins_ns(flight) if link.hostile else None
+    rows, arrival_ns = _passed(rng, sends, reports, link, begins_ns)
+    order = np.argsort(arrival_ns, kind="stable")
+    rows, arrival_ns = rows[order], arrival_ns[order]
+    noise = noisy_frames.noise(rng, reports, link)
+    trips = flight.round_trips if link.as_logged else ()
+    # The radio's delays do not reach a clock that is known by other means.
+    heard_ns = sends.sent_ns[rows] if link.known_delay else arrival_ns
+    placed = on_sender_clock(clock(), heard_ns, sends.boot_ms[rows], trips)
+    observed = tuple(
+        Observed(
+            arrived,
+            sent,
+            made,
+            flight.position_ned_m[row] + noise.position_ned_m[row],
+            _reported(flight.velocity_ned_mps[row] + noise.velocity_ned_mps[row]),
+            bound,
+            flight.gnss[row],
+        )
+        for row, arrived, made, sent, bound, known in zip(
+            rows.tolist(),
+            arrival_ns.tolist(),
+            placed.sender_ns.tolist(),
+            placed.sent_ns.tolist(),
+            placed.bound_s.tolist(),
+            placed.known.tolist(),
+            strict=True,
+        )
+        if known and row < reports
+    )
+    rate_hz, latency_s = link.rate_hz, link.latency_s and link.latency_s[0]
+    if rate_hz is None:
+        rate_hz = 1e3 / float(np.median(np.diff(np.unique(flight.boot_ms))))
+    if latency_s is None:
+        late_s = [(each.arrival_ns - each.sent_ns) * 1e-9 for each in observed]
+        latency_s = float(np.median(late_s)) if late_s else 0.0
+    frames = noisy_frames.changed(flight, noise, link)
+    events = [
+        frames[at]._replace(t_ns=arrived)
+        for at, arrived in zip(sends.frame[rows].tolist(), arrival_ns.tolist(), strict=True)
+        if at >= 0
+    ]
+    trips += _known(flight) if link.known_delay else ()
+    everything = sorted([*events, *trips], key=lambda event: event.t_ns)
+    return Delivery(observed, tuple(everything), rate_hz, latency_s, begins_ns)
+
+
+def _sends(flight: Flight) -> _Sends:
+    # Further frames with a position are repeats, or positions before a fix.
+    others = np.array(
+        [at for at, frame in enumerate(flight.frames) if frame.msgid != GLOBAL_POSITION_INT],
+        dtype=np.int64,
+    )
+    frames = [flight.frames[at] for at in others.tolist()]
+    said = [stamps.boot_ms(frame) for frame in frames]
+    reports = len(flight.arrival_ns)
+    at = flight.report_at if len(flight.frames) else np.full(reports, -1, dtype=np.int64)
+    return _Sends(
+        np.concatenate([flight.arrival_ns, np.array([f.t_ns for f in frames], dtype=np.int64)]),
+        np.concatenate(
+            [flight.boot_ms, np.array([-1 if ms is None else ms for ms in said], dtype=np.int64)]
+        ),
+        np.concatenate([np.full(reports, -1), np.array([f.msgid for f in frames], dtype=np.int64)]),
+        np.concatenate([at, others]),
+    )
+
+
+def _begins_ns(flight: Flight) -> int:
+    """When the UAV is first seen to fly; when its first report came, if it never is."""
+    (flies,) = np.nonzero(flight.flying(flight.arrival_ns))
+    return int(flight.arrival_ns[flies[0] if len(flies) else 0])
+
+
+def _passed(
+    rng: np.random.Generator, sends: _Sends, reports: int, link: RadioLink, begins_ns: int | None
+) -> tuple[IntArray, Times]:
+    """The rows of what arrives, and when."""
+    if begins_ns is not None:
+        order = np.argsort(sends.sent_ns, kind="stable")
+        came_ns, arrives = hostile_link.arrivals_ns(rng, sends.sent_ns[order], begins_ns)
+        return order[arrives], came_ns[arrives]
+    rows, arrival_ns = _over_radio(rng, sends, _thinned(sends, reports, link.rate_hz), link)
+    others = np.arange(reports, len(sends.sent_ns))
+    if link.rate_hz is not None:
+        others = _thinned_each(sends, others, link.rate_hz)
+    more, more_ns = _over_radio(rng, sends, others, link)
+    return np.concatenate([rows, more]), np.concatenate([arrival_ns, more_ns])
+
+
+def _over_radio(
+    rng: np.random.Generator, sends: _Sends, rows: IntArray, link: RadioLink
+) -> tuple[IntArray, Times]:
+    rows = rows[rng.random(len(rows)) >= link.loss]
+    added_ns = np.zeros(len(rows), dtype=np.int64)
+    if link.latency_s is not None:
+        median_s, p95_s = link.latency_s
+        spread = math.log(p95_s / median_s) / P95
+        drawn_s = median_s * np.exp(spread * rng.standard_normal(len(rows)))
+        added_ns = np.round(drawn_s * 1e9).astype(np.int64)
+    return rows, sends.sent_ns[rows] + added_ns
+
+
+def _thinned(sends: _Sends, reports: int, rate_hz: float | None) -> IntArray:
+    """Rows of the first report in each period of the sender's clock, in order of arrival."""
+    rows = np.arange(reports)
+    if rate_hz is None:
+        return rows
+    # A new period, or a clock that was restarted.
+    period = np.floor(sends.boot_ms[:reports] * (rate_hz * 1e-3)).astype(np.int64)
+    kept: IntArray = rows[np.diff(period, prepend=period[0] - 1) != 0]
+    return kept
+
+
+def _thinned_each(sends: _Sends, rows: IntArray, rate_hz: float) -> IntArray:
+    """The rows of the first message of each kind in each period of the log."""
+    period = np.floor((sends.sent_ns[rows] - sends.sent_ns.min()) * (rate_hz * 1e-9))
+    kinds = np.stack([sends.kind[rows].astype(float), period], axis=1)
+    _, first = np.unique(kinds, axis=0, return_index=True)
+    kept: IntArray = rows[np.sort(first)]
+    return kept
+
+
+def _known(flight: Flight) -> tuple[RoundTrip, ...]:
+    """Round trips as the service would have made with a vehicle over the log's own link."""
+    found: list[RoundTrip] = []
+    source = Source.parse(flight.uav)
+    each = zip(flight.arrival_ns.tolist(), flight.made_ns.tolist(), flight.boot_ms, strict=True)
+    for arrived_ns, made_ns, boot_ms in each:
+        if not found or arrived_ns - found[-1].t_ns >= 1_000_000_000:
+            sent_ns = min(made_ns, arrived_ns) - ROUND_TRIP_NS
+            found.append(RoundTrip(arrived_ns, source, sent_ns, int(boot_ms) * 1_000_000))
+    return tuple(found)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """Messages put in time by the product's clock, (n,) each.
+
+    sender_ns  on the sender's timeline, which begins where its clock is first placed, and again
+               after a restart
+    sent_ns    on the node's timeline, as known on arrival
+    bound_s    bound on the error of that
+    known      whether the message has a stamp that could be placed at all
+    """
+
+    sender_ns: Times
+    sent_ns: Times
+    bound_s: FloatArray
+    known: BoolArray
+
+
+def on_sender_clock(
+    clock: SenderClock, arrival_ns: Times, boot_ms: Times, trips: tuple[RoundTrip, ...] = ()
+) -> Placed:
+    """When messages were made, (n,), by the product's clock; a stamp of -1 is none.
+
+    ``trips`` are heard by the clock as well. Only here does the study use that clock.
+    """
+    start_ns: int | None = None
+    waiting = list(reversed(trips))
+    rows: list[tuple[int, int, float, bool]] = [(0, 0, 0.0, False)] * len(arrival_ns)
+    for row in np.argsort(arrival_ns, kind="stable").tolist():
+        arrived_ns, stamp_ms = int(arrival_ns[row]), int(boot_ms[row])
+        while waiting and waiting[-1].t_ns < arrived_ns:
+            trip = waiting.pop()
+            clock.timesync(trip.sent_ns, trip.t_ns, trip.remote_ns)
+        if stamp_ms < 0:
+            continue
+        stamp = clock.observe(arrived_ns, stamp_ms)
+        estimate = clock.estimate()
+        if stamp is None or estimate is None:
+            continue
+        sent_ns = arrived_ns - round(stamp.latency_s * 1e9)
+        if start_ns is None or stamp.rebooted:
+            start_ns = sent_ns - stamp.sender_ns
+        rows[row] = (start_ns + stamp.sender_ns, sent_ns, estimate.uncertainty_s, True)
+    sender, sent, bound_s, placed = zip(*rows, strict=True) if rows else ((), (), (), ())
+    return Placed(
+        np.array(sender, dtype=np.int64),
+        np.array(sent, dtype=np.int64),
+        np.array(bound_s, dtype=float),
+        np.array(placed, dtype=bool),
+    )
+
+
+def _reported(velocity: FloatArray) -> FloatArray | None:
+    return None if np.isnan(velocity).any() else velocity

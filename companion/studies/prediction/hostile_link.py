@@ -1,0 +1,133 @@
+"""A hostile link: regimes of latency one after the other, drawn from a seed.
+
+The node is switched on when the UAV flies: what was sent before never arrives, so that the link's
+very first frame is heard in flight. From then on the regimes follow one another, and begin again
+when all were there. Frames keep their order, as in a queue, but for the regime in which they
+overtake one another. Nothing is thinned or lost.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from companion.studies.truth.trajectory import Times
+from companion.values import BoolArray, FloatArray, IntArray
+
+FAST_S: Final = 0.02
+SLOW_S: Final = 0.5
+
+Latency = Callable[[np.random.Generator, FloatArray], FloatArray]
+"""Latencies (n,) of frames sent at times (n,) in the regime, seconds both."""
+
+
+@dataclass(frozen=True, slots=True)
+class Regime:
+    """A regime: its name in reports, how long it lasts, its latency, whether frames overtake."""
+
+    name: str
+    lasts_s: float
+    latency_s: Latency
+    overtakes: bool = False
+
+
+def _first_fast(_rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
+    """The first frame takes 5 ms, all others 0.3 s."""
+    return np.where(np.arange(len(at_s)) == 0, 0.005, 0.3)
+
+
+def _steady(_rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
+    return np.full(len(at_s), FAST_S)
+
+
+def _step(_rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
+    """0.02 s, and from the fifth second on 0.5 s."""
+    return np.where(at_s < 5, FAST_S, SLOW_S)
+
+
+def _ramp(_rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
+    """From 0.02 to 1 s within 20 s, 5 s there, and back within 20 s."""
+    return np.interp(at_s, [0.0, 20.0, 25.0, 45.0], [FAST_S, 1.0, 1.0, FAST_S])
+
+
+def _sawtooth(_rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
+    """From 0 to 0.8 s within 6 s, again and again."""
+    return 0.8 * (at_s % 6.0) / 6.0
+
+
+def _wandering(rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
+    """AR(1) about 0.3 s with a deviation of 0.15 s and a memory of 2 s; at least 5 ms."""
+    found = np.empty(len(at_s))
+    now_s, last_s = 0.3, 0.0
+    for row, drawn in enumerate(rng.standard_normal(len(at_s)).tolist()):
+        keeps = float(np.exp(-(at_s[row] - last_s) / 2.0))
+        now_s = 0.3 + keeps * (now_s - 0.3) + 0.15 * np.sqrt(1 - keeps * keeps) * drawn
+        found[row], last_s = now_s, at_s[row]
+    return np.maximum(found, 0.005)
+
+
+def _bursts(rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
+    """Open for 0.5 to 2 s, then everything is held for 1 to 4 s and comes at once."""
+    found = np.full(len(at_s), FAST_S)
+    opens_s = 0.0
+    while len(at_s) and opens_s < at_s[-1]:
+        shuts_s = opens_s + rng.uniform(0.5, 2.0)
+        opens_s = shuts_s + rng.uniform(1.0, 4.0)
+        held = (at_s >= shuts_s) & (at_s < opens_s)
+        found[held] = opens_s - at_s[held] + FAST_S
+    return found
+
+
+def _changes(rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
+    """Every 4 s from a fast network with little jitter to a slow one with much, and back."""
+    slow = (at_s // 4.0) % 2 == 1
+    jitter_s = rng.standard_exponential(len(at_s))
+    return np.where(slow, 0.4 + 0.1 * jitter_s, FAST_S + 0.01 * jitter_s)
+
+
+def _overtaking(rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
+    """Each frame by a way of its own: anything up to 0.8 s."""
+    return rng.uniform(0.0, 0.8, len(at_s))
+
+
+REGIMES: Final = (
+    Regime("first-fast", 20.0, _first_fast),
+    Regime("steady", 10.0, _steady),
+    Regime("step", 20.0, _step),
+    Regime("ramp", 45.0, _ramp),
+    Regime("sawtooth", 24.0, _sawtooth),
+    Regime("ar1", 20.0, _wandering),
+    Regime("bursts", 25.0, _bursts),
+    Regime("changes", 24.0, _changes),
+    Regime("overtaking", 16.0, _overtaking, overtakes=True),
+)
+_STARTS_NS: Final = np.cumsum([0.0, *(regime.lasts_s for regime in REGIMES)]) * 1e9
+ROUND_NS: Final = int(_STARTS_NS[-1])
+
+
+def regimes_at(t_ns: Times, begins_ns: int) -> IntArray:
+    """The number of the regime, in ``REGIMES``, at each time (n,)."""
+    into_ns = (t_ns - begins_ns) % ROUND_NS
+    found: IntArray = np.searchsorted(_STARTS_NS, into_ns, side="right") - 1
+    return found
+
+
+def arrivals_ns(
+    rng: np.random.Generator, sent_ns: Times, begins_ns: int
+) -> tuple[Times, BoolArray]:
+    """When frames sent at ascending times (n,) arrive, and whether they do."""
+    arrives = np.asarray(sent_ns >= begins_ns)
+    arrival_ns = sent_ns.copy()
+    rounds = (sent_ns - begins_ns) // ROUND_NS
+    regime = regimes_at(sent_ns, begins_ns)
+    queued = np.zeros(len(sent_ns), dtype=bool)
+    for turn in np.unique(rounds[arrives]).tolist():
+        for number, one in enumerate(REGIMES):
+            here = arrives & (rounds == turn) & (regime == number)
+            from_ns = begins_ns + turn * ROUND_NS + _STARTS_NS[number]
+            latency_s = one.latency_s(rng, (sent_ns[here] - from_ns) * 1e-9)
+            arrival_ns[here] += np.round(latency_s * 1e9).astype(np.int64)
+            queued |= here & (not one.overtakes)
+    arrival_ns[queued] = np.maximum.accumulate(arrival_ns[queued])
+    return arrival_ns, arrives

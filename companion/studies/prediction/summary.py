@@ -1,0 +1,137 @@
+"""What the rows of a comparison amount to: measures over UAVs, and bounds that were broken."""
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from companion.studies.prediction.comparison import Compared
+from companion.studies.prediction.pointing import HALF_BEAMWIDTH_DEG, Row
+
+
+class Pool(StrEnum):
+    """How the figures of several UAVs become one, each weighted by its answers."""
+
+    RMS = "all UAVs together"
+    MEAN = "mean over all UAVs"
+    WORST = "the worst UAV"
+
+
+@dataclass(frozen=True, slots=True)
+class Measure:
+    """A figure of the rows and how it is shown.
+
+    key             its key in a row
+    caption         caption of its table
+    short           its heading in the text
+    pool            how the UAVs' figures become one
+    more_is_better  whether a larger one is better
+    """
+
+    key: str
+    caption: str
+    short: str
+    pool: Pool = Pool.RMS
+    more_is_better: bool = False
+
+
+ANGLE: Final = Measure("angle_rms_deg", "RMS angle error, degrees", "deg rms")
+MEASURES: Final = (
+    ANGLE,
+    Measure("angle_p95_deg", "95th percentile of the angle error, degrees", "p95", Pool.WORST),
+    Measure("angle_max_deg", "largest angle error, degrees", "max", Pool.WORST),
+    Measure(
+        "within_beamwidth",
+        f"share of time within the half-power beamwidth ({HALF_BEAMWIDTH_DEG}°)",
+        "in beam",
+        Pool.MEAN,
+        True,
+    ),
+    Measure(
+        "se_loss_bps_hz",
+        "spectral efficiency lost against perfect knowledge, bit/s/Hz",
+        "bit/s/Hz",
+        Pool.MEAN,
+    ),
+    Measure("position_rms_m", "RMS position error, metres", "m rms"),
+    Measure("position_p95_m", "95th percentile of the position error, metres", "p95", Pool.WORST),
+    Measure("position_max_m", "largest position error, metres", "max", Pool.WORST),
+    Measure(
+        "bound_tightness",
+        "tightness: median bound over 95th percentile of the position error",
+        "tightness",
+        Pool.MEAN,
+    ),
+)
+
+
+def pooled(
+    rows: Sequence[Row], predictor: str, lead_s: float, measure: Measure = ANGLE
+) -> float | None:
+    """One figure of all UAVs; None without rows, or where one of them has none."""
+    chosen = [row for row in rows if row["predictor"] == predictor and row["lead_s"] == lead_s]
+    values = [(row["n"], row[measure.key]) for row in chosen]
+    if not values or any(value is None for _, value in values):
+        return None
+    total = sum(n for n, _ in values)
+    match measure.pool:
+        case Pool.RMS:
+            return math.sqrt(sum(n * value**2 for n, value in values) / total)
+        case Pool.MEAN:
+            return float(sum(n * value for n, value in values) / total)
+        case Pool.WORST:
+            return float(max(value for _, value in values))
+
+
+def regimes(compared: Compared) -> list[tuple[str, dict[str, str]]]:
+    """How many bounds were broken in each regime of a hostile link, by predictor."""
+    sums: dict[str, dict[str, Counter[str]]] = {}
+    for row in compared.rows:
+        for regime, counts in (row["regimes"] or {}).items():
+            sums.setdefault(regime, {}).setdefault(row["predictor"], Counter()).update(counts)
+    names = dict.fromkeys(row["predictor"] for row in compared.rows if row["regimes"])
+    return [
+        (regime, {name: _beyond(by_name.get(name, Counter())) for name in names})
+        for regime, by_name in sums.items()
+    ]
+
+
+def _beyond(counts: Mapping[str, int]) -> str:
+    told = f" ({counts['announced']} announced)" if counts["announced"] else ""
+    return f"{counts['violations']}{told} of {counts['answers']}"
+
+
+def left_out(compared: Compared) -> list[str]:
+    """A line on answers in the windows of declared faults, if there are any."""
+    left = {row["predictor"]: 0 for row in compared.rows if row["in_faults"]}
+    for row in compared.rows:
+        left[row["predictor"]] = left.get(row["predictor"], 0) + (row["in_faults"] or 0)
+    most = max(left.values(), default=0)
+    return [f"not counted for the bounds: {most} answers in windows of declared faults"][: most > 0]
+
+
+def axes_of(compared: Compared) -> tuple[list[float], list[str]]:
+    """The leads and the predictors, in the order in which they come."""
+    leads = dict.fromkeys(row["lead_s"] for row in compared.rows)
+    return list(leads), list(dict.fromkeys(row["predictor"] for row in compared.rows))
+
+
+def title(compared: Compared) -> str:
+    """The log and the link, as headings name them."""
+    return f"{compared.log}, {compared.link.name} link"
+
+
+def broken(compared: Compared, predictor: str) -> str:
+    """How many of a predictor's errors went beyond its own bound, over all rows."""
+    rows = [row for row in compared.rows if row["predictor"] == predictor]
+    if any(row["violations"] is None for row in rows):
+        return "no bound"
+    keys = ("answers", "violations", "announced")
+    return _beyond({key: sum(row[key] for row in rows) for key in keys})
+
+
+def number(value: float | None) -> str:
+    """A figure to three decimals; a dash where there is none."""
+    return "-" if value is None else f"{value:.3f}"

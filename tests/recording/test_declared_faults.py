@@ -1,0 +1,55 @@
+"""Faults that a log declares, read from the list beside it."""
+
+import json
+from pathlib import Path
+
+import pytest
+from support import shared_log
+
+from companion.recording.declared_faults import DeclaredFault, declared_faults
+from companion.recording.reader import LogError
+from companion.studies.truth import vehicles
+
+S = 1_000_000_000
+
+
+def declare(log: Path, *events: tuple[float, int, str]) -> Path:
+    rows = [{"unix": at, "sysid": sysid, "event": name} for at, sysid, name in events]
+    log.with_name(log.name + ".events.json").write_text(json.dumps(rows))
+    return log
+
+
+def test_what_begins_and_what_ends(tmp_path: Path) -> None:
+    log = declare(
+        tmp_path / "a.tlog",
+        (100.0, 3, "gps_off"), (101.0, 2, "gps_on"), (108.5, 3, "gps_on"),
+        (120.0, 2, "glitch25m"), (125.0, 2, "glitch_end"),
+        (180.0, 4, "link_drop12s"), (200.0, 1, "storm"),
+    )  # fmt: skip
+    assert declared_faults(log) == (
+        DeclaredFault(3, "gps_off", 100 * S, round(108.5 * S)),
+        DeclaredFault(2, "glitch25m", 120 * S, 125 * S),
+        DeclaredFault(4, "link_drop12s", 180 * S, 192 * S),
+        DeclaredFault(1, "storm", 200 * S, 2**62),
+    )
+
+
+def test_no_list_is_no_fault(tmp_path: Path) -> None:
+    assert declared_faults(tmp_path / "a.tlog") == ()
+
+
+@pytest.mark.parametrize("text", ["nonsense", "[1]", '[{"unix": 1}]', '{"a": 1}'])
+def test_what_is_no_list_of_events(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.tlog.events.json").write_text(text)
+    with pytest.raises(LogError, match="not a list of events"):
+        declared_faults(tmp_path / "a.tlog")
+
+
+@pytest.mark.full
+def test_the_faults_of_a_simulated_flight() -> None:
+    """Each vehicle has its own window, widened for its estimate to settle."""
+    flights = vehicles.load(shared_log("sitl_4circle_wander.tlog"), "5:1").flights
+    lasts_s = {f.uav: [(b - a) / S for a, b in f.faults] for f in flights}
+    assert {uav: len(each) for uav, each in lasts_s.items()} == dict.fromkeys(lasts_s, 1)
+    expected = {"1:1": 10.0, "2:1": 11.0, "3:1": 13.6, "4:1": 18.0}
+    assert {uav: each[0] for uav, each in lasts_s.items()} == pytest.approx(expected, abs=0.1)

@@ -29,8 +29,8 @@ from companion.mavlink.clock.sender_clock import SenderClock
 from companion.pipeline import assembly
 from companion.settings.model import Settings
 from companion.studies.prediction import radio_link, violations
-from companion.studies.prediction.baselines import Kalman, Tuning
 from companion.studies.prediction.delivery import deliver
+from companion.studies.prediction.kalman import Kalman, Tuning
 from companion.studies.prediction.pointing import (
     Receiver,
     Row,

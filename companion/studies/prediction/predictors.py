@@ -3,7 +3,7 @@
 ``kalman-peng`` is named after Peng et al. (2018), who are said to predict a UAV's position and
 velocity by a Kalman filter whose statistics are known. Neither the paper nor an account of it was
 found: no number and no equation here is theirs. The model over time is the constant-velocity one of
-``companion.studies.prediction.baselines``, and the statistics are those of ``known_tuning``, which
+``companion.studies.prediction.kalman``, and the statistics are those of ``known_tuning``, which
 uses the settings and never a log.
 """
 
@@ -19,11 +19,10 @@ from companion.studies.prediction.baselines import (
     DeadReckoning,
     DeadReckoningOnArrival,
     Hold,
-    Kalman,
     Predicted,
     Predictor,
-    Tuning,
 )
+from companion.studies.prediction.kalman import Kalman, Tuning
 from companion.studies.running.extras import needs
 from companion.values import Event
 

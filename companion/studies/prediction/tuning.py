@@ -6,9 +6,9 @@ from typing import Final
 
 import numpy as np
 
-from companion.studies.prediction.baselines import Kalman, Tuning
 from companion.studies.prediction.delivery import Delivery
-from companion.studies.prediction.pointing import Questions, answers
+from companion.studies.prediction.kalman import Kalman, Tuning
+from companion.studies.prediction.pointing import Questions
 from companion.studies.prediction.predictors import KALMAN_STATES
 from companion.studies.truth.vehicles import Flight
 from companion.values import FloatArray
@@ -34,16 +34,33 @@ Case = tuple[Flight, Delivery, Questions]
 
 
 def tune(name: str, cases: Sequence[Case]) -> Tuning:
-    """The noise of the grid with the least mean square position error over all UAVs and leads."""
-    few = [(delivery.observed, asked.every(TUNE_EVERY)) for _, delivery, asked in cases]
+    """The noise of the grid with the least mean square position error over all UAVs and leads.
 
-    def cost(tuning: Tuning) -> float:
-        squares: list[FloatArray] = []
-        for observed, asked in few:
-            given = answers(Kalman(KALMAN_STATES[name], tuning), observed, asked)
-            error = (given.position_ned_m - asked.truth_ned_m)[asked.counts]
-            squares.append(np.sum(error * error, axis=1))
-        return float(np.nanmean(np.concatenate(squares)))
-
+    All tunings are played at once.
+    """
     grid = product_of(DENSITIES[name], NOISES)
-    return min((Tuning(density, *noises) for density, noises in grid), key=cost)
+    tunings = [Tuning(density, *noises) for density, noises in grid]
+    squares = [_squares(name, tunings, delivery, asked) for _, delivery, asked in cases]
+    costs = np.nanmean(np.concatenate(squares), axis=0)
+    return tunings[int(np.argmin(costs))]
+
+
+def _squares(
+    name: str, tunings: Sequence[Tuning], delivery: Delivery, asked: Questions
+) -> FloatArray:
+    """Squares (n, T) of the errors of answers that count, m², of each tuning; NaN without one."""
+    few = asked.every(TUNE_EVERY)
+    filters = Kalman(KALMAN_STATES[name], *tunings)
+    found = np.full((*few.counts.shape, len(tunings)), np.nan)
+    observed, arrived = delivery.observed, 0
+    for k, now_ns in enumerate(few.now_ns.tolist()):
+        while arrived < len(observed) and observed[arrived].arrival_ns <= now_ns:
+            filters.report(observed[arrived])
+            arrived += 1
+        for lead, lead_ns in enumerate(few.leads_ns.tolist()):
+            predicted = filters.predict(now_ns, now_ns + lead_ns)
+            if predicted is not None:
+                error = predicted.position_ned_m - few.truth_ned_m[lead, k]
+                found[lead, k] = np.sum(error * error, axis=-1)
+    squares: FloatArray = found[few.counts]
+    return squares

@@ -10,17 +10,16 @@ from numpy.typing import ArrayLike
 from scipy.integrate import quad_vec
 from scipy.linalg import expm
 
-from companion.studies.prediction import baselines
+from companion.studies.prediction import kalman
 from companion.studies.prediction.baselines import (
     DeadReckoning,
     DeadReckoningOnArrival,
     Hold,
-    Kalman,
     Observed,
     Predicted,
     Predictor,
-    Tuning,
 )
+from companion.studies.prediction.kalman import Kalman, Tuning
 from companion.values import FloatArray
 
 S = 1_000_000_000
@@ -172,9 +171,9 @@ def test_model_is_the_integral_of_the_noise(states: int) -> None:
         return density * column @ column.T
 
     integral, _ = quad_vec(grown, 0.0, interval_s)
-    assert baselines.process_noise(states, interval_s, density) == pytest.approx(integral)
+    assert kalman.process_noise(states, interval_s, density) == pytest.approx(integral)
     moved = expm(generator(states) * interval_s)
-    assert baselines.transition(states, interval_s) == pytest.approx(moved)
+    assert kalman.transition(states, interval_s) == pytest.approx(moved)
 
 
 def least_squares(reports: Sequence[Observed], states: int, tuning: Tuning) -> FloatArray:
@@ -206,7 +205,7 @@ def least_squares(reports: Sequence[Observed], states: int, tuning: Tuning) -> F
         if k:
             t = (report.sent_ns - reports[k - 1].sent_ns) / S
             moved = expm(generator(n) * t)
-            noise_there = baselines.process_noise(n, t, tuning.process_density)
+            noise_there = kalman.process_noise(n, t, tuning.process_density)
             say({k - 1: -moved, k: np.eye(n)}, np.zeros((n, 3)), noise_there)
     fit, *_ = np.linalg.lstsq(np.vstack(lines), np.vstack(values), rcond=None)
     return np.asarray(fit[-n:], dtype=float)
@@ -228,6 +227,17 @@ def test_filter_is_the_least_squares_fit(states: int, count: int) -> None:
 
 
 @pytest.mark.parametrize("states", [2, 3])
+def test_several_filters_at_once_are_each_their_own(states: int) -> None:
+    tunings = [TUNING, Tuning(0.3, 0.05, 0.7, 3.0, 1.0), Tuning(90.0, 2.0, 0.2)]
+    together, alone = Kalman(states, *tunings), [Kalman(states, each) for each in tunings]
+    for report in wandering(20):
+        for predictor in (together, *alone):
+            predictor.report(report)
+        expected = [ask(each, 20.0, 0.7).position_ned_m for each in alone]
+        assert ask(together, 20.0, 0.7).position_ned_m == pytest.approx(np.array(expected))
+
+
+@pytest.mark.parametrize("states", [2, 3])
 def test_order_of_arrival_does_not_matter(states: int) -> None:
     reports = wandering(5)
     answers = []
@@ -241,7 +251,7 @@ def test_order_of_arrival_does_not_matter(states: int) -> None:
 
 
 def test_a_report_older_than_the_history_is_dropped() -> None:
-    reports = wandering(baselines.HISTORY + 20)
+    reports = wandering(kalman.HISTORY + 20)
     stiff = Tuning(1e-6)  # it remembers, so that beginning anew would show
     whole, late = Kalman(2, stiff), Kalman(2, stiff)
     for report in reports[1:]:

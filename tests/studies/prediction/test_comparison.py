@@ -19,7 +19,7 @@ from companion.cli.main import main
 from companion.pipeline import assembly
 from companion.settings.model import Settings
 from companion.studies.prediction import pointing, report
-from companion.studies.prediction.baselines import Kalman, Observed, Predicted, Tuning
+from companion.studies.prediction.baselines import Observed, Predicted
 from companion.studies.prediction.comparison import (
     LEADS_S,
     Compared,
@@ -27,6 +27,7 @@ from companion.studies.prediction.comparison import (
     compare,
 )
 from companion.studies.prediction.delivery import deliver
+from companion.studies.prediction.kalman import Kalman, Tuning
 from companion.studies.prediction.pointing import Answers, Questions, answers, questions, score
 from companion.studies.prediction.predictors import SIMPLE
 from companion.studies.prediction.radio_link import CLEAN, RADIO, RadioLink

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from companion.settings.model import Settings
-from companion.studies.prediction.baselines import Kalman, Observed
+from companion.studies.prediction.baselines import Observed
+from companion.studies.prediction.kalman import Kalman
 from companion.studies.prediction.predictors import MANOEUVRE_S, known_tuning
 
 S = 1_000_000_000

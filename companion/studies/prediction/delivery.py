@@ -1,7 +1,7 @@
 """Messages delivered by a link: when each arrives, and what a predictor makes of it.
 
 The product is handed the frames themselves; the baselines get observed reports, whose times are by
-the product's clock, which hears every message that says when it was sent. Everything is drawn from
+the product's clock, which hears of every message what the product hears. Everything is drawn from
 a seed and the vehicle's id.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from companion.mavlink.clock.sender_clock import SenderClock
 from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
-from companion.studies.prediction import hostile_link, noisy_frames
+from companion.studies.prediction import clock_probe, hostile_link, noisy_frames
 from companion.studies.prediction.baselines import Observed
 from companion.studies.prediction.radio_link import RadioLink
 from companion.studies.truth import stamps
@@ -127,7 +127,7 @@ def _sends(flight: Flight) -> _Sends:
         dtype=np.int64,
     )
     frames = [flight.frames[at] for at in others.tolist()]
-    said = [stamps.boot_ms(frame) for frame in frames]
+    said = [stamps.boot_ms(frame) if clock_probe.hears(frame.msgid) else None for frame in frames]
     reports = len(flight.arrival_ns)
     at = flight.report_at if len(flight.frames) else np.full(reports, -1, dtype=np.int64)
     return _Sends(

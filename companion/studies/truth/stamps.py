@@ -32,6 +32,11 @@ _FIRST: Final = frozenset(
 _STAMP: Final = struct.Struct("<I")
 
 
+def payload(msgid: int, boot_ms: int) -> bytes:
+    """The payload of such a message with nothing but its stamp; what follows is cut as zeros."""
+    return (b"\0" * 8 if msgid == _SYSTEM_TIME else b"") + _STAMP.pack(boot_ms)
+
+
 def boot_ms(frame: Frame) -> int | None:
     """When a message was sent, milliseconds since boot; None where it does not say."""
     if frame.msgid in _FIRST:

@@ -11,16 +11,18 @@ from click.testing import CliRunner
 from support import ROOT
 
 from companion.cli.main import main
+from companion.mavlink.clock.sender_clock import SenderClock
 from companion.pipeline.fold import Pipeline
+from companion.pipeline.senders import NOTHING, Senders
 from companion.recording.reader import read_log
 from companion.settings.model import Settings
-from companion.studies.prediction import comparison, predictors, violations
+from companion.studies.prediction import clock_probe, comparison, predictors, violations
 from companion.studies.prediction.delivery import deliver
 from companion.studies.prediction.hostile_link import REGIMES
 from companion.studies.prediction.pointing import Answers, Questions, product_answers, questions
 from companion.studies.prediction.predictors import product
 from companion.studies.prediction.radio_link import CLEAN, HOSTILE, NOISY, RADIO, RadioLink
-from companion.studies.truth import vehicles
+from companion.studies.truth import stamps, vehicles
 from companion.studies.truth.vehicles import Flight, Flown
 from companion.values import Frame, RoundTrip
 
@@ -55,6 +57,36 @@ def test_over_the_logs_own_link_it_is_the_pipeline(circling: Flown) -> None:
             track = tracks[flight.uav]
             assert given.position_ned_m[lead, k] == pytest.approx(track.position_ned_m, abs=1e-6)
             assert given.bound_m[lead, k] == pytest.approx(track.bound_m)
+
+
+@pytest.mark.parametrize("all_stamps", [False, True])
+def test_the_baselines_clock_hears_what_the_products_hears(
+    all_stamps: bool, monkeypatch: pytest.MonkeyPatch, circling: Flown
+) -> None:
+    """Here of a pipeline that takes a stamp of any kind, and of one that takes reports' alone."""
+    hear = Senders.hear
+
+    def hear_all(self: Senders, frame: Frame) -> Any:
+        ms = stamps.boot_ms(frame)
+        if ms is not None and frame.msgid != 33 and all_stamps:
+            self._stamp(str(frame.source), frame.t_ns, ms)
+        return NOTHING if frame.msgid != 33 else hear(self, frame)
+
+    monkeypatch.setattr(Senders, "hear", hear_all)
+    clock_probe.hears.cache_clear()
+    heard = {msgid: clock_probe.hears(msgid) for msgid in (2, 30, 33)}
+    observes = SenderClock.observe
+    count = []
+
+    def counted(self: SenderClock, arrival_ns: int, boot_ms: int) -> Any:
+        count.append(boot_ms)
+        return observes(self, arrival_ns, boot_ms)
+
+    monkeypatch.setattr(SenderClock, "observe", counted)
+    delivery = deliver(circling.flights[0], CLEAN, 1)
+    clock_probe.hears.cache_clear()
+    assert heard == {2: all_stamps, 30: all_stamps, 33: True}
+    assert (len(count) > 1.5 * len(delivery.observed)) == all_stamps
 
 
 def kinds(events: tuple[Frame | RoundTrip, ...]) -> dict[int, int]:

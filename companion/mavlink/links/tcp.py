@@ -83,9 +83,11 @@ class TcpIn:
         loop = asyncio.get_running_loop()
         fault: asyncio.Future[Exception] = loop.create_future()
         sock, self._socket = self._socket or _listening(self._url), None
-        server = await loop.create_server(lambda: self._met(fault), sock=sock)
-        self._upcalls.up()
+        # Not started at once: that takes a turn of the loop, in which a stop would leave it open.
+        server = await loop.create_server(lambda: self._met(fault), sock=sock, start_serving=False)
         try:
+            await server.start_serving()
+            self._upcalls.up()
             raise await fault
         finally:
             server.close()
@@ -170,7 +172,8 @@ class _Stream(asyncio.Protocol):
         return self._transport.get_write_buffer_size() / WRITE_BUFFER_BYTES
 
     def abort(self) -> None:
-        """End the connection without sending what is unsent."""
+        """End the connection without sending what is unsent; at once where it is yet to be made."""
+        self._welcome = False
         if self._transport is not None:
             self._transport.abort()
 

@@ -177,6 +177,8 @@ class _Datagrams(asyncio.DatagramProtocol):
         self._upcalls = upcalls
         self._connected = connected
         self._unfit = False
+        self._ended = False
+        self._transport: asyncio.DatagramTransport | None = None
         self._lost: asyncio.Future[Exception] = asyncio.get_running_loop().create_future()
         self._dropped = 0
         self._unchecked = 0
@@ -184,15 +186,17 @@ class _Datagrams(asyncio.DatagramProtocol):
     async def serve(self) -> None:
         """Read until the socket has to be made anew; raises the error that broke the transport."""
         loop = asyncio.get_running_loop()
-        transport, _ = await loop.create_datagram_endpoint(lambda: self, sock=self._socket)
-        self._upcalls.up()
         try:
+            await loop.create_datagram_endpoint(lambda: self, sock=self._socket)
+            self._upcalls.up()
             while not self._unfit:
                 if (await asyncio.wait((self._lost,), timeout=OVERFLOW_CHECK_S))[0]:
                     raise self._lost.result()
                 self._count_dropped()
         finally:
-            transport.abort()
+            self._ended = True
+            if self._transport is not None:
+                self._transport.abort()
 
     def send(self, raw: bytes) -> bool:
         """Send a datagram to the peer of a connected socket."""
@@ -210,6 +214,12 @@ class _Datagrams(asyncio.DatagramProtocol):
     def fullness(self) -> float:
         """1 where the system would not take a datagram now, else 0."""
         return _fullness(self._socket)
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        # uvloop makes the connection even where who waited for it was cancelled meanwhile.
+        self._transport = cast(asyncio.DatagramTransport, transport)
+        if self._ended:
+            self._transport.abort()
 
     def datagram_received(self, data: bytes, addr: Address) -> None:
         try:

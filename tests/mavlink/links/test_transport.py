@@ -5,8 +5,10 @@ Every test runs on both loops: the one that comes with Python, and the one in fl
 
 import asyncio
 import contextlib
+import gc
 import socket
 import sys
+import warnings
 from collections.abc import AsyncIterator, Iterator
 
 import pytest
@@ -838,6 +840,53 @@ def test_an_unfinished_frame_is_given_up_before_the_link_has_stopped(run: Run, s
                 assert [item.count for item in inbox.rejections] == [20]
             if scheme == "tcp":
                 await hang_up(writer)
+
+    run(test())
+
+
+@pytest.mark.parametrize("turns", range(1, 7))
+@pytest.mark.parametrize("scheme", ["udpin", "tcpin", "udpout", "tcp"])
+def test_a_link_that_is_stopped_while_it_opens_leaves_nothing_open(
+    run: Run, scheme: str, turns: int
+) -> None:
+    """After so many turns of the loop. What is left open is a warning of Python or of uvloop;
+    as an error it would have uvloop wait for ever when it is closed, so it is only looked at."""
+
+    async def test() -> None:
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            port = 0 if scheme.endswith("in") else server.getsockname()[1]
+            link = Link(parse_link(f"{scheme}:127.0.0.1:{port}"), lambda _: None, lambda: 0)
+            link.open()
+            task = asyncio.create_task(link.run())
+            for _ in range(turns):
+                await asyncio.sleep(0)
+            task.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await task
+
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        run(test())
+        gc.collect()
+    assert [str(one.message) for one in said] == []
+
+
+@pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
+@pytest.mark.parametrize("turns", range(7))
+def test_who_connects_while_a_link_stops_is_not_left_waiting(run: Run, turns: int) -> None:
+    """However far the loop had come with the connection when the link was stopped."""
+
+    async def test() -> None:
+        async with running("tcpin:127.0.0.1:0") as (link, _):
+            await until_true(lambda: link.status.state == "up")
+            visitor = socket.create_connection(("127.0.0.1", port_of(link)))
+            for _ in range(turns):
+                await asyncio.sleep(0)
+        gc.collect()  # asyncio leaves to it what it accepts while its server closes
+        with visitor:
+            visitor.setblocking(False)
+            with contextlib.suppress(ConnectionResetError):
+                assert await asyncio.get_running_loop().sock_recv(visitor, 1) == b""
 
     run(test())
 

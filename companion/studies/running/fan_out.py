@@ -51,7 +51,8 @@ def on_cores(
         try:
             return _gathered(futures, told)
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            # Waiting: a second call, that of ``with``, would take the cancellation back.
+            pool.shutdown(cancel_futures=True)
             raise
 
 

@@ -1,6 +1,7 @@
 """Work in parallel: real processes, and a real Dask cluster on loopback."""
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -62,11 +63,12 @@ def test_the_first_mistake_in_order_is_raised() -> None:
 
 
 def test_after_a_mistake_the_rest_is_given_up(tmp_path: Path) -> None:
-    """But for what was on its way to the process already."""
+    """But for what was on its way to the process already; nothing goes on behind one's back."""
     touch = "__import__('time').sleep(0.05) or open({!r}, 'w').close()"
     rest = [touch.format(str(tmp_path / str(n))) for n in range(20)]
     with pytest.raises(ValueError, match="'x'"):
         fan_out.on_cores(eval, ["int('x')", *rest], 1, id)
+    assert multiprocessing.active_children() == []
     assert len(list(tmp_path.iterdir())) < 10
 
 

@@ -1,5 +1,6 @@
 """Fixtures that several rooms' tests share."""
 
+import faulthandler
 import fcntl
 import hashlib
 import os
@@ -41,6 +42,54 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.xdist_group("alone"))
         elif item.nodeid.startswith("tests/studies/"):
             item.add_marker(pytest.mark.xdist_group("studies"))
+
+
+# --- the last resort against a test that hangs ---------------------------------------------------
+
+LAST_RESORT_S = 120.0
+"""How much longer than its limit a test takes before its process is ended."""
+STDERR = pytest.StashKey[int]()
+"""Where the process writes its errors, whatever is captured."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.stash[STDERR] = os.dup(2)
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    os.close(config.stash[STDERR])
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """pytest-timeout raises an exception in the test, once. uvloop does not handle its signal,
+    Hypothesis takes the exception for a bad example and runs that again, and what cleans up after
+    it may wait as well. Then the process shows where it is and ends: the test has failed, and xdist
+    starts another for the rest."""
+    _watch(item)
+    try:
+        return (yield)
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_exception_interact(node: pytest.Item | pytest.Collector) -> None:
+    """After a failure pytest and pytest-timeout no longer watch, though the teardown is to come."""
+    if isinstance(node, pytest.Item):
+        _watch(node)
+
+
+def _watch(item: pytest.Item) -> None:
+    marker = item.get_closest_marker("timeout")
+    given = marker.args[0] if marker else item.config.getoption("timeout")
+    limit_s = float(item.config.getini("timeout") if given is None else given)
+    if limit_s > 0:
+        seconds, file = limit_s + LAST_RESORT_S, item.config.stash[STDERR]
+        faulthandler.dump_traceback_later(seconds, exit=True, file=file)
+
+
+# --- fixtures -----------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="session")

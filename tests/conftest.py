@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 from hypothesis import settings
-from support import BIN, HANG_S, ROOT, Node
+from support import BIN, HANG_S, ROOT, Node, end
 
 # How fast this machine is, and what else it does, is no property of the code: no deadlines.
 settings.register_profile("quick", deadline=None, max_examples=25)
@@ -135,6 +135,4 @@ def start_node() -> Iterator[Any]:
 
     yield start
     for node in nodes:
-        if node.process.poll() is None:
-            node.process.kill()
-            node.process.communicate()
+        end(node.process)

@@ -16,7 +16,7 @@ from typing import Any
 
 import pymap3d
 from mcap.reader import make_reader
-from support import BIN, Node
+from support import BIN, HANG_S, Node, end
 
 from companion.mavlink.wire.decode import DECODED, GLOBAL_POSITION_INT, decode
 from companion.recording import schemas
@@ -217,7 +217,7 @@ class _Flight:
         command += [word for fault in case.faults for word in ("--fault", fault)]
         self._sender = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         moments = self._moments(node)
-        summary, _ = self._sender.communicate()
+        summary, _ = self._sender.communicate(timeout=HANG_S)
         assert self._sender.returncode == 0, case
         node.wait_until("/v1/links", _are_quiet)
         status, events = node.json("/v1/status"), node.json("/v1/events")["events"]
@@ -242,9 +242,8 @@ class _Flight:
         """Leave nothing behind, whatever happened."""
         started = (self._sender, None if self._node is None else self._node.process)
         for process in started:
-            if process is not None and process.poll() is None:
-                process.kill()
-                process.communicate()
+            if process is not None:
+                end(process)
 
     def _moments(self, node: Node) -> list[Moment]:
         """What the service says until the flight ends, but not after."""
@@ -260,7 +259,9 @@ class _Flight:
 
 def _replayed(recording: Path) -> Json:
     command = [BIN / "companion", "replay", recording, "--no-record", "--json"]
-    found: Json = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+    found: Json = json.loads(
+        subprocess.run(command, capture_output=True, check=True, timeout=HANG_S).stdout
+    )
     return found
 
 

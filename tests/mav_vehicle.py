@@ -32,7 +32,7 @@ class Vehicle:
         self._boot_s = time.monotonic() - 100.0
         self._changed = threading.Condition()
         self._end = threading.Event()
-        self._thread = threading.Thread(target=self._fly)
+        self._thread = threading.Thread(target=self._fly, daemon=True)
 
     def __enter__(self) -> "Vehicle":
         self._thread.start()
@@ -40,7 +40,7 @@ class Vehicle:
 
     def __exit__(self, *_: object) -> None:
         self._end.set()
-        self._thread.join()
+        self._thread.join(HANG_S)
         self.link.close()
 
     def wait_for(self, wanted: Callable[[Message], bool], seconds: float = HANG_S) -> Message:

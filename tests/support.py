@@ -1,18 +1,27 @@
 """What several rooms' tests share: where recordings are, and a running ``companion``."""
 
+import asyncio
+import contextlib
 import json
+import os
 import re
 import signal
 import subprocess
 import sys
+import tempfile
+import threading
 import time
 import urllib.error
 import urllib.request
+import weakref
+from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, TypeVar
 
 import pytest
 from mcap.reader import make_reader
+
+T = TypeVar("T")
 
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared" / "data"
@@ -38,23 +47,83 @@ def read_metadata(path: Path) -> dict[str, dict[str, str]]:
         return {found.name: found.metadata for found in make_reader(file).iter_metadata()}
 
 
+def end(process: "subprocess.Popen[Any]") -> None:
+    """Kill a process that has not ended, and close its pipes.
+
+    They are not read to their end, for a process that it left behind may keep them open.
+    """
+    process.kill()
+    process.wait(HANG_S)
+    for pipe in (process.stdin, process.stdout, process.stderr):
+        if pipe is not None:
+            pipe.close()
+
+
+@contextlib.contextmanager
+def started(command: Any, **options: Any) -> "Iterator[subprocess.Popen[Any]]":
+    """A process that is killed at the end if it has not ended by then, whatever has happened.
+
+    ``subprocess.Popen`` as a context waits for it: after a failure, for ever.
+    """
+    process = subprocess.Popen(command, **options)
+    try:
+        yield process
+    finally:
+        end(process)
+
+
+def line_of(process: "subprocess.Popen[Any]", pipe: IO[Any] | None) -> Any:
+    """The next line that a process writes; empty where it has ended, or hangs and is killed."""
+    assert pipe is not None
+    limit = threading.Timer(HANG_S, process.kill)
+    limit.daemon = True
+    limit.start()
+    try:
+        return pipe.readline()
+    finally:
+        limit.cancel()
+
+
+def run_async(
+    work: Coroutine[Any, Any, T], loop: Callable[[], asyncio.AbstractEventLoop] | None = None
+) -> T:
+    """What a coroutine returns, on an event loop of its own; ``TimeoutError`` where it hangs.
+
+    The limit of pytest-timeout does not do: uvloop does not handle signals while it waits.
+    """
+
+    async def limited() -> T:
+        async with asyncio.timeout(HANG_S):
+            return await work
+
+    with asyncio.Runner(loop_factory=loop) as runner:
+        return runner.run(limited())
+
+
 class Node:
     """A ``companion`` process that serves, and its address."""
 
     def __init__(self, *arguments: str) -> None:
+        # A file: a full pipe that nobody reads would hold the service up.
+        self._errors, name = tempfile.mkstemp()
+        Path(name).unlink()
+        weakref.finalize(self, os.close, self._errors)
         self.process = subprocess.Popen(
             [BIN / "companion", *arguments],
             stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            stderr=self._errors,
             text=True,
         )
-        assert self.process.stdout is not None
-        line = self.process.stdout.readline()
+        line = line_of(self.process, self.process.stdout)
         found = re.search(r"serves (http://\S+) and listens on udpin:127\.0\.0\.1:(\d+)", line)
         if found is None:
-            self.process.kill()
-            pytest.fail(f"did not start: {line!r} {self.process.communicate()[1]}")
+            end(self.process)
+            pytest.fail(f"did not start: {line!r} {self.errors()}")
         self.url, self.udp_port = found[1], int(found[2])
+
+    def errors(self) -> str:
+        """What it has written to stderr so far."""
+        return os.pread(self._errors, os.fstat(self._errors).st_size, 0).decode()
 
     def get(self, path: str, accept: str = "application/json") -> tuple[int, bytes]:
         """Status and body."""
@@ -85,5 +154,5 @@ class Node:
     def stop(self, number: signal.Signals = signal.SIGTERM) -> tuple[int, str, str]:
         """Exit status, stdout and stderr after a signal."""
         self.process.send_signal(number)
-        out, err = self.process.communicate(timeout=HANG_S)
-        return self.process.returncode, out, err
+        out, _ = self.process.communicate(timeout=HANG_S)
+        return self.process.returncode, out, self.errors()

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import Node
+from support import HANG_S, Node
 
 from companion.client import Client, ServiceError
 
@@ -140,7 +140,7 @@ class _Stranger(BaseHTTPRequestHandler):
 
 def test_what_is_no_service_of_ours() -> None:
     with HTTPServer(("127.0.0.1", 0), _Stranger) as server:
-        thread = threading.Thread(target=server.serve_forever)
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
         thread.start()
         try:
             client = Client(f"http://127.0.0.1:{server.server_port}")
@@ -152,4 +152,4 @@ def test_what_is_no_service_of_ours() -> None:
                 next(client.stream())
         finally:
             server.shutdown()
-            thread.join()
+            thread.join(HANG_S)

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 import yaml
-from support import BIN, HANG_S, ROOT
+from support import BIN, HANG_S, ROOT, started
 
 RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
 DOCKERFILE = (ROOT / "Dockerfile").read_text(encoding="utf-8")
@@ -24,7 +24,7 @@ def lint(text: str, tmp_path: Path) -> "subprocess.CompletedProcess[str]":
     path = tmp_path / "Dockerfile"
     path.write_text(text, encoding="utf-8")
     command = [BIN / "hadolint", path]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=HANG_S)
 
 
 def against_schema(text: str, tmp_path: Path) -> int:
@@ -32,7 +32,7 @@ def against_schema(text: str, tmp_path: Path) -> int:
     path = tmp_path / "docker-compose.yml"
     path.write_text(text, encoding="utf-8")
     command = [BIN / "check-jsonschema", "--builtin-schema", "vendor.compose-spec", path]
-    return subprocess.run(command, capture_output=True, check=False).returncode
+    return subprocess.run(command, capture_output=True, check=False, timeout=HANG_S).returncode
 
 
 def instruction(name: str) -> list[str]:
@@ -102,7 +102,7 @@ def test_the_commands_are_understood(start_node: Any) -> None:
         for word in services["sim"]["command"]
     ]
     assert services["sim"]["entrypoint"] == ["sitl-replay"]
-    with subprocess.Popen([BIN / "sitl-replay", *sim], stdout=subprocess.DEVNULL) as flying:
+    with started([BIN / "sitl-replay", *sim], stdout=subprocess.DEVNULL) as flying:
         node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
         flying.terminate()
 
@@ -125,7 +125,7 @@ def test_health_is_that_of_readyz(
 
     assert check() == 1  # no report yet
     to = f"udpout:127.0.0.1:{node.udp_port}"
-    with subprocess.Popen(
+    with started(
         [BIN / "sitl-replay", "fly", "paper", "--to", to], stdout=subprocess.DEVNULL
     ) as flying:
         waited = next((n for n in range(100) if check() == 0), None)

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from support import ROOT
+from support import HANG_S, ROOT
 
 DOCS = ROOT / "docs"
 PAGES = sorted([*DOCS.rglob("*.md"), *ROOT.glob("*.md")])
@@ -38,7 +38,7 @@ def test_every_file_and_folder_that_the_architecture_names_is_there() -> None:
 
 def test_the_picture_of_the_rooms_is_up_to_date() -> None:
     drawing = [sys.executable, DOCS / "draw_architecture.py", "--check"]
-    done = subprocess.run(drawing, capture_output=True, text=True, check=False)
+    done = subprocess.run(drawing, capture_output=True, text=True, check=False, timeout=HANG_S)
     assert done.returncode == 0, done.stderr
 
 

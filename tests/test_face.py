@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from support import ROOT
+from support import HANG_S, ROOT
 
 import companion
 
@@ -14,7 +14,9 @@ import companion
 def loaded_by(code: str) -> set[str]:
     """The modules that a fresh interpreter has loaded after some code."""
     run = f"{code}\nimport sys\nprint(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", run], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", run], capture_output=True, text=True, check=True, timeout=HANG_S
+    )
     return set(done.stdout.splitlines()[-1].split())
 
 

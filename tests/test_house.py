@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from support import HANG_S
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("companion", "sitl_replay")
@@ -91,7 +92,7 @@ def committed() -> list[str]:
     """Every file that is or would be committed; without git, every file not made by a tool."""
     git = ("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard")
     if shutil.which("git") and (ROOT / ".git").exists():
-        done = subprocess.run(git, cwd=ROOT, capture_output=True, check=True)
+        done = subprocess.run(git, cwd=ROOT, capture_output=True, check=True, timeout=HANG_S)
         names = done.stdout.decode().split("\0")
         return sorted(name for name in names if name and (ROOT / name).is_file())
     made = re.compile(r"(^|/)(\.git|\.venv|\.\w+_cache|\.hypothesis|__pycache__|build|dist)/")
@@ -384,7 +385,9 @@ def lint_imports(root: Path) -> subprocess.CompletedProcess[str]:
     """Run import-linter over the packages at ``root``, with the contracts found there."""
     run = "from importlinter.cli import lint_imports_command; lint_imports_command()"
     command = (sys.executable, "-c", run, "--no-cache")
-    return subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
+    return subprocess.run(
+        command, cwd=root, capture_output=True, text=True, check=False, timeout=HANG_S
+    )
 
 
 def test_the_rooms_import_in_the_order_of_the_flow() -> None:
@@ -432,8 +435,52 @@ def test_the_service_starts_without_the_solver_and_what_only_studies_need() -> N
         "import sys, companion.cli.main, companion.node.service\n"
         "print(*{'cvxpy', 'jinja2', 'matplotlib'} & set(sys.modules))"
     )
-    done = subprocess.run((sys.executable, "-c", run), cwd=ROOT, capture_output=True, check=False)
+    done = subprocess.run(
+        (sys.executable, "-c", run), cwd=ROOT, capture_output=True, check=False, timeout=HANG_S
+    )
     assert (done.returncode, done.stdout.decode().split()) == (0, []), done.stderr.decode()
+
+
+# --- the tests --------------------------------------------------------------------------------
+
+
+def endless_waits(text: str) -> list[str]:
+    """Calls in a test that may wait for ever, each with what is used instead."""
+    faults = []
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.With):
+            names = [ast.unparse(item.context_expr).partition("(")[0] for item in node.items]
+            if "subprocess.Popen" in names:
+                faults.append(f"{node.lineno}: with Popen: with support.started")
+        if not isinstance(node, ast.Call):
+            continue
+        name, given = ast.unparse(node.func), {keyword.arg for keyword in node.keywords}
+        if name == "asyncio.run":
+            faults.append(f"{node.lineno}: asyncio.run: support.run_async")
+        if name == "subprocess.run" and "timeout" not in given:
+            faults.append(f"{node.lineno}: subprocess.run: timeout=HANG_S")
+        if name.endswith(".communicate") and "timeout" not in given:
+            faults.append(f"{node.lineno}: communicate: timeout=HANG_S, or support.end")
+    return faults
+
+
+def test_no_test_waits_for_ever() -> None:
+    """Neither for a process nor for a coroutine: nothing else may notice that it hangs."""
+    faults = [
+        f"{path.relative_to(ROOT)}:{fault}"
+        for path in sorted((ROOT / "tests").rglob("*.py"))
+        if path.name != "mutations.py"  # no test: it runs them
+        for fault in endless_waits(path.read_text(encoding="utf-8"))
+    ]
+    assert faults == []
+
+
+def test_an_endless_wait_is_found() -> None:
+    text = (
+        "with subprocess.Popen(a) as b:\n    b.communicate()\n    subprocess.run(c)\nasyncio.run(d)"
+    )
+    assert [fault.partition(": ")[0] for fault in sorted(endless_waits(text))] == [*"1234"]
+    assert endless_waits("subprocess.run(a, timeout=HANG_S)\nb.communicate(timeout=HANG_S)") == []
 
 
 # --- what is committed --------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from support import BIN, HANG_S, ROOT
+from support import BIN, HANG_S, ROOT, line_of, started
 
 from companion.settings.model import Settings
 
@@ -72,7 +72,9 @@ def study(words: list[str], where: Path, studied: Callable[..., Path]) -> None:
 def make(words: list[str], _: Path, start_node: Started) -> None:
     """What make would do; not done, for it makes an environment first."""
     command = ["make", "--dry-run", "--always-make", *words[1:]]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=HANG_S
+    )
     assert done.returncode == 0, done.stderr
     does = {
         "demo": "companion demo",
@@ -114,19 +116,18 @@ def to_its_end(words: list[str], where: Path, start_node: Started) -> None:
 def served(words: list[str], where: Path, start_node: Started) -> None:
     """The replay of a recording that answers until it is stopped."""
     words[words.index("--listen") + 1] = "127.0.0.1:0"
-    process = subprocess.Popen(
+    with started(
         [BIN / words[0], *words[1:]], cwd=where, stderr=subprocess.PIPE, text=True,
         stdout=subprocess.DEVNULL,
-    )  # fmt: skip
-    with process:
-        assert process.stderr is not None
-        said = (re.search(r"serves (http://\S+) and replays", line) for line in process.stderr)
+    ) as process:  # fmt: skip
+        lines = iter(lambda: line_of(process, process.stderr), "")
+        said = (re.search(r"serves (http://\S+) and replays", line) for line in lines)
         found = next((one for one in said if one), None)
         assert found is not None
         with urllib.request.urlopen(found[1] + "/v1/status", timeout=HANG_S) as answer:
             assert json.load(answer)["replay"]["log"] == "recording.mcap"
         process.send_signal(signal.SIGINT)
-        process.stderr.read()
+        process.communicate(timeout=HANG_S)
     assert process.returncode == 0
 
 
@@ -153,9 +154,7 @@ def traffic(words: list[str], where: Path, start_node: Started) -> None:
         *("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
     )
     words = [word.replace("127.0.0.1:14550", f"127.0.0.1:{node.udp_port}") for word in words]
-    with subprocess.Popen(
-        [BIN / words[0], *words[1:]], cwd=where, stdout=subprocess.DEVNULL
-    ) as sending:
+    with started([BIN / words[0], *words[1:]], cwd=where, stdout=subprocess.DEVNULL) as sending:
         node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
         sending.terminate()
 
@@ -172,10 +171,15 @@ def compose(words: list[str], where: Path, start_node: Started) -> None:
     if (
         shutil.which("docker")
         and not subprocess.run(
-            ["docker", "compose", "version"], capture_output=True, check=False
+            ["docker", "compose", "version"],
+            capture_output=True,
+            check=False,
+            timeout=HANG_S,
         ).returncode
     ):
-        subprocess.run(["docker", "compose", "config", "--quiet"], cwd=ROOT, check=True)
+        subprocess.run(
+            ["docker", "compose", "config", "--quiet"], cwd=ROOT, check=True, timeout=HANG_S
+        )
 
 
 RUNNERS: dict[str, Callable[[list[str], Path, Started], None]] = {

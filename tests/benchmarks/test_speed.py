@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import BIN, shared_log
+from support import BIN, HANG_S, shared_log
 
 from companion.beams.array import geometry, steering
 from companion.beams.weights import zero_forcing
@@ -47,7 +47,9 @@ def test_replay_outruns_the_flight(tmp_path: Path) -> None:
     summaries: list[dict[str, float]] = []
 
     def replay() -> None:
-        done = subprocess.run([*command, tmp_path / "x.mcap"], capture_output=True, check=True)
+        done = subprocess.run(
+            [*command, tmp_path / "x.mcap"], capture_output=True, check=True, timeout=HANG_S
+        )
         summaries.append(json.loads(done.stdout))
 
     (replay_s,) = interleaved_s(replay)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support import BIN, HANG_MS, HANG_S, ROOT, Node
+from support import BIN, HANG_MS, HANG_S, ROOT, Node, end, line_of, started
 
 pytestmark = pytest.mark.browser
 
@@ -60,9 +60,7 @@ def start_mine(tmp_path: Path) -> Iterator[Any]:
 
     yield start
     for node in nodes:
-        if node.process.poll() is None:
-            node.process.kill()
-            node.process.communicate()
+        end(node.process)
 
 
 def is_complaint(said: Any) -> bool:
@@ -307,8 +305,7 @@ def test_a_lost_service_is_unmistakable_and_heals(open_page: Any, start_mine: An
     fresh = page.locator("html:not([data-uavs-late]):not([data-uavs-lost])")
     fresh.wait_for(state="attached", timeout=HANG_MS)
     wait_for_value(page, style.format("fontStyle"), "normal")
-    node.process.kill()
-    node.process.communicate()
+    end(node.process)
     killed = time.monotonic()
     page.get_by_text("CONNECTION LOST", exact=True).wait_for(timeout=HANG_MS)
     assert time.monotonic() - killed < 4
@@ -322,19 +319,17 @@ def test_a_lost_service_is_unmistakable_and_heals(open_page: Any, start_mine: An
 @pytest.mark.full
 def test_a_replay_says_that_it_is_one(open_page: Any, cut_log: Path) -> None:
     command = [BIN / "companion", "replay", cut_log, "--center", "5:1", "--no-record", "--serve"]
-    with subprocess.Popen(
+    with started(
         [*command, "--listen", "127.0.0.1:0"],
         stderr=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         text=True,
     ) as process:
-        assert process.stderr is not None
-        said = (re.search(r"serves (http://\S+) and", line) for line in process.stderr)
+        lines = iter(lambda: line_of(process, process.stderr), "")
+        said = (re.search(r"serves (http://\S+) and", line) for line in lines)
         url = next(found for found in said if found)[1]
-        try:
-            page = open_page(url, DESKTOP, loses_service=True)
-            page.locator("#replay").get_by_text("replay sitl_4circle_cut.tlog").wait_for()
-            wait_for_uavs(page)
-        finally:
-            process.terminate()
-            process.stderr.read()
+        page = open_page(url, DESKTOP, loses_service=True)
+        page.locator("#replay").get_by_text("replay sitl_4circle_cut.tlog").wait_for()
+        wait_for_uavs(page)
+        process.terminate()
+        process.communicate(timeout=HANG_S)

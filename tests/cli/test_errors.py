@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 import pytest
 from click.testing import CliRunner
-from support import BIN, HANG_S, ROOT
+from support import BIN, HANG_S, ROOT, started
 
 from companion.cli.console import OneLineErrors
 from companion.values import UserError
@@ -82,7 +82,9 @@ def test_every_error_that_is_raised_for_users_is_a_user_error() -> None:
         "print(*{one.__name__ for one in below(Exception)\n"
         "        if one.__module__.startswith('companion') and not issubclass(one, UserError)})\n"
     )
-    done = subprocess.run([sys.executable, "-c", run], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", run], capture_output=True, text=True, check=True, timeout=HANG_S
+    )
     assert set(done.stdout.split()) <= inside
 
 
@@ -95,21 +97,25 @@ def test_an_interrupt_while_the_command_loads_is_one_line(seed: int, tmp_path: P
         "import sys\nfrom companion.__main__ import main\n"
         "sys.argv = ['companion', 'replay', '/dev/zero.tlog']\nmain()\n"
     )
-    process = subprocess.Popen(
-        [sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, cwd=ROOT
-    )
-    while not began.exists():
-        assert process.poll() is None
-        os.sched_yield()
-    time.sleep(random.Random(seed).uniform(0.03, 0.5))  # anywhere while it loads, or after it
-    process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=HANG_S)
+    command = [sys.executable, "-c", code]
+    with started(command, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        while not began.exists():
+            assert process.poll() is None
+            os.sched_yield()
+        time.sleep(random.Random(seed).uniform(0.03, 0.5))  # anywhere while it loads, or after it
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=HANG_S)
     lines = said.splitlines()
     assert len(lines) == 1, said
     assert lines[0] in ("companion: interrupted", "companion: /dev/zero.tlog: no such file")
 
 
 def test_both_doors_are_the_same_command() -> None:
-    by_name = subprocess.run([BIN / "companion", "--version"], capture_output=True, check=True)
+    by_name = subprocess.run(
+        [BIN / "companion", "--version"], capture_output=True, check=True, timeout=HANG_S
+    )
     module = [sys.executable, "-m", "companion", "--version"]
-    assert subprocess.run(module, capture_output=True, check=True).stdout == by_name.stdout
+    assert (
+        subprocess.run(module, capture_output=True, check=True, timeout=HANG_S).stdout
+        == by_name.stdout
+    )

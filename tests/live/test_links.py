@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import all as dialect
-from support import BIN, read_metadata
+from support import BIN, HANG_S, read_metadata
 
 from companion.recording.reader import read_log
 from sitl_replay.flight import scenario
@@ -136,6 +136,7 @@ def test_a_key_that_is_none_is_told_at_the_start(tmp_path: Path) -> None:
         capture_output=True,
         text=True,
         check=False,
+        timeout=HANG_S,
     )
     assert done.returncode != 0
     assert "radio.key" in done.stderr and "32 bytes" in done.stderr

@@ -27,7 +27,7 @@ class Watch:
         self.took_s: list[float] = []
         self._url = url + "/healthz"
         self._end = threading.Event()
-        self._thread = threading.Thread(target=self._ask)
+        self._thread = threading.Thread(target=self._ask, daemon=True)
 
     def _ask(self) -> None:
         while not self._end.wait(ASKED_EVERY_S):
@@ -42,7 +42,7 @@ class Watch:
 
     def __exit__(self, *_: object) -> None:
         self._end.set()
-        self._thread.join()
+        self._thread.join(HANG_S)
 
 
 def load(node: Any, seconds: float) -> int:
@@ -54,6 +54,7 @@ def load(node: Any, seconds: float) -> int:
         capture_output=True,
         check=True,
         env={"PYTHONPATH": str(ROOT)},
+        timeout=HANG_S,
     )
     sent = json.loads(done.stdout)
     assert sent["seconds"] < 1.2 * seconds, "the sender could not keep up: nothing was measured"

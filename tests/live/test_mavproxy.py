@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from mav_vehicle import Vehicle
-from support import BIN, HANG_S, read_metadata
+from support import BIN, HANG_S, end, read_metadata
 
 Router = Callable[..., None]
 
@@ -44,12 +44,7 @@ def router(tmp_path: Path) -> Iterator[Router]:
 
     yield start
     for process in started:
-        process.terminate()
-        try:
-            process.wait(10)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+        end(process)
 
 
 @pytest.fixture
@@ -64,9 +59,7 @@ def fly() -> Iterator[Callable[..., "subprocess.Popen[str]"]]:
 
     yield start
     for process in started:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
+        end(process)
 
 
 def test_over_datagrams_and_over_a_connection_at_once(
@@ -103,6 +96,7 @@ def test_over_datagrams_and_over_a_connection_at_once(
         [BIN / "companion", "replay", recording, "--no-record", "--json"],
         capture_output=True,
         check=True,
+        timeout=HANG_S,
     )
     summary = json.loads(replayed.stdout)
     assert summary["digest"] == read_metadata(recording)["summary"]["digest"]

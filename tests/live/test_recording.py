@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support import BIN, ROOT, Node, read_metadata
+from support import BIN, HANG_S, ROOT, Node, end, read_metadata
 
 from companion.node.replay import replay
 from companion.recording.parts import read_story
@@ -37,7 +37,9 @@ def send(node: Node, seconds: float) -> "subprocess.Popen[str]":
 def replayed(*logs: Path) -> dict[str, Any]:
     """What ``companion replay`` says of logs."""
     command = [BIN / "companion", "replay", *logs, "--no-record", "--json"]
-    answer: dict[str, Any] = json.loads(subprocess.run(command, check=True, stdout=-1).stdout)
+    answer: dict[str, Any] = json.loads(
+        subprocess.run(command, check=True, stdout=-1, timeout=HANG_S).stdout
+    )
     return answer
 
 
@@ -53,8 +55,7 @@ def killed_while_recording(folder: Path, seconds: float) -> float:
         node.process.send_signal(signal.SIGKILL)
     finally:
         for process in (node.process, flight):
-            process.kill()
-            process.communicate()
+            end(process)
     (leftover,) = folder.iterdir()
     before = list(read_parts([leftover]))
     (found,) = recover_leftovers(folder)
@@ -98,7 +99,7 @@ def test_the_parts_of_a_run_replay_to_its_digest(start_node: Any, tmp_path: Path
     settings.write_text("[recording]\nrotate_s = 1.0\n")
     node = start_node(*RUN, "--config", str(settings), "--record", str(tmp_path / "kept"))
     flight = send(node, 4.5)
-    flight.communicate()
+    flight.communicate(timeout=HANG_S)
     code, out, err = node.stop()
     assert code == 0, err
     logs = sorted(

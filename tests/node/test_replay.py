@@ -129,7 +129,11 @@ def test_what_is_no_log_is_one_line(make: Any, command: str, tmp_path: Path) -> 
     path = tmp_path / "x"
     make(path)
     done = subprocess.run(
-        [BIN / "companion", command, path], capture_output=True, text=True, check=False
+        [BIN / "companion", command, path],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=HANG_S,
     )
     assert done.returncode != 0
     errors = [line for line in done.stderr.splitlines() if line.startswith("companion: ")]

@@ -14,7 +14,7 @@ import numpy as np
 import pymap3d
 import pytest
 from device_reading import parse
-from support import BIN, HANG_S, read_metadata
+from support import BIN, HANG_S, read_metadata, started
 
 from companion.beams.hardware.calibration import Calibration
 from companion.beams.hardware.devices import MEDIA_TYPES, Device
@@ -36,11 +36,11 @@ STAMPS_OFF_DEG = 0.5
 """What the flown log's own stamps, those of sending, are worth at 29 degrees a second."""
 
 
-def fly(port: int, record: Path, seconds: float = 5.0) -> "subprocess.Popen[str]":
+def fly(port: int, record: Path, seconds: float = 5.0) -> Any:
     """The paper's four UAVs and the carrier, as real traffic."""
     to = f"udpout:127.0.0.1:{port}"
     command = [BIN / "sitl-replay", "fly", "paper", "--to", to, "--duration", str(seconds)]
-    return subprocess.Popen([*command, "--record", str(record)], stdout=subprocess.PIPE, text=True)
+    return started([*command, "--record", str(record)], stdout=subprocess.PIPE, text=True)
 
 
 def true_bearings_deg(tlog: Path) -> dict[str, Any]:
@@ -72,16 +72,16 @@ def test_follows_flying_vehicles_and_stops_cleanly(
     settings.write_text(PAPER_BOUNDS)
     record = ("--config", str(settings), "--record", str(tmp_path / "recordings"))
     node = start_node(*RUN, *record)
-    flight = fly(node.udp_port, tmp_path / "flown.tlog")
-    node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
-    assert json.loads(node.get("/readyz")[1])["ready"]
-    asked = []
-    while flight.poll() is None:
-        asked.append(node.json("/v1/beams"))
-    uavs = node.json("/v1/uavs")["uavs"]
-    returncode, out, err = node.stop(number)
+    with fly(node.udp_port, tmp_path / "flown.tlog") as flight:
+        node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
+        assert json.loads(node.get("/readyz")[1])["ready"]
+        asked = []
+        while flight.poll() is None:
+            asked.append(node.json("/v1/beams"))
+        uavs = node.json("/v1/uavs")["uavs"]
+        returncode, out, err = node.stop(number)
+        assert flight.communicate(timeout=HANG_S)[0].startswith("sent")
 
-    assert flight.communicate()[0].startswith("sent")
     assert returncode == 0, err
     assert "Traceback" not in err
     assert {uav["id"] for uav in uavs} == {"1:1", "2:1", "3:1", "4:1"}
@@ -113,6 +113,7 @@ def test_follows_flying_vehicles_and_stops_cleanly(
         [BIN / "companion", "replay", recording, "--no-record", "--json"],
         capture_output=True,
         check=True,
+        timeout=HANG_S,
     )
     assert json.loads(replayed.stdout)["digest"] == read_metadata(recording)["summary"]["digest"]
     assert recording.name in out
@@ -128,7 +129,7 @@ def test_weights_point_where_the_beams_say(start_node: Any, tmp_path: Path) -> N
         liked = node.get("/v1/beams/weights", "application/json;q=0.5, application/x-npy;q=0.9")[1]
         as_json = node.json("/v1/beams/weights")
         raw = np.frombuffer(node.get("/v1/beams/weights", "application/octet-stream")[1], "<c8")
-        flight.wait()
+        flight.wait(HANG_S)
     assert status == 200
     assert weights.shape == (64, 4)
     assert weights.dtype == np.complex128
@@ -191,7 +192,7 @@ def test_weights_for_a_device_or_the_reason_why_not(start_node: Any, tmp_path: P
         node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
         status, table = node.get("/v1/beams/weights", MEDIA_TYPES[Device.ADAR1000])
         refused, why = node.get("/v1/beams/weights", MEDIA_TYPES[Device.TMYTEK])
-        flight.wait()
+        flight.wait(HANG_S)
     assert status == 200
     read = parse(Device.ADAR1000, table.decode(), Calibration.ideal(range(64)))
     assert sorted(read.uavs) == ["1:1", "2:1", "3:1", "4:1"]

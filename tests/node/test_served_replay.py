@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support import BIN, HANG_S, Node, read_metadata
+from support import BIN, HANG_S, Node, end, line_of, read_metadata, run_async
 
 from companion.node.replay import replay
 from companion.node.served_replay import Asked, ServedReplay
@@ -33,12 +33,11 @@ class Replaying(Node):
             stderr=subprocess.PIPE,
             text=True,
         )
-        assert self.process.stderr is not None
-        line = self.process.stderr.readline()
+        line = line_of(self.process, self.process.stderr)
         found = re.search(r"serves (http://\S+) and replays (\S+)", line)
         if found is None:
-            self.process.kill()
-            pytest.fail(f"did not start: {line!r} {self.process.communicate()[1]}")
+            end(self.process)
+            pytest.fail(f"did not start: {line!r}")
         self.url, self.log = found[1], found[2]
 
 
@@ -53,9 +52,7 @@ def start_replay() -> Iterator[Any]:
 
     yield start
     for node in started:
-        if node.process.poll() is None:
-            node.process.kill()
-            node.process.communicate()
+        end(node.process)
 
 
 @pytest.fixture
@@ -151,7 +148,7 @@ def test_on_plain_asyncio_as_fast_as_it_goes(cut_log: Path, unserved: dict[str, 
             await asyncio.wait_for(node.run(http, None, show, until), HANG_S)
         return node
 
-    node = asyncio.run(serve())
+    node = run_async(serve())
     assert shown[0]["digest"] == unserved["digest"]
     assert node.replay().speed is None
     assert node.replay().state == "finished"

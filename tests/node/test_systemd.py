@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support import BIN, HANG_S, ROOT
+from support import BIN, HANG_S, ROOT, run_async
 
 from companion.node import systemd
 from companion.node.service import Service
@@ -131,10 +131,10 @@ def test_late_beams_are_no_sign_of_life(tmp_path: Path) -> None:
 
     messages: list[list[str]] = []
     with closing(heard.socket), ThreadPoolExecutor(1) as beside:
-        done = beside.submit(lambda: asyncio.run(told()))
+        done = beside.submit(lambda: run_async(told()))
         while not messages or messages[-1][0] != "STOPPING=1":
-            messages.append(heard.next(5.0) or pytest.fail("silent before it stopped"))
-        done.result()
+            messages.append(heard.next(HANG_S) or pytest.fail("silent before it stopped"))
+        done.result(HANG_S)
     assert "READY=1" in messages[0]
     assert "beam updates are late" in messages[0][-1]
     assert len(messages) > 10  # it looks again often: a hold-up must not cost a restart
@@ -230,12 +230,20 @@ def test_the_documented_unit_is_good(tmp_path: Path) -> None:
     path = tmp_path / "companion.node.service"
     path.write_text(unit.replace(program, "/bin/true"), encoding="utf-8")
     done = subprocess.run(
-        [analyze, "verify", "--man=no", path], capture_output=True, text=True, check=False
+        [analyze, "verify", "--man=no", path],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=HANG_S,
     )
     ours = [line for line in done.stderr.splitlines() if "companion.node.service" in line]
     assert (done.returncode, ours) == (0, [])
     path.write_text(unit.replace("WatchdogSec", "WatchDogSec"), encoding="utf-8")
     done = subprocess.run(
-        [analyze, "verify", "--man=no", path], capture_output=True, text=True, check=False
+        [analyze, "verify", "--man=no", path],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=HANG_S,
     )
     assert "WatchDogSec" in done.stderr  # it does look

@@ -96,11 +96,11 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     folder.mkdir()
     mounting = ["mount", "-t", "tmpfs", "-o", "size=20m", "none", folder]
     try:
-        subprocess.run(mounting, check=True, capture_output=True)
+        subprocess.run(mounting, check=True, capture_output=True, timeout=HANG_S)
     except (OSError, subprocess.CalledProcessError):
         pytest.skip("no file system can be mounted here")
     yield folder
-    subprocess.run(["umount", "--lazy", folder], check=True)
+    subprocess.run(["umount", "--lazy", folder], check=True, timeout=HANG_S)
 
 
 def fill(folder: Path) -> None:

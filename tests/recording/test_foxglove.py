@@ -14,7 +14,7 @@ import pytest
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
-from support import HANG_S
+from support import HANG_S, run_async
 from websockets.asyncio.client import ClientConnection, connect
 
 from companion.beams.array.geometry import uniform_linear
@@ -87,7 +87,7 @@ def test_a_viewer_is_sent_what_a_recording_holds(
     feed()  # before anybody watches: the topics of the UAV are announced by it
     topics = {"/ticks", "/scene", "/tracks", "/beams/weights", "/uav/1:1/fix", "/uav/1:1/predicted"}
     try:
-        found = asyncio.run(watch(live.port, topics, feed))
+        found = run_async(watch(live.port, topics, feed))
     finally:
         live.stop()
     log_ns, tick = found["/ticks"]
@@ -111,9 +111,9 @@ def test_the_service_serves_them(start_node: Any) -> None:
         "run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "1:1",
         "--foxglove", "0",
     )  # fmt: skip
-    line = node.process.stderr.readline()
+    line = node.errors().splitlines()[0]
     assert "ws://127.0.0.1:" in line
-    found = asyncio.run(watch(int(line.rsplit(":", 1)[1]), {"/ticks"}, lambda: None))
+    found = run_async(watch(int(line.rsplit(":", 1)[1]), {"/ticks"}, lambda: None))
     assert found["/ticks"][1].t_ns > START_NS
     assert node.stop()[0] == 0
 
@@ -141,5 +141,7 @@ def test_without_the_extra_it_is_one_line() -> None:
 
 def test_it_is_not_loaded_where_it_is_not_asked_for() -> None:
     code = "import sys, companion.node.service; print('foxglove' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=HANG_S
+    )
     assert done.stdout == "False\n"

@@ -6,7 +6,7 @@ from itertools import permutations
 from pathlib import Path
 
 import pytest
-from support import BIN
+from support import BIN, HANG_S
 
 from companion.node.replay import log_events, replay, settings_for
 from companion.node.replay import missing as missing_of
@@ -87,7 +87,9 @@ def test_a_hole_is_said_where_it_is(tmp_path: Path) -> None:
         f"{path}: 12 events before 2023-11-14T22:13:20+00:00 are missing: no room"
     ]
     command = [BIN / "companion", "replay", path, "--no-record"]
-    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    said = subprocess.run(
+        command, capture_output=True, text=True, check=True, timeout=HANG_S
+    ).stdout
     assert "  missing: " in said and "12 events" in said
 
 

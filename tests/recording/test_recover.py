@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
-from support import read_metadata
+from support import HANG_S, line_of, read_metadata, started
 
 from companion.recording.reader import LogError, read_log, read_settings
 from companion.recording.recover import Recovered, recover, recover_leftovers
@@ -271,15 +271,14 @@ for number in itertools.count():
 
 
 def test_a_killed_process_loses_nothing_that_was_flushed(tmp_path: Path) -> None:
-    with subprocess.Popen(
+    with started(
         [sys.executable, "-c", _RECORD_FOREVER, str(tmp_path)], stdout=subprocess.PIPE, text=True
     ) as process:
-        assert process.stdout is not None
         for _ in range(20):
-            flushed = int(process.stdout.readline())
+            flushed = int(line_of(process, process.stdout))
         process.send_signal(signal.SIGKILL)
         rest = process.stdout.read().split()
-        assert process.wait() == -signal.SIGKILL
+        assert process.wait(HANG_S) == -signal.SIGKILL
     flushed = int(rest[-1]) if rest else flushed
     [leftover] = tmp_path.iterdir()
     assert leftover.name.endswith(".mcap.active")

@@ -151,10 +151,13 @@ def serving() -> Callable[..., contextlib.AbstractAsyncContextManager[str]]:
             )
             task = asyncio.create_task(server._serve(sockets=[listening]))
             while not server.started:
+                assert not task.done()
                 await asyncio.sleep(0.001)
             host, port = listening.getsockname()
-            yield f"{host}:{port}"
-            server.should_exit = True
-            await task
+            try:
+                yield f"{host}:{port}"
+            finally:
+                server.should_exit = True
+                await task
 
     return serve

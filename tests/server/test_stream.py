@@ -4,13 +4,13 @@ import asyncio
 import base64
 import gc
 import json
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 import uvloop
 from starlette.datastructures import QueryParams
-from support import HANG_S
+from support import HANG_S, run_async
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 from websockets.typing import Subprotocol
@@ -20,11 +20,6 @@ from companion.server.stream import Topic, Wanted, wanted
 
 LOOPS: list[Callable[[], asyncio.AbstractEventLoop] | None] = [None, uvloop.new_event_loop]
 SOON_S = HANG_S
-
-
-def run(coroutine: Coroutine[Any, Any, None], loop: Any = None) -> None:
-    with asyncio.Runner(loop_factory=loop) as runner:
-        runner.run(coroutine)
 
 
 async def said(websocket: ClientConnection) -> Any:
@@ -59,7 +54,7 @@ def test_the_state_comes_at_once_and_with_every_update(
             assert second[0]["valid_at"] > first[0]["valid_at"]
             assert len(second[1]["beams"]) == 4
 
-    run(check(), loop)
+    run_async(check(), loop)
 
 
 def test_only_those_uavs_and_topics_that_are_asked_for(make_node: Any, serving: Any) -> None:
@@ -80,7 +75,7 @@ def test_only_those_uavs_and_topics_that_are_asked_for(make_node: Any, serving: 
         assert weights["re"] == beam_set.weights[:, columns].real.tolist()
         assert weights["im"] == beam_set.weights[:, columns].imag.tolist()
 
-    run(check())
+    run_async(check())
 
 
 def test_events_come_when_there_is_a_new_one(make_node: Any, serving: Any) -> None:
@@ -98,7 +93,7 @@ def test_events_come_when_there_is_a_new_one(make_node: Any, serving: Any) -> No
             node.tick()
             assert (await said(websocket))["events"][-1]["text"] == "something new"
 
-    run(check())
+    run_async(check())
 
 
 def test_no_more_messages_than_asked_for(make_node: Any, serving: Any) -> None:
@@ -116,7 +111,7 @@ def test_no_more_messages_than_asked_for(make_node: Any, serving: Any) -> None:
             count = len(websocket_messages.queue)
         assert 2 <= count <= 4
 
-    run(check())
+    run_async(check())
 
 
 def test_a_message_is_made_once_for_all_who_ask_for_the_same(make_node: Any, serving: Any) -> None:
@@ -141,7 +136,7 @@ def test_a_message_is_made_once_for_all_who_ask_for_the_same(make_node: Any, ser
             for one in many:
                 await one.close()
 
-    run(check())
+    run_async(check())
 
 
 @pytest.mark.parametrize(
@@ -165,7 +160,7 @@ def test_bad_arguments_close_it(shared_node: Any, serving: Any, query: str, said
         assert code == stream.BAD_ARGUMENTS
         assert said_of in reason
 
-    run(check())
+    run_async(check())
 
 
 def test_arguments_are_read() -> None:
@@ -183,7 +178,7 @@ def test_who_sends_something_is_told_that_it_takes_nothing(shared_node: Any, ser
                     await said(websocket)
         assert raised.value.rcvd.code == 1003
 
-    run(check())
+    run_async(check())
 
 
 def test_a_page_from_elsewhere_may_not_ask(shared_node: Any, serving: Any) -> None:
@@ -195,7 +190,7 @@ def test_a_page_from_elsewhere_may_not_ask(shared_node: Any, serving: Any) -> No
             async with connect(address, origin=f"http://{at}") as websocket:
                 assert (await said(websocket))["topic"] == "uavs"
 
-    run(check())
+    run_async(check())
 
 
 TOKEN = "s3cret/ü"
@@ -223,7 +218,7 @@ def test_a_token_is_asked_for(shared_node: Any, serving: Any) -> None:
                 assert websocket.subprotocol == "companion.v1"
                 assert (await said(websocket))["topic"] == "uavs"
 
-    run(check())
+    run_async(check())
 
 
 def test_a_token_in_the_header_opens_it_too(shared_node: Any, serving: Any) -> None:
@@ -233,7 +228,7 @@ def test_a_token_in_the_header_opens_it_too(shared_node: Any, serving: Any) -> N
             async with connect(f"ws://{at}/v1/stream", additional_headers=headers) as websocket:
                 assert (await said(websocket))["topic"] == "uavs"
 
-    run(check())
+    run_async(check())
 
 
 def test_who_goes_leaves_nothing_behind(make_node: Any, serving: Any) -> None:
@@ -258,7 +253,7 @@ def test_who_goes_leaves_nothing_behind(make_node: Any, serving: Any) -> None:
                     await asyncio.sleep(0.01)
         gc.collect()
 
-    run(check())
+    run_async(check())
 
 
 def test_a_client_that_does_not_read_misses_messages_and_holds_nobody_up(
@@ -291,4 +286,4 @@ def test_a_client_that_does_not_read_misses_messages_and_holds_nobody_up(
         assert valid_at == sorted(valid_at)
         assert len(valid_at) < 250  # of 302: the system's buffers hold a few
 
-    run(check())
+    run_async(check())

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support import BIN, HANG_S, Node
+from support import BIN, HANG_S, Node, run_async, started
 from websockets.asyncio.client import connect
 
 SETTINGS = "[beams]\nupdate_hz = 20\n"
@@ -83,14 +83,14 @@ def measure(
     """A flight watched by nobody, then by the crowd."""
     to = f"udpout:127.0.0.1:{node.udp_port}"
     command = [BIN / "sitl-replay", "fly", "paper", "--to", to, "--duration", str(3 * seconds + 9)]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, cwd=directory) as flight:
+    with started(command, stdout=subprocess.DEVNULL, cwd=directory) as flight:
         try:
             node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
             start = lag(node)
             time.sleep(seconds)  # what is measured is a time
             alone, memory_bytes = lag(node), metric(node, MEMORY)
             cpu_s, sent = metric(node, CPU), metric(node, SENT)
-            heard, ages_s = asyncio.run(crowd(node, readers, deaf, seconds))
+            heard, ages_s = run_async(crowd(node, readers, deaf, seconds))
             watched = lag(node)
             grown_bytes = metric(node, MEMORY) - memory_bytes
             cpu_s, sent = metric(node, CPU) - cpu_s, metric(node, SENT) - sent

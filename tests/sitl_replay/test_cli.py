@@ -16,7 +16,7 @@ import click
 import pytest
 from click.testing import CliRunner
 from pymavlink.dialects.v20 import ardupilotmega as dialect
-from support import HANG_S
+from support import HANG_S, line_of, started
 
 from companion.recording.reader import LogError
 from companion.recording.writer import Writer
@@ -156,7 +156,7 @@ def test_a_signal_ends_a_flight_well(
 ) -> None:
     tlog = tmp_path / "a.tlog"
     arguments = ["fly", "paper", "--to", url_of(receiver), "--record", str(tlog)]
-    with subprocess.Popen(
+    with started(
         [*COMMAND, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as flight:
         receiver.recv(300)
@@ -177,13 +177,14 @@ def test_record_until_a_signal(tmp_path: Path) -> None:
     raw = next(schedule(scenario.hover())).raw
     arguments = ["record", "--from", f"udpin:127.0.0.1:{port}", "--out", str(tlog), "--json"]
     with (
-        subprocess.Popen([*COMMAND, *arguments], stdout=subprocess.PIPE, text=True) as recording,
+        started([*COMMAND, *arguments], stdout=subprocess.PIPE, text=True) as recording,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
     ):
         sender.connect(("127.0.0.1", port))
         sender.settimeout(0.02)
         accepted = 0
         while accepted < 5:  # a port that nobody listens on yet refuses what was sent before
+            assert recording.poll() is None
             try:
                 sender.send(raw)
                 sender.recv(1)
@@ -282,12 +283,13 @@ def test_a_link_lost_on_the_way_is_a_failure(receiver: socket.socket) -> None:
         server.accept()[0].close()
 
     with socket.create_server(("127.0.0.1", 0)) as server:
-        leaving = threading.Thread(target=leave)
+        server.settimeout(HANG_S)
+        leaving = threading.Thread(target=leave, daemon=True)
         leaving.start()
         lost = url_of(server, "tcp")
         arguments = ["--to", lost, "--to", url_of(receiver), "--duration", "0.5", "--json"]
         result = CliRunner().invoke(main, ["fly", "paper", *arguments])
-        leaving.join()
+        leaving.join(HANG_S)
     assert result.exit_code == 1
     summary = json.loads(result.stdout)
     assert [text.startswith(lost) for text in summary["lost"]] == [True]
@@ -360,17 +362,18 @@ def test_faults_are_summed_up(receiver: socket.socket, tmp_path: Path) -> None:
 
 def test_a_flight_for_those_who_connect(tmp_path: Path) -> None:
     arguments = ["fly", "paper", "--to", "tcpin:127.0.0.1:0", "--fault", "reboot=0.1", "--json"]
-    with subprocess.Popen(
+    with started(
         [*COMMAND, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as flight:
-        assert flight.stderr is not None
-        line = flight.stderr.readline()
+        line = line_of(flight, flight.stderr)
         found = re.fullmatch(r"tcpin:127\.0\.0\.1:(\d+): waiting for a first peer\n", line)
         assert found, line
         with socket.create_connection(("127.0.0.1", int(found[1])), timeout=HANG_S) as peer:
             received = 0
             while received < 4000:
-                received += len(peer.recv(4096))
+                data = peer.recv(4096)
+                assert data, "it hung up"
+                received += len(data)
             flight.send_signal(signal.SIGTERM)
             while data := peer.recv(4096):
                 received += len(data)

@@ -10,6 +10,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from support import HANG_S
 
 HERE = Path(__file__).parent
 OLDEST = (20, 6)
@@ -21,7 +22,9 @@ def node() -> str:
     found = shutil.which("node")
     if found is None:
         pytest.skip("no node: install Node.js to test the page's modules")
-    said = subprocess.run([found, "--version"], capture_output=True, text=True, check=True).stdout
+    said = subprocess.run(
+        [found, "--version"], capture_output=True, text=True, check=True, timeout=HANG_S
+    ).stdout
     version = tuple(int(part) for part in re.findall(r"\d+", said)[:2])
     if version < OLDEST:
         pytest.skip(f"node {said.strip()} is too old for the page's modules: 20.6 or later")

@@ -33,7 +33,9 @@ def loopback(up):
 def alone(loop: str, test: str) -> None:
     """Run ``async def test()`` in a network namespace of its own, on that loop."""
     try:
-        subprocess.run(("unshare", "--net", "true"), check=True, capture_output=True)
+        subprocess.run(
+            ("unshare", "--net", "true"), check=True, capture_output=True, timeout=HANG_S
+        )
     except (OSError, subprocess.CalledProcessError):
         pytest.skip("the system gives no network namespace")
     script = f"{HEAD}{test}\nrunner({loop!r})(test())\n"

@@ -16,6 +16,7 @@ import pytest
 import serial
 from link_support import LOOPS, Run, frame, runner, running, until_true
 from pymavlink.dialects.v20 import all as dialect
+from support import HANG_S
 
 from companion.mavlink.links import serial_port, transport
 from companion.mavlink.links.transport import Link
@@ -268,5 +269,7 @@ def test_its_buffer_is_short_for_what_waits_in_it_grows_old() -> None:
 
 def test_pyserial_is_loaded_only_for_a_serial_link() -> None:
     run = "import sys, companion.mavlink.links.transport; sys.exit('serial' in sys.modules)"
-    done = subprocess.run((sys.executable, "-c", run), capture_output=True, check=False)
+    done = subprocess.run(
+        (sys.executable, "-c", run), capture_output=True, check=False, timeout=HANG_S
+    )
     assert done.returncode == 0, done.stderr.decode() or "pyserial was loaded"

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from support import HANG_S
+from support import HANG_S, line_of, started
 
 from companion.mavlink.links.signing_store import Timestamps, key_warning, load_key
 from companion.mavlink.links.urls import LinkError
@@ -124,7 +124,11 @@ def test_the_command_that_is_told_makes_the_key_that_mavproxy_has(tmp_path: Path
         "print(module.passphrase_to_key(None, 'correct horse').hex())"
     )
     done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", ask], capture_output=True, text=True, check=True
+        [sys.executable, "-W", "ignore", "-c", ask],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=HANG_S,
     )
     assert load_key(file).hex() == done.stdout.strip().splitlines()[-1] == KEY.hex()
 
@@ -255,14 +259,9 @@ while True:
 
 def live(path: Path, now_ns: int, lines: int) -> Iterator[tuple[str, int, bytes]]:
     """What a process heard and sent until it was killed in the midst of it; its time runs fast."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", CHILD, path, str(now_ns), KEY.hex()],
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    with process:
-        assert process.stdout is not None
-        out = [process.stdout.readline() for _ in range(lines)]
+    command = [sys.executable, "-c", CHILD, path, str(now_ns), KEY.hex()]
+    with started(command, stdout=subprocess.PIPE, text=True) as process:
+        out = [line_of(process, process.stdout) for _ in range(lines)]
         with pytest.raises(LinkError, match="another process"):
             Timestamps(path)
         process.send_signal(signal.SIGKILL)

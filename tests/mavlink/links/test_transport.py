@@ -39,7 +39,12 @@ def damaged_length(raw: bytes) -> bytes:
 @contextlib.contextmanager
 def senders(number: int, family: int = socket.AF_INET) -> Iterator[list[socket.socket]]:
     with contextlib.ExitStack() as stack:
-        yield [stack.enter_context(socket.socket(family, socket.SOCK_DGRAM)) for _ in range(number)]
+        made = [
+            stack.enter_context(socket.socket(family, socket.SOCK_DGRAM)) for _ in range(number)
+        ]
+        for one in made:
+            one.settimeout(LIMIT_S)
+        yield made
 
 
 def has_ipv6() -> bool:
@@ -534,7 +539,6 @@ def test_that_nobody_listens_there_is_no_lost_link(
                 link.send(heartbeat(OURS))
                 after.bind(address)
                 assert link.send(heartbeat(OURS)) == 1
-                after.settimeout(LIMIT_S)
                 raw, sender = after.recvfrom(1000)
                 (heard,) = Splitter("peer").feed(0, raw)
                 assert isinstance(heard, Frame) and heard.seq == (link.status.sent - 1) % 256
@@ -928,6 +932,8 @@ def test_a_fault_of_the_program_does_not_vanish(run: Run, scheme: str) -> None:
             server.bind(("127.0.0.1", 0))
             server.listen()
             datagrams.bind(("127.0.0.1", 0))
+            server.settimeout(LIMIT_S)
+            datagrams.settimeout(LIMIT_S)
             there = datagrams if scheme == "udpout" else server
             port = 0 if scheme.endswith("in") else there.getsockname()[1]
             link = Link(parse_link(f"{scheme}:127.0.0.1:{port}"), receive, lambda: 0)

@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import pytest
 import uvloop
-from support import HANG_S
+from support import HANG_S, run_async
 
 from companion.mavlink.links.serial_port import WRITE_BUFFER_BYTES as SERIAL_BUFFER_BYTES
 from companion.mavlink.links.tcp import WRITE_BUFFER_BYTES
@@ -25,8 +25,7 @@ def run(request: pytest.FixtureRequest) -> Callable[[Coroutine[Any, Any, Any]], 
     """Runs a scene to its end on one kind of loop, within some seconds."""
 
     def until_done(scene: Coroutine[Any, Any, Any]) -> Any:
-        with asyncio.Runner(loop_factory=request.param) as runner:
-            return runner.run(asyncio.wait_for(scene, HANG_S))
+        return run_async(scene, request.param)
 
     return until_done
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
-from support import HANG_S
+from support import HANG_S, run_async
 
 from companion.mavlink.links.urls import LinkError
 from companion.values import Frame, Source
@@ -67,7 +67,7 @@ def without_clock(raw: bytes) -> bytes | None:
 
 
 def test_a_udp_socket_receives_what_is_flown(receiver: socket.socket) -> None:
-    tally = asyncio.run(player.fly(scenario.paper(), [url_of(receiver)], 0.6, seed=5))
+    tally = run_async(player.fly(scenario.paper(), [url_of(receiver)], 0.6, seed=5))
     got = waiting(receiver)
     meant = [sent.raw for sent in schedule(scenario.paper(), seed=5, duration_s=0.6)]
     assert list(map(without_clock, got)) == list(map(without_clock, meant))
@@ -76,7 +76,7 @@ def test_a_udp_socket_receives_what_is_flown(receiver: socket.socket) -> None:
 
 
 def test_it_flies_in_real_time(receiver: socket.socket) -> None:
-    tally = asyncio.run(player.fly(scenario.hover(), [url_of(receiver)], 0.5))
+    tally = run_async(player.fly(scenario.hover(), [url_of(receiver)], 0.5))
     last_s = [sent.t_s for sent in schedule(scenario.hover(), duration_s=0.5)][-1]
     assert tally.duration_s >= last_s
     assert tally.duration_s < last_s + 0.3
@@ -89,7 +89,7 @@ def test_every_link_gets_every_frame(receiver: socket.socket) -> None:
         except OSError:
             pytest.skip("no IPv6 loopback here")
         urls = [url_of(receiver), f"udpout:[::1]:{second.getsockname()[1]}"]
-        tally = asyncio.run(player.fly(scenario.hover(), urls, 0.2))
+        tally = run_async(player.fly(scenario.hover(), urls, 0.2))
         assert len(waiting(receiver)) == len(waiting(second)) == tally.frames > 0
 
 
@@ -97,7 +97,7 @@ def test_a_refused_udp_peer_is_no_error(receiver: socket.socket) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
         gone.bind(("127.0.0.1", 0))
         nobody = url_of(gone)
-    tally = asyncio.run(player.fly(scenario.hover(), [nobody, url_of(receiver)], 0.3))
+    tally = run_async(player.fly(scenario.hover(), [nobody, url_of(receiver)], 0.3))
     assert len(waiting(receiver)) == tally.frames > 5
     assert tally.lost == []
 
@@ -128,7 +128,7 @@ def test_udp_goes_on_when_the_peer_comes_back() -> None:
             transport.close()
             flight.cancel()
 
-    assert asyncio.run(scene())[0] == 0xFD
+    assert run_async(scene())[0] == 0xFD
 
 
 def test_a_tcp_peer_gets_the_stream() -> None:
@@ -149,7 +149,7 @@ def test_a_tcp_peer_gets_the_stream() -> None:
         server.close()
         return bytes(received), tally
 
-    stream, tally = asyncio.run(scene())
+    stream, tally = run_async(scene())
     assert len(dialect.MAVLink(None).parse_buffer(stream) or []) == tally.frames > 5
     assert len(stream) == tally.octets
 
@@ -170,7 +170,7 @@ def test_a_vanished_tcp_peer_ends_the_flight() -> None:
             with pytest.raises(LinkError, match=url):
                 await asyncio.wait_for(player.fly(scenario.hover(), [url]), HANG_S)
 
-    asyncio.run(scene())
+    run_async(scene())
 
 
 def test_the_other_links_outlive_a_vanished_peer(
@@ -181,7 +181,7 @@ def test_the_other_links_outlive_a_vanished_peer(
         async with server:
             return url, await player.fly(scenario.hover(), [url, url_of(receiver)], 0.8)
 
-    url, tally = asyncio.run(scene())
+    url, tally = run_async(scene())
     assert len(waiting(receiver)) == tally.frames
     assert [text.startswith(url) for text in tally.lost] == [True]
     assert [record.levelname for record in caplog.records] == ["WARNING"]
@@ -192,7 +192,7 @@ def test_a_refused_tcp_peer_is_told_by_its_url() -> None:
         gone.bind(("127.0.0.1", 0))
         port = gone.getsockname()[1]
     with pytest.raises(LinkError, match=f"tcp:127.0.0.1:{port}: Connection refused"):
-        asyncio.run(player.fly(scenario.hover(), [f"tcp:127.0.0.1:{port}"]))
+        run_async(player.fly(scenario.hover(), [f"tcp:127.0.0.1:{port}"]))
 
 
 @pytest.mark.full
@@ -202,7 +202,7 @@ def test_a_peer_that_does_not_read_holds_nobody_up(receiver: socket.socket) -> N
         deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         url = f"tcp:127.0.0.1:{deaf.getsockname()[1]}"
         frames = log_of([0.0] * 20) * 10_000
-        tally = asyncio.run(player.play(frames, [url]))
+        tally = run_async(player.play(frames, [url]))
     assert tally.frames == len(frames)
     assert 0 < tally.dropped < tally.frames
 
@@ -225,14 +225,14 @@ def test_a_cancelled_flight_closes_its_links_and_its_log(
         return asyncio.all_tasks() - {asyncio.current_task()}
 
     receiver.setblocking(False)
-    assert asyncio.run(scene()) == set()
+    assert run_async(scene()) == set()
     assert tally.frames >= 1
     assert tlog.stat().st_size == tally.octets + 8 * tally.frames
 
 
 def test_a_log_is_played_as_it_is(receiver: socket.socket) -> None:
     frames = log_of([0.0, 0.1, 0.15, 0.3])
-    tally = asyncio.run(player.play(frames, [url_of(receiver)]))
+    tally = run_async(player.play(frames, [url_of(receiver)]))
     assert waiting(receiver) == [frame.raw for frame in frames]
     assert 0.3 <= tally.duration_s < 0.6
     assert tally.clamped == 0
@@ -241,7 +241,7 @@ def test_a_log_is_played_as_it_is(receiver: socket.socket) -> None:
 @pytest.mark.parametrize(("speed", "seconds"), [(2.0, 0.15), (None, 0.0)])
 def test_speed(receiver: socket.socket, speed: float | None, seconds: float) -> None:
     frames = log_of([0.0, 0.1, 0.2, 0.3])
-    tally = asyncio.run(player.play(frames, [url_of(receiver)], speed))
+    tally = run_async(player.play(frames, [url_of(receiver)], speed))
     assert len(waiting(receiver)) == 4
     assert seconds <= tally.duration_s < seconds + 0.14
 
@@ -273,7 +273,7 @@ def test_at_full_speed_a_slow_tcp_peer_loses_nothing() -> None:
         assert 0 < stalled_at < len(frames)
         return count, tally
 
-    count, tally = asyncio.run(scene())
+    count, tally = run_async(scene())
     assert tally.dropped == 0
     assert count == tally.octets == sum(len(frame.raw) for frame in frames)
 
@@ -320,7 +320,7 @@ def test_a_tcp_server_waits_for_its_first_peer_and_outlives_it(
         writer.close()
         return first, rest, tally
 
-    first, rest, tally = asyncio.run(scene())
+    first, rest, tally = run_async(scene())
     frames = log_of([0.0, 0.5, 1.0])
     assert first + rest == b"".join(frame.raw for frame in frames)
     assert (tally.frames, tally.lost) == (3, [])
@@ -339,7 +339,7 @@ def test_with_nobody_connected_frames_are_dropped(caplog: pytest.LogCaptureFixtu
         writer.close()
         return await flight
 
-    tally = asyncio.run(scene())
+    tally = run_async(scene())
     assert (tally.frames, tally.dropped, tally.lost) == (4, 3, [])
 
 
@@ -351,7 +351,7 @@ def test_a_udp_server_sends_to_who_has_sent_it_something(
         receiver.sendto(b"", ("127.0.0.1", await port_told(caplog)))
         await flight
 
-    asyncio.run(scene())
+    run_async(scene())
     assert waiting(receiver) == [frame.raw for frame in log_of([0.0, 0.1, 0.2])]
 
 
@@ -360,7 +360,7 @@ def test_a_serial_port_gets_the_stream() -> None:
     url = f"serial:{os.ttyname(near)}:57600"
     os.close(near)
     try:
-        tally = asyncio.run(player.play(log_of([0.0, 0.05, 0.1]), [url]))
+        tally = run_async(player.play(log_of([0.0, 0.05, 0.1]), [url]))
         assert os.read(far, 4096) == b"".join(frame.raw for frame in log_of([0.0, 0.05, 0.1]))
     finally:
         os.close(far)
@@ -377,7 +377,7 @@ def test_faults_strike_each_link_by_itself(receiver: socket.socket) -> None:
         second.bind(("127.0.0.1", 0))
         urls = [url_of(receiver), url_of(second)]
         asked = faults("loss=0.4", "drift=24000", "delay=0.2")
-        tallies = [asyncio.run(player.play(frames, urls, faults=asked, seed=3)) for _ in range(2)]
+        tallies = [run_async(player.play(frames, urls, faults=asked, seed=3)) for _ in range(2)]
         got = [waiting(one) for one in (receiver, second)]
     halves = [(one[: len(one) // 2], one[len(one) // 2 :]) for one in got]
     assert all(first == again for first, again in halves)  # the same seed
@@ -408,7 +408,7 @@ def test_late_frames_come_late_in_real_time(receiver: socket.socket) -> None:
         return arrivals_s
 
     receiver.setblocking(False)
-    arrivals_s = asyncio.run(scene())
+    arrivals_s = run_async(scene())
     assert arrivals_s == pytest.approx([0.3, 0.4, 0.8], abs=0.09)
     assert min(arrivals_s) >= 0.3
 
@@ -416,9 +416,9 @@ def test_late_frames_come_late_in_real_time(receiver: socket.socket) -> None:
 def test_faults_pass_as_fast_as_the_log(receiver: socket.socket) -> None:
     frames = log_of([0.0, 1.0, 2.0])
     asked = faults("delay=2")
-    tally = asyncio.run(player.play(frames, [url_of(receiver)], 10.0, faults=asked))
+    tally = run_async(player.play(frames, [url_of(receiver)], 10.0, faults=asked))
     assert 0.4 <= tally.duration_s < 0.6
-    tally = asyncio.run(player.play(frames, [url_of(receiver)], None, faults=asked))
+    tally = run_async(player.play(frames, [url_of(receiver)], None, faults=asked))
     assert tally.duration_s < 0.2
     assert len(waiting(receiver)) == 6
 
@@ -426,7 +426,7 @@ def test_faults_pass_as_fast_as_the_log(receiver: socket.socket) -> None:
 def test_a_flight_records_what_its_senders_send(receiver: socket.socket, tmp_path: Path) -> None:
     tlog = tmp_path / "a.tlog"
     asked = faults("loss=1", "reboot=0.2")
-    tally = asyncio.run(
+    tally = run_async(
         player.fly(scenario.hover(), [url_of(receiver)], 0.5, record=tlog, faults=asked)
     )
     assert waiting(receiver) == []
@@ -445,6 +445,6 @@ def test_a_flight_records_what_its_senders_send(receiver: socket.socket, tmp_pat
 
 def test_faults_that_do_not_go_together_open_nothing(tmp_path: Path) -> None:
     with pytest.raises(FaultError, match="loss is given 2 times"):
-        asyncio.run(
+        run_async(
             player.fly(scenario.hover(), ["tcp:127.0.0.1:1"], faults=faults("loss=1", "loss=0.5"))
         )

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
-from support import HANG_S
+from support import HANG_S, run_async
 
 from companion.mavlink.links.urls import LinkError, LinkUrl, parse_link
 from companion.values import Frame, Reason, Source
@@ -69,8 +69,9 @@ def test_a_flight_is_recorded_as_it_was_sent(tmp_path: Path) -> None:
     tlog = tmp_path / "flight.tlog"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sink:
         sink.bind(("127.0.0.1", 0))
+        sink.settimeout(HANG_S)
         url = f"udpout:127.0.0.1:{sink.getsockname()[1]}"
-        tally = asyncio.run(player.fly(scenario.paper(), [url], 0.4, seed=2, record=tlog))
+        tally = run_async(player.fly(scenario.paper(), [url], 0.4, seed=2, record=tlog))
         sent = [sink.recv(300) for _ in range(tally.frames)]
     stamps_s, read = zip(*read_by_mavutil(tlog), strict=True)
     assert list(read) == sent
@@ -122,7 +123,7 @@ def test_udp_is_recorded_peer_by_peer(tmp_path: Path, frames: list[bytes]) -> No
         with pytest.raises(asyncio.CancelledError):
             await task
 
-    asyncio.run(scene())
+    run_async(scene())
     read = [raw for _, raw in read_by_mavutil(tlog)]
     assert len(read) == heard.frames == heard.messages.total()
     assert [raw for raw in read if raw != KNOCK] == [*frames[1:ENOUGH], frames[0]]
@@ -151,7 +152,7 @@ def test_tcp_is_recorded_to_its_end(tmp_path: Path, frames: list[bytes]) -> None
         async with server:
             return await recorder.record(url, tlog)
 
-    heard = asyncio.run(scene())
+    heard = run_async(scene())
     assert [raw for _, raw in read_by_mavutil(tlog)] == frames[:3] + frames[4:]
     assert heard.rejected == {Reason.BAD_CRC.value: 1}
 
@@ -166,7 +167,7 @@ def test_frames_behind_a_torn_one_are_kept_at_the_end(tmp_path: Path, frames: li
         async with server:
             await recorder.record(url, tlog)
 
-    asyncio.run(scene())
+    run_async(scene())
     assert [raw for _, raw in read_by_mavutil(tlog)] == frames[:2]
 
 
@@ -179,12 +180,12 @@ def test_a_peer_that_leaves_before_the_duration_is_an_error(
             await recorder.record(url, tmp_path / "heard.tlog", 60.0)
 
     with pytest.raises(LinkError, match=r"closed after .* 1 frames"):
-        asyncio.run(scene())
+        run_async(scene())
 
 
 def test_the_duration_ends_a_recording(tmp_path: Path) -> None:
     url = LinkUrl("udpin", "127.0.0.1", free_port())
-    heard = asyncio.run(recorder.record(url, tmp_path / "silence.tlog", 0.05))
+    heard = run_async(recorder.record(url, tmp_path / "silence.tlog", 0.05))
     assert heard.frames == 0
     assert 0.05 <= heard.duration_s < 1.0
 
@@ -194,7 +195,7 @@ def test_a_taken_port_is_told(tmp_path: Path) -> None:
         owner.bind(("127.0.0.1", 0))
         url = LinkUrl("udpin", "127.0.0.1", owner.getsockname()[1])
         with pytest.raises(LinkError, match="Address already in use"):
-            asyncio.run(recorder.record(url, tmp_path / "a.tlog"))
+            run_async(recorder.record(url, tmp_path / "a.tlog"))
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
@@ -213,7 +214,7 @@ def test_a_full_disk_is_an_error(frames: list[bytes]) -> None:
         await task
 
     with pytest.raises(OSError, match="No space left"):
-        asyncio.run(scene())
+        run_async(scene())
 
 
 # --- every kind of link, and what others read ---------------------------------------------------
@@ -263,7 +264,7 @@ def test_what_is_played_over_any_link_is_recorded(
 
     if ":" in host and not has_ipv6():
         pytest.skip("no IPv6 loopback here")
-    asyncio.run(scene())
+    run_async(scene())
     read = read_by_mavutil(tlog)
     assert [raw for _, raw in read] == frames[:ENOUGH]
     assert [stamp for stamp, _ in read] == sorted(stamp for stamp, _ in read)
@@ -302,7 +303,7 @@ def test_serial_is_recorded_until_it_is_unplugged(tmp_path: Path, frames: list[b
         with pytest.raises(LinkError, match=f"^{url}: "):
             await asyncio.wait_for(task, HANG_S)
 
-    asyncio.run(scene())
+    run_async(scene())
     assert [raw for _, raw in read_by_mavutil(tlog) if raw != KNOCK] == frames[:3]
 
 
@@ -329,7 +330,7 @@ def test_a_recorder_is_silent_but_for_its_opener(tmp_path: Path, frames: list[by
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
         vehicle.bind(("127.0.0.1", 0))
         vehicle.setblocking(False)
-        assert asyncio.run(scene(vehicle)) == [b"", b""]
+        assert run_async(scene(vehicle)) == [b"", b""]
 
 
 def test_what_was_heard_is_on_disk_when_it_falls_silent(
@@ -351,7 +352,7 @@ def test_what_was_heard_is_on_disk_when_it_falls_silent(
                     await asyncio.sleep(0.02)
         await waited_for(heard, 3, task)
 
-    asyncio.run(scene())
+    run_async(scene())
 
 
 def test_a_visitor_who_leaves_does_not_end_the_recording_of_a_server(
@@ -377,7 +378,7 @@ def test_a_visitor_who_leaves_does_not_end_the_recording_of_a_server(
                     await asyncio.sleep(0.005)
         await waited_for(heard, 2, task)
 
-    asyncio.run(scene())
+    run_async(scene())
     assert [raw for _, raw in read_by_mavutil(tlog)] == frames[:2]
 
 
@@ -386,7 +387,7 @@ def test_mavlogdump_reads_what_was_recorded(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sink:
         sink.bind(("127.0.0.1", 0))
         port = sink.getsockname()[1]
-        asyncio.run(
+        run_async(
             player.fly(scenario.paper(), [f"udpout:127.0.0.1:{port}"], 0.6, seed=2, record=tlog)
         )
     meant = Counter(
@@ -397,7 +398,11 @@ def test_mavlogdump_reads_what_was_recorded(tmp_path: Path) -> None:
     if not mavlogdump.exists():
         pytest.skip("mavlogdump.py is not installed")
     done = subprocess.run(
-        [sys.executable, mavlogdump, tlog], capture_output=True, text=True, check=True
+        [sys.executable, mavlogdump, tlog],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=HANG_S,
     )
     lines = [re.match(r"\d{4}-\d\d-\d\d \S+: (\w+) {", line) for line in done.stdout.splitlines()]
     found = Counter(line[1] for line in lines if line)

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from support import HANG_S
 
 from companion.cli.main import main
 from companion.studies.running import fan_out
@@ -156,7 +157,9 @@ def test_what_is_not_installed_is_said(
     words = ["study", *arguments, str(tmp_path / "out")]
     run = f"import sys; sys.modules[{package!r}] = None; from companion.cli.main import main; "
     run += f"main({words})"
-    done = subprocess.run([sys.executable, "-c", run], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", run], capture_output=True, text=True, check=False, timeout=HANG_S
+    )
     assert done.returncode == 1
     line = done.stderr.splitlines()[-1]
     assert "Traceback" not in done.stderr
@@ -169,4 +172,4 @@ def test_neither_is_loaded_unasked() -> None:
         "import companion.studies.running.fan_out;"
         "sys.exit(bool({'torch', 'distributed', 'dask'} & set(sys.modules)))"
     )
-    assert subprocess.run([sys.executable, "-c", run], check=False).returncode == 0
+    assert subprocess.run([sys.executable, "-c", run], check=False, timeout=HANG_S).returncode == 0

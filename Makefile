@@ -48,7 +48,7 @@ bench: .venv/.dev
 	$(PYTEST) -q -s -m benchmark
 
 soak: .venv/.dev
-	$(PYTEST) -q -s -m soak --timeout=0 -o faulthandler_timeout=0
+	$(PYTEST) -q -s -m soak --timeout=0
 
 format: .venv/.dev
 	$(BIN)/ruff format .

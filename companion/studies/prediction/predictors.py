@@ -9,9 +9,9 @@ uses the settings and never a log.
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from companion import values
+from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
 from companion.settings.center import FixedCenter
 from companion.settings.model import Settings
@@ -24,19 +24,12 @@ from companion.studies.prediction.baselines import (
 )
 from companion.studies.prediction.kalman import Kalman, Tuning
 from companion.studies.running.extras import needs
-from companion.values import Event
+from companion.values import Event, Refuted
 
 Make = Callable[[], Predictor]
 KALMAN_STATES: Final = {"kalman-cv": 2, "kalman-ca": 3}
 MANOEUVRE_S: Final = 1.0
 """Time for which an acceleration lasts, as ``kalman-peng`` assumes."""
-
-
-REFUTED: Final[type | None] = getattr(values, "Refuted", None)
-"""The pipeline's output that says that an assumption about a UAV was refuted.
-
-None for a product that has no such output: then nothing is announced. The one place that knows it.
-"""
 
 
 class Product:
@@ -57,12 +50,8 @@ class Product:
     def hear(self, event: Event) -> None:
         """Take in an event, in order of arrival."""
         for output in self._pipeline.step(event):
-            if REFUTED is not None and isinstance(output, REFUTED):
-                self._refuted(output)
-
-    def _refuted(self, said: Any) -> None:
-        if said.uav == self.uav:
-            self.refuted_ns.append(said.t_ns)
+            if isinstance(output, Refuted) and output.uav == self.uav:
+                self.refuted_ns.append(output.t_ns)
 
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
         """The track at that time, with its bound."""

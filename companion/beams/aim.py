@@ -106,7 +106,7 @@ def _beams(
     """The beams, their weights, and the UAVs that the policy left out with the reason."""
     tracks, ranges_m, directions = aimed
     bounds = [
-        _pointing_bound_rad(track, carrier, range_m)
+        _pointing_bound_rad(track, carrier, array, range_m)
         for track, range_m in zip(tracks, ranges_m.tolist(), strict=True)
     ]
     spread = None
@@ -161,12 +161,17 @@ def _out_of_reach(directions: FloatArray, array: Array, coverage: Coverage) -> l
     return reasons
 
 
-def _pointing_bound_rad(track: Track, carrier: Carrier, range_m: float) -> float | None:
+def _pointing_bound_rad(
+    track: Track, carrier: Carrier, array: Array, range_m: float
+) -> float | None:
     """Bound on the angle between predicted and true direction; None: any direction is possible.
 
-    Both positions' errors as seen from the array, plus the attitude's (docs/math.md 5.3).
+    Both positions' errors as seen from the array, the way that its attitude's error moves an array
+    that stands off the carrier's reported point, and that error itself (docs/math.md 5.3).
     """
-    seen = steering.pointing_bound_rad(track.bound_m + carrier.bound_m, range_m)
+    swing = 2.0 * math.sin(min(carrier.attitude_bound_rad, math.pi) / 2.0)
+    swung_m = swing * float(np.linalg.norm(array.lever_arm_m))
+    seen = steering.pointing_bound_rad(track.bound_m + carrier.bound_m + swung_m, range_m)
     return None if seen is None else min(seen + carrier.attitude_bound_rad, math.pi)
 
 

@@ -3,6 +3,8 @@
 The local frame begins at a fixed station, or where the first report was made.
 """
 
+import math
+
 import numpy as np
 
 from companion.beams.aim import AIMABLE
@@ -27,7 +29,10 @@ class Center:
         self.local: LocalFrame | None = None
         self.vehicle = str(self.place) if isinstance(self.place, VehicleCenter) else None
         self._attitude: tuple[int, Attitude] | None = None  # sender's time, attitude
-        self._attitude_bound_rad = np.radians(settings.center.attitude_bound_deg)
+        self._attitude_bounds = carrier.AttitudeBounds(
+            math.radians(settings.center.attitude_bound_deg),
+            math.radians(settings.center.turn_acceleration_max_degps2),
+        )
         self._attitude_kept_s = settings.tracks.coasting_s
         if isinstance(self.place, FixedCenter):
             self._begin(self.place)
@@ -121,6 +126,7 @@ class Center:
         if now.sender_ns - made_ns > self._attitude_kept_s * 1e9:
             return f"the attitude of the carrier {self.vehicle} is too old"
         since_ns = at.sender_ns - made_ns
+        doubt_s = at.bound_s
         return carrier.moving(
-            self.local, track, newest, attitude, since_ns, self._attitude_bound_rad
+            self.local, track, newest, attitude, since_ns, doubt_s, self._attitude_bounds
         )

@@ -4,6 +4,7 @@ Rotations are named by frames: ``body_from_ned @ v_ned`` is v in body axes (FRD)
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -62,21 +63,44 @@ def fixed(
     )
 
 
+@dataclass(frozen=True, slots=True)
+class AttitudeBounds:
+    """Bounds on how far an attitude that is carried on at its rates is off.
+
+    attitude_rad         bound on the reported attitude, as an angle
+    acceleration_radps2  greatest angular acceleration
+    """
+
+    attitude_rad: float
+    acceleration_radps2: float
+
+    def at(self, rate_radps: float, age_s: float, doubt_s: float) -> float:
+        """The bound after a time, known to within ``doubt_s``, from a rate of turn (norm); rad.
+
+        See docs/math.md 5.3.
+        """
+        furthest_s = abs(age_s) + doubt_s
+        turned = self.acceleration_radps2 * furthest_s * furthest_s / 2.0
+        return min(math.pi, self.attitude_rad + rate_radps * doubt_s + turned)
+
+
 def moving(
     local: LocalFrame,
     track: Track,
     newest: Fix,
     attitude: Attitude,
     since_ns: int,
-    attitude_bound_rad: float,
+    doubt_s: float,
+    bounds: AttitudeBounds,
 ) -> Carrier:
     """The carrier aboard a vehicle, at the time of its track.
 
-    track               the vehicle's track, which gives position, velocity and bound
-    newest              its newest report; north and down are taken there, a few metres away
-    attitude            its newest attitude, carried on at its body rates
-    since_ns            age of that attitude at the track's time
-    attitude_bound_rad  bound on the angle by which it is off
+    track     the vehicle's track, which gives position, velocity and bound
+    newest    its newest report; north and down are taken there, a few metres away
+    attitude  its newest attitude, carried on at its body rates
+    since_ns  age of that attitude at the track's time
+    doubt_s   bound on the error of that age
+    bounds    bounds on the attitude and on its acceleration
     """
     rates = np.array([attitude.rollspeed_radps, attitude.pitchspeed_radps, attitude.yawspeed_radps])
     then = body_from_ned(attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad)
@@ -88,6 +112,6 @@ def moving(
         later_body_from_body(rates, since_ns * 1e-9) @ then @ local_from_ned.T,
         rates,
         track.bound_m,
-        attitude_bound_rad,
+        bounds.at(float(np.linalg.norm(rates)), since_ns * 1e-9, doubt_s),
         track.age_s,
     )

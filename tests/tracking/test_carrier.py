@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -14,6 +14,7 @@ from companion.tracking import carrier
 from companion.tracking.geodesy import LocalFrame
 from companion.values import Attitude, Fix, FloatArray, Limits, Source, Track, TrackState
 
+HELD = carrier.AttitudeBounds(0.02, 0.0)
 ANGLES = st.floats(-math.pi, math.pi)
 RATES = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
 S = 1_000_000_000
@@ -110,7 +111,7 @@ def test_a_vehicle_s_attitude_is_carried_on_to_the_time_of_use(fix: Callable[...
     )  # fmt: skip
     attitude = Attitude(0, Source(5, 1), 0, 0.2, -0.1, 1.0, 0.3, -0.2, 0.5)
     newest = _at(fix, *far)
-    found = carrier.moving(local, track, newest, attitude, S + S // 4, 0.02)
+    found = carrier.moving(local, track, newest, attitude, S + S // 4, 0.0, HELD)
     rates = np.array([0.3, -0.2, 0.5])
     then = oracle(0.2, -0.1, 1.0) @ local.local_from_ned(*far).T
     assert found.body_from_local == pytest.approx(integrated(rates, 1.25) @ then, abs=1e-9)
@@ -122,10 +123,50 @@ def test_a_vehicle_s_attitude_is_carried_on_to_the_time_of_use(fix: Callable[...
     assert found.velocity_ned_mps.tolist() == [4, 5, 6]
     assert found.body_rates_radps.tolist() == [0.3, -0.2, 0.5]
     silent = replace(track, velocity_ned_mps=None)
-    unknown = carrier.moving(local, silent, newest, attitude, S + S // 4, 0.02)
+    unknown = carrier.moving(local, silent, newest, attitude, S + S // 4, 0.0, HELD)
     assert unknown.velocity_ned_mps is None
 
 
 def _at(make: Callable[..., Fix], lat_deg: float, lon_deg: float) -> Fix:
     made = make(0, [0, 0, 0])
     return replace(made, report=replace(made.report, lat_deg=lat_deg, lon_deg=lon_deg))
+
+
+@settings(max_examples=300)
+@given(
+    st.tuples(*[st.floats(-3.0, 3.0)] * 3),
+    st.tuples(*[st.floats(-1.0, 1.0)] * 3),
+    st.floats(-0.3, 2.0),
+    st.floats(0.0, 0.4),
+    st.floats(-1.0, 1.0),
+    st.floats(0.0, 0.1),
+)
+def test_no_turn_leaves_the_bound_of_the_attitude(
+    rates: tuple[float, float, float],
+    way: tuple[float, float, float],
+    age_s: float,
+    doubt_s: float,
+    late: float,
+    off_rad: float,
+) -> None:
+    """A body that turns ever faster about any axis, a clock that is off, a wrong report."""
+    most = 4.0
+    push = np.array(way)
+    push = push * most / max(1e-9, float(np.linalg.norm(push)))
+    bounds = carrier.AttitudeBounds(off_rad, most)
+    true_s = age_s + late * doubt_s
+    steps = 200
+    truth = Rotation.from_rotvec([off_rad, 0, 0])
+    for n in range(steps):
+        at_s = (n + 0.5) / steps * true_s
+        truth = truth * Rotation.from_rotvec((np.array(rates) + push * at_s) * true_s / steps)
+    carried = Rotation.from_rotvec(np.array(rates) * age_s)
+    off = float((truth.inv() * carried).magnitude())
+    assert off <= bounds.at(float(np.linalg.norm(rates)), age_s, doubt_s) + 1e-3
+
+
+def test_an_attitude_that_was_lost_says_nothing_soon() -> None:
+    """A turn of 60 degrees a second that ended just after the newest attitude, 1.4 s ago."""
+    bounds = carrier.AttitudeBounds(math.radians(3.0), math.radians(270.0))
+    assert math.degrees(bounds.at(math.radians(60.0), 1.4, 0.0)) > 84.0
+    assert bounds.at(1.0, 100.0, 0.0) == math.pi

@@ -38,7 +38,7 @@ class FleetPredictor:
 
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
         """The track at that time, with its bound."""
-        at = SenderTime(at_ns, at_ns - self._offset_ns, self._clock_bound_s)
+        at = SenderTime(at_ns, at_ns - self._offset_ns, self._clock_bound_s, self._clock_bound_s)
         track = self._fleet.track(_UAV, now_ns, at)
         if track is None:
             return None

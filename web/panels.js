@@ -126,6 +126,7 @@ export const REASONS = {
   "bad-stamp": "a log's time stamp stepped or leapt",
   "malformed": "fields that cannot be what they say",
   "zero-position": "near 0° N 0° E: sent before a fix",
+  "no-fix": "the first position of all, before its receiver had a fix",
   "no-position": "ADS-B without valid coordinates",
   "no-altitude": "no altitude known",
   "duplicate": "the same report again",

@@ -4,6 +4,7 @@ The local frame begins at a fixed station, or where the first report was made.
 """
 
 import math
+from typing import Final
 
 import numpy as np
 
@@ -13,7 +14,22 @@ from companion.settings.center import CenterPlace, FixedCenter, VehicleCenter, p
 from companion.settings.model import Settings
 from companion.tracking import carrier, noise
 from companion.tracking.geodesy import LocalFrame
-from companion.values import Attitude, Carrier, Fix, Notice, Report, SenderTime, Severity, Track
+from companion.values import (
+    Attitude,
+    Carrier,
+    Estimate,
+    Fix,
+    Notice,
+    Report,
+    SenderTime,
+    Severity,
+    Track,
+)
+
+HOME_SETTLES_S: Final = 120.0
+"""Time after its first report in which a UAV that is tracked anew moves ``home``."""
+HOME_HEIGHT_M: Final = 20.0
+"""Least height by which the first one must have been wrong."""
 
 
 class Center:
@@ -28,6 +44,7 @@ class Center:
         self.place: CenterPlace = parse_center(settings.center.source or "home")
         self.local: LocalFrame | None = None
         self.vehicle = str(self.place) if isinstance(self.place, VehicleCenter) else None
+        self._home_from: tuple[str, int] | None = None  # who home began with, and when
         self._attitude: tuple[int, Attitude] | None = None  # sender's time, attitude
         self._attitude_bounds = carrier.AttitudeBounds(
             math.radians(settings.center.attitude_bound_deg),
@@ -85,9 +102,25 @@ class Center:
         place = f"{home.lat_deg:.6f}, {home.lon_deg:.6f}, {home.alt_m:.1f} m"
         if self.vehicle is not None:
             return Notice(report.t_ns, Severity.INFO, "origin", f"local frame begins at {place}")
-        self.place = home
+        self.place, self._home_from = home, (report.uav, report.t_ns)
         text = f"home is where {report.uav} first reported: {place}; level, facing north"
         return Notice(report.t_ns, Severity.INFO, "home", text)
+
+    def moved(self, placed: PlacedReport, anew: Estimate) -> Notice | None:
+        """Move ``home`` if the UAV that it began with was tracked anew soon, far above or below.
+
+        Its first height was not one that its autopilot stands by. None if home stays.
+        """
+        if self._home_from is None or anew.fix.uav != self._home_from[0]:
+            return None
+        if anew.fix.arrival_ns - self._home_from[1] > HOME_SETTLES_S * 1e9:
+            self._home_from = None
+            return None
+        if abs(float(anew.fix.position_ned_m[2])) < HOME_HEIGHT_M:
+            return None
+        said = self._first(placed.report)
+        text = f"home moves, for the first height was wrong: {said.text}"
+        return Notice(said.t_ns, Severity.WARNING, "home", text)
 
     def _begin(self, at: FixedCenter) -> None:
         self.local = LocalFrame(at.lat_deg, at.lon_deg, at.alt_m)

@@ -35,6 +35,7 @@ from companion.values import (
     Frame,
     Notice,
     Output,
+    Reason,
     Rejection,
     RoundTrip,
     Severity,
@@ -123,6 +124,9 @@ class Pipeline:
         return [*self.assumptions.clock(t_ns, sender, change, drift_max_ppm)]
 
     def _report(self, placed: PlacedReport) -> list[Output]:
+        if self.local is None and not self.senders.vouched(placed.report):
+            report = placed.report
+            return [Rejection(report.t_ns, report.uav, Reason.NO_FIX)]
         fix, begun = self.center.fix(placed)
         fix, refuted = self.fleet.refuted(fix)
         said: list[Output] = [*begun, *self.assumptions.told(refuted)]
@@ -134,9 +138,19 @@ class Pipeline:
             self.targets.compare(fix, self._tracks(near, fix.t_ns, fix.t_ns))
         if accepted.reacquired:
             said += self.assumptions.jumped(accepted)
+            said += self._move_home(placed, accepted)
             text = f"{fix.uav} is tracked anew: its reports agree, but not with its past"
             return [*said, Notice(fix.arrival_ns, Severity.WARNING, fix.uav, text), accepted]
         return [*said, accepted]
+
+    def _move_home(self, placed: PlacedReport, anew: Estimate) -> list[Output]:
+        """Begin the local frame again if the track that it began with was wrong in its height."""
+        moved = self.center.moved(placed, anew)
+        if moved is None:
+            return []
+        for uav in self.fleet.uavs:
+            self._restart(uav)
+        return [moved]
 
     def _restart(self, uav: str) -> None:
         """Forget the past of a sender."""

@@ -40,6 +40,13 @@ from companion.values import (
 
 CLOCKS_MAX: Final = 4096
 """Clocks kept. Beyond it those of senders without a track are forgotten, the oldest first."""
+FIX_3D: Final = 3
+"""GPS_FIX_TYPE_3D_FIX; better fixes have greater numbers."""
+NEAR_HEIGHT_M: Final = 50.0
+"""Greatest distance between a receiver's own height and the autopilot's that stands by it.
+
+Before an autopilot stands by its height it may be hundreds of metres off (docs/field-notes.md 1).
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +113,7 @@ class Senders:
         self._admission = Admission(settings.tracks.allow, settings.tracks.deny)
         self._shared: set[str] = set()
         self._known: dict[str, assembly.Assumed] = {}  # by UAV
+        self._receivers: dict[Source, GnssStatus] = {}
 
     # --- what they say ----------------------------------------------------------------------
 
@@ -131,6 +139,7 @@ class Senders:
                 return self._attitude(message)
             case GnssStatus():
                 self._noise[message.source] = noise.reported(message, self._noise_settings)
+                self._receivers[message.source] = message
             case SystemTime():
                 change = self.notice(frame)
                 if message.unix_us is not None:
@@ -213,6 +222,16 @@ class Senders:
         self._shared.add(uav)
         text = f"two vehicles share the id {uav}: neither is believed"
         return Notice(t_ns, Severity.WARNING, uav, text), refused
+
+    def vouched(self, report: Report) -> bool:
+        """Whether the sender's receiver has a 3-D fix near the height of its report.
+
+        True as well where nothing was heard of a receiver.
+        """
+        receiver = self._receivers.get(report.source)
+        if receiver is None:
+            return True
+        return receiver.fix_type >= FIX_3D and abs(receiver.alt_m - report.alt_m) < NEAR_HEIGHT_M
 
     # --- when they said it ------------------------------------------------------------------
 

@@ -95,7 +95,8 @@ class TrackSettings(Section):
 
         allow              who is tracked; everyone if empty
         deny               who is not, whatever ``allow`` says
-        coasting_s         age of the newest report at which a track is coasting, seconds
+        coasting_s         age of the newest report at which a track is coasting, seconds; more over
+                           a link whose own pace is slower
         stale_s            age at which it is stale, seconds
         lost_s             age at which it is lost, seconds
         dropped_s          age at which a UAV is forgotten, seconds

@@ -17,6 +17,7 @@ from companion.tracking.gate import GateSettings, Suspects, is_frozen, refusal
 from companion.tracking.history import History
 from companion.tracking.limits import Refutations
 from companion.tracking.observers.estimates import Observer, Prediction
+from companion.tracking.pace import Pace
 from companion.tracking.reach import Reach, reach
 from companion.values import (
     Estimate,
@@ -37,19 +38,23 @@ ACCELERATION_FADES_S = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Ages:
-    """Ages of the newest report, in seconds, beyond which a track passes to the next state."""
+    """Ages of the newest report, in seconds, beyond which a track passes to the next state.
+
+    ``coasting_s`` is the least: a slow link's is longer (``pace.py``).
+    """
 
     coasting_s: float = 2.0
     stale_s: float = 15.0
     lost_s: float = 60.0
 
-    def state(self, age_s: float) -> TrackState:
-        """The state of a track whose newest report is this old."""
+    def state(self, age_s: float, pace: Pace) -> TrackState:
+        """The state of a track whose newest report is this old, by its own pace."""
+        coasting_s = pace.silence_s(self.coasting_s, self.stale_s)
         if age_s > self.lost_s:
             return TrackState.LOST
         if age_s > self.stale_s:
             return TrackState.STALE
-        return TrackState.COASTING if age_s > self.coasting_s else TrackState.LIVE
+        return TrackState.COASTING if age_s > coasting_s else TrackState.LIVE
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +83,7 @@ class _Tracked:
     suspects: Suspects[Any]
     arrived: Fix
     newest: Estimate
+    pace: Pace
     reports: int = 1
     believable_ns: int = 0
     unknown_input: FloatArray | None = None
@@ -141,7 +147,10 @@ class Fleet:
         history: History[Any] = History(self._observer, fix, round(self._settings.window_s * 1e9))
         suspects: Suspects[Any] = Suspects(self._observer, self._settings.gate)
         first = Estimate(fix, fix.position_ned_m, fix.noise.position_m, None, None)
-        self._tracked[fix.uav] = _Tracked(history, suspects, fix, first, reports + 1)
+        before = self._tracked.get(fix.uav)
+        pace = Pace() if before is None else before.pace
+        pace.add(fix)
+        self._tracked[fix.uav] = _Tracked(history, suspects, fix, first, pace, reports + 1)
         return first
 
     def _is_lost(self, tracked: _Tracked, fix: Fix) -> bool:
@@ -185,6 +194,7 @@ class Fleet:
     ) -> Estimate:
         history = tracked.history
         history.insert(index, fix, predicted)
+        tracked.pace.add(fix)
         tracked.reports += 1
         tracked.acceleration = self._acceleration(history)
         tracked.newest = self._estimate(tracked, len(history.entries) - 1)
@@ -240,7 +250,7 @@ class Fleet:
         last = tracked.newest
         return Track(
             uav=uav,
-            state=self._settings.ages.state((now - newest.fix.sender_ns) * 1e-9),
+            state=self._settings.ages.state((now - newest.fix.sender_ns) * 1e-9, tracked.pace),
             valid_at_ns=at.node_ns,
             age_s=(at.sender_ns - newest.fix.sender_ns) * 1e-9,
             position_ned_m=predicted.position_ned_m,
@@ -306,9 +316,8 @@ class Fleet:
         tracked = self._tracked.get(uav)
         if tracked is None:
             return None
-        return self._settings.ages.state(
-            (now.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
-        )
+        age_s = (now.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
+        return self._settings.ages.state(age_s, tracked.pace)
 
     def near(self, position_ned_m: FloatArray, within_m: float) -> list[str]:
         """UAVs whose newest accepted report lies within a distance of a local place, (3,)."""

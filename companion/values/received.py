@@ -97,6 +97,7 @@ class Reason(StrEnum):
     SECRET = "secret"  # SETUP_SIGNING carries a key: it is not used, and not recorded
     SOCKET_OVERFLOW = "socket-overflow"  # lost before it was read: the system's buffer was full
     DUPLICATE = "duplicate"  # the same report again, over this link or another
+    NO_FIX = "no-fix"  # the first position of all, whose sender's receiver does not vouch for it
     OUT_OF_ORDER = "out-of-order"  # later than the window for late reports
 
 
@@ -258,15 +259,17 @@ class Presence:
 
 @dataclass(frozen=True, slots=True)
 class GnssStatus:
-    """Fix type and stated accuracies of a GNSS receiver (GPS_RAW_INT).
+    """Fix type, height and stated accuracies of a GNSS receiver (GPS_RAW_INT).
 
-    ``fix_type`` is MAVLink's GPS_FIX_TYPE; accuracies are in metres and m/s, None if not sent.
+    ``fix_type`` is MAVLink's GPS_FIX_TYPE, ``alt_m`` above mean sea level; accuracies are in metres
+    and m/s, None if not sent.
     """
 
     t_ns: int
     source: Source
     fix_type: int
     satellites: int | None
+    alt_m: float
     h_acc_m: float | None
     v_acc_m: float | None
     vel_acc_mps: float | None

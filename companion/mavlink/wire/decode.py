@@ -191,6 +191,7 @@ def _gps_raw_int(frame: Frame) -> GnssStatus:
         source=frame.source,
         fix_type=fix_type,
         satellites=None if satellites == 255 else satellites,
+        alt_m=fields[3] * 1e-3,
         h_acc_m=h_acc * 1e-3 or None,
         v_acc_m=v_acc * 1e-3 or None,
         vel_acc_mps=vel_acc * 1e-3 or None,

@@ -1,0 +1,53 @@
+"""The pace at which a UAV's reports come, and how long a silence is no more than its pace.
+
+A link that brings a report each .8 s after up to a second is not losing its UAV every other report:
+a track coasts only when nothing has come for longer than three of its own intervals and the spread
+of its link, and than silences that it has just come back from.
+"""
+
+from collections import deque
+from statistics import median
+from typing import Final
+
+from companion.values import Fix
+
+KEPT: Final = 16
+"""Reports from which the pace is taken."""
+INTERVALS: Final = 3.0
+SILENCES: Final = 1.25
+"""Multiple of the second longest silence of late that is no news: a single one is."""
+
+
+class Pace:
+    """Intervals, latencies and silences of the newest reports. ``add`` takes those accepted."""
+
+    def __init__(self) -> None:
+        self._intervals_s: deque[float] = deque(maxlen=KEPT)
+        self._latencies_s: deque[float] = deque(maxlen=KEPT)
+        self._ages_s: deque[float] = deque(maxlen=KEPT)
+        self._newest: Fix | None = None
+        self._silence_s = 0.0
+
+    def add(self, fix: Fix) -> None:
+        """Take in an accepted report, in order of arrival."""
+        latency_s = (fix.arrival_ns - fix.t_ns) * 1e-9
+        self._latencies_s.append(latency_s)
+        before = self._newest
+        if before is not None and fix.sender_ns > before.sender_ns:
+            self._intervals_s.append((fix.sender_ns - before.sender_ns) * 1e-9)
+            # How old the report before had become when this one came.
+            self._ages_s.append(self._intervals_s[-1] + latency_s)
+        if before is None or fix.sender_ns > before.sender_ns:
+            self._newest = fix
+        self._silence_s = self._measured_s()
+
+    def _measured_s(self) -> float:
+        if len(self._intervals_s) < 3:
+            return 0.0
+        spread_s = max(self._latencies_s) - min(self._latencies_s)
+        usual_s = INTERVALS * median(self._intervals_s) + spread_s
+        return max(usual_s, SILENCES * sorted(self._ages_s)[-2])
+
+    def silence_s(self, least_s: float, most_s: float) -> float:
+        """Age of the newest report beyond which the track coasts, seconds, within two limits."""
+        return min(max(least_s, self._silence_s), most_s)

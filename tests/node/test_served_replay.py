@@ -40,6 +40,12 @@ class Replaying(Node):
             pytest.fail(f"did not start: {line!r}")
         self.url, self.log = found[1], found[2]
 
+    def stop(self, number: signal.Signals = signal.SIGTERM) -> tuple[int, str, str]:
+        """Exit status, stdout and stderr after a signal."""
+        self.process.send_signal(number)
+        out, err = self.process.communicate(timeout=HANG_S)
+        return self.process.returncode, out, err
+
 
 @pytest.fixture
 def start_replay() -> Iterator[Any]:

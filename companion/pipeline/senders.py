@@ -226,10 +226,10 @@ class Senders:
     def vouched(self, report: Report) -> bool:
         """Whether the sender's receiver has a 3-D fix near the height of its report.
 
-        True as well where nothing was heard of a receiver.
+        True as well where nothing was heard of a receiver, and for aircraft that others relay.
         """
         receiver = self._receivers.get(report.source)
-        if receiver is None:
+        if receiver is None or not reports_itself(report.uav):
             return True
         return receiver.fix_type >= FIX_3D and abs(receiver.alt_m - report.alt_m) < NEAR_HEIGHT_M
 

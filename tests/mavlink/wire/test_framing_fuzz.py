@@ -409,12 +409,14 @@ def test_frames_of_a_whole_log_outside_the_damage_are_found(
 # --- any frames, anything between them ----------------------------------------------------------
 
 _mav = dialect.MAVLink(None)
+PACKED = sorted(n for n in SEEDS if "c" not in dialect.mavlink_map[n].unpacker.format)
+"""Messages that pymavlink can pack again: not those with a single ``char``, which it reads as text."""
 
 
 @st.composite
 def frames_of_the_dialect(draw: st.DrawFn) -> bytes:
     """Any message with any payload, as pymavlink packs it: version 1, 2, or 2 signed."""
-    msgid = draw(st.sampled_from(sorted(SEEDS)))
+    msgid = draw(st.sampled_from(PACKED))
     size = dialect.mavlink_map[msgid].unpacker.size
     payload = draw(st.binary(min_size=size, max_size=size))
     body = bytes([size, 0, 0, 0, 1, 1]) + msgid.to_bytes(3, "little") + payload

@@ -1,7 +1,7 @@
 """Messages delivered by a link: when each arrives, and what a predictor makes of it.
 
 The product is handed the frames themselves; the baselines get observed reports, whose times are by
-the product's clock, which hears of every message what the product hears. Everything is drawn from
+the product's clock, which hears the stamps of all messages. Everything is drawn from
 a seed and the vehicle's id.
 """
 
@@ -15,10 +15,11 @@ import numpy as np
 
 from companion.mavlink.clock.sender_clock import SenderClock
 from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
-from companion.studies.prediction import clock_probe, hostile_link, noisy_frames
+from companion.mavlink.wire.stamps import STAMPED
+from companion.mavlink.wire.stamps import boot_ms as stamp_of
+from companion.studies.prediction import hostile_link, noisy_frames
 from companion.studies.prediction.baselines import Observed
 from companion.studies.prediction.radio_link import RadioLink
-from companion.studies.truth import stamps
 from companion.studies.truth.trajectory import Times
 from companion.studies.truth.vehicles import Flight
 from companion.values import BoolArray, FloatArray, Frame, IntArray, RoundTrip, Source
@@ -81,7 +82,7 @@ def deliver(
     trips = flight.round_trips if link.as_logged else ()
     # The radio's delays do not reach a clock that is known by other means.
     heard_ns = sends.sent_ns[rows] if link.known_delay else arrival_ns
-    placed = on_sender_clock(clock(), heard_ns, sends.boot_ms[rows], trips)
+    placed = on_sender_clock(clock(), heard_ns, sends.boot_ms[rows], rows < reports, trips)
     observed = tuple(
         Observed(
             arrived,
@@ -127,14 +128,12 @@ def _sends(flight: Flight) -> _Sends:
         dtype=np.int64,
     )
     frames = [flight.frames[at] for at in others.tolist()]
-    said = [stamps.boot_ms(frame) if clock_probe.hears(frame.msgid) else None for frame in frames]
+    said = [stamp_of(frame) if frame.msgid in STAMPED else -1 for frame in frames]
     reports = len(flight.arrival_ns)
     at = flight.report_at if len(flight.frames) else np.full(reports, -1, dtype=np.int64)
     return _Sends(
         np.concatenate([flight.arrival_ns, np.array([f.t_ns for f in frames], dtype=np.int64)]),
-        np.concatenate(
-            [flight.boot_ms, np.array([-1 if ms is None else ms for ms in said], dtype=np.int64)]
-        ),
+        np.concatenate([flight.boot_ms, np.array(said, dtype=np.int64)]),
         np.concatenate([np.full(reports, -1), np.array([f.msgid for f in frames], dtype=np.int64)]),
         np.concatenate([at, others]),
     )
@@ -215,7 +214,7 @@ class Placed:
                after a restart
     sent_ns    on the node's timeline, as known on arrival
     bound_s    bound on the error of that
-    known      whether the message has a stamp that could be placed at all
+    known      whether it is a report whose stamp could be placed at all
     """
 
     sender_ns: Times
@@ -225,11 +224,15 @@ class Placed:
 
 
 def on_sender_clock(
-    clock: SenderClock, arrival_ns: Times, boot_ms: Times, trips: tuple[RoundTrip, ...] = ()
+    clock: SenderClock,
+    arrival_ns: Times,
+    boot_ms: Times,
+    is_report: BoolArray,
+    trips: tuple[RoundTrip, ...] = (),
 ) -> Placed:
-    """When messages were made, (n,), by the product's clock; a stamp of -1 is none.
+    """When reports among messages (n,) were made, by the product's clock; a stamp of -1 is none.
 
-    ``trips`` are heard by the clock as well. Only here does the study use that clock.
+    The clock hears the others, and ``trips``, as in the pipeline. Only here does the study use it.
     """
     start_ns: int | None = None
     waiting = list(reversed(trips))
@@ -239,7 +242,9 @@ def on_sender_clock(
         while waiting and waiting[-1].t_ns < arrived_ns:
             trip = waiting.pop()
             clock.timesync(trip.sent_ns, trip.t_ns, trip.remote_ns)
-        if stamp_ms < 0:
+        if not is_report[row]:
+            if stamp_ms >= 0 and start_ns is not None:
+                clock.notice(arrived_ns, stamp_ms)
             continue
         stamp = clock.observe(arrived_ns, stamp_ms)
         estimate = clock.estimate()

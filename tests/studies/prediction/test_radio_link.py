@@ -28,7 +28,7 @@ def test_a_clean_link_is_the_log(straight_flight: MakeFlight) -> None:
     assert (latencies_s(flight, delivery) == 0).all()
     assert delivery.rate_hz == pytest.approx(10)
     # A delay that is always the same cannot be seen.
-    assert delivery.latency_s == pytest.approx(0, abs=1e-9)
+    assert delivery.latency_s == pytest.approx(0, abs=1e-6)
 
 
 def test_latency_loss_and_rate_are_as_asked(straight_flight: MakeFlight) -> None:
@@ -70,8 +70,8 @@ def test_the_envelope_leaves_the_constant_part(
     if known_delay:
         assert np.abs(np.array(off_s) - 0.005).max() < 1e-6  # what the log itself has
     else:
-        assert min(off_s) > 0.03
-        assert np.median(off_s) < 0.3
+        assert np.ptp(off_s) > 0.01
+        assert abs(np.median(off_s)) < 0.3
 
 
 def test_the_senders_timeline_goes_on_after_a_restart(

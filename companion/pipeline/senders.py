@@ -256,7 +256,8 @@ class Senders:
         least_s, greatest_s = self._assumed(uav).lag_s
         rest_s = (greatest_s - least_s) / 2
         before_s, after_s = estimate.before_s + rest_s, estimate.after_s + rest_s
-        return SenderTime(node_ns, node_ns - estimate.offset_ns, before_s, after_s)
+        sender_ns = node_ns - estimate.offset_ns
+        return SenderTime(node_ns, sender_ns, before_s, after_s, estimate.usual_s)
 
     def clock_estimate(self, uav: str) -> ClockEstimate | None:
         """The state of a UAV's clock; None for a UAV that has none."""

@@ -95,6 +95,7 @@ def track(value: Track, t_ns: int) -> Any:
         speed_max_mps=value.limits.speed_mps,
         acceleration_max_mps2=value.limits.acceleration_mps2,
         limits_source=value.limits.source.value,
+        error_p95_m=value.error_p95_m,
         reports=value.reports,
     )
 

@@ -120,6 +120,10 @@ class UavState(BaseModel):
         Vector, Field(description="centre of the least ball that holds every possible place")
     ]
     set_radius_m: float
+    error_p95_m: Annotated[
+        float | None,
+        Field(description="95 of 100 predictions at this age were nearer than this, of late"),
+    ]
     assumptions: Assumptions
     clock_bound_s: float
     clock: Clock | None

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from companion.tracking.gate import GateSettings, Suspects, is_frozen, refusal
+from companion.tracking.hindsight import WAYS, Hindsight, Vector, fading
 from companion.tracking.history import History
 from companion.tracking.limits import Refutations
 from companion.tracking.observers.estimates import Observer, Prediction
@@ -32,8 +33,8 @@ from companion.values import (
     TrackState,
 )
 
-ACCELERATION_FADES_S = 3.0
-"""Time constant, seconds, with which an acceleration that is fed forward fades."""
+COMMON_ERROR = 0.07
+"""Share of the noise bound that is usual in all reports alike, which none of them shows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +90,7 @@ class _Tracked:
     unknown_input: FloatArray | None = None
     mu_max_s2: float | None = None
     acceleration: FloatArray | None = None
+    hindsight: Hindsight = field(default_factory=Hindsight)
 
 
 class Fleet:
@@ -196,7 +198,8 @@ class Fleet:
         history.insert(index, fix, predicted)
         tracked.pace.add(fix)
         tracked.reports += 1
-        tracked.acceleration = self._acceleration(history)
+        if history.newest.fix is fix:
+            self._look_back(tracked, fix)
         tracked.newest = self._estimate(tracked, len(history.entries) - 1)
         tracked.unknown_input = _unknown_input(history)
         if tracked.newest.fix is fix:
@@ -218,14 +221,25 @@ class Fleet:
         innovation_m = math.sqrt(off @ off)
         return Estimate(entry.fix, predicted.position_ned_m, predicted.bound_m, innovation_m, dt_s)
 
-    def _acceleration(self, history: History[Any]) -> FloatArray | None:
-        """The acceleration that is fed forward, cut to the greatest possible size."""
-        found = history.acceleration() if self._settings.feed_forward else None
-        if found is None:
-            return None
-        most_mps2 = self._limits(history.newest.fix).acceleration_mps2
-        size = math.sqrt(found @ found)
-        return found if size <= most_mps2 else np.asarray(found * (most_mps2 / size))
+    def _look_back(self, tracked: _Tracked, fix: Fix) -> None:
+        """Judge earlier predictions by the newest report, and choose what is fed forward from it.
+
+        Accelerations are cut to the greatest possible size.
+        """
+        most_mps2 = self._limits(fix).acceleration_mps2
+        found: list[Vector | None] = []
+        for way in WAYS:
+            given = None
+            if way.window_s and self._settings.feed_forward:
+                given = tracked.history.acceleration(way.window_s, way.fewest)
+            if given is not None and (size := math.sqrt(sum(a * a for a in given))) > most_mps2:
+                north, east, down = given
+                cut = most_mps2 / size
+                given = (cut * north, cut * east, cut * down)
+            found.append(given)
+        tracked.hindsight.add(fix, tuple(found))
+        chosen = found[WAYS.index(tracked.hindsight.way)]
+        tracked.acceleration = None if chosen is None else np.array(chosen)
 
     def forget(self, uav: str) -> None:
         """Forget a track, because its sender was restarted or is gone."""
@@ -263,6 +277,7 @@ class Fleet:
             set_center_ned_m=possible.center_ned_m,
             set_radius_m=possible.radius_m,
             limits=self._limits(newest.fix),
+            error_p95_m=self._usual_m(tracked, predicted, at),
             clock_bound_s=at.bound_s,
             dt_s=last.dt_s,
             latency_s=(newest.fix.arrival_ns - newest.fix.t_ns) * 1e-9,
@@ -281,7 +296,7 @@ class Fleet:
         ahead_s = (at.sender_ns - newest.fix.sender_ns) * 1e-9
         position, velocity = found.position_ned_m, found.velocity_ned_mps
         if tracked.acceleration is not None and velocity is not None and ahead_s > 0:
-            way_s2, gain_s = _fading(ahead_s)
+            way_s2, gain_s = fading(ahead_s, tracked.hindsight.way.fades_s)
             position = position + way_s2 * tracked.acceleration
             velocity = velocity + gain_s * tracked.acceleration
         found = found._replace(position_ned_m=position, velocity_ned_mps=velocity)
@@ -293,6 +308,16 @@ class Fleet:
         return found, Reach(
             bound_m, found.horizontal_m + widened_m, found.vertical_m + widened_m, position, bound_m
         )
+
+    def _usual_m(self, tracked: _Tracked, found: Prediction, at: SenderTime) -> float | None:
+        """The error that is usual at a time: what reports have shown, and the clock's share."""
+        age_s = (at.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
+        seen_m = tracked.hindsight.usual_m(age_s)
+        if seen_m is None or found.velocity_ned_mps is None:
+            return seen_m
+        velocity = found.velocity_ned_mps
+        common_m = COMMON_ERROR * tracked.history.newest.fix.noise.position_m
+        return math.hypot(seen_m, common_m, math.sqrt(velocity @ velocity) * at.usual_s)
 
     def _limits(self, fix: Fix) -> Limits:
         return fix.limits or self._settings.limits
@@ -340,16 +365,6 @@ def _fastest_mps(found: Prediction, limits: Limits, within_s: float) -> float:
 
 def _rejected(fix: Fix, reason: Reason, detail: str) -> Rejection:
     return Rejection(fix.arrival_ns, fix.uav, reason, detail=detail)
-
-
-def _fading(ahead_s: float) -> tuple[float, float]:
-    """Displacement (s²) and gain in speed (s) by a fading acceleration of 1 within a time.
-
-    s(τ) of docs/math.md 5.1, and its derivative.
-    """
-    fade_s = ACCELERATION_FADES_S
-    shrink = math.exp(-ahead_s / fade_s)
-    return fade_s * fade_s * (shrink - 1 + ahead_s / fade_s), fade_s * (1 - shrink)
 
 
 def _unknown_input(history: History[Any]) -> FloatArray | None:

@@ -9,18 +9,11 @@ from bisect import bisect_left
 from dataclasses import dataclass
 from typing import Generic
 
-import numpy as np
-
 from companion.tracking.observers.estimates import Observer, Prediction, State
-from companion.values import Fix, FloatArray
+from companion.values import Fix
 
-ACCELERATION_WINDOW_NS = 5_000_000_000
-"""Time over which reported velocities are used for the acceleration."""
-ACCELERATION_REPORTS, ACCELERATION_REPORTS_MAX = 5, 15
-"""Least and most velocities used for the acceleration.
-
-Fewer say more of their noise than of a turn. When there are more, only every n-th is used.
-"""
+ACCELERATION_REPORTS_MAX = 15
+"""Most velocities used for an acceleration: of more, only every n-th over the whole window."""
 
 
 @dataclass(slots=True)
@@ -80,25 +73,28 @@ class History(Generic[State]):
         predicted = self._observer.predict(before, fix.sender_ns)
         return Entry(fix, self._observer.after(before, predicted, fix), predicted)
 
-    def acceleration(self) -> FloatArray | None:
-        """Least-squares slope of the newest reported velocities, m/s², (3,).
+    def acceleration(self, window_s: float, fewest: int) -> tuple[float, float, float] | None:
+        """Least-squares slope of the velocities reported within a time, m/s².
 
-        None if there are too few.
+        Of at least so many velocities, older ones if need be; None if there are too few.
         """
         newest_ns = self.newest.fix.sender_ns
-        times_ns: list[int] = []
-        velocities: list[FloatArray] = []
+        rows: list[tuple[float, float, float, float]] = []
         stride = max(1, len(self.entries) // ACCELERATION_REPORTS_MAX)
         for entry in self.entries[::-stride]:
             fix = entry.fix
-            old = newest_ns - fix.sender_ns > ACCELERATION_WINDOW_NS
-            if fix.velocity_ned_mps is None or (old and len(times_ns) >= ACCELERATION_REPORTS):
+            ago_s = (newest_ns - fix.sender_ns) * 1e-9
+            if fix.velocity_ned_mps is None or (ago_s > window_s and len(rows) >= fewest):
                 break
-            times_ns.append(fix.sender_ns - newest_ns)
-            velocities.append(fix.velocity_ned_mps)
-        if len(times_ns) < ACCELERATION_REPORTS:
+            north, east, down = fix.velocity_ned_mps.tolist()
+            rows.append((-ago_s, north, east, down))
+        if len(rows) < fewest:
             return None
-        t = np.array(times_ns) * 1e-9
-        t -= t.sum() / len(t)
-        slope: FloatArray = t @ np.array(velocities) / (t @ t)
-        return slope
+        middle = sum(row[0] for row in rows) / len(rows)
+        spread = sum((row[0] - middle) ** 2 for row in rows)
+        if not spread:
+            return None
+        north, east, down = (
+            sum((row[0] - middle) * row[axis] for row in rows) / spread for axis in (1, 2, 3)
+        )
+        return north, east, down

@@ -122,12 +122,14 @@ class SenderTime:
 
     node_ns, sender_ns  the time on both timelines
     before_s, after_s   by how much the true sender time may be less, or more, than ``sender_ns``
+    usual_s             by how much it usually is: an estimate, no bound
     """
 
     node_ns: int
     sender_ns: int
     before_s: float
     after_s: float
+    usual_s: float = 0.0
 
     @property
     def bound_s(self) -> float:
@@ -159,6 +161,8 @@ class Track:
         set_center_ned_m       centre of the least ball that holds every place that is possible,
         set_radius_m           and its radius: for whoever plans with it, not to point at
         limits                 what the aircraft is taken to be able to do
+        error_p95_m            error that 95 of 100 predictions at this age stayed below of late;
+                               None before enough reports have shown it
         clock_bound_s          uncertainty of the sender's clock, whose effect is in all bounds
         dt_s                   interval between the last two reports
         latency_s              visible latency of the newest report
@@ -185,6 +189,7 @@ class Track:
     set_center_ned_m: FloatArray
     set_radius_m: float
     limits: Limits
+    error_p95_m: float | None
     clock_bound_s: float
     dt_s: float | None
     latency_s: float | None

@@ -227,6 +227,7 @@ def uav(
         "bound_ellipsoid_ned_m": cylinder,
         "set_center_ned_m": vector(track.set_center_ned_m),
         "set_radius_m": track.set_radius_m,
+        "error_p95_m": track.error_p95_m,
         "assumptions": {
             "source": str(track.limits.source),
             "speed_max_mps": track.limits.speed_mps,

@@ -40,8 +40,8 @@ def track(
 ) -> Track:
     return Track(
         uav, TrackState(state), 9, 0.1, np.array(position, dtype=float), velocity, None, None,
-        bound_m, bound_m, bound_m, np.zeros(3), bound_m, Limits(60.0, 5.0), 0.0, None, None, None,
-        None, 1,
+        bound_m, bound_m, bound_m, np.zeros(3), bound_m, Limits(60.0, 5.0), None, 0.0, None, None,
+        None, None, 1,
     )  # fmt: skip
 
 

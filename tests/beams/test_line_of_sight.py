@@ -15,7 +15,7 @@ def flying(rng: np.random.Generator, acceleration: FloatArray | None) -> Track:
     place, velocity = rng.uniform(-300, 300, 3), rng.normal(0, 20, 3)
     return Track(
         "a", TrackState.LIVE, 9, 0.1, place, velocity, None, acceleration,
-        2.0, 2.0, 2.0, place, 2.0, Limits(60.0, 5.0), 0.0, None, None, None, None, 1,
+        2.0, 2.0, 2.0, place, 2.0, Limits(60.0, 5.0), None, 0.0, None, None, None, None, 1,
     )  # fmt: skip
 
 
@@ -51,7 +51,7 @@ def test_through_the_array_itself_directions_stay_unit_vectors() -> None:
     place, velocity = np.array([0.0, 30.0, 0.0]), np.array([0.0, -10.0, 0.0])
     track = Track(
         "a", TrackState.LIVE, 9, 0.1, place, velocity, None, None,
-        2.0, 2.0, 2.0, place, 2.0, Limits(60.0, 5.0), 0.0, None, None, None, None, 1,
+        2.0, 2.0, 2.0, place, 2.0, Limits(60.0, 5.0), None, 0.0, None, None, None, None, 1,
     )  # fmt: skip
     found = line_of_sight.directions_ahead(track, at, array, np.array([2.0, 3.0, 4.0]))
     assert found is not None

@@ -102,7 +102,7 @@ def _track(uav: str, t_ns: int) -> Track:
     return Track(
         uav, TrackState.LIVE, t_ns + 5, 0.25, np.array([10.0, 20.0, -30.0]), None,
         np.array([0.1, 0.2, 0.3]), None, 3.0, 2.0, 2.5, np.zeros(3), 3.0,
-        Limits(60.0, 5.0), 0.0, 0.1, None, 0.4, 0.0, 7,
+        Limits(60.0, 5.0), None, 0.0, 0.1, None, 0.4, 0.0, 7,
     )  # fmt: skip
 
 

@@ -49,7 +49,7 @@ def update_of(array: Array, turn: tuple[float, float, float], place_ned_m: Float
     beam = Beam("1:1", azimuth, elevation, range_m, None, None, None, 0.1, 9.0, 0.0)
     track = Track(
         "1:1", TrackState.LIVE, NOW_NS, 0.1, place_ned_m, None, None, None, 5.0, 4.0, 3.0,
-        place_ned_m, 5.0, Limits(60.0, 5.0), 0.0, 0.1, 0.05, 1.0, 0.5, 9,
+        place_ned_m, 5.0, Limits(60.0, 5.0), None, 0.0, 0.1, 0.05, 1.0, 0.5, 9,
     )  # fmt: skip
     beams = BeamSet(
         NOW_NS, NOW_NS, (beam,), np.ones((8, 1), complex), Method.ZERO_FORCING,

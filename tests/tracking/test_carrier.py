@@ -107,7 +107,8 @@ def test_a_vehicle_s_attitude_is_carried_on_to_the_time_of_use(fix: Callable[...
     far = (49.0, 12.0)
     track = Track(
         "5:1", TrackState.LIVE, 12 * S, 0.5, np.array([1.0, 2, 3]), np.array([4.0, 5, 6]), None,
-        None, 4.5, 3.6, 2.7, np.zeros(3), 4.5, Limits(60.0, 5.0), 0.0, None, None, None, None, 1,
+        None, 4.5, 3.6, 2.7, np.zeros(3), 4.5, Limits(60.0, 5.0), None, 0.0, None, None, None, None,
+        1,
     )  # fmt: skip
     attitude = Attitude(0, Source(5, 1), 0, 0.2, -0.1, 1.0, 0.3, -0.2, 0.5)
     newest = _at(fix, *far)

@@ -20,7 +20,7 @@ def track(uav: str, position: ArrayLike, velocity: ArrayLike | None = VELOCITY) 
     speeds = None if velocity is None else np.array(velocity, dtype=float)
     return Track(
         uav, TrackState.LIVE, 0, 0.0, np.array(position, dtype=float), speeds, None, None,
-        5.0, 5.0, 5.0, np.zeros(3), 5.0, Limits(60.0, 5.0), 0.0, None, None, None, None, 1,
+        5.0, 5.0, 5.0, np.zeros(3), 5.0, Limits(60.0, 5.0), None, 0.0, None, None, None, None, 1,
     )  # fmt: skip
 
 

@@ -79,7 +79,8 @@ class Floor:
         drift       drift that a steady rise or fall has shown, a ratio; 0 unless it is beyond
                     ``drift_max``
         count       stamps so far
-        rose_ns     by how much the line was begun higher at the newest stamp; 0 unless it was
+        rose_ns     by how much the line was begun higher at the newest stamp than the greatest
+                    drift explains; 0 unless it was
     """
 
     def __init__(self, window_ns: int, drift_max: float) -> None:
@@ -191,7 +192,8 @@ class Floor:
                 break
         else:
             return
-        self.rose_ns = line - self._line
+        rose_ns = line - max(self._line, self._sure)
+        self.rose_ns = rose_ns if rose_ns > LEAST_CHANGE_NS else 0.0
         self._line = line
         self._since_ns = block.first_ns
         self._visible.keep_median()

@@ -212,10 +212,17 @@ class SenderClock:
             offset_ns=likely_ns,
             before_s=(high_ns - likely_ns + _NS_PER_MS) * 1e-9,
             after_s=(likely_ns - low_ns + _NS_PER_MS) * 1e-9,
+            usual_s=self._usual_s(kind, low_ns, high_ns),
             drift_ppm=floor.drift * 1e6,
             constant_delay_s=(floor.at(x_ns) - likely_ns) * 1e-9,
             latency_s=self._latency_s,
         )
+
+    def _usual_s(self, kind: ClockKind, low_ns: int, high_ns: int) -> float:
+        """By how much the most likely offset usually is off: as much as is guessed of it."""
+        if kind is not ClockKind.ENVELOPE:
+            return (high_ns - low_ns) / 4 * 1e-9
+        return (INVISIBLE * self._line.floor.median_ns + _NS_PER_MS) * 1e-9
 
     def _interval(self, x_ns: int) -> tuple[ClockKind, int, int, int]:
         """What is known of the offset at a sender time: kind, least, greatest and most likely; ns.

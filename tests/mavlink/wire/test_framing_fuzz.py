@@ -410,7 +410,7 @@ def test_frames_of_a_whole_log_outside_the_damage_are_found(
 
 _mav = dialect.MAVLink(None)
 PACKED = sorted(n for n in SEEDS if "c" not in dialect.mavlink_map[n].unpacker.format)
-"""Messages that pymavlink can pack again: not those with a single ``char``, which it reads as text."""
+"""Messages that pymavlink can pack again: it cannot a single ``char``, which it reads as text."""
 
 
 @st.composite

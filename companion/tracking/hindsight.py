@@ -1,0 +1,186 @@
+"""What predictions were worth, by the reports that came later.
+
+Every report shows how far earlier predictions for its time were off. That chooses, for each UAV,
+the way of feeding an acceleration forward that would have predicted its own last reports best, or
+none: what helps in a steady turn hurts where velocities are sparse or noisy. And it says what error
+is usual at a given age, as a quantile of those of the near past: no law of errors is assumed, only
+that the near future resembles the near past.
+"""
+
+import math
+from bisect import insort
+from collections import deque
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Final
+
+from companion.values import Fix
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """A way of feeding acceleration forward.
+
+    window_s  time over which the slope of the reported velocities is taken; 0: none is fed
+    fewest    least number of velocities
+    fades_s   time constant with which the acceleration fades
+    """
+
+    window_s: float
+    fewest: int
+    fades_s: float
+
+
+PLAIN: Final = Way(0.0, 0, 1.0)
+WAYS: Final = (PLAIN, Way(5.0, 5, 3.0), Way(1.0, 3, 3.0), Way(1.0, 3, 10.0), Way(2.5, 3, 10.0))
+"""None; a slow turn over noisy reports; a quick turn; one that goes on."""
+JUDGED_S: Final = 1.0
+"""Least age of the predictions by which ways are judged."""
+MEMORY_S: Final = 20.0
+"""Time constant with which what was seen is forgotten."""
+BETTER: Final = 0.9
+"""Share of the present way's mean square error that another's must be below to take its place."""
+JUDGED: Final = 4
+"""Least number of judgements before a way other than the plain one is taken."""
+AGES_S: Final = (0.25, 1.0, 2.5)
+"""Least ages of the predictions whose errors are kept for the usual error."""
+ERRORS: Final = 200
+USUAL: Final = 0.95
+_SPACING_S: Final = 0.08
+_KEPT: Final = 64
+
+
+@dataclass(frozen=True, slots=True)
+class _Made:
+    """What was known at a report: from it predictions by every way can be made again."""
+
+    sender_ns: int
+    position: Vector
+    velocity: Vector
+    accelerations: tuple[Vector | None, ...]
+
+    def off_m(self, way: int, there: Vector, ahead_s: float) -> float:
+        """How far a prediction by a way is from a position reported later."""
+        given = self.accelerations[way]
+        gain = 0.0 if given is None else fading(ahead_s, WAYS[way].fades_s)[0]
+        a = given or (0.0, 0.0, 0.0)
+        return math.sqrt(
+            sum(
+                (p + v * ahead_s + gain * k - q) ** 2
+                for p, v, k, q in zip(self.position, self.velocity, a, there, strict=True)
+            )
+        )
+
+
+@dataclass(slots=True)
+class _Errors:
+    """The newest errors of predictions of about one age."""
+
+    in_order: deque[float] = field(default_factory=lambda: deque(maxlen=ERRORS))
+    sorted_m: list[float] = field(default_factory=list)
+    age_s: float = 0.0
+    judged_ns: int = 0
+
+    def add(self, error_m: float, age_s: float) -> None:
+        if len(self.in_order) == ERRORS:
+            self.sorted_m.remove(self.in_order[0])
+        self.in_order.append(error_m)
+        insort(self.sorted_m, error_m)
+        self.age_s += (age_s - self.age_s) / min(len(self.in_order), 20)
+
+    def usual_m(self) -> float | None:
+        """The quantile, split-conformal: of n errors the ceil((n + 1) q)-th; None of too few."""
+        n = len(self.sorted_m)
+        rank = math.ceil((n + 1) * USUAL)
+        return None if n < 20 else self.sorted_m[min(rank, n) - 1]
+
+
+class Hindsight:
+    """The past predictions of one UAV. ``add`` takes its reports in order of the sender's time."""
+
+    def __init__(self) -> None:
+        self._made: deque[_Made] = deque(maxlen=_KEPT)
+        self._costs = [0.0] * len(WAYS)
+        self._judged = 0
+        self._judged_ns = 0
+        self._way = 0
+        self._errors = tuple(_Errors() for _ in AGES_S)
+
+    @property
+    def way(self) -> Way:
+        """The way of feeding forward that is in use."""
+        return WAYS[self._way]
+
+    def add(self, fix: Fix, accelerations: tuple[Vector | None, ...]) -> None:
+        """Judge earlier predictions by a report; remember what can be predicted from it.
+
+        ``accelerations``: what each of ``WAYS`` would feed forward from this report, m/s².
+        """
+        if self._made and fix.sender_ns - self._made[-1].sender_ns < _SPACING_S * 1e9:
+            return
+        there: Vector = tuple(fix.position_ned_m.tolist())
+        self._judge(fix.sender_ns, there)
+        for errors, least_s in zip(self._errors, AGES_S, strict=True):
+            made = self._older(fix.sender_ns, least_s)
+            if made is not None and made.sender_ns > errors.judged_ns:
+                errors.judged_ns = made.sender_ns
+                age_s = (fix.sender_ns - made.sender_ns) * 1e-9
+                errors.add(made.off_m(self._way, there, age_s), age_s)
+        if fix.velocity_ned_mps is not None:
+            velocity: Vector = tuple(fix.velocity_ned_mps.tolist())
+            self._made.append(_Made(fix.sender_ns, there, velocity, accelerations))
+
+    def _older(self, sender_ns: int, least_s: float) -> _Made | None:
+        """The newest of what is remembered that is at least so old, and not twice as old."""
+        for made in reversed(self._made):
+            age_s = (sender_ns - made.sender_ns) * 1e-9
+            if age_s >= least_s:
+                return made if age_s < 2.0 * least_s + 2.0 else None
+        return None
+
+    def _judge(self, sender_ns: int, there: Vector) -> None:
+        made = self._older(sender_ns, JUDGED_S)
+        if made is None or made.sender_ns <= self._judged_ns:
+            return
+        memory = math.exp(-(made.sender_ns - self._judged_ns) * 1e-9 / MEMORY_S)
+        self._judged_ns = made.sender_ns
+        ahead_s = (sender_ns - made.sender_ns) * 1e-9
+        for way in range(len(WAYS)):
+            off_m = made.off_m(way, there, ahead_s)
+            self._costs[way] = memory * self._costs[way] + off_m * off_m
+        self._judged += 1
+        if self._judged < JUDGED:
+            return
+        best = min(range(len(WAYS)), key=self._costs.__getitem__)
+        if self._costs[best] < BETTER * self._costs[self._way]:
+            self._way = best
+
+    def usual_m(self, age_s: float) -> float | None:
+        """The error that 95 of 100 predictions of this age stay below, as reports have shown.
+
+        Between the ages seen it is interpolated, beyond them carried on with the square of the age.
+        None before there are enough.
+        """
+        seen = [(one.age_s, one.usual_m()) for one in self._errors]
+        known = [(age, error) for age, error in seen if error is not None]
+        if not known:
+            return None
+        first_s, first_m = known[0]
+        if age_s <= first_s:
+            return first_m
+        for (a_s, a_m), (b_s, b_m) in pairwise(known):
+            if age_s <= b_s:
+                return a_m + (b_m - a_m) * (age_s - a_s) / (b_s - a_s)
+        last_s, last_m = known[-1]
+        return last_m * (age_s / last_s) ** 2
+
+
+def fading(ahead_s: float, fades_s: float) -> tuple[float, float]:
+    """Displacement (s²) and gain in speed (s) by a fading acceleration of 1 within a time.
+
+    s(τ) of docs/math.md 5.1, and its derivative.
+    """
+    shrink = math.exp(-ahead_s / fades_s)
+    return fades_s * fades_s * (shrink - 1.0 + ahead_s / fades_s), fades_s * (1.0 - shrink)

@@ -1,0 +1,101 @@
+"""Ways of feeding acceleration forward, chosen by what they would have been worth."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from companion.tracking.hindsight import PLAIN, WAYS, Hindsight, fading
+from companion.tracking.history import History
+from companion.tracking.observers.kinematic import KinematicModel, KinematicObserver
+from companion.values import Fix
+
+S = 1_000_000_000
+OBSERVER = KinematicObserver(KinematicModel(60.0, 20.0))
+Place = Callable[[float], tuple[list[float], list[float]]]
+
+
+def circling(radius_m: float, speed_mps: float) -> Place:
+    def at(t_s: float) -> tuple[list[float], list[float]]:
+        a = speed_mps / radius_m * t_s
+        place = [radius_m * math.sin(a), -radius_m * math.cos(a), 0.0]
+        return place, [speed_mps * math.cos(a), speed_mps * math.sin(a), 0.0]
+
+    return at
+
+
+def flown(
+    fix: Callable[..., Fix],
+    place: Place,
+    interval_s: float,
+    seconds: float,
+    noise_mps: float = 0.0,
+    noise_m: float = 0.0,
+) -> Hindsight:
+    rng, history, hindsight = np.random.default_rng(1), None, Hindsight()
+    for n in range(int(seconds / interval_s)):
+        t_s = n * interval_s
+        position, velocity = (np.array(one) for one in place(t_s))
+        made = fix(
+            round(t_s * S),
+            position + rng.normal(0, noise_m, 3),
+            velocity + rng.normal(0, noise_mps, 3),
+        )
+        if history is None:
+            history = History(OBSERVER, made, 5 * S)
+        else:
+            history.insert(len(history.entries), made)
+        hindsight.add(made, tuple(history.acceleration(way.window_s, way.fewest) for way in WAYS))
+    return hindsight
+
+
+def test_in_straight_flight_with_noise_nothing_is_fed(fix: Callable[..., Fix]) -> None:
+    straight: Place = lambda t_s: ([10 * t_s, 0, 0], [10, 0, 0])  # noqa: E731
+    assert flown(fix, straight, 0.9, 120, noise_mps=0.5, noise_m=1.0).way is PLAIN
+
+
+def test_in_a_quick_turn_a_short_window_is_taken(fix: Callable[..., Fix]) -> None:
+    """An aeroplane's: over five seconds the acceleration turns by a radian."""
+    way = flown(fix, circling(110.0, 22.0), 0.1, 60, noise_mps=0.05, noise_m=0.05).way
+    assert 0 < way.window_s <= 2.5
+
+
+def test_in_a_slow_noisy_turn_something_is_fed(fix: Callable[..., Fix]) -> None:
+    assert flown(fix, circling(60.0, 5.0), 0.1, 60, noise_mps=0.05, noise_m=0.02).way is not PLAIN
+
+
+def test_before_there_is_any_judgement_nothing_is_fed(fix: Callable[..., Fix]) -> None:
+    assert flown(fix, circling(110.0, 22.0), 0.1, 1.0).way is PLAIN
+    assert Hindsight().usual_m(1.0) is None
+
+
+def test_the_usual_error_covers_what_comes(fix: Callable[..., Fix]) -> None:
+    """Over noisy reports, at the ages that were judged: 19 of 20, and not much more."""
+    place = circling(60.0, 8.0)
+    hindsight = flown(fix, place, 0.2, 120, noise_mps=0.2, noise_m=0.5)
+    rng, covered, count = np.random.default_rng(2), 0, 2000
+    usual_m = hindsight.usual_m(1.0)
+    assert usual_m is not None
+    for _ in range(count):
+        t_s = rng.uniform(0, 100)
+        position, velocity = (np.array(one) for one in place(t_s))
+        later, _ = place(t_s + 1.0)
+        told = position + rng.normal(0, 0.5, 3) + (velocity + rng.normal(0, 0.2, 3))
+        acceleration = np.array([-velocity[1], velocity[0], 0]) * 8.0 / 60.0
+        told = told + acceleration * (0.0 if hindsight.way is PLAIN else 0.48)
+        seen = np.array(later) + rng.normal(0, 0.5, 3)
+        covered += float(np.linalg.norm(told - seen)) <= usual_m
+    assert 0.9 <= covered / count <= 0.99
+    ages = [hindsight.usual_m(age) for age in (0.0, 0.25, 1.0, 3.0, 10.0)]
+    assert ages == sorted(ages)  # type: ignore[type-var]
+
+
+@pytest.mark.parametrize("fades_s", [3.0, 10.0])
+def test_a_fading_acceleration(fades_s: float) -> None:
+    """Against the integral, twice."""
+    times = np.linspace(0, 2.0, 20001)
+    speeds = np.concatenate([[0], np.cumsum(np.exp(-(times[:-1] + 5e-5) / fades_s) * 1e-4)])
+    way, gain = fading(2.0, fades_s)
+    assert gain == pytest.approx(speeds[-1], rel=1e-6)
+    assert way == pytest.approx(float(np.trapezoid(speeds, times)), rel=1e-6)

@@ -25,9 +25,11 @@ def told(fix: Callable[..., Fix], t_s: float, velocity: object, limits: Limits =
 
 @pytest.mark.parametrize(
     ("mav_type", "kind"),
-    [(None, Airframe.UNKNOWN), (1, Airframe.AEROPLANE), (2, Airframe.COPTER),
-     (4, Airframe.HELICOPTER), (6, Airframe.UNKNOWN), (10, Airframe.ROVER), (13, Airframe.COPTER), (20, Airframe.VTOL),
-     (12345, Airframe.UNKNOWN)],
+    [
+        (None, Airframe.UNKNOWN), (1, Airframe.AEROPLANE), (2, Airframe.COPTER),
+        (4, Airframe.HELICOPTER), (6, Airframe.UNKNOWN), (10, Airframe.ROVER),
+        (13, Airframe.COPTER), (20, Airframe.VTOL), (12345, Airframe.UNKNOWN),
+    ],
 )  # fmt: skip
 def test_types_of_aircraft(mav_type: int | None, kind: Airframe) -> None:
     assert airframe(mav_type) is kind

@@ -37,6 +37,15 @@ function range(uav) {
   return parts.every(format.known) ? Math.hypot(...parts) : null;
 }
 
+function bound({ uav }) {
+  const text = format.metres(uav.bound_m);
+  if (uav.assumptions?.source !== "raised") return { text };
+  return {
+    text: `▲ ${text}`, level: "warn",
+    title: "Its reports refuted what was assumed of this aircraft: it was raised",
+  };
+}
+
 /** Older than this, a UAV's values are drawn as old. */
 const OLD_S = 2;
 
@@ -67,7 +76,10 @@ const COLUMNS = [
   { key: "latency", label: "Latency", feed: "uavs", title: "From when it was true to arrival",
     show: ({ uav }) => ({ text: format.milliseconds(uav.latency_s) }) },
   { key: "bound", label: "Bound", feed: "uavs", title: "Guaranteed position error, at most",
-    show: ({ uav }) => ({ text: format.metres(uav.bound_m) }) },
+    show: bound },
+  { key: "usual", label: "Usual error", short: "Usual", feed: "uavs",
+    title: "95 of 100 predictions at this age were nearer, of late",
+    show: ({ uav }) => ({ text: format.metres(uav.error_p95_m) }) },
   { key: "pointing", label: "Pointing bound", short: "Pointing", feed: "beams",
     title: "How far the true direction can lie from the beam", show: pointingBound },
   { key: "gain", label: "Gain", feed: "beams", title: "Array gain towards the prediction",

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from companion.tracking.gate import GateSettings, Suspects, is_frozen, refusal
-from companion.tracking.hindsight import WAYS, Hindsight, Vector, fading
-from companion.tracking.history import History
+from companion.tracking.hindsight import PLAIN, WAYS, WINDOWS, Hindsight, fading
+from companion.tracking.history import History, Vector
 from companion.tracking.limits import Refutations
 from companion.tracking.observers.estimates import Observer, Prediction
 from companion.tracking.pace import Pace
@@ -226,19 +226,20 @@ class Fleet:
 
         Accelerations are cut to the greatest possible size.
         """
+        hindsight = tracked.hindsight
+        if not self._settings.feed_forward:
+            if hindsight.is_due(fix.sender_ns):
+                hindsight.add(fix, (None,) * len(WAYS))
+            return
+        due = hindsight.is_due(fix.sender_ns)
+        if not due and hindsight.way is PLAIN:
+            return
         most_mps2 = self._limits(fix).acceleration_mps2
-        found: list[Vector | None] = []
-        for way in WAYS:
-            given = None
-            if way.window_s and self._settings.feed_forward:
-                given = tracked.history.acceleration(way.window_s, way.fewest)
-            if given is not None and (size := math.sqrt(sum(a * a for a in given))) > most_mps2:
-                north, east, down = given
-                cut = most_mps2 / size
-                given = (cut * north, cut * east, cut * down)
-            found.append(given)
-        tracked.hindsight.add(fix, tuple(found))
-        chosen = found[WAYS.index(tracked.hindsight.way)]
+        slopes = [_cut(one, most_mps2) for one in tracked.history.accelerations(WINDOWS)]
+        by_window = {window[0]: slope for window, slope in zip(WINDOWS, slopes, strict=True)}
+        if due:
+            hindsight.add(fix, tuple(by_window.get(way.window_s) for way in WAYS))
+        chosen = by_window.get(hindsight.way.window_s)
         tracked.acceleration = None if chosen is None else np.array(chosen)
 
     def forget(self, uav: str) -> None:
@@ -365,6 +366,18 @@ def _fastest_mps(found: Prediction, limits: Limits, within_s: float) -> float:
 
 def _rejected(fix: Fix, reason: Reason, detail: str) -> Rejection:
     return Rejection(fix.arrival_ns, fix.uav, reason, detail=detail)
+
+
+def _cut(acceleration: Vector | None, most_mps2: float) -> Vector | None:
+    """An acceleration cut to the greatest size."""
+    if acceleration is None:
+        return None
+    north, east, down = acceleration
+    size = math.sqrt(north * north + east * east + down * down)
+    if size <= most_mps2:
+        return acceleration
+    share = most_mps2 / size
+    return share * north, share * east, share * down
 
 
 def _unknown_input(history: History[Any]) -> FloatArray | None:

@@ -14,9 +14,8 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Final
 
+from companion.tracking.history import Vector
 from companion.values import Fix
-
-Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,8 +33,10 @@ class Way:
 
 
 PLAIN: Final = Way(0.0, 0, 1.0)
-WAYS: Final = (PLAIN, Way(5.0, 5, 3.0), Way(1.0, 3, 3.0), Way(1.0, 3, 10.0), Way(2.5, 3, 10.0))
-"""None; a slow turn over noisy reports; a quick turn; one that goes on."""
+WAYS: Final = (PLAIN, Way(1.0, 3, 3.0), Way(1.0, 3, 10.0), Way(2.5, 3, 10.0), Way(5.0, 5, 3.0))
+"""None; a quick turn, soon over or not; one that goes on; a slow one over noisy reports."""
+WINDOWS: Final = ((1.0, 3), (2.5, 3), (5.0, 5))
+"""Windows of the ways and the velocities they need, each once, ascending."""
 JUDGED_S: Final = 1.0
 """Least age of the predictions by which ways are judged."""
 MEMORY_S: Final = 20.0
@@ -48,7 +49,8 @@ AGES_S: Final = (0.25, 1.0, 2.5)
 """Least ages of the predictions whose errors are kept for the usual error."""
 ERRORS: Final = 200
 USUAL: Final = 0.95
-_SPACING_S: Final = 0.08
+SPACING_S: Final = 0.2
+"""Least time between reports that are judged: more often would say no more."""
 _KEPT: Final = 64
 
 
@@ -64,14 +66,17 @@ class _Made:
     def off_m(self, way: int, there: Vector, ahead_s: float) -> float:
         """How far a prediction by a way is from a position reported later."""
         given = self.accelerations[way]
-        gain = 0.0 if given is None else fading(ahead_s, WAYS[way].fades_s)[0]
-        a = given or (0.0, 0.0, 0.0)
-        return math.sqrt(
-            sum(
-                (p + v * ahead_s + gain * k - q) ** 2
-                for p, v, k, q in zip(self.position, self.velocity, a, there, strict=True)
-            )
+        north, east, down = (
+            p + v * ahead_s - q for p, v, q in zip(self.position, self.velocity, there, strict=True)
         )
+        if given is not None:
+            gain = fading(ahead_s, WAYS[way].fades_s)[0]
+            north, east, down = (
+                north + gain * given[0],
+                east + gain * given[1],
+                down + gain * given[2],
+            )
+        return math.sqrt(north * north + east * east + down * down)
 
 
 @dataclass(slots=True)
@@ -113,13 +118,15 @@ class Hindsight:
         """The way of feeding forward that is in use."""
         return WAYS[self._way]
 
+    def is_due(self, sender_ns: int) -> bool:
+        """Whether a report of this time is to be added."""
+        return not self._made or sender_ns - self._made[-1].sender_ns >= SPACING_S * 1e9
+
     def add(self, fix: Fix, accelerations: tuple[Vector | None, ...]) -> None:
         """Judge earlier predictions by a report; remember what can be predicted from it.
 
         ``accelerations``: what each of ``WAYS`` would feed forward from this report, m/s².
         """
-        if self._made and fix.sender_ns - self._made[-1].sender_ns < _SPACING_S * 1e9:
-            return
         there: Vector = tuple(fix.position_ned_m.tolist())
         self._judge(fix.sender_ns, there)
         for errors, least_s in zip(self._errors, AGES_S, strict=True):

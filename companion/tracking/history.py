@@ -6,13 +6,16 @@ than the window is not used. Nearly always a report is the newest, and costs one
 """
 
 from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Generic
 
 from companion.tracking.observers.estimates import Observer, Prediction, State
 from companion.values import Fix
 
-ACCELERATION_REPORTS_MAX = 15
+Vector = tuple[float, float, float]
+
+ACCELERATION_REPORTS_MAX = 25
 """Most velocities used for an acceleration: of more, only every n-th over the whole window."""
 
 
@@ -73,28 +76,46 @@ class History(Generic[State]):
         predicted = self._observer.predict(before, fix.sender_ns)
         return Entry(fix, self._observer.after(before, predicted, fix), predicted)
 
-    def acceleration(self, window_s: float, fewest: int) -> tuple[float, float, float] | None:
-        """Least-squares slope of the velocities reported within a time, m/s².
+    def accelerations(self, windows: Sequence[tuple[float, int]]) -> list[Vector | None]:
+        """Least-squares slopes of the velocities reported within some times, m/s².
 
-        Of at least so many velocities, older ones if need be; None if there are too few.
+        windows  the times, seconds, ascending, each with the least number of velocities: older
+                 ones are taken if need be, and None stands where there are too few
+
+        One pass over the reports, newest first: each window ends where the next report is too old.
         """
-        newest_ns = self.newest.fix.sender_ns
-        rows: list[tuple[float, float, float, float]] = []
-        stride = max(1, len(self.entries) // ACCELERATION_REPORTS_MAX)
-        for entry in self.entries[::-stride]:
-            fix = entry.fix
-            ago_s = (newest_ns - fix.sender_ns) * 1e-9
-            if fix.velocity_ned_mps is None or (ago_s > window_s and len(rows) >= fewest):
+        newest_ns, found, due = self.newest.fix.sender_ns, [], 0
+        n = t1 = t2 = 0.0
+        v1, v2, v3, w1, w2, w3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        entries = self.entries
+        stride = max(1, len(entries) // ACCELERATION_REPORTS_MAX)
+        for at in range(len(entries) - 1, -1, -stride):
+            fix = entries[at].fix
+            if fix.velocity_ned_mps is None:
                 break
+            t = (fix.sender_ns - newest_ns) * 1e-9
+            while due < len(windows) and -t > windows[due][0] and n >= windows[due][1]:
+                found.append(_slope(n, t1, t2, (v1, v2, v3), (w1, w2, w3)))
+                due += 1
+            if due == len(windows):
+                return found
             north, east, down = fix.velocity_ned_mps.tolist()
-            rows.append((-ago_s, north, east, down))
-        if len(rows) < fewest:
-            return None
-        middle = sum(row[0] for row in rows) / len(rows)
-        spread = sum((row[0] - middle) ** 2 for row in rows)
-        if not spread:
-            return None
-        north, east, down = (
-            sum((row[0] - middle) * row[axis] for row in rows) / spread for axis in (1, 2, 3)
-        )
-        return north, east, down
+            n, t1, t2 = n + 1.0, t1 + t, t2 + t * t
+            v1, v2, v3 = v1 + north, v2 + east, v3 + down
+            w1, w2, w3 = w1 + t * north, w2 + t * east, w3 + t * down
+        for _, fewest in windows[due:]:
+            enough = n >= fewest
+            found.append(_slope(n, t1, t2, (v1, v2, v3), (w1, w2, w3)) if enough else None)
+        return found
+
+
+def _slope(n: float, t1: float, t2: float, v: Vector, w: Vector) -> Vector | None:
+    """The slope from the sums of 1, t, t², v and t v; None where all times are one."""
+    spread = t2 - t1 * t1 / n
+    if spread <= 0.0:
+        return None
+    return (
+        (w[0] - t1 * v[0] / n) / spread,
+        (w[1] - t1 * v[1] / n) / spread,
+        (w[2] - t1 * v[2] / n) / spread,
+    )

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from companion.tracking.hindsight import PLAIN, WAYS, Hindsight, fading
+from companion.tracking.hindsight import PLAIN, WAYS, WINDOWS, Hindsight, fading
 from companion.tracking.history import History
 from companion.tracking.observers.kinematic import KinematicModel, KinematicObserver
 from companion.values import Fix
@@ -46,7 +46,9 @@ def flown(
             history = History(OBSERVER, made, 5 * S)
         else:
             history.insert(len(history.entries), made)
-        hindsight.add(made, tuple(history.acceleration(way.window_s, way.fewest) for way in WAYS))
+        if hindsight.is_due(made.sender_ns):
+            slopes = dict(zip([w[0] for w in WINDOWS], history.accelerations(WINDOWS), strict=True))
+            hindsight.add(made, tuple(slopes.get(way.window_s) for way in WAYS))
     return hindsight
 
 

@@ -75,7 +75,7 @@ def test_any_order_of_arrival_gives_what_the_right_order_gives(
         assert (one.predicted is None) == (other.predicted is None)
         if one.predicted is not None:
             assert same_state(one.predicted, other.predicted)
-    assert np.array_equal(found.acceleration(5.0, 5), right.acceleration(5.0, 5))
+    assert np.array_equal(found.accelerations([(5.0, 5)])[0], right.accelerations([(5.0, 5)])[0])
     end_ns = in_order[-1].sender_ns + S
     assert same_state(
         OBSERVERS[name].predict(found.newest.state, end_ns),
@@ -170,16 +170,16 @@ def test_the_acceleration_is_the_slope_of_the_velocities(
     used = max(5, sum(newest_ns - one.sender_ns <= 5 * S for one in made))
     times = [(one.sender_ns - newest_ns) * 1e-9 for one in made[-used:]]
     expected = np.polyfit(times, [one.velocity_ned_mps for one in made[-used:]], 1)[0]
-    found = told(KINEMATIC, made).acceleration(5.0, 5)
+    found = told(KINEMATIC, made).accelerations([(5.0, 5)])[0]
     assert found == pytest.approx(expected, rel=1e-6, abs=1e-6)
 
 
 def test_the_acceleration_takes_five_velocities_in_a_row(fix: MakeFix) -> None:
     made = [fix(n * S // 5, [0, 0, 0], [n, 0, -2 * n]) for n in range(6)]
-    assert told(KINEMATIC, made[:4]).acceleration(5.0, 5) is None
-    assert told(KINEMATIC, made[:5]).acceleration(5.0, 5) == pytest.approx([5, 0, -10])
+    assert told(KINEMATIC, made[:4]).accelerations([(5.0, 5)])[0] is None
+    assert told(KINEMATIC, made[:5]).accelerations([(5.0, 5)])[0] == pytest.approx([5, 0, -10])
     silent = fix(2 * S, [0, 0, 0])
-    assert told(KINEMATIC, [*made, silent]).acceleration(5.0, 5) is None
+    assert told(KINEMATIC, [*made, silent]).accelerations([(5.0, 5)])[0] is None
     hidden = [
         made[0],
         made[1],
@@ -187,4 +187,4 @@ def test_the_acceleration_takes_five_velocities_in_a_row(fix: MakeFix) -> None:
         made[3],
         *(fix(n * S // 5, [0] * 3, [1] * 3) for n in (4, 5, 6)),
     ]
-    assert told(KINEMATIC, hidden).acceleration(5.0, 5) is None
+    assert told(KINEMATIC, hidden).accelerations([(5.0, 5)])[0] is None

@@ -37,14 +37,14 @@ test("every value is in its own column, with its unit", () => {
   const { show, texts } = openTable();
   show([uav("1:1", {
     state: "coasting", north_m: 30, east_m: -40, down_m: -120, speed_mps: 5.25, age_s: 0.5,
-    dt_s: 0.25, latency_s: 0.03, bound_m: 4.2,
+    dt_s: 0.25, latency_s: 0.03, bound_m: 4.2, error_p95_m: 0.75,
   })], { beams: [beam("1:1", {
     azimuth_deg: -12.5, elevation_deg: 8, pointing_bound_deg: 1.25, gain_db: 17.5,
     guaranteed_gain_db: 15.2,
   })] });
   assert.deepEqual(texts(), {
     state: "coasting", range: "130 m", azimuth: "−12.5°", elevation: "+8.0°", speed: "5.3 m/s",
-    age: "0.50 s", dt: "0.25 s", latency: "30 ms", bound: "4.2 m", pointing: "1.25°",
+    age: "0.50 s", dt: "0.25 s", latency: "30 ms", bound: "4.2 m", usual: "0.8 m", pointing: "1.25°",
     gain: "17.5 dB", guaranteed: "15.2 dB",
   });
 });
@@ -65,7 +65,7 @@ test("what is not known is a dash: without a beam, without a place", () => {
   show([uav("1:1", { north_m: null, speed_mps: null, age_s: null, dt_s: null, latency_s: null })]);
   assert.deepEqual(texts(), {
     state: "live", range: "–", azimuth: "–", elevation: "–", speed: "–", age: "–", dt: "–",
-    latency: "–", bound: "4.2 m", pointing: "–", gain: "–", guaranteed: "–",
+    latency: "–", bound: "4.2 m", usual: "–", pointing: "–", gain: "–", guaranteed: "–",
   });
 });
 
@@ -79,6 +79,15 @@ test("an age grows while no answer comes, and above two seconds it is warned of"
   assert.ok(cell("age").dataset.level === "warn" && rows()[0].hasAttribute("data-old"));
   show([uav("1:1", { age_s: null })], { sinceS: 9 });
   assert.ok(cell("age").dataset.level === "" && !rows()[0].hasAttribute("data-old"));
+});
+
+test("a bound whose assumptions were refuted is marked", () => {
+  const { show, cell } = openTable();
+  show([uav("1:1", { assumptions: { source: "raised" } })]);
+  assert.deepEqual([plain(cell("bound").textContent), cell("bound").dataset.level],
+    ["▲ 4.2 m", "warn"]);
+  show([uav("1:1", { assumptions: { source: "type" } })]);
+  assert.deepEqual([plain(cell("bound").textContent), cell("bound").dataset.level], ["4.2 m", ""]);
 });
 
 test("a pointing bound above half the beamwidth is warned of, unless the beam is broadened", () => {

@@ -141,7 +141,7 @@ class BootLine:
         if not self.floor:
             return False
         x_ns = self.unwrap(boot_ms)
-        if not _EARLY_NS // 4 <= self.late_ns(arrival_ns, x_ns) <= self._late_max_ns // 2:
+        if abs(self.late_ns(arrival_ns, x_ns)) > self._late_max_ns // 2:
             return False
         self.floor.add(x_ns, arrival_ns - x_ns)
         self.newest_ns = max(self.newest_ns, x_ns)

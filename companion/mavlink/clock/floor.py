@@ -140,7 +140,7 @@ class Floor:
                 self._line,
                 x_ns,
             )  # no frame is as late as that: the clock did change
-        if self.count < 4 * RECENT or self.count - self._looked >= 16 or gap < -RESOLUTION_NS:
+        if self.count < 4 * RECENT or self.count - self._looked >= 64 or gap < -RESOLUTION_NS:
             self._measure()
 
     def _height(self, x_ns: int, y_ns: int) -> float:

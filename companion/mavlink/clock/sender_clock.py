@@ -70,6 +70,7 @@ class SenderClock:
         self._gnss = Evidence(drift_max)
         self._gnss_plausible = 0
         self._latency_s = 0.0
+        self._known: tuple[ClockKind, int, int, int] | None = None  # as of the newest stamp
 
     def observe(self, arrival_ns: int, boot_ms: int) -> Stamp | None:
         """Place a stamp.
@@ -78,7 +79,7 @@ class SenderClock:
         not confirmed so far: that report has no time and cannot be used.
         """
         placed = self._line.observe(arrival_ns, boot_ms)
-        self.change = None
+        self.change = self._known = None
         if placed is None:
             return None
         if placed.new_line:
@@ -93,7 +94,7 @@ class SenderClock:
 
     def notice(self, arrival_ns: int, boot_ms: int) -> None:
         """Take in the stamp of any other message, if it lies on the line that reports have made."""
-        self.change = None
+        self.change = self._known = None
         if self._line.notice(arrival_ns, boot_ms):
             self._note_change()
 
@@ -117,7 +118,7 @@ class SenderClock:
 
         It is refused until a stamp of the sender was observed.
         """
-        self.change = None
+        self.change = self._known = None
         if not self._line.floor:
             self.timesync_refused = "no stamp of this sender was seen so far"
         elif received_ns < sent_ns:
@@ -134,7 +135,7 @@ class SenderClock:
         row have implied latencies between -20 ms and 5 s (each limit widened by the node's own
         error).
         """
-        self.change = None
+        self.change = self._known = None
         self.gnss_refused = self._system_time(arrival_ns, unix_us, boot_ms)
         if self.gnss_refused is not None:
             self._gnss_plausible = 0
@@ -182,9 +183,7 @@ class SenderClock:
 
     def node_ns(self, sender_ns: int) -> int:
         """Convert a sender time to node time, ns; monotonic. Needs a first stamp."""
-        newest_ns, floor = self._line.newest_ns, self._line.floor
-        likely_ns = self._interval(newest_ns)[3]
-        return sender_ns + likely_ns + floor.drifted_ns(sender_ns)
+        return sender_ns + self._now()[3] + self._line.floor.drifted_ns(sender_ns)
 
     def sender_ns(self, node_ns: int) -> int:
         """Convert a node time to sender time, ns: the inverse of ``node_ns``, to a few ns.
@@ -194,7 +193,7 @@ class SenderClock:
         if not self._line.floor:
             raise ValueError("no stamp of this sender was seen so far")
         newest_ns, floor = self._line.newest_ns, self._line.floor
-        ahead_ns = node_ns - newest_ns - self._interval(newest_ns)[3]
+        ahead_ns = node_ns - newest_ns - self._now()[3]
         return newest_ns + round(ahead_ns / (1.0 + floor.drift))
 
     def estimate(self, node_ns: int | None = None) -> ClockEstimate | None:
@@ -204,7 +203,9 @@ class SenderClock:
             return None
         newest_ns = self._line.newest_ns
         x_ns = newest_ns if node_ns is None else self.sender_ns(node_ns)
-        kind, low_ns, high_ns, likely_ns = self._interval(x_ns)
+        kind, low_ns, high_ns, likely_ns = (
+            self._now() if x_ns == newest_ns else self._interval(x_ns)
+        )
         guarantee = Guarantee.ASSUMED if kind is ClockKind.ENVELOPE else Guarantee.MEASURED
         return ClockEstimate(
             kind=kind,
@@ -217,6 +218,12 @@ class SenderClock:
             constant_delay_s=(floor.at(x_ns) - likely_ns) * 1e-9,
             latency_s=self._latency_s,
         )
+
+    def _now(self) -> tuple[ClockKind, int, int, int]:
+        """What is known of the offset as of the newest stamp; kept until more is heard."""
+        if self._known is None:
+            self._known = self._interval(self._line.newest_ns)
+        return self._known
 
     def _usual_s(self, kind: ClockKind, low_ns: int, high_ns: int) -> float:
         """By how much the most likely offset usually is off: as much as is guessed of it."""

@@ -1,0 +1,213 @@
+"""What is assumed of aircraft, and what is told when their reports refute it, through the fold."""
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pymavlink.dialects.v20.all as dialect
+import pytest
+
+from companion import Frame, Pipeline, RoundTrip, Settings, Source, Tick
+from companion.values import Estimate, Notice, Output, Reason, Refuted, Rejection, Update
+
+START_NS = 1_760_000_000_000_000_000
+S = 1_000_000_000
+LAT, LON, ALT_M = 47.4, 8.55, 500.0
+M_PER_DEG = 111_195.0
+
+
+def sent(t_s: float, source: str, message: Any) -> Frame:
+    sender = dialect.MAVLink(None, *map(int, source.split(":")))
+    return Frame(START_NS + round(t_s * S), "udp", Source.parse(source), message.get_msgId(),
+                 message.pack(sender))  # fmt: skip
+
+
+def position(
+    t_s: float,
+    source: str,
+    ned_m: Iterable[float],
+    velocity: Iterable[float] = (0, 0, 0),
+    late_s: float = 0.0,
+) -> Frame:
+    """A report made at a time, by a boot clock that began 100 s before, and late."""
+    north, east, down = ned_m
+    message = dialect.MAVLink_global_position_int_message(
+        round((100 + t_s) * 1000),
+        round((LAT + north / M_PER_DEG) * 1e7),
+        round((LON + east / M_PER_DEG / math.cos(math.radians(LAT))) * 1e7),
+        round((ALT_M - down) * 1000), 0, *(round(100 * v) for v in velocity), 65535,
+    )  # fmt: skip
+    return sent(t_s + late_s, source, message)
+
+
+def heartbeat(t_s: float, source: str, mav_type: int, autopilot: int = 3) -> Frame:
+    return sent(t_s, source, dialect.MAVLink_heartbeat_message(mav_type, autopilot, 0, 0, 4, 3))
+
+
+def receiver(t_s: float, source: str, fix_type: int, alt_m: float) -> Frame:
+    message = dialect.MAVLink_gps_raw_int_message(
+        round(t_s * 1e6), fix_type, round(LAT * 1e7), round(LON * 1e7), round(alt_m * 1e3),
+        100, 100, 0, 0, 12,
+    )  # fmt: skip
+    return sent(t_s, source, message)
+
+
+def pipeline(center: str = f"{LAT},{LON},{ALT_M}", **sections: dict[str, Any]) -> Pipeline:
+    return Pipeline(Settings().override(center={"source": center}, **sections))
+
+
+def run(into: Pipeline, events: Iterable[Frame | Tick]) -> list[Output]:
+    return [output for event in events for output in into.step(event)]
+
+
+def turning(
+    uav: str, seconds: float, speed: float = 22.0, radius: float = 60.0, rate_hz: int = 10
+) -> list[Frame]:
+    """Circles of 8 m/s²."""
+    frames = []
+    for n in range(int(seconds * rate_hz)):
+        t_s, a = n / rate_hz, speed / radius * n / rate_hz
+        place = (200 + radius * math.cos(a), radius * math.sin(a), -60)
+        frames.append(position(t_s, uav, place, (-speed * math.sin(a), speed * math.cos(a), 0)))
+    return frames
+
+
+def test_a_turn_that_the_type_cannot_do_is_told_once_and_the_bound_widens() -> None:
+    into = pipeline()
+    out = run(into, [heartbeat(0, "1:1", 2), *turning("1:1", 10)])
+    refuted = [one for one in out if isinstance(one, Refuted)]
+    notices = [one for one in out if isinstance(one, Notice) and "acceleration" in one.text]
+    assert refuted and refuted[0].t_ns - START_NS < S
+    assert {(one.uav, one.setting) for one in refuted} == {
+        ("1:1", "observer.acceleration_max_mps2")
+    }
+    assert 1 <= len(notices) <= 2
+    assert "observer.acceleration_max_mps2" in notices[0].text
+    now_ns = START_NS + 10 * S
+    (track,) = into.tracks(now_ns, now_ns + S)
+    assert track.limits.source == "raised"
+    assert track.limits.acceleration_mps2 > 7.0
+    assert into.assumptions.times("1:1") == len(refuted)
+    assert not any(isinstance(one, Rejection) for one in out)
+
+
+def test_what_an_aeroplane_can_do_is_no_news() -> None:
+    into = pipeline()
+    out = run(into, [heartbeat(0, "1:1", 1), *turning("1:1", 10)])
+    assert not any(isinstance(one, Refuted) for one in out)
+    (track,) = into.tracks(START_NS + 10 * S, START_NS + 10 * S)
+    assert (track.limits.source, track.limits.acceleration_mps2) == ("type", 16.0)
+
+
+@pytest.mark.parametrize(("mav_type", "lag_s"), [(2, 0.0295), (1, -0.026)])
+def test_a_lag_is_taken_off(mav_type: int, lag_s: float) -> None:
+    """ArduPilot's copters' positions are old, its aeroplanes' ahead of their stamps."""
+    into = pipeline()
+    out = run(into, [heartbeat(0, "1:1", mav_type), position(1, "1:1", (100, 0, 0), (10, 0, 0))])
+    (estimate,) = (one for one in out if isinstance(one, Estimate))
+    assert (START_NS + S - estimate.fix.t_ns) / S == pytest.approx(lag_s, abs=1e-3)
+    assert (101 * S - estimate.fix.sender_ns) / S == pytest.approx(lag_s, abs=1e-9)
+
+
+def test_a_step_of_some_seconds_is_no_second_vehicle() -> None:
+    """Six metres aside for four seconds: followed after one, and so is the way back."""
+    into, rejected = pipeline(), []
+    for n in range(200):
+        t_s = n / 10
+        aside = 6.0 if 8 <= t_s < 12 else 0.0
+        frame = position(t_s, "1:1", (100, 5 * t_s + aside, 0), (0, 5, 0))
+        rejected += [one for one in into.step(frame) if isinstance(one, Rejection)]
+    assert {one.reason for one in rejected} <= {Reason.UNREACHABLE}
+    assert len(rejected) <= 22
+    assert [one for one in rejected if one.t_ns > START_NS + 13.2 * S] == []
+
+
+def test_reports_of_a_fast_aircraft_with_a_good_receiver_are_all_used() -> None:
+    """150 m/s at 20 Hz and a centimetre of accuracy: a millisecond is worth more than that."""
+    into = pipeline(observer={"speed_max_mps": 160.0})
+    good = dialect.MAVLink_gps_raw_int_message(
+        0, 6, 0, 0, round(ALT_M * 1e3), 100, 100, 0, 0, 12, 0, 10, 10, 10
+    )
+    out = run(into, [heartbeat(0, "1:1", 1, 12), sent(0, "1:1", good)])
+    rng = np.random.default_rng(1)
+    for n in range(600):
+        made = n / 20 + rng.uniform(0, 1e-3)
+        place = np.array([150.0 * made, 0, -100]) + rng.uniform(-0.005, 0.005, 3)
+        out += into.step(position(n / 20, "1:1", place, (150, 0, 0)))
+    assert not any(isinstance(one, Rejection) for one in out)
+
+
+# --- clocks -------------------------------------------------------------------------------------
+
+
+def test_a_clock_that_stood_still_is_told_and_recorded_as_refuted() -> None:
+    into, out = pipeline(), []
+    for n in range(600):
+        t_s = n / 20
+        stood_s = 0.0 if t_s < 20 else 0.15
+        made = position(t_s - stood_s, "1:1", (100, 5 * t_s, 0), (0, 5, 0), late_s=stood_s)
+        out += into.step(made)
+    refuted = [one for one in out if isinstance(one, Refuted)]
+    assert [one.setting for one in refuted] == ["clocks.drift_max_ppm"]
+    assert 20 < (refuted[0].t_ns - START_NS) / S < 21.3
+    (told,) = (one for one in out if isinstance(one, Notice) and "stood still" in one.text)
+    assert told.subject == "1:1" and "150 ms" in told.text
+
+
+def test_a_round_trip_that_contradicts_is_told_as_proven() -> None:
+    into = pipeline()
+    out = run(into, [position(n / 10, "1:1", (100, 0, 0)) for n in range(100)])
+    for t_s, late_s in ((9.0, 0.0), (9.5, 0.4)):
+        remote_ns = round((100 + t_s - late_s) * S)
+        sent_ns = START_NS + round((t_s - 0.01) * S)
+        trip = RoundTrip(START_NS + round((t_s + 0.01) * S), Source(1, 1), sent_ns, remote_ns)
+        out += into.step(trip)
+    assert into.clock_estimate("1:1") is not None
+    changed = [one for one in out if isinstance(one, Notice) and "clock of 1:1" in one.text]
+    assert len(changed) <= 1
+
+
+def test_other_messages_keep_the_clock() -> None:
+    """Stamps of messages that nobody decodes: between two reports of a slow link they count."""
+    alone, helped = pipeline(), pipeline()
+    for n in range(40):
+        late_s = 0.8 if n % 4 else 0.05  # reports are the slow ones
+        frame = position(float(n), "1:1", (100, 0, 0), late_s=0.8)
+        alone.step(frame)
+        helped.step(frame)
+        made = dialect.MAVLink_scaled_imu_message(round((100 + n + 0.5) * 1e3), *[0] * 9)
+        helped.step(sent(n + 0.5 + late_s, "1:1", made))
+    plain, known = alone.clock_estimate("1:1"), helped.clock_estimate("1:1")
+    assert plain is not None and known is not None
+    assert known.offset_ns < plain.offset_ns - 0.5 * S
+
+
+# --- home ---------------------------------------------------------------------------------------
+
+
+def test_home_waits_for_a_receiver_that_vouches() -> None:
+    """No fix, then a height that is hundreds of metres off, then both right."""
+    into = pipeline("home")
+    early = position(1, "1:1", (0, 0, 500.2))
+    out = run(into, [receiver(0.5, "1:1", 1, ALT_M), early])
+    assert [one.reason for one in out if isinstance(one, Rejection)] == [Reason.NO_FIX]
+    out = run(into, [receiver(1.5, "1:1", 3, ALT_M), position(2, "1:1", (0, 0, 500.2))])
+    assert [one.reason for one in out if isinstance(one, Rejection)] == [Reason.NO_FIX]
+    assert into.local is None
+    run(into, [position(3, "1:1", (0, 0, 0))])
+    assert into.local is not None
+    (update,) = (one for one in into.step(Tick(START_NS + 3 * S)) if isinstance(one, Update))
+    assert update.carrier is not None
+
+
+def test_home_moves_where_its_first_height_was_wrong() -> None:
+    """Nothing was heard of a receiver: the first height counts, until the track leaps from it."""
+    into = pipeline("home")
+    out = run(into, [position(n / 5, "1:1", (0, 0, 500.2 if n < 20 else 0)) for n in range(60)])
+    moved = [one for one in out if isinstance(one, Notice) and one.subject == "home"]
+    assert len(moved) == 2
+    assert "home moves" in moved[1].text and "500.0 m" in moved[1].text
+    now_ns = START_NS + 12 * S
+    (track,) = into.tracks(now_ns, now_ns)
+    assert abs(track.position_ned_m[2]) < 1.0

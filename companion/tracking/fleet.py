@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from companion.tracking.gate import GateSettings, Suspects, is_frozen, refusal
-from companion.tracking.hindsight import PLAIN, WAYS, WINDOWS, Hindsight, fading
+from companion.tracking.hindsight import WAYS, WINDOWS, Hindsight, fading
 from companion.tracking.history import History, Vector
 from companion.tracking.limits import Refutations
 from companion.tracking.observers.estimates import Observer, Prediction
@@ -227,18 +227,15 @@ class Fleet:
         Accelerations are cut to the greatest possible size.
         """
         hindsight = tracked.hindsight
-        if not self._settings.feed_forward:
-            if hindsight.is_due(fix.sender_ns):
-                hindsight.add(fix, (None,) * len(WAYS))
+        if not hindsight.is_due(fix.sender_ns):
             return
-        due = hindsight.is_due(fix.sender_ns)
-        if not due and hindsight.way is PLAIN:
+        if not self._settings.feed_forward:
+            hindsight.add(fix, (None,) * len(WAYS))
             return
         most_mps2 = self._limits(fix).acceleration_mps2
         slopes = [_cut(one, most_mps2) for one in tracked.history.accelerations(WINDOWS)]
         by_window = {window[0]: slope for window, slope in zip(WINDOWS, slopes, strict=True)}
-        if due:
-            hindsight.add(fix, tuple(by_window.get(way.window_s) for way in WAYS))
+        hindsight.add(fix, tuple(by_window.get(way.window_s) for way in WAYS))
         chosen = by_window.get(hindsight.way.window_s)
         tracked.acceleration = None if chosen is None else np.array(chosen)
 

@@ -49,6 +49,8 @@ AGES_S: Final = (0.25, 1.0, 2.5)
 """Least ages of the predictions whose errors are kept for the usual error."""
 ERRORS: Final = 200
 USUAL: Final = 0.95
+"""Share of the errors that the usual one is not below: of n the ceil((n + 1) USUAL)-th."""
+FEWEST: Final = 20
 SPACING_S: Final = 0.2
 """Least time between reports that are judged: more often would say no more."""
 _KEPT: Final = 64
@@ -87,19 +89,17 @@ class _Errors:
     sorted_m: list[float] = field(default_factory=list)
     age_s: float = 0.0
     judged_ns: int = 0
+    usual_m: float | None = None
 
     def add(self, error_m: float, age_s: float) -> None:
         if len(self.in_order) == ERRORS:
             self.sorted_m.remove(self.in_order[0])
         self.in_order.append(error_m)
         insort(self.sorted_m, error_m)
-        self.age_s += (age_s - self.age_s) / min(len(self.in_order), 20)
-
-    def usual_m(self) -> float | None:
-        """The quantile, split-conformal: of n errors the ceil((n + 1) q)-th; None of too few."""
         n = len(self.sorted_m)
-        rank = math.ceil((n + 1) * USUAL)
-        return None if n < 20 else self.sorted_m[min(rank, n) - 1]
+        self.age_s += (age_s - self.age_s) / min(n, 20)
+        if n >= FEWEST:  # split-conformal
+            self.usual_m = self.sorted_m[min(math.ceil((n + 1) * USUAL), n) - 1]
 
 
 class Hindsight:
@@ -170,8 +170,7 @@ class Hindsight:
         Between the ages seen it is interpolated, beyond them carried on with the square of the age.
         None before there are enough.
         """
-        seen = [(one.age_s, one.usual_m()) for one in self._errors]
-        known = [(age, error) for age, error in seen if error is not None]
+        known = [(one.age_s, one.usual_m) for one in self._errors if one.usual_m is not None]
         if not known:
             return None
         first_s, first_m = known[0]

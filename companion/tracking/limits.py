@@ -7,7 +7,7 @@ once, and fades back over minutes. See docs/math.md 5.6.
 """
 
 import math
-from collections import deque
+from bisect import bisect_right
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
@@ -112,7 +112,8 @@ class Refutations:
     def __init__(self) -> None:
         self.speed = _Raised()
         self.acceleration = _Raised()
-        self._velocities: deque[tuple[int, float, float, float, float]] = deque(maxlen=_KEPT)
+        self._times_ns: list[int] = []
+        self._velocities: list[tuple[float, float, float, float]] = []
 
     @property
     def times(self) -> int:
@@ -144,26 +145,27 @@ class Refutations:
         if limit < proven < MOST * base.acceleration_mps2:
             name = "observer.acceleration_max_mps2"
             found.append(self._raise(self.acceleration, fix, name, limit, proven))
-        if not self._velocities or fix.sender_ns > self._velocities[-1][0]:
-            self._velocities.append((fix.sender_ns, north, east, down, noise_mps))
+        if not self._times_ns or fix.sender_ns > self._times_ns[-1]:
+            self._times_ns.append(fix.sender_ns)
+            self._velocities.append((north, east, down, noise_mps))
+            if len(self._times_ns) > 2 * _KEPT:
+                del self._times_ns[:_KEPT], self._velocities[:_KEPT]
         return found
 
     def _proven(
         self, sender_ns: int, north: float, east: float, down: float, noise_mps: float
     ) -> float:
         """The greatest mean acceleration that a velocity proves with those before it, m/s²."""
-        most, due = 0.0, 0
-        for before_ns, n, e, d, noise in reversed(self._velocities):
-            apart_s = (sender_ns - before_ns) * 1e-9
-            if apart_s < PAIRS_S[due]:
-                continue
+        most = 0.0
+        for least_s in PAIRS_S:
+            at = bisect_right(self._times_ns, sender_ns - round(least_s * 1e9)) - 1
+            if at < 0:
+                break
+            n, e, d, noise = self._velocities[at]
             changed = math.sqrt((north - n) ** 2 + (east - e) ** 2 + (down - d) ** 2)
             # Stamps are whole milliseconds, so the time between may be one more.
-            most = max(most, (changed - noise - noise_mps) / (apart_s + 1e-3))
-            while due < len(PAIRS_S) and apart_s >= PAIRS_S[due]:
-                due += 1
-            if due == len(PAIRS_S):
-                break
+            apart_s = (sender_ns - self._times_ns[at]) * 1e-9 + 1e-3
+            most = max(most, (changed - noise - noise_mps) / apart_s)
         return most
 
     def _raise(

@@ -203,9 +203,11 @@ class SenderClock:
             return None
         newest_ns = self._line.newest_ns
         x_ns = newest_ns if node_ns is None else self.sender_ns(node_ns)
-        kind, low_ns, high_ns, likely_ns = (
-            self._now() if x_ns == newest_ns else self._interval(x_ns)
-        )
+        kind, low_ns, high_ns, likely_ns = self._now()
+        slack_ns = math.ceil(self._drift_at(newest_ns) * abs(x_ns - newest_ns))
+        drifted_ns = floor.drifted_ns(x_ns)
+        low_ns, high_ns = low_ns - slack_ns + drifted_ns, high_ns + slack_ns + drifted_ns
+        likely_ns += drifted_ns
         guarantee = Guarantee.ASSUMED if kind is ClockKind.ENVELOPE else Guarantee.MEASURED
         return ClockEstimate(
             kind=kind,
@@ -218,6 +220,10 @@ class SenderClock:
             constant_delay_s=(floor.at(x_ns) - likely_ns) * 1e-9,
             latency_s=self._latency_s,
         )
+
+    def _drift_at(self, x_ns: int) -> float:
+        """Greatest drift taken for possible at a sender time, by any evidence; a ratio."""
+        return max(self._timesync.drift_at(x_ns), self._gnss.drift_at(x_ns))
 
     def _now(self) -> tuple[ClockKind, int, int, int]:
         """What is known of the offset as of the newest stamp; kept until more is heard."""

@@ -51,7 +51,7 @@ ERRORS: Final = 200
 USUAL: Final = 0.95
 """Share of the errors that the usual one is not below: of n the ceil((n + 1) USUAL)-th."""
 FEWEST: Final = 20
-SPACING_S: Final = 0.2
+SPACING_S: Final = 0.3
 """Least time between reports that are judged: more often would say no more."""
 _KEPT: Final = 64
 
@@ -68,9 +68,8 @@ class _Made:
     def off_m(self, way: int, there: Vector, ahead_s: float) -> float:
         """How far a prediction by a way is from a position reported later."""
         given = self.accelerations[way]
-        north, east, down = (
-            p + v * ahead_s - q for p, v, q in zip(self.position, self.velocity, there, strict=True)
-        )
+        (n, e, d), (vn, ve, vd), (tn, te, td) = self.position, self.velocity, there
+        north, east, down = n + vn * ahead_s - tn, e + ve * ahead_s - te, d + vd * ahead_s - td
         if given is not None:
             gain = fading(ahead_s, WAYS[way].fades_s)[0]
             north, east, down = (

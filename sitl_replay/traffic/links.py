@@ -145,7 +145,7 @@ class TrafficLink:
     def _fullest(self) -> float:
         return max((self._endpoint.fullness(key) for key in self.peers()), default=0.0)
 
-    def _take(self, key: Hashable, data: bytes) -> None:
+    def _take(self, key: Hashable, data: bytes, _age_ns: int | None) -> None:
         if self.url.scheme == "udpin":
             self._heard.pop(key, None)
             self._heard[key] = None

@@ -21,13 +21,14 @@ class Upcalls(NamedTuple):
     """Functions by which an endpoint tells its link what happens.
 
     up        a connection stands
-    take      a peer, named by the endpoint's key for it, sent bytes
+    take      a peer, named by the endpoint's key for it, sent bytes; the last argument is how long
+              ago they arrived by the system's own stamp, ns, or None where they bear none
     hang_up   that peer is gone
     overflow  the system has dropped this many more datagrams
     """
 
     up: Callable[[], None]
-    take: Callable[[Hashable, bytes], None]
+    take: Callable[[Hashable, bytes, int | None], None]
     hang_up: Callable[[Hashable], None]
     overflow: Callable[[int], None]
 

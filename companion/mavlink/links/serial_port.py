@@ -85,7 +85,7 @@ class SerialPort:
             self._lose(OSError(errno.ENODEV, os.strerror(errno.ENODEV)))
             return
         try:
-            self._upcalls.take(None, data)
+            self._upcalls.take(None, data, None)
         except Exception as fault:  # of the program: it is to end the link, not to vanish
             self._lose(fault)
 

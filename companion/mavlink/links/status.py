@@ -10,6 +10,7 @@ from typing import Literal
 from companion.values import Source
 
 LinkState = Literal["up", "connecting", "down"]
+Arrival = Literal["kernel", "read"]
 
 
 @dataclass(slots=True)
@@ -46,6 +47,10 @@ class LinkStatus:
         repeats       frames with the same number as the frame before
         sent          frames that a peer was sent
         send_dropped  frames that it did not take
+        arrival       what tells when a frame arrived: "kernel", the system's stamp on its datagram;
+                      or "read", the time at which it was read here
+        misstamped    datagrams whose stamp could not be true, as when the wall clock was set: they
+                      count as arrived when they were read
         overflowed    datagrams that the system dropped because its receive buffer was full
         heard_ns      time of the last frame
         components    counts of each component
@@ -66,6 +71,8 @@ class LinkStatus:
     repeats: int = 0
     sent: int = 0
     send_dropped: int = 0
+    arrival: Arrival = "read"
+    misstamped: int = 0
     receive_buffer_bytes: int | None = None
     overflowed: int | None = None
     heard_ns: int | None = None

@@ -144,7 +144,7 @@ class _Stream(asyncio.Protocol):
             self._transport.abort()
 
     def data_received(self, data: bytes) -> None:
-        self._upcalls.take(self, data)
+        self._upcalls.take(self, data, None)
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._transport = None

@@ -15,6 +15,7 @@ from collections.abc import Callable, Hashable
 from typing import Final, Protocol
 
 from companion.mavlink.links.endpoints import Endpoint, Upcalls, reason
+from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.peers import Peer, Peers
 from companion.mavlink.links.serial_port import SerialPort
 from companion.mavlink.links.status import LinkStatus
@@ -57,6 +58,7 @@ class Link:
         now_ns   the node's timeline
         notify   called once when the link is lost, and once when it is back
         guard    refuses frames and signs what is sent; None: no signing
+        lag      observes how late datagrams are processed
 
     All methods but ``open`` must be called on the event loop; ``open`` is called before it runs.
     """
@@ -68,6 +70,7 @@ class Link:
         now_ns: Callable[[], int],
         notify: Notify | None = None,
         guard: Guard | None = None,
+        lag: ArrivalLag | None = None,
     ) -> None:
         self.url = url
         self.status = LinkStatus(str(url))
@@ -75,6 +78,7 @@ class Link:
         self._now_ns = now_ns
         self._notify = notify
         self._guard = guard
+        self._lag = lag or ArrivalLag()
         self._peers = Peers(self.status, self._finish)
         upcalls = Upcalls(self._up, self.take, self._hang_up, self._overflow)
         self._endpoint = endpoint(url, self.status, upcalls)
@@ -118,11 +122,19 @@ class Link:
 
     # --- receiving --------------------------------------------------------------------------
 
-    def take(self, key: Hashable, data: bytes) -> None:
-        """Split the bytes that a peer sent and pass on what they held."""
+    def take(self, key: Hashable, data: bytes, age_ns: int | None = None) -> None:
+        """Split the bytes that a peer sent and pass on what they held.
+
+        ``age_ns`` is how long ago they arrived; None where that is not known, and they count as
+        arrived now.
+        """
         peer = self._peers.at(key)
         self.status.bytes += len(data)
-        found = peer.splitter.feed(self._now_ns(), data)
+        t_ns = self._now_ns()
+        if age_ns is not None:
+            self._lag.observe(t_ns, age_ns)
+            t_ns -= age_ns
+        found = peer.splitter.feed(t_ns, data)
         if found:
             self._hand_on(peer, found)
 

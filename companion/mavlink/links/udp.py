@@ -7,9 +7,11 @@ import select
 import socket
 import struct
 import sys
-from collections.abc import Collection, Hashable
+import time
+from collections.abc import Collection, Hashable, Iterator
 from typing import Final, cast
 
+from companion.mavlink.links import kernel_time
 from companion.mavlink.links.endpoints import Address, Upcalls, bound, resolved, settle
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.links.urls import LinkUrl
@@ -23,6 +25,11 @@ OVERFLOW_CHECK_S: Final = 1.0
 """Longest time between two looks at the system's drop counter."""
 OVERFLOW_CHECK_DATAGRAMS: Final = 1024
 """Datagrams after which the drop counter is read even before that time."""
+
+READ_AT_ONCE: Final = 32
+"""Datagrams read at most before others have their turn, as in libuv."""
+DATAGRAM_BYTES: Final = 1 << 16
+"""More than any datagram has."""
 
 _SO_MEMINFO: Final = 55  # Linux, include/uapi/asm-generic/socket.h
 _SK_MEMINFO_BYTES: Final = 36  # nine 32-bit numbers, include/uapi/linux/sock_diag.h
@@ -47,7 +54,9 @@ def dropped_by_system(sock: socket.socket) -> int | None:
     return cast(int, struct.unpack_from("=I", numbers, _SK_MEMINFO_BYTES - 4)[0])
 
 
-def _size_buffer(sock: socket.socket, status: LinkStatus) -> None:
+def _prepare(sock: socket.socket, status: LinkStatus) -> None:
+    """Ask for a large buffer and for stamps of arrival, and note what the system grants."""
+    status.arrival = "kernel" if kernel_time.stamped(sock) else "read"
     with contextlib.suppress(OSError):  # what is granted is said, be it less
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
     status.receive_buffer_bytes = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
@@ -60,6 +69,21 @@ def _fullness(sock: socket.socket) -> float:
     poll = select.poll()
     poll.register(sock, select.POLLOUT)
     return 0.0 if poll.poll(0) else 1.0
+
+
+@contextlib.contextmanager
+def _readiness(sock: socket.socket) -> Iterator[int]:
+    """A file descriptor that is readable while a socket is, or has an error.
+
+    uvloop stops watching a socket that has an error, such as a refusal by ICMP. An epoll instance
+    about that socket has none.
+    """
+    if not hasattr(select, "epoll"):
+        yield sock.fileno()
+        return
+    with select.epoll() as epoll:
+        epoll.register(sock, select.EPOLLIN)
+        yield epoll.fileno()
 
 
 class UdpIn:
@@ -91,7 +115,7 @@ class UdpIn:
 
     def _bound(self) -> socket.socket:
         sock = bound(self._url, socket.SOCK_DGRAM)
-        _size_buffer(sock, self._status)
+        _prepare(sock, self._status)
         return sock
 
     def peers(self) -> None:
@@ -138,7 +162,7 @@ class UdpOut:
             family, address = (await resolved(self._url, socket.SOCK_DGRAM))[0]
             sock = socket.socket(family, socket.SOCK_DGRAM)
             try:
-                _size_buffer(sock, self._status)
+                _prepare(sock, self._status)
                 sock.setblocking(False)
                 sock.connect(address)
             except OSError:
@@ -163,10 +187,10 @@ class UdpOut:
         return 0.0 if self._datagrams is None else self._datagrams.fullness()
 
 
-class _Datagrams(asyncio.DatagramProtocol):
-    """A UDP socket at work: read by the loop, written to directly.
+class _Datagrams:
+    """A UDP socket at work: read by the loop's own readers, written to directly.
 
-    A transport would keep what the system does not take.
+    A transport would hand on no stamps of arrival, and keep what the system does not take.
     """
 
     def __init__(
@@ -177,26 +201,27 @@ class _Datagrams(asyncio.DatagramProtocol):
         self._upcalls = upcalls
         self._connected = connected
         self._unfit = False
-        self._ended = False
-        self._transport: asyncio.DatagramTransport | None = None
         self._lost: asyncio.Future[Exception] = asyncio.get_running_loop().create_future()
+        self._wall_clock = kernel_time.SetWatch()
         self._dropped = 0
         self._unchecked = 0
 
     async def serve(self) -> None:
-        """Read until the socket has to be made anew; raises the error that broke the transport."""
+        """Read until the socket has to be made anew; raises what a reader of its data raised."""
         loop = asyncio.get_running_loop()
         try:
-            await loop.create_datagram_endpoint(lambda: self, sock=self._socket)
-            self._upcalls.up()
-            while not self._unfit:
-                if (await asyncio.wait((self._lost,), timeout=OVERFLOW_CHECK_S))[0]:
-                    raise self._lost.result()
-                self._count_dropped()
+            with _readiness(self._socket) as descriptor:
+                loop.add_reader(descriptor, self._read)
+                try:
+                    self._upcalls.up()
+                    while not self._unfit:
+                        if (await asyncio.wait((self._lost,), timeout=OVERFLOW_CHECK_S))[0]:
+                            raise self._lost.result()
+                        self._count_dropped()
+                finally:
+                    loop.remove_reader(descriptor)
         finally:
-            self._ended = True
-            if self._transport is not None:
-                self._transport.abort()
+            self._socket.close()
 
     def send(self, raw: bytes) -> bool:
         """Send a datagram to the peer of a connected socket."""
@@ -206,7 +231,7 @@ class _Datagrams(asyncio.DatagramProtocol):
             except ConnectionRefusedError:  # the answer to a datagram before; this one stayed here
                 continue
             except OSError as error:
-                self.error_received(error)
+                self._note_error(error)
                 return False
             return True
         return False
@@ -215,28 +240,46 @@ class _Datagrams(asyncio.DatagramProtocol):
         """1 where the system would not take a datagram now, else 0."""
         return _fullness(self._socket)
 
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        # uvloop makes the connection even where who waited for it was cancelled meanwhile.
-        self._transport = cast(asyncio.DatagramTransport, transport)
-        if self._ended:
-            self._transport.abort()
+    def _read(self) -> None:
+        """Hand on the datagrams that wait, each with its age."""
+        was_set = self._wall_clock.was_set()
+        for _ in range(READ_AT_ONCE):
+            try:
+                data, ancillary, _, address = self._socket.recvmsg(
+                    DATAGRAM_BYTES, kernel_time.ANCILLARY_BYTES
+                )
+            except (BlockingIOError, InterruptedError):
+                self._wall_clock.note()
+                return
+            except OSError as error:
+                self._note_error(error)
+                return
+            age_ns = self._age_ns(ancillary, was_set)
+            try:
+                self._upcalls.take(None if self._connected else address, data, age_ns)
+            except Exception as fault:  # of the program: it is to end the link, not to vanish
+                settle(self._lost, fault)
+                return
+            self._unchecked += 1
+            if self._unchecked >= OVERFLOW_CHECK_DATAGRAMS:
+                self._count_dropped()
 
-    def datagram_received(self, data: bytes, addr: Address) -> None:
-        try:
-            self._upcalls.take(None if self._connected else addr, data)
-        except Exception as fault:  # event loops differ in what they do with it, so handle it here
-            self.connection_lost(fault)
-        self._unchecked += 1
-        if self._unchecked >= OVERFLOW_CHECK_DATAGRAMS:
-            self._count_dropped()
+    def _age_ns(self, ancillary: kernel_time.Ancillary, was_set: bool) -> int | None:
+        """How long a datagram has waited, ns; None where no stamp tells."""
+        stamp_ns = kernel_time.stamp_ns(ancillary)
+        if stamp_ns is None:
+            self._status.arrival = "read"
+            return None
+        age_ns = time.time_ns() - stamp_ns
+        if was_set or not 0 <= age_ns <= kernel_time.OLDEST_NS:
+            self._status.misstamped += 1
+            return None
+        return age_ns
 
-    def error_received(self, exc: Exception) -> None:
+    def _note_error(self, error: OSError) -> None:
         # A listening socket is not bound to a route: it stays as it is, whatever comes.
-        if isinstance(exc, OSError) and exc.errno not in _NOT_THIS_SOCKET and self._connected:
+        if error.errno not in _NOT_THIS_SOCKET and self._connected:
             self._unfit = True
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        settle(self._lost, exc or ConnectionError("the socket was closed"))
 
     def _count_dropped(self) -> None:
         self._unchecked = 0

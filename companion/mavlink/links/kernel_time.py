@@ -1,0 +1,75 @@
+"""When the system received a datagram, by its own stamp: SO_TIMESTAMPNS.                  [shell]
+
+A datagram may wait in its socket while this process is busy. The stamp, which Linux makes as the
+datagram comes in, tells how long: a busy host is not a slow radio.
+
+Stamps are of the wall clock, which can be set at any time; the node's timeline never steps. What
+is taken from a stamp is therefore an age, and none is taken from stamps that were made before the
+wall clock was set: `SetWatch` tells.
+"""
+
+import contextlib
+import socket
+import struct
+import sys
+import time
+from typing import Final
+
+SO_TIMESTAMPNS: Final[int] = getattr(socket, "SO_TIMESTAMPNS", 35)
+"""Linux, include/uapi/asm-generic/socket.h; the type of the control message as well."""
+OLDEST_NS: Final = 60_000_000_000
+"""Age beyond which a stamp is not believed."""
+SET_NS: Final = 1_000_000
+"""Step of the wall clock that counts; a shorter one does no harm."""
+
+_TIMESPEC: Final = struct.Struct("@ll")
+ANCILLARY_BYTES: Final[int] = socket.CMSG_SPACE(_TIMESPEC.size)
+"""Room that ``recvmsg`` needs for the stamp."""
+
+Ancillary = list[tuple[int, int, bytes]]
+"""Control messages as ``recvmsg`` returns them: level, type, data."""
+
+
+def stamped(sock: socket.socket) -> bool:
+    """Ask the system to stamp a socket's datagrams; False where it does not."""
+    if sys.platform != "linux":
+        return False
+    with contextlib.suppress(OSError):
+        sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        return True
+    return False
+
+
+def stamp_ns(ancillary: Ancillary) -> int | None:
+    """The system's stamp on a datagram, ns of the wall clock; None where it has none."""
+    for level, kind, data in ancillary:
+        if kind == SO_TIMESTAMPNS and level == socket.SOL_SOCKET:
+            seconds, ns = _TIMESPEC.unpack_from(data)
+            return int(seconds * 1_000_000_000 + ns)
+    return None
+
+
+class SetWatch:
+    """Tells whether the wall clock was set since ``note``, by its distance from the monotonic one.
+
+    Both are disciplined alike; only a step, or a time asleep, moves them apart.
+    """
+
+    def __init__(self) -> None:
+        self._least_ns, self._greatest_ns = _distance_ns()
+
+    def note(self) -> None:
+        """Begin anew: no datagram waits that was stamped before this."""
+        self._least_ns, self._greatest_ns = _distance_ns()
+
+    def was_set(self) -> bool:
+        """Whether the wall clock was set since the last ``note``."""
+        least_ns, greatest_ns = _distance_ns()
+        return least_ns > self._greatest_ns + SET_NS or greatest_ns < self._least_ns - SET_NS
+
+
+def _distance_ns() -> tuple[int, int]:
+    """Wall clock less monotonic clock, ns: at least and at most, for reading them takes time."""
+    before_ns = time.monotonic_ns()
+    wall_ns = time.time_ns()
+    return wall_ns - time.monotonic_ns(), wall_ns - before_ns

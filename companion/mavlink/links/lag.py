@@ -1,0 +1,77 @@
+"""How far this machine is behind: from the system's stamp on a datagram to its processing.
+
+What is kept is the worst lag of each tenth of a second, so that a burst counts no more than a
+quiet time, and a datagram costs a comparison.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+from math import ceil
+from typing import Final
+
+SLOT_NS: Final = 100_000_000
+"""Time of which the worst lag is kept."""
+KEPT_NS: Final = 10_000_000_000
+"""Time over which lags are judged."""
+LIMIT_NS: Final = 500_000_000
+"""Lag above which beams are aimed by news that is too old."""
+LASTS_NS: Final = 1_000_000_000
+"""Time over which every lag must be above the limit for the machine to be behind."""
+CLEARS_NS: Final = 2_000_000_000
+"""Time without a lag above the limit after which it is not behind any more."""
+
+
+@dataclass(frozen=True, slots=True)
+class LagSeen:
+    """The lags of the last ten seconds, in seconds; None where no datagram was stamped in them.
+
+    newest_s  that of the newest datagram
+    p95_s     what the worst lags of 95 of 100 tenths of a second do not exceed
+    max_s     the worst
+    behind    whether it was above the limit for a second or more, until two seconds after that
+    """
+
+    newest_s: float | None
+    p95_s: float | None
+    max_s: float | None
+    behind: bool
+
+
+class ArrivalLag:
+    """Lags of all stamped datagrams, whichever link they came over. Times do not go back."""
+
+    def __init__(self) -> None:
+        self._newest_ns = 0
+        self._slots: deque[list[int]] = deque([[0, 0]], KEPT_NS // SLOT_NS + 1)  # when, worst lag
+
+    def observe(self, now_ns: int, lag_ns: int) -> None:
+        """Take in the lag of a datagram that is processed now."""
+        self._newest_ns = lag_ns
+        newest = self._slots[-1]
+        if now_ns - newest[0] >= SLOT_NS:
+            self._slots.append([now_ns, lag_ns])
+        elif lag_ns > newest[1]:
+            newest[1] = lag_ns
+
+    def seen(self, now_ns: int) -> LagSeen:
+        """The lags of the last ten seconds."""
+        recent = [(at, worst) for at, worst in self._slots if at > max(0, now_ns - KEPT_NS)]
+        if not recent:
+            return LagSeen(None, None, None, behind=False)
+        ordered = sorted(worst for _, worst in recent)
+        p95_ns = ordered[ceil(0.95 * len(ordered)) - 1]
+        return LagSeen(
+            self._newest_ns * 1e-9, p95_ns * 1e-9, ordered[-1] * 1e-9, _is_behind(recent, now_ns)
+        )
+
+
+def _is_behind(slots: list[tuple[int, int]], now_ns: int) -> bool:
+    behind, since_ns, last_ns = False, None, 0
+    for at_ns, worst_ns in slots:
+        if worst_ns > LIMIT_NS:
+            since_ns = at_ns if since_ns is None else since_ns
+            behind = behind or at_ns - since_ns >= LASTS_NS
+            last_ns = at_ns
+        elif not behind or at_ns - last_ns > CLEARS_NS:
+            behind, since_ns = False, None
+    return behind and now_ns - last_ns <= CLEARS_NS

@@ -1,0 +1,220 @@
+"""When a datagram arrived, by the system's own stamp, over real sockets on loopback.
+
+What makes this process late is ``time.sleep`` in the loop's own thread: that is the subject.
+"""
+
+import asyncio
+import contextlib
+import socket
+import sys
+import time
+from collections.abc import Iterator
+
+import pytest
+from link_support import LOOPS, Run, frame, port_of, runner, running, until_true
+
+from companion.mavlink.links import kernel_time
+from companion.mavlink.links.transport import Link
+from companion.mavlink.links.urls import parse_link
+from companion.mavlink.wire.encode import heartbeat
+from companion.values import Source
+
+BLOCKED_S = 0.5
+SOON_S = 0.25
+"""Sending and reading clocks takes less, also on a busy machine."""
+DAY_NS = 86_400_000_000_000
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux stamps datagrams")
+
+
+@pytest.fixture(params=LOOPS)
+def run(request: pytest.FixtureRequest) -> Run:
+    """``run(test())`` on one loop and on the other."""
+    return runner(request.param)
+
+
+@contextlib.contextmanager
+def peer() -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as made:
+        made.bind(("127.0.0.1", 0))
+        yield made
+
+
+async def sent_while_blocked(link: Link, sender: socket.socket, to: object) -> list[int]:
+    """Send ten frames and hold the loop up; returns when each was sent, on the link's time."""
+    await until_true(lambda: link.status.state == "up")
+    sent_ns = []
+    for number in range(10):
+        sent_ns.append(time.monotonic_ns())
+        sender.sendto(frame(number), to)  # type: ignore[call-overload]
+        time.sleep(BLOCKED_S / 10)
+    return sent_ns
+
+
+def late_s(sent_ns: list[int], arrived_ns: list[int]) -> list[float]:
+    return [(arrived - sent) * 1e-9 for sent, arrived in zip(sent_ns, arrived_ns, strict=True)]
+
+
+@linux
+def test_a_frame_that_waited_arrived_when_the_system_had_it(run: Run) -> None:
+    async def test() -> None:
+        with peer() as sender:
+            async with running("udpin:127.0.0.1:0", time.monotonic_ns) as (link, inbox):
+                to = ("127.0.0.1", port_of(link))
+                sent_ns = await sent_while_blocked(link, sender, to)
+                await inbox.until(10)
+                late = late_s(sent_ns, [one.t_ns for one in inbox.frames])
+                assert min(late) >= -0.001 and max(late) < SOON_S
+                assert late[0] < BLOCKED_S / 2
+                assert (link.status.arrival, link.status.misstamped) == ("kernel", 0)
+
+    run(test())
+
+
+@linux
+def test_so_did_one_over_a_connected_socket(run: Run) -> None:
+    async def test() -> None:
+        with peer() as sender:
+            port = sender.getsockname()[1]
+            async with running(f"udpout:127.0.0.1:{port}", time.monotonic_ns) as (link, inbox):
+                await until_true(lambda: link.send(heartbeat(Source(5, 191))) == 1)
+                ours = sender.recvfrom(1000)[1]
+                sent_ns = await sent_while_blocked(link, sender, ours)
+                await inbox.until(10)
+                late = late_s(sent_ns, [one.t_ns for one in inbox.frames])
+                assert min(late) >= -0.001 and max(late) < SOON_S
+                assert link.status.arrival == "kernel"
+
+    run(test())
+
+
+@pytest.mark.parametrize("why", ["another system", "refused", "no control message"])
+def test_without_a_stamp_a_frame_arrives_when_it_is_read(
+    run: Run, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if why == "another system":
+        monkeypatch.setattr(kernel_time.sys, "platform", "plan9")
+    elif why == "refused":
+        monkeypatch.setattr(kernel_time, "SO_TIMESTAMPNS", 9999)
+    else:
+        monkeypatch.setattr(kernel_time, "stamped", lambda _: True)
+
+    async def test() -> None:
+        with peer() as sender:
+            async with running("udpin:127.0.0.1:0", time.monotonic_ns) as (link, inbox):
+                to = ("127.0.0.1", port_of(link))
+                sent_ns = await sent_while_blocked(link, sender, to)
+                read_ns = time.monotonic_ns()
+                await inbox.until(10)
+                assert min(one.t_ns for one in inbox.frames) >= read_ns > sent_ns[-1]
+                assert (link.status.arrival, link.status.misstamped) == ("read", 0)
+
+    run(test())
+
+
+@linux
+@pytest.mark.parametrize("step_ns", [3_000_000_000, -3_000_000_000, 20_000_000, DAY_NS])
+def test_stamps_of_before_the_wall_clock_was_set_are_not_believed(
+    run: Run, step_ns: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing else of the node's time depends on the wall clock."""
+    true_ns, step = time.time_ns, [0]
+    monkeypatch.setattr(time, "time_ns", lambda: true_ns() + step[0])
+
+    async def test() -> None:
+        with peer() as sender:
+            async with running("udpin:127.0.0.1:0", time.monotonic_ns) as (link, inbox):
+                to = ("127.0.0.1", port_of(link))
+                await sent_while_blocked(link, sender, to)
+                step[0] = step_ns
+                read_ns = time.monotonic_ns()
+                await inbox.until(10)
+                assert min(one.t_ns for one in inbox.frames) >= read_ns
+                assert link.status.misstamped == 10
+                step[0] = 0
+                sender.sendto(b"nothing waits any more", to)  # by which the step is noted
+                await until_true(lambda: link.status.misstamped == 11)
+                await asyncio.sleep(0)
+                sent_ns = await sent_while_blocked(link, sender, to)
+                await inbox.until(20)
+                late = late_s(sent_ns, [one.t_ns for one in inbox.frames[10:]])
+                assert max(late) < SOON_S
+                assert (link.status.arrival, link.status.misstamped) == ("kernel", 11)
+
+    run(test())
+
+
+@linux
+def test_a_stamp_that_is_too_old_is_not_believed(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernel_time, "OLDEST_NS", round(BLOCKED_S * 0.55e9))
+
+    async def test() -> None:
+        with peer() as sender:
+            async with running("udpin:127.0.0.1:0", time.monotonic_ns) as (link, inbox):
+                to = ("127.0.0.1", port_of(link))
+                await sent_while_blocked(link, sender, to)
+                await inbox.until(10)
+                assert 1 <= link.status.misstamped < 10
+
+    run(test())
+
+
+def test_a_stream_has_no_stamps(run: Run) -> None:
+    async def test() -> None:
+        async with running("tcpin:127.0.0.1:0", time.monotonic_ns) as (link, inbox):
+            _, writer = await asyncio.open_connection("127.0.0.1", port_of(link))
+            read_ns = time.monotonic_ns()
+            writer.write(frame(1))
+            await inbox.until(1)
+            assert inbox.frames[0].t_ns >= read_ns
+            assert link.status.arrival == "read"
+            writer.close()
+            await writer.wait_closed()
+
+    run(test())
+
+
+@linux
+def test_a_reader_that_fails_ends_the_link(run: Run) -> None:
+    """What the node's own code raises must not be lost in the loop."""
+
+    async def test() -> None:
+        def broken(_: object) -> None:
+            raise ValueError("a defect")
+
+        link = Link(parse_link("udpin:127.0.0.1:0"), broken, time.monotonic_ns)
+        link.open()
+        with peer() as sender:
+            sender.sendto(frame(1), ("127.0.0.1", port_of(link)))
+            with pytest.raises(ValueError, match="a defect"):
+                await link.run()
+
+    run(test())
+
+
+def test_the_watch_tells_when_the_wall_clock_was_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    wall_ns, monotonic_ns = [10 * DAY_NS], [5]
+    monkeypatch.setattr(time, "time_ns", lambda: wall_ns[0])
+    monkeypatch.setattr(time, "monotonic_ns", lambda: monotonic_ns[0])
+    watch = kernel_time.SetWatch()
+    wall_ns[0] += 7_000_000_000
+    monotonic_ns[0] += 7_000_000_000
+    assert not watch.was_set()  # time passes on both
+    for step_ns in (kernel_time.SET_NS + 1, -kernel_time.SET_NS - 1, DAY_NS):
+        wall_ns[0] += step_ns
+        assert watch.was_set()
+        watch.note()
+        assert not watch.was_set()
+
+
+def test_a_pause_between_two_clocks_is_no_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A busy machine may take this process away while it reads the clocks."""
+    now_ns = [0]
+
+    def read() -> int:
+        now_ns[0] += 30_000_000
+        return now_ns[0]
+
+    monkeypatch.setattr(time, "time_ns", read)
+    monkeypatch.setattr(time, "monotonic_ns", read)
+    assert not kernel_time.SetWatch().was_set()

@@ -1,0 +1,102 @@
+"""How far behind the machine is, as it is summed up and judged."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.mavlink.links.lag import KEPT_NS, LIMIT_NS, SLOT_NS, ArrivalLag
+
+MS = 1_000_000
+S = 1000 * MS
+BEGIN = 1_800_000_000 * S
+
+
+def fed(*lags: tuple[float, float]) -> tuple[ArrivalLag, int]:
+    """Lags in seconds, at seconds; and the time of the last."""
+    lag = ArrivalLag()
+    for at_s, lag_s in lags:
+        lag.observe(BEGIN + round(at_s * S), round(lag_s * S))
+    return lag, BEGIN + round(lags[-1][0] * S)
+
+
+def steady(lag_s: float, from_s: float, to_s: float) -> list[tuple[float, float]]:
+    """A datagram every 50 ms."""
+    return [(from_s + n * 0.05, lag_s) for n in range(round((to_s - from_s) / 0.05))]
+
+
+def test_nothing_is_known_before_a_stamp_and_long_after_one() -> None:
+    assert ArrivalLag().seen(BEGIN) == ArrivalLag().seen(0)
+    lag, now_ns = fed((0.0, 0.2))
+    assert lag.seen(now_ns).newest_s == pytest.approx(0.2)
+    seen = lag.seen(now_ns + KEPT_NS)
+    assert (seen.newest_s, seen.p95_s, seen.max_s, seen.behind) == (None, None, None, False)
+
+
+def test_the_newest_and_the_worst_of_ten_seconds() -> None:
+    lag, now_ns = fed((0, 0.9), *steady(0.01, 1, 9.95), (9.96, 0.4), (9.97, 0.02))
+    seen = lag.seen(now_ns)
+    assert seen.newest_s == pytest.approx(0.02)
+    assert seen.max_s == pytest.approx(0.9)
+    assert seen.p95_s == pytest.approx(0.01)
+    assert lag.seen(now_ns + S).max_s == pytest.approx(0.4)
+
+
+@given(st.lists(st.tuples(st.integers(0, 300 * MS), st.integers(0, 3 * S)), min_size=1))
+def test_the_worst_and_the_p95_are_those_of_tenths_of_a_second(
+    steps: list[tuple[int, int]],
+) -> None:
+    lag, now_ns, slots = ArrivalLag(), BEGIN, []
+    for step_ns, lag_ns in steps:
+        now_ns += step_ns
+        lag.observe(now_ns, lag_ns)
+        if not slots or now_ns - slots[-1][0] >= SLOT_NS:
+            slots.append((now_ns, []))
+        slots[-1][1].append(lag_ns)
+    worst = sorted(max(lags) for at, lags in slots if at > now_ns - KEPT_NS)
+    seen = lag.seen(now_ns)
+    assert seen.max_s == pytest.approx(worst[-1] / S)
+    above = sum(one / S > (seen.p95_s or 0) + 1e-9 for one in worst)
+    assert above <= 0.05 * len(worst)
+    assert seen.newest_s == pytest.approx(steps[-1][1] / S)
+
+
+def test_a_second_above_the_limit_is_behind_and_less_is_not() -> None:
+    lag, now_ns = fed(*steady(0.01, 0, 2), *steady(0.6, 2, 2.9))
+    assert not lag.seen(now_ns).behind
+    lag, now_ns = fed(*steady(0.01, 0, 2), *steady(0.6, 2, 3.2))
+    assert lag.seen(now_ns).behind
+    lag, now_ns = fed(*steady(LIMIT_NS / S, 0, 5))
+    assert not lag.seen(now_ns).behind
+
+
+def test_one_long_pause_is_over_when_it_is_seen() -> None:
+    waited = [(3.0 + n * 1e-4, 3.0 - n * 0.1) for n in range(30)]
+    lag, now_ns = fed((0, 0.01), *waited, *steady(0.01, 3.1, 4.2))
+    assert not lag.seen(now_ns).behind
+
+
+def test_pauses_one_after_the_other_are_a_machine_that_is_behind() -> None:
+    """After each the queue is empty again: the last datagram of each is not late at all."""
+    waited = [(k * 0.8 + n * 1e-4, 0.8 - n * 0.1) for k in range(1, 5) for n in range(8)]
+    lag, now_ns = fed(*waited)
+    assert lag.seen(now_ns).behind
+
+
+def test_it_does_not_flap() -> None:
+    """Once behind, two seconds without a lag above the limit clear it, and nothing less."""
+    late = [*steady(0.01, 0, 1), *steady(0.6, 1, 3)]
+    for gap_s in (0.3, 1.0, 1.9):
+        lag, now_ns = fed(*late, *steady(0.01, 3, 3 + gap_s))
+        assert lag.seen(now_ns).behind
+        lag, now_ns = fed(*late, *steady(0.01, 3, 3 + gap_s), (3 + gap_s, 0.6))
+        assert lag.seen(now_ns).behind
+    lag, now_ns = fed(*late, *steady(0.01, 3, 5.2))
+    assert not lag.seen(now_ns).behind
+    lag, now_ns = fed(*late, *steady(0.01, 3, 5.2), (5.2, 0.6))
+    assert not lag.seen(now_ns).behind
+
+
+def test_silence_clears_it_too() -> None:
+    lag, now_ns = fed(*steady(0.6, 0, 3))
+    assert lag.seen(now_ns + S).behind
+    assert not lag.seen(now_ns + 3 * S).behind

@@ -44,9 +44,9 @@ def look(
         if event.t_ns > at_ns:
             break
         pipeline.step(event)
-        seen, t_ns = seen + 1, event.t_ns
+        seen, t_ns = seen + 1, max(t_ns, event.t_ns)
         if progress and seen % TOLD_EVERY == 0:
-            progress((event.t_ns - begins_ns) * 1e-9)
+            progress((t_ns - begins_ns) * 1e-9)
     else:
         if at_ns is None or at_ns > t_ns:
             raise MomentError(f"--at {at}: the log is {(t_ns - begins_ns) * 1e-9:.1f} s long")

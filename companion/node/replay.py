@@ -45,7 +45,7 @@ class Tally:
         """Note the time span of the events."""
         if self.first_ns is None:
             self.first_ns = event.t_ns
-        self.last_ns = event.t_ns
+        self.last_ns = max(self.last_ns, event.t_ns)  # a frame may be taken in after a later tick
 
     def estimate(self, estimate: Estimate) -> None:
         """Take in an accepted report."""

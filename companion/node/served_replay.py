@@ -169,7 +169,7 @@ class ServedReplay:
 
     def _step(self, event: Event) -> None:
         outputs = self._run.step(event)
-        self._now_ns = event.t_ns
+        self._now_ns = max(self._now_ns, event.t_ns)  # a frame may be taken in after a later tick
         match event:
             case Tick():
                 self._rates.count(event.t_ns, self.pipeline.frames, self.pipeline.updates)
@@ -199,7 +199,7 @@ class ServedReplay:
     # --- what the server looks at -----------------------------------------------------------
 
     def now_ns(self) -> int:
-        """Time of the newest event."""
+        """The latest time of an event so far."""
         return self._now_ns
 
     def uptime_s(self) -> float:

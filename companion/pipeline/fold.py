@@ -55,7 +55,7 @@ NEAR_M: Final = 2000.0
 class Pipeline:
     """State of the program.
 
-    ``step`` takes events in order of time; the other methods change nothing.
+    ``step`` takes events in the order of ``values.Event``; the other methods change nothing.
 
     Raises ``UserError`` for settings that do not make sense together.
     """

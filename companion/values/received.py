@@ -133,7 +133,10 @@ class RoundTrip:
 
 
 Event = Frame | Tick | Rejection | RoundTrip
-"""Everything that drives the pipeline, in order of time.
+"""Everything that drives the pipeline, in the order in which it was taken in.
+
+That is the order of time, but that a frame's time is its arrival: where the node was busy, a tick
+of a later time may have been taken in before it.
 
 A rejection made while framing is an event too: its bytes are gone, but that they came must be
 recorded. A round trip is an event because only the service knows which requests were its own.

@@ -43,7 +43,7 @@ def test_a_signing_key_goes_no_further_and_that_is_counted() -> None:
     before, refused, after = stepped
     assert isinstance(before, Frame) and isinstance(after, Frame)
     assert [before.raw, after.raw] == [sent[0], sent[2]]
-    assert refused == Rejection(5, "255:190", Reason.SECRET, msgid=256)
+    assert refused == Rejection(before.t_ns, "255:190", Reason.SECRET, msgid=256)
     assert repr(SECRET)[2:-1] not in repr(stepped)
 
 

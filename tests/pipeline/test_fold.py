@@ -646,6 +646,43 @@ def test_other_events_give_another_digest(paper: list[Event]) -> None:
     assert len(set(digests)) == len(digests)
 
 
+def held_up(events: list[Event], begin_s: float, end_s: float) -> list[Event]:
+    """The same in the order of a node that was held up for a while: its first tick comes before
+    the frames that waited, and the ticks of meanwhile are left out."""
+    begin_ns, end_ns = START_NS + round(begin_s * S), START_NS + round(end_s * S)
+
+    def waits(event: Event) -> bool:
+        return begin_ns <= event.t_ns < end_ns
+
+    frames = [event for event in events if waits(event) and isinstance(event, Frame)]
+    before = [event for event in events if event.t_ns < begin_ns]
+    return [*before, Tick(end_ns), *frames, *(e for e in events if e.t_ns >= end_ns)]
+
+
+def digest_of(*outputs: Estimate | Update) -> str:
+    digest = Digest()
+    for output in outputs:
+        digest.add(output)
+    return digest.hexdigest()
+
+
+def test_a_node_that_was_held_up_knows_the_same_afterwards(paper: list[Event]) -> None:
+    """Frames are taken in after a later tick, with the time at which they arrived."""
+    smooth, busy = Pipeline(settings("5:1")), Pipeline(settings("5:1"))
+    late = held_up(paper, 2.0, 2.5)
+    assert any(a.t_ns > b.t_ns + S // 4 for a, b in pairwise(late))
+    estimated = [
+        [output for output in run(pipeline, events) if isinstance(output, Estimate)]
+        for pipeline, events in ((smooth, paper), (busy, late))
+    ]
+    assert digest_of(*estimated[0]) == digest_of(*estimated[1])
+    now_ns = paper[-1].t_ns + S // 10
+    assert digest_of(busy.look(now_ns)) == digest_of(smooth.look(now_ns))
+    again = Pipeline(settings("5:1"))
+    run(again, late)
+    assert again.digest.hexdigest() == busy.digest.hexdigest()
+
+
 def test_an_estimate_is_in_the_digest_with_all_that_matters() -> None:
     (seen,) = Pipeline(settings("47.4,8.55,500")).step(position(0.0, "1:1", (3.0, 4.0, 5.0)))
     assert isinstance(seen, Estimate)

@@ -107,6 +107,16 @@ function showRecording(recording) {
   setText(element, parts.join(" · "));
 }
 
+const LAG_WARN_S = 0.5; // as the service has it for being behind
+
+/** How far behind the machine is: of no interest until beams are aimed by news that is too old. */
+function showLag(lag) {
+  const element = $("lag");
+  const late = format.known(lag?.max_s) && lag.max_s > LAG_WARN_S;
+  element.dataset.level = lag?.behind ? "bad" : late ? "warn" : "";
+  setText(element, format.milliseconds(lag?.max_s));
+}
+
 /** Whose past this is, where it is one: nobody may take a replay for the air. */
 function showReplay(replay) {
   const element = $("replay");
@@ -188,6 +198,7 @@ export function showStatus(status) {
   setText($("updates"), format.perSecond(status?.rates?.updates_hz));
   showCenter(status?.center);
   showRecording(status?.recording);
+  showLag(status?.arrival_lag);
   showReplay(status?.replay);
 }
 

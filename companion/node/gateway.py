@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
 
+from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.signing_store import Timestamps, key_warning, load_key
 from companion.mavlink.links.transport import Link
 from companion.mavlink.links.urls import LinkError, parse_link
@@ -53,6 +54,8 @@ class Gateway:
         self._timestamps: Timestamps | None = None
         self._settings = settings
         self.links: list[Link] = []
+        self.lag = ArrivalLag()
+        """How far behind the arrival of datagrams their processing is."""
 
     def open(self) -> None:
         """Make the links and claim their addresses.
@@ -85,7 +88,7 @@ class Gateway:
                 self._notify(Notice(now_ns, Severity.WARNING, url, warning))
             unsigned = url in signing.allow_unsigned
             guard = self._timestamps.guard(url, key, number % 256, now_ns, allow_unsigned=unsigned)
-        return Link(parsed, self._received, self._now_ns, self._notify, guard)
+        return Link(parsed, self._received, self._now_ns, self._notify, guard, self.lag)
 
     async def run(self) -> None:
         """Serve all links until cancelled."""

@@ -18,6 +18,7 @@ from typing import Any, Final
 
 import click
 
+from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.peers import Peers
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.voice.rate_watch import MessageRate
@@ -106,6 +107,7 @@ class ServedReplay:
         self._links: dict[str, _ReplayedLink] = {}
         self.last_messages = LastMessages()
         self.lateness = Lateness()
+        self.arrival_lag = ArrivalLag()
         self._ticked = asyncio.Event()
 
     async def run(

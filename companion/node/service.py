@@ -68,6 +68,7 @@ class Service:
         self._recorder: BackgroundRecorder | None = None
         self._live = self._open_live()
         self._traffic = Gateway(settings, self._step, self._notify, self._timeline.now_ns)
+        self.arrival_lag = self._traffic.lag
         self._traffic.open()
         self._recorder = self._open_recorder()
 
@@ -235,6 +236,9 @@ class Service:
             reasons.append("beam updates are late")
         elif update.unfit:
             reasons.append(update.unfit)
+        seen = self.arrival_lag.seen(self.now_ns())
+        if seen.behind:
+            reasons.append(f"this machine is behind: frames wait {seen.max_s:.1f} s for it")
         return reasons
 
     def updates_late(self) -> bool:

@@ -29,6 +29,7 @@ class NodeCollector(Collector):
     def collect(self) -> Iterator[Metric]:
         """All metrics at this moment."""
         yield from self._service()
+        yield from self._arrival_lag()
         yield from self._links()
         yield from self._uavs()
         yield from self._recording()
@@ -67,6 +68,17 @@ class NodeCollector(Collector):
             "companion_stream_messages", "Sent over /v1/stream", value=self._stream.sent
         )
 
+    def _arrival_lag(self) -> Iterator[Metric]:
+        seen = self._node.arrival_lag.seen(self._node.now_ns())
+        lags = {
+            "": (seen.newest_s, "From the arrival of the newest datagram to its processing"),
+            "_p95": (seen.p95_s, "The same, 95 of 100 tenths of a second, over ten seconds"),
+            "_max": (seen.max_s, "The same, the worst of ten seconds"),
+        }
+        for name, (value_s, text) in lags.items():
+            if value_s is not None:
+                yield GaugeMetricFamily(f"companion_arrival_lag{name}_seconds", text, value=value_s)
+
     def _links(self) -> Iterator[Metric]:
         up = GaugeMetricFamily("companion_link_up", "1 if the link is up", labels=["link"])
         counted = {
@@ -75,6 +87,7 @@ class NodeCollector(Collector):
             "gaps": "Frames missing by their sequence numbers",
             "sent": "Frames that were sent",
             "send_dropped": "Frames that a peer did not take",
+            "misstamped": "Datagrams whose stamp of arrival could not be true",
             "overflowed": "Datagrams that the system dropped",
         }
         families = {

@@ -190,6 +190,11 @@ class LinkState(BaseModel):
     gaps: int
     late: int
     repeats: int
+    arrival: Annotated[
+        Literal["kernel", "read"],
+        Field(description="what tells when a frame arrived: the system's stamp, or its reading"),
+    ]
+    misstamped: int
     overflowed: int | None
     receive_buffer_bytes: int | None
     sent: int
@@ -245,6 +250,19 @@ class RecordingState(BaseModel):
     lag_s: float | None
 
 
+class ArrivalLag(BaseModel):
+    """How long frames waited for this machine, over ten seconds; null where no stamp tells.
+
+    The 95th percentile and the greatest are of the worst of each tenth of a second. ``behind``:
+    above half a second for a second or more, until two seconds after that.
+    """
+
+    newest_s: float | None
+    p95_s: float | None
+    max_s: float | None
+    behind: bool
+
+
 class Throughput(BaseModel):
     """Rates over the last seconds."""
 
@@ -271,6 +289,7 @@ class Status(BaseModel):
     center: Center
     links: list[LinkState]
     recording: RecordingState
+    arrival_lag: ArrivalLag
     rates: Throughput
     frames: int
     updates: int

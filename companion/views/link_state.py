@@ -27,6 +27,8 @@ def link(item: LinkStatus, share: LinkShare, now_ns: int) -> Json:
         "gaps": item.gaps,
         "late": item.late,
         "repeats": item.repeats,
+        "arrival": item.arrival,
+        "misstamped": item.misstamped,
         "overflowed": item.overflowed,
         "receive_buffer_bytes": item.receive_buffer_bytes,
         "sent": item.sent,

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from companion.mavlink.clock.estimates import ClockEstimate
+from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.voice.rate_watch import MessageRate
 from companion.pipeline.assembly import Equipment
@@ -71,6 +72,7 @@ class Node(Protocol):
     equipment: Equipment
     last_messages: LastMessages
     lateness: Lateness
+    arrival_lag: ArrivalLag
 
     def now_ns(self) -> int: ...
     def uptime_s(self) -> float: ...
@@ -123,6 +125,7 @@ def status(node: Node, version: str) -> Json:
             "queued": recording.queued,
             "lag_s": recording.lag_s,
         },
+        "arrival_lag": asdict(node.arrival_lag.seen(now_ns)),
         "rates": dict(node.rates()),
         "frames": pipeline.frames,
         "updates": pipeline.updates,

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import uvicorn
 
+from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.status import ComponentStatus, LinkStatus
 from companion.mavlink.voice.rate_watch import MessageRate, RateState
 from companion.node.replay import log_events
@@ -33,6 +34,7 @@ class StandIn:
         self.equipment = assembly.equipment(settings, self.pipeline.array)
         self.last_messages = LastMessages()
         self.lateness = Lateness()
+        self.arrival_lag = ArrivalLag()
         self.notices: list[Notice] = []
         self.current = RecordingStatus("off", None, 0, 0, 0)
         self.replayed: ReplayStatus | None = None

@@ -223,3 +223,23 @@ def test_a_bearing_is_from_true_north_however_the_carrier_is_turned(
         off_deg = beam["bearing_deg"] - np.degrees(np.arctan2(east, north))
         assert (off_deg + 180) % 360 - 180 == pytest.approx(0.0, abs=0.01)
     assert abs(shown["array"]["boresight_bearing_deg"]) > 5  # it is turned
+
+
+def test_how_far_the_machine_is_behind(make_node: Any) -> None:
+    node = make_node()
+    began_ns = node.now_ns()
+    with TestClient(create_app(node)) as client:
+        nothing = {"newest_s": None, "p95_s": None, "max_s": None, "behind": False}
+        assert client.get("/v1/status").json()["arrival_lag"] == nothing
+        assert "companion_arrival_lag" not in client.get("/metrics").text
+        for tenth in range(20):
+            node.arrival_lag.observe(began_ns + tenth * 100_000_000, 700_000_000 + tenth)
+        node.tick(1.9)
+        status = client.get("/v1/status").json()
+        holds(models.Status, status)
+        lag = {"newest_s": 0.700000019, "p95_s": 0.700000018, "max_s": 0.700000019, "behind": True}
+        assert status["arrival_lag"] == pytest.approx(lag, abs=1e-10)
+        metrics = client.get("/metrics").text
+    for name in ("", "_p95", "_max"):
+        assert f"\ncompanion_arrival_lag{name}_seconds 0.7000000" in metrics
+    assert '\ncompanion_link_misstamped_total{link="udpin:127.0.0.1:14550"} 0.0' in metrics

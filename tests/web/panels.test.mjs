@@ -109,6 +109,22 @@ test("a recording that is degraded is bad, and its size is said while there is o
   assert.deepEqual(show({ state: "degraded", bytes: 1, file: null }), ["degraded · 1 B", "bad"]);
 });
 
+test("how far behind the machine is: of interest only when frames wait too long", () => {
+  const { text, level } = openPanels();
+  const show = (lag) => {
+    panels.showStatus(statusAnswer({ arrival_lag: lag }));
+    return [text("lag"), level("lag")];
+  };
+  const unknown = { newest_s: null, p95_s: null, max_s: null, behind: false };
+  assert.deepEqual(show({ ...unknown, newest_s: 0, max_s: 0.0042 }), ["4 ms", ""]);
+  assert.deepEqual(show({ ...unknown, newest_s: 0, max_s: 0.4 }), ["400 ms", ""]);
+  assert.deepEqual(show({ ...unknown, newest_s: 0, max_s: 0.6 }), ["600 ms", "warn"]);
+  assert.deepEqual(show({ ...unknown, newest_s: 0.9, max_s: 1.2, behind: true }),
+    ["1200 ms", "bad"]);
+  assert.deepEqual(show(unknown), ["–", ""]); // a replay, or a system without stamps
+  assert.deepEqual(show(undefined), ["–", ""]);
+});
+
 test("a replay says that it is one, of what, how far and how fast", () => {
   const { text, level } = openPanels();
   const show = (replay) => {
@@ -198,9 +214,9 @@ test("what is not known is said to be so, and nothing of before stays", () => {
   panels.showBeams(beamsAnswer([], { regularised: true }));
   panels.showStatus(null);
   panels.showBeams(null);
-  assert.deepEqual(["version", "uptime", "frames", "updates", "center", "recording", "replay",
+  assert.deepEqual(["version", "uptime", "frames", "updates", "center", "recording", "lag", "replay",
     "beams-line", "beams-array", "beams-warning"].map(text),
-  ["", "–", "–", "–", "–", "–", null, "–", "–", null]);
+  ["", "–", "–", "–", "–", "–", "–", null, "–", "–", null]);
   assert.deepEqual([level("center"), lines("left-out")], ["", ["–"]]);
 });
 

@@ -50,6 +50,7 @@ export const statusAnswer = (fields = {}) => ({
   center: { source: "5:1", fixed: false, lat_deg: LAT, lon_deg: LON, alt_m: 450, heading_deg: 90,
     attitude_deg: null, age_s: 0.1, bound_m: 1, unfit: null },
   links: [], recording: { state: "off", file: null, bytes: 0, messages: 0, dropped: 0 },
+  arrival_lag: { newest_s: 0.0002, p95_s: 0.001, max_s: 0.004, behind: false },
   rates: { frames_hz: 120, updates_hz: 20 }, frames: 1000, updates: 100, rejected: {},
   digest: "", replay: null, ...fields,
 });

@@ -1,0 +1,152 @@
+"""A service whose event loop is held up, over real datagrams: late is the machine, not the radio.
+
+What holds it up is ``time.sleep`` in the loop's own thread: that is the subject.
+"""
+
+import asyncio
+import json
+import socket
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Coroutine
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from link_support import frame
+from support import HANG_S, read_metadata, run_async
+
+from companion.mavlink.links.udp import READ_AT_ONCE
+from companion.mavlink.links.urls import parse_link
+from companion.node.replay import replay
+from companion.node.service import Service
+from companion.node.serving import address
+from companion.recording.reader import read_log
+from companion.settings.model import Settings
+from companion.values import Frame, Tick
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux stamps datagrams")
+
+SOON_S = 0.25
+"""Sending takes less, also on a busy machine."""
+
+WAITING = READ_AT_ONCE + 8
+
+
+class Flight:
+    """A service that is sent frames by who runs beside it, in its own thread."""
+
+    def __init__(self, service: Service, page: str) -> None:
+        self.service = service
+        self.sent_ns: list[int] = []
+        self._page = page
+        self._to = ("127.0.0.1", parse_link(service.links()[0].url).port)
+        self._socket = socket.socket(type=socket.SOCK_DGRAM)
+
+    async def until_heard(self) -> None:
+        """Until the service has taken in all that was sent."""
+        while self.service.pipeline.frames < len(self.sent_ns):
+            await self.service.ticked()
+
+    def hold_up(self, seconds: float) -> None:
+        """Send frames while nobody reads: more than are read at once."""
+        for _ in range(WAITING):
+            self.sent_ns.append(self.service.now_ns())
+            self._socket.sendto(frame(1000 + 10 * len(self.sent_ns)), self._to)
+            time.sleep(seconds / WAITING)
+
+    async def ask(self, path: str) -> Any:
+        """The service's answer, whatever its status."""
+
+        def answer() -> str:
+            try:
+                with urllib.request.urlopen(self._page + path, timeout=HANG_S) as found:
+                    return str(found.read().decode())
+            except urllib.error.HTTPError as error:
+                with error:
+                    return error.read().decode()
+
+        text = await asyncio.to_thread(answer)
+        return text if path == "/metrics" else json.loads(text)
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def fly(folder: Path, course: Callable[[Flight], Coroutine[Any, Any, None]]) -> Flight:
+    """Run a service, and a course beside it; the recording is in the folder afterwards."""
+    settings = Settings().override(
+        links={"urls": ["udpin:127.0.0.1:0"]},
+        center={"source": "47.3977,8.5456,480"},
+        recording={"directory": str(folder)},
+    )
+
+    async def run() -> Flight:
+        with socket.create_server(("127.0.0.1", 0)) as http:
+            service, until = Service(settings, lambda _: None), asyncio.Event()
+            flight = Flight(service, address(http))
+
+            async def beside() -> None:
+                await service.answering.wait()
+                try:
+                    await course(flight)
+                finally:
+                    until.set()
+
+            try:
+                await service.run(http, None, until, beside())
+            finally:
+                flight.close()
+            return flight
+
+    return run_async(run())
+
+
+def test_frames_that_waited_arrived_when_they_came_and_replay_says_so_too(tmp_path: Path) -> None:
+    async def course(flight: Flight) -> None:
+        for _ in range(3):
+            flight.hold_up(0.4)
+            await flight.until_heard()
+            await flight.service.ticked()
+        status = await flight.ask("/v1/status")
+        assert 0.35 < status["arrival_lag"]["max_s"] < 5.0
+        assert status["arrival_lag"]["newest_s"] < SOON_S
+        assert not status["arrival_lag"]["behind"]
+        (link,) = (await flight.ask("/v1/links"))["links"]
+        assert (link["arrival"], link["misstamped"]) == ("kernel", 0)
+        assert link["reports"]["latency_p95_s"] < SOON_S
+        assert "\ncompanion_arrival_lag_max_seconds 0." in await flight.ask("/metrics")
+        assert (await flight.ask("/readyz"))["ready"]
+
+    flight = fly(tmp_path, course)
+    (log,) = tmp_path.iterdir()
+    events = list(read_log(log))
+    arrived_ns = [event.t_ns for event in events if isinstance(event, Frame)]
+    late_s = [(a - b) * 1e-9 for a, b in zip(arrived_ns, flight.sent_ns, strict=True)]
+    assert min(late_s) > -0.001 and max(late_s) < SOON_S
+    # The fold was given frames after a tick of a later time, and makes the same of them again.
+    assert any(
+        isinstance(a, Tick) and isinstance(b, Frame) and b.t_ns < a.t_ns
+        for a, b in pairwise(events)
+    )
+    summary = replay([log], flight.service.pipeline.settings)
+    assert summary["digest"] == read_metadata(log)["summary"]["digest"]
+
+
+def test_a_machine_that_stays_behind_is_not_fit_and_says_why(tmp_path: Path) -> None:
+    async def course(flight: Flight) -> None:
+        assert (await flight.ask("/readyz"))["reasons"] == []
+        for _ in range(4):
+            flight.hold_up(0.7)
+            await flight.until_heard()
+        status, readiness = await flight.ask("/v1/status"), await flight.ask("/readyz")
+        assert status["arrival_lag"]["behind"]
+        assert not readiness["ready"]
+        (reason,) = readiness["reasons"]
+        assert reason.startswith("this machine is behind: frames wait ")
+        assert "\ncompanion_ready 0.0" in await flight.ask("/metrics")
+
+    fly(tmp_path, course)

@@ -107,12 +107,10 @@ def fly(folder: Path, course: Callable[[Flight], Coroutine[Any, Any, None]]) -> 
 
 def test_frames_that_waited_arrived_when_they_came_and_replay_says_so_too(tmp_path: Path) -> None:
     async def course(flight: Flight) -> None:
-        for _ in range(3):
-            flight.hold_up(0.4)
-            await flight.until_heard()
-            await flight.service.ticked()
+        flight.hold_up(0.5)  # once: several in a row would be a machine that stays behind
+        await flight.until_heard()
         status = await flight.ask("/v1/status")
-        assert 0.35 < status["arrival_lag"]["max_s"] < 5.0
+        assert 0.45 < status["arrival_lag"]["max_s"] < 5.0
         assert status["arrival_lag"]["newest_s"] < SOON_S
         assert not status["arrival_lag"]["behind"]
         (link,) = (await flight.ask("/v1/links"))["links"]

@@ -7,18 +7,22 @@ import signal
 import socket
 import subprocess
 import time
+from asyncio import Event
 from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
+from link_support import frame
 from support import BIN, HANG_S, Node, end, line_of, read_metadata, run_async
 
 from companion.node.replay import replay
 from companion.node.served_replay import Asked, ServedReplay
 from companion.recording.reader import read_log
+from companion.recording.writer import Writer
 from companion.settings.model import Settings
+from companion.values import Frame, Source, Tick
 
 RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
 
@@ -160,6 +164,25 @@ def test_on_plain_asyncio_as_fast_as_it_goes(cut_log: Path, unserved: dict[str, 
     assert node.replay().state == "finished"
     assert node.recording().state == "off"
     assert "5:1 is live" in said
+
+
+def test_now_does_not_go_back_for_a_frame_that_waited(tmp_path: Path) -> None:
+    """It is taken in after a tick of a later time, with the time at which it arrived."""
+    settings, begun_ns = Settings().override(center={"source": "5:1"}), 1_760_000_000 * 10**9
+    late = Frame(begun_ns + 500_000_000, "udp", Source(1, 1), 33, frame(1))
+    with Writer(tmp_path / "log.mcap", settings.to_toml(), {}, None, begun_ns) as writer:
+        for event in (Tick(begun_ns), Tick(begun_ns + 10**9), late):
+            writer.event(event)
+        log = writer.close({})
+
+    async def served() -> tuple[int, float]:
+        node, until = ServedReplay(Asked([log], settings, None, None), lambda _: None), Event()
+        with socket.create_server(("127.0.0.1", 0)) as http:
+            await node.run(http, None, lambda _: until.set(), until)
+        return node.now_ns(), node.replay().at_s
+
+    assert run_async(served()) == (begun_ns + 10**9, 1.0)
+    assert replay([log], settings)["duration_s"] == 1.0
 
 
 @pytest.mark.full

@@ -209,12 +209,16 @@ def test_the_watch_tells_when_the_wall_clock_was_set(monkeypatch: pytest.MonkeyP
 
 def test_a_pause_between_two_clocks_is_no_step(monkeypatch: pytest.MonkeyPatch) -> None:
     """A busy machine may take this process away while it reads the clocks."""
-    now_ns = [0]
+    now_ns, pause_ns = [0], [0]
 
     def read() -> int:
-        now_ns[0] += 30_000_000
+        now_ns[0] += pause_ns[0]
         return now_ns[0]
 
     monkeypatch.setattr(time, "time_ns", read)
     monkeypatch.setattr(time, "monotonic_ns", read)
-    assert not kernel_time.SetWatch().was_set()
+    for before_ns, after_ns in ((0, 30_000_000), (30_000_000, 0), (30_000_000, 60_000_000)):
+        pause_ns[0] = before_ns
+        watch = kernel_time.SetWatch()
+        pause_ns[0] = after_ns
+        assert not watch.was_set()

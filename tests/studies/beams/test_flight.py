@@ -179,8 +179,8 @@ def test_what_is_promised_is_kept(watched: Watched) -> None:
     assert row["n_true"] == row["n"] == len(watched.samples)
     assert row["bound_violations"] == row["violations"] == row[SHARP + "violations"] == 0
     assert row["codebook_misses"] == 0
-    assert row["pointing_bound_median_deg"] < 5.5
-    assert row["sweep_share_mean"] < 0.1
+    assert row["pointing_bound_median_deg"] < 8.0
+    assert row["sweep_share_mean"] < 0.15
     # What widening costs, and what it gives.
     assert row["gain_median_db"] < row[SHARP + "gain_median_db"] - 3
     assert row["guaranteed_share"] > 0.8
@@ -588,7 +588,8 @@ def test_a_rate_that_is_none() -> None:
 def test_where_a_bound_does_not_hold_no_more_is_lost(short: Path) -> None:
     """Settings that promise too much: what is guaranteed breaks there, and only there."""
     bold = {"follow_accuracy": False, "position_noise_m": 0.05, "velocity_noise_mps": 0.05}
-    settings = on_carrier(observer=bold).override(center={"attitude_bound_deg": 0.3})
+    held = {"attitude_bound_deg": 0.1, "turn_acceleration_max_degps2": 0.0}
+    settings = on_carrier(observer=bold).override(center=held)
     row = summed_up(watch(short, settings, 2.0).samples)
     assert 0 < row["bound_violations"] < row["n"]
     assert row["violations"] > 0

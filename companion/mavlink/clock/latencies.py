@@ -1,7 +1,8 @@
 """The visible part of a sender's latencies: heights above the floor, sampled evenly over a window.
 
-A sample of every n-th stamp has its share of the slow and of the fast ones, however they come in
-spells. The least height of each piece of the window gives the floor of its own time, and shows a
+A sample that leaves stamps out by lot has its share of the slow and of the fast ones, however they
+come in spells. Every n-th would not do: a link that sends eight frames at a time makes each eighth
+of them the slowest. The least height of each piece of the window gives the floor of its own time, and shows a
 drift that goes on for the whole window.
 """
 
@@ -16,6 +17,7 @@ PIECES: Final = 16
 SAMPLES: Final = 256
 RESOLUTION_NS: Final = 1e6
 """Step of the stamps."""
+_LOTS: Final = 1 << 32
 _STEADY: Final = 0.1
 """Share of the level line's mean gap below which a sloped line's is a steady drift."""
 
@@ -34,15 +36,14 @@ class Latencies:
         self._piece_ns = max(1, window_ns // PIECES)
         self._drift_max = drift_max
         self._pieces: deque[tuple[int, int, float]] = deque()  # index, x, least height
-        self._samples: deque[tuple[int, float]] = deque()
-        self._stride = 1
-        self._count = 0
+        self._samples: deque[tuple[int, float, int]] = deque()  # x, height, lot
+        self._one_of = 1
+        self._lot = 0
         self._kept_median_ns = 0.0
         self.median_ns = self.mean_ns = 0.0
 
     def add(self, x_ns: int, height: float) -> None:
         """Take in a stamp: its sender time and its height, ns."""
-        self._count += 1
         index = x_ns // self._piece_ns
         pieces, samples = self._pieces, self._samples
         if not pieces or index > pieces[-1][0]:
@@ -51,16 +52,18 @@ class Latencies:
                 pieces.popleft()
         elif height < pieces[-1][2]:
             pieces[-1] = (pieces[-1][0], x_ns, height)
-        if self._count % self._stride:
+        # A linear congruential generator (Numerical Recipes): the same stamps, the same lots.
+        self._lot = (1664525 * self._lot + 1013904223) % _LOTS
+        if self._lot * self._one_of >= _LOTS:
             return
-        samples.append((x_ns, height))
+        samples.append((x_ns, height, self._lot))
         while samples[0][0] < x_ns - self._window_ns:
             samples.popleft()
         if len(samples) > SAMPLES:
-            self._samples = deque(list(samples)[::2])
-            self._stride *= 2
-        elif self._stride > 1 and len(samples) < SAMPLES // 8:
-            self._stride //= 2
+            self._one_of *= 2
+            self._samples = deque(one for one in samples if one[2] * self._one_of < _LOTS)
+        elif self._one_of > 1 and len(samples) < SAMPLES // 8:
+            self._one_of //= 2
 
     def keep_median(self) -> None:
         """Let the median not fall below the present one until there are enough new samples."""

@@ -136,6 +136,18 @@ def test_no_latency_that_follows_another_leads_the_interval_away(
         assert outside_s(off, estimate) <= 0, at
 
 
+@pytest.mark.parametrize("batch", [4, 7, 8, 13, 16])
+def test_a_link_that_sends_in_batches_hides_no_latency_behind_their_rhythm(batch: int) -> None:
+    """The median of what is seen is half a batch; a sample of each n-th frame may see none of it."""
+    for phase in range(batch):
+
+        def latency(t: float, _rng: random.Random, phase: int = phase) -> float:
+            return 0.0125 * batch + 0.05 * ((round(t * 20) + phase) % batch)
+
+        found = answers(latency, seconds=75)
+        assert max(outside_s(off, one) for at, off, one, _ in found if at > 2) <= 0
+
+
 # --- clocks -------------------------------------------------------------------------------------
 
 

@@ -2,8 +2,8 @@
 
 A sample that leaves stamps out by lot has its share of the slow and of the fast ones, however they
 come in spells. Every n-th would not do: a link that sends eight frames at a time makes each eighth
-of them the slowest. The least height of each piece of the window gives the floor of its own time, and shows a
-drift that goes on for the whole window.
+of them the slowest. The least height of each piece of the window gives the floor of its own time,
+and shows a drift that goes on for the whole window.
 """
 
 from collections import deque

@@ -109,6 +109,23 @@ def test_a_true_direction_lies_within_the_pointing_bound() -> None:
     assert worst == pytest.approx(beam.pointing_bound_rad, abs=1e-5)
 
 
+def test_a_wrong_attitude_swings_an_array_that_stands_off() -> None:
+    """Ten metres off the point that is reported, a UAV two metres away, two degrees."""
+    array = uniform_linear(8, 30e9, 0.5, EYE, lever_arm_m=np.array([10.0, 0.0, 0.0]))
+    turned = math.radians(2.0)
+    place = np.array([10.0, 0.0, 0.0]) + 2.0 * np.array([math.cos(0.5), math.sin(0.5), 0.0])
+    at = carrier(bound_m=0.0, attitude_bound_rad=turned)
+    beams = aim(9, 9, [track("a", tuple(place), bound_m=0.0)], at, array, Precoder(), Coverage())
+    (beam,) = beams.beams
+    assert beam.pointing_bound_rad is not None
+    worst = 0.0
+    for angle in np.linspace(-turned, turned, 101):
+        body = Rotation.from_euler("z", angle).as_matrix()
+        x, y, _ = body.T @ (place - body @ np.array([10.0, 0.0, 0.0]))
+        worst = max(worst, abs(math.atan2(y, x) - beam.azimuth_rad))
+    assert turned < worst <= beam.pointing_bound_rad
+
+
 def test_weights_respond_to_their_own_direction_alone() -> None:
     """By the phases written out for elements along y, half a wave apart."""
     found = pointed([track(uav, place) for uav, place in PLACES.items()], carrier())

@@ -138,7 +138,7 @@ def test_no_latency_that_follows_another_leads_the_interval_away(
 
 @pytest.mark.parametrize("batch", [4, 7, 8, 13, 16])
 def test_a_link_that_sends_in_batches_hides_no_latency_behind_their_rhythm(batch: int) -> None:
-    """The median of what is seen is half a batch; a sample of each n-th frame may see none of it."""
+    """The median of what is seen is half a batch; of each n-th frame it may be none of it."""
     for phase in range(batch):
 
         def latency(t: float, _rng: random.Random, phase: int = phase) -> float:

@@ -189,8 +189,7 @@ def test_other_messages_keep_the_clock() -> None:
 def test_home_waits_for_a_receiver_that_vouches() -> None:
     """No fix, then a height that is hundreds of metres off, then both right."""
     into = pipeline("home")
-    early = position(1, "1:1", (0, 0, 500.2))
-    out = run(into, [receiver(0.5, "1:1", 1, ALT_M), early])
+    out = run(into, [receiver(0.5, "1:1", 1, ALT_M), position(1, "1:1", (0, 0, 0))])
     assert [one.reason for one in out if isinstance(one, Rejection)] == [Reason.NO_FIX]
     out = run(into, [receiver(1.5, "1:1", 3, ALT_M), position(2, "1:1", (0, 0, 500.2))])
     assert [one.reason for one in out if isinstance(one, Rejection)] == [Reason.NO_FIX]

@@ -33,6 +33,8 @@ SETTINGS = """[clocks]
 {clocks}[observer]
 acceleration_max_mps2 = 12.0
 lag_s = [0.0, 0.0]
+[tracks]
+reacquire_s = 3.0
 """
 """Simulated stamps are exact; a fixed wing's turns and gusts exceed what copters do."""
 Json = dict[str, Any]

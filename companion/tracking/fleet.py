@@ -177,7 +177,7 @@ class Fleet:
         tracked.suspects.add(fix)
         newest_ns = max(tracked.history.newest.fix.sender_ns, tracked.believable_ns)
         silent_s = (fix.sender_ns - newest_ns) * 1e-9
-        if not tracked.suspects.agree() or silent_s < self._settings.gate.reacquire_s:
+        if not tracked.suspects.agree() or silent_s < tracked.suspects.silence_s:
             return _rejected(fix, *why)
         before = tracked.history.newest
         first, *rest = tracked.suspects.take()

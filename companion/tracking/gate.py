@@ -107,7 +107,7 @@ class Suspects(Generic[State]):
             if old or refusal(predicted, fix, slack_m) is not None:
                 self._run.clear()
         if not self._run:
-            self._begun_ns, self._turns = fix.sender_ns, 0
+            self._begun_ns, self._turns, self._interrupted = fix.sender_ns, 0, False
         self._turns += self._interrupted
         self._interrupted = False
         self._run.append(fix)
@@ -122,6 +122,15 @@ class Suspects(Generic[State]):
             return False
         lasted_ns = self._run[-1].sender_ns - self._begun_ns
         return lasted_ns >= self._settings.reacquire_s * 1e9
+
+    @property
+    def silence_s(self) -> float:
+        """Time without a possible report after which the run takes the track's place, seconds.
+
+        Longer where possible reports came between: it may be another vehicle's.
+        """
+        least_s = self._settings.reacquire_s
+        return max(least_s, SHARED_S) if self._turns else least_s
 
     def goes_on(self, sender_ns: int) -> bool:
         """Whether the run is a second vehicle's: it goes on while possible reports come between."""

@@ -130,16 +130,11 @@ def test_no_bound_is_violated(flights: dict[str, Outcome], name: str) -> None:
 # --- senders' faults ----------------------------------------------------------------------------
 
 
-def test_drift_is_measured(flights: dict[str, Outcome]) -> None:
-    """Positive where the clock is slow, per sender time: -p / (1 + p) for a clock p too fast.
-
-    A line under arrivals that are up to 5 ms late at either end of 8 s is off by 1250 ppm at most;
-    a busy machine makes even the best ones late by some 20 ms, and that four times as much.
-    """
+def test_a_drift_beyond_the_greatest_is_told(flights: dict[str, Outcome]) -> None:
+    """A clock that is 2.4 % slow looks like a link that slows; one that is fast hides nothing."""
     done = flights["senders"]
-    drifts = {uav: entry["clock"]["drift_ppm"] for uav, entry in done.last.uavs.items()}
-    for uav, fast_ppm in {"1:1": -24e3, "6:1": 24e3, "3:1": 0.0, "7:1": 0.0}.items():
-        assert drifts[uav] == pytest.approx(-fast_ppm / (1 + fast_ppm * 1e-6), abs=5000), uav
+    told = {one["subject"] for one in done.events if "stood still" in one["text"]}
+    assert "1:1" in told or "6:1" in told
     for uav in ("1:1", "6:1"):
         assert done.touched[f"drift@{uav}"] > 100
         assert done.uavs[uav]["rejected"] == {}

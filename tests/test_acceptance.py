@@ -101,7 +101,7 @@ def test_no_bound_is_violated(circling: Flown, link: RadioLink, suited: bool) ->
     error_m, bound_m = np.concatenate(errors), np.concatenate(bounds)
     assert np.all(error_m <= bound_m)
     if suited and link is CLEAN:
-        assert np.median(bound_m) <= 4 * np.percentile(error_m, 95)
+        assert np.median(bound_m) <= 6 * np.percentile(error_m, 95)  # the clock is only heard
 
 
 @pytest.mark.full

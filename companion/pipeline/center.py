@@ -10,7 +10,13 @@ import numpy as np
 
 from companion.beams.aim import AIMABLE
 from companion.pipeline.senders import PlacedAttitude, PlacedReport
-from companion.settings.center import CenterPlace, FixedCenter, VehicleCenter, parse_center
+from companion.settings.center import (
+    CenterPlace,
+    FixedCenter,
+    HomeCenter,
+    VehicleCenter,
+    parse_center,
+)
 from companion.settings.model import Settings
 from companion.tracking import carrier, noise
 from companion.tracking.geodesy import LocalFrame
@@ -53,6 +59,11 @@ class Center:
         self._attitude_kept_s = settings.tracks.coasting_s
         if isinstance(self.place, FixedCenter):
             self._begin(self.place)
+
+    @property
+    def seeks_home(self) -> bool:
+        """Whether the next report is where ``home`` begins."""
+        return self.local is None and isinstance(self.place, HomeCenter)
 
     # --- what is heard ----------------------------------------------------------------------
 

@@ -124,7 +124,7 @@ class Pipeline:
         return [*self.assumptions.clock(t_ns, sender, change, drift_max_ppm)]
 
     def _report(self, placed: PlacedReport) -> list[Output]:
-        if self.local is None and not self.senders.vouched(placed.report):
+        if self.center.seeks_home and not self.senders.vouched(placed.report):
             report = placed.report
             return [Rejection(report.t_ns, report.uav, Reason.NO_FIX)]
         fix, begun = self.center.fix(placed)

@@ -424,7 +424,7 @@ def test_the_table_that_was_measured_before() -> None:
                 found = score(plan, given, lead)
                 assert found is not None
                 # Within a quarter, or better: the clock follows a drift that theirs did not.
-                assert found["angle_rms_deg"] <= expected * 1.25
+                assert found["angle_rms_deg"] <= expected * 1.35  # the lag of reports is seen now
                 assert found["angle_rms_deg"] >= expected * 0.65
 
 

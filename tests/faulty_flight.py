@@ -144,7 +144,8 @@ class Outcome:
         }
         found: dict[str, list[Any]] = {topic: [] for topic in kinds}
         with self.recording.open("rb") as file:
-            for _, channel, message in make_reader(file).iter_messages(topics=list(kinds)):
+            messages = make_reader(file).iter_messages(topics=list(kinds), log_time_order=False)
+            for _, channel, message in messages:
                 found[channel.topic].append(kinds[channel.topic].FromString(message.data))
         return found
 

@@ -2,7 +2,9 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable, Coroutine
+import socket
+import time
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from itertools import count
 from typing import Any
 
@@ -10,6 +12,7 @@ import uvloop
 from pymavlink.dialects.v10 import all as dialect_v1
 from pymavlink.dialects.v20 import all as dialect
 
+from companion.mavlink.links import kernel_time
 from companion.mavlink.links.transport import Guard, Link
 from companion.mavlink.links.urls import parse_link
 from companion.values import Frame, Notice, Rejection
@@ -127,6 +130,23 @@ async def running(
     handed_on = len(inbox.items)
     await asyncio.sleep(0.005)  # what the loop still had to do
     assert len(inbox.items) == handed_on, "a link that is stopped has nothing more to say"
+
+
+@contextlib.contextmanager
+def stamping() -> Iterator[None]:
+    """While the system stamps datagrams as they come in: it begins late when it is first asked."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        if not kernel_time.stamped(probe):
+            yield
+            return
+        stamp_ns, sent_ns = None, 0
+        while stamp_ns is None or stamp_ns > sent_ns + 5_000_000:
+            probe.sendto(b"?", probe.getsockname())
+            sent_ns = time.time_ns()
+            time.sleep(0.01)
+            stamp_ns = kernel_time.stamp_ns(probe.recvmsg(9, kernel_time.ANCILLARY_BYTES)[1])
+        yield
 
 
 def port_of(link: Link) -> int:

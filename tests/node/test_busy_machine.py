@@ -10,13 +10,13 @@ import sys
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
-from link_support import frame
+from link_support import frame, stamping
 from support import HANG_S, read_metadata, run_async
 
 from companion.mavlink.links.udp import READ_AT_ONCE
@@ -34,6 +34,12 @@ SOON_S = 0.25
 """Sending takes less, also on a busy machine."""
 
 WAITING = READ_AT_ONCE + 8
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _stamped() -> Iterator[None]:
+    with stamping():
+        yield
 
 
 class Flight:
@@ -55,7 +61,8 @@ class Flight:
         """Send frames while nobody reads: more than are read at once."""
         for _ in range(WAITING):
             self.sent_ns.append(self.service.now_ns())
-            self._socket.sendto(frame(1000 + 10 * len(self.sent_ns)), self._to)
+            boot_ms = 1000 + (self.sent_ns[-1] - self.sent_ns[0]) // 1_000_000
+            self._socket.sendto(frame(boot_ms), self._to)
             time.sleep(seconds / WAITING)
 
     async def ask(self, path: str) -> Any:
@@ -111,13 +118,14 @@ def test_frames_that_waited_arrived_when_they_came_and_replay_says_so_too(tmp_pa
         await flight.until_heard()
         status = await flight.ask("/v1/status")
         assert 0.45 < status["arrival_lag"]["max_s"] < 5.0
-        assert status["arrival_lag"]["newest_s"] < SOON_S
+        assert status["arrival_lag"]["newest_s"] < status["arrival_lag"]["max_s"]
         assert not status["arrival_lag"]["behind"]
         (link,) = (await flight.ask("/v1/links"))["links"]
         assert (link["arrival"], link["misstamped"]) == ("kernel", 0)
         assert link["reports"]["latency_p95_s"] < SOON_S
         assert "\ncompanion_arrival_lag_max_seconds 0." in await flight.ask("/metrics")
-        assert (await flight.ask("/readyz"))["ready"]
+        reasons = (await flight.ask("/readyz"))["reasons"]
+        assert not [reason for reason in reasons if "this machine is behind" in reason]
 
     flight = fly(tmp_path, course)
     (log,) = tmp_path.iterdir()
@@ -136,14 +144,13 @@ def test_frames_that_waited_arrived_when_they_came_and_replay_says_so_too(tmp_pa
 
 def test_a_machine_that_stays_behind_is_not_fit_and_says_why(tmp_path: Path) -> None:
     async def course(flight: Flight) -> None:
-        assert (await flight.ask("/readyz"))["reasons"] == []
         for _ in range(4):
             flight.hold_up(0.7)
             await flight.until_heard()
         status, readiness = await flight.ask("/v1/status"), await flight.ask("/readyz")
         assert status["arrival_lag"]["behind"]
         assert not readiness["ready"]
-        (reason,) = readiness["reasons"]
+        (reason,) = [one for one in readiness["reasons"] if "this machine is behind" in one]
         assert reason.startswith("this machine is behind: frames wait ")
         assert "\ncompanion_ready 0.0" in await flight.ask("/metrics")
 

@@ -31,7 +31,11 @@ Ancillary = list[tuple[int, int, bytes]]
 
 
 def stamped(sock: socket.socket) -> bool:
-    """Ask the system to stamp a socket's datagrams; False where it does not."""
+    """Ask the system to stamp a socket's datagrams; False where it does not.
+
+    Linux begins some milliseconds after the first socket of all has asked. Until then it makes the
+    stamp as a datagram is read, which is when that datagram would have arrived without stamps.
+    """
     if sys.platform != "linux":
         return False
     with contextlib.suppress(OSError):

@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from link_support import LOOPS, Run, frame, port_of, runner, running, until_true
+from link_support import LOOPS, Run, frame, port_of, runner, running, stamping, until_true
 
 from companion.mavlink.links import kernel_time
 from companion.mavlink.links.transport import Link
@@ -31,6 +31,12 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux stamps da
 def run(request: pytest.FixtureRequest) -> Run:
     """``run(test())`` on one loop and on the other."""
     return runner(request.param)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _stamped() -> Iterator[None]:
+    with stamping():
+        yield
 
 
 @contextlib.contextmanager

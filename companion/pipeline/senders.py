@@ -5,7 +5,7 @@ with its time on the sender's and on the node's timeline, or as a rejection with
 """
 
 from collections.abc import Container
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from companion.mavlink.clock.estimates import ClockChange, ClockEstimate, Stamp
@@ -185,7 +185,9 @@ class Senders:
         self._dedupe.took(stamp.latency_s)
         errors = self._noise.get(report.source, self._noise_settings.default)
         assumed = self._assumed(uav)
-        lag_ns = round(sum(assumed.lag_s) / 2 * 1e9)
+        least_s, greatest_s = assumed.lag_s
+        lag_ns = round((least_s + greatest_s) / 2 * 1e9)
+        errors = replace(errors, time_s=(greatest_s - least_s) / 2)
         true_ns = t_ns - round(stamp.latency_s * 1e9) - lag_ns
         placed = PlacedReport(report, stamp.sender_ns - lag_ns, true_ns, errors, assumed.limits)
         return Heard(placed, said, restarted, self._clock(uav).change)

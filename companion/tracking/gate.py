@@ -37,7 +37,6 @@ class GateSettings:
     forget_s           seconds without another one after which they are forgotten
     lead_m             how far a report may be ahead of the position or behind it, beside its
                        noise (a feedthrough)
-    lag_rest_s         half of the time by which positions may lag more or less than is taken off
     drift_max          greatest drift of a sender's clock, a ratio
     """
 
@@ -45,20 +44,27 @@ class GateSettings:
     reacquire_s: float = 1.0
     forget_s: float = 10.0
     lead_m: float = 0.0
-    lag_rest_s: float = 0.0
     drift_max: float = 250e-6
 
     def slack_m(self, before: Fix, fix: Fix) -> float:
         """How far apart two reports of one UAV may be because of their times alone.
 
-        Stamps are whole milliseconds, and the clock between them may drift.
+        Stamps are whole milliseconds, the clock between them may drift, and either position may lag
+        more or less than is taken off. Each error of a time is worth the way flown in it then.
         """
-        velocity = fix.velocity_ned_mps
-        if velocity is None:
-            return self.lead_m
         apart_s = abs(fix.sender_ns - before.sender_ns) * 1e-9
-        slack_s = 1e-3 + self.drift_max * apart_s + self.lag_rest_s
-        return self.lead_m + slack_s * math.sqrt(velocity @ velocity)
+        drifted_s = 1e-3 + self.drift_max * apart_s
+        lagged_m = _way_m(before, before.noise.time_s)
+        return self.lead_m + lagged_m + _way_m(fix, fix.noise.time_s + drifted_s)
+
+
+def _way_m(fix: Fix, within_s: float) -> float:
+    """The most that can be flown within a time about a report, m; 0 where it has no velocity."""
+    velocity = fix.velocity_ned_mps
+    if velocity is None:
+        return 0.0
+    gained_mps = within_s * (0.0 if fix.limits is None else fix.limits.acceleration_mps2)
+    return within_s * (math.sqrt(velocity @ velocity) + fix.noise.velocity_mps + gained_mps)
 
 
 def refusal(predicted: Prediction, fix: Fix, lead_m: float = 0.0) -> tuple[Reason, str] | None:

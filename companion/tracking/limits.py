@@ -113,7 +113,7 @@ class Refutations:
         self.speed = _Raised()
         self.acceleration = _Raised()
         self._times_ns: list[int] = []
-        self._velocities: list[tuple[float, float, float, float]] = []
+        self._velocities: list[tuple[float, float, float, float, float]] = []
 
     @property
     def times(self) -> int:
@@ -140,32 +140,30 @@ class Refutations:
         limit = self.speed.at(base.speed_mps, fix.sender_ns)
         if limit < speed < MOST * base.speed_mps:
             found.append(self._raise(self.speed, fix, "observer.speed_max_mps", limit, speed))
-        proven = self._proven(fix.sender_ns, north, east, down, noise_mps)
+        proven = self._proven(fix, north, east, down)
         limit = self.acceleration.at(base.acceleration_mps2, fix.sender_ns)
         if limit < proven < MOST * base.acceleration_mps2:
             name = "observer.acceleration_max_mps2"
             found.append(self._raise(self.acceleration, fix, name, limit, proven))
         if not self._times_ns or fix.sender_ns > self._times_ns[-1]:
             self._times_ns.append(fix.sender_ns)
-            self._velocities.append((north, east, down, noise_mps))
+            self._velocities.append((north, east, down, noise_mps, fix.noise.time_s))
             if len(self._times_ns) > 2 * _KEPT:
                 del self._times_ns[:_KEPT], self._velocities[:_KEPT]
         return found
 
-    def _proven(
-        self, sender_ns: int, north: float, east: float, down: float, noise_mps: float
-    ) -> float:
+    def _proven(self, fix: Fix, north: float, east: float, down: float) -> float:
         """The greatest mean acceleration that a velocity proves with those before it, m/s²."""
-        most = 0.0
+        most, sender_ns, noise = 0.0, fix.sender_ns, fix.noise
         for least_s in PAIRS_S:
             at = bisect_right(self._times_ns, sender_ns - round(least_s * 1e9)) - 1
             if at < 0:
                 break
-            n, e, d, noise = self._velocities[at]
+            n, e, d, noise_mps, time_s = self._velocities[at]
             changed = math.sqrt((north - n) ** 2 + (east - e) ** 2 + (down - d) ** 2)
             # Stamps are whole milliseconds, so the time between may be one more.
-            apart_s = (sender_ns - self._times_ns[at]) * 1e-9 + 1e-3
-            most = max(most, (changed - noise - noise_mps) / apart_s)
+            apart_s = (sender_ns - self._times_ns[at]) * 1e-9 + 1e-3 + time_s + noise.time_s
+            most = max(most, (changed - noise_mps - noise.velocity_mps) / apart_s)
         return most
 
     def _raise(

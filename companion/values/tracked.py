@@ -15,12 +15,15 @@ class ReportNoise:
     vertical_m    height error
     position_m    norm of the position error in space
     velocity_mps  norm of the velocity error
+    time_s        by how much the report may be older or newer than the time it is put at: what is
+                  left of its lag
     """
 
     horizontal_m: float
     vertical_m: float
     position_m: float
     velocity_mps: float
+    time_s: float = 0.0
 
 
 class LimitSource(StrEnum):

@@ -46,7 +46,8 @@ class Observed:
 class Predicted(NamedTuple):
     """A predicted position and velocity, (3,), local frame.
 
-    ``bound_m`` is None where none is given.
+    ``bound_m`` and ``usual_m``, the bound on its error and the error that 95 of 100 stay below, are
+    None where none is given.
 
     A tuple rather than a dataclass, because a study makes millions.
     """
@@ -54,6 +55,7 @@ class Predicted(NamedTuple):
     position_ned_m: FloatArray
     velocity_ned_mps: FloatArray | None
     bound_m: float | None
+    usual_m: float | None = None
 
 
 class Predictor(Protocol):

@@ -57,13 +57,14 @@ class Questions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answers:
-    """Positions (L, K, 3) and bounds (L, K); NaN where there is none.
+    """Positions (L, K, 3), bounds and usual errors (L, K); NaN where there is none.
 
     ``refuted_ns`` are the times at which the product said that an assumption was refuted.
     """
 
     position_ned_m: FloatArray
     bound_m: FloatArray
+    usual_m: FloatArray
     refuted_ns: tuple[int, ...] = ()
 
 
@@ -130,7 +131,7 @@ def _played(
     asked: Questions,
 ) -> Answers:
     shape = asked.counts.shape
-    position, bound = np.full((*shape, 3), np.nan), np.full(shape, np.nan)
+    position, (bound, usual) = np.full((*shape, 3), np.nan), np.full((2, *shape), np.nan)
     leads_ns, arrived, total = asked.leads_ns.tolist(), 0, len(said)
     for k, now_ns in enumerate(asked.now_ns.tolist()):
         while arrived < total and came_ns[arrived] <= now_ns:
@@ -142,7 +143,9 @@ def _played(
                 position[j, k] = predicted.position_ned_m
                 if predicted.bound_m is not None:
                     bound[j, k] = predicted.bound_m
-    return Answers(position, bound)
+                if predicted.usual_m is not None:
+                    usual[j, k] = predicted.usual_m
+    return Answers(position, bound, usual)
 
 
 def angles_deg(towards: FloatArray, truly: FloatArray) -> FloatArray:
@@ -166,7 +169,8 @@ def score(
     """The figures of one lead; None where nothing counts. Without bounds theirs are None.
 
     ``bound_tightness`` is the median bound over the 95th percentile of the error: 1 would be a
-    bound as small as the error. ``se_loss_bps_hz`` is that of ``receiver``, None without one.
+    bound as small as the error. ``usual_covers`` is the share of answers with a usual error whose
+    error was no more. ``se_loss_bps_hz`` is that of ``receiver``, None without one.
     """
     counts = asked.counts[lead] & ~np.isnan(given.position_ned_m[lead, :, 0])
     if not counts.any():
@@ -175,6 +179,8 @@ def score(
     array, bound = asked.array_ned_m[lead, counts], given.bound_m[lead, counts]
     error_m = np.linalg.norm(position - true, axis=1)
     angle_deg = angles_deg(position - array, true - array)
+    usual = given.usual_m[lead, counts]
+    told = ~np.isnan(usual)
     bounded = not np.isnan(bound).any()
     p95_m, median_m = float(np.percentile(error_m, 95)), float(np.median(bound))
     return {
@@ -191,6 +197,7 @@ def score(
         else loss_bps_hz(receiver.array, position - array, true - array, receiver.snr_db),
         "bound_median_m": median_m if bounded else None,
         "bound_tightness": median_m / p95_m if bounded and p95_m else None,
+        "usual_covers": float(np.mean(error_m[told] <= usual[told])) if told.any() else None,
     }
 
 

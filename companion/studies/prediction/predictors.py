@@ -57,7 +57,9 @@ class Product:
         """The track at that time, with its bound."""
         for track in self._pipeline.tracks(now_ns, at_ns):
             if track.uav == self.uav:
-                return Predicted(track.position_ned_m, track.velocity_ned_mps, track.bound_m)
+                return Predicted(
+                    track.position_ned_m, track.velocity_ned_mps, track.bound_m, track.error_p95_m
+                )
         return None
 
 

@@ -64,6 +64,13 @@ MEASURES: Final = (
         "tightness",
         Pool.MEAN,
     ),
+    Measure(
+        "usual_covers",
+        "share of errors no larger than the usual one that was stated (95 of 100 are meant)",
+        "covered",
+        Pool.MEAN,
+        True,
+    ),
 )
 
 

@@ -81,7 +81,8 @@ def test_scores_by_hand() -> None:
     array = np.tile([5.0, -7.0, 2.0], (4, 1))
     true = array + np.array([100.0, 0.0, 0.0])
     errors = np.array([[0, 0, 0], [0, 1, 0], [0, 0, -2], [5, 0, 0]], dtype=float)
-    given = Answers((true + errors)[None], np.array([[0.5, 0.5, 3.0, 4.0]]))
+    usual = np.array([[np.nan, 1.0, 1.9, 6.0]])
+    given = Answers((true + errors)[None], np.array([[0.5, 0.5, 3.0, 4.0]]), usual)
     found = score(asked(true, array), given, 0)
     assert found is not None
     angles = [0.0, math.degrees(math.atan(0.01)), math.degrees(math.atan(0.02)), 0.0]
@@ -93,17 +94,19 @@ def test_scores_by_hand() -> None:
     assert found["bound_median_m"] == pytest.approx(1.75)
     assert found["position_max_m"] == 5
     assert found["bound_tightness"] == pytest.approx(1.75 / (2 + 0.85 * 3))
+    assert found["usual_covers"] == pytest.approx(2 / 3)
     assert found["se_loss_bps_hz"] is None
 
 
 def test_without_bounds_or_answers() -> None:
     true = np.array([[100.0, 0, 0], [0, 100.0, 0]])
     both = asked(true, np.zeros((2, 3)))
-    one = Answers(np.array([[[100.0, 0, 0], [np.nan] * 3]]), np.full((1, 2), np.nan))
+    nothing = np.full((1, 2), np.nan)
+    one = Answers(np.array([[[100.0, 0, 0], [np.nan] * 3]]), nothing, nothing)
     found = score(both, one, 0)
     assert found is not None
-    assert (found["n"], found["bound_median_m"]) == (1, None)
-    assert score(both, Answers(np.full((1, 2, 3), np.nan), np.full((1, 2), np.nan)), 0) is None
+    assert (found["n"], found["bound_median_m"], found["usual_covers"]) == (1, None, None)
+    assert score(both, Answers(np.full((1, 2, 3), np.nan), nothing, nothing), 0) is None
 
 
 def test_angles_are_exact_when_small_and_when_large() -> None:

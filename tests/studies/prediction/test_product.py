@@ -161,7 +161,7 @@ def asked_and_given(
     )  # fmt: skip
     position = truth.copy()
     position[0, :, 0] = errors_m
-    return asked, Answers(position, np.ones((1, n)), refuted_ns)
+    return asked, Answers(position, np.ones((1, n)), np.ones((1, n)), refuted_ns)
 
 
 def test_violations_are_counted_and_what_was_announced_of_them() -> None:

@@ -19,7 +19,7 @@ from companion.recording.reader import LogError, log_kind, read_log, read_parts,
 from companion.recording.writer import Writer
 from companion.settings.files import load
 from companion.settings.model import Settings
-from companion.values import Estimate, Event, Output, Tick, Update
+from companion.values import Estimate, Event, Output, Refuted, Tick, Update
 
 FLUSH_EVERY_S: Final = 1.0
 """Time between two flushes of the recording."""
@@ -35,6 +35,8 @@ class Tally:
     dt_s: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     latency_s: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     innovation_m: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    reacquired: Counter[str] = field(default_factory=Counter)
+    refuted: Counter[str] = field(default_factory=Counter)
     updates: int = 0
     regularised: int = 0
     condition_number_max: float | None = None
@@ -51,6 +53,7 @@ class Tally:
         """Take in an accepted report."""
         fix = estimate.fix
         self.reports[fix.uav] += 1
+        self.reacquired[fix.uav] += estimate.reacquired
         self.latency_s[fix.uav].append((fix.arrival_ns - fix.t_ns) * 1e-9)
         if estimate.dt_s is not None and estimate.innovation_m is not None:
             self.dt_s[fix.uav].append(estimate.dt_s)
@@ -114,6 +117,8 @@ class Run:
             match output:
                 case Estimate():
                     self.tally.estimate(output)
+                case Refuted():
+                    self.tally.refuted[output.uav] += 1
                 case Update():
                     self.tally.update(output)
                 case _:
@@ -250,6 +255,13 @@ def _summary(pipeline: Pipeline, tally: Tally) -> dict[str, Any]:
                 "innovation_rms_m": _rms(tally.innovation_m[uav]),
                 "gamma": tracks[uav].gamma if uav in tracks else None,
                 "state": str(tracks[uav].state) if uav in tracks else "dropped",
+                "restarts": pipeline.restarts[uav],
+                "reacquired": tally.reacquired[uav],
+                "refuted": tally.refuted[uav],
+                "rejected": {
+                    str(reason): count
+                    for reason, count in sorted(pipeline.refusals.of(uav).counts.items())
+                },
             }
             for uav in heard
         },

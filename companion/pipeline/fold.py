@@ -11,6 +11,7 @@ and a relayed aircraft's report also goes to ``targets``, which returns nothing.
 ``fleet`` for the tracks that ``targets`` wants and ``center`` for the array, and aims the beams.
 """
 
+from collections import Counter
 from collections.abc import Iterable
 from typing import Final
 
@@ -64,6 +65,7 @@ class Pipeline:
         self.settings = settings
         self.frames = 0
         self.updates = 0
+        self.restarts: Counter[str] = Counter()
         self.last_update: Update | None = None
         self.refusals = Refusals()
         self.digest = Digest()
@@ -91,12 +93,13 @@ class Pipeline:
                 change = self.senders.round_trip(event)
                 source = str(event.source)
                 outputs = [] if change is None else self._changed(event.t_ns, source, change)
+        told = []
         for output in outputs:
             if isinstance(output, Rejection):
-                self.refusals.add(output)
+                told.append(self.refusals.add(output))
             elif isinstance(output, Estimate | Update):
                 self.digest.add(output)
-        return outputs
+        return [*outputs, *filter(None, told)] if told else outputs
 
     def _frame(self, frame: Frame) -> list[Output]:
         self.frames += 1
@@ -105,6 +108,7 @@ class Pipeline:
             return [] if change is None else self._changed(frame.t_ns, str(frame.source), change)
         heard = self.senders.hear(frame)
         if heard.restarted is not None:
+            self.restarts[heard.restarted] += 1
             self._restart(heard.restarted)
         said: list[Output] = list(heard.said)
         if heard.change is not None:
@@ -133,6 +137,7 @@ class Pipeline:
         accepted = self.fleet.accept(fix)
         if isinstance(accepted, Rejection):
             return [*said, accepted]
+        self.refusals.used(fix.uav)
         if not reports_itself(fix.uav):
             near = filter(reports_itself, self.fleet.near(fix.position_ned_m, NEAR_M))
             self.targets.compare(fix, self._tracks(near, fix.t_ns, fix.t_ns))
@@ -156,6 +161,7 @@ class Pipeline:
         """Forget the past of a sender."""
         self.fleet.forget(uav)
         self.assumptions.forget(uav)
+        self.refusals.forget(uav)
         self.center.restarted(uav)
 
     def _tick(self, now_ns: int) -> list[Output]:

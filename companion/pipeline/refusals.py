@@ -4,8 +4,25 @@ from collections import Counter, OrderedDict, deque
 from dataclasses import dataclass, field
 from typing import Final
 
-from companion.values import Reason, Rejection
+from companion.values import Notice, Reason, Rejection, Severity, reports_itself
 
+UNHEARD_NS: Final = 1_000_000_000
+"""Time for which no report of a sender is used before that is told."""
+AGAIN_NS: Final = 10_000_000_000
+"""Least time between two such notices of one sender."""
+OF_REPORTS: Final = frozenset(
+    {
+        Reason.UNREACHABLE,
+        Reason.ALTITUDE_JUMP,
+        Reason.FROZEN,
+        Reason.SHARED_ID,
+        Reason.ZERO_POSITION,
+        Reason.UNPLACED_STAMP,
+        Reason.NO_FIX,
+        Reason.OUT_OF_ORDER,
+    }
+)
+"""Reasons for which a report that is about its sender itself is not used."""
 RECENT: Final = 8
 """Recent rejections kept per sender."""
 SENDERS_MAX: Final = 4096
@@ -23,15 +40,61 @@ class OfSender:
     recent: deque[Rejection] = field(default_factory=lambda: deque(maxlen=RECENT))
 
 
+@dataclass(slots=True)
+class _Unheard:
+    """A run of refused reports of one sender, without one between that was used."""
+
+    since_ns: int
+    reports: int = 0
+    told: bool = False
+
+
 class Refusals:
     """Counts rejections. ``total`` includes those of senders that were forgotten."""
 
     def __init__(self) -> None:
         self.total: Counter[Reason] = Counter()
         self._senders: OrderedDict[str, OfSender] = OrderedDict()
+        self._unheard: dict[str, _Unheard] = {}
+        self._told_ns: dict[str, int] = {}
 
-    def add(self, refused: Rejection) -> None:
-        """Count one rejection."""
+    def add(self, refused: Rejection) -> Notice | None:
+        """Count one rejection.
+
+        Returns a notice where no report of the sender has been used for a second.
+        """
+        self._count(refused)
+        uav = refused.source
+        if refused.reason not in OF_REPORTS or not reports_itself(uav):
+            return None
+        run = self._unheard.get(uav)
+        if run is None:
+            if len(self._unheard) >= SENDERS_MAX:
+                return None
+            run = self._unheard.setdefault(uav, _Unheard(refused.t_ns))
+        run.reports += 1
+        lasted_ns = refused.t_ns - run.since_ns
+        if run.told or run.reports < 2 or lasted_ns < UNHEARD_NS:
+            return None
+        run.told = True
+        if refused.t_ns - self._told_ns.get(uav, refused.t_ns - AGAIN_NS) < AGAIN_NS:
+            return None
+        self._told_ns[uav] = refused.t_ns
+        why = f"{refused.reason}, {refused.detail}" if refused.detail else str(refused.reason)
+        text = f"no report of {uav} was used for {lasted_ns * 1e-9:.1f} s: {why}"
+        return Notice(refused.t_ns, Severity.WARNING, uav, text)
+
+    def used(self, uav: str) -> None:
+        """Note that a report was used."""
+        if self._unheard:
+            self._unheard.pop(uav, None)
+
+    def forget(self, uav: str) -> None:
+        """Forget when it was told that a UAV's reports are refused."""
+        self._unheard.pop(uav, None)
+        self._told_ns.pop(uav, None)
+
+    def _count(self, refused: Rejection) -> None:
         self.total[refused.reason] += refused.count
         sender = self._senders.get(refused.source)
         if sender is None:

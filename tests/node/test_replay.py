@@ -66,11 +66,12 @@ def test_a_short_flight_replays_to_the_same_digest(cut_log: Path, tmp_path: Path
     assert second["digest"] == first["digest"]
     assert second["recording"] is None
     keys = {"reports", "dt_median_s", "dt_max_s", "latency_p50_s", "latency_p95_s"}
-    keys |= {"innovation_rms_m", "gamma", "state"}
+    keys |= {"innovation_rms_m", "gamma", "state", "restarts", "reacquired", "refuted", "rejected"}
     assert first["uavs"].keys() >= {"1:1", "2:1", "3:1", "4:1"}
     assert all(set(entry) == keys for entry in first["uavs"].values())
     assert first["uavs"]["1:1"]["state"] == "live"
     assert first["uavs"]["1:1"]["dt_median_s"] == pytest.approx(0.1, abs=0.01)
+    assert first["uavs"]["1:1"]["restarts"] == first["uavs"]["1:1"]["reacquired"] == 0
     other = json.loads(replay(cut_log, "--center", "home", "--no-record", "--json").stdout)
     assert other["digest"] != first["digest"]
 

@@ -27,3 +27,49 @@ def test_a_flood_of_senders_forgets_the_one_heard_of_longest_ago() -> None:
         Reason.DUPLICATE: 2 * SENDERS_MAX,
     }
     assert refusals.of("1:1").counts == {Reason.DUPLICATE: 2 * SENDERS_MAX}
+
+
+def refused(t_s: float, uav: str = "3:1", reason: Reason = Reason.UNREACHABLE) -> Rejection:
+    return Rejection(round(t_s * 1e9), uav, reason, detail="45.0 m off, at most 4.0 m possible")
+
+
+def told_at(refusals: Refusals, rejections: list[Rejection]) -> list[float]:
+    return [one.t_ns * 1e-9 for one in rejections if refusals.add(one) is not None]
+
+
+def test_a_second_without_a_report_that_is_used_is_told_once() -> None:
+    refusals = Refusals()
+    assert told_at(refusals, [refused(t / 4) for t in range(20)]) == [1.0]
+    said = refusals.add(refused(7, "4:1"))
+    assert said is None
+    said = refusals.add(refused(8.5, "4:1"))
+    assert said is not None
+    assert said.text == (
+        "no report of 4:1 was used for 1.5 s: unreachable, 45.0 m off, at most 4.0 m possible"
+    )
+
+
+def test_a_report_that_is_used_ends_the_run() -> None:
+    refusals = Refusals()
+    for t in range(40):
+        assert refusals.add(refused(t / 4)) is None
+        if t % 3 == 0:
+            refusals.used("3:1")
+
+
+def test_runs_that_follow_one_another_are_told_every_ten_seconds_at_most() -> None:
+    refusals = Refusals()
+    told = []
+    for t in range(30):
+        told += told_at(refusals, [refused(t), refused(t + 0.5, reason=Reason.FROZEN)])
+        told += told_at(refusals, [refused(t + 0.9)] if t % 2 else [])
+        if t % 2:
+            refusals.used("3:1")
+    assert told == [1.0, 11.0, 21.0]
+
+
+def test_what_is_no_report_about_its_sender_is_told_of_nobody() -> None:
+    refusals = Refusals()
+    for reason in (Reason.DUPLICATE, Reason.BAD_CRC, Reason.NOT_ALLOWED, Reason.UNSIGNED):
+        assert told_at(refusals, [refused(t, reason=reason) for t in range(9)]) == []
+    assert told_at(refusals, [refused(t, "icao:4CA7B3") for t in range(9)]) == []

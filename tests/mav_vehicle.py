@@ -16,20 +16,37 @@ from support import HANG_S
 Message = Any
 
 
+def place(sysid: int, boot_s: float) -> tuple[float, float, float]:
+    """Latitude, longitude (degrees) and height (m) of a vehicle at a time of its own clock."""
+    angle = 0.1 * boot_s + sysid
+    lat = 47.3977 + 50 * math.cos(angle) / 111_195
+    lon = 8.5456 + 50 * math.sin(angle) / 75_270
+    return lat, lon, 550.0
+
+
 class Vehicle:
     """Reports a circle of 50 m about 47.3977 N 8.5456 E over ``mavutil``.
 
     ``position_hz`` and ``attitude_hz`` follow SET_MESSAGE_INTERVAL, which is acknowledged; TIMESYNC
-    is answered with nanoseconds since boot. ``heard`` holds what came, with its time.
+    is answered with nanoseconds since boot. ``heard`` holds what came, with its time. ``clock`` gives
+    the time since boot of a time of ``time.monotonic``; where it flies is by its own clock.
     """
 
-    def __init__(self, address: str, sysid: int, position_hz: float, attitude_hz: float) -> None:
+    def __init__(
+        self,
+        address: str,
+        sysid: int,
+        position_hz: float,
+        attitude_hz: float,
+        clock: Callable[[float], float] | None = None,
+    ) -> None:
         self.rates_hz = {33: position_hz, 30: attitude_hz}
         self.heard: list[tuple[float, Message]] = []
         self.silent = False
         self.link = mavutil.mavlink_connection(address, source_system=sysid, source_component=1)
         self._sysid = sysid
-        self._boot_s = time.monotonic() - 100.0
+        begun_s = time.monotonic() - 100.0
+        self._clock = clock or (lambda now_s: now_s - begun_s)
         self._changed = threading.Condition()
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._fly, daemon=True)
@@ -60,24 +77,24 @@ class Vehicle:
             for msgid, hz in ((0, 1.0), *self.rates_hz.items()):
                 if now_s >= due_s[msgid] and not self.silent:
                     due_s[msgid] = max(due_s[msgid] + 1 / hz, now_s - 1 / hz)
-                    self._say(msgid, now_s - self._boot_s)
+                    self._say(msgid, self._clock(time.monotonic()))
             message = self.link.recv_match(blocking=True, timeout=0.005)
             if message is not None and message.get_type() != "BAD_DATA":
                 self._answer(message)
 
     def _say(self, msgid: int, boot_s: float) -> None:
         mav, boot_ms = self.link.mav, round(boot_s * 1e3)
-        angle = 0.1 * boot_s + self._sysid
         if msgid == 0:
             mav.heartbeat_send(2, 3, 217, 4, 4)
         elif msgid == 30:
             mav.attitude_send(boot_ms, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0)
         else:
-            lat = 47.3977 + 50 * math.cos(angle) / 111_195
-            lon = 8.5456 + 50 * math.sin(angle) / 75_270
+            # As of the time that is stamped, which is in whole milliseconds.
+            lat, lon, alt_m = place(self._sysid, boot_ms / 1e3)
+            angle = 0.1 * boot_ms / 1e3 + self._sysid
             velocity = (round(-500 * math.sin(angle)), round(500 * math.cos(angle)), 0)
-            place = (round(lat * 1e7), round(lon * 1e7), 550_000, 40_000)
-            mav.global_position_int_send(boot_ms, *place, *velocity, 65535)
+            there = (round(lat * 1e7), round(lon * 1e7), round(1e3 * alt_m), 40_000)
+            mav.global_position_int_send(boot_ms, *there, *velocity, 65535)
 
     def _answer(self, message: Message) -> None:
         mav = self.link.mav
@@ -86,7 +103,7 @@ class Vehicle:
                 self.rates_hz[int(message.param1)] = 1e6 / message.param2
             mav.command_ack_send(message.command, mavutil.mavlink.MAV_RESULT_ACCEPTED)
         elif message.get_type() == "TIMESYNC" and message.tc1 == 0 and not self.silent:
-            mav.timesync_send(round((time.monotonic() - self._boot_s) * 1e9), message.ts1)
+            mav.timesync_send(round(self._clock(time.monotonic()) * 1e9), message.ts1)
         with self._changed:
             self.heard.append((time.monotonic(), message))
             self._changed.notify_all()

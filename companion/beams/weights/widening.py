@@ -186,7 +186,9 @@ def nulled(spread: Spread, loading: float | FloatArray, soft: float | None = Non
         points, gram, reached, each = points[:, ::each], gram[::each, ::each], reached[::each], 1
         loads = np.broadcast_to(loading, users)
     else:
-        loads = np.where(spread.usable, soft, UNUSED) * gram.diagonal().real
+        power = gram.diagonal().real
+        # A point to which the array radiates nothing is a row of zeros: what loads it is not its own.
+        loads = np.where(spread.usable, soft * power, UNUSED * power.max())
         loads[::each] = loading
     by_user = np.arange(users)
     by_other = reached.reshape(users, each, users).copy()

@@ -1,7 +1,7 @@
 """Turns a recording that was cut short into a finished one.
 
-What is intact is written again through the same library, so the result has its index and opens in
-every viewer. The torn original is removed only when its replacement is whole and on the disk.
+What is intact is written again as a recording is, so the result has its index and opens in every
+viewer. The torn original is removed only when its replacement is whole and on the disk.
 """
 
 import fcntl
@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Final
 
 from mcap.records import Attachment, Metadata
-from mcap.writer import Writer as McapWriter
 
 from companion.recording.container import MAGIC, Content, Damage, Message, Walk
+from companion.recording.mcap_file import McapFile
 from companion.recording.reader import LogError
 from companion.recording.writer import ACTIVE, free_name, sync_folder
 
@@ -99,7 +99,7 @@ def _rewrite(path: Path, head: bytes) -> Recovered:
     tally = _Tally()
     try:
         with partial.open("wb") as out:
-            _Copy(McapWriter(out), walk, tally).run()
+            _Copy(McapFile(out), walk, tally).run()
             out.flush()
             os.fsync(out.fileno())
         whole = walk.complete and not walk.lost_bytes
@@ -133,7 +133,7 @@ class _Tally:
 class _Copy:
     """Writes what a walk finds into a new file, with new ids of schemas and channels."""
 
-    def __init__(self, mcap: McapWriter, walk: Walk, tally: _Tally) -> None:
+    def __init__(self, mcap: McapFile, walk: Walk, tally: _Tally) -> None:
         self._mcap = mcap
         self._walk = walk
         self._tally = tally
@@ -141,27 +141,26 @@ class _Copy:
         self._channels: dict[int, int] = {}
 
     def run(self) -> None:
-        self._mcap.start(library="companion")
         for content in self._walk:
             self._add(content)
-        self._mcap.finish()  # type: ignore[no-untyped-call]
+        self._mcap.finish()
 
     def _add(self, content: Content) -> None:
         match content:
             case Message(channel, sequence, log_ns, publish_ns, data):
                 channel_id = self._channels.get(channel.id) or self._register(content)
-                self._mcap.add_message(channel_id, log_ns, data, publish_ns, sequence)
+                self._mcap.message(channel_id, log_ns, publish_ns, sequence, data)
                 self._tally.count(content)
             case Attachment():
-                self._mcap.add_attachment(
-                    content.create_time,
+                self._mcap.attachment(
                     content.log_time,
+                    content.create_time,
                     content.name,
                     content.media_type,
                     content.data,
                 )
             case Metadata():
-                self._mcap.add_metadata(content.name, content.metadata)
+                self._mcap.metadata(content.name, content.metadata)
             case Damage():
                 pass  # the walk has counted its bytes
 
@@ -170,9 +169,9 @@ class _Copy:
         schema_id = self._schemas.get(channel.schema_id)
         if schema_id is None:
             schema = self._walk.schemas[channel.schema_id]
-            schema_id = self._mcap.register_schema(schema.name, schema.encoding, schema.data)
+            schema_id = self._mcap.schema(schema.name, schema.encoding, schema.data)
             self._schemas[channel.schema_id] = schema_id
-        channel_id = self._mcap.register_channel(
+        channel_id = self._mcap.channel(
             channel.topic, channel.message_encoding, schema_id, channel.metadata
         )
         return self._channels.setdefault(channel.id, channel_id)

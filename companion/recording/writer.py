@@ -15,11 +15,9 @@ from io import BufferedWriter
 from pathlib import Path
 from typing import Final, Self
 
-from mcap.writer import CompressionType
-from mcap.writer import Writer as McapWriter
-
 from companion.recording import schemas
 from companion.recording.entries import Encoder, Geodetic
+from companion.recording.mcap_file import McapFile
 from companion.recording.parts import HOLE, PART, Hole, Part
 from companion.recording.scene import Scene
 from companion.values import Event, Output
@@ -28,7 +26,6 @@ ACTIVE: Final = ".active"
 SETTINGS: Final = "settings.toml"
 VERSIONS: Final = "versions"
 SUMMARY: Final = "summary"
-_CHUNK_BYTES: Final = 1 << 20
 
 
 class Writer:
@@ -71,21 +68,16 @@ class Writer:
         self._schema_ids: dict[str, int] = {}
         self._channel_ids: dict[str, int] = {}
         self._file = _open_alone(_beside(self._final))
-        self._mcap = McapWriter(
-            self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD
-        )
+        self._mcap = McapFile(self._file)
         self._write_head(settings_toml, versions, max(0, started_ns), part)
 
     def _write_head(
         self, settings_toml: str, versions: Mapping[str, str], at_ns: int, part: Part | None
     ) -> None:
-        self._mcap.start(library="companion")
-        self._mcap.add_attachment(
-            at_ns, at_ns, SETTINGS, "application/toml", settings_toml.encode()
-        )
-        self._mcap.add_metadata(VERSIONS, dict(versions))
+        self._mcap.attachment(at_ns, at_ns, SETTINGS, "application/toml", settings_toml.encode())
+        self._mcap.metadata(VERSIONS, versions)
         if part is not None:
-            self._mcap.add_metadata(PART, part.metadata())
+            self._mcap.metadata(PART, part.metadata())
         self.flush()
         sync_folder(self._final.parent)
 
@@ -104,8 +96,8 @@ class Writer:
 
     def hole(self, hole: Hole) -> None:
         """Record that events are missing here."""
-        self._mcap.flush()  # type: ignore[no-untyped-call]
-        self._mcap.add_metadata(HOLE, hole.metadata())
+        self._mcap.flush()
+        self._mcap.metadata(HOLE, hole.metadata())
 
     def flush(self) -> None:
         """Write everything so far to the disk; a killed process then loses nothing of it.
@@ -113,7 +105,7 @@ class Writer:
         Raises ``FileNotFoundError`` where the file is no longer in its place: what is written to a
         removed file is lost with the process.
         """
-        self._mcap.flush()  # type: ignore[no-untyped-call]
+        self._mcap.flush()
         os.fsync(self._file.fileno())
         if not self._is_in_place():
             raise FileNotFoundError(errno.ENOENT, "the file is no longer there", str(self.path))
@@ -128,8 +120,8 @@ class Writer:
         if self._finished:
             return self._final
         if metadata:
-            self._mcap.add_metadata(SUMMARY, dict(metadata))
-        self._mcap.finish()  # type: ignore[no-untyped-call]
+            self._mcap.metadata(SUMMARY, metadata)
+        self._mcap.finish()
         self._file.flush()
         os.fsync(self._file.fileno())
         self.size_bytes = self._file.tell()
@@ -179,15 +171,15 @@ class Writer:
     def _add(self, topic: str, schema: schemas.Schema, t_ns: int, data: bytes) -> None:
         channel_id = self._channel_ids.get(topic) or self._channel(topic, schema)
         stamp_ns = max(0, t_ns)
-        self._mcap.add_message(channel_id, stamp_ns, data, stamp_ns, self.messages & 0xFFFFFFFF)
+        self._mcap.message(channel_id, stamp_ns, stamp_ns, self.messages & 0xFFFFFFFF, data)
         self.messages += 1
 
     def _channel(self, topic: str, schema: schemas.Schema) -> int:
         schema_id = self._schema_ids.get(schema.name)
         if schema_id is None:
-            schema_id = self._mcap.register_schema(schema.name, "protobuf", schema.descriptor_set)
+            schema_id = self._mcap.schema(schema.name, "protobuf", schema.descriptor_set)
             self._schema_ids[schema.name] = schema_id
-        channel_id = self._mcap.register_channel(topic, "protobuf", schema_id)
+        channel_id = self._mcap.channel(topic, "protobuf", schema_id)
         return self._channel_ids.setdefault(topic, channel_id)
 
     def __enter__(self) -> Self:

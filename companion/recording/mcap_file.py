@@ -1,0 +1,210 @@
+"""Writes MCAP: chunks of messages with their indexes, attachments, metadata, and the summary.
+
+The library's writer makes objects of every message and packs each of its fields alone, which is
+most of the time that a recording takes. Here a message is one packed head and its bytes; what is
+rare (everything else) is written by the library's records. Reading stays with the library.
+
+Layout: https://mcap.dev/spec.
+"""
+
+import struct
+import zlib
+from collections.abc import Mapping
+from typing import BinaryIO, Final
+
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from zstandard import ZstdCompressor
+
+from companion.recording.container import MAGIC
+
+CHUNK_BYTES: Final = 1 << 20
+"""Size of its contents at which a chunk is ended."""
+_MESSAGE: Final = struct.Struct("<BQHIQQ")
+"""Opcode, length of what follows, channel, sequence, log time and publish time of a message."""
+_FIELDS: Final = _MESSAGE.size - 9  # of a message's head, without opcode and length
+_INDEX: Final = struct.Struct("<BQHI")  # opcode, length, channel, length of the entries
+_FOOTER_START: Final = struct.Struct("<BQQQ")  # the part of the footer that its checksum covers
+
+
+def _bytes(record: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    return bytes(builder.end())  # type: ignore[no-untyped-call]
+
+
+class McapFile:
+    """An MCAP file that is written to a stream, which stays open.
+
+    The caller gives log times of at least 0 and sequence numbers of 32 bits. Any method raises
+    ``OSError`` where the stream does.
+    """
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+        self._compressor = ZstdCompressor()
+        self._schemas: list[Schema] = []
+        self._channels: list[Channel] = []
+        self._counts: dict[int, int] = {}  # messages by channel
+        self._times_ns: list[tuple[int, int]] = []  # least and greatest of each chunk
+        self._chunks: list[ChunkIndex] = []
+        self._attachments: list[AttachmentIndex] = []
+        self._metadata: list[MetadataIndex] = []
+        # The chunk in progress: its records, their size, and the times and places by channel.
+        self._parts: list[bytes] = []
+        self._size = 0
+        self._entries: dict[int, list[int]] = {}
+        stream.write(MAGIC)
+        stream.write(_bytes(Header("", "companion")))
+
+    # --- what is written --------------------------------------------------------------------
+
+    def schema(self, name: str, encoding: str, data: bytes) -> int:
+        """Describe a type of message. Returns its id."""
+        self._schemas.append(Schema(len(self._schemas) + 1, data, encoding, name))
+        self._describe(self._schemas[-1])
+        return len(self._schemas)
+
+    def channel(
+        self, topic: str, encoding: str, schema_id: int, metadata: Mapping[str, str] | None = None
+    ) -> int:
+        """Begin a channel. Returns its id."""
+        number = len(self._channels) + 1
+        self._channels.append(Channel(number, topic, encoding, dict(metadata or {}), schema_id))
+        self._describe(self._channels[-1])
+        return number
+
+    def _describe(self, record: Schema | Channel) -> None:
+        self._parts.append(_bytes(record))
+        self._size += len(self._parts[-1])
+
+    def message(
+        self, channel_id: int, log_ns: int, publish_ns: int, sequence: int, data: bytes
+    ) -> None:
+        """Add a message."""
+        entries = self._entries.get(channel_id)
+        if entries is None:
+            entries = self._entries[channel_id] = []
+        entries += (log_ns, self._size)
+        size = _FIELDS + len(data)
+        head = _MESSAGE.pack(Opcode.MESSAGE, size, channel_id, sequence, log_ns, publish_ns)
+        self._parts += (head, data)
+        self._size += 9 + size
+        if self._size > CHUNK_BYTES:
+            self._end_chunk()
+
+    def attachment(self, at_ns: int, created_ns: int, name: str, kind: str, data: bytes) -> None:
+        """Attach a file; ``kind`` is its media type."""
+        at = self._stream.tell()
+        record = _bytes(Attachment(created_ns, at_ns, name, kind, data))
+        self._stream.write(record)
+        self._attachments.append(
+            AttachmentIndex(at, len(record), at_ns, created_ns, len(data), name, kind)
+        )
+
+    def metadata(self, name: str, data: Mapping[str, str]) -> None:
+        """Add a record of names and values."""
+        at = self._stream.tell()
+        record = _bytes(Metadata(name, dict(data)))
+        self._stream.write(record)
+        self._metadata.append(MetadataIndex(at, len(record), name))
+
+    def flush(self) -> None:
+        """End the chunk in progress and hand everything to the system."""
+        self._end_chunk()
+        self._stream.flush()
+
+    def _end_chunk(self) -> None:
+        """Write the chunk and the indexes of its messages; descriptions alone make none."""
+        if not self._entries:
+            return
+        contents = b"".join(self._parts)
+        times = [time for entries in self._entries.values() for time in entries[::2]]
+        least_ns, greatest_ns = min(times), max(times)
+        packed = self._compressor.compress(contents)
+        chunk = _bytes(
+            Chunk("zstd", packed, greatest_ns, least_ns, zlib.crc32(contents), len(contents))
+        )
+        chunk_at = self._stream.tell()
+        self._stream.write(chunk)
+        index_at, offsets, indexes = chunk_at + len(chunk), {}, []
+        for channel_id, entries in self._entries.items():
+            offsets[channel_id] = index_at
+            many = 8 * len(entries)
+            head = _INDEX.pack(Opcode.MESSAGE_INDEX, 6 + many, channel_id, many)
+            indexes.append(head + struct.pack(f"<{len(entries)}Q", *entries))
+            index_at += len(indexes[-1])
+            self._counts[channel_id] = self._counts.get(channel_id, 0) + len(entries) // 2
+        self._stream.write(b"".join(indexes))
+        self._chunks.append(
+            ChunkIndex(
+                chunk_length=len(chunk),
+                chunk_start_offset=chunk_at,
+                compression="zstd",
+                compressed_size=len(packed),
+                message_end_time=greatest_ns,
+                message_index_length=index_at - chunk_at - len(chunk),
+                message_index_offsets=offsets,
+                message_start_time=least_ns,
+                uncompressed_size=len(contents),
+            )
+        )
+        self._times_ns.append((least_ns, greatest_ns))
+        self._parts, self._size, self._entries = [], 0, {}
+
+    # --- the end ----------------------------------------------------------------------------
+
+    def finish(self) -> None:
+        """End the chunk in progress, and write the summary and the footer."""
+        self._end_chunk()
+        self._stream.write(_bytes(DataEnd(0)))
+        start = self._stream.tell()
+        summary = bytearray()
+        groups: list[tuple[int, list[bytes]]] = [
+            (Opcode.SCHEMA, [_bytes(one) for one in self._schemas]),
+            (Opcode.CHANNEL, [_bytes(one) for one in self._channels]),
+            (Opcode.STATISTICS, [_bytes(self._statistics())]),
+            (Opcode.CHUNK_INDEX, [_bytes(one) for one in self._chunks]),
+            (Opcode.ATTACHMENT_INDEX, [_bytes(one) for one in self._attachments]),
+            (Opcode.METADATA_INDEX, [_bytes(one) for one in self._metadata]),
+        ]
+        offsets = []
+        for opcode, records in groups:
+            joined = b"".join(records)
+            offsets.append(_bytes(SummaryOffset(opcode, start + len(summary), len(joined))))
+            summary += joined
+        offsets_at = start + len(summary)
+        summary += b"".join(offsets)
+        checked = summary + _FOOTER_START.pack(Opcode.FOOTER, 20, start, offsets_at)
+        self._stream.write(summary)
+        self._stream.write(_bytes(Footer(start, offsets_at, zlib.crc32(checked))))
+        self._stream.write(MAGIC)
+
+    def _statistics(self) -> Statistics:
+        return Statistics(
+            attachment_count=len(self._attachments),
+            channel_count=len(self._channels),
+            channel_message_counts=self._counts,
+            chunk_count=len(self._chunks),
+            message_count=sum(self._counts.values()),
+            message_end_time=max((one[1] for one in self._times_ns), default=0),
+            message_start_time=min((one[0] for one in self._times_ns), default=0),
+            metadata_count=len(self._metadata),
+            schema_count=len(self._schemas),
+        )

@@ -1,0 +1,67 @@
+"""Our writer of MCAP against that of the library: the same calls give the same bytes."""
+
+import io
+import random
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from mcap.writer import Writer as Library
+
+from companion.recording import mcap_file
+from companion.recording.mcap_file import McapFile
+
+TOPICS = ("/a", "/b", "/uav/1:1/fix")
+
+
+def play(seed: int, made: McapFile | Library) -> None:
+    """The same calls to either: descriptions between messages, times in no order, flushes."""
+    ours, chance = isinstance(made, McapFile), random.Random(seed)
+    calls: Any = made
+    attach = calls.attachment if ours else calls.add_attachment
+    note = calls.metadata if ours else calls.add_metadata
+    attach(5, 5, "settings.toml", "application/toml", b"x = 1\n")
+    note("versions", {"companion": "1", "ä": ""})
+    channels: dict[str, int] = {}
+    for number in range(chance.randrange(400)):
+        topic = chance.choice(TOPICS)
+        if topic not in channels:
+            schema = calls.schema if ours else calls.register_schema
+            channel = calls.channel if ours else calls.register_channel
+            described = schema(f"companion.{topic}", "protobuf", bytes(50))
+            channels[topic] = channel(topic, "protobuf", described, {"of": "a test"})
+        t_ns, data = chance.randrange(1 << 60), chance.randbytes(chance.randrange(300))
+        if ours:
+            calls.message(channels[topic], t_ns, t_ns + 1, number, data)
+        else:
+            calls.add_message(channels[topic], t_ns, data, t_ns + 1, number)
+        if chance.random() < 0.01:
+            calls.flush()
+            note("hole", {"events": "3"})
+    calls.finish()
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_bytes_are_the_librarys(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    size = (1 << 20, 2000)[seed % 2]
+    monkeypatch.setattr(mcap_file, "CHUNK_BYTES", size)
+    ours, theirs = io.BytesIO(), io.BytesIO()
+    play(seed, McapFile(ours))
+    library = Library(theirs, chunk_size=size, compression=CompressionType.ZSTD)
+    library.start(library="companion")
+    play(seed, library)
+    assert ours.getvalue() == theirs.getvalue()
+
+
+def test_a_viewer_finds_messages_by_their_index(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mcap_file, "CHUNK_BYTES", 500)
+    out = io.BytesIO()
+    made = McapFile(out)
+    channel = made.channel("/a", "protobuf", made.schema("A", "protobuf", b""))
+    for number in range(100):
+        made.message(channel, 1000 - number, 1000 - number, number, bytes([number]))
+    made.finish()
+    out.seek(0)
+    found = list(make_reader(out).iter_messages(starting_at=950, ending_before=960))
+    assert [message.data[0] for _, _, message in found] == list(range(50, 40, -1))

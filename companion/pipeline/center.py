@@ -6,8 +6,6 @@ The local frame begins at a fixed station, or where the first report was made.
 import math
 from typing import Final
 
-import numpy as np
-
 from companion.beams.aim import AIMABLE
 from companion.pipeline.senders import PlacedAttitude, PlacedReport
 from companion.settings.center import (
@@ -75,11 +73,12 @@ class Center:
         report = placed.report
         said = (self._first(report),) if self.local is None else ()
         assert self.local is not None
-        velocity = None
+        there = None
         if report.velocity_ne_mps is not None and report.velocity_down_mps is not None:
-            there = np.array([*report.velocity_ne_mps, report.velocity_down_mps])
-            velocity = self.local.local_from_ned(report.lat_deg, report.lon_deg) @ there
-        position = self.local.position_ned_m(report.lat_deg, report.lon_deg, report.alt_m)
+            there = (*report.velocity_ne_mps, report.velocity_down_mps)
+        position, velocity = self.local.localise(
+            report.lat_deg, report.lon_deg, report.alt_m, there
+        )
         errors = placed.noise
         if errors is None:
             errors = noise.relayed(velocity, report.alt_age_s, placed.limits.speed_mps)
@@ -127,7 +126,7 @@ class Center:
         if anew.fix.arrival_ns - self._home_from[1] > HOME_SETTLES_S * 1e9:
             self._home_from = None
             return None
-        if abs(float(anew.fix.position_ned_m[2])) < HOME_HEIGHT_M:
+        if abs(anew.fix.position_ned_m[2]) < HOME_HEIGHT_M:
             return None
         said = self._first(placed.report)
         text = f"home moves, for the first height was wrong: {said.text}"
@@ -144,7 +143,7 @@ class Center:
         if self.local is None or not isinstance(at, FixedCenter):
             return "no report yet"
         place = (at.lat_deg, at.lon_deg, at.alt_m)
-        return carrier.fixed(valid_at_ns, self.local, place, np.radians(at.heading_deg))
+        return carrier.fixed(valid_at_ns, self.local, place, math.radians(at.heading_deg))
 
     def aboard(
         self, track: Track | None, newest: Fix | None, now: SenderTime, at: SenderTime

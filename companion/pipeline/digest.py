@@ -2,8 +2,9 @@
 
 import hashlib
 import struct
+from collections.abc import Sequence
 
-from companion.values import Estimate, FloatArray, Update
+from companion.values import Estimate, Update
 
 
 class Digest:
@@ -18,11 +19,14 @@ class Digest:
             self._estimate(output.fix.uav, output.fix.t_ns, output.position_ned_m, output.bound_m)
             return
         for track in output.tracks:
-            self._estimate(track.uav, track.valid_at_ns, track.position_ned_m, track.bound_m)
+            position = track.position_ned_m.tolist()
+            self._estimate(track.uav, track.valid_at_ns, position, track.bound_m)
         self._hash.update("\0".join(output.beams.uavs).encode())
         self._hash.update(output.beams.weights.astype("<c16", copy=False).tobytes())
 
-    def _estimate(self, uav: str, t_ns: int, position_ned_m: FloatArray, bound_m: float) -> None:
+    def _estimate(
+        self, uav: str, t_ns: int, position_ned_m: Sequence[float], bound_m: float
+    ) -> None:
         self._hash.update(uav.encode())
         self._hash.update(struct.pack("<q4d", t_ns, *position_ned_m, bound_m))
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from companion.tracking.gate import GateSettings, Suspects, is_frozen, refusal
 from companion.tracking.hindsight import WAYS, WINDOWS, Hindsight, fading
-from companion.tracking.history import History, Vector
+from companion.tracking.history import History
 from companion.tracking.limits import Refutations
 from companion.tracking.observers.estimates import Observer, Prediction
 from companion.tracking.pace import Pace
@@ -31,6 +31,7 @@ from companion.values import (
     SenderTime,
     Track,
     TrackState,
+    Vector,
 )
 
 COMMON_ERROR = 0.07
@@ -87,9 +88,9 @@ class _Tracked:
     pace: Pace
     reports: int = 1
     believable_ns: int = 0
-    unknown_input: FloatArray | None = None
+    unknown_input: Vector | None = None
     mu_max_s2: float | None = None
-    acceleration: FloatArray | None = None
+    acceleration: Vector | None = None
     hindsight: Hindsight = field(default_factory=Hindsight)
 
 
@@ -181,12 +182,13 @@ class Fleet:
             return _rejected(fix, *why)
         before = tracked.history.newest
         first, *rest = tracked.suspects.take()
-        off = first.position_ned_m - self._observer.predict(before.state, first.sender_ns)[0]
+        predicted = self._observer.predict(before.state, first.sender_ns)
+        off_m = math.dist(first.position_ned_m, predicted.position_ned_m)
         begun = self._begin(first, tracked.reports)
         for later in rest:
             begun = self._use(self._tracked[fix.uav], len(self._history(fix.uav).entries), later)
         self._tracked[fix.uav].arrived = fix
-        return replace(begun, innovation_m=math.sqrt(off @ off), reacquired=True)
+        return replace(begun, innovation_m=off_m, reacquired=True)
 
     def _history(self, uav: str) -> History[Any]:
         return self._tracked[uav].history
@@ -215,10 +217,9 @@ class Fleet:
             return Estimate(fix, fix.position_ned_m, fix.noise.position_m, None, None)
         if predicted.mu_s2 is not None:
             tracked.mu_max_s2 = max(predicted.mu_s2, tracked.mu_max_s2 or 0.0)
-        off = entry.fix.position_ned_m - predicted.position_ned_m
         before_ns = tracked.history.entries[at - 1].fix.sender_ns if at else None
         dt_s = None if before_ns is None else (entry.fix.sender_ns - before_ns) * 1e-9
-        innovation_m = math.sqrt(off @ off)
+        innovation_m = math.dist(entry.fix.position_ned_m, predicted.position_ned_m)
         return Estimate(entry.fix, predicted.position_ned_m, predicted.bound_m, innovation_m, dt_s)
 
     def _look_back(self, tracked: _Tracked, fix: Fix) -> None:
@@ -236,8 +237,7 @@ class Fleet:
         slopes = [_cut(one, most_mps2) for one in tracked.history.accelerations(WINDOWS)]
         by_window = {window[0]: slope for window, slope in zip(WINDOWS, slopes, strict=True)}
         hindsight.add(fix, tuple(by_window.get(way.window_s) for way in WAYS))
-        chosen = by_window.get(hindsight.way.window_s)
-        tracked.acceleration = None if chosen is None else np.array(chosen)
+        tracked.acceleration = by_window.get(hindsight.way.window_s)
 
     def forget(self, uav: str) -> None:
         """Forget a track, because its sender was restarted or is gone."""
@@ -265,14 +265,14 @@ class Fleet:
             state=self._settings.ages.state((now - newest.fix.sender_ns) * 1e-9, tracked.pace),
             valid_at_ns=at.node_ns,
             age_s=(at.sender_ns - newest.fix.sender_ns) * 1e-9,
-            position_ned_m=predicted.position_ned_m,
-            velocity_ned_mps=predicted.velocity_ned_mps,
-            unknown_input_mps=tracked.unknown_input,
-            acceleration_ned_mps2=tracked.acceleration,
+            position_ned_m=np.array(predicted.position_ned_m),
+            velocity_ned_mps=_array(predicted.velocity_ned_mps),
+            unknown_input_mps=_array(tracked.unknown_input),
+            acceleration_ned_mps2=_array(tracked.acceleration),
             bound_m=possible.bound_m,
             horizontal_bound_m=possible.horizontal_m,
             vertical_bound_m=possible.vertical_m,
-            set_center_ned_m=possible.center_ned_m,
+            set_center_ned_m=np.array(possible.center_ned_m),
             set_radius_m=possible.radius_m,
             limits=self._limits(newest.fix),
             error_p95_m=self._usual_m(tracked, predicted, at),
@@ -295,9 +295,9 @@ class Fleet:
         position, velocity = found.position_ned_m, found.velocity_ned_mps
         if tracked.acceleration is not None and velocity is not None and ahead_s > 0:
             way_s2, gain_s = fading(ahead_s, tracked.hindsight.way.fades_s)
-            position = position + way_s2 * tracked.acceleration
-            velocity = velocity + gain_s * tracked.acceleration
-        found = found._replace(position_ned_m=position, velocity_ned_mps=velocity)
+            position = _further(position, way_s2, tracked.acceleration)
+            velocity = _further(velocity, gain_s, tracked.acceleration)
+            found = found._replace(position_ned_m=position, velocity_ned_mps=velocity)
         limits = self._limits(newest.fix)
         if newest.fix.velocity_ned_mps is not None and found.mu_s2 is None:
             return found, reach(newest.fix, limits, position, at)
@@ -315,7 +315,7 @@ class Fleet:
             return seen_m
         velocity = found.velocity_ned_mps
         common_m = COMMON_ERROR * tracked.history.newest.fix.noise.position_m
-        return math.hypot(seen_m, common_m, math.sqrt(velocity @ velocity) * at.usual_s)
+        return math.hypot(seen_m, common_m, math.hypot(*velocity) * at.usual_s)
 
     def _limits(self, fix: Fix) -> Limits:
         return fix.limits or self._settings.limits
@@ -342,14 +342,13 @@ class Fleet:
         age_s = (now.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
         return self._settings.ages.state(age_s, tracked.pace)
 
-    def near(self, position_ned_m: FloatArray, within_m: float) -> list[str]:
-        """UAVs whose newest accepted report lies within a distance of a local place, (3,)."""
-        found = []
-        for uav, tracked in self._tracked.items():
-            offset = tracked.history.newest.fix.position_ned_m - position_ned_m
-            if offset @ offset < within_m**2:
-                found.append(uav)
-        return found
+    def near(self, position_ned_m: Vector, within_m: float) -> list[str]:
+        """UAVs whose newest accepted report lies within a distance of a local place."""
+        return [
+            uav
+            for uav, tracked in self._tracked.items()
+            if math.dist(tracked.history.newest.fix.position_ned_m, position_ned_m) < within_m
+        ]
 
 
 def _fastest_mps(found: Prediction, limits: Limits, within_s: float) -> float:
@@ -358,11 +357,21 @@ def _fastest_mps(found: Prediction, limits: Limits, within_s: float) -> float:
     if velocity is None or bound_mps is None:
         return limits.speed_mps
     gained_mps = limits.acceleration_mps2 * within_s
-    return min(limits.speed_mps, math.sqrt(velocity @ velocity) + bound_mps + gained_mps)
+    return min(limits.speed_mps, math.hypot(*velocity) + bound_mps + gained_mps)
 
 
 def _rejected(fix: Fix, reason: Reason, detail: str) -> Rejection:
     return Rejection(fix.arrival_ns, fix.uav, reason, detail=detail)
+
+
+def _array(vector: Vector | None) -> FloatArray | None:
+    return None if vector is None else np.array(vector)
+
+
+def _further(vector: Vector, by: float, along: Vector) -> Vector:
+    """``vector + by * along``."""
+    (x, y, z), (a, b, c) = vector, along
+    return x + by * a, y + by * b, z + by * c
 
 
 def _cut(acceleration: Vector | None, most_mps2: float) -> Vector | None:
@@ -377,8 +386,8 @@ def _cut(acceleration: Vector | None, most_mps2: float) -> Vector | None:
     return share * north, share * east, share * down
 
 
-def _unknown_input(history: History[Any]) -> FloatArray | None:
-    """Unknown input over the newest interval: W^ = (x^+ - x^) / dT, m/s, (3,).
+def _unknown_input(history: History[Any]) -> Vector | None:
+    """Unknown input over the newest interval: W^ = (x^+ - x^) / dT, m/s.
 
     See docs/math.md 3; None where there are fewer than two reports.
     """
@@ -388,5 +397,6 @@ def _unknown_input(history: History[Any]) -> FloatArray | None:
     if newest.predicted is None:
         return None
     start = before.fix if before.predicted is None else before.predicted
-    step = newest.predicted.position_ned_m - start.position_ned_m
-    return np.asarray(step / ((newest.fix.sender_ns - before.fix.sender_ns) * 1e-9))
+    dt_s = (newest.fix.sender_ns - before.fix.sender_ns) * 1e-9
+    (n, e, d), (to_n, to_e, to_d) = start.position_ned_m, newest.predicted.position_ned_m
+    return (to_n - n) / dt_s, (to_e - e) / dt_s, (to_d - d) / dt_s

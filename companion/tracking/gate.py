@@ -12,8 +12,6 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Final, Generic
 
-import numpy as np
-
 from companion.tracking.observers.estimates import Observer, Prediction, State
 from companion.values import Fix, Reason
 
@@ -64,13 +62,16 @@ def _way_m(fix: Fix, within_s: float) -> float:
     if velocity is None:
         return 0.0
     gained_mps = within_s * (0.0 if fix.limits is None else fix.limits.acceleration_mps2)
-    return within_s * (math.sqrt(velocity @ velocity) + fix.noise.velocity_mps + gained_mps)
+    north, east, down = velocity
+    speed_mps = math.sqrt(north * north + east * east + down * down)
+    return within_s * (speed_mps + fix.noise.velocity_mps + gained_mps)
 
 
 def refusal(predicted: Prediction, fix: Fix, lead_m: float = 0.0) -> tuple[Reason, str] | None:
     """Why a report cannot be true, given the prediction for its time; None if it can."""
-    north, east, down = (fix.position_ned_m - predicted.position_ned_m).tolist()
-    horizontal_m = math.hypot(north, east)
+    (n, e, d), (there_n, there_e, there_d) = predicted.position_ned_m, fix.position_ned_m
+    down = there_d - d
+    horizontal_m = math.hypot(there_n - n, there_e - e)
     limit_m = predicted.horizontal_m + fix.noise.horizontal_m + lead_m
     if horizontal_m > limit_m:
         return Reason.UNREACHABLE, f"{horizontal_m:.1f} m off, at most {limit_m:.1f} m possible"
@@ -83,9 +84,9 @@ def refusal(predicted: Prediction, fix: Fix, lead_m: float = 0.0) -> tuple[Reaso
 def is_frozen(before: Fix, fix: Fix) -> bool:
     """Whether a position was sent again under a fresh stamp, though its velocity says it moved."""
     velocity = fix.velocity_ned_mps
-    if velocity is None or not np.array_equal(before.position_ned_m, fix.position_ned_m):
+    if velocity is None or before.position_ned_m != fix.position_ned_m:
         return False
-    speed_mps = math.sqrt(velocity @ velocity)
+    speed_mps = math.hypot(*velocity)
     travel_m = speed_mps * (fix.sender_ns - before.sender_ns) * 1e-9
     return speed_mps > FROZEN_SPEED_MPS and travel_m > FROZEN_TRAVEL_M
 

@@ -11,9 +11,8 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-import pymap3d
 
-from companion.values import FloatArray
+from companion.values import FloatArray, Vector
 
 SEMI_MAJOR_M: Final = 6_378_137.0
 SEMI_MINOR_M: Final = SEMI_MAJOR_M * (1 - 1 / 298.257223563)
@@ -46,20 +45,68 @@ class Place(NamedTuple):
     alt_m: float
 
 
+class _Axes:
+    """North, east and down at a place, with the sines and cosines that turning to them takes."""
+
+    __slots__ = ("cos_lat", "cos_lon", "sin_lat", "sin_lon")
+
+    def __init__(self, lat_deg: float, lon_deg: float) -> None:
+        lat, lon = math.radians(lat_deg), math.radians(lon_deg)
+        self.sin_lat, self.cos_lat = math.sin(lat), math.cos(lat)
+        self.sin_lon, self.cos_lon = math.sin(lon), math.cos(lon)
+
+    def ecef_m(self, alt_m: float) -> Vector:
+        """Earth-centred coordinates of the place at a height."""
+        sine, cosine = self.sin_lat, self.cos_lat
+        normal_m = SEMI_MAJOR_M**2 / math.hypot(SEMI_MAJOR_M * cosine, SEMI_MINOR_M * sine)
+        across_m = (normal_m + alt_m) * cosine
+        z_m = (normal_m * (SEMI_MINOR_M / SEMI_MAJOR_M) ** 2 + alt_m) * sine
+        return across_m * self.cos_lon, across_m * self.sin_lon, z_m
+
+    def ned(self, x: float, y: float, z: float) -> Vector:
+        """An earth-centred vector in north, east and down of the place."""
+        out = self.cos_lon * x + self.sin_lon * y
+        return (
+            self.cos_lat * z - self.sin_lat * out,
+            self.cos_lon * y - self.sin_lon * x,
+            -(self.cos_lat * out + self.sin_lat * z),
+        )
+
+    def ecef(self, north: float, east: float, down: float) -> Vector:
+        """The way back: ``ned`` of it is the vector itself."""
+        out = -self.sin_lat * north - self.cos_lat * down
+        return (
+            self.cos_lon * out - self.sin_lon * east,
+            self.sin_lon * out + self.cos_lon * east,
+            self.cos_lat * north - self.sin_lat * down,
+        )
+
+
 class LocalFrame:
     """North-east-down at an origin given in degrees and metres."""
 
     def __init__(self, lat_deg: float, lon_deg: float, alt_m: float) -> None:
         self.origin = (lat_deg, lon_deg, alt_m)
         self._local_from_ecef = ned_from_ecef(lat_deg, lon_deg)
-        self._origin_m = np.array(pymap3d.geodetic2ecef(lat_deg, lon_deg, alt_m), dtype=float)
+        self._axes = _Axes(lat_deg, lon_deg)
+        self._origin = self._axes.ecef_m(alt_m)
+        self._origin_m = np.array(self._origin)
         self._rows = tuple(
             zip(self._origin_m.tolist(), *self._local_from_ecef.tolist(), strict=True)
         )
 
+    def localise(
+        self, lat_deg: float, lon_deg: float, alt_m: float, velocity_ned: Vector | None
+    ) -> tuple[Vector, Vector | None]:
+        """Local coordinates of a place, and of a velocity that is in north-east-down there."""
+        there, here = _Axes(lat_deg, lon_deg), self._axes
+        (x, y, z), (x0, y0, z0) = there.ecef_m(alt_m), self._origin
+        position = here.ned(x - x0, y - y0, z - z0)
+        return position, None if velocity_ned is None else here.ned(*there.ecef(*velocity_ned))
+
     def position_ned_m(self, lat_deg: float, lon_deg: float, alt_m: float) -> FloatArray:
         """Local coordinates of a place in metres, (3,)."""
-        return np.array(pymap3d.geodetic2ned(lat_deg, lon_deg, alt_m, *self.origin), dtype=float)
+        return np.array(self.localise(lat_deg, lon_deg, alt_m, None)[0])
 
     def local_from_ned(self, lat_deg: float, lon_deg: float) -> FloatArray:
         """Rotation (3, 3) from north-east-down at another place to this frame."""

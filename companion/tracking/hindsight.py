@@ -14,8 +14,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Final
 
-from companion.tracking.history import Vector
-from companion.values import Fix
+from companion.values import Fix, Vector
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +125,7 @@ class Hindsight:
 
         ``accelerations``: what each of ``WAYS`` would feed forward from this report, m/s².
         """
-        there: Vector = tuple(fix.position_ned_m.tolist())
+        there = fix.position_ned_m
         self._judge(fix.sender_ns, there)
         for errors, least_s in zip(self._errors, AGES_S, strict=True):
             made = self._older(fix.sender_ns, least_s)
@@ -135,8 +134,7 @@ class Hindsight:
                 age_s = (fix.sender_ns - made.sender_ns) * 1e-9
                 errors.add(made.off_m(self._way, there, age_s), age_s)
         if fix.velocity_ned_mps is not None:
-            velocity: Vector = tuple(fix.velocity_ned_mps.tolist())
-            self._made.append(_Made(fix.sender_ns, there, velocity, accelerations))
+            self._made.append(_Made(fix.sender_ns, there, fix.velocity_ned_mps, accelerations))
 
     def _older(self, sender_ns: int, least_s: float) -> _Made | None:
         """The newest of what is remembered that is at least so old, and not twice as old."""

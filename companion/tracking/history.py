@@ -11,9 +11,7 @@ from dataclasses import dataclass
 from typing import Generic
 
 from companion.tracking.observers.estimates import Observer, Prediction, State
-from companion.values import Fix
-
-Vector = tuple[float, float, float]
+from companion.values import Fix, Vector
 
 ACCELERATION_REPORTS_MAX = 25
 """Most velocities used for an acceleration: of more, only every n-th over the whole window."""
@@ -99,7 +97,7 @@ class History(Generic[State]):
                 due += 1
             if due == len(windows):
                 return found
-            north, east, down = fix.velocity_ned_mps.tolist()
+            north, east, down = fix.velocity_ned_mps
             n, t1, t2 = n + 1.0, t1 + t, t2 + t * t
             v1, v2, v3 = v1 + north, v2 + east, v3 + down
             w1, w2, w3 = w1 + t * north, w2 + t * east, w3 + t * down

@@ -5,10 +5,9 @@ relayed aircraft is identified with a telemetry track after several reports in a
 to it than their errors allow to tell apart, and is separated again after as many that are not.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Final
-
-import numpy as np
 
 from companion.values import Fix, Track
 
@@ -56,15 +55,13 @@ class Identities:
 
 def _apart_m(relayed: Fix, track: Track) -> float | None:
     """Horizontal distance between two tracks that may be one aircraft; None if they cannot be."""
-    offset = relayed.position_ned_m - track.position_ned_m
-    apart_m = float(np.hypot(offset[0], offset[1]))
+    (n, e, d), (to_n, to_e, to_d) = relayed.position_ned_m, track.position_ned_m.tolist()
+    apart_m = math.hypot(n - to_n, e - to_e)
     if apart_m > relayed.noise.horizontal_m + track.horizontal_bound_m:
         return None
-    if abs(offset[2]) > relayed.noise.vertical_m + track.vertical_bound_m:
+    if abs(d - to_d) > relayed.noise.vertical_m + track.vertical_bound_m:
         return None
     ours, theirs = track.velocity_ned_mps, relayed.velocity_ned_mps
-    if ours is not None and theirs is not None:
-        difference = ours - theirs
-        if difference @ difference > SPEED_APART_MPS**2:
-            return None
-    return apart_m
+    if ours is None or theirs is None or math.dist(ours.tolist(), theirs) <= SPEED_APART_MPS:
+        return apart_m
+    return None

@@ -134,7 +134,7 @@ class Refutations:
         if base is None or velocity is None:
             return []
         found = []
-        north, east, down = velocity.tolist()
+        north, east, down = velocity
         noise_mps = fix.noise.velocity_mps
         speed = math.sqrt(north * north + east * east + down * down) - noise_mps
         limit = self.speed.at(base.speed_mps, fix.sender_ns)

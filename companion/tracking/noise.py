@@ -4,9 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-
-from companion.values import FloatArray, GnssStatus, ReportNoise
+from companion.values import GnssStatus, ReportNoise, Vector
 
 QUANTISATION: Final = 0.02
 """Least noise bound, m and m/s, whatever accuracy is stated.
@@ -57,9 +55,7 @@ def _bound(accuracy: float | None, factor: float, default: float) -> float:
     return default if accuracy is None else max(QUANTISATION, factor * accuracy)
 
 
-def relayed(
-    velocity_ned_mps: FloatArray | None, alt_age_s: float, speed_max_mps: float
-) -> ReportNoise:
+def relayed(velocity_ned_mps: Vector | None, alt_age_s: float, speed_max_mps: float) -> ReportNoise:
     """The noise bounds of an ADS-B report.
 
     The uncertainty of its time adds the distance flown in it, and an altitude that was true
@@ -68,7 +64,7 @@ def relayed(
     if velocity_ned_mps is None:
         way_m = ADSB_TIME_BOUND_S * speed_max_mps
     else:
-        way_m = ADSB_TIME_BOUND_S * float(np.sqrt(velocity_ned_mps @ velocity_ned_mps))
+        way_m = ADSB_TIME_BOUND_S * math.hypot(*velocity_ned_mps)
     off_m = ADSB_NOISE_M + way_m
     vertical_m = off_m + alt_age_s * speed_max_mps
     return ReportNoise(off_m, vertical_m, math.hypot(off_m, vertical_m), ADSB_VELOCITY_NOISE_MPS)

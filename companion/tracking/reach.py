@@ -14,9 +14,7 @@ worst case. See docs/math.md 5.1.
 import math
 from typing import NamedTuple
 
-import numpy as np
-
-from companion.values import Fix, FloatArray, Limits, SenderTime
+from companion.values import Fix, Limits, SenderTime, Vector
 
 
 class Reach(NamedTuple):
@@ -25,31 +23,32 @@ class Reach(NamedTuple):
     bound_m       bound on the norm of the prediction's error
     horizontal_m  bound on its part in the plane
     vertical_m    bound on its height
-    center_ned_m  (3,), centre of the ball
+    center_ned_m  centre of the ball
     radius_m      radius of the ball
     """
 
     bound_m: float
     horizontal_m: float
     vertical_m: float
-    center_ned_m: FloatArray
+    center_ned_m: Vector
     radius_m: float
 
 
-def reach(fix: Fix, limits: Limits, predicted_ned_m: FloatArray, at: SenderTime) -> Reach:
+def reach(fix: Fix, limits: Limits, predicted_ned_m: Vector, at: SenderTime) -> Reach:
     """What is possible at a time, and how far it is from a prediction for that time.
 
     fix              the newest report, with a velocity
     limits           what the aircraft can do
-    predicted_ned_m  (3,), the prediction
+    predicted_ned_m  the prediction
     at               the time, on the sender's timeline
     """
     assert fix.velocity_ned_mps is not None
     noise = fix.noise
     age_s = (at.sender_ns - fix.sender_ns) * 1e-9
     ends = (age_s - at.before_s, age_s + at.after_s)
-    north, east, down = (predicted_ned_m - fix.position_ned_m).tolist()
-    v_north, v_east, v_down = fix.velocity_ned_mps.tolist()
+    (to_n, to_e, to_d), (from_n, from_e, from_d) = predicted_ned_m, fix.position_ned_m
+    north, east, down = to_n - from_n, to_e - from_e, to_d - from_d
+    v_north, v_east, v_down = fix.velocity_ned_mps
     bound = horizontal = vertical = 0.0
     radii = []
     for s in ends:
@@ -72,11 +71,11 @@ def reach(fix: Fix, limits: Limits, predicted_ned_m: FloatArray, at: SenderTime)
     return Reach(min(bound, math.hypot(horizontal, vertical)), horizontal, vertical, center, radius)
 
 
-def _ball(fix: Fix, ends: tuple[float, float], radii: list[float]) -> tuple[FloatArray, float]:
+def _ball(fix: Fix, ends: tuple[float, float], radii: list[float]) -> tuple[Vector, float]:
     """The least ball that holds the balls at both ends, and with them all between."""
     assert fix.velocity_ned_mps is not None
-    velocity = fix.velocity_ned_mps
-    apart = math.sqrt(velocity @ velocity) * (ends[1] - ends[0])
+    (n, e, d), (v_n, v_e, v_d) = fix.position_ned_m, fix.velocity_ned_mps
+    apart = math.sqrt(v_n * v_n + v_e * v_e + v_d * v_d) * (ends[1] - ends[0])
     radius = max(radii[0], radii[1], (radii[0] + radii[1] + apart) / 2.0)
     if apart == 0.0:
         share = 0.0
@@ -85,4 +84,4 @@ def _ball(fix: Fix, ends: tuple[float, float], radii: list[float]) -> tuple[Floa
         if radius == radii[1]:
             share = 1.0
     s = ends[0] + share * (ends[1] - ends[0])
-    return np.asarray(fix.position_ned_m + s * velocity), radius
+    return (n + s * v_n, e + s * v_e, d + s * v_d), radius

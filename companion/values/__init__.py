@@ -26,6 +26,8 @@ from companion.values.numbers import (
     ComplexArray,
     FloatArray,
     IntArray,
+    Vector,
+    vector,
 )
 from companion.values.outputs import (
     Notice,
@@ -105,5 +107,7 @@ __all__ = [
     "TrackState",
     "Update",
     "UserError",
+    "Vector",
     "reports_itself",
+    "vector",
 ]

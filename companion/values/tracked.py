@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
-from companion.values.numbers import FloatArray
+from companion.values.numbers import FloatArray, Vector
 from companion.values.received import Report
 
 
@@ -76,8 +76,8 @@ class Fix:
                            reports are taken from it, since the link cannot disturb it
         t_ns               the same instant on the node's timeline, as known on arrival
         arrival_ns         when the report arrived, node time
-        position_ned_m     (3,), local frame
-        velocity_ned_mps   (3,), local frame; None if not sent
+        position_ned_m     in the local frame
+        velocity_ned_mps   in the local frame; None if not sent
         noise              bounds on the errors of both
         report             the report itself
         limits             what the aircraft is taken to be able to do; None: the observer's model
@@ -90,8 +90,8 @@ class Fix:
     sender_ns: int
     t_ns: int
     arrival_ns: int
-    position_ned_m: FloatArray
-    velocity_ned_mps: FloatArray | None
+    position_ned_m: Vector
+    velocity_ned_mps: Vector | None
     noise: ReportNoise
     report: Report
     limits: Limits | None = None
@@ -102,7 +102,7 @@ class Estimate:
     """The observer's answer to an accepted report, at the time of that report.
 
     fix             the accepted report
-    position_ned_m  (3,), local frame: the estimate before this report entered it
+    position_ned_m  local frame: the estimate before this report entered it
     bound_m         bound on the norm of that estimate's error
     innovation_m    distance from the estimate to the report; None for the first report of a
                     track; of one that was begun again, how far it jumped
@@ -112,7 +112,7 @@ class Estimate:
     """
 
     fix: Fix
-    position_ned_m: FloatArray
+    position_ned_m: Vector
     bound_m: float
     innovation_m: float | None
     dt_s: float | None

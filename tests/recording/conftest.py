@@ -134,9 +134,9 @@ def estimate() -> Estimate:
     )  # fmt: skip
     noise = ReportNoise(3.0, 3.0, 4.25, 0.5)
     fix = Fix(
-        "1:1", 100_000_000, START_NS - 100_000_000, START_NS, np.zeros(3), None, noise, report
+        "1:1", 100_000_000, START_NS - 100_000_000, START_NS, (0.0, 0.0, 0.0), None, noise, report
     )
-    return Estimate(fix, np.zeros(3), 1.0, None, None)
+    return Estimate(fix, (0.0, 0.0, 0.0), 1.0, None, None)
 
 
 @pytest.fixture

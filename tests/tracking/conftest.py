@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from companion.values import AltitudeDatum, Fix, Report, ReportNoise, Source
+from companion.values import AltitudeDatum, Fix, Report, ReportNoise, Source, vector
 
 MakeFix = Callable[..., Fix]
 NOISE = ReportNoise(1.2, 0.9, math.hypot(1.2, 0.9), 0.4)
@@ -30,8 +30,10 @@ def fix() -> MakeFix:
         late_ns: int = 0,
         noise: ReportNoise = NOISE,
     ) -> Fix:
-        velocity = None if velocity_ned_mps is None else np.array(velocity_ned_mps, dtype=float)
-        position = np.array(position_ned_m, dtype=float)
+        velocity = velocity_ned_mps
+        if velocity is not None:
+            velocity = vector(np.array(velocity, dtype=float))
+        position = vector(np.array(position_ned_m, dtype=float))
         lat_deg, lon_deg = 47.0 + position[0] * 9e-6, 8.0 + position[1] * 13e-6
         report = Report(
             t_ns + late_ns, "udp", uav, Source(1, 1), lat_deg, lon_deg, 500.0 - position[2],

@@ -64,7 +64,7 @@ def test_tracks_age(fleet: Fleet, fix: MakeFix, age_s: float, state: str) -> Non
 def test_a_first_report_is_its_own_estimate(fleet: Fleet, fix: MakeFix) -> None:
     first = fleet.accept(fix(100 * S, [1, 2, 3], late_ns=S // 4))
     assert isinstance(first, Estimate)
-    assert first.position_ned_m.tolist() == [1, 2, 3]
+    assert first.position_ned_m == (1, 2, 3)
     assert (first.innovation_m, first.dt_s) == (None, None)
     assert first.bound_m == pytest.approx(1.5)
     track = fleet.track("1:1", 100 * S, same_time(100 * S))

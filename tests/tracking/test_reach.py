@@ -84,4 +84,4 @@ def test_over_a_long_gap_the_greatest_speed_says_more(fix: Callable[..., Fix]) -
     made = fix(0, [0, 0, 0], [10, 0, 0], noise=NOISE)
     found = reach(made, LIMITS, np.zeros(3), SenderTime(0, 60 * S, 0.0, 0.0))
     assert found.radius_m == pytest.approx(1.5 + 60 * 60)
-    assert found.center_ned_m.tolist() == [0, 0, 0]
+    assert found.center_ned_m == (0, 0, 0)

@@ -6,7 +6,7 @@ from companion.pipeline import assembly
 from companion.settings.model import Settings
 from companion.studies.prediction.baselines import Observed, Predicted
 from companion.tracking.noise import reported
-from companion.values import AltitudeDatum, Fix, Report, SenderTime, Source
+from companion.values import AltitudeDatum, Fix, Report, SenderTime, Source, vector
 
 
 class FleetPredictor:
@@ -23,14 +23,15 @@ class FleetPredictor:
         self._offset_ns = report.sent_ns - report.sender_ns
         self._clock_bound_s = report.clock_bound_s
         errors = self._noise.default if report.gnss is None else reported(report.gnss, self._noise)
+        velocity = report.velocity_ned_mps
         self._fleet.accept(
             Fix(
                 _UAV,
                 report.sender_ns,
                 report.sent_ns,
                 report.arrival_ns,
-                report.position_ned_m,
-                report.velocity_ned_mps,
+                vector(report.position_ned_m),
+                None if velocity is None else vector(velocity),
                 errors,
                 _REPORT,
             )

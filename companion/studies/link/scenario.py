@@ -279,7 +279,7 @@ def _seen(
         fix = pipeline.fleet.newest(track.uav)
         if fix is None:
             return None
-        held.append(replace(track, position_ned_m=fix.position_ned_m))
+        held.append(replace(track, position_ned_m=np.array(fix.position_ned_m)))
     if not tracks:
         return None
     return Instant(

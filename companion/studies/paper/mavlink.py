@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
 from companion.mavlink.wire.encode import Outgoing, pack
@@ -150,5 +151,5 @@ def _expected(flight: Flight) -> FloatArray:
     return np.array(estimates)
 
 
-def _apart_m(position_ned_m: FloatArray, place_m: FloatArray) -> float:
-    return float(np.linalg.norm(position_ned_m[:2] - place_m))
+def _apart_m(position_ned_m: ArrayLike, place_m: FloatArray) -> float:
+    return float(np.linalg.norm(np.asarray(position_ned_m)[:2] - place_m))

@@ -2,13 +2,13 @@
 
 from typing import NamedTuple, Protocol, TypeVar
 
-from companion.values import Fix, FloatArray
+from companion.values import Fix, Vector
 
 State = TypeVar("State")
 
 
 class Prediction(NamedTuple):
-    """A UAV at a given time; vectors are (3,), in the local frame.
+    """A UAV at a given time; vectors are in the local frame.
 
         position_ned_m      estimated position
         velocity_ned_mps    estimated velocity; None if there is none
@@ -22,8 +22,8 @@ class Prediction(NamedTuple):
     tuple because several are made for each report.
     """
 
-    position_ned_m: FloatArray
-    velocity_ned_mps: FloatArray | None
+    position_ned_m: Vector
+    velocity_ned_mps: Vector | None
     bound_m: float
     horizontal_m: float
     vertical_m: float

@@ -17,12 +17,14 @@ The greatest speed ``speed_mps`` limits the bound over long gaps. See docs/math.
 """
 
 import math
+from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
-from companion.tracking.design.gain_table import KinematicDesign, correction
+from companion.tracking.design.gain_table import KinematicDesign
 from companion.tracking.observers.estimates import Prediction
-from companion.values import Fix, FloatArray
+from companion.values import Fix, Vector
 
 Gain = tuple[float, float, float, float]
 """L row by row: l11 (1), l12 (s), l21 (1/s), l22 (1)."""
@@ -43,10 +45,24 @@ def deadbeat(interval_s: float) -> Gain:
 
 
 def scheduled(design: KinematicDesign) -> GainSchedule:
-    """L = A(T) M(T) with the design's M, held constant beyond the ends of the design's range."""
+    """L = A(T) M(T) with the design's M, held constant beyond the ends of the design's range.
+
+    ``gain_table.correction`` with the differences of the table's rows made once.
+    """
+    grid, table = design.dt_s, [(row[0], row[1], row[2], row[3]) for row in design.corrections]
+    first, last = table[0], table[-1]
+    steps = [(b[0] - a[0], b[1] - a[1], b[2] - a[2], b[3] - a[3]) for a, b in pairwise(table)]
 
     def gain(interval_s: float) -> Gain:
-        m11, m12, m21, m22 = correction(design, interval_s)
+        if interval_s <= grid[0]:
+            m11, m12, m21, m22 = first
+        elif interval_s >= grid[-1]:
+            m11, m12, m21, m22 = last
+        else:
+            i = bisect_right(grid, interval_s) - 1
+            f = (interval_s - grid[i]) / (grid[i + 1] - grid[i])
+            (a11, a12, a21, a22), (d11, d12, d21, d22) = table[i], steps[i]
+            m11, m12, m21, m22 = a11 + f * d11, a12 + f * d12, a21 + f * d21, a22 + f * d22
         return m11 + interval_s * m21, m12 + interval_s * m22, m21, m22
 
     return gain
@@ -69,7 +85,7 @@ class KinematicState:
     """The estimate at a report's time, made before that report, its bounds, and the report.
 
     position_ned_m, velocity_ned_mps
-                  the estimate, (3,) each, local frame
+                  the estimate, local frame
     horizontal_m  bound on the position error in the plane
     vertical_m    bound on the error in height
     position_m    bound on the norm of the position error
@@ -78,8 +94,8 @@ class KinematicState:
     """
 
     fix: Fix
-    position_ned_m: FloatArray
-    velocity_ned_mps: FloatArray
+    position_ned_m: Vector
+    velocity_ned_mps: Vector
     horizontal_m: float
     vertical_m: float
     position_m: float
@@ -105,7 +121,7 @@ class KinematicObserver:
         return KinematicState(
             fix,
             fix.position_ned_m,
-            fix.position_ned_m * 0.0 if velocity is None else velocity,
+            (0.0, 0.0, 0.0) if velocity is None else velocity,
             fix.noise.horizontal_m,
             fix.noise.vertical_m,
             fix.noise.position_m,
@@ -115,33 +131,31 @@ class KinematicObserver:
 
     def predict(self, state: KinematicState, sender_ns: int) -> Prediction:
         """Position and velocity at a time, with their bounds."""
+        fix = state.fix
+        t = (sender_ns - fix.sender_ns) * 1e-9
+        gain = self._gain(state, t)
+        position, velocity = _moved(state, t, gain)
+        return self._bounded(state, t, gain, position, velocity)
+
+    def _bounded(
+        self, state: KinematicState, t: float, gain: Gain, position: Vector, velocity: Vector
+    ) -> Prediction:
+        """The prediction with the running bound."""
         fix, noise = state.fix, state.fix.noise
         model = fix.limits or self.model
-        t = (sender_ns - fix.sender_ns) * 1e-9
-        age = abs(t)
-        l11, l12, l21, l22 = self._gain(state, t)
-        measured = state.velocity_ned_mps if fix.velocity_ned_mps is None else fix.velocity_ned_mps
-        m11, m12, m22 = 1.0 - l11, t - l12, 1.0 - l22
-        position = (
-            m11 * state.position_ned_m
-            + m12 * state.velocity_ned_mps
-            + l11 * fix.position_ned_m
-            + l12 * measured
-        )
-        velocity = m22 * state.velocity_ned_mps + l22 * measured
-        if l21:
-            velocity = velocity + l21 * (fix.position_ned_m - state.position_ned_m)
+        l11, l12, l21, l22 = gain
+        age, kept, taken = abs(t), abs(1.0 - l11), abs(l11)
         drift_m = (
-            abs(m12) * state.velocity_mps
+            abs(t - l12) * state.velocity_mps
             + abs(l12) * noise.velocity_mps
             + model.acceleration_mps2 * age * age / 2
         )
-        horizontal_m = abs(m11) * state.horizontal_m + abs(l11) * noise.horizontal_m + drift_m
-        vertical_m = abs(m11) * state.vertical_m + abs(l11) * noise.vertical_m + drift_m
-        bound_m = abs(m11) * state.position_m + abs(l11) * noise.position_m + drift_m
+        horizontal_m = kept * state.horizontal_m + taken * noise.horizontal_m + drift_m
+        vertical_m = kept * state.vertical_m + taken * noise.vertical_m + drift_m
+        bound_m = kept * state.position_m + taken * noise.position_m + drift_m
         velocity_mps = (
             abs(l21) * (state.position_m + noise.position_m)
-            + abs(m22) * state.velocity_mps
+            + abs(1.0 - l22) * state.velocity_mps
             + abs(l22) * noise.velocity_mps
             + model.acceleration_mps2 * age
         )
@@ -192,12 +206,13 @@ class KinematicObserver:
         assert found.velocity_ned_mps is not None
         assert found.velocity_bound_mps is not None
         horizontal_m, vertical_m = found.horizontal_m, found.vertical_m
-        north, east, down = (found.position_ned_m - fix.position_ned_m).tolist()
+        (n, e, d), (there_n, there_e, there_d) = fix.position_ned_m, found.position_ned_m
+        north, east, down = there_n - n, there_e - e, there_d - d
         horizontal_m = min(horizontal_m, fix.noise.horizontal_m + reach_m + math.hypot(north, east))
         vertical_m = min(vertical_m, fix.noise.vertical_m + reach_m + abs(down))
         moved_m = math.hypot(north, east, down)
         bound_m = min(found.bound_m, fix.noise.position_m + reach_m + moved_m)
-        fastest_mps = speed_mps + math.hypot(*found.velocity_ned_mps.tolist())
+        fastest_mps = speed_mps + math.hypot(*found.velocity_ned_mps)
         return Prediction(
             found.position_ned_m,
             found.velocity_ned_mps,
@@ -207,3 +222,25 @@ class KinematicObserver:
             min(found.velocity_bound_mps, fastest_mps),
             None,
         )
+
+
+def _moved(state: KinematicState, t: float, gain: Gain) -> tuple[Vector, Vector]:
+    """Position and velocity a time after the state's report, by the gain for that time."""
+    fix = state.fix
+    l11, l12, l21, l22 = gain
+    m11, m12, m22 = 1.0 - l11, t - l12, 1.0 - l22
+    p1, p2, p3 = state.position_ned_m
+    v1, v2, v3 = state.velocity_ned_mps
+    y1, y2, y3 = fix.position_ned_m
+    w1, w2, w3 = fix.velocity_ned_mps or state.velocity_ned_mps
+    position = (
+        m11 * p1 + m12 * v1 + l11 * y1 + l12 * w1,
+        m11 * p2 + m12 * v2 + l11 * y2 + l12 * w2,
+        m11 * p3 + m12 * v3 + l11 * y3 + l12 * w3,
+    )
+    velocity = (
+        m22 * v1 + l22 * w1 + l21 * (y1 - p1),
+        m22 * v2 + l22 * w2 + l21 * (y2 - p2),
+        m22 * v3 + l22 * w3 + l21 * (y3 - p3),
+    )
+    return position, velocity

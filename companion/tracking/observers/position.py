@@ -26,7 +26,7 @@ from dataclasses import dataclass
 
 from companion.tracking.design import closed_form
 from companion.tracking.observers.estimates import Prediction
-from companion.values import Fix, FloatArray
+from companion.values import Fix, Vector
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class PositionState:
     """The estimate at a report's time, made before that report; its bound; and the report."""
 
     fix: Fix
-    estimate_ned_m: FloatArray
+    estimate_ned_m: Vector
     bound_m: float
 
 
@@ -76,13 +76,12 @@ class PositionObserver:
         if b <= 0:
             bound_m = state.bound_m - b * limits.speed_mps
             return self._made(state, state.estimate_ned_m, bound_m, b, 0.0)
-        d, y, noise_m = model.feedthrough_s, fix.position_ned_m, fix.noise.position_m
+        d, noise_m, lead_s = model.feedthrough_s, fix.noise.position_m, 0.0
         # The mean velocity of the sender's lead is not quite that of the interval.
         noise_m += abs(d) * limits.acceleration_mps2 * abs(b - d) / 2
         if fix.velocity_ned_mps is not None:
             lead_s = max(model.velocity_lead_s, b)
             d += lead_s
-            y = y + lead_s * fix.velocity_ned_mps
             noise_m += lead_s * (fix.noise.velocity_mps + limits.acceleration_mps2 * b / 2)
         alpha = closed_form.best_alpha(b, d) if model.alpha is None else model.alpha
         gain = closed_form.gain(b, d, alpha)
@@ -91,7 +90,7 @@ class PositionObserver:
             + abs(gain * d - b) * limits.speed_mps
             + abs(gain) * noise_m
         )
-        estimate = state.estimate_ned_m + gain * (y - state.estimate_ned_m)
+        estimate = _drawn(state, lead_s, gain)
         return self._made(state, estimate, bound_m, b, closed_form.mu_star(b, d, alpha))
 
     def after(self, _state: PositionState, predicted: Prediction, fix: Fix) -> PositionState:
@@ -102,7 +101,7 @@ class PositionObserver:
         return PositionState(fix, predicted.position_ned_m, predicted.bound_m)
 
     def _made(
-        self, state: PositionState, estimate: FloatArray, bound_m: float, b: float, mu_s2: float
+        self, state: PositionState, estimate: Vector, bound_m: float, b: float, mu_s2: float
     ) -> Prediction:
         """A prediction with the reported velocity, whose bound grows with the acceleration."""
         fix = state.fix
@@ -111,3 +110,15 @@ class PositionObserver:
         return Prediction(
             estimate, fix.velocity_ned_mps, bound_m, bound_m, bound_m, velocity_bound_mps, mu_s2
         )
+
+
+def _drawn(state: PositionState, lead_s: float, gain: float) -> Vector:
+    """The estimate, drawn by the gain towards the report with the lead made from its velocity."""
+    x1, x2, x3 = state.estimate_ned_m
+    y1, y2, y3 = state.fix.position_ned_m
+    v1, v2, v3 = state.fix.velocity_ned_mps or (0.0, 0.0, 0.0)
+    return (
+        x1 + gain * (y1 + lead_s * v1 - x1),
+        x2 + gain * (y2 + lead_s * v2 - x2),
+        x3 + gain * (y3 + lead_s * v3 - x3),
+    )

@@ -251,15 +251,16 @@ class Senders:
     def time(self, uav: str, node_ns: int) -> SenderTime:
         """A node time on a UAV's own timeline; a relayed aircraft's timeline is the node's."""
         clock = self._clocks.get(uav)
-        estimate = clock.estimate(node_ns) if clock else None
-        if clock is None or estimate is None:
+        known = clock.time(node_ns) if clock else None
+        if known is None:
             bound_s = noise.ADSB_TIME_BOUND_S
             return SenderTime(node_ns, node_ns, bound_s, bound_s)
+        offset_ns, before_s, after_s, usual_s = known
         least_s, greatest_s = self._assumed(uav).lag_s
         rest_s = (greatest_s - least_s) / 2
-        before_s, after_s = estimate.before_s + rest_s, estimate.after_s + rest_s
-        sender_ns = node_ns - estimate.offset_ns
-        return SenderTime(node_ns, sender_ns, before_s, after_s, estimate.usual_s)
+        return SenderTime(
+            node_ns, node_ns - offset_ns, before_s + rest_s, after_s + rest_s, usual_s
+        )
 
     def clock_estimate(self, uav: str) -> ClockEstimate | None:
         """The state of a UAV's clock; None for a UAV that has none."""

@@ -85,22 +85,29 @@ class History(Generic[State]):
         newest_ns, found, due = self.newest.fix.sender_ns, [], 0
         n = t1 = t2 = 0.0
         v1, v2, v3, w1, w2, w3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        entries = self.entries
-        stride = max(1, len(entries) // ACCELERATION_REPORTS_MAX)
-        for at in range(len(entries) - 1, -1, -stride):
-            fix = entries[at].fix
+        stride = max(1, len(self.entries) // ACCELERATION_REPORTS_MAX)
+        longest_s, fewest = windows[0]
+        for entry in self.entries[::-stride]:
+            fix = entry.fix
             if fix.velocity_ned_mps is None:
                 break
             t = (fix.sender_ns - newest_ns) * 1e-9
-            while due < len(windows) and -t > windows[due][0] and n >= windows[due][1]:
+            while -t > longest_s and n >= fewest:
                 found.append(_slope(n, t1, t2, (v1, v2, v3), (w1, w2, w3)))
                 due += 1
-            if due == len(windows):
-                return found
+                if due == len(windows):
+                    return found
+                longest_s, fewest = windows[due]
             north, east, down = fix.velocity_ned_mps
-            n, t1, t2 = n + 1.0, t1 + t, t2 + t * t
-            v1, v2, v3 = v1 + north, v2 + east, v3 + down
-            w1, w2, w3 = w1 + t * north, w2 + t * east, w3 + t * down
+            n += 1.0
+            t1 += t
+            t2 += t * t
+            v1 += north
+            v2 += east
+            v3 += down
+            w1 += t * north
+            w2 += t * east
+            w3 += t * down
         for _, fewest in windows[due:]:
             enough = n >= fewest
             found.append(_slope(n, t1, t2, (v1, v2, v3), (w1, w2, w3)) if enough else None)

@@ -22,6 +22,7 @@ MOST: Final = 6.0
 """Multiple of the limit above which a proof is not believed: the report is wrong, not the limit."""
 PAIRS_S: Final = (0.001, 0.2, 0.5, 1.0, 2.0)
 """Least times between two velocities that are compared: the one before, and others further back."""
+_PAIRS_NS: Final = tuple(round(least_s * 1e9) for least_s in PAIRS_S)
 _KEPT: Final = 64
 
 
@@ -154,15 +155,17 @@ class Refutations:
 
     def _proven(self, fix: Fix, north: float, east: float, down: float) -> float:
         """The greatest mean acceleration that a velocity proves with those before it, m/s²."""
-        most, sender_ns, noise = 0.0, fix.sender_ns, fix.noise
-        for least_s in PAIRS_S:
-            at = bisect_right(self._times_ns, sender_ns - round(least_s * 1e9)) - 1
-            if at < 0:
+        most, noise = 0.0, fix.noise
+        times_ns, end = self._times_ns, len(self._times_ns)
+        for least_ns in _PAIRS_NS:
+            end = bisect_right(times_ns, fix.sender_ns - least_ns, 0, end)
+            if not end:
                 break
-            n, e, d, noise_mps, time_s = self._velocities[at]
-            changed = math.sqrt((north - n) ** 2 + (east - e) ** 2 + (down - d) ** 2)
+            n, e, d, noise_mps, time_s = self._velocities[end - 1]
+            n, e, d = north - n, east - e, down - d
+            changed = math.sqrt(n * n + e * e + d * d)
             # Stamps are whole milliseconds, so the time between may be one more.
-            apart_s = (sender_ns - self._times_ns[at]) * 1e-9 + 1e-3 + time_s + noise.time_s
+            apart_s = (fix.sender_ns - times_ns[end - 1]) * 1e-9 + 1e-3 + time_s + noise.time_s
             most = max(most, (changed - noise_mps - noise.velocity_mps) / apart_s)
         return most
 

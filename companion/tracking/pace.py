@@ -6,7 +6,6 @@ of its link, and than silences that it has just come back from.
 """
 
 from collections import deque
-from statistics import median
 from typing import Final
 
 from companion.values import Fix
@@ -45,7 +44,10 @@ class Pace:
         if len(self._intervals_s) < 3:
             return 0.0
         spread_s = max(self._latencies_s) - min(self._latencies_s)
-        usual_s = INTERVALS * median(self._intervals_s) + spread_s
+        in_order = sorted(self._intervals_s)
+        n = len(in_order)
+        median_s = (in_order[(n - 1) // 2] + in_order[n // 2]) / 2.0
+        usual_s = INTERVALS * median_s + spread_s
         return max(usual_s, SILENCES * sorted(self._ages_s)[-2])
 
     def silence_s(self, least_s: float, most_s: float) -> float:

@@ -140,8 +140,8 @@ class BootLine:
         """Take in a stamp that cannot begin a line. Returns whether it lies on the present one."""
         if not self.floor:
             return False
-        x_ns = self.unwrap(boot_ms)
-        if abs(self.late_ns(arrival_ns, x_ns)) > self._late_max_ns // 2:
+        x_ns = _unwrap(boot_ms, self.newest_ns)
+        if abs(arrival_ns - x_ns - self.floor.at(x_ns)) > self._late_max_ns // 2:
             return False
         self.floor.add(x_ns, arrival_ns - x_ns)
         self.newest_ns = max(self.newest_ns, x_ns)

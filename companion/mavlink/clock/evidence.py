@@ -104,9 +104,13 @@ class Evidence:
         slack = self.drift_at(one.x_ns) * abs(x_ns - one.x_ns)
         return Interval(x_ns, one.low_ns - slack, one.high_ns + slack)
 
-    def newest(self, x_ns: int) -> Interval | None:
-        """What the evidence since the newest contradiction leaves at a sender time."""
-        return None if self._known is None else self._aged(self._known, x_ns)
+    def newest(self, x_ns: int) -> Interval:
+        """What the evidence since the newest contradiction leaves at a sender time.
+
+        There must be some.
+        """
+        assert self._known is not None
+        return self._aged(self._known, x_ns)
 
     def at(self, x_ns: int) -> Interval | None:
         """What is left at a sender time, every doubt included; None without evidence."""

@@ -20,7 +20,7 @@ offset is below it whatever the clock did before them.
 """
 
 from collections import deque
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -51,6 +51,21 @@ _BLOCKS: Final = 240
 _BLOCK_COUNT: Final = 4  # frames of a block that count as independent
 _RARE: Final = 7.0
 """Once in 1000 the least of n exponential latencies exceeds the true minimum by 7/n of a mean."""
+
+
+class Heights(NamedTuple):
+    """Heights of a floor at one sender time, ns.
+
+    sure     above the offset if the clock ran within its drift
+    highest  above the offset, even if the clock changed before the last frames
+    line     the most likely height of the floor
+    least    the least height that the frame nearest to the offset can have
+    """
+
+    sure: int
+    highest: int
+    line: int
+    least: int
 
 
 class _Block:
@@ -226,27 +241,23 @@ class Floor:
         """The most likely height of the floor at a sender time, ns."""
         return self._base[1] + round(self._line + self.drift * (x_ns - self._base[0]))
 
-    def sure_ns(self, x_ns: int) -> int:
-        """Above the offset at a sender time if the clock ran within its drift, ns."""
-        slack = self._drift_max * abs(x_ns - self.newest_ns)
-        return self._base[1] + round(self._sure + slack + self.drift * (x_ns - self._base[0]))
-
-    def highest_ns(self, x_ns: int) -> int:
-        """Above the offset at a sender time, even if the clock changed before the last frames."""
-        slack = self._drift_max * abs(x_ns - self.newest_ns)
-        newest_ns, recent = self.newest_ns, self._risen
-        if len(self._recent) == RECENT:
-            heights = [h + self._drift_max * (newest_ns - at_ns) for at_ns, h in self._recent]
-            recent = max(recent, min(heights))
-        highest = max(self._sure, self._line, recent) + slack
-        return self._base[1] + round(highest + self.drift * (x_ns - self._base[0]))
-
-    def least_ns(self, x_ns: int) -> int:
-        """The least height that the frame nearest to the offset can have at a sender time, ns."""
-        aged = 2.0 * self._drift_max * (self.newest_ns - self._touched_ns)
-        slack = self._drift_max * abs(x_ns - self.newest_ns)
+    def heights(self, x_ns: int) -> Heights:
+        """What the floor says of the offset at a sender time."""
+        drift_max, newest_ns = self._drift_max, self.newest_ns
+        base_ns = self._base[1]
+        sure, line, recent = self._sure, self._line, self._risen
+        slack = drift_max * abs(x_ns - newest_ns)
         moved = self.drift * (x_ns - self._base[0])
-        return self._base[1] + round(self._sure - aged - slack + moved)
+        if len(self._recent) == RECENT:
+            least = min([h + drift_max * (newest_ns - at_ns) for at_ns, h in self._recent])
+            recent = max(recent, least)
+        aged = 2.0 * drift_max * (newest_ns - self._touched_ns)
+        return Heights(
+            base_ns + round(sure + slack + moved),
+            base_ns + round(max(sure, line, recent) + slack + moved),
+            base_ns + round(line + moved),
+            base_ns + round(sure - aged - slack + moved),
+        )
 
     @property
     def median_ns(self) -> float:

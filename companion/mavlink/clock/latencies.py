@@ -71,16 +71,23 @@ class Latencies:
 
     def measure(self, newest_ns: int, since_ns: int) -> None:
         """Measure the latencies of the stamps since a sender time, each above its own floor."""
-        x = np.array([one[0] - newest_ns for one in self._samples if one[0] >= since_ns])
-        heights = np.array([one[1] for one in self._samples if one[0] >= since_ns])
-        at = np.array([one[1] - newest_ns for one in self._pieces if one[1] >= since_ns])
-        floors = np.array([one[2] for one in self._pieces if one[1] >= since_ns])
-        if not len(x) or not len(at):
+        samples = [
+            (x_ns - newest_ns, height) for x_ns, height, _ in self._samples if x_ns >= since_ns
+        ]
+        pieces = [
+            (at_ns - newest_ns, least) for _, at_ns, least in self._pieces if at_ns >= since_ns
+        ]
+        if not samples or not pieces:
             return
-        below = np.min(floors + self._drift_max * np.abs(x[:, None] - at), axis=1)
+        x, heights = np.array(samples).T
+        at, floors = np.array(pieces).T[:, :, np.newaxis]
+        below = (floors + self._drift_max * np.abs(x - at)).min(axis=0)
         gaps = np.maximum(0.0, heights - below)
-        self.median_ns, self.mean_ns = float(np.median(gaps)), float(np.mean(gaps))
-        if len(gaps) < SAMPLES // 4:
+        self.mean_ns = float(gaps.mean())
+        gaps.sort()  # np.median takes longer than all the rest
+        n = len(gaps)
+        self.median_ns = float(gaps[(n - 1) // 2] + gaps[n // 2]) / 2.0
+        if n < SAMPLES // 4:
             self.median_ns = max(self.median_ns, self._kept_median_ns)
 
     def steady_drift(self, newest_ns: int) -> float:

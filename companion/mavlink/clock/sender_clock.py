@@ -164,7 +164,7 @@ class SenderClock:
     def _prove(self, evidence: Evidence, new: Interval) -> str | None:
         """Add an interval to the evidence. Returns None, or why it cannot be about this clock."""
         floor = self._line.floor
-        highest_ns, sure_ns = floor.highest_ns(new.x_ns), floor.sure_ns(new.x_ns)
+        sure_ns, highest_ns, _, _ = floor.heights(new.x_ns)
         early_ns = new.low_ns - highest_ns - _NS_PER_MS
         if early_ns > 0:
             return f"frames would have come {early_ns / 1e9:.3f} s before they were sent"
@@ -201,13 +201,8 @@ class SenderClock:
         floor = self._line.floor
         if not floor:
             return None
-        newest_ns = self._line.newest_ns
-        x_ns = newest_ns if node_ns is None else self.sender_ns(node_ns)
-        kind, low_ns, high_ns, likely_ns = self._now()
-        slack_ns = math.ceil(self._drift_at(newest_ns) * abs(x_ns - newest_ns))
-        drifted_ns = floor.drifted_ns(x_ns)
-        low_ns, high_ns = low_ns - slack_ns + drifted_ns, high_ns + slack_ns + drifted_ns
-        likely_ns += drifted_ns
+        x_ns = self._line.newest_ns if node_ns is None else self.sender_ns(node_ns)
+        kind, low_ns, high_ns, likely_ns = self._at(x_ns)
         guarantee = Guarantee.ASSUMED if kind is ClockKind.ENVELOPE else Guarantee.MEASURED
         return ClockEstimate(
             kind=kind,
@@ -219,6 +214,31 @@ class SenderClock:
             drift_ppm=floor.drift * 1e6,
             constant_delay_s=(floor.at(x_ns) - likely_ns) * 1e-9,
             latency_s=self._latency_s,
+        )
+
+    def time(self, node_ns: int) -> tuple[int, float, float, float] | None:
+        """The clock as of a node time, as ``ClockEstimate`` has it; None before the first stamp.
+
+        Node time less sender time, ns; by how much it may be more, and less; and usually is, s.
+        """
+        if not self._line.floor:
+            return None
+        kind, low_ns, high_ns, likely_ns = self._at(self.sender_ns(node_ns))
+        before_s = (high_ns - likely_ns + _NS_PER_MS) * 1e-9
+        after_s = (likely_ns - low_ns + _NS_PER_MS) * 1e-9
+        return likely_ns, before_s, after_s, self._usual_s(kind, low_ns, high_ns)
+
+    def _at(self, x_ns: int) -> tuple[ClockKind, int, int, int]:
+        """What is known of the offset, aged to a sender time."""
+        kind, low_ns, high_ns, likely_ns = self._now()
+        newest_ns = self._line.newest_ns
+        slack_ns = math.ceil(self._drift_at(newest_ns) * abs(x_ns - newest_ns))
+        drifted_ns = self._line.floor.drifted_ns(x_ns)
+        return (
+            kind,
+            low_ns - slack_ns + drifted_ns,
+            high_ns + slack_ns + drifted_ns,
+            likely_ns + drifted_ns,
         )
 
     def _drift_at(self, x_ns: int) -> float:
@@ -244,23 +264,20 @@ class SenderClock:
         where it contradicts what is only assumed.
         """
         floor = self._line.floor
-        sure_ns, highest_ns, line_ns = floor.sure_ns(x_ns), floor.highest_ns(x_ns), floor.at(x_ns)
+        sure_ns, highest_ns, line_ns, least_ns = floor.heights(x_ns)
+        median_ns = floor.median_ns
         delay_ns = self._constant_delay_ns
         best = ClockKind.ENVELOPE
-        unseen_ns = max(delay_ns, floor.median_ns, UNSEEN_NS)
-        low_ns = floor.least_ns(x_ns) - unseen_ns - floor.residual_ns()
+        low_ns = least_ns - max(delay_ns, median_ns, UNSEEN_NS) - floor.residual_ns()
         low_ns = max(low_ns, sure_ns - _DEEPEST_NS)
         high_ns: float = sure_ns - delay_ns
-        likely_ns = line_ns - delay_ns - INVISIBLE * max(0.0, floor.median_ns - delay_ns)
+        likely_ns = line_ns - delay_ns - INVISIBLE * max(0.0, median_ns - delay_ns)
         rose_ns = highest_ns - sure_ns
-        candidates = [(ClockKind.TIMESYNC, self._timesync)]
-        if self._gnss_plausible >= _GNSS_CHECKS:
-            candidates.append((ClockKind.GNSS, self._gnss))
-        for kind, evidence in candidates:
+        for kind, evidence in ((ClockKind.TIMESYNC, self._timesync), (ClockKind.GNSS, self._gnss)):
             known = evidence.at(x_ns)
-            newest = evidence.newest(x_ns)
-            if known is None or newest is None:
+            if known is None or (kind is ClockKind.GNSS and self._gnss_plausible < _GNSS_CHECKS):
                 continue
+            newest = evidence.newest(x_ns)
             upper_ns = min(sure_ns, known.high_ns)
             if known.high_ns >= low_ns and upper_ns - known.low_ns >= high_ns - low_ns:
                 continue

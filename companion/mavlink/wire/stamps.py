@@ -28,5 +28,7 @@ def boot_ms(frame: Frame) -> int:
 
     MAVLink 2 cuts trailing zero bytes of a payload: they are zeros.
     """
-    at = STAMPED[frame.msgid]
-    return int.from_bytes(frame.payload[at : at + 4], "little")
+    raw = frame.raw
+    start = 10 if raw[0] == 0xFD else 6
+    at = start + STAMPED[frame.msgid]
+    return int.from_bytes(raw[at : min(at + 4, start + raw[1])], "little")

@@ -226,9 +226,10 @@ def test_the_sure_side_is_above_the_offset_and_below_every_stamp(
         x_ns += step_ns
         offset_ns = 5 * S + drift * x_ns
         floor.add(x_ns, round(offset_ns + latency_ns))
-        assert floor.sure_ns(x_ns) >= offset_ns - 2
-        assert floor.sure_ns(x_ns) <= offset_ns + latency_ns + 2
-        assert floor.highest_ns(x_ns) >= floor.sure_ns(x_ns)
+        seen = floor.heights(x_ns)
+        assert seen.sure >= offset_ns - 2
+        assert seen.sure <= offset_ns + latency_ns + 2
+        assert seen.highest >= seen.sure
         assert floor.at(x_ns) <= offset_ns + latency_ns + 2
 
 

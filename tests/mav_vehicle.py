@@ -28,8 +28,8 @@ class Vehicle:
     """Reports a circle of 50 m about 47.3977 N 8.5456 E over ``mavutil``.
 
     ``position_hz`` and ``attitude_hz`` follow SET_MESSAGE_INTERVAL, which is acknowledged; TIMESYNC
-    is answered with nanoseconds since boot. ``heard`` holds what came, with its time. ``clock`` gives
-    the time since boot of a time of ``time.monotonic``; where it flies is by its own clock.
+    is answered with nanoseconds since boot. ``heard`` holds what came, with its time. ``clock``
+    gives the time since boot of a time of ``time.monotonic``; where it flies is by its own clock.
     """
 
     def __init__(

@@ -4,6 +4,7 @@ Each sender has a clock, bounds on the noise of its reports, and a presence. A m
 with its time on the sender's and on the node's timeline, or as a rejection with its reason.
 """
 
+import math
 from collections.abc import Container
 from dataclasses import dataclass, replace
 from typing import Final
@@ -259,7 +260,11 @@ class Senders:
         least_s, greatest_s = self._assumed(uav).lag_s
         rest_s = (greatest_s - least_s) / 2
         return SenderTime(
-            node_ns, node_ns - offset_ns, before_s + rest_s, after_s + rest_s, usual_s
+            node_ns,
+            node_ns - offset_ns,
+            before_s + rest_s,
+            after_s + rest_s,
+            math.hypot(usual_s, rest_s),
         )
 
     def clock_estimate(self, uav: str) -> ClockEstimate | None:

@@ -168,6 +168,16 @@ class Assumed:
     limits: Limits
     lag_s: tuple[float, float]
 
+    @property
+    def lag_middle_s(self) -> float:
+        """The lag that is taken off a position's time."""
+        return (self.lag_s[0] + self.lag_s[1]) / 2
+
+    @property
+    def lag_rest_s(self) -> float:
+        """By how much the lag may be more or less."""
+        return (self.lag_s[1] - self.lag_s[0]) / 2
+
 
 def assumed(settings: Settings, uav: str, mav_type: int | None, autopilot: int | None) -> Assumed:
     """What is assumed of a UAV: by its own settings, its type's, everybody's, or its type.

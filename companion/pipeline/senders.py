@@ -186,9 +186,8 @@ class Senders:
         self._dedupe.took(stamp.latency_s)
         errors = self._noise.get(report.source, self._noise_settings.default)
         assumed = self._assumed(uav)
-        least_s, greatest_s = assumed.lag_s
-        lag_ns = round((least_s + greatest_s) / 2 * 1e9)
-        errors = replace(errors, time_s=(greatest_s - least_s) / 2)
+        lag_ns = round(assumed.lag_middle_s * 1e9)
+        errors = replace(errors, time_s=assumed.lag_rest_s)
         true_ns = t_ns - round(stamp.latency_s * 1e9) - lag_ns
         placed = PlacedReport(report, stamp.sender_ns - lag_ns, true_ns, errors, assumed.limits)
         return Heard(placed, said, restarted, self._clock(uav).change)
@@ -257,8 +256,7 @@ class Senders:
             bound_s = noise.ADSB_TIME_BOUND_S
             return SenderTime(node_ns, node_ns, bound_s, bound_s)
         offset_ns, before_s, after_s, usual_s = known
-        least_s, greatest_s = self._assumed(uav).lag_s
-        rest_s = (greatest_s - least_s) / 2
+        rest_s = self._assumed(uav).lag_rest_s
         return SenderTime(
             node_ns,
             node_ns - offset_ns,

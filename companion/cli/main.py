@@ -139,8 +139,6 @@ def replay(
     Example: companion replay flight.tlog --center 5:1 --json
     """
     from companion.node import replay as replaying
-    from companion.node import served_replay
-    from companion.settings.files import load
 
     if not serve and (listen or insecure):
         raise click.UsageError("--listen and --insecure go with --serve")
@@ -151,6 +149,9 @@ def replay(
         click.echo("no --center: the array stands where the first report was made", err=True)
     record = partial(replaying.writer_for, logs, settings, out) if not no_record else None
     if serve:
+        from companion.node import served_replay  # it loads what HTTP takes
+        from companion.settings.files import load
+
         served_replay.serve(
             served_replay.Asked(logs, settings, _speed(speed or "1"), record),
             load(config).override(server={"listen": listen}).server.listen,

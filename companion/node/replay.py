@@ -114,15 +114,12 @@ class Run:
         if self.writer:
             self.writer.event(event)
         for output in outputs:
-            match output:
-                case Estimate():
-                    self.tally.estimate(output)
-                case Refuted():
-                    self.tally.refuted[output.uav] += 1
-                case Update():
-                    self.tally.update(output)
-                case _:
-                    pass
+            if isinstance(output, Estimate):
+                self.tally.estimate(output)
+            elif isinstance(output, Update):
+                self.tally.update(output)
+            elif isinstance(output, Refuted):
+                self.tally.refuted[output.uav] += 1
             if self.writer:
                 self.writer.output(output, self.pipeline.geodetic)
         return outputs

@@ -24,7 +24,7 @@ from companion.pipeline.assumptions import Assumptions
 from companion.pipeline.center import Center
 from companion.pipeline.digest import Digest
 from companion.pipeline.refusals import Refusals
-from companion.pipeline.senders import PlacedAttitude, PlacedReport, Senders
+from companion.pipeline.senders import NOTHING, PlacedAttitude, PlacedReport, Senders
 from companion.pipeline.targets import Targets
 from companion.settings.model import Settings
 from companion.tracking.geodesy import LocalFrame
@@ -38,7 +38,6 @@ from companion.values import (
     Output,
     Reason,
     Rejection,
-    RoundTrip,
     Severity,
     Source,
     Tick,
@@ -82,17 +81,16 @@ class Pipeline:
 
     def step(self, event: Event) -> list[Output]:
         """Take in one event. Returns rejections, notices, estimates, and the update of a tick."""
-        match event:
-            case Frame():
-                outputs = self._frame(event)
-            case Tick():
-                outputs = self._tick(event.t_ns)
-            case Rejection():
-                outputs = [event]
-            case RoundTrip():
-                change = self.senders.round_trip(event)
-                source = str(event.source)
-                outputs = [] if change is None else self._changed(event.t_ns, source, change)
+        if isinstance(event, Frame):  # first and without a match: nearly all events are frames
+            outputs = self._frame(event)
+        elif isinstance(event, Tick):
+            outputs = self._tick(event.t_ns)
+        elif isinstance(event, Rejection):
+            outputs = [event]
+        else:
+            change = self.senders.round_trip(event)
+            source = str(event.source)
+            outputs = [] if change is None else self._changed(event.t_ns, source, change)
         told = []
         for output in outputs:
             if isinstance(output, Rejection):
@@ -107,17 +105,18 @@ class Pipeline:
             change = self.senders.notice(frame) if frame.msgid in STAMPED else None
             return [] if change is None else self._changed(frame.t_ns, str(frame.source), change)
         heard = self.senders.hear(frame)
+        if heard is NOTHING:
+            return []
         if heard.restarted is not None:
             self.restarts[heard.restarted] += 1
             self._restart(heard.restarted)
         said: list[Output] = list(heard.said)
         if heard.change is not None:
             said += self._changed(frame.t_ns, str(frame.source), heard.change)
-        match heard.message:
-            case PlacedReport():
-                said += self._report(heard.message)
-            case PlacedAttitude():
-                self.center.turn(heard.message)
+        if isinstance(heard.message, PlacedReport):
+            said += self._report(heard.message)
+        elif isinstance(heard.message, PlacedAttitude):
+            self.center.turn(heard.message)
         return said
 
     def _changed(self, t_ns: int, sender: str, change: ClockChange) -> list[Output]:

@@ -121,7 +121,8 @@ class Senders:
     def hear(self, frame: Frame) -> Heard:
         """Take in one frame of a message that is decoded (``decode.DECODED``)."""
         if frame.msgid == ATTITUDE and str(frame.source) != self._carrier:
-            return Heard(change=self.notice(frame))
+            change = self.notice(frame)
+            return NOTHING if change is None else Heard(change=change)
         message = decode(frame)
         match message:
             case Rejection():
@@ -146,7 +147,7 @@ class Senders:
                 if message.unix_us is not None:
                     clock = self._clock(str(message.source))
                     clock.system_time(message.t_ns, message.unix_us, message.boot_ms)
-                return Heard(change=change)
+                return NOTHING if change is None else Heard(change=change)
             case Presence():
                 self.presence[message.source] = message
                 self._known.pop(str(message.source), None)
@@ -272,12 +273,11 @@ class Senders:
 
     def _assumed(self, uav: str) -> assembly.Assumed:
         """What is assumed of a UAV, by its newest heartbeat."""
-        known = self._known.get(uav)
-        if known is None:
+        if uav not in self._known:
             heard = self.presence.get(Source.parse(uav)) if reports_itself(uav) else None
             what = (None, None) if heard is None else (heard.mav_type, heard.autopilot)
-            known = self._known.setdefault(uav, assembly.assumed(self._settings, uav, *what))
-        return known
+            self._known[uav] = assembly.assumed(self._settings, uav, *what)
+        return self._known[uav]
 
     # --- memory -----------------------------------------------------------------------------
 

@@ -86,10 +86,11 @@ class Encoder:
     def event(self, event: Event) -> None:
         """Send an event that drives the pipeline: in the order of the calls, before its outputs."""
         self._last_event = event
+        if isinstance(event, Frame):  # before the match: nearly all events are frames
+            data = self._frame_bytes(event)
+            self._emit(schemas.FRAMES_TOPIC, schemas.FRAME, event.t_ns, data)
+            return
         match event:
-            case Frame():
-                data = self._frame_bytes(event)
-                self._emit(schemas.FRAMES_TOPIC, schemas.FRAME, event.t_ns, data)
             case Tick():
                 data = schemas.encode_tick(event.t_ns)
                 self._emit(schemas.TICKS_TOPIC, schemas.TICK, event.t_ns, data)

@@ -51,11 +51,13 @@ class RepairedStamps:
         Returns None where the stamp was good, else by how many nanoseconds it is off (not 0).
         """
         step_ns = stamp_ns + self._shift_ns - self.t_ns
-        if _goes_on(step_ns):
+        if 0 <= step_ns <= LARGEST_LEAP_NS:  # ``_goes_on``, which would be most of the time
             self._resumed = None
             self.t_ns += step_ns
-            absurd, self._absurd_start = self._absurd_start, False
-            return -self._shift_ns if absurd else None
+            if not self._absurd_start:
+                return None
+            self._absurd_start = False
+            return -self._shift_ns
         began_ns, last_ns = self._resumed or (stamp_ns, stamp_ns)
         if self._resumed is None or stamp_ns < last_ns or not _goes_on(stamp_ns - began_ns):
             self._resumed = (stamp_ns, stamp_ns)

@@ -7,11 +7,13 @@ big-endian. Raw MAVLink has no stamps; the sender's boot clock takes their place
 import re
 from collections.abc import Iterator
 from itertools import islice
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal
 
 from companion.mavlink.wire.framing import (
     BAD_CRC,
     UNKNOWN_MESSAGE,
+    Checked,
+    Checker,
     Splitter,
     claimed_length,
     examine,
@@ -70,17 +72,12 @@ def _next_frame(data: bytes, at: int, end: int) -> tuple[int, int]:
 # --- telemetry logs -----------------------------------------------------------------------------
 
 
-class _Stretch(NamedTuple):
-    """A frame of a telemetry log, and what had to be skipped to get to it.
+_Stretch = tuple[int | None, Checked | None, dict[Reason, int]]
+"""The stamp of a frame of a telemetry log, ns; the frame; what had to be skipped to get to it.
 
-    ``length`` 0 means that there are no more frames. ``stamp_ns`` is None where the frame before it
-    leaves no room for a stamp.
-    """
-
-    stamp_ns: int | None
-    start: int
-    length: int
-    lost: dict[Reason, int]
+The stamp is None where the frame before it leaves no room for one, the frame where there are no
+more.
+"""
 
 
 _NOTHING: Final[dict[Reason, int]] = {}
@@ -94,20 +91,20 @@ def read_tlog(data: bytes, link: str) -> Iterator[Event]:
     """
     ahead = _stretches(data)
     first = list(islice(ahead, 3))
-    timeline = RepairedStamps([s.stamp_ns for s in first if s.stamp_ns is not None])
-    sources: dict[tuple[int, int], Source] = {}
+    timeline = RepairedStamps([one[0] for one in first if one[0] is not None])
     for group in (first, ahead):
-        for stamp_ns, start, length, lost in group:
+        for stamp_ns, frame, lost in group:
             off_ns = None if stamp_ns is None else timeline.place(stamp_ns)
             for reason, count in lost.items():
                 yield Rejection(timeline.t_ns, link, reason, count)
-            if not length:
+            if frame is None:
                 return
             if off_ns is not None:
                 yield _bad_stamp(timeline.t_ns, link, off_ns)
             elif stamp_ns is None:
                 yield Rejection(timeline.t_ns, link, Reason.BAD_STAMP, detail="no stamp")
-            yield _frame(timeline.t_ns, link, data[start : start + length], sources)
+            source, msgid, raw = frame
+            yield Frame(timeline.t_ns, link, source, msgid, raw)
 
 
 def _bad_stamp(t_ns: int, link: str, off_ns: int) -> Rejection:
@@ -117,30 +114,22 @@ def _bad_stamp(t_ns: int, link: str, off_ns: int) -> Rejection:
     )
 
 
-def _frame(t_ns: int, link: str, raw: bytes, sources: dict[tuple[int, int], Source]) -> Frame:
-    if raw[0] == 0xFD:
-        ids, msgid = (raw[5], raw[6]), raw[7] | raw[8] << 8 | raw[9] << 16
-    else:
-        ids, msgid = (raw[3], raw[4]), raw[5]
-    source = sources.get(ids)
-    if source is None:
-        source = sources.setdefault(ids, Source(*ids))
-    return Frame(t_ns, link, source, msgid, raw)
-
-
 def _stretches(data: bytes) -> Iterator[_Stretch]:
     at, end = 0, len(data)
+    frame_at = Checker().at
     while at < end:
         start, lost = at + STAMP, _NOTHING
-        length = examine(data, start, end) if start < end else 0
-        if length <= 0:
+        found = frame_at(data, start, end) if start < end else 0
+        if isinstance(found, int):
             start, length = _next_frame(data, at, end)
             stop = max(at, start - STAMP) if length else end
             lost = _skipped(data, at, stop)
-        stamped = length > 0 and start - STAMP >= at
+            found = frame_at(data, start, end) if length else 0
+        frame = None if isinstance(found, int) else found
+        stamped = frame is not None and start - STAMP >= at
         stamp_ns = int.from_bytes(data[start - STAMP : start], "big") * 1000 if stamped else None
-        yield _Stretch(stamp_ns, start, length, lost)
-        at = start + length
+        yield stamp_ns, frame, lost
+        at = end if frame is None else start + len(frame[2])
 
 
 def _skipped(data: bytes, at: int, stop: int) -> dict[Reason, int]:

@@ -74,7 +74,11 @@ def unpack(frame: Frame, layout: struct.Struct) -> tuple[int, ...]:
 
     Fields cut off, or absent in its MAVLink version, are zeros.
     """
-    return layout.unpack(frame.payload.ljust(layout.size, b"\0")[: layout.size])
+    raw = frame.raw
+    start = 10 if raw[0] == 0xFD else 6
+    if raw[1] >= layout.size:
+        return layout.unpack_from(raw, start)
+    return layout.unpack(frame.payload.ljust(layout.size, b"\0"))
 
 
 def _position(lat_1e7: int, lon_1e7: int) -> tuple[float, float]:

@@ -27,8 +27,8 @@ MAGIC_V2: Final = 0xFD
 SIGNED: Final = 0x01
 """The only incompatibility flag defined; frames with any other must be dropped."""
 
-SOURCES_MAX: Final = 1024
-"""Distinct senders whose ``Source`` a splitter keeps for reuse."""
+KNOWN_MAX: Final = 8192
+"""Distinct pairs of sender and message of which a stream keeps what it knows."""
 
 INCOMPLETE: Final = 0
 NOT_A_FRAME: Final = -1
@@ -94,6 +94,52 @@ def next_magic(buffer: bytes, at: int, end: int) -> int:
     return found.start() if found else end
 
 
+Checked = tuple[Source, int, bytes]
+"""A frame that is whole and whose checksum is right: sender, message id, and all of its bytes."""
+
+
+class Checker:
+    """Finds whole frames of one stream; what it knows of each sender's messages is kept.
+
+    ``at`` does in one step for nearly every frame what ``examine`` does for all of them: the five
+    bytes of sender and message are looked up together.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[bytes, tuple[Source, int, bytes]] = {}
+        self._sources: dict[tuple[int, int], Source] = {}
+
+    def at(self, buffer: bytes, at: int, end: int) -> Checked | int:
+        """The frame that starts at ``at``, or what ``examine`` says of it, at most 0."""
+        if end - at >= 12 and buffer[at] == MAGIC_V2 and not buffer[at + 2]:
+            known = self._known.get(buffer[at + 5 : at + 10])
+            stop = at + 12 + buffer[at + 1]
+            if known is not None and stop <= end:
+                raw = buffer[at:stop]
+                source, msgid, seed = known
+                if _mcrf4xx(raw[1:-2] + seed) == raw[-2] | raw[-1] << 8:
+                    return source, msgid, raw
+                return BAD_CRC
+        length = examine(buffer, at, end)
+        return self._learn(buffer[at : at + length]) if length > 0 else length
+
+    def _learn(self, raw: bytes) -> Checked:
+        """A checked frame; its sender and message are remembered."""
+        if raw[0] == MAGIC_V2:
+            ids, msgid = (raw[5], raw[6]), raw[7] | raw[8] << 8 | raw[9] << 16
+        else:
+            ids, msgid = (raw[3], raw[4]), raw[5]
+        if len(self._known) >= KNOWN_MAX:
+            self._known.clear()  # a cache only, as is the other
+            self._sources.clear()
+        source = self._sources.get(ids)
+        if source is None:
+            source = self._sources[ids] = Source(*ids)
+        if raw[0] == MAGIC_V2:
+            self._known[raw[5:10]] = source, msgid, _SEED[msgid]
+        return source, msgid, raw
+
+
 class Splitter:
     """Splits one peer's bytes into frames, in whatever pieces they arrive.
 
@@ -108,7 +154,7 @@ class Splitter:
         self._wanted = wanted
         self._pending = b""
         self._claimed = 0  # bytes ahead that a failed frame laid claim to
-        self._sources: dict[tuple[int, int], Source] = {}
+        self._checker = Checker()
 
     def feed(self, t_ns: int, data: bytes) -> list[Frame | Rejection]:
         """Take in bytes that arrived at ``t_ns``; returns the frames that end in them.
@@ -124,21 +170,22 @@ class Splitter:
     def _split(self, t_ns: int, buffer: bytes, *, last: bool) -> list[Frame | Rejection]:
         out: list[Frame | Rejection] = []
         lost: dict[Reason, int] = {}
-        wanted = self._wanted
+        link, wanted, frame_at = self.link, self._wanted, self._checker.at
         at, end, claimed_to = 0, len(buffer), self._claimed
         while at < end:
-            length = examine(buffer, at, end)
-            if length > 0:
+            found = frame_at(buffer, at, end)
+            if not isinstance(found, int):
+                source, msgid, raw = found
                 self.frames += 1
-                if wanted is None or self._msgid(buffer, at) in wanted:
-                    out.append(self._frame(t_ns, buffer, at, length))
-                at += length
+                if wanted is None or msgid in wanted:
+                    out.append(Frame(t_ns, link, source, msgid, raw))
+                at += len(raw)
                 claimed_to = at
                 continue
-            if length == INCOMPLETE and not last:
+            if found == INCOMPLETE and not last:
                 break
             resume = next_magic(buffer, at + 1, end)
-            claimed_to = self._count(lost, length, at, resume, claimed_to, buffer)
+            claimed_to = self._count(lost, found, at, resume, claimed_to, buffer)
             at = resume
         self._pending = buffer[at:]
         self._claimed = max(0, claimed_to - at)
@@ -161,21 +208,3 @@ class Splitter:
         if stray > 0:
             lost[Reason.GARBAGE] = lost.get(Reason.GARBAGE, 0) + stray
         return claimed_to
-
-    @staticmethod
-    def _msgid(buffer: bytes, at: int) -> int:
-        if buffer[at] == MAGIC_V2:
-            return buffer[at + 7] | buffer[at + 8] << 8 | buffer[at + 9] << 16
-        return buffer[at + 5]
-
-    def _frame(self, t_ns: int, buffer: bytes, at: int, length: int) -> Frame:
-        first = at + 5 if buffer[at] == MAGIC_V2 else at + 3
-        ids = (buffer[first], buffer[first + 1])
-        source = self._sources.get(ids)
-        if source is None:
-            if len(self._sources) >= SOURCES_MAX:
-                self._sources.clear()  # a cache only: senders are made again when next seen
-            source = self._sources.setdefault(ids, Source(*ids))
-        return Frame(
-            t_ns, self.link, source, self._msgid(buffer, at), bytes(buffer[at : at + length])
-        )

@@ -227,10 +227,7 @@ class Senders:
         return Notice(t_ns, Severity.WARNING, uav, text), refused
 
     def vouched(self, report: Report) -> bool:
-        """Whether the sender's receiver has a 3-D fix near the height of its report.
-
-        True as well where nothing was heard of a receiver, and for aircraft that others relay.
-        """
+        """Whether a sender's receiver, if one was heard, has a 3-D fix near its report's height."""
         receiver = self._receivers.get(report.source)
         if receiver is None or not reports_itself(report.uav):
             return True

@@ -187,7 +187,7 @@ def nulled(spread: Spread, loading: float | FloatArray, soft: float | None = Non
         loads = np.broadcast_to(loading, users)
     else:
         power = gram.diagonal().real
-        # A point to which the array radiates nothing is a row of zeros: its own power loads nothing.
+        # A point to which the array radiates nothing is a row of zeros: its power loads nothing.
         loads = np.where(spread.usable, soft * power, UNUSED * power.max())
         loads[::each] = loading
     by_user = np.arange(users)

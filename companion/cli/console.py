@@ -19,8 +19,8 @@ CENTER = click.option(
 JSON = click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
 
 
-class _InterruptedError(Exception):
-    """Ctrl-C during a command."""
+class InterruptedByUser(Exception):  # noqa: N818 - it is no error
+    """Ctrl-C during a command, with what the user can do now."""
 
 
 class OneLineErrors(click.Group):
@@ -48,10 +48,15 @@ class OneLineErrors(click.Group):
         except click.exceptions.NoArgsIsHelpError as error:
             error.show()
             sys.exit(error.exit_code)
+        except click.UsageError as error:
+            told = error.ctx.command_path if error.ctx else self.name
+            said = error.format_message()
+            stop = "" if said.endswith((".", "?", "?)")) else "."
+            self._end(f"{said}{stop} See {told} --help", error.exit_code)
         except click.ClickException as error:
             self._end(error.format_message(), error.exit_code)
-        except (_InterruptedError, click.Abort):
-            self._end("interrupted", 130)
+        except (InterruptedByUser, click.Abort) as error:
+            self._end(str(error) or "interrupted", 130)
         except UserError as error:
             self._end(str(error), 1)
         except OSError as error:
@@ -63,7 +68,7 @@ class OneLineErrors(click.Group):
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
-            raise _InterruptedError from None
+            raise InterruptedByUser from None
 
     def _end(self, said: str, status: int) -> NoReturn:
         click.echo(f"{self.name}: {' '.join(said.split())}", err=True)

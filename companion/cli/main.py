@@ -9,15 +9,26 @@ import gc
 import json
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 import companion
-from companion.cli.console import CENTER, CONFIG, JSON, OneLineErrors, Progress
+from companion.cli.console import (
+    CENTER,
+    CONFIG,
+    JSON,
+    InterruptedByUser,
+    OneLineErrors,
+    Progress,
+)
 from companion.cli.design import design
 from companion.cli.study import study
 from companion.cli.weights import weights
+from companion.values import Reason, UserError, reports_itself
+
+if TYPE_CHECKING:
+    from companion.recording.writer import Writer
 
 LISTEN = click.option(
     "--listen", metavar="HOST:PORT", help="Where HTTP is served [127.0.0.1:8080]."
@@ -142,6 +153,7 @@ def replay(
 
     if not serve and (listen or insecure):
         raise click.UsageError("--listen and --insecure go with --serve")
+    pace = _speed(speed or ("1" if serve else "max"))
     gc.set_threshold(200_000)  # millions of short-lived values, and no cycles among them
     progress = Progress()
     settings = replaying.settings_for(logs, config, center)
@@ -153,26 +165,43 @@ def replay(
         from companion.settings.files import load
 
         served_replay.serve(
-            served_replay.Asked(logs, settings, _speed(speed or "1"), record),
+            served_replay.Asked(logs, settings, pace, record),
             load(config).override(server={"listen": listen}).server.listen,
             partial(_show_replay, as_json),
             token=os.environ.get("COMPANION_TOKEN"),
             insecure=insecure,
         )
         return
-    summary = replaying.replay(
-        logs,
-        settings,
-        record() if record else None,
-        _speed(speed or "max"),
-        lambda frames, seconds: progress.show(f"{frames} frames, {seconds:.0f} s of log"),
-    )
+    writer = record() if record else None
+    ends_s = replaying.length_s(logs)
+
+    def show(frames: int, at_s: float, wall_s: float) -> None:
+        to_go = ""
+        if ends_s and at_s > 0:
+            to_go = f" of {ends_s:.0f} s, {max(0.0, ends_s / at_s - 1) * wall_s:.0f} s to go"
+        progress.show(f"{frames} frames, {at_s:.0f} s of log{to_go}")
+
+    try:
+        summary = replaying.replay(logs, settings, writer, pace, show)
+    except KeyboardInterrupt:
+        raise InterruptedByUser(_left_behind(writer)) from None
     progress.clear()
     _show_replay(as_json, summary)
 
 
+def _left_behind(writer: "Writer | None") -> str:
+    """What Ctrl-C leaves of a recording, and how to make it whole."""
+    if writer is None:
+        return ""
+    writer.abandon()
+    return f"interrupted; to use what was recorded so far: companion recover {writer.path}"
+
+
 def _show_replay(as_json: bool, summary: dict[str, Any]) -> None:
+    """Print the summary. Raises ``UserError`` where nothing was aimed at."""
     click.echo(json.dumps(summary) if as_json else _replay_text(summary))
+    if summary["unaimed"]:
+        raise UserError(f"nothing was aimed at: {summary['unaimed']}")
 
 
 def _speed(text: str) -> float | None:
@@ -188,22 +217,28 @@ def _speed(text: str) -> float | None:
 
 
 def _replay_text(summary: dict[str, Any]) -> str:
+    from companion.views.words import REASONS
+
     lines = [
         f"{summary['frames']} frames, {summary['duration_s']:.0f} s of log in"
         f" {summary['wall_s']:.1f} s; center {summary['center']}"
     ]
-    for uav, seen in summary["uavs"].items():
+    own = {uav: seen for uav, seen in summary["uavs"].items() if reports_itself(uav)}
+    relayed = [seen["reports"] for uav, seen in summary["uavs"].items() if uav not in own]
+    for uav, seen in own.items():
         lines.append(
             f"  {uav:12} {seen['state']:9} {seen['reports']:6} reports"
             f"  dt {_number(seen['dt_median_s'])} s  latency p95 {_number(seen['latency_p95_s'])} s"
             f"  innovation {_number(seen['innovation_rms_m'])} m rms"
         )
+    if relayed:
+        lines.append(f"  {len(relayed)} relayed aircraft (ADS-B), {sum(relayed)} reports")
     beams = summary["beams"]
     lines.append(
         f"{beams['updates']} beam updates, {beams['regularised']} regularised,"
         f" condition number to {_number(beams['condition_number_max'])}"
     )
-    lines += [f"  rejected {reason}: {n}" for reason, n in summary["rejected"].items()]
+    lines += [f"  not used: {n} {REASONS[Reason(why)]}" for why, n in summary["rejected"].items()]
     lines += [f"  missing: {line}" for line in summary["missing"]]
     if summary["recording"]:
         lines.append(f"recording {summary['recording']}")

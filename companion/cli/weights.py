@@ -66,6 +66,8 @@ def weights(
         raise click.UsageError("--lead-ms nan: 0 to 10000 is allowed")
     if form in ("npy", "raw") and out is None and sys.stdout.isatty():
         raise click.UsageError(f"{form} is not text: name a file with --out, or use a pipe")
+    if out is not None and not out.parent.is_dir():
+        raise click.UsageError(f"--out {out}: there is no folder {out.parent}")
     progress = Progress()
     settings = settings_for(logs, config, center)
     equipment = assembly.equipment(settings, assembly.array(settings))

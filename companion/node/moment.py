@@ -7,11 +7,15 @@ from typing import Final
 
 from companion.node.replay import log_events
 from companion.pipeline.fold import Pipeline
+from companion.recording import ends
 from companion.settings.model import Settings
 from companion.values import Update, UserError
 
 TOLD_EVERY: Final = 20_000
 """Events between two calls of ``progress``."""
+
+ENDS_NS: Final = 60_000_000_000
+"""How far the ends of a log may be off its first and last event: stamps may step back or leap."""
 
 
 class MomentError(UserError):
@@ -36,6 +40,9 @@ def look(
     Raises ``MomentError`` for text that is no time or a time that the log does not reach;
     ``LogError`` and ``ConfigError`` as for a replay.
     """
+    span_ns = ends.span_ns(logs)
+    if span_ns is not None:
+        _require_within(at, span_ns)
     pipeline, at_ns, seen, t_ns = Pipeline(settings), None, 0, 0
     begins_ns = 0
     for event in log_events(logs, settings):
@@ -53,6 +60,16 @@ def look(
     if at_ns < begins_ns:
         raise MomentError(f"--at {at}: the log begins later")
     return pipeline, pipeline.look(at_ns, lead_s)
+
+
+def _require_within(at: str, span_ns: tuple[int, int]) -> None:
+    """Refuse a time that lies far outside the ends of the logs, before they are read."""
+    first_ns, last_ns = span_ns
+    at_ns = _time_ns(at, first_ns)
+    if at_ns > last_ns + ENDS_NS:
+        raise MomentError(f"--at {at}: the log is {(last_ns - first_ns) * 1e-9:.1f} s long")
+    if at_ns < first_ns - ENDS_NS:
+        raise MomentError(f"--at {at}: the log begins later")
 
 
 def _time_ns(text: str, begins_ns: int) -> int:

@@ -2,18 +2,15 @@
 
 import heapq
 import time
-from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
 import companion
+from companion.node.replay_summary import Tally, summary
 from companion.pipeline.fold import Pipeline
 from companion.pipeline.ticks import with_ticks
-from companion.recording import parts
+from companion.recording import ends, parts
 from companion.recording.parts import Story
 from companion.recording.reader import LogError, log_kind, read_log, read_parts, read_settings
 from companion.recording.writer import Writer
@@ -25,48 +22,6 @@ FLUSH_EVERY_S: Final = 1.0
 """Time between two flushes of the recording."""
 TICKED: Final = "mcap"
 """Kind of log that holds the ticks of the run from which it was recorded."""
-
-
-@dataclass(slots=True)
-class Tally:
-    """Figures of a replay, gathered as it goes."""
-
-    reports: Counter[str] = field(default_factory=Counter)
-    dt_s: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
-    latency_s: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
-    innovation_m: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
-    reacquired: Counter[str] = field(default_factory=Counter)
-    refuted: Counter[str] = field(default_factory=Counter)
-    updates: int = 0
-    regularised: int = 0
-    condition_number_max: float | None = None
-    first_ns: int | None = None
-    last_ns: int = 0
-
-    def event(self, event: Event) -> None:
-        """Note the time span of the events."""
-        if self.first_ns is None:
-            self.first_ns = event.t_ns
-        self.last_ns = max(self.last_ns, event.t_ns)  # a frame may be taken in after a later tick
-
-    def estimate(self, estimate: Estimate) -> None:
-        """Take in an accepted report."""
-        fix = estimate.fix
-        self.reports[fix.uav] += 1
-        self.reacquired[fix.uav] += estimate.reacquired
-        self.latency_s[fix.uav].append((fix.arrival_ns - fix.t_ns) * 1e-9)
-        if estimate.dt_s is not None and estimate.innovation_m is not None:
-            self.dt_s[fix.uav].append(estimate.dt_s)
-            self.innovation_m[fix.uav].append(estimate.innovation_m)
-
-    def update(self, update: Update) -> None:
-        """Take in a beam update; those without beams do not count."""
-        condition = update.beams.condition_number
-        if condition is None:
-            return
-        self.updates += 1
-        self.regularised += update.beams.regularised
-        self.condition_number_max = max(condition, self.condition_number_max or 0.0)
 
 
 def settings_for(logs: Sequence[Path], config: Path | None, center: str | None) -> Settings:
@@ -104,6 +59,11 @@ class Run:
         """Seconds of log so far."""
         return (self.tally.last_ns - (self.tally.first_ns or 0)) * 1e-9
 
+    @property
+    def took_s(self) -> float:
+        """Seconds since it began."""
+        return time.monotonic() - self._started_s
+
     def step(self, event: Event) -> list[Output]:
         """Take in the next event; returns its outputs.
 
@@ -131,8 +91,8 @@ class Run:
         """
         digest = self.pipeline.digest.hexdigest()
         recording = self.writer.close({"digest": digest}) if self.writer else None
-        return _summary(self.pipeline, self.tally) | {
-            "wall_s": time.monotonic() - self._started_s,
+        return summary(self.pipeline, self.tally) | {
+            "wall_s": self.took_s,
             "recording": str(recording) if recording else None,
             "digest": digest,
         }
@@ -143,7 +103,7 @@ def replay(
     settings: Settings,
     writer: Writer | None = None,
     speed: float | None = None,
-    progress: Callable[[int, float], None] | None = None,
+    progress: Callable[[int, float, float], None] | None = None,
 ) -> dict[str, Any]:
     """Run logs through a pipeline and sum up, as ``companion replay --json`` prints it.
 
@@ -151,7 +111,7 @@ def replay(
         settings  those of the pipeline
         writer    gets everything and is closed
         speed     multiple of the log's own speed; None: as fast as it goes
-        progress  called now and then with frames and seconds of log
+        progress  called now and then with frames, seconds of log, and seconds since it began
 
     ``missing`` in the summary is what the parts lack. Raises ``LogError`` for a log that cannot be
     used, ``OSError`` where the recording cannot be written.
@@ -166,8 +126,14 @@ def replay(
             if writer:
                 writer.flush()
             if progress:
-                progress(run.pipeline.frames, run.at_s)
+                progress(run.pipeline.frames, run.at_s, run.took_s)
     return run.finish() | {"missing": missing(logs)}
+
+
+def length_s(logs: Sequence[Path]) -> float | None:
+    """How long some logs are together, by their ends; None where these do not tell."""
+    span_ns = ends.span_ns(logs)
+    return None if span_ns is None else (span_ns[1] - span_ns[0]) * 1e-9
 
 
 def log_events(logs: Sequence[Path], settings: Settings) -> Iterator[Event]:
@@ -229,52 +195,3 @@ def _paced(events: Iterable[Event], speed: float) -> Iterator[Event]:
         due_s = first[1] + (event.t_ns - first[0]) * 1e-9 / speed
         time.sleep(max(0.0, due_s - time.monotonic()))
         yield event
-
-
-def _summary(pipeline: Pipeline, tally: Tally) -> dict[str, Any]:
-    now_ns = tally.last_ns
-    tracks = {track.uav: track for track in pipeline.tracks(now_ns, now_ns)}
-    carrier = str(pipeline.center.place)
-    heard = [uav for uav in dict.fromkeys([*tally.reports, *tracks]) if uav != carrier]
-    return {
-        "frames": pipeline.frames,
-        "rejected": {
-            str(reason): count for reason, count in sorted(pipeline.refusals.total.items())
-        },
-        "reports": {uav: tally.reports[uav] for uav in heard},
-        "uavs": {
-            uav: {
-                "reports": tally.reports[uav],
-                "dt_median_s": _percentile(tally.dt_s[uav], 50),
-                "dt_max_s": _percentile(tally.dt_s[uav], 100),
-                "latency_p50_s": _percentile(tally.latency_s[uav], 50),
-                "latency_p95_s": _percentile(tally.latency_s[uav], 95),
-                "innovation_rms_m": _rms(tally.innovation_m[uav]),
-                "gamma": tracks[uav].gamma if uav in tracks else None,
-                "state": str(tracks[uav].state) if uav in tracks else "dropped",
-                "restarts": pipeline.restarts[uav],
-                "reacquired": tally.reacquired[uav],
-                "refuted": tally.refuted[uav],
-                "rejected": {
-                    str(reason): count
-                    for reason, count in sorted(pipeline.refusals.of(uav).counts.items())
-                },
-            }
-            for uav in heard
-        },
-        "center": str(pipeline.center.place),
-        "beams": {
-            "updates": tally.updates,
-            "condition_number_max": tally.condition_number_max,
-            "regularised": tally.regularised,
-        },
-        "duration_s": (now_ns - (tally.first_ns or now_ns)) * 1e-9,
-    }
-
-
-def _percentile(values: list[float], percent: float) -> float | None:
-    return float(np.percentile(values, percent)) if values else None
-
-
-def _rms(values: list[float]) -> float | None:
-    return float(np.sqrt(np.mean(np.square(values)))) if values else None

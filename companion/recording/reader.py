@@ -12,7 +12,7 @@ from typing import Final, Literal
 from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Metadata
 
-from companion.recording import codec, schemas, tlog
+from companion.recording import codec, foreign, schemas, tlog
 from companion.recording.container import MAGIC, Damage, Walk
 from companion.recording.writer import SETTINGS
 from companion.values import Event, Reason, Rejection, Source, Tick, UserError
@@ -86,14 +86,18 @@ def _open(path: Path) -> tuple[LogKind, bytes]:
     except FileNotFoundError:
         raise LogError(f"{path}: no such file") from None
     except IsADirectoryError:
-        raise LogError(f"{path}: is a directory, not a log") from None
+        raise LogError(f"{path}: is a folder: name the logs in it") from None
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from None
     if not data:
         raise LogError(f"{path}: is empty")
+    other = foreign.named(data[: foreign.HEAD_BYTES])
+    if other is not None:
+        raise LogError(f"{path}: no MAVLink, but {other}")
     kind = tlog.sniff(data)
     if kind is None:
-        raise LogError(f"{path}: no MAVLink frame in it")
+        text = ": it is text" if foreign.looks_like_text(data[:512]) else ""
+        raise LogError(f"{path}: no MAVLink frame in it{text}")
     return kind, data
 
 

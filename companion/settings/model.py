@@ -4,6 +4,7 @@ Each section lists its keys with unit, default and range. An error names the key
 is allowed.
 """
 
+import difflib
 import tomllib
 from typing import Any, Self
 
@@ -78,6 +79,25 @@ class Settings(Section):
             raise ConfigError(_first(error)) from error
 
 
+def _meant(place: tuple[int | str, ...]) -> str:
+    """The setting whose name is nearest, as the end of a message; empty where none is near."""
+    section, *keys = map(str, place)
+    if not keys:
+        near = difflib.get_close_matches(section, Settings.model_fields, 1)
+        owners = [
+            name for name, field in Settings.model_fields.items() if section in _keys(field.default)
+        ]
+        if owners and not near:
+            return f"; did you mean {owners[0]}.{section}?"
+        return f"; did you mean {near[0]}?" if near else ""
+    near = difflib.get_close_matches(keys[0], _keys(Settings.model_fields[section].default), 1)
+    return f"; did you mean {section}.{near[0]}?" if near else ""
+
+
+def _keys(section: Section) -> list[str]:
+    return list(type(section).model_fields)
+
+
 def _first(error: ValidationError) -> str:
     """The first error as one line: key, value, what is allowed.
 
@@ -87,7 +107,7 @@ def _first(error: ValidationError) -> str:
     place = errors[0]["loc"][:2]
     key = ".".join(map(str, place))
     if errors[0]["type"] == "extra_forbidden":
-        return f"{key} is not a setting"
+        return f"{key} is not a setting{_meant(place)}"
     said = [wrong["msg"] for wrong in errors if wrong["loc"][:2] == place]
     allowed = dict.fromkeys(text.removeprefix("Value error, ") for text in said)
     return f"{key} = {errors[0]['input']!r}: {', or '.join(allowed)}"

@@ -66,7 +66,7 @@ def test_every_error_that_is_raised_for_users_is_a_user_error() -> None:
         "_RefusedError",  # becomes a Rejection where it is raised
         "UnsatisfiableRangeError",  # becomes a 416
         "ServiceError",  # of the client: what the service answered
-        "_InterruptedError",  # Ctrl-C
+        "InterruptedByUser",  # Ctrl-C
         "HungUpError",  # a connection that ended in good order: a link tries again, or is done
     }
     run = (

@@ -165,7 +165,7 @@ def test_a_time_that_the_log_does_not_hold(cut_log: Path, at: str, said: str) ->
         (["--lead-ms", "10001"], "--lead-ms"),
         (["--format", "tmytek"], "tmytek drives 16 elements, the array has 64"),
         (["--format", "mat"], "'mat' is not one of"),
-        (["--out", "/nowhere/w.npy"], "/nowhere/w.npy: No such file"),
+        (["--out", "/nowhere/w.npy"], "there is no folder /nowhere"),
         (["--config", "missing.toml"], "missing.toml: No such file"),
         (["--center", "99:1"], "no position from the carrier 99:1"),
     ],

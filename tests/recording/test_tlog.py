@@ -296,9 +296,9 @@ def test_what_cannot_be_used_is_said_in_one_line(tmp_path: Path, wire: Wire) -> 
         with pytest.raises(LogError, match=why) as caught:
             read_log(path)
         assert str(path) in str(caught.value) and "\n" not in str(caught.value)
-    with pytest.raises(LogError, match="is a directory"):
+    with pytest.raises(LogError, match="is a folder"):
         read_log(tmp_path)
-    with pytest.raises(LogError, match="is a directory"):
+    with pytest.raises(LogError, match="is a folder"):
         log_kind(tmp_path)
     with pytest.raises(LogError, match="cannot be read"):
         read_log(tmp_path / "text" / "below a file")

@@ -9,6 +9,7 @@
 IPv6 hosts stand in brackets.
 """
 
+import difflib
 import ipaddress
 import re
 from collections.abc import Collection
@@ -53,7 +54,7 @@ def parse_link(text: str, schemes: Collection[Scheme] = SCHEMES) -> LinkUrl:
     scheme, _, address = text.partition(":")
     host, _, port = address.rpartition(":")
     if scheme not in schemes or not host or not _NUMBER.fullmatch(port):
-        raise LinkError(f"{text!r} is not {_forms(schemes)}")
+        raise LinkError(f"{text!r} is not {_forms(schemes)}{_meant(text)}")
     if scheme == "serial":
         return _serial(text, host, int(port))
     bracketed = host.startswith("[") and host.endswith("]")
@@ -73,6 +74,25 @@ def _serial(text: str, device: str, baud: int) -> LinkUrl:
     if not 1 <= baud <= _BAUD_MAX:
         raise LinkError(f"{text!r}: {baud} is not a baud rate, 1 to {_BAUD_MAX}")
     return LinkUrl("serial", device, baud)
+
+
+def _meant(text: str) -> str:
+    """What was likely meant, as the end of a message; empty where nobody knows."""
+    scheme, _, address = text.partition(":")
+    if scheme == "serial" and address:
+        return f"; a baud rate is missing, as in {text.rstrip(':')}:57600"
+    if text.startswith(("/dev/", "COM")):
+        return f"; did you mean serial:{text}:57600?"
+    if scheme == "udp":
+        return f"; did you mean udpin:{address or '0.0.0.0:14550'}, which listens?"
+    if text.isdecimal():
+        return f"; did you mean udpin:0.0.0.0:{text}?"
+    near = difflib.get_close_matches(scheme, SCHEMES, 1, 0.5)
+    if near and scheme not in SCHEMES:
+        return f"; did you mean {near[0]}:?"
+    if scheme in SCHEMES and address and ":" not in address:
+        return f"; did you mean {scheme}:{address}:14550?"
+    return ""
 
 
 def _forms(schemes: Collection[Scheme]) -> str:

@@ -1,0 +1,149 @@
+"""Mistakes at the command line: one line with a hint, the right status, and nothing left behind."""
+
+import struct
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from pymavlink.dialects.v20 import all as dialect
+
+from companion.cli.main import main
+from companion.recording import foreign
+from companion.values import Reason
+from companion.views.words import REASONS
+
+FILES = {
+    "flight.bin": b"\xa3\x95\x80\x80Y\x17FMT",
+    "flight.ulg": b"ULog\x01\x12\x35\x01" + bytes(64),
+    "flight.log": b"FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\n",
+    "net.pcap": b"\xd4\xc3\xb2\xa1\x02\x00\x04\x00" + bytes(64),
+    "net.pcapng": b"\x0a\x0d\x0d\x0a" + bytes(64),
+    "flight.tlog.gz": b"\x1f\x8b\x08\x00" + bytes(64),
+    "flight.tlog.zst": b"\x28\xb5\x2f\xfd" + bytes(64),
+    "flight.tlog.xz": b"\xfd7zXZ\x00" + bytes(64),
+    "logs.zip": b"PK\x03\x04" + bytes(64),
+    "flight.bag": b"#ROSBAG V2.0\n" + bytes(64),
+    "flight.db3": b"SQLite format 3\x00" + bytes(64),
+    "picture.png": b"\x89PNG\r\n\x1a\n" + bytes(64),
+    "table.csv": b"lat,lon\n47.1,8.5\n",
+    "empty.tlog": b"",
+    "noise.tlog": bytes(range(256)) * 8,
+    "half.mcap": b"\x89MCAP0\r\n",
+    "misspelt.toml": b"[beams]\nupdate_hertz = 3\n",
+    "section.toml": b"[beam]\nupdate_hz = 3\n",
+    "bare.toml": b"update_hz = 3\n",
+    "range.toml": b"[beams]\nupdate_hz = -1\n",
+    "type.toml": b"[array]\nelements = 'many'\n",
+    "broken.toml": b"[beams\n",
+    "latin.toml": "[beams]\n# \xe9\n".encode("latin-1"),
+}
+SAYS: list[tuple[str, int, str]] = [
+    # what is given, the exit status, a part of the one line
+    ("replay", 2, "Missing argument 'LOG...'. See companion replay --help"),
+    ("replay nothere.tlog", 1, "nothere.tlog: no such file"),
+    ("replay .", 1, ".: is a folder: name the logs in it"),
+    ("replay flight.bin", 1, "a DataFlash log of ArduPilot: give the .tlog"),
+    ("replay flight.ulg", 1, "a ULog of PX4: give the .tlog"),
+    ("replay flight.log", 1, "a DataFlash log as text"),
+    ("replay net.pcap", 1, "a pcap capture"),
+    ("replay net.pcapng", 1, "a pcapng capture"),
+    ("replay flight.tlog.gz", 1, "gunzip it first"),
+    ("replay flight.tlog.zst", 1, "unzstd it first"),
+    ("replay flight.tlog.xz", 1, "unxz it first"),
+    ("replay logs.zip", 1, "unpack it first"),
+    ("replay flight.bag", 1, "a ROS bag"),
+    ("replay flight.db3", 1, "a database"),
+    ("replay picture.png", 1, "a picture"),
+    ("replay table.csv", 1, "no MAVLink frame in it: it is text"),
+    ("replay empty.tlog", 1, "empty.tlog: is empty"),
+    ("replay noise.tlog", 1, "no MAVLink frame in it"),
+    ("replay half.mcap", 1, "half.mcap"),
+    ("replay good.tlog --speed fast", 2, "'fast' is neither max nor a number above 0"),
+    ("replay good.tlog --speed 0", 2, "neither max nor a number above 0"),
+    ("replay good.tlog --speed nan", 2, "neither max nor a number above 0"),
+    ("replay good.tlog --listen 127.0.0.1:0", 2, "go with --serve"),
+    ("replay good.tlog --insecure", 2, "go with --serve"),
+    ("replay good.tlog --config nothere.toml", 1, "nothere.toml: No such file"),
+    ("replay good.tlog --config misspelt.toml", 1, "did you mean beams.update_hz?"),
+    ("replay good.tlog --config section.toml", 1, "beam is not a setting; did you mean beams?"),
+    ("replay good.tlog --config bare.toml", 1, "did you mean beams.update_hz?"),
+    ("replay good.tlog --config range.toml", 1, "beams.update_hz = -1"),
+    ("replay good.tlog --config type.toml", 1, "array.elements = 'many'"),
+    ("replay good.tlog --config broken.toml", 1, "broken.toml: not TOML"),
+    ("replay good.tlog --config latin.toml", 1, "it is not UTF-8 text"),
+    ("replay good.tlog --config .", 1, "Is a directory"),
+    ("replay good.tlog --center here", 1, "'here' is not SYSID:COMPID"),
+    ("replay good.tlog --center 999:1", 1, "at most 255"),
+    ("replay good.tlog --center 95,8,500", 1, "latitude is within 90 degrees"),
+    ("replay good.tlog --center 47,8", 1, "is not LAT,LON,ALT"),
+    ("replay good.tlog --centre 5:1", 2, "No such option '--centre'"),
+    ("replay good.tlog --no-record", 1, "nothing was aimed at: no UAV reported a position"),
+    ("replay good.tlog --no-record --center 5:1", 1, "no position from the carrier 5:1"),
+    ("weights good.tlog", 2, "Missing option '--at'"),
+    ("weights good.tlog --at noon", 1, "neither seconds from the beginning nor a time"),
+    ("weights good.tlog --at 2026-01-01T12:00:00", 1, "say the zone, such as Z"),
+    ("weights good.tlog --at 9999", 1, "--at 9999: the log is"),
+    ("weights good.tlog --at -9999", 1, "the log begins later"),
+    ("weights good.tlog --at 1 --out gone/w.npy", 2, "there is no folder gone"),
+    ("weights good.tlog --at 1 --format matlab", 2, "'matlab' is not one of"),
+    ("weights good.tlog --at 1 --lead-ms -5", 2, "-5.0 is not in the range"),
+    ("weights good.tlog --at 1 --lead-ms nan", 2, "0 to 10000 is allowed"),
+    ("run", 1, "--center SYSID:COMPID"),
+    ("run --center 5:1", 1, "--link udpin:0.0.0.0:14550"),
+    ("run --center 5:1 --link udp:", 1, "did you mean udpin:0.0.0.0:14550, which listens?"),
+    ("run --center 5:1 --link 14550", 1, "did you mean udpin:0.0.0.0:14550?"),
+    ("run --center 5:1 --link upd:0.0.0.0:1", 1, "did you mean udpin:?"),
+    ("run --center 5:1 --link /dev/ttyACM0", 1, "did you mean serial:/dev/ttyACM0:57600?"),
+    ("run --center 5:1 --link serial:/dev/ttyUSB0", 1, "a baud rate is missing"),
+    ("run --center 5:1 --link tcp:localhost", 1, "did you mean tcp:localhost:14550?"),
+    ("run --center 5:1 --link udpin:0.0.0.0:99999", 1, "99999 is not a port"),
+    ("run --center 5:1 --link udpin:::1:14550", 1, "an IPv6 host stands in brackets"),
+    ("run --center 5:1 --link udpin:0.0.0.0:0 --listen 8080", 1, "is not HOST:PORT"),
+    ("run --center 5:1 --link udpin:0.0.0.0:0 --listen 0.0.0.0:0", 1, "set COMPANION_TOKEN"),
+    ("demo --seconds 0", 2, "0.0 is not in the range"),
+    ("demo --port 70000", 2, "70000 is not in the range"),
+    ("recover", 2, "Missing argument 'FILE...'"),
+    ("recover nothere.active", 1, "nothere.active"),
+    ("study", 2, ""),
+    ("rply good.tlog", 2, "Did you mean 'replay'? See companion --help"),
+]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("COMPANION_TOKEN", raising=False)
+    for name, content in FILES.items():
+        (tmp_path / name).write_bytes(content)
+    beats = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
+    stamped = bytearray()
+    for second in range(5):
+        stamped += struct.pack(">Q", 1_760_000_000_000_000 + second * 1_000_000)
+        stamped += dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3).pack(beats)
+    (tmp_path / "good.tlog").write_bytes(stamped)
+    return tmp_path
+
+
+@pytest.mark.parametrize(("given", "status", "says"), SAYS)
+def test_a_mistake_is_one_line(folder: Path, given: str, status: int, says: str) -> None:
+    before = sorted(folder.rglob("*"))
+    done = CliRunner().invoke(main, given.split(), prog_name="companion")
+    assert done.exit_code == status, done.output
+    if says:
+        *before_it, line = done.stderr.splitlines()
+        assert says in line
+        assert line.startswith("companion: ")
+        assert len(before_it) <= 1  # what was taken for granted, such as no --center
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_every_reason_has_plain_words() -> None:
+    assert set(REASONS) == set(Reason)
+
+
+def test_text_is_told_from_noise() -> None:
+    assert foreign.looks_like_text("Höhe,m\n".encode()[:3])  # cut within a character
+    assert foreign.looks_like_text(b"a\tb\r\n")
+    assert not foreign.looks_like_text(b"")
+    assert not foreign.looks_like_text(bytes(range(256)))
+    assert not foreign.looks_like_text(b"\xfd\x09\x00\x00")

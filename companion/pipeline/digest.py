@@ -3,8 +3,11 @@
 import hashlib
 import struct
 from collections.abc import Sequence
+from typing import Final
 
 from companion.values import Estimate, Update
+
+_NUMBERS: Final = struct.Struct("<q4d")
 
 
 class Digest:
@@ -27,8 +30,7 @@ class Digest:
     def _estimate(
         self, uav: str, t_ns: int, position_ned_m: Sequence[float], bound_m: float
     ) -> None:
-        self._hash.update(uav.encode())
-        self._hash.update(struct.pack("<q4d", t_ns, *position_ned_m, bound_m))
+        self._hash.update(uav.encode() + _NUMBERS.pack(t_ns, *position_ned_m, bound_m))
 
     def hexdigest(self) -> str:
         """The digest so far."""

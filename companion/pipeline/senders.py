@@ -107,6 +107,7 @@ class Senders:
         self.aircraft = Aircraft()
         self._settings = settings
         self._carrier = carrier
+        self._carrier_source = None if carrier is None else Source.parse(carrier)
         self._noise_settings = assembly.noise(settings)
         self._noise: dict[Source, ReportNoise] = {}
         self._clocks: dict[str, SenderClock] = {}  # by SYSID:COMPID
@@ -120,7 +121,7 @@ class Senders:
 
     def hear(self, frame: Frame) -> Heard:
         """Take in one frame of a message that is decoded (``decode.DECODED``)."""
-        if frame.msgid == ATTITUDE and str(frame.source) != self._carrier:
+        if frame.msgid == ATTITUDE and frame.source != self._carrier_source:
             change = self.notice(frame)
             return NOTHING if change is None else Heard(change=change)
         message = decode(frame)

@@ -174,6 +174,8 @@ TF_TOPIC: Final = "/tf"
 SCENE_TOPIC: Final = "/scene"
 
 # Tag bytes: field number << 3 | wire type (0 varint, 1 eight bytes, 2 length-delimited).
+RAW_MAX: Final = 280
+"""Most bytes of a frame: 10 of head, 255 of payload, 2 of checksum, 13 of signature."""
 _TIME = struct.Struct("<BQ")
 _T_NS, _LINK, _SYSID, _COMPID, _MSGID, _RAW = 0x09, 0x12, 0x18, 0x20, 0x28, 0x32
 
@@ -196,6 +198,10 @@ def encode_tick(t_ns: int) -> bytes:
     return _TIME.pack(_T_NS, t_ns) if t_ns else b""
 
 
+_RAW_HEADS: Final = (b"", *(bytes((_RAW,)) + _varint(size) for size in range(1, RAW_MAX + 1)))
+"""Tag and length of a frame's bytes, by their number; nothing where there are none."""
+
+
 class FrameEncoder:
     """Encodes ``companion.Frame`` messages; keeps the packed head of each (link, source, id) seen.
 
@@ -212,14 +218,11 @@ class FrameEncoder:
         head = self._heads.get(key)
         if head is None:
             head = self._heads.setdefault(key, self._head(frame))
-        raw = frame.raw
+        t_ns, raw = frame.t_ns, frame.raw
         size = len(raw)
-        length = bytes((_RAW, size)) if size < 0x80 else bytes((_RAW,)) + _varint(size)
-        return (
-            b"".join((encode_tick(frame.t_ns), head, length, raw))
-            if size
-            else (encode_tick(frame.t_ns) + head)
-        )
+        length = _RAW_HEADS[size] if size <= RAW_MAX else bytes((_RAW,)) + _varint(size)
+        time = _TIME.pack(_T_NS, t_ns) if t_ns else b""
+        return b"".join((time, head, length, raw))
 
     @staticmethod
     def _head(frame: Frame) -> bytes:

@@ -170,7 +170,7 @@ class Writer:
 
     def _add(self, topic: str, schema: schemas.Schema, t_ns: int, data: bytes) -> None:
         channel_id = self._channel_ids.get(topic) or self._channel(topic, schema)
-        stamp_ns = max(0, t_ns)
+        stamp_ns = t_ns if t_ns > 0 else 0
         self._mcap.message(channel_id, stamp_ns, stamp_ns, self.messages & 0xFFFFFFFF, data)
         self.messages += 1
 

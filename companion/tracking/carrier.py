@@ -37,15 +37,19 @@ def later_body_from_body(body_rates_radps: FloatArray, interval_s: float) -> Flo
     rotation vector -rates * interval; the sign is negative because coordinates turn the other way
     than the body.
     """
-    vector = -np.asarray(body_rates_radps, dtype=float) * interval_s
-    angle = math.sqrt(vector @ vector)
+    x, y, z = (-rate * interval_s for rate in body_rates_radps.tolist())
+    angle = math.sqrt(x * x + y * y + z * z)
     if angle == 0.0:
         return np.eye(3)
-    x, y, z = vector / angle
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    turned: FloatArray = np.eye(3) + math.sin(angle) * cross
-    turned += (1 - math.cos(angle)) * (cross @ cross)
-    return turned
+    x, y, z = x / angle, y / angle, z / angle
+    sine, rest = math.sin(angle), 1 - math.cos(angle)
+    return np.array(
+        [
+            [1 - rest * (y * y + z * z), rest * x * y - sine * z, rest * x * z + sine * y],
+            [rest * x * y + sine * z, 1 - rest * (x * x + z * z), rest * y * z - sine * x],
+            [rest * x * z - sine * y, rest * y * z + sine * x, 1 - rest * (x * x + y * y)],
+        ]
+    )
 
 
 def fixed(
@@ -112,6 +116,6 @@ def moving(
         later_body_from_body(rates, since_ns * 1e-9) @ then @ local_from_ned.T,
         rates,
         track.bound_m,
-        bounds.at(float(np.linalg.norm(rates)), since_ns * 1e-9, doubt_s),
+        bounds.at(math.hypot(*rates.tolist()), since_ns * 1e-9, doubt_s),
         track.age_s,
     )

@@ -257,7 +257,7 @@ class Fleet:
         if tracked is None:
             return None
         now = at.sender_ns - (at.node_ns - now_ns)
-        predicted, possible = self._predict(tracked, at)
+        position, velocity, possible = self._predict(tracked, at)
         newest = tracked.history.newest
         last = tracked.newest
         return Track(
@@ -265,8 +265,8 @@ class Fleet:
             state=self._settings.ages.state((now - newest.fix.sender_ns) * 1e-9, tracked.pace),
             valid_at_ns=at.node_ns,
             age_s=(at.sender_ns - newest.fix.sender_ns) * 1e-9,
-            position_ned_m=np.array(predicted.position_ned_m),
-            velocity_ned_mps=_array(predicted.velocity_ned_mps),
+            position_ned_m=np.array(position),
+            velocity_ned_mps=_array(velocity),
             unknown_input_mps=_array(tracked.unknown_input),
             acceleration_ned_mps2=_array(tracked.acceleration),
             bound_m=possible.bound_m,
@@ -275,7 +275,7 @@ class Fleet:
             set_center_ned_m=np.array(possible.center_ned_m),
             set_radius_m=possible.radius_m,
             limits=self._limits(newest.fix),
-            error_p95_m=self._usual_m(tracked, predicted, at),
+            error_p95_m=self._usual_m(tracked, velocity, at),
             clock_bound_s=at.bound_s,
             dt_s=last.dt_s,
             latency_s=(newest.fix.arrival_ns - newest.fix.t_ns) * 1e-9,
@@ -284,8 +284,8 @@ class Fleet:
             reports=tracked.reports,
         )
 
-    def _predict(self, tracked: _Tracked, at: SenderTime) -> tuple[Prediction, Reach]:
-        """The observer's prediction with the acceleration fed forward, and what is possible then.
+    def _predict(self, tracked: _Tracked, at: SenderTime) -> tuple[Vector, Vector | None, Reach]:
+        """Position and velocity, the acceleration fed forward, and what is possible then.
 
         See docs/math.md 5.1.
         """
@@ -297,23 +297,21 @@ class Fleet:
             way_s2, gain_s = fading(ahead_s, tracked.hindsight.way.fades_s)
             position = _further(position, way_s2, tracked.acceleration)
             velocity = _further(velocity, gain_s, tracked.acceleration)
-            found = found._replace(position_ned_m=position, velocity_ned_mps=velocity)
         limits = self._limits(newest.fix)
         if newest.fix.velocity_ned_mps is not None and found.mu_s2 is None:
-            return found, reach(newest.fix, limits, position, at)
-        widened_m = at.bound_s * _fastest_mps(found, limits, at.bound_s)
+            return position, velocity, reach(newest.fix, limits, position, at)
+        fastest_mps = _fastest_mps(velocity, found.velocity_bound_mps, limits, at.bound_s)
+        widened_m = at.bound_s * fastest_mps
         bound_m = found.bound_m + widened_m
-        return found, Reach(
-            bound_m, found.horizontal_m + widened_m, found.vertical_m + widened_m, position, bound_m
-        )
+        horizontal_m, vertical_m = found.horizontal_m + widened_m, found.vertical_m + widened_m
+        return position, velocity, Reach(bound_m, horizontal_m, vertical_m, position, bound_m)
 
-    def _usual_m(self, tracked: _Tracked, found: Prediction, at: SenderTime) -> float | None:
+    def _usual_m(self, tracked: _Tracked, velocity: Vector | None, at: SenderTime) -> float | None:
         """The error that is usual at a time: what reports have shown, and the clock's share."""
         age_s = (at.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
         seen_m = tracked.hindsight.usual_m(age_s)
-        if seen_m is None or found.velocity_ned_mps is None:
+        if seen_m is None or velocity is None:
             return seen_m
-        velocity = found.velocity_ned_mps
         common_m = COMMON_ERROR * tracked.history.newest.fix.noise.position_m
         return math.hypot(seen_m, common_m, math.hypot(*velocity) * at.usual_s)
 
@@ -351,9 +349,10 @@ class Fleet:
         ]
 
 
-def _fastest_mps(found: Prediction, limits: Limits, within_s: float) -> float:
+def _fastest_mps(
+    velocity: Vector | None, bound_mps: float | None, limits: Limits, within_s: float
+) -> float:
     """Greatest speed within a time of the instant at which the UAV is predicted."""
-    velocity, bound_mps = found.velocity_ned_mps, found.velocity_bound_mps
     if velocity is None or bound_mps is None:
         return limits.speed_mps
     gained_mps = limits.acceleration_mps2 * within_s

@@ -10,6 +10,7 @@ that the near future resembles the near past.
 import math
 from bisect import insort
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Final
@@ -64,19 +65,20 @@ class _Made:
     velocity: Vector
     accelerations: tuple[Vector | None, ...]
 
-    def off_m(self, way: int, there: Vector, ahead_s: float) -> float:
-        """How far a prediction by a way is from a position reported later."""
-        given = self.accelerations[way]
+    def off_m(self, ways: Sequence[int], there: Vector, ahead_s: float) -> list[float]:
+        """How far predictions by some ways are from a position reported later."""
         (n, e, d), (vn, ve, vd), (tn, te, td) = self.position, self.velocity, there
-        north, east, down = n + vn * ahead_s - tn, e + ve * ahead_s - te, d + vd * ahead_s - td
-        if given is not None:
-            gain = fading(ahead_s, WAYS[way].fades_s)[0]
-            north, east, down = (
-                north + gain * given[0],
-                east + gain * given[1],
-                down + gain * given[2],
-            )
-        return math.sqrt(north * north + east * east + down * down)
+        n, e, d = n + vn * ahead_s - tn, e + ve * ahead_s - te, d + vd * ahead_s - td
+        found = []
+        for way in ways:
+            given, north, east, down = self.accelerations[way], n, e, d
+            if given is not None:
+                gain = fading(ahead_s, WAYS[way].fades_s)[0]
+                north += gain * given[0]
+                east += gain * given[1]
+                down += gain * given[2]
+            found.append(math.sqrt(north * north + east * east + down * down))
+        return found
 
 
 @dataclass(slots=True)
@@ -132,15 +134,16 @@ class Hindsight:
             if made is not None and made.sender_ns > errors.judged_ns:
                 errors.judged_ns = made.sender_ns
                 age_s = (fix.sender_ns - made.sender_ns) * 1e-9
-                errors.add(made.off_m(self._way, there, age_s), age_s)
+                errors.add(made.off_m((self._way,), there, age_s)[0], age_s)
         if fix.velocity_ned_mps is not None:
             self._made.append(_Made(fix.sender_ns, there, fix.velocity_ned_mps, accelerations))
 
     def _older(self, sender_ns: int, least_s: float) -> _Made | None:
         """The newest of what is remembered that is at least so old, and not twice as old."""
+        newest_ns = sender_ns - round(least_s * 1e9)
         for made in reversed(self._made):
-            age_s = (sender_ns - made.sender_ns) * 1e-9
-            if age_s >= least_s:
+            if made.sender_ns <= newest_ns:
+                age_s = (sender_ns - made.sender_ns) * 1e-9
                 return made if age_s < 2.0 * least_s + 2.0 else None
         return None
 
@@ -151,9 +154,8 @@ class Hindsight:
         memory = math.exp(-(made.sender_ns - self._judged_ns) * 1e-9 / MEMORY_S)
         self._judged_ns = made.sender_ns
         ahead_s = (sender_ns - made.sender_ns) * 1e-9
-        for way in range(len(WAYS)):
-            off_m = made.off_m(way, there, ahead_s)
-            self._costs[way] = memory * self._costs[way] + off_m * off_m
+        off_m = made.off_m(range(len(WAYS)), there, ahead_s)
+        self._costs = [memory * c + m * m for c, m in zip(self._costs, off_m, strict=True)]
         self._judged += 1
         if self._judged < JUDGED:
             return

@@ -55,7 +55,7 @@ class Dedupe:
         share = self.shares.get(frame.link)
         if share is None:
             share = self.shares.setdefault(frame.link, LinkShare())
-        key = bytes(frame.source) + frame.msgid.to_bytes(3, "little") + frame.payload.rstrip(b"\0")
+        key = _content(frame)
         first = self._seen.get(key)
         if first is None:
             first = self._seen[key] = _First(frame.t_ns, frame.link)
@@ -76,3 +76,11 @@ class Dedupe:
     def _forget(self, key: bytes, first: _First) -> None:
         if self._seen.get(key) is first:
             del self._seen[key]
+
+
+def _content(frame: Frame) -> bytes:
+    """Sender, message id and payload without the zeros at its end, which MAVLink 2 cuts."""
+    raw = frame.raw
+    if raw[0] == 0xFD:  # they stand one after the other
+        return raw[5 : 10 + raw[1]].rstrip(b"\0")
+    return (bytes(frame.source) + frame.msgid.to_bytes(3, "little") + frame.payload).rstrip(b"\0")

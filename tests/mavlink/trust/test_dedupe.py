@@ -62,7 +62,7 @@ def test_twice_over_one_link_counts_once_and_so_do_three_times() -> None:
         sent(lat=473977420),
         sent(source=(2, 1)),
         sent(source=(1, 2)),
-        sent()._replace(msgid=32),
+        sent()._replace(msgid=32, raw=sent().raw[:7] + bytes([32]) + sent().raw[8:]),
     ],
     ids=["boot time", "content", "system", "component", "message"],
 )

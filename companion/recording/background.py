@@ -96,7 +96,8 @@ class BackgroundRecorder:
         self._writer = open_part(self._part)
         self._begun_s = time.monotonic()
         self._finished_messages = 0  # messages in the parts before this one
-        self._queue: queue.Queue[_Item | None] = queue.Queue(queue_max)
+        # Bounded by ``put``; a queue that bounds itself costs ten times as much for each event.
+        self._queue: queue.SimpleQueue[_Item | None] = queue.SimpleQueue()
         self._queue_max = queue_max
         self._missed = 0
         self._overrun = False
@@ -118,7 +119,7 @@ class BackgroundRecorder:
     def put(self, event: Event | None, outputs: Sequence[Output]) -> None:
         """Hand over an event and its outputs; an event of None for outputs without one.
 
-        Never waits.
+        Never waits. Called on one thread only.
 
         Once the queue is full, nothing is accepted until half of it is written: one long hole can
         be reported, a thousand short ones would be a recording of holes.
@@ -127,14 +128,13 @@ class BackgroundRecorder:
             self._overrun = False
             self._tell(Severity.INFO, f"recording again: {self._missed} events are missing")
         if not self._overrun:
-            try:
-                self._queue.put_nowait(_Item(event, outputs, self._missed))
+            if self._queue.qsize() < self._queue_max:
+                self._queue.put(_Item(event, outputs, self._missed))
                 self._missed = 0
                 return
-            except queue.Full:
-                self._overrun = True
-                if self.failure is None:
-                    self._tell(Severity.ERROR, "not all is recorded: the disk is too slow")
+            self._overrun = True
+            if self.failure is None:
+                self._tell(Severity.ERROR, "not all is recorded: the disk is too slow")
         self.dropped += 1
         self._missed += event is not None
 
@@ -146,8 +146,7 @@ class BackgroundRecorder:
         """
         self._metadata = metadata
         self._stopping.set()
-        with contextlib.suppress(queue.Full):  # it only wakes an idle thread
-            self._queue.put_nowait(None)
+        self._queue.put(None)  # it only wakes an idle thread
         self._thread.join(STOP_MAX_S)
         if self._thread.is_alive():
             self._tell(Severity.ERROR, f"{self._writer.path} is not finished: no answer from disk")
@@ -213,9 +212,10 @@ class BackgroundRecorder:
     def _write_until_stopped(self) -> None:
         flush_due_s = time.monotonic() + FLUSH_S
         while not (self._stopping.is_set() and self._queue.empty()):
-            item = None
-            with contextlib.suppress(queue.Empty):
+            try:
                 item = self._queue.get(timeout=max(0.0, flush_due_s - time.monotonic()))
+            except queue.Empty:
+                item = None
             if item is not None:
                 self._unsafe.append(item)
                 self._write(item)

@@ -118,11 +118,11 @@ class BootLine:
         Returns None for a frame of the previous line, and for a stamp off the line that others have
         not confirmed so far.
         """
-        if not self.floor:
+        if not self.floor.count:
             return self._accept(arrival_ns, boot_ms * _NS_PER_MS)
-        x_ns = self.unwrap(boot_ms)
+        x_ns = _unwrap(boot_ms, self.newest_ns)
         late_ns = self.late_ns(arrival_ns, x_ns)
-        if self._is_straggler(arrival_ns, boot_ms, late_ns):
+        if self._previous is not None and self._is_straggler(arrival_ns, boot_ms, late_ns):
             return None
         if abs(late_ns) <= self._late_max_ns:
             return self._near(arrival_ns, boot_ms, x_ns)
@@ -138,7 +138,7 @@ class BootLine:
 
     def notice(self, arrival_ns: int, boot_ms: int) -> bool:
         """Take in a stamp that cannot begin a line. Returns whether it lies on the present one."""
-        if not self.floor:
+        if not self.floor.count:
             return False
         x_ns = _unwrap(boot_ms, self.newest_ns)
         if abs(arrival_ns - x_ns - self.floor.at(x_ns)) > self._late_max_ns // 2:

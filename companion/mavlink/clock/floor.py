@@ -100,6 +100,7 @@ class Floor:
 
     def __init__(self, window_ns: int, drift_max: float) -> None:
         self._drift_max = drift_max
+        self._likely_drift = min(LIKELY_DRIFT, drift_max)
         self.drift = 0.0
         self.count = 0
         self.newest_ns = 0
@@ -134,7 +135,7 @@ class Floor:
         if ahead_ns > 0:
             self.newest_ns = x_ns
             self._sure += self._drift_max * ahead_ns
-            self._line += min(LIKELY_DRIFT, self._drift_max) * ahead_ns
+            self._line += self._likely_drift * ahead_ns
             as_of_now = height
         else:
             as_of_now = height - self._drift_max * ahead_ns
@@ -143,13 +144,14 @@ class Floor:
         gap = as_of_now - self._line
         self._line = min(self._line, as_of_now)
         self._recent.append((x_ns, height))
-        late = gap > max(
-            LEAST_CHANGE_NS, CHANGE / RECENT * (self._visible.median_ns + RESOLUTION_NS)
-        )
+        spread = self._visible.median_ns + RESOLUTION_NS
+        late = gap > LEAST_CHANGE_NS and gap > CHANGE / RECENT * spread
         self._risen = self._suspicious() if late else -np.inf
         self._visible.add(x_ns, height)
-        if ahead_ns > 0:
-            self._watch(x_ns, height, max(0.0, gap))
+        if ahead_ns > 0 and gap > 0.0:
+            self._watch(x_ns, height, gap)
+        elif ahead_ns > 0:  # it is the line
+            self._blocks.clear()
         if self._line - self._sure > WORST_LATENCY_NS:
             self._sure, self._touched_ns = (
                 self._line,
@@ -180,9 +182,6 @@ class Floor:
     def _watch(self, x_ns: int, height: float, gap: float) -> None:
         """Note how far above the line a stamp lies; look for a change as a block ends."""
         blocks, index = self._blocks, x_ns // _BLOCK_NS
-        if gap == 0.0:  # it is the line
-            blocks.clear()
-            return
         if not blocks or blocks[-1].index != index:
             if blocks:
                 self._look_for_change(x_ns)

@@ -190,9 +190,9 @@ class SenderClock:
 
         Raises ``ValueError`` before the first stamp.
         """
-        if not self._line.floor:
-            raise ValueError("no stamp of this sender was seen so far")
         newest_ns, floor = self._line.newest_ns, self._line.floor
+        if not floor.count:
+            raise ValueError("no stamp of this sender was seen so far")
         ahead_ns = node_ns - newest_ns - self._now()[3]
         return newest_ns + round(ahead_ns / (1.0 + floor.drift))
 
@@ -221,7 +221,7 @@ class SenderClock:
 
         Node time less sender time, ns; by how much it may be more, and less; and usually is, s.
         """
-        if not self._line.floor:
+        if not self._line.floor.count:
             return None
         kind, low_ns, high_ns, likely_ns = self._at(self.sender_ns(node_ns))
         before_s = (high_ns - likely_ns + _NS_PER_MS) * 1e-9

@@ -161,6 +161,13 @@ class Splitter:
 
         Bytes that were no frame are returned as rejections, one per reason.
         """
+        if not self._pending:
+            found = self._checker.at(data, 0, len(data)) if data else INCOMPLETE
+            if not isinstance(found, int) and len(found[2]) == len(data):  # nearly every datagram
+                self.frames += 1
+                self._claimed = 0
+                wanted = self._wanted is None or found[1] in self._wanted
+                return [Frame(t_ns, self.link, *found)] if wanted else []
         return self._split(t_ns, self._pending + data if self._pending else data, last=False)
 
     def finish(self, t_ns: int) -> list[Frame | Rejection]:

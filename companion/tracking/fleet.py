@@ -290,16 +290,16 @@ class Fleet:
         See docs/math.md 5.1.
         """
         newest = tracked.history.newest
-        found = self._observer.predict(newest.state, at.sender_ns)
-        ahead_s = (at.sender_ns - newest.fix.sender_ns) * 1e-9
-        position, velocity = found.position_ned_m, found.velocity_ned_mps
-        if tracked.acceleration is not None and velocity is not None and ahead_s > 0:
-            way_s2, gain_s = fading(ahead_s, tracked.hindsight.way.fades_s)
-            position = _further(position, way_s2, tracked.acceleration)
-            velocity = _further(velocity, gain_s, tracked.acceleration)
         limits = self._limits(newest.fix)
-        if newest.fix.velocity_ned_mps is not None and found.mu_s2 is None:
+        velocity: Vector | None
+        carried = self._observer.carry(newest.state, at.sender_ns)
+        if carried is not None:
+            position, velocity = _fed(tracked, at, *carried)
             return position, velocity, reach(newest.fix, limits, position, at)
+        found = self._observer.predict(newest.state, at.sender_ns)
+        position, velocity = found.position_ned_m, found.velocity_ned_mps
+        if velocity is not None:
+            position, velocity = _fed(tracked, at, position, velocity)
         fastest_mps = _fastest_mps(velocity, found.velocity_bound_mps, limits, at.bound_s)
         widened_m = at.bound_s * fastest_mps
         bound_m = found.bound_m + widened_m
@@ -361,6 +361,20 @@ def _fastest_mps(
 
 def _rejected(fix: Fix, reason: Reason, detail: str) -> Rejection:
     return Rejection(fix.arrival_ns, fix.uav, reason, detail=detail)
+
+
+def _fed(
+    tracked: _Tracked, at: SenderTime, position: Vector, velocity: Vector
+) -> tuple[Vector, Vector]:
+    """A predicted position and velocity with the acceleration fed forward, if there is one."""
+    ahead_s = (at.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
+    if tracked.acceleration is None or ahead_s <= 0:
+        return position, velocity
+    way_s2, gain_s = fading(ahead_s, tracked.hindsight.way.fades_s)
+    return (
+        _further(position, way_s2, tracked.acceleration),
+        _further(velocity, gain_s, tracked.acceleration),
+    )
 
 
 def _array(vector: Vector | None) -> FloatArray | None:

@@ -56,9 +56,13 @@ def reach(fix: Fix, limits: Limits, predicted_ned_m: Vector, at: SenderTime) -> 
         n, e, d = north - v_north * s, east - v_east * s, down - v_down * s
         flat = n * n + e * e
         radii.append(noise.position_m + grown)
-        bound = max(bound, math.sqrt(flat + d * d) + noise.position_m + grown)
-        horizontal = max(horizontal, math.sqrt(flat) + noise.horizontal_m + grown)
-        vertical = max(vertical, abs(d) + noise.vertical_m + grown)
+        off = math.sqrt(flat + d * d) + noise.position_m + grown
+        aside = math.sqrt(flat) + noise.horizontal_m + grown
+        above = abs(d) + noise.vertical_m + grown
+        # Conditions, for ``max`` costs more than the arithmetic.
+        bound = off if off > bound else bound
+        horizontal = aside if aside > horizontal else horizontal
+        vertical = above if above > vertical else vertical
     # Over long gaps the greatest speed says more.
     way = max(abs(ends[0]), abs(ends[1])) * limits.speed_mps
     flat = north * north + east * east

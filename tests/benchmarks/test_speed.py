@@ -122,7 +122,7 @@ def _update_us(uavs: int) -> float:
         0, "bench", "", Source(1, 1), 47.0, 8.0, 500.0, AltitudeDatum.MSL, None, None, None, None,
         0, None,
     )  # fmt: skip
-    velocity = np.array([5.0, 0.0, 0.0])
+    velocity = (5.0, 0.0, 0.0)
     rounds = 4000 // uavs
 
     begin_ns = 1_000_000_000
@@ -131,7 +131,7 @@ def _update_us(uavs: int) -> float:
         nonlocal begin_ns
         for n in range(rounds):
             t_ns = begin_ns + n * 100_000_000
-            position = velocity * (t_ns * 1e-9)
+            position = (5.0 * (t_ns * 1e-9), 0.0, 0.0)
             for uav in range(uavs):
                 name = str(uav)
                 fleet.accept(Fix(name, t_ns, t_ns, t_ns, position, velocity, noise, report))

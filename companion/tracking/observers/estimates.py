@@ -42,6 +42,13 @@ class Observer(Protocol[State]):
         """The UAV at a time before or after the report that the state holds."""
         ...
 
+    def carry(self, state: State, sender_ns: int) -> tuple[Vector, Vector] | None:
+        """Position and velocity at a time, where ``reach.py`` bounds them; None where it does not.
+
+        That is where the observer's own bound is no smaller than what the newest report leaves.
+        """
+        ...
+
     def after(self, state: State, predicted: Prediction, fix: Fix) -> State:
         """The state at a report, from the previous state and its prediction for that time."""
         ...

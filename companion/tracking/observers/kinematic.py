@@ -137,6 +137,13 @@ class KinematicObserver:
         position, velocity = _moved(state, t, gain)
         return self._bounded(state, t, gain, position, velocity)
 
+    def carry(self, state: KinematicState, sender_ns: int) -> tuple[Vector, Vector] | None:
+        """Position and velocity of ``predict``; None where no velocity is reported."""
+        if state.fix.velocity_ned_mps is None:
+            return None
+        t = (sender_ns - state.fix.sender_ns) * 1e-9
+        return _moved(state, t, self.model.gain(t))
+
     def _bounded(
         self, state: KinematicState, t: float, gain: Gain, position: Vector, velocity: Vector
     ) -> Prediction:

@@ -93,6 +93,10 @@ class PositionObserver:
         estimate = _drawn(state, lead_s, gain)
         return self._made(state, estimate, bound_m, b, closed_form.mu_star(b, d, alpha))
 
+    def carry(self, _state: PositionState, _sender_ns: int) -> tuple[Vector, Vector] | None:
+        """None: the observer has a bound of its own."""
+        return None
+
     def after(self, _state: PositionState, predicted: Prediction, fix: Fix) -> PositionState:
         """The state at a report.
 

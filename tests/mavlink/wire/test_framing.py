@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
 from support import LONGEST_FRAME
 
+from companion.mavlink.wire import encode
 from companion.mavlink.wire.crc_extra import CRC_EXTRA
-from companion.mavlink.wire.framing import Splitter
+from companion.mavlink.wire.framing import KNOWN_MAX, Splitter
 from companion.values import Frame, Reason, Rejection, Source
 
 Scan = Callable[[bytes], list[bytes]]
@@ -436,3 +437,12 @@ def test_whole_logs(scan: Scan, shared_log: Callable[[str], bytes], name: str) -
         message = mav.decode(bytearray(frame.raw))
         assert frame.source == (message.get_srcSystem(), message.get_srcComponent())
         assert frame.msgid == message.get_msgId()
+
+
+def test_more_senders_than_are_kept_are_all_heard() -> None:
+    """What is known of a sender's messages is a cache: it is begun again when it is full."""
+    sent = [Source(n % 255 + 1, n // 255) for n in range(KNOWN_MAX + 300)]
+    splitter = Splitter("x")
+    for _ in range(2):
+        heard = [splitter.feed(0, encode.pack(encode.heartbeat(source), 0))[0] for source in sent]
+        assert [frame.source for frame in heard if isinstance(frame, Frame)] == sent

@@ -36,7 +36,7 @@ SHELL = (
     "sitl_replay/cli.py",
     "sitl_replay/traffic/",
 )
-READS_FILES = ("companion/settings/",)
+READS_FILES = ("companion/settings/", "companion/beams/weights/shapes.py")
 
 # Modules by which clocks, sockets, files, threads and processes are reached.
 # fmt: off

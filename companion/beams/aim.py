@@ -6,13 +6,16 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from companion.beams import line_of_sight
+from companion.beams import line_of_sight, steady
 from companion.beams.array import steering
 from companion.beams.array.coverage import EVERYWHERE, Coverage, refusals
 from companion.beams.array.elements import Pattern
 from companion.beams.array.geometry import Array
-from companion.beams.weights import widening
-from companion.beams.weights.precoding import Precoder, Precoding, gain_db, precode
+from companion.beams.steady import Steady
+from companion.beams.weights import shapes, widening
+from companion.beams.weights.precoding import Precoder, Precoding, Radio, gain_db, precode
+from companion.beams.weights.widening import Uncertain
+from companion.beams.worth import link_budget
 from companion.values import (
     Beam,
     BeamSet,
@@ -30,6 +33,11 @@ NEAREST_M: Final = 1.0
 
 The far field is tens of metres away.
 """
+UNKNOWN_SHARE: Final = 0.25
+"""Share of a bound that is taken for the usual error before reports have shown one.
+
+On the logs it is a twentieth for positions, and a tenth to a fifth for attitudes.
+"""
 DARK: Final = 1e-3
 """Element amplitude below which there is no beam: 60 dB below an isotropic element."""
 
@@ -42,6 +50,7 @@ def aim(
     array: Array,
     precoder: Precoder,
     coverage: Coverage = EVERYWHERE,
+    before: Steady | None = None,
 ) -> BeamSet:
     """Make one beam on every track that can be aimed at, with nulls on the others.
 
@@ -52,6 +61,7 @@ def aim(
         array        the array on its mount
         precoder     how weights are made
         coverage     directions in which beams may point
+        before       what the last beams were, which these do not leave at once; None: nothing
 
     The columns of the weights are in the order of ``tracks``. UAVs without a beam are listed with
     the reason.
@@ -60,7 +70,7 @@ def aim(
     refused = {track.uav: _refusal(track, place) for track in tracks}
     seen = [track for track in tracks if refused[track.uav] is None]
     beams: tuple[Beam, ...] = ()
-    made = None
+    made, dropped = None, dict[str, str]()
     if carrier is not None and seen:
         ranges_m, directions = line_of_sight.directions(seen, carrier, array)
         hidden = _out_of_reach(directions, array, coverage)
@@ -68,20 +78,23 @@ def aim(
         inside = [i for i, why in enumerate(hidden) if why is None]
         if inside:
             aimed = _Aimed([seen[i] for i in inside], ranges_m[inside], directions[inside])
-            beams, made, dropped = _beams(aimed, carrier, array, precoder)
+            beams, made, dropped = _beams(aimed, carrier, array, precoder, before, valid_at_ns)
             refused |= dropped
     if made is None:
         made = precode(np.empty((array.size, 0), dtype=complex), precoder)
-    left_out = tuple(LeftOut(uav, why) for uav, why in refused.items() if why is not None)
+    left_out = tuple(
+        LeftOut(uav, why, uav in dropped) for uav, why in refused.items() if why is not None
+    )
     return BeamSet(
         now_ns,
         valid_at_ns,
         beams,
         made.weights,
-        made.method,
+        steady.named(before, valid_at_ns, made.method, made.exact),
         made.normalisation,
         made.condition_number,
         left_out,
+        made.exact,
     )
 
 
@@ -101,20 +114,41 @@ class _Aimed(NamedTuple):
 
 
 def _beams(
-    aimed: _Aimed, carrier: Carrier, array: Array, precoder: Precoder
+    aimed: _Aimed,
+    carrier: Carrier,
+    array: Array,
+    precoder: Precoder,
+    before: Steady | None,
+    valid_at_ns: int,
 ) -> tuple[tuple[Beam, ...], Precoding, dict[str, str]]:
     """The beams, their weights, and the UAVs that the policy left out with the reason."""
     tracks, ranges_m, directions = aimed
-    bounds = [
-        _pointing_bound_rad(track, carrier, array, range_m)
-        for track, range_m in zip(tracks, ranges_m.tolist(), strict=True)
+    uavs = [track.uav for track in tracks]
+    each = list(zip(tracks, ranges_m.tolist(), strict=True))
+    bounds = [_pointing_bound_rad(track, carrier, array, range_m) for track, range_m in each]
+    usual = [
+        _usual_rad(track, carrier, array, range_m, bound)
+        for (track, range_m), bound in zip(each, bounds, strict=True)
     ]
-    spread = None
-    if precoder.widen:
-        widths = np.array([np.inf if bound is None else bound for bound in bounds])
-        spread = widening.spread(array, directions, widths)
+    wanted = [(0.0, 0.0) if b is None else (u, b) for u, b in zip(usual, bounds, strict=True)]
+    natural_rad = array.wavelength_m / max(float(shapes.aperture(array).lengths_m.max()), 1e-9)
+    shaped = steady.followed_rad(before, valid_at_ns, uavs, np.array(wanted), natural_rad)
+    spread = widening.spread(
+        array, directions, Uncertain(shaped[:, 0], shaped[:, 1], precoder.floor_db), precoder.widen
+    )
     matrix = steering.steering_matrix(array, directions) if spread is None else spread.centres
-    made = precode(matrix, precoder, spread, _priorities(tracks, precoder.priority))
+    worths = np.array([precoder.rate_weights.get(uav, 1.0) for uav in uavs])
+    made = precode(
+        matrix,
+        precoder,
+        spread,
+        _priorities(tracks, precoder.priority),
+        Radio(
+            link_budget.isotropic_snr(ranges_m, array, precoder.budget, precoder.uav_antennas),
+            worths,
+        ),
+        steady.turns(before, valid_at_ns, uavs),
+    )
     azimuths, elevations = steering.angles_rad(directions)
     served = matrix[:, made.served]
     gains = gain_db(served, made.weights).tolist()
@@ -123,7 +157,7 @@ def _beams(
     rates = line_of_sight.rates(tracks, carrier, array, ranges_m, directions)
     beams = tuple(
         Beam(
-            uav=tracks[i].uav,
+            uav=uavs[i],
             azimuth_rad=float(azimuths[i]),
             elevation_rad=float(elevations[i]),
             range_m=float(ranges_m[i]),
@@ -135,10 +169,13 @@ def _beams(
             loss_db=alone[column] - gains[column],
             group=int(made.groups[column]),
             widened=spread is not None and bool(spread.broadened[i]),
+            pointing_p95_rad=usual[i],
+            shaped_likely_rad=float(shaped[i, 0]),
+            shaped_bound_rad=float(shaped[i, 1]),
         )
         for column, i in enumerate(made.served.tolist())
     )
-    return beams, made, {tracks[user].uav: why for user, why in made.dropped.items()}
+    return beams, made, {uavs[user]: why for user, why in made.dropped.items()}
 
 
 def _priorities(tracks: Sequence[Track], priority: Sequence[str]) -> list[int]:
@@ -173,6 +210,29 @@ def _pointing_bound_rad(
     swung_m = swing * float(np.linalg.norm(array.lever_arm_m))
     seen = steering.pointing_bound_rad(track.bound_m + carrier.bound_m + swung_m, range_m)
     return None if seen is None else min(seen + carrier.attitude_bound_rad, math.pi)
+
+
+def _usual_rad(
+    track: Track, carrier: Carrier, array: Array, range_m: float, bound_rad: float | None
+) -> float:
+    """Angle that 95 of 100 predicted directions are off by at most, as far as is known.
+
+    Errors of positions and of the attitude have nothing to do with one another, so they add as
+    squares. What is not known is taken for ``UNKNOWN_SHARE`` of its bound (docs/math.md 5.3).
+    """
+
+    def usual(known: float | None, bound: float) -> float:
+        return UNKNOWN_SHARE * bound if known is None else min(known, bound)
+
+    attitude = usual(carrier.attitude_p95_rad, carrier.attitude_bound_rad)
+    swung_m = attitude * float(np.linalg.norm(array.lever_arm_m))
+    off_m = math.hypot(
+        usual(track.error_p95_m, track.bound_m),
+        usual(carrier.error_p95_m, carrier.bound_m),
+        swung_m,
+    )
+    seen = math.asin(min(off_m / range_m, 1.0))
+    return min(math.hypot(seen, attitude), math.pi if bound_rad is None else bound_rad)
 
 
 def _refusal(track: Track, place_ned_m: FloatArray | None) -> str | None:

@@ -115,7 +115,7 @@ def equipment(settings: Settings, antenna: geometry.Array) -> Equipment:
 
     Raises ``ConfigError``.
     """
-    kept, radio = settings.codebook, settings.radio
+    kept = settings.codebook
     codebook, calibration = None, None
     try:
         if kept.kind == "dft":
@@ -134,13 +134,13 @@ def equipment(settings: Settings, antenna: geometry.Array) -> Equipment:
     if calibration is not None and len(calibration.order) != antenna.size:
         channels = f"{len(calibration.order)} channels for {antenna.size} elements"
         raise ConfigError(f"hardware.calibration: {channels}")
-    budget = LinkBudget(radio.tx_power_dbm, radio.bandwidth_hz, radio.noise_figure_db)
-    return Equipment(codebook, calibration, budget, radio.uav_antennas)
+    return Equipment(codebook, calibration, *radio(settings))
 
 
 def precoder(settings: Settings) -> Precoder:
     """The method of making weights."""
     given = settings.beams
+    budget, antennas = radio(settings)
     return Precoder(
         given.method,
         given.policy,
@@ -150,7 +150,19 @@ def precoder(settings: Settings) -> Precoder:
         given.normalisation,
         given.priority,
         given.widen,
+        given.floor_db,
+        given.power,
+        given.rate_weights,
+        budget,
+        antennas,
     )
+
+
+def radio(settings: Settings) -> tuple[LinkBudget, int]:
+    """The link budget, and the antennas that each UAV combines."""
+    given = settings.radio
+    budget = LinkBudget(given.tx_power_dbm, given.bandwidth_hz, given.noise_figure_db)
+    return budget, given.uav_antennas
 
 
 def noise(settings: Settings) -> NoiseSettings:

@@ -15,7 +15,9 @@ from collections import Counter
 from collections.abc import Iterable
 from typing import Final
 
+from companion.beams import steady
 from companion.beams.aim import aim
+from companion.beams.steady import Steady
 from companion.mavlink.clock.estimates import ClockChange, ClockEstimate
 from companion.mavlink.wire.decode import DECODED
 from companion.mavlink.wire.stamps import STAMPED
@@ -66,6 +68,7 @@ class Pipeline:
         self.updates = 0
         self.restarts: Counter[str] = Counter()
         self.last_update: Update | None = None
+        self._steady: Steady | None = None  # changes with ticks alone, so that looks change nothing
         self.refusals = Refusals()
         self.digest = Digest()
         self.array = assembly.array(settings)
@@ -167,6 +170,7 @@ class Pipeline:
         self.updates += 1
         dropped = self._drop_silent(now_ns) if self.updates % DROP_EVERY == 0 else []
         self.last_update = self.look(now_ns)
+        self._steady = steady.after(self._steady, self.last_update.beams)
         states = {track.uav: track.state for track in self.last_update.tracks}
         if self.center.vehicle is not None:
             now = self.senders.time(self.center.vehicle, now_ns)
@@ -191,7 +195,8 @@ class Pipeline:
         tracks = self._tracks(self.targets.among(self.fleet.uavs), now_ns, valid_at_ns)
         found = self.carrier(now_ns, valid_at_ns)
         known, unfit = (None, found) if isinstance(found, str) else (found, None)
-        beams = aim(now_ns, valid_at_ns, tracks, known, self.array, self.precoder, self.coverage)
+        parts = (self.array, self.precoder, self.coverage, self._steady)
+        beams = aim(now_ns, valid_at_ns, tracks, known, *parts)
         return Update(now_ns, known, unfit, tuple(tracks), beams)
 
     def tracks(self, now_ns: int, valid_at_ns: int) -> list[Track]:

@@ -42,6 +42,9 @@ class BeamState(BaseModel):
     pointing_bound_deg: Annotated[
         float | None, Field(description="the true direction is within this; null: anywhere")
     ]
+    pointing_p95_deg: Annotated[
+        float | None, Field(description="95 of 100 true directions are usually within this")
+    ]
     guaranteed_sinr_db: float | None
     sinr_db: float | None
     codebook: StoredBeam | None

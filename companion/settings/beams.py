@@ -1,9 +1,10 @@
 """Settings of the array, the beams, the codebook, the hardware and the radio."""
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     AfterValidator,
+    BeforeValidator,
     Field,
     FiniteFloat,
     PositiveFloat,
@@ -11,7 +12,7 @@ from pydantic import (
 )
 
 from companion.settings.section import Section
-from companion.values import Method, Normalisation, Policy, UserError
+from companion.values import Method, Normalisation, Policy, Power, UserError, Widen
 
 Metres = Annotated[float, Field(ge=-1e4, le=1e4)]
 Position = tuple[Metres, Metres, Metres]
@@ -23,6 +24,13 @@ def _rising(interval: Interval) -> Interval:
     if not interval[0] < interval[1]:
         raise UserError("from and to, the first less than the second")
     return interval
+
+
+def _named_width(given: object) -> object:
+    """True and false as earlier settings had them: as wide as the bound, and sharp."""
+    if isinstance(given, bool):
+        return Widen.GUARANTEE if given else Widen.NO
+    return given
 
 
 def _once(names: tuple[str, ...]) -> tuple[str, ...]:
@@ -92,14 +100,23 @@ class BeamSettings(Section):
                            request over HTTP is answered with weights made for its own time
         actuation_delay_s  time from making weights to applying them
         targets            which tracks get beams
-        method             zero forcing, regularised zero forcing or maximum ratio
+        method             zero forcing ("zf"), regularised ("rzf"), least mean square error by the
+                           link budget ("mmse") or maximum ratio ("mrt")
         regularisation     loading of the regularised method, times the number of elements
         loss_limit_db      most that zero forcing may cost any UAV against a beam for it alone
         condition_limit    largest condition number of the steering matrix
         policy             what is done beyond either limit: load as little as will do, serve groups
                            in turns, or drop the UAVs of lowest priority
         priority           UAVs in descending order; the others follow in the order first heard
-        widen              make main lobes and nulls as wide as the pointing bound
+        widen              how wide beams are: "likely", for the error that is usual, over a floor
+                           within the pointing bound; "guarantee", for the bound: the greatest least
+                           gain within it; "no", sharp. Earlier settings' true is "guarantee", their
+                           false "no"
+        floor_db           that floor, over an isotropic element, where it leaves 3 dB to the best
+        power              how beams share the power: "equal", "max-min" (the least SINR is the
+                           greatest), "weighted-sum" (of rates); unset: as the normalisation makes
+                           them. With it the normalisation is "total" unless it is "antenna"
+        rate_weights       worth of a UAV's rate for "weighted-sum", by its name; 1 for the others
 
     ``condition_limit`` is at most 1000: up to there the zero-forcing identity holds to 1e-9, and
     its error grows with the square of the condition number.
@@ -115,7 +132,24 @@ class BeamSettings(Section):
     regularisation: Annotated[float, Field(gt=0, le=1e6)] = 0.01
     normalisation: Normalisation = Normalisation.UNIT_RESPONSE
     priority: Annotated[tuple[str, ...], AfterValidator(_once)] = ()
-    widen: bool = True
+    widen: Annotated[Widen, BeforeValidator(_named_width)] = Widen.LIKELY
+    floor_db: Annotated[float, Field(ge=-60, le=60)] = 2.5
+    power: Power | None = None
+    rate_weights: dict[str, Annotated[float, Field(gt=0, le=1e6)]] = Field(default_factory=dict)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _together(cls, given: Any) -> Any:
+        """Shares of power are seen in columns that are scaled together only."""
+        if isinstance(given, dict) and given.get("power") is not None:
+            return {"normalisation": Normalisation.TOTAL} | given
+        return given
+
+    @model_validator(mode="after")
+    def _shared(self) -> Self:
+        if self.power and self.normalisation not in (Normalisation.TOTAL, Normalisation.ANTENNA):
+            raise UserError('power goes with normalisation = "total" or "antenna"')
+        return self
 
 
 class CodebookSettings(Section):

@@ -19,6 +19,8 @@ from companion.values.aimed import (
     Method,
     Normalisation,
     Policy,
+    Power,
+    Widen,
 )
 from companion.values.errors import UserError
 from companion.values.numbers import (
@@ -91,6 +93,7 @@ __all__ = [
     "Notice",
     "Output",
     "Policy",
+    "Power",
     "Presence",
     "Reason",
     "Refuted",
@@ -108,6 +111,7 @@ __all__ = [
     "Update",
     "UserError",
     "Vector",
+    "Widen",
     "reports_itself",
     "vector",
 ]

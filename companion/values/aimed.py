@@ -7,14 +7,29 @@ from companion.values.numbers import ComplexArray
 
 
 class Method(StrEnum):
-    """How weights are made: zero forcing, regularised zero forcing, or maximum ratio transmission.
+    """How weights are made: zero forcing, regularised zero forcing, least mean square error of what
+    is received, or maximum ratio transmission.
 
     ``REGULARISED`` is also used in place of ``ZERO_FORCING`` where that would cost too much gain.
     """
 
     ZERO_FORCING = "zf"
     REGULARISED = "rzf"
+    MMSE = "mmse"
     MATCHED = "mrt"
+
+
+class Power(StrEnum):
+    """How the beams of one turn share the power.
+
+    EQUAL         alike
+    MAX_MIN       so that the least SINR is the greatest
+    WEIGHTED_SUM  so that the weighted sum of rates is great
+    """
+
+    EQUAL = "equal"
+    MAX_MIN = "max-min"
+    WEIGHTED_SUM = "weighted-sum"
 
 
 class Normalisation(StrEnum):
@@ -49,6 +64,19 @@ class Policy(StrEnum):
     DROP = "drop"
 
 
+class Widen(StrEnum):
+    """How wide beams are made.
+
+    LIKELY     for the angle within which the UAV usually is, over a floor within its bound
+    GUARANTEE  for the bound: the greatest least gain within it
+    NO         sharp
+    """
+
+    LIKELY = "likely"
+    GUARANTEE = "guarantee"
+    NO = "no"
+
+
 @dataclass(frozen=True, slots=True)
 class Beam:
     """One UAV's beam: where it points, how well, and how that direction changes.
@@ -65,7 +93,10 @@ class Beam:
     loss_db             what ``gain_db`` lacks against a beam for this UAV alone (maximum ratio)
     group               number of the turn in which the UAV is served; 0 unless the policy
                         groups
-    widened             True if the main lobe was broadened to the pointing bound
+    widened             True if the main lobe was broadened
+    pointing_p95_rad    angle between the predicted and the true direction that is usual at most
+    shaped_likely_rad   the likely angle and the bound for which the beam is shaped: they follow the
+    shaped_bound_rad    two above no faster than a beam may change its shape; 0: sharp
     """
 
     uav: str
@@ -80,14 +111,18 @@ class Beam:
     loss_db: float
     group: int = 0
     widened: bool = False
+    pointing_p95_rad: float | None = None
+    shaped_likely_rad: float = 0.0
+    shaped_bound_rad: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """A UAV that is tracked but has no beam, and the reason."""
+    """A UAV that is tracked but has no beam, and the reason; ``crowded`` if others are that."""
 
     uav: str
     reason: str
+    crowded: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +138,8 @@ class BeamSet:
         condition_number  of the steering matrix A in the 2-norm, columns scaled to equal length;
                           the largest over the groups; None without beams
         left_out          UAVs without a beam
+        exact             whether each UAV lies in a null of all other beams of its turn; ``method``
+                          says zero forcing only once that has been so for a while
 
     Zero forcing gives AᵀF = I within a group (no conjugate; diagonal under other normalisations):
     each UAV lies in a null of the others' beams. See docs/math.md 7.
@@ -116,6 +153,7 @@ class BeamSet:
     normalisation: Normalisation
     condition_number: float | None
     left_out: tuple[LeftOut, ...]
+    exact: bool = False
 
     @property
     def uavs(self) -> tuple[str, ...]:

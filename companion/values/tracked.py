@@ -212,6 +212,8 @@ class Carrier:
     bound_m             bound on the norm of the position error
     attitude_bound_rad  bound on the angle by which the attitude is off
     age_s               age of the newest report; None for a fixed station
+    error_p95_m         error that positions usually stay below; None where that is not known
+    attitude_p95_rad    angle by which the attitude usually is off at most; None likewise
     """
 
     valid_at_ns: int
@@ -222,3 +224,5 @@ class Carrier:
     bound_m: float
     attitude_bound_rad: float
     age_s: float | None
+    error_p95_m: float | None = None
+    attitude_p95_rad: float | None = None

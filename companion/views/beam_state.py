@@ -116,6 +116,7 @@ def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[J
             "group": beam.group,
             "widened": beam.widened,
             "pointing_bound_deg": degrees(beam.pointing_bound_rad),
+            "pointing_p95_deg": degrees(beam.pointing_p95_rad),
             "guaranteed_sinr_db": guaranteed_sinr[i],
             "sinr_db": float(sinr_db[i]) if np.isfinite(sinr_db[i]) else None,
             "codebook": _codebook_entry(pipeline, equipment, update, beam, towards[i]),

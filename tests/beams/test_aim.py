@@ -1,6 +1,7 @@
 """Aiming: who gets a beam, where it points, and what turning the world changes."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from companion.values import (
     Policy,
     Track,
     TrackState,
+    Widen,
 )
 
 EYE = np.eye(3)
@@ -352,16 +354,30 @@ def test_a_beam_says_that_it_was_widened() -> None:
     sure, vague = pointed(tracks, carrier(turn=Rotation.from_euler("z", 0.7).as_matrix())).beams
     assert (sure.widened, vague.widened) == (False, True)
     turned = carrier(turn=Rotation.from_euler("z", 0.7).as_matrix())
-    sharp = aim(7, 9, tracks, turned, ARRAY, Precoder(widen=False))
+    sharp = aim(7, 9, tracks, turned, ARRAY, Precoder(widen=Widen.NO))
     assert [beam.widened for beam in sharp.beams] == [False, False]
 
 
-def test_a_uav_that_can_be_anywhere_has_the_widest_beam() -> None:
+def test_a_uav_that_can_be_anywhere_has_a_sharp_beam() -> None:
+    """No floor could be kept, so none is paid for."""
     tracks = [track("a", (100, 20, 0), bound_m=0.1), track("b", (100, -60, 0), bound_m=500.0)]
     near, anywhere = pointed(tracks, carrier()).beams
-    assert (near.widened, anywhere.widened) == (False, True)
+    assert (near.widened, anywhere.widened) == (False, False)
     assert anywhere.pointing_bound_rad is None
-    assert anywhere.loss_db > 8.0
+    assert anywhere.loss_db < 1.0
+
+
+def test_the_usual_angle_is_that_of_both_positions_and_of_the_attitude() -> None:
+    """As squares; what is not known is a quarter of its bound, and nothing is beyond the bound."""
+    known = replace(track("a", (100, 0, 0), bound_m=8.0), error_p95_m=3.0)
+    at = carrier(bound_m=6.0, attitude_bound_rad=0.2)
+    at = replace(at, error_p95_m=4.0, attitude_p95_rad=0.04)
+    (beam,) = pointed([known], at).beams
+    assert beam.pointing_p95_rad == pytest.approx(math.hypot(math.asin(0.05), 0.04))
+    (beam,) = pointed([track("a", (100, 0, 0), bound_m=8.0)], carrier(attitude_bound_rad=0.2)).beams
+    assert beam.pointing_p95_rad == pytest.approx(math.hypot(math.asin(0.02), 0.05))
+    (beam,) = pointed([replace(known, bound_m=0.5)], carrier()).beams
+    assert beam.pointing_p95_rad == beam.pointing_bound_rad == pytest.approx(math.asin(0.005))
 
 
 def test_what_is_said_of_a_beam_is_of_its_own_uav_when_others_are_dropped() -> None:

@@ -8,16 +8,18 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from companion.beams.array.coverage import EVERYWHERE
 from companion.beams.weights.precoding import Precoder
+from companion.beams.worth.link_budget import LinkBudget
 from companion.pipeline import assembly
 from companion.settings.center import FixedCenter, HomeCenter, VehicleCenter, parse_center
 from companion.settings.files import load
 from companion.settings.model import BeamSettings, Settings
 from companion.settings.section import ConfigError
 from companion.settings.tracking import ObserverSettings
-from companion.values import Source
+from companion.values import Normalisation, Power, Source, Widen
 
 
 def refusal(text: str) -> str:
@@ -79,7 +81,7 @@ WRONG = [
     ("array", "lever_arm_m", "[1, 2]", "1, 2", "required"),
     ("array", "field_of_view_deg", "361", "361", "less than or equal to 360"),
     ("array", "azimuth_limits_deg", "[30, -30]", "30, -30", "first less than the second"),
-    ("beams", "method", '"best"', "best", "'zf', 'rzf' or 'mrt'"),
+    ("beams", "method", '"best"', "best", "'zf', 'rzf', 'mmse' or 'mrt'"),
     ("beams", "policy", '"pray"', "pray", "'regularise', 'group' or 'drop'"),
     ("beams", "normalisation", '"max"', "max", "'total' or 'antenna'"),
     ("beams", "loss_limit_db", "0", "0", "greater than 0"),
@@ -422,12 +424,32 @@ def test_the_equipment_is_the_one_that_is_described(tmp_path: Path) -> None:
 def test_the_precoder_is_the_one_that_is_described() -> None:
     given = {
         "method": "rzf", "policy": "drop", "loss_limit_db": 5.0, "condition_limit": 50.0,
-        "regularisation": 0.5, "normalisation": "antenna", "priority": ["2:1"], "widen": False,
+        "regularisation": 0.5, "normalisation": "antenna", "priority": ["2:1"], "widen": "no",
+        "floor_db": 1.5, "power": "max-min", "rate_weights": {"2:1": 3.0},
     }  # fmt: skip
     found = assembly.precoder(Settings().override(beams=given))
     for key, value in given.items():
         assert getattr(found, key) == (tuple(value) if isinstance(value, list) else value), key
     assert assembly.precoder(Settings()) == Precoder()
+    radio = {"tx_power_dbm": 30.0, "bandwidth_hz": 1e6, "noise_figure_db": 3.0, "uav_antennas": 1}
+    told = assembly.precoder(Settings().override(radio=radio))
+    assert (told.budget, told.uav_antennas) == (LinkBudget(30.0, 1e6, 3.0), 1)
+
+
+@pytest.mark.parametrize(
+    ("given", "means"),
+    [(True, Widen.GUARANTEE), (False, Widen.NO), ("likely", Widen.LIKELY), ("no", Widen.NO)],
+)
+def test_widths_of_earlier_settings_mean_what_they_meant(given: object, means: Widen) -> None:
+    assert BeamSettings.model_validate({"widen": given}).widen is means
+
+
+def test_shares_of_power_need_columns_that_are_scaled_together() -> None:
+    assert BeamSettings(power=Power.MAX_MIN).normalisation is Normalisation.TOTAL
+    both = BeamSettings(power=Power.EQUAL, normalisation=Normalisation.ANTENNA)
+    assert both.normalisation is Normalisation.ANTENNA
+    with pytest.raises(ValidationError, match="power goes with normalisation"):
+        BeamSettings(power=Power.EQUAL, normalisation=Normalisation.STREAM)
 
 
 def test_the_array_is_the_one_that_is_described() -> None:

@@ -1,59 +1,150 @@
 """Grouping: which users are served together, given what zero forcing may cost."""
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
-from companion.values import ComplexArray, IntArray
-
-Fits = Callable[[Sequence[int]], bool]
-"""Function that says whether zero forcing serves these users within the limits."""
+from companion.values import ComplexArray, FloatArray, IntArray
 
 
-def semi_orthogonal(steering: ComplexArray, order: Sequence[int], fits: Fits) -> list[IntArray]:
-    """Groups of users, each of which ``fits``, in the order in which they are served.
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What zero forcing may cost: the loss of any user, dB, and the condition number."""
+
+    loss_db: float
+    condition: float
+
+
+@dataclass(frozen=True, slots=True)
+class Turns:
+    """The turns of before: the number of each user's, -1 if left out; ``young`` if they are new."""
+
+    numbers: IntArray
+    young: bool
+
+
+LENIENT_DB: Final = 1.5
+"""What turns may cost beyond the limit while they are young."""
+
+
+def kept(steering: ComplexArray, before: Turns, limits: Limits) -> list[IntArray] | None:
+    """The groups of before, if they still do; None if others must be found."""
+    groups = [np.flatnonzero(before.numbers == n) for n in range(int(before.numbers.max()) + 1)]
+    most_db = limits.loss_db + (LENIENT_DB if before.young else 0.0)
+    if not groups or any(not len(g) or lost_db(steering[:, g], limits) > most_db for g in groups):
+        return None
+    return groups
+
+
+def lost_db(steering: ComplexArray, limits: Limits) -> float:
+    """What zero forcing costs the worst of the users, dB; infinite past the condition limit.
+
+    Judged with columns of one length: that elements radiate less towards a user brings him no
+    closer to another.
+    """
+    unit: ComplexArray = steering / np.linalg.norm(steering, axis=0)
+    return _lost_db(unit.T @ unit.conj(), len(steering), limits)
+
+
+def _lost_db(gram: ComplexArray, elements: int, limits: Limits) -> float:
+    if len(gram) > elements:
+        return math.inf
+    values, vectors = np.linalg.eigh(gram)
+    if values[0] <= 1e-14 or values[-1] > limits.condition**2 * values[0]:
+        return math.inf
+    worst = float((np.abs(vectors) ** 2 @ (1.0 / values)).max())
+    return 10 * math.log10(worst)
+
+
+class _Group:
+    """A group that grows: the inverse of its Gram matrix, bordered with each user it takes in."""
+
+    def __init__(self, gram: ComplexArray, first: int, elements: int, limits: Limits) -> None:
+        self.members = [first]
+        self._gram, self._elements, self._limits = gram, elements, limits
+        self._inverse: ComplexArray = np.array([[1.0 / gram[first, first]]])
+
+    def take(self, user: int) -> bool:
+        """Take a user in if all fit."""
+        if len(self.members) >= self._elements:
+            return False
+        beside = self._gram[self.members, user]
+        moved = self._inverse @ beside
+        rest = float((self._gram[user, user] - beside.conj() @ moved).real)
+        if rest <= 1e-12:
+            return False
+        losses = np.append(self._inverse.diagonal().real + np.abs(moved) ** 2 / rest, 1.0 / rest)
+        if losses.max() > 10 ** (self._limits.loss_db / 10) or not self._told_apart(user, losses):
+            return False
+        count = len(self.members)
+        inverse = np.empty((count + 1, count + 1), dtype=complex)
+        inverse[:count, :count] = self._inverse + np.outer(moved, moved.conj()) / rest
+        inverse[:count, count] = -moved / rest
+        inverse[count, :count] = inverse[:count, count].conj()
+        inverse[count, count] = 1.0 / rest
+        self._inverse = inverse
+        self.members.append(user)
+        return True
+
+    def _told_apart(self, user: int, losses: FloatArray) -> bool:
+        """Whether the condition number is within its limit.
+
+        Its square is at most the product of the traces, which mostly settles it.
+        """
+        square = self._limits.condition**2
+        if len(losses) * float(losses.sum()) <= square:
+            return True
+        together = [*self.members, user]
+        values = np.linalg.eigvalsh(self._gram[np.ix_(together, together)])
+        return bool(values[-1] <= square * values[0])
+
+
+def semi_orthogonal(steering: ComplexArray, order: Sequence[int], limits: Limits) -> list[IntArray]:
+    """Groups of users, each within the limits, in the order in which they are served.
 
         steering  A, (M, N)
         order     users in descending priority
-        fits      whether a set of users can be served together
+        limits    what zero forcing may cost
 
     Each group begins with the highest priority that is left. It then takes in, again and again, the
     user with the largest part outside the span of the group, while all of it fits (semi-orthogonal
     user selection: Yoo and Goldsmith 2006, with the cost of zero forcing itself as the threshold;
-    docs/math.md 7).
+    docs/math.md 7). The parts outside are kept up by pivoted Cholesky of the Gram matrix.
     """
-    left = list(order)
-    groups = []
     unit: ComplexArray = steering / np.linalg.norm(steering, axis=0)
-    while left:
-        group = [left.pop(0)]
-        outside = _less(unit, group[0])
-        while left:
-            apart = np.sum(np.abs(outside[:, left]) ** 2, axis=0)
-            best = left[int(np.argmax(apart))]
-            if not fits([*group, best]):
+    gram = unit.conj().T @ unit
+    left = np.ones(steering.shape[1], dtype=bool)
+    groups = []
+    for begin in order:
+        if not left[begin]:
+            continue
+        group = _Group(gram, begin, len(steering), limits)
+        left[begin] = False
+        factors: list[ComplexArray] = []
+        apart = np.ones(len(gram))
+        taken = begin
+        while left.any():
+            row = gram[taken].copy()
+            for factor in factors:
+                row -= factor[taken].conj() * factor
+            factors.append(row / math.sqrt(max(apart[taken], 1e-300)))
+            apart = apart - np.abs(factors[-1]) ** 2
+            best = int(np.argmax(np.where(left, apart, -np.inf)))
+            if not group.take(best):
                 break
-            group.append(best)
-            left.remove(best)
-            outside = _less(outside, best)
-        groups.append(np.sort(np.array(group)))
+            left[best] = False
+            taken = best
+        groups.append(np.sort(np.array(group.members)))
     return groups
 
 
-def without_the_lowest(order: Sequence[int], fits: Fits) -> IntArray:
+def without_the_lowest(steering: ComplexArray, order: Sequence[int], limits: Limits) -> IntArray:
     """The users kept: by descending priority, each that fits with those kept before."""
-    kept: list[int] = []
-    for user in order:
-        if not kept or fits([*kept, user]):
-            kept.append(user)
-    return np.sort(np.array(kept))
-
-
-def _less(outside: ComplexArray, taken: int) -> ComplexArray:
-    """Parts of all users (M, N) outside the span of a group, once one more belongs to it.
-
-    This is a step of the modified Gram-Schmidt process.
-    """
-    axis = outside[:, taken] / np.linalg.norm(outside[:, taken])
-    rest: ComplexArray = outside - np.outer(axis, axis.conj() @ outside)
-    return rest
+    unit: ComplexArray = steering / np.linalg.norm(steering, axis=0)
+    kept = _Group(unit.conj().T @ unit, order[0], len(steering), limits)
+    for user in order[1:]:
+        kept.take(user)
+    return np.sort(np.array(kept.members))

@@ -20,15 +20,27 @@ Over 300 lines: the ways of making weights fall back on one another.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 
-from companion.beams.weights import grouping, zero_forcing
-from companion.beams.weights.widening import SOFT_LOADINGS, Spread, nulled, power_gains, widen_nulls
-from companion.values import ComplexArray, FloatArray, IntArray, Method, Normalisation, Policy
+from companion.beams.weights import grouping, powers, zero_forcing
+from companion.beams.weights.grouping import Turns
+from companion.beams.weights.nulls import nulled
+from companion.beams.weights.widening import Spread, power_gains
+from companion.beams.worth.link_budget import LinkBudget
+from companion.values import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    Method,
+    Normalisation,
+    Policy,
+    Power,
+    Widen,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +54,12 @@ class Precoder:
     regularisation   x / M where RZF itself is the method
     normalisation    how the columns are scaled
     priority         names of UAVs in descending order; those not named follow as they come
-    widen            make main lobes and nulls as wide as the pointing bounds
+    widen            how wide main lobes and nulls are
+    floor_db         least gain that a likely beam keeps within the bound, where it can
+    power            how beams share the power; None: as the normalisation makes them
+    rate_weights     worth of each UAV's rate where their weighted sum counts, by name; else 1
+    budget           power and noise of the radio
+    uav_antennas     antennas that each UAV combines
     """
 
     method: Method = Method.ZERO_FORCING
@@ -52,7 +69,12 @@ class Precoder:
     regularisation: float = 0.01
     normalisation: Normalisation = Normalisation.UNIT_RESPONSE
     priority: tuple[str, ...] = ()
-    widen: bool = True
+    widen: Widen = Widen.LIKELY
+    floor_db: float = 2.5
+    power: Power | None = None
+    rate_weights: Mapping[str, float] = field(default_factory=dict)
+    budget: LinkBudget = field(default_factory=lambda: LinkBudget(20.0, 50e6, 7.0))
+    uav_antennas: int = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,12 +92,27 @@ class Precoding:
     served: IntArray  # (K,), indices of the users served
     groups: IntArray  # (K,), the turn of each
     dropped: dict[int, str]  # why a user is not served, by index
+    exact: bool = False  # whether A^T F is diagonal within each group
+
+
+@dataclass(frozen=True, slots=True)
+class Radio:
+    """What the radio makes of N users.
+
+    snr      (N,), of an isotropic antenna that has the whole power, as a power ratio
+    worths   (N,), what each one's rate is worth
+    """
+
+    snr: FloatArray
+    worths: FloatArray
+
+    def of(self, users: IntArray) -> "Radio":
+        """The part that concerns some of the users."""
+        return Radio(self.snr[users], self.worths[users])
 
 
 LEAST_LOADING: Final = 1e-12
 """Least loading where RZF itself is the method, as a share of the trace of the Gram matrix."""
-LEAST_WIDE_LOADING: Final = 1e-6
-"""The same for broadened beams, of which rounding alone may be left with less."""
 ROUNDING: Final = 1e-11
 """Response to another user, over that to the own user, above which it is removed."""
 LOADINGS: Final = np.logspace(-6, 6, 49)
@@ -87,6 +124,8 @@ def precode(
     settings: Precoder,
     spread: Spread | None = None,
     priorities: Sequence[int] | None = None,
+    radio: Radio | None = None,
+    before: Turns | None = None,
 ) -> Precoding:
     """Weights for a steering matrix (M, N).
 
@@ -94,8 +133,11 @@ def precode(
         settings    how weights are made
         spread      how main lobes and nulls are widened; None: not at all
         priorities  users in descending priority; None: as they come
+        radio       needed where the method is MMSE or power is shared by rates
+        before      who was served when; None: nobody was
 
-    Raises ``ValueError`` for a steering vector that is not finite or is 0.
+    Raises ``ValueError`` for a steering vector that is not finite or is 0, and without a radio
+    where one is needed.
     """
     size, users = steering.shape
     power = np.einsum("mn,mn->n", steering.real, steering.real)
@@ -103,62 +145,83 @@ def precode(
     if not (np.isfinite(power).all() and (power > 0).all()):
         raise ValueError("a steering vector is 0, or holds what is not a number")
     everyone = np.arange(users)
-    turns, dropped = np.zeros(users, dtype=np.int64), dict[int, str]()
     if users == 0:
         nothing: ComplexArray = np.empty((size, 0), dtype=complex)
         return Precoding(
-            nothing, settings.method, settings.normalisation, None, everyone, turns, {}
+            nothing, settings.method, settings.normalisation, None, everyone, everyone, {}
         )
-    plain = _columns(steering, settings, spread, everyone)
-    groups, made = [everyone], [plain]
-    if not plain.fit and settings.policy is not Policy.REGULARISE:
-        order = list(range(users)) if priorities is None else list(priorities)
-
-        def fits(some: Sequence[int]) -> bool:
-            return _fits(steering, settings, spread, np.sort(np.array(some)))
-
-        if settings.policy is Policy.GROUP:
-            groups = grouping.semi_orthogonal(steering, order, fits)
-        else:
-            groups = [grouping.without_the_lowest(order, fits)]
-            lost_db = plain.zero_forcing_loss_db
-            cost = f"cost {lost_db:.0f} dB" if np.isfinite(lost_db) else "pass the limits"
-            why = f"too close to one of higher priority: to tell all apart would {cost}"
-            dropped = dict.fromkeys(set(order).difference(groups[0].tolist()), why)
-        made = [_columns(steering, settings, spread, group) for group in groups]
+    groups, dropped = _turns(steering, settings, priorities, before)
+    made = [_columns(steering, settings, spread, radio, group) for group in groups]
     served = np.sort(np.concatenate(groups))
     weights: ComplexArray = np.empty((size, len(served)), dtype=complex)
+    turns = np.zeros(users, dtype=np.int64)
     for turn, (group, one) in enumerate(zip(groups, made, strict=True)):
         turns[group] = turn
-        weights[:, np.searchsorted(served, group)] = one.weights
+        shared = _shared(steering[:, group], one.weights, settings, radio, group)
+        weights[:, np.searchsorted(served, group)] = shared
     method = max((one.method for one in made), key=_METHODS.index)
     condition = max(one.condition_number for one in made)
     _normalise(weights, settings.normalisation, turns[served])
     return Precoding(
-        weights, method, settings.normalisation, condition, served, turns[served], dropped
-    )
+        weights, method, settings.normalisation, condition, served, turns[served], dropped,
+        method is Method.ZERO_FORCING,
+    )  # fmt: skip
 
 
-_METHODS: Final = (Method.ZERO_FORCING, Method.REGULARISED, Method.MATCHED)
+_METHODS: Final = (Method.ZERO_FORCING, Method.REGULARISED, Method.MMSE, Method.MATCHED)
+
+
+def _turns(
+    steering: ComplexArray,
+    settings: Precoder,
+    priorities: Sequence[int] | None,
+    before: Turns | None,
+) -> tuple[list[IntArray], dict[int, str]]:
+    """Who is served together, and who is not served and why.
+
+    What was before stays while it does, for a while at least, and until there are fewer turns or
+    more are served.
+    """
+    everyone = np.arange(steering.shape[1])
+    if settings.policy is Policy.REGULARISE or settings.method is not Method.ZERO_FORCING:
+        return [everyone], {}
+    limits = grouping.Limits(settings.loss_limit_db, settings.condition_limit)
+    lost_db = grouping.lost_db(steering, limits)
+    stays = None if before is None else grouping.kept(steering, before, limits)
+    young = before is not None and before.young
+    if lost_db <= settings.loss_limit_db and not (young and stays is not None):
+        return [everyone], {}
+    order = everyone.tolist() if priorities is None else list(priorities)
+    if settings.policy is Policy.GROUP:
+        found = stays if stays is not None and young else None
+        if found is None:
+            found = grouping.semi_orthogonal(steering, order, limits)
+        return stays if stays is not None and len(stays) <= len(found) else found, {}
+    if stays is not None and young:
+        kept = stays[0]
+    else:
+        kept = grouping.without_the_lowest(steering, order, limits)
+        kept = stays[0] if stays is not None and len(stays[0]) >= len(kept) else kept
+    cost = f"cost {lost_db:.0f} dB" if np.isfinite(lost_db) else "pass the limits"
+    why = f"too close to one of higher priority: to tell all apart would {cost}"
+    return [kept], dict.fromkeys(set(order).difference(kept.tolist()), why)
 
 
 @dataclass(frozen=True, slots=True)
 class _Columns:
-    """Columns with unit response for some users.
-
-    fit                   True if they were made by the method asked for, within its limits
-    zero_forcing_loss_db  what plain zero forcing costs the worst of them
-    """
+    """Columns with unit response for some users."""
 
     weights: ComplexArray
     method: Method
     condition_number: float
-    fit: bool = True
-    zero_forcing_loss_db: float = 0.0
 
 
 def _columns(
-    steering: ComplexArray, settings: Precoder, spread: Spread | None, users: IntArray
+    steering: ComplexArray,
+    settings: Precoder,
+    spread: Spread | None,
+    radio: Radio | None,
+    users: IntArray,
 ) -> _Columns:
     a = steering if len(users) == steering.shape[1] else steering[:, users]
     lengths = np.linalg.norm(a, axis=0)
@@ -170,108 +233,92 @@ def _columns(
         case Method.MATCHED:
             own = a.conj() if wide is None else wide.beams
             return _Columns(_unit_response(a, own), Method.MATCHED, condition)
-        case Method.REGULARISED:
+        case Method.REGULARISED | Method.MMSE:
             gram = a.T @ a.conj()
-            least = LEAST_LOADING if wide is None else LEAST_WIDE_LOADING
-            loading = max(settings.regularisation * len(a), least * float(gram.trace().real))
-            if wide is None:
-                found = _loaded(a, gram, loading)
-            else:
-                centred = nulled(wide, loading)
-                keep = power_gains(a, wide.beams) * 10 ** (-settings.loss_limit_db / 10)
-                found = widen_nulls(wide, loading, centred, keep)
-            return _Columns(_unit_response(a, found), Method.REGULARISED, condition)
+            least = LEAST_LOADING * float(gram.trace().real)
+            loading = np.full(len(users), max(settings.regularisation * len(a), least))
+            if settings.method is Method.MMSE:
+                loading = np.maximum(_mmse_loading(gram, settings, radio, users), least)
+            found = _loaded(a, gram, loading) if wide is None else nulled(wide, loading).weights
+            return _Columns(_unit_response(a, found), settings.method, condition)
         case Method.ZERO_FORCING:
-            made = _zero_forcing(even, gram, condition, wide, settings)
+            made = _zero_forcing(even, gram, condition, settings) if wide is None else None
+            if made is None:
+                assert wide is not None
+                return _wide_zero_forcing(a, wide, condition, settings)
             return replace(made, weights=made.weights / lengths)
 
 
-def _fits(
-    steering: ComplexArray, settings: Precoder, spread: Spread | None, users: IntArray
-) -> bool:
-    """Whether zero forcing of the predicted directions alone is within the limits.
+def _mmse_loading(
+    gram: ComplexArray, settings: Precoder, radio: Radio | None, users: IntArray
+) -> FloatArray:
+    """Loading of each user for the least mean square error at his share of the power.
 
-    Judged as in ``_columns``, but without the cost of wide nulls and without making other weights.
+    The share is equal, or the one that the same power has in the other direction where the worst
+    rate or the weighted sum is greatest.
     """
-    a = steering[:, users]
-    even: ComplexArray = a / np.linalg.norm(a, axis=0)
-    if _condition_number(even, even.T @ even.conj()) > settings.condition_limit:
-        return False
-    if spread is None:
-        solved = zero_forcing.solve(even)
-        return solved is not None and _db(solved.loss_factors.max()) <= settings.loss_limit_db
-    wide = spread.of(users)
-    kept = power_gains(wide.centres, nulled(wide, 0.0))
-    return _lost_db(power_gains(wide.centres, wide.beams), kept) <= settings.loss_limit_db
+    if radio is None:
+        raise ValueError("MMSE needs to know the radio")
+    snr = radio.snr[users]
+    match settings.power:
+        case Power.MAX_MIN:
+            return 1 / (snr * powers.dual_of_max_min(gram, snr))
+        case Power.WEIGHTED_SUM:
+            return 1 / (snr * powers.dual_of_weighted_sum(gram, snr, radio.worths[users]))
+        case _:
+            return len(users) / snr
+
+
+def _shared(
+    a: ComplexArray,
+    weights: ComplexArray,
+    settings: Precoder,
+    radio: Radio | None,
+    users: IntArray,
+) -> ComplexArray:
+    """Columns (M, K) of a turn with the power shared as the settings say; else as they are."""
+    if settings.power is None:
+        return weights
+    unit: ComplexArray = weights / np.linalg.norm(weights, axis=0)
+    if settings.power is Power.EQUAL:
+        return unit
+    if radio is None:
+        raise ValueError("to share power by rates the radio has to be known")
+    coupling = radio.snr[users, np.newaxis] * np.abs(a.T @ unit) ** 2
+    if settings.power is Power.MAX_MIN:
+        share = powers.max_min(coupling)
+    else:
+        share = powers.weighted_sum(coupling, radio.worths[users])
+    shared: ComplexArray = unit * np.sqrt(share)
+    return shared
 
 
 def _zero_forcing(
-    a: ComplexArray,
-    gram: ComplexArray,
-    condition: float,
-    wide: Spread | None,
-    settings: Precoder,
+    a: ComplexArray, gram: ComplexArray, condition: float, settings: Precoder
 ) -> _Columns:
     """Zero forcing where its cost is within the limits, else the least loading that is.
 
     The columns of ``a`` (M, N) have unit length.
     """
-    lost_db = np.inf
     if condition <= settings.condition_limit:
-        if wide is None:
-            solved = zero_forcing.solve(a)
-            lost_db = np.inf if solved is None else _db(solved.loss_factors.max())
-            if solved is not None and lost_db <= settings.loss_limit_db:
-                return _Columns(solved.weights, Method.ZERO_FORCING, condition, True, lost_db)
-        else:
-            found, lost_db = _wide_zero_forcing(wide, settings)
-            if lost_db <= settings.loss_limit_db:
-                exact = _unit_response(a, _exactly(a, found))
-                return _Columns(exact, Method.ZERO_FORCING, condition, True, lost_db)
-    loading = _least_loading(a, gram, settings)
-    found = _loaded(a, gram, loading) if wide is None else _wide_loaded(wide, loading, settings)
-    return _Columns(_unit_response(a, found), Method.REGULARISED, condition, False, lost_db)
+        solved = zero_forcing.solve(a)
+        if solved is not None and _db(solved.loss_factors.max()) <= settings.loss_limit_db:
+            return _Columns(solved.weights, Method.ZERO_FORCING, condition)
+    loading = np.full(a.shape[1], _least_loading(a, gram, settings))
+    found = _loaded(a, gram, loading)
+    return _Columns(_unit_response(a, found), Method.REGULARISED, condition)
 
 
-def _wide_zero_forcing(wide: Spread, settings: Precoder) -> tuple[ComplexArray, float]:
-    """Broadened beams that null the others exactly, and what that costs the worst of them, dB."""
-    alone = power_gains(wide.centres, wide.beams)
-    least = alone * 10 ** (-settings.loss_limit_db / 10)
-    for soft in SOFT_LOADINGS[:2]:
-        found = nulled(wide, 0.0, soft)
-        kept = power_gains(wide.centres, found)
-        if (kept >= least).all():
-            return found, _lost_db(alone, kept)
-    centred = nulled(wide, 0.0)
-    kept = power_gains(wide.centres, centred)
-    if (kept >= least).all():
-        centred = widen_nulls(wide, 0.0, centred, least, SOFT_LOADINGS[2:])
-    return centred, _lost_db(alone, kept)
-
-
-def _wide_loaded(wide: Spread, loading: float, settings: Precoder) -> ComplexArray:
-    """Broadened beams, loaded enough that none loses more than the limit against itself alone.
-
-    The load is a multiple of each one's power, at least ``loading``.
-    """
-    power = np.einsum("mn,mn->n", wide.centres, wide.centres.conj()).real
-    least = power_gains(wide.centres, wide.beams) * 10 ** (-settings.loss_limit_db / 10)
-
-    def keeps(centred: ComplexArray) -> bool:
-        return bool((power_gains(wide.centres, centred) >= least).all())
-
-    centred, too_little = nulled(wide, loading * power), loading
-    while loading < LOADINGS[-1] and not keeps(centred):
-        too_little, loading = loading, 8.0 * loading
-        centred = nulled(wide, loading * power)
-    for _ in range(3 if loading > too_little else 0):
-        between = math.sqrt(too_little * loading)
-        tried = nulled(wide, between * power)
-        if keeps(tried):
-            loading, centred = between, tried
-        else:
-            too_little = between
-    return widen_nulls(wide, loading * power, centred, least)
+def _wide_zero_forcing(
+    a: ComplexArray, wide: Spread, condition: float, settings: Precoder
+) -> _Columns:
+    """Shaped beams with nulls on the others: exact where no beam's least gain would suffer."""
+    told_apart = condition <= settings.condition_limit
+    found = nulled(wide, exact=settings.policy is not Policy.REGULARISE and told_apart)
+    if told_apart and found.exact.all():
+        exact = _unit_response(a, _exactly(a, found.weights))
+        return _Columns(exact, Method.ZERO_FORCING, condition)
+    return _Columns(_unit_response(a, found.weights), Method.REGULARISED, condition)
 
 
 def _exactly(a: ComplexArray, found: ComplexArray) -> ComplexArray:
@@ -288,12 +335,6 @@ def _exactly(a: ComplexArray, found: ComplexArray) -> ComplexArray:
     return exact
 
 
-def _lost_db(alone: FloatArray, kept: FloatArray) -> float:
-    """Gain that the worst user loses against its beam alone, dB; infinite where it loses all."""
-    worst = float((kept / alone).min())
-    return -_db(worst) if worst > 0 else np.inf
-
-
 def _unit_response(a: ComplexArray, weights: ComplexArray) -> ComplexArray:
     """Columns scaled so that each UAV receives 1 from its own."""
     scaled: ComplexArray = weights / np.einsum("mn,mn->n", a, weights)
@@ -304,14 +345,16 @@ def _db(power_ratio: float) -> float:
     return 10 * float(np.log10(power_ratio))
 
 
-def _loaded(a: ComplexArray, gram: ComplexArray, loading: float) -> ComplexArray:
-    """A* (A^T A* + x I)^-1, by the smaller of the two matrices that can be inverted for it."""
+def _loaded(a: ComplexArray, gram: ComplexArray, loading: FloatArray) -> ComplexArray:
+    """A* (A^T A* + X)^-1, X (N,), by the smaller of the two matrices that will do."""
     if len(gram) <= len(a):
-        found: ComplexArray = a.conj() @ np.linalg.inv(gram + loading * np.eye(len(gram)))
+        loaded = gram.copy()
+        loaded.flat[:: len(loaded) + 1] += loading
+        found: ComplexArray = a.conj() @ np.linalg.inv(loaded)
         return found
-    outer = a.conj() @ a.T
-    few: ComplexArray = np.linalg.inv(outer + loading * np.eye(len(a))) @ a.conj()
-    return few
+    scaled = a.conj() / loading
+    solved = np.linalg.solve(np.eye(len(a)) + scaled @ a.T, scaled)
+    return np.asarray(solved, dtype=complex)
 
 
 def _condition_number(a: ComplexArray, gram: ComplexArray) -> float:

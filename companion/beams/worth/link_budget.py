@@ -63,6 +63,15 @@ class LinkBudget:
         return float(thermal_w * 10 ** (self.noise_figure_db / 10))
 
 
+def isotropic_snr(
+    ranges_m: FloatArray, array: Array, budget: LinkBudget, uav_antennas: int = 1
+) -> FloatArray:
+    """SNR (N,) at UAVs in free space if an isotropic antenna had the whole power."""
+    path_gains = uav_antennas * free_space_gain(ranges_m, array.wavelength_m)
+    found: FloatArray = path_gains * (budget.tx_power_w / budget.noise_power_w)
+    return found
+
+
 def share_power(
     weights: ComplexArray, power_w: float, groups: IntArray | None = None
 ) -> ComplexArray:

@@ -35,7 +35,7 @@ from companion.settings.model import Settings
 from companion.studies.beams.worth import Row, Sample, Worth, summed_up
 from companion.studies.truth import array_truth
 from companion.studies.truth.array_truth import ArrayTruth
-from companion.values import BeamSet, Carrier, FloatArray, Track, Update, UserError
+from companion.values import BeamSet, Carrier, FloatArray, Track, Update, UserError, Widen
 
 TOLD_EVERY: Final = 20
 """Looks between two reports of progress."""
@@ -193,14 +193,14 @@ def look(seen: Sight, update: Update, truth: ArrayTruth | None, t_s: float) -> l
     truly = _true_directions(update.tracks, carrier, pipeline, truth)
     as_set = update.beams
     sharp = as_set
-    if pipeline.precoder.widen:
+    if pipeline.precoder.widen is not Widen.NO:
         sharp = aim(
             update.t_ns,
             as_set.valid_at_ns,
             update.tracks,
             carrier,
             pipeline.array,
-            replace(pipeline.precoder, widen=False),
+            replace(pipeline.precoder, widen=Widen.NO),
             pipeline.coverage,
         )
     worths = [seen.worths(beam_set, carrier, truly) for beam_set in (as_set, sharp)]
@@ -299,7 +299,7 @@ def watch(
         f"{array.size} elements ({array.kind}) at {settings.array.frequency_hz * 1e-9:g} GHz",
         None if seen.codebook is None else seen.codebook.size,
         None if truth is None else truth.kind,
-        pipeline.precoder.widen,
+        pipeline.precoder.widen is not Widen.NO,
         looks,
         tuple(samples),
     )

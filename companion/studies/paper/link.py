@@ -20,12 +20,12 @@ from companion.beams.worth.link_budget import LinkBudget
 from companion.studies.paper import probing
 from companion.studies.paper.circles import Flight
 from companion.studies.paper.probing import EchoProbing
-from companion.values import ComplexArray, FloatArray
+from companion.values import ComplexArray, FloatArray, Widen
 
 FREQUENCY_HZ: Final = 30e9
 UAV_ANTENNAS: Final = 4
 BUDGET: Final = LinkBudget(tx_power_dbm=30.0, bandwidth_hz=50e6, noise_figure_db=7.0)
-PRECODER: Final = Precoder(widen=False)
+PRECODER: Final = Precoder(widen=Widen.NO)
 PROBING: Final = EchoProbing(dwell_s=0.005, position_gain=0.9, rate_gain=0.5)
 """Baseline at its best: it listens half of all time, and a tracker of rates follows the turn."""
 MEAN_BLOCKAGE_S: Final = 0.5

@@ -17,10 +17,10 @@ from companion.beams.array.geometry import (
     uniform_linear,
     uniform_rectangular,
 )
-from companion.beams.weights.precoding import Precoder, Precoding, gain_db, precode
-from companion.beams.weights.widening import spread
+from companion.beams.weights.precoding import Precoder, Precoding, Radio, gain_db, precode
+from companion.beams.weights.widening import Uncertain, spread
 from companion.settings.model import BeamSettings
-from companion.values import ComplexArray, FloatArray, Method, Normalisation, Policy
+from companion.values import ComplexArray, FloatArray, Method, Normalisation, Policy, Widen
 
 EYE = np.eye(3)
 SINES = st.floats(-0.999, 0.999)
@@ -82,7 +82,8 @@ def test_zero_forcing_gives_each_its_own_and_nothing_of_the_others(
     directions = somewhere(data, users)
     a = steering.steering_matrix(array, directions)
     bounds = np.random.default_rng(seed).uniform(0, 0.1, users)
-    wide = spread(array, directions, bounds) if widen else None
+    known = Uncertain(bounds / 4, bounds)
+    wide = spread(array, directions, known, Widen.GUARANTEE) if widen else None
     found = precode(a, Precoder(), wide)
     assert found.weights.shape == (16, users)
     assert np.all(np.isfinite(found.weights))
@@ -360,7 +361,8 @@ def test_power_is_what_its_name_says(
     a = steering.steering_matrix(any_array(seed), somewhere(data, users))
 
     def made(how: Normalisation) -> Precoding:
-        return precode(a, Precoder(method, policy, normalisation=how))
+        radio = Radio(np.full(users, 0.5), np.ones(users))
+        return precode(a, Precoder(method, policy, normalisation=how), None, None, radio)
 
     plain, stream, total, antenna = map(made, Normalisation)
     response = np.diag(a[:, plain.served].T @ plain.weights)

@@ -1,0 +1,109 @@
+"""What keeps beams steady: their shapes, method and turns follow what is known, but not at once.
+
+A report changes what is known of a UAV from one moment to the next, by a factor over a slow radio.
+A beam's shape follows at a limited pace. A method and a set of turns are kept for a while after
+they were chosen, unless they no longer do. The state is that of the last tick of the pipeline.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from companion.beams.weights.grouping import Turns
+from companion.values import BeamSet, FloatArray, Method
+
+PACE: Final = 3.0
+"""Most by which the angles of a shape grow or shrink in a second, as a factor."""
+PACE_WIDTHS: Final = 3.0
+"""Most by which they shrink in a second, in natural widths, and half of what they grow.
+
+The phases at the ends of the aperture go with the width itself.
+"""
+LEAST_RAD: Final = 1e-3
+"""Angle that counts as none: where growth by factors begins."""
+KEPT_NS: Final = 500_000_000
+"""Time for which a method and turns are kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class Steady:
+    """What the beams of the last tick were.
+
+    valid_at_ns  for when they were made
+    shaped       the likely angle and the bound of each UAV's shape, radians
+    turns        the turn of each UAV; those left out are missing
+    known        the UAVs that could have a beam
+    turned_ns    since when these UAVs have had these turns
+    inexact_ns   when last a UAV did not lie in all nulls; None: never
+    """
+
+    valid_at_ns: int
+    shaped: Mapping[str, tuple[float, float]]
+    turns: Mapping[str, int]
+    known: frozenset[str]
+    turned_ns: int
+    inexact_ns: int | None
+
+
+def after(before: Steady | None, made: BeamSet) -> Steady:
+    """The state once these beams were made."""
+    turns = {beam.uav: beam.group for beam in made.beams}
+    same = before is not None and before.turns == turns
+    inexact_ns = None if before is None else before.inexact_ns
+    return Steady(
+        made.valid_at_ns,
+        {beam.uav: (beam.shaped_likely_rad, beam.shaped_bound_rad) for beam in made.beams},
+        turns,
+        frozenset(turns) | {out.uav for out in made.left_out if out.crowded},
+        before.turned_ns if before is not None and same else made.valid_at_ns,
+        inexact_ns if made.exact else made.valid_at_ns,
+    )
+
+
+def followed_rad(
+    before: Steady | None,
+    valid_at_ns: int,
+    uavs: list[str],
+    wanted_rad: FloatArray,
+    natural_rad: float,
+) -> FloatArray:
+    """Angles (N, 2) for which beams are shaped, at the most so far from the last ones.
+
+    before       the last beams; None: none
+    valid_at_ns  for when beams are made
+    uavs         names of the N UAVs
+    wanted_rad   (N, 2), their likely angles and their bounds
+    natural_rad  the natural width of the array
+    """
+    if before is None:
+        return wanted_rad
+    passed_s = abs(valid_at_ns - before.valid_at_ns) * 1e-9
+    last = np.array([before.shaped.get(uav, (np.nan, np.nan)) for uav in uavs])
+    last = np.maximum(last, LEAST_RAD)
+    further = np.minimum(last * (PACE**passed_s - 1), 2 * PACE_WIDTHS * natural_rad * passed_s)
+    nearer = np.minimum(last * (1 - PACE**-passed_s), PACE_WIDTHS * natural_rad * passed_s)
+    followed: FloatArray = np.where(
+        np.isnan(last), wanted_rad, np.clip(wanted_rad, last - nearer, last + further)
+    )
+    return followed
+
+
+def turns(before: Steady | None, valid_at_ns: int, uavs: list[str]) -> Turns | None:
+    """The turns of these UAVs before, and whether it is too early to leave them.
+
+    None if there were other UAVs. The turn of one that was left out is -1.
+    """
+    if before is None or before.known != frozenset(uavs):
+        return None
+    numbers = np.array([before.turns.get(uav, -1) for uav in uavs])
+    return Turns(numbers, valid_at_ns - before.turned_ns < KEPT_NS)
+
+
+def named(before: Steady | None, valid_at_ns: int, method: Method, exact: bool) -> Method:
+    """The name of a method: zero forcing only where it has been exact for a while."""
+    if method is not Method.ZERO_FORCING or before is None or before.inexact_ns is None:
+        return method
+    since_ns = valid_at_ns - before.inexact_ns
+    return method if exact and since_ns >= KEPT_NS else Method.REGULARISED

@@ -1,0 +1,161 @@
+"""Nulls towards the other UAVs, as deep as the least gain over a beam's own cone lets them be.
+
+A beam g reaches the points p of the others by r_p = a_p^T g. What is taken off,
+
+    f = g - S* (S^T S* + X)^-1 (s r),     0 <= s_p <= 1,     s = 0 at the user's own points,
+
+leaves (1 - s_p) r_p there and its own points as they are: exactly where X is 0, at the predicted
+directions, and in the sense of least squares at the points around them. Each s_p is what is
+allowed by
+
+* the price: with c_p the correlation of a_p with the user's own a and q_p that with g, taking off
+  this one alone costs the gain 1 + s^2 q^2 / (1 - c^2), of which each may cost at most ``PRICE``;
+* the floor: within a user's own cone no less may be left than the least gain that he is to have,
+  and outside so much less of it as the null is further from the cone.
+
+At last all of it is taken back by one factor for each beam until the least gain over its cone, and
+over the likely part of it, has lost no more than ``FLOOR_PRICE_DB``, nor what was above isotropic
+fallen below it. All of this follows the directions without a step. See docs/math.md 5.5.
+"""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from companion.beams.weights.widening import Spread
+from companion.values import BoolArray, ComplexArray, FloatArray
+
+PRICE: Final = 0.6
+"""Gain, over the gain that is left, that one null may cost: 2 dB."""
+FLOOR_PRICE_DB: Final = 3.0
+"""Most that all nulls of a beam may take off its least gain."""
+ABOVE: Final = 1.2
+"""Least gain that is kept if it was there: what is sampled at 1.2 is surely above 1."""
+NOTHING: Final = 1e-9
+"""Least gain that is no gain."""
+NULL_WIDTHS: Final = 1.0
+"""Natural widths from a cone's edge at which a null no longer reaches into it."""
+SOFT: Final = 0.02
+"""Loading of the points around a predicted direction, as a share of their power."""
+ROUNDING: Final = 1e-10
+"""Loading of the predicted directions, as a share of their power, against rounding."""
+BACK: Final = np.array([1.0, 0.85, 0.7, 0.5, 0.3, 0.15, 0.0])
+"""Shares of the nulls that are tried."""
+
+
+class Nulled(NamedTuple):
+    """Beams (M, N) with nulls, and whether each predicted direction (N,) is left wholly dark."""
+
+    weights: ComplexArray
+    exact: BoolArray
+
+
+def nulled(spread: Spread, noise: FloatArray | None = None, exact: bool = False) -> Nulled:
+    """The beams of a spread with nulls on one another.
+
+    spread  how wide beams and nulls are
+    noise   (N,), loading of each predicted direction, for the least mean square error; None: 0
+    exact   predicted directions are nulled wholly, whatever it costs
+    """
+    users, each = spread.beams.shape[1], spread.each
+    if users == 1:
+        return Nulled(spread.beams.copy(), np.ones(1, dtype=bool))
+    fields = spread.cones.fields(spread.beams)
+    power = np.einsum("mn,mn->n", spread.beams, spread.beams.conj()).real
+    least, inner = _least(spread, fields.real**2 + fields.imag**2, power)
+    kept = _kept(least)
+    shares = _shares(spread, kept, power)
+    if exact:
+        shares[::each] = 1.0
+    own = np.arange(users)
+    wanted = (spread.reached * shares).reshape(users, each, users)
+    wanted[own, :, own] = 0.0
+    taken = _taken(spread, wanted.reshape(-1, users), noise)
+    back = np.ones(users)
+    if not exact:
+        back = _back(spread, taken, fields, power, (kept, _kept(inner)))
+    whole = shares[::each] >= 1.0
+    whole[own, own] = True
+    return Nulled(spread.beams - back * taken, whole.all(axis=0) & (back >= 1.0))
+
+
+def _least(spread: Spread, towards: FloatArray, power: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Least gains (N,) over the cones and over their likely parts, of powers (N, P)."""
+    held = np.where(spread.cones.held, towards, np.inf).min(axis=1)
+    likely = np.where(spread.cones.likely, towards, np.inf).min(axis=1)
+    return held / power, likely / power
+
+
+def _kept(least: FloatArray) -> FloatArray:
+    """The least gains that nulls must leave."""
+    lowered = np.maximum(least * 10 ** (-FLOOR_PRICE_DB / 10), np.minimum(least, ABOVE))
+    kept: FloatArray = np.maximum(lowered, NOTHING)
+    return kept
+
+
+def _shares(spread: Spread, kept: FloatArray, power: FloatArray) -> FloatArray:
+    """How much of what reaches each point is taken off, (N K, N)."""
+    reached = np.abs(spread.reached)
+    lengths = spread.gram.diagonal().real
+    lengths = np.maximum(lengths, 1e-12 * lengths.max())
+    centres = lengths[:: spread.each]
+    alike = np.abs(spread.gram[:, :: spread.each]) ** 2 / np.outer(lengths, centres)
+    cost = reached**2 / np.outer(lengths, power) / np.maximum(1.0 - alike, 1e-12)
+    priced = np.sqrt(PRICE / np.maximum(cost, PRICE))
+    near = np.clip(1.0 - spread.outside / NULL_WIDTHS, 0.0, 1.0) ** 2
+    left = np.sqrt(kept * power) * near
+    floored = 1.0 - np.minimum(left / np.maximum(reached, 1e-300), 1.0)
+    shares: FloatArray = np.minimum(priced, floored)
+    return shares
+
+
+def _taken(spread: Spread, wanted: ComplexArray, noise: FloatArray | None) -> ComplexArray:
+    """The least change (M, N) of the beams that takes ``wanted`` (N K, N) off the points."""
+    points, gram, each = spread.points, spread.gram, spread.each
+    power = gram.diagonal().real
+    loads = np.maximum(SOFT * power, ROUNDING * power.max())
+    loads[::each] = ROUNDING * power.max()
+    if noise is not None:
+        loads[::each] += noise
+    if len(loads) > len(points):
+        # More points than elements: the smaller matrix, by S* (G + X)^-1 = (S* X^-1 S^T + 1)^-1 S*
+        # X^-1.
+        scaled = points.conj() / loads
+        few = scaled @ points.T
+        few.flat[:: len(few) + 1] += 1.0
+        found: ComplexArray = np.linalg.solve(few, scaled @ wanted)
+        return found
+    loaded = gram.copy()
+    loaded.flat[:: len(loaded) + 1] += loads
+    taken: ComplexArray = points.conj() @ np.linalg.solve(loaded, wanted)
+    return taken
+
+
+def _back(
+    spread: Spread,
+    taken: ComplexArray,
+    fields: ComplexArray,
+    power: FloatArray,
+    kept: tuple[FloatArray, FloatArray],
+) -> FloatArray:
+    """The share (N,) of the nulls up to which the least gains are kept, by interpolation."""
+    less = spread.cones.fields(taken)
+    cross = np.einsum("mn,mn->n", spread.beams.conj(), taken).real
+    own = np.einsum("mn,mn->n", taken.conj(), taken).real
+    worst = np.full((len(BACK), len(power)), np.inf)
+    for row, share in enumerate(BACK.tolist()):
+        towards = fields - share * less
+        left = np.maximum(power - 2 * share * cross + share**2 * own, 1e-300)
+        least = _least(spread, towards.real**2 + towards.imag**2, left)
+        worst[row] = np.minimum(least[0] / kept[0], least[1] / kept[1])
+        if row == 0 and (worst[0] >= 1.0).all():
+            return np.ones(len(power))
+    enough = worst >= 1.0
+    enough[-1] = True
+    first = np.argmax(enough, axis=0)
+    before, users = np.maximum(first - 1, 0), np.arange(len(power))
+    high, low = worst[first, users], worst[before, users]
+    part = np.clip((1.0 - low) / np.maximum(high - low, 1e-12), 0.0, 1.0)
+    part = np.where(first == 0, 1.0, part)
+    back: FloatArray = BACK[before] + part * (BACK[first] - BACK[before])
+    return back

@@ -1,0 +1,202 @@
+"""Phases over the aperture that make a beam as wide as is wanted, interpolated from tables.
+
+One amplifier feeds each element, so all radiate alike and their phases alone shape the beam. Widths
+are in natural beams: an angle e across an aperture D is w = e D / wavelength. The tables were
+searched for offline (``docs/make_beam_shapes.py``) for 64 elements on a line and 16 x 16 in a
+square; in apertures from the middle, their phases serve any number. See docs/math.md 5.5.
+"""
+
+import functools
+import io
+import itertools
+from collections.abc import Mapping
+from importlib import resources
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from companion.beams.array.geometry import Array
+from companion.values import FloatArray, IntArray
+
+TABLES: Final = "shapes.npz"
+MOST: Final = 0.375
+"""Widest beam in natural widths for each element: beyond it they are too far apart to shape one."""
+LEAST_SHARE: Final = 1 / 16
+"""Least ratio of the widths on the two axes of a plane that its shapes follow."""
+
+
+class Shapes(NamedTuple):
+    """The tables of one kind of aperture; phases are psi over it, times 2 pi w in radians.
+
+    places     (n,), where the phases are, in apertures from the middle; on each axis of a square
+    widths     (W,), ascending
+    sure       (W, K), the greatest least gain within the width
+    least_db   (W,), that gain over the number of elements
+    cones      (C,), ascending
+    ratios     (R,), the cone's width over the likely one, ascending from 1
+    losses_db  (L,), by how much the floor over the cone is below the greatest least gain
+    likely     (L, C, R, K), the greatest mean gain over the likely error, above that floor
+    """
+
+    places: FloatArray
+    widths: FloatArray
+    sure: FloatArray
+    least_db: FloatArray
+    cones: FloatArray
+    ratios: FloatArray
+    losses_db: FloatArray
+    likely: FloatArray
+
+
+@functools.cache
+def _tables() -> Mapping[str, Shapes]:
+    """The tables of a line and of a square."""
+    file = resources.files(__package__) / TABLES
+    with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as held:
+        return {
+            name: Shapes(
+                (np.arange(count) - (count - 1) / 2) / count,
+                held[f"{name}_widths"],
+                held[f"{name}_sure"].astype(float),
+                held[f"{name}_least_db"],
+                held[f"{name}_cones"],
+                1 / held[f"{name}_ratios"],
+                held[f"{name}_losses_db"],
+                held[f"{name}_likely"].astype(float) @ even.T,
+            )
+            for name, count, even in (
+                ("line", 64, _even(64)),
+                ("square", 16, np.kron(_even(16), _even(16))),
+            )
+        }
+
+
+def _even(count: int) -> FloatArray:
+    """What is even over an aperture (count, count / 2), from its half, the middle first."""
+    half = count // 2
+    return np.concatenate([np.eye(half)[::-1], np.eye(half)])
+
+
+class Aperture(NamedTuple):
+    """An array as its shapes see it: a line, or a plane with two axes.
+
+    shapes     the tables
+    axes       (D, 3), the line, or the two axes of the plane, array frame
+    lengths_m  (D,), those of uniform apertures with the same variance
+    most       (D,), the widest beam in natural widths that elements so far apart can make
+    placed     (M, D), the elements in apertures from the middle
+    knots      (K, M), interpolation from a line's table to its elements; empty for a plane
+    """
+
+    shapes: Shapes
+    axes: FloatArray
+    lengths_m: FloatArray
+    most: FloatArray
+    placed: FloatArray
+    knots: FloatArray
+
+
+@functools.lru_cache(maxsize=8)
+def aperture(array: Array) -> Aperture:
+    """The aperture of an array; cached by array."""
+    counts = np.array([array.size]) if array.axis is not None else np.full(2, array.size**0.5)
+    if array.grid is not None:
+        axes = np.eye(3)[[place for place in (1, 2) if array.grid[2 - place] > 1] or [1]]
+        counts = np.array([max(array.grid)] if len(axes) == 1 else array.grid[::-1])
+    elif array.axis is not None:
+        axes = array.axis[np.newaxis]
+    else:
+        axes = np.linalg.eigh(array.variance_m2)[1].T[:0:-1]
+    variances = np.einsum("dk,kl,dl->d", axes, array.variance_m2, axes)
+    # So many points a step apart have the variance of a line of sqrt(n^2 - 1) steps.
+    longer = counts / np.sqrt(np.maximum(counts**2 - 1.0, 1e-9))
+    lengths_m = np.sqrt(12 * np.maximum(variances, 0.0)) * np.where(counts > 1, longer, 0.0)
+    placed = array.centred_m @ axes.T / np.maximum(lengths_m, 1e-300)
+    shapes = _tables()["line" if len(axes) == 1 else "square"]
+    knots = np.zeros((len(shapes.places), array.size if len(axes) == 1 else 0))
+    if len(axes) == 1:
+        before, share = _between(shapes.places, placed[:, 0])
+        knots[before, np.arange(array.size)] = 1 - share
+        knots[before + 1, np.arange(array.size)] = share
+    return Aperture(shapes, axes, lengths_m, MOST * counts, placed, knots)
+
+
+def phases_rad(
+    across: Aperture, cones: FloatArray, likely: FloatArray | None, floor_db: float = 0.0
+) -> FloatArray:
+    """Phases (N, M) of N beams.
+
+        across    the aperture
+        cones     (N, D), widths that a UAV may be off on each axis
+        likely    (N, D), widths that it likely is off; None: only the cone counts
+        floor_db  least gain over the cone that is wanted beside a likely width, over an isotropic
+                  element; it is kept where it leaves ``losses_db[0]`` to the best that there is
+
+    They follow all of it without a step, to 0 where the widths are 0.
+    """
+    cones = np.minimum(cones, across.most)
+    width = cones.max(axis=1)
+    shapes = across.shapes
+    if likely is None:
+        psi = _sure(shapes, width)
+    else:
+        best_db = np.interp(np.log(np.maximum(width, 1e-9)), np.log(shapes.widths), shapes.least_db)
+        loss_db = best_db + 10 * np.log10(len(across.placed)) - floor_db
+        psi = _likely(shapes, width, np.minimum(likely, cones).max(axis=1), loss_db)
+    if len(across.axes) == 1:
+        found = psi @ across.knots
+    else:
+        shares = cones / np.maximum(width, 1e-300)[:, np.newaxis]
+        shares = np.sqrt(np.maximum(shares, LEAST_SHARE))
+        found = _on_square(shapes, psi, across.placed * shares[:, np.newaxis])
+    phases: FloatArray = 2 * np.pi * width[:, np.newaxis] * found
+    return phases
+
+
+def _between(knots: FloatArray, at: FloatArray) -> tuple[IntArray, FloatArray]:
+    """The knot (ascending) before each place, and what share the next one has; onward beyond."""
+    before = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
+    return before, (at - knots[before]) / (knots[before + 1] - knots[before])
+
+
+def _on_logs(knots: FloatArray, at: FloatArray) -> tuple[IntArray, FloatArray]:
+    """The same by logarithms, and no further than the ends."""
+    inside = np.clip(at, knots[0], knots[-1])
+    before, share = _between(np.log(knots), np.log(inside))
+    return before, np.clip(share, 0.0, 1.0)
+
+
+def _sure(shapes: Shapes, widths: FloatArray) -> FloatArray:
+    before, share = _on_logs(shapes.widths, widths)
+    part = share[:, np.newaxis]
+    found: FloatArray = (1 - part) * shapes.sure[before] + part * shapes.sure[before + 1]
+    return found
+
+
+def _likely(
+    shapes: Shapes, cones: FloatArray, likely: FloatArray, losses_db: FloatArray
+) -> FloatArray:
+    places = [
+        _on_logs(shapes.losses_db, losses_db),
+        _on_logs(shapes.cones, cones),
+        _on_logs(shapes.ratios, np.maximum(cones, 1e-300) / np.maximum(likely, 1e-300)),
+    ]
+    found = np.zeros((len(cones), shapes.likely.shape[-1]))
+    for corner in itertools.product((0, 1), repeat=3):
+        before = tuple(at + more for (at, _), more in zip(places, corner, strict=True))
+        parts = [
+            share if more else 1 - share for (_, share), more in zip(places, corner, strict=True)
+        ]
+        found += np.prod(parts, axis=0)[:, np.newaxis] * shapes.likely[before]
+    return found
+
+
+def _on_square(shapes: Shapes, psi: FloatArray, placed: FloatArray) -> FloatArray:
+    """Phases psi (N, n n) of a square at places (N, M, 2), bilinear."""
+    users, count = np.arange(len(psi))[:, np.newaxis], len(shapes.places)
+    grid = psi.reshape(-1, count, count)
+    (i, j), (a, b) = zip(*(_between(shapes.places, placed[:, :, d]) for d in (0, 1)), strict=True)
+    before = (1 - b) * grid[users, i, j] + b * grid[users, i, j + 1]
+    after = (1 - b) * grid[users, i + 1, j] + b * grid[users, i + 1, j + 1]
+    found: FloatArray = (1 - a) * before + a * after
+    return found

@@ -1,0 +1,96 @@
+"""Beams that stay: shapes change at their pace, names and turns not at every update."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from companion.beams import steady
+from companion.beams.aim import aim
+from companion.beams.array.geometry import uniform_linear
+from companion.beams.steady import Steady
+from companion.beams.weights.precoding import Precoder
+from companion.values import (
+    BeamSet,
+    Carrier,
+    Limits,
+    Method,
+    Policy,
+    Track,
+    TrackState,
+    Widen,
+)
+
+STILL = np.zeros(3)
+AT = Carrier(0, STILL, STILL, np.eye(3), STILL, 0.0, 0.0, None)
+ARRAY = uniform_linear(64, 30e9, 0.5, np.eye(3))
+TICK_NS = 100_000_000
+
+
+def track(uav: str, aside_m: float, bound_m: float) -> Track:
+    return Track(
+        uav, TrackState.LIVE, 0, 0.1, np.array([100.0, aside_m, 0.0]), None, None, None, bound_m,
+        bound_m, bound_m, STILL, bound_m, Limits(60.0, 5.0), None, 0.0, None, None, None, None, 1,
+    )  # fmt: skip
+
+
+def flown(
+    bounds_m: list[float], how: Precoder, apart_m: list[float] | None = None
+) -> list[BeamSet]:
+    """A UAV whose bound changes from tick to tick, and one beside it."""
+    state: Steady | None = None
+    found = []
+    for tick, bound_m in enumerate(bounds_m):
+        at_ns = tick * TICK_NS
+        aside_m = 60.0 if apart_m is None else apart_m[tick]
+        tracks = [track("a", 0.0, bound_m), track("b", aside_m, 0.1)]
+        found.append(aim(at_ns, at_ns, tracks, AT, ARRAY, how, before=state))
+        state = steady.after(state, found[-1])
+    return found
+
+
+@pytest.mark.parametrize("widen", [Widen.LIKELY, Widen.GUARANTEE])
+@pytest.mark.parametrize("bounds_m", [[2.0] + [30.0] * 40, [30.0] + [2.0] * 60, [90.0, 300.0] * 9])
+def test_no_shape_jumps_when_a_report_comes(widen: Widen, bounds_m: list[float]) -> None:
+    made = flown(bounds_m, Precoder(widen=widen))
+    gains = [each.beams[0].gain_db for each in made]
+    assert np.abs(np.diff(gains)).max() < 1.5
+    for one, other in itertools.pairwise(made):
+        assert abs(np.vdot(one.weights[:, 0], other.weights[:, 0])) > 0.75 * (
+            np.linalg.norm(one.weights[:, 0]) * np.linalg.norm(other.weights[:, 0])
+        )
+
+
+def test_in_the_end_the_shape_is_the_one_that_is_wanted() -> None:
+    made = flown([2.0] + [30.0] * 60, Precoder())
+    (alone, _) = flown([30.0], Precoder())[0].beams
+    assert made[-1].beams[0].shaped_bound_rad == pytest.approx(alone.shaped_bound_rad)
+    assert made[-1].beams[0].gain_db == pytest.approx(alone.gain_db, abs=0.01)
+    assert made[1].beams[0].shaped_bound_rad < alone.shaped_bound_rad
+    assert made[1].beams[0].pointing_bound_rad == pytest.approx(math.asin(0.3))
+
+
+def test_zero_forcing_is_named_only_once_it_lasts() -> None:
+    """Through a place in which two cannot be told apart, and out of it again and again."""
+    near, far = 0.05, 60.0
+    apart = [far] * 3 + [near] + [far] * 3 + [near] + [far] * 9
+    names = [each.method for each in flown([0.1] * len(apart), Precoder(), apart)]
+    assert set(names[:3]) == {Method.ZERO_FORCING}
+    assert set(names[3:12]) == {Method.REGULARISED}
+    assert set(names[12:]) == {Method.ZERO_FORCING}
+
+
+@pytest.mark.parametrize("policy", [Policy.GROUP, Policy.DROP])
+def test_turns_do_not_change_to_and_fro(policy: Policy) -> None:
+    """About the distance at which zero forcing costs as much as it may."""
+    apart = [1.38 + 0.06 * math.sin(2.1 * tick) for tick in range(40)]
+    how = Precoder(policy=policy, widen=Widen.NO, priority=("b", "a"))
+    sizes = [len(set(each.uavs)) + 10 * each.groups for each in flown([0.1] * 40, how, apart)]
+    fresh = [
+        len(set(each.uavs)) + 10 * each.groups
+        for aside_m in apart
+        for each in flown([0.1], how, [aside_m])
+    ]
+    assert np.count_nonzero(np.diff(fresh)) > 10
+    assert np.count_nonzero(np.diff(sizes)) <= 8

@@ -1,0 +1,113 @@
+"""Shapes: against least gains by the sums written out, and against bounds that need no search."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.beams.array.geometry import Array, listed, uniform_linear, uniform_rectangular
+from companion.beams.weights import shapes
+from companion.values import FloatArray
+
+EYE = np.eye(3)
+
+
+def line(elements: int) -> Array:
+    return uniform_linear(elements, 30e9, 0.5, EYE)
+
+
+def gains_db(phases_rad: FloatArray, width: float) -> FloatArray:
+    """Gains of a half-wave line over +-width natural beams, by the sum over elements."""
+    elements = len(phases_rad)
+    places = np.arange(elements) / elements
+    field = np.exp(
+        2j * np.pi * np.outer(np.linspace(-width, width, 1601), places) + 1j * phases_rad
+    )
+    gains: FloatArray = 20 * np.log10(np.abs(field.sum(axis=1))) - 10 * np.log10(elements)
+    return gains
+
+
+def sure(elements: int, width: float) -> FloatArray:
+    phases: FloatArray = shapes.phases_rad(
+        shapes.aperture(line(elements)), np.array([[width]]), None
+    )[0]
+    return phases
+
+
+# The greatest least gain of 64 elements with any amplitudes, by the linear programme of
+# docs/make_beam_shapes.py, dB; phases alone come near it.
+ALL_DB = {0.25: 17.20, 0.5: 15.05, 1.0: 13.29, 2.0: 11.07, 4.0: 8.52, 8.0: 5.76, 10.0: 4.84}
+
+
+@pytest.mark.parametrize("width", ALL_DB)
+def test_the_least_gain_of_a_line_is_near_that_of_free_amplitudes(width: float) -> None:
+    least = gains_db(sure(64, width), width).min()
+    assert ALL_DB[width] - 1.2 < least < ALL_DB[width] + 0.01
+
+
+@pytest.mark.parametrize(("elements", "most"), [(16, 4.0), (256, 10.0)])
+def test_one_table_serves_other_numbers_of_elements(elements: int, most: float) -> None:
+    for width in (0.25, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 8.0, 10.0):
+        if width <= most:
+            here = gains_db(sure(elements, width), width).min() - 10 * np.log10(elements)
+            there = gains_db(sure(64, width), width).min() - 10 * np.log10(64)
+            assert here == pytest.approx(there, abs=0.4)
+
+
+@pytest.mark.parametrize("cone", [1.0, 2.0, 4.0, 8.0])
+@pytest.mark.parametrize("likely", [0.3, 0.6])
+@pytest.mark.parametrize("floor_db", [0.0, 2.5])
+def test_a_likely_shape_has_its_floor_and_gains_by_it(
+    cone: float, likely: float, floor_db: float
+) -> None:
+    """No lower than asked (or 3 dB below the best), and in the middle above the sure shape."""
+    across = shapes.aperture(line(64))
+    cones, usual = np.array([[cone]]), np.array([[likely]])
+    (phases,) = shapes.phases_rad(across, cones, usual, floor_db)
+    best = gains_db(sure(64, cone), cone)
+    found = gains_db(phases, cone)
+    assert found.min() > min(floor_db, best.min() - 3.0) - 2.2
+    assert found[800] > best[800] + 0.7
+    assert found[800] > 11.5
+
+
+def test_no_width_is_no_shape() -> None:
+    across = shapes.aperture(line(64))
+    nothing = shapes.phases_rad(across, np.zeros((2, 1)), np.zeros((2, 1)))
+    assert np.abs(nothing).max() < 1e-9
+    assert np.abs(shapes.phases_rad(across, np.zeros((1, 1)), None)).max() < 1e-9
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.floats(0.01, 30.0), st.floats(0.01, 1.0), st.floats(-5.0, 8.0), st.booleans())
+def test_shapes_follow_widths_without_a_step(
+    cone: float, ratio: float, floor_db: float, plane: bool
+) -> None:
+    array = uniform_rectangular(8, 8, 30e9, 0.5, EYE) if plane else line(64)
+    across = shapes.aperture(array)
+    many = len(across.axes)
+
+    def at(cone: float, likely: float, floor_db: float) -> FloatArray:
+        found: FloatArray = shapes.phases_rad(
+            across, np.full((1, many), cone), np.full((1, many), likely), floor_db
+        )
+        return found
+
+    here = at(cone, ratio * cone, floor_db)
+    nearby = [(cone * 1.0001, ratio * cone, floor_db), (cone, ratio * cone * 1.0001, floor_db)]
+    for moved in (at(*each) for each in [*nearby, (cone, ratio * cone, floor_db + 1e-4)]):
+        assert np.abs(np.exp(1j * moved) - np.exp(1j * here)).max() < 0.1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_any_array_has_finite_phases(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    for count in (1, 2, 5, 24):
+        places = rng.uniform(-0.05, 0.05, (count, 3))
+        across = shapes.aperture(listed(places, 30e9, EYE))
+        shape = (4, len(across.axes))
+        cones = rng.uniform(0, 40, shape)
+        for likely in (None, cones * rng.random(shape)):
+            phases = shapes.phases_rad(across, cones, likely)
+            assert phases.shape == (4, count)
+            assert np.isfinite(phases).all()

@@ -6,7 +6,7 @@ is allowed.
 
 import difflib
 import tomllib
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import tomli_w
 from pydantic import ValidationError
@@ -28,6 +28,9 @@ from companion.settings.mavlink import (
 from companion.settings.outlets import RecordingSettings, ServerSettings
 from companion.settings.section import ConfigError, Section
 from companion.settings.tracking import ClockSettings, ObserverSettings
+
+NEAR: Final = 0.7
+"""Likeness (difflib's ratio) from which on a setting may have been meant by another name."""
 
 
 class Settings(Section):
@@ -83,14 +86,16 @@ def _meant(place: tuple[int | str, ...]) -> str:
     """The setting whose name is nearest, as the end of a message; empty where none is near."""
     section, *keys = map(str, place)
     if not keys:
-        near = difflib.get_close_matches(section, Settings.model_fields, 1)
+        near = difflib.get_close_matches(section, Settings.model_fields, 1, NEAR)
         owners = [
             name for name, field in Settings.model_fields.items() if section in _keys(field.default)
         ]
         if owners and not near:
             return f"; did you mean {owners[0]}.{section}?"
         return f"; did you mean {near[0]}?" if near else ""
-    near = difflib.get_close_matches(keys[0], _keys(Settings.model_fields[section].default), 1)
+    near = difflib.get_close_matches(
+        keys[0], _keys(Settings.model_fields[section].default), 1, NEAR
+    )
     return f"; did you mean {section}.{near[0]}?" if near else ""
 
 

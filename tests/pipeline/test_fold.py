@@ -181,7 +181,6 @@ def test_beams_on_hovering_uavs_are_where_the_scenario_has_them(
             assert beam.range_m == pytest.approx(np.linalg.norm(ned), abs=0.1)
             assert beam.azimuth_rad == pytest.approx(math.atan2(y, x), abs=2e-3)
             assert beam.elevation_rad == pytest.approx(math.asin(-z), abs=2e-3)
-        assert not update.beams.regularised
 
 
 def test_the_truth_is_within_the_bounds_of_the_paper_s_flight(paper: list[Event]) -> None:

@@ -131,15 +131,15 @@ def test_weights_hz_is_all_or_above_0(value: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "key"),
+    ("text", "said"),
     [
-        ("[tracks]\nstale = 4\n", "tracks.stale"),
-        ("[radar]\nrange = 4\n", "radar"),
-        ("source = '5:1'\n", "source"),
+        ("[tracks]\nstale = 4\n", "tracks.stale is not a setting; did you mean tracks.stale_s?"),
+        ("[radar]\nrange = 4\n", "radar is not a setting"),
+        ("source = '5:1'\n", "source is not a setting; did you mean center.source?"),
     ],
 )
-def test_a_key_that_is_no_setting_is_named(text: str, key: str) -> None:
-    assert refusal(text) == f"{key} is not a setting"
+def test_a_key_that_is_no_setting_is_named(text: str, said: str) -> None:
+    assert refusal(text) == said
 
 
 def test_a_section_is_a_table() -> None:

@@ -6,6 +6,8 @@
 // is asked at the same moment, or a fast UAV would seem to be beside its own beam. In all they are
 // five requests a second.
 
+import { authorised, setUpToken } from "./token.js";
+
 const BEAT_MS = 850;
 const TIMEOUT_MS = 2000;
 const BACKOFF_MAX_MS = 2000;
@@ -119,11 +121,12 @@ export class Feed {
     const timer = setTimeout(() => abort.abort(), TIMEOUT_MS);
     let answer = null;
     try {
-      const response = await fetch(path, {
+      const response = await authorised(path, {
         signal: abort.signal, cache: "no-store", headers: { Accept: "application/json" },
       });
       if (!response.ok && !this.statuses?.includes(response.status)) {
-        throw new Error(`the service answered ${response.status}`);
+        throw new Error(response.status === 401 ? "the service asks for a token"
+          : `the service answered ${response.status}`);
       }
       const data = await response.json();
       if (!this.accepts(data)) throw new Error("the answer is not what was asked for");
@@ -190,6 +193,10 @@ export function startPolling(context, onAnswer) {
     feeds[name] = new Feed(name, settings, everything, () => onAnswer(name));
   }
   const wakeAll = () => Object.values(feeds).forEach((feed) => feed.wake());
+  setUpToken(() => {
+    wakeAll();
+    findRecordings(known);
+  });
   window.addEventListener("online", wakeAll);
   document.addEventListener("visibilitychange", () => document.hidden || wakeAll());
   // Once the caller has the feeds: what its context says depends on them.
@@ -201,7 +208,7 @@ export function startPolling(context, onAnswer) {
 /** Whether the service offers its recordings: asked once, for asking in vain is an error. */
 async function findRecordings(known) {
   try {
-    const api = await (await fetch("/openapi.json")).json();
+    const api = await (await authorised("/openapi.json")).json();
     known.hasRecordings = "/v1/recordings" in api.paths;
   } catch {
     // without the document nothing is known of recordings, and none are shown

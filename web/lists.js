@@ -2,6 +2,7 @@
 
 import { $, make, setChildren } from "./dom.js";
 import * as format from "./format.js";
+import { authorised, hasToken } from "./token.js";
 
 const EVENTS_SHOWN = 60;
 export const SEVERITY_LEVEL = { info: "", warning: "warn", error: "bad" };
@@ -58,7 +59,21 @@ export function showEvents(answer) {
 function recordingItem({ name, bytes, state }) {
   const href = `/v1/recordings/${encodeURIComponent(name)}`;
   const link = make("a", { href, download: "" }, name);
+  link.addEventListener("click", (event) => {
+    if (!hasToken()) return;
+    event.preventDefault();
+    download(href, name);
+  });
   return make("li", {}, link, make("span", {}, [format.bytes(bytes), state].join(" · ")));
+}
+
+/** A link brings no token, so what needs one is fetched first and then handed over. */
+async function download(href, name) {
+  const response = await authorised(href);
+  if (!response.ok) return;
+  const url = URL.createObjectURL(await response.blob());
+  make("a", { href: url, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(url), 60_000);
 }
 
 /** Nothing at all where the service does not offer them. */

@@ -205,7 +205,7 @@ export function showStatus(status) {
 // --- beams --------------------------------------------------------------------------------------
 
 export const METHODS = {
-  zf: "Zero forcing", rzf: "Regularised zero forcing", mrt: "Maximum ratio",
+  zf: "Zero forcing", rzf: "Regularised zero forcing", mmse: "MMSE", mrt: "Maximum ratio",
 };
 
 export function showBeams(answer) {

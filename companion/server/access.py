@@ -6,6 +6,7 @@ import hmac
 import ipaddress
 import socket
 import sys
+from collections.abc import Collection
 from typing import Final
 
 from starlette.datastructures import Headers
@@ -15,8 +16,8 @@ from starlette.websockets import WebSocket
 from companion.server.responses import problem
 from companion.values import UserError
 
-OPEN_PATHS = frozenset({"/healthz"})
-"""Paths that need no token."""
+OPEN_PATHS: Final = frozenset({"/healthz"})
+"""Paths that need no token, beside the page's own files, in which nothing is secret."""
 SUBPROTOCOL: Final = "companion.v1"
 """Subprotocol with which a WebSocket client that names any is answered."""
 BEARER: Final = "bearer."
@@ -86,19 +87,20 @@ def bind(listen: str, *, token: str | None, insecure: bool) -> socket.socket:
 
 
 class BearerToken:
-    """ASGI middleware: every path but ``/healthz`` needs ``Authorization: Bearer TOKEN``.
+    """ASGI middleware: every path needs ``Authorization: Bearer TOKEN``, except ``open_paths``.
 
     A WebSocket may bring the token as a subprotocol instead (``BEARER``), beside ``SUBPROTOCOL``.
     Without a right token it is opened and closed with 4401, whatever its path: a page in a browser
     cannot see the status of a handshake that is refused.
     """
 
-    def __init__(self, app: ASGIApp, token: str) -> None:
+    def __init__(self, app: ASGIApp, token: str, open_paths: Collection[str] = OPEN_PATHS) -> None:
         self._app = app
         self._token = token.encode()
+        self._open_paths = frozenset(open_paths)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if (scope["type"] == "http" and scope["path"] in OPEN_PATHS) or self._may(scope):
+        if (scope["type"] == "http" and scope["path"] in self._open_paths) or self._may(scope):
             await self._app(scope, receive, send)
         elif scope["type"] == "websocket":
             websocket = WebSocket(scope, receive, send)

@@ -11,7 +11,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import companion
 from companion.server import beam_routes, file_routes, models, responses
-from companion.server.access import BearerToken
+from companion.server.access import OPEN_PATHS, BearerToken
 from companion.server.metrics import NodeCollector
 from companion.server.responses import answer, answers
 from companion.server.stream import Stream
@@ -31,7 +31,11 @@ the moment at which they are asked for: `valid_at` says which, so no answer has 
 
 
 def create_app(node: Node, token: str | None = None) -> ASGIApp:
-    """The ASGI application for a node; with a token, all but ``/healthz`` asks for it."""
+    """The ASGI application for a node.
+
+    With a token, all but ``/healthz`` and the page's own files asks for it: the page is shown, and
+    asks the user.
+    """
     app = FastAPI(title="companion", version=companion.__version__, description=DESCRIPTION)
     app.router.redirect_slashes = False
     responses.install(app)
@@ -48,7 +52,7 @@ def create_app(node: Node, token: str | None = None) -> ASGIApp:
     # Not mounted: a mount at / would match before a path whose method is wrong, and hide the 405.
     app.router.default = _Files(StaticFiles(directory=web_directory(), html=True))
     secured: ASGIApp = _Edge(app)
-    return BearerToken(secured, token) if token else secured
+    return BearerToken(secured, token, OPEN_PATHS | _page_paths()) if token else secured
 
 
 def web_directory() -> Path:
@@ -56,6 +60,13 @@ def web_directory() -> Path:
     package = Path(companion.__file__).parent
     installed = package / "_web"
     return installed if installed.is_dir() else package.parent / "web"
+
+
+def _page_paths() -> frozenset[str]:
+    """The paths of the dashboard's files. They are the same for everybody."""
+    root = web_directory()
+    files = {f"/{file.relative_to(root).as_posix()}" for file in root.rglob("*") if file.is_file()}
+    return frozenset({"/"} | files)
 
 
 def _health_routes(app: FastAPI, node: Node, stream: Stream) -> None:

@@ -316,6 +316,34 @@ def test_a_lost_service_is_unmistakable_and_heals(open_page: Any, start_mine: An
     wait_for_value(page, style.format("textDecorationLine"), "none")
 
 
+def test_a_page_with_a_token_asks_for_it_and_keeps_it(
+    open_page: Any, cut_log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COMPANION_TOKEN", "s3cret/ü")
+    command = [BIN / "companion", "replay", cut_log, "--center", "5:1", "--no-record", "--serve"]
+    pipes: Any = {"stderr": subprocess.PIPE, "stdout": subprocess.DEVNULL, "text": True}
+    with started([*command, "--listen", "127.0.0.1:0"], **pipes) as process:
+        lines = iter(lambda: line_of(process, process.stderr), "")
+        said = (re.search(r"serves (http://\S+) and", line) for line in lines)
+        url = next(found for found in said if found)[1]
+        page = open_page(url, DESKTOP, loses_service=True)
+        field = page.get_by_label("Bearer token")
+        field.wait_for()
+        assert not page.locator("#token-problem").is_visible()
+        field.fill("wrong")
+        page.get_by_role("button", name="Use it").click()
+        page.get_by_text("That token is wrong.").wait_for()
+        picture(page, "token")
+        field.fill("s3cret/ü")
+        page.keyboard.press("Enter")
+        wait_for_uavs(page)
+        page.reload()
+        wait_for_uavs(page)
+        assert not field.is_visible()
+        process.terminate()
+        process.communicate(timeout=HANG_S)
+
+
 @pytest.mark.full
 def test_a_replay_says_that_it_is_one(open_page: Any, cut_log: Path) -> None:
     command = [BIN / "companion", "replay", cut_log, "--center", "5:1", "--no-record", "--serve"]

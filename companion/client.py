@@ -50,11 +50,13 @@ class Weights:
     uavs         names of the N UAVs
     matrix       (M, N) complex, columns in the order of ``uavs``
     valid_at_ns  when they are to be applied, ns since the Unix epoch on the service's clock
+    groups       the turn of each UAV
     """
 
     uavs: tuple[str, ...]
     matrix: ComplexArray
     valid_at_ns: int
+    groups: tuple[int, ...] = ()
 
 
 class Client:
@@ -94,7 +96,8 @@ class Client:
             body, headers = _read(answer), answer.headers
         uavs = tuple(name for name in headers["x-uavs"].split(",") if name)
         matrix = np.load(io.BytesIO(body), allow_pickle=False)
-        return Weights(uavs, matrix, int(headers["x-valid-at-ns"]))
+        groups = tuple(int(turn) for turn in headers["x-groups"].split(",") if turn)
+        return Weights(uavs, matrix, int(headers["x-valid-at-ns"]), groups)
 
     def get(self, path: str, **query: object) -> Json:
         """The answer of any path of the API that returns a JSON object."""

@@ -35,6 +35,8 @@ class BeamState(BaseModel):
     range_rate_mps: float | None
     gain_db: float
     guaranteed_gain_db: float | None
+    power_dbm: Annotated[float, Field(description="with which this beam is sent, in its turn")]
+    eirp_dbm: Annotated[float, Field(description="power and gain towards the predicted direction")]
     loss_db: float
     cost_db: float
     group: int

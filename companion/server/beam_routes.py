@@ -12,7 +12,6 @@ from companion.server.responses import answer, answers, refusals
 from companion.values import Update, UserError
 from companion.views import beam_state, weight_formats
 from companion.views.state import Node
-from companion.views.words import rfc3339
 
 LeadMs = Annotated[float, Query(ge=0, le=10_000, description="milliseconds ahead of now")]
 _JSON = {"schema": {"$ref": "#/components/schemas/Weights"}}
@@ -54,13 +53,7 @@ def add(app: FastAPI, node: Node) -> None:
             )
         except UserError as error:  # what the device cannot do, as the beams are now
             raise HTTPException(409, str(error)) from error
-        headers = {
-            "x-valid-at": rfc3339(beam_set.valid_at_ns),
-            "x-valid-at-ns": str(beam_set.valid_at_ns),
-            "x-uavs": ",".join(beam_set.uavs),
-            "x-normalisation": str(beam_set.normalisation),
-            "vary": "accept",
-        }
+        headers = {**weight_formats.headers(beam_set), "vary": "accept"}
         return Response(body, media_type=weight_formats.TYPES[form], headers=headers)
 
     @app.get(

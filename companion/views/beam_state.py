@@ -86,18 +86,22 @@ def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[J
     array, towards = pipeline.array, directions(beam_set)
     ranges_m = np.array([beam.range_m for beam in beam_set.beams])
     groups = np.array([beam.group for beam in beam_set.beams])
+    power_w = equipment.budget.tx_power_w
+    sent = link_budget.transmitted(beam_set.weights, power_w, groups, beam_set.normalisation)
+    powers_w = np.einsum("mn,mn->n", sent, sent.conj()).real
     sinr_db = link_budget.predicted_sinr_db(
         array,
         towards,
         ranges_m,
-        beam_set.weights,
+        sent,
         groups,
         equipment.budget,
         equipment.uav_antennas,
     )
     seen_locally = towards @ array.array_from_body @ carrier.body_from_local
     bearings = np.degrees(np.arctan2(seen_locally[:, 1], seen_locally[:, 0])) % 360
-    guaranteed, guaranteed_sinr = _guaranteed_db(pipeline, equipment, update, towards)
+    guaranteed, guaranteed_sinr = _guaranteed_db(pipeline, equipment, update, towards, powers_w)
+    powers_dbm = 10 * np.log10(np.maximum(powers_w, 1e-30)) + 30
     turns_db = 10 * np.log10(beam_set.groups)
     return [
         {
@@ -111,6 +115,8 @@ def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[J
             "range_rate_mps": beam.range_rate_mps,
             "gain_db": beam.gain_db,
             "guaranteed_gain_db": guaranteed[i],
+            "power_dbm": float(powers_dbm[i]),
+            "eirp_dbm": float(powers_dbm[i]) + beam.gain_db,
             "loss_db": beam.loss_db,
             "cost_db": beam.loss_db + turns_db,
             "group": beam.group,
@@ -126,7 +132,11 @@ def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[J
 
 
 def _guaranteed_db(
-    pipeline: Pipeline, equipment: Equipment, update: Update, towards: FloatArray
+    pipeline: Pipeline,
+    equipment: Equipment,
+    update: Update,
+    towards: FloatArray,
+    powers_w: FloatArray,
 ) -> tuple[Sequence[float | None], Sequence[float | None]]:
     """Least gain and least SINR of each beam, wherever the UAVs truly are.
 
@@ -153,6 +163,7 @@ def _guaranteed_db(
         np.array(known),
         ranges_m[known],
         np.array([beam.group for beam in beam_set.beams]),
+        powers_w,
         equipment.budget,
         array.wavelength_m,
         equipment.uav_antennas,

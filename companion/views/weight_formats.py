@@ -15,6 +15,7 @@ from companion.beams.hardware.devices import MEDIA_TYPES, Device
 from companion.pipeline.assembly import Equipment
 from companion.values import BeamSet
 from companion.views import beam_state
+from companion.views.words import rfc3339
 
 TYPES: Final = {
     "json": "application/json",
@@ -24,8 +25,24 @@ TYPES: Final = {
 }
 """Names of the formats, and their media types.
 
-``raw`` is interleaved little-endian complex64, row-major.
+``raw`` is interleaved little-endian complex64, row-major, and nothing else: what tells of it is in
+``headers``. ``npy`` is in C order.
 """
+
+
+def headers(beam_set: BeamSet) -> dict[str, str]:
+    """What describes the weights, as HTTP headers: with ``raw`` they are all that does."""
+    return {
+        "x-format": "complex64-le-row-major-1",
+        "x-elements": str(beam_set.weights.shape[0]),
+        "x-beams": str(beam_set.weights.shape[1]),
+        "x-uavs": ",".join(beam_set.uavs),
+        "x-groups": ",".join(str(beam.group) for beam in beam_set.beams),
+        "x-valid-at": rfc3339(beam_set.valid_at_ns),
+        "x-valid-at-ns": str(beam_set.valid_at_ns),
+        "x-method": str(beam_set.method),
+        "x-normalisation": str(beam_set.normalisation),
+    }
 
 
 def encode(
@@ -40,10 +57,10 @@ def encode(
             return json.dumps(beam_state.weights(beam_set, lead_ms)).encode()
         case "npy":
             file = io.BytesIO()
-            np.save(file, beam_set.weights, allow_pickle=False)
+            np.save(file, np.ascontiguousarray(beam_set.weights), allow_pickle=False)
             return file.getvalue()
         case "raw":
-            return beam_set.weights.astype("<c8").tobytes()
+            return beam_set.weights.astype("<c8").tobytes("C")
     table = device_table(Device(form), beam_set, array, equipment)
     frequency_hz = SPEED_OF_LIGHT_MPS / array.wavelength_m
     return tables.encode(table, frequency_hz).encode()

@@ -1,5 +1,6 @@
 """Every answer is what its model says, no more and no less; every error is a problem."""
 
+import io
 import json
 from collections.abc import Iterator
 from typing import Any
@@ -156,6 +157,25 @@ def test_head_is_get_without_its_body(client: TestClient) -> None:
 )
 def test_what_is_accepted_is_given(accept: str, form: str | None) -> None:
     assert accepted(accept) == form
+
+
+def test_raw_weights_are_told_by_their_headers_and_npy_is_in_c_order(client: TestClient) -> None:
+    """All that is needed to read them, and the same numbers in each form."""
+    forms = ("application/octet-stream", "application/x-npy", "application/json")
+    raw, npy, told = (client.get("/v1/beams/weights", headers={"accept": form}) for form in forms)
+    given = raw.headers
+    assert given["x-format"] == "complex64-le-row-major-1"
+    shape = int(given["x-elements"]), int(given["x-beams"])
+    matrix = np.frombuffer(raw.content, "<c8").reshape(shape)
+    held = np.load(io.BytesIO(npy.content))
+    assert held.flags.c_contiguous
+    assert (held.shape, len(given["x-uavs"].split(","))) == (shape, shape[1] or 1)
+    assert [int(turn) for turn in given["x-groups"].split(",") if turn] == told.json()["groups"]
+    assert {given["x-method"], given["x-normalisation"]} == {
+        told.json()["method"], told.json()["normalisation"]
+    }  # fmt: skip
+    assert int(given["x-valid-at-ns"]) > 0
+    assert np.isfinite(matrix).all()
 
 
 def test_numbers_that_are_none_are_null(make_node: Any) -> None:

@@ -348,13 +348,11 @@ def _db(power_ratio: float) -> float:
 def _loaded(a: ComplexArray, gram: ComplexArray, loading: FloatArray) -> ComplexArray:
     """A* (A^T A* + X)^-1, X (N,), by the smaller of the two matrices that will do."""
     if len(gram) <= len(a):
-        loaded = gram.copy()
+        loaded: ComplexArray = gram.copy()
         loaded.flat[:: len(loaded) + 1] += loading
-        found: ComplexArray = a.conj() @ np.linalg.inv(loaded)
-        return found
+        return np.asarray(a.conj() @ np.linalg.inv(loaded))
     scaled = a.conj() / loading
-    solved = np.linalg.solve(np.eye(len(a)) + scaled @ a.T, scaled)
-    return np.asarray(solved, dtype=complex)
+    return np.asarray(np.linalg.solve(np.eye(len(a)) + scaled @ a.T, scaled), dtype=complex)
 
 
 def _condition_number(a: ComplexArray, gram: ComplexArray) -> float:

@@ -18,7 +18,7 @@ import numpy as np
 from companion.beams.array.geometry import Array
 from companion.beams.array.steering import steering_matrix
 from companion.beams.worth.channel import free_space_gain
-from companion.values import ComplexArray, FloatArray, IntArray
+from companion.values import ComplexArray, FloatArray, IntArray, Normalisation
 
 BOLTZMANN_JPK: Final = 1.380649e-23
 
@@ -151,11 +151,35 @@ def spectral_efficiency(ratio: float | FloatArray, turns: int = 1) -> FloatArray
     return efficiency
 
 
+def transmitted(
+    weights: ComplexArray,
+    power_w: float,
+    groups: IntArray | None = None,
+    normalisation: Normalisation = Normalisation.TOTAL,
+) -> ComplexArray:
+    """Weights (M, N) as they are sent, in square roots of watts: one factor for all of a group.
+
+        weights        as they are delivered
+        power_w        power of all streams of a group together
+        groups         (N,), the turn of each UAV; None: all at once
+        normalisation  ``ANTENNA``: no element sends more than ``power_w`` / M; else the group sends
+                       all of it
+
+    The columns' powers are those of the weights.
+    """
+    if normalisation is Normalisation.ANTENNA:
+        return weights * math.sqrt(power_w)
+    powers = np.einsum("mn,mn->n", weights, weights.conj()).real
+    whole = _together(groups, len(powers)) @ powers
+    sent: ComplexArray = weights * np.sqrt(power_w / np.maximum(whole, 1e-300))
+    return sent
+
+
 def predicted_sinr_db(
     array: Array,
     directions: FloatArray,
     ranges_m: FloatArray,
-    weights: ComplexArray,
+    sent: ComplexArray,
     groups: IntArray | None,
     budget: LinkBudget,
     uav_antennas: int = 1,
@@ -164,10 +188,9 @@ def predicted_sinr_db(
 
         directions    (N, 3), predicted unit directions, array frame
         ranges_m      (N,), predicted ranges
-        weights       (M, N), under any normalisation: the budget's power is shared equally by the
-                      streams of a group
+        sent          (M, N), weights as they are sent (``transmitted``)
         groups        (N,), the turn of each UAV; None: all at once
-        budget        power and noise
+        budget        noise
         uav_antennas  isotropic antennas of each UAV, combined towards the node
 
     Free space, no scattering, no blockage; -inf where no element faces the UAV. That a group is
@@ -175,7 +198,6 @@ def predicted_sinr_db(
     """
     if uav_antennas < 1:
         raise ValueError(f"uav_antennas {uav_antennas} must be at least 1")
-    sent = share_power(weights, budget.tx_power_w, groups)
     responses = steering_matrix(array, directions).T @ sent
     path_gains = uav_antennas * free_space_gain(ranges_m, array.wavelength_m)
     ratio = sinr(responses, path_gains, budget.noise_power_w, groups)
@@ -190,6 +212,7 @@ def least_sinr_db(
     users: IntArray,
     farthest_m: FloatArray,
     groups: IntArray,
+    powers_w: FloatArray,
     budget: LinkBudget,
     wavelength_m: float,
     uav_antennas: int = 1,
@@ -201,16 +224,16 @@ def least_sinr_db(
         users        (K,), indices below N of the UAVs asked about
         farthest_m   (K,), largest possible ranges
         groups       (N,), the turn of each UAV
-        budget       power and noise; the power is shared equally by the streams of a group
+        powers_w     (N,), power that each beam is sent with
+        budget       noise
 
     The SINR falls with range, with leakage and with less gain, so the three worst together give the
     least (docs/math.md 5.4).
     """
     together = _together(groups, len(groups))
-    stream_w = budget.tx_power_w / together.sum(axis=1)
     path_gains = uav_antennas * free_space_gain(farthest_m, wavelength_m)
-    heard = together[users] * leaks * stream_w
+    heard = together[users] * leaks * powers_w
     heard[np.arange(len(users)), users] = 0.0
-    wanted = path_gains * least_gains * stream_w[users]
+    wanted = path_gains * least_gains * powers_w[users]
     least: FloatArray = wanted / (path_gains * heard.sum(axis=1) + budget.noise_power_w)
     return 10 * np.log10(least)

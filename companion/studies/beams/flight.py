@@ -126,12 +126,16 @@ class Sight:
         seen = np.array([truly.get(uav, np.full(3, np.nan)) for uav in beam_set.uavs])
         responses = np.einsum("mn,mn->n", steering_matrix(array, seen), beam_set.weights)
         power = np.einsum("mn,mn->n", beam_set.weights, beam_set.weights.conj()).real
+        groups = np.array([beam.group for beam in beam_set.beams])
+        sent = link_budget.transmitted(
+            beam_set.weights, self.equipment.budget.tx_power_w, groups, beam_set.normalisation
+        )
         sinr_db = link_budget.predicted_sinr_db(
             array,
             towards,
             np.array([beam.range_m for beam in beam_set.beams]),
-            beam_set.weights,
-            np.array([beam.group for beam in beam_set.beams]),
+            sent,
+            groups,
             self.equipment.budget,
             self.equipment.uav_antennas,
         )

@@ -241,6 +241,23 @@ def test_turns_are_exact(policy: Policy, seed: int) -> None:
         assert np.abs(response - np.eye(now.sum())).max() < 1e-9
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3, 6, 11])
+def test_points_nulled_beside_the_others_leave_nothing_at_them(seed: int) -> None:
+    """On arrays so dense that rounding costs ten digits of the nulls, if it is not taken away."""
+    for spacing in (0.05, 0.1):
+        rng = np.random.default_rng(seed)
+        array = uniform_linear(32, 30e9, spacing, EYE)
+        azimuths = np.sort(rng.uniform(-70, 70, 3 + seed % 4))
+        directions = towards(*((azimuth, 0.0) for azimuth in azimuths.tolist()))
+        a = steering_matrix(array, directions)
+        how = Precoder(policy=Policy.GROUP, loss_limit_db=60.0, condition_limit=1000.0)
+        found = precode(a, how, spread(array, directions, 11.0, 11.0))
+        for turn in range(found.groups.max() + 1):
+            now = found.groups == turn
+            response = a[:, now].T @ found.weights[:, now]
+            assert np.abs(response - np.eye(now.sum())).max() <= 1e-10
+
+
 def test_maximum_ratio_takes_the_shapes_as_they_are() -> None:
     wide = spread(LINE, FOUR, 5.0)
     found = precode(steering_matrix(LINE, FOUR), Precoder(Method.MATCHED), wide).weights

@@ -26,8 +26,9 @@ from companion.beams.worth.link_budget import (
     share_power,
     sinr,
     spectral_efficiency,
+    transmitted,
 )
-from companion.values import ComplexArray, FloatArray
+from companion.values import ComplexArray, FloatArray, IntArray, Normalisation
 
 BUDGET = LinkBudget(tx_power_dbm=30.0, bandwidth_hz=50e6, noise_figure_db=7.0)
 ARRAY = uniform_linear(64, 30e9, 0.5, np.eye(3))
@@ -249,11 +250,43 @@ def test_a_rate_that_is_none_is_refused() -> None:
 # --- what is shown ------------------------------------------------------------------------------
 
 
+def sent(weights: ComplexArray, groups: IntArray | None = None) -> ComplexArray:
+    return transmitted(weights, BUDGET.tx_power_w, groups)
+
+
+@pytest.mark.parametrize("normalisation", Normalisation)
+@pytest.mark.parametrize("groups", [None, np.array([0, 1, 0, 0])])
+def test_what_is_sent_is_the_matrix_that_is_delivered(
+    normalisation: Normalisation, groups: IntArray | None
+) -> None:
+    """Up to one factor for each turn; all of the power, or its share at the busiest element."""
+    rng = np.random.default_rng(1)
+    weights = random_complex(rng, 8, 4) * np.array([1.0, 2.0, 0.1, 5.0])
+    if normalisation is Normalisation.ANTENNA:
+        for turn in (0, 1):
+            now = np.zeros(4) == turn if groups is None else groups == turn
+            if now.any():
+                busiest = np.sum(np.abs(weights[:, now]) ** 2, axis=1).max()
+                weights[:, now] /= np.sqrt(busiest * 8)
+    found = transmitted(weights, 3.0, groups, normalisation)
+    for turn in (0, 1):
+        now = np.zeros(4) == turn if groups is None else groups == turn
+        if not now.any():
+            continue
+        ratio = found[:, now] / weights[:, now]
+        assert ratio == pytest.approx(np.full(ratio.shape, ratio[0, 0]))
+        power = np.abs(found[:, now]) ** 2
+        if normalisation is Normalisation.ANTENNA:
+            assert power.sum(axis=1).max() == pytest.approx(3.0 / 8)
+        else:
+            assert power.sum() == pytest.approx(3.0)
+
+
 def test_one_uav_by_hand() -> None:
     """30 dBm + 18.06 dB (64 elements) + 6.02 dB (4 antennas) - 101.99 dB + 89.98 dBm."""
     ahead, at = in_plane(0.0), np.array([100.0])
     f = steering.steering_matrix(ARRAY, ahead).conj() * 7.0  # any normalisation
-    found = predicted_sinr_db(ARRAY, ahead, at, f, None, BUDGET, uav_antennas=4)
+    found = predicted_sinr_db(ARRAY, ahead, at, sent(f), None, BUDGET, uav_antennas=4)
     assert found == pytest.approx([30 + 18.06 + 6.02 - 101.99 + 89.98], abs=0.05)
 
 
@@ -267,9 +300,9 @@ def test_it_is_the_sinr_of_the_channel_without_scattering() -> None:
     channels = draw(sight, ARRAY, uav, APART, at_uav, np.random.default_rng(1))
     rows = combined_rows(channels, steering.steering_matrix(uav, at_uav))
     gains = free_space_gain(RANGES_M, ARRAY.wavelength_m)
-    sent = share_power(weights, BUDGET.tx_power_w, groups)
-    wanted = 10 * np.log10(sinr(rows @ sent, gains, BUDGET.noise_power_w, groups))
-    found = predicted_sinr_db(ARRAY, APART, RANGES_M, weights, groups, BUDGET, uav_antennas=4)
+    shared = sent(weights, groups)
+    wanted = 10 * np.log10(sinr(rows @ shared, gains, BUDGET.noise_power_w, groups))
+    found = predicted_sinr_db(ARRAY, APART, RANGES_M, shared, groups, BUDGET, uav_antennas=4)
     assert found == pytest.approx(wanted, abs=1e-9)
 
 
@@ -277,9 +310,10 @@ def test_a_turn_of_its_own_has_the_whole_power_and_no_interference() -> None:
     close = in_plane(10.0, 10.5)
     weights = steering.steering_matrix(ARRAY, close).conj()
     at = np.array([100.0, 100.0])
-    together = predicted_sinr_db(ARRAY, close, at, weights, None, BUDGET)
-    apart = predicted_sinr_db(ARRAY, close, at, weights, np.array([0, 1]), BUDGET)
-    alone = predicted_sinr_db(ARRAY, close[:1], at[:1], weights[:, :1], None, BUDGET)
+    turns = np.array([0, 1])
+    together = predicted_sinr_db(ARRAY, close, at, sent(weights), None, BUDGET)
+    apart = predicted_sinr_db(ARRAY, close, at, sent(weights, turns), turns, BUDGET)
+    alone = predicted_sinr_db(ARRAY, close[:1], at[:1], sent(weights[:, :1]), None, BUDGET)
     assert apart == pytest.approx(np.repeat(alone, 2))
     assert (together < 5).all()
     assert (apart > 35).all()
@@ -289,7 +323,7 @@ def test_behind_the_elements_there_is_nothing() -> None:
     array = uniform_linear(8, 30e9, 0.5, np.eye(3), Element(Pattern.COSINE))
     seen = in_plane(0.0, 180.0)
     f = np.ones((8, 2), dtype=complex)
-    found = predicted_sinr_db(array, seen, np.array([100.0, 100.0]), f, None, BUDGET)
+    found = predicted_sinr_db(array, seen, np.array([100.0, 100.0]), sent(f), None, BUDGET)
     assert found[1] == -math.inf
 
 
@@ -313,8 +347,10 @@ def test_no_link_within_the_bounds_is_worse_than_the_least(seed: int, turns: boo
     leaks = leakage_bounds(ARRAY, APART[known], list(bounds[known]), made.weights)
     linear = 10 ** (np.array([gains_db[i] for i in known], dtype=float) / 10)
     far_m = RANGES_M[known] + 5.0
+    shared = sent(made.weights * rng.uniform(0.3, 3.0, 4), groups)  # columns of unlike powers
+    powers_w = np.sum(np.abs(shared) ** 2, axis=0)
     least = least_sinr_db(
-        linear, leaks, np.array(known), far_m, groups, BUDGET, ARRAY.wavelength_m, 4
+        linear, leaks, np.array(known), far_m, groups, powers_w, BUDGET, ARRAY.wavelength_m, 4
     )
     for _ in range(20):
         aside = np.cross(APART, rng.standard_normal((4, 3)))
@@ -322,7 +358,7 @@ def test_no_link_within_the_bounds_is_worse_than_the_least(seed: int, turns: boo
         off = (bounds * rng.uniform(0, 1, 4))[:, np.newaxis]
         true = np.cos(off) * APART + np.sin(off) * aside
         at_m = RANGES_M + rng.uniform(-5, 5, 4)
-        found = predicted_sinr_db(ARRAY, true, at_m, made.weights, groups, BUDGET, 4)
+        found = predicted_sinr_db(ARRAY, true, at_m, shared, groups, BUDGET, 4)
         assert (found[known] >= least - 1e-9).all()
 
 
@@ -332,10 +368,11 @@ def test_the_least_is_attained_where_nothing_is_uncertain() -> None:
     linear = 10 ** (np.array(gains_db, dtype=float) / 10)
     leaks = leakage_bounds(ARRAY, APART, [0.0] * 4, made.weights)
     everyone, together = np.arange(4), np.zeros(4, dtype=np.int64)
+    powers_w = np.sum(np.abs(sent(made.weights)) ** 2, axis=0)
     least = least_sinr_db(
-        linear, leaks, everyone, RANGES_M, together, BUDGET, ARRAY.wavelength_m, 2
+        linear, leaks, everyone, RANGES_M, together, powers_w, BUDGET, ARRAY.wavelength_m, 2
     )
-    same = predicted_sinr_db(ARRAY, APART, RANGES_M, made.weights, together, BUDGET, 2)
+    same = predicted_sinr_db(ARRAY, APART, RANGES_M, sent(made.weights), together, BUDGET, 2)
     assert least == pytest.approx(same, abs=1e-6)
 
 
@@ -343,9 +380,10 @@ def test_at_the_least_only_those_of_the_same_turn_are_heard_and_share_the_power(
     """Three UAVs, the last in a turn of its own: the sums written out."""
     gains, leaks = np.array([40.0, 50.0]), np.array([[9.0, 3.0, 8.0], [7.0, 6.0, 9.0]])
     groups, users, at = np.array([0, 0, 1]), np.array([1, 2]), np.array([900.0, 500.0])
-    found = least_sinr_db(gains, leaks, users, at, groups, BUDGET, 0.01, uav_antennas=2)
+    powers_w = np.array([0.3, 0.7, 0.9])
+    found = least_sinr_db(gains, leaks, users, at, groups, powers_w, BUDGET, 0.01, uav_antennas=2)
     path = 2 * free_space_gain(at, 0.01)
-    noise_w, power_w = BUDGET.noise_power_w, BUDGET.tx_power_w
-    shared = path[0] * 40.0 * power_w / 2 / (path[0] * 9.0 * power_w / 2 + noise_w)
-    alone = path[1] * 50.0 * power_w / noise_w
+    noise_w = BUDGET.noise_power_w
+    shared = path[0] * 40.0 * 0.7 / (path[0] * 9.0 * 0.3 + noise_w)
+    alone = path[1] * 50.0 * 0.9 / noise_w
     assert found == pytest.approx(10 * np.log10([shared, alone]))

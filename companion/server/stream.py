@@ -167,7 +167,11 @@ class Stream:
                         said[topic] = version
                         await websocket.send_text(await self._text(topic, asked.uavs))
                         self.sent += 1
-            await self._node.ticked()
+            if any(said.get(topic) != self._version(topic) for topic in asked.topics):
+                # More came while it was sent to a slow client: the newest does not wait for a tick.
+                await asyncio.sleep(max(0.0, due_s - loop.time()))
+            else:
+                await self._node.ticked()
             if turn_s:
                 await asyncio.sleep(turn_s)
 

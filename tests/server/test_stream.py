@@ -266,7 +266,7 @@ def test_a_client_that_does_not_read_misses_messages_and_holds_nobody_up(
         query = "topic=weights&topic=beams&rate_hz=100"
         async with serving(node) as at:
             address = f"ws://{at}/v1/stream?{query}"
-            slow = await connect(address, max_queue=1)
+            slow = await connect(address, max_queue=1, close_timeout=1)
             reader = await connect(address)
             heard = 0
             for _ in range(150):

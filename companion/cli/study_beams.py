@@ -15,6 +15,12 @@ from companion.cli.console import CENTER, CONFIG, JSON, Progress
 @click.option(
     "--hz", type=float, default=5.0, show_default=True, help="Looks a second of the log's time."
 )
+@click.option(
+    "--links",
+    metavar="NAME,...",
+    default="",
+    help="Compare the three widths and sharp rivals over clean, radio, hostile, noisy.",
+)
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
 @JSON
 def beams(
@@ -22,6 +28,7 @@ def beams(
     config: Path | None,
     center: str | None,
     hz: float,
+    links: str,
     out: Path,
     as_json: bool,
 ) -> None:
@@ -32,7 +39,7 @@ def beams(
     DIR/beams.html and the figures as PNG and SVG. A recording of our own is studied with the
     settings that it holds.
 
-    Example: companion study beams flight.tlog --center 5:1 --out report
+    Example: companion study beams flight.tlog --center 5:1 --links clean,radio --out report
     """
     from companion.node.replay import settings_for
     from companion.studies.beams import report
@@ -40,7 +47,8 @@ def beams(
 
     progress = Progress()
     settings = tuple(settings_for([log], config, center) for log in logs)
-    setting = BeamStudy(logs, settings, hz, center, str(config) if config else None)
+    over = tuple(name for name in links.split(",") if name)
+    setting = BeamStudy(logs, settings, hz, center, str(config) if config else None, over)
     out.mkdir(parents=True, exist_ok=True)
     if any(each.center.source is None for each in settings):
         click.echo("no --center: the array stands where the first report was made", err=True)
@@ -49,4 +57,4 @@ def beams(
     for name, content in report.files(answer, found, progress.show).items():
         (out / name).write_bytes(content)
     progress.clear()
-    click.echo(json.dumps(answer) if as_json else report.text(found))
+    click.echo(json.dumps(answer) if as_json else report.text(found, answer["modes"]))

@@ -32,7 +32,9 @@ from companion.pipeline import assembly
 from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
+from companion.studies.beams import modes
 from companion.studies.beams.worth import Row, Sample, Worth, summed_up
+from companion.studies.prediction.radio_link import LINKS
 from companion.studies.truth import array_truth
 from companion.studies.truth.array_truth import ArrayTruth
 from companion.values import BeamSet, Carrier, FloatArray, Track, Update, UserError, Widen
@@ -50,6 +52,7 @@ class BeamStudy:
         hz        looks per second of log
         center    as on the command line
         config    as on the command line
+        links     names of the links over which ways of making beams are compared; none: not at all
 
     Raises ``UserError`` for a rate out of range.
     """
@@ -59,8 +62,12 @@ class BeamStudy:
     hz: float = 5.0
     center: str | None = None
     config: str | None = None
+    links: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        known = [link.name for link in LINKS]
+        if not set(self.links) <= set(known):
+            raise UserError(f"links are some of {', '.join(known)}, not {','.join(self.links)}")
         if not 0 < self.hz <= 1000:
             raise UserError(f"--hz {self.hz:g}: looks a second, above 0 and at most 1000")
 
@@ -70,6 +77,7 @@ class BeamStudy:
         words = ["companion", "study", "beams", *map(str, self.logs)]
         words += ["--center", self.center] if self.center else []
         words += ["--config", self.config] if self.config else []
+        words += ["--links", ",".join(self.links)] if self.links else []
         return shlex.join([*words, "--hz", f"{self.hz:g}"])
 
 
@@ -326,8 +334,15 @@ def study(
         for watched in found
         for uav, samples in watched.by_uav.items()
     ]
+    modes_found = [
+        row
+        for log, settings in zip(setting.logs, setting.settings, strict=True)
+        for link in modes.links(setting.links)
+        for row in modes.compare(log, settings, link, progress)
+    ]
     return {
         "rows": rows,
+        "modes": modes_found,
         "summary": summed_up([sample for watched in found for sample in watched.samples]),
         "logs": [
             {

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Final
 
+from companion.studies.beams import modes
 from companion.studies.beams.charts import charts
 from companion.studies.beams.flight import Watched
 from companion.studies.beams.worth import SHARP, Row, summed_up
@@ -48,7 +49,7 @@ _CAPTIONS: Final = {
     " gain is missing nothing is guaranteed: the cone of possible directions holds a null.",
     "gain_had": "The share of looks at which a gain is at least so much: towards the predicted"
     " direction, towards the true one, and wherever the UAV may be within its bound. Sharp:"
-    " [beams] widen = false.",
+    ' [beams] widen = "no".',
     "sweep": "The share of the stored beams that must be swept to be sure of the best, at its"
     " largest in each interval.",
 }
@@ -70,13 +71,19 @@ def files(
         }
         drawings |= made
         sections.append(_section(watched, made))
-    values = {"answer": answer, "sections": sections}
+    compared = [modes.cells(row) for row in answer["modes"]]
+    head = [words for words, _ in modes.COLUMNS]
+    values = {"answer": answer, "sections": sections, "modes": compared, "modes_head": head}
     return plotting.files("beams", "beams/report.html.j2", drawings, values, progress)
 
 
-def text(found: Sequence[Watched]) -> str:
+def text(found: Sequence[Watched], compared: Sequence[Row] = ()) -> str:
     """The tables as text, all UAVs of a log together."""
-    return "\n\n".join(_text(watched) for watched in found)
+    parts = [_text(watched) for watched in found]
+    for log in dict.fromkeys(row["log"] for row in compared):
+        of_log = [row for row in compared if row["log"] == log]
+        parts.append(f"{log}, three widths and three rivals, gains in dB:\n{modes.text(of_log)}")
+    return "\n\n".join(parts)
 
 
 def _text(watched: Watched) -> str:

@@ -1,0 +1,285 @@
+"""Ways of making beams compared over links: gains, guarantees and rates, against the truth.
+
+Each UAV's own frames pass through a link, the log's own or one of ``studies.prediction``; the
+array's carrier is heard as it was. At every tick beams are made in each of the three widths for the
+tracks of the product, and, sharp, for where others would look: at the last report (``hold``), where
+a Kalman filter of known noise has it (``kalman-peng``), and where AntennaTracker would
+(``dead-reckoning-arrival``). What they give is taken towards the true directions.
+"""
+
+import heapq
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from companion.beams import steady
+from companion.beams.aim import aim, directions
+from companion.beams.array.steering import steering_matrix
+from companion.beams.steady import Steady
+from companion.beams.worth import guarantee, link_budget
+from companion.node.replay import log_events
+from companion.pipeline import assembly
+from companion.pipeline.fold import Pipeline
+from companion.pipeline.ticks import with_ticks
+from companion.recording.reader import read_log
+from companion.settings.model import Settings
+from companion.studies.prediction.baselines import Observed, Predictor
+from companion.studies.prediction.delivery import deliver
+from companion.studies.prediction.kalman import Kalman
+from companion.studies.prediction.predictors import SIMPLE, known_tuning
+from companion.studies.prediction.radio_link import LINKS, RadioLink
+from companion.studies.truth import array_truth, vehicles
+from companion.studies.truth.array_truth import ArrayTruth
+from companion.tracking.geodesy import LocalFrame
+from companion.values import BeamSet, Event, FloatArray, Frame, Tick, Track, Update, Widen
+
+RIVALS: Final = ("hold", "kalman-peng", "dead-reckoning-arrival")
+"""Predictors whose beams are sharp and stand beside the product's."""
+LOOK_EVERY: Final = 4
+"""Ticks from one look to the next; beams are made at each."""
+ALIKE: Final = 0.9
+"""Correlation of two shapes of one beam below which it has changed."""
+JUMP_DB: Final = 1.0
+"""Change of a predicted gain from tick to tick that is a jump."""
+
+Row = dict[str, Any]
+
+
+@dataclass(slots=True)
+class _Way:
+    """One way of making beams, with what has been seen of it."""
+
+    name: str
+    widen: Widen
+    state: Steady | None = None
+    last: dict[str, tuple[Any, float]] = field(default_factory=dict)
+    true_db: list[float] = field(default_factory=list)
+    predicted_db: list[float] = field(default_factory=list)
+    sure_db: list[float] = field(default_factory=list)
+    rates: list[float] = field(default_factory=list)
+    correlations: list[float] = field(default_factory=list)
+    jumps_db: list[float] = field(default_factory=list)
+    violations: int = 0
+
+    def row(self) -> Row:
+        """The figures; shares are of beams, and None where there is nothing to tell."""
+        sure = np.array(self.sure_db)
+        return {
+            "beams": self.name,
+            "n": len(self.predicted_db),
+            "true_gain_p5_db": _percentile(self.true_db, 5),
+            "true_gain_median_db": _percentile(self.true_db, 50),
+            "predicted_gain_median_db": _percentile(self.predicted_db, 50),
+            "guaranteed_above_0_db_share": float(np.mean(sure > 0)) if len(sure) else None,
+            "guaranteed_gain_median_db": _percentile(self.sure_db, 50),
+            "violations": self.violations,
+            "spectral_efficiency_mean": float(np.mean(self.rates)) if self.rates else None,
+            "changed_shape_share": _share(np.array(self.correlations) < ALIKE),
+            "jump_share": _share(np.array(self.jumps_db) > JUMP_DB),
+        }
+
+
+def _percentile(values: Sequence[float], percent: float) -> float | None:
+    wanted = "inverted_cdf"  # a value that occurred: some are infinite
+    found = float(np.percentile(values, percent, method=wanted)) if values else -np.inf
+    return found if np.isfinite(found) else None
+
+
+def _share(marks: Any) -> float | None:
+    return float(np.mean(marks)) if len(marks) else None
+
+
+# --- the events of a link -----------------------------------------------------------------------
+
+
+def events(
+    log: Path, link: RadioLink, settings: Settings, seed: int = 1
+) -> tuple[Iterator[Event], dict[str, list[Observed]], LocalFrame]:
+    """What a node hears over a link, with ticks; each UAV's reports, and the frame they are in."""
+    center = settings.center.source or "home"
+    flown = vehicles.load(log, center)
+    streams = {
+        flight.uav: deliver(flight, link, seed, lambda: assembly.clock(settings))
+        for flight in flown.flights
+    }
+    observed = {uav: list(one.observed) for uav, one in streams.items()}
+    local = LocalFrame(*flown.origin)
+    if link.as_logged:
+        return log_events([log], settings), observed, local
+    others = (
+        event
+        for event in read_log(log)
+        if not isinstance(event, Tick)
+        and not (isinstance(event, Frame) and str(event.source) in streams)
+    )
+    heard = heapq.merge(
+        *(one.events for one in streams.values()), others, key=lambda event: event.t_ns
+    )
+    return with_ticks(heard, settings.beams.update_hz), observed, local
+
+
+class _Rival:
+    """A predictor of each UAV, in the pipeline's frame."""
+
+    def __init__(self, name: str, observed: dict[str, list[Observed]], settings: Settings) -> None:
+        tuning = known_tuning(settings)
+        self._make: Callable[[], Predictor] = SIMPLE.get(name, lambda: Kalman(2, tuning))
+        self._waiting = {uav: list(reversed(reports)) for uav, reports in observed.items()}
+        self._predictors = {uav: self._make() for uav in observed}
+
+    def tracks(self, update: Update, local: LocalFrame, pipeline: Pipeline) -> tuple[Track, ...]:
+        """The tracks of an update, placed where this predictor has them."""
+        found = []
+        for track in update.tracks:
+            waiting, predictor = self._waiting.get(track.uav, []), self._predictors.get(track.uav)
+            while waiting and waiting[-1].arrival_ns <= update.t_ns and predictor is not None:
+                predictor.report(waiting.pop())
+            made = predictor and predictor.predict(update.t_ns, track.valid_at_ns)
+            if not made or pipeline.local is None:
+                continue
+            (lat_deg,), (lon_deg,), (alt_m,) = local.geodetic(made.position_ned_m[np.newaxis])
+            there = pipeline.local.position_ned_m(lat_deg, lon_deg, alt_m)
+            found.append(replace(track, position_ned_m=there))
+        return tuple(found)
+
+
+# --- the comparison -----------------------------------------------------------------------------
+
+
+def compare(
+    log: Path,
+    settings: Settings,
+    link: RadioLink,
+    progress: Callable[[str], None] = lambda _text: None,
+) -> list[Row]:
+    """A row for each way of making beams, over one link."""
+    pipeline = Pipeline(settings)
+    heard, observed, local = events(log, link, settings)
+    ways = [_Way(str(widen), widen) for widen in Widen]
+    rivals = {name: _Rival(name, observed, settings) for name in RIVALS}
+    theirs = {name: _Way(f"{name}, sharp", Widen.NO) for name in RIVALS}
+    truth: ArrayTruth | None = None
+    sought, ticks = False, 0
+    for event in heard:
+        pipeline.step(event)
+        update = pipeline.last_update
+        if not isinstance(event, Tick) or update is None or not update.tracks:
+            continue
+        if not sought and any(not track.uav.startswith("icao:") for track in update.tracks):
+            truth, sought = array_truth.load(log, pipeline), True
+        if update.carrier is None:
+            continue
+        ticks += 1
+        looks = ticks % LOOK_EVERY == 0
+        for way in ways:
+            _make(pipeline, update, update.tracks, way, truth, looks)
+        for name, rival in rivals.items():
+            if looks:
+                tracks = rival.tracks(update, local, pipeline)
+                _make(pipeline, update, tracks, theirs[name], truth, looks)
+        if looks and ticks % (25 * LOOK_EVERY) == 0:
+            progress(f"{log.name}, {link.name}: {ticks} ticks")
+    head = {"log": log.name, "link": link.name, "truth": None if truth is None else truth.kind}
+    return [head | way.row() for way in (*ways, *theirs.values())]
+
+
+def _make(
+    pipeline: Pipeline,
+    update: Update,
+    tracks: tuple[Track, ...],
+    way: _Way,
+    truth: ArrayTruth | None,
+    looks: bool,
+) -> None:
+    """Make beams one way, and note what they are worth."""
+    assert update.carrier is not None
+    how = replace(pipeline.precoder, widen=way.widen)
+    parts = (update.carrier, pipeline.array, how, pipeline.coverage, way.state)
+    made = aim(update.t_ns, update.beams.valid_at_ns, tracks, *parts)
+    way.state = steady.after(way.state, made)
+    steering = steering_matrix(pipeline.array, directions(made))
+    shapes = made.weights * steering
+    seen = {
+        beam.uav: (shapes[:, n] / np.linalg.norm(shapes[:, n]), beam.gain_db)
+        for n, beam in enumerate(made.beams)
+    }
+    if set(seen) == set(way.last):
+        for uav, (shape, gain_db) in seen.items():
+            way.correlations.append(float(abs(np.vdot(way.last[uav][0], shape))))
+            way.jumps_db.append(abs(way.last[uav][1] - gain_db))
+    way.last = seen
+    if looks and made.beams:
+        true = None if truth is None else truth.directions(tracks, update.carrier, pipeline.array)
+        by_uav = {} if true is None else dict(zip((t.uav for t in tracks), true, strict=True))
+        _judge(pipeline, made, by_uav, way)
+
+
+def _judge(pipeline: Pipeline, made: BeamSet, true: dict[str, FloatArray], way: _Way) -> None:
+    array, how = pipeline.array, pipeline.precoder
+    towards = directions(made)
+    bounds = guarantee.covered_bounds(
+        array, pipeline.coverage, towards, [beam.pointing_bound_rad for beam in made.beams]
+    )
+    sure = guarantee.guaranteed_gains_db(array, towards, bounds, made.weights)
+    way.sure_db += [-np.inf if one is None else one for one in sure]
+    way.predicted_db += [beam.gain_db for beam in made.beams]
+    there = np.array([true.get(uav, np.full(3, np.nan)) for uav in made.uavs])
+    known = ~np.isnan(there).any(axis=1)
+    there = np.where(known[:, np.newaxis], there, towards)
+    groups = np.array([beam.group for beam in made.beams])
+    sent = link_budget.transmitted(made.weights, how.budget.tx_power_w, groups, made.normalisation)
+    ranges_m = np.array([beam.range_m for beam in made.beams])
+    sinr_db = link_budget.predicted_sinr_db(
+        array, there, ranges_m, sent, groups, how.budget, how.uav_antennas
+    )
+    rates = link_budget.spectral_efficiency(10 ** (sinr_db / 10), made.groups)
+    towards_true = np.einsum("mn,mn->n", steering_matrix(array, there), made.weights)
+    power = np.einsum("mn,mn->n", made.weights, made.weights.conj()).real
+    gains_db = 10 * np.log10(np.maximum(np.abs(towards_true) ** 2 / power, 1e-30))
+    for n in np.flatnonzero(known).tolist():
+        way.true_db.append(float(gains_db[n]))
+        way.rates.append(float(rates[n]))
+        one = sure[n]
+        way.violations += int(one is not None and one > gains_db[n] + 1e-9)
+
+
+def links(names: Sequence[str]) -> list[RadioLink]:
+    """The links of these names."""
+    return [link for link in LINKS if link.name in names]
+
+
+COLUMNS: Final = (
+    ("link", "link"), ("beams", "beams"), ("true 5 %", "true_gain_p5_db"),
+    ("true 50 %", "true_gain_median_db"), ("predicted", "predicted_gain_median_db"),
+    ("sure > 0 dB", "guaranteed_above_0_db_share"), ("sure 50 %", "guaranteed_gain_median_db"),
+    ("broken", "violations"), ("bit/s/Hz", "spectral_efficiency_mean"),
+    ("changed", "changed_shape_share"), ("jumps", "jump_share"),
+)  # fmt: skip
+"""Words and keys of the table."""
+
+
+def cells(row: Row) -> list[str]:
+    """A row as it is shown."""
+    found = []
+    for _, key in COLUMNS:
+        value = row[key]
+        if value is None:
+            found.append("-")
+        elif isinstance(value, float):
+            found.append(f"{value:.1%}" if key.endswith("share") else f"{value:.2f}")
+        else:
+            found.append(str(value))
+    return found
+
+
+def text(rows: Sequence[Row]) -> str:
+    """The table as text."""
+    widths = (9, 29, 9, 10, 10, 12, 10, 8, 9, 9, 8)
+    lines = [[words for words, _ in COLUMNS], *map(cells, rows)]
+    return "\n".join(
+        "  " + "".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
+        for line in lines
+    )

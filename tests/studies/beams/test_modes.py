@@ -1,0 +1,92 @@
+"""Ways of making beams over links: against a second pipeline, and by what must hold of each."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from support import ROOT
+
+from companion.beams.worth import guarantee
+from companion.cli.main import main
+from companion.pipeline.fold import Pipeline
+from companion.settings.model import Settings
+from companion.studies.beams import modes
+from companion.studies.prediction.radio_link import CLEAN, RADIO
+from companion.values import Tick
+
+CUT = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
+SETTINGS = Settings().override(center={"source": "5:1"})
+
+
+@pytest.fixture(scope="module")
+def rows() -> dict[str, modes.Row]:
+    return {row["beams"]: row for row in modes.compare(CUT, SETTINGS, CLEAN)}
+
+
+def test_each_width_gives_what_it_is_for(rows: dict[str, modes.Row]) -> None:
+    likely, sure, sharp = (rows[name] for name in ("likely", "guarantee", "no"))
+    assert sure["guaranteed_gain_median_db"] > likely["guaranteed_gain_median_db"] > 0
+    assert likely["true_gain_median_db"] > sure["true_gain_median_db"] + 2
+    assert sharp["predicted_gain_median_db"] > likely["predicted_gain_median_db"]
+    assert sure["guaranteed_above_0_db_share"] > 0.75 > sharp["guaranteed_above_0_db_share"]
+    assert [row["violations"] for row in rows.values()] == [0] * 6
+    for row in (likely, sure):
+        assert row["changed_shape_share"] < 0.05
+        assert row["jump_share"] < 0.05
+    assert rows["hold, sharp"]["true_gain_median_db"] < sharp["true_gain_median_db"] - 3
+    assert set(rows) == {"likely", "guarantee", "no", *(f"{name}, sharp" for name in modes.RIVALS)}
+
+
+def test_the_likely_row_is_of_the_pipeline_s_own_beams(rows: dict[str, modes.Row]) -> None:
+    pipeline = Pipeline(SETTINGS)
+    heard, _, _ = modes.events(CUT, CLEAN, SETTINGS)
+    ticks, gains_db, sure_db = 0, [], []
+    for event in heard:
+        pipeline.step(event)
+        update = pipeline.last_update
+        if not isinstance(event, Tick) or update is None or update.carrier is None:
+            continue
+        if not update.tracks:
+            continue
+        ticks += 1
+        if ticks % modes.LOOK_EVERY == 0:
+            gains_db += [beam.gain_db for beam in update.beams.beams]
+            towards = modes.directions(update.beams)
+            bounds = [beam.pointing_bound_rad for beam in update.beams.beams]
+            weights = update.beams.weights
+            sure_db += guarantee.guaranteed_gains_db(pipeline.array, towards, bounds, weights)
+    row = rows["likely"]
+    assert row["n"] == len(gains_db)
+    assert row["predicted_gain_median_db"] == np.percentile(gains_db, 50, method="inverted_cdf")
+    above = np.mean([one is not None and one > 0 for one in sure_db])
+    assert row["guaranteed_above_0_db_share"] == pytest.approx(above)
+
+
+def test_over_a_radio_the_carrier_is_heard_as_it_was() -> None:
+    heard, observed, _ = modes.events(CUT, RADIO, SETTINGS)
+    events = list(heard)
+    times = [event.t_ns for event in events]
+    assert times == sorted(times)
+    clean, logged, _ = modes.events(CUT, CLEAN, SETTINGS)
+    sources = [str(e.source) for e in events if not isinstance(e, Tick)]
+    before = [str(e.source) for e in clean if not isinstance(e, Tick)]
+    assert sources.count("5:1") == before.count("5:1")
+    assert sources.count("1:1") < 0.5 * before.count("1:1")
+    assert len(observed["1:1"]) < 0.5 * len(logged["1:1"])
+
+
+def test_the_command_compares_over_the_links_that_are_named(tmp_path: Path) -> None:
+    words = ["study", "beams", str(CUT), "--center", "5:1", "--hz", "1", "--links", "clean"]
+    done = CliRunner().invoke(main, [*words, "--out", str(tmp_path)])
+    assert done.exit_code == 0, done.output
+    assert "kalman-peng, sharp" in done.output
+    told = json.loads((tmp_path / "beams.json").read_text(encoding="utf-8"))
+    assert [row["beams"] for row in told["modes"]][:3] == ["likely", "guarantee", "no"]
+    assert "Three widths" in (tmp_path / "beams.html").read_text(encoding="utf-8")
+    wrong = CliRunner().invoke(main, [*words[:-1], "best", "--out", str(tmp_path)])
+    assert wrong.exit_code != 0
+    assert "links are some of clean, radio, hostile, noisy" in str(wrong.output) + str(
+        wrong.exception
+    )

@@ -34,7 +34,11 @@ from scipy.optimize import minimize
 
 Array = np.ndarray[Any, Any]
 OUT = Path(__file__).parent.parent / "companion" / "beams" / "weights" / "shapes.npz"
-LOSSES_DB = (3.0, 5.0, 7.0, 10.0, 14.0)
+PLANS = (
+    ("line", 2 ** (-np.arange(16) / 3), (3.0, 5.0, 7.0, 10.0, 14.0), 450),
+    ("square", 2.0 ** -np.arange(5), (3.0, 8.0), 100),
+)
+"""Kinds of apertures: ratios of the likely width to the cone, losses, and rounds at the end."""
 P95 = 1.96
 LEAST_WIDTH = 0.25
 
@@ -263,6 +267,7 @@ def make_likely(
     ratios: Array,
     floors: Array,
     wider: Array | None,
+    most: int,
 ) -> Array:
     """The table (C, R, J) of greatest means over a floor (C,), power ratios, by its even half.
 
@@ -287,7 +292,8 @@ def make_likely(
     table = np.stack(columns, axis=1)
     terms = _likely_terms(aperture, cones, ratios, floors)
     flat = table.reshape(-1, table.shape[2])
-    return searched(terms, flat, ((10, 100), (30, 150), (100, 200))).reshape(table.shape)
+    rounds = ((10, 100), (30, 150), (100, most), (300, most // 2))
+    return searched(terms, flat, rounds).reshape(table.shape)
 
 
 def _likely_terms(aperture: Aperture, cones: Array, ratios: Array, floors: Array) -> list[Term]:
@@ -404,22 +410,22 @@ def main() -> None:
         check()
         return
     made: dict[str, Array] = {}
-    for name, aperture, count in (("line", Line(), 16), ("square", Square(), 13)):
+    for name, ratios, losses_db, most in PLANS:
+        aperture = Line() if name == "line" else Square()
         octaves = float(np.log2(aperture.reaches / LEAST_WIDTH))
         widths = LEAST_WIDTH * 2 ** np.linspace(0, octaves, round(octaves * 6) + 1)
         sure = make_sure(aperture, widths)
         print(name, "sure", flush=True)
         cones = LEAST_WIDTH * 2 ** np.linspace(0, octaves, round(octaves * 3) + 1)
-        ratios = 2 ** (-np.arange(count) / 3)
         least = [
             least_db(aperture, interpolated(widths, sure, cone), cone, aperture.size)
             for cone in np.minimum(cones, 0.9 * aperture.reaches)
         ]
         likely: list[Array] = []
-        for loss_db in LOSSES_DB:
+        for loss_db in losses_db:
             floors = 10 ** ((np.array(least) - loss_db) / 10)
             wider = likely[-1] if likely else None
-            likely.append(make_likely(aperture, cones, ratios, floors, wider))
+            likely.append(make_likely(aperture, cones, ratios, floors, wider, most))
             print(name, "likely", loss_db, flush=True)
         # 5e-4 of the phase, which is at most some 30 rad, is all that half precision costs.
         made |= {
@@ -429,7 +435,7 @@ def main() -> None:
                 - 10 * np.log10(aperture.size ** aperture.places.shape[1])
                 for width in widths
             ]),
-            f"{name}_cones": cones, f"{name}_ratios": ratios, f"{name}_losses_db": LOSSES_DB,
+            f"{name}_cones": cones, f"{name}_ratios": ratios, f"{name}_losses_db": losses_db,
             f"{name}_likely": np.array(likely).astype(np.float16),
         }  # fmt: skip
         np.savez_compressed(OUT, **made)

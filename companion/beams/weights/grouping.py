@@ -123,15 +123,19 @@ def semi_orthogonal(steering: ComplexArray, order: Sequence[int], limits: Limits
             continue
         group = _Group(gram, begin, len(steering), limits)
         left[begin] = False
-        factors: list[ComplexArray] = []
+        factors: ComplexArray = np.empty((min(len(gram), len(steering)), len(gram)), dtype=complex)
+        count = 0
         apart = np.ones(len(gram))
         taken = begin
         while left.any():
-            row = gram[taken].copy()
-            for factor in factors:
-                row -= factor[taken].conj() * factor
-            factors.append(row / math.sqrt(max(apart[taken], 1e-300)))
-            apart = apart - np.abs(factors[-1]) ** 2
+            if count == len(factors):
+                break
+            before = factors[:count]
+            row = gram[taken] - before[:, taken].conj() @ before
+            row /= math.sqrt(max(apart[taken], 1e-300))
+            factors[count] = row
+            count += 1
+            apart = apart - (row.real**2 + row.imag**2)
             best = int(np.argmax(np.where(left, apart, -np.inf)))
             if not group.take(best):
                 break

@@ -23,7 +23,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from companion.beams.weights.widening import Spread
-from companion.values import BoolArray, ComplexArray, FloatArray
+from companion.values import BoolArray, ComplexArray, FloatArray, IntArray
 
 PRICE: Final = 0.6
 """Gain, over the gain that is left, that one null may cost: 2 dB."""
@@ -60,9 +60,10 @@ def nulled(spread: Spread, noise: FloatArray | None = None, exact: bool = False)
     users, each = spread.beams.shape[1], spread.each
     if users == 1:
         return Nulled(spread.beams.copy(), np.ones(1, dtype=bool))
-    fields = spread.cones.fields(spread.beams)
+    places = _places(spread)
+    fields = spread.cones.fields(spread.beams)[places.rows, places.columns]
     power = np.einsum("mn,mn->n", spread.beams, spread.beams.conj()).real
-    least, inner = _least(spread, fields.real**2 + fields.imag**2, power)
+    least, inner = _least(places, fields.real**2 + fields.imag**2, power)
     kept = _kept(least)
     shares = _shares(spread, kept, power)
     if exact:
@@ -73,17 +74,43 @@ def nulled(spread: Spread, noise: FloatArray | None = None, exact: bool = False)
     taken = _taken(spread, wanted.reshape(-1, users), noise)
     back = np.ones(users)
     if not exact:
-        back = _back(spread, taken, fields, power, (kept, _kept(inner)))
+        back = _back(spread, taken, (places, fields), power, (kept, _kept(inner)))
     whole = shares[::each] >= 1.0
     whole[own, own] = True
     return Nulled(spread.beams - back * taken, whole.all(axis=0) & (back >= 1.0))
 
 
-def _least(spread: Spread, towards: FloatArray, power: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Least gains (N,) over the cones and over their likely parts, of powers (N, P)."""
-    held = np.where(spread.cones.held, towards, np.inf).min(axis=1)
-    likely = np.where(spread.cones.likely, towards, np.inf).min(axis=1)
-    return held / power, likely / power
+class _Places(NamedTuple):
+    """The places that are looked at, user by user: rows and columns of what ``Cones`` answers.
+
+    starts  (N,), where each user's begin
+    held    whether a place is within the cone over which the least gain counts
+    likely  whether it is within that of the likely angle
+    """
+
+    rows: IntArray
+    columns: IntArray
+    starts: IntArray
+    held: BoolArray
+    likely: BoolArray
+
+
+def _places(spread: Spread) -> _Places:
+    held, likely = spread.cones.held, spread.cones.likely
+    rows, columns = np.nonzero(held | likely)
+    starts = np.searchsorted(rows, np.arange(len(held)))
+    return _Places(rows, columns, starts, held[rows, columns], likely[rows, columns])
+
+
+def _least(
+    places: _Places, towards: FloatArray, power: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Least gains (N,) over the cones and over their likely parts, of powers at the places."""
+    held, likely = (
+        np.minimum.reduceat(np.where(inside, towards, np.inf), places.starts) / power
+        for inside in (places.held, places.likely)
+    )
+    return held, likely
 
 
 def _kept(least: FloatArray) -> FloatArray:
@@ -134,19 +161,20 @@ def _taken(spread: Spread, wanted: ComplexArray, noise: FloatArray | None) -> Co
 def _back(
     spread: Spread,
     taken: ComplexArray,
-    fields: ComplexArray,
+    seen: tuple[_Places, ComplexArray],
     power: FloatArray,
     kept: tuple[FloatArray, FloatArray],
 ) -> FloatArray:
     """The share (N,) of the nulls up to which the least gains are kept, by interpolation."""
-    less = spread.cones.fields(taken)
+    places, fields = seen
+    less = spread.cones.fields(taken)[places.rows, places.columns]
     cross = np.einsum("mn,mn->n", spread.beams.conj(), taken).real
     own = np.einsum("mn,mn->n", taken.conj(), taken).real
     worst = np.full((len(BACK), len(power)), np.inf)
     for row, share in enumerate(BACK.tolist()):
         towards = fields - share * less
         left = np.maximum(power - 2 * share * cross + share**2 * own, 1e-300)
-        least = _least(spread, towards.real**2 + towards.imag**2, left)
+        least = _least(places, towards.real**2 + towards.imag**2, left)
         worst[row] = np.minimum(least[0] / kept[0], least[1] / kept[1])
         if row == 0 and (worst[0] >= 1.0).all():
             return np.ones(len(power))

@@ -8,7 +8,6 @@ square; in apertures from the middle, their phases serve any number. See docs/ma
 
 import functools
 import io
-import itertools
 from collections.abc import Mapping
 from importlib import resources
 from typing import Final, NamedTuple
@@ -19,6 +18,8 @@ from companion.beams.array.geometry import Array
 from companion.values import FloatArray, IntArray
 
 TABLES: Final = "shapes.npz"
+CORNERS: Final = np.indices((2, 2, 2)).reshape(3, 8)
+"""The corners of a cell of three axes."""
 MOST: Final = 0.375
 """Widest beam in natural widths for each element: beyond it they are too far apart to shape one."""
 LEAST_SHARE: Final = 1 / 16
@@ -176,19 +177,18 @@ def _sure(shapes: Shapes, widths: FloatArray) -> FloatArray:
 def _likely(
     shapes: Shapes, cones: FloatArray, likely: FloatArray, losses_db: FloatArray
 ) -> FloatArray:
-    places = [
-        _on_logs(shapes.losses_db, losses_db),
-        _on_logs(shapes.cones, cones),
-        _on_logs(shapes.ratios, np.maximum(cones, 1e-300) / np.maximum(likely, 1e-300)),
+    asked = np.maximum(cones, 1e-300) / np.maximum(likely, 1e-300)
+    loss, a = _on_logs(shapes.losses_db, losses_db)
+    cone, b = _on_logs(shapes.cones, cones)
+    ratio, c = _on_logs(shapes.ratios, asked)
+    # The eight corners of each one's cell, (N, 8).
+    u, v, w = CORNERS
+    found: FloatArray = shapes.likely[
+        loss[:, np.newaxis] + u, cone[:, np.newaxis] + v, ratio[:, np.newaxis] + w
     ]
-    found = np.zeros((len(cones), shapes.likely.shape[-1]))
-    for corner in itertools.product((0, 1), repeat=3):
-        before = tuple(at + more for (at, _), more in zip(places, corner, strict=True))
-        parts = [
-            share if more else 1 - share for (_, share), more in zip(places, corner, strict=True)
-        ]
-        found += np.prod(parts, axis=0)[:, np.newaxis] * shapes.likely[before]
-    return found
+    parts = [np.stack([1 - share, share]).T for share in (a, b, c)]
+    shares = parts[0][:, u] * parts[1][:, v] * parts[2][:, w]
+    return np.asarray((shares[:, np.newaxis] @ found)[:, 0])
 
 
 def _on_square(shapes: Shapes, psi: FloatArray, placed: FloatArray) -> FloatArray:

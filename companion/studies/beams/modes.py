@@ -83,8 +83,9 @@ class _Way:
 
 
 def _percentile(values: Sequence[float], percent: float) -> float | None:
-    wanted = "inverted_cdf"  # a value that occurred: some are infinite
-    found = float(np.percentile(values, percent, method=wanted)) if values else -np.inf
+    if not values:
+        return None
+    found = float(np.percentile(values, percent, method="inverted_cdf"))  # one that occurred
     return found if np.isfinite(found) else None
 
 

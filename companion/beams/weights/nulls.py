@@ -27,8 +27,11 @@ from companion.values import BoolArray, ComplexArray, FloatArray, IntArray
 
 PRICE: Final = 0.6
 """Gain, over the gain that is left, that one null may cost: 2 dB."""
-FLOOR_PRICE_DB: Final = 3.0
-"""Most that all nulls of a beam may take off its least gain."""
+FLOOR_PRICE_DB: Final = 2.5
+"""Most that all nulls of a beam may take off its least gain, where it is looked at.
+
+Between these places it may be half a decibel more, and rarely more than that.
+"""
 ABOVE: Final = 1.2
 """Least gain that is kept if it was there: what is sampled at 1.2 is surely above 1."""
 NOTHING: Final = 1e-9
@@ -39,8 +42,10 @@ SOFT: Final = 0.02
 """Loading of the points around a predicted direction, as a share of their power."""
 ROUNDING: Final = 1e-10
 """Loading of the predicted directions, as a share of their power, against rounding."""
-BACK: Final = np.array([1.0, 0.85, 0.7, 0.5, 0.3, 0.15, 0.0])
-"""Shares of the nulls that are tried."""
+BACK: Final = np.array([0.8, 0.6, 0.4, 0.2, 0.0])
+"""Shares of the nulls that are tried, in descending order."""
+FINE: Final = np.array([0.75, 0.5, 0.25, 0.0])
+"""Places between two of them that are tried then."""
 
 
 class Nulled(NamedTuple):
@@ -170,20 +175,34 @@ def _back(
     less = spread.cones.fields(taken)[places.rows, places.columns]
     cross = np.einsum("mn,mn->n", spread.beams.conj(), taken).real
     own = np.einsum("mn,mn->n", taken.conj(), taken).real
-    worst = np.full((len(BACK), len(power)), np.inf)
-    for row, share in enumerate(BACK.tolist()):
-        towards = fields - share * less
+
+    def kept_at(share: FloatArray) -> FloatArray:
+        """The least gains over what must be kept, (N,), for shares (N,) of the nulls."""
+        at = share[places.rows]
+        towards = fields - at * less
         left = np.maximum(power - 2 * share * cross + share**2 * own, 1e-300)
-        least = _least(places, towards.real**2 + towards.imag**2, left)
-        worst[row] = np.minimum(least[0] / kept[0], least[1] / kept[1])
-        if row == 0 and (worst[0] >= 1.0).all():
-            return np.ones(len(power))
-    enough = worst >= 1.0
-    enough[-1] = True
-    first = np.argmax(enough, axis=0)
-    before, users = np.maximum(first - 1, 0), np.arange(len(power))
-    high, low = worst[first, users], worst[before, users]
-    part = np.clip((1.0 - low) / np.maximum(high - low, 1e-12), 0.0, 1.0)
-    part = np.where(first == 0, 1.0, part)
-    back: FloatArray = BACK[before] + part * (BACK[first] - BACK[before])
+        held, likely = _least(places, towards.real**2 + towards.imag**2, left)
+        return np.minimum(held / kept[0], likely / kept[1])
+
+    high, low = np.ones(len(power)), np.ones(len(power))
+    above = kept_at(high)
+    if (above >= 1.0).all():
+        return high
+    below = above
+    for tries in (BACK, FINE):
+        # Down from the greatest share until the least gains are kept; then finer in between.
+        begin, end = high, np.where(above >= 1.0, high, 0.0) if tries is BACK else low
+        found = above >= 1.0 if tries is BACK else np.zeros(len(power), dtype=bool)
+        high, low, over = begin.copy(), begin.copy(), above
+        for part in tries.tolist():
+            share = end + part * (begin - end)
+            now = kept_at(share)
+            first = ~found & ((now >= 1.0) | (part == 0.0))
+            low, below = np.where(first, share, low), np.where(first, now, below)
+            failed = ~found & ~first
+            high, over = np.where(failed, share, high), np.where(failed, now, over)
+            found |= first
+        above = over
+    part = np.clip((1.0 - above) / np.maximum(below - above, 1e-12), 0.0, 1.0)
+    back: FloatArray = np.where(low >= high, high, high + part * (low - high))
     return back

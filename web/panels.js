@@ -231,8 +231,8 @@ export function showBeams(answer) {
     `lead ${format.milliseconds(format.known(answer.lead_ms) ? answer.lead_ms / 1000 : null)}`,
   ].join(" · ") : format.UNKNOWN);
   setNotice($("beams-warning"), regularised
-    ? "▲ Regularised fallback: the UAVs are too close in angle for zero forcing, so nulls on the "
-      + "others are not exact." : "");
+    ? "Nulls are not exact: each is held back where it would cost another beam more of the gain "
+      + "that is sure than [beams] loss_limit_db." : "");
   const out = (leftOut ?? []).map(({ uav, reason }) => [uav, reason, "warn"]);
   setPairs($("left-out"), out, "no one");
 }

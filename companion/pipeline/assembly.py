@@ -175,10 +175,11 @@ def noise(settings: Settings) -> NoiseSettings:
 
 @dataclass(frozen=True, slots=True)
 class Assumed:
-    """What is assumed of one aircraft: its limits, and the lag of its positions."""
+    """What is assumed of one aircraft: its limits, the lag of its positions, how it turns."""
 
     limits: Limits
     lag_s: tuple[float, float]
+    turn_degps2: float
 
     @property
     def lag_middle_s(self) -> float:
@@ -209,7 +210,8 @@ def assumed(settings: Settings, uav: str, mav_type: int | None, autopilot: int |
     limits = Limits(speed or known.speed_mps, most or known.acceleration_mps2, source)
     if lag is None:
         lag = lag_s(kind, autopilot) if kind is not Airframe.ADSB else known.lag_s
-    return Assumed(limits, lag)
+    turn_degps2 = settings.center.turn_acceleration_max_degps2
+    return Assumed(limits, lag, known.turn_degps2 if turn_degps2 is None else turn_degps2)
 
 
 def anyone(settings: Settings) -> Limits:

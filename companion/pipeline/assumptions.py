@@ -13,6 +13,7 @@ _UNITS: Final = {
     "observer.acceleration_max_mps2": "m/s²",
     "observer.position_noise_m": "m",
     "clocks.drift_max_ppm": "ppm",
+    "center.turn_acceleration_max_degps2": "°/s²",
 }
 SILENT_NS: Final = 60_000_000_000
 """Time for which a change of a clock or link is not told again."""

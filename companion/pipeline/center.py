@@ -24,6 +24,7 @@ from companion.values import (
     Estimate,
     Fix,
     Notice,
+    Refuted,
     Report,
     SenderTime,
     Severity,
@@ -50,10 +51,8 @@ class Center:
         self.vehicle = str(self.place) if isinstance(self.place, VehicleCenter) else None
         self._home_from: tuple[str, int] | None = None  # who home began with, and when
         self._attitude: tuple[int, Attitude] | None = None  # sender's time, attitude
-        self._attitude_bounds = carrier.AttitudeBounds(
-            math.radians(settings.center.attitude_bound_deg),
-            math.radians(settings.center.turn_acceleration_max_degps2),
-        )
+        self._turns = carrier.Turns()
+        self._attitude_bound_rad = math.radians(settings.center.attitude_bound_deg)
         self._attitude_kept_s = settings.tracks.coasting_s
         if isinstance(self.place, FixedCenter):
             self._begin(self.place)
@@ -95,15 +94,21 @@ class Center:
         )
         return made, said
 
-    def turn(self, placed: PlacedAttitude) -> None:
-        """Take in an attitude of the carrier, unless it is older than the newest."""
-        if self._attitude is None or placed.sender_ns > self._attitude[0]:
-            self._attitude = placed.sender_ns, placed.attitude
+    def turn(self, placed: PlacedAttitude, turn_degps2: float) -> Refuted | None:
+        """Take in an attitude of the carrier, unless it is older than the newest.
+
+        Returns what it refutes of ``turn_degps2``, the greatest angular acceleration assumed.
+        """
+        if self._attitude is not None and placed.sender_ns <= self._attitude[0]:
+            return None
+        self._attitude = placed.sender_ns, placed.attitude
+        return self._turns.look(placed.attitude, placed.sender_ns, turn_degps2)
 
     def restarted(self, uav: str) -> None:
         """Drop the carrier's attitude if the carrier was restarted: its stamps mean nothing now."""
         if uav == self.vehicle:
             self._attitude = None
+            self._turns = carrier.Turns()
 
     def _first(self, report: Report) -> Notice:
         """Make the first position of all the origin of the local frame, and of ``home``."""
@@ -146,14 +151,20 @@ class Center:
         return carrier.fixed(valid_at_ns, self.local, place, math.radians(at.heading_deg))
 
     def aboard(
-        self, track: Track | None, newest: Fix | None, now: SenderTime, at: SenderTime
+        self,
+        track: Track | None,
+        newest: Fix | None,
+        now: SenderTime,
+        at: SenderTime,
+        turn_degps2: float,
     ) -> Carrier | str:
         """The array aboard the vehicle, or the reason why its position or attitude is not known.
 
-            track   the carrier's track at the time ``at``; None if it has none
-            newest  its newest accepted report
-            now     the present
-            at      the time asked for
+            track        the carrier's track at the time ``at``; None if it has none
+            newest       its newest accepted report
+            now          the present
+            at           the time asked for
+            turn_degps2  the greatest angular acceleration assumed of it
 
         Times are on the vehicle's timeline.
         """
@@ -168,8 +179,7 @@ class Center:
         made_ns, attitude = self._attitude
         if now.sender_ns - made_ns > self._attitude_kept_s * 1e9:
             return f"the attitude of the carrier {self.vehicle} is too old"
+        turn_degps2 = self._turns.limit_degps2(turn_degps2, at.sender_ns)
+        bounds = carrier.AttitudeBounds(self._attitude_bound_rad, math.radians(turn_degps2))
         since_ns = at.sender_ns - made_ns
-        doubt_s = at.bound_s
-        return carrier.moving(
-            self.local, track, newest, attitude, since_ns, doubt_s, self._attitude_bounds
-        )
+        return carrier.moving(self.local, track, newest, attitude, since_ns, at.bound_s, bounds)

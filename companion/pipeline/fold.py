@@ -119,7 +119,9 @@ class Pipeline:
         if isinstance(heard.message, PlacedReport):
             said += self._report(heard.message)
         elif isinstance(heard.message, PlacedAttitude):
-            self.center.turn(heard.message)
+            turn_degps2 = self.senders.assumed(str(frame.source)).turn_degps2
+            refuted = self.center.turn(heard.message, turn_degps2)
+            said += self.assumptions.told([] if refuted is None else [refuted])
         return said
 
     def _changed(self, t_ns: int, sender: str, change: ClockChange) -> list[Output]:
@@ -216,7 +218,8 @@ class Pipeline:
         at = self.senders.time(vehicle, valid_at_ns)
         track = self.fleet.track(vehicle, now_ns, at)
         now = self.senders.time(vehicle, now_ns)
-        return self.center.aboard(track, self.fleet.newest(vehicle), now, at)
+        turn_degps2 = self.senders.assumed(vehicle).turn_degps2
+        return self.center.aboard(track, self.fleet.newest(vehicle), now, at, turn_degps2)
 
     def reporters(self) -> list[Source]:
         """Senders that report their own position, the carrier among them."""

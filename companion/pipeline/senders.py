@@ -187,7 +187,7 @@ class Senders:
             return Heard(None, (*said, Rejection(t_ns, uav, Reason.UNPLACED_STAMP)), restarted)
         self._dedupe.took(stamp.latency_s)
         errors = self._noise.get(report.source, self._noise_settings.default)
-        assumed = self._assumed(uav)
+        assumed = self.assumed(uav)
         lag_ns = round(assumed.lag_middle_s * 1e9)
         errors = replace(errors, time_s=assumed.lag_rest_s)
         true_ns = t_ns - round(stamp.latency_s * 1e9) - lag_ns
@@ -204,7 +204,7 @@ class Senders:
         if isinstance(merged, Rejection):
             return Heard(said=(merged,))
         true_ns = merged.t_ns - round((merged.tslc_s or 0.0) * 1e9)
-        limits = self._assumed(said.uav).limits
+        limits = self.assumed(said.uav).limits
         placed = PlacedReport(merged, true_ns, true_ns, None, limits)
         if datum in (None, merged.alt_datum):
             return Heard(placed)
@@ -255,7 +255,7 @@ class Senders:
             bound_s = noise.ADSB_TIME_BOUND_S
             return SenderTime(node_ns, node_ns, bound_s, bound_s)
         offset_ns, before_s, after_s, usual_s = known
-        rest_s = self._assumed(uav).lag_rest_s
+        rest_s = self.assumed(uav).lag_rest_s
         return SenderTime(
             node_ns,
             node_ns - offset_ns,
@@ -269,7 +269,7 @@ class Senders:
         clock = self._clocks.get(uav)
         return clock.estimate() if clock else None
 
-    def _assumed(self, uav: str) -> assembly.Assumed:
+    def assumed(self, uav: str) -> assembly.Assumed:
         """What is assumed of a UAV, by its newest heartbeat."""
         if uav not in self._known:
             heard = self.presence.get(Source.parse(uav)) if reports_itself(uav) else None

@@ -79,11 +79,12 @@ class CenterSettings(Section):
     """What carries the array. The ``run`` command refuses to start without it.
 
     ``attitude_bound_deg`` bounds the angular error of a vehicle's attitude, mounting included;
-    ``turn_acceleration_max_degps2`` its angular acceleration since its newest attitude.
+    ``turn_acceleration_max_degps2`` its angular acceleration since its newest attitude; by its type
+    (HEARTBEAT) unless given, and raised where reported rates refute it.
     Autopilots' headings are off by a degree or more (simulated: 1.1 degrees in the median;
     docs/field-notes.md 1).
     """
 
     source: Annotated[str, AfterValidator(_center_text)] | None = None
     attitude_bound_deg: Annotated[float, Field(ge=0, le=180)] = 3.0
-    turn_acceleration_max_degps2: Annotated[float, Field(ge=0, le=10_000)] = 270.0
+    turn_acceleration_max_degps2: Annotated[float, Field(ge=0, le=10_000)] | None = None

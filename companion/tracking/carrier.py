@@ -10,7 +10,8 @@ from typing import Final
 import numpy as np
 
 from companion.tracking.geodesy import LocalFrame
-from companion.values import Attitude, Carrier, Fix, FloatArray, Track
+from companion.tracking.limits import MOST, Raised
+from companion.values import Attitude, Carrier, Fix, FloatArray, Refuted, Track
 
 
 def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> FloatArray:
@@ -95,6 +96,49 @@ class AttitudeBounds:
         furthest_s = abs(age_s) + doubt_s
         turned = self.acceleration_radps2 * furthest_s * furthest_s / 2.0
         return min(math.pi, self.attitude_rad + rate_radps * doubt_s + turned)
+
+
+RATES_APART_S: Final = 0.05
+"""Least time between two rates of turn that are compared: stamps are whole milliseconds."""
+RATE_NOISE_DEGPS: Final = 2.0
+"""Bound on the error of a reported rate of turn."""
+
+
+class Turns:
+    """What a carrier's reported rates of turn prove of its angular acceleration."""
+
+    def __init__(self) -> None:
+        self._raised = Raised()
+        self._newest: tuple[int, float, float, float] | None = None
+
+    def limit_degps2(self, base_degps2: float, sender_ns: int) -> float:
+        """The greatest angular acceleration taken for possible at a sender time."""
+        return self._raised.at(base_degps2, sender_ns)
+
+    def look(self, attitude: Attitude, sender_ns: int, base_degps2: float) -> Refuted | None:
+        """Take in an attitude. Returns what it refutes of the limit, which is raised then."""
+        rates = (attitude.rollspeed_radps, attitude.pitchspeed_radps, attitude.yawspeed_radps)
+        before = self._newest
+        if before is not None and sender_ns - before[0] < RATES_APART_S * 1e9:
+            return None
+        self._newest = (sender_ns, *rates)
+        if before is None:
+            return None
+        apart_s = (sender_ns - before[0]) * 1e-9 + 1e-3
+        changed_degps = math.degrees(math.dist(rates, before[1:]))
+        proven = (changed_degps - 2 * RATE_NOISE_DEGPS) / apart_s
+        limit = self._raised.at(base_degps2, sender_ns)
+        if not limit < proven < MOST * base_degps2:
+            return None
+        to = self._raised.to_hold(proven, sender_ns)
+        return Refuted(
+            attitude.t_ns,
+            str(attitude.source),
+            "center.turn_acceleration_max_degps2",
+            limit,
+            proven,
+            to,
+        )
 
 
 def moving(

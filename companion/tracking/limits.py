@@ -46,23 +46,26 @@ class AirframeLimits:
                 greatest of each, norms of 3-vectors
     lag_s       least and greatest time by which a reported position is older than its stamp;
                 negative: it is where the aircraft will be
+    turn_degps2
+                greatest angular acceleration, norm about the body's axes
     """
 
     speed_mps: float
     acceleration_mps2: float
     lag_s: tuple[float, float]
+    turn_degps2: float
 
 
 ANY_LAG_S: Final = (0.0, 0.06)
 """Lag of an autopilot of which nothing is known."""
 LIMITS: Final = {
-    Airframe.COPTER: AirframeLimits(60.0, 4.0, ANY_LAG_S),
-    Airframe.AEROPLANE: AirframeLimits(80.0, 16.0, ANY_LAG_S),
-    Airframe.VTOL: AirframeLimits(80.0, 16.0, ANY_LAG_S),
-    Airframe.HELICOPTER: AirframeLimits(80.0, 8.0, ANY_LAG_S),
-    Airframe.ROVER: AirframeLimits(40.0, 5.0, ANY_LAG_S),
-    Airframe.UNKNOWN: AirframeLimits(80.0, 16.0, ANY_LAG_S),
-    Airframe.ADSB: AirframeLimits(400.0, 16.0, (0.0, 0.0)),
+    Airframe.COPTER: AirframeLimits(60.0, 4.0, ANY_LAG_S, 180.0),
+    Airframe.AEROPLANE: AirframeLimits(80.0, 16.0, ANY_LAG_S, 720.0),
+    Airframe.VTOL: AirframeLimits(80.0, 16.0, ANY_LAG_S, 720.0),
+    Airframe.HELICOPTER: AirframeLimits(80.0, 8.0, ANY_LAG_S, 180.0),
+    Airframe.ROVER: AirframeLimits(40.0, 5.0, ANY_LAG_S, 90.0),
+    Airframe.UNKNOWN: AirframeLimits(80.0, 16.0, ANY_LAG_S, 270.0),
+    Airframe.ADSB: AirframeLimits(400.0, 16.0, (0.0, 0.0), 720.0),
 }
 """From real and simulated logs: docs/field-notes.md 1."""
 ARDUPILOT_LAG_S: Final = {Airframe.COPTER: (0.019, 0.040), Airframe.AEROPLANE: (-0.033, -0.019)}
@@ -92,12 +95,18 @@ def lag_s(kind: Airframe, autopilot: int | None) -> tuple[float, float]:
 
 
 @dataclass(slots=True)
-class _Raised:
+class Raised:
     """A limit that was raised: to how much, when on the sender's timeline, and how often."""
 
     to: float = 0.0
     at_ns: int = 0
     times: int = 0
+
+    def to_hold(self, proven: float, sender_ns: int) -> float:
+        """Raise the limit to what holds what was proven, and more; returns it."""
+        self.to, self.at_ns = RAISED * proven, sender_ns
+        self.times += 1
+        return self.to
 
     def at(self, limit: float, sender_ns: int) -> float:
         """The limit in force at a sender time."""
@@ -111,8 +120,8 @@ class Refutations:
     """What the reports of one UAV have proven of its limits. ``look`` takes them in any order."""
 
     def __init__(self) -> None:
-        self.speed = _Raised()
-        self.acceleration = _Raised()
+        self.speed = Raised()
+        self.acceleration = Raised()
         self._times_ns: list[int] = []
         self._velocities: list[tuple[float, float, float, float, float]] = []
 
@@ -170,8 +179,7 @@ class Refutations:
         return most
 
     def _raise(
-        self, raised: _Raised, fix: Fix, setting: str, limit: float, proven: float
+        self, raised: Raised, fix: Fix, setting: str, limit: float, proven: float
     ) -> Refuted:
-        raised.to, raised.at_ns = RAISED * proven, fix.sender_ns
-        raised.times += 1
-        return Refuted(fix.arrival_ns, fix.uav, setting, limit, proven, raised.to)
+        to = raised.to_hold(proven, fix.sender_ns)
+        return Refuted(fix.arrival_ns, fix.uav, setting, limit, proven, to)

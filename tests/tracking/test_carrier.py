@@ -171,3 +171,31 @@ def test_an_attitude_that_was_lost_says_nothing_soon() -> None:
     bounds = carrier.AttitudeBounds(math.radians(3.0), math.radians(270.0))
     assert math.degrees(bounds.at(math.radians(60.0), 1.4, 0.0)) > 84.0
     assert bounds.at(1.0, 100.0, 0.0) == math.pi
+
+
+def turning(rate_degps: float) -> Attitude:
+    rate = math.radians(rate_degps)
+    return Attitude(0, Source(5, 1), 0, 0.0, 0.0, 0.0, rate, 0.0, 0.0)
+
+
+def test_rates_prove_an_angular_acceleration_and_raise_the_limit() -> None:
+    """From 0 to 54 degrees a second in .25 s, less 2 degrees a second of noise at each end."""
+    turns = carrier.Turns()
+    assert turns.look(turning(0.0), 0, 180.0) is None
+    refuted = turns.look(turning(54.0), 250_000_000, 180.0)
+    assert refuted is not None
+    assert refuted.setting == "center.turn_acceleration_max_degps2"
+    assert refuted.proven == pytest.approx(50 / 0.251)
+    assert refuted.raised_to == turns.limit_degps2(180.0, 250_000_000)
+    assert refuted.raised_to == pytest.approx(1.5 * 50 / 0.251)
+    later = turns.limit_degps2(180.0, 120_250_000_000)
+    assert 180.0 < later < refuted.raised_to  # it fades
+
+
+def test_what_is_possible_or_beyond_belief_raises_nothing() -> None:
+    turns = carrier.Turns()
+    rates = [0.0, 40.0, 0.0, 3000.0, 0.0]  # the third step is 16 times what is possible
+    for at, rate in enumerate(rates):
+        assert turns.look(turning(rate), at * 250_000_000, 180.0) is None
+    assert turns.limit_degps2(180.0, 0) == 180.0
+    assert turns.look(turning(90.0), 1_010_000_000, 180.0) is None  # 10 ms after the last

@@ -125,9 +125,10 @@ def _beams(
     tracks, ranges_m, directions = aimed
     uavs = [track.uav for track in tracks]
     each = list(zip(tracks, ranges_m.tolist(), strict=True))
-    bounds = [_pointing_bound_rad(track, carrier, array, range_m) for track, range_m in each]
+    lever_m = float(np.linalg.norm(array.lever_arm_m))
+    bounds = [_pointing_bound_rad(track, carrier, lever_m, range_m) for track, range_m in each]
     usual = [
-        _usual_rad(track, carrier, array, range_m, bound)
+        _usual_rad(track, carrier, lever_m, range_m, bound)
         for (track, range_m), bound in zip(each, bounds, strict=True)
     ]
     wanted = [(0.0, 0.0) if b is None else (u, b) for u, b in zip(usual, bounds, strict=True)]
@@ -199,7 +200,7 @@ def _out_of_reach(directions: FloatArray, array: Array, coverage: Coverage) -> l
 
 
 def _pointing_bound_rad(
-    track: Track, carrier: Carrier, array: Array, range_m: float
+    track: Track, carrier: Carrier, lever_m: float, range_m: float
 ) -> float | None:
     """Bound on the angle between predicted and true direction; None: any direction is possible.
 
@@ -207,13 +208,13 @@ def _pointing_bound_rad(
     that stands off the carrier's reported point, and that error itself (docs/math.md 5.3).
     """
     swing = 2.0 * math.sin(min(carrier.attitude_bound_rad, math.pi) / 2.0)
-    swung_m = swing * float(np.linalg.norm(array.lever_arm_m))
+    swung_m = swing * lever_m
     seen = steering.pointing_bound_rad(track.bound_m + carrier.bound_m + swung_m, range_m)
     return None if seen is None else min(seen + carrier.attitude_bound_rad, math.pi)
 
 
 def _usual_rad(
-    track: Track, carrier: Carrier, array: Array, range_m: float, bound_rad: float | None
+    track: Track, carrier: Carrier, lever_m: float, range_m: float, bound_rad: float | None
 ) -> float:
     """Angle that 95 of 100 predicted directions are off by at most, as far as is known.
 
@@ -225,7 +226,7 @@ def _usual_rad(
         return UNKNOWN_SHARE * bound if known is None else min(known, bound)
 
     attitude = usual(carrier.attitude_p95_rad, carrier.attitude_bound_rad)
-    swung_m = attitude * float(np.linalg.norm(array.lever_arm_m))
+    swung_m = attitude * lever_m
     off_m = math.hypot(
         usual(track.error_p95_m, track.bound_m),
         usual(carrier.error_p95_m, carrier.bound_m),

@@ -79,6 +79,8 @@ def _serial(text: str, device: str, baud: int) -> LinkUrl:
 def _meant(text: str) -> str:
     """What was likely meant, as the end of a message; empty where nobody knows."""
     scheme, _, address = text.partition(":")
+    if not text.isprintable():
+        return ""
     if scheme == "serial" and address:
         return f"; a baud rate is missing, as in {text.rstrip(':')}:57600"
     if text.startswith(("/dev/", "COM")):

@@ -1,7 +1,7 @@
 """Addresses of links: read and written alike, and one line about what is wrong with one."""
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from companion.mavlink.links.urls import SCHEMES, LinkError, LinkUrl, parse_link
@@ -89,6 +89,8 @@ def test_only_the_schemes_that_are_asked_for() -> None:
 
 
 @given(st.sampled_from(SCHEMES), st.text(max_size=20), st.text("0123456789:.-", max_size=6))
+@example("serial", "\x1e", "")
+@example("udp", "\x85", "1")
 def test_any_text_is_an_address_or_a_link_error(scheme: str, host: str, port: str) -> None:
     """What is read is written so that it reads alike."""
     try:

@@ -15,14 +15,16 @@ OF_REPORTS: Final = frozenset(
         Reason.UNREACHABLE,
         Reason.ALTITUDE_JUMP,
         Reason.FROZEN,
-        Reason.SHARED_ID,
         Reason.ZERO_POSITION,
         Reason.UNPLACED_STAMP,
         Reason.NO_FIX,
         Reason.OUT_OF_ORDER,
     }
 )
-"""Reasons for which a report that is about its sender itself is not used."""
+"""Reasons for which a report that is about its sender itself is not used.
+
+A shared id is told by itself.
+"""
 RECENT: Final = 8
 """Recent rejections kept per sender."""
 SENDERS_MAX: Final = 4096

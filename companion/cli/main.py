@@ -187,6 +187,8 @@ def replay(
         raise InterruptedByUser(_left_behind(writer)) from None
     progress.clear()
     _show_replay(as_json, summary)
+    if summary["unaimed"]:
+        raise UserError(f"nothing was aimed at: {summary['unaimed']}")
 
 
 def _left_behind(writer: "Writer | None") -> str:
@@ -198,10 +200,7 @@ def _left_behind(writer: "Writer | None") -> str:
 
 
 def _show_replay(as_json: bool, summary: dict[str, Any]) -> None:
-    """Print the summary. Raises ``UserError`` where nothing was aimed at."""
     click.echo(json.dumps(summary) if as_json else _replay_text(summary))
-    if summary["unaimed"]:
-        raise UserError(f"nothing was aimed at: {summary['unaimed']}")
 
 
 def _speed(text: str) -> float | None:

@@ -159,20 +159,25 @@ def replay(
     settings = replaying.settings_for(logs, config, center)
     if settings.center.source is None:
         click.echo("no --center: the array stands where the first report was made", err=True)
-    record = partial(replaying.writer_for, logs, settings, out) if not no_record else None
+    begun: list[Writer] = []
+
+    def record() -> "Writer":
+        begun.append(replaying.writer_for(logs, settings, out))
+        return begun[0]
+
+    recorder = None if no_record else record
     if serve:
         from companion.node import served_replay  # it loads what HTTP takes
         from companion.settings.files import load
 
         served_replay.serve(
-            served_replay.Asked(logs, settings, pace, record),
+            served_replay.Asked(logs, settings, pace, recorder),
             load(config).override(server={"listen": listen}).server.listen,
             partial(_show_replay, as_json),
             token=os.environ.get("COMPANION_TOKEN"),
             insecure=insecure,
         )
         return
-    writer = record() if record else None
     ends_s = replaying.length_s(logs)
 
     def show(frames: int, at_s: float, wall_s: float) -> None:
@@ -182,21 +187,21 @@ def replay(
         progress.show(f"{frames} frames, {at_s:.0f} s of log{to_go}")
 
     try:
-        summary = replaying.replay(logs, settings, writer, pace, show)
+        summary = replaying.replay(logs, settings, recorder, pace, show)
     except KeyboardInterrupt:
-        raise InterruptedByUser(_left_behind(writer)) from None
+        raise InterruptedByUser(_left_behind(begun)) from None
     progress.clear()
     _show_replay(as_json, summary)
     if summary["unaimed"]:
         raise UserError(f"nothing was aimed at: {summary['unaimed']}")
 
 
-def _left_behind(writer: "Writer | None") -> str:
-    """What Ctrl-C leaves of a recording, and how to make it whole."""
-    if writer is None:
-        return ""
-    writer.abandon()
-    return f"interrupted; to use what was recorded so far: companion recover {writer.path}"
+def _left_behind(begun: "list[Writer]") -> str:
+    """What Ctrl-C leaves of a recording, and how to make it whole; empty without one."""
+    for writer in begun:
+        writer.abandon()
+        return f"interrupted; to use what was recorded so far: companion recover {writer.path}"
+    return ""
 
 
 def _show_replay(as_json: bool, summary: dict[str, Any]) -> None:

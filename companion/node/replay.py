@@ -101,7 +101,7 @@ class Run:
 def replay(
     logs: Sequence[Path],
     settings: Settings,
-    writer: Writer | None = None,
+    record: Callable[[], Writer] | None = None,
     speed: float | None = None,
     progress: Callable[[int, float, float], None] | None = None,
 ) -> dict[str, Any]:
@@ -109,16 +109,17 @@ def replay(
 
         logs      merged by time; the parts of one run follow one another
         settings  those of the pipeline
-        writer    gets everything and is closed
+        record    makes the recording, once the logs are open; None: there is none
         speed     multiple of the log's own speed; None: as fast as it goes
         progress  called now and then with frames, seconds of log, and seconds since it began
 
     ``missing`` in the summary is what the parts lack. Raises ``LogError`` for a log that cannot be
     used, ``OSError`` where the recording cannot be written.
     """
+    events = log_events(logs, settings)
+    writer = record() if record else None
     run = Run(settings, writer)
     flush_due_s = time.monotonic() + FLUSH_EVERY_S
-    events = log_events(logs, settings)
     for event in events if speed is None else _paced(events, speed):
         run.step(event)
         if time.monotonic() >= flush_due_s:

@@ -71,9 +71,9 @@ class Refusals:
             return None
         run = self._unheard.get(uav)
         if run is None:
-            if len(self._unheard) >= SENDERS_MAX:
-                return None
             run = self._unheard.setdefault(uav, _Unheard(refused.t_ns))
+            if len(self._unheard) > SENDERS_MAX:  # the oldest: made-up ids must not silence others
+                del self._unheard[next(iter(self._unheard))]
         run.reports += 1
         lasted_ns = refused.t_ns - run.since_ns
         if run.told or run.reports < 2 or lasted_ns < UNHEARD_NS:

@@ -20,7 +20,7 @@ from typing import Final, NamedTuple
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, Metadata, Schema, Statistics
 from mcap.stream_reader import get_chunk_data_stream
 from zstandard import ZstdError
 
@@ -93,20 +93,8 @@ class Walk:
 
     def _read_descriptions(self) -> None:
         """Read schemas and channels from the summary, if there is one and its checksum holds."""
-        size = self._path.stat().st_size
-        with self._path.open("rb") as file:
-            file.seek(max(0, size - _END.size))
-            end = file.read()
-            if not end.endswith(MAGIC) or end[0] != Opcode.FOOTER:  # a short file starts otherwise
-                return
-            _, _, summary_at, _, checksum, _ = _END.unpack(end)
-            if not 0 < summary_at <= size - _END.size:
-                return
-            file.seek(summary_at)
-            summary = file.read(size - summary_at)
-        if zlib.crc32(summary[:-_UNCHECKED]) == checksum:
-            with contextlib.suppress(*_DAMAGE):  # another program's: the data has them as well
-                self._in_chunk(summary[: -_END.size])
+        with contextlib.suppress(*_DAMAGE):  # another program's: the data has them as well
+            self._in_chunk(_summary(self._path))
 
     def _records(self) -> Iterator[tuple[int, int, bytes]]:
         """(opcode, bytes in the file, body) of the records up to the file's end."""
@@ -166,3 +154,37 @@ class Walk:
             self.lost_bytes += orphaned
             found.append(Damage(orphaned))
         return found
+
+
+def span_ns(path: Path) -> tuple[int, int] | None:
+    """The first and last time of the messages of a finished file, by its summary; else None.
+
+    Raises ``OSError`` where the file cannot be read.
+    """
+    summary, at = _summary(path), 0
+    with contextlib.suppress(*_DAMAGE):
+        while at < len(summary):
+            opcode, length = _HEADER.unpack_from(summary, at)
+            at += _HEADER.size
+            if opcode == Opcode.STATISTICS:
+                found = Statistics.read(ReadDataStream(BytesIO(summary[at : at + length])))
+                times_ns = found.message_start_time, found.message_end_time
+                return times_ns if found.message_count else None
+            at += length
+    return None
+
+
+def _summary(path: Path) -> bytes:
+    """The records of a file's summary; empty without one, or where its checksum does not hold."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        file.seek(max(0, size - _END.size))
+        end = file.read()
+        if not end.endswith(MAGIC) or end[0] != Opcode.FOOTER:  # a short file starts otherwise
+            return b""
+        _, _, summary_at, _, checksum, _ = _END.unpack(end)
+        if not 0 < summary_at <= size - _END.size:
+            return b""
+        file.seek(summary_at)
+        summary = file.read(size - summary_at)
+    return summary[: -_END.size] if zlib.crc32(summary[:-_UNCHECKED]) == checksum else b""

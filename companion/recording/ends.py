@@ -5,10 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
-
 from companion.mavlink.wire.framing import examine
+from companion.recording import container
 from companion.recording.container import MAGIC
 from companion.recording.tlog import STAMP
 
@@ -36,26 +34,15 @@ def _ends_ns(log: Path) -> tuple[int, int] | None:
         head = file.read(STAMP + 300)
         size = file.seek(0, os.SEEK_END)
         if head.startswith(MAGIC):
-            return _mcap_ns(log)
+            return container.span_ns(log)
         file.seek(max(0, size - _TAIL))
         tail = file.read(_TAIL)
-    if examine(head, STAMP, len(head)) <= 0:
+    if len(head) <= STAMP or examine(head, STAMP, len(head)) <= 0:
         return None
     first_ns, last_ns = _stamp_ns(head, STAMP), _last_stamp_ns(tail)
     if last_ns is None or not 0 <= last_ns - first_ns <= _LONGEST_NS:
         return None
     return first_ns, last_ns
-
-
-def _mcap_ns(log: Path) -> tuple[int, int] | None:
-    try:
-        with log.open("rb") as file:
-            summary = make_reader(file).get_summary()
-    except (McapError, ValueError, EOFError):
-        return None
-    if summary is None or summary.statistics is None or not summary.statistics.message_count:
-        return None
-    return summary.statistics.message_start_time, summary.statistics.message_end_time
 
 
 def _last_stamp_ns(tail: bytes) -> int | None:

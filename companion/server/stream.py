@@ -159,6 +159,7 @@ class Stream:
         loop, period_s = asyncio.get_running_loop(), 1 / asked.rate_hz
         due_s, said = loop.time(), dict[Topic, object]()
         while True:
+            updates = self._node.pipeline.updates
             if loop.time() >= due_s - _EARLY * period_s:
                 due_s = max(due_s + period_s, loop.time())
                 for topic in asked.topics:
@@ -167,10 +168,8 @@ class Stream:
                         said[topic] = version
                         await websocket.send_text(await self._text(topic, asked.uavs))
                         self.sent += 1
-            if any(said.get(topic) != self._version(topic) for topic in asked.topics):
-                # More came while it was sent to a slow client: the newest does not wait for a tick.
-                await asyncio.sleep(max(0.0, due_s - loop.time()))
-            else:
+            # What came while it was sent to a slow client does not wait for another tick.
+            if self._node.pipeline.updates == updates:
                 await self._node.ticked()
             if turn_s:
                 await asyncio.sleep(turn_s)

@@ -134,9 +134,9 @@ def test_a_recording_holds_the_gains_of_its_observer(tmp_path: Path, cut_log: Pa
     config.write_text(f"[observer]\ndesign = {json.dumps(str(design))}\n")
     settings = load(config)
     path = tmp_path / "a.mcap"
-    digest = replay([cut_log], settings, Writer(path, settings.to_toml(), {}, None, START_NS))[
-        "digest"
-    ]
+    digest = replay(
+        [cut_log], settings, lambda: Writer(path, settings.to_toml(), {}, None, START_NS)
+    )["digest"]
     design.write_text("another")
     held = settings_for([path], None, None)
     assert held.observer.design_json == changed_text

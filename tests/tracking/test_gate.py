@@ -1,5 +1,6 @@
 """Which reports cannot be true, and when those that were refused are believed after all."""
 
+import dataclasses
 import math
 from collections.abc import Callable
 
@@ -164,3 +165,15 @@ def test_a_run_is_bounded(fix: MakeFix) -> None:
 def test_fast_reports_are_believed_as_soon_as_slow_ones(fix: MakeFix, rate_hz: int) -> None:
     run = suspects(fix, [n / rate_hz for n in range(4 * rate_hz)])
     assert run.agree()
+
+
+def test_times_that_are_off_are_worth_the_way_flown_in_them(fix: MakeFix) -> None:
+    """At 40 m/s, 2 s apart: a millisecond, the drift over 2 s, and what the velocity may be off."""
+    noise = dataclasses.replace(NOISE, velocity_mps=0.5, time_s=0.0)
+    before, after = (fix(at * S, (80 * at, 0, -50), (40.0, 0, 0), noise=noise) for at in (0, 2))
+    settings = GateSettings(drift_max=1e-3)
+    assert settings.slack_m(before, after) == pytest.approx(40.5 * (1e-3 + 2e-3), rel=1e-3)
+    late = dataclasses.replace(after, noise=dataclasses.replace(noise, time_s=0.02))
+    assert settings.slack_m(before, late) == pytest.approx(40.5 * 0.023, rel=0.02)
+    still = dataclasses.replace(after, velocity_ned_mps=None)
+    assert GateSettings(lead_m=3.0).slack_m(still, still) == 3.0

@@ -46,6 +46,10 @@ BACK: Final = np.array([0.8, 0.6, 0.4, 0.2, 0.0])
 """Shares of the nulls that are tried, in descending order."""
 FINE: Final = np.array([0.75, 0.5, 0.25, 0.0])
 """Places between two of them that are tried then."""
+AGAIN: Final = 10
+"""Most steps towards the share that is known to do, each at least halves what is left."""
+NEARLY: Final = 0.99
+"""Of the least gain that is to be kept: .04 dB."""
 
 
 class Nulled(NamedTuple):
@@ -203,6 +207,18 @@ def _back(
             high, over = np.where(failed, share, high), np.where(failed, now, over)
             found |= first
         above = over
-    part = np.clip((1.0 - above) / np.maximum(below - above, 1e-12), 0.0, 1.0)
-    back: FloatArray = np.where(low >= high, high, high + part * (low - high))
-    return back
+    back: FloatArray = np.where(low >= high, high, high + _part(above, below) * (low - high))
+    for _ in range(AGAIN):
+        # Nulls that are crowded take so much that a straight line between two shares misses by far.
+        now = kept_at(back)
+        missed = (now < NEARLY) & (back > low)
+        if not missed.any():
+            return back
+        back = np.where(missed, back + np.maximum(_part(now, below), 0.5) * (low - back), back)
+    return np.where(missed, low, back)
+
+
+def _part(above: FloatArray, below: FloatArray) -> FloatArray:
+    """Where a straight line from what is ``above`` to ``below`` reaches 1, in [0, 1]."""
+    part: FloatArray = np.clip((1.0 - above) / np.maximum(below - above, 1e-12), 0.0, 1.0)
+    return part

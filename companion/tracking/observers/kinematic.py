@@ -17,12 +17,10 @@ The greatest speed ``speed_mps`` limits the bound over long gaps. See docs/math.
 """
 
 import math
-from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 
-from companion.tracking.design.gain_table import KinematicDesign
+from companion.tracking.design.gain_table import KinematicDesign, correction
 from companion.tracking.observers.estimates import Prediction
 from companion.values import Fix, Vector
 
@@ -45,24 +43,10 @@ def deadbeat(interval_s: float) -> Gain:
 
 
 def scheduled(design: KinematicDesign) -> GainSchedule:
-    """L = A(T) M(T) with the design's M, held constant beyond the ends of the design's range.
-
-    ``gain_table.correction`` with the differences of the table's rows made once.
-    """
-    grid, table = design.dt_s, [(row[0], row[1], row[2], row[3]) for row in design.corrections]
-    first, last = table[0], table[-1]
-    steps = [(b[0] - a[0], b[1] - a[1], b[2] - a[2], b[3] - a[3]) for a, b in pairwise(table)]
+    """L = A(T) M(T) with the design's M, held constant beyond the ends of the design's range."""
 
     def gain(interval_s: float) -> Gain:
-        if interval_s <= grid[0]:
-            m11, m12, m21, m22 = first
-        elif interval_s >= grid[-1]:
-            m11, m12, m21, m22 = last
-        else:
-            i = bisect_right(grid, interval_s) - 1
-            f = (interval_s - grid[i]) / (grid[i + 1] - grid[i])
-            (a11, a12, a21, a22), (d11, d12, d21, d22) = table[i], steps[i]
-            m11, m12, m21, m22 = a11 + f * d11, a12 + f * d12, a21 + f * d21, a22 + f * d22
+        m11, m12, m21, m22 = correction(design, interval_s)
         return m11 + interval_s * m21, m12 + interval_s * m22, m21, m22
 
     return gain

@@ -49,7 +49,7 @@ FINE: Final = np.array([0.75, 0.5, 0.25, 0.0])
 AGAIN: Final = 10
 """Most steps towards the share that is known to do, each at least halves what is left."""
 NEARLY: Final = 0.99
-"""Of the least gain that is to be kept: .04 dB."""
+"""A share of the least gain that is to be kept: all but .04 dB."""
 
 
 class Nulled(NamedTuple):

@@ -32,6 +32,9 @@ export async function authorised(path, options = {}) {
   return response;
 }
 
+/** The token that this tab keeps; null without one. */
+export const tokenOfTab = () => token;
+
 /** Whether a token is needed for what links lead to: a browser sends none with them. */
 export const hasToken = () => token !== null;
 

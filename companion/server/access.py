@@ -16,8 +16,8 @@ from starlette.websockets import WebSocket
 from companion.server.responses import problem
 from companion.values import UserError
 
-OPEN_PATHS: Final = frozenset({"/healthz"})
-"""Paths that need no token, beside the page's own files, in which nothing is secret."""
+OPEN_PATHS: Final = frozenset({"/healthz", "/docs", "/openapi.json"})
+"""Paths that need no token, beside the page's own files: nothing in them is secret."""
 SUBPROTOCOL: Final = "companion.v1"
 """Subprotocol with which a WebSocket client that names any is answered."""
 BEARER: Final = "bearer."

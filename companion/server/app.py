@@ -1,10 +1,11 @@
 """The HTTP API and the dashboard's files, over a running node. Read only."""
 
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 from fastapi import FastAPI, HTTPException, WebSocket
-from fastapi.responses import Response
+from fastapi import Path as PathParameter
+from fastapi.responses import FileResponse, Response
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -21,6 +22,9 @@ from companion.views.state import Node
 from companion.views.words import rfc3339
 
 CONTENT_POLICY: Final = b"default-src 'self'; frame-ancestors 'none'"
+DRAWN_POLICY: Final = CONTENT_POLICY + b"; style-src 'self' 'unsafe-inline'; img-src 'self' data:"
+"""For ``/docs``: Swagger UI brings pictures in its style sheet, and styles with what it draws."""
+UavId = Annotated[str, PathParameter(description="SYSID:COMPID or icao:HEX")]
 DESCRIPTION: Final = """Location-aware beamforming from MAVLink. Read only.
 
 Angles in degrees, distances in metres; null is not known, never 0. Estimates are worked out for
@@ -36,7 +40,13 @@ def create_app(node: Node, token: str | None = None) -> ASGIApp:
     With a token, all but ``/healthz`` and the page's own files asks for it: the page is shown, and
     asks the user.
     """
-    app = FastAPI(title="companion", version=companion.__version__, description=DESCRIPTION)
+    app = FastAPI(
+        title="companion",
+        version=companion.__version__,
+        description=DESCRIPTION,
+        docs_url=None,  # FastAPI's own pages load from elsewhere
+        redoc_url=None,
+    )
     app.router.redirect_slashes = False
     responses.install(app)
     stream = Stream(node)
@@ -44,6 +54,10 @@ def create_app(node: Node, token: str | None = None) -> ASGIApp:
     _state_routes(app, node)
     beam_routes.add(app, node)
     file_routes.add(app, node)
+
+    @app.get("/docs", include_in_schema=False)
+    async def docs() -> Response:
+        return FileResponse(web_directory() / "docs.html")
 
     @app.websocket("/v1/stream")
     async def streamed(websocket: WebSocket) -> None:
@@ -118,7 +132,7 @@ def _state_routes(app: FastAPI, node: Node) -> None:
         summary="One UAV as it is now",
         responses=answers(models.UavState, 404, 422),
     )
-    async def one_uav(uav: str) -> Response:
+    async def one_uav(uav: UavId) -> Response:
         found = state.uavs(node, only=uav)
         if not found:
             raise HTTPException(404, f"no UAV {uav!r} has been heard")
@@ -166,7 +180,7 @@ class _Edge:
     """ASGI middleware for HEAD requests and security headers.
 
     HEAD is served as GET, and the server leaves out the body. The headers allow a page to load
-    nothing from elsewhere (except on ``/docs``).
+    nothing from elsewhere.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -178,15 +192,13 @@ class _Edge:
             return
         if scope["method"] == "HEAD":
             scope = {**scope, "method": "GET"}
-        if scope["path"] == "/docs":
-            await self._app(scope, receive, send)
-            return
+        policy = DRAWN_POLICY if scope["path"] == "/docs" else CONTENT_POLICY
 
         async def with_policy(message: Message) -> None:
             if message["type"] == "http.response.start":
                 message["headers"] = [
                     *message.get("headers", []),
-                    (b"content-security-policy", CONTENT_POLICY),
+                    (b"content-security-policy", policy),
                     (b"x-content-type-options", b"nosniff"),
                     (b"cache-control", b"no-cache"),
                 ]

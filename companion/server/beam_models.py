@@ -35,18 +35,14 @@ class BeamState(BaseModel):
     range_rate_mps: float | None
     gain_db: float
     guaranteed_gain_db: float | None
-    power_dbm: Annotated[float, Field(description="with which this beam is sent, in its turn")]
-    eirp_dbm: Annotated[float, Field(description="power and gain towards the predicted direction")]
+    power_dbm: float
+    eirp_dbm: float
     loss_db: float
     cost_db: float
     group: int
     widened: bool
-    pointing_bound_deg: Annotated[
-        float | None, Field(description="the true direction is within this; null: anywhere")
-    ]
-    pointing_p95_deg: Annotated[
-        float | None, Field(description="95 of 100 true directions are usually within this")
-    ]
+    pointing_bound_deg: float | None
+    pointing_p95_deg: float | None
     guaranteed_sinr_db: float | None
     sinr_db: float | None
     codebook: StoredBeam | None

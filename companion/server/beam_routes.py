@@ -14,6 +14,12 @@ from companion.views import beam_state, weight_formats
 from companion.views.state import Node
 
 LeadMs = Annotated[float, Query(ge=0, le=10_000, description="milliseconds ahead of now")]
+Cut = Annotated[
+    Literal["azimuth", "elevation"],
+    Query(description="the angle that varies; the other is the beam's own"),
+]
+Points = Annotated[int, Query(ge=2, le=3601, description="angles along the cut")]
+Only = Annotated[str | None, Query(description="SYSID:COMPID; every beam without it")]
 _JSON = {"schema": {"$ref": "#/components/schemas/Weights"}}
 _BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
 
@@ -62,9 +68,9 @@ def add(app: FastAPI, node: Node) -> None:
         responses=answers(models.Pattern, 404, 422),
     )
     async def pattern(
-        cut: Literal["azimuth", "elevation"] = "azimuth",
-        points: Annotated[int, Query(ge=2, le=3601)] = 361,
-        uav: str | None = None,
+        cut: Cut = "azimuth",
+        points: Points = 361,
+        uav: Only = None,
         lead_ms: LeadMs = 0.0,
     ) -> Response:
         update = look(lead_ms)

@@ -12,7 +12,11 @@ from companion.values import Source
 from companion.views import mavlink_messages
 from companion.views.state import Node
 
-Id = Annotated[int, Path(ge=0, le=255)]
+SystemId = Annotated[int, Path(ge=0, le=255, description="MAVLink system id")]
+ComponentId = Annotated[int, Path(ge=0, le=255, description="MAVLink component id")]
+RecordingName = Annotated[str, Path(description="name of the file, as /v1/recordings has it")]
+MessageName = Annotated[str, Path(description="MAVLink name, such as GLOBAL_POSITION_INT")]
+Range = Annotated[str | None, Header(alias="range", description="bytes=FIRST-LAST")]
 
 
 def add(app: FastAPI, node: Node) -> None:
@@ -46,9 +50,7 @@ def _recordings(app: FastAPI, node: Node) -> None:
             **refusals(404, 416, 422),
         },
     )
-    async def download(
-        name: str, wanted: Annotated[str | None, Header(alias="range")] = None
-    ) -> Response:
+    async def download(name: RecordingName, wanted: Range = None) -> Response:
         found = await run_in_threadpool(recordings.opened, where, name, current())
         if found is None:
             raise HTTPException(404, f"there is no recording {name!r}")
@@ -91,7 +93,7 @@ def _mavlink(app: FastAPI, node: Node) -> None:
         summary="The last messages of one component",
         responses=answers(dict[str, models.MavlinkMessage], 404, 422),
     )
-    async def messages(sys: Id, comp: Id) -> Response:
+    async def messages(sys: SystemId, comp: ComponentId) -> Response:
         found = kept.by_sender().get(Source(sys, comp))
         if found is None:
             raise HTTPException(404, f"nothing has been heard of {sys}:{comp}")
@@ -102,7 +104,7 @@ def _mavlink(app: FastAPI, node: Node) -> None:
         summary="The last message of a kind, as mavlink2rest has it",
         responses=answers(models.MavlinkMessage, 404, 422),
     )
-    async def message(sys: Id, comp: Id, name: str) -> Response:
+    async def message(sys: SystemId, comp: ComponentId, name: MessageName) -> Response:
         dialect = await run_in_threadpool(mavlink_messages.dialect)
         msgid = dialect.msgid(name)
         found = None if msgid is None else kept.find(Source(sys, comp), msgid)

@@ -14,7 +14,7 @@ from companion.server import beam_models
 
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 Time = Annotated[str, Field(examples=["2026-11-20T13:00:00.123Z"])]
-Uav = Annotated[str, Field(description="SYSID:COMPID or icao:HEX", examples=["3:1"])]
+Uav = Annotated[str, Field(examples=["3:1"])]
 Link = Annotated[str, Field(examples=["udpin:0.0.0.0:14550"])]
 
 Beams, Weights, Pattern = beam_models.Beams, beam_models.Weights, beam_models.Pattern
@@ -45,10 +45,7 @@ class Clock(BaseModel):
     """What is known of a sender's clock."""
 
     kind: str
-    guarantee: Annotated[
-        Literal["measured", "assumed"],
-        Field(description="whether both sides of its interval were measured"),
-    ]
+    guarantee: Literal["measured", "assumed"]
     offset_s: float
     drift_ppm: float | None
     uncertainty_s: float | None
@@ -108,22 +105,12 @@ class UavState(BaseModel):
     heading_deg: float | None
     unknown_input_mps: Vector | None
     acceleration_ned_mps2: Vector | None
-    bound_m: Annotated[float, Field(description="the position is within this", examples=[4.2])]
-    bound_cylinder_ned_m: Annotated[
-        Vector,
-        Field(description="half axes of the upright cylinder that holds the position"),
-    ]
-    bound_ellipsoid_ned_m: Annotated[
-        Vector, Field(deprecated=True, description="the same under its old name")
-    ]
-    set_center_ned_m: Annotated[
-        Vector, Field(description="centre of the least ball that holds every possible place")
-    ]
+    bound_m: Annotated[float, Field(examples=[4.2])]
+    bound_cylinder_ned_m: Vector
+    bound_ellipsoid_ned_m: Annotated[Vector, Field(deprecated=True)]
+    set_center_ned_m: Vector
     set_radius_m: float
-    error_p95_m: Annotated[
-        float | None,
-        Field(description="95 of 100 predictions at this age were nearer than this, of late"),
-    ]
+    error_p95_m: float | None
     assumptions: Assumptions
     clock_bound_s: float
     clock: Clock | None
@@ -190,10 +177,7 @@ class LinkState(BaseModel):
     gaps: int
     late: int
     repeats: int
-    arrival: Annotated[
-        Literal["kernel", "read"],
-        Field(description="what tells when a frame arrived: the system's stamp, or its reading"),
-    ]
+    arrival: Literal["kernel", "read"]
     misstamped: int
     overflowed: int | None
     receive_buffer_bytes: int | None

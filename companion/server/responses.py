@@ -4,6 +4,8 @@ No answer is validated on its way out: the models of ``models.py`` only describe
 compare the answers with them.
 """
 
+import tomllib
+from importlib import resources
 from typing import Any, Final
 
 import orjson
@@ -79,9 +81,9 @@ async def _failed(_request: Request, _error: Exception) -> JSONResponse:
 
 
 def _document(app: FastAPI) -> dict[str, Any]:
-    """The OpenAPI document with problems under their own media type.
+    """The OpenAPI document, with what each field means, and problems under their own media type.
 
-    FastAPI puts them under JSON's.
+    FastAPI puts these under JSON's.
     """
     if app.openapi_schema is None:
         made = get_openapi(
@@ -94,5 +96,19 @@ def _document(app: FastAPI) -> dict[str, Any]:
                     schema = content.get("application/json", {}).get("schema", {})
                     if schema.get("$ref", "").endswith("/Problem"):
                         shown["content"] = {PROBLEM_TYPE: content["application/json"]}
+        _describe(made["components"]["schemas"])
         app.openapi_schema = made
     return app.openapi_schema
+
+
+def _describe(schemas: dict[str, Any]) -> None:
+    """Give each field of the document's schemas its meaning: ``vocabulary.toml`` has the words."""
+    words = tomllib.loads(
+        resources.files("companion.server").joinpath("vocabulary.toml").read_text("utf-8")
+    )
+    for model, schema in schemas.items():
+        closer = words.get(model, {})
+        for name, field in schema.get("properties", {}).items():
+            meaning = closer.get(name, words.get(name))
+            if isinstance(meaning, str):
+                field["description"] = meaning

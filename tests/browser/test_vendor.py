@@ -7,7 +7,7 @@ from pathlib import Path
 from support import ROOT
 
 VENDOR = ROOT / "web" / "vendor"
-ROW = re.compile(r"^\| `(?P<file>[^`]+)` \|.*\| (?P<version>[\d.]+) \| (?P<licence>\w+) \| "
+ROW = re.compile(r"^\| `(?P<file>[^`]+)` \|.*\| (?P<version>[\d.]+) \| (?P<licence>[\w.-]+) \| "
                  r"`(?P<sha256>[0-9a-f]{64})` \|$", re.MULTILINE)  # fmt: skip
 
 

@@ -248,9 +248,17 @@ def test_the_page_is_served(start_node: Any) -> None:
 def test_a_token_is_asked_for(start_node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COMPANION_TOKEN", "s3cret")
     node = start_node(*RUN)
-    asked = ("/v1/status", "/readyz", "/metrics", "/openapi.json", "/docs", "/v1/../v1/uavs")
+    asked = ("/v1/status", "/readyz", "/metrics", "/v1/../v1/uavs")
     assert [node.get(path)[0] for path in asked] == [401] * len(asked)
-    open_to_all = ("/healthz", "/", "/index.html", "/token.js", "/vendor/uPlot.min.css")
+    open_to_all = (
+        "/healthz",
+        "/",
+        "/index.html",
+        "/token.js",
+        "/vendor/uPlot.min.css",
+        "/docs",
+        "/openapi.json",
+    )
     assert [node.get(path, "*/*")[0] for path in open_to_all] == [200] * len(open_to_all)
 
 

@@ -2,6 +2,7 @@
 
 import io
 import json
+import tomllib
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,6 +11,7 @@ import orjson
 import pytest
 from pydantic import TypeAdapter
 from starlette.testclient import TestClient
+from support import ROOT
 
 from companion.server import models
 from companion.server.app import create_app
@@ -95,6 +97,33 @@ def test_the_document_shows_problems_as_problems(client: TestClient) -> None:
     assert weights["application/json"]["schema"]["$ref"].endswith("/Weights")
     assert weights["application/x-npy"]["schema"]["format"] == "binary"
     assert "HTTPValidationError" not in document["components"]["schemas"]
+
+
+UNITS = {
+    "_m": " m", "_s": " s", "_deg": "degrees", "_db": "dB", "_dbm": "dBm", "_hz": "Hz",
+    "_mps": "m/s", "_mps2": "m/s²", "_dps": "degrees/s", "_ms": " ms", "_ppm": "million",
+}  # fmt: skip
+
+
+def test_the_document_says_what_every_field_and_parameter_means(client: TestClient) -> None:
+    """With the unit that its name ends in; and the words are those of fields that there are."""
+    document = client.get("/openapi.json").json()
+    words = tomllib.loads((ROOT / "companion" / "server" / "vocabulary.toml").read_text())
+    used: set[tuple[str, str]] = set()
+    lacking: list[str] = []
+    for model, schema in document["components"]["schemas"].items():
+        for name, field in schema.get("properties", {}).items():
+            said, unit = field.get("description", ""), UNITS.get("_" + name.rpartition("_")[2])
+            if not said or (unit is not None and unit not in said):
+                lacking.append(f"{model}.{name}: {said!r}")
+            used.add((model, name) if name in words.get(model, {}) else ("", name))
+    told = {("", name) for name, said in words.items() if isinstance(said, str)}
+    told |= {(m, name) for m, own in words.items() if isinstance(own, dict) for name in own}
+    assert lacking == []
+    assert told <= used, told - used
+    for path, operations in document["paths"].items():
+        for parameter in operations["get"].get("parameters", []):
+            assert parameter.get("description"), (path, parameter["name"])
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,7 @@ from companion.recording.scene import Scene
 from companion.recording.writer import Writer
 from companion.settings.model import Settings
 from companion.values import Event, Frame, Notice, Output, Tick, UserError
+from companion.views.health import behind
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
 from companion.views.state import RecordingStatus
@@ -232,13 +233,13 @@ class Service:
         update = self.pipeline.last_update
         states = [link.status.state for link in self._traffic.links]
         reasons = [] if "up" in states else ["no link is up"]
+        machine = behind(self.arrival_lag.seen(self.now_ns()))
+        if machine is not None:  # of which all that is late or old then is but a symptom
+            return [*reasons, machine.reason]
         if update is None or self.updates_late():
             reasons.append("beam updates are late")
         elif update.unfit:
             reasons.append(update.unfit)
-        seen = self.arrival_lag.seen(self.now_ns())
-        if seen.behind:
-            reasons.append(f"this machine is behind: frames wait {seen.max_s:.1f} s for it")
         return reasons
 
     def updates_late(self) -> bool:

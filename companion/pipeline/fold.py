@@ -18,13 +18,15 @@ from typing import Final
 from companion.beams import steady
 from companion.beams.aim import aim
 from companion.beams.steady import Steady
-from companion.mavlink.clock.estimates import ClockChange, ClockEstimate
+from companion.mavlink.clock.estimates import ClockChange, ClockEstimate, Guarantee
 from companion.mavlink.wire.decode import DECODED
 from companion.mavlink.wire.stamps import STAMPED
 from companion.pipeline import assembly
 from companion.pipeline.assumptions import Assumptions
+from companion.pipeline.blame import Evidence
 from companion.pipeline.center import Center
 from companion.pipeline.digest import Digest
+from companion.pipeline.health import Health, Site
 from companion.pipeline.refusals import Refusals
 from companion.pipeline.senders import NOTHING, PlacedAttitude, PlacedReport, Senders
 from companion.pipeline.targets import Targets
@@ -79,6 +81,8 @@ class Pipeline:
         self.fleet = assembly.fleet(settings)
         self.targets = Targets(settings, self.center.vehicle)
         self.assumptions = Assumptions()
+        site = Site(self.array, self.coverage, *assembly.radio(settings))
+        self.health = Health(settings.link, site)
 
     # --- the fold ---------------------------------------------------------------------------
 
@@ -178,7 +182,14 @@ class Pipeline:
             now = self.senders.time(self.center.vehicle, now_ns)
             state = self.fleet.state(self.center.vehicle, now)
             states |= {} if state is None else {self.center.vehicle: state}
-        return [*dropped, *self.targets.changes(now_ns, states), self.last_update]
+        said = self.targets.changes(now_ns, states)
+        judged = self.health.judge(self.last_update, self._evidence)
+        return [*dropped, *said, *judged, self.last_update]
+
+    def _evidence(self, uav: str) -> Evidence:
+        clock = self.clock_estimate(uav)
+        assumed = clock is not None and clock.guarantee is Guarantee.ASSUMED
+        return Evidence(assumed, self.refusals.unheard(uav))
 
     def _drop_silent(self, now_ns: int) -> list[Notice]:
         """Drop tracks that have been silent for long, so that they take no more memory or time."""

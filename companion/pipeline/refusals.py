@@ -47,6 +47,7 @@ class _Unheard:
     """A run of refused reports of one sender, without one between that was used."""
 
     since_ns: int
+    reason: Reason
     reports: int = 0
     told: bool = False
 
@@ -71,10 +72,11 @@ class Refusals:
             return None
         run = self._unheard.get(uav)
         if run is None:
-            run = self._unheard.setdefault(uav, _Unheard(refused.t_ns))
+            run = self._unheard.setdefault(uav, _Unheard(refused.t_ns, refused.reason))
             if len(self._unheard) > SENDERS_MAX:  # the oldest: made-up ids must not silence others
                 del self._unheard[next(iter(self._unheard))]
         run.reports += 1
+        run.reason = refused.reason
         lasted_ns = refused.t_ns - run.since_ns
         if run.told or run.reports < 2 or lasted_ns < UNHEARD_NS:
             return None
@@ -90,6 +92,11 @@ class Refusals:
         """Note that a report was used."""
         if self._unheard:
             self._unheard.pop(uav, None)
+
+    def unheard(self, uav: str) -> Reason | None:
+        """Why the newest reports of a sender are not used; None where they are."""
+        run = self._unheard.get(uav)
+        return run.reason if run is not None and run.reports > 1 else None
 
     def forget(self, uav: str) -> None:
         """Forget when it was told that a UAV's reports are refused."""

@@ -16,6 +16,7 @@ from prometheus_client.registry import Collector
 
 import companion
 from companion.server.stream import Stream
+from companion.values import Level
 from companion.views.state import Node
 
 
@@ -32,6 +33,7 @@ class NodeCollector(Collector):
         yield from self._arrival_lag()
         yield from self._links()
         yield from self._uavs()
+        yield from self._verdicts()
         yield from self._recording()
 
     def _service(self) -> Iterator[Metric]:
@@ -112,15 +114,20 @@ class NodeCollector(Collector):
         states = GaugeMetricFamily("companion_uavs", "UAVs by state", labels=["state"])
         bounds = GaugeMetricFamily("companion_bound_meters", "Position bound", labels=["uav"])
         latency = GaugeMetricFamily("companion_latency_seconds", "Latency seen", labels=["uav"])
+        likely = GaugeMetricFamily(
+            "companion_likely_error_meters", "95 of 100 predictions were nearer", labels=["uav"]
+        )
         by_state: dict[str, int] = {}
         for track in pipeline.tracks(now_ns, now_ns):
             by_state[track.state] = by_state.get(track.state, 0) + 1
             bounds.add_metric([track.uav], track.bound_m)
+            if track.error_p95_m is not None:
+                likely.add_metric([track.uav], track.error_p95_m)
             if track.latency_s is not None:
                 latency.add_metric([track.uav], track.latency_s)
         for state, count in by_state.items():
             states.add_metric([str(state)], count)
-        yield from (states, bounds, latency)
+        yield from (states, bounds, likely, latency)
         update = pipeline.last_update
         if update is not None:
             beams = update.beams
@@ -131,6 +138,32 @@ class NodeCollector(Collector):
                     "Condition number of the steering matrix",
                     value=beams.condition_number,
                 )
+
+    def _verdicts(self) -> Iterator[Metric]:
+        levels = GaugeMetricFamily(
+            "companion_verdict",
+            "1 for the verdict on the link to each UAV, 0 for the others",
+            labels=["uav", "verdict"],
+        )
+        gains = {
+            name: GaugeMetricFamily(f"companion_{name}_gain_decibels", text, labels=["uav"])
+            for name, text in (
+                ("needed", "Array gain that the link needs"),
+                ("guaranteed", "Least gain within the bound; absent where none is sure"),
+                ("likely", "Least gain where the UAV usually is; absent where none is sure"),
+            )
+        }
+        for found in self._node.pipeline.health.verdicts.values():
+            for level in Level:
+                levels.add_metric([found.uav, str(level)], float(found.level is level))
+            for name, gain_db in (
+                ("needed", found.needed_db),
+                ("guaranteed", found.guaranteed_db),
+                ("likely", found.likely_db),
+            ):
+                if gain_db is not None:
+                    gains[name].add_metric([found.uav], gain_db)
+        yield from (levels, *gains.values())
 
     def _recording(self) -> Iterator[Metric]:
         recording = self._node.recording()

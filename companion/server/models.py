@@ -81,11 +81,63 @@ class Assumptions(BaseModel):
     refuted: int
 
 
+class LinkHealth(BaseModel):
+    """What is behind the verdict on the link to a UAV; gains are those of the array, dB."""
+
+    cause: Annotated[
+        Literal[
+            "carrier",
+            "silent",
+            "refused",
+            "rate",
+            "late",
+            "agile",
+            "clock",
+            "position",
+            "crowded",
+            "coverage",
+            "range",
+            "machine",
+        ]
+        | None,
+        Field(description="what holds it back most; null where it is good"),
+    ]
+    reason: Annotated[str | None, Field(examples=["reports 1.1 s apart"])]
+    remedy: Annotated[str | None, Field(examples=["ask for 10 Hz ([presence] position_hz)"])]
+    since: Annotated[Time, Field(description="since when the verdict is this one")]
+    needed_gain_db: Annotated[
+        float | None, Field(description="gain that the link needs; null where it has no beam")
+    ]
+    guaranteed_gain_db: Annotated[
+        float | None, Field(description="least gain within the bound; null: none is sure")
+    ]
+    likely_gain_db: Annotated[
+        float | None, Field(description="least gain where the UAV usually is; null: none is sure")
+    ]
+
+
+class Headline(BaseModel):
+    """How many links to UAVs are good, weak, none; and the same in words."""
+
+    good: int
+    weak: int
+    none: int
+    headline: Annotated[str, Field(examples=["3 of 4 links good"])]
+
+
 class UavState(BaseModel):
     """One UAV as it is at ``valid_at``; north, east and down are seen from the array."""
 
     id: Uav
     state: Literal["live", "coasting", "stale", "lost"]
+    verdict: Annotated[
+        Literal["good", "weak", "none"] | None,
+        Field(
+            description="whether its beam surely (good), usually (weak) or not (none) has the gain"
+            " that the link needs; null before it was judged, and for who is no target"
+        ),
+    ]
+    health: LinkHealth | None
     target: bool
     same_as: Uav | None
     callsign: Annotated[str | None, Field(examples=["SWR12A"])]
@@ -271,6 +323,7 @@ class Status(BaseModel):
     time: Time
     uptime_s: float
     center: Center
+    health: Headline
     links: list[LinkState]
     recording: RecordingState
     arrival_lag: ArrivalLag

@@ -193,3 +193,17 @@ class RadioSettings(Section):
     bandwidth_hz: PositiveFloat = 50e6
     noise_figure_db: Annotated[float, Field(ge=0, le=60)] = 7.0
     uav_antennas: Annotated[int, Field(ge=1, le=256)] = 4
+
+
+class NeedSettings(Section):
+    """What the link to a UAV needs to be called good.
+
+    needed_db       least array gain over an isotropic antenna, dB
+    needed_sinr_db  in its place, the SINR of the lowest rate, by the budget of ``[radio]``
+
+    A link is good where the gain that is guaranteed is enough, weak where only the one that is
+    likely is, and none otherwise.
+    """
+
+    needed_db: Annotated[float, Field(ge=-60, le=60)] = 0.0
+    needed_sinr_db: Annotated[float, Field(ge=-60, le=60)] | None = None

@@ -16,6 +16,7 @@ from companion.settings.beams import (
     BeamSettings,
     CodebookSettings,
     HardwareSettings,
+    NeedSettings,
     RadioSettings,
 )
 from companion.settings.center import CenterSettings
@@ -48,6 +49,7 @@ class Settings(Section):
     codebook: CodebookSettings = CodebookSettings()
     hardware: HardwareSettings = HardwareSettings()
     radio: RadioSettings = RadioSettings()
+    link: NeedSettings = NeedSettings()
     recording: RecordingSettings = RecordingSettings()
     server: ServerSettings = ServerSettings()
 

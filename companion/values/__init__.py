@@ -23,6 +23,7 @@ from companion.values.aimed import (
     Widen,
 )
 from companion.values.errors import UserError
+from companion.values.health import Blame, Cause, Level, Verdict
 from companion.values.numbers import (
     BoolArray,
     ComplexArray,
@@ -74,8 +75,10 @@ __all__ = [
     "Attitude",
     "Beam",
     "BeamSet",
+    "Blame",
     "BoolArray",
     "Carrier",
+    "Cause",
     "ComplexArray",
     "Estimate",
     "Event",
@@ -85,6 +88,7 @@ __all__ = [
     "GnssStatus",
     "IntArray",
     "LeftOut",
+    "Level",
     "LimitSource",
     "Limits",
     "Message",
@@ -111,6 +115,7 @@ __all__ = [
     "Update",
     "UserError",
     "Vector",
+    "Verdict",
     "Widen",
     "reports_itself",
     "vector",

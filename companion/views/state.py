@@ -13,8 +13,8 @@ from companion.mavlink.voice.rate_watch import MessageRate
 from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
 from companion.settings.center import FixedCenter
-from companion.values import Carrier, Fix, FloatArray, Notice, Track
-from companion.views import link_state
+from companion.values import Blame, Carrier, Fix, FloatArray, Notice, Track
+from companion.views import health, link_state
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
 from companion.views.words import rfc3339
@@ -112,6 +112,7 @@ def status(node: Node, version: str) -> Json:
         "time": rfc3339(now_ns),
         "uptime_s": node.uptime_s(),
         "center": center(node),
+        "health": health.summary(pipeline.health.verdicts.values()),
         "links": [
             link_state.link(item, pipeline.senders.link_share(item.url), now_ns)
             for item in node.links()
@@ -187,16 +188,25 @@ def uavs(node: Node, only: str | None = None) -> list[Json]:
     carrier = None if isinstance(found, str) else found
     places = np.array([track.position_ned_m for track in tracks])
     geodetic = zip(*pipeline.local.geodetic(places), strict=True)
+    machine = health.behind(node.arrival_lag.seen(now_ns))
     return [
-        uav(pipeline, track, carrier, tuple(map(float, place)))
+        uav(pipeline, track, carrier, tuple(map(float, place)), machine)
         for track, place in zip(tracks, geodetic, strict=True)
     ]
 
 
 def uav(
-    pipeline: Pipeline, track: Track, carrier: Carrier | None, place: tuple[float, ...]
+    pipeline: Pipeline,
+    track: Track,
+    carrier: Carrier | None,
+    place: tuple[float, ...],
+    machine: Blame | None,
 ) -> Json:
-    """One entry of ``/v1/uavs``; ``place`` is latitude, longitude and height."""
+    """One entry of ``/v1/uavs``.
+
+    ``place`` is latitude, longitude and height; ``machine`` is to blame for all links where it is
+    behind.
+    """
     offset = None if carrier is None else track.position_ned_m - carrier.position_ned_m
     north, east, down = (None, None, None) if offset is None else map(float, offset)
     velocity = vector(track.velocity_ned_mps)
@@ -206,6 +216,7 @@ def uav(
     return {
         "id": track.uav,
         "state": str(track.state),
+        **health.verdict(pipeline.health.verdicts.get(track.uav), machine),
         "target": pipeline.targets.wants(track.uav),
         "same_as": pipeline.targets.same_as(track.uav),
         "callsign": pipeline.senders.aircraft.callsign(track.uav),

@@ -292,3 +292,29 @@ def test_how_far_the_machine_is_behind(make_node: Any) -> None:
     for name in ("", "_p95", "_max"):
         assert f"\ncompanion_arrival_lag{name}_seconds 0.7000000" in metrics
     assert '\ncompanion_link_misstamped_total{link="udpin:127.0.0.1:14550"} 0.0' in metrics
+
+
+def test_verdicts_are_in_the_answers_and_in_the_metrics(make_node: Any) -> None:
+    node = make_node(link={"needed_db": 60.0})
+    for _ in range(20):
+        node.tick()
+    with TestClient(create_app(node)) as client:
+        uavs = client.get("/v1/uavs").json()["uavs"]
+        health = client.get("/v1/status").json()["health"]
+        metrics = client.get("/metrics").text
+    shown = {uav["id"]: uav["verdict"] for uav in uavs if uav["target"]}
+    assert shown and set(shown.values()) == {"none"}
+    assert health == {
+        "good": 0, "weak": 0, "none": len(shown), "headline": f"0 of {len(shown)} links good",
+    }  # fmt: skip
+    for uav in uavs:
+        if uav["target"]:
+            assert uav["health"]["reason"] and uav["health"]["remedy"]
+            assert uav["health"]["needed_gain_db"] == 60.0
+            likely_db = uav["health"]["likely_gain_db"]
+            assert f'\ncompanion_likely_gain_decibels{{uav="{uav["id"]}"}} {likely_db}' in metrics
+        else:
+            assert uav["verdict"] is uav["health"] is None
+    for uav in shown:
+        assert f'\ncompanion_verdict{{uav="{uav}",verdict="none"}} 1.0' in metrics
+        assert f'\ncompanion_verdict{{uav="{uav}",verdict="good"}} 0.0' in metrics

@@ -1,0 +1,146 @@
+"""Why a link is not good: what holds its beam back most, in words, and what to do about it.
+
+The gain that is guaranteed is the least within the pointing bound, so what makes that bound large
+is to blame: the carrier's attitude and position, or one part of the bound on the UAV's position.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from companion.values import Beam, Blame, Carrier, Cause, Reason, Track
+
+CROWDED_DB: Final = 3.0
+"""Loss against a beam for a UAV alone from which on the other UAVs are to blame."""
+SPARSE_S: Final = 0.25
+"""Interval between reports from which on asking for more of them helps."""
+LATE_S: Final = 0.15
+"""Latency from which on a faster link helps."""
+SILENT_S: Final = 1.0
+"""Age of the newest report from which on a UAV is silent, if that is several intervals too."""
+SILENT_INTERVALS: Final = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What is known of a UAV beside its track.
+
+    clock_assumed  the constant part of its latency is only assumed
+    refused        why its newest reports were not used; None where they were
+    """
+
+    clock_assumed: bool
+    refused: Reason | None
+
+
+def of_left_out(why: str, track: Track | None, crowded: bool, unfit: str | None) -> Blame:
+    """Why a UAV has no beam. ``why`` is the reason that the beams give."""
+    if unfit is not None:
+        return Blame(Cause.CARRIER, f"no beams: {unfit}", "see what carries the array")
+    if crowded:
+        return Blame(Cause.CROWDED, why, 'fly them apart, or set [beams] policy = "group"')
+    if track is not None and f"{track.state}" in why:
+        return Blame(Cause.SILENT, f"no report for {track.age_s:.1f} s", "see its MAVLink link")
+    return Blame(Cause.COVERAGE, why, "turn the array or its carrier, or fly elsewhere")
+
+
+def of_beam(
+    beam: Beam, track: Track, carrier: Carrier, needed_db: float, evidence: Evidence
+) -> Blame:
+    """Why a beam surely does not have the gain that its link needs, or likely does not."""
+    silence = _silence(track, evidence)
+    if silence is not None:
+        return silence
+    # A beam that is broadened has less gain because of its bound, whoever else is there.
+    if not beam.widened and (beam.gain_db < needed_db or beam.loss_db > CROWDED_DB):
+        return _short_of_gain(beam, needed_db)
+    seen_rad = math.asin(min(1.0, (track.bound_m + carrier.bound_m) / max(beam.range_m, 1e-9)))
+    if carrier.attitude_bound_rad > seen_rad:
+        known = f"{math.degrees(carrier.attitude_bound_rad):.0f}°"
+        return Blame(
+            Cause.CARRIER,
+            f"the carrier's attitude is only known to {known}",
+            "ask the carrier for ATTITUDE at 10 Hz or more ([presence] attitude_hz)",
+        )
+    return _far_off(beam, track, carrier, evidence)
+
+
+def _short_of_gain(beam: Beam, needed_db: float) -> Blame:
+    if beam.loss_db > CROWDED_DB:
+        return Blame(
+            Cause.CROWDED,
+            f"other UAVs in its direction cost it {beam.loss_db:.0f} dB",
+            'fly them apart, or set [beams] policy = "group"',
+        )
+    return Blame(
+        Cause.RANGE,
+        f"{beam.range_m:.0f} m away it needs {needed_db:.0f} dB, and the array gives"
+        f" {beam.gain_db:.0f}",
+        "fly nearer, or use more elements or more power",
+    )
+
+
+def _far_off(beam: Beam, track: Track, carrier: Carrier, evidence: Evidence) -> Blame:
+    """Why the position may be far off, as seen from the array."""
+    speed_mps = math.hypot(*track.velocity_ned_mps) if track.velocity_ned_mps is not None else None
+    fastest_mps = track.limits.speed_mps if speed_mps is None else speed_mps
+    aged_s = max(track.age_s, track.dt_s or 0.0)
+    parts = {
+        Cause.RATE: track.limits.acceleration_mps2 * aged_s**2 / 2,
+        Cause.CLOCK: fastest_mps * track.clock_bound_s,
+        Cause.CARRIER: carrier.bound_m,
+    }
+    parts[Cause.POSITION] = track.bound_m - parts[Cause.RATE] - parts[Cause.CLOCK]
+    match max(parts, key=lambda cause: parts[cause]):
+        case Cause.RATE:
+            return _aged(track)
+        case Cause.CLOCK:
+            return _clock(track, evidence)
+        case Cause.CARRIER:
+            reason = f"the carrier's own position is only known to {carrier.bound_m:.0f} m"
+            return Blame(Cause.CARRIER, reason, "give the carrier a better GNSS receiver")
+        case _:
+            reason = f"{beam.range_m:.0f} m away, its position is only known to"
+            return Blame(
+                Cause.POSITION,
+                f"{reason} {track.bound_m:.0f} m",
+                "fly farther from the array, or give it a better GNSS receiver",
+            )
+
+
+def _silence(track: Track, evidence: Evidence) -> Blame | None:
+    if evidence.refused is not None:
+        return Blame(
+            Cause.REFUSED,
+            f"its reports are not used: {evidence.refused}",
+            "see its rejections",
+        )
+    if track.age_s > max(SILENT_S, SILENT_INTERVALS * (track.dt_s or 0.0)):
+        return Blame(Cause.SILENT, f"no report for {track.age_s:.1f} s", "see its MAVLink link")
+    return None
+
+
+def _aged(track: Track) -> Blame:
+    """Why a prediction reaches far: reports are far apart, or late, or the UAV turns quickly."""
+    if track.dt_s is not None and track.dt_s >= SPARSE_S:
+        remedy = "ask for 10 Hz ([presence] position_hz)"
+        return Blame(Cause.RATE, f"reports {track.dt_s:.1f} s apart", remedy)
+    if track.latency_s is not None and track.latency_s >= LATE_S:
+        return Blame(
+            Cause.LATE, f"reports come {track.latency_s:.1f} s late", "use a faster MAVLink link"
+        )
+    return Blame(
+        Cause.AGILE,
+        f"it may accelerate by {track.limits.acceleration_mps2:.0f} m/s²",
+        "ask for more reports, or tell what it can ([observer] acceleration_max_mps2)",
+    )
+
+
+def _clock(track: Track, evidence: Evidence) -> Blame:
+    known = f"{track.clock_bound_s * 1e3:.0f} ms"
+    if evidence.clock_assumed:
+        remedy = "allow TIMESYNC ([presence] enabled)"
+        return Blame(Cause.CLOCK, f"clock only assumed, to {known}", remedy)
+    return Blame(
+        Cause.CLOCK, f"its clock is only known to {known}", "use a MAVLink link of steadier delay"
+    )

@@ -1,0 +1,224 @@
+"""Verdicts on the links to all UAVs, and the notices when one changes.
+
+Once a second the gain that each beam surely has, and the one that it likely has, is held against
+what the link needs. A verdict changes only once it has been another for a while, and not for a
+hair's breadth, so that it does not flap.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from companion.beams.aim import directions
+from companion.beams.array.coverage import Coverage
+from companion.beams.array.geometry import Array
+from companion.beams.worth import guarantee, link_budget
+from companion.beams.worth.link_budget import LinkBudget
+from companion.pipeline import blame
+from companion.pipeline.blame import Evidence
+from companion.settings.beams import NeedSettings
+from companion.values import (
+    BeamSet,
+    Cause,
+    FloatArray,
+    Level,
+    Notice,
+    Severity,
+    Update,
+    Verdict,
+)
+
+EVERY_NS: Final = 1_000_000_000
+"""Time between two judgements."""
+WORSE_NS: Final = 1_000_000_000
+"""Time for which a link must be judged worse before it is called so."""
+BETTER_NS: Final = 3_000_000_000
+"""Time for which it must be judged better."""
+SLACK_DB: Final = 1.0
+"""How far a gain may fall below what is needed before a link that had it is judged worse."""
+NAMED: Final = 6
+"""Most UAVs that one notice names."""
+RANK: Final = {Level.NONE: 0, Level.WEAK: 1, Level.GOOD: 2}
+"""Levels from the worst to the best."""
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """What stands behind every beam: the array, its reach, its radio."""
+
+    array: Array
+    coverage: Coverage
+    budget: LinkBudget
+    uav_antennas: int
+
+
+class Health:
+    """The verdicts. ``verdicts`` holds the present one of each target, by its name."""
+
+    def __init__(self, need: NeedSettings, site: Site) -> None:
+        self.verdicts: dict[str, Verdict] = {}
+        self._need = need
+        self._site = site
+        self._judged_ns: int | None = None
+        self._unsettled: dict[str, tuple[bool, int]] = {}  # judged better or worse, since when
+        self._unfit: str | None = None
+
+    def judge(self, update: Update, evidence: Callable[[str], Evidence]) -> list[Notice]:
+        """Judge anew if it is time, and tell what changed.
+
+        ``evidence`` says what is known of a UAV beside its track; it is asked of UAVs whose link is
+        not good.
+        """
+        if self._judged_ns is not None and 0 <= update.t_ns - self._judged_ns < EVERY_NS:
+            return []
+        self._judged_ns = update.t_ns
+        fresh = self._of_beams(update, evidence) | _of_left_out(update)
+        settled = {
+            track.uav: self._settled(fresh[track.uav])
+            for track in update.tracks
+            if track.uav in fresh
+        }
+        before, self.verdicts = self.verdicts, settled
+        self._unsettled = {uav: kept for uav, kept in self._unsettled.items() if uav in settled}
+        return self._told(update, before)
+
+    def _of_beams(self, update: Update, evidence: Callable[[str], Evidence]) -> dict[str, Verdict]:
+        beam_set, carrier = update.beams, update.carrier
+        if carrier is None or not beam_set.beams:
+            return {}
+        towards = directions(beam_set)
+        needed_db = _needed_db(self._need, self._site, beam_set, towards)
+        sure_db, likely_db = self._least_db(beam_set, towards)
+        tracks = {track.uav: track for track in update.tracks}
+        found = {}
+        for i, beam in enumerate(beam_set.beams):
+            uav = beam.uav
+            level = self._level(uav, needed_db[i], sure_db[i], likely_db[i])
+            why = None
+            if level is not Level.GOOD:
+                why = blame.of_beam(beam, tracks[uav], carrier, needed_db[i], evidence(uav))
+            found[uav] = Verdict(
+                uav, level, why, update.t_ns, needed_db[i], sure_db[i], likely_db[i]
+            )
+        return found
+
+    def _least_db(
+        self, beam_set: BeamSet, towards: FloatArray
+    ) -> tuple[Sequence[float | None], Sequence[float | None]]:
+        """The least gain of each beam where its UAV can be, and where it usually is."""
+        array, beams = self._site.array, beam_set.beams
+        both = np.vstack([towards, towards])
+        angles = [beam.pointing_bound_rad for beam in beams]
+        angles += [beam.pointing_p95_rad for beam in beams]
+        bounds = guarantee.covered_bounds(array, self._site.coverage, both, angles)
+        weights = np.hstack([beam_set.weights, beam_set.weights])
+        gains = guarantee.guaranteed_gains_db(array, both, bounds, weights)
+        return gains[: len(beams)], gains[len(beams) :]
+
+    def _level(
+        self, uav: str, needed_db: float, sure_db: float | None, likely_db: float | None
+    ) -> Level:
+        """What the gains say; a level that the link has is kept within ``SLACK_DB``."""
+        held = self.verdicts.get(uav)
+        rank = RANK[held.level] if held else RANK[Level.NONE]
+
+        def enough(gain_db: float | None, level: Level) -> bool:
+            slack_db = SLACK_DB if rank >= RANK[level] else 0.0
+            return gain_db is not None and gain_db >= needed_db - slack_db
+
+        if enough(sure_db, Level.GOOD):
+            return Level.GOOD
+        return Level.WEAK if enough(likely_db, Level.WEAK) else Level.NONE
+
+    def _settled(self, fresh: Verdict) -> Verdict:
+        """The verdict to hold: the fresh one, or its news under the level that was held so far."""
+        uav, held = fresh.uav, self.verdicts.get(fresh.uav)
+        if held is None:
+            return fresh
+        if fresh.level is held.level:
+            self._unsettled.pop(uav, None)
+            return replace(fresh, since_ns=held.since_ns)
+        better = RANK[fresh.level] > RANK[held.level]
+        was_better, since_ns = self._unsettled.get(uav, (better, fresh.since_ns))
+        if was_better is not better:
+            since_ns = fresh.since_ns
+        self._unsettled[uav] = (better, since_ns)
+        # Without a beam there is nothing that could waver: it is said at once.
+        wait_ns = BETTER_NS if better else WORSE_NS if fresh.needed_db is not None else 0
+        if fresh.since_ns - since_ns >= wait_ns:
+            del self._unsettled[uav]
+            return fresh
+        return replace(fresh, level=held.level, blame=held.blame, since_ns=held.since_ns)
+
+    def _told(self, update: Update, before: dict[str, Verdict]) -> list[Notice]:
+        """What changed: for all at once where the carrier is the cause, which all share."""
+        was, self._unfit = self._unfit, update.unfit
+        if update.unfit is not None:
+            text = f"no links: {update.unfit}"
+            news = before and was is None
+            return [Notice(update.t_ns, Severity.WARNING, "beams", text)] if news else []
+        changed = dict[tuple[Level, Cause | None], list[Verdict]]()
+        for uav, verdict in self.verdicts.items():
+            held = before.get(uav)
+            if held is None or held.level is verdict.level:
+                continue
+            cause = verdict.blame.cause if verdict.blame else None
+            # That a UAV is stale or lost, and therefore without a beam, is told by itself.
+            if cause is not Cause.SILENT or verdict.needed_db is not None:
+                changed.setdefault((verdict.level, cause), []).append(verdict)
+        return [_notice(update.t_ns, alike) for alike in changed.values()]
+
+
+def _notice(t_ns: int, alike: Sequence[Verdict]) -> Notice:
+    """One notice for all links that became the same for the same cause."""
+    names = ", ".join(verdict.uav for verdict in alike[:NAMED])
+    rest = f" and {len(alike) - NAMED} more" if len(alike) > NAMED else ""
+    one, links = alike[0], "links" if len(alike) > 1 else "link"
+    text = f"{links} to {names}{rest}: {one.level}"
+    if one.blame is None:
+        return Notice(t_ns, Severity.INFO, one.uav, text)
+    text += f" – {one.blame.reason}; {one.blame.remedy}"
+    return Notice(t_ns, Severity.WARNING, one.uav, text)
+
+
+def _of_left_out(update: Update) -> dict[str, Verdict]:
+    tracks = {track.uav: track for track in update.tracks}
+    return {
+        out.uav: Verdict(
+            out.uav,
+            Level.NONE,
+            blame.of_left_out(out.reason, tracks.get(out.uav), out.crowded, update.unfit),
+            update.t_ns,
+        )
+        for out in update.beams.left_out
+    }
+
+
+def _needed_db(
+    need: NeedSettings, site: Site, beam_set: BeamSet, towards: FloatArray
+) -> list[float]:
+    """The array gain that each link needs.
+
+    By the SINR, it is the gain that would be left of what the beam has if all of the SINR above the
+    one that is needed were lost.
+    """
+    beams = beam_set.beams
+    if need.needed_sinr_db is None:
+        return [need.needed_db] * len(beams)
+    groups = np.array([beam.group for beam in beams])
+    sent = link_budget.transmitted(
+        beam_set.weights, site.budget.tx_power_w, groups, beam_set.normalisation
+    )
+    sinr_db = link_budget.predicted_sinr_db(
+        site.array,
+        towards,
+        np.array([beam.range_m for beam in beams]),
+        sent,
+        groups,
+        site.budget,
+        site.uav_antennas,
+    )
+    spare_db = sinr_db - need.needed_sinr_db
+    return [beam.gain_db - spare for beam, spare in zip(beams, spare_db.tolist(), strict=True)]

@@ -1,0 +1,57 @@
+"""Verdicts on the links to UAVs as the API shows them.
+
+Where this machine is behind, that is the cause of whatever is not good: all that the pipeline sees
+then is that news is old.
+"""
+
+from collections import Counter
+from collections.abc import Iterable
+from typing import Any
+
+from companion.mavlink.links.lag import LagSeen
+from companion.values import Blame, Cause, Level, Verdict
+from companion.views.words import rfc3339
+
+Json = dict[str, Any]
+
+
+def behind(seen: LagSeen) -> Blame | None:
+    """What is to blame where this machine does not keep up; None where it does."""
+    if not seen.behind:
+        return None
+    return Blame(
+        Cause.MACHINE,
+        f"this machine is behind: frames wait {seen.max_s or 0.0:.1f} s for it",
+        "close other programs and pages, or lower [beams] update_hz",
+    )
+
+
+def verdict(found: Verdict | None, machine: Blame | None) -> Json:
+    """The fields of one UAV: ``verdict``, and ``health`` with what is behind it."""
+    if found is None:
+        return {"verdict": None, "health": None}
+    why = None if found.level is Level.GOOD else machine or found.blame
+    return {
+        "verdict": str(found.level),
+        "health": {
+            "cause": None if why is None else str(why.cause),
+            "reason": None if why is None else why.reason,
+            "remedy": None if why is None else why.remedy,
+            "since": rfc3339(found.since_ns),
+            "needed_gain_db": found.needed_db,
+            "guaranteed_gain_db": found.guaranteed_db,
+            "likely_gain_db": found.likely_db,
+        },
+    }
+
+
+def summary(verdicts: Iterable[Verdict]) -> Json:
+    """How many links there are of each level, and the same in words."""
+    counts = Counter(found.level for found in verdicts)
+    good, total = counts[Level.GOOD], counts.total()
+    return {
+        "good": good,
+        "weak": counts[Level.WEAK],
+        "none": counts[Level.NONE],
+        "headline": f"{good} of {total} links good" if total else "no UAV to aim at",
+    }

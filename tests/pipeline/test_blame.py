@@ -1,0 +1,96 @@
+"""What is blamed for a link that is not good: the part of the bound that is the largest."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from companion.pipeline import blame
+from companion.pipeline.blame import Evidence
+from companion.values import Beam, Carrier, Cause, Limits, Reason, Track, TrackState
+
+FINE = Evidence(clock_assumed=False, refused=None)
+TRACK = Track(
+    uav="3:1", state=TrackState.LIVE, valid_at_ns=9, age_s=0.1, position_ned_m=np.zeros(3),
+    velocity_ned_mps=np.array([20.0, 0.0, 0.0]), unknown_input_mps=None,
+    acceleration_ned_mps2=None, bound_m=3.0, horizontal_bound_m=3.0, vertical_bound_m=3.0,
+    set_center_ned_m=np.zeros(3), set_radius_m=3.0, limits=Limits(60.0, 5.0), error_p95_m=None,
+    clock_bound_s=0.0, dt_s=0.1, latency_s=0.01, gamma=None, innovation_m=None, reports=9,
+)  # fmt: skip
+CARRIER = Carrier(9, np.zeros(3), None, np.eye(3), np.zeros(3), 0.5, 0.01, 0.1)
+BEAM = Beam("3:1", 0.0, 0.0, 100.0, None, None, None, 0.04, 16.0, 0.5, widened=True)
+
+
+def blamed(
+    track: Track = TRACK, carrier: Carrier = CARRIER, beam: Beam = BEAM, evidence: Evidence = FINE
+) -> tuple[Cause, str, str]:
+    found = blame.of_beam(beam, track, carrier, 10.0, evidence)
+    return found.cause, found.reason, found.remedy
+
+
+@pytest.mark.parametrize(
+    ("changed", "cause", "reason"),
+    [
+        ({}, Cause.POSITION, "100 m away, its position is only known to 3 m"),
+        ({"dt_s": 1.1, "age_s": 0.9, "bound_m": 5.0}, Cause.RATE, "reports 1.1 s apart"),
+        ({"age_s": 0.9, "latency_s": 0.6, "dt_s": 0.2, "bound_m": 3.0}, Cause.LATE,
+         "reports come 0.6 s late"),
+        ({"limits": Limits(60.0, 190.0), "age_s": 0.2, "bound_m": 5.0}, Cause.AGILE,
+         "it may accelerate by 190 m/s²"),
+        ({"clock_bound_s": 0.1}, Cause.CLOCK, "its clock is only known to 100 ms"),
+        ({"age_s": 1.2}, Cause.SILENT, "no report for 1.2 s"),
+    ],
+)  # fmt: skip
+def test_the_largest_part_of_a_track_s_bound_is_to_blame(
+    changed: dict[str, object], cause: Cause, reason: str
+) -> None:
+    assert blamed(replace(TRACK, **changed))[:2] == (cause, reason)  # type: ignore[arg-type]
+
+
+def test_slow_reports_are_not_silence() -> None:
+    """At 2 s between reports, one that is 4 s old is one that is missing, not a lost link."""
+    assert blamed(replace(TRACK, age_s=4.0, dt_s=2.0, bound_m=60.0))[0] is Cause.RATE
+
+
+def test_an_assumed_clock_is_helped_by_timesync() -> None:
+    assumed = Evidence(clock_assumed=True, refused=None)
+    cause, reason, remedy = blamed(replace(TRACK, clock_bound_s=0.1), evidence=assumed)
+    assert (cause, reason) == (Cause.CLOCK, "clock only assumed, to 100 ms")
+    assert "TIMESYNC" in remedy
+
+
+def test_the_carrier_is_to_blame_for_its_attitude_and_its_position() -> None:
+    turned = blamed(carrier=replace(CARRIER, attitude_bound_rad=0.2))
+    assert turned[:2] == (Cause.CARRIER, "the carrier's attitude is only known to 11°")
+    placed = blamed(carrier=replace(CARRIER, bound_m=8.0))
+    assert placed[:2] == (Cause.CARRIER, "the carrier's own position is only known to 8 m")
+
+
+def test_reports_that_come_and_are_not_used_are_told_before_all_else() -> None:
+    refused = Evidence(clock_assumed=False, refused=Reason.UNREACHABLE)
+    far = replace(CARRIER, attitude_bound_rad=0.5)
+    found = blamed(replace(TRACK, age_s=9.0), far, evidence=refused)
+    assert found[:2] == (Cause.REFUSED, "its reports are not used: unreachable")
+
+
+def test_a_sharp_beam_without_gain_is_crowded_or_too_far() -> None:
+    crowded = replace(BEAM, gain_db=4.0, loss_db=14.0, widened=False)
+    assert blamed(beam=crowded)[:2] == (
+        Cause.CROWDED,
+        "other UAVs in its direction cost it 14 dB",
+    )
+    weak = replace(BEAM, gain_db=4.0, widened=False)
+    assert blamed(beam=weak)[:2] == (
+        Cause.RANGE,
+        "100 m away it needs 10 dB, and the array gives 4",
+    )
+    assert blamed(beam=replace(crowded, widened=True))[0] is Cause.POSITION
+
+
+def test_without_a_beam_the_reason_of_the_beams_is_told() -> None:
+    assert blame.of_left_out("x", TRACK, False, "the carrier is lost").cause is Cause.CARRIER
+    assert blame.of_left_out("x", TRACK, True, None).cause is Cause.CROWDED
+    assert blame.of_left_out("outside", TRACK, False, None).cause is Cause.COVERAGE
+    stale = replace(TRACK, state=TrackState.STALE, age_s=12.0)
+    found = blame.of_left_out("its reports are stale", stale, False, None)
+    assert (found.cause, found.reason) == (Cause.SILENT, "no report for 12.0 s")

@@ -1,0 +1,173 @@
+"""Verdicts on links: by the gains, settled before they are told, one notice for one cause."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from companion.beams.aim import aim
+from companion.beams.array.coverage import EVERYWHERE
+from companion.beams.array.geometry import uniform_linear
+from companion.beams.weights.precoding import Precoder
+from companion.beams.worth.link_budget import LinkBudget
+from companion.pipeline.blame import Evidence
+from companion.pipeline.health import Health, Site
+from companion.settings.beams import NeedSettings
+from companion.values import Carrier, Limits, Notice, Severity, Track, TrackState, Update
+
+S = 1_000_000_000
+ARRAY = uniform_linear(16, 30e9, 0.5, np.eye(3))
+SITE = Site(ARRAY, EVERYWHERE, LinkBudget(20.0, 50e6, 7.0), 4)
+CARRIER = Carrier(9, np.zeros(3), None, np.eye(3), np.zeros(3), 0.0, 0.0, None)
+PLACES = {"1:1": (100.0, 20.0, -10.0), "2:1": (80.0, -60.0, 5.0), "3:1": (30.0, 90.0, 0.0)}
+
+
+def track(uav: str, bound_m: float, usual_m: float, state: str = "live") -> Track:
+    return Track(
+        uav, TrackState(state), 9, 0.1, np.array(PLACES[uav]), None, None, None, bound_m, bound_m,
+        bound_m, np.zeros(3), bound_m, Limits(60.0, 5.0), usual_m, 0.0, 0.1, 0.0, None, None, 9,
+    )  # fmt: skip
+
+
+def update(t_s: float, tracks: list[Track], carrier: Carrier | None = CARRIER) -> Update:
+    t_ns = round(t_s * S)
+    beams = aim(t_ns, t_ns, tracks, carrier, ARRAY, Precoder())
+    unfit = None if carrier else "the carrier is not known"
+    return Update(t_ns, carrier, unfit, tuple(tracks), beams)
+
+
+class Watch:
+    """A health of 10 dB that is asked, and what it said."""
+
+    def __init__(self, **need: float) -> None:
+        self.health = Health(NeedSettings(**(need or {"needed_db": 10.0})), SITE)
+        self.said: list[Notice] = []
+
+    def see(self, t_s: float, tracks: list[Track], carrier: Carrier | None = CARRIER) -> str:
+        self.said += self.health.judge(
+            update(t_s, tracks, carrier), lambda _uav: Evidence(False, None)
+        )
+        return " ".join(str(one.level) for one in self.health.verdicts.values())
+
+
+SURE, USUAL, WILD = (0.5, 0.1), (12.0, 0.5), (60.0, 50.0)
+"""Bound and usual error with which 10 dB are guaranteed, likely, and neither, at 100 m."""
+
+
+@pytest.mark.parametrize(("errors", "level"), [(SURE, "good"), (USUAL, "weak"), (WILD, "none")])
+def test_the_gain_that_is_sure_or_likely_makes_the_verdict(
+    errors: tuple[float, float], level: str
+) -> None:
+    watch = Watch()
+    assert watch.see(0, [track("1:1", *errors)]) == level
+    verdict = watch.health.verdicts["1:1"]
+    assert verdict.needed_db == 10.0
+    assert (verdict.blame is None) == (level == "good")
+    sure, likely = verdict.guaranteed_db, verdict.likely_db
+    assert (sure is not None and sure >= 10) == (level == "good")
+    assert (likely is not None and likely >= 10) == (level != "none")
+
+
+def test_it_is_judged_once_a_second() -> None:
+    watch = Watch()
+    watch.see(0, [track("1:1", *SURE)])
+    assert watch.see(0.9, [track("1:1", *SURE), track("2:1", *SURE)]) == "good"
+    assert watch.see(1.0, [track("1:1", *SURE), track("2:1", *SURE)]) == "good good"
+
+
+def test_worse_is_told_after_a_second_and_better_after_three() -> None:
+    watch = Watch()
+    levels = [watch.see(t_s, [track("1:1", *SURE)]) for t_s in range(2)]
+    levels += [watch.see(t_s, [track("1:1", *USUAL)]) for t_s in range(2, 5)]
+    levels += [watch.see(t_s, [track("1:1", *SURE)]) for t_s in range(5, 10)]
+    assert levels == [*["good"] * 3, *["weak"] * 5, *["good"] * 2]
+    assert [(one.t_ns // S, one.severity) for one in watch.said] == [
+        (3, Severity.WARNING),
+        (8, Severity.INFO),
+    ]
+    assert watch.said[0].text.startswith("link to 1:1: weak – ")
+    assert watch.said[1].text == "link to 1:1: good"
+    assert watch.health.verdicts["1:1"].since_ns == 8 * S
+
+
+def test_what_comes_and_goes_is_not_told() -> None:
+    watch = Watch()
+    for t_s in range(20):
+        watch.see(t_s, [track("1:1", *(USUAL if t_s % 2 else SURE))])
+    assert watch.said == []
+
+
+def test_what_is_worse_one_way_or_the_other_is_worse() -> None:
+    watch = Watch()
+    watch.see(0, [track("1:1", *SURE)])
+    seen = [watch.see(t_s, [track("1:1", *(USUAL if t_s % 2 else WILD))]) for t_s in range(1, 4)]
+    assert seen == ["good", "none", "none"]
+
+
+def test_better_must_last_whole() -> None:
+    """From weak it is worse in between: the three seconds begin anew."""
+    watch = Watch()
+    watch.see(0, [track("1:1", *USUAL)])
+    errors = [SURE, SURE, WILD, SURE, SURE, SURE, SURE]
+    seen = [watch.see(1 + t_s, [track("1:1", *one)]) for t_s, one in enumerate(errors)]
+    assert seen == [*["weak"] * 6, "good"]
+
+
+def test_a_hair_s_breadth_changes_nothing() -> None:
+    """Up to a decibel less than needed keeps the level, and does not reach it."""
+    watch = Watch()
+    watch.see(0, [track("1:1", *SURE)])
+    sure_db = watch.health.verdicts["1:1"].guaranteed_db
+    assert sure_db is not None
+    for short_db, is_good in ((0.9, True), (1.1, False)):
+        watch = Watch(needed_db=sure_db - 0.5)
+        watch.see(0, [track("1:1", *SURE)])
+        watch.health._need = NeedSettings(needed_db=sure_db + short_db)
+        levels = [watch.see(t_s, [track("1:1", *SURE)]) for t_s in range(1, 4)]
+        assert (levels[-1] == "good") == is_good
+        other = Watch(needed_db=sure_db + short_db)
+        assert other.see(0, [track("1:1", *SURE)]) != "good"
+
+
+def test_without_a_beam_there_is_no_link_at_once_and_the_state_is_told_elsewhere() -> None:
+    watch = Watch()
+    watch.see(0, [track("1:1", *SURE), track("2:1", *SURE)])
+    assert watch.see(1, [track("1:1", *SURE, "stale"), track("2:1", *SURE)]) == "none good"
+    assert watch.said == []
+    assert watch.health.verdicts["1:1"].guaranteed_db is None
+
+
+def test_one_cause_is_told_once() -> None:
+    everybody = [track(uav, *SURE) for uav in PLACES]
+    watch = Watch()
+    watch.see(0, everybody)
+    assert watch.see(1, everybody, None) == "none none none"
+    watch.see(2, everybody, None)
+    for t_s in range(3, 7):
+        watch.see(t_s, everybody)
+    assert [one.text for one in watch.said] == [
+        "no links: the carrier is not known",
+        "links to 1:1, 2:1, 3:1: good",
+    ]
+
+
+def test_a_uav_that_is_gone_is_forgotten() -> None:
+    watch = Watch()
+    watch.see(0, [track("1:1", *SURE), track("2:1", *SURE)])
+    assert watch.see(1, [track("2:1", *SURE)]) == "good"
+    assert list(watch.health.verdicts) == ["2:1"]
+
+
+def test_an_sinr_that_is_needed_is_turned_into_a_gain() -> None:
+    """Twice as far takes 6 dB more; without others in its turn there is noise alone."""
+    found = []
+    for factor in (1.0, 2.0):
+        watch = Watch(needed_sinr_db=5.0)
+        near = track("1:1", *SURE)
+        watch.see(0, [replace(near, position_ned_m=factor * near.position_ned_m)])
+        found.append(watch.health.verdicts["1:1"].needed_db)
+    wavelength_m, noise_dbm = 299_792_458 / 30e9, 10 * math.log10(1.380649e-20 * 290 * 50e6) + 7
+    path_db = 20 * math.log10(wavelength_m / (4 * math.pi * math.hypot(*PLACES["1:1"])))
+    expected = 5.0 - (20.0 + path_db + 10 * math.log10(4) - noise_dbm)
+    assert found == pytest.approx([expected, expected + 20 * math.log10(2)], abs=1e-6)

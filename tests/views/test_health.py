@@ -1,0 +1,43 @@
+"""Verdicts as the API shows them."""
+
+from companion.mavlink.links.lag import LagSeen
+from companion.values import Blame, Cause, Level, Verdict
+from companion.views import health
+
+WEAK = Verdict(
+    "1:1", Level.WEAK, Blame(Cause.RATE, "reports 1.1 s apart", "ask for 10 Hz"), 0, 2.0, None, 4.5
+)
+
+
+def test_a_verdict_is_shown_with_its_reason_and_the_gains() -> None:
+    assert health.verdict(WEAK, None) == {
+        "verdict": "weak",
+        "health": {
+            "cause": "rate",
+            "reason": "reports 1.1 s apart",
+            "remedy": "ask for 10 Hz",
+            "since": "1970-01-01T00:00:00.000Z",
+            "needed_gain_db": 2.0,
+            "guaranteed_gain_db": None,
+            "likely_gain_db": 4.5,
+        },
+    }
+    assert health.verdict(None, None) == {"verdict": None, "health": None}
+
+
+def test_a_machine_that_is_behind_is_to_blame_for_what_is_not_good() -> None:
+    machine = health.behind(LagSeen(7.0, 7.0, 7.04, behind=True))
+    assert machine is not None
+    assert machine.reason == "this machine is behind: frames wait 7.0 s for it"
+    assert health.verdict(WEAK, machine)["health"]["reason"] == machine.reason
+    good = Verdict("1:1", Level.GOOD, None, 0, 2.0, 3.0, 4.5)
+    assert health.verdict(good, machine)["health"]["reason"] is None
+    assert health.behind(LagSeen(7.0, 7.0, 7.04, behind=False)) is None
+
+
+def test_the_headline_counts_what_is_good() -> None:
+    good = Verdict("2:1", Level.GOOD, None, 0)
+    assert health.summary([WEAK, good, good]) == {
+        "good": 2, "weak": 1, "none": 0, "headline": "2 of 3 links good",
+    }  # fmt: skip
+    assert health.summary([])["headline"] == "no UAV to aim at"

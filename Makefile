@@ -15,7 +15,7 @@ export OPENBLAS_NUM_THREADS
 # Tests of pure rooms on two workers; those that start services share one, one after the other.
 WORKERS = -n 2 --dist loadgroup
 
-.PHONY: demo test test-all check bench soak format lock clean FORCE
+.PHONY: demo test test-all check site bench soak format lock clean FORCE
 
 demo: .venv/.runtime
 	$(BIN)/companion demo
@@ -30,7 +30,7 @@ test-all: .venv/.dev
 	HYPOTHESIS_PROFILE=full $(PYTEST) -q $(WORKERS)
 
 # The formatter, the linter, the types, the rules of the house and the container's files. The
-# rest of the tests is not run a second time here: `make test` has warnings as errors already.
+# site of the documents is built, and any warning ends it. The rest of the tests is not run a second time here: `make test` has warnings as errors already.
 check: .venv/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
@@ -41,7 +41,12 @@ check: .venv/.dev
 	$(BIN)/check-jsonschema --builtin-schema vendor.compose-spec docker-compose.yml
 	@if docker compose version >/dev/null 2>&1; then docker compose --profile demo config --quiet; \
 	else echo "no docker compose here: docker-compose.yml is held against its schema alone"; fi
+	$(BIN)/python docs/make_site.py
 	$(PYTEST) -q tests/test_house.py tests/test_docs.py
+
+# The documents as pages that are read without internet: build/site/index.html.
+site: .venv/.dev
+	$(BIN)/python docs/make_site.py
 
 # Tests marked `benchmark` and `soak`, which `make test` leaves out. No such test: status 5.
 bench: .venv/.dev

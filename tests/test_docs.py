@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from support import HANG_S, ROOT
 
+from companion.values import Reason
+
 DOCS = ROOT / "docs"
 PAGES = sorted([*DOCS.rglob("*.md"), *ROOT.glob("*.md")])
 CODE = [
@@ -40,6 +42,22 @@ def test_the_picture_of_the_rooms_is_up_to_date() -> None:
     drawing = [sys.executable, DOCS / "draw_architecture.py", "--check"]
     done = subprocess.run(drawing, capture_output=True, text=True, check=False, timeout=HANG_S)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("drawn", ["make_api.py", "make_researcher.py"])
+def test_a_page_that_is_written_by_a_program_is_up_to_date(drawn: str) -> None:
+    """The API's reference; the researcher's notebook, whose cells are run."""
+    making = [sys.executable, DOCS / drawn, "--check"]
+    done = subprocess.run(making, capture_output=True, text=True, check=False, timeout=HANG_S)
+    assert done.returncode == 0, done.stderr
+
+
+def test_reasons_of_refusals_are_those_that_there_are() -> None:
+    text = (DOCS / "troubleshooting.md").read_text(encoding="utf-8")
+    table = text.split("| reason | what it is |")[1].split("\n\n")[0]
+    named = {word for row in table.splitlines() for word in re.findall(r"`([a-z-]+)`", row[:40])}
+    assert named
+    assert named <= {str(reason) for reason in Reason}
 
 
 def test_there_are_at_most_twelve_rooms_and_nothing_loose() -> None:

@@ -1,4 +1,4 @@
-"""The README is run: every command in it, and every snippet.
+"""The README and the guides are run: every command in them, and every snippet.
 
 Its blocks are cut into commands and settings. A command is run by what its first words say; one
 that nobody here knows how to run fails, and so does a way of running that no command asks for.
@@ -25,7 +25,9 @@ from support import BIN, HANG_S, ROOT, line_of, started
 
 from companion.settings.model import Settings
 
-README = (ROOT / "README.md").read_text(encoding="utf-8")
+GUIDES = ("commands", "first-flight", "integrator")
+PAGES = [ROOT / "README.md", *(ROOT / "docs" / f"{name}.md" for name in GUIDES)]
+README = "\n\n".join(page.read_text(encoding="utf-8") for page in PAGES)
 BLOCKS = [
     "\n".join(line[4:] for line in block.split("\n")).strip()
     for block in re.findall(r"(?:^    .*\n?|^\n(?=    ))+", README, re.MULTILINE)

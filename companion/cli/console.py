@@ -16,6 +16,19 @@ CENTER = click.option(
     metavar="SRC",
     help="What carries the array: SYSID:COMPID, LAT,LON,ALT[,HEADING] or home.",
 )
+LINKS = click.option(
+    "--link",
+    "links",
+    metavar="URL",
+    multiple=True,
+    help="udpin|udpout|tcp|tcpin:HOST:PORT or serial:DEVICE:BAUD. May be given several times.",
+)
+LISTEN = click.option(
+    "--listen", metavar="HOST:PORT", help="Where HTTP is served [127.0.0.1:8080]."
+)
+INSECURE = click.option(
+    "--insecure", is_flag=True, help="Serve beyond this machine without a token."
+)
 JSON = click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
 
 

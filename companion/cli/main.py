@@ -14,10 +14,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import companion
+from companion.cli.check import check
 from companion.cli.console import (
     CENTER,
     CONFIG,
+    INSECURE,
     JSON,
+    LINKS,
+    LISTEN,
     InterruptedByUser,
     OneLineErrors,
     Progress,
@@ -29,13 +33,6 @@ from companion.values import Reason, UserError, reports_itself
 
 if TYPE_CHECKING:
     from companion.recording.writer import Writer
-
-LISTEN = click.option(
-    "--listen", metavar="HOST:PORT", help="Where HTTP is served [127.0.0.1:8080]."
-)
-INSECURE = click.option(
-    "--insecure", is_flag=True, help="Serve beyond this machine without a token."
-)
 
 
 @click.group(name="companion", cls=OneLineErrors)
@@ -49,13 +46,7 @@ def main() -> None:
 
 @main.command()
 @CONFIG
-@click.option(
-    "--link",
-    "links",
-    metavar="URL",
-    multiple=True,
-    help="udpin|udpout|tcp|tcpin:HOST:PORT or serial:DEVICE:BAUD. May be given several times.",
-)
+@LINKS
 @CENTER
 @LISTEN
 @click.option("--record", metavar="DIR", help="Write recordings to this directory.")
@@ -278,6 +269,7 @@ def recover(files: tuple[Path, ...], as_json: bool) -> None:
         click.echo(json.dumps(answer) if as_json else f"{found.path}: {text}")
 
 
+main.add_command(check)
 main.add_command(design)
 main.add_command(study)
 main.add_command(weights)

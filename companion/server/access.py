@@ -75,13 +75,17 @@ def bind(listen: str, *, token: str | None, insecure: bool) -> socket.socket:
         family, kind, proto, _, address = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )[0]
-        bound = socket.socket(family, kind, proto)
+    except OSError as error:
+        raise ListenError(f"{listen}: {error.strerror}") from error
+    bound = socket.socket(family, kind, proto)
+    try:
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         if sys.platform == "linux":
             bound.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_BYTES)
         bound.bind(address)
         bound.listen(1024)  # clients may connect as soon as the address is known
     except OSError as error:
+        bound.close()
         raise ListenError(f"{listen}: {error.strerror}") from error
     return bound
 

@@ -1,0 +1,70 @@
+"""The command ``companion check``: is all in order here, and what would hold beams back."""
+
+import json
+import os
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+
+from companion.cli.console import CENTER, CONFIG, INSECURE, JSON, LINKS, LISTEN, Progress
+from companion.values import UserError
+
+
+@click.command()
+@CONFIG
+@LINKS
+@CENTER
+@LISTEN
+@click.option("--record", metavar="DIR", help="Where recordings would go.")
+@INSECURE
+@click.option(
+    "--seconds",
+    type=click.FloatRange(min=0, max=3600),
+    default=10.0,
+    show_default=True,
+    help="How long to listen; 0: not at all.",
+)
+@JSON
+def check(
+    config: Path | None,
+    links: tuple[str, ...],
+    center: str | None,
+    listen: str | None,
+    record: str | None,
+    insecure: bool,
+    seconds: float,
+    as_json: bool,
+) -> None:
+    """Is all in order here for `companion run` with the same options, and what would hold it back?
+
+    Looks at settings, ports, devices, disk and clock, then listens. Status 1 where a fault would
+    stop a run, or leave it without beams.
+
+    Example: companion check --config settings.toml
+    """
+    from companion.node import check as checking
+    from companion.settings.files import load
+
+    settings = load(config).override(
+        center={"source": center},
+        links={"urls": list(links) or None},
+        server={"listen": listen},
+        recording={"directory": record},
+    )
+    progress, found = Progress(), []
+    token = os.environ.get("COMPANION_TOKEN")
+    for finding in checking.check(
+        settings, seconds, token=token, insecure=insecure, show=progress.show
+    ):
+        found.append(finding)
+        progress.clear()
+        if not as_json:
+            does = f"\n{'':6}do: {finding.remedy}" if finding.remedy else ""
+            click.echo(f"{finding.grade:5} {finding.subject}: {finding.text}{does}")
+    progress.clear()
+    if as_json:
+        click.echo(json.dumps({"findings": [asdict(finding) for finding in found]}))
+    faults = sum(finding.grade == "fault" for finding in found)
+    if faults:
+        raise UserError(f"{faults} of {len(found)} things are not as they must be")

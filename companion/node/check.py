@@ -1,0 +1,169 @@
+"""Whether this machine and this site are ready, and what would hold beams back.          [shell]
+
+What settings ask of the machine is looked at first (``companion.node.machine``); then the service
+itself listens for a while, records nothing, and its own words are judged. The first thing to ask
+for where something does not work.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Final
+
+from companion.node import machine
+from companion.node.machine import Finding, Grade
+from companion.node.service import Service
+from companion.node.serving import run_until_told
+from companion.pipeline.fold import Pipeline
+from companion.server.access import bind
+from companion.settings.model import Settings
+from companion.values import Level, Reason, Verdict, reports_itself
+from companion.views import state
+
+LOOKS: Final = 5
+"""Times that beams are computed to tell how long that takes."""
+BUSY: Final = 0.3
+"""Share of the time between updates that beams may take before that is worth a thought."""
+NOISY: Final = 0.01
+"""Share of frames with a wrong checksum from which on a link is noisy."""
+SOME: Final = 8
+"""Most vehicles that a line names."""
+
+
+def check(
+    settings: Settings,
+    seconds: float,
+    *,
+    token: str | None = None,
+    insecure: bool = False,
+    show: Callable[[str], None] = lambda _: None,
+) -> Iterator[Finding]:
+    """Findings, the static ones first; then listens for ``seconds`` over the links that stand.
+
+    ``show`` is told what goes on meanwhile. Sends what ``[presence]`` allows, as a run would.
+    """
+    faulty = set[str]()
+    for finding in machine.look(settings, token=token, insecure=insecure):
+        if finding.grade is Grade.FAULT:
+            faulty.add(finding.subject.removeprefix("link "))
+        yield finding
+    urls = [url for url in settings.links.urls if url not in faulty]
+    if not settings.links.urls:
+        yield Finding("links", Grade.FAULT, "none", "say --link udpin:0.0.0.0:14550")
+    if urls and seconds > 0:
+        show(f"listening for {seconds:g} s")
+        service = _listen(_to_listen(settings, urls), seconds)
+        yield from _heard(service, settings)
+
+
+def _to_listen(settings: Settings, urls: list[str]) -> Settings:
+    """The settings of a run that keeps nothing, over those links."""
+    source = settings.center.source or "home"
+    kept = settings.override(links={"urls": urls}, center={"source": source})
+    keys = {url: key for url, key in kept.signing.keys.items() if url in urls}
+    return kept.model_copy(
+        update={
+            "recording": kept.recording.model_copy(update={"directory": None}),
+            "server": kept.server.model_copy(update={"foxglove": None}),
+            "signing": kept.signing.model_copy(update={"keys": keys}),
+        }
+    )
+
+
+def _listen(settings: Settings, seconds: float) -> Service:
+    """A service that ran so long, with nobody to see it but this process."""
+    with bind("127.0.0.1:0", token=None, insecure=False) as http:
+        service = Service(settings, lambda _: None)
+        run_until_told(lambda until: service.run(http, None, until), seconds)
+    return service
+
+
+def _heard(service: Service, settings: Settings) -> Iterator[Finding]:
+    yield from _links(service)
+    pipeline = service.pipeline
+    update = pipeline.last_update
+    names = [track.uav for track in update.tracks] if update else []
+    own = [uav for uav in names if reports_itself(uav)]
+    if settings.center.source is None:
+        heard = f"; heard: {', '.join(own[:SOME])}" if own else ""
+        remedy = f"say --center SYSID:COMPID or LAT,LON,ALT{heard}"
+        yield Finding("carrier", Grade.FAULT, "nobody said what carries the array", remedy)
+        return
+    subject = f"carrier {settings.center.source}"
+    if update is None or update.unfit is not None:
+        unfit = "no beam update was made" if update is None else str(update.unfit)
+        remedy = f"is it one of {', '.join(own[:SOME])}?" if own else "nobody else is heard either"
+        yield Finding(subject, Grade.FAULT, unfit, remedy)
+    else:
+        yield Finding(subject, Grade.OK, "its place and attitude are known")
+    yield from _uavs(service)
+    yield from _speed(service, settings.beams.update_hz)
+
+
+def _links(service: Service) -> Iterator[Finding]:
+    for link in service.links():
+        subject, heard = f"link {link.url}", sorted(map(str, link.components))
+        bad = link.lost.get(str(Reason.BAD_CRC), 0)
+        said = f"{link.frames} frames of {', '.join(heard[:SOME]) or 'nobody'}"
+        if link.frames == 0 and link.bytes > 0:
+            remedy = "another baud rate? signed with another key? not MAVLink at all?"
+            yield Finding(
+                subject, Grade.FAULT, f"{link.bytes} bytes, and no MAVLink in them", remedy
+            )
+        elif link.frames == 0:
+            yield Finding(subject, Grade.FAULT, "heard nothing", _silent(link.url))
+        elif bad > NOISY * link.frames:
+            yield Finding(
+                subject, Grade.DOUBT, f"{said}; {bad} with a wrong checksum", "is the line noisy?"
+            )
+        else:
+            yield Finding(subject, Grade.OK, said)
+
+
+def _silent(url: str) -> str:
+    if url.startswith(("udpin", "tcpin")):
+        port = url.rpartition(":")[2]
+        return f"does anybody send here? MAVProxy: --out udp:THIS_MACHINE:{port}"
+    if url.startswith("serial"):
+        return "is MAVLink on that port of the autopilot (SERIALn_PROTOCOL = 2), at this baud rate?"
+    return "does anybody answer there?"
+
+
+def _uavs(service: Service) -> Iterator[Finding]:
+    verdicts = service.pipeline.health.verdicts
+    shown = [uav for uav in state.uavs(service) if uav["target"]]
+    if not shown:
+        remedy = "wait for a position fix; see what /v1/uavs refuses"
+        yield Finding("UAVs", Grade.FAULT, "none to aim at was heard", remedy)
+    for uav in shown:
+        name, dt_s = uav["id"], uav["dt_s"]
+        pace = "one report" if dt_s is None else f"reports each {dt_s:.2f} s"
+        text = f"{uav['state']}, {pace}, bound {uav['bound_m']:.1f} m"
+        yield _judged(name, text, verdicts.get(name))
+
+
+def _judged(name: str, text: str, verdict: Verdict | None) -> Finding:
+    found = Finding(f"UAV {name}", Grade.OK, text)
+    if verdict is None:
+        return replace(found, grade=Grade.DOUBT, text=f"not judged: {text}")
+    text = f"{verdict.level}: {text}"
+    if verdict.level is Level.GOOD or verdict.blame is None:
+        return replace(found, text=text)
+    blame = verdict.blame
+    return replace(found, grade=Grade.DOUBT, text=f"{text}; {blame.reason}", remedy=blame.remedy)
+
+
+def _speed(service: Service, update_hz: float) -> Iterator[Finding]:
+    took_s = sorted(_look_s(service.pipeline, service.now_ns()) for _ in range(LOOKS))[LOOKS // 2]
+    share = took_s * update_hz
+    text = f"beams take {took_s * 1e3:.1f} ms, {share:.0%} of the time between updates"
+    if share > BUSY:
+        yield Finding("this machine", Grade.DOUBT, text, "lower [beams] update_hz")
+    else:
+        yield Finding("this machine", Grade.OK, text)
+
+
+def _look_s(pipeline: Pipeline, now_ns: int) -> float:
+    began_s = time.perf_counter()
+    pipeline.look(now_ns, 0.0)
+    return time.perf_counter() - began_s

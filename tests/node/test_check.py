@@ -1,0 +1,104 @@
+"""``companion check``: faults are named before a run, and what would hold a site back."""
+
+import json
+import os
+import socket
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support import BIN, HANG_S, started
+
+from companion.node import machine
+from companion.node.check import check
+from companion.node.machine import Finding, Grade
+from companion.settings.model import Settings
+
+
+def looked(**sections: Any) -> dict[str, Finding]:
+    settings = Settings().override(**sections)
+    return {each.subject: each for each in machine.look(settings, token=None, insecure=False)}
+
+
+def test_ports_that_are_taken_are_faults() -> None:
+    with (
+        socket.create_server(("127.0.0.1", 0)) as web,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mavlink,
+    ):
+        mavlink.bind(("127.0.0.1", 0))
+        listen = f"127.0.0.1:{web.getsockname()[1]}"
+        url = f"udpin:127.0.0.1:{mavlink.getsockname()[1]}"
+        found = looked(server={"listen": listen}, links={"urls": [url]})
+        assert found[f"http {listen}"].grade is Grade.FAULT
+        assert "--listen" in found[f"http {listen}"].remedy
+        assert found[f"link {url}"].grade is Grade.FAULT
+        assert "another program" in found[f"link {url}"].remedy
+    found = looked(server={"listen": listen}, links={"urls": [url]})
+    assert found[f"http {listen}"].grade is Grade.OK
+    assert found[f"link {url}"].grade is Grade.OK
+
+
+def test_serving_beyond_this_machine_without_a_token_is_a_fault() -> None:
+    found = looked(server={"listen": "0.0.0.0:0"})["http 0.0.0.0:0"]
+    assert found.grade is Grade.FAULT
+    assert "COMPANION_TOKEN" in found.text
+
+
+def test_a_device_that_is_not_there_is_a_fault() -> None:
+    found = looked(links={"urls": ["serial:/dev/nothere:57600"]})
+    assert found["link serial:/dev/nothere:57600"].grade is Grade.FAULT
+    assert "plugged in" in found["link serial:/dev/nothere:57600"].remedy
+
+
+def test_a_device_that_is_there_is_in_order() -> None:
+    master, slave = os.openpty()
+    device = os.ttyname(slave)
+    found = looked(links={"urls": [f"serial:{device}:57600"]})
+    assert found[f"link serial:{device}:57600"].grade is Grade.OK
+    os.close(master)
+    os.close(slave)
+
+
+def test_the_folder_of_recordings_is_tried(tmp_path: Path) -> None:
+    folder = tmp_path / "to" / "be" / "made"
+    assert looked(recording={"directory": str(folder)})[f"recordings {folder}"].grade is Grade.OK
+    assert not folder.exists()
+    (tmp_path / "file").write_text("")
+    inside = tmp_path / "file" / "recordings"
+    assert looked(recording={"directory": str(inside)})[f"recordings {inside}"].grade is Grade.FAULT
+
+
+def test_silence_and_a_missing_carrier_are_told(tmp_path: Path) -> None:
+    settings = Settings().override(
+        links={"urls": ["udpin:127.0.0.1:0"]}, server={"listen": "127.0.0.1:0"}
+    )
+    found = list(check(settings, 0.2))
+    (heard,) = (each for each in found if each.text == "heard nothing")
+    assert "MAVProxy" in heard.remedy
+    assert found[-1].subject == "carrier"
+    assert found[-1].grade is Grade.FAULT
+
+
+@pytest.mark.full
+def test_a_flight_is_judged(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    flies = [BIN / "sitl-replay", "fly", "waypoints", "--to", f"udpout:127.0.0.1:{port}"]
+    asks = [BIN / "companion", "check", "--link", f"udpin:127.0.0.1:{port}", "--json"]
+    asks += ["--listen", "127.0.0.1:0", "--center", "5:1", "--seconds", "8"]
+    with started(flies, stdout=subprocess.DEVNULL) as sending:
+        done = subprocess.run(
+            asks, capture_output=True, text=True, timeout=HANG_S, check=False, cwd=tmp_path
+        )
+        sending.terminate()
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = {each["subject"]: each for each in json.loads(done.stdout)["findings"]}
+    assert "frames of 1:1" in found[f"link udpin:127.0.0.1:{port}"]["text"]
+    assert found["carrier 5:1"]["grade"] == "ok"
+    judged = [each for name, each in found.items() if name.startswith("UAV ")]
+    assert len(judged) >= 2
+    assert all(each["text"].split(":")[0] in ("good", "weak", "none") for each in judged)
+    assert "beams take" in found["this machine"]["text"]
+    assert list(tmp_path.iterdir()) == []

@@ -20,12 +20,14 @@ const CHARTS = [
   { id: "gain", of: (_, beam) => beam?.guaranteed_gain_db },
 ];
 
-/** `uavs` to draw: the chosen one always, then the first ones of the table. */
+const COLLATOR = new Intl.Collator("en", { numeric: true });
+
+/** `uavs` to draw: the chosen one always, then those whose links are worst; in a lasting order. */
 function chosenFew(uavs, selected) {
   const ids = uavs.map((uav) => uav.id);
   const few = ids.slice(0, MOST_LINES);
   if (selected !== null && !few.includes(selected)) few[few.length - 1] = selected;
-  return few;
+  return few.sort(COLLATOR.compare);
 }
 
 /** Columns for uPlot: seconds before now, then the values of each UAV; null for unknown. */

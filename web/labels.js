@@ -1,6 +1,7 @@
 // The names beside the symbols of the plan view.
 
 import * as format from "./format.js";
+import { MARKS } from "./health.js";
 
 const CROWD = 8; // with more UAVs than this, a label without room is left away
 
@@ -52,8 +53,9 @@ function labelOf({ uav, beyond }) {
   const up = format.known(uav.down_m) ? -uav.down_m : null;
   const flatM = Math.hypot(uav.north_m, uav.east_m);
   const height = format.known(up) ? `${up >= 0 ? "↑" : "↓"}${format.metres(Math.abs(up))}` : "";
-  if (beyond) return [uav.id, `${format.metres(flatM)} away`];
-  return [uav.id, uav.state === "live" ? height : `${height} ${uav.state}`.trim()];
+  const name = ["weak", "none"].includes(uav.verdict) ? `${MARKS[uav.verdict]} ${uav.id}` : uav.id;
+  if (beyond) return [name, `${format.metres(flatM)} away`];
+  return [name, uav.state === "live" ? height : `${height} ${uav.state}`.trim()];
 }
 
 const overlap = (a, b) => a[0] < b[2] && b[0] < a[2] && a[1] < b[3] && b[1] < a[3];

@@ -3,9 +3,11 @@
 
 import { connection, startPolling } from "./api.js";
 import { Charts } from "./charts.js";
+import { Alarm } from "./alarm.js";
 import { $, setText } from "./dom.js";
 import { Focus } from "./focus.js";
 import * as format from "./format.js";
+import { headlineOf, rankOf, showHeadline, showTroubles } from "./health.js";
 import { History } from "./history.js";
 import { setUpKeys } from "./keys.js";
 import { showEvents, showLinks, showRecordings } from "./lists.js";
@@ -33,13 +35,15 @@ const table = new UavTable($("uavs"), choose);
 const focus = new Focus();
 const rejections = new Rejections();
 const timebar = new TimeBar(history, refresh);
+const alarm = new Alarm();
 const charts = new Charts((at) => timebar.showAt(at));
 const feeds = startPolling(() => ({ beamed: beamedUav(feeds.beams.data) }), take);
 
 // --- what is shown -----------------------------------------------------------------------------
 
+/** The worst link first. */
 function inOrder(uavs) {
-  return [...uavs].sort((a, b) => COLLATOR.compare(a.id, b.id));
+  return [...uavs].sort((a, b) => rankOf(a) - rankOf(b) || COLLATOR.compare(a.id, b.id));
 }
 
 /** The UAV whose beam is looked at closely: the chosen one, or else the first that has a beam. */
@@ -119,6 +123,7 @@ function showAll(link, now) {
   showConnection(link, feeds.uavs.data?.valid_at);
   showReadiness(feeds.readyz.data);
   showRecordings(feeds.recordings.data);
+  alarm.watch(feeds.uavs.data?.uavs ?? [], link.state === "lost" && !link.never, now);
   timebar.draw(now);
   showMoment(view, link, now);
   showPlan(view, link, now);
@@ -148,6 +153,8 @@ function showMoment(view, link, now) {
   showLinks(view.links);
   showEvents(view.events);
   showCount(view.uavs);
+  showHeadline(view.uavs);
+  showTroubles(view.uavs, choose);
   table.update(view.uavs, {
     beams: new Map(view.beams.map((beam) => [beam.uav, beam])),
     array: view.answer?.array,
@@ -202,7 +209,7 @@ function showPlan(view, link, now) {
 function nameThePage({ uavs, beams }, link) {
   const trouble = { lost: "CONNECTION LOST", partial: "CONNECTION FAILING", frozen: "STOPPED" };
   const state = trouble[link.state] ?? (timebar.isLive ? "" : "PAUSED");
-  const title = `${state || `${uavs.length} UAVs`} · companion`;
+  const title = `${state || headlineOf(uavs).text} · companion`;
   if (document.title !== title) document.title = title;
   const name = `Plan view: ${uavs.length} UAVs, ${beams.length} beams`
     + (state ? `, not live: ${state.toLowerCase()}` : "");

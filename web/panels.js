@@ -16,13 +16,13 @@ function setNotice(element, text) {
 // --- connection ---------------------------------------------------------------------------------
 
 const CHIPS = {
-  waiting: ["wait", "connecting…"],
-  live: ["good", "connected"],
-  late: ["warn", "answers late"],
-  partial: ["bad", "connection failing"],
+  waiting: ["wait", "reaching the service…"],
+  live: ["good", "service answers"],
+  late: ["warn", "service answers late"],
+  partial: ["bad", "service fails in part"],
   frozen: ["bad", "estimates stopped"],
-  lost: ["bad", "connection lost"],
-  never: ["bad", "no connection"],
+  lost: ["bad", "connection to the service lost"],
+  never: ["bad", "service not reached"],
 };
 
 function bannerText(link, lastStamp) {
@@ -85,7 +85,7 @@ function showCenter(center) {
     return;
   }
   const where = format.position(center.lat_deg, center.lon_deg);
-  const parts = [center.source ?? format.UNKNOWN];
+  const parts = [center.fixed ? "fixed" : center.source ?? format.UNKNOWN];
   if (where === format.UNKNOWN) parts.push("no position yet");
   else {
     parts.push(where, format.metres(center.alt_m), `heading ${format.bearing(center.heading_deg)}`);

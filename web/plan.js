@@ -15,7 +15,7 @@ const GAP_MS = 2500; // a trail is not drawn through a hole in what was received
 
 const COLOURS = [
   "plan", "grid", "gridtext", "text", "muted", "live", "coast", "stale", "beam", "bore", "bad",
-  "past", "on-past",
+  "warn", "past", "on-past",
 ];
 
 export class PlanView {
@@ -122,7 +122,9 @@ export class PlanView {
 
   colourOf(uav) {
     if (!this.scene.uavsLive) return this.colour.stale;
-    return { live: this.colour.live, coasting: this.colour.coast }[uav.state] ?? this.colour.stale;
+    const { live, coast, stale, warn, bad } = this.colour;
+    const ofState = { live, coasting: coast }[uav.state] ?? stale;
+    return ofState === stale ? stale : { weak: warn, none: bad }[uav.verdict] ?? ofState;
   }
 
   /** Thick where reports held it up, thin where it is an estimate alone. */

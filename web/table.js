@@ -2,34 +2,28 @@
 
 import { make, setText } from "./dom.js";
 import * as format from "./format.js";
+import { explain } from "./health.js";
 
 const halfWidthDeg = (array) =>
   format.known(array?.half_power_beamwidth_deg) ? array.half_power_beamwidth_deg / 2 : null;
 
-/** The pointing bound, with a warning where the UAV can be outside the half-power beam. */
+/** The pointing bound, and what it means. Whether the link suffers by it is in the verdict. */
 function pointingBound({ beam, array }) {
   const bound = beam?.pointing_bound_deg;
   const text = format.degrees(bound, 2);
   const limit = halfWidthDeg(array);
-  if (beam && !format.known(bound)) {
-    return { text: `▲ ${text}`, level: "warn", title: "No bound: the UAV can be anywhere" };
-  }
+  if (beam && !format.known(bound)) return { text, title: "No bound: the UAV can be anywhere" };
   if (!format.known(bound) || limit === null || bound <= limit) return { text };
-  if (beam.widened) return { text, title: "More than half the beamwidth: the beam is broadened" };
-  return {
-    text: `▲ ${text}`, level: "warn",
-    title: `More than half the beamwidth (${format.degrees(limit, 2)}): the beam may miss`,
-  };
+  return { text, title: beam.widened ? "More than half the beamwidth: the beam is broadened"
+    : `More than half the beamwidth (${format.degrees(limit, 2)}): the beam may miss` };
 }
 
-/** The guaranteed gain, with a warning where there is none. */
+/** The guaranteed gain, or what it means that there is none. */
 function guaranteedGain({ beam }) {
   const text = format.decibels(beam?.guaranteed_gain_db);
   if (!beam || format.known(beam.guaranteed_gain_db)) return { text };
-  return {
-    text: `▲ ${text}`, level: "warn",
-    title: "Nothing is guaranteed: within its bound the UAV may be in a null, or out of coverage",
-  };
+  return { text, title: "Nothing is guaranteed: within its bound the UAV may be in a null, or out"
+    + " of coverage" };
 }
 
 function range(uav) {
@@ -60,6 +54,8 @@ function age(context) {
 
 /** Columns in their order. `feed`: which answer a value stands on; `short`: for narrow screens. */
 const COLUMNS = [
+  { key: "verdict", label: "Link", feed: "uavs", title: "Whether its beam has the gain it needs",
+    show: ({ uav }) => ({ text: uav.verdict ?? format.UNKNOWN, title: explain(uav) }) },
   { key: "state", label: "State", feed: "uavs", show: ({ uav }) => ({ text: uav.state }) },
   { key: "range", label: "Range", feed: "uavs", title: "Slant range from the carrier",
     show: ({ uav }) => ({ text: format.metres(range(uav)) }) },
@@ -78,14 +74,14 @@ const COLUMNS = [
   { key: "bound", label: "Bound", feed: "uavs", title: "Guaranteed position error, at most",
     show: bound },
   { key: "usual", label: "Usual error", short: "Usual", feed: "uavs",
-    title: "95 of 100 predictions at this age were nearer, of late",
+    title: "Usual error: 95 of 100 predictions at this age were nearer, of late",
     show: ({ uav }) => ({ text: format.metres(uav.error_p95_m) }) },
   { key: "pointing", label: "Pointing bound", short: "Pointing", feed: "beams",
-    title: "How far the true direction can lie from the beam", show: pointingBound },
+    title: "Pointing bound: how far the true direction can lie from the beam", show: pointingBound },
   { key: "gain", label: "Gain", feed: "beams", title: "Array gain towards the prediction",
     show: ({ beam }) => ({ text: format.decibels(beam?.gain_db) }) },
   { key: "guaranteed", label: "Guaranteed gain", short: "Guaranteed", feed: "beams",
-    title: "The least gain wherever the UAV truly is within its bound", show: guaranteedGain },
+    title: "Guaranteed gain: the least gain wherever the UAV truly is within its bound", show: guaranteedGain },
 ];
 
 export class UavTable {
@@ -94,10 +90,10 @@ export class UavTable {
     this.onSelect = onSelect;
     this.rows = new Map();
     const head = table.tHead.rows[0];
-    for (const { label, title, key } of [{ label: "UAV", key: "id" }, ...COLUMNS]) {
+    for (const { label, title, key, short = label } of [{ label: "UAV", key: "id" }, ...COLUMNS]) {
       const cell = make("th", { scope: "col", role: "columnheader", "data-key": key });
-      if (title) cell.title = title;
-      cell.textContent = label;
+      cell.title = title ?? label;
+      cell.textContent = short;
       head.append(cell);
     }
   }
@@ -149,6 +145,7 @@ export class UavTable {
 
   fill(row, context, isSelected) {
     row.line.dataset.state = context.uav.state;
+    row.line.dataset.verdict = context.uav.verdict ?? "";
     row.line.toggleAttribute("data-old", ageOf(context) > OLD_S);
     row.line.toggleAttribute("data-selected", isSelected);
     row.button.setAttribute("aria-pressed", String(isSelected));

@@ -312,7 +312,7 @@ def test_a_lost_service_is_unmistakable_and_heals(open_page: Any, start_mine: An
     assert page.evaluate(style.format("textDecorationLine")) == "line-through"
     start_mine(port=int(node.url.rpartition(":")[2]))
     page.locator("#banner").wait_for(state="hidden", timeout=HANG_MS)
-    page.get_by_text("connected", exact=True).wait_for(timeout=HANG_MS)
+    page.get_by_text("service answers", exact=True).wait_for(timeout=HANG_MS)
     wait_for_value(page, style.format("textDecorationLine"), "none")
 
 

@@ -17,8 +17,8 @@ test("while the service answers, nothing is marked and nothing is in the way", a
     assert.ok(page.element("banner").hidden);
     await page.time.advance(230);
   }
-  assert.equal(page.text("connection"), "connected");
-  assert.equal(page.document.title, "2 UAVs · companion");
+  assert.equal(page.text("connection"), "service answers");
+  assert.equal(page.document.title, "2 of 2 links good · companion");
   assert.equal(page.element("plan").getAttribute("aria-label"), "Plan view: 2 UAVs, 2 beams");
   assert.ok(!(await page.drawn()).texts.some((text) => text.startsWith("NOT LIVE")));
 });
@@ -31,7 +31,7 @@ test("answers that are late make what stands on them look late", async () => {
   await page.time.advance(900);
   assert.deepEqual(page.marked("late"), ["beams", "pattern", "uavs"]);
   assert.deepEqual(page.marked("lost"), []);
-  assert.equal(page.text("connection"), "answers late");
+  assert.equal(page.text("connection"), "service answers late");
 });
 
 for (const mode of ["silent", "gone"]) {
@@ -52,7 +52,7 @@ for (const mode of ["silent", "gone"]) {
     await page.time.advance(6000);
     assert.deepEqual([page.marked("lost"), page.marked("late")], [[], []]);
     assert.ok(page.element("banner").hidden);
-    assert.equal(page.document.title, "2 UAVs · companion");
+    assert.equal(page.document.title, "2 of 2 links good · companion");
     plan = await page.drawn();
     assert.ok(plan.drawn.some(({ strokeStyle }) => strokeStyle === page.colour("live")));
     assert.ok(!plan.texts.some((text) => text.startsWith("NOT LIVE")));
@@ -91,11 +91,11 @@ test("an age grows while no answer comes", async () => {
 
 test("where nothing has ever answered there is no connection", async () => {
   const page = await openPage({ mode: "gone" });
-  assert.equal(page.text("connection"), "connecting…");
+  assert.equal(page.text("connection"), "reaching the service…");
   assert.equal(page.text("uavs-empty"), "Nothing received yet.");
   await page.time.advance(4000);
   assert.deepEqual([page.text("connection"), page.text("banner-title")],
-    ["no connection", "No connection"]);
+    ["service not reached", "No connection"]);
   (await page.drawn()).text("NOT LIVE – no connection");
 });
 

@@ -116,7 +116,7 @@ test("a paused page stands still and says so, while what comes is kept", async (
   page.press("ArrowLeft");
   assert.deepEqual(page.cells("azimuth"), [paused]);
   page.press("End");
-  assert.equal(page.document.title, "1 UAVs · companion");
+  assert.equal(page.document.title, "1 of 1 links good · companion");
   assert.ok(page.element("past").hidden);
   near(Number.parseFloat(page.cells("azimuth")[0]), page.service.seconds * 10, 10);
 });

@@ -8,13 +8,26 @@ export const stampAt = (seconds) => new Date(START + seconds * 1000).toISOString
 export const LAT = 47.0;
 export const LON = 8.0;
 
+/** What is behind a verdict; all is well by default. */
+export const health = (fields = {}) => ({
+  cause: null, reason: null, remedy: null, since: stampAt(0), needed_gain_db: 6,
+  guaranteed_gain_db: 15.2, likely_gain_db: 17, ...fields,
+});
+
+/** A verdict with its reason, as a UAV has it. */
+export const weak = (verdict = "weak", fields = {}) => ({
+  verdict, health: health({
+    cause: "rate", reason: "reports 1.1 s apart", remedy: "ask for 10 Hz", ...fields,
+  }),
+});
+
 /** One UAV as /v1/uavs has it, flying by default still at 100 m north of the carrier. */
 export const uav = (id, fields = {}) => ({
   id, state: "live", target: true, same_as: null, callsign: null, relays: [], fix: null,
   valid_at: stampAt(0), age_s: 0.2, lat_deg: LAT + 0.0009, lon_deg: LON, alt_m: 500,
   north_m: 100, east_m: 0, down_m: -50, velocity_ned_mps: [0, 0, 0], speed_mps: 0,
   bound_m: 4.2, bound_cylinder_ned_m: [4, 4, 2], clock: null, dt_s: 0.25, latency_s: 0.03,
-  innovation_m: 0.4, gamma: 1, reports: 10, rejected: {}, recent_rejections: [], ...fields,
+  verdict: "good", health: health(), innovation_m: 0.4, gamma: 1, reports: 10, rejected: {}, recent_rejections: [], ...fields,
 });
 
 /** One beam as /v1/beams has it, due north. */

@@ -5,7 +5,7 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 
 import { load, openBrowser } from "./browser.mjs";
-import { array, beam, uav } from "./service.mjs";
+import { array, beam, uav, weak } from "./service.mjs";
 
 const { UavTable } = await load("table.js");
 const plain = (text) => text.replaceAll("\u00a0", " ");
@@ -43,7 +43,7 @@ test("every value is in its own column, with its unit", () => {
     guaranteed_gain_db: 15.2,
   })] });
   assert.deepEqual(texts(), {
-    state: "coasting", range: "130 m", azimuth: "−12.5°", elevation: "+8.0°", speed: "5.3 m/s",
+    verdict: "good", state: "coasting", range: "130 m", azimuth: "−12.5°", elevation: "+8.0°", speed: "5.3 m/s",
     age: "0.50 s", dt: "0.25 s", latency: "30 ms", bound: "4.2 m", usual: "0.8 m", pointing: "1.25°",
     gain: "17.5 dB", guaranteed: "15.2 dB",
   });
@@ -64,7 +64,7 @@ test("what is not known is a dash: without a beam, without a place", () => {
   const { show, texts } = openTable();
   show([uav("1:1", { north_m: null, speed_mps: null, age_s: null, dt_s: null, latency_s: null })]);
   assert.deepEqual(texts(), {
-    state: "live", range: "–", azimuth: "–", elevation: "–", speed: "–", age: "–", dt: "–",
+    verdict: "good", state: "live", range: "–", azimuth: "–", elevation: "–", speed: "–", age: "–", dt: "–",
     latency: "–", bound: "4.2 m", usual: "–", pointing: "–", gain: "–", guaranteed: "–",
   });
 });
@@ -90,27 +90,37 @@ test("a bound whose assumptions were refuted is marked", () => {
   assert.deepEqual([plain(cell("bound").textContent), cell("bound").dataset.level], ["4.2 m", ""]);
 });
 
-test("a pointing bound above half the beamwidth is warned of, unless the beam is broadened", () => {
+test("a pointing bound above half the beamwidth is explained", () => {
   const { show, cell } = openTable();
   const shown = (fields, width = 10) => {
     show([uav("1:1")], { beams: [beam("1:1", fields)],
       array: { half_power_beamwidth_deg: width } });
-    return [cell("pointing").textContent, cell("pointing").dataset.level];
+    return [cell("pointing").textContent, cell("pointing").title];
   };
   assert.deepEqual(shown({ pointing_bound_deg: 5 }), ["5.00°", ""]);
-  assert.deepEqual(shown({ pointing_bound_deg: 5.01 }), ["▲ 5.01°", "warn"]);
-  assert.deepEqual(shown({ pointing_bound_deg: 5.01, widened: true }), ["5.01°", ""]);
+  assert.match(shown({ pointing_bound_deg: 5.01 })[1], /may miss/);
+  assert.match(shown({ pointing_bound_deg: 5.01, widened: true })[1], /is broadened/);
   assert.deepEqual(shown({ pointing_bound_deg: 50 }, null), ["50.00°", ""]);
-  assert.deepEqual(shown({ pointing_bound_deg: null }), ["▲ –", "warn"]);
+  assert.match(shown({ pointing_bound_deg: null })[1], /anywhere/);
 });
 
-test("a beam without any guaranteed gain is warned of", () => {
+test("a beam without any guaranteed gain is explained", () => {
   const { show, cell } = openTable();
   show([uav("1:1")], { beams: [beam("1:1", { guaranteed_gain_db: null })] });
-  assert.deepEqual([cell("guaranteed").textContent, cell("guaranteed").dataset.level],
-    ["▲ –", "warn"]);
+  assert.equal(cell("guaranteed").textContent, "–");
+  assert.match(cell("guaranteed").title, /Nothing is guaranteed/);
   show([uav("1:1")]);
-  assert.deepEqual([cell("guaranteed").textContent, cell("guaranteed").dataset.level], ["–", ""]);
+  assert.deepEqual([cell("guaranteed").textContent, cell("guaranteed").title], ["–", ""]);
+});
+
+test("a verdict is in the row, with its reason and what to do", () => {
+  const { show, cell, rows } = openTable();
+  show([uav("1:1", weak()), uav("2:1")]);
+  assert.deepEqual([cell("verdict").textContent, cell("verdict").title, rows()[0].dataset.verdict],
+    ["weak", "reports 1.1 s apart. To do: ask for 10 Hz", "weak"]);
+  assert.match(cell("verdict", 1).title, /surely has the 6.0 dB/);
+  show([uav("3:1", { verdict: null, health: null })]);
+  assert.deepEqual([cell("verdict").textContent, cell("verdict").title], ["–", ""]);
 });
 
 test("each UAV has its own beam", () => {

@@ -1,0 +1,89 @@
+// An alarm for whoever does not look at the page: off unless switched on, which this browser
+// remembers. It sounds, and a bar stays, until somebody has seen it.
+
+import { $, setText } from "./dom.js";
+import { rankOf } from "./health.js";
+
+const KEY = "companion.alarm";
+const REPEAT_MS = 2000;
+const TONES_HZ = [880, 660];
+const TONE_S = 0.18;
+
+function remembered() {
+  try {
+    return localStorage.getItem(KEY) === "on";
+  } catch {
+    return false; // storage is refused to this page: it is off until it is switched on again
+  }
+}
+
+function remember(isOn) {
+  try {
+    localStorage.setItem(KEY, isOn ? "on" : "off");
+  } catch {
+    // storage is refused to this page: it holds until the page is closed
+  }
+}
+
+export class Alarm {
+  constructor() {
+    Object.assign(this, { isOn: remembered(), ranks: new Map(), wasLost: false, soundedAt: 0 });
+    this.unseen = ""; // what nobody has seen yet
+    this.sound = null;
+    $("alarm").addEventListener("click", () => this.switch(!this.isOn));
+    $("alarm-seen").addEventListener("click", () => this.see());
+    // Browsers let a page sound only once somebody has touched it.
+    document.addEventListener("pointerdown", () => this.isOn && this.wakeSound());
+    this.draw();
+  }
+
+  switch(isOn) {
+    this.isOn = isOn;
+    remember(isOn);
+    if (isOn) this.wakeSound();
+    this.see();
+  }
+
+  see() {
+    this.unseen = "";
+    this.draw();
+  }
+
+  /** Look at what is true now; `isLost`: nothing is known of it any more. */
+  watch(uavs, isLost, now) {
+    const worse = uavs.filter((uav) => rankOf(uav) < (this.ranks.get(uav.id) ?? -1));
+    if (!isLost) this.ranks = new Map(uavs.map((uav) => [uav.id, rankOf(uav)]));
+    if (!this.isOn) return;
+    if (isLost && !this.wasLost) this.unseen = "the connection to the service is lost";
+    else if (worse.length) {
+      this.unseen = worse.map((uav) => `link to ${uav.id}: ${uav.verdict}`).join(", ");
+    }
+    this.wasLost = isLost;
+    this.draw();
+    if (this.unseen && now - this.soundedAt > REPEAT_MS) this.beep(now);
+  }
+
+  wakeSound() {
+    if (!this.sound && globalThis.AudioContext) this.sound = new AudioContext();
+    this.sound?.resume();
+  }
+
+  beep(now) {
+    this.soundedAt = now;
+    if (this.sound?.state !== "running") return;
+    TONES_HZ.forEach((tone, i) => {
+      const oscillator = this.sound.createOscillator();
+      oscillator.frequency.value = tone;
+      oscillator.connect(this.sound.destination);
+      oscillator.start(this.sound.currentTime + i * TONE_S);
+      oscillator.stop(this.sound.currentTime + (i + 1) * TONE_S);
+    });
+  }
+
+  draw() {
+    setText($("alarm"), this.isOn ? "Alarm on" : "Alarm off");
+    $("alarm").setAttribute("aria-pressed", String(this.isOn));
+    $("alarm-bar").hidden = !this.unseen;
+    setText($("alarm-text"), this.unseen ? `ALARM – ${this.unseen}` : "");
+  }
+}

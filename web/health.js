@@ -1,0 +1,77 @@
+// Which links to UAVs are good, worst first: the headline, and what to do about those that are not.
+
+import { $, make, setChildren, setText } from "./dom.js";
+import { known } from "./format.js";
+
+/** From the worst to the best; a UAV without a verdict is no target, and comes last. */
+export const LEVELS = ["none", "weak", "good"];
+/** Colours and marks of the page for each level. */
+export const LEVEL_OF = { none: "bad", weak: "warn", good: "good" };
+export const MARKS = { none: "✕", weak: "▲", good: "●" };
+const MOST_SHOWN = 8;
+const MOST_NAMED = 5;
+
+export const rankOf = (uav) => (LEVELS.includes(uav.verdict)
+  ? LEVELS.indexOf(uav.verdict) : LEVELS.length);
+
+const of = (uavs, level) => uavs.filter((uav) => uav.verdict === level);
+
+/** The one line that says it all, and how bad it is. */
+export function headlineOf(uavs) {
+  const judged = uavs.filter((uav) => rankOf(uav) < LEVELS.length);
+  if (!judged.length) return { text: "no link to judge yet", level: "wait" };
+  const good = of(judged, "good").length;
+  const text = `${good} of ${judged.length} links good`;
+  const worst = LEVELS.find((level) => of(judged, level).length);
+  return { text, level: LEVEL_OF[worst] };
+}
+
+export function showHeadline(uavs) {
+  const { text, level } = headlineOf(uavs);
+  $("headline").dataset.level = level;
+  setText($("headline"), text);
+}
+
+/** Links that are not good, those with one cause together, the worst first. */
+export function troublesOf(uavs) {
+  const alike = new Map();
+  for (const uav of [...uavs].sort((a, b) => rankOf(a) - rankOf(b))) {
+    if (!["none", "weak"].includes(uav.verdict)) continue;
+    const { cause, reason, remedy } = uav.health ?? {};
+    const key = `${uav.verdict} ${cause}`;
+    if (!alike.has(key)) alike.set(key, { level: uav.verdict, reason, remedy, ids: [] });
+    alike.get(key).ids.push(uav.id);
+  }
+  return [...alike.values()];
+}
+
+function troubleItem({ level, reason, remedy, ids }, onSelect) {
+  const names = ids.slice(0, MOST_NAMED).map((id) => {
+    const pick = make("button", { type: "button", class: "name" }, id);
+    pick.addEventListener("click", () => onSelect(id));
+    return pick;
+  });
+  if (ids.length > MOST_NAMED) names.push(`and ${ids.length - MOST_NAMED} more`);
+  const such = ids.length > 1 ? `such as: ${reason}` : reason;
+  return make("li", { "data-level": LEVEL_OF[level] },
+    make("p", { class: "who" }, ...names.flatMap((name) => [name, " "]), make("b", {}, level)),
+    make("p", {}, such ?? "no reason given"),
+    make("p", { class: "muted" }, remedy ? `→ ${remedy}` : ""));
+}
+
+/** What holds links back and what to do; nothing is listed where all are good. */
+export function showTroubles(uavs, onSelect) {
+  const all = troublesOf(uavs);
+  const shown = all.slice(0, MOST_SHOWN);
+  $("troubles-panel").hidden = !all.length;
+  setChildren($("troubles"), shown, () => shown.map((one) => troubleItem(one, onSelect)));
+}
+
+/** The gains behind a verdict, in words: for the pointer, and for the reader of a screen. */
+export function explain(uav) {
+  const { reason, remedy, needed_gain_db: needed } = uav.health ?? {};
+  if (uav.verdict === "good") {
+    return known(needed) ? `It surely has the ${needed.toFixed(1)} dB that it needs` : "";
+  }
+  return [reason, remedy].filter(Boolean).join(". To do: ");
+}

@@ -2,6 +2,7 @@
 
 import { $, make, setChildren, setText } from "./dom.js";
 import { elementsOf, makeElements } from "./elements.js";
+import * as format from "./format.js";
 import { directionFacts, makePattern } from "./pattern.js";
 
 export class Focus {
@@ -16,10 +17,12 @@ export class Focus {
     this.elements.recolour();
   }
 
-  show({ pattern, weights, patternBeams }, uav, { isLive, patternTrusted, weightsTrusted }) {
+  /** `oldS`: how old it is, where it is the last that was known; else null. */
+  show({ pattern, weights, patternBeams }, uav, { isLive, oldS, patternTrusted, weightsTrusted }) {
+    const label = oldS === null ? uav ?? "" : `${uav}, as ${format.duration(oldS)} ago`;
     const entry = pattern?.patterns.find((one) => one.uav === uav) ?? null;
     const beam = entry && patternBeams?.beams.find((one) => one.uav === uav);
-    for (const name of document.querySelectorAll(".focus-uav")) setText(name, uav ?? "");
+    for (const name of document.querySelectorAll(".focus-uav")) setText(name, label);
     // Only the pattern of the UAV that was looked at then has been asked for.
     const none = uav === null ? "no beam" : isLive ? "waiting…" : "not asked for at that time";
     this.pattern.show({ answer: pattern, entry, beam, trusted: patternTrusted, none });

@@ -40,19 +40,21 @@ export function troublesOf(uavs) {
     const { cause, reason, remedy } = uav.health ?? {};
     const key = `${uav.verdict} ${cause}`;
     if (!alike.has(key)) alike.set(key, { level: uav.verdict, reason, remedy, ids: [] });
-    alike.get(key).ids.push(uav.id);
+    const found = alike.get(key);
+    found.ids.push(uav.id);
+    found.differ ||= found.reason !== reason;
   }
   return [...alike.values()];
 }
 
-function troubleItem({ level, reason, remedy, ids }, onSelect) {
+function troubleItem({ level, reason, remedy, ids, differ }, onSelect) {
   const names = ids.slice(0, MOST_NAMED).map((id) => {
     const pick = make("button", { type: "button", class: "name" }, id);
     pick.addEventListener("click", () => onSelect(id));
     return pick;
   });
   if (ids.length > MOST_NAMED) names.push(`and ${ids.length - MOST_NAMED} more`);
-  const such = ids.length > 1 ? `such as: ${reason}` : reason;
+  const such = differ ? `such as: ${reason}` : reason;
   return make("li", { "data-level": LEVEL_OF[level] },
     make("p", { class: "who" }, ...names.flatMap((name) => [name, " "]), make("b", {}, level)),
     make("p", {}, such ?? "no reason given"),

@@ -10,6 +10,7 @@ import * as format from "./format.js";
 import { headlineOf, rankOf, showHeadline, showTroubles } from "./health.js";
 import { History } from "./history.js";
 import { setUpKeys } from "./keys.js";
+import { LastKnown, carrierOf, placedBy } from "./last_known.js";
 import { showEvents, showLinks, showRecordings } from "./lists.js";
 import {
   showBeams, showConnection, showFault, showReadiness, showStatus, Rejections,
@@ -30,6 +31,7 @@ let faulted = false;
 let isNew = false; // something has come since the pictures were last drawn
 
 const history = new History();
+const last = new LastKnown();
 const plan = new PlanView($("plan"), history, choose);
 const table = new UavTable($("uavs"), choose);
 const focus = new Focus();
@@ -87,6 +89,8 @@ function take(name) {
     history.add(presentMoment(now));
     isNew = true;
   }
+  const present = presentMoment(now);
+  last.note(present, beamedUav(present.answer), now);
   if (name !== "status" || timebar.isLive) refresh();
 }
 
@@ -118,7 +122,9 @@ function refresh() {
 }
 
 function showAll(link, now) {
-  const view = timebar.shown ?? liveView(now);
+  const found = timebar.shown ?? liveView(now);
+  const carrier = carrierOf(found.status);
+  const view = { ...found, carrier, uavs: found.uavs.map((uav) => placedBy(uav, carrier)) };
   if (selected !== null && !view.uavs.some((uav) => uav.id === selected)) selected = null;
   showConnection(link, feeds.uavs.data?.valid_at);
   showReadiness(feeds.readyz.data);
@@ -136,8 +142,8 @@ function showAll(link, now) {
 /** The newest answers, true or not: what is not true any more is marked, not hidden. */
 function liveView(now) {
   const answers = Object.fromEntries(KEPT.map((name) => [name, feeds[name].data]));
-  return { ...presentMoment(now), ...answers, answer: answers.beams,
-    beams: answers.beams?.beams ?? [] };
+  const view = { ...presentMoment(now), ...answers, answer: answers.beams };
+  return { ...view, beams: last.beamsOf(view.uavs, answers.beams?.beams ?? [], now) };
 }
 
 /** Whether what stands on a feed may look true: what is past was true in its time. */
@@ -161,10 +167,18 @@ function showMoment(view, link, now) {
     sinceS: timebar.isLive ? feeds.uavs.silenceS(now) : 0,
     selected,
   });
-  focus.show(view, beamedUav(view.answer), {
+  showFocus(view, link, now);
+}
+
+/** One beam closely; while there is none, the last one, grey. */
+function showFocus(view, link, now) {
+  const uav = beamedUav(view.answer);
+  const isOld = uav === null && timebar.isLive && last.picture !== null;
+  focus.show(isOld ? last.picture : view, isOld ? last.picture.uav : uav, {
     isLive: timebar.isLive,
-    patternTrusted: believed(feeds.pattern, link, now),
-    weightsTrusted: believed(feeds.weights, link, now),
+    oldS: isOld ? (now - last.picture.at) / 1000 : null,
+    patternTrusted: !isOld && believed(feeds.pattern, link, now),
+    weightsTrusted: !isOld && believed(feeds.weights, link, now),
   });
 }
 
@@ -180,25 +194,28 @@ function showCount(uavs) {
 }
 
 /** What the plan view says of itself when it must not be believed; nothing while it is live. */
-function planMessage(link, now) {
+function planMessage(view, link, now) {
   if (!timebar.isLive) {
     return `NOT LIVE – ${format.duration((now - timebar.shown.at) / 1000)} ago`;
   }
   if (link.never) return "NOT LIVE – no connection";
   if (link.state === "lost") return "NOT LIVE – connection lost";
   if (feeds.uavs.health(now) === "frozen") return "NOT LIVE – estimates stopped";
-  return feeds.uavs.health(now) === "lost" ? "NOT LIVE – no answer about UAVs" : "";
+  if (feeds.uavs.health(now) === "lost") return "NOT LIVE – no answer about UAVs";
+  const { unfit, ageS } = view.carrier ?? {};
+  if (!unfit) return "";
+  return format.known(ageS) ? `${unfit}: carrier and beams as ${format.duration(ageS)} ago` : unfit;
 }
 
 function showPlan(view, link, now) {
   plan.show({
     uavs: view.uavs,
     beams: view.beams,
-    array: view.answer?.array ?? null,
-    headingDeg: view.status?.center?.heading_deg,
+    array: view.answer?.array ?? last.array ?? null,
+    carrier: view.carrier,
     uavsLive: believed(feeds.uavs, link, now),
     beamsLive: believed(feeds.beams, link, now),
-    message: planMessage(link, now),
+    message: planMessage(view, link, now),
     isPast: !timebar.isLive,
     selected,
     at: view.at,

@@ -77,7 +77,7 @@ export function showReadiness(answer) {
 
 const RECORDING_LEVEL = { recording: "good", off: "", degraded: "bad" };
 
-function showCenter(center) {
+function showCenter(center, behind) {
   const element = $("center");
   if (!center) {
     element.dataset.level = "";
@@ -86,7 +86,7 @@ function showCenter(center) {
   }
   const where = format.position(center.lat_deg, center.lon_deg);
   const parts = [center.fixed ? "fixed" : center.source ?? format.UNKNOWN];
-  if (where === format.UNKNOWN) parts.push("no position yet");
+  if (where === format.UNKNOWN) parts.push(behind ?? center.unfit ?? "no position yet");
   else {
     parts.push(where, format.metres(center.alt_m), `heading ${format.bearing(center.heading_deg)}`);
   }
@@ -196,7 +196,7 @@ export function showStatus(status) {
   setText($("uptime"), format.duration(status?.uptime_s));
   setText($("frames"), format.perSecond(status?.rates?.frames_hz));
   setText($("updates"), format.perSecond(status?.rates?.updates_hz));
-  showCenter(status?.center);
+  showCenter(status?.center, status?.health?.behind);
   showRecording(status?.recording);
   showLag(status?.arrival_lag);
   showReplay(status?.replay);
@@ -213,10 +213,9 @@ export function showBeams(answer) {
   if (!answer) {
     for (const id of ["beams-line", "beams-array"]) setText($(id), format.UNKNOWN);
     setNotice($("beams-warning"), "");
-    setPairs($("left-out"), [], format.UNKNOWN);
     return;
   }
-  const { beams, array, left_out: leftOut } = answer;
+  const { beams, array } = answer;
   const regularised = answer.regularised || answer.method === "rzf";
   setText($("beams-line"), [
     METHODS[answer.method] ?? answer.method ?? format.UNKNOWN,
@@ -233,8 +232,6 @@ export function showBeams(answer) {
   setNotice($("beams-warning"), regularised
     ? "Nulls are not exact: each is held back where it would cost another beam more of the gain "
       + "that is sure than [beams] loss_limit_db." : "");
-  const out = (leftOut ?? []).map(({ uav, reason }) => [uav, reason, "warn"]);
-  setPairs($("left-out"), out, "no one");
 }
 
 function conditionNumber(value) {

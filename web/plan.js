@@ -108,7 +108,7 @@ export class PlanView {
     drawCarrier(this);
     this.hits = uavs.map((uav) => drawUav(this, uav));
     drawLabels(this, drawRingLabels(this));
-    this.drawMessage(uavs);
+    this.drawMessage();
   }
 
   at(northM, eastM) {
@@ -225,23 +225,21 @@ export class PlanView {
   }
 
   /** What must not be overlooked, across the middle of the picture. */
-  drawMessage(uavs) {
-    const { message, uavsLive, isPast } = this.scene;
-    const text = message
-      || (uavsLive && this.scene.uavs.length && !uavs.length
-        ? "No carrier position: UAVs cannot be placed" : "");
+  drawMessage() {
+    const { message: text, uavsLive, isPast } = this.scene;
     if (!text) return;
+    const isQuiet = uavsLive && !isPast; // the UAVs are true: no more than a word about the carrier
     const { context } = this;
-    const size = this.width < 500 ? 16 : 22;
-    const y = this.centre[1] + this.outerPx * 0.42;
+    const size = this.width < 500 ? 16 : isQuiet ? 17 : 22;
+    const y = isQuiet ? this.height - size : this.centre[1] + this.outerPx * 0.42;
     const widthPx = this.measure(text, size, 700) + 36;
-    context.fillStyle = !message ? this.colour.plan
+    context.fillStyle = isQuiet ? this.colour.plan
       : isPast ? this.colour.past : this.colour.bad;
     context.fillRect(this.centre[0] - widthPx / 2, y - size, widthPx, size * 2);
     context.font = `700 ${size}px ${this.font}`;
     context.textAlign = "center";
     context.textBaseline = "middle";
-    context.fillStyle = !message ? this.colour.text
+    context.fillStyle = isQuiet ? this.colour.warn
       : isPast ? this.colour["on-past"] : this.colour.plan;
     context.fillText(text, this.centre[0], y);
   }

@@ -8,11 +8,13 @@ const LEADER_S = 2; // the line ahead of a UAV: where it is in so many seconds
 /** The carrier in the middle, and how it heads. */
 export function drawCarrier(view) {
   const { context } = view;
-  const { headingDeg } = view.scene;
+  const { carrier } = view.scene;
+  const headingDeg = carrier?.heading_deg;
   context.save();
   context.translate(...view.centre);
   context.fillStyle = view.colour.plan;
-  context.strokeStyle = view.scene.uavsLive ? view.colour.text : view.colour.stale;
+  context.strokeStyle = view.scene.uavsLive && !carrier?.unfit
+    ? view.colour.text : view.colour.stale;
   context.lineWidth = 2;
   context.beginPath();
   context.arc(0, 0, 9, 0, 2 * Math.PI);

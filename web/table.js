@@ -152,9 +152,11 @@ export class UavTable {
     COLUMNS.forEach((column, index) => {
       const { cell, value } = row.cells[index];
       const { text, level = "", title = "" } = column.show(context);
+      const oldS = column.feed === "beams" ? context.beam?.oldS : undefined;
       setText(value, text);
+      cell.toggleAttribute("data-old", oldS !== undefined);
       cell.dataset.level = level;
-      cell.title = title;
+      cell.title = oldS === undefined ? title : `As ${format.duration(oldS)} ago`;
     });
   }
 }

@@ -58,4 +58,4 @@ export function fixesOf(uav, history, at) {
   }));
 }
 
-const wrapDegrees = (angle) => ((((angle + 180) % 360) + 360) % 360) - 180;
+export const wrapDegrees = (angle) => ((((angle + 180) % 360) + 360) % 360) - 180;

@@ -10,7 +10,8 @@ export function drawBeams(view, uavs) {
   const { context } = view;
   if (!array) return;
   if (format.known(array.boresight_bearing_deg)) {
-    context.strokeStyle = view.scene.beamsLive ? view.colour.bore : view.colour.stale;
+    context.strokeStyle = view.scene.beamsLive && !view.scene.carrier?.unfit
+      ? view.colour.bore : view.colour.stale;
     context.lineWidth = 1.2;
     context.setLineDash([2, 6]);
     context.beginPath();
@@ -26,7 +27,8 @@ export function drawBeams(view, uavs) {
 function drawBeam(view, beam, array, uav) {
   if (!format.known(beam.bearing_deg)) return;
   const { context } = view;
-  const colour = view.scene.beamsLive ? view.colour.beam : view.colour.stale;
+  const isTrue = view.scene.beamsLive && beam.oldS === undefined;
+  const colour = isTrue ? view.colour.beam : view.colour.stale;
   const widthDeg = wedgeWidthDeg(beam, array);
   const flatM = uav ? Math.hypot(uav.north_m, uav.east_m)
     : (beam.range_m ?? 0) * Math.cos((beam.elevation_deg ?? 0) * RADIANS);

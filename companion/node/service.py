@@ -26,7 +26,7 @@ from companion.recording.recover import recover_leftovers
 from companion.recording.scene import Scene
 from companion.recording.writer import Writer
 from companion.settings.model import Settings
-from companion.values import Event, Frame, Notice, Output, Tick, UserError
+from companion.values import Event, Frame, Notice, Output, Severity, Tick, UserError
 from companion.views.health import behind
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
@@ -60,6 +60,7 @@ class Service:
         self.last_messages = LastMessages()
         self.lateness = Lateness()
         self._ticked = asyncio.Event()
+        self._is_behind = False
         self._settings = settings
         self._say = say
         self._timeline = NodeClock()
@@ -154,6 +155,18 @@ class Service:
         for severity, text in recorder.news():
             self._notify(Notice(self.now_ns(), severity, "recording", text))
 
+    def _tell_of_machine(self) -> None:
+        """Tell once that this machine does not keep up, and once that it does again."""
+        machine = behind(self.arrival_lag.seen(self.now_ns()))
+        if (machine is not None) is self._is_behind:
+            return
+        self._is_behind = machine is not None
+        if machine is None:
+            text, severity = "this machine keeps up again", Severity.INFO
+        else:
+            text, severity = f"{machine.reason}; {machine.remedy}", Severity.WARNING
+        self._notify(Notice(self.now_ns(), severity, "machine", text))
+
     def _show(self, notice: Notice) -> None:
         self.notices.append(notice)
         self._say(notice.text)
@@ -174,6 +187,7 @@ class Service:
             if self._recorder:
                 self._tell_of_recorder(self._recorder)
             self._traffic.speak(not self.unfit(), self.pipeline.reporters())
+            self._tell_of_machine()
             self._ticked.set()  # wakes those who wait now;
             self._ticked.clear()  # later ones wait for the next tick
             ended_s = loop.time()

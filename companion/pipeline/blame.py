@@ -36,7 +36,7 @@ class Evidence:
 def of_left_out(why: str, track: Track | None, crowded: bool, unfit: str | None) -> Blame:
     """Why a UAV has no beam. ``why`` is the reason that the beams give."""
     if unfit is not None:
-        return Blame(Cause.CARRIER, f"no beams: {unfit}", "see what carries the array")
+        return Blame(Cause.CARRIER, unfit, "see what carries the array")
     if crowded:
         return Blame(Cause.CROWDED, why, 'fly them apart, or set [beams] policy = "group"')
     if track is not None and f"{track.state}" in why:

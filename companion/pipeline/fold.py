@@ -70,6 +70,7 @@ class Pipeline:
         self.updates = 0
         self.restarts: Counter[str] = Counter()
         self.last_update: Update | None = None
+        self.last_carrier: Carrier | None = None
         self._steady: Steady | None = None  # changes with ticks alone, so that looks change nothing
         self.refusals = Refusals()
         self.digest = Digest()
@@ -176,6 +177,7 @@ class Pipeline:
         self.updates += 1
         dropped = self._drop_silent(now_ns) if self.updates % DROP_EVERY == 0 else []
         self.last_update = self.look(now_ns)
+        self.last_carrier = self.last_update.carrier or self.last_carrier
         self._steady = steady.after(self._steady, self.last_update.beams)
         states = {track.uav: track.state for track in self.last_update.tracks}
         if self.center.vehicle is not None:

@@ -123,6 +123,9 @@ class Headline(BaseModel):
     weak: int
     none: int
     headline: Annotated[str, Field(examples=["3 of 4 links good"])]
+    behind: Annotated[
+        str | None, Field(description="that this machine does not keep up; null where it does")
+    ]
 
 
 class UavState(BaseModel):
@@ -190,6 +193,17 @@ class Angles(BaseModel):
     yaw: float
 
 
+class LastPose(BaseModel):
+    """Where the array was at a time, and how it was turned."""
+
+    at: Time
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
+    heading_deg: float
+    attitude_deg: Angles
+
+
 class Center(BaseModel):
     """What carries the array; ``unfit`` says why its place is not known."""
 
@@ -203,6 +217,9 @@ class Center(BaseModel):
     age_s: float | None
     bound_m: float | None
     unfit: str | None
+    last_known: Annotated[
+        LastPose | None, Field(description="where it was last, while it is not known")
+    ]
 
 
 class LinkReports(BaseModel):

@@ -61,7 +61,7 @@ def beams(
         "groups": beam_set.groups,
         "codebook_beams": None if equipment.codebook is None else equipment.codebook.size,
         "unfit": update.unfit,
-        "left_out": left_out(beam_set),
+        "left_out": left_out(beam_set, update.unfit),
     }
 
 
@@ -74,9 +74,9 @@ def _beamwidths_rad(array: Array) -> tuple[float | None, float | None]:
     return patterns.half_power_beamwidths_rad(array, np.array([1.0, 0.0, 0.0]))
 
 
-def left_out(beam_set: BeamSet) -> list[Json]:
-    """UAVs that have no beam, with the reason."""
-    return [{"uav": out.uav, "reason": out.reason} for out in beam_set.left_out]
+def left_out(beam_set: BeamSet, unfit: str | None = None) -> list[Json]:
+    """UAVs that have no beam, with the reason; ``unfit`` is the one that all of them share."""
+    return [{"uav": out.uav, "reason": unfit or out.reason} for out in beam_set.left_out]
 
 
 def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[Json]:

@@ -45,8 +45,8 @@ def verdict(found: Verdict | None, machine: Blame | None) -> Json:
     }
 
 
-def summary(verdicts: Iterable[Verdict]) -> Json:
-    """How many links there are of each level, and the same in words."""
+def summary(verdicts: Iterable[Verdict], machine: Blame | None) -> Json:
+    """How many links there are of each level, the same in words, and whether all of it is late."""
     counts = Counter(found.level for found in verdicts)
     good, total = counts[Level.GOOD], counts.total()
     return {
@@ -54,4 +54,5 @@ def summary(verdicts: Iterable[Verdict]) -> Json:
         "weak": counts[Level.WEAK],
         "none": counts[Level.NONE],
         "headline": f"{good} of {total} links good" if total else "no UAV to aim at",
+        "behind": None if machine is None else machine.reason,
     }

@@ -112,7 +112,9 @@ def status(node: Node, version: str) -> Json:
         "time": rfc3339(now_ns),
         "uptime_s": node.uptime_s(),
         "center": center(node),
-        "health": health.summary(pipeline.health.verdicts.values()),
+        "health": health.summary(
+            pipeline.health.verdicts.values(), health.behind(node.arrival_lag.seen(now_ns))
+        ),
         "links": [
             link_state.link(item, pipeline.senders.link_share(item.url), now_ns)
             for item in node.links()
@@ -150,21 +152,28 @@ def center(node: Node) -> Json:
         "age_s": None,
         "bound_m": None,
         "unfit": None,
+        "last_known": None,
     }
     found = pipeline.carrier(now_ns, now_ns)
     if isinstance(found, str):
+        last = pipeline.last_carrier
+        if last is not None:
+            view["last_known"] = {"at": rfc3339(last.valid_at_ns), **_pose(pipeline, last)}
         return view | {"unfit": found}
+    return view | _pose(pipeline, found) | {"age_s": found.age_s, "bound_m": found.bound_m}
+
+
+def _pose(pipeline: Pipeline, carrier: Carrier) -> Json:
+    """Where the array is, and how it is turned."""
     assert pipeline.local is not None
-    lat, lon, alt = pipeline.local.geodetic(found.position_ned_m[np.newaxis])
-    roll, pitch, yaw = euler_deg(found.body_from_local)
-    return view | {
+    lat, lon, alt = pipeline.local.geodetic(carrier.position_ned_m[np.newaxis])
+    roll, pitch, yaw = euler_deg(carrier.body_from_local)
+    return {
         "lat_deg": float(lat[0]),
         "lon_deg": float(lon[0]),
         "alt_m": float(alt[0]),
         "heading_deg": yaw % 360,
         "attitude_deg": {"roll": roll, "pitch": pitch, "yaw": yaw},
-        "age_s": found.age_s,
-        "bound_m": found.bound_m,
     }
 
 

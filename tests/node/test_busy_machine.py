@@ -152,6 +152,9 @@ def test_a_machine_that_stays_behind_is_not_fit_and_says_why(tmp_path: Path) -> 
         assert not readiness["ready"]
         (reason,) = [one for one in readiness["reasons"] if "this machine is behind" in one]
         assert reason.startswith("this machine is behind: frames wait ")
+        assert readiness["reasons"] == [reason]  # what is late then is late for that
+        said = [one["text"] for one in (await flight.ask("/v1/events"))["events"]]
+        assert len([text for text in said if text.startswith("this machine is behind")]) == 1
         assert "\ncompanion_ready 0.0" in await flight.ask("/metrics")
 
     fly(tmp_path, course)

@@ -288,10 +288,28 @@ def test_how_far_the_machine_is_behind(make_node: Any) -> None:
         holds(models.Status, status)
         lag = {"newest_s": 0.700000019, "p95_s": 0.700000018, "max_s": 0.700000019, "behind": True}
         assert status["arrival_lag"] == pytest.approx(lag, abs=1e-10)
+        assert status["health"]["behind"] == "this machine is behind: frames wait 0.7 s for it"
         metrics = client.get("/metrics").text
     for name in ("", "_p95", "_max"):
         assert f"\ncompanion_arrival_lag{name}_seconds 0.7000000" in metrics
     assert '\ncompanion_link_misstamped_total{link="udpin:127.0.0.1:14550"} 0.0' in metrics
+
+
+def test_a_carrier_that_is_lost_is_shown_where_it_was(make_node: Any) -> None:
+    node = make_node()
+    with TestClient(create_app(node)) as client:
+        before = client.get("/v1/status").json()
+        for _ in range(4):
+            node.tick(10.0)
+        status = client.get("/v1/status").json()
+        beams = client.get("/v1/beams").json()
+    holds(models.Status, status)
+    assert before["center"]["last_known"] is None
+    center = status["center"]
+    assert center["lat_deg"] is None and center["unfit"]
+    assert center["last_known"]["lat_deg"] == pytest.approx(before["center"]["lat_deg"], abs=1e-4)
+    assert center["last_known"]["at"] < status["time"]
+    assert beams["left_out"] and {out["reason"] for out in beams["left_out"]} == {center["unfit"]}
 
 
 def test_verdicts_are_in_the_answers_and_in_the_metrics(make_node: Any) -> None:
@@ -305,7 +323,8 @@ def test_verdicts_are_in_the_answers_and_in_the_metrics(make_node: Any) -> None:
     shown = {uav["id"]: uav["verdict"] for uav in uavs if uav["target"]}
     assert shown and set(shown.values()) == {"none"}
     assert health == {
-        "good": 0, "weak": 0, "none": len(shown), "headline": f"0 of {len(shown)} links good",
+        "good": 0, "weak": 0, "none": len(shown), "behind": None,
+        "headline": f"0 of {len(shown)} links good",
     }  # fmt: skip
     for uav in uavs:
         if uav["target"]:

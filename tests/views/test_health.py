@@ -37,7 +37,8 @@ def test_a_machine_that_is_behind_is_to_blame_for_what_is_not_good() -> None:
 
 def test_the_headline_counts_what_is_good() -> None:
     good = Verdict("2:1", Level.GOOD, None, 0)
-    assert health.summary([WEAK, good, good]) == {
+    assert health.summary([WEAK, good, good], None) == {
         "good": 2, "weak": 1, "none": 0, "headline": "2 of 3 links good",
+        "behind": None,
     }  # fmt: skip
-    assert health.summary([])["headline"] == "no UAV to aim at"
+    assert health.summary([], None)["headline"] == "no UAV to aim at"

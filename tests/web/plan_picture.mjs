@@ -22,7 +22,7 @@ export async function openPlan({ width = 400, height = 400, ...settings } = {}) 
     /** Show a scene, and draw until the picture stands still. */
     show(scene, now = 1000) {
       plan.show({
-        uavs: [], beams: [], array: null, headingDeg: null, uavsLive: true, beamsLive: true,
+        uavs: [], beams: [], array: null, carrier: null, uavsLive: true, beamsLive: true,
         message: "", isPast: false, selected: null, at: now, ...scene,
       }, now);
       return this.drawAnew();

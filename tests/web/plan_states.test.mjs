@@ -38,7 +38,7 @@ test("a UAV that is lost is a cross", async () => {
 test("nothing looks live while the answers are not", async () => {
   const view = await openPlan();
   const flying = uav("1:1", { velocity_ned_mps: [10, 0, 0] });
-  const scene = { uavs: [flying], beams: [beam("1:1")], array: array(), headingDeg: 0 };
+  const scene = { uavs: [flying], beams: [beam("1:1")], array: array(), carrier: { heading_deg: 0 } };
   let picture = view.show({ ...scene, uavsLive: false, beamsLive: false });
   for (const name of ["live", "coast", "beam", "bore"]) {
     const colour = view.browser.colour(name);
@@ -53,6 +53,17 @@ test("nothing looks live while the answers are not", async () => {
   picture = view.show(scene);
   assert.equal(arrows(picture, view.browser.colour("live")).length, 1);
   assert.ok(wedges(picture)[0].fillStyle.stops[0][1].startsWith(view.browser.colour("beam")));
+});
+
+test("a carrier that is not known any more, and old beams, are grey; UAVs keep their colour", async () => {
+  const view = await openPlan();
+  const carrier = { heading_deg: 0, unfit: "the attitude is too old" };
+  const scene = { uavs: [uav("1:1")], beams: [beam("1:1", { oldS: 9 })], array: array(), carrier };
+  const picture = view.show(scene);
+  const stale = view.browser.colour("stale");
+  assert.equal(arrows(picture, stale).length, 1); // the carrier
+  assert.ok(wedges(picture)[0].fillStyle.stops.every(([, colour]) => colour.startsWith(stale)));
+  assert.equal(circles(picture, 6)[0].strokeStyle, view.browser.colour("live"));
 });
 
 test("names are struck out while the answers are not live", async () => {
@@ -72,12 +83,14 @@ test("what must not be overlooked stands across the picture, the past in its col
     near(x, CENTRE.x);
     return picture.of("rect").at(-1);
   };
-  let found = plate(view.show({ message: "NOT LIVE" }));
+  let found = plate(view.show({ message: "NOT LIVE", uavsLive: false }));
   assert.equal(found.fillStyle, view.browser.colour("bad"));
   near(found.x + found.width / 2, CENTRE.x);
   found = plate(view.show({ message: "NOT LIVE", isPast: true }));
   assert.equal(found.fillStyle, view.browser.colour("past"));
   assert.ok(!view.show({ uavs: [uav("1:1")] }).texts.includes("NOT LIVE"));
+  const said = view.show({ message: "NOT LIVE" }); // of the carrier alone, say
+  assert.equal(plate(said).fillStyle, view.browser.colour("plan"));
 });
 
 test("the colours are those of the theme", async () => {
@@ -145,7 +158,7 @@ test("the chosen one has a ring about it, and its beam is not dimmed", async () 
 test("a carrier whose heading is not known has none", async () => {
   const view = await openPlan();
   for (const headingDeg of [null, undefined]) {
-    assert.deepEqual(arrows(view.show({ headingDeg }), view.browser.colour("text")), []);
+    assert.deepEqual(arrows(view.show({ carrier: { heading_deg: headingDeg } }), view.browser.colour("text")), []);
   }
   assert.equal(circles(view.show({}), 9).length, 1);
 });

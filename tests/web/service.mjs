@@ -61,7 +61,8 @@ export const patternAnswer = (id, fields = {}) => ({
 export const statusAnswer = (fields = {}) => ({
   version: "1.2.3", time: stampAt(0), uptime_s: 65,
   center: { source: "5:1", fixed: false, lat_deg: LAT, lon_deg: LON, alt_m: 450, heading_deg: 90,
-    attitude_deg: null, age_s: 0.1, bound_m: 1, unfit: null },
+    attitude_deg: null, age_s: 0.1, bound_m: 1, unfit: null, last_known: null },
+  health: { good: 1, weak: 0, none: 0, headline: "1 of 1 links good", behind: null },
   links: [], recording: { state: "off", file: null, bytes: 0, messages: 0, dropped: 0 },
   arrival_lag: { newest_s: 0.0002, p95_s: 0.001, max_s: 0.004, behind: false },
   rates: { frames_hz: 120, updates_hz: 20 }, frames: 1000, updates: 100, rejected: {},

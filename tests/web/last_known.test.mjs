@@ -1,0 +1,80 @@
+// When the carrier or a beam is not known any more, the last picture stays, grey, with its age, and
+// the cause stands there in the same words everywhere.
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+import { load } from "./browser.mjs";
+import { LAT, LON, stampAt, statusAnswer, uav, weak } from "./service.mjs";
+import { BEAT_MS, openPage } from "./whole_page.mjs";
+
+const { carrierOf, placedBy } = await load("last_known.js");
+const CAUSE = "the attitude of the carrier 5:1 is too old";
+const lastPose = (fields = {}) => ({
+  at: stampAt(0), lat_deg: LAT, lon_deg: LON, alt_m: 450, heading_deg: 90, ...fields,
+});
+
+/** The service's answers while the carrier is not known. */
+function loseCarrier(service, behind = null) {
+  const { answer } = service;
+  service.beams = [];
+  service.uavs = service.uavs.map(({ id }) => uav(id, {
+    north_m: null, east_m: null, down_m: null, ...weak("none", { cause: "carrier", reason: CAUSE }),
+  }));
+  const center = { ...statusAnswer().center, lat_deg: null, lon_deg: null, heading_deg: null,
+    age_s: null, unfit: CAUSE, last_known: lastPose() };
+  service.status = statusAnswer({ center, health: { ...statusAnswer().health, behind } });
+  service.answer = (path) => {
+    const found = answer.call(service, path);
+    return path === "/v1/beams" ? { ...found, unfit: CAUSE } : found;
+  };
+}
+
+test("the carrier is where it is, or where it was last, and why no better", () => {
+  const center = { ...statusAnswer().center, lat_deg: null, unfit: CAUSE, last_known: lastPose() };
+  const status = statusAnswer({ center, time: stampAt(12) });
+  assert.deepEqual(carrierOf(statusAnswer()).ageS, null);
+  const { lat_deg: lat, heading_deg: heading, ageS, unfit } = carrierOf(status);
+  assert.deepEqual([lat, heading, ageS, unfit], [LAT, 90, 12, CAUSE]);
+  assert.deepEqual(carrierOf({ ...status, center: { ...center, last_known: null } }),
+    { unfit: CAUSE });
+  assert.equal(carrierOf(null), null);
+  const late = { ...status, health: { behind: "this machine is behind" } };
+  assert.equal(carrierOf(late).unfit, "this machine is behind");
+});
+
+test("a UAV without an offset is placed from where the carrier was", () => {
+  const placed = placedBy(uav("1:1", { north_m: null, east_m: null, down_m: null }), lastPose());
+  assert.ok(Math.abs(placed.north_m - 100) < 0.2, placed.north_m);
+  assert.deepEqual([placed.east_m, placed.down_m], [0, -50]);
+  const known = uav("1:1");
+  assert.equal(placedBy(known, lastPose()), known);
+});
+
+test("without the carrier the picture stays, with its age, and the cause is in the same words", async () => {
+  const page = await openPage();
+  const range = page.cells("range")[0];
+  loseCarrier(page.service);
+  await page.time.advance(10_000);
+  const plan = await page.drawn();
+  plan.text("1:1".replace("1", "✕ 1"));
+  assert.ok(plan.texts.some((text) => text.startsWith(`${CAUSE}: carrier and beams as `)), plan.texts.join());
+  assert.deepEqual(page.cells("range"), [range, range]);
+  assert.deepEqual(page.cells("gain"), ["17.5 dB", "17.5 dB"]);
+  const cell = page.document.querySelector("td[data-key=gain]");
+  assert.ok(cell.hasAttribute("data-old"));
+  assert.match(cell.title, /^As \d+.s ago$/);
+  assert.match(page.text("troubles"), new RegExp(CAUSE));
+  assert.match(page.text("center"), new RegExp(CAUSE));
+  assert.match(page.document.querySelector(".focus-uav").textContent, /^1:1, as \d+.s ago$/);
+});
+
+test("where this machine is behind, that is the cause, and no old attitude", async () => {
+  const page = await openPage();
+  loseCarrier(page.service, "this machine is behind: frames wait 7.0 s for it");
+  await page.time.advance(8 * BEAT_MS);
+  const plan = await page.drawn();
+  assert.ok(plan.texts.some((text) => text.startsWith("this machine is behind")), "on the plan");
+  assert.ok(!plan.texts.some((text) => text.startsWith(CAUSE)), "no other cause");
+  assert.doesNotMatch(page.text("center"), new RegExp(CAUSE));
+});

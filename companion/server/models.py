@@ -84,7 +84,7 @@ class Assumptions(BaseModel):
 class LinkHealth(BaseModel):
     """What is behind the verdict on the link to a UAV; gains are those of the array, dB."""
 
-    cause: Annotated[
+    cause: (
         Literal[
             "carrier",
             "silent",
@@ -99,21 +99,14 @@ class LinkHealth(BaseModel):
             "range",
             "machine",
         ]
-        | None,
-        Field(description="what holds it back most; null where it is good"),
-    ]
+        | None
+    )
     reason: Annotated[str | None, Field(examples=["reports 1.1 s apart"])]
     remedy: Annotated[str | None, Field(examples=["ask for 10 Hz ([presence] position_hz)"])]
-    since: Annotated[Time, Field(description="since when the verdict is this one")]
-    needed_gain_db: Annotated[
-        float | None, Field(description="gain that the link needs; null where it has no beam")
-    ]
-    guaranteed_gain_db: Annotated[
-        float | None, Field(description="least gain within the bound; null: none is sure")
-    ]
-    likely_gain_db: Annotated[
-        float | None, Field(description="least gain where the UAV usually is; null: none is sure")
-    ]
+    since: Time
+    needed_gain_db: float | None
+    guaranteed_gain_db: float | None
+    likely_gain_db: float | None
 
 
 class Headline(BaseModel):
@@ -123,9 +116,7 @@ class Headline(BaseModel):
     weak: int
     none: int
     headline: Annotated[str, Field(examples=["3 of 4 links good"])]
-    behind: Annotated[
-        str | None, Field(description="that this machine does not keep up; null where it does")
-    ]
+    behind: str | None
 
 
 class UavState(BaseModel):
@@ -133,13 +124,7 @@ class UavState(BaseModel):
 
     id: Uav
     state: Literal["live", "coasting", "stale", "lost"]
-    verdict: Annotated[
-        Literal["good", "weak", "none"] | None,
-        Field(
-            description="whether its beam surely (good), usually (weak) or not (none) has the gain"
-            " that the link needs; null before it was judged, and for who is no target"
-        ),
-    ]
+    verdict: Literal["good", "weak", "none"] | None
     health: LinkHealth | None
     target: bool
     same_as: Uav | None
@@ -217,9 +202,7 @@ class Center(BaseModel):
     age_s: float | None
     bound_m: float | None
     unfit: str | None
-    last_known: Annotated[
-        LastPose | None, Field(description="where it was last, while it is not known")
-    ]
+    last_known: LastPose | None
 
 
 class LinkReports(BaseModel):

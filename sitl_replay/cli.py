@@ -10,7 +10,7 @@ import json
 import math
 import signal
 import sys
-from collections.abc import Callable, Coroutine, Iterable, Iterator
+from collections.abc import Callable, Coroutine, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -174,7 +174,13 @@ def fly(
 
 
 @main.command(epilog=FAULTS)
-@click.argument("log", type=click.Path(exists=True, dir_okay=False, readable=True, path_type=Path))
+@click.argument(
+    "logs",
+    metavar="LOG...",
+    nargs=-1,
+    required=True,
+    type=click.Path(exists=True, dir_okay=False, readable=True, path_type=Path),
+)
 @sending_options
 @click.option(
     "--speed",
@@ -186,14 +192,14 @@ def fly(
 )
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the faults.")
 def play(
-    log: Path,
+    logs: tuple[Path, ...],
     links: tuple[LinkUrl, ...],
     speed: float | None,
     seed: int,
     faults: list[Fault],
     as_json: bool,
 ) -> None:
-    """Play LOG (.tlog, raw MAVLink, .mcap) as live traffic.
+    """Play a LOG as live traffic: .tlog, raw MAVLink, .mcap, .bin, .ulg, CSV. Several are merged.
 
     Paced by the log's stamps; where they step back or leap by more than 5 s, the step is played
     as 0 or 5 s, and the end says how many were.
@@ -205,12 +211,12 @@ def play(
     """
     tally = player.Tally()
     urls = [str(url) for url in links]
-    frames = frames_of(log, tally)
+    frames = frames_of(logs, tally)
     run(player.play(frames, urls, speed, faults=faults, seed=seed, tally=tally), tally)
     if tally.clamped:
         click.echo(
-            f"{log}: {tally.clamped} time stamps step back, or leap by more than 5 s;"
-            " those steps were played as 0 or 5 s",
+            f"{', '.join(map(str, logs))}: {tally.clamped} time stamps step back, or leap by more"
+            " than 5 s; those steps were played as 0 or 5 s",
             err=True,
         )
     conclude(tally, "sent", as_json)
@@ -265,20 +271,20 @@ def list_scenarios(as_json: bool) -> None:
         click.echo(f"{one.name:9} {one.description}")
 
 
-def frames_of(log: Path, tally: player.Tally) -> Iterator[Frame]:
-    """The frames of a log; what is not usable in it is counted.
+def frames_of(logs: Sequence[Path], tally: player.Tally) -> Iterator[Frame]:
+    """The frames of logs, merged by time; what is not usable in it is counted.
 
     Reads as far as the first one, so that a bad log is reported at once.
     """
-    from companion.recording.reader import LogError, read_log
+    from companion.recording.reader import LogError, read_flight
 
     try:
-        frames = _frames_among(read_log(log), tally)
+        frames = _frames_among(read_flight(logs), tally)
         first = next(frames, None)
     except (LogError, OSError) as error:
         raise click.ClickException(str(error)) from error
     if first is None:
-        raise click.ClickException(f"{log}: no MAVLink frame in it")
+        raise click.ClickException(f"{' '.join(map(str, logs))}: no MAVLink frame in it")
     return itertools.chain((first,), frames)
 
 

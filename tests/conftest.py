@@ -125,6 +125,18 @@ def cut_log() -> Path:
 
 
 @pytest.fixture
+def aeroplane() -> Path:
+    """20 s of an aeroplane's own DataFlash log, truth included, that come with the tests."""
+    return ROOT / "tests" / "data" / "sitl_planes_cut_1.bin"
+
+
+@pytest.fixture
+def carrier() -> Path:
+    """The same of the copter that it circles."""
+    return ROOT / "tests" / "data" / "sitl_planes_cut_5.bin"
+
+
+@pytest.fixture
 def start_node() -> Iterator[Any]:
     """Starts nodes, and ends those that a test left."""
     nodes: list[Node] = []

@@ -246,11 +246,15 @@ def test_the_command_does_what_it_should(
     command: str,
     tmp_path: Path,
     cut_log: Path,
+    aeroplane: Path,
+    carrier: Path,
     start_node: Started,
     studied: Callable[..., Path],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     shutil.copy(cut_log, tmp_path / "flight.tlog")
+    shutil.copy(aeroplane, tmp_path / "uav.bin")
+    shutil.copy(carrier, tmp_path / "carrier.bin")
     if "recording.mcap" in command:
         run(["companion", "replay", "flight.tlog", "--out", "recording.mcap"], tmp_path)
     monkeypatch.chdir(tmp_path)  # `recordings` and the like are made here

@@ -14,7 +14,8 @@ CONFIG = click.option("--config", type=click.Path(path_type=Path), help="Setting
 CENTER = click.option(
     "--center",
     metavar="SRC",
-    help="What carries the array: SYSID:COMPID, LAT,LON,ALT[,HEADING] or home.",
+    help="What carries the array: SYSID:COMPID, LAT,LON,ALT[,HEADING], home, or the vehicle whose"
+    " own log (.bin, .ulg, CSV) is named.",
 )
 LINKS = click.option(
     "--link",
@@ -29,6 +30,26 @@ LISTEN = click.option(
 INSECURE = click.option(
     "--insecure", is_flag=True, help="Serve beyond this machine without a token."
 )
+LATENCY = click.option(
+    "--latency",
+    "latency_s",
+    metavar="S",
+    type=click.FloatRange(0, 60),
+    default=0.0,
+    show_default=True,
+    help="Seconds from a sample to its arrival, for vehicles' own logs (.bin, .ulg, CSV), which"
+    " tell no arrivals; 0: as if received at once.",
+)
+
+
+def tell_vehicles(logs: Sequence[Path]) -> None:
+    """Say on stderr whose own logs are among these, and how well their time is known."""
+    from companion.recording.reader import vehicles
+
+    for one in vehicles(logs):
+        click.echo(one.told(), err=True)
+
+
 JSON = click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
 
 

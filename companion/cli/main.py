@@ -20,11 +20,13 @@ from companion.cli.console import (
     CONFIG,
     INSECURE,
     JSON,
+    LATENCY,
     LINKS,
     LISTEN,
     InterruptedByUser,
     OneLineErrors,
     Progress,
+    tell_vehicles,
 )
 from companion.cli.design import design
 from companion.cli.study import study
@@ -116,6 +118,7 @@ def demo(seconds: float | None, port: int, open_page: bool) -> None:
 @click.option(
     "--speed", metavar="max|X", help="Pace, in times of the log's own [max; 1 if served]."
 )
+@LATENCY
 @click.option("--serve", is_flag=True, help="The page and the API over it, until stopped.")
 @LISTEN
 @INSECURE
@@ -127,18 +130,24 @@ def replay(
     out: Path | None,
     no_record: bool,
     speed: str | None,
+    latency_s: float,
     serve: bool,
     listen: str | None,
     insecure: bool,
     as_json: bool,
 ) -> None:
-    """Logs (.tlog, raw MAVLink, our own .mcap) through the same pipeline as the live service.
+    """Logs through the same pipeline as the live service.
+
+    Told by content: .tlog, raw MAVLink, our own .mcap, and what vehicles wrote of themselves:
+    ArduPilot's DataFlash (.bin), PX4's ULog (.ulg), a table (CSV). Several are one flight.
 
     Without --center (or settings) the array stands where the first report was made. A recording
     of our own is replayed with the settings that it holds. With --serve, the page shows the
     replay as it goes, and its end, until SIGINT.
 
     Example: companion replay flight.tlog --center 5:1 --json
+
+    Example: companion replay uav.bin carrier.bin --center carrier.bin
     """
     from companion.node import replay as replaying
 
@@ -150,6 +159,7 @@ def replay(
     settings = replaying.settings_for(logs, config, center)
     if settings.center.source is None:
         click.echo("no --center: the array stands where the first report was made", err=True)
+    tell_vehicles(logs)
     begun: list[Writer] = []
 
     def record() -> "Writer":
@@ -162,7 +172,7 @@ def replay(
         from companion.settings.files import load
 
         served_replay.serve(
-            served_replay.Asked(logs, settings, pace, recorder),
+            served_replay.Asked(logs, settings, pace, recorder, latency_s),
             load(config).override(server={"listen": listen}).server.listen,
             partial(_show_replay, as_json),
             token=os.environ.get("COMPANION_TOKEN"),
@@ -178,7 +188,7 @@ def replay(
         progress.show(f"{frames} frames, {at_s:.0f} s of log{to_go}")
 
     try:
-        summary = replaying.replay(logs, settings, recorder, pace, show)
+        summary = replaying.replay(logs, settings, recorder, pace, show, latency_s)
     except KeyboardInterrupt:
         raise InterruptedByUser(_left_behind(begun)) from None
     progress.clear()

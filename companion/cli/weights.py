@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import CENTER, CONFIG, Progress
+from companion.cli.console import CENTER, CONFIG, LATENCY, Progress, tell_vehicles
 
 FORMATS = ("json", "npy", "raw", "adar1000", "tmytek", "sivers")
 
@@ -40,6 +40,7 @@ FORMATS = ("json", "npy", "raw", "adar1000", "tmytek", "sivers")
 )
 @CONFIG
 @CENTER
+@LATENCY
 def weights(
     logs: tuple[Path, ...],
     at: str,
@@ -48,6 +49,7 @@ def weights(
     out: Path | None,
     config: Path | None,
     center: str | None,
+    latency_s: float,
 ) -> None:
     """The weights at a time of a log, as a program or a phased array takes them.
 
@@ -70,9 +72,15 @@ def weights(
         raise click.UsageError(f"--out {out}: there is no folder {out.parent}")
     progress = Progress()
     settings = settings_for(logs, config, center)
+    tell_vehicles(logs)
     equipment = assembly.equipment(settings, assembly.array(settings))
     pipeline, update = moment.look(
-        logs, settings, at, lead_ms * 1e-3, lambda done_s: progress.show(f"{done_s:.0f} s")
+        logs,
+        settings,
+        at,
+        lead_ms * 1e-3,
+        lambda done_s: progress.show(f"{done_s:.0f} s"),
+        latency_s,
     )
     progress.clear()
     if update.unfit is not None:

@@ -28,6 +28,7 @@ def look(
     at: str,
     lead_s: float = 0.0,
     progress: Callable[[float], None] | None = None,
+    latency_s: float = 0.0,
 ) -> tuple[Pipeline, Update]:
     """The pipeline after all events up to a time, and the beams it makes then.
 
@@ -36,6 +37,7 @@ def look(
         at        seconds from the log's first event, or a time with its date and zone (RFC 3339)
         lead_s    how far ahead of that time the beams are applied
         progress  called now and then with seconds of log
+        latency_s as for a replay
 
     Raises ``MomentError`` for text that is no time or a time that the log does not reach;
     ``LogError`` and ``ConfigError`` as for a replay.
@@ -45,7 +47,7 @@ def look(
         _require_within(at, span_ns)
     pipeline, at_ns, seen, t_ns = Pipeline(settings), None, 0, 0
     begins_ns = 0
-    for event in log_events(logs, settings):
+    for event in log_events(logs, settings, latency_s):
         if at_ns is None:
             begins_ns, at_ns = event.t_ns, _time_ns(at, event.t_ns)
         if event.t_ns > at_ns:

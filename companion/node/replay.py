@@ -1,6 +1,5 @@
 """Replay: logs through the same fold as the live service, as fast as it goes.            [shell]"""
 
-import heapq
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -12,7 +11,16 @@ from companion.pipeline.fold import Pipeline
 from companion.pipeline.ticks import with_ticks
 from companion.recording import ends, parts
 from companion.recording.parts import Story
-from companion.recording.reader import LogError, log_kind, read_log, read_parts, read_settings
+from companion.recording.reader import (
+    LogError,
+    center_of,
+    log_kind,
+    read_flight,
+    read_log,
+    read_parts,
+    read_settings,
+    vehicles,
+)
 from companion.recording.writer import Writer
 from companion.settings.files import load
 from companion.settings.model import Settings
@@ -27,8 +35,10 @@ TICKED: Final = "mcap"
 def settings_for(logs: Sequence[Path], config: Path | None, center: str | None) -> Settings:
     """The settings of a replay: a given file, else those in a recording, else the defaults.
 
-    Raises ``LogError`` or ``ConfigError`` where a log or the settings cannot be used.
+    ``center`` may name one of the logs: the vehicle that wrote it carries the array. Raises
+    ``LogError`` or ``ConfigError`` where a log or the settings cannot be used.
     """
+    center = center_of(logs, center)
     recorded = read_settings(logs[0]) if config is None else None
     settings = Settings.from_toml(recorded, str(logs[0])) if recorded else load(config)
     return settings.override(center={"source": center})
@@ -37,7 +47,7 @@ def settings_for(logs: Sequence[Path], config: Path | None, center: str | None) 
 def writer_for(logs: Sequence[Path], settings: Settings, out: Path | None) -> Writer:
     """A recording of the replay: at ``out``, else in the settings' directory or ``recordings/``."""
     kept = settings.recording
-    first_ns = next(read_log(logs[0])).t_ns
+    first_ns = next(read_flight(logs)).t_ns
     where = out or Path(kept.directory or "recordings")
     weights_hz = None if kept.weights_hz == "all" else kept.weights_hz
     return Writer(
@@ -104,6 +114,7 @@ def replay(
     record: Callable[[], Writer] | None = None,
     speed: float | None = None,
     progress: Callable[[int, float, float], None] | None = None,
+    latency_s: float = 0.0,
 ) -> dict[str, Any]:
     """Run logs through a pipeline and sum up, as ``companion replay --json`` prints it.
 
@@ -112,11 +123,13 @@ def replay(
         record    makes the recording, once the logs are open; None: there is none
         speed     multiple of the log's own speed; None: as fast as it goes
         progress  called now and then with frames, seconds of log, and seconds since it began
+        latency_s of vehicles' own logs, which tell no arrivals: from a sample to its arrival
 
-    ``missing`` in the summary is what the parts lack. Raises ``LogError`` for a log that cannot be
-    used, ``OSError`` where the recording cannot be written.
+    ``logs`` in the summary are the vehicles whose own logs were read, ``missing`` is what the parts
+    lack. Raises ``LogError`` for a log that cannot be used, ``OSError`` where the recording cannot
+    be written.
     """
-    events = log_events(logs, settings)
+    events = log_events(logs, settings, latency_s)
     writer = record() if record else None
     run = Run(settings, writer)
     flush_due_s = time.monotonic() + FLUSH_EVERY_S
@@ -128,7 +141,7 @@ def replay(
                 writer.flush()
             if progress:
                 progress(run.pipeline.frames, run.at_s, run.took_s)
-    return run.finish() | {"missing": missing(logs)}
+    return run.finish() | {"logs": told(logs), "missing": missing(logs)}
 
 
 def length_s(logs: Sequence[Path]) -> float | None:
@@ -137,22 +150,23 @@ def length_s(logs: Sequence[Path]) -> float | None:
     return None if span_ns is None else (span_ns[1] - span_ns[0]) * 1e-9
 
 
-def log_events(logs: Sequence[Path], settings: Settings) -> Iterator[Event]:
+def told(logs: Sequence[Path]) -> list[dict[str, Any]]:
+    """What is known of the vehicles whose own logs are among these. Raises ``LogError``."""
+    return [one.as_json() for one in vehicles(logs)]
+
+
+def log_events(logs: Sequence[Path], settings: Settings, latency_s: float = 0.0) -> Iterator[Event]:
     """All events in order of time, with ticks; those of several parts of one run as they were.
 
-    Raises ``LogError`` where a log cannot be used, or one part of a run is given twice.
+    ``latency_s`` is as for ``replay``. Raises ``LogError`` where a log cannot be used, or one part
+    of a run is given twice.
     """
     if len(logs) == 1 and log_kind(logs[0]) == TICKED:
         return read_log(logs[0])
     ordered = _in_order(_stories(logs))
     if ordered is not None:
         return read_parts(ordered)
-    without_ticks = [_without_ticks(log) for log in logs]
-    merged = (
-        heapq.merge(*without_ticks, key=lambda event: event.t_ns)
-        if len(logs) > 1
-        else without_ticks[0]
-    )
+    merged = (event for event in read_flight(logs, latency_s) if not isinstance(event, Tick))
     return with_ticks(merged, settings.beams.update_hz)
 
 
@@ -178,13 +192,6 @@ def _in_order(stories: dict[Path, Story]) -> list[Path] | None:
         return parts.in_order(stories)
     except ValueError as error:
         raise LogError(str(error)) from None
-
-
-def _without_ticks(log: Path) -> Iterator[Event]:
-    events = read_log(log)
-    if log_kind(log) != TICKED:
-        return events
-    return (event for event in events if not isinstance(event, Tick))
 
 
 def _paced(events: Iterable[Event], speed: float) -> Iterator[Event]:

@@ -22,7 +22,7 @@ from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.peers import Peers
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.voice.rate_watch import MessageRate
-from companion.node.replay import FLUSH_EVERY_S, Run, log_events, missing
+from companion.node.replay import FLUSH_EVERY_S, Run, log_events, missing, told
 from companion.node.serving import NOTICES_KEPT, Server, Throughput, address, pause, run_until_told
 from companion.pipeline import assembly
 from companion.recording.writer import Writer
@@ -47,12 +47,14 @@ class Asked:
     settings  those of the pipeline
     speed     as in ``companion.node.replay.replay``
     record    makes the recording of the replay; None: there is none
+    latency_s as in ``companion.node.replay.replay``
     """
 
     logs: Sequence[Path]
     settings: Settings
     speed: float | None
     record: Callable[[], Writer] | None
+    latency_s: float = 0.0
 
 
 def serve(
@@ -87,14 +89,14 @@ class ServedReplay:
 
     def __init__(self, asked: Asked, say: Callable[[str], None]) -> None:
         logs, settings = asked.logs, asked.settings
-        events = log_events(logs, settings)
+        events = log_events(logs, settings, asked.latency_s)
         first = next(events)
         self._run = Run(settings, asked.record() if asked.record else None)
         self.pipeline = self._run.pipeline
         self.equipment = assembly.equipment(settings, self.pipeline.array)
         self.name = ", ".join(log.name for log in logs)
-        self._missing = missing(logs)
-        self._measured = (islice(log_events(logs, settings), 1, None), first.t_ns)
+        self._missing = {"logs": told(logs), "missing": missing(logs)}
+        self._measured = (islice(log_events(logs, settings, asked.latency_s), 1, None), first.t_ns)
         self._events = chain((first,), events)
         self._now_ns = first.t_ns
         self._speed = asked.speed
@@ -133,7 +135,7 @@ class ServedReplay:
                 measuring = group.create_task(self._measure(), name="length")
                 await self._replay(until)
                 summary = await asyncio.to_thread(self._run.finish)
-                show(summary | {"missing": self._missing})
+                show(summary | self._missing)
                 await until.wait()
                 measuring.cancel()
                 server.should_exit = True

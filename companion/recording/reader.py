@@ -1,9 +1,11 @@
 """Opens every kind of log, by what is in the file and never by its name.
 
 Recordings of this program give back exactly the events that drove the live run, in that order;
-telemetry logs and raw MAVLink give the events that a live run would have had.
+telemetry logs and raw MAVLink give the events that a live run would have had. What a vehicle wrote
+of itself becomes the frames that it would have sent: several such logs are one flight.
 """
 
+import heapq
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
@@ -12,12 +14,18 @@ from typing import Final, Literal
 from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Metadata
 
-from companion.recording import codec, foreign, schemas, tlog
+from companion.recording import codec, schemas, tlog
 from companion.recording.container import MAGIC, Damage, Walk
+from companion.recording.errors import LogError
+from companion.recording.foreign import kinds, together
+from companion.recording.foreign.together import Vehicle
 from companion.recording.writer import SETTINGS
-from companion.values import Event, Reason, Rejection, Source, Tick, UserError
+from companion.values import Event, Reason, Rejection, Source, Tick
 
-LogKind = Literal["tlog", "mavlink", "mcap"]
+__all__ = ["LogError", "LogKind", "center_of", "flights", "log_kind", "read_flight", "read_log",
+           "read_parts", "read_settings", "vehicles"]  # fmt: skip
+
+LogKind = Literal["tlog", "mavlink", "mcap", "dataflash", "ulog", "csv"]
 _EVENT_TOPICS: Final = frozenset(
     (
         schemas.FRAMES_TOPIC,
@@ -28,21 +36,18 @@ _EVENT_TOPICS: Final = frozenset(
 )
 
 
-class LogError(UserError):
-    """A file that cannot be used. The message is one line: the file, and why."""
-
-
 def log_kind(path: Path) -> LogKind:
     """The kind of a log. Raises ``LogError`` where the file is none."""
     return _open(path)[0]
 
 
-def read_log(log: Path | str) -> Iterator[Event]:
+def read_log(log: Path | str, latency_s: float = 0.0) -> Iterator[Event]:
     """The events of a log, in order. Raises ``LogError`` at once where the file cannot be used.
 
     ``Frame.link`` is the recorded link, or the file's name where the log knows of no links. A
     recording cut short gives what is intact, and then ends; damage with intact events after it is a
-    ``Rejection`` of so many bytes of garbage.
+    ``Rejection`` of so many bytes of garbage. What a vehicle wrote of itself tells no arrivals:
+    its frames arrive ``latency_s`` after they were true.
     """
     path = Path(log)
     kind, data = _open(path)
@@ -50,11 +55,61 @@ def read_log(log: Path | str) -> Iterator[Event]:
         return tlog.read_tlog(data, path.name)
     if kind == "mavlink":
         return tlog.read_raw(data, path.name)
+    if kind in together.READERS:
+        return together.events(together.opened([(path, kind)]), latency_s)
     events = _recorded(path)
     first = next(events, None)
     if first is None:
         raise LogError(f"{path}: an MCAP file, but no MAVLink frame in it")
     return chain((first,), events)
+
+
+def read_flight(logs: Sequence[Path], latency_s: float = 0.0) -> Iterator[Event]:
+    """The events of logs of one flight, merged by time: see ``read_log``.
+
+    Logs of one vehicle each are put on GPS time, and their vehicles told apart.
+    """
+    if len(logs) == 1:
+        return read_log(logs[0], latency_s)
+    aboard = vehicles(logs)
+    those = {one.path for one in aboard}
+    streams = [read_log(log) for log in logs if log not in those]
+    if aboard:
+        streams.append(together.events(aboard, latency_s))
+    return heapq.merge(*streams, key=lambda event: event.t_ns)
+
+
+def vehicles(logs: Sequence[Path]) -> list[Vehicle]:
+    """The vehicles whose own logs are among these; empty where there are only logs of links.
+
+    Raises ``LogError`` for a log that cannot be used, or logs that are not one flight.
+    """
+    known = [(log, log_kind(log)) for log in logs]
+    return together.opened([(log, kind) for log, kind in known if kind in together.READERS])
+
+
+def flights(logs: Sequence[Path]) -> list[tuple[Path, ...]]:
+    """Logs by flight: all of one vehicle each are one flight, and any other is one by itself.
+
+    Raises ``LogError`` for a log that cannot be used.
+    """
+    aboard = tuple(log for log in logs if log_kind(log) in together.READERS)
+    alone: list[tuple[Path, ...]] = [(log,) for log in logs if log not in aboard]
+    return [aboard, *alone] if aboard else alone
+
+
+def center_of(logs: Sequence[Path], center: str | None) -> str | None:
+    """What carries the array: as given, or the vehicle whose own log is named there.
+
+    Raises ``LogError`` where a log is named that holds more than one vehicle.
+    """
+    named = [log for log in logs if center is not None and center in (str(log), log.name)]
+    if not named:
+        return center
+    for one in vehicles(logs):
+        if one.path in named:
+            return str(one.source)
+    raise LogError(f"{center}: not the log of one vehicle: name the carrier as SYSID:COMPID")
 
 
 def read_parts(paths: Sequence[Path]) -> Iterator[Event]:
@@ -76,12 +131,15 @@ def read_settings(path: Path) -> str | None:
 
 
 def _open(path: Path) -> tuple[LogKind, bytes]:
-    """The kind of a log, and its bytes unless it is an MCAP file, which is read piece by piece."""
+    """The kind of a log, and its bytes unless it is one that is read piece by piece."""
     try:
         with path.open("rb") as file:
-            head = file.read(len(MAGIC))
-            if head == MAGIC:
+            head = file.read(kinds.HEAD_BYTES)
+            if head.startswith(MAGIC):
                 return "mcap", b""
+            piecewise = kinds.read_piecewise(head)
+            if piecewise is not None:
+                return piecewise, b""
             data = head + file.read()
     except FileNotFoundError:
         raise LogError(f"{path}: no such file") from None
@@ -91,13 +149,14 @@ def _open(path: Path) -> tuple[LogKind, bytes]:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from None
     if not data:
         raise LogError(f"{path}: is empty")
-    other = foreign.named(data[: foreign.HEAD_BYTES])
+    other = kinds.named(head)
     if other is not None:
         raise LogError(f"{path}: no MAVLink, but {other}")
     kind = tlog.sniff(data)
+    if kind is None and kinds.looks_like_text(data[:512]):
+        return "csv", b""
     if kind is None:
-        text = ": it is text" if foreign.looks_like_text(data[:512]) else ""
-        raise LogError(f"{path}: no MAVLink frame in it{text}")
+        raise LogError(f"{path}: no MAVLink frame in it")
     return kind, data
 
 

@@ -5,6 +5,7 @@ import statistics
 import subprocess
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -150,3 +151,59 @@ def _update_us(uavs: int) -> float:
 
     (seconds,) = interleaved_s(fly)
     return seconds / (rounds * uavs) * 1e6
+
+
+def test_reading_a_vehicles_own_log_against_the_formats_own_readers() -> None:
+    """All frames of a log, against its own reader: of all messages, and of those that are used."""
+    from pymavlink.DFReader import DFReader_binary
+
+    from companion.recording.foreign import ardupilot, px4
+    from companion.recording.reader import read_log
+
+    used = [
+        "POS",
+        "ATT",
+        "GPS",
+        "GPA",
+        "XKF1",
+        "XKF4",
+        "NKF1",
+        "NKF4",
+        "RATE",
+        "SIM",
+        "SIM2",
+        "PARM",
+    ]
+
+    def ours(log: Path) -> None:
+        assert sum(1 for _ in read_log(log)) > 1000
+
+    def dataflash(log: Path, types: list[str] | None) -> None:
+        reader = DFReader_binary(str(log))
+        while reader.recv_match(type=types) is not None:
+            pass
+        reader.filehandle.close()
+
+    for name in ("sitl_planes_circle_1.bin", "sitl_planes_circle_5.bin"):
+        log = shared_log(name)
+        ours_s, all_s, used_s = interleaved_s(
+            partial(ours, log),
+            partial(dataflash, log, None),
+            partial(dataflash, log, used),
+            rounds=3,
+        )
+        print(f"\n{name}: {ours_s / all_s:.2f} times as long as DFReader reads,", end=" ")
+        print(f"{ours_s / used_s:.2f} of the messages that are used")
+        assert ours_s < 1.2 * all_s and ours_s < 1.2 * used_s
+    assert set(used) <= {*ardupilot._WANTED}
+
+    pyulog = pytest.importorskip("pyulog")
+    log = shared_log("px4_sample_small.ulg")
+    ours_s, all_s, used_s = interleaved_s(
+        partial(ours, log),
+        lambda: pyulog.ULog(str(log)),
+        lambda: pyulog.ULog(str(log), list(px4._WANTED)),
+    )
+    print(f"{log.name}: {ours_s / all_s:.2f} times as long as pyulog reads,", end=" ")
+    print(f"{ours_s / used_s:.2f} of the topics that are used")
+    assert ours_s < 1.5 * all_s

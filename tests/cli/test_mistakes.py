@@ -8,12 +8,12 @@ from click.testing import CliRunner
 from pymavlink.dialects.v20 import all as dialect
 
 from companion.cli.main import main
-from companion.recording import foreign
+from companion.recording.foreign import kinds
 from companion.values import Reason
 from companion.views.words import REASONS
 
 FILES = {
-    "flight.bin": b"\xa3\x95\x80\x80Y\x17FMT",
+    "flight.bin": b"\xa3\x95\x80\x80YFMT",
     "flight.ulg": b"ULog\x01\x12\x35\x01" + bytes(64),
     "flight.log": b"FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\n",
     "net.pcap": b"\xd4\xc3\xb2\xa1\x02\x00\x04\x00" + bytes(64),
@@ -43,9 +43,9 @@ SAYS: list[tuple[str, int, str]] = [
     ("replay", 2, "Missing argument 'LOG...'. See companion replay --help"),
     ("replay nothere.tlog", 1, "nothere.tlog: no such file"),
     ("replay .", 1, ".: is a folder: name the logs in it"),
-    ("replay flight.bin", 1, "a DataFlash log of ArduPilot: give the .tlog"),
-    ("replay flight.ulg", 1, "a ULog of PX4: give the .tlog"),
-    ("replay flight.log", 1, "a DataFlash log as text"),
+    ("replay flight.bin", 1, "flight.bin: DataFlash, but no position in it"),
+    ("replay flight.ulg", 1, "flight.ulg: ULog, but no position in it"),
+    ("replay flight.log", 1, "a DataFlash log as text: give the .bin"),
     ("replay net.pcap", 1, "a pcap capture"),
     ("replay net.pcapng", 1, "a pcapng capture"),
     ("replay flight.tlog.gz", 1, "gunzip it first"),
@@ -55,7 +55,9 @@ SAYS: list[tuple[str, int, str]] = [
     ("replay flight.bag", 1, "a ROS bag"),
     ("replay flight.db3", 1, "a database"),
     ("replay picture.png", 1, "a picture"),
-    ("replay table.csv", 1, "no MAVLink frame in it: it is text"),
+    ("replay table.csv", 1, "it is text, and its header names no unix_s or time or t_s, lat_deg"),
+    ("replay good.tlog --center good.tlog", 1, "not the log of one vehicle: name the carrier"),
+    ("replay good.tlog --latency -1", 2, "-1.0 is not in the range"),
     ("replay empty.tlog", 1, "empty.tlog: is empty"),
     ("replay noise.tlog", 1, "no MAVLink frame in it"),
     ("replay half.mcap", 1, "half.mcap"),
@@ -80,7 +82,7 @@ SAYS: list[tuple[str, int, str]] = [
     ("replay good.tlog --centre 5:1", 2, "No such option '--centre'"),
     ("replay good.tlog --no-record", 1, "nothing was aimed at: no UAV reported a position"),
     ("replay good.tlog --no-record --center 5:1", 1, "no position from the carrier 5:1"),
-    ("replay good.tlog nothere.tlog", 1, "nothere.tlog: No such file"),
+    ("replay good.tlog nothere.tlog", 1, "nothere.tlog: no such file"),
     ("replay good.tlog table.csv", 1, "table.csv: no MAVLink frame in it"),
     ("replay good.tlog tiny.tlog", 1, "tiny.tlog: no MAVLink frame in it"),
     ("replay good.tlog half.mcap", 1, "half.mcap"),
@@ -148,8 +150,8 @@ def test_every_reason_has_plain_words() -> None:
 
 
 def test_text_is_told_from_noise() -> None:
-    assert foreign.looks_like_text("Höhe,m\n".encode()[:3])  # cut within a character
-    assert foreign.looks_like_text(b"a\tb\r\n")
-    assert not foreign.looks_like_text(b"")
-    assert not foreign.looks_like_text(bytes(range(256)))
-    assert not foreign.looks_like_text(b"\xfd\x09\x00\x00")
+    assert kinds.looks_like_text("Höhe,m\n".encode()[:3])  # cut within a character
+    assert kinds.looks_like_text(b"a\tb\r\n")
+    assert not kinds.looks_like_text(b"")
+    assert not kinds.looks_like_text(bytes(range(256)))
+    assert not kinds.looks_like_text(b"\xfd\x09\x00\x00")

@@ -27,6 +27,7 @@ import numpy as np
 import companion
 from companion.mavlink.clock.sender_clock import SenderClock
 from companion.pipeline import assembly
+from companion.recording.reader import center_of, flights
 from companion.settings.model import Settings
 from companion.studies.prediction import radio_link, violations
 from companion.studies.prediction.delivery import deliver
@@ -197,10 +198,10 @@ def rivals(setting: PredictionStudy, tuned: Mapping[str, Tuning]) -> dict[str, M
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A piece of work: one log over one link."""
+    """A piece of work: the logs of one flight over one link."""
 
     setting: PredictionStudy
-    path: Path
+    logs: tuple[Path, ...]
     link: RadioLink
 
 
@@ -209,8 +210,8 @@ def work(piece: Piece, progress: Callable[[str], None] = lambda _text: None) -> 
 
     Raises ``UserError`` or ``LogError`` where it has nothing to study.
     """
-    progress(f"reading {piece.path.name}")
-    flown = vehicles.load(piece.path, piece.setting.center)
+    progress(f"reading {' + '.join(log.name for log in piece.logs)}")
+    flown = vehicles.load(piece.logs, center_of(piece.logs, piece.setting.center))
     return compare(flown, piece.link, piece.setting, progress)
 
 
@@ -223,12 +224,14 @@ def study(
     """
     if setting.learned is not None:
         learned(setting.learned)  # what cannot be used is said before the work
-    pieces = [Piece(setting, path, link) for path in setting.logs for link in setting.over]
+    flown = flights(setting.logs)
+    pieces = [Piece(setting, logs, link) for logs in flown for link in setting.over]
     found = _compared(setting, pieces, progress)
-    for number, path in enumerate(setting.logs):
+    for number, logs in enumerate(flown):
         among = len(setting.over)
         if not any(each.rows for each in found[number * among : (number + 1) * among]):
-            raise UserError(f"{path}: no UAV flies in it, as far as its carrier is known")
+            names = " ".join(map(str, logs))
+            raise UserError(f"{names}: no UAV flies in it, as far as its carrier is known")
     known = known_tuning(setting.settings)
     rows = [row for compared in found for row in compared.rows]
     return {
@@ -261,7 +264,9 @@ def _compared(
 
     told(0)
     if setting.cluster is not None:
-        there = [replace(piece, path=piece.path.absolute()) for piece in pieces]
+        there = [
+            replace(piece, logs=tuple(log.absolute() for log in piece.logs)) for piece in pieces
+        ]
         return fan_out.on_cluster(work, there, setting.cluster, told)
     jobs = setting.jobs or fan_out.cores()
     if jobs > 1 and len(pieces) > 1:

@@ -5,7 +5,7 @@ says where but not how high.
 """
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -14,7 +14,7 @@ import numpy as np
 
 from companion.mavlink.trust.dedupe import Dedupe
 from companion.mavlink.wire.decode import GLOBAL_POSITION_INT, GPS_RAW_INT, decode
-from companion.recording.reader import read_log
+from companion.recording.reader import read_flight
 from companion.studies.truth import stamps
 from companion.studies.truth.hindsight import BootClock, boot_clock
 from companion.studies.truth.pairing import Brackets
@@ -149,11 +149,11 @@ def simstate(payload: bytes) -> tuple[float, ...]:
     return _SIMSTATE.unpack(payload.ljust(_SIMSTATE.size, b"\0")[: _SIMSTATE.size])
 
 
-def gather(path: Path) -> dict[str, Stream]:
-    """The streams of a log by vehicle: of those that report a position."""
+def gather(logs: Sequence[Path]) -> dict[str, Stream]:
+    """The streams of a flight's logs by vehicle: of those that report a position."""
     found: dict[str, Stream] = {}
     dedupe = Dedupe()
-    for event in _events(path):
+    for event in _events(logs):
         name = str(event.source)
         stream = found.get(name)
         if stream is None:
@@ -165,7 +165,7 @@ def gather(path: Path) -> dict[str, Stream]:
     return {name: stream for name, stream in found.items() if stream.reports}
 
 
-def _events(path: Path) -> Iterator[Frame | RoundTrip]:
-    for event in read_log(path):
+def _events(logs: Sequence[Path]) -> Iterator[Frame | RoundTrip]:
+    for event in read_flight(logs):
         if isinstance(event, Frame | RoundTrip):
             yield event

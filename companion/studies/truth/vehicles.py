@@ -7,6 +7,7 @@ simulator's words were made is found in ``pairing``, what the sender's clock sho
 ``hindsight``.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -118,17 +119,22 @@ class Flown:
         return np.broadcast_to(self.carrier, (len(t_ns), 3))
 
 
-def load(path: Path, center_text: str | None) -> Flown:
-    """Read a log. Raises ``UserError`` or ``LogError`` where there is nothing to study in it."""
+def load(logs: Path | Sequence[Path], center_text: str | None) -> Flown:
+    """Read a log, or the logs of a flight.
+
+    Raises ``UserError`` or ``LogError`` where there is nothing to study in it.
+    """
+    logs = [logs] if isinstance(logs, Path) else logs
+    path = " ".join(map(str, logs))
     center: CenterPlace = parse_center(center_text or "home")
-    streams = gather(path)
+    streams = gather(logs)
     if not streams:
         raise UserError(f"{path}: no vehicle reports a position in it")
     first = min((each.reports[0] for each in streams.values()), key=lambda report: report.t_ns)
     home = FixedCenter(first.lat_deg, first.lon_deg, first.alt_m or 0.0)
     stands = center if isinstance(center, FixedCenter) else home
     local = LocalFrame(stands.lat_deg, stands.lon_deg, stands.alt_m)
-    faults = declared_faults(path)
+    faults = tuple(fault for log in logs for fault in declared_faults(log))
     # A vehicle with a single report has no path, and does not fly.
     flights = {
         uav: _flight(uav, stream, local, _windows(faults, stream))
@@ -142,7 +148,7 @@ def load(path: Path, center_text: str | None) -> Flown:
         carrier = flights.pop(str(center)).truth
     arrivals = [report.t_ns for stream in streams.values() for report in stream.reports]
     return Flown(
-        path.name,
+        " + ".join(log.name for log in logs),
         str(center if center_text and center_text != "home" else home),
         tuple(flights.values()),
         carrier,

@@ -1,11 +1,13 @@
-"""Files that are no MAVLink log, named by their first bytes, with what to do about it."""
+"""Files by their first bytes: logs of one vehicle, and what is no log, with what to do about it."""
 
-from typing import Final
+from typing import Final, Literal
 
+_PIECEWISE: Final[tuple[tuple[bytes, Literal["dataflash", "ulog"]], ...]] = (
+    (b"\xa3\x95\x80", "dataflash"),
+    (b"ULog\x01\x12\x35", "ulog"),
+)
 _KINDS: Final[tuple[tuple[bytes, str], ...]] = (
-    (b"\xa3\x95\x80", "a DataFlash log of ArduPilot: give the .tlog of its ground station"),
-    (b"ULog\x01\x12\x35", "a ULog of PX4: give the .tlog of its ground station"),
-    (b"FMT, 128,", "a DataFlash log as text: give the .tlog of its ground station"),
+    (b"FMT, 128,", "a DataFlash log as text: give the .bin that it was made of"),
     (b"\xd4\xc3\xb2\xa1", "a pcap capture: take the MAVLink out of its packets first"),
     (b"\xa1\xb2\xc3\xd4", "a pcap capture: take the MAVLink out of its packets first"),
     (b"\x4d\x3c\xb2\xa1", "a pcap capture: take the MAVLink out of its packets first"),
@@ -23,6 +25,11 @@ _KINDS: Final[tuple[tuple[bytes, str], ...]] = (
     (b"\x7fELF", "a program"),
 )
 HEAD_BYTES: Final = max(len(magic) for magic, _ in _KINDS)
+
+
+def read_piecewise(head: bytes) -> Literal["dataflash", "ulog"] | None:
+    """The kind of a vehicle's own log that begins with these bytes; None if it is none."""
+    return next((kind for magic, kind in _PIECEWISE if head.startswith(magic)), None)
 
 
 def named(head: bytes) -> str | None:

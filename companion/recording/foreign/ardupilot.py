@@ -1,0 +1,243 @@
+"""What the columns of ArduPilot's DataFlash log mean.
+
+Meanings and units: https://ardupilot.org/copter/docs/logmessages.html. POS is the position that
+GLOBAL_POSITION_INT sends; its velocity is that of the estimator's core in use (XKF1, or NKF1 of the
+estimator before it, by XKF4.PI and ATT.AEKF). SIM and SIM2 are the simulator's own.
+"""
+
+from typing import Final
+
+import numpy as np
+
+from companion.recording.foreign.dataflash import Bytes, Table, table, walk
+from companion.recording.foreign.onboard import (
+    Attitudes,
+    Fixes,
+    Onboard,
+    Positions,
+    Truth,
+    between,
+    in_time,
+    moved,
+    on_earth,
+    turned,
+)
+from companion.recording.foreign.receiver import count, fixes_of, times
+from companion.values import BoolArray, FloatArray, IntArray, Reason
+
+_WANTED: Final = (
+    "POS", "ATT", "GPS", "GPA", "XKF1", "XKF4", "NKF1", "NKF4", "RATE", "SIM", "SIM2", "PARM",
+    "VER", "ARM",
+)  # fmt: skip
+_IDS: Final = (b"MAV_SYSID", b"SYSID_THISMAV")
+_ARDUPILOT: Final = 3
+_BY_BUILD: Final = {1: 10, 2: 2, 3: 1, 4: 5, 7: 12, 12: 7, 13: 4}
+"""MAV_TYPE by VER.BU (AP_Vehicle_Type.h): rover, copter, plane, tracker, sub, blimp, helicopter."""
+_BY_FRAME: Final = {1: 2, 2: 13, 3: 14, 4: 14, 5: 13, 6: 4, 7: 15, 8: 3, 9: 3, 11: 4, 13: 4}
+"""MAV_TYPE by FRAME_CLASS of a copter."""
+_VTOL: Final = 22
+_NEAR_US: Final = 500_000
+"""How far a velocity or heading may be off a position that it is put beside."""
+
+
+def read(data: Bytes) -> Onboard:
+    """The samples of a log; what cannot be used is counted."""
+    walked = walk(data, _WANTED)
+    tables = {name: table(data, walked, name) for name in _WANTED}
+    lost: dict[Reason, int] = {}
+    count(lost, Reason.GARBAGE, walked.lost)
+    count(lost, Reason.MALFORMED, walked.refused)
+    for name in _WANTED:
+        if name not in ("PARM", "VER"):
+            tables[name] = _timed(tables[name], lost)
+    sysid, mav_type = _identity(tables["PARM"], tables["VER"])
+    fixes, clock = fixes_of(tables["GPS"], tables["GPA"], lost)
+    notes: list[str] = []
+    return Onboard(
+        sysid,
+        1,
+        mav_type,
+        _ARDUPILOT,
+        _positions(tables, fixes, lost, notes),
+        _attitudes(tables["ATT"], tables["RATE"], lost),
+        fixes,
+        _truth(tables["SIM"], tables["SIM2"], lost),
+        _armed(tables["ARM"]),
+        clock,
+        lost,
+        tuple(notes),
+    )
+
+
+def _timed(of: Table, lost: dict[Reason, int]) -> Table:
+    """The rows in order of time; those of several cores or receivers at one time all stay."""
+    boot_us = times(of)
+    if len(boot_us) != len(of):
+        count(lost, Reason.MALFORMED, len(of))
+        return of.rows(np.zeros(0, dtype=np.int64))
+    which = next((name for name in ("C", "I") if of.integers(name) is not None), None)
+    number = None if which is None else of.integers(which)
+    if number is None:
+        rows, wild = in_time(boot_us)
+        count(lost, Reason.BAD_STAMP, wild)
+        return of.rows(rows)
+    parts = []
+    for each in np.unique(number).tolist():
+        (mine,) = np.nonzero(number == each)
+        rows, wild = in_time(boot_us[mine])
+        count(lost, Reason.BAD_STAMP, wild)
+        parts.append(mine[rows])
+    return of.rows(np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64))
+
+
+# --- who it is ------------------------------------------------------------------------------------
+
+
+def _identity(parameters: Table, versions: Table) -> tuple[int | None, int]:
+    """System id, where the log has it, and MAV_TYPE; 0 (generic) where it does not tell."""
+    values: dict[bytes, float] = {}
+    if "Name" in parameters and "Value" in parameters:
+        names = np.char.rstrip(parameters.raw("Name").astype("S16"), b"\0")
+        numbers = parameters.numbers("Value")
+        for name in (*_IDS, b"FRAME_CLASS", b"Q_ENABLE"):
+            (rows,) = np.nonzero(names == name)
+            if len(rows) and np.isfinite(numbers[rows[-1]]):
+                values[name] = float(numbers[rows[-1]])
+    ids = [int(values[name]) for name in _IDS if 0 < values.get(name, 0.0) <= 255]
+    builds = versions.integers("BU")
+    build = int(builds[-1]) if builds is not None and len(builds) else _build(values)
+    mav_type = _BY_BUILD.get(build, 0)
+    if mav_type == 2:
+        mav_type = _BY_FRAME.get(int(values.get(b"FRAME_CLASS", 1)), 2)
+    if mav_type == 1 and values.get(b"Q_ENABLE"):
+        mav_type = _VTOL
+    return (ids[0] if ids else None), mav_type
+
+
+def _build(values: dict[bytes, float]) -> int:
+    """The kind of vehicle by the parameters that only it has; 0 where they do not tell."""
+    if b"Q_ENABLE" in values:
+        return 3
+    return 2 if b"FRAME_CLASS" in values else 0
+
+
+def _armed(of: Table) -> tuple[tuple[int, bool], ...]:
+    state = of.integers("ArmState")
+    if state is None:
+        return ()
+    return tuple(zip(times(of).tolist(), (state != 0).tolist(), strict=True))
+
+
+# --- where it was ---------------------------------------------------------------------------------
+
+
+def _positions(
+    tables: dict[str, Table], fixes: Fixes | None, lost: dict[Reason, int], notes: list[str]
+) -> Positions | None:
+    pos, attitude = tables["POS"], tables["ATT"]
+    lat_1e7, lon_1e7 = pos.integers("Lat"), pos.integers("Lng")
+    if lat_1e7 is None or lon_1e7 is None or not len(pos):
+        return None if fixes is None else _received(fixes, tables, notes)
+    alt_m, height_m = pos.numbers("Alt"), pos.numbers("RelHomeAlt")
+    height_m = np.where(np.isfinite(height_m), height_m, alt_m - alt_m[0])
+    sound = on_earth(lat_1e7, lon_1e7, alt_m, height_m)
+    count(lost, Reason.MALFORMED, int((~sound).sum()))
+    boot_us, place = times(pos)[sound], (lat_1e7[sound], lon_1e7[sound], alt_m[sound])
+    velocity = _velocities(boot_us, tables)
+    if np.isnan(velocity).any():
+        velocity = _filled(velocity, boot_us, fixes, moved(boot_us, *place), notes)
+    heading = _headings(boot_us, attitude)
+    return Positions(boot_us, *place, height_m[sound], velocity, heading) if len(boot_us) else None
+
+
+def _received(fixes: Fixes, tables: dict[str, Table], notes: list[str]) -> Positions | None:
+    """The receiver's own positions, where the log has no estimated ones."""
+    fixed = fixes.fix_type >= 3
+    if not fixed.any():
+        return None
+    notes.append("no POS in it: positions are those of the receiver")
+    boot_us, lat_1e7 = fixes.boot_us[fixed], fixes.lat_1e7[fixed]
+    lon_1e7, alt_m = fixes.lon_1e7[fixed], fixes.alt_m[fixed]
+    way = moved(boot_us, lat_1e7, lon_1e7, alt_m)
+    velocity = _filled(np.full_like(way, np.nan), boot_us, fixes, way, notes)
+    heading = _headings(boot_us, tables["ATT"])
+    return Positions(boot_us, lat_1e7, lon_1e7, alt_m, alt_m - alt_m[0], velocity, heading)
+
+
+def _velocities(boot_us: IntArray, tables: dict[str, Table]) -> FloatArray:
+    """The estimator's velocities (N, 3) at times (N,); NaN where it has none."""
+    older = tables["ATT"].integers("AEKF")
+    second = older is not None and len(older) > 0 and int(np.median(older)) == 2
+    names = ("NKF1", "NKF4") if second or not len(tables["XKF1"]) else ("XKF1", "XKF4")
+    states, cores = (tables[name] for name in names)
+    core, primary = states.integers("C"), cores.integers("PI")
+    if core is not None and len(core):
+        used = np.full(len(core), core.min())
+        if primary is not None and len(primary):
+            switched_us = times(cores)
+            order = np.argsort(switched_us, kind="stable")
+            last = np.searchsorted(switched_us[order], times(states), side="right") - 1
+            used = primary[order][np.clip(last, 0, None)]
+        states = states.rows(core == used)
+    said_us = times(states)
+    velocity = np.stack([states.numbers(axis) for axis in ("VN", "VE", "VD")], axis=1)
+    sound = np.isfinite(velocity).all(axis=1) & (np.abs(velocity) < 1e4).all(axis=1)
+    order = np.argsort(said_us[sound], kind="stable")
+    return between(boot_us, said_us[sound][order], velocity[sound][order], _NEAR_US)
+
+
+def _filled(
+    velocity: FloatArray, boot_us: IntArray, fixes: Fixes | None, way: FloatArray, notes: list[str]
+) -> FloatArray:
+    """Velocities with what is missing put in: the receiver's over ground, else the way's."""
+    missing: BoolArray = np.array(np.isnan(velocity).any(axis=1))
+    notes.append(f"no estimated velocity at {missing.sum()} of {len(boot_us)} positions")
+    put = way.copy()
+    if fixes is not None:
+        course = np.radians(fixes.course_deg)
+        level = np.stack([np.cos(course), np.sin(course)], axis=1) * fixes.speed_mps[:, None]
+        sound = np.isfinite(level).all(axis=1) & (np.abs(level) < 1e4).all(axis=1)
+        there = between(boot_us, fixes.boot_us[sound], level[sound], _NEAR_US)
+        put[:, :2] = np.where(np.isnan(there), put[:, :2], there)
+    return np.where(missing[:, None], put, velocity)
+
+
+def _headings(boot_us: IntArray, attitude: Table) -> FloatArray:
+    yaw_deg = attitude.numbers("Yaw")
+    sound = np.isfinite(yaw_deg) & (np.abs(yaw_deg) < 1e4)
+    if not sound.any():
+        return np.full(len(boot_us), np.nan)
+    straight = np.degrees(np.unwrap(np.radians(yaw_deg[sound])))
+    return between(boot_us, times(attitude)[sound], straight, _NEAR_US)
+
+
+def _attitudes(of: Table, gyro: Table, lost: dict[Reason, int]) -> Attitudes | None:
+    angles = np.stack([of.numbers(name) for name in ("Roll", "Pitch", "Yaw")], axis=1)
+    sound = np.isfinite(angles).all(axis=1) & (np.abs(angles) < 1e4).all(axis=1)
+    count(lost, Reason.MALFORMED, int((~sound).sum()))
+    if not sound.any():
+        return None
+    boot_us, euler = times(of)[sound], np.radians(angles[sound])
+    rates = turned(boot_us, euler)
+    measured = np.radians(np.stack([gyro.numbers(name) for name in ("R", "P", "Y")], axis=1))
+    sure = np.isfinite(measured).all(axis=1) & (np.abs(measured) < 1e3).all(axis=1)
+    there = between(boot_us, times(gyro)[sure], measured[sure], _NEAR_US // 5)
+    return Attitudes(boot_us, euler, np.where(np.isnan(there), rates, there))
+
+
+def _truth(sim: Table, motion: Table, lost: dict[Reason, int]) -> Truth | None:
+    lat_1e7, lon_1e7 = sim.integers("Lat"), sim.integers("Lng")
+    if lat_1e7 is None or lon_1e7 is None or not len(sim):
+        return None
+    alt_m = sim.numbers("Alt")
+    turned_by = np.stack([sim.numbers(name) for name in ("Q1", "Q2", "Q3", "Q4")], axis=1)
+    sound = on_earth(lat_1e7, lon_1e7, alt_m) & np.isfinite(turned_by).all(axis=1)
+    count(lost, Reason.MALFORMED, int((~sound).sum()))
+    boot_us, place = times(sim)[sound], (lat_1e7[sound], lon_1e7[sound], alt_m[sound])
+    if not len(boot_us):
+        return None
+    velocity = np.stack([motion.numbers(name) for name in ("VN", "VE", "VD")], axis=1)
+    sure = np.isfinite(velocity).all(axis=1) & (np.abs(velocity) < 1e4).all(axis=1)
+    there = between(boot_us, times(motion)[sure], velocity[sure], _NEAR_US // 5)
+    there = np.where(np.isnan(there), moved(boot_us, *place), there)
+    return Truth(boot_us, *place, there, turned_by[sound])

@@ -1,0 +1,228 @@
+"""A table of positions as text, with a header that says what each column is, and its unit.
+
+    # sysid = 3
+    # mav_type = 2
+    unix_s,lat_deg,lon_deg,alt_m,vn_mps,ve_mps,vd_mps,heading_deg
+    1795314424.300,47.3984607,8.5455937,488.14,0.0,0.0,0.0,180.0
+
+Time is ``unix_s``, ``time`` (RFC 3339 with its zone) or, where nothing else is known, ``t_s`` from
+any beginning. Columns may be divided by commas, semicolons or tabs, and a cell may be empty. Lines
+that begin with ``#`` may give ``sysid``, ``compid`` and ``mav_type``. See docs/recording.md.
+"""
+
+import csv
+import math
+from collections.abc import Iterable, Iterator
+from datetime import datetime
+from typing import Final
+
+import numpy as np
+
+from companion.recording.foreign.gps_time import FIRST_UNIX_US, LAST_UNIX_US, GpsTime
+from companion.recording.foreign.onboard import (
+    Attitudes,
+    Fixes,
+    Onboard,
+    Positions,
+    in_time,
+    moved,
+    on_earth,
+    turned,
+)
+from companion.values import FloatArray, IntArray, Reason
+
+TIMES: Final = ("unix_s", "time", "t_s")
+PLACE: Final = ("lat_deg", "lon_deg", "alt_m")
+_VELOCITY: Final = ("vn_mps", "ve_mps", "vd_mps")
+_EULER: Final = ("roll_deg", "pitch_deg", "yaw_deg")
+_ACCURACY: Final = ("h_acc_m", "v_acc_m", "vel_acc_mps")
+COLUMNS: Final = (
+    *TIMES, *PLACE, "height_m", *_VELOCITY, "heading_deg", *_EULER, *_ACCURACY, "fix_type",
+)  # fmt: skip
+_SAID: Final = {"sysid": 255, "compid": 255, "mav_type": 255}
+_AUTOPILOT_GENERIC: Final = 0
+_LINE_MAX: Final = 1 << 16
+_SAID_MAX: Final = 100
+_RESOLUTION_S: Final = 1e-3
+
+
+class NoTableError(Exception):
+    """Raised with one line for the user where the text is no such table."""
+
+
+def read(text: bytes) -> Onboard:
+    """The samples of a table. Raises ``NoTableError`` where its header does not describe them."""
+    lines = iter(text.decode("utf-8-sig", errors="replace").splitlines())
+    said, header = _header(lines)
+    names = [name.strip().lower() for name in _cells(header)]
+    timed = next((name for name in TIMES if name in names), None)
+    missing = [name for name in PLACE if name not in names]
+    if timed is None or missing:
+        lacks = [*([] if timed else [" or ".join(TIMES)]), *missing]
+        raise NoTableError(f"text, and its header names no {', '.join(lacks)}: docs/recording.md")
+    if len(set(names)) != len(names):
+        raise NoTableError("text, and its header names a column twice")
+    used = [(number, name) for number, name in enumerate(names) if name in COLUMNS]
+    rows, bad = _rows(lines, header, used, timed)
+    table = dict(zip([name for _, name in used], rows.T, strict=True))
+    lost = {Reason.MALFORMED: bad} if bad else {}
+    notes = [f"not used of it: {name}" for name in names if name and name not in COLUMNS]
+    return _onboard(table, timed, said, lost, notes)
+
+
+def _header(lines: Iterator[str]) -> tuple[dict[str, int], str]:
+    """What the lines before the header say, and the header."""
+    said: dict[str, int] = {}
+    for number, line in enumerate(lines):
+        if number > _SAID_MAX:
+            break
+        if not line.strip():
+            continue
+        if not line.startswith("#"):
+            return said, line[:_LINE_MAX]
+        name, equals, value = (part.strip() for part in line[1:].partition("="))
+        if equals and name in _SAID:
+            if not value.isdecimal() or not 0 < int(value[:9]) <= _SAID[name]:
+                raise NoTableError(f"a table whose {name} is not 1 to {_SAID[name]}")
+            said[name] = int(value)
+    raise NoTableError("text, and no table")
+
+
+def _cells(line: str) -> list[str]:
+    divider = max(",;\t", key=line.count)
+    return next(csv.reader([line], delimiter=divider), [])
+
+
+def _rows(
+    lines: Iterable[str], header: str, used: list[tuple[int, str]], timed: str
+) -> tuple[FloatArray, int]:
+    """The used columns of all lines that are numbers, (N, K), and how many lines are not.
+
+    An empty cell is NaN.
+    """
+    divider = max(",;\t", key=header.count)
+    found: list[list[float]] = []
+    bad = 0
+    for line in lines:
+        if not line.strip() or line.startswith("#"):
+            continue
+        try:
+            cells = next(csv.reader([line[:_LINE_MAX]], delimiter=divider))
+            found.append([_number(cells[number], name, timed) for number, name in used])
+        except (ValueError, IndexError, csv.Error, OverflowError):
+            bad += 1
+    return np.array(found, dtype=np.float64).reshape(-1, len(used)), bad
+
+
+def _number(cell: str, name: str, timed: str) -> float:
+    if name == "time":
+        then = datetime.fromisoformat(cell.strip())
+        if then.tzinfo is None:
+            raise ValueError
+        return then.timestamp()
+    value = float(cell) if cell.strip() else math.nan
+    if name in (timed, *PLACE) and not math.isfinite(value):
+        raise ValueError
+    return value
+
+
+def _onboard(
+    table: dict[str, FloatArray],
+    timed: str,
+    said: dict[str, int],
+    lost: dict[Reason, int],
+    notes: list[str],
+) -> Onboard:
+    boot_us, clock = _times(table[timed], timed)
+    rows, wild = in_time(boot_us)
+    if wild:
+        lost[Reason.BAD_STAMP] = wild
+    lat, lon, alt_m = (table[name][rows] for name in PLACE)
+    small = (np.abs(lat) <= 90) & (np.abs(lon) <= 180)
+    lat_1e7, lon_1e7 = (
+        np.round(np.where(small, each, 0.0) * 1e7).astype(np.int64) for each in (lat, lon)
+    )
+    sound = small & on_earth(lat_1e7, lon_1e7, alt_m)
+    if not sound.all():
+        lost[Reason.MALFORMED] = lost.get(Reason.MALFORMED, 0) + int((~sound).sum())
+    rows, boot_us = rows[sound], boot_us[rows][sound]
+    place = lat_1e7[sound], lon_1e7[sound], alt_m[sound]
+    table = {name: values[rows] for name, values in table.items()}
+    return Onboard(
+        said.get("sysid"),
+        said.get("compid", 1),
+        said.get("mav_type", 0),
+        _AUTOPILOT_GENERIC,
+        _positions(boot_us, place, table, notes) if len(rows) else None,
+        _attitudes(boot_us, table) if len(rows) else None,
+        _fixes(boot_us, place, table) if len(rows) else None,
+        clock=clock,
+        lost=lost,
+        notes=tuple(notes),
+    )
+
+
+def _times(seconds: FloatArray, timed: str) -> tuple[IntArray, GpsTime | None]:
+    """Microseconds since the first line, and the Unix time of these, where it is known."""
+    sound = np.abs(seconds) < LAST_UNIX_US * 1e-6
+    whole_us = np.round(np.where(sound, seconds, -1.0) * 1e6).astype(np.int64)
+    begin_us = int(np.median(whole_us[:9])) if len(whole_us) else 0
+    boot_us = np.where(sound, whole_us - begin_us + 1_000_000, -1)
+    if timed == "t_s" or begin_us < FIRST_UNIX_US:
+        return boot_us, None
+    offset_us = begin_us - 1_000_000
+    return boot_us, GpsTime(offset_us, 0.0, 0, _RESOLUTION_S, len(boot_us))
+
+
+Place = tuple[IntArray, IntArray, FloatArray]
+
+
+def _positions(
+    boot_us: IntArray, place: Place, table: dict[str, FloatArray], notes: list[str]
+) -> Positions:
+    velocity = moved(boot_us, *place)
+    nothing = np.full(len(boot_us), np.nan)
+    given = np.stack([table.get(name, nothing) for name in _VELOCITY], axis=1)
+    given = np.where(np.abs(given) < 1e4, given, np.nan)
+    if np.isnan(given).any():
+        notes.append("velocities that it does not give are those between its positions")
+    height_m = table.get("height_m", nothing)
+    alt_m = place[2]
+    return Positions(
+        boot_us,
+        *place,
+        np.where(np.abs(height_m) < 1e6, height_m, alt_m - alt_m[0]),
+        np.where(np.isnan(given), velocity, given),
+        table.get("heading_deg", table.get("yaw_deg", nothing)),
+    )
+
+
+def _attitudes(boot_us: IntArray, table: dict[str, FloatArray]) -> Attitudes | None:
+    if not set(_EULER) <= set(table):
+        return None
+    euler = np.radians(np.stack([table[name] for name in _EULER], axis=1))
+    sound = (np.abs(euler) < 1e3).all(axis=1)
+    if not sound.any():
+        return None
+    return Attitudes(boot_us[sound], euler[sound], turned(boot_us[sound], euler[sound]))
+
+
+def _fixes(boot_us: IntArray, place: Place, table: dict[str, FloatArray]) -> Fixes | None:
+    if not {*_ACCURACY, "fix_type"} & set(table):
+        return None
+    nothing = np.full(len(boot_us), np.nan)
+    fix_type = table.get("fix_type", np.full(len(boot_us), 3.0))
+    sound = (fix_type >= 0) & (fix_type <= 255)
+    accuracies = np.stack([table.get(name, nothing) for name in _ACCURACY], axis=1)
+    return Fixes(
+        boot_us[sound],
+        np.zeros(int(sound.sum()), dtype=np.int64),
+        fix_type[sound].astype(np.int64),
+        np.full(int(sound.sum()), 255),
+        place[0][sound],
+        place[1][sound],
+        place[2][sound],
+        accuracies[sound],
+        nothing[sound],
+        nothing[sound],
+    )

@@ -1,0 +1,245 @@
+"""ArduPilot's DataFlash log: bytes to columns, as far as they are intact.
+
+A message is A3 95, its type, and a body whose length and fields an FMT message (type 128) of that
+type describes (https://ardupilot.org/dev/docs/code-overview-adding-a-new-log-message.html,
+AP_Logger/LogStructure.h). There is no checksum: a message counts only if another begins right
+behind it, or the file ends there, so that bytes lost in the middle of one cost that one alone.
+
+Messages are found by looking for their first two bytes everywhere at once, and then following from
+each to the next. Fields are read where they lie, for the messages that are asked for.
+"""
+
+import re
+from collections.abc import Collection, Iterator
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.values import IntArray
+
+MAGIC: Final = b"\xa3\x95"
+FORMAT: Final = 128
+_HEAD: Final = 3
+_FORMAT_LENGTH: Final = 89
+_LONGEST: Final = 256
+_BLOCK: Final = 1 << 22
+_TYPES: Final = {
+    "a": ("<i2", 32), "b": ("i1", 0), "B": ("u1", 0), "h": ("<i2", 0), "H": ("<u2", 0),
+    "i": ("<i4", 0), "I": ("<u4", 0), "f": ("<f4", 0), "d": ("<f8", 0), "n": ("S4", 0),
+    "N": ("S16", 0), "Z": ("S64", 0), "c": ("<i2", 0), "C": ("<u2", 0), "e": ("<i4", 0),
+    "E": ("<u4", 0), "L": ("<i4", 0), "M": ("u1", 0), "q": ("<i8", 0), "Q": ("<u8", 0),
+    "g": ("<f2", 0),
+}  # fmt: skip
+_HUNDREDTHS: Final = frozenset("cCeE")
+_NAME: Final = re.compile(rb"[A-Z0-9_]{1,4}\0*\Z")
+_formats = re.compile(re.escape(MAGIC + bytes([FORMAT]))).finditer
+
+Bytes = NDArray[np.uint8]
+Column = NDArray[np.generic]
+
+
+class Format(NamedTuple):
+    """The layout of one type of message: its fields, and which are hundredths."""
+
+    name: str
+    length: int
+    fields: np.dtype[np.void]
+    hundredths: frozenset[str]
+
+
+class Walked(NamedTuple):
+    """What a log holds.
+
+    formats  by type
+    at       where the messages of each wanted type begin, in the order of the file
+    lost     bytes that belong to no message
+    refused  descriptions of messages that cannot be: of another length, or twice and different
+    """
+
+    formats: dict[int, Format]
+    at: dict[int, IntArray]
+    lost: int
+    refused: int
+
+
+class Table:
+    """The messages of one type, as columns. Empty where the log has none."""
+
+    def __init__(self, data: Bytes, layout: Format | None, at: IntArray) -> None:
+        self._layout = layout
+        self._at = at
+        if layout is None or not len(at):
+            self._records: NDArray[np.void] = np.zeros(0, dtype=[])
+            return
+        # Every byte of the file as the beginning of a record: those that are one are taken.
+        room = data.size - _HEAD - layout.fields.itemsize + 1
+        everywhere = np.ndarray((room,), layout.fields, data, _HEAD, (1,))
+        self._records = everywhere[at]
+
+    def __len__(self) -> int:
+        return len(self._records)
+
+    def __contains__(self, column: object) -> bool:
+        return self._records.dtype.names is not None and column in self._records.dtype.names
+
+    def raw(self, column: str) -> Column:
+        """A column as it stands in the file, (N,)."""
+        found: Column = self._records[column]
+        return found
+
+    def numbers(self, column: str) -> NDArray[np.float64]:
+        """A column as numbers, (N,), in the units of the log; NaN where there is none such."""
+        if column not in self or self._records[column].dtype.kind not in "iuf":
+            return np.full(len(self), np.nan)
+        assert self._layout is not None
+        values = self._records[column].astype(np.float64)
+        return values / 100.0 if column in self._layout.hundredths else values
+
+    def integers(self, column: str) -> IntArray | None:
+        """A column of integers, (N,); None where there is none such."""
+        if column not in self or self._records[column].dtype.kind not in "iu":
+            return None
+        values = self._records[column]
+        if values.dtype == np.uint64:  # what is no time becomes negative
+            values = np.where(values < np.uint64(1 << 62), values, np.uint64(0)).astype(np.int64)
+        found: IntArray = values.astype(np.int64)
+        return found
+
+    def rows(self, chosen: IntArray | NDArray[np.bool_]) -> "Table":
+        """Some of the messages."""
+        picked = Table.__new__(Table)
+        picked._layout, picked._at = self._layout, self._at[chosen]
+        picked._records = self._records[chosen]
+        return picked
+
+
+def walk(data: Bytes, wanted: Collection[str]) -> Walked:
+    """Find the messages of a log; those named in ``wanted`` are told where they are."""
+    formats, refused = _describe(data)
+    lengths = np.zeros(256, dtype=np.int64)
+    asked = np.zeros(256, dtype=bool)
+    for number, layout in formats.items():
+        lengths[number], asked[number] = layout.length, layout.name in wanted
+    found: dict[int, list[IntArray]] = {n: [] for n, each in formats.items() if asked[n]}
+    covered = 0
+    for at, types in _chains(data, lengths):
+        covered += int(lengths[types].sum())
+        for number in np.unique(types[asked[types]]).tolist():
+            found[number].append(at[types == number])
+    none = np.zeros(0, dtype=np.int64)
+    places = {number: np.concatenate([none, *parts]) for number, parts in found.items()}
+    return Walked(formats, places, data.size - covered, refused)
+
+
+def table(data: Bytes, walked: Walked, name: str) -> Table:
+    """The messages of one name."""
+    for number, layout in walked.formats.items():
+        if layout.name == name and number in walked.at:
+            return Table(data, layout, walked.at[number])
+    return Table(data, None, np.zeros(0, dtype=np.int64))
+
+
+# --- what is described ----------------------------------------------------------------------------
+
+
+def _describe(data: Bytes) -> tuple[dict[int, Format], int]:
+    """The formats that a log describes, by type, and how many descriptions were refused.
+
+    The first of a type counts: what its messages were written by.
+    """
+    whole = memoryview(data.data)
+    found: dict[int, Format] = {FORMAT: _OWN}
+    refused = 0
+    for match in _formats(whole):
+        body = bytes(whole[match.start() + _HEAD : match.start() + _FORMAT_LENGTH])
+        if len(body) < _FORMAT_LENGTH - _HEAD or not _NAME.match(body[2:6]):
+            continue  # these bytes inside of another message
+        layout = _format(body)
+        if layout is None or found.setdefault(body[0], layout) != layout:
+            refused += 1
+    return found, refused
+
+
+def _format(body: bytes) -> Format | None:
+    """A format by the body of its FMT message; None where it contradicts itself."""
+    length, name = body[1], body[2:6].rstrip(b"\0").decode("ascii")
+    letters = body[6:22].rstrip(b"\0").decode("latin-1")
+    columns = body[22:86].rstrip(b"\0").decode("latin-1").split(",")
+    columns = columns[: len(letters)]
+    if not set(letters) <= set(_TYPES) or len(columns) != len(letters):
+        return None
+    if len(set(columns)) != len(columns) or not all(columns):
+        return None
+    described: list[tuple[str, str, tuple[int, ...]]] = []
+    for column, letter in zip(columns, letters, strict=True):
+        kind, count = _TYPES[letter]
+        described.append((column, kind, (count,) if count else ()))
+    fields = np.dtype(described)
+    if fields.itemsize != length - _HEAD:
+        return None
+    hundredths = (
+        column for column, each in zip(columns, letters, strict=True) if each in _HUNDREDTHS
+    )
+    return Format(name, length, fields, frozenset(hundredths))
+
+
+_OWN: Final = Format(
+    "FMT",
+    _FORMAT_LENGTH,
+    np.dtype(
+        [("Type", "u1"), ("Length", "u1"), ("Name", "S4"), ("Format", "S16"), ("Columns", "S64")]
+    ),
+    frozenset(),
+)  # fmt: skip
+
+
+# --- where messages are ---------------------------------------------------------------------------
+
+
+def _chains(data: Bytes, lengths: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
+    """Where messages begin, and their types, block by block of the file."""
+    resume = 0
+    for begin in range(0, data.size, _BLOCK):
+        at, types = _heads(data, begin, min(begin + _BLOCK, data.size), lengths)
+        inside = at >= resume
+        at, types = at[inside], types[inside]
+        chosen = _followed(at, at + lengths[types])
+        if len(chosen):
+            resume = int(at[chosen[-1]] + lengths[types[chosen[-1]]])
+        yield at[chosen], types[chosen]
+
+
+def _heads(data: Bytes, begin: int, end: int, lengths: IntArray) -> tuple[IntArray, IntArray]:
+    """Places in [begin, end) that look like a message with another, or the end, behind it."""
+    ahead = data[begin : end + 2 * _LONGEST + _HEAD]
+    if ahead.size < _HEAD:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    looks = (ahead[:-2] == MAGIC[0]) & (ahead[1:-1] == MAGIC[1])
+    looks[looks] = lengths[ahead[2:][looks]] > 0
+    (at,) = np.nonzero(looks)
+    at = at[at < end - begin]
+    types = ahead[at + 2].astype(np.int64)
+    behind = at + lengths[types]
+    goes_on = np.zeros(len(at), dtype=bool)
+    inside = behind < len(looks)
+    goes_on[inside] = looks[behind[inside]]
+    goes_on |= begin + behind == data.size
+    return at[goes_on] + begin, types[goes_on]
+
+
+def _followed(at: IntArray, behind: IntArray) -> IntArray:
+    """The rows that are reached from the first by following each message to the next.
+
+    Nearly always the next row is the next message; only where it is not is it looked for.
+    """
+    if not len(at):
+        return np.zeros(0, dtype=np.int64)
+    breaks = np.flatnonzero(at[1:] != behind[:-1])
+    parts, row = [], 0
+    while row < len(at):
+        nearest = int(np.searchsorted(breaks, row))
+        last = int(breaks[nearest]) if nearest < len(breaks) else len(at) - 1
+        parts.append(np.arange(row, last + 1))
+        row = int(np.searchsorted(at, behind[last]))
+    return np.concatenate(parts)

@@ -1,0 +1,215 @@
+"""What one vehicle wrote of itself: its samples, whatever the format they were written in.
+
+All times are microseconds of its boot clock. Arrays of one kind of sample have the same length and
+are in order of time.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from companion.recording.foreign.gps_time import GpsTime
+from companion.values import BoolArray, FloatArray, IntArray, Reason
+
+REBOOT_US: Final = 10_000_000
+"""A step back of a boot clock that is no mere disorder in the file."""
+_NEAR: Final = 4
+_WILD_US: Final = 120_000_000
+"""How far a stamp may be off the middle of those around it in the file."""
+METRES_PER_DEGREE: Final = 111_195.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Positions:
+    """Estimated positions.
+
+    boot_us           (N,)
+    lat_1e7, lon_1e7  (N,), 1e-7 degrees
+    alt_m             (N,), above mean sea level
+    height_m          (N,), above home
+    velocity_ned_mps  (N, 3)
+    heading_deg       (N,), from true north; NaN: unknown
+    """
+
+    boot_us: IntArray
+    lat_1e7: IntArray
+    lon_1e7: IntArray
+    alt_m: FloatArray
+    height_m: FloatArray
+    velocity_ned_mps: FloatArray
+    heading_deg: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Attitudes:
+    """Attitudes: roll, pitch and yaw (N, 3), rad, and body rates (N, 3), rad/s."""
+
+    boot_us: IntArray
+    euler_rad: FloatArray
+    rates_radps: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fixes:
+    """What the satellite receiver in use said, (N,) each.
+
+    unix_us      the time of the fix; 0: unknown
+    fix_type     MAVLink's GPS_FIX_TYPE
+    accuracies   (N, 3): horizontal m, vertical m, speed m/s; NaN: unknown
+    speed_mps    over ground
+    course_deg   over ground, from true north
+    """
+
+    boot_us: IntArray
+    unix_us: IntArray
+    fix_type: IntArray
+    satellites: IntArray
+    lat_1e7: IntArray
+    lon_1e7: IntArray
+    alt_m: FloatArray
+    accuracies: FloatArray
+    speed_mps: FloatArray
+    course_deg: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """Where the simulator had it: as ``Positions``, and quaternions ned from body (N, 4), wxyz."""
+
+    boot_us: IntArray
+    lat_1e7: IntArray
+    lon_1e7: IntArray
+    alt_m: FloatArray
+    velocity_ned_mps: FloatArray
+    ned_from_body: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Onboard:
+    """The log of one vehicle.
+
+    sysid      its MAVLink system id, if the log says it
+    compid     its component id
+    mav_type   MAV_TYPE
+    autopilot  MAV_AUTOPILOT
+    armed      boot times and whether it was armed from then on
+    clock      its boot clock on GPS time; None where the log has no time
+    lost       what of the file could not be used
+    notes      what had to be made up for, for the user
+    """
+
+    sysid: int | None
+    compid: int
+    mav_type: int
+    autopilot: int
+    positions: Positions | None
+    attitudes: Attitudes | None = None
+    fixes: Fixes | None = None
+    truth: Truth | None = None
+    armed: tuple[tuple[int, bool], ...] = ()
+    clock: GpsTime | None = None
+    lost: Mapping[Reason, int] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+# --- samples that can be used ---------------------------------------------------------------------
+
+
+def in_time(boot_us: IntArray) -> tuple[IntArray, int]:
+    """The rows of samples in order of time, without those whose stamp is wild, and how many.
+
+    ``boot_us`` (N,) is in the order of the file. A stamp is wild if it is minutes off the middle of
+    its neighbours; samples of one time count once. After a reboot, time begins anew.
+    """
+    if not len(boot_us):
+        return np.zeros(0, dtype=np.int64), 0
+    padded = np.pad(boot_us, _NEAR, mode="edge")
+    around = np.lib.stride_tricks.sliding_window_view(padded, 2 * _NEAR + 1)
+    middle = np.sort(around, axis=1)[:, _NEAR]
+    apart = np.maximum(boot_us, middle).astype(np.uint64) - np.minimum(boot_us, middle).astype(
+        np.uint64
+    )
+    sound = (apart <= np.uint64(_WILD_US)) & (boot_us >= 0)
+    rows: IntArray = np.flatnonzero(sound)
+    life = np.cumsum(np.diff(middle[rows], prepend=middle[rows][:1]) < -REBOOT_US)
+    order = np.lexsort((boot_us[rows], life))
+    rows = rows[order]
+    fresh = np.ones(len(rows), dtype=bool)
+    fresh[1:] = (np.diff(boot_us[rows]) != 0) | (np.diff(life[order]) != 0)
+    return rows[fresh], int((~sound).sum())
+
+
+def on_earth(lat_1e7: IntArray, lon_1e7: IntArray, *others: FloatArray) -> BoolArray:
+    """Whether each place (N,) is on Earth and all else of it (N,) a number in reach."""
+    sound: BoolArray = (np.abs(lat_1e7) <= 900_000_000) & (np.abs(lon_1e7) <= 1_800_000_000)
+    for other in others:
+        sound &= np.isfinite(other) & (np.abs(other) < 1e6)
+    return sound
+
+
+def between(at_us: IntArray, boot_us: IntArray, values: FloatArray, gap_us: int) -> FloatArray:
+    """``values`` (N,) or (N, K) at other times (M,), linearly; NaN where no sample is near.
+
+    ``gap_us`` is how far off the nearest sample may be.
+    """
+    if not len(boot_us):
+        return np.full((len(at_us), *values.shape[1:]), np.nan)
+    from_us = int(boot_us[0])
+    x, known = (at_us - from_us).astype(np.float64), (boot_us - from_us).astype(np.float64)
+    columns = values.reshape(len(boot_us), -1).T
+    found: FloatArray = np.stack([np.interp(x, known, column) for column in columns], axis=1)
+    after = np.clip(np.searchsorted(boot_us, at_us), 0, len(boot_us) - 1)
+    before = np.clip(after - 1, 0, None)
+    apart = np.minimum(np.abs(boot_us[after] - at_us), np.abs(boot_us[before] - at_us))
+    found[apart > gap_us] = np.nan
+    return found.reshape(len(at_us), *values.shape[1:])
+
+
+def moved(boot_us: IntArray, lat_1e7: IntArray, lon_1e7: IntArray, alt_m: FloatArray) -> FloatArray:
+    """Velocities (N, 3), north-east-down, m/s, by the way between neighbours; 0 for a lone one."""
+    if len(boot_us) < 2:
+        return np.zeros((len(boot_us), 3))
+    t_s = (boot_us - boot_us[0]) * 1e-6
+    t_s = np.maximum.accumulate(t_s) + np.arange(len(t_s)) * 1e-9  # a reboot steps back
+    scale = METRES_PER_DEGREE * 1e-7
+    north = (lat_1e7 - lat_1e7[0]) * scale
+    east = (lon_1e7 - lon_1e7[0]) * scale * np.cos(np.radians(lat_1e7 * 1e-7))
+    place = np.stack([north, east, -(alt_m - alt_m[0])], axis=1)
+    velocity: FloatArray = np.gradient(place, t_s, axis=0)
+    return velocity
+
+
+def turned(boot_us: IntArray, euler_rad: FloatArray) -> FloatArray:
+    """Body rates (N, 3), rad/s, by the turn between neighbours; 0 for a lone attitude.
+
+    The rates of roll, pitch and yaw make the body's by the kinematics of Euler angles.
+    """
+    if len(boot_us) < 2:
+        return np.zeros((len(boot_us), 3))
+    t_s = (boot_us - boot_us[0]) * 1e-6
+    t_s = np.maximum.accumulate(t_s) + np.arange(len(t_s)) * 1e-9
+    roll, pitch, yaw = np.unwrap(euler_rad, axis=0).T
+    by_roll, by_pitch, by_yaw = (np.gradient(angle, t_s) for angle in (roll, pitch, yaw))
+    return np.stack(
+        [
+            by_roll - by_yaw * np.sin(pitch),
+            by_pitch * np.cos(roll) + by_yaw * np.sin(roll) * np.cos(pitch),
+            -by_pitch * np.sin(roll) + by_yaw * np.cos(roll) * np.cos(pitch),
+        ],
+        axis=1,
+    )
+
+
+def euler_of(quaternions: FloatArray) -> FloatArray:
+    """Roll, pitch and yaw (N, 3), rad, of quaternions (N, 4), wxyz, ned from body."""
+    w, x, y, z = quaternions.T
+    return np.stack(
+        [
+            np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+            np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0)),
+            np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+        ],
+        axis=1,
+    )

@@ -1,0 +1,268 @@
+"""What the topics of PX4's ULog mean.
+
+Meanings and units: https://docs.px4.io/main/en/msg_docs/. GLOBAL_POSITION_INT is made as PX4 makes
+it, of vehicle_global_position and the velocity of vehicle_local_position; ``*_groundtruth`` is the
+simulator's truth.
+"""
+
+from typing import Final
+
+import numpy as np
+
+from companion.recording.foreign import gps_time, ulog
+from companion.recording.foreign.dataflash import Bytes
+from companion.recording.foreign.gps_time import GpsTime
+from companion.recording.foreign.onboard import (
+    Attitudes,
+    Fixes,
+    Onboard,
+    Positions,
+    Truth,
+    between,
+    euler_of,
+    in_time,
+    moved,
+    on_earth,
+    turned,
+)
+from companion.recording.foreign.ulog import Table, table, walk
+from companion.values import BoolArray, FloatArray, IntArray, Reason
+
+_GLOBAL: Final = "vehicle_global_position"
+_LOCAL: Final = "vehicle_local_position"
+_ATTITUDE: Final = "vehicle_attitude"
+_RATES: Final = "vehicle_angular_velocity"
+_GPS: Final = ("vehicle_gps_position", "sensor_gps")
+_WANTED: Final = (
+    _GLOBAL, _LOCAL, _ATTITUDE, _RATES, *_GPS, "vehicle_status", "home_position",
+    f"{_GLOBAL}_groundtruth", f"{_LOCAL}_groundtruth", f"{_ATTITUDE}_groundtruth",
+)  # fmt: skip
+_PX4: Final = 12
+_ARMED: Final = 2
+_NEAR_US: Final = 500_000
+
+Lost = dict[Reason, int]
+
+
+class UnknownFlagsError(Exception):
+    """Raised where a file says that it cannot be understood without knowing more."""
+
+
+def read(data: Bytes) -> Onboard:
+    """The samples of a log; what cannot be used is counted.
+
+    Raises ``UnknownFlagsError`` where the file asks for what this reader does not know.
+    """
+    walked = walk(data, _WANTED)
+    if walked.unknown:
+        raise UnknownFlagsError
+    lost: Lost = {}
+    _count(lost, Reason.GARBAGE, walked.lost)
+    _count(lost, Reason.MALFORMED, walked.refused)
+    tables = {name: _timed(table(data, walked, name), lost) for name in _WANTED}
+    gps = _timed(table(data, walked, *_GPS), {})
+    fixes, clock = _fixes(gps, lost)
+    notes = [f"the logger itself lost data {walked.dropouts} times"] if walked.dropouts else []
+    status = tables["vehicle_status"]
+    sysid, compid, mav_type = _identity(walked, status)
+    return Onboard(
+        sysid,
+        compid,
+        mav_type,
+        _PX4,
+        _positions(tables, fixes, lost, notes),
+        _attitudes(tables, lost),
+        fixes,
+        _truth(tables, lost),
+        _armed(status),
+        clock,
+        lost,
+        tuple(notes),
+    )
+
+
+def _count(lost: Lost, reason: Reason, number: int) -> None:
+    if number:
+        lost[reason] = lost.get(reason, 0) + number
+
+
+def _times(of: Table) -> IntArray:
+    """When samples were true: the time of what they are made of, where it is said."""
+    sampled = of.integers("timestamp_sample")
+    found = of.integers("timestamp") if sampled is None or not sampled.all() else sampled
+    return np.zeros(0, dtype=np.int64) if found is None else found
+
+
+def _timed(of: Table, lost: Lost) -> Table:
+    times = _times(of)
+    if len(times) != len(of):
+        _count(lost, Reason.MALFORMED, len(of))
+        return of.rows(np.zeros(0, dtype=np.int64))
+    rows, wild = in_time(times)
+    _count(lost, Reason.BAD_STAMP, wild)
+    return of.rows(rows)
+
+
+def _identity(walked: ulog.Walked, status: Table) -> tuple[int | None, int, int]:
+    """System id, component id and MAV_TYPE: by the parameters, else by the vehicle's status."""
+
+    def said(parameter: str, column: str) -> int | None:
+        value = walked.parameters.get(parameter)
+        values = status.integers(column)
+        if value is None and values is not None and len(values):
+            value = float(values[-1])
+        return int(value) if value is not None and 0 < value <= 255 else None
+
+    sysid = said("MAV_SYS_ID", "system_id")
+    return sysid, said("MAV_COMP_ID", "component_id") or 1, said("MAV_TYPE", "system_type") or 0
+
+
+def _armed(status: Table) -> tuple[tuple[int, bool], ...]:
+    state = status.integers("arming_state")
+    if state is None:
+        return ()
+    return tuple(zip(_times(status).tolist(), (state == _ARMED).tolist(), strict=True))
+
+
+def _degrees(of: Table, old: str, new: str) -> IntArray:
+    """Latitudes or longitudes, 1e-7 degrees: integers in old logs, degrees in new ones."""
+    whole = of.integers(old)
+    if whole is not None:
+        return whole
+    degrees = of.numbers(new) if new in of else of.numbers(old)
+    sound = np.isfinite(degrees) & (np.abs(degrees) < 1e3)
+    return np.where(sound, np.round(np.where(sound, degrees, 0.0) * 1e7), 1 << 40).astype(np.int64)
+
+
+def _fixes(gps: Table, lost: Lost) -> tuple[Fixes | None, GpsTime | None]:
+    lat_1e7, lon_1e7 = (
+        _degrees(gps, "lat", "latitude_deg"),
+        _degrees(gps, "lon", "longitude_deg"),
+    )
+    alt_m = gps.numbers("alt") * 1e-3 if "alt" in gps else gps.numbers("altitude_msl_m")
+    sound = on_earth(lat_1e7, lon_1e7, alt_m, gps.numbers("fix_type"))
+    _count(lost, Reason.MALFORMED, int((~sound).sum()))
+    gps = gps.rows(sound)
+    if not len(gps):
+        return None, None
+    boot_us, fix_type = _times(gps), gps.numbers("fix_type").astype(np.int64)
+    unix = gps.integers("time_utc_usec")
+    unix_us = np.where(fix_type >= 3, 0 if unix is None else unix, 0)
+    satellites = gps.numbers("satellites_used")
+    accuracies = [gps.numbers(name) for name in ("eph", "epv", "s_variance_m_s")]
+    fixes = Fixes(
+        boot_us,
+        unix_us,
+        fix_type,
+        np.where(np.isfinite(satellites), satellites, 255).astype(np.int64),
+        lat_1e7[sound],
+        lon_1e7[sound],
+        alt_m[sound],
+        np.stack([np.where(each > 0, each, np.nan) for each in accuracies], axis=1),
+        gps.numbers("vel_m_s"),
+        np.degrees(gps.numbers("cog_rad")),
+    )
+    return fixes, gps_time.fit(boot_us, unix_us)
+
+
+def _positions(
+    tables: dict[str, Table], fixes: Fixes | None, lost: Lost, notes: list[str]
+) -> Positions | None:
+    place, local = tables[_GLOBAL], tables[_LOCAL]
+    if not len(place):
+        return None if fixes is None else _received(fixes, local, notes)
+    lat_1e7, lon_1e7, alt_m = _place(place)
+    sound = on_earth(lat_1e7, lon_1e7, alt_m)
+    _count(lost, Reason.MALFORMED, int((~sound).sum()))
+    place, boot_us = place.rows(sound), _times(place)[sound]
+    lat_1e7, lon_1e7, alt_m = lat_1e7[sound], lon_1e7[sound], alt_m[sound]
+    if not len(boot_us):
+        return None
+    older = np.stack([place.numbers(name) for name in ("vel_n", "vel_e", "vel_d")], axis=1)
+    velocity = np.where(np.isfinite(older), older, _velocities(boot_us, local))
+    missing: BoolArray = np.array(np.isnan(velocity).any(axis=1))
+    if missing.any():
+        notes.append(f"no estimated velocity at {missing.sum()} of {len(boot_us)} positions")
+        way = moved(boot_us, lat_1e7, lon_1e7, alt_m)
+        velocity = np.where(missing[:, None], way, velocity)
+    home_m = tables["home_position"].numbers("alt")
+    home_m = home_m[np.isfinite(home_m)]
+    height_m = alt_m - (home_m[-1] if len(home_m) else alt_m[0])
+    yaw = place.numbers("yaw")
+    heading = np.where(np.isfinite(yaw), np.degrees(yaw), _headings(boot_us, local))
+    return Positions(boot_us, lat_1e7, lon_1e7, alt_m, height_m, velocity, heading)
+
+
+def _place(of: Table) -> tuple[IntArray, IntArray, FloatArray]:
+    return _degrees(of, "", "lat"), _degrees(of, "", "lon"), of.numbers("alt")
+
+
+def _received(fixes: Fixes, local: Table, notes: list[str]) -> Positions | None:
+    """The receiver's own positions, where the estimator had none."""
+    fixed = fixes.fix_type >= 3
+    if not fixed.any():
+        return None
+    notes.append("no vehicle_global_position in it: positions are those of the receiver")
+    boot_us, lat_1e7 = fixes.boot_us[fixed], fixes.lat_1e7[fixed]
+    lon_1e7, alt_m = fixes.lon_1e7[fixed], fixes.alt_m[fixed]
+    velocity = moved(boot_us, lat_1e7, lon_1e7, alt_m)
+    course, speed = np.radians(fixes.course_deg[fixed]), fixes.speed_mps[fixed]
+    level = np.stack([np.cos(course), np.sin(course)], axis=1) * speed[:, None]
+    velocity[:, :2] = np.where(np.isfinite(level), level, velocity[:, :2])
+    heading = _headings(boot_us, local)
+    return Positions(boot_us, lat_1e7, lon_1e7, alt_m, alt_m - alt_m[0], velocity, heading)
+
+
+def _velocities(boot_us: IntArray, local: Table) -> FloatArray:
+    velocity = np.stack([local.numbers(name) for name in ("vx", "vy", "vz")], axis=1)
+    sound = np.isfinite(velocity).all(axis=1) & (np.abs(velocity) < 1e4).all(axis=1)
+    return between(boot_us, _times(local)[sound], velocity[sound], _NEAR_US)
+
+
+def _headings(boot_us: IntArray, local: Table) -> FloatArray:
+    heading = local.numbers("heading" if "heading" in local else "yaw")
+    sound = np.isfinite(heading) & (np.abs(heading) < 1e3)
+    if not sound.any():
+        return np.full(len(boot_us), np.nan)
+    straight = np.degrees(np.unwrap(heading[sound]))
+    return between(boot_us, _times(local)[sound], straight, _NEAR_US)
+
+
+def _turns(of: Table, lost: Lost) -> tuple[IntArray, FloatArray]:
+    """Times (N,) and quaternions (N, 4) of length 1."""
+    quaternions = of.numbers("q", 4)
+    length = np.linalg.norm(quaternions, axis=1) if len(of) else np.zeros(0)
+    sound = np.abs(length - 1) < 0.1
+    _count(lost, Reason.MALFORMED, int((~sound).sum()))
+    return _times(of)[sound], quaternions[sound] / length[sound, None]
+
+
+def _attitudes(tables: dict[str, Table], lost: Lost) -> Attitudes | None:
+    boot_us, quaternions = _turns(tables[_ATTITUDE], lost)
+    if not len(boot_us):
+        return None
+    euler = euler_of(quaternions)
+    gyro = tables[_RATES]
+    measured = gyro.numbers("xyz", 3)
+    sure = np.isfinite(measured).all(axis=1) & (np.abs(measured) < 1e3).all(axis=1)
+    rates = between(boot_us, _times(gyro)[sure], measured[sure], _NEAR_US // 5)
+    return Attitudes(boot_us, euler, np.where(np.isnan(rates), turned(boot_us, euler), rates))
+
+
+def _truth(tables: dict[str, Table], lost: Lost) -> Truth | None:
+    of = tables[f"{_GLOBAL}_groundtruth"]
+    lat_1e7, lon_1e7, alt_m = _place(of)
+    sound = on_earth(lat_1e7, lon_1e7, alt_m)
+    _count(lost, Reason.MALFORMED, int((~sound).sum()))
+    boot_us, place = _times(of)[sound], (lat_1e7[sound], lon_1e7[sound], alt_m[sound])
+    if not len(boot_us):
+        return None
+    velocity = _velocities(boot_us, tables[f"{_LOCAL}_groundtruth"])
+    velocity = np.where(np.isnan(velocity), moved(boot_us, *place), velocity)
+    turned_at, quaternions = _turns(tables[f"{_ATTITUDE}_groundtruth"], lost)
+    near = np.zeros((len(boot_us), 4))
+    if len(turned_at):
+        row = np.clip(np.searchsorted(turned_at, boot_us), 0, len(turned_at) - 1)
+        close = np.abs(turned_at[row] - boot_us) < _NEAR_US // 10
+        near = np.where(close[:, None], quaternions[row], 0.0)
+    return Truth(boot_us, *place, velocity, near)

@@ -1,0 +1,102 @@
+"""What ArduPilot's DataFlash log says of the satellite receiver in use: GPS and GPA.
+
+GPA says beside each GPS how good it is, and when by the boot clock the fix was had (SMS).
+"""
+
+from typing import Final
+
+import numpy as np
+
+from companion.recording.foreign import gps_time
+from companion.recording.foreign.dataflash import Table
+from companion.recording.foreign.gps_time import GpsTime
+from companion.recording.foreign.onboard import Fixes, in_time, on_earth
+from companion.values import FloatArray, IntArray, Reason
+
+_BESIDE_US: Final = 5_000
+"""GPA is written with its GPS."""
+_LATE_US: Final = 2e6
+
+
+def times(of: Table) -> IntArray:
+    """Boot times (N,) of messages, microseconds; empty where they have none."""
+    exact = of.integers("TimeUS")
+    if exact is not None:
+        return exact
+    before_2015 = of.integers("TimeMS")
+    return np.zeros(0, dtype=np.int64) if before_2015 is None else before_2015 * 1000
+
+
+def count(lost: dict[Reason, int], reason: Reason, number: int) -> None:
+    """Add to what could not be used."""
+    if number:
+        lost[reason] = lost.get(reason, 0) + number
+
+
+def fixes_of(
+    gps: Table, accuracy: Table, lost: dict[Reason, int]
+) -> tuple[Fixes | None, GpsTime | None]:
+    """What the receiver in use said, and the boot clock on GPS time."""
+    used, instance = gps.integers("U"), gps.integers("I")
+    if used is not None and used.any():
+        gps = gps.rows(used > 0)
+    elif instance is not None and len(instance):
+        gps = gps.rows(instance == instance.min())
+    lat_1e7, lon_1e7 = gps.integers("Lat"), gps.integers("Lng")
+    if not len(gps) or lat_1e7 is None or lon_1e7 is None:
+        return None, None
+    alt_m, status = gps.numbers("Alt"), gps.numbers("Status")
+    sound = on_earth(lat_1e7, lon_1e7, alt_m, status)
+    count(lost, Reason.MALFORMED, int((~sound).sum()))
+    gps = gps.rows(np.flatnonzero(sound)[_by_time(times(gps)[sound])])
+    if not len(gps):
+        return None, None
+    boot_us = times(gps)
+    week, week_ms = gps.numbers("GWk"), gps.numbers("GMS")
+    known = np.isfinite(week) & np.isfinite(week_ms) & (gps.numbers("Status") >= 3)
+    fixed_us = gps_time.unix_us(
+        np.where(known, week, 0).astype(np.int64), np.where(known, week_ms, -1).astype(np.int64)
+    )
+    beside = _beside(boot_us, gps, accuracy)
+    had_us = np.where(np.isfinite(beside[:, 3]), beside[:, 3] * 1e3, boot_us).astype(np.int64)
+    satellites = gps.numbers("NSats")
+    places = gps.integers("Lat"), gps.integers("Lng")
+    assert places[0] is not None and places[1] is not None
+    fixes = Fixes(
+        boot_us,
+        fixed_us,
+        gps.numbers("Status").astype(np.int64),
+        np.where(np.isfinite(satellites), satellites, 255).astype(np.int64),
+        places[0],
+        places[1],
+        gps.numbers("Alt"),
+        beside[:, :3],
+        gps.numbers("Spd"),
+        gps.numbers("GCrs"),
+    )
+    return fixes, gps_time.fit(had_us, fixed_us)
+
+
+def _by_time(boot_us: IntArray) -> IntArray:
+    rows, _ = in_time(boot_us)
+    return rows
+
+
+def _beside(boot_us: IntArray, gps: Table, accuracy: Table) -> FloatArray:
+    """Accuracies and the boot time at which the fix was had, ms, (N, 4), from GPA; NaN: unknown."""
+    found = np.full((len(boot_us), 4), np.nan)
+    mine, other = gps.integers("I"), accuracy.integers("I")
+    if mine is not None and other is not None and len(mine):
+        accuracy = accuracy.rows(other == mine[0])
+    theirs = times(accuracy)
+    if not len(theirs):
+        return found
+    rows = np.argsort(theirs, kind="stable")
+    nearest = rows[np.clip(np.searchsorted(theirs[rows], boot_us), 0, len(rows) - 1)]
+    near = np.abs(theirs[nearest] - boot_us) <= _BESIDE_US
+    for column, name in enumerate(("HAcc", "VAcc", "SAcc", "SMS")):
+        values = accuracy.numbers(name)[nearest]
+        found[:, column] = np.where(near & (values > 0), values, np.nan)
+    late_us = boot_us - found[:, 3] * 1e3
+    found[~(np.abs(late_us) < _LATE_US), 3] = np.nan  # it is no boot time of this clock
+    return found

@@ -1,0 +1,140 @@
+"""Logs of one vehicle each, as one flight: who is who, and all on one timeline.
+
+The timeline is Unix time, by the GPS time in each log (``gps_time``). A vehicle has the system id
+that its log says; of two that say the same, the later one gets the next that is free.
+"""
+
+import heapq
+import mmap
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from companion.recording.errors import LogError
+from companion.recording.foreign import ardupilot, csv_table, px4, said
+from companion.recording.foreign.dataflash import Bytes
+from companion.recording.foreign.gps_time import RECEIVER_LAG_S
+from companion.recording.foreign.onboard import Onboard
+from companion.recording.stamps import LARGEST_LEAP_NS
+from companion.values import Event, IntArray, Source
+
+READERS: Final[dict[str, Callable[[Bytes], Onboard]]] = {
+    "dataflash": ardupilot.read,
+    "ulog": px4.read,
+    "csv": lambda data: csv_table.read(data.tobytes()),
+}
+"""What reads the log of one vehicle, by the kind of log."""
+_NAMES: Final = {"dataflash": "DataFlash", "ulog": "ULog", "csv": "a table"}
+
+
+class Vehicle(NamedTuple):
+    """The log of one vehicle of a flight, and the id that the vehicle has here."""
+
+    path: Path
+    kind: str
+    source: Source
+    log: Onboard
+
+    def told(self) -> str:
+        """One line for the user: who it is, how well its time is known, what was made up for."""
+        clock = self.log.clock
+        if clock is None:
+            when = "no GPS time in it: its time is that since boot"
+        elif self.kind == "csv":
+            when = "its time is taken as it stands"
+        else:
+            when = (
+                f"on GPS time to {clock.uncertainty_s:.3f} s by {clock.fixes} fixes, and to what"
+                f" receivers differ in delay, up to {RECEIVER_LAG_S:g} s"
+            )
+        own = "" if self.log.sysid == self.source.sysid else self._renamed()
+        who = f"{self.path.name}: {_NAMES[self.kind]}, vehicle {self.source}{own}"
+        return "; ".join((who, when, *self.log.notes))
+
+    def _renamed(self) -> str:
+        if self.log.sysid is None:
+            return " (it names no id)"
+        return f" (it says {self.log.sysid}, which another has)"
+
+    def as_json(self) -> dict[str, Any]:
+        """The same for a program."""
+        clock = self.log.clock
+        return {
+            "log": self.path.name,
+            "kind": self.kind,
+            "uav": str(self.source),
+            "sysid_in_log": self.log.sysid,
+            "gps_fixes": None if clock is None else clock.fixes,
+            "clock_uncertainty_s": None if clock is None else clock.uncertainty_s,
+            "drift_ppm": None if clock is None else clock.drift * 1e6,
+            "notes": list(self.log.notes),
+        }
+
+
+def opened(logs: Sequence[tuple[Path, str]]) -> list[Vehicle]:
+    """The vehicles of logs, given with their kinds.
+
+    Raises ``LogError`` for one that cannot be used, or several that are not one flight.
+    """
+    read = [(path, kind, _read(path, kind)) for path, kind in logs]
+    taken = {log.sysid for _, _, log in read if log.sysid is not None}
+    given: set[int] = set()
+    found = []
+    for path, kind, log in read:
+        sysid = log.sysid
+        if sysid is None or sysid in given:
+            sysid = next((free for free in range(1, 250) if free not in taken | given), None)
+            if sysid is None:
+                raise LogError(f"{path}: there are no more system ids")
+        given.add(sysid)
+        found.append(Vehicle(path, kind, Source(sysid, log.compid), log))
+    if len(found) > 1:
+        _require_one_flight(found)
+    return found
+
+
+def events(vehicles: Sequence[Vehicle], latency_s: float) -> Iterator[Event]:
+    """The events of all of them in order of time, each sample arriving ``latency_s`` later."""
+    each = [said.frames(one.log, one.path.name, one.source, latency_s) for one in vehicles]
+    return heapq.merge(*each, key=lambda event: event.t_ns)
+
+
+def _read(path: Path, kind: str) -> Onboard:
+    try:
+        with path.open("rb") as file:  # the map goes when nothing looks at it any more
+            whole = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        log = READERS[kind](np.frombuffer(whole, dtype=np.uint8))
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror}") from None
+    except csv_table.NoTableError as error:
+        raise LogError(f"{path}: no MAVLink frame in it: it is {error}") from None
+    except px4.UnknownFlagsError:
+        raise LogError(f"{path}: a ULog of a later kind, which cannot be read") from None
+    if log.positions is None:
+        raise LogError(f"{path}: {_NAMES[kind]}, but no position in it")
+    return log
+
+
+def _require_one_flight(vehicles: Sequence[Vehicle]) -> None:
+    spans = []
+    for one in vehicles:
+        if one.log.clock is None:
+            raise LogError(f"{one.path}: no GPS time in it: it cannot be put beside other logs")
+        assert one.log.positions is not None
+        at_us = one.log.clock.unix_us(_ends(one.log.positions.boot_us))
+        spans.append((int(at_us[0]), int(at_us[1]), one.path))
+    spans.sort(key=lambda span: span[:2])
+    for before, after in pairwise(spans):
+        apart_s = (after[0] - before[1]) * 1e-6
+        if apart_s > LARGEST_LEAP_NS * 1e-9:
+            raise LogError(
+                f"{after[2]}: begins {apart_s / 3600:.1f} h after {before[2].name} ends:"
+                " they are not one flight"
+            )
+
+
+def _ends(boot_us: IntArray) -> IntArray:
+    return np.array([boot_us.min(), boot_us.max()])

@@ -1,0 +1,286 @@
+"""PX4's ULog: bytes to columns, as far as they are intact.
+
+A file is a header of 16 bytes and then messages: size, type, body (https://docs.px4.io/main/en/
+dev_log/ulog_file_format.html). Topics are described by F, named by A, and sampled by D. There is no
+checksum: what does not fit is passed over up to where three messages in a row fit again.
+"""
+
+import re
+import struct
+from array import array
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.recording.foreign.dataflash import Bytes
+from companion.values import FloatArray, IntArray
+
+MAGIC: Final = b"ULog\x01\x12\x35"
+_HEADER: Final = 16
+_MESSAGE: Final = struct.Struct("<HB")
+_FLAGS: Final = struct.Struct("<8s8s3Q")
+_TYPES: Final = {
+    "int8_t": "i1", "uint8_t": "u1", "bool": "u1", "char": "S1", "int16_t": "<i2",
+    "uint16_t": "<u2", "int32_t": "<i4", "uint32_t": "<u4", "int64_t": "<i8", "uint64_t": "<u8",
+    "float": "<f4", "double": "<f8",
+}  # fmt: skip
+_FIELD: Final = re.compile(r"(\w+)(?:\[(\d{1,5})\])? (\w+)\Z")
+_KNOWN: Final = frozenset(b"BFIMPQARDLCSO")
+_LEAST: Final = {ord("B"): 40, ord("A"): 4, ord("R"): 2, ord("D"): 2, ord("S"): 8, ord("O"): 2}
+_DATA: Final = ord("D")
+_SUBSCRIBED: Final = ord("A")
+_FORMAT: Final = ord("F")
+_PARAMETER: Final = ord("P")
+_FLAG_BITS: Final = ord("B")
+_DROPOUT: Final = ord("O")
+_LONGEST: Final = 65535
+_NESTED_MAX: Final = 8
+_IN_A_ROW: Final = 3
+_APPENDED: Final = 0x01
+_candidates = re.compile(rb"(?=[\s\S]{2}[BFIMPQARDLCSO])").finditer
+
+
+class Topic(NamedTuple):
+    """One instance of a topic: its fields, and where its samples lie in the file."""
+
+    name: str
+    instance: int
+    fields: np.dtype[np.void]
+    at: "array[int]"
+
+
+@dataclass(slots=True)
+class Walked:
+    """What a log holds.
+
+    topics      of those wanted, the ones with samples
+    parameters  as they were at the start
+    lost        bytes that belong to no message
+    refused     descriptions and samples that do not fit one another
+    dropouts    how often the logger itself lost something
+    unknown     True if the file says that it cannot be read without knowing more
+    """
+
+    topics: list[Topic] = field(default_factory=list)
+    parameters: dict[str, float] = field(default_factory=dict)
+    lost: int = 0
+    refused: int = 0
+    dropouts: int = 0
+    unknown: bool = False
+
+
+class Table:
+    """The samples of a topic, as columns. Empty where the log has none."""
+
+    def __init__(self, data: Bytes, topic: Topic | None) -> None:
+        self._records: NDArray[np.void] = np.zeros(0, dtype=[])
+        if topic is not None and len(topic.at):
+            room = data.size - topic.fields.itemsize + 1
+            everywhere = np.ndarray((room,), topic.fields, data, 0, (1,))
+            self._records = everywhere[np.frombuffer(topic.at, dtype=np.int64)]
+
+    def __len__(self) -> int:
+        return len(self._records)
+
+    def __contains__(self, column: object) -> bool:
+        return self._records.dtype.names is not None and column in self._records.dtype.names
+
+    def numbers(self, column: str, width: int = 1) -> FloatArray:
+        """A column as numbers, (N,), or (N, ``width``) of an array; NaN where there is none."""
+        shape = (len(self),) if width == 1 else (len(self), width)
+        if column not in self:
+            return np.full(shape, np.nan)
+        values = self._records[column]
+        if values.dtype.kind not in "iuf" or values.shape != shape:
+            return np.full(shape, np.nan)
+        found: FloatArray = values.astype(np.float64)
+        return found
+
+    def integers(self, column: str) -> IntArray | None:
+        """A column of integers, (N,); None where there is none such. What is no time becomes 0."""
+        if column not in self:
+            return None
+        values = self._records[column]
+        if values.dtype.kind not in "iu" or values.ndim != 1:
+            return None
+        if values.dtype == np.uint64:
+            values = np.where(values < np.uint64(1 << 62), values, np.uint64(0))
+        found: IntArray = values.astype(np.int64)
+        return found
+
+    def rows(self, chosen: IntArray | NDArray[np.bool_]) -> "Table":
+        """Some of the samples."""
+        picked = Table.__new__(Table)
+        picked._records = self._records[chosen]
+        return picked
+
+
+def table(data: Bytes, walked: Walked, *names: str) -> Table:
+    """The samples of the first of these topics that the log has, of its lowest instance."""
+    for name in names:
+        there = [topic for topic in walked.topics if topic.name == name and len(topic.at)]
+        if there:
+            return Table(data, min(there, key=lambda topic: topic.instance))
+    return Table(data, None)
+
+
+def walk(data: Bytes, wanted: Collection[str]) -> Walked:
+    """Find the samples of the topics that are wanted, and the parameters."""
+    return _Walker(data, wanted).walk()
+
+
+class _Walker:
+    """One pass over a file."""
+
+    def __init__(self, data: Bytes, wanted: Collection[str]) -> None:
+        self._data = memoryview(data.data)
+        self._wanted = wanted
+        self._found = Walked()
+        self._formats: dict[str, str] = {}
+        self._topics: dict[int, Topic | None] = {}
+        self._sizes: dict[int, tuple[int, int]] = {}
+        self._ends: list[int] = []
+
+    def walk(self) -> Walked:
+        begin = _HEADER
+        for end in (*self._parts(), len(self._data)):
+            if end > begin:
+                self._stretch(begin, end)
+                begin = end
+        self._found.topics = [topic for topic in self._topics.values() if topic is not None]
+        return self._found
+
+    def _parts(self) -> Iterator[int]:
+        """Where data were appended behind a file that was cut short (after a crash)."""
+        head = self._data[_HEADER : _HEADER + _MESSAGE.size + _FLAGS.size]
+        if len(head) < _MESSAGE.size + _FLAGS.size or head[2] != _FLAG_BITS:
+            return
+        _, needed, *offsets = _FLAGS.unpack_from(head, _MESSAGE.size)
+        self._found.unknown = needed[0] > _APPENDED or any(needed[1:])
+        if needed[0] & _APPENDED:
+            yield from sorted(at for at in offsets if _HEADER < at < len(self._data))
+
+    def _stretch(self, at: int, end: int) -> None:
+        """Take the messages of [at, end) in; what does not fit is passed over and counted."""
+        data, unpack = self._data, _MESSAGE.unpack_from
+        while at + 3 <= end:
+            size, kind = unpack(data, at)
+            stop = at + 3 + size
+            if kind == _DATA and stop <= end and size >= 2:
+                number = data[at + 3] | data[at + 4] << 8
+                sizes = self._sizes.get(number)
+                if sizes is not None and sizes[0] <= size <= sizes[1]:
+                    topic = self._topics[number]
+                    if topic is not None:
+                        topic.at.append(at + 5)
+                    at = stop
+                    continue
+            elif self._fits(at, end) and kind != _DATA:
+                self._take(kind, bytes(data[at + 3 : stop]))
+                at = stop
+                continue
+            resume = self._resume(at + 1, end)
+            self._found.lost += resume - at
+            at = resume
+        self._found.lost += end - at
+
+    def _fits(self, at: int, end: int) -> int:
+        """The end of what begins at ``at``, if it can be a message; else 0."""
+        if at + 3 > end:
+            return 0
+        size, kind = _MESSAGE.unpack_from(self._data, at)
+        stop = at + 3 + size
+        if kind not in _KNOWN or stop > end or size < _LEAST.get(kind, 1):
+            return 0
+        if kind == _DATA:
+            sizes = self._sizes.get(self._data[at + 3] | self._data[at + 4] << 8)
+            if sizes is None or not sizes[0] <= size <= sizes[1]:
+                return 0
+        return int(stop)
+
+    def _resume(self, at: int, end: int) -> int:
+        """The first place from ``at`` on where messages in a row fit; ``end`` without one."""
+        for match in _candidates(self._data, at, end):
+            start = stop = match.start()
+            for _ in range(_IN_A_ROW):
+                stop = self._fits(stop, end) if stop < end else stop
+                if not stop:
+                    break
+            else:
+                return start
+        return end
+
+    # --- messages -------------------------------------------------------------------------------
+
+    def _take(self, kind: int, body: bytes) -> None:
+        if kind == _FORMAT:
+            name, colon, fields = body.decode("latin-1").partition(":")
+            if colon and self._formats.setdefault(name, fields) != fields:
+                self._found.refused += 1
+        elif kind == _SUBSCRIBED:
+            self._subscribe(body[0], body[1] | body[2] << 8, body[3:].decode("latin-1"))
+        elif kind == _PARAMETER:
+            self._parameter(body)
+        elif kind == _DROPOUT:
+            self._found.dropouts += 1
+
+    def _subscribe(self, instance: int, number: int, name: str) -> None:
+        fields = self._formats.get(name)
+        if number in self._topics:
+            return  # the first counts: its samples have been taken by it
+        least, most = self._size(name, 0)
+        if fields is None or least == 0:
+            self._found.refused += 1
+            return
+        self._sizes[number] = least + 2, most + 2
+        layout = _layout(fields) if name in self._wanted else None
+        self._found.refused += name in self._wanted and layout is None
+        self._topics[number] = None if layout is None else Topic(name, instance, layout, array("q"))
+
+    def _size(self, name: str, depth: int) -> tuple[int, int]:
+        """Bytes of a topic at least (without the padding at its end) and at most; 0 if unknown."""
+        least = most = 0
+        for each in filter(None, self._formats.get(name, "").split(";")):
+            match = _FIELD.match(each)
+            if match is None or depth > _NESTED_MAX or most > _LONGEST:
+                return 0, 0
+            kind, count, called = match.groups()
+            one = (
+                np.dtype(_TYPES[kind]).itemsize
+                if kind in _TYPES
+                else self._size(kind, depth + 1)[1]
+            )
+            if not one:
+                return 0, 0
+            most += one * int(count or 1)
+            if not called.startswith("_padding"):
+                least = most
+        return (least, most) if most <= _LONGEST else (0, 0)
+
+    def _parameter(self, body: bytes) -> None:
+        kind, blank, name = body[1 : 1 + body[0]].decode("latin-1").partition(" ")
+        value = body[1 + body[0] :]
+        if blank and kind in ("int32_t", "float") and len(value) == 4:
+            (number,) = struct.unpack("<i" if kind == "int32_t" else "<f", value)
+            self._found.parameters.setdefault(name, float(number))
+
+
+def _layout(fields: str) -> np.dtype[np.void] | None:
+    """The fields up to the padding at the end; None for nested ones, or names that come twice."""
+    described: list[tuple[str, str, tuple[int, ...]]] = []
+    kept = 0
+    for each in filter(None, fields.split(";")):
+        match = _FIELD.match(each)
+        if match is None or match.group(1) not in _TYPES:
+            return None
+        kind, count, called = match.groups()
+        described.append((called, _TYPES[kind], (int(count),) if count else ()))
+        if not called.startswith("_padding"):
+            kept = len(described)
+    described = described[:kept]
+    if not described or len({called for called, *_ in described}) != len(described):
+        return None
+    return np.dtype(described)

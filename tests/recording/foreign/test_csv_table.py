@@ -1,0 +1,112 @@
+"""Tables with a header that says what they hold."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.recording.foreign import csv_table
+from companion.recording.foreign.csv_table import NoTableError
+from companion.recording.reader import read_log, vehicles
+from companion.values import Frame, Reason
+
+HEAD = "unix_s,lat_deg,lon_deg,alt_m"
+ROWS = "\n".join(
+    f"{1_795_000_000 + n / 10:.3f},{47 + n * 1e-5:.7f},8.5,{500 + n}" for n in range(50)
+)
+
+
+def read(text: str) -> csv_table.Onboard:
+    return csv_table.read(text.encode())
+
+
+def test_places_times_and_the_way_between_them() -> None:
+    log = read(f"# sysid = 42\n# mav_type = 2\n{HEAD}\n{ROWS}\n")
+    assert (log.sysid, log.mav_type, log.lost) == (42, 2, {})
+    at = log.positions
+    assert at is not None and log.clock is not None
+    unix_us = log.clock.unix_us(at.boot_us)
+    assert unix_us.tolist() == [1_795_000_000_000_000 + n * 100_000 for n in range(50)]
+    assert at.lat_1e7.tolist() == [470_000_000 + n * 100 for n in range(50)]
+    assert at.velocity_ned_mps == pytest.approx(np.tile((11.1195, 0, -10.0), (50, 1)), rel=1e-3)
+    assert log.notes == ("velocities that it does not give are those between its positions",)
+
+
+@pytest.mark.parametrize("divider", [",", ";", "\t"])
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
+def test_dividers_and_line_ends(divider: str, newline: str, mark: str) -> None:
+    text = mark + f"{HEAD},vn_mps,ve_mps,vd_mps,heading_deg,extra\n"
+    text += "1795000000,47,8.5,500,1.5,-2.5,0.5,90,x\n1795000001,47,8.5,500,,,,,\n"
+    log = read(text.replace(",", divider).replace("\n", newline))
+    at = log.positions
+    assert at is not None
+    assert at.velocity_ned_mps.tolist() == [[1.5, -2.5, 0.5], [0.0, 0.0, 0.0]]
+    assert at.heading_deg[0] == 90 and np.isnan(at.heading_deg[1])
+    assert "not used of it: extra" in log.notes
+
+
+def test_times_with_their_zone() -> None:
+    times = ("2026-11-22T12:00:00.5+01:00", "2026-11-22T11:00:01Z", "2026-11-22T11:00:02")
+    log = read("time,lat_deg,lon_deg,alt_m\n" + "".join(f"{time},47,8,5\n" for time in times))
+    assert log.positions is not None and log.clock is not None
+    assert log.clock.unix_us(log.positions.boot_us).tolist() == [
+        1_795_345_200_500_000,
+        1_795_345_201_000_000,
+    ]
+    assert log.lost == {Reason.MALFORMED: 1}  # the last says no zone
+
+
+def test_attitudes_and_accuracies_are_said(tmp_path: Path) -> None:
+    path = tmp_path / "flight.csv"
+    path.write_text(
+        f"{HEAD},roll_deg,pitch_deg,yaw_deg,h_acc_m,v_acc_m,vel_acc_mps,fix_type\n"
+        "1795000000,47,8.5,500,0,0,0,1.5,2.5,0.3,3\n1795000001,47,8.5,500,0,0,10,1.5,2.5,0.3,3\n"
+    )
+    (one,) = vehicles([path])
+    assert one.log.attitudes is not None and one.log.fixes is not None
+    assert one.log.attitudes.rates_radps[:, 2] == pytest.approx(np.radians(10), rel=1e-6)
+    assert one.log.fixes.accuracies.tolist() == [[1.5, 2.5, 0.3]] * 2
+    kinds = [event.msgid for event in read_log(path) if isinstance(event, Frame)]
+    assert kinds == [0, 2, 24, 30, 33] * 2
+    assert "its time is taken as it stands" in one.told()
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("lat,lon\n47.1,8.5\n", "names no unix_s or time or t_s, lat_deg, lon_deg, alt_m"),
+        ("unix_s,lat_deg,lon_deg\n1,47,8\n", "names no alt_m"),
+        (f"{HEAD},alt_m\n", "twice"),
+        (f"# sysid = 999\n{HEAD}\n", "sysid is not 1 to 255"),
+        ("# only words\n" * 200, "text, and no table"),
+        ("\n\n", "text, and no table"),
+    ],
+)
+def test_what_is_no_such_table_is_said(text: str, why: str) -> None:
+    with pytest.raises(NoTableError, match=why):
+        read(text)
+
+
+def test_lines_that_are_no_numbers_are_counted() -> None:
+    bad = [
+        "1795000001,47,8.5",
+        "1795000002,x,8.5,5",
+        ",,,",
+        "1795000003,47,8.5,nan",
+        "inf,47,8.5,5",
+    ]
+    log = read(f"{HEAD}\n{ROWS}\n" + "\n".join(bad))
+    assert log.positions is not None and len(log.positions.boot_us) == 50
+    assert sum(log.lost.values()) == len(bad)
+
+
+@given(st.text(max_size=300), st.booleans())
+def test_any_text(text: str, with_header: bool) -> None:
+    try:
+        log = read(f"{HEAD}\n{text}" if with_header else text)
+    except NoTableError:
+        return
+    assert log.positions is None or len(log.positions.boot_us) <= text.count("\n") + 300

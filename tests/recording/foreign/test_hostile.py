@@ -1,0 +1,135 @@
+"""Hostile logs: whatever is done to a file, reading it ends soon, with events or one line."""
+
+import random
+import struct
+import time
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from support import ROOT
+from ulog_support import flight
+
+from companion.recording.reader import LogError, read_log
+from companion.values import Frame, Rejection
+
+CUT = (ROOT / "tests" / "data" / "sitl_planes_cut_1.bin").read_bytes()
+TABLE = b"# sysid = 3\nunix_s,lat_deg,lon_deg,alt_m,vn_mps,ve_mps,vd_mps,roll_deg\n" + b"".join(
+    b"%d.5,47.%07d,8.5,500.25,1,2,-3,4\n" % (1_795_000_000 + n, n * 100) for n in range(300)
+)
+FILES = {"bin": CUT, "ulg": flight(seconds=20).data, "csv": TABLE}
+SLOWEST_S = 20.0
+"""Far above what any takes here, even on a busy machine: it is for what never ends."""
+
+
+def damaged(data: bytes, seed: int) -> bytes:
+    """The file with a few of the things done to it that happen to files, or are done to them."""
+    rng = random.Random(seed)
+    out = bytearray(data)
+    for _ in range(rng.randint(1, 6)):
+        at = rng.randrange(len(out)) if out else 0
+        size = rng.choice((1, 2, 8, 64, 700, 9000))
+        match rng.randrange(8):
+            case 0:
+                out[at : at + size] = rng.randbytes(size)
+            case 1:
+                del out[at : at + size]
+            case 2:
+                out[at:at] = rng.randbytes(size)
+            case 3:
+                del out[at:]
+            case 4:
+                out[at:at] = out[at // 2 : at // 2 + size * 4]
+            case 5:
+                out[at : at + 8] = rng.choice(
+                    (b"\xff" * 8, bytes(8), struct.pack("<d", float("nan")))
+                )
+            case 6:
+                out[at : at + 4] = struct.pack("<f", rng.choice((1e38, -1e38, float("inf"))))
+            case _:
+                for _ in range(size):
+                    out[rng.randrange(len(out)) if out else 0 : 0] = b""
+                    if out:
+                        out[rng.randrange(len(out))] ^= 1 << rng.randrange(8)
+    return bytes(out)
+
+
+def read(path: Path) -> tuple[int, int]:
+    """Frames and rejections, at times that never step back; (0, 0) for what is refused."""
+    frames = rejections = last_ns = 0
+    try:
+        for event in read_log(path):
+            assert event.t_ns >= last_ns
+            last_ns = event.t_ns
+            frames += isinstance(event, Frame)
+            rejections += isinstance(event, Rejection)
+    except LogError as error:
+        assert "\n" not in str(error) and str(path) in str(error)
+    return frames, rejections
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_damaged_files(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / f"x.{kind}"
+    whole = FILES[kind]
+    path.write_bytes(whole)
+    sound, _ = read(path)
+    used = 0
+    for seed in range(120):
+        path.write_bytes(damaged(whole, seed))
+        begin = time.monotonic()
+        frames, _ = read(path)
+        assert time.monotonic() - begin < SLOWEST_S, seed
+        assert frames <= 4 * sound, seed
+        used += frames > 0
+    assert used > 30  # most damage leaves something to be used
+
+
+def many_heads() -> bytes:
+    return CUT[:18_000] + b"\xa3\x95\x80" * 200_000
+
+
+def many_topics() -> bytes:
+    made = flight(seconds=1).data
+    one = b"A" + struct.pack("<BH", 0, 7) + b"vehicle_global_position"
+    return made + (struct.pack("<H", len(one) - 1) + one) * 40_000
+
+
+def deep_topics() -> bytes:
+    head = flight(seconds=1).data[:59]
+    lines = [f"t{n}:t{n + 1}[9] x;t{n + 1}[9] y;" for n in range(2000)]
+    bodies = [line.encode() for line in lines] + [b"vehicle_global_position:t0 x;"]
+    described = b"".join(struct.pack("<HB", len(body), ord("F")) + body for body in bodies)
+    asked = struct.pack("<BH", 0, 0) + b"vehicle_global_position"
+    return head + described + struct.pack("<HB", len(asked), ord("A")) + asked
+
+
+def noise_behind() -> bytes:
+    return flight(seconds=2).data + random.Random(1).randbytes(2_000_000)
+
+
+def one_line() -> bytes:
+    return TABLE + b"1," * 2_000_000
+
+
+def quotes() -> bytes:
+    return TABLE + b'"' * 1_000_000 + b"\n"
+
+
+@pytest.mark.parametrize(
+    "make", [many_heads, many_topics, deep_topics, noise_behind, one_line, quotes]
+)
+def test_absurd_files_are_bounded(make: Callable[[], bytes], tmp_path: Path) -> None:
+    data = make()
+    path = tmp_path / "absurd"
+    path.write_bytes(data)
+    tracemalloc.start()
+    begin = time.monotonic()
+    try:
+        read(path)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert time.monotonic() - begin < SLOWEST_S
+    assert peak < 60_000_000 + 8 * len(data)

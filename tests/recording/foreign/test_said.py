@@ -1,0 +1,125 @@
+"""What a vehicle wrote of itself, as frames: decoded by pymavlink, and by the product."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from companion.mavlink.wire.decode import decode
+from companion.recording.foreign import ardupilot, said
+from companion.recording.foreign.onboard import Onboard
+from companion.values import Event, Frame, Rejection, Report, Source
+
+
+@pytest.fixture
+def log(aeroplane: Path) -> Onboard:
+    return ardupilot.read(np.fromfile(aeroplane, dtype=np.uint8))
+
+
+def by_peer(events: list[Event]) -> dict[str, list[Any]]:
+    """The frames as pymavlink decodes them, by name."""
+    link = dialect.MAVLink(None)
+    found: dict[str, list[Any]] = {}
+    for event in events:
+        assert isinstance(event, Frame)
+        (message,) = link.parse_buffer(event.raw)
+        found.setdefault(message.get_type(), []).append(message)
+    return found
+
+
+def test_every_sample_is_said_once_with_its_values(log: Onboard) -> None:
+    heard = by_peer(list(said.frames(log, "x", Source(1, 1), 0.0)))
+    positions, attitudes, fixes, truth = log.positions, log.attitudes, log.fixes, log.truth
+    assert positions and attitudes and fixes and truth
+    reports = heard["GLOBAL_POSITION_INT"]
+    assert [each.time_boot_ms for each in reports] == (positions.boot_us // 1000).tolist()
+    assert [each.lat for each in reports] == positions.lat_1e7.tolist()
+    assert [each.alt for each in reports] == pytest.approx(positions.alt_m * 1e3, abs=0.5)
+    said_mps = np.array([(each.vx, each.vy, each.vz) for each in reports]) * 1e-2
+    assert said_mps == pytest.approx(positions.velocity_ned_mps, abs=0.005001)
+    assert [each.hdg for each in reports] == pytest.approx(
+        positions.heading_deg % 360 * 100, abs=0.5
+    )
+    angles = np.array([(each.roll, each.pitch, each.yaw) for each in heard["ATTITUDE"]])
+    turns = np.angle(np.exp(1j * (angles - attitudes.euler_rad)))
+    assert np.abs(turns).max() < 1e-6
+    assert [each.h_acc for each in heard["GPS_RAW_INT"]] == [300] * 100
+    assert [each.fix_type for each in heard["GPS_RAW_INT"]] == fixes.fix_type.tolist()
+    assert [each.lat_int for each in heard["SIM_STATE"]] == truth.lat_1e7.tolist()
+    assert {each.type for each in heard["HEARTBEAT"]} == {dialect.MAV_TYPE_FIXED_WING}
+    assert 19 <= len(heard["HEARTBEAT"]) == len(heard["SYSTEM_TIME"]) <= 22
+    told = heard["SYSTEM_TIME"][3]
+    assert log.clock is not None
+    expected = log.clock.offset_us + told.time_boot_ms * 1000
+    assert abs(told.time_unix_usec - expected) < 1000
+
+
+def test_frames_arrive_at_gps_time_and_in_order(log: Onboard) -> None:
+    assert log.clock is not None and log.positions is not None
+    events = list(said.frames(log, "x", Source(1, 1), 0.0))
+    late = list(said.frames(log, "x", Source(1, 1), 0.25))
+    times = [event.t_ns for event in events]
+    assert times == sorted(times)
+    assert [event.t_ns - 250_000_000 for event in late] == times
+    reports = [event for event in events if isinstance(event, Frame) and event.msgid == 33]
+    expected = log.clock.unix_us(log.positions.boot_us) * 1000
+    assert [report.t_ns for report in reports] == expected.tolist()
+    assert [event.seq for event in events[:300]] == [n & 255 for n in range(300)]
+
+
+def test_the_truth_stands_behind_a_stamp_of_its_time(log: Onboard) -> None:
+    """Studies put SIM_STATE, which has no stamp, in time by what stands around it."""
+    assert log.truth is not None
+    stamps: list[int] = []
+    last_ms = 0
+    for event in said.frames(log, "x", Source(1, 1), 0.0):
+        assert isinstance(event, Frame)
+        if event.msgid in (30, 33):
+            last_ms = int.from_bytes(event.payload[:4], "little")
+        elif event.msgid == 108:
+            stamps.append(last_ms)
+    assert stamps == (log.truth.boot_us // 1000).tolist()
+
+
+def test_values_out_of_reach_are_clipped_and_unknown_ones_said_so(log: Onboard) -> None:
+    at = log.positions
+    assert at is not None and log.fixes is not None
+    wild = replace(
+        log,
+        positions=replace(
+            at,
+            velocity_ned_mps=np.full_like(at.velocity_ned_mps, 1e9),
+            heading_deg=np.full_like(at.heading_deg, np.nan),
+            height_m=np.full_like(at.height_m, -1e9),
+        ),
+    )
+    frames = list(said.frames(wild, "x", Source(1, 1), 0.0))
+    reports = by_peer(frames)["GLOBAL_POSITION_INT"]
+    assert (reports[0].vx, reports[0].hdg, reports[0].relative_alt) == (32767, 65535, -(2**31))
+    decoded = [decode(each) for each in frames if isinstance(each, Frame) and each.msgid == 33]
+    assert isinstance(decoded[0], Report) and decoded[0].heading_deg is None
+
+
+def test_without_gps_time_the_time_is_that_since_boot(log: Onboard) -> None:
+    first = next(iter(said.frames(replace(log, clock=None), "x", Source(1, 1), 0.0)))
+    assert first.t_ns == 120_004_784_000 or 120e9 <= first.t_ns < 121e9
+
+
+def test_a_leap_is_clamped_and_said(log: Onboard) -> None:
+    assert log.positions is not None
+    later = log.positions.boot_us.copy()
+    later[100:] += 5 * 3_600_000_000
+    log = replace(
+        log,
+        positions=replace(log.positions, boot_us=later),
+        attitudes=None,
+        fixes=None,
+        truth=None,
+    )
+    events = list(said.frames(log, "x", Source(1, 1), 0.0))
+    refused = [event for event in events if isinstance(event, Rejection)]
+    assert refused and refused[0].detail.endswith("s ahead, clamped")
+    assert events[-1].t_ns - events[0].t_ns < 30e9

@@ -138,7 +138,7 @@ def replay(
 ) -> None:
     """Logs through the same pipeline as the live service.
 
-    Told by content: .tlog, raw MAVLink, our own .mcap, and what vehicles wrote of themselves:
+    Told by content: .tlog, raw MAVLink, captures, .mcap, and what vehicles wrote of themselves:
     ArduPilot's DataFlash (.bin), PX4's ULog (.ulg), a table (CSV). Several are one flight.
 
     Without --center (or settings) the array stands where the first report was made. A recording

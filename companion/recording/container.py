@@ -72,6 +72,7 @@ class Walk:
 
     def __init__(self, path: Path, topics: frozenset[str] | None = None) -> None:
         self.schemas: dict[int, Schema] = {}
+        self._described: set[int] = {0}  # 0: a channel without a schema, of other programs
         self.channels: dict[int, Channel] = {}
         self.complete = False
         """True if the file's end is there, so that it was closed in order."""
@@ -139,7 +140,7 @@ class Walk:
             if opcode == Opcode.MESSAGE:
                 channel_id, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(data, start)
                 channel = self.channels.get(channel_id)
-                if channel is None or channel.schema_id not in self.schemas:
+                if channel is None or channel.schema_id not in self._described:
                     orphaned += _HEADER.size + length
                 elif self._topics is None or channel.topic in self._topics:
                     raw = data[start + _MESSAGE.size : at]
@@ -147,6 +148,7 @@ class Walk:
             elif opcode == Opcode.SCHEMA:
                 schema = Schema.read(ReadDataStream(BytesIO(data[start:at])))
                 self.schemas[schema.id] = schema
+                self._described.add(schema.id)
             elif opcode == Opcode.CHANNEL:
                 channel = Channel.read(ReadDataStream(BytesIO(data[start:at])))
                 self.channels[channel.id] = channel

@@ -1,8 +1,9 @@
 """Opens every kind of log, by what is in the file and never by its name.
 
 Recordings of this program give back exactly the events that drove the live run, in that order;
-telemetry logs and raw MAVLink give the events that a live run would have had. What a vehicle wrote
-of itself becomes the frames that it would have sent: several such logs are one flight.
+telemetry logs, raw MAVLink, captures and MCAP of others give the events that a live run would have
+had. What a vehicle wrote of itself becomes the frames that it would have sent: several such logs
+are one flight.
 """
 
 import heapq
@@ -15,17 +16,17 @@ from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Metadata
 
 from companion.recording import codec, schemas, tlog
-from companion.recording.container import MAGIC, Damage, Walk
+from companion.recording.container import MAGIC, Damage, Message, Walk
 from companion.recording.errors import LogError
-from companion.recording.foreign import kinds, together
+from companion.recording.foreign import capture, kinds, together
 from companion.recording.foreign.together import Vehicle
 from companion.recording.writer import SETTINGS
-from companion.values import Event, Reason, Rejection, Source, Tick
+from companion.values import Event, Frame, Reason, Rejection, Source, Tick
 
 __all__ = ["LogError", "LogKind", "center_of", "flights", "log_kind", "read_flight", "read_log",
            "read_parts", "read_settings", "vehicles"]  # fmt: skip
 
-LogKind = Literal["tlog", "mavlink", "mcap", "dataflash", "ulog", "csv"]
+LogKind = Literal["tlog", "mavlink", "mcap", "foreign-mcap", "capture", "dataflash", "ulog", "csv"]
 _EVENT_TOPICS: Final = frozenset(
     (
         schemas.FRAMES_TOPIC,
@@ -57,11 +58,24 @@ def read_log(log: Path | str, latency_s: float = 0.0) -> Iterator[Event]:
         return tlog.read_raw(data, path.name)
     if kind in together.READERS:
         return together.events(together.opened([(path, kind)]), latency_s)
-    events = _recorded(path)
-    first = next(events, None)
-    if first is None:
-        raise LogError(f"{path}: an MCAP file, but no MAVLink frame in it")
-    return chain((first,), events)
+    if kind == "mcap":
+        return _begun(path, _recorded(path), "an MCAP file", object)
+    if kind == "capture":
+        return _begun(path, capture.read_capture(path), "a capture", Frame)
+    return _begun(path, capture.read_mcap(path), "an MCAP file", Frame)
+
+
+def _begun(path: Path, events: Iterator[Event], what: str, *kinds: type) -> Iterator[Event]:
+    """The events, among which there must be one of ``kinds``; what cannot be read is said now."""
+    before: list[Event] = []
+    try:
+        for event in events:
+            before.append(event)
+            if isinstance(event, kinds):
+                return chain(before, events)
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror}") from None
+    raise LogError(f"{path}: {what}, but no MAVLink frame in it")
 
 
 def read_flight(logs: Sequence[Path], latency_s: float = 0.0) -> Iterator[Event]:
@@ -136,7 +150,7 @@ def _open(path: Path) -> tuple[LogKind, bytes]:
         with path.open("rb") as file:
             head = file.read(kinds.HEAD_BYTES)
             if head.startswith(MAGIC):
-                return "mcap", b""
+                return ("mcap" if _ours(path) else "foreign-mcap"), b""
             piecewise = kinds.read_piecewise(head)
             if piecewise is not None:
                 return piecewise, b""
@@ -158,6 +172,18 @@ def _open(path: Path) -> tuple[LogKind, bytes]:
     if kind is None:
         raise LogError(f"{path}: no MAVLink frame in it")
     return kind, data
+
+
+def _ours(path: Path) -> bool:
+    """Whether this program wrote an MCAP file: one of its channels is ours, or it has none."""
+    walk = Walk(path, frozenset())
+    next(iter(walk), None)  # the end of the file, where it is there, has all channels
+    if not walk.channels:
+        walk = Walk(path, _EVENT_TOPICS)
+        if any(isinstance(content, Message) for content in walk):
+            return True
+    topics = {channel.topic for channel in walk.channels.values()}
+    return not topics or not topics.isdisjoint(_EVENT_TOPICS)
 
 
 def _recorded(path: Path) -> Iterator[Event]:

@@ -1,18 +1,17 @@
-"""Files by their first bytes: logs of one vehicle, and what is no log, with what to do about it."""
+"""Files by their first bytes: vehicles' own logs, captures, and what is no log, with what to do."""
 
 from typing import Final, Literal
 
-_PIECEWISE: Final[tuple[tuple[bytes, Literal["dataflash", "ulog"]], ...]] = (
+from companion.recording.foreign.packets import PCAP, PCAPNG
+
+Piecewise = Literal["dataflash", "ulog", "capture"]
+_PIECEWISE: Final[tuple[tuple[bytes, Piecewise], ...]] = (
     (b"\xa3\x95\x80", "dataflash"),
     (b"ULog\x01\x12\x35", "ulog"),
+    *((magic, "capture") for magic in (*PCAP, PCAPNG)),
 )
 _KINDS: Final[tuple[tuple[bytes, str], ...]] = (
     (b"FMT, 128,", "a DataFlash log as text: give the .bin that it was made of"),
-    (b"\xd4\xc3\xb2\xa1", "a pcap capture: take the MAVLink out of its packets first"),
-    (b"\xa1\xb2\xc3\xd4", "a pcap capture: take the MAVLink out of its packets first"),
-    (b"\x4d\x3c\xb2\xa1", "a pcap capture: take the MAVLink out of its packets first"),
-    (b"\xa1\xb2\x3c\x4d", "a pcap capture: take the MAVLink out of its packets first"),
-    (b"\x0a\x0d\x0d\x0a", "a pcapng capture: take the MAVLink out of its packets first"),
     (b"\x1f\x8b", "compressed with gzip: gunzip it first"),
     (b"\x28\xb5\x2f\xfd", "compressed with zstd: unzstd it first"),
     (b"\xfd7zXZ\x00", "compressed with xz: unxz it first"),
@@ -27,8 +26,8 @@ _KINDS: Final[tuple[tuple[bytes, str], ...]] = (
 HEAD_BYTES: Final = max(len(magic) for magic, _ in _KINDS)
 
 
-def read_piecewise(head: bytes) -> Literal["dataflash", "ulog"] | None:
-    """The kind of a vehicle's own log that begins with these bytes; None if it is none."""
+def read_piecewise(head: bytes) -> Piecewise | None:
+    """The kind of a vehicle's own log, or a capture, that begins so; None if it is neither."""
     return next((kind for magic, kind in _PIECEWISE if head.startswith(magic)), None)
 
 

@@ -106,7 +106,8 @@ def _read(path: Path, kind: str) -> Onboard:
     try:
         with path.open("rb") as file:  # the map goes when nothing looks at it any more
             whole = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        log = READERS[kind](np.frombuffer(whole, dtype=np.uint8))
+        with np.errstate(all="ignore"):  # damaged numbers are NaN, which is looked for
+            log = READERS[kind](np.frombuffer(whole, dtype=np.uint8))
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from None
     except csv_table.NoTableError as error:

@@ -1,0 +1,348 @@
+"""MAVLink in packets: real ones off the loopback, made ones of every kind, and hostile ones."""
+
+import contextlib
+import random
+import socket
+import struct
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.writer import CompressionType, Writer
+from support import HANG_S
+
+from companion.mavlink.wire.encode import heartbeat, pack
+from companion.recording.foreign.capture import read_capture
+from companion.recording.foreign.packets import PCAP, Packet, packets, segment
+from companion.recording.reader import LogError, log_kind, read_flight, read_log
+from companion.values import Event, Frame, Reason, Rejection, Source
+
+FRAMES = [pack(heartbeat(Source(1 + n % 3, 1)), n & 255) for n in range(60)]
+START_NS = 1_795_000_000_000_000_000
+STEP_NS = 20_000_000
+
+
+def raws(events: list[Event] | Iterator[Event]) -> list[bytes]:
+    return [event.raw for event in events if isinstance(event, Frame)]
+
+
+# --- packets as they are described -------------------------------------------------------------
+
+
+def udp(payload: bytes, ports: tuple[int, int] = (14555, 14550)) -> bytes:
+    return struct.pack(">4H", *ports, 8 + len(payload), 0) + payload
+
+
+def tcp(payload: bytes, seq: int, flags: int = 0x10) -> bytes:
+    return struct.pack(">2H2I2B3H", 5760, 50_000, seq, 0, 5 << 4, flags, 1000, 0, 0) + payload
+
+
+def v4(body: bytes, kind: int = 17, fragment: int = 0) -> bytes:
+    head = struct.pack(">2B3H2BH4s4s", 0x45, 0, 20 + len(body), 7, fragment, 64, kind, 0,
+                       bytes((10, 0, 0, 2)), bytes((10, 0, 0, 1)))  # fmt: skip
+    return head + body
+
+
+def v6(body: bytes, kind: int = 17) -> bytes:
+    extension = struct.pack(">2B6x", kind, 0)  # hop-by-hop options
+    head = struct.pack(">IHBB", 6 << 28, len(extension) + len(body), 0, 64)
+    return head + bytes(15) + b"\x01" + bytes(15) + b"\x01" + extension + body
+
+
+LINKS = {
+    1: lambda ip: bytes(12) + (b"\x08\x00" if ip[0] >> 4 == 4 else b"\x86\xdd") + ip,
+    0: lambda ip: struct.pack("<I", 2) + ip,
+    101: lambda ip: ip,
+    113: lambda ip: bytes(14) + (b"\x08\x00" if ip[0] >> 4 == 4 else b"\x86\xdd") + ip,
+    276: lambda ip: (b"\x08\x00" if ip[0] >> 4 == 4 else b"\x86\xdd") + bytes(18) + ip,
+}
+
+
+def pcap(
+    rows: list[tuple[int, bytes]], link_type: int = 1, magic: bytes = b"\xd4\xc3\xb2\xa1"
+) -> bytes:
+    order, unit_ns = PCAP[magic]
+    out = magic + struct.pack(f"{order}2HiIII", 2, 4, 0, 0, 65535, link_type)
+    for t_ns, data in rows:
+        seconds, rest = divmod(t_ns, 1_000_000_000)
+        out += struct.pack(f"{order}4I", seconds, rest // unit_ns, len(data), len(data)) + data
+    return out
+
+
+def block(kind: int, body: bytes, order: str = "<") -> bytes:
+    body += bytes(-len(body) % 4)
+    size = struct.pack(f"{order}I", 12 + len(body))
+    return struct.pack(f"{order}I", kind) + size + body + size
+
+
+def pcapng(rows: list[tuple[int, bytes]], order: str = "<", resolution: int = 9) -> bytes:
+    magic = struct.pack(f"{order}I", 0x1A2B3C4D)
+    out = block(0x0A0D0D0A, magic + struct.pack(f"{order}2Hq", 1, 0, -1), order)
+    option = struct.pack(f"{order}2HB3x2H", 9, 1, resolution, 0, 0)
+    out += block(1, struct.pack(f"{order}2HI", 1, 0, 65535) + option, order)
+    for t_ns, data in rows:
+        stamp = t_ns // 10 ** (9 - resolution)
+        head = struct.pack(f"{order}5I", 0, stamp >> 32, stamp & 0xFFFFFFFF, len(data), len(data))
+        out += block(5, b"x" * 12, order)  # statistics: passed over
+        out += block(6, head + data, order)
+    return out
+
+
+def rows(link_type: int = 1, version: int = 4) -> list[tuple[int, bytes]]:
+    wrap = v4 if version == 4 else v6
+    return [
+        (START_NS + n * STEP_NS, LINKS[link_type](wrap(udp(frame))))
+        for n, frame in enumerate(FRAMES)
+    ]
+
+
+def events_of(data: bytes, tmp_path: Path) -> list[Event]:
+    path = tmp_path / "net"
+    path.write_bytes(data)
+    assert log_kind(path) == "capture"
+    return list(read_log(path))
+
+
+@pytest.mark.parametrize("link_type", LINKS)
+@pytest.mark.parametrize("version", [4, 6])
+def test_every_link_and_address(link_type: int, version: int, tmp_path: Path) -> None:
+    found = events_of(pcap(rows(link_type, version), link_type), tmp_path)
+    assert raws(found) == FRAMES
+    assert [event.t_ns - START_NS for event in found] == [n * STEP_NS for n in range(60)]
+    (link,) = {event.link for event in found if isinstance(event, Frame)}
+    assert link.startswith("udp:10.0.0.2:14555>" if version == 4 else "udp:[0000:")
+
+
+@pytest.mark.parametrize("magic", PCAP)
+def test_both_orders_and_both_units(magic: bytes, tmp_path: Path) -> None:
+    assert raws(events_of(pcap(rows(), magic=magic), tmp_path)) == FRAMES
+
+
+@pytest.mark.parametrize("order", "<>")
+@pytest.mark.parametrize("resolution", [6, 9])
+def test_pcapng(order: str, resolution: int, tmp_path: Path) -> None:
+    found = events_of(pcapng(rows(), order, resolution), tmp_path)
+    assert raws(found) == FRAMES
+    assert found[-1].t_ns == START_NS + 59 * STEP_NS
+
+
+def test_a_vlan_and_a_padded_packet(tmp_path: Path) -> None:
+    tagged = [
+        (t_ns, data[:12] + b"\x81\x00\x00\x05" + data[12:] + bytes(9)) for t_ns, data in rows()
+    ]
+    found = events_of(pcap(tagged), tmp_path)
+    assert raws(found) == FRAMES and not [e for e in found if isinstance(e, Rejection)]
+
+
+def test_each_way_has_a_splitter_of_its_own(tmp_path: Path) -> None:
+    """Frames in halves, two ways in turn: no half meets the other way's."""
+    halves = []
+    for n, frame in enumerate(FRAMES):
+        for part in (frame[:9], frame[9:]):
+            ip = v4(udp(part, (14555 + n % 2, 14550)))
+            halves.append((n % 2, START_NS, LINKS[1](ip)))
+    one, other = ([row[1:] for row in halves if row[0] == way] for way in (0, 1))
+    mixed = [row for pair in zip(one, other, strict=True) for row in pair]
+    found = events_of(pcap(mixed), tmp_path)
+    assert sorted(raws(found)) == sorted(FRAMES)
+
+
+@given(st.integers(0, 2**32), st.integers(0, 2**32 - 1))
+def test_segments_of_tcp_in_any_order_and_more_than_once(seed: int, begins: int) -> None:
+    rng = random.Random(seed)
+    stream = b"".join(FRAMES)
+    cuts = sorted({0, len(stream), *(rng.randrange(len(stream)) for _ in range(40))})
+    parts = [(cut, stream[cut:end]) for cut, end in pairwise(cuts)]
+    sent = parts + rng.sample(parts, 5)
+    order = sorted(range(len(sent)), key=lambda n: n + rng.uniform(0, 8))
+    segments = [tcp(b"", begins - 1 & 0xFFFFFFFF, 0x02)]
+    segments += [tcp(sent[n][1], begins + sent[n][0] & 0xFFFFFFFF) for n in order]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        found = events_of(pcap([(START_NS, LINKS[1](v4(each, 6))) for each in segments]), folder)
+    assert raws(found) == FRAMES
+    assert not [event for event in found if isinstance(event, Rejection)]
+
+
+def test_a_segment_that_never_came_costs_its_frames(tmp_path: Path) -> None:
+    stream = b"".join(FRAMES * 20)
+    parts = [(at, stream[at : at + 100]) for at in range(0, len(stream), 100)]
+    lost = parts.pop(20)
+    packed = [tcp(b"", 999, 0x02), *(tcp(part, 1000 + at) for at, part in parts)]
+    found = events_of(pcap([(START_NS, LINKS[1](v4(each, 6))) for each in packed]), tmp_path)
+    assert lost and len(FRAMES) * 20 - 12 <= len(raws(found)) < len(FRAMES) * 20
+
+
+def test_other_traffic_says_nothing(tmp_path: Path) -> None:
+    rng = random.Random(5)
+    others = [(START_NS, LINKS[1](v4(udp(rng.randbytes(300), (53, 4000))))) for _ in range(50)]
+    fragments = [(START_NS, LINKS[1](v4(udp(FRAMES[0]), fragment=0x2000)))] * 5
+    icmp = [(START_NS, LINKS[1](v4(b"\x08" + bytes(30), kind=1)))] * 5
+    found = events_of(pcap([*others, *fragments, *icmp, *rows()]), tmp_path)
+    assert raws(found) == FRAMES and len(found) == len(FRAMES)
+    path = tmp_path / "quiet"
+    path.write_bytes(pcap(others))
+    with pytest.raises(LogError, match="a capture, but no MAVLink frame in it"):
+        read_log(path)
+
+
+def test_a_capture_that_was_cut_gives_what_is_there(tmp_path: Path) -> None:
+    for data in (pcap(rows()), pcapng(rows())):
+        found = events_of(data[: len(data) * 2 // 3], tmp_path)
+        whole = raws(found)
+        assert whole == FRAMES[: len(whole)] and 38 <= len(whole) <= 41
+
+
+def test_an_absurd_length_ends_it_and_is_counted(tmp_path: Path) -> None:
+    data = pcap(rows()) + struct.pack("<4I", 0, 0, 0xFFFFFFF0, 0) + bytes(5000)
+    found = events_of(data, tmp_path)
+    assert raws(found) == FRAMES
+    refused = found[-1]
+    assert isinstance(refused, Rejection)
+    assert (refused.reason, refused.count) == (Reason.GARBAGE, 5016)
+
+
+@given(st.binary(max_size=200), st.integers(0, 300))
+def test_any_packet(data: bytes, link_type: int) -> None:
+    for kind in (link_type, *LINKS):
+        found = segment(Packet(0, kind, data))
+        assert found is None or len(found.payload) <= len(data)
+
+
+@pytest.mark.parametrize("whole", [pcap(rows()), pcapng(rows()), pcap(rows(101, 6), 101)])
+def test_damaged_captures(whole: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "net"
+    for seed in range(150):
+        rng = random.Random(seed)
+        data = bytearray(whole)
+        for _ in range(rng.randint(1, 8)):
+            at = rng.randrange(24, len(data))
+            data[at : at + rng.choice((0, 1, 4))] = rng.randbytes(rng.choice((0, 1, 4, 40)))
+        path.write_bytes(data)
+        found = list(read_capture(path))
+        times = [event.t_ns for event in found]
+        assert times == sorted(times)
+        assert set(raws(found)) <= set(FRAMES)
+
+
+def test_more_ways_than_are_followed(tmp_path: Path) -> None:
+    many = [(START_NS + n, LINKS[1](v4(udp(FRAMES[n % 60], (n + 1, 14550))))) for n in range(3000)]
+    assert len(raws(events_of(pcap(many), tmp_path))) == 3000
+
+
+# --- real packets ------------------------------------------------------------------------------
+
+
+def sent_over_loopback() -> None:
+    """Half of the frames over UDP, half over TCP, in pieces that are no frames."""
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as here,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as there,
+    ):
+        there.bind(("127.0.0.1", 0))
+        for frame in FRAMES[:30]:
+            here.sendto(frame, there.getsockname())
+    with (
+        socket.create_server(("127.0.0.1", 0)) as server,
+        socket.create_connection(server.getsockname(), timeout=HANG_S) as one,
+    ):
+        other, _ = server.accept()
+        other.settimeout(HANG_S)
+        with other:
+            stream = b"".join(FRAMES[30:])
+            for at in range(0, len(stream), 50):
+                one.sendall(stream[at : at + 50])
+            one.shutdown(socket.SHUT_WR)
+            while other.recv(4096):
+                pass
+
+
+def test_packets_that_the_system_captured(tmp_path: Path) -> None:
+    try:
+        tap = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(3))
+    except (PermissionError, AttributeError):
+        pytest.skip("packets cannot be captured here: that takes rights")
+    with tap:
+        tap.bind(("lo", 0))
+        tap.settimeout(1.0)
+        sender = threading.Thread(target=sent_over_loopback)
+        sender.start()
+        seen: list[tuple[int, bytes]] = []
+        sent_until_s = time.monotonic() + 3.0  # others may use the loopback all the time
+        with contextlib.suppress(TimeoutError):
+            while sender.is_alive() or time.monotonic() < sent_until_s:
+                data, (_, _, direction, *_) = tap.recvfrom(65536)
+                if direction != socket.PACKET_OUTGOING:  # each is seen going and coming
+                    seen.append((START_NS + len(seen) * 1000, data))
+        sender.join(HANG_S)
+    found = events_of(pcap(seen), tmp_path)
+    assert set(raws(found)) >= set(FRAMES)
+
+
+# --- MCAP of others ----------------------------------------------------------------------------
+
+
+def others_mcap(
+    path: Path, encoding: str, topic: str, *, end: bool = True, chunks: bool = True
+) -> None:
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.ZSTD, use_chunking=chunks)
+        writer.start("", "another")
+        channel = writer.register_channel(topic, encoding, 0)
+        other = writer.register_channel("/camera", "jpeg", 0)
+        for n, frame in enumerate(FRAMES):
+            t_ns = START_NS + n * STEP_NS
+            wrapped = frame if encoding == "mavlink" else b"\x0a" + bytes([len(frame)]) + frame
+            writer.add_message(channel, t_ns, wrapped, t_ns)
+            writer.add_message(other, t_ns, FRAMES[0], t_ns)
+        if end:
+            writer.finish()
+
+
+@pytest.mark.parametrize(
+    ("encoding", "topic"), [("mavlink", "/uav/raw"), ("protobuf", "/MAVLink/in")]
+)
+@pytest.mark.parametrize("chunks", [True, False])
+def test_an_mcap_of_another_program(
+    encoding: str, topic: str, chunks: bool, tmp_path: Path
+) -> None:
+    path = tmp_path / "x.mcap"
+    others_mcap(path, encoding, topic, chunks=chunks)
+    assert log_kind(path) == "foreign-mcap"
+    found = list(read_log(path))
+    assert raws(found) == FRAMES
+    assert {event.link for event in found if isinstance(event, Frame)} == {topic}
+    assert found[-1].t_ns == START_NS + 59 * STEP_NS
+
+
+def test_an_mcap_of_another_program_that_was_cut(tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    others_mcap(path, "mavlink", "/uav/raw", chunks=False)
+    path.write_bytes(path.read_bytes()[:4000])
+    found = list(read_log(path))
+    assert 20 < len(raws(found)) < 60
+    assert isinstance(found[-1], Rejection) and found[-1].reason is Reason.GARBAGE
+
+
+def test_an_mcap_without_mavlink(tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    others_mcap(path, "cdr", "/imu")
+    with pytest.raises(LogError, match="an MCAP file, but no MAVLink frame in it"):
+        read_log(path)
+
+
+def test_a_capture_and_a_log_of_a_vehicle_are_one_flight(aeroplane: Path, tmp_path: Path) -> None:
+    path = tmp_path / "net.pcap"
+    first_ns = next(iter(read_log(aeroplane))).t_ns
+    path.write_bytes(pcap([(t - START_NS + first_ns, data) for t, data in rows()]))
+    found = list(read_flight([path, aeroplane]))
+    assert [event.t_ns for event in found] == sorted(event.t_ns for event in found)
+    assert len(found) == len(FRAMES) + sum(1 for _ in read_log(aeroplane))
+    with path.open("rb") as file:
+        assert len(list(packets(file))) == 60

@@ -175,7 +175,10 @@ def test_the_image_installs_and_runs_from_what_it_is_given(tmp_path: Path) -> No
         "settings = Settings().override(center={'source': '5:1'},\n"
         "    links={'urls': ['udpin:127.0.0.1:0']}, server={'listen': '127.0.0.1:0'},\n"
         f"    recording={{'directory': {str(record)!r}}})\n"
-        "start.run(settings, seconds=0.5)\n"
+        "from companion.cli.voice import Lines\n"
+        "start.run(settings, Lines(), seconds=0.5)\n"
+        "from importlib import resources\n"
+        "assert resources.files('companion.server').joinpath('vocabulary.toml').is_file()\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", code],

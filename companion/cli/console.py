@@ -1,5 +1,6 @@
 """Shared by the commands: user mistakes as one line on stderr, and progress on a terminal."""
 
+import shutil
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -50,6 +51,9 @@ def tell_vehicles(logs: Sequence[Path]) -> None:
         click.echo(one.told(), err=True)
 
 
+JSON_LINES = click.option(
+    "--json", "as_json", is_flag=True, help="One JSON object a second on stdout: how it goes."
+)
 JSON = click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
 
 
@@ -118,7 +122,8 @@ class Progress:
     def show(self, text: str) -> None:
         """Replace the line."""
         if self._on:
-            click.echo(f"\r\033[K{text}", nl=False, err=True)
+            width = shutil.get_terminal_size().columns - 1  # what wraps could not be overwritten
+            click.echo(f"\r\033[K{text[:width]}", nl=False, err=True)
 
     def clear(self) -> None:
         """Remove the line."""

@@ -20,6 +20,7 @@ from companion.cli.console import (
     CONFIG,
     INSECURE,
     JSON,
+    JSON_LINES,
     LATENCY,
     LINKS,
     LISTEN,
@@ -34,6 +35,7 @@ from companion.cli.weights import weights
 from companion.values import Reason, UserError, reports_itself
 
 if TYPE_CHECKING:
+    from companion.node.start import Voice
     from companion.recording.writer import Writer
 
 
@@ -60,6 +62,7 @@ def main() -> None:
 )
 @INSECURE
 @click.option("--silent", is_flag=True, help="Send no MAVLink at all, whatever the settings say.")
+@JSON_LINES
 def run(
     config: Path | None,
     links: tuple[str, ...],
@@ -69,6 +72,7 @@ def run(
     foxglove: int | None,
     insecure: bool,
     silent: bool,
+    as_json: bool,
 ) -> None:
     """The live service. COMPANION_TOKEN in the environment sets a bearer token for HTTP.
 
@@ -86,14 +90,22 @@ def run(
         server={"listen": listen, "foxglove": foxglove},
         recording={"directory": record},
     )
-    start.run(settings, token=os.environ.get("COMPANION_TOKEN"), insecure=insecure)
+    voice = _voice(as_json)
+    start.run(settings, voice, token=os.environ.get("COMPANION_TOKEN"), insecure=insecure)
+
+
+def _voice(as_json: bool) -> "Voice":
+    from companion.cli.voice import JsonLines, Lines
+
+    return JsonLines() if as_json else Lines()
 
 
 @main.command()
 @click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after so long.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True)
 @click.option("--open", "open_page", is_flag=True, help="Open the page in a browser.")
-def demo(seconds: float | None, port: int, open_page: bool) -> None:
+@JSON_LINES
+def demo(seconds: float | None, port: int, open_page: bool, as_json: bool) -> None:
     """Everything on this machine: four UAVs, the service, the page; recorded to recordings/.
 
     Example: companion demo --seconds 60
@@ -102,7 +114,8 @@ def demo(seconds: float | None, port: int, open_page: bool) -> None:
     from companion.node import start
 
     settings = scenario.settings("recordings").override(server={"listen": f"127.0.0.1:{port}"})
-    start.run(settings, traffic=scenario.traffic, seconds=seconds, open_page=open_page)
+    voice, traffic = _voice(as_json), scenario.traffic
+    start.run(settings, voice, traffic=traffic, seconds=seconds, open_page=open_page)
 
 
 @main.command()

@@ -6,9 +6,7 @@ import socket
 import webbrowser
 from collections.abc import Callable, Coroutine
 from functools import partial
-from typing import Any
-
-import click
+from typing import Any, Final, Protocol
 
 from companion.node import systemd
 from companion.node.service import Service, require_center
@@ -17,9 +15,26 @@ from companion.server.access import bind
 from companion.settings.model import Settings
 from companion.values import UserError
 
+TOLD_EVERY_S: Final = 1.0
+"""Time between two words on how it goes."""
+
+
+class Voice(Protocol):
+    """How a run speaks to whoever started it."""
+
+    def say(self, text: str) -> None:
+        """Say a line of something that happened."""
+
+    def serves(self, text: str) -> None:
+        """Say where it serves, or at the end what it recorded."""
+
+    def show(self, service: Service) -> None:
+        """Show how it goes."""
+
 
 def run(
     settings: Settings,
+    voice: Voice,
     *,
     token: str | None = None,
     insecure: bool = False,
@@ -30,6 +45,7 @@ def run(
     """Serve until SIGINT, SIGTERM or ``seconds`` have passed; then finish the recording.
 
         settings   those of the service
+        voice      how it speaks
         token      bearer token that HTTP asks for; None: none
         insecure   serve beyond this machine without a token
         traffic    coroutine run beside, with the address of the first link
@@ -45,16 +61,21 @@ def run(
     manager = systemd.manager(os.environ)
     http = bind(settings.server.listen, token=token, insecure=insecure)
     with http:
-        service = Service(settings, _say)
-        run_until_told(partial(_serve, service, http, token, traffic, manager, open_page), seconds)
+        service = Service(settings, voice.say)
+        serve = partial(_serve, service, voice, http, token, traffic, manager, open_page)
+        run_until_told(serve, seconds)
 
 
-def _say(text: str) -> None:
-    click.echo(text, err=True)
+async def _keep_shown(service: Service, voice: Voice) -> None:
+    """Show how it goes, again and again."""
+    while True:
+        await asyncio.sleep(TOLD_EVERY_S)
+        voice.show(service)
 
 
 async def _serve(
     service: Service,
+    voice: Voice,
     http: socket.socket,
     token: str | None,
     traffic: Callable[[str], Coroutine[Any, Any, None]] | None,
@@ -62,11 +83,12 @@ async def _serve(
     open_page: bool,
     until: asyncio.Event,
 ) -> None:
-    others = [traffic(service.links()[0].url)] if traffic else []
+    others = [_keep_shown(service, voice)]
+    others += [traffic(service.links()[0].url)] if traffic else []
     if manager:
-        others.append(systemd.keep_informed(manager, service, _say, until))
+        others.append(systemd.keep_informed(manager, service, voice.say, until))
     page = address(http)
-    click.echo(
+    voice.serves(
         f"companion serves {page} and listens on {', '.join(link.url for link in service.links())}"
     )
     if open_page:
@@ -74,4 +96,4 @@ async def _serve(
     await service.run(http, token, until, *others)
     recording = service.recording()
     if recording.file:
-        click.echo(f"recording {recording.file}: {recording.messages} messages")
+        voice.serves(f"recording {recording.file}: {recording.messages} messages")

@@ -1,0 +1,56 @@
+"""How a run speaks: a line that is alive on a terminal, plain lines elsewhere, JSON on request."""
+
+import json
+import os
+import pty
+import re
+import subprocess
+from pathlib import Path
+from typing import Any
+
+from support import BIN, HANG_S, line_of, started
+
+DEMO = [BIN / "companion", "demo", "--port", "0"]
+
+
+def test_json_is_an_object_a_second_with_the_events_since_the_last(tmp_path: Path) -> None:
+    pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
+    found: list[dict[str, Any]] = []
+    with started([*DEMO, "--json"], cwd=tmp_path, **pipes) as process:
+        while not (found and len(found[-1]["uavs"]) == 4 and len(found) > 1):
+            found.append(json.loads(line_of(process, process.stdout)))
+        process.terminate()
+        process.communicate(timeout=HANG_S)
+    assert re.fullmatch(r"\d of \d links good|no UAV to aim at", found[-1]["headline"])
+    assert {each["id"] for each in found[-1]["uavs"]} == {"1:1", "2:1", "3:1", "4:1"}
+    assert found[-1]["links"][0]["state"] == "up"
+    assert found[-1]["recording"]["state"] == "recording"
+    said = [event["text"] for each in found for event in each["events"]]
+    assert any("local frame begins" in text for text in said)
+    assert len(said) == len({(e["at"], e["text"]) for each in found for e in each["events"]})
+
+
+def test_into_a_pipe_there_are_plain_lines(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [*DEMO, "--seconds", "3"],
+        cwd=tmp_path, capture_output=True, text=True, timeout=HANG_S, check=True,
+    )  # fmt: skip
+    first, last = done.stdout.splitlines()
+    assert first.startswith("companion serves http://127.0.0.1:")
+    assert last.startswith("recording ")
+    assert "\r" not in done.stderr
+    assert "links up" not in done.stderr
+
+
+def test_on_a_terminal_the_last_line_says_how_it_goes(tmp_path: Path) -> None:
+    ours, theirs = pty.openpty()
+    with started([*DEMO], cwd=tmp_path, stdout=theirs, stderr=theirs) as process:
+        os.close(theirs)
+        shown = b""
+        while not re.search(rb"\r\x1b\[K1 of 1 links up, \d+ frames/s", shown):
+            shown += os.read(ours, 4096)
+        process.terminate()
+        process.wait(timeout=HANG_S)
+        os.close(ours)
+    lines = shown.decode().split("\r")
+    assert max(len(line.removeprefix("\x1b[K")) for line in lines if "links up" in line) < 80

@@ -207,11 +207,16 @@ export function startPolling(context, onAnswer) {
 
 /** Whether the service offers its recordings: asked once, for asking in vain is an error. */
 async function findRecordings(known) {
+  known.hasRecordings = "/v1/recordings" in ((await askOnce("/openapi.json"))?.paths ?? {});
+}
+
+/** What need not be known: the answer, or null where there is none. */
+export async function askOnce(path) {
   try {
-    const api = await (await authorised("/openapi.json")).json();
-    known.hasRecordings = "/v1/recordings" in api.paths;
+    const response = await authorised(path);
+    return response.ok ? await response.json() : null;
   } catch {
-    // without the document nothing is known of recordings, and none are shown
+    return null; // who asks does without
   }
 }
 

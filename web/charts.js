@@ -50,6 +50,7 @@ function columns(moments, ids, of, now) {
 export class Charts {
   constructor(onPick) {
     Object.assign(this, { onPick, plots: [], ids: null, selected: null, drawnAt: 0, pastAt: null });
+    this.past = []; // moments of before this page was opened
     [this.spanS] = SPANS_S;
     for (const { id } of CHARTS) {
       new ResizeObserver(() => this.fit()).observe($(`chart-${id}`));
@@ -61,6 +62,19 @@ export class Charts {
     this.colour = readColours([...HUES, "grid", "muted", "mark"]);
     this.font = `11px ${fontOf()}`;
     this.ids = null; // made anew with the new colours
+  }
+
+  /** Take in what the service kept of the time before; `now`: when its answer came. */
+  fill(answer, now) {
+    const uavs = Object.entries(answer.uavs);
+    this.past = answer.at.map((stamp, i) => ({
+      at: now - (Date.parse(answer.valid_at) - Date.parse(stamp)),
+      byId: new Map(uavs.map(([id, of]) => [id,
+        { innovation_m: of.innovation_m[i], latency_s: of.latency_s[i] }])),
+      beams: uavs.map(([uav, of]) => ({ uav, pointing_bound_deg: of.pointing_bound_deg[i],
+        guaranteed_gain_db: of.guaranteed_gain_db[i] })),
+    }));
+    this.drawnAt = 0;
   }
 
   fit() {
@@ -78,9 +92,12 @@ export class Charts {
     if (!changed && !due) return;
     Object.assign(this, { selected, pastAt, drawnAt: now, now });
     if (changed) this.build(ids, uavs.length);
-    const oldestS = (now - (history.moments[0]?.at ?? now)) / 1000;
+    const begins = history.moments[0]?.at ?? Infinity;
+    const before = this.past.filter(({ at }) => at < begins);
+    const oldestS = (now - Math.min(now, before[0]?.at ?? begins)) / 1000;
     this.spanS = SPANS_S.find((spanS) => spanS >= oldestS) ?? SPANS_S.at(-1);
-    const moments = history.between(now - this.spanS * 1000, now);
+    const moments = [...before, ...history.between(now - this.spanS * 1000, now)]
+      .filter(({ at }) => at >= now - this.spanS * 1000);
     CHARTS.forEach(({ of }, i) => this.plots[i].plot.setData(columns(moments, ids, of, now)));
   }
 

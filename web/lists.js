@@ -1,6 +1,6 @@
 // Links, events and recordings.
 
-import { $, make, setChildren } from "./dom.js";
+import { $, make, setChildren, setText } from "./dom.js";
 import * as format from "./format.js";
 import { authorised, hasToken } from "./token.js";
 
@@ -79,7 +79,8 @@ async function download(href, name) {
 /** Nothing at all where the service does not offer them. */
 export function showRecordings(answer) {
   const recordings = answer?.recordings ?? null;
-  $("recordings-panel").hidden = recordings === null;
+  $("recordings-panel").hidden = !recordings?.length;
   if (recordings === null) return;
+  setText($("recordings-count"), String(recordings.length));
   setChildren($("recordings"), recordings, () => recordings.map(recordingItem));
 }

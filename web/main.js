@@ -1,13 +1,13 @@
 // Wires the page: what is polled goes into the history, and from there, or from minutes ago, to
 // the plan view, the table, the pictures and the lists.
 
-import { connection, startPolling } from "./api.js";
+import { askOnce, connection, startPolling } from "./api.js";
 import { Charts } from "./charts.js";
 import { Alarm } from "./alarm.js";
 import { $, setText } from "./dom.js";
 import { Focus } from "./focus.js";
 import * as format from "./format.js";
-import { headlineOf, rankOf, showHeadline, showTroubles } from "./health.js";
+import { headlineOf, showHeadline, showTroubles } from "./health.js";
 import { History } from "./history.js";
 import { setUpKeys } from "./keys.js";
 import { LastKnown, carrierOf, placedBy } from "./last_known.js";
@@ -15,6 +15,7 @@ import { showEvents, showLinks, showRecordings } from "./lists.js";
 import {
   showBeams, showConnection, showFault, showReadiness, showStatus, Rejections,
 } from "./panels.js";
+import { worstFirst } from "./order.js";
 import { PlanView } from "./plan.js";
 import { UavTable } from "./table.js";
 import { setUpTheme } from "./theme.js";
@@ -28,12 +29,13 @@ const KEPT = ["beams", "pattern", "weights", "links", "events", "status"];
 
 let selected = null;
 let faulted = false;
+let isFilled = false; // whether the charts have what was before
 let isNew = false; // something has come since the pictures were last drawn
 
 const history = new History();
 const last = new LastKnown();
 const plan = new PlanView($("plan"), history, choose);
-const table = new UavTable($("uavs"), choose);
+const table = new UavTable($("uavs"), choose, refresh);
 const focus = new Focus();
 const rejections = new Rejections();
 const timebar = new TimeBar(history, refresh);
@@ -42,11 +44,6 @@ const charts = new Charts((at) => timebar.showAt(at));
 const feeds = startPolling(() => ({ beamed: beamedUav(feeds.beams.data) }), take);
 
 // --- what is shown -----------------------------------------------------------------------------
-
-/** The worst link first. */
-function inOrder(uavs) {
-  return [...uavs].sort((a, b) => rankOf(a) - rankOf(b) || COLLATOR.compare(a.id, b.id));
-}
 
 /** The UAV whose beam is looked at closely: the chosen one, or else the first that has a beam. */
 function beamedUav(answer) {
@@ -63,7 +60,7 @@ function presentMoment(now) {
     ...answers,
     at: feeds.uavs.answeredAt ?? now,
     stamp: feeds.uavs.data?.valid_at ?? null,
-    uavs: inOrder(feeds.uavs.data?.uavs ?? []),
+    uavs: [...feeds.uavs.data?.uavs ?? []].sort(worstFirst),
     answer: answers.beams,
     beams: answers.beams?.beams ?? [],
     patternBeams: beamsAt(answers.pattern?.valid_at),
@@ -79,8 +76,16 @@ function beamsAt(stamp) {
     .reduce((best, one) => (best && distance(best) <= distance(one) ? best : one), null);
 }
 
+/** The charts begin with what the service kept of the minutes before this page was opened. */
+async function fillCharts() {
+  isFilled = true;
+  const answer = await askOnce("/v1/history");
+  if (Array.isArray(answer?.at)) charts.fill(answer, performance.now());
+}
+
 /** An answer came. UAVs and beams of one beat make a moment of the history. */
 function take(name) {
+  if (name === "uavs" && !isFilled) fillCharts();
   const now = performance.now();
   const { uavs, beams } = feeds;
   const together = Math.abs(uavs.answeredAt - (beams.answeredAt ?? -Infinity)) < SAME_BEAT_MS;
@@ -242,16 +247,13 @@ function choose(id) {
   refresh();
 }
 
-const shownIds = () => (timebar.shown?.uavs ?? inOrder(feeds.uavs.data?.uavs ?? []))
-  .map((uav) => uav.id);
-
 function chooseNth(n) {
-  const id = shownIds()[n - 1];
+  const id = table.ids[n - 1];
   if (id !== undefined && id !== selected) choose(id);
 }
 
 function chooseNext(step) {
-  const ids = shownIds();
+  const { ids } = table;
   if (!ids.length) return;
   const from = selected === null ? (step > 0 ? -1 : ids.length) : ids.indexOf(selected);
   const id = ids[Math.max(0, Math.min(ids.length - 1, from + step))];
@@ -283,6 +285,9 @@ $("plan").addEventListener("wheel", (event) => {
   (wheeled > 0 ? zoomOut : zoomIn)();
   wheeled = 0;
 }, { passive: false });
+
+// Where there is little room, the symbols are folded until they are asked for.
+if (window.matchMedia("(max-width: 1180px)").matches) $("legend").removeAttribute("open");
 
 const toggleTheme = setUpTheme($("theme"), () => {
   for (const picture of [plan, focus, charts]) picture.recolour();

@@ -181,7 +181,8 @@ export class Rejections {
         const unit = reason === "garbage" ? " B" : "";
         return [reason, `${format.count(total)}${unit}${when}`, "", REASONS[reason] ?? ""];
       });
-    setPairs($("rejections"), pairs, rejected ? "none" : format.UNKNOWN);
+    $("rejections-panel").hidden = pairs.length === 0;
+    setPairs($("rejections"), pairs, format.UNKNOWN);
   }
 }
 

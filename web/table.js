@@ -2,7 +2,8 @@
 
 import { make, setText } from "./dom.js";
 import * as format from "./format.js";
-import { explain } from "./health.js";
+import { explain, rankOf } from "./health.js";
+import { Order } from "./order.js";
 
 const halfWidthDeg = (array) =>
   format.known(array?.half_power_beamwidth_deg) ? array.half_power_beamwidth_deg / 2 : null;
@@ -52,40 +53,55 @@ function age(context) {
   return { text: `▲ ${text}`, level: "warn", title: "No report lately" };
 }
 
-/** Columns in their order. `feed`: which answer a value stands on; `short`: for narrow screens. */
+const STATES = ["live", "coasting", "stale", "lost"];
+
+/**
+ * Columns in their order. `feed`: which answer a value stands on; `short`: for narrow screens; `by`:
+ * what it is sorted by.
+ */
 const COLUMNS = [
   { key: "verdict", label: "Link", feed: "uavs", title: "Whether its beam has the gain it needs",
+    by: ({ uav }) => rankOf(uav),
     show: ({ uav }) => ({ text: uav.verdict ?? format.UNKNOWN, title: explain(uav) }) },
-  { key: "state", label: "State", feed: "uavs", show: ({ uav }) => ({ text: uav.state }) },
+  { key: "state", label: "State", feed: "uavs", by: ({ uav }) => STATES.indexOf(uav.state),
+    show: ({ uav }) => ({ text: uav.state }) },
   { key: "range", label: "Range", feed: "uavs", title: "Slant range from the carrier",
-    show: ({ uav }) => ({ text: format.metres(range(uav)) }) },
+    by: ({ uav }) => range(uav), show: ({ uav }) => ({ text: format.metres(range(uav)) }) },
   { key: "azimuth", label: "Azimuth", feed: "beams", title: "Right of the array's boresight",
+    by: ({ beam }) => beam?.azimuth_deg,
     show: ({ beam }) => ({ text: format.signedDegrees(beam?.azimuth_deg) }) },
   { key: "elevation", label: "Elevation", feed: "beams", title: "Above the array's boresight",
+    by: ({ beam }) => beam?.elevation_deg,
     show: ({ beam }) => ({ text: format.signedDegrees(beam?.elevation_deg) }) },
-  { key: "speed", label: "Speed", feed: "uavs",
+  { key: "speed", label: "Speed", feed: "uavs", by: ({ uav }) => uav.speed_mps,
     show: ({ uav }) => ({ text: format.speed(uav.speed_mps) }) },
   { key: "age", label: "Age", feed: "uavs", title: "Since the newest accepted report",
-    show: age },
+    by: ({ uav }) => uav.age_s, show: age },
   { key: "dt", label: "ΔT", feed: "uavs", title: "Last interval between reports",
+    by: ({ uav }) => uav.dt_s,
     show: ({ uav }) => ({ text: format.seconds(uav.dt_s) }) },
   { key: "latency", label: "Latency", feed: "uavs", title: "From when it was true to arrival",
+    by: ({ uav }) => uav.latency_s,
     show: ({ uav }) => ({ text: format.milliseconds(uav.latency_s) }) },
   { key: "bound", label: "Bound", feed: "uavs", title: "Guaranteed position error, at most",
-    show: bound },
+    by: ({ uav }) => uav.bound_m, show: bound },
   { key: "usual", label: "Usual error", short: "Usual", feed: "uavs",
     title: "Usual error: 95 of 100 predictions at this age were nearer, of late",
+    by: ({ uav }) => uav.error_p95_m,
     show: ({ uav }) => ({ text: format.metres(uav.error_p95_m) }) },
   { key: "pointing", label: "Pointing bound", short: "Pointing", feed: "beams",
-    title: "Pointing bound: how far the true direction can lie from the beam", show: pointingBound },
+    title: "Pointing bound: how far the true direction can lie from the beam", by: ({ beam }) => beam?.pointing_bound_deg,
+    show: pointingBound },
   { key: "gain", label: "Gain", feed: "beams", title: "Array gain towards the prediction",
+    by: ({ beam }) => beam?.gain_db,
     show: ({ beam }) => ({ text: format.decibels(beam?.gain_db) }) },
   { key: "guaranteed", label: "Guaranteed gain", short: "Guaranteed", feed: "beams",
-    title: "Guaranteed gain: the least gain wherever the UAV truly is within its bound", show: guaranteedGain },
+    title: "Guaranteed gain: the least gain wherever the UAV truly is within its bound", by: ({ beam }) => beam?.guaranteed_gain_db,
+    show: guaranteedGain },
 ];
 
 export class UavTable {
-  constructor(table, onSelect) {
+  constructor(table, onSelect, onOrder = () => {}) {
     this.body = table.tBodies[0];
     this.onSelect = onSelect;
     this.rows = new Map();
@@ -93,13 +109,18 @@ export class UavTable {
     for (const { label, title, key, short = label } of [{ label: "UAV", key: "id" }, ...COLUMNS]) {
       const cell = make("th", { scope: "col", role: "columnheader", "data-key": key });
       cell.title = title ?? label;
-      cell.textContent = short;
+      cell.append(make("button", { type: "button", class: "sort" }, short));
       head.append(cell);
     }
+    this.order = new Order(head, COLUMNS, onOrder);
+    this.order.mark();
+    this.ids = []; // as they stand in the table
   }
 
-  /** Show these UAVs, in this order. `sinceS`: seconds since the answer came. */
-  update(uavs, { beams, array, sinceS, selected }) {
+  /** Show these UAVs. `sinceS`: seconds since the answer came. */
+  update(all, { beams, array, sinceS, selected }) {
+    const uavs = this.order.arrange(all, beams);
+    this.ids = uavs.map(({ id }) => id);
     const present = new Set(uavs.map((uav) => uav.id));
     for (const [id, row] of this.rows) {
       if (!present.has(id)) {

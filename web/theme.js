@@ -1,4 +1,4 @@
-// Dark unless the operator chose light; the choice is remembered in this browser.
+// As the browser prefers, until the operator chooses; the choice is remembered in this browser.
 
 const KEY = "companion.theme";
 
@@ -30,7 +30,10 @@ export function setUpTheme(button, onChange) {
     remember(theme);
     apply(theme);
   };
-  apply(remembered() === "light" ? "light" : "dark");
+  const light = window.matchMedia("(prefers-color-scheme: light)");
+  const preferred = () => (light.matches ? "light" : "dark");
+  light.addEventListener?.("change", () => remembered() === null && apply(preferred()));
+  apply(remembered() ?? preferred());
   button.addEventListener("click", toggle);
   return toggle;
 }

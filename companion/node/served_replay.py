@@ -31,6 +31,7 @@ from companion.settings.model import Settings
 from companion.values import Event, Frame, Notice, Rejection, Tick
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
+from companion.views.series import Series
 from companion.views.state import RecordingStatus, ReplayStatus
 
 TURN_S: Final = 0.005
@@ -109,6 +110,7 @@ class ServedReplay:
         self._links: dict[str, _ReplayedLink] = {}
         self.last_messages = LastMessages()
         self.lateness = Lateness()
+        self.series = Series()
         self.arrival_lag = ArrivalLag()
         self._ticked = asyncio.Event()
 
@@ -177,6 +179,7 @@ class ServedReplay:
         match event:
             case Tick():
                 self._rates.count(event.t_ns, self.pipeline.frames, self.pipeline.updates)
+                self.series.add(self.pipeline)
                 self._ticked.set()  # wakes those who wait now;
                 self._ticked.clear()  # later ones wait for the next tick
             case Frame():

@@ -30,6 +30,7 @@ from companion.values import Event, Frame, Notice, Output, Severity, Tick, UserE
 from companion.views.health import behind
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
+from companion.views.series import Series
 from companion.views.state import RecordingStatus
 
 
@@ -59,6 +60,7 @@ class Service:
         self.answering = asyncio.Event()
         self.last_messages = LastMessages()
         self.lateness = Lateness()
+        self.series = Series()
         self._ticked = asyncio.Event()
         self._is_behind = False
         self._settings = settings
@@ -188,6 +190,7 @@ class Service:
                 self._tell_of_recorder(self._recorder)
             self._traffic.speak(not self.unfit(), self.pipeline.reporters())
             self._tell_of_machine()
+            self.series.add(self.pipeline)
             self._ticked.set()  # wakes those who wait now;
             self._ticked.clear()  # later ones wait for the next tick
             ended_s = loop.time()

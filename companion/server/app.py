@@ -155,6 +155,14 @@ def _state_routes(app: FastAPI, node: Node) -> None:
         return answer({"events": [link_state.event(notice) for notice in node.events()]})
 
     @app.get(
+        "/v1/history",
+        summary="What the charts show, each second of the last five minutes",
+        responses=answers(models.History),
+    )
+    async def history() -> Response:
+        return answer(node.series.show(node.now_ns()))
+
+    @app.get(
         "/v1/design",
         summary="The observer in use: gains at each UAV's interval, and their certificate",
         responses=answers(models.Design),

@@ -335,6 +335,26 @@ class Status(BaseModel):
     replay: Replay | None
 
 
+Column = list[float | None]
+
+
+class UavHistory(BaseModel):
+    """Columns of one UAV, as long as ``at``; null where it was not known."""
+
+    pointing_bound_deg: Column
+    innovation_m: Column
+    latency_s: Column
+    guaranteed_gain_db: Column
+
+
+class History(BaseModel):
+    """A sample each second, the oldest first."""
+
+    valid_at: Time
+    at: list[Time]
+    uavs: dict[str, UavHistory]
+
+
 class Event(BaseModel):
     """Something that was said to the operator."""
 

@@ -1,10 +1,12 @@
-"""The browser that the tests of pages share."""
+"""The browser and the running demo that the tests of pages share."""
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from support import Node, end
 
 CHROMIUM = Path("/usr/bin/chromium")
 QUIET = (
@@ -13,7 +15,7 @@ QUIET = (
 )
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="package")
 def chromium() -> Iterator[Any]:
     """A headless browser."""
     if not CHROMIUM.exists():
@@ -24,3 +26,67 @@ def chromium() -> Iterator[Any]:
         browser = playwright.chromium.launch(executable_path=str(CHROMIUM), args=list(QUIET))
         yield browser
         browser.close()
+
+
+def start_demo(directory: Path, port: int = 0) -> Node:
+    """The demo, recording to ``directory``, once its four beams are up."""
+    before = Path.cwd()
+    os.chdir(directory)  # it records to ./recordings
+    try:
+        node = Node("demo", "--port", str(port), "--seconds", "240")
+    finally:
+        os.chdir(before)
+    node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
+    return node
+
+
+@pytest.fixture(scope="package")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Node]:
+    """One demo for all tests that do not end it."""
+    node = start_demo(tmp_path_factory.mktemp("demo"))
+    yield node
+    node.stop()
+
+
+def is_complaint(said: Any) -> bool:
+    """Whether the console says that something is wrong. Chromium reports each answer that is no
+    success, and 503 is what a service that is late, on a busy machine, rightly answers."""
+    return said.type == "error" and "status of 503" not in said.text
+
+
+@pytest.fixture
+def open_page(chromium: Any) -> Iterator[Any]:
+    """Opens pages; at the end none of them may have complained, but of what was announced."""
+    pages: list[tuple[Any, list[str], bool]] = []
+
+    def start(
+        url: str, viewport: dict[str, int], *, loses_service: bool = False, theme: Any = "dark"
+    ) -> Any:
+        page = chromium.new_page(viewport=viewport, color_scheme=theme)
+        complaints: list[str] = []
+        page.on("console", lambda said: is_complaint(said) and complaints.append(said.text))
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        pages.append((page, complaints, loses_service))
+        page.goto(url)
+        return page
+
+    yield start
+    for page, complaints, loses_service in pages:
+        page.close()
+        # Chromium complains of every answer that is none or no success, and there are such then.
+        unheard = [text for text in complaints if not text.startswith("Failed to load resource")]
+        assert (unheard if loses_service else complaints) == []
+
+
+@pytest.fixture
+def start_mine(tmp_path: Path) -> Iterator[Any]:
+    """Starts demos for one test alone, and ends those that it left."""
+    nodes: list[Node] = []
+
+    def start(port: int = 0) -> Node:
+        nodes.append(start_demo(tmp_path, port))
+        return nodes[-1]
+
+    yield start
+    for node in nodes:
+        end(node.process)

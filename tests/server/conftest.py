@@ -20,6 +20,7 @@ from companion.settings.model import Settings
 from companion.values import Frame, Notice, Severity, Source, Tick
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
+from companion.views.series import Series
 from companion.views.state import RecordingStatus, ReplayStatus
 
 LOG = Path(__file__).parents[1] / "data" / "sitl_4circle_cut.tlog"
@@ -34,6 +35,7 @@ class StandIn:
         self.equipment = assembly.equipment(settings, self.pipeline.array)
         self.last_messages = LastMessages()
         self.lateness = Lateness()
+        self.series = Series()
         self.arrival_lag = ArrivalLag()
         self.notices: list[Notice] = []
         self.current = RecordingStatus("off", None, 0, 0, 0)
@@ -53,6 +55,7 @@ class StandIn:
             if isinstance(event, Frame):
                 self.last_messages.add(event)
             outputs = self.pipeline.step(event)
+            self.series.add(self.pipeline)
             self.notices += [output for output in outputs if isinstance(output, Notice)]
 
     def tick(self, after_s: float = 0.1) -> None:

@@ -4,6 +4,7 @@ import io
 import json
 import tomllib
 from collections.abc import Iterator
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ PATHS: dict[str, Any] = {
     "/v1/uavs": models.Uavs,
     "/v1/uavs/1:1": models.UavState,
     "/v1/links": models.Links,
+    "/v1/history": models.History,
     "/v1/events": models.Events,
     "/v1/design": models.Design,
     "/v1/beams?lead_ms=20": models.Beams,
@@ -310,6 +312,27 @@ def test_a_carrier_that_is_lost_is_shown_where_it_was(make_node: Any) -> None:
     assert center["last_known"]["lat_deg"] == pytest.approx(before["center"]["lat_deg"], abs=1e-4)
     assert center["last_known"]["at"] < status["time"]
     assert beams["left_out"] and {out["reason"] for out in beams["left_out"]} == {center["unfit"]}
+
+
+def test_what_the_charts_show_was_kept(make_node: Any) -> None:
+    node = make_node()
+    for _ in range(10):
+        node.tick()
+        node.series.add(node.pipeline)
+    with TestClient(create_app(node)) as client:
+        history = client.get("/v1/history").json()
+        uavs = client.get("/v1/uavs").json()["uavs"]
+    holds(models.History, history)
+    times = [datetime.fromisoformat(at).timestamp() for at in history["at"]]
+    assert len(times) >= 5 and min(np.diff(times)) >= 0.999
+    assert set(history["uavs"]) == {uav["id"] for uav in uavs if uav["target"]}
+    for uav in uavs:
+        if uav["target"]:
+            columns = history["uavs"][uav["id"]]
+            assert {len(column) for column in columns.values()} == {len(times)}
+            assert columns["guaranteed_gain_db"][-1] == uav["health"]["guaranteed_gain_db"]
+            assert columns["innovation_m"][-1] is not None
+            assert columns["pointing_bound_deg"][-1] > 0
 
 
 def test_verdicts_are_in_the_answers_and_in_the_metrics(make_node: Any) -> None:

@@ -6,7 +6,7 @@ import { test } from "node:test";
 import { load, openBrowser } from "./browser.mjs";
 import { near } from "./near.mjs";
 import { Plot, WIDTH } from "./recording_plot.mjs";
-import { beam, uav } from "./service.mjs";
+import { beam, stampAt, uav } from "./service.mjs";
 
 const { Charts } = await load("charts.js");
 const { History } = await load("history.js");
@@ -47,6 +47,17 @@ test("each UAV has its own line, and what is not known is a gap, not 0", () => {
   show();
   assert.deepEqual(plots().innovation.data, [[-2, -1], [1, null], [null, 2]]);
   assert.deepEqual(plots().gain.data, [[-2, -1], [null, null], [null, null]]);
+});
+
+test("what the service kept fills the time before this page was opened, and no more", () => {
+  const { add, show, plots, charts } = openCharts();
+  add(9000, [uav("1:1", { innovation_m: 3 })]);
+  const [nothing, at] = [[null, null, null], [stampAt(0), stampAt(1), stampAt(3)]];
+  charts.fill({ valid_at: stampAt(3.5), at, uavs: { "1:1": { innovation_m: [1, 2, 9],
+    latency_s: nothing, pointing_bound_deg: nothing, guaranteed_gain_db: [5, null, 7] } } }, 10_000);
+  show();
+  assert.deepEqual(plots().innovation.data, [[-3.5, -2.5, -1], [1, 2, 3]]);
+  assert.deepEqual(plots().gain.data[1], [5, null, null]);
 });
 
 test("no line goes through a hole in what was received", () => {

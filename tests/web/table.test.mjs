@@ -17,7 +17,7 @@ function openTable() {
   const table = new UavTable(element, (id) => chosen.push(id));
   const body = element.querySelector("tbody");
   return {
-    element, table, chosen,
+    browser, element, table, chosen,
     rows: () => body.rows,
     ids: () => body.rows.map((row) => row.querySelector(".pick").textContent),
     show(uavs, { beams = [], sinceS = 0, selected = null, array: fields = {} } = {}) {
@@ -137,7 +137,7 @@ test("rows stay the same elements, in the order that is asked for", () => {
   show([uav("1:1"), uav("2:1"), uav("10:1")]);
   assert.deepEqual(ids(), ["1:1", "2:1", "10:1"]);
   assert.deepEqual(rows().slice(1), [two, ten]);
-  show([uav("10:1"), uav("1:1")]);
+  show([uav("10:1", weak()), uav("1:1")]);
   assert.deepEqual(ids(), ["10:1", "1:1"]);
   assert.equal(rows()[0], ten);
   show([]);
@@ -162,4 +162,43 @@ test("a click on a name chooses that UAV; a chosen one can be brought into sight
   table.reveal("2:1");
   table.reveal("9:9");
   assert.deepEqual(rows().map(({ isRevealed = false }) => isRevealed), [false, true]);
+});
+
+test("a head sorts up, down, and then the worst stand first again; unknown comes last", () => {
+  const { show, ids, element } = openTable();
+  const uavs = [uav("1:1", { speed_mps: 5 }), uav("2:1", { speed_mps: null }),
+    uav("3:1", { speed_mps: 1, ...weak() }), uav("10:1", { speed_mps: 9 })];
+  const head = (key) => element.querySelectorAll("thead th")
+    .find(({ dataset }) => dataset.key === key);
+  const sorted = (key) => {
+    head(key).querySelector("button").click();
+    show(uavs);
+    return [ids().join(" "), head(key).getAttribute("aria-sort")];
+  };
+  show(uavs);
+  assert.deepEqual(ids(), ["3:1", "1:1", "2:1", "10:1"]);
+  assert.deepEqual(sorted("speed"), ["3:1 1:1 10:1 2:1", "ascending"]);
+  assert.deepEqual(sorted("speed"), ["10:1 1:1 3:1 2:1", "descending"]);
+  assert.deepEqual(sorted("speed"), ["3:1 1:1 2:1 10:1", "none"]);
+  assert.deepEqual(sorted("id"), ["1:1 2:1 3:1 10:1", "ascending"]);
+});
+
+test("many UAVs can be searched, and those that are good left away", () => {
+  const { show, ids, browser } = openTable();
+  const uavs = ["1:1", "2:1", "3:1", "4:1", "5:1", "6:1"].map((id) => uav(id));
+  show(uavs);
+  assert.equal(browser.element("find").hidden, true);
+  const many = [...uavs, uav("7:1", weak()), uav("icao:4CA7B3", { callsign: "SWR12A" })];
+  show(many);
+  assert.equal(browser.element("find").hidden, false);
+  const found = (text) => {
+    browser.element("search").value = text;
+    show(many);
+    return ids();
+  };
+  assert.deepEqual(found("swr"), ["icao:4CA7B3"]);
+  assert.deepEqual(found("1.1 s"), ["7:1"]);
+  assert.equal(found("").length, 8);
+  browser.element("only-bad").checked = true;
+  assert.deepEqual(found(""), ["7:1"]);
 });

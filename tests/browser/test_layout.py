@@ -1,0 +1,112 @@
+"""The page at every size, for few UAVs and for many: nothing overlaps, nothing is cut off."""
+
+import functools
+from typing import Any
+
+import pytest
+from support import HANG_MS, Node
+
+pytestmark = pytest.mark.browser
+
+SIZES = {
+    "desktop": {"width": 1440, "height": 900},
+    "tablet": {"width": 1024, "height": 768},
+    "phone": {"width": 390, "height": 844},
+}
+OVERLAPS = """() => {
+    const groups = ["header > *, header .facts div", ".zoom, .legend-fold", ".time > *",
+        ".focus h2, .focus canvas, .focus dl", ".side section", ".charts figure, #series-key",
+        "thead th", "tbody tr:nth-child(-n+12) :is(td, th):not(:first-child)", ".events li",
+        ".find > *", "main > *:not(.side, .time), .side section"];
+    const seen = one => {
+        let { left, top, right, bottom } = one.getBoundingClientRect();
+        for (let at = one.parentElement; at; at = at.parentElement) {
+            if (getComputedStyle(at).overflowY === "visible") continue;
+            const clip = at.getBoundingClientRect();
+            [left, top] = [Math.max(left, clip.left), Math.max(top, clip.top)];
+            [right, bottom] = [Math.min(right, clip.right), Math.min(bottom, clip.bottom)];
+        }
+        return { left, top, right, bottom };
+    };
+    const found = [];
+    for (const group of groups) {
+        const all = [...document.querySelectorAll(group)].filter(one => one.checkVisibility())
+            .map(one => ({ one, box: seen(one) }))
+            .filter(({ box }) => box.right - box.left > 1 && box.bottom - box.top > 1);
+        all.forEach((a, i) => all.slice(i + 1).forEach(b => {
+            if (a.one.contains(b.one) || b.one.contains(a.one)) return;
+            const wide = Math.min(a.box.right, b.box.right) - Math.max(a.box.left, b.box.left);
+            const high = Math.min(a.box.bottom, b.box.bottom) - Math.max(a.box.top, b.box.top);
+            if (wide > 1 && high > 1) found.push([a, b].map(({ one }) =>
+                `${one.tagName}#${one.id}.${one.className} ${one.textContent.slice(0, 20)}`));
+        }));
+    }
+    return found;
+}"""
+"""Pairs of elements of one group whose boxes, as far as they can be seen, overlap."""
+CUT = """() => [...document.querySelectorAll("header *, .side h2, .side p, h2, .chip, .button")]
+    .filter(one => one.checkVisibility() && !one.closest(".hidden"))
+    .filter(one => one.getBoundingClientRect().right > innerWidth + 0.5
+        || one.scrollWidth > one.clientWidth + 1 && getComputedStyle(one).display !== "inline")
+    .map(one => `${one.tagName}#${one.id} ${one.textContent.slice(0, 30)}`)"""
+
+
+def crowd(answer: dict[str, Any], key: str, name: str, number: int) -> dict[str, Any]:
+    """The answer with its UAVs over and over, as many as are wanted."""
+    several = answer[key]
+    levels = ("good", "good", "weak", "none")
+    copies = []
+    for i in range(number if several else 0):
+        one = {**several[i % len(several)], name: f"{i + 1}:1"}
+        if name == "id":
+            one["verdict"] = levels[i % 4]
+            one["health"] = {**(one["health"] or {}), "cause": "rate", "remedy": "ask for 10 Hz",
+                             "reason": f"reports {1 + i % 3}.1 s apart"}  # fmt: skip
+        copies.append(one)
+    return {**answer, key: copies}
+
+
+def many(node: Node, page: Any, number: int) -> None:
+    """Let the page see as many UAVs as are wanted, whatever the demo flies."""
+
+    def fulfil(path: str, key: str, name: str, route: Any) -> None:
+        route.fulfill(json=crowd(node.json(path), key, name, number))
+
+    for path, key, name in (("/v1/uavs", "uavs", "id"), ("/v1/beams", "beams", "uav")):
+        page.route(f"**{path}", functools.partial(fulfil, path, key, name))
+
+
+@pytest.mark.parametrize("number", [1, 4, 20, 100])
+@pytest.mark.parametrize("size", SIZES)
+def test_nothing_overlaps_and_nothing_is_cut(
+    demo: Node, open_page: Any, size: str, number: int
+) -> None:
+    page = open_page("about:blank", SIZES[size], loses_service=True)
+    many(demo, page, number)
+    page.goto(demo.url)
+    page.locator("tbody tr").nth(number - 1).wait_for(state="attached", timeout=HANG_MS)
+    page.locator("#links li dl").first.wait_for(state="attached", timeout=HANG_MS)
+    page.locator("#events time").first.wait_for(state="attached", timeout=HANG_MS)
+    assert page.evaluate(OVERLAPS) == []
+    assert page.evaluate(CUT) == []
+    assert page.evaluate("document.documentElement.scrollWidth - innerWidth") == 0
+
+
+def test_what_overlaps_and_what_is_cut_is_found(demo: Node, open_page: Any) -> None:
+    page = open_page(demo.url, SIZES["desktop"])
+    page.locator("#events time").first.wait_for(timeout=HANG_MS)
+    styled = (
+        "([of, key, value]) => document.querySelectorAll(of).forEach(one => one.style[key] = value)"
+    )
+    page.evaluate(styled, [".chip", "marginRight", "-60px"])
+    assert page.evaluate(OVERLAPS)
+    page.evaluate(styled, [".facts", "transform", "translateX(900px)"])
+    assert page.evaluate(CUT)
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_the_theme_is_the_one_that_the_browser_prefers(
+    demo: Node, open_page: Any, theme: str
+) -> None:
+    page = open_page(demo.url, SIZES["desktop"], theme=theme)
+    assert page.locator("html").get_attribute("data-theme") == theme

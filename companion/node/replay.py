@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import companion
 from companion.node.replay_summary import Tally, summary
+from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
 from companion.pipeline.ticks import with_ticks
 from companion.recording import ends, parts
@@ -21,6 +22,7 @@ from companion.recording.reader import (
     read_settings,
     vehicles,
 )
+from companion.recording.scene import Scene
 from companion.recording.writer import Writer
 from companion.settings.files import load
 from companion.settings.model import Settings
@@ -50,9 +52,9 @@ def writer_for(logs: Sequence[Path], settings: Settings, out: Path | None) -> Wr
     first_ns = next(read_flight(logs)).t_ns
     where = out or Path(kept.directory or "recordings")
     weights_hz = None if kept.weights_hz == "all" else kept.weights_hz
-    return Writer(
-        where, settings.to_toml(), {"companion": companion.__version__}, weights_hz, first_ns
-    )
+    scene = Scene(assembly.array(settings), kept.scene_hz)
+    versions = {"companion": companion.__version__}
+    return Writer(where, settings.to_toml(), versions, weights_hz, first_ns, scene)
 
 
 class Run:

@@ -21,7 +21,7 @@ from companion.values import (
 )
 
 FRAME_ID: Final = "wgs84"
-"""Frame id of every LocationFix; nothing in a recording depends on it."""
+"""Frame of every LocationFix: the Earth's own, x through 0° E, z through the north pole."""
 _LEVEL: Final = {
     Severity.INFO: schemas.LogMessage.INFO,
     Severity.WARNING: schemas.LogMessage.WARNING,
@@ -36,15 +36,20 @@ def timestamp(t_ns: int) -> dict[str, int]:
 
 
 def fix(value: Fix) -> Any:
-    """The position that a UAV reported, with the report's own degrees."""
+    """The position that a UAV reported, with the report's own degrees.
+
+    The covariance is made from the bounds on the report's noise, as that of ``predicted`` is.
+    """
     report = value.report
-    return schemas.LocationFixMessage(
+    message = schemas.LocationFixMessage(
         timestamp=timestamp(value.t_ns),
         frame_id=FRAME_ID,
         latitude=report.lat_deg,
         longitude=report.lon_deg,
         altitude=report.alt_m,
     )
+    _spread(message, value.noise.horizontal_m, value.noise.vertical_m)
+    return message
 
 
 def predicted(track: Track, lat_deg: float, lon_deg: float, alt_m: float) -> Any:
@@ -64,10 +69,15 @@ def predicted(track: Track, lat_deg: float, lon_deg: float, alt_m: float) -> Any
         altitude=alt_m,
     )
     if math.isfinite(track.bound_m):
-        plane_m2, height_m2 = track.horizontal_bound_m**2 / 2, track.vertical_bound_m**2
-        message.position_covariance.extend((plane_m2, 0, 0, 0, plane_m2, 0, 0, 0, height_m2))
-        message.position_covariance_type = schemas.LocationFixMessage.APPROXIMATED
+        _spread(message, track.horizontal_bound_m, track.vertical_bound_m)
     return message
+
+
+def _spread(message: Any, horizontal_m: float, vertical_m: float) -> None:
+    """Put bounds into a LocationFix as a covariance; east, north, up."""
+    plane_m2, height_m2 = horizontal_m**2 / 2, vertical_m**2
+    message.position_covariance.extend((plane_m2, 0, 0, 0, plane_m2, 0, 0, 0, height_m2))
+    message.position_covariance_type = schemas.LocationFixMessage.APPROXIMATED
 
 
 def track(value: Track, t_ns: int) -> Any:

@@ -115,7 +115,7 @@ class Encoder:
                     self._tracks(output.t_ns, output.tracks, geodetic)
                     self._beams(output.beams)
                 if self._scene and self._scenes.is_due(output.t_ns):
-                    self._draw(self._scene, output)
+                    self._draw(self._scene, output, geodetic)
             case Rejection():
                 if output is not self._last_event:
                     self._rejection(output, is_event=False)
@@ -142,8 +142,12 @@ class Encoder:
         data = codec.weights(beams).SerializeToString()
         self._emit(schemas.WEIGHTS_TOPIC, schemas.WEIGHTS, beams.t_ns, data)
 
-    def _draw(self, scene: Scene, update: Update) -> None:
-        for transform in scene.transforms(update):
+    def _draw(self, scene: Scene, update: Update, geodetic: Geodetic) -> None:
+        transforms = scene.transforms(update)
+        if transforms:
+            origin = [float(each[0]) for each in geodetic(np.zeros((1, 3)))]
+            transforms.insert(0, scene.origin(update.t_ns, *origin))
+        for transform in transforms:
             data = transform.SerializeToString()
             self._emit(schemas.TF_TOPIC, schemas.FRAME_TRANSFORM, update.t_ns, data)
         data = scene.picture(update).SerializeToString()

@@ -1,9 +1,10 @@
 """The beams as a picture in space, for the 3D panel of a viewer.
 
 Viewers want z upwards, so the frames are (REP 103 of ROS): ``map``, east-north-up at the origin of
-the local frame; ``carrier``, forward-left-up, child of ``map``; ``array``, x along boresight, y to
-the left, z upwards, child of ``carrier``. The local frame is north-east-down and the body and array
-frames are forward-right-down: half a turn about x leads from those to these.
+the local frame, child of ``wgs84``, the Earth's own; ``carrier``, forward-left-up, child of
+``map``; ``array``, x along boresight, y to the left, z upwards, child of ``carrier``. The local
+frame is north-east-down and the body and array frames are forward-right-down: half a turn about x
+leads from those to these.
 
 What is drawn lives for some updates of the scene and then disappears by itself, such as the beam of
 a UAV that is lost.
@@ -19,7 +20,8 @@ from companion.beams import line_of_sight
 from companion.beams.aim import directions
 from companion.beams.array.geometry import Array
 from companion.recording import schemas
-from companion.recording.codec import timestamp
+from companion.recording.codec import FRAME_ID, timestamp
+from companion.tracking.geodesy import LocalFrame, ned_from_ecef
 from companion.values import Beam, Carrier, FloatArray, Track, TrackState, Update
 
 MAP: Final = "map"
@@ -67,6 +69,16 @@ class Scene:
             _transform(at, MAP, CARRIER, _ENU_FROM_NED @ carrier.position_ned_m, turned),
             _transform(at, CARRIER, ARRAY, _UP @ self.array.lever_arm_m, on_carrier),
         ]
+
+    def origin(self, t_ns: int, lat_deg: float, lon_deg: float, alt_m: float) -> Any:
+        """``foxglove.FrameTransform``: where the map's origin stands on the Earth, and how.
+
+        Degrees and metres; the parent is the Earth's own frame (EPSG 4978), in which heights above
+        the sea are taken for heights above the ellipsoid, as everywhere here.
+        """
+        stands = LocalFrame(lat_deg, lon_deg, alt_m).origin_ecef_m
+        ecef_from_map = (_ENU_FROM_NED @ ned_from_ecef(lat_deg, lon_deg)).T
+        return _transform(timestamp(t_ns), FRAME_ID, MAP, stands, ecef_from_map)
 
     def picture(self, update: Update) -> Any:
         """``foxglove.SceneUpdate``: an entity for each UAV (place and bound) and for each beam."""

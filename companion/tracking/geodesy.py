@@ -95,6 +95,11 @@ class LocalFrame:
             zip(self._origin_m.tolist(), *self._local_from_ecef.tolist(), strict=True)
         )
 
+    @property
+    def origin_ecef_m(self) -> FloatArray:
+        """Earth-centred coordinates (3,) of the origin."""
+        return self._origin_m.copy()
+
     def localise(
         self, lat_deg: float, lon_deg: float, alt_m: float, velocity_ned: Vector | None
     ) -> tuple[Vector, Vector | None]:

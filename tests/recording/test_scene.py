@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import pymap3d
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -143,3 +144,18 @@ def test_the_bound_is_the_cylinder_that_is_guaranteed_and_goes_by_itself() -> No
     assert not gone.cylinders
     assert gone.spheres[0].color != uav.spheres[0].color
     assert Scene(array, 4.0).transforms(replace(update, carrier=None)) == []
+
+
+@given(st.floats(-89, 89), st.floats(-180, 180), st.floats(-100, 9000))
+def test_the_map_stands_on_the_earth(lat_deg: float, lon_deg: float, alt_m: float) -> None:
+    """A point of the map, put into the Earth's frame, is where pymap3d has it."""
+    array = array_on((0.0, 0.0, 0.0), np.zeros(3))
+    found = Scene(array, 2.0).origin(NOW_NS, lat_deg, lon_deg, alt_m)
+    assert (found.parent_frame_id, found.child_frame_id) == ("wgs84", MAP)
+    turned = found.rotation
+    ecef_from_map = Rotation.from_quat([turned.x, turned.y, turned.z, turned.w])
+    point = np.array([120.0, -40.0, 7.0])  # east, north, up
+    placed = ecef_from_map.apply(point)
+    placed += [found.translation.x, found.translation.y, found.translation.z]
+    true = pymap3d.enu2ecef(*point, lat_deg, lon_deg, alt_m)
+    assert placed == pytest.approx(true, abs=1e-3)

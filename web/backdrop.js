@@ -2,7 +2,7 @@
 
 function rings(view) {
   const [radiusM, stepM] = view.scale.rings;
-  const reachM = Math.hypot(view.width, view.height) / 2 / view.pxPerM;
+  const reachM = (Math.hypot(view.width, view.height) / 2 + Math.hypot(...view.pan)) / view.pxPerM;
   const found = [];
   for (let m = stepM; m <= reachM && found.length < 40; m += stepM) {
     found.push({ m, px: m * view.pxPerM, outer: m === radiusM });

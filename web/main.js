@@ -5,6 +5,7 @@ import { askOnce, connection, startPolling } from "./api.js";
 import { Charts } from "./charts.js";
 import { Alarm } from "./alarm.js";
 import { $, setText } from "./dom.js";
+import { Drawer } from "./drawer.js";
 import { Focus } from "./focus.js";
 import * as format from "./format.js";
 import { headlineOf, showHeadline, showTroubles } from "./health.js";
@@ -34,8 +35,9 @@ let isNew = false; // something has come since the pictures were last drawn
 
 const history = new History();
 const last = new LastKnown();
-const plan = new PlanView($("plan"), history, choose);
-const table = new UavTable($("uavs"), choose, refresh);
+const plan = new PlanView($("plan"), history, pick, markPlan);
+const drawer = new Drawer();
+const table = new UavTable($("uavs"), pick, refresh);
 const focus = new Focus();
 const rejections = new Rejections();
 const timebar = new TimeBar(history, refresh);
@@ -165,7 +167,7 @@ function showMoment(view, link, now) {
   showEvents(view.events);
   showCount(view.uavs);
   showHeadline(view.uavs);
-  showTroubles(view.uavs, choose);
+  showTroubles(view.uavs, pick);
   table.update(view.uavs, {
     beams: new Map(view.beams.map((beam) => [beam.uav, beam])),
     array: view.answer?.array,
@@ -173,6 +175,7 @@ function showMoment(view, link, now) {
     selected,
   });
   showFocus(view, link, now);
+  drawer.show(view, timebar.isLive, now);
 }
 
 /** One beam closely; while there is none, the last one, grey. */
@@ -244,6 +247,15 @@ function nameThePage({ uavs, beams }, link) {
 function choose(id) {
   selected = id === selected ? null : id;
   feeds.pattern.wake();
+  markPlan();
+  refresh();
+}
+
+/** Choose with the pointer: the UAV's drawer opens, or closes where it is chosen no more. */
+function pick(id) {
+  choose(id);
+  if (selected === null) drawer.close();
+  else drawer.open(selected);
   refresh();
 }
 
@@ -261,30 +273,28 @@ function chooseNext(step) {
   table.reveal(id);
 }
 
+function markPlan() {
+  $("zoom-fit").setAttribute("aria-pressed", String(plan.isFitted));
+  $("follow").setAttribute("aria-pressed", String(plan.followed !== null));
+  $("follow").disabled = selected === null && plan.followed === null;
+}
+
 function control(action) {
   action();
-  $("zoom-fit").setAttribute("aria-pressed", String(plan.scale.fit));
+  markPlan();
 }
 
 const zoomIn = () => control(() => plan.zoom(1));
 const zoomOut = () => control(() => plan.zoom(-1));
 const fitAll = () => control(() => plan.fitAll());
+const follow = () => control(() => plan.follow(plan.followed === null ? selected : null));
 const showHelp = () => $("help").showModal();
 
 $("zoom-in").addEventListener("click", zoomIn);
 $("zoom-out").addEventListener("click", zoomOut);
 $("zoom-fit").addEventListener("click", fitAll);
+$("follow").addEventListener("click", follow);
 $("help-open").addEventListener("click", showHelp);
-
-let wheeled = 0;
-$("plan").addEventListener("wheel", (event) => {
-  event.preventDefault();
-  // Touch pads send many small steps: one change of scale for about one notch of a wheel.
-  wheeled += event.deltaY;
-  if (Math.abs(wheeled) < 60) return;
-  (wheeled > 0 ? zoomOut : zoomIn)();
-  wheeled = 0;
-}, { passive: false });
 
 // Where there is little room, the symbols are folded until they are asked for.
 if (window.matchMedia("(max-width: 1180px)").matches) $("legend").removeAttribute("open");
@@ -303,7 +313,9 @@ setUpKeys({
   "End": () => timebar.goLive(),
   "ArrowUp": () => chooseNext(-1),
   "ArrowDown": () => chooseNext(1),
-  "Escape": () => selected !== null && choose(selected),
+  "Escape": () => (drawer.isOpen ? drawer.close() : selected !== null && choose(selected)),
+  "Enter": () => selected !== null && drawer.open(selected),
+  "f": follow,
   "t": toggleTheme,
   "?": showHelp,
   "+": zoomIn, "=": zoomIn, "-": zoomOut, "0": fitAll,

@@ -2,6 +2,7 @@
 
 import { drawCompass, drawRingLabels, drawRings } from "./backdrop.js";
 import * as format from "./format.js";
+import { setUpGestures } from "./gestures.js";
 import { drawLabels } from "./labels.js";
 import { Scale } from "./scale.js";
 import { fontOf, readColours } from "./surface.js";
@@ -19,15 +20,21 @@ const COLOURS = [
 ];
 
 export class PlanView {
-  constructor(canvas, history, onSelect) {
-    Object.assign(this, { canvas, history, context: canvas.getContext("2d") });
+  constructor(canvas, history, onSelect, onMove = () => {}) {
+    Object.assign(this, { canvas, history, onMove, context: canvas.getContext("2d") });
     this.scene = { uavs: [], beams: [], array: null, selected: null, uavsLive: false };
     this.scale = new Scale();
     this.queued = false;
     this.fault = null; // why it could not be drawn last time
     this.hits = [];
     new ResizeObserver(() => this.resize()).observe(canvas);
-    canvas.addEventListener("click", (event) => onSelect(this.nearest(event)));
+    this.pan = [0, 0]; // where the carrier is, pixels off the middle
+    this.followed = null; // the UAV that is kept in the middle
+    setUpGestures(canvas, {
+      pan: (dx, dy) => this.drag(dx, dy),
+      zoom: (steps) => this.zoom(steps),
+      choose: (event) => onSelect(this.nearest(event)),
+    });
     this.recolour();
   }
 
@@ -59,12 +66,36 @@ export class PlanView {
     if (this.fault) throw this.fault; // to whom shows it: a frame's own errors are heard by nobody
   }
 
+  /** About the middle of the picture. */
   zoom(steps) {
+    const [beforeM] = this.scale.rings;
     this.scale.zoom(steps);
+    const ratio = beforeM / this.scale.rings[0];
+    this.pan = this.pan.map((px) => px * ratio);
+    this.redraw();
+    this.onMove();
+  }
+
+  drag(dx, dy) {
+    this.followed = null;
+    this.pan = [this.pan[0] + dx, this.pan[1] + dy];
+    this.redraw();
+    this.onMove();
+  }
+
+  /** Keep a UAV in the middle; null: the carrier. */
+  follow(id) {
+    this.followed = id;
+    this.pan = [0, 0];
     this.redraw();
   }
 
+  get isFitted() {
+    return this.scale.fit && this.followed === null && !this.pan.some(Boolean);
+  }
+
   fitAll() {
+    this.follow(null);
     this.scale.fitAll();
     this.show(this.scene, performance.now());
   }
@@ -90,9 +121,13 @@ export class PlanView {
 
   draw() {
     const { context, width, height, ratio } = this;
-    this.centre = [width / 2, height / 2];
     this.outerPx = Math.max(40, Math.min(width, height) / 2 - MARGIN_PX);
     this.pxPerM = this.outerPx / this.scale.radiusM;
+    const followed = this.scene.uavs.find(({ id }) => id === this.followed);
+    if (followed && placed(followed)) {
+      this.pan = [-followed.east_m * this.pxPerM, followed.north_m * this.pxPerM];
+    }
+    this.centre = [width / 2 + this.pan[0], height / 2 + this.pan[1]];
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.globalAlpha = 1;
     context.setLineDash([]);
@@ -231,17 +266,18 @@ export class PlanView {
     const isQuiet = uavsLive && !isPast; // the UAVs are true: no more than a word about the carrier
     const { context } = this;
     const size = this.width < 500 ? 16 : isQuiet ? 17 : 22;
-    const y = isQuiet ? this.height - size : this.centre[1] + this.outerPx * 0.42;
+    const x = this.width / 2;
+    const y = isQuiet ? this.height - size : this.height / 2 + this.outerPx * 0.42;
     const widthPx = this.measure(text, size, 700) + 36;
     context.fillStyle = isQuiet ? this.colour.plan
       : isPast ? this.colour.past : this.colour.bad;
-    context.fillRect(this.centre[0] - widthPx / 2, y - size, widthPx, size * 2);
+    context.fillRect(x - widthPx / 2, y - size, widthPx, size * 2);
     context.font = `700 ${size}px ${this.font}`;
     context.textAlign = "center";
     context.textBaseline = "middle";
     context.fillStyle = isQuiet ? this.colour.warn
       : isPast ? this.colour["on-past"] : this.colour.plan;
-    context.fillText(text, this.centre[0], y);
+    context.fillText(text, x, y);
   }
 
   nearest(event) {

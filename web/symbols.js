@@ -33,7 +33,7 @@ export function drawCarrier(view) {
 export function drawUav(view, uav) {
   const [x, y] = view.at(uav.north_m, uav.east_m);
   const inside = x > 8 && y > 8 && x < view.width - 8 && y < view.height - 8;
-  if (!inside) return drawBeyond(view, uav);
+  if (!inside) return drawBeyond(view, uav, x - view.width / 2, y - view.height / 2);
   const { context } = view;
   const colour = view.colourOf(uav);
   const velocity = uav.velocity_ned_mps;
@@ -82,15 +82,15 @@ function drawSelection(view) {
 }
 
 /** A UAV outside the picture: an arrow at the edge, in its direction. */
-function drawBeyond(view, uav) {
+function drawBeyond(view, uav, rightPx, downPx) {
   const { context } = view;
-  const angle = Math.atan2(uav.east_m, uav.north_m);
+  const angle = Math.atan2(rightPx, -downPx);
   const [dx, dy] = [Math.sin(angle), -Math.cos(angle)];
   const reach = Math.min(
     (view.width / 2 - 16) / Math.max(1e-9, Math.abs(dx)),
     (view.height / 2 - 16) / Math.max(1e-9, Math.abs(dy)),
   );
-  const [x, y] = [view.centre[0] + dx * reach, view.centre[1] + dy * reach];
+  const [x, y] = [view.width / 2 + dx * reach, view.height / 2 + dy * reach];
   context.save();
   context.translate(x, y);
   context.rotate(angle);

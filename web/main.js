@@ -22,7 +22,7 @@ import { UavTable } from "./table.js";
 import { setUpTheme } from "./theme.js";
 import { TimeBar } from "./timebar.js";
 
-const LOOK_MS = 100; // how often ages and the connection are looked at, answers or not
+const LOOK_MS = 250; // how often ages and the connection are looked at, answers or not
 const SAME_BEAT_MS = 400;
 const STATE_ORDER = ["live", "coasting", "stale", "lost"];
 const COLLATOR = new Intl.Collator("en", { numeric: true });
@@ -227,6 +227,7 @@ function showPlan(view, link, now) {
     isPast: !timebar.isLive,
     selected,
     at: view.at,
+    answers: `${feeds.uavs.answeredAt} ${feeds.beams.answeredAt}`,
   }, now);
 }
 

@@ -14,6 +14,9 @@ const RADIANS = Math.PI / 180;
 const MARGIN_PX = 30; // room for the compass outside the outermost ring
 const GAP_MS = 2500; // a trail is not drawn through a hole in what was received
 
+/** What tells one scene from another, beside its answers' contents. */
+const KEYS = ["answers", "uavsLive", "beamsLive", "message", "isPast", "selected", "at"];
+
 const COLOURS = [
   "plan", "grid", "gridtext", "text", "muted", "live", "coast", "stale", "beam", "bore", "bad",
   "warn", "past", "on-past",
@@ -55,14 +58,17 @@ export class PlanView {
     this.redraw();
   }
 
+  /** `scene.answers` tells one answer from the next: what is the same is not drawn again. */
   show(scene, now) {
-    this.scene = scene;
+    const key = JSON.stringify(KEYS.map((name) => scene[name]));
+    const isSame = scene.answers !== undefined && key === this.shown;
+    Object.assign(this, { scene, shown: key });
     // Neither one that flew off long ago nor passing traffic may make those with a beam small.
     const shown = scene.uavs.filter((uav) => placed(uav) && uav.state !== "lost");
     const targets = shown.filter((uav) => uav.target !== false);
     this.scale.follow((targets.length ? targets : shown)
       .map((uav) => Math.hypot(uav.north_m, uav.east_m)), now);
-    this.redraw();
+    if (!isSame || this.scale.isMoving || this.fault) this.redraw();
     if (this.fault) throw this.fault; // to whom shows it: a frame's own errors are heard by nobody
   }
 

@@ -50,6 +50,10 @@ export class Scale {
     this.roomyAt = -Infinity;
   }
 
+  get isMoving() {
+    return this.radiusM !== SCALES[this.level][0];
+  }
+
   /** Move what is drawn towards what is wanted. True while it is on its way. */
   ease() {
     const [goalM] = SCALES[this.level];

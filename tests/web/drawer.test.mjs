@@ -74,7 +74,7 @@ test("Escape closes the drawer, then chooses nothing; messages are asked for whi
   page.press("Escape");
   assert.deepEqual([page.element("drawer").hidden, page.chosen()], [true, ["2:1"]]);
   const asked = page.service.count(MESSAGES);
-  assert.ok(asked >= 1);
+  assert.ok(asked >= 1 && asked <= 2, asked); // every other second
   await page.time.advance(10 * BEAT_MS);
   assert.equal(page.service.count(MESSAGES), asked);
   page.press("Enter");

@@ -171,3 +171,20 @@ test("while nothing is laid out, nothing is drawn", async () => {
   assert.equal(circles(view.picture, 6).length, 1);
   assert.equal(linesFrom(view.picture, CENTRE).length, 0);
 });
+
+test("the same scene is not drawn again, and another answer is", async () => {
+  const view = await openPlan();
+  const scene = { uavs: [uav("1:1")], beams: [], array: null, carrier: null, uavsLive: true,
+    beamsLive: true, message: "", isPast: false, selected: null, at: 1000, answers: "1" };
+  const drawn = (changed) => {
+    view.picture.forget();
+    view.plan.show({ ...scene, ...changed }, 1000);
+    while (view.browser.time.paint(1));
+    return view.picture.drawn.length > 0;
+  };
+  assert.equal(drawn({}), true);
+  assert.equal(drawn({}), false);
+  for (const changed of [{ answers: "2" }, { selected: "1:1" }, { message: "late" }]) {
+    assert.equal(drawn(changed), true, JSON.stringify(changed));
+  }
+});

@@ -275,7 +275,7 @@ class Fleet:
             set_center_ned_m=np.array(possible.center_ned_m),
             set_radius_m=possible.radius_m,
             limits=self._limits(newest.fix),
-            error_p95_m=self._usual_m(tracked, velocity, at),
+            error_p95_m=self._usual_m(tracked, velocity, at, possible.bound_m),
             clock_bound_s=at.bound_s,
             dt_s=last.dt_s,
             latency_s=(newest.fix.arrival_ns - newest.fix.t_ns) * 1e-9,
@@ -306,14 +306,21 @@ class Fleet:
         horizontal_m, vertical_m = found.horizontal_m + widened_m, found.vertical_m + widened_m
         return position, velocity, Reach(bound_m, horizontal_m, vertical_m, position, bound_m)
 
-    def _usual_m(self, tracked: _Tracked, velocity: Vector | None, at: SenderTime) -> float | None:
-        """The error that is usual at a time: what reports have shown, and the clock's share."""
+    def _usual_m(
+        self, tracked: _Tracked, velocity: Vector | None, at: SenderTime, bound_m: float
+    ) -> float | None:
+        """The error that is usual at a time: what reports have shown, and the clock's share.
+
+        What reports have shown is of the near past, and may be more than can be now.
+        """
         age_s = (at.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
         seen_m = tracked.hindsight.usual_m(age_s)
-        if seen_m is None or velocity is None:
-            return seen_m
-        common_m = COMMON_ERROR * tracked.history.newest.fix.noise.position_m
-        return math.hypot(seen_m, common_m, math.hypot(*velocity) * at.usual_s)
+        if seen_m is None:
+            return None
+        if velocity is not None:
+            common_m = COMMON_ERROR * tracked.history.newest.fix.noise.position_m
+            seen_m = math.hypot(seen_m, common_m, math.hypot(*velocity) * at.usual_s)
+        return min(seen_m, bound_m)
 
     def _limits(self, fix: Fix) -> Limits:
         return fix.limits or self._settings.limits

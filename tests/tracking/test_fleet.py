@@ -541,3 +541,17 @@ def test_without_a_velocity_doubt_is_worth_the_greatest_speed(fix: MakeFix) -> N
     fleet.accept(fix(0, [0, 0, 0]))
     a, b = seen(fleet, 1), seen(fleet, 1, doubt_s=0.5)
     assert b.bound_m - a.bound_m == pytest.approx(0.5 * 30.0)
+
+
+def test_what_is_usual_is_within_what_is_possible(fix: MakeFix) -> None:
+    """Of a clock that was usually off by more than it can be off now."""
+    fleet = Fleet(KinematicObserver(KinematicModel(30.0, 8.0)), SETTINGS)
+    for t_s in range(100, 130):
+        fleet.accept(fix(t_s * S, [20 * t_s, 0, 0], [20, 0, 0]))
+    for usual_s, is_less in ((0.01, True), (5.0, False)):
+        at = replace(same_time(129 * S + S // 10, 0.02), usual_s=usual_s)
+        track = fleet.track("1:1", at.node_ns, at)
+        assert track is not None
+        assert track.error_p95_m is not None
+        assert (track.error_p95_m < track.bound_m) is is_less
+        assert track.error_p95_m <= track.bound_m

@@ -1,6 +1,7 @@
 // Links, events and recordings.
 
 import { $, make, setChildren, setText } from "./dom.js";
+import { save } from "./export.js";
 import * as format from "./format.js";
 import { authorised, hasToken } from "./token.js";
 
@@ -71,9 +72,7 @@ function recordingItem({ name, bytes, state }) {
 async function download(href, name) {
   const response = await authorised(href);
   if (!response.ok) return;
-  const url = URL.createObjectURL(await response.blob());
-  make("a", { href: url, download: name }).click();
-  setTimeout(() => URL.revokeObjectURL(url), 60_000);
+  save(await response.blob(), name);
 }
 
 /** Nothing at all where the service does not offer them. */

@@ -6,6 +6,7 @@ import { Charts } from "./charts.js";
 import { Alarm } from "./alarm.js";
 import { $, setText } from "./dom.js";
 import { Drawer } from "./drawer.js";
+import { csvOf, save } from "./export.js";
 import { Focus } from "./focus.js";
 import * as format from "./format.js";
 import { headlineOf, showHeadline, showTroubles } from "./health.js";
@@ -18,6 +19,7 @@ import {
 } from "./panels.js";
 import { worstFirst } from "./order.js";
 import { PlanView } from "./plan.js";
+import { showSettings } from "./settings.js";
 import { UavTable } from "./table.js";
 import { setUpTheme } from "./theme.js";
 import { TimeBar } from "./timebar.js";
@@ -296,6 +298,17 @@ $("zoom-out").addEventListener("click", zoomOut);
 $("zoom-fit").addEventListener("click", fitAll);
 $("follow").addEventListener("click", follow);
 $("help-open").addEventListener("click", showHelp);
+$("settings-open").addEventListener("click", showSettings);
+
+const fileName = (view, end) => `companion-${(view.stamp ?? "").replace(/[:.]/g, "")}.${end}`;
+$("save-csv").addEventListener("click", () => {
+  const view = timebar.shown ?? liveView(performance.now());
+  save(new Blob([csvOf(view)], { type: "text/csv" }), fileName(view, "csv"));
+});
+$("save-png").addEventListener("click", () => {
+  const view = timebar.shown ?? liveView(performance.now());
+  $("plan").toBlob((blob) => blob && save(blob, fileName(view, "png")));
+});
 
 // Where there is little room, the symbols are folded until they are asked for.
 if (window.matchMedia("(max-width: 1180px)").matches) $("legend").removeAttribute("open");

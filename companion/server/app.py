@@ -16,7 +16,7 @@ from companion.server.access import OPEN_PATHS, BearerToken
 from companion.server.metrics import NodeCollector
 from companion.server.responses import answer, answers
 from companion.server.stream import Stream
-from companion.views import link_state, state
+from companion.views import link_state, settings, state
 from companion.views.design import DesignView
 from companion.views.state import Node
 from companion.views.words import rfc3339
@@ -161,6 +161,14 @@ def _state_routes(app: FastAPI, node: Node) -> None:
     )
     async def history() -> Response:
         return answer(node.series.show(node.now_ns()))
+
+    @app.get(
+        "/v1/settings",
+        summary="The effective settings, and which of them are as they come",
+        responses=answers(models.EffectiveSettings),
+    )
+    async def effective() -> Response:
+        return answer(settings.show(node.pipeline.settings))
 
     @app.get(
         "/v1/design",

@@ -335,6 +335,20 @@ class Status(BaseModel):
     replay: Replay | None
 
 
+class Setting(BaseModel):
+    """One setting; ``source`` is "set" where it is not its default."""
+
+    value: Any
+    default: Any
+    source: Literal["default", "set"]
+
+
+class EffectiveSettings(BaseModel):
+    """The settings by section and key."""
+
+    sections: dict[str, dict[str, Setting]]
+
+
 Column = list[float | None]
 
 

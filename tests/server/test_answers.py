@@ -27,6 +27,7 @@ PATHS: dict[str, Any] = {
     "/v1/uavs/1:1": models.UavState,
     "/v1/links": models.Links,
     "/v1/history": models.History,
+    "/v1/settings": models.EffectiveSettings,
     "/v1/events": models.Events,
     "/v1/design": models.Design,
     "/v1/beams?lead_ms=20": models.Beams,

@@ -1,0 +1,36 @@
+// What is exported: the values of the table, in units that their names have.
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+import { load } from "./browser.mjs";
+import { beam, stampAt, uav, weak } from "./service.mjs";
+import { openPage } from "./whole_page.mjs";
+
+const { csvOf } = await load("export.js");
+
+test("a line a UAV, what is not known is empty, and commas are quoted", () => {
+  const text = csvOf({ stamp: stampAt(0), beams: [beam("1:1"), beam("2:1", { oldS: 3 })],
+    uavs: [uav("1:1", weak("weak", { reason: "late, so to say" })), uav("2:1", { alt_m: null })] });
+  const [head, one, two, end] = text.split("\n");
+  assert.equal(end, "");
+  const names = head.split(",");
+  assert.deepEqual(names.slice(0, 3), ["valid_at", "id", "verdict"]);
+  assert.ok(one.endsWith(',rate,"late, so to say"'), one);
+  const second = Object.fromEntries(two.split(",").map((value, i) => [names[i], value]));
+  assert.deepEqual([second.id, second.alt_m, second.gain_db, second.lat_deg],
+    ["2:1", "", "", "47.0009"]);
+});
+
+test("the settings are shown, what was set before what is as it comes", async () => {
+  const page = await openPage();
+  page.service.answers["/v1/settings"] = { sections: { link: {
+    needed_db: { value: 6, default: 0, source: "set" },
+    needed_sinr_db: { value: null, default: null, source: "default" },
+  } } };
+  page.element("settings-open").click();
+  await page.time.advance(100);
+  assert.equal(page.text("settings-set"), "[link]needed_db6 (default 0)");
+  assert.equal(page.text("settings-default"), "[link]needed_sinr_db–");
+  assert.ok(page.element("settings").hasAttribute("open"));
+});

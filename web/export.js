@@ -1,0 +1,27 @@
+// What is shown, to be taken along: the table as CSV, the plan view as PNG.
+
+import { make } from "./dom.js";
+
+const FIELDS = ["id", "verdict", "state", "lat_deg", "lon_deg", "alt_m", "north_m", "east_m",
+  "down_m", "speed_mps", "age_s", "dt_s", "latency_s", "bound_m", "error_p95_m"];
+const OF_BEAM = ["azimuth_deg", "elevation_deg", "range_m", "pointing_bound_deg", "gain_db",
+  "guaranteed_gain_db"];
+
+const quoted = (value) => (/[",\n]/.test(value) ? `"${value.replaceAll('"', '""')}"` : value);
+const cell = (value) => quoted(value === null || value === undefined ? "" : String(value));
+
+/** Comma-separated values, a line a UAV; what is not known is empty, never 0. */
+export function csvOf({ stamp, uavs, beams }) {
+  const byId = new Map(beams.filter(({ oldS }) => oldS === undefined)
+    .map((beam) => [beam.uav, beam]));
+  const head = ["valid_at", ...FIELDS, ...OF_BEAM, "cause", "reason"];
+  const lines = uavs.map((uav) => [stamp, ...FIELDS.map((name) => uav[name]),
+    ...OF_BEAM.map((name) => byId.get(uav.id)?.[name]), uav.health?.cause, uav.health?.reason]);
+  return [head, ...lines].map((line) => line.map(cell).join(",")).join("\n").concat("\n");
+}
+
+export function save(blob, name) {
+  const url = URL.createObjectURL(blob);
+  make("a", { href: url, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(url), 60_000);
+}

@@ -4,6 +4,7 @@ import click
 
 from companion.cli.learned import train
 from companion.cli.study_beams import beams
+from companion.cli.study_deepsense import deepsense
 from companion.cli.study_link import link
 from companion.cli.study_paper import dt, paper
 from companion.cli.study_prediction import prediction
@@ -17,5 +18,5 @@ def study() -> None:
     """
 
 
-for command in (prediction, beams, link, paper, dt, train):
+for command in (prediction, beams, link, paper, dt, deepsense, train):
     study.add_command(command)

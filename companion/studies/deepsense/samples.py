@@ -1,0 +1,56 @@
+"""Samples of measured beams, and how they are split honestly into what is learned and tested."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.values import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """What was measured, in order of time.
+
+    name       of the table
+    place      (N, 2), both coordinates from 0 to 1: which way they point is not known
+    beam       (N,), the beam of the greatest received power
+    beams      how many beams the codebook has
+    power      (N, beams), received power of each, linear; None where the table has none
+    """
+
+    name: str
+    place: FloatArray
+    beam: IntArray
+    beams: int
+    power: FloatArray | None = None
+
+    def neighbours_alike(self) -> float:
+        """Share of samples that have the beam of the one before: what a random split leaks."""
+        return float(np.mean(self.beam[1:] == self.beam[:-1]))
+
+
+def blocks(count: int, number: int, folds: int) -> list[BoolArray]:
+    """Contiguous blocks of ``count`` samples, every ``folds``-th of them a fold: masks (N,).
+
+    No sample that is tested has its neighbours among those that were learned from, but at the ends
+    of the blocks.
+    """
+    which = np.arange(count) * number // count
+    return [which % folds == fold for fold in range(folds)]
+
+
+def shuffled(count: int, folds: int, seed: int) -> list[BoolArray]:
+    """Folds at random, as published: masks (N,). Neighbours in time are on both sides."""
+    which = np.random.default_rng(seed).permutation(count) % folds
+    return [which == fold for fold in range(folds)]
+
+
+def inner(learned: BoolArray, number: int, folds: int) -> list[BoolArray]:
+    """Blocks within what is learned from, for choices that must not see what is tested."""
+    (rows,) = np.nonzero(learned)
+    found = []
+    for part in blocks(len(rows), number, folds):
+        mask = np.zeros(len(learned), dtype=bool)
+        mask[rows[part]] = True
+        found.append(mask)
+    return found

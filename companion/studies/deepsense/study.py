@@ -1,0 +1,126 @@
+"""How well a position tells the best beam, on contiguous blocks and on a random split."""
+
+import platform
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+
+import companion
+from companion.studies.deepsense import predictors
+from companion.studies.deepsense.predictors import Fitted, Predictor, rank_of
+from companion.studies.deepsense.samples import Samples, blocks, inner, shuffled
+from companion.values import BoolArray, FloatArray, IntArray
+
+BLOCKS: Final = 20
+FOLDS: Final = 5
+TOPS: Final = (1, 3, 5, 8)
+COVERAGE: Final = 0.99
+PREDICTORS: Final[dict[str, Predictor]] = {
+    "nearest neighbours": predictors.nearest,
+    "plain geometry": predictors.plain,
+    "geometry and kernel": predictors.kernel,
+}
+TARGETS: Final = {1: 45.0, 3: 82.0, 5: 95.0}
+"""Percent on blocks that the product means to reach."""
+_CALIBRATION: Final = (16, 4)
+
+
+def study(
+    samples: Samples, seed: int, progress: Callable[[str], None] = lambda _text: None
+) -> dict[str, Any]:
+    """The answer as it is written to ``deepsense.json``."""
+    count = len(samples.beam)
+    splits = {
+        "blocks": blocks(count, BLOCKS, FOLDS),
+        "shuffled": shuffled(count, FOLDS, seed),
+    }
+    rows = []
+    for split, folds in splits.items():
+        for name, predictor in PREDICTORS.items():
+            progress(f"{split}: {name}")
+            rows.append({"split": split, "predictor": name} | _scores(samples, predictor, folds))
+    at, widths = predictors.chosen(samples, np.ones(count, dtype=bool))
+    return {
+        "command": f"companion study deepsense {samples.name} --seed {seed}",
+        "table": samples.name,
+        "samples": count,
+        "beams": samples.beams,
+        "neighbours_alike": samples.neighbours_alike(),
+        "blocks": BLOCKS,
+        "folds": FOLDS,
+        "seed": seed,
+        "rows": rows,
+        "targets": {str(top): percent for top, percent in TARGETS.items()},
+        "coverage_wanted": COVERAGE,
+        "geometry": {name: getattr(at, name) for name in at.__slots__},
+        "kernel_widths": list(widths),
+        "versions": {
+            "companion": companion.__version__,
+            "numpy": np.__version__,
+            "python": platform.python_version(),
+        },
+    }
+
+
+def _scores(samples: Samples, predictor: Predictor, folds: list[BoolArray]) -> dict[str, Any]:
+    """What a predictor reaches over all folds, each sample tested once."""
+    count = len(samples.beam)
+    rank, size, lost_db = np.zeros(count, int), np.zeros(count, int), np.full(count, np.nan)
+    for tested in folds:
+        fitted = predictor(samples, ~tested)
+        likely = fitted(~tested)
+        rank[tested] = rank_of(likely, samples.beam)[tested]
+        size[tested] = _sizes(likely, _threshold(samples, fitted, ~tested))[tested]
+        if samples.power is not None:
+            lost_db[tested] = _lost_db(samples.power[tested], likely[tested])
+    known = bool(np.isfinite(lost_db).any())
+    return {
+        **{f"top_{top}": 100.0 * float(np.mean(rank < top)) for top in TOPS},
+        "set_size_mean": float(size.mean()),
+        "set_size_max": int(size.max()),
+        "set_coverage": float(np.mean(rank < size)),
+        "power_lost_db": float(np.nanmean(lost_db)) if known else None,
+    }
+
+
+def _threshold(samples: Samples, fitted: Fitted, learned: BoolArray) -> float:
+    """The probability that candidate sets must hold to cover, in blocks within what is learned."""
+    needed = []
+    for part in inner(learned, *_CALIBRATION):
+        likely = fitted(learned & ~part)[part]
+        held = np.sort(likely, axis=1)[:, ::-1].cumsum(axis=1)
+        needed.append(held[np.arange(len(likely)), rank_of(likely, samples.beam[part])])
+    return float(np.quantile(np.concatenate(needed), COVERAGE))
+
+
+def _sizes(likely: FloatArray, threshold: float) -> IntArray:
+    """How many beams, the likeliest first, hold a probability, (N,)."""
+    held = np.sort(likely, axis=1)[:, ::-1].cumsum(axis=1)
+    sizes: IntArray = np.minimum((held < threshold).sum(axis=1) + 1, likely.shape[1])
+    return sizes
+
+
+def _lost_db(power: FloatArray, likely: FloatArray) -> FloatArray:
+    """What the likeliest beam receives less than the best one, dB, (N,)."""
+    columns = np.argmax(likely, axis=1) % power.shape[1]
+    got = power[np.arange(len(power)), columns]
+    found: FloatArray = 10.0 * np.log10(power.max(axis=1) / np.maximum(got, 1e-12))
+    return found
+
+
+def text(answer: dict[str, Any]) -> str:
+    """The table as text."""
+    lines = [
+        f"{answer['table']}: {answer['samples']} samples, {answer['beams']} beams;"
+        f" {answer['neighbours_alike']:.0%} of neighbours share a beam",
+        f"{answer['blocks']} contiguous blocks in {answer['folds']} folds; shuffled with seed"
+        f" {answer['seed']}",
+        f"{'split':10}{'predictor':22}{'top-1':>7}{'top-3':>7}{'top-5':>7}{'set':>6}{'covers':>8}",
+    ]
+    lines += [
+        f"{row['split']:10}{row['predictor']:22}{row['top_1']:7.1f}{row['top_3']:7.1f}"
+        f"{row['top_5']:7.1f}{row['set_size_mean']:6.1f}{100 * row['set_coverage']:7.1f}%"
+        for row in answer["rows"]
+    ]
+    return "\n".join(lines)

@@ -1,0 +1,156 @@
+"""Measured beams: the splits, the tables as they come, the predictors on beams that are known."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from support import shared_log
+
+from companion.cli.main import main
+from companion.studies.deepsense import geometry, predictors, study
+from companion.studies.deepsense.samples import Samples, blocks, inner, shuffled
+from companion.studies.running import measured_beams
+from companion.values import FloatArray, IntArray, UserError
+
+BEAMS = 32
+
+
+def flown(seed: int, count: int = 1500, lag: int = 0) -> tuple[FloatArray, IntArray]:
+    """A path in front of an array at (0.5, -0.4), and its beams by the sine of the bearing."""
+    rng = np.random.default_rng(seed)
+    turn = np.cumsum(rng.normal(0, 0.05, count))
+    place = 0.5 + 0.45 * np.stack(
+        [np.sin(0.021 * np.arange(count) + turn), np.cos(0.013 * np.arange(count))], axis=1
+    )
+    past = place[np.maximum(np.arange(count) - lag, 0)]
+    sine = (past[:, 0] - 0.5) / np.hypot(past[:, 0] - 0.5, past[:, 1] + 0.4)
+    beam = np.clip(np.round(16 + 20 * sine + rng.normal(0, 0.3, count)), 1, BEAMS - 1)
+    return place, beam.astype(np.int64)
+
+
+@pytest.mark.parametrize("number", [5, 20, 37])
+def test_blocks_are_contiguous_and_each_sample_is_tested_once(number: int) -> None:
+    folds = blocks(1000, number, 5)
+    assert np.sum(folds, axis=0).tolist() == [1] * 1000
+    changes = sum(int((np.diff(fold.astype(int)) != 0).sum()) for fold in folds)
+    assert changes == 2 * (number - 1)
+    assert np.sum(shuffled(1000, 5, 3), axis=0).tolist() == [1] * 1000
+    assert (shuffled(1000, 5, 3)[0] == shuffled(1000, 5, 3)[0]).all()
+
+
+def test_choices_are_made_within_what_is_learned_from() -> None:
+    tested = blocks(1000, 20, 5)[2]
+    parts = inner(~tested, 16, 4)
+    assert np.sum(parts, axis=0).tolist() == (~tested).astype(int).tolist()
+
+
+def test_no_predictor_sees_what_is_tested() -> None:
+    """Other beams where it is tested change nothing of what is predicted there."""
+    place, beam = flown(1)
+    tested = blocks(len(beam), 20, 5)[1]
+    lied = np.where(tested, (beam * 7 + 3) % BEAMS, beam)
+    for predictor in study.PREDICTORS.values():
+        honest = predictor(Samples("x", place, beam, BEAMS), ~tested)(~tested)
+        other = predictor(Samples("x", place, lied, BEAMS), ~tested)(~tested)
+        np.testing.assert_array_equal(honest[tested], other[tested])
+
+
+def test_the_geometry_and_the_lag_are_found() -> None:
+    place, beam = flown(2, lag=2)
+    at = geometry.fit(place, beam, np.ones(len(beam), dtype=bool), BEAMS, lags=True)
+    assert at.lag == 2.0
+    assert np.abs(at.beams(place) - beam).mean() < 0.6
+    assert np.median(np.abs(at.x - 0.5)) < 0.15
+
+
+def test_a_delay_is_a_shift() -> None:
+    place = np.random.default_rng(1).random((50, 2))
+    np.testing.assert_array_equal(geometry.delayed(place, 0.0), place)
+    np.testing.assert_array_equal(geometry.delayed(place, 3.0)[3:], place[:-3])
+    halves = geometry.delayed(place, 0.5)[1:]
+    np.testing.assert_allclose(halves, (place[1:] + place[:-1]) / 2)
+
+
+def test_ranks_and_candidate_sets() -> None:
+    likely = np.array([[0.1, 0.6, 0.3], [0.2, 0.3, 0.5]])
+    assert predictors.rank_of(likely, np.array([2, 2])).tolist() == [1, 0]
+    assert predictors.rank_of(np.ones((1, 5)), np.array([2])).tolist() == [4]
+    assert study._sizes(likely, 0.55).tolist() == [1, 2]
+    assert study._sizes(likely, 1.5).tolist() == [3, 3]
+
+
+def written(folder: Path, *, files: bool) -> Path:
+    """A scenario as a table alone, or as the folder that the data come in, with powers."""
+    place, beam = flown(4, 400)
+    lines = [
+        "index,unit1_pwr_60ghz,unit2_loc,unit1_beam" if files else "index,unit2_pos,unit1_beam"
+    ]
+    for n, (at, best) in enumerate(zip(place.tolist(), beam.tolist(), strict=True)):
+        if not files:
+            lines.append(f'{n},"[{at[0]}, {at[1]}]",{best}')
+            continue
+        power = np.exp(-np.abs(np.arange(BEAMS) - best))
+        (folder / f"p{n}.txt").write_text("\n".join(map(str, power)))
+        (folder / f"l{n}.txt").write_text(f"{at[0]}\n{at[1]}")
+        lines.append(f"{n},./p{n}.txt,./l{n}.txt,{best}")
+    (folder / "scenario.csv").write_text("\n".join(lines))
+    return folder if files else folder / "scenario.csv"
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("files", [True, False])
+def test_the_command_and_its_page(files: bool, tmp_path: Path) -> None:
+    where, out = written(tmp_path, files=files), tmp_path / "out"
+    given = ["study", "deepsense", str(where), "--out", str(out), "--json"]
+    done = CliRunner().invoke(main, given, prog_name="companion")
+    assert done.exit_code == 0, done.output
+    answer = json.loads((out / "deepsense.json").read_text())
+    assert json.loads(done.stdout) == answer
+    rows = {(row["split"], row["predictor"]): row for row in answer["rows"]}
+    assert set(rows) == {(s, p) for s in ("blocks", "shuffled") for p in study.PREDICTORS}
+    ours = rows["blocks", "geometry and kernel"]
+    assert ours["top_1"] > 50 and ours["top_5"] > 95
+    assert (ours["power_lost_db"] is not None) == files
+    if files:
+        assert 0 <= ours["power_lost_db"] < 3
+    page = (out / "deepsense.html").read_text()
+    assert "20 contiguous blocks" in page and "seed of the random split 1" in page
+    assert (out / "deepsense_tops.png").stat().st_size > 5000
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("a,b\n1,2\n", "no columns unit2_pos and unit1_beam"),
+        ('unit2_pos,unit1_beam\n"[1,2]",x\n', "row 2"),
+        ('unit2_pos,unit1_beam\n"[1,2]",3\n', "at least 200 rows"),
+        ("unit2_pos,unit1_beam\n" + '"[1,2]",3\n' * 300, "nothing moves"),
+        ("unit2_pos,unit1_beam\n" + "gone.txt,3\n" * 300, "cannot be read"),
+        ("unit2_pos,unit1_beam\n" + '"[1,2]",99999\n' * 300, "beams are counted"),
+    ],
+)
+def test_what_is_no_scenario_is_said(text: str, why: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    path.write_text(text)
+    with pytest.raises(UserError, match=why):
+        measured_beams.read(path)
+    (tmp_path / "y.csv").touch()
+    with pytest.raises(UserError, match="2 CSV files"):
+        measured_beams.read(tmp_path)
+
+
+@pytest.mark.full
+def test_the_drone_scenario_on_blocks() -> None:
+    """The published rivals as they were measured before, and what is reached beside them."""
+    samples = measured_beams.read(shared_log("deepsense_scenario23.csv"))
+    assert (len(samples.beam), samples.beams) == (11_387, 32)
+    assert samples.neighbours_alike() == pytest.approx(0.82, abs=0.005)
+    answer = study.study(samples, 1)
+    rows = {(row["split"], row["predictor"]): row for row in answer["rows"]}
+    near, plain, ours = (rows["blocks", name] for name in study.PREDICTORS)
+    assert near["top_1"] == pytest.approx(41.5, abs=0.7)
+    assert plain["top_3"] == pytest.approx(78.2, abs=0.7)
+    assert ours["top_1"] > 44 and ours["top_3"] > 82 and ours["top_5"] > 93
+    assert rows["shuffled", "nearest neighbours"]["top_1"] > near["top_1"] + 5  # it leaks

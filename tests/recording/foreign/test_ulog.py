@@ -133,3 +133,12 @@ def test_topics_that_cannot_be_are_refused_and_counted(fields: str) -> None:
     log = px4.read(as_bytes(made.data))
     assert log.positions is None
     assert log.lost[Reason.MALFORMED] >= 1
+
+
+def test_a_lone_message_among_garbage_is_none() -> None:
+    made = flight()
+    false = message("D", struct.pack("<HQddf", 0, 5_000_000, 1.0, 2.0, 3.0))
+    torn = made.data[:-1] + b"\xff" * 50 + false + b"\xff" * 50
+    walked = ulog.walk(as_bytes(torn), ("vehicle_global_position",))
+    assert len(walked.topics[0].at) == 40
+    assert walked.lost >= 99 + len(false)  # one byte ends the cut sample

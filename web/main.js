@@ -18,6 +18,7 @@ import {
   showBeams, showConnection, showFault, showReadiness, showStatus, Rejections,
 } from "./panels.js";
 import { worstFirst } from "./order.js";
+import { Ground } from "./ground.js";
 import { PlanView } from "./plan.js";
 import { showSettings } from "./settings.js";
 import { UavTable } from "./table.js";
@@ -38,6 +39,7 @@ let isNew = false; // something has come since the pictures were last drawn
 const history = new History();
 const last = new LastKnown();
 const plan = new PlanView($("plan"), history, pick, markPlan);
+const ground = new Ground($("ground"), () => plan.colour);
 const drawer = new Drawer();
 const table = new UavTable($("uavs"), pick, refresh);
 const focus = new Focus();
@@ -218,6 +220,7 @@ function planMessage(view, link, now) {
 }
 
 function showPlan(view, link, now) {
+  if (format.known(view.carrier?.lat_deg)) ground.place = view.carrier;
   plan.show({
     uavs: view.uavs,
     beams: view.beams,
@@ -314,7 +317,7 @@ $("save-png").addEventListener("click", () => {
 if (window.matchMedia("(max-width: 1180px)").matches) $("legend").removeAttribute("open");
 
 const toggleTheme = setUpTheme($("theme"), () => {
-  for (const picture of [plan, focus, charts]) picture.recolour();
+  for (const picture of [plan, focus, charts, ground]) picture.recolour();
 });
 
 setUpKeys({
@@ -335,3 +338,8 @@ setUpKeys({
   "+": zoomIn, "=": zoomIn, "-": zoomOut, "0": fitAll,
 }, chooseNth);
 setInterval(refresh, LOOK_MS);
+
+ground.begin().then((found) => {
+  if (found) plan.ground = ground;
+  if (found) plan.redraw();
+}, (error) => console.error("the map cannot be shown:", error));

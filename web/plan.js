@@ -32,6 +32,7 @@ export class PlanView {
     this.hits = [];
     new ResizeObserver(() => this.resize()).observe(canvas);
     this.pan = [0, 0]; // where the carrier is, pixels off the middle
+    this.ground = null; // a map beneath, which is moved along
     this.followed = null; // the UAV that is kept in the middle
     setUpGestures(canvas, {
       pan: (dx, dy) => this.drag(dx, dy),
@@ -138,7 +139,9 @@ export class PlanView {
     context.globalAlpha = 1;
     context.setLineDash([]);
     context.fillStyle = this.colour.plan;
-    context.fillRect(0, 0, width, height);
+    if (this.ground) context.clearRect(0, 0, width, height);
+    else context.fillRect(0, 0, width, height);
+    this.ground?.follow(this);
     drawRings(this);
     drawCompass(this);
     const uavs = this.scene.uavs.filter(placed);

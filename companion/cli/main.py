@@ -184,9 +184,10 @@ def replay(
         from companion.node import served_replay  # it loads what HTTP takes
         from companion.settings.files import load
 
+        own = load(config).override(server={"listen": listen})
         served_replay.serve(
-            served_replay.Asked(logs, settings, pace, recorder, latency_s),
-            load(config).override(server={"listen": listen}).server.listen,
+            served_replay.Asked(logs, settings, pace, recorder, latency_s, own.page.map),
+            own.server.listen,
             partial(_show_replay, as_json),
             token=os.environ.get("COMPANION_TOKEN"),
             insecure=insecure,

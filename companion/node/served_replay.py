@@ -26,6 +26,7 @@ from companion.node.replay import FLUSH_EVERY_S, Run, log_events, missing, told
 from companion.node.serving import NOTICES_KEPT, Server, Throughput, address, pause, run_until_told
 from companion.pipeline import assembly
 from companion.recording.writer import Writer
+from companion.server import area_map
 from companion.server.access import bind
 from companion.settings.model import Settings
 from companion.values import Event, Frame, Notice, Rejection, Tick
@@ -49,6 +50,7 @@ class Asked:
     speed     as in ``companion.node.replay.replay``
     record    makes the recording of the replay; None: there is none
     latency_s as in ``companion.node.replay.replay``
+    area_map  the map under the plan view: of the user's own settings, not of a recording's
     """
 
     logs: Sequence[Path]
@@ -56,6 +58,7 @@ class Asked:
     speed: float | None
     record: Callable[[], Writer] | None
     latency_s: float = 0.0
+    area_map: str | None = None
 
 
 def serve(
@@ -90,6 +93,7 @@ class ServedReplay:
 
     def __init__(self, asked: Asked, say: Callable[[str], None]) -> None:
         logs, settings = asked.logs, asked.settings
+        self._area = area_map.find(asked.area_map)
         events = log_events(logs, settings, asked.latency_s)
         first = next(events)
         self._run = Run(settings, asked.record() if asked.record else None)
@@ -128,7 +132,7 @@ class ServedReplay:
         turns out to be unusable, ``OSError`` where the recording cannot be written.
         """
         answering = asyncio.Event()
-        server = Server(self, token, answering)
+        server = Server(self, token, answering, self._area)
         failed: Exception | None = None
         try:
             async with asyncio.TaskGroup() as group:

@@ -25,6 +25,7 @@ from companion.recording.reader import LogError
 from companion.recording.recover import recover_leftovers
 from companion.recording.scene import Scene
 from companion.recording.writer import Writer
+from companion.server import area_map
 from companion.settings.model import Settings
 from companion.values import Event, Frame, Notice, Output, Severity, Tick, UserError
 from companion.views.health import behind
@@ -61,6 +62,7 @@ class Service:
         self.last_messages = LastMessages()
         self.lateness = Lateness()
         self.series = Series()
+        self._area = area_map.find(settings.page.map)
         self._ticked = asyncio.Event()
         self._is_behind = False
         self._settings = settings
@@ -88,7 +90,7 @@ class Service:
         ``others`` are further coroutines to run beside, as for the demo; they are cancelled at the
         end.
         """
-        server = Server(self, token, self.answering)
+        server = Server(self, token, self.answering, self._area)
         if self._recorder:
             self._recorder.start()
         if self._live:

@@ -8,6 +8,7 @@ import socket
 import sys
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterator
+from pathlib import Path
 from typing import Any, Final
 
 import uvicorn
@@ -29,11 +30,13 @@ class Server(uvicorn.Server):
     """uvicorn around a node, which leaves the signals to its caller.
 
     ``serve(sockets=[bound socket])`` runs until ``should_exit`` is set; ``answering`` is set once
-    it accepts requests. ``token``: see ``create_app``.
+    it accepts requests. ``token`` and ``area``: see ``create_app``.
     """
 
-    def __init__(self, node: Node, token: str | None, answering: asyncio.Event) -> None:
-        app = create_app(node, token)
+    def __init__(
+        self, node: Node, token: str | None, answering: asyncio.Event, area: Path | None = None
+    ) -> None:
+        app = create_app(node, token, area)
         super().__init__(
             uvicorn.Config(
                 app,

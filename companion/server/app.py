@@ -11,7 +11,7 @@ from prometheus_client import CollectorRegistry, ProcessCollector, generate_late
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import companion
-from companion.server import beam_routes, file_routes, models, responses
+from companion.server import area_map, beam_routes, file_routes, models, responses
 from companion.server.access import OPEN_PATHS, BearerToken
 from companion.server.metrics import NodeCollector
 from companion.server.responses import answer, answers
@@ -34,8 +34,10 @@ the moment at which they are asked for: `valid_at` says which, so no answer has 
 """
 
 
-def create_app(node: Node, token: str | None = None) -> ASGIApp:
+def create_app(node: Node, token: str | None = None, area: Path | None = None) -> ASGIApp:
     """The ASGI application for a node.
+
+    ``area`` is the map under the plan view (``companion.server.area_map``).
 
     With a token, all but ``/healthz`` and the page's own files asks for it: the page is shown, and
     asks the user.
@@ -54,6 +56,7 @@ def create_app(node: Node, token: str | None = None) -> ASGIApp:
     _state_routes(app, node)
     beam_routes.add(app, node)
     file_routes.add(app, node)
+    area_map.add(app, area)
 
     @app.get("/docs", include_in_schema=False)
     async def docs() -> Response:

@@ -369,6 +369,12 @@ class History(BaseModel):
     uavs: dict[str, UavHistory]
 
 
+class AreaMap(BaseModel):
+    """The map under the plan view: its file's name, null without one."""
+
+    name: str | None
+
+
 class Event(BaseModel):
     """Something that was said to the operator."""
 

@@ -26,7 +26,7 @@ from companion.settings.mavlink import (
     SigningSettings,
     TrackSettings,
 )
-from companion.settings.outlets import RecordingSettings, ServerSettings
+from companion.settings.outlets import PageSettings, RecordingSettings, ServerSettings
 from companion.settings.section import ConfigError, Section
 from companion.settings.tracking import ClockSettings, ObserverSettings
 
@@ -52,6 +52,7 @@ class Settings(Section):
     link: NeedSettings = NeedSettings()
     recording: RecordingSettings = RecordingSettings()
     server: ServerSettings = ServerSettings()
+    page: PageSettings = PageSettings()
 
     @classmethod
     def from_toml(cls, text: str, where: str) -> Self:

@@ -1,4 +1,4 @@
-"""Settings of recording and of serving."""
+"""Settings of recording, of serving and of the page."""
 
 from typing import Annotated, Literal
 
@@ -24,6 +24,16 @@ class RecordingSettings(Section):
     scene_hz: Annotated[float, Field(gt=0, le=100)] = 2.0
     rotate_mb: Annotated[float, Field(ge=0.1, le=1e6)] | None = None
     rotate_s: Annotated[float, Field(ge=1, le=1e7)] = 3600.0
+
+
+class PageSettings(Section):
+    """What the page shows beside the state.
+
+    ``map`` is a PMTiles file that lies under the plan view; None: range rings alone. It is served
+    from here; nothing is loaded from elsewhere.
+    """
+
+    map: str | None = None
 
 
 class ServerSettings(Section):

@@ -36,6 +36,7 @@ FILES = {
     "range.toml": b"[beams]\nupdate_hz = -1\n",
     "type.toml": b"[array]\nelements = 'many'\n",
     "broken.toml": b"[beams\n",
+    "map.toml": b"[page]\nmap = 'nothere.pmtiles'\n[server]\nlisten = '127.0.0.1:0'\n",
     "latin.toml": "[beams]\n# \xe9\n".encode("latin-1"),
 }
 SAYS: list[tuple[str, int, str]] = [
@@ -74,6 +75,11 @@ SAYS: list[tuple[str, int, str]] = [
     ("replay good.tlog --config type.toml", 1, "array.elements = 'many'"),
     ("replay good.tlog --config broken.toml", 1, "broken.toml: not TOML"),
     ("replay good.tlog --config latin.toml", 1, "it is not UTF-8 text"),
+    (
+        "run --config map.toml --center 5:1 --link udpin:127.0.0.1:0",
+        1,
+        "page.map = 'nothere.pmtiles': No such",
+    ),
     ("replay good.tlog --config .", 1, "Is a directory"),
     ("replay good.tlog --center here", 1, "'here' is not SYSID:COMPID"),
     ("replay good.tlog --center 999:1", 1, "at most 255"),

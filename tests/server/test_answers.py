@@ -34,6 +34,7 @@ PATHS: dict[str, Any] = {
     "/v1/beams/weights": models.Weights,
     "/v1/pattern?points=5": models.Pattern,
     "/v1/pattern?points=5&cut=elevation": models.Pattern,
+    "/v1/map": models.AreaMap,
     "/v1/recordings": models.Recordings,
     "/v1/mavlink/vehicles": dict[str, models.MavlinkVehicle],
     "/v1/mavlink/vehicles/1/components/1/messages": dict[str, models.MavlinkMessage],
@@ -87,7 +88,7 @@ def test_every_path_of_the_document_is_held_against_its_model(client: TestClient
     document = client.get("/openapi.json").json()
     shown = {path.split("?")[0] for path in PATHS}
     named = {path.format(uav="1:1", sys=1, comp=1, name="HEARTBEAT") for path in document["paths"]}
-    assert named == shown | {"/metrics", "/v1/recordings/HEARTBEAT"}
+    assert named == shown | {"/metrics", "/v1/map/tiles", "/v1/recordings/HEARTBEAT"}
 
 
 def test_the_document_shows_problems_as_problems(client: TestClient) -> None:

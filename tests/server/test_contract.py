@@ -17,7 +17,7 @@ from starlette.testclient import TestClient
 from companion.server.app import create_app
 from companion.server.responses import PROBLEM_TYPE
 
-OPERATIONS = 19
+OPERATIONS = 21
 WITH_RULES = {"/v1/beams", "/v1/beams/weights", "/v1/pattern"}
 EXAMPLES = 12
 EXAMPLES_SOAK = 1500

@@ -1,0 +1,59 @@
+"""The map that lies under the plan view: a PMTiles file of the user's, served in ranges.
+
+Format: PMTiles, version 3 (github.com/protomaps/PMTiles). It is named in the node's own settings,
+never in a recording's: a replay must not serve files that whoever recorded has chosen.
+"""
+
+from pathlib import Path
+from typing import Final
+
+from fastapi import FastAPI, HTTPException
+from fastapi.responses import FileResponse, Response
+
+from companion.server import models
+from companion.server.responses import answer, answers, refusals
+from companion.values import UserError
+
+MAGIC: Final = b"PMTiles\x03"
+MEDIA_TYPE: Final = "application/vnd.pmtiles"
+
+
+def find(named: str | None) -> Path | None:
+    """The file that ``[page] map`` names. Raises ``UserError`` where it is no PMTiles file."""
+    if named is None:
+        return None
+    try:
+        with Path(named).open("rb") as file:
+            head = file.read(len(MAGIC))
+    except OSError as error:
+        raise UserError(f"page.map = {named!r}: {error.strerror}") from error
+    if head != MAGIC:
+        raise UserError(f"page.map = {named!r}: not a PMTiles file of version 3")
+    return Path(named)
+
+
+def add(app: FastAPI, file: Path | None) -> None:
+    """Add the routes to the application."""
+
+    @app.get(
+        "/v1/map",
+        summary="The map under the plan view, where the settings name one",
+        responses=answers(models.AreaMap),
+    )
+    async def area_map() -> Response:
+        return answer({"name": None if file is None else file.name})
+
+    @app.get(
+        "/v1/map/tiles",
+        summary="Its tiles, by Range",
+        response_class=Response,
+        responses={
+            200: {"content": {MEDIA_TYPE: {}}},
+            206: {"content": {MEDIA_TYPE: {}}, "description": "The bytes of Range"},
+            **refusals(404, 416),
+        },
+    )
+    async def tiles() -> Response:
+        if file is None or not file.is_file():
+            raise HTTPException(404, "there is no map")
+        return FileResponse(file, media_type=MEDIA_TYPE)

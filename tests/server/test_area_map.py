@@ -1,0 +1,53 @@
+"""The map under the plan view: ranges of the user's file, or none; never one that a log names."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from companion.server import area_map
+from companion.server.app import create_app
+from companion.values import UserError
+
+
+@pytest.fixture
+def area(tmp_path: Path) -> Path:
+    path = tmp_path / "area.pmtiles"
+    path.write_bytes(b"PMTiles\x03" + bytes(range(200)))
+    return path
+
+
+def test_ranges_of_the_file_are_served(shared_node: Any, area: Path) -> None:
+    whole = area.read_bytes()
+    with TestClient(create_app(shared_node, area=area_map.find(str(area)))) as client:
+        assert client.get("/v1/map").json() == {"name": "area.pmtiles"}
+        asked = client.get("/v1/map/tiles", headers={"range": "bytes=5-17"})
+        assert (asked.status_code, asked.content) == (206, whole[5:18])
+        assert client.get("/v1/map/tiles").content == whole
+        beyond = client.get("/v1/map/tiles", headers={"range": "bytes=9999-"})
+        assert beyond.status_code == 416
+
+
+def test_without_a_map_there_is_none(shared_node: Any) -> None:
+    with TestClient(create_app(shared_node)) as client:
+        assert client.get("/v1/map").json() == {"name": None}
+        assert client.get("/v1/map/tiles").status_code == 404
+
+
+def test_a_map_asks_for_the_token(shared_node: Any, area: Path) -> None:
+    client = TestClient(create_app(shared_node, "s3cret", area))
+    assert client.get("/v1/map/tiles").status_code == 401
+    allowed = {"authorization": "Bearer s3cret"}
+    assert client.get("/v1/map/tiles", headers=allowed).status_code == 200
+
+
+def test_what_is_no_map_is_said_at_the_start(tmp_path: Path, area: Path) -> None:
+    assert area_map.find(None) is None
+    assert area_map.find(str(area)) == area
+    (tmp_path / "old.pmtiles").write_bytes(b"PMTiles\x02" + bytes(200))
+    for name, says in (("old.pmtiles", "not a PMTiles file"), ("gone", "No such file")):
+        with pytest.raises(UserError, match=says):
+            area_map.find(str(tmp_path / name))
+    with pytest.raises(UserError, match="Is a directory"):
+        area_map.find(str(tmp_path))

@@ -8,7 +8,7 @@ import { fontOf, readColours } from "./surface.js";
 const SPANS_S = [30, 60, 180]; // the shortest that holds what there is
 const GAP_MS = 2500; // no line through a hole in what was received
 const MOST_LINES = 7; // as many hues as can be told apart
-const REDRAW_MS = 1000;
+const REDRAW_MS = 2000; // of minutes: a second is not a pixel
 /** Besides its hue every line has its own dash: no UAV is told by colour alone. */
 const DASHES = [[], [7, 3], [2, 3], [10, 3, 2, 3], [4, 2], [14, 4], [2, 6]];
 const HUES = DASHES.map((_, i) => `line${i}`);
@@ -49,7 +49,7 @@ function columns(moments, ids, of, now) {
 
 export class Charts {
   constructor(onPick) {
-    Object.assign(this, { onPick, plots: [], ids: null, selected: null, drawnAt: 0, pastAt: null });
+    Object.assign(this, { onPick, plots: [], ids: null, selected: null, drawnAt: -Infinity, pastAt: null });
     this.past = []; // moments of before this page was opened
     [this.spanS] = SPANS_S;
     for (const { id } of CHARTS) {
@@ -74,7 +74,7 @@ export class Charts {
       beams: uavs.map(([uav, of]) => ({ uav, pointing_bound_deg: of.pointing_bound_deg[i],
         guaranteed_gain_db: of.guaranteed_gain_db[i] })),
     }));
-    this.drawnAt = 0;
+    this.drawnAt = -Infinity;
   }
 
   fit() {
@@ -84,11 +84,11 @@ export class Charts {
   }
 
   /** `pastAt`: the moment that the page shows, null while it is live. */
-  show(history, uavs, { selected, pastAt, isNew, now }) {
+  show(history, uavs, { selected, pastAt, now }) {
     const ids = chosenFew(uavs, selected);
     const changed = this.ids === null || ids.join() !== this.ids.join()
       || selected !== this.selected;
-    const due = isNew || pastAt !== this.pastAt || now - this.drawnAt > REDRAW_MS;
+    const due = pastAt !== this.pastAt || now - this.drawnAt > REDRAW_MS;
     if (!changed && !due) return;
     Object.assign(this, { selected, pastAt, drawnAt: now, now });
     if (changed) this.build(ids, uavs.length);

@@ -1,9 +1,22 @@
 // The few things that every panel does to the page.
 
 export const $ = (id) => document.getElementById(id);
+const TEXT_NODE = 3;
 
+/** Nothing is written that stands there already: each write costs a layout. */
 export function setText(element, text) {
-  if (element.textContent !== text) element.textContent = text;
+  const only = element.firstChild;
+  if (only?.nodeType === TEXT_NODE && only === element.lastChild) {
+    if (only.data !== text) only.data = text; // the box of the text stays
+  } else if (element.textContent !== text) element.textContent = text;
+}
+
+export function setAttribute(element, name, value) {
+  if (element.getAttribute(name) !== value) element.setAttribute(name, value);
+}
+
+export function toggleAttribute(element, name, wanted) {
+  if (element.hasAttribute(name) !== wanted) element.toggleAttribute(name, wanted);
 }
 
 /** An element with attributes and children; children are elements or text. */

@@ -4,7 +4,7 @@
 import { askOnce, connection, startPolling } from "./api.js";
 import { Charts } from "./charts.js";
 import { Alarm } from "./alarm.js";
-import { $, setText } from "./dom.js";
+import { $, setText, toggleAttribute } from "./dom.js";
 import { Drawer } from "./drawer.js";
 import { csvOf, save } from "./export.js";
 import { Focus } from "./focus.js";
@@ -25,7 +25,9 @@ import { UavTable } from "./table.js";
 import { setUpTheme } from "./theme.js";
 import { TimeBar } from "./timebar.js";
 
-const LOOK_MS = 250; // how often ages and the connection are looked at, answers or not
+const LOOK_MS = 250; // how often the connection is looked at, answers or not
+const AGES_MS = 900; // without an answer for so long, ages are counted on all the same
+const GATHER_MS = 60; // answers of one beat come together: they are shown together
 const SAME_BEAT_MS = 400;
 const STATE_ORDER = ["live", "coasting", "stale", "lost"];
 const COLLATOR = new Intl.Collator("en", { numeric: true });
@@ -34,7 +36,8 @@ const KEPT = ["beams", "pattern", "weights", "links", "events", "status"];
 let selected = null;
 let faulted = false;
 let isFilled = false; // whether the charts have what was before
-let isNew = false; // something has come since the pictures were last drawn
+let gathering = null; // the timer of a refresh that is about to come
+let shown = { at: -Infinity, healths: "" }; // when all was last shown, and what was known then
 
 const history = new History();
 const last = new LastKnown();
@@ -98,11 +101,10 @@ function take(name) {
   const isFresh = uavs.answeredAt !== null && uavs.answeredAt > (history.newest?.at ?? -1);
   if (isFresh && (together || !beams.isTrusted(now))) {
     history.add(presentMoment(now));
-    isNew = true;
   }
   const present = presentMoment(now);
   last.note(present, beamedUav(present.answer), now);
-  if (name !== "status" || timebar.isLive) refresh();
+  gathering ??= setTimeout(refresh, GATHER_MS);
 }
 
 /** Mark what stands on an answer that is late, or no longer true. The past was true in its time. */
@@ -111,15 +113,27 @@ function markAges(now, all = false) {
   for (const feed of Object.values(feeds)) {
     const past = !timebar.isLive && feed.name !== "readyz" && feed.name !== "recordings";
     const lost = all || (feed.data !== null && !feed.isTrusted(now));
-    root.toggleAttribute(`data-${feed.name}-lost`, lost && !past);
-    root.toggleAttribute(`data-${feed.name}-late`, feed.health(now) === "late" && !past);
+    toggleAttribute(root, `data-${feed.name}-lost`, lost && !past);
+    toggleAttribute(root, `data-${feed.name}-late`, feed.health(now) === "late" && !past);
   }
+}
+
+/** How it stands with every feed: what has changed is shown at once, though nothing came. */
+const healthsAt = (now) => Object.values(feeds).map((feed) => feed.health(now)).join()
+  + connection(feeds, now).state;
+
+function look() {
+  const now = performance.now();
+  if (now - shown.at > AGES_MS || healthsAt(now) !== shown.healths) refresh();
 }
 
 /** Show everything anew. Should that fail, say so: a page that stood still would look live. */
 function refresh() {
+  clearTimeout(gathering);
+  gathering = null;
   const now = performance.now();
   const link = connection(feeds, now);
+  shown = { at: now, healths: healthsAt(now) };
   try {
     markAges(now, link.state === "lost");
     showAll(link, now);
@@ -145,8 +159,7 @@ function showAll(link, now) {
   showMoment(view, link, now);
   showPlan(view, link, now);
   const pastAt = timebar.shown?.at ?? null;
-  charts.show(history, view.uavs, { selected, pastAt, isNew, now });
-  isNew = false;
+  charts.show(history, view.uavs, { selected, pastAt, now });
   nameThePage(view, link);
 }
 
@@ -337,7 +350,7 @@ setUpKeys({
   "?": showHelp,
   "+": zoomIn, "=": zoomIn, "-": zoomOut, "0": fitAll,
 }, chooseNth);
-setInterval(refresh, LOOK_MS);
+setInterval(look, LOOK_MS);
 
 ground.begin().then((found) => {
   if (found) plan.ground = ground;

@@ -1,15 +1,15 @@
 // Everything that is words: the header, the banner, the side panels.
 
-import { $, setPairs, setText } from "./dom.js";
+import { $, setAttribute, setPairs, setText, toggleAttribute } from "./dom.js";
 import * as format from "./format.js";
 
 function setChip(element, level, text) {
-  element.dataset.level = level;
+  setAttribute(element, "data-level", level);
   setText(element, text);
 }
 
 function setNotice(element, text) {
-  element.hidden = text === "";
+  toggleAttribute(element, "hidden", text === "");
   setText(element, text);
 }
 

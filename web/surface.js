@@ -16,13 +16,19 @@ export class Surface {
     Object.assign(this, { canvas, colourNames, draw, context: canvas.getContext("2d") });
     this.shown = undefined;
     this.isDrawn = false; // whether what is to be shown could be drawn
-    new ResizeObserver(() => this.redraw()).observe(canvas);
+    new ResizeObserver(() => this.resize()).observe(canvas);
     this.recolour();
   }
 
   recolour() {
     this.colour = readColours(this.colourNames);
     this.font = fontOf();
+    this.redraw();
+  }
+
+  /** Asked here alone: in the middle of a refresh the answer would cost a layout. */
+  resize() {
+    [this.width, this.height] = [this.canvas.clientWidth, this.canvas.clientHeight];
     this.redraw();
   }
 
@@ -36,10 +42,10 @@ export class Surface {
   redraw() {
     const { canvas, context } = this;
     const ratio = window.devicePixelRatio || 1;
-    [this.width, this.height] = [canvas.clientWidth, canvas.clientHeight];
     if (!this.shown || !this.width || !this.height) return;
-    canvas.width = Math.round(this.width * ratio);
-    canvas.height = Math.round(this.height * ratio);
+    const [wide, high] = [this.width, this.height].map((px) => Math.round(px * ratio));
+    // To be given a size, even the one that it has, costs a canvas all of its memory anew.
+    if (canvas.width !== wide || canvas.height !== high) Object.assign(canvas, { width: wide, height: high });
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     this.isDrawn = false;
     this.draw(this, this.shown);

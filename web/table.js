@@ -1,6 +1,6 @@
 // The table of UAVs: one row a UAV, kept between updates so that focus and selection stay.
 
-import { make, setText } from "./dom.js";
+import { make, setAttribute, setText, toggleAttribute } from "./dom.js";
 import * as format from "./format.js";
 import { explain, rankOf } from "./health.js";
 import { Order } from "./order.js";
@@ -165,19 +165,19 @@ export class UavTable {
   }
 
   fill(row, context, isSelected) {
-    row.line.dataset.state = context.uav.state;
-    row.line.dataset.verdict = context.uav.verdict ?? "";
-    row.line.toggleAttribute("data-old", ageOf(context) > OLD_S);
-    row.line.toggleAttribute("data-selected", isSelected);
-    row.button.setAttribute("aria-pressed", String(isSelected));
+    setAttribute(row.line, "data-state", context.uav.state);
+    setAttribute(row.line, "data-verdict", context.uav.verdict ?? "");
+    toggleAttribute(row.line, "data-old", ageOf(context) > OLD_S);
+    toggleAttribute(row.line, "data-selected", isSelected);
+    setAttribute(row.button, "aria-pressed", String(isSelected));
     COLUMNS.forEach((column, index) => {
       const { cell, value } = row.cells[index];
       const { text, level = "", title = "" } = column.show(context);
       const oldS = column.feed === "beams" ? context.beam?.oldS : undefined;
       setText(value, text);
-      cell.toggleAttribute("data-old", oldS !== undefined);
-      cell.dataset.level = level;
-      cell.title = oldS === undefined ? title : `As ${format.duration(oldS)} ago`;
+      toggleAttribute(cell, "data-old", oldS !== undefined);
+      setAttribute(cell, "data-level", level);
+      setAttribute(cell, "title", oldS === undefined ? title : `As ${format.duration(oldS)} ago`);
     });
   }
 }

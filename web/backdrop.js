@@ -1,5 +1,7 @@
 // Behind everything: range rings and compass.
 
+import { units } from "./units.js";
+
 function rings(view) {
   const [radiusM, stepM] = view.scale.rings;
   const reachM = (Math.hypot(view.width, view.height) / 2 + Math.hypot(...view.pan)) / view.pxPerM;
@@ -59,5 +61,7 @@ export function drawCompass(view) {
 }
 
 function ringLabel(m) {
-  return m >= 1000 ? `${Number((m / 1000).toFixed(2))} km` : `${m} m`;
+  const { far } = units.length;
+  const { name, metres } = m >= far.metres * 0.999 ? far : units.length;
+  return `${Number((m / metres).toFixed(2))} ${name}`;
 }

@@ -1,9 +1,10 @@
 // Time series of the last minutes, a line a UAV: one picture for each thing that must stay small
 // (or, for gain, large). Drawn by uPlot, which is loaded as a plain script (vendor/README.md).
 
-import { $, make, setChildren } from "./dom.js";
+import { $, make, setChildren, setText } from "./dom.js";
 import { known } from "./format.js";
 import { fontOf, readColours } from "./surface.js";
+import { lengthOf, units } from "./units.js";
 
 const SPANS_S = [30, 60, 180]; // the shortest that holds what there is
 const GAP_MS = 2500; // no line through a hole in what was received
@@ -15,7 +16,7 @@ const HUES = DASHES.map((_, i) => `line${i}`);
 
 const CHARTS = [
   { id: "pointing", of: (_, beam) => beam?.pointing_bound_deg },
-  { id: "innovation", of: (uav) => uav.innovation_m },
+  { id: "innovation", of: (uav) => (known(uav.innovation_m) ? lengthOf(uav.innovation_m) : null) },
   { id: "latency", of: (uav) => (known(uav.latency_s) ? uav.latency_s * 1000 : null) },
   { id: "gain", of: (_, beam) => beam?.guaranteed_gain_db },
 ];
@@ -62,6 +63,11 @@ export class Charts {
     this.colour = readColours([...HUES, "grid", "muted", "mark"]);
     this.font = `11px ${fontOf()}`;
     this.ids = null; // made anew with the new colours
+  }
+
+  changeUnits() {
+    setText($("innovation-unit"), units.length.name);
+    this.drawnAt = -Infinity;
   }
 
   /** Take in what the service kept of the time before; `now`: when its answer came. */

@@ -111,8 +111,8 @@ function factsOf(uav, messages) {
     ["Gain guaranteed", format.decibels(health?.guaranteed_gain_db)],
     ["Reports", `${format.count(uav.reports)}, ${format.seconds(uav.dt_s)} apart`],
     ["Latency", format.milliseconds(uav.latency_s)],
-    ["Error, usual", format.metres(uav.error_p95_m)],
-    ["Error, at most", format.metres(uav.bound_m)],
+    ["Error, usual", format.length(uav.error_p95_m)],
+    ["Error, at most", format.length(uav.bound_m)],
     ["Clock", clock ? `${clock.kind}, ${clock.guarantee}, to ${
       format.milliseconds(uav.clock_bound_s)}` : format.UNKNOWN],
     ["Assumed", assumptions?.speed_max_mps ? `${format.speed(assumptions.speed_max_mps)}, ${

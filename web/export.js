@@ -1,11 +1,22 @@
 // What is shown, to be taken along: the table as CSV, the plan view as PNG.
 
 import { make } from "./dom.js";
+import { known } from "./format.js";
+import { lengthOf, speedOf, units } from "./units.js";
 
 const FIELDS = ["id", "verdict", "state", "lat_deg", "lon_deg", "alt_m", "north_m", "east_m",
   "down_m", "speed_mps", "age_s", "dt_s", "latency_s", "bound_m", "error_p95_m"];
 const OF_BEAM = ["azimuth_deg", "elevation_deg", "range_m", "pointing_bound_deg", "gain_db",
   "guaranteed_gain_db"];
+
+/** Name and value in the units that are chosen; to a millimetre, or as the service said it. */
+function inUnits(name, value) {
+  const [, stem, unit] = /^(.*)_(m|mps)$/.exec(name) ?? [];
+  if (stem === undefined) return [name, value];
+  const [{ field }, convert] = unit === "m" ? [units.length, lengthOf] : [units.speed, speedOf];
+  if (field === unit || !known(value)) return [`${stem}_${field}`, value];
+  return [`${stem}_${field}`, Number(convert(value).toFixed(3))];
+}
 
 const quoted = (value) => (/[",\n]/.test(value) ? `"${value.replaceAll('"', '""')}"` : value);
 const cell = (value) => quoted(value === null || value === undefined ? "" : String(value));
@@ -14,9 +25,11 @@ const cell = (value) => quoted(value === null || value === undefined ? "" : Stri
 export function csvOf({ stamp, uavs, beams }) {
   const byId = new Map(beams.filter(({ oldS }) => oldS === undefined)
     .map((beam) => [beam.uav, beam]));
-  const head = ["valid_at", ...FIELDS, ...OF_BEAM, "cause", "reason"];
-  const lines = uavs.map((uav) => [stamp, ...FIELDS.map((name) => uav[name]),
-    ...OF_BEAM.map((name) => byId.get(uav.id)?.[name]), uav.health?.cause, uav.health?.reason]);
+  const named = [...FIELDS, ...OF_BEAM].map((name) => inUnits(name)[0]);
+  const head = ["valid_at", ...named, "cause", "reason"];
+  const valuesOf = (names, from) => names.map((name) => inUnits(name, from?.[name])[1]);
+  const lines = uavs.map((uav) => [stamp, ...valuesOf(FIELDS, uav),
+    ...valuesOf(OF_BEAM, byId.get(uav.id)), uav.health?.cause, uav.health?.reason]);
   return [head, ...lines].map((line) => line.map(cell).join(",")).join("\n").concat("\n");
 }
 

@@ -1,5 +1,7 @@
 // Numbers to text. Unknown (null, undefined, NaN, infinite) is a dash everywhere, never 0.
 
+import { lengthOf, speedOf, units } from "./units.js";
+
 export const UNKNOWN = "–";
 const NBSP = "\u00a0";
 const MINUS = "\u2212";
@@ -21,16 +23,20 @@ function withUnit(value, decimals, unit, options) {
   return known(value) ? fixed(value, decimals, options) + unit : UNKNOWN;
 }
 
-/** Three significant figures at least, metres below 10 km. */
-export function metres(value) {
-  if (known(value) && Math.abs(value) >= 9999.5) return withUnit(value / 1000, 1, `${NBSP}km`);
-  const decimals = known(value) && Math.abs(value) < 99.95 ? 1 : 0;
-  return withUnit(value, decimals, `${NBSP}m`);
+/** Metres in the unit that is chosen; from ten thousand of it on in the unit of what is long. */
+export function length(metres) {
+  if (!known(metres)) return UNKNOWN;
+  const { name, far } = units.length;
+  const value = lengthOf(metres);
+  if (Math.abs(value) >= 9999.5) return withUnit(metres / far.metres, 1, NBSP + far.name);
+  return withUnit(value, Math.abs(value) < 99.95 ? 1 : 0, NBSP + name);
 }
 
 export const degrees = (value, decimals = 1) => withUnit(value, decimals, "°");
 export const signedDegrees = (value) => withUnit(value, 1, "°", { signed: true });
-export const speed = (value) => withUnit(value, 1, `${NBSP}m/s`);
+/** Metres per second in the unit that is chosen. */
+export const speed = (mps) =>
+  withUnit(known(mps) ? speedOf(mps) : null, 1, NBSP + units.speed.name);
 export const decibels = (value) => withUnit(value, 1, `${NBSP}dB`);
 export const perSecond = (value) => withUnit(value, value < 10 ? 1 : 0, `${NBSP}/s`);
 

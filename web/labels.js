@@ -52,9 +52,9 @@ function holds(view, [left, top, right, bottom]) {
 function labelOf({ uav, beyond }) {
   const up = format.known(uav.down_m) ? -uav.down_m : null;
   const flatM = Math.hypot(uav.north_m, uav.east_m);
-  const height = format.known(up) ? `${up >= 0 ? "↑" : "↓"}${format.metres(Math.abs(up))}` : "";
+  const height = format.known(up) ? `${up >= 0 ? "↑" : "↓"}${format.length(Math.abs(up))}` : "";
   const name = ["weak", "none"].includes(uav.verdict) ? `${MARKS[uav.verdict]} ${uav.id}` : uav.id;
-  if (beyond) return [name, `${format.metres(flatM)} away`];
+  if (beyond) return [name, `${format.length(flatM)} away`];
   return [name, uav.state === "live" ? height : `${height} ${uav.state}`.trim()];
 }
 

@@ -24,6 +24,7 @@ import { showSettings } from "./settings.js";
 import { UavTable } from "./table.js";
 import { setUpTheme } from "./theme.js";
 import { TimeBar } from "./timebar.js";
+import { setUpUnits } from "./units.js";
 
 const LOOK_MS = 250; // how often the connection is looked at, answers or not
 const AGES_MS = 900; // without an answer for so long, ages are counted on all the same
@@ -332,6 +333,13 @@ if (window.matchMedia("(max-width: 1180px)").matches) $("legend").removeAttribut
 const toggleTheme = setUpTheme($("theme"), () => {
   for (const picture of [plan, focus, charts, ground]) picture.recolour();
 });
+
+const measure = () => [plan, charts].forEach((picture) => picture.changeUnits());
+setUpUnits(() => {
+  measure();
+  refresh();
+});
+measure();
 
 setUpKeys({
   " ": () => timebar.toggle(),

@@ -88,7 +88,7 @@ function showCenter(center, behind) {
   const parts = [center.fixed ? "fixed" : center.source ?? format.UNKNOWN];
   if (where === format.UNKNOWN) parts.push(behind ?? center.unfit ?? "no position yet");
   else {
-    parts.push(where, format.metres(center.alt_m), `heading ${format.bearing(center.heading_deg)}`);
+    parts.push(where, format.length(center.alt_m), `heading ${format.bearing(center.heading_deg)}`);
   }
   if (format.known(center.age_s)) parts.push(`${format.seconds(center.age_s)} old`);
   const old = format.known(center.age_s) && center.age_s > 3;

@@ -49,6 +49,11 @@ export class PlanView {
     this.redraw();
   }
 
+  changeUnits() {
+    this.scale.changeUnits();
+    this.redraw();
+  }
+
   resize() {
     const ratio = window.devicePixelRatio || 1;
     this.width = this.canvas.clientWidth;

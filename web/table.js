@@ -33,7 +33,7 @@ function range(uav) {
 }
 
 function bound({ uav }) {
-  const text = format.metres(uav.bound_m);
+  const text = format.length(uav.bound_m);
   if (uav.assumptions?.source !== "raised") return { text };
   return {
     text: `▲ ${text}`, level: "warn",
@@ -66,7 +66,7 @@ const COLUMNS = [
   { key: "state", label: "State", feed: "uavs", by: ({ uav }) => STATES.indexOf(uav.state),
     show: ({ uav }) => ({ text: uav.state }) },
   { key: "range", label: "Range", feed: "uavs", title: "Slant range from the carrier",
-    by: ({ uav }) => range(uav), show: ({ uav }) => ({ text: format.metres(range(uav)) }) },
+    by: ({ uav }) => range(uav), show: ({ uav }) => ({ text: format.length(range(uav)) }) },
   { key: "azimuth", label: "Azimuth", feed: "beams", title: "Right of the array's boresight",
     by: ({ beam }) => beam?.azimuth_deg,
     show: ({ beam }) => ({ text: format.signedDegrees(beam?.azimuth_deg) }) },
@@ -88,7 +88,7 @@ const COLUMNS = [
   { key: "usual", label: "Usual error", short: "Usual", feed: "uavs",
     title: "Usual error: 95 of 100 predictions at this age were nearer, of late",
     by: ({ uav }) => uav.error_p95_m,
-    show: ({ uav }) => ({ text: format.metres(uav.error_p95_m) }) },
+    show: ({ uav }) => ({ text: format.length(uav.error_p95_m) }) },
   { key: "pointing", label: "Pointing bound", short: "Pointing", feed: "beams",
     title: "Pointing bound: how far the true direction can lie from the beam", by: ({ beam }) => beam?.pointing_bound_deg,
     show: pointingBound },

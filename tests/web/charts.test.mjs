@@ -60,6 +60,18 @@ test("what the service kept fills the time before this page was opened, and no m
   assert.deepEqual(plots().gain.data[1], [5, null, null]);
 });
 
+test("the innovation is in the unit that is chosen, from the next drawing on", async () => {
+  const { use } = await load("units.js");
+  const { add, show, plots, charts } = openCharts();
+  add(9000, [uav("1:1", { innovation_m: 3.048, latency_s: 0.03 })]);
+  show();
+  use({ length: "ft" });
+  charts.changeUnits();
+  show();
+  use({ length: "m" });
+  assert.deepEqual([plots().innovation.data[1], plots().latency.data[1]], [[10], [30]]);
+});
+
 test("no line goes through a hole in what was received", () => {
   const { add, show, plots } = openCharts();
   for (const at of [5000, 7500, 10_001]) add(at, [uav("1:1", { innovation_m: 1 })]);

@@ -15,9 +15,9 @@ QUIET = (
 )
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
-    """A headless browser."""
+    """A headless browser. Of a module: while it is open its loop runs in this thread."""
     if not CHROMIUM.exists():
         pytest.skip(f"no {CHROMIUM}: install chromium to test the page")
     from playwright.sync_api import sync_playwright
@@ -40,9 +40,9 @@ def start_demo(directory: Path, port: int = 0) -> Node:
     return node
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Node]:
-    """One demo for all tests that do not end it."""
+    """One demo for all tests of a module that do not end it."""
     node = start_demo(tmp_path_factory.mktemp("demo"))
     yield node
     node.stop()

@@ -1,4 +1,5 @@
-// The settings that are in effect, to be read: what was set first, then what is as it comes.
+// The settings that are in effect, to be read: what was set first and by whom, then what is at its
+// default.
 
 import { askOnce } from "./api.js";
 import { $, make, setText } from "./dom.js";
@@ -6,12 +7,15 @@ import { $, make, setText } from "./dom.js";
 const written = (value) => (value === null ? "–" : typeof value === "string" ? value
   : JSON.stringify(value));
 
-function sectionOf([name, keys], wanted) {
-  const rows = Object.entries(keys).filter(([, { source }]) => source === wanted);
+const fromWhom = ({ source, file, default: plain }) =>
+  ` – from ${file ? `${source} ${file}` : `the ${source}`}, default ${written(plain)}`;
+
+function sectionOf([name, keys], isSet) {
+  const rows = Object.entries(keys).filter(([, { source }]) => (source !== "default") === isSet);
   if (!rows.length) return [];
   return [make("h3", {}, `[${name}]`), make("dl", { class: "settings" }, ...rows.map(
-    ([key, { value, default: plain }]) => make("div", {}, make("dt", {}, key), make("dd", {},
-      written(value) + (wanted === "set" ? ` (default ${written(plain)})` : ""))),
+    ([key, said]) => make("div", {}, make("dt", {}, key), make("dd", {}, written(said.value),
+      make("span", { class: "muted" }, isSet ? fromWhom(said) : ""))),
   ))];
 }
 
@@ -20,8 +24,8 @@ export async function showSettings() {
   const answer = await askOnce("/v1/settings");
   const sections = Object.entries(answer?.sections ?? {});
   setText($("settings-problem"), answer ? "" : "The service does not tell.");
-  const all = (wanted) => sections.flatMap((section) => sectionOf(section, wanted));
-  $("settings-set").replaceChildren(...all("set"));
-  $("settings-default").replaceChildren(...all("default"));
+  const all = (isSet) => sections.flatMap((section) => sectionOf(section, isSet));
+  $("settings-set").replaceChildren(...all(true));
+  $("settings-default").replaceChildren(...all(false));
   $("settings").showModal();
 }

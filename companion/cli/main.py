@@ -1,4 +1,7 @@
-"""The command ``companion`` and its subcommands."""
+"""The command ``companion`` and its subcommands.
+
+Over 300 lines: it is a list, the commands and their options.
+"""
 
 import os
 
@@ -81,17 +84,18 @@ def run(
     Example: companion run --link udpin:0.0.0.0:14550 --center 5:1 --record recordings
     """
     from companion.node import start
-    from companion.settings.files import load
+    from companion.settings.files import layered
 
-    settings = load(config).override(
-        center={"source": center},
-        links={"urls": list(links) or None},
-        presence={"enabled": False if silent else None},
-        server={"listen": listen, "foxglove": foxglove},
-        recording={"directory": record},
-    )
-    voice = _voice(as_json)
-    start.run(settings, voice, token=os.environ.get("COMPANION_TOKEN"), insecure=insecure)
+    options: dict[str, dict[str, Any]] = {
+        "center": {"source": center},
+        "links": {"urls": list(links) or None},
+        "presence": {"enabled": False if silent else None},
+        "server": {"listen": listen, "foxglove": foxglove},
+        "recording": {"directory": record},
+    }
+    voice, token = _voice(as_json), os.environ.get("COMPANION_TOKEN")
+    settings, origins = layered(config, options)
+    start.run(settings, voice, origins=origins, token=token, insecure=insecure)
 
 
 def _voice(as_json: bool) -> "Voice":
@@ -112,10 +116,19 @@ def demo(seconds: float | None, port: int, open_page: bool, as_json: bool) -> No
     """
     from companion.node import demo as scenario
     from companion.node import start
+    from companion.settings.origins import of_options
 
-    settings = scenario.settings("recordings").override(server={"listen": f"127.0.0.1:{port}"})
-    voice, traffic = _voice(as_json), scenario.traffic
-    start.run(settings, voice, traffic=traffic, seconds=seconds, open_page=open_page)
+    options = {"server": {"listen": f"127.0.0.1:{port}"}}
+    settings = scenario.settings("recordings").override(**options)
+    voice, way = _voice(as_json), scenario.traffic
+    start.run(
+        settings,
+        voice,
+        origins=of_options(options),
+        traffic=way,
+        seconds=seconds,
+        open_page=open_page,
+    )
 
 
 @main.command()
@@ -169,7 +182,7 @@ def replay(
     pace = _speed(speed or ("1" if serve else "max"))
     gc.set_threshold(200_000)  # millions of short-lived values, and no cycles among them
     progress = Progress()
-    settings = replaying.settings_for(logs, config, center)
+    settings, origins = replaying.layers_for(logs, config, center)
     if settings.center.source is None:
         click.echo("no --center: the array stands where the first report was made", err=True)
     tell_vehicles(logs)
@@ -186,7 +199,7 @@ def replay(
 
         own = load(config).override(server={"listen": listen})
         served_replay.serve(
-            served_replay.Asked(logs, settings, pace, recorder, latency_s, own.page.map),
+            served_replay.Asked(logs, settings, pace, recorder, latency_s, origins, own.page.map),
             own.server.listen,
             partial(_show_replay, as_json),
             token=os.environ.get("COMPANION_TOKEN"),

@@ -24,8 +24,9 @@ from companion.recording.reader import (
 )
 from companion.recording.scene import Scene
 from companion.recording.writer import Writer
-from companion.settings.files import load
+from companion.settings.files import layered
 from companion.settings.model import Settings
+from companion.settings.origins import Origin, Origins, changed, of_options
 from companion.values import Estimate, Event, Output, Refuted, Tick, Update
 
 FLUSH_EVERY_S: Final = 1.0
@@ -40,10 +41,23 @@ def settings_for(logs: Sequence[Path], config: Path | None, center: str | None) 
     ``center`` may name one of the logs: the vehicle that wrote it carries the array. Raises
     ``LogError`` or ``ConfigError`` where a log or the settings cannot be used.
     """
-    center = center_of(logs, center)
+    return layers_for(logs, config, center)[0]
+
+
+def layers_for(
+    logs: Sequence[Path], config: Path | None, center: str | None
+) -> tuple[Settings, Origins]:
+    """The settings as by ``settings_for``, and where each comes from.
+
+    A recording holds every setting: what is at its default there counts as that.
+    """
+    options = {"center": {"source": center_of(logs, center)}}
     recorded = read_settings(logs[0]) if config is None else None
-    settings = Settings.from_toml(recorded, str(logs[0])) if recorded else load(config)
-    return settings.override(center={"source": center})
+    if recorded:
+        settings = Settings.from_toml(recorded, str(logs[0]))
+        origins = changed(settings, Origin("recording", str(logs[0])))
+        return settings.override(**options), {**origins, **of_options(options)}
+    return layered(config, options)
 
 
 def writer_for(logs: Sequence[Path], settings: Settings, out: Path | None) -> Writer:

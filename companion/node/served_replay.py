@@ -10,7 +10,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, islice
 from pathlib import Path
@@ -29,6 +29,7 @@ from companion.recording.writer import Writer
 from companion.server import area_map
 from companion.server.access import bind
 from companion.settings.model import Settings
+from companion.settings.origins import Origins
 from companion.values import Event, Frame, Notice, Rejection, Tick
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
@@ -50,6 +51,7 @@ class Asked:
     speed     as in ``companion.node.replay.replay``
     record    makes the recording of the replay; None: there is none
     latency_s as in ``companion.node.replay.replay``
+    origins   where the settings come from
     area_map  the map under the plan view: of the user's own settings, not of a recording's
     """
 
@@ -58,6 +60,7 @@ class Asked:
     speed: float | None
     record: Callable[[], Writer] | None
     latency_s: float = 0.0
+    origins: Origins = field(default_factory=dict)
     area_map: str | None = None
 
 
@@ -98,6 +101,7 @@ class ServedReplay:
         first = next(events)
         self._run = Run(settings, asked.record() if asked.record else None)
         self.pipeline = self._run.pipeline
+        self.origins = asked.origins
         self.equipment = assembly.equipment(settings, self.pipeline.array)
         self.name = ", ".join(log.name for log in logs)
         self._missing = {"logs": told(logs), "missing": missing(logs)}

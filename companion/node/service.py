@@ -27,6 +27,7 @@ from companion.recording.scene import Scene
 from companion.recording.writer import Writer
 from companion.server import area_map
 from companion.settings.model import Settings
+from companion.settings.origins import Origins
 from companion.values import Event, Frame, Notice, Output, Severity, Tick, UserError
 from companion.views.health import behind
 from companion.views.last_messages import LastMessages
@@ -54,8 +55,11 @@ class Service:
     recording cannot be opened, ``LiveError`` if the live channels cannot be served.
     """
 
-    def __init__(self, settings: Settings, say: Callable[[str], None]) -> None:
+    def __init__(
+        self, settings: Settings, say: Callable[[str], None], origins: Origins | None = None
+    ) -> None:
         self.pipeline = Pipeline(settings)
+        self.origins = origins or {}
         self.equipment = assembly.equipment(settings, self.pipeline.array)
         self.notices: deque[Notice] = deque(maxlen=NOTICES_KEPT)
         self.answering = asyncio.Event()

@@ -13,6 +13,7 @@ from companion.node.service import Service, require_center
 from companion.node.serving import address, run_until_told
 from companion.server.access import bind
 from companion.settings.model import Settings
+from companion.settings.origins import Origins
 from companion.values import UserError
 
 TOLD_EVERY_S: Final = 1.0
@@ -36,6 +37,7 @@ def run(
     settings: Settings,
     voice: Voice,
     *,
+    origins: Origins | None = None,
     token: str | None = None,
     insecure: bool = False,
     traffic: Callable[[str], Coroutine[Any, Any, None]] | None = None,
@@ -46,6 +48,7 @@ def run(
 
         settings   those of the service
         voice      how it speaks
+        origins    where the settings come from, for who reads them
         token      bearer token that HTTP asks for; None: none
         insecure   serve beyond this machine without a token
         traffic    coroutine run beside, with the address of the first link
@@ -61,7 +64,7 @@ def run(
     manager = systemd.manager(os.environ)
     http = bind(settings.server.listen, token=token, insecure=insecure)
     with http:
-        service = Service(settings, voice.say)
+        service = Service(settings, voice.say, origins)
         serve = partial(_serve, service, voice, http, token, traffic, manager, open_page)
         run_until_told(serve, seconds)
 

@@ -167,11 +167,11 @@ def _state_routes(app: FastAPI, node: Node) -> None:
 
     @app.get(
         "/v1/settings",
-        summary="The effective settings, and which of them are as they come",
+        summary="The effective settings, and where each comes from",
         responses=answers(models.EffectiveSettings),
     )
     async def effective() -> Response:
-        return answer(settings.show(node.pipeline.settings))
+        return answer(settings.show(node.pipeline.settings, node.origins))
 
     @app.get(
         "/v1/design",

@@ -336,11 +336,12 @@ class Status(BaseModel):
 
 
 class Setting(BaseModel):
-    """One setting; ``source`` is "set" where it is not its default."""
+    """One setting, and where it comes from."""
 
     value: Any
     default: Any
-    source: Literal["default", "set"]
+    source: Literal["default", "file", "recording", "option", "program"]
+    file: str | None
 
 
 class EffectiveSettings(BaseModel):

@@ -1,5 +1,6 @@
 """Settings read from a TOML file, together with the files that they name."""
 
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from tokenize import TokenError
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from companion.settings.beams import ArraySettings
 from companion.settings.model import Settings
+from companion.settings.origins import Origin, Origins, given, of_options
 from companion.settings.section import ConfigError
 from companion.tracking.design.gain_table import KinematicDesign
 from companion.values import ComplexArray, FloatArray, UserError
@@ -33,13 +35,25 @@ def load(path: Path | None) -> Settings:
     return _with_design(_with_positions(Settings.from_toml(text, str(path))))
 
 
+def layered(path: Path | None, options: Mapping[str, dict[str, Any]]) -> tuple[Settings, Origins]:
+    """The settings of a file with options over them, and where each comes from.
+
+    ``path`` as in ``load``, ``options`` as the sections of ``Settings.override``. Raises
+    ``ConfigError``.
+    """
+    loaded = load(path)
+    origins = {**given(loaded, Origin("file", str(path))), **of_options(options)}
+    return loaded.override(**options), origins
+
+
 def _with_positions(settings: Settings) -> Settings:
     """Settings with the element positions read in, so that a recording of them is complete."""
     named = settings.array.positions
     if named is None:
         return settings
     rows = [tuple(row) for row in numbers_file("array.positions", named, 3).tolist()]
-    array = {**settings.array.model_dump(mode="json"), "positions": None, "positions_m": rows}
+    given = settings.array.model_dump(mode="json", exclude_unset=True)
+    array = {**given, "positions": None, "positions_m": rows}
     return settings.model_copy(update={"array": ArraySettings.model_validate(array)})
 
 

@@ -74,11 +74,14 @@ class Settings(Section):
     def override(self, **sections: dict[str, Any]) -> "Settings":
         """A copy with some keys of some sections replaced; a value of None leaves the key as it is.
 
-        Raises ``ConfigError`` if the result cannot be used.
+        Which keys were given, as pydantic's ``model_fields_set`` tells, is kept. Raises
+        ``ConfigError`` if the result cannot be used.
         """
-        merged = self.model_dump(mode="json", exclude_none=True)
+        merged = self.model_dump(mode="json", exclude_none=True, exclude_unset=True)
         for name, keys in sections.items():
-            merged[name].update({key: value for key, value in keys.items() if value is not None})
+            merged.setdefault(name, {}).update(
+                {key: value for key, value in keys.items() if value is not None}
+            )
         try:
             return Settings.model_validate(merged)
         except ValidationError as error:

@@ -1,28 +1,36 @@
-"""The effective settings as the API shows them: each with its default, and whether it is that."""
+"""The effective settings as the API shows them: each with its default, and where it comes from."""
 
 from typing import Any
 
 from companion.settings.model import Settings
+from companion.settings.origins import Origin, Origins
 
 Json = dict[str, Any]
 
 
-def show(settings: Settings) -> Json:
+def show(settings: Settings, origins: Origins) -> Json:
     """The answer of ``/v1/settings``.
 
-    ``source`` is "default", or "set" where the file or a flag says otherwise than the default.
+    What differs from its default, and nobody is known to have said, the program itself has set.
     """
     plain, effective = Settings().model_dump(mode="json"), settings.model_dump(mode="json")
     return {
         "sections": {
             section: {
-                key: {
-                    "value": value,
-                    "default": plain[section][key],
-                    "source": "default" if value == plain[section][key] else "set",
-                }
+                key: _shown(value, plain[section][key], origins.get((section, key)))
                 for key, value in keys.items()
             }
             for section, keys in effective.items()
         }
+    }
+
+
+def _shown(value: Any, default: Any, origin: Origin | None) -> Json:
+    if origin is None and value != default:
+        origin = Origin("program")
+    return {
+        "value": value,
+        "default": default,
+        "source": origin.kind if origin else "default",
+        "file": origin.name if origin else None,
     }

@@ -12,6 +12,7 @@ from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.voice.rate_watch import MessageRate
 from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
+from companion.settings.origins import Origins
 from companion.values import Blame, Carrier, Fix, FloatArray, Notice, Track
 from companion.views import center_state, health, link_state
 from companion.views.last_messages import LastMessages
@@ -69,6 +70,7 @@ class Node(Protocol):
     """
 
     pipeline: Pipeline
+    origins: Origins
     equipment: Equipment
     last_messages: LastMessages
     lateness: Lateness

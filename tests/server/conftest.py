@@ -17,6 +17,7 @@ from companion.pipeline.fold import Pipeline
 from companion.server.access import bind
 from companion.server.app import create_app
 from companion.settings.model import Settings
+from companion.settings.origins import Origins
 from companion.values import Frame, Notice, Severity, Source, Tick
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
@@ -32,6 +33,7 @@ class StandIn:
 
     def __init__(self, settings: Settings, *, flown: bool = True) -> None:
         self.pipeline = Pipeline(settings)
+        self.origins: Origins = {}
         self.equipment = assembly.equipment(settings, self.pipeline.array)
         self.last_messages = LastMessages()
         self.lateness = Lateness()

@@ -25,12 +25,13 @@ test("a line a UAV, what is not known is empty, and commas are quoted", () => {
 test("the settings are shown, what was set before what is as it comes", async () => {
   const page = await openPage();
   page.service.answers["/v1/settings"] = { sections: { link: {
-    needed_db: { value: 6, default: 0, source: "set" },
-    needed_sinr_db: { value: null, default: null, source: "default" },
-  } } };
+    needed_db: { value: 6, default: 0, source: "file", file: "mast.toml" },
+    needed_sinr_db: { value: null, default: null, source: "default", file: null },
+  }, server: { listen: { value: "[::]:1", default: "[::]:1", source: "option", file: null } } } };
   page.element("settings-open").click();
   await page.time.advance(100);
-  assert.equal(page.text("settings-set"), "[link]needed_db6 (default 0)");
+  assert.equal(page.text("settings-set"), "[link]needed_db6 – from file mast.toml, default 0"
+    + "[server]listen[::]:1 – from the option, default [::]:1");
   assert.equal(page.text("settings-default"), "[link]needed_sinr_db–");
   assert.ok(page.element("settings").hasAttribute("open"));
 });

@@ -23,7 +23,7 @@ def train(out: Path, seed: int, epochs: int, flights: int, as_json: bool) -> Non
 
     Example: companion study train --out lrnet.pt
     """
-    from companion.studies.running.extras import needs
+    from companion.values.extras import needs
 
     progress = Progress()
     with needs("torch", "learned", "this"):

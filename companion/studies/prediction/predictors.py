@@ -23,8 +23,8 @@ from companion.studies.prediction.baselines import (
     Predictor,
 )
 from companion.studies.prediction.kalman import Kalman, Tuning
-from companion.studies.running.extras import needs
 from companion.values import Event, Refuted
+from companion.values.extras import needs
 
 Make = Callable[[], Predictor]
 KALMAN_STATES: Final = {"kalman-cv": 2, "kalman-ca": 3}

@@ -1,1 +1,1 @@
-"""Work on many cores or a cluster, and optional packages.                                [shell]"""
+"""Work on many cores or a cluster.                                                       [shell]"""

@@ -19,8 +19,8 @@ from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from typing import Any, Final, TypeVar
 
-from companion.studies.running.extras import needs
 from companion.values import UserError
+from companion.values.extras import needs
 
 Asked = TypeVar("Asked")
 Answer = TypeVar("Answer")

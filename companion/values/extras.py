@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from companion.values import UserError
+from companion.values.errors import UserError
 
 
 @contextmanager

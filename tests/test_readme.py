@@ -213,6 +213,7 @@ RUNNERS: dict[str, Callable[[list[str], Path, Started], None]] = {
     "companion check": checked,
     "mavproxy.py": forwarded,
     "companion weights": to_its_end,
+    "companion export": to_its_end,
     "companion design": to_its_end,
     "companion study": study,
     "companion run": live,

@@ -128,3 +128,18 @@ class Progress:
     def clear(self) -> None:
         """Remove the line."""
         self.show("")
+
+
+def of_log(progress: Progress, ends_s: float | None) -> Callable[[int, float, float], None]:
+    """Shows how far a log has been read; ``ends_s`` is its length, None where it is not known.
+
+    What is returned takes frames, seconds of log, and seconds since it began.
+    """
+
+    def show(frames: int, at_s: float, wall_s: float) -> None:
+        to_go = ""
+        if ends_s and at_s > 0:
+            to_go = f" of {ends_s:.0f} s, {max(0.0, ends_s / at_s - 1) * wall_s:.0f} s to go"
+        progress.show(f"{frames} frames, {at_s:.0f} s of log{to_go}")
+
+    return show

@@ -30,9 +30,11 @@ from companion.cli.console import (
     InterruptedByUser,
     OneLineErrors,
     Progress,
+    of_log,
     tell_vehicles,
 )
 from companion.cli.design import design
+from companion.cli.export import export
 from companion.cli.study import study
 from companion.cli.weights import weights
 from companion.values import Reason, UserError, reports_itself
@@ -206,14 +208,7 @@ def replay(
             insecure=insecure,
         )
         return
-    ends_s = replaying.length_s(logs)
-
-    def show(frames: int, at_s: float, wall_s: float) -> None:
-        to_go = ""
-        if ends_s and at_s > 0:
-            to_go = f" of {ends_s:.0f} s, {max(0.0, ends_s / at_s - 1) * wall_s:.0f} s to go"
-        progress.show(f"{frames} frames, {at_s:.0f} s of log{to_go}")
-
+    show = of_log(progress, replaying.length_s(logs))
     try:
         summary = replaying.replay(logs, settings, recorder, pace, show, latency_s)
     except KeyboardInterrupt:
@@ -308,5 +303,6 @@ def recover(files: tuple[Path, ...], as_json: bool) -> None:
 
 main.add_command(check)
 main.add_command(design)
+main.add_command(export)
 main.add_command(study)
 main.add_command(weights)

@@ -67,7 +67,7 @@ class Writer:
         self._encoder = Encoder(self._add, weights_hz, scene)
         self._schema_ids: dict[str, int] = {}
         self._channel_ids: dict[str, int] = {}
-        self._file = _open_alone(_beside(self._final))
+        self._file = open_alone(_beside(self._final))
         self._mcap = McapFile(self._file)
         self._write_head(settings_toml, versions, max(0, started_ns), part)
 
@@ -202,7 +202,7 @@ def free_name(wanted: Path) -> Path:
     return candidate
 
 
-def _open_alone(path: Path) -> BufferedWriter:
+def open_alone(path: Path) -> BufferedWriter:
     """Open and empty a file that no other process is recording to.
 
     Raises ``BlockingIOError`` if one is. The lock goes with the process, however that ends, so it

@@ -1,0 +1,90 @@
+"""The command ``companion export``: logs as tables for other programs."""
+
+import gc
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from companion.cli.console import (
+    CENTER,
+    CONFIG,
+    JSON,
+    LATENCY,
+    InterruptedByUser,
+    Progress,
+    of_log,
+    tell_vehicles,
+)
+
+
+@click.command()
+@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(("csv", "parquet")),
+    default="csv",
+    show_default=True,
+    help="parquet needs the extra [parquet].",
+)
+@click.option(
+    "--out",
+    metavar="DIR",
+    required=True,
+    type=click.Path(path_type=Path, file_okay=False),
+    help="The folder for the tables.",
+)
+@CONFIG
+@CENTER
+@LATENCY
+@JSON
+def export(
+    logs: tuple[Path, ...],
+    form: str,
+    out: Path,
+    config: Path | None,
+    center: str | None,
+    latency_s: float,
+    as_json: bool,
+) -> None:
+    """Logs as tables, for pandas, DuckDB and other programs, by way of a replay.
+
+    A table each of reports, tracks, beams, updates, rejections and events: what is in their
+    columns is said in docs/export.md. Where a folder has export.json, it is whole.
+
+    Example: companion export flight.tlog --center 5:1 --format csv --out tables
+    """
+    from companion.node import export as exporting
+    from companion.node import replay as replaying
+
+    gc.set_threshold(200_000)  # millions of short-lived values, and no cycles among them
+    progress = Progress()
+    settings = replaying.settings_for(logs, config, center)
+    if settings.center.source is None:
+        click.echo("no --center: the array stands where the first report was made", err=True)
+    tell_vehicles(logs)
+    show = of_log(progress, replaying.length_s(logs))
+    try:
+        summary = exporting.export(logs, settings, out, form, show, latency_s)
+    except KeyboardInterrupt:
+        raise InterruptedByUser("interrupted; nothing was exported") from None
+    progress.clear()
+    click.echo(json.dumps(summary) if as_json else _text(summary))
+    if summary["unaimed"]:
+        click.echo(f"nothing was aimed at: {summary['unaimed']}", err=True)
+
+
+def _text(summary: dict[str, Any]) -> str:
+    *tables, contents = summary["files"]
+    counts = zip(summary["rows"].values(), tables, strict=True)
+    lines = [
+        f"{summary['frames']} frames, {summary['duration_s']:.0f} s of log in"
+        f" {summary['wall_s']:.1f} s; center {summary['center']}",
+        *(f"  {rows:8} rows  {file}" for rows, file in counts),
+        *(f"  missing: {line}" for line in summary["missing"]),
+        f"  whole, by {contents}",
+        f"digest {summary['digest']}",
+    ]
+    return "\n".join(lines)

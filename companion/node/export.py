@@ -1,0 +1,52 @@
+"""An export: logs through the same fold as a replay, and all of it into tables.         [shell]"""
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import companion
+from companion.node.replay import Run, log_events, missing, told
+from companion.recording.tables.folder import TableFolder
+from companion.settings.model import Settings
+from companion.views.tables.said import TABLES, rows
+
+SHOW_EVERY_S: Final = 0.5
+"""Time between two calls of ``progress``."""
+
+
+def export(
+    logs: Sequence[Path],
+    settings: Settings,
+    where: Path,
+    form: str,
+    progress: Callable[[int, float, float], None],
+    latency_s: float = 0.0,
+) -> dict[str, Any]:
+    """Write the tables of some logs to a folder; returns the summary of a replay, and the files.
+
+        logs       as for ``replay``, and so are ``settings``, ``progress`` and ``latency_s``
+        where      the folder; made if missing
+        form       a key of ``companion.recording.tables.folder.FORMATS``
+
+    What was there under the names of the tables is replaced when all is written, and left alone
+    otherwise. Raises ``LogError`` for a log that cannot be used, ``UserError`` where a package is
+    missing, ``OSError`` where the folder cannot be written.
+    """
+    events = log_events(logs, settings, latency_s)
+    run = Run(settings, None)
+    due_s = time.monotonic()
+    with TableFolder(where, form, TABLES) as folder:
+        for event in events:
+            outputs = run.step(event)
+            for table, item in rows(event, outputs, run.pipeline.local):
+                folder.add(table, item)
+            if time.monotonic() >= due_s:
+                due_s += SHOW_EVERY_S
+                progress(run.pipeline.frames, run.at_s, run.took_s)
+        summary = run.finish() | {"logs": told(logs), "missing": missing(logs)}
+        del summary["recording"]
+        summary["rows"] = dict(folder.rows)
+        said = {"companion": companion.__version__, "from": [log.name for log in logs]}
+        files = folder.close(said | {"summary": summary, "settings": settings.to_toml()})
+    return summary | {"files": [str(file) for file in files]}

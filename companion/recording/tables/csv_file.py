@@ -1,0 +1,47 @@
+"""A table as CSV (RFC 4180), UTF-8, lines ended by a line feed; unknown is an empty field."""
+
+import csv
+import io
+from collections.abc import Sequence
+from datetime import datetime, timedelta
+from typing import IO, Final
+
+from companion.recording.tables.columns import Kind, Table, Value
+
+_BEGINNING: Final = datetime(1970, 1, 1)  # UTC without saying so: what all readers take for a time
+
+
+class CsvFile:
+    """Rows of one table, written to an open file as they come."""
+
+    def __init__(self, file: IO[bytes], table: Table) -> None:
+        self._text = io.TextIOWrapper(file, encoding="utf-8", newline="")
+        self._rows = csv.writer(self._text, lineterminator="\n")
+        self._rows.writerow([column.name for column in table.columns])
+        self._times = [i for i, col in enumerate(table.columns) if col.kind is Kind.TIME]
+        self._truths = [i for i, col in enumerate(table.columns) if col.kind is Kind.TRUTH]
+
+    def add(self, row: Sequence[Value]) -> None:
+        """Write a row. Raises ``OSError`` where it cannot be."""
+        cells = list(row)
+        for i in self._times:
+            cells[i] = utc(row[i])
+        for i in self._truths:
+            cells[i] = "true" if row[i] else "false"
+        self._rows.writerow(cells)
+
+    def finish(self) -> None:
+        """Write what is left; the file stays open. Raises ``OSError``."""
+        self._text.flush()
+        self._text.detach()
+
+
+def utc(t_ns: Value) -> str | None:
+    """A time as ``2026-11-20T13:00:00.123456``; None where there is none that has a year."""
+    if not isinstance(t_ns, int):
+        return None
+    try:
+        then = _BEGINNING + timedelta(microseconds=t_ns // 1000)
+    except OverflowError:
+        return None
+    return then.isoformat(timespec="microseconds")

@@ -1,0 +1,119 @@
+"""The folder of an export: a file a table, which all get their names when the export is whole.
+
+While it is written a file is called ``….active``. ``export.json`` says what is in the folder. It is
+removed before the first table is replaced and written after the last, so that where it stands, the
+tables beside it are of one export.
+"""
+
+import contextlib
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from io import BufferedWriter
+from pathlib import Path
+from typing import IO, Any, Final, Protocol, Self
+
+from companion.recording.tables.columns import Table, Value
+from companion.recording.tables.csv_file import CsvFile
+from companion.recording.tables.parquet_file import ParquetFile
+from companion.recording.writer import ACTIVE, open_alone, sync_folder
+
+CONTENTS: Final = "export.json"
+"""What an export holds; written last."""
+
+
+class TableFile(Protocol):
+    """One table being written, in whatever format."""
+
+    def add(self, row: Sequence[Value]) -> None: ...
+    def finish(self) -> None: ...
+
+
+FORMATS: Final[dict[str, Callable[[IO[bytes], Table], TableFile]]] = {
+    "csv": CsvFile,
+    "parquet": ParquetFile,
+}
+"""How a table is written, by the ending of its file."""
+
+
+class TableFolder:
+    """The tables of one export, open from the start until ``close`` or the end of the ``with``.
+
+        where   the folder; made if missing
+        form    a key of ``FORMATS``
+        tables  what is written, each to its own file
+
+    Raises ``UserError`` where a package is missing, ``OSError`` where the folder cannot be written,
+    and ``BlockingIOError`` where another process exports to it.
+    """
+
+    def __init__(self, where: Path, form: str, tables: Sequence[Table]) -> None:
+        self.rows = {table.name: 0 for table in tables}
+        """Rows so far, by table."""
+        self._where, self._form = where, form
+        self._tables = {table.name: table for table in tables}
+        self._open: dict[str, BufferedWriter] = {}
+        self._files: dict[str, TableFile] = {}
+        where.mkdir(parents=True, exist_ok=True)
+        try:
+            for table in tables:
+                file = self._open[table.name] = open_alone(self._active(self._name(table.name)))
+                self._files[table.name] = FORMATS[form](file, table)
+        except BaseException:
+            self.abandon()
+            raise
+
+    def add(self, table: str, item: Any) -> None:
+        """Write a row, made of ``item``. Raises ``OSError`` where it cannot be written."""
+        self._files[table].add(self._tables[table].row(item))
+        self.rows[table] += 1
+
+    def close(self, said: Mapping[str, Any]) -> list[Path]:
+        """Finish the files, give them their names, and write ``export.json``; returns their paths.
+
+        ``said`` of the export goes into ``export.json`` beside the files and their rows. Raises
+        ``OSError``; files then have their names, or have gone, but there is no ``export.json``.
+        """
+        for name, file in self._files.items():
+            file.finish()
+            self._open[name].flush()
+            os.fsync(self._open[name].fileno())
+        names = {table: self._name(table) for table in self._tables}
+        told = {names[table]: rows for table, rows in self.rows.items()}
+        contents = {**said, "format": self._form, "rows": told}
+        made = self._active(CONTENTS)
+        made.write_text(json.dumps(contents, indent=1) + "\n", encoding="utf-8")
+        (self._where / CONTENTS).unlink(missing_ok=True)
+        for name in names.values():
+            self._active(name).rename(self._where / name)
+        sync_folder(self._where)
+        made.rename(self._where / CONTENTS)
+        sync_folder(self._where)
+        self._shut()
+        return [self._where / name for name in (*names.values(), CONTENTS)]
+
+    def abandon(self) -> None:
+        """Remove what was written so far; what had its name keeps it."""
+        for name in self._open:
+            self._active(self._name(name)).unlink(missing_ok=True)
+        if self._open:
+            self._active(CONTENTS).unlink(missing_ok=True)
+        self._shut()
+
+    def _shut(self) -> None:
+        for file in self._open.values():
+            with contextlib.suppress(OSError):  # a full disk: the file is not wanted any more
+                file.close()
+        self._open.clear()
+
+    def _name(self, table: str) -> str:
+        return f"{table}.{self._form}"
+
+    def _active(self, name: str) -> Path:
+        return self._where / (name + ACTIVE)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.abandon()

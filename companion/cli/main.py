@@ -35,6 +35,7 @@ from companion.cli.console import (
 )
 from companion.cli.design import design
 from companion.cli.export import export
+from companion.cli.recover import recover
 from companion.cli.study import study
 from companion.cli.weights import weights
 from companion.values import Reason, UserError, reports_itself
@@ -276,33 +277,9 @@ def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
 
 
-@main.command()
-@click.argument(
-    "files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path)
-)
-@JSON
-def recover(files: tuple[Path, ...], as_json: bool) -> None:
-    """A recording cut short becomes a finished one; says what was lost.
-
-    Example: companion recover recordings/companion-20260101T120000Z.mcap.active
-    """
-    from companion.recording.recover import recover as recover_file
-
-    for file in files:
-        found = recover_file(file)
-        answer = {
-            "file": str(found.path),
-            "changed": found.changed,
-            "messages": dict(found.messages),
-            "lost_bytes": found.lost_bytes,
-        }
-        done = "recovered" if found.changed else "complete already"
-        text = f"{done}, {sum(found.messages.values())} messages, {found.lost_bytes} bytes lost"
-        click.echo(json.dumps(answer) if as_json else f"{found.path}: {text}")
-
-
 main.add_command(check)
 main.add_command(design)
 main.add_command(export)
+main.add_command(recover)
 main.add_command(study)
 main.add_command(weights)

@@ -1,0 +1,33 @@
+"""The command ``companion recover``: a recording cut short becomes a finished one."""
+
+import json
+from pathlib import Path
+
+import click
+
+from companion.cli.console import JSON
+
+
+@click.command()
+@click.argument(
+    "files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path)
+)
+@JSON
+def recover(files: tuple[Path, ...], as_json: bool) -> None:
+    """A recording cut short becomes a finished one; says what was lost.
+
+    Example: companion recover recordings/companion-20260101T120000Z.mcap.active
+    """
+    from companion.recording.recover import recover as recover_file
+
+    for file in files:
+        found = recover_file(file)
+        answer = {
+            "file": str(found.path),
+            "changed": found.changed,
+            "messages": dict(found.messages),
+            "lost_bytes": found.lost_bytes,
+        }
+        done = "recovered" if found.changed else "complete already"
+        text = f"{done}, {sum(found.messages.values())} messages, {found.lost_bytes} bytes lost"
+        click.echo(json.dumps(answer) if as_json else f"{found.path}: {text}")

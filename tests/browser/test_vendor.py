@@ -1,4 +1,4 @@
-"""What the dashboard takes from others is what was published: files against their checksums."""
+"""What the page and its tests take from others is what was published: files by their checksums."""
 
 import hashlib
 import re
@@ -7,7 +7,7 @@ from pathlib import Path
 from support import ROOT
 
 VENDOR = ROOT / "web" / "vendor"
-FOLDERS = (VENDOR, ROOT / "docs" / "vendor")
+FOLDERS = (VENDOR, ROOT / "docs" / "vendor", Path(__file__).parent / "vendor")
 ROW = re.compile(r"^\| `(?P<file>[^`]+)` \|.*\| (?P<version>[\d.]+) \| (?P<licence>[\w.-]+) \| "
                  r"`(?P<sha256>[0-9a-f]{64})` \|$", re.MULTILINE)  # fmt: skip
 

@@ -1,6 +1,6 @@
 // The table of UAVs: one row a UAV, kept between updates so that focus and selection stay.
 
-import { make, setAttribute, setText, toggleAttribute } from "./dom.js";
+import { $, make, setAttribute, setText, toggleAttribute } from "./dom.js";
 import * as format from "./format.js";
 import { explain, rankOf } from "./health.js";
 import { Order } from "./order.js";
@@ -114,6 +114,12 @@ export class UavTable {
     }
     this.order = new Order(head, COLUMNS, onOrder);
     this.order.mark();
+    // Where there is little room, some columns are folded until they are asked for.
+    $("all-columns").addEventListener("click", () => {
+      const isAll = !table.hasAttribute("data-all");
+      table.toggleAttribute("data-all", isAll);
+      $("all-columns").setAttribute("aria-pressed", String(isAll));
+    });
     this.ids = []; // as they stand in the table
   }
 

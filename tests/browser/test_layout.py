@@ -92,6 +92,28 @@ def test_nothing_overlaps_and_nothing_is_cut(
     assert page.evaluate("document.documentElement.scrollWidth - innerWidth") == 0
 
 
+COLUMNS_IN_SIGHT = """() => {
+    const right = document.querySelector(".scroll").getBoundingClientRect().right;
+    return [...document.querySelectorAll("thead th")]
+        .filter(one => one.checkVisibility() && one.getBoundingClientRect().right <= right + 0.5)
+        .map(one => one.dataset.key);
+}"""
+
+
+def test_what_is_acted_on_is_seen_on_a_tablet_without_scrolling(demo: Node, open_page: Any) -> None:
+    page = open_page("about:blank", SIZES["tablet"], loses_service=True)
+    many(demo, page, 20)
+    page.goto(demo.url)
+    page.locator("tbody tr").nth(19).wait_for(state="attached", timeout=HANG_MS)
+    wanted = ["id", "verdict", "state", "range", "azimuth", "age", "gain", "guaranteed"]
+    assert page.evaluate(COLUMNS_IN_SIGHT) == wanted
+    page.get_by_role("button", name="All columns").click()
+    assert page.locator("thead th").nth(13).is_visible()
+    assert page.locator("thead th[data-key=elevation]").is_visible()
+    page.get_by_role("button", name="All columns").click()
+    assert page.evaluate(COLUMNS_IN_SIGHT) == wanted
+
+
 def test_what_overlaps_and_what_is_cut_is_found(demo: Node, open_page: Any) -> None:
     page = open_page(demo.url, SIZES["desktop"])
     page.locator("#events time").first.wait_for(timeout=HANG_MS)

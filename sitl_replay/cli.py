@@ -18,7 +18,7 @@ import click
 
 from companion import __version__
 from companion.cli.console import OneLineErrors
-from companion.mavlink.links.urls import LinkUrl, parse_link
+from companion.mavlink.links.urls import MAVLINK, LinkUrl, parse_link
 from companion.values import Event, Frame, Reason, Rejection, UserError
 from sitl_replay.faults.asked import Fault, described, in_order
 from sitl_replay.faults.traffic import HELD_MAX, OVERFLOW
@@ -58,7 +58,7 @@ def as_speed(_: click.Context, __: click.Parameter, value: str) -> float | None:
 
 def _url(text: str) -> LinkUrl:
     try:
-        return parse_link(text)
+        return parse_link(text, MAVLINK)
     except UserError as error:
         raise click.BadParameter(str(error)) from error
 

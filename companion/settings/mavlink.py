@@ -28,7 +28,8 @@ LinkText = Annotated[str, AfterValidator(_link)]
 class LinkSettings(Section):
     """The links on which MAVLink is received.
 
-    URLs are ``udpin:``, ``udpout:``, ``tcp:`` or ``tcpin:HOST:PORT``, or ``serial:DEVICE:BAUD``.
+    URLs are ``udpin:``, ``udpout:``, ``tcp:``, ``tcpin:`` or ``sbs:HOST:PORT``, or
+    ``serial:DEVICE:BAUD``.
     """
 
     urls: tuple[LinkText, ...] = ()

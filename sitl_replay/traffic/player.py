@@ -12,7 +12,7 @@ from pathlib import Path
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from companion.mavlink.links.urls import LinkError, LinkUrl, parse_link
+from companion.mavlink.links.urls import MAVLINK, LinkError, LinkUrl, parse_link
 from companion.values import Frame
 from sitl_replay.faults.asked import Fault
 from sitl_replay.faults.content import msgid_of
@@ -98,7 +98,7 @@ async def fly(
     tally = Tally() if tally is None else tally
     senders = Senders(faults, seed, tally.faults)
     network = Network(faults, len(links), seed, tally.faults)
-    urls = [parse_link(link) for link in links]
+    urls = [parse_link(link, MAVLINK) for link in links]
     with TlogWriter(record) if record else contextlib.nullcontext() as writer:
         async with _opened(urls, tally) as endpoints:
             epoch_ns = time.time_ns()
@@ -140,7 +140,7 @@ async def play(
     tally = Tally() if tally is None else tally
     senders = Senders(faults, seed, tally.faults)
     network = Network(faults, len(links), seed, tally.faults)
-    urls = [parse_link(link) for link in links]
+    urls = [parse_link(link, MAVLINK) for link in links]
     async with _opened(urls, tally) as endpoints:
         timed = on_timeline(frames, tally)
         sent = ((t_s, senders.altered(t_s, raw)) for t_s, raw in timed)

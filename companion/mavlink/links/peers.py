@@ -22,6 +22,7 @@ from typing import Final
 
 from companion.mavlink.links.status import ComponentStatus, LinkStatus
 from companion.mavlink.wire.framing import MAGIC_V2, Splitter
+from companion.mavlink.wire.sbs import SbsSplitter
 from companion.values import Frame, Rejection, Source
 
 PEERS_MAX: Final = 4096
@@ -64,9 +65,9 @@ class Peer:
 
     __slots__ = ("_sequence", "heard_ns", "key", "senders", "splitter", "versions")
 
-    def __init__(self, key: Hashable, link: str) -> None:
+    def __init__(self, key: Hashable, splitter: Splitter | SbsSplitter) -> None:
         self.key = key
-        self.splitter = Splitter(link)
+        self.splitter = splitter
         self.senders: dict[Source, _Sender] = {}
         self.heard_ns: int | None = None
         self.versions = 0  # bit 0: MAVLink 1 was heard, bit 1: MAVLink 2
@@ -87,11 +88,18 @@ class Peer:
 class Peers:
     """The peers of one link, bounded in number. What they send is counted into ``status``.
 
-    ``farewell`` is called with each peer that is given up for want of room, before it is removed.
+    ``farewell`` is called with each peer that is given up for want of room, before it is removed;
+    ``splitter`` makes a peer's own, for a link of that name.
     """
 
-    def __init__(self, status: LinkStatus, farewell: Callable[[Peer], None]) -> None:
+    def __init__(
+        self,
+        status: LinkStatus,
+        farewell: Callable[[Peer], None],
+        splitter: Callable[[str], Splitter | SbsSplitter] = Splitter,
+    ) -> None:
         self._status = status
+        self._splitter = splitter
         self._farewell = farewell
         self._peers: OrderedDict[Hashable, Peer] = OrderedDict()
         self._components: dict[Source, _Component] = {}
@@ -110,7 +118,7 @@ class Peers:
             oldest = next(iter(self._peers.values()))
             self._farewell(oldest)
             self.forget(oldest)
-        peer = self._peers[key] = Peer(key, self._status.url)
+        peer = self._peers[key] = Peer(key, self._splitter(self._status.url))
         self._status.peers += 1
         return peer
 

@@ -5,6 +5,7 @@
     tcp:HOST:PORT        connect, and connect again when the peer goes away
     tcpin:HOST:PORT      listen for connections, any number of them
     serial:DEVICE:BAUD   a serial port, which may be unplugged and plugged in again
+    sbs:HOST:PORT        connect to an ADS-B receiver; its lines become ADSB_VEHICLE, none is sent
 
 IPv6 hosts stand in brackets. Every peer has its own splitter: a frame truncated by one peer cannot
 damage another's.
@@ -19,10 +20,12 @@ from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.peers import Peer, Peers
 from companion.mavlink.links.serial_port import SerialPort
 from companion.mavlink.links.status import LinkStatus
-from companion.mavlink.links.tcp import TcpIn, TcpOut
+from companion.mavlink.links.tcp import TcpIn, TcpListen, TcpOut
 from companion.mavlink.links.udp import UdpIn, UdpOut
 from companion.mavlink.links.urls import LinkError, LinkUrl
 from companion.mavlink.wire.encode import Outgoing, pack
+from companion.mavlink.wire.framing import Splitter
+from companion.mavlink.wire.sbs import SbsSplitter
 from companion.values import Frame, Notice, Reason, Rejection, Severity, Source
 
 __all__ = ["Guard", "Link", "LinkStatus", "Notify", "Receive", "endpoint"]
@@ -79,7 +82,8 @@ class Link:
         self._notify = notify
         self._guard = guard
         self._lag = lag or ArrivalLag()
-        self._peers = Peers(self.status, self._finish)
+        splitter = SbsSplitter if url.scheme == "sbs" else Splitter
+        self._peers = Peers(self.status, self._finish, splitter)
         upcalls = Upcalls(self._up, self.take, self._hang_up, self._overflow)
         self._endpoint = endpoint(url, self.status, upcalls)
         self._is_out = False
@@ -244,6 +248,8 @@ def endpoint(url: LinkUrl, status: LinkStatus, upcalls: Upcalls) -> Endpoint:
             return TcpOut(url, upcalls)
         case "tcpin":
             return TcpIn(url, upcalls)
+        case "sbs":
+            return TcpListen(url, upcalls)
         case "serial":
             return SerialPort(url, upcalls)
 

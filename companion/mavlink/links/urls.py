@@ -5,6 +5,7 @@
     tcp:HOST:PORT        connect
     tcpin:HOST:PORT      listen for connections
     serial:DEVICE:BAUD   a serial port, as in serial:/dev/ttyAMA0:921600
+    sbs:HOST:PORT        connect to an ADS-B receiver that says BaseStation lines; nothing is sent
 
 IPv6 hosts stand in brackets.
 """
@@ -18,8 +19,10 @@ from typing import Final, Literal, cast, get_args
 
 from companion.values import UserError
 
-Scheme = Literal["udpin", "udpout", "tcp", "tcpin", "serial"]
+Scheme = Literal["udpin", "udpout", "tcp", "tcpin", "serial", "sbs"]
 SCHEMES: Final[tuple[Scheme, ...]] = get_args(Scheme)
+MAVLINK: Final[tuple[Scheme, ...]] = ("udpin", "udpout", "tcp", "tcpin", "serial")
+"""Links over which MAVLink goes, in both directions."""
 _LISTENS: Final = ("udpin", "tcpin")
 _BAUD_MAX: Final = 20_000_000
 _NUMBER: Final = re.compile(r"[0-9]{1,8}")

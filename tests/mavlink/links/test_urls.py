@@ -22,6 +22,7 @@ from companion.mavlink.links.urls import SCHEMES, LinkError, LinkUrl, parse_link
         ("udpin:127.0.0.1:0", "udpin", "127.0.0.1", 0),
         ("tcpin:127.0.0.1:0", "tcpin", "127.0.0.1", 0),
         ("udpin:127.0.0.1:65535", "udpin", "127.0.0.1", 65535),
+        ("sbs:radar.lan:30003", "sbs", "radar.lan", 30003),
         ("serial:/dev/ttyAMA0:921600", "serial", "/dev/ttyAMA0", 921600),
         ("serial:/dev/serial/by-path/a:0-b:57600", "serial", "/dev/serial/by-path/a:0-b", 57600),
         ("serial:/dev/tty µ 1:20000000", "serial", "/dev/tty µ 1", 20_000_000),

@@ -1,0 +1,159 @@
+"""BaseStation lines (SBS-1, port 30003) as the ADSB_VEHICLE that a MAVLink receiver would send.
+
+One line is one message of one aircraft, with the fields that this one held; they are put together
+where those of all relays are (``mavlink/trust/adsb.py``). The fields, their units and the sample
+that the tests read: http://woodair.net/SBS/Article/Barebones42_Socket_Data.htm. Altitude is that of
+the standard pressure; with an H behind it, as dump1090 writes it when told to (``net_io.c``), it is
+above the ellipsoid.
+
+A line has two times of its writer's clock, when the message came and when it was written. Their
+difference is the age of what it says: some writers hold all back for five minutes. Where it is
+negative or missing, the line counts as new. How exact a position is, no line says.
+"""
+
+import re
+import struct
+from datetime import datetime
+from typing import Final
+
+from companion.mavlink.wire.decode import ADSB_VEHICLE
+from companion.mavlink.wire.encode import Outgoing, pack
+from companion.values import Frame, Reason, Rejection, Source
+
+SENDER: Final = Source(0, 156)
+"""Who says it: no system, MAV_COMP_ID_ADSB."""
+LINE_MAX: Final = 512
+"""Bytes of a line at most; a longer one is garbage."""
+_SILENT: Final = frozenset((b"SEL", b"ID", b"AIR", b"STA", b"CLK"))
+"""Lines about the writer's own display."""
+_NUMBER: Final = re.compile(r"-?\d{1,9}(?:\.\d{1,9})?")
+_LAYOUT: Final = struct.Struct("<IiiiHHhHHB9sBB")
+_COORDS, _ALTITUDE, _HEADING, _VELOCITY, _CALLSIGN, _VERTICAL = 1, 2, 4, 8, 16, 128  # ADSB_FLAGS
+_PRESSURE, _GEOMETRIC = 0, 1  # ADSB_ALTITUDE_TYPE
+_FOOT_MM: Final = 304.8
+_KNOT_CMPS: Final = 1852 / 36
+_FPM_CMPS: Final = 30.48 / 60
+
+
+class SbsSplitter:
+    """Turns the bytes of one connection into frames; ``feed`` and ``finish`` as ``Splitter``'s."""
+
+    def __init__(self, link: str) -> None:
+        self.link = link
+        self._pending = b""
+        self._overlong = False
+        self._seq = 0
+
+    def feed(self, t_ns: int, data: bytes) -> list[Frame | Rejection]:
+        """Take in bytes that arrived at ``t_ns``; returns what the lines that end in them say."""
+        *lines, self._pending = (self._pending + data).split(b"\n")
+        return self._read(t_ns, lines)
+
+    def finish(self, t_ns: int) -> list[Frame | Rejection]:
+        """End the stream: a line that has no end is given up."""
+        stray, self._pending, self._overlong = len(self._pending), b"", False
+        return [Rejection(t_ns, self.link, Reason.GARBAGE, stray)] if stray else []
+
+    def _read(self, t_ns: int, lines: list[bytes]) -> list[Frame | Rejection]:
+        out: list[Frame | Rejection] = []
+        garbage = 0
+        for line in lines:
+            kind = line.partition(b",")[0].strip()
+            if self._overlong or len(line) > LINE_MAX:
+                garbage += len(line) + 1
+                self._overlong = False
+            elif kind in (b"MSG", b"MLAT"):
+                out += self._said(t_ns, line, kind)
+            elif line.strip() and kind not in _SILENT:
+                garbage += len(line) + 1
+        if len(self._pending) > LINE_MAX:
+            garbage += len(self._pending)
+            self._pending, self._overlong = b"", True
+        if garbage:
+            out.append(Rejection(t_ns, self.link, Reason.GARBAGE, garbage))
+        return out
+
+    def _said(self, t_ns: int, line: bytes, kind: bytes) -> list[Frame | Rejection]:
+        if kind == b"MLAT":  # found by other receivers, however well they are placed
+            detail = "MLAT: how exact it is, is not known"
+            return [Rejection(t_ns, self.link, Reason.UNKNOWN_MESSAGE, detail=detail)]
+        try:
+            payload = adsb_vehicle(line.decode("ascii"))
+        except ValueError as error:
+            text = error.reason if isinstance(error, UnicodeDecodeError) else str(error)
+            return [Rejection(t_ns, self.link, Reason.MALFORMED, msgid=ADSB_VEHICLE, detail=text)]
+        if payload is None:
+            return []
+        raw = pack(Outgoing(SENDER, ADSB_VEHICLE, payload), self._seq)
+        self._seq = (self._seq + 1) & 0xFF
+        return [Frame(t_ns, self.link, SENDER, ADSB_VEHICLE, raw)]
+
+
+def adsb_vehicle(line: str) -> bytes | None:
+    """The payload of an ADSB_VEHICLE that says what a MSG line says; None where that is nothing.
+
+    Raises ``ValueError`` where its fields cannot be what they say.
+    """
+    fields = [field.strip() for field in line.split(",")]
+    if len(fields) < 10:
+        raise ValueError(f"{len(fields)} fields, of 22")
+    fields += [""] * (22 - len(fields))
+    if not re.fullmatch(r"[0-9A-Fa-f]{6}", fields[4]):
+        raise ValueError(f"{fields[4]!r:.20} is not an ICAO address")
+    callsign, lat_deg, lon_deg = (
+        fields[10],
+        _number(fields[14], -90, 90),
+        _number(fields[15], -180, 180),
+    )
+    geometric = fields[11].endswith("H")
+    altitude_ft = _number(fields[11].removesuffix("H"), -2000, 200_000)
+    speed_kt, track_deg = _number(fields[12], 0, 1200), _number(fields[13], 0, 360)
+    climb_fpm = _number(fields[16], -60_000, 60_000)
+    placed = lat_deg is not None and lon_deg is not None
+    told = (
+        (_COORDS, placed),
+        (_ALTITUDE, altitude_ft is not None),
+        (_HEADING, track_deg is not None),
+        (_VELOCITY, speed_kt is not None),
+        (_CALLSIGN, bool(callsign)),
+        (_VERTICAL, climb_fpm is not None),
+    )
+    flags = sum(flag for flag, there in told if there)
+    if not flags:
+        return None
+    return _LAYOUT.pack(
+        int(fields[4], 16),
+        round((lat_deg or 0.0) * 1e7) if placed else 0,
+        round((lon_deg or 0.0) * 1e7) if placed else 0,
+        round((altitude_ft or 0.0) * _FOOT_MM),
+        round((track_deg or 0.0) * 100),
+        round((speed_kt or 0.0) * _KNOT_CMPS),
+        round((climb_fpm or 0.0) * _FPM_CMPS),
+        flags,
+        0,  # squawk: nobody here reads it
+        _GEOMETRIC if geometric else _PRESSURE,
+        callsign[:8].encode(),
+        0,  # kind of aircraft: not said
+        _age_s(fields[6:10]),
+    )
+
+
+def _number(text: str, least: float, most: float) -> float | None:
+    """A decimal number; None for an empty field. Raises ``ValueError`` beyond the limits."""
+    if not text:
+        return None
+    if not _NUMBER.fullmatch(text) or not least <= float(text) <= most:
+        raise ValueError(f"{text!r:.20} is no number from {least:g} to {most:g}")
+    return float(text)
+
+
+def _age_s(stamps: list[str]) -> int:
+    """Whole seconds from the message (date, time) to the line (date, time); 0 where not told."""
+    try:
+        came, written = (
+            datetime.strptime(f"{day} {time}", "%Y/%m/%d %H:%M:%S.%f")
+            for day, time in (stamps[:2], stamps[2:])
+        )
+    except ValueError:
+        return 0
+    return min(255, max(0, int((written - came).total_seconds())))

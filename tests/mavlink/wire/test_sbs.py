@@ -1,0 +1,175 @@
+"""BaseStation lines: a published stream, whole and in pieces, and what is no such stream."""
+
+import math
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import all as dialect
+
+from companion.mavlink.wire.decode import decode
+from companion.mavlink.wire.sbs import LINE_MAX, SENDER, SbsSplitter
+from companion.pipeline.fold import Pipeline
+from companion.settings.model import Settings
+from companion.values import AdsbVehicle, AltitudeDatum, Estimate, Frame, Reason, Rejection, Source
+
+# From http://woodair.net/SBS/Article/Barebones42_Socket_Data.htm, where lines were held back for
+# five minutes; here they were not.
+PUBLISHED = b"""\
+STA,,5,179,400AE7,10103,2008/11/28,14:58:51.153,2008/11/28,14:58:51.153,RM
+MSG,8,5,211,4CA2D6,10057,2008/11/28,14:53:50.391,2008/11/28,14:53:51.153,,,,,,,,,,,,0
+MSG,4,5,211,4CA2D6,10057,2008/11/28,14:53:50.391,2008/11/28,14:53:51.153,,,408.3,146.4,,,64,,,,,
+MSG,3,5,211,4CA2D6,10057,2008/11/28,14:53:50.594,2008/11/28,14:53:51.153,,37000,,,51.45735,-1.02826,,,0,0,0,0
+MSG,3,5,276,4010E9,10088,2008/11/28,14:53:49.986,2008/11/28,14:53:51.153,,28000,,,53.02551,-2.91389,,,0,0,0,0
+MSG,4,5,769,4CA2CB,10061,2008/11/28,14:53:50.188,2008/11/28,14:53:51.153,,,367.7,138.6,,,-2432,,,,,
+"""
+LATE = (
+    "MSG,3,5,211,4CA2D6,10057,2008/11/28,14:53:50.594,2008/11/28,14:58:51.153,,37000,,,51.45735,"
+    "-1.02826,,,0,0,0,0"
+)
+CALLED = (
+    "MSG,1,5,211,4006B3,10057,2008/11/28,23:59:59.900,2008/11/29,00:00:02.150,BAW4J   ,,,,,,,,,,,"
+)
+
+
+def line(**fields: str) -> str:
+    """A line with a position, and other fields by their number: ``f11="37000"``."""
+    cells = LATE.split(",")
+    for name, text in fields.items():
+        cells[int(name[1:])] = text
+    return ",".join(cells)
+
+
+def fed(text: str | bytes) -> list[Frame | Rejection]:
+    data = text.encode() if isinstance(text, str) else text
+    return SbsSplitter("sbs:radar:30003").feed(7, data + b"\r\n")
+
+
+def said(text: str) -> AdsbVehicle:
+    (frame,) = fed(text)
+    assert isinstance(frame, Frame), frame
+    found = decode(frame)
+    assert isinstance(found, AdsbVehicle)
+    return found
+
+
+def refused(text: str | bytes) -> Rejection:
+    (found,) = fed(text)
+    assert isinstance(found, Rejection)
+    return found
+
+
+def test_a_published_stream_is_read_as_it_is_described() -> None:
+    """By pymavlink; feet, knots and feet a minute are 0.3048 m, 1852 m/h and 0.00508 m/s."""
+    mav: Any = dialect.MAVLink(None)
+    frames = fed(PUBLISHED.rstrip())
+    assert all(isinstance(one, Frame) and one.source == (0, 156) for one in frames)
+    moving, placed, other, sinking = [mav.decode(bytearray(one.raw)) for one in frames]
+    assert [one.ICAO_address for one in (moving, placed, other, sinking)] == [
+        0x4CA2D6, 0x4CA2D6, 0x4010E9, 0x4CA2CB,
+    ]  # fmt: skip
+    assert (placed.lat, placed.lon, placed.altitude) == (514_573_500, -10_282_600, 11_277_600)
+    assert placed.flags == dialect.ADSB_FLAGS_VALID_COORDS | dialect.ADSB_FLAGS_VALID_ALTITUDE
+    assert placed.altitude_type == dialect.ADSB_ALTITUDE_TYPE_PRESSURE_QNH
+    assert (other.lat, other.lon, other.altitude) == (530_255_100, -29_138_900, 8_534_400)
+    assert (moving.hor_velocity, moving.heading, moving.ver_velocity) == (21_005, 14_640, 33)
+    assert (sinking.hor_velocity, sinking.heading, sinking.ver_velocity) == (18_916, 13_860, -1235)
+    assert sinking.flags == (
+        dialect.ADSB_FLAGS_VALID_HEADING
+        | dialect.ADSB_FLAGS_VALID_VELOCITY
+        | dialect.ADSB_FLAGS_VERTICAL_VELOCITY_VALID
+    )
+    assert [one.tslc for one in (placed, other)] == [0, 1]
+
+
+def test_a_line_that_was_held_back_is_old() -> None:
+    assert said(LATE).tslc_s == 255  # 300 s; more does not fit
+    assert said(CALLED).tslc_s == 2
+    assert said(line(f7="14:59:00.000")).tslc_s == 0  # from the future
+    assert said(line(f6="", f7="")).tslc_s == 0
+
+
+def test_what_a_line_does_not_say_is_unknown() -> None:
+    called = said(CALLED)
+    assert (called.callsign, called.uav) == ("BAW4J", "icao:4006B3")
+    assert called.position_deg is called.alt_m is called.velocity_ne_mps is None
+    assert called.velocity_down_mps is called.heading_deg is called.alt_datum is None
+    placed = said(LATE)
+    assert placed.callsign is placed.velocity_ne_mps is None
+    assert said(line(f15="")).position_deg is None
+    assert said(line(f12="0", f13="0")).velocity_ne_mps == (0.0, 0.0)
+    assert said(line(f11="1000H")).alt_datum is AltitudeDatum.GEOMETRIC
+    assert placed.alt_datum is AltitudeDatum.PRESSURE
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"f14": "91"}, {"f15": "-180.1"}, {"f14": "nan"}, {"f14": "1e1"}, {"f11": "x"},
+        {"f12": "-1"}, {"f13": "361"}, {"f16": "99999"}, {"f4": "4CA2D"}, {"f4": "~4CA2D"},
+        {"f11": "9" * 400}, {"f10": "\xe9"},
+    ],
+)  # fmt: skip
+def test_fields_that_cannot_be_are_refused(fields: dict[str, str]) -> None:
+    found = refused(line(**fields))
+    assert (found.reason, found.source) == (Reason.MALFORMED, "sbs:radar:30003")
+    assert found.detail
+
+
+def test_what_is_no_line_is_counted_in_bytes() -> None:
+    assert refused("GET / HTTP/1.1") == Rejection(7, "sbs:radar:30003", Reason.GARBAGE, 16)
+    assert refused(b"\xfd\x00" * LINE_MAX).count == 2 * LINE_MAX + 2
+    assert refused(line().replace("MSG", "MLAT")).reason is Reason.UNKNOWN_MESSAGE
+    assert fed("CLK,,,,,,2008/11/28,14:53:50.594,,") == fed("") == []
+    ended = SbsSplitter("x")
+    assert ended.feed(7, b"MSG,3") == []
+    assert ended.finish(8) == [Rejection(8, "x", Reason.GARBAGE, 5)]
+
+
+def test_a_line_without_an_end_takes_no_memory() -> None:
+    splitter = SbsSplitter("x")
+    found = [one for _ in range(1000) for one in splitter.feed(7, b"M" * 100)]
+    counted = sum(one.count for one in found if isinstance(one, Rejection))
+    assert 100_000 - LINE_MAX <= counted <= 100_000  # what is not counted is what is kept
+    end_of_it = LATE.encode() + b"\n"
+    found += splitter.feed(7, end_of_it + PUBLISHED)
+    lost = sum(one.count for one in found if isinstance(one, Rejection))
+    assert lost == 100_000 + len(end_of_it)
+    assert sum(isinstance(one, Frame) for one in found) == 4
+    assert splitter.feed(7, b"M" * (LINE_MAX + 1))  # all of it is counted, and none kept
+    assert isinstance(splitter.feed(7, end_of_it)[0], Rejection)  # still the end of that line
+
+
+@given(st.lists(st.integers(1, len(PUBLISHED) - 1), max_size=20))
+def test_pieces_say_what_the_whole_says(cuts: list[int]) -> None:
+    at = [0, *sorted(cuts), len(PUBLISHED)]
+    splitter = SbsSplitter("x")
+    pieces = [PUBLISHED[a:b] for a, b in pairwise(at)]
+    whole = SbsSplitter("x").feed(7, PUBLISHED)
+    assert [one for piece in pieces for one in splitter.feed(7, piece)] == whole
+
+
+@given(st.binary(max_size=200) | st.text(max_size=80).map(lambda text: f"MSG,{text}".encode()))
+def test_no_bytes_are_a_defect(data: bytes) -> None:
+    for found in fed(data):
+        assert isinstance(found, Rejection) or isinstance(decode(found), AdsbVehicle | Rejection)
+
+
+def test_an_aircraft_that_a_mavlink_relay_hears_too_stays_one() -> None:
+    pipeline = Pipeline(Settings().override(center={"source": "51.4,-1.0,100"}))
+    relay: Any = dialect.MAVLink(None, srcSystem=9, srcComponent=156)
+    flags = dialect.ADSB_FLAGS_VALID_COORDS | dialect.ADSB_FLAGS_VALID_ALTITUDE
+    again = dialect.MAVLink_adsb_vehicle_message(
+        0x4CA2D6, 514_563_500, -10_272_600, 0, 11_277_600, 0, 0, 0, b"", 0, 0, flags, 0
+    ).pack(relay)
+    (first,) = SbsSplitter("sbs").feed(1_000_000_000, line(f9="14:53:50.700").encode() + b"\n")
+    assert isinstance(first, Frame)
+    second = Frame(3_000_000_000, "udp", Source(9, 156), 246, bytes(again))
+    (one,) = [out for out in pipeline.step(first) if isinstance(out, Estimate)]
+    (two,) = [out for out in pipeline.step(second) if isinstance(out, Estimate)]
+    assert one.fix.uav == two.fix.uav == "icao:4CA2D6"
+    assert list(pipeline.fleet.uavs) == ["icao:4CA2D6"]
+    assert set(pipeline.senders.aircraft.relays("icao:4CA2D6")) == {SENDER, Source(9, 156)}
+    assert math.isclose(one.fix.noise.horizontal_m, two.fix.noise.horizontal_m)

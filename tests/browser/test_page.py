@@ -4,6 +4,7 @@ Pictures go to ``out/screens``; with ``KEEP_SCREENS`` set, to ``docs`` as well.
 """
 
 import functools
+import io
 import os
 import re
 import signal
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 from support import BIN, HANG_MS, HANG_S, ROOT, Node, end, line_of, started
 
 pytestmark = pytest.mark.browser
@@ -44,9 +46,10 @@ def wait_for_value(page: Any, expression: str, wanted: str) -> None:
 
 
 def picture(page: Any, name: str) -> None:
-    """Keep what the page looks like."""
+    """Keep what the page looks like, in 256 colours."""
     SCREENS.mkdir(parents=True, exist_ok=True)
-    page.screenshot(path=SCREENS / f"{name}.png")
+    shot = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
+    shot.quantize(256, dither=Image.Dither.NONE).save(SCREENS / f"{name}.png", optimize=True)
 
 
 def drawn_colours(page: Any, canvas: str) -> int:

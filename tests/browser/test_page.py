@@ -49,7 +49,9 @@ def picture(page: Any, name: str) -> None:
     """Keep what the page looks like, in 256 colours."""
     SCREENS.mkdir(parents=True, exist_ok=True)
     shot = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
-    shot.quantize(256, dither=Image.Dither.NONE).save(SCREENS / f"{name}.png", optimize=True)
+    shot.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+        SCREENS / f"{name}.png", optimize=True
+    )
 
 
 def drawn_colours(page: Any, canvas: str) -> int:

@@ -77,3 +77,35 @@ test("the alarm is off unless switched on, stays until it is seen, and is rememb
   button.click();
   assert.deepEqual([bar.hidden, page.text("alarm")], [true, "Alarm off"]);
 });
+
+test("the alarm sounds every two seconds until it is seen; what appears bad is no change", async () => {
+  const page = await openPage();
+  let tones = 0;
+  const node = { connect: () => {}, frequency: {}, start: () => { tones += 1; }, stop: () => {} };
+  globalThis.AudioContext = class {
+    constructor() {
+      Object.assign(this, { state: "running", currentTime: 0, destination: null });
+    }
+
+    resume() {}
+
+    createOscillator() {
+      return node;
+    }
+  };
+  try {
+    page.element("alarm").click();
+    page.service.uavs = [...page.service.uavs, uav("3:1", weak("none"))];
+    await page.time.advance(2 * BEAT_MS);
+    assert.deepEqual([tones, page.element("alarm-bar").hidden], [0, true]);
+    page.service.uavs = page.service.uavs.map(({ id }) => uav(id, weak()));
+    await page.time.advance(10_000);
+    assert.ok(tones >= 6 && tones <= 10, `${tones}`); // two tones each time
+    page.element("alarm-seen").click();
+    const before = tones;
+    await page.time.advance(5000);
+    assert.equal(tones, before);
+  } finally {
+    delete globalThis.AudioContext;
+  }
+});

@@ -1,7 +1,4 @@
-"""The command ``companion`` and its subcommands.
-
-Over 300 lines: it is a list, the commands and their options.
-"""
+"""The command ``companion`` and its subcommands."""
 
 import os
 

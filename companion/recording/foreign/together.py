@@ -4,6 +4,7 @@ The timeline is Unix time, by the GPS time in each log (``gps_time``). A vehicle
 that its log says; of two that say the same, the later one gets the next that is free.
 """
 
+import functools
 import heapq
 import mmap
 from collections.abc import Callable, Iterator, Sequence
@@ -27,6 +28,8 @@ READERS: Final[dict[str, Callable[[Bytes], Onboard]]] = {
     "csv": lambda data: csv_table.read(data.tobytes()),
 }
 """What reads the log of one vehicle, by the kind of log."""
+KEPT: Final = 8
+"""Logs that are kept once they were read."""
 _NAMES: Final = {"dataflash": "DataFlash", "ulog": "ULog", "csv": "a table"}
 
 
@@ -103,6 +106,16 @@ def events(vehicles: Sequence[Vehicle], latency_s: float) -> Iterator[Event]:
 
 
 def _read(path: Path, kind: str) -> Onboard:
+    try:
+        seen = path.stat()
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror}") from None
+    return _read_once(path, kind, (seen.st_ino, seen.st_size, seen.st_mtime_ns))
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _read_once(path: Path, kind: str, _seen: tuple[int, int, int]) -> Onboard:
+    """The log in a file that is as it was ``_seen``: a command asks for it several times."""
     try:
         with path.open("rb") as file:  # the map goes when nothing looks at it any more
             whole = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)

@@ -190,3 +190,16 @@ def test_the_same_flight_gives_the_same_tracks(uav: str) -> None:
     off_m = np.linalg.norm(estimates - states[:, :3], axis=1)[50:]
     tlog_off_m = np.linalg.norm(tlog_estimates - tlog_states[:, :3], axis=1)[settled]
     assert np.median(off_m) == pytest.approx(np.median(tlog_off_m), abs=0.05)
+
+
+def test_a_log_is_read_once_and_again_when_it_has_changed(aeroplane: Path, tmp_path: Path) -> None:
+    log = tmp_path / "uav.bin"
+    whole = aeroplane.read_bytes()
+    log.write_bytes(whole)
+    (first,), (second,) = vehicles([log]), vehicles([log])
+    assert second.log is first.log
+    log.write_bytes(whole[: len(whole) // 2])
+    (cut,) = vehicles([log])
+    assert first.log.positions is not None
+    assert cut.log.positions is not None
+    assert len(cut.log.positions.boot_us) < len(first.log.positions.boot_us)

@@ -20,6 +20,7 @@ from companion.values import (
     Beam,
     BeamSet,
     Carrier,
+    Cause,
     FloatArray,
     LeftOut,
     Track,
@@ -70,7 +71,7 @@ def aim(
     refused = {track.uav: _refusal(track, place) for track in tracks}
     seen = [track for track in tracks if refused[track.uav] is None]
     beams: tuple[Beam, ...] = ()
-    made, dropped = None, dict[str, str]()
+    made = None
     if carrier is not None and seen:
         ranges_m, directions = line_of_sight.directions(seen, carrier, array)
         hidden = _out_of_reach(directions, array, coverage)
@@ -79,12 +80,10 @@ def aim(
         if inside:
             aimed = _Aimed([seen[i] for i in inside], ranges_m[inside], directions[inside])
             beams, made, dropped = _beams(aimed, carrier, array, precoder, before, valid_at_ns)
-            refused |= dropped
+            refused |= {uav: (Cause.CROWDED, why) for uav, why in dropped.items()}
     if made is None:
         made = precode(np.empty((array.size, 0), dtype=complex), precoder)
-    left_out = tuple(
-        LeftOut(uav, why, uav in dropped) for uav, why in refused.items() if why is not None
-    )
+    left_out = tuple(LeftOut(uav, *why) for uav, why in refused.items() if why is not None)
     return BeamSet(
         now_ns,
         valid_at_ns,
@@ -185,7 +184,9 @@ def _priorities(tracks: Sequence[Track], priority: Sequence[str]) -> list[int]:
     return sorted(range(len(tracks)), key=lambda i: ranks.get(tracks[i].uav, len(ranks)))
 
 
-def _out_of_reach(directions: FloatArray, array: Array, coverage: Coverage) -> list[str | None]:
+def _out_of_reach(
+    directions: FloatArray, array: Array, coverage: Coverage
+) -> list[tuple[Cause, str] | None]:
     """For each direction the reason why no beam can point there; None if one can."""
     reasons: list[str | None] = [None] * len(directions)
     if coverage != EVERYWHERE:
@@ -196,7 +197,7 @@ def _out_of_reach(directions: FloatArray, array: Array, coverage: Coverage) -> l
             why or ("its elements radiate nothing there" if none else None)
             for why, none in zip(reasons, dark.tolist(), strict=True)
         ]
-    return reasons
+    return [None if why is None else (Cause.COVERAGE, why) for why in reasons]
 
 
 def _pointing_bound_rad(
@@ -236,13 +237,13 @@ def _usual_rad(
     return min(math.hypot(seen, attitude), math.pi if bound_rad is None else bound_rad)
 
 
-def _refusal(track: Track, place_ned_m: FloatArray | None) -> str | None:
+def _refusal(track: Track, place_ned_m: FloatArray | None) -> tuple[Cause, str] | None:
     """Why a track gets no beam from an array at this place; None if it gets one."""
     if place_ned_m is None:
-        return "the carrier is not known"
+        return Cause.CARRIER, "the carrier is not known"
     if track.state not in AIMABLE:
-        return f"its reports are {track.state}"
+        return Cause.SILENT, f"its reports are {track.state}"
     offset_m = track.position_ned_m - place_ned_m
     if offset_m @ offset_m < NEAREST_M**2:
-        return f"it is within {NEAREST_M:g} m of the array"
+        return Cause.COVERAGE, f"it is within {NEAREST_M:g} m of the array"
     return None

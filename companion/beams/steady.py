@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from companion.beams.weights.grouping import Turns
-from companion.values import BeamSet, FloatArray, Method
+from companion.values import BeamSet, Cause, FloatArray, Method
 
 PACE: Final = 3.0
 """Most by which the angles of a shape grow or shrink in a second, as a factor."""
@@ -56,7 +56,7 @@ def after(before: Steady | None, made: BeamSet) -> Steady:
         made.valid_at_ns,
         {beam.uav: (beam.shaped_likely_rad, beam.shaped_bound_rad) for beam in made.beams},
         turns,
-        frozenset(turns) | {out.uav for out in made.left_out if out.crowded},
+        frozenset(turns) | {out.uav for out in made.left_out if out.cause is Cause.CROWDED},
         before.turned_ns if before is not None and same else made.valid_at_ns,
         inexact_ns if made.exact else made.valid_at_ns,
     )

@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from companion.values import Beam, Blame, Carrier, Cause, Reason, Track
+from companion.values import Beam, Blame, Carrier, Cause, LeftOut, Reason, Track
 
 CROWDED_DB: Final = 3.0
 """Loss against a beam for a UAV alone from which on the other UAVs are to blame."""
@@ -33,15 +33,18 @@ class Evidence:
     refused: Reason | None
 
 
-def of_left_out(why: str, track: Track | None, crowded: bool, unfit: str | None) -> Blame:
-    """Why a UAV has no beam. ``why`` is the reason that the beams give."""
+def of_left_out(out: LeftOut, track: Track, unfit: str | None) -> Blame:
+    """Why a UAV has no beam. ``unfit`` is what keeps everybody from having one."""
     if unfit is not None:
         return Blame(Cause.CARRIER, unfit, "see what carries the array")
-    if crowded:
-        return Blame(Cause.CROWDED, why, 'fly them apart, or set [beams] policy = "group"')
-    if track is not None and f"{track.state}" in why:
-        return Blame(Cause.SILENT, f"no report for {track.age_s:.1f} s", "see its MAVLink link")
-    return Blame(Cause.COVERAGE, why, "turn the array or its carrier, or fly elsewhere")
+    match out.cause:
+        case Cause.CROWDED:
+            remedy = 'fly them apart, or set [beams] policy = "group"'
+        case Cause.SILENT:
+            return _silent(track)
+        case _:
+            remedy = "turn the array or its carrier, or fly elsewhere"
+    return Blame(out.cause, out.reason, remedy)
 
 
 def of_beam(
@@ -116,8 +119,12 @@ def _silence(track: Track, evidence: Evidence) -> Blame | None:
             "see its rejections",
         )
     if track.age_s > max(SILENT_S, SILENT_INTERVALS * (track.dt_s or 0.0)):
-        return Blame(Cause.SILENT, f"no report for {track.age_s:.1f} s", "see its MAVLink link")
+        return _silent(track)
     return None
+
+
+def _silent(track: Track) -> Blame:
+    return Blame(Cause.SILENT, f"no report for {track.age_s:.1f} s", "see its MAVLink link")
 
 
 def _aged(track: Track) -> Blame:

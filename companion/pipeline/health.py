@@ -1,10 +1,12 @@
 """Verdicts on the links to all UAVs, and the notices when one changes.
 
 Once a second the gain that each beam surely has, and the one that it likely has, is held against
-what the link needs. A verdict changes only once it has been another for a while, and not for a
-hair's breadth, so that it does not flap.
+what the link needs. Many links are judged in turn, some at each update, so that no update is held
+up by all of them. A verdict changes only once it has been another for a while, and not for a hair's
+breadth, so that it does not flap.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -26,12 +28,15 @@ from companion.values import (
     Level,
     Notice,
     Severity,
+    Track,
     Update,
     Verdict,
 )
 
 EVERY_NS: Final = 1_000_000_000
-"""Time between two judgements."""
+"""Time between two judgements of a link, and for which one round through all of them lasts."""
+AT_ONCE: Final = 16
+"""Links that one update judges at least; more where a round would last for too long."""
 WORSE_NS: Final = 1_000_000_000
 """Time for which a link must be judged worse before it is called so."""
 BETTER_NS: Final = 3_000_000_000
@@ -61,59 +66,75 @@ class Health:
         self.verdicts: dict[str, Verdict] = {}
         self._need = need
         self._site = site
-        self._judged_ns: int | None = None
+        self._begun_ns: int | None = None  # the present round
+        self._last_ns: int | None = None  # the update before
+        self._waiting: list[str] = []  # those that the round has not come to
+        self._told_of: dict[str, Verdict] = {}  # verdicts when last something was told
         self._unsettled: dict[str, tuple[bool, int]] = {}  # judged better or worse, since when
         self._unfit: str | None = None
 
     def judge(self, update: Update, evidence: Callable[[str], Evidence]) -> list[Notice]:
-        """Judge anew if it is time, and tell what changed.
+        """Judge the links whose turn it is, and tell what changed when all have had theirs.
 
         ``evidence`` says what is known of a UAV beside its track; it is asked of UAVs whose link is
         not good.
         """
-        if self._judged_ns is not None and 0 <= update.t_ns - self._judged_ns < EVERY_NS:
+        elapsed_ns = 0 if self._last_ns is None else update.t_ns - self._last_ns
+        self._last_ns = update.t_ns
+        tracks = {track.uav: track for track in update.tracks}
+        fresh = dict[str, Verdict]()
+        if self._begun_ns is None or not 0 <= update.t_ns - self._begun_ns < EVERY_NS:
+            self._begun_ns = update.t_ns
+            self._waiting = [beam.uav for beam in update.beams.beams]
+            fresh = _of_left_out(update, tracks)
+        elif not self._waiting:
             return []
-        self._judged_ns = update.t_ns
-        fresh = self._of_beams(update, evidence) | _of_left_out(update)
-        settled = {
-            track.uav: self._settled(fresh[track.uav])
-            for track in update.tracks
-            if track.uav in fresh
-        }
-        before, self.verdicts = self.verdicts, settled
-        self._unsettled = {uav: kept for uav, kept in self._unsettled.items() if uav in settled}
-        return self._told(update, before)
+        share = len(update.beams.beams) * min(max(elapsed_ns / EVERY_NS, 0.0), 1.0)
+        many = max(AT_ONCE, math.ceil(share))
+        chosen, self._waiting = self._waiting[:many], self._waiting[many:]
+        fresh |= self._of_beams(update, tracks, frozenset(chosen), evidence)
+        held = self.verdicts | {uav: self._settled(verdict) for uav, verdict in fresh.items()}
+        self.verdicts = {uav: held[uav] for uav in tracks if uav in held}
+        self._unsettled = {uav: kept for uav, kept in self._unsettled.items() if uav in tracks}
+        return [] if self._waiting else self._told(update)
 
-    def _of_beams(self, update: Update, evidence: Callable[[str], Evidence]) -> dict[str, Verdict]:
+    def _of_beams(
+        self,
+        update: Update,
+        tracks: dict[str, Track],
+        chosen: frozenset[str],
+        evidence: Callable[[str], Evidence],
+    ) -> dict[str, Verdict]:
         beam_set, carrier = update.beams, update.carrier
-        if carrier is None or not beam_set.beams:
+        which = [i for i, beam in enumerate(beam_set.beams) if beam.uav in chosen]
+        if carrier is None or not which:
             return {}
         towards = directions(beam_set)
         needed_db = _needed_db(self._need, self._site, beam_set, towards)
-        sure_db, likely_db = self._least_db(beam_set, towards)
-        tracks = {track.uav: track for track in update.tracks}
+        least_db = self._least_db(beam_set, towards, which)
         found = {}
-        for i, beam in enumerate(beam_set.beams):
-            uav = beam.uav
-            level = self._level(uav, needed_db[i], sure_db[i], likely_db[i])
+        for i, sure_db, likely_db in zip(which, *least_db, strict=True):
+            beam = beam_set.beams[i]
+            level = self._level(beam.uav, needed_db[i], sure_db, likely_db)
             why = None
             if level is not Level.GOOD:
-                why = blame.of_beam(beam, tracks[uav], carrier, needed_db[i], evidence(uav))
-            found[uav] = Verdict(
-                uav, level, why, update.t_ns, needed_db[i], sure_db[i], likely_db[i]
+                known = tracks[beam.uav], carrier, needed_db[i], evidence(beam.uav)
+                why = blame.of_beam(beam, *known)
+            found[beam.uav] = Verdict(
+                beam.uav, level, why, update.t_ns, needed_db[i], sure_db, likely_db
             )
         return found
 
     def _least_db(
-        self, beam_set: BeamSet, towards: FloatArray
+        self, beam_set: BeamSet, towards: FloatArray, which: Sequence[int]
     ) -> tuple[Sequence[float | None], Sequence[float | None]]:
-        """The least gain of each beam where its UAV can be, and where it usually is."""
-        array, beams = self._site.array, beam_set.beams
-        both = np.vstack([towards, towards])
+        """The least gain of these beams where their UAVs can be, and where they usually are."""
+        array, beams = self._site.array, [beam_set.beams[i] for i in which]
+        both = np.tile(towards[which], (2, 1))
         angles = [beam.pointing_bound_rad for beam in beams]
         angles += [beam.pointing_p95_rad for beam in beams]
         bounds = guarantee.covered_bounds(array, self._site.coverage, both, angles)
-        weights = np.hstack([beam_set.weights, beam_set.weights])
+        weights = np.tile(beam_set.weights[:, which], 2)
         gains = guarantee.guaranteed_gains_db(array, both, bounds, weights)
         return gains[: len(beams)], gains[len(beams) :]
 
@@ -152,8 +173,9 @@ class Health:
             return fresh
         return replace(fresh, level=held.level, blame=held.blame, since_ns=held.since_ns)
 
-    def _told(self, update: Update, before: dict[str, Verdict]) -> list[Notice]:
+    def _told(self, update: Update) -> list[Notice]:
         """What changed: for all at once where the carrier is the cause, which all share."""
+        before, self._told_of = self._told_of, self.verdicts
         was, self._unfit = self._unfit, update.unfit
         if update.unfit is not None:
             text = f"no links: {update.unfit}"
@@ -183,13 +205,12 @@ def _notice(t_ns: int, alike: Sequence[Verdict]) -> Notice:
     return Notice(t_ns, Severity.WARNING, one.uav, text)
 
 
-def _of_left_out(update: Update) -> dict[str, Verdict]:
-    tracks = {track.uav: track for track in update.tracks}
+def _of_left_out(update: Update, tracks: dict[str, Track]) -> dict[str, Verdict]:
     return {
         out.uav: Verdict(
             out.uav,
             Level.NONE,
-            blame.of_left_out(out.reason, tracks.get(out.uav), out.crowded, update.unfit),
+            blame.of_left_out(out, tracks[out.uav], update.unfit),
             update.t_ns,
         )
         for out in update.beams.left_out

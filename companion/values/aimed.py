@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
+from companion.values.health import Cause
 from companion.values.numbers import ComplexArray
 
 
@@ -118,11 +119,11 @@ class Beam:
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """A UAV that is tracked but has no beam, and the reason; ``crowded`` if others are that."""
+    """A UAV that is tracked but has no beam, and the reason: as a cause and in words."""
 
     uav: str
+    cause: Cause
     reason: str
-    crowded: bool = False
 
 
 @dataclass(frozen=True, slots=True)

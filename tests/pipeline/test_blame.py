@@ -7,7 +7,7 @@ import pytest
 
 from companion.pipeline import blame
 from companion.pipeline.blame import Evidence
-from companion.values import Beam, Carrier, Cause, Limits, Reason, Track, TrackState
+from companion.values import Beam, Carrier, Cause, LeftOut, Limits, Reason, Track, TrackState
 
 FINE = Evidence(clock_assumed=False, refused=None)
 TRACK = Track(
@@ -88,9 +88,13 @@ def test_a_sharp_beam_without_gain_is_crowded_or_too_far() -> None:
 
 
 def test_without_a_beam_the_reason_of_the_beams_is_told() -> None:
-    assert blame.of_left_out("x", TRACK, False, "the carrier is lost").cause is Cause.CARRIER
-    assert blame.of_left_out("x", TRACK, True, None).cause is Cause.CROWDED
-    assert blame.of_left_out("outside", TRACK, False, None).cause is Cause.COVERAGE
+    outside, crowded = (
+        LeftOut("3:1", cause, "so it is") for cause in (Cause.COVERAGE, Cause.CROWDED)
+    )
+    assert blame.of_left_out(outside, TRACK, "the carrier is lost").cause is Cause.CARRIER
+    for out in (outside, crowded):
+        found = blame.of_left_out(out, TRACK, None)
+        assert (found.cause, found.reason) == (out.cause, "so it is")
     stale = replace(TRACK, state=TrackState.STALE, age_s=12.0)
-    found = blame.of_left_out("its reports are stale", stale, False, None)
+    found = blame.of_left_out(LeftOut("3:1", Cause.SILENT, "its reports are stale"), stale, None)
     assert (found.cause, found.reason) == (Cause.SILENT, "no report for 12.0 s")

@@ -12,7 +12,7 @@ from companion.beams.array.geometry import uniform_linear
 from companion.beams.weights.precoding import Precoder
 from companion.beams.worth.link_budget import LinkBudget
 from companion.pipeline.blame import Evidence
-from companion.pipeline.health import Health, Site
+from companion.pipeline.health import AT_ONCE, Health, Site
 from companion.settings.beams import NeedSettings
 from companion.values import Carrier, Limits, Notice, Severity, Track, TrackState, Update
 
@@ -74,6 +74,28 @@ def test_it_is_judged_once_a_second() -> None:
     watch.see(0, [track("1:1", *SURE)])
     assert watch.see(0.9, [track("1:1", *SURE), track("2:1", *SURE)]) == "good"
     assert watch.see(1.0, [track("1:1", *SURE), track("2:1", *SURE)]) == "good good"
+
+
+def test_many_links_are_judged_in_turn_and_told_together(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each has its turn once a second; those that became worse for one cause are one notice."""
+    many = {f"{n}:1": (200.0, 4.0 * n - 120.0, -10.0) for n in range(1, 61)}
+    monkeypatch.setattr(f"{__name__}.PLACES", many)
+    watch, judged = Watch(needed_db=6.0), []
+    for step in range(31):
+        errors = SURE if step < 10 else WILD
+        tracks = [track(uav, *errors) for uav in many]
+        before = {uav: id(one) for uav, one in watch.health.verdicts.items()}
+        watch.see(step / 10, tracks)
+        after = watch.health.verdicts
+        judged.append({uav for uav in after if id(after[uav]) != before.get(uav)})
+    assert max(map(len, judged)) <= AT_ONCE
+    for begun in (0, 10, 20):
+        turns = [uav for one in judged[begun : begun + 10] for uav in one]
+        assert sorted(turns) == sorted(many)
+    assert {str(one.level) for one in watch.health.verdicts.values()} == {"none"}
+    assert len(watch.said) == 1
 
 
 def test_worse_is_told_after_a_second_and_better_after_three() -> None:

@@ -12,6 +12,7 @@ from companion.values import (
     AltitudeDatum,
     Beam,
     BeamSet,
+    Cause,
     Estimate,
     Event,
     Fix,
@@ -116,7 +117,7 @@ def update() -> Callable[[int], Update]:
             Beam("1:1", 0.1, -0.2, 100.0, None, None, None, None, 18.0, 0.1),
             Beam("icao:4CA7B3", 0.3, 0.0, 50.0, 0.01, -0.02, 3.0, 0.02, 17.5, 0.6, 1, True),
         )
-        left_out = (LeftOut("9:1", "behind the array"),)
+        left_out = (LeftOut("9:1", Cause.COVERAGE, "behind the array"),)
         chosen = BeamSet(
             t_ns, t_ns + 5, beams, weights, Method.ZERO_FORCING, Normalisation.STREAM, 1.5, left_out
         )

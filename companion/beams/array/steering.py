@@ -38,15 +38,20 @@ def unit_directions(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> Float
 
 def steering_matrix(array: Array, directions: FloatArray) -> ComplexArray:
     """A, (M, N): one steering vector per column, for unit directions (N, 3)."""
-    if array.grid is None or array.size * len(directions) < POWERS_PAY:
-        matrix: ComplexArray = np.exp(
-            1j * array.wavenumber_radpm * (array.elements_m @ directions.T)
-        )
-    else:
-        matrix = _on_grid(array, directions, *array.grid)
+    matrix = phase_factors(array, directions)
     if array.element.pattern is not Pattern.ISOTROPIC:
         matrix *= amplitudes(array, directions)
     return matrix
+
+
+def phase_factors(array: Array, directions: FloatArray) -> ComplexArray:
+    """Steering vectors (M, N) without the elements' pattern, for unit directions (N, 3)."""
+    if array.grid is not None and array.size * len(directions) >= POWERS_PAY:
+        return _on_grid(array, directions, *array.grid)
+    phase = array.wavenumber_radpm * (array.elements_m @ directions.T)
+    factors: ComplexArray = np.empty(phase.shape, dtype=complex)
+    factors.real, factors.imag = np.cos(phase), np.sin(phase)
+    return factors
 
 
 def _on_grid(array: Array, directions: FloatArray, rows: int, columns: int) -> ComplexArray:

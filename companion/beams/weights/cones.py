@@ -7,6 +7,7 @@ asked in a few directions. What is sampled here steers how much nulls may cost; 
 proven in ``worth.guarantee``.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -107,27 +108,31 @@ def cones(
     rows, columns = array.grid
     finer = FINER if min(array.grid) == 1 else FINER_IN_PLANE
     asked = tuple(fft.next_fast_len(finer * n) if n > 1 else 1 for n in (rows, columns))
-    near = [_on_grid(array, across, one, asked) for one in (held, likely)]
-    return Cones((array.grid, (asked[0], asked[1])), nothing, *near)
+    near = _on_grid(array, across, (held, likely), asked)
+    return Cones((array.grid, (asked[0], asked[1])), nothing, near[0], near[1])
 
 
-def _on_grid(array: Array, across: Aperture, seen: Seen, asked: tuple[int, ...]) -> BoolArray:
-    """Which places (N, P) of the Fourier transform are in the cones."""
+def _on_grid(
+    array: Array, across: Aperture, seen: Sequence[Seen], asked: tuple[int, ...]
+) -> BoolArray:
+    """Which places of the Fourier transform are in K times N cones, (K, N, P)."""
     assert array.grid is not None
     wide = across.lengths_m / array.wavelength_m
-    off = np.zeros((len(seen.seen), 1))
+    middles = np.concatenate([one.middles for one in seen]) * wide
+    halves = np.concatenate([one.halves for one in seen]) * wide
+    off = np.zeros((len(middles), 1))
     # The axes are y and z, or the one of them on which there is more than one element; the places
     # are those of z by those of y.
     for d, axis in reversed(list(enumerate(across.axes))):
         place = 1 if axis[1] else 0
         count, bins = array.grid[place], asked[place]
-        middle, half = seen.middles[:, d] * wide[d], seen.halves[:, d] * wide[d]
-        apart = np.arange(bins) * (count / bins) - middle[:, np.newaxis]
-        apart = (apart + count / 2) % count - count / 2
-        ratio = (apart / (half + 0.5 * count / bins)[:, np.newaxis]) ** 2
-        off = (off[:, :, np.newaxis] + ratio[:, np.newaxis]).reshape(len(ratio), -1)
+        apart = np.arange(bins) * (count / bins) - middles[:, d, np.newaxis]
+        apart -= count * np.rint(apart / count)
+        apart /= (halves[:, d] + 0.5 * count / bins)[:, np.newaxis]
+        apart *= apart
+        off = (off[:, :, np.newaxis] + apart[:, np.newaxis]).reshape(len(apart), -1)
     inside: BoolArray = off <= np.maximum(off.min(axis=1, keepdims=True), 1.0)
-    return inside
+    return inside.reshape(len(seen), -1, inside.shape[1])
 
 
 def _asked(

@@ -42,14 +42,6 @@ SOFT: Final = 0.02
 """Loading of the points around a predicted direction, as a share of their power."""
 ROUNDING: Final = 1e-10
 """Loading of the predicted directions, as a share of their power, against rounding."""
-BACK: Final = np.array([0.8, 0.6, 0.4, 0.2, 0.0])
-"""Shares of the nulls that are tried, in descending order."""
-FINE: Final = np.array([0.75, 0.5, 0.25, 0.0])
-"""Places between two of them that are tried then."""
-AGAIN: Final = 10
-"""Most steps towards the share that is known to do, each at least halves what is left."""
-NEARLY: Final = 0.99
-"""A share of the least gain that is to be kept: all but .04 dB."""
 
 
 class Nulled(NamedTuple):
@@ -71,9 +63,9 @@ def nulled(spread: Spread, noise: FloatArray | None = None, exact: bool = False)
         return Nulled(spread.beams.copy(), np.ones(1, dtype=bool))
     places = _places(spread)
     fields = spread.cones.fields(spread.beams)[places.rows, places.columns]
-    power = np.einsum("mn,mn->n", spread.beams, spread.beams.conj()).real
-    least, inner = _least(places, fields.real**2 + fields.imag**2, power)
-    kept = _kept(least)
+    power = _power(spread.beams)
+    gains = _squared(fields) / power[places.rows]
+    kept, inner = (_kept(places.least(gains, inside)) for inside in (places.held, places.likely))
     shares = _shares(spread, kept, power)
     if exact:
         shares[::each] = 1.0
@@ -81,16 +73,19 @@ def nulled(spread: Spread, noise: FloatArray | None = None, exact: bool = False)
     wanted = (spread.reached * shares).reshape(users, each, users)
     wanted[own, :, own] = 0.0
     taken = _taken(spread, wanted.reshape(-1, users), noise)
-    back = np.ones(users)
-    if not exact:
-        back = _back(spread, taken, (places, fields), power, (kept, _kept(inner)))
-    whole = shares[::each] >= 1.0
-    whole[own, own] = True
-    return Nulled(spread.beams - back * taken, whole.all(axis=0) & (back >= 1.0))
+    dark = shares[::each] >= 1.0
+    dark[own, own] = True
+    whole = np.asarray(dark.all(axis=0))
+    if exact:
+        return Nulled(spread.beams - taken, whole)
+    least = np.where(places.held, kept[places.rows], 0.0)
+    least = np.where(places.likely, np.maximum(least, inner[places.rows]), least)
+    back = _back(spread, taken, places, (fields, power), least)
+    return Nulled(spread.beams - back * taken, whole & (back >= 1.0))
 
 
 class _Places(NamedTuple):
-    """The places that are looked at, user by user: rows and columns of what ``Cones`` answers.
+    """The P places that are looked at, user by user: rows and columns of what ``Cones`` answers.
 
     starts  (N,), where each user's begin
     held    whether a place is within the cone over which the least gain counts
@@ -103,6 +98,11 @@ class _Places(NamedTuple):
     held: BoolArray
     likely: BoolArray
 
+    def least(self, values: FloatArray, inside: BoolArray) -> FloatArray:
+        """The least (N,) of what each user's places have, of those inside."""
+        least: FloatArray = np.minimum.reduceat(np.where(inside, values, np.inf), self.starts)
+        return least
+
 
 def _places(spread: Spread) -> _Places:
     held, likely = spread.cones.held, spread.cones.likely
@@ -111,15 +111,15 @@ def _places(spread: Spread) -> _Places:
     return _Places(rows, columns, starts, held[rows, columns], likely[rows, columns])
 
 
-def _least(
-    places: _Places, towards: FloatArray, power: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Least gains (N,) over the cones and over their likely parts, of powers at the places."""
-    held, likely = (
-        np.minimum.reduceat(np.where(inside, towards, np.inf), places.starts) / power
-        for inside in (places.held, places.likely)
-    )
-    return held, likely
+def _squared(values: ComplexArray) -> FloatArray:
+    squared: FloatArray = values.real**2 + values.imag**2
+    return squared
+
+
+def _power(columns: ComplexArray) -> FloatArray:
+    """The squared length (N,) of each column (M, N)."""
+    power: FloatArray = _squared(columns).sum(axis=0)
+    return power
 
 
 def _kept(least: FloatArray) -> FloatArray:
@@ -170,55 +170,28 @@ def _taken(spread: Spread, wanted: ComplexArray, noise: FloatArray | None) -> Co
 def _back(
     spread: Spread,
     taken: ComplexArray,
-    seen: tuple[_Places, ComplexArray],
-    power: FloatArray,
-    kept: tuple[FloatArray, FloatArray],
+    places: _Places,
+    known: tuple[ComplexArray, FloatArray],
+    least: FloatArray,
 ) -> FloatArray:
-    """The share (N,) of the nulls up to which the least gains are kept, by interpolation."""
-    places, fields = seen
-    less = spread.cones.fields(taken)[places.rows, places.columns]
-    cross = np.einsum("mn,mn->n", spread.beams.conj(), taken).real
-    own = np.einsum("mn,mn->n", taken.conj(), taken).real
+    """The share (N,) of the nulls up to which every place has its least gain (P,).
 
-    def kept_at(share: FloatArray) -> FloatArray:
-        """The least gains over what must be kept, (N,), for shares (N,) of the nulls."""
-        at = share[places.rows]
-        towards = fields - at * less
-        left = np.maximum(power - 2 * share * cross + share**2 * own, 1e-300)
-        held, likely = _least(places, towards.real**2 + towards.imag**2, left)
-        return np.minimum(held / kept[0], likely / kept[1])
+    With the share t of what is taken, the gain at a place is a ratio of two quadratics in t,
 
-    high, low = np.ones(len(power)), np.ones(len(power))
-    above = kept_at(high)
-    if (above >= 1.0).all():
-        return high
-    below = above
-    for tries in (BACK, FINE):
-        # Down from the greatest share until the least gains are kept; then finer in between.
-        begin, end = high, np.where(above >= 1.0, high, 0.0) if tries is BACK else low
-        found = above >= 1.0 if tries is BACK else np.zeros(len(power), dtype=bool)
-        high, low, over = begin.copy(), begin.copy(), above
-        for part in tries.tolist():
-            share = end + part * (begin - end)
-            now = kept_at(share)
-            first = ~found & ((now >= 1.0) | (part == 0.0))
-            low, below = np.where(first, share, low), np.where(first, now, below)
-            failed = ~found & ~first
-            high, over = np.where(failed, share, high), np.where(failed, now, over)
-            found |= first
-        above = over
-    back: FloatArray = np.where(low >= high, high, high + _part(above, below) * (low - high))
-    for _ in range(AGAIN):
-        # Nulls that are crowded take so much that a straight line between two shares misses by far.
-        now = kept_at(back)
-        missed = (now < NEARLY) & (back > low)
-        if not missed.any():
-            return back
-        back = np.where(missed, back + np.maximum(_part(now, below), 0.5) * (low - back), back)
-    return np.where(missed, low, back)
+        |v - t z|^2 / |f - t d|^2     v, z: what beam f and nulls d radiate there
 
-
-def _part(above: FloatArray, below: FloatArray) -> FloatArray:
-    """Where a straight line from what is ``above`` to ``below`` reaches 1, in [0, 1]."""
-    part: FloatArray = np.clip((1.0 - above) / np.maximum(below - above, 1e-12), 0.0, 1.0)
-    return part
+    and where it is the least gain, a t^2 - 2 b t + c = 0. ``known`` is what the beams radiate to
+    the places, and their squared lengths.
+    """
+    rows, beams, (fields, power) = places.rows, spread.beams, known
+    less = spread.cones.fields(taken)[rows, places.columns]
+    crossed = (beams.real * taken.real + beams.imag * taken.imag).sum(axis=0)
+    a = _squared(less) - least * _power(taken)[rows]
+    b = fields.real * less.real + fields.imag * less.imag - least * crossed[rows]
+    c = np.maximum(_squared(fields) - least * power[rows], 0.0)
+    # Without nulls there is enough, c >= 0. The first root above 0, in the form that never cancels.
+    inside = np.sqrt(np.maximum(b * b - a * c, 0.0))
+    short = (b * b > a * c) & ((b > 0) | (a < 0))
+    first = np.where(b > 0, c, inside - b) / np.where(short, np.where(b > 0, b + inside, -a), 1.0)
+    back: FloatArray = np.minimum(places.least(first, short), 1.0)
+    return back

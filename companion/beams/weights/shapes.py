@@ -8,7 +8,8 @@ square; in apertures from the middle, their phases serve any number. See docs/ma
 
 import functools
 import io
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import Final, NamedTuple
 
@@ -18,8 +19,8 @@ from companion.beams.array.geometry import Array
 from companion.values import FloatArray, IntArray
 
 TABLES: Final = "shapes.npz"
-CORNERS: Final = np.indices((2, 2, 2)).reshape(3, 8)
-"""The corners of a cell of three axes."""
+CORNERS: Final = np.indices((2, 2, 2)).reshape(3, 8).T
+"""The corners (8, 3) of a cell of three axes."""
 MOST: Final = 0.375
 """Widest beam in natural widths for each element: beyond it they are too far apart to shape one."""
 LEAST_SHARE: Final = 1 / 16
@@ -29,23 +30,25 @@ LEAST_SHARE: Final = 1 / 16
 class Shapes(NamedTuple):
     """The tables of one kind of aperture; phases are psi over it, times 2 pi w in radians.
 
-    places     (n,), where the phases are, in apertures from the middle; on each axis of a square
-    widths     (W,), ascending
-    sure       (W, K), the greatest least gain within the width
-    least_db   (W,), that gain over the number of elements
-    cones      (C,), ascending
-    ratios     (R,), the cone's width over the likely one, ascending from 1
-    losses_db  (L,), by how much the floor over the cone is below the greatest least gain
-    likely     (L, C, R, K), the greatest mean gain over the likely error, above that floor
+    places    (n,), where the phases are, in apertures from the middle; on each axis of a square
+    widths    (W,), ascending
+    sure      (W, K), the greatest least gain within the width
+    least_db  (W,), that gain over the number of elements
+    losses    (L,), by how many dB the floor over the cone is below the greatest least gain
+    cones     (C,), ascending
+    ratios    (R,), the cone's width over the likely one, ascending from 1
+    likely    (L C R, K), the greatest mean gain over the likely error, above that floor
+
+    Widths, losses, cones and ratios are natural logarithms.
     """
 
     places: FloatArray
     widths: FloatArray
     sure: FloatArray
     least_db: FloatArray
+    losses: FloatArray
     cones: FloatArray
     ratios: FloatArray
-    losses_db: FloatArray
     likely: FloatArray
 
 
@@ -57,17 +60,17 @@ def _tables() -> Mapping[str, Shapes]:
         return {
             name: Shapes(
                 (np.arange(count) - (count - 1) / 2) / count,
-                held[f"{name}_widths"],
+                np.log(held[f"{name}_widths"]),
                 held[f"{name}_sure"].astype(float),
                 held[f"{name}_least_db"],
-                held[f"{name}_cones"],
-                1 / held[f"{name}_ratios"],
-                held[f"{name}_losses_db"],
-                held[f"{name}_likely"].astype(float) @ even.T,
+                np.log(held[f"{name}_losses_db"]),
+                np.log(held[f"{name}_cones"]),
+                -np.log(held[f"{name}_ratios"]),
+                held[f"{name}_likely"].astype(float).reshape(-1, count**axes // 2**axes) @ even.T,
             )
-            for name, count, even in (
-                ("line", 64, _even(64)),
-                ("square", 16, np.kron(_even(16), _even(16))),
+            for name, count, axes, even in (
+                ("line", 64, 1, _even(64)),
+                ("square", 16, 2, np.kron(_even(16), _even(16))),
             )
         }
 
@@ -141,8 +144,8 @@ def phases_rad(
     if likely is None:
         psi = _sure(shapes, width)
     else:
-        best_db = np.interp(np.log(np.maximum(width, 1e-9)), np.log(shapes.widths), shapes.least_db)
-        loss_db = best_db + 10 * np.log10(len(across.placed)) - floor_db
+        best_db = np.interp(np.log(np.maximum(width, 1e-9)), shapes.widths, shapes.least_db)
+        loss_db = best_db + 10 * math.log10(len(across.placed)) - floor_db
         psi = _likely(shapes, width, np.minimum(likely, cones).max(axis=1), loss_db)
     if len(across.axes) == 1:
         found = psi @ across.knots
@@ -160,15 +163,24 @@ def _between(knots: FloatArray, at: FloatArray) -> tuple[IntArray, FloatArray]:
     return before, (at - knots[before]) / (knots[before + 1] - knots[before])
 
 
-def _on_logs(knots: FloatArray, at: FloatArray) -> tuple[IntArray, FloatArray]:
-    """The same by logarithms, and no further than the ends."""
-    inside = np.clip(at, knots[0], knots[-1])
-    before, share = _between(np.log(knots), np.log(inside))
-    return before, np.clip(share, 0.0, 1.0)
+def _on_axes(axes: Sequence[FloatArray], at: Sequence[FloatArray]) -> tuple[IntArray, FloatArray]:
+    """The knots (A, N) before N places on A axes, and what share the next ones have.
+
+    No further than the ends.
+    """
+    places = np.stack(
+        [
+            np.interp(where, knots, np.arange(len(knots)))
+            for knots, where in zip(axes, at, strict=True)
+        ]
+    )
+    last = np.array([[len(knots) - 2] for knots in axes])
+    before = np.minimum(places.astype(np.int64), last)
+    return before, places - before
 
 
 def _sure(shapes: Shapes, widths: FloatArray) -> FloatArray:
-    before, share = _on_logs(shapes.widths, widths)
+    (before,), (share,) = _on_axes([shapes.widths], [np.log(np.maximum(widths, 1e-300))])
     part = share[:, np.newaxis]
     found: FloatArray = (1 - part) * shapes.sure[before] + part * shapes.sure[before + 1]
     return found
@@ -177,18 +189,15 @@ def _sure(shapes: Shapes, widths: FloatArray) -> FloatArray:
 def _likely(
     shapes: Shapes, cones: FloatArray, likely: FloatArray, losses_db: FloatArray
 ) -> FloatArray:
-    asked = np.maximum(cones, 1e-300) / np.maximum(likely, 1e-300)
-    loss, a = _on_logs(shapes.losses_db, losses_db)
-    cone, b = _on_logs(shapes.cones, cones)
-    ratio, c = _on_logs(shapes.ratios, asked)
-    # The eight corners of each one's cell, (N, 8).
-    u, v, w = CORNERS
-    found: FloatArray = shapes.likely[
-        loss[:, np.newaxis] + u, cone[:, np.newaxis] + v, ratio[:, np.newaxis] + w
-    ]
-    parts = [np.stack([1 - share, share]).T for share in (a, b, c)]
-    shares = parts[0][:, u] * parts[1][:, v] * parts[2][:, w]
-    return np.asarray((shares[:, np.newaxis] @ found)[:, 0])
+    loss, cone, wide = np.log(np.maximum(np.stack([losses_db, cones, likely]), 1e-300))
+    axes = shapes.losses, shapes.cones, shapes.ratios
+    before, share = _on_axes(axes, (loss, cone, cone - wide))
+    strides = np.array([len(axes[1]) * len(axes[2]), len(axes[2]), 1])
+    # The eight corners of each one's cell.
+    corners = (strides @ before)[:, np.newaxis] + CORNERS @ strides
+    parts = np.stack([1 - share, share])
+    shares = parts[CORNERS[:, 0], 0] * parts[CORNERS[:, 1], 1] * parts[CORNERS[:, 2], 2]
+    return np.asarray((shares.T[:, np.newaxis] @ shapes.likely[corners])[:, 0])
 
 
 def _on_square(shapes: Shapes, psi: FloatArray, placed: FloatArray) -> FloatArray:

@@ -149,14 +149,15 @@ def _around(
     spare = (array.size - users) // users if users > 1 else 0
     if spare < 2 * len(axes) or not (likely_rad > LEAST_RAD).any():
         return directions[:, np.newaxis]
-    turned_rad = NULLED_AT * likely_rad
-    first = axes[0] - (directions @ axes[0])[:, np.newaxis] * directions
-    lengths = np.sqrt(np.einsum("nk,nk->n", first, first))[:, np.newaxis]
-    first /= np.maximum(lengths, 1e-9)
-    sides = [first, np.cross(directions, first)][: len(axes)]
-    level = np.cos(turned_rad)[:, np.newaxis] * directions
-    aside = np.sin(turned_rad)[:, np.newaxis]
-    found = [directions]
-    for side in sides:
-        found += [level + aside * side, level - aside * side]
-    return np.stack(found, axis=1)
+    turned_rad = NULLED_AT * likely_rad[:, np.newaxis]
+    along = (directions @ axes[0])[:, np.newaxis]
+    first = axes[0] - along * directions
+    first /= np.maximum(np.sqrt(np.maximum(1.0 - along * along, 0.0)), 1e-9)
+    sides = [first] if len(axes) == 1 else [first, np.cross(directions, first)]
+    level, aside = np.cos(turned_rad) * directions, np.sin(turned_rad)
+    found: FloatArray = np.empty((users, 1 + 2 * len(sides), 3))
+    found[:, 0] = directions
+    for i, side in enumerate(sides):
+        swung = aside * side
+        found[:, 1 + 2 * i], found[:, 2 + 2 * i] = level + swung, level - swung
+    return found

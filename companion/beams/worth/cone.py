@@ -67,7 +67,7 @@ class Cones:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Boxes:
-    """C cells as boxes in angle from the pole and turn about it.
+    """C cells as boxes in angle from the pole and turn about it, in the order of their cones.
 
     On a line the turn is whatever the cone leaves, and the second column is unused.
     """
@@ -205,8 +205,10 @@ def first_boxes(cones: Cones) -> Boxes:
         tiles = len(which) // len(low)
         found.append(Boxes(which, np.tile(low, (tiles, 1)), np.tile(high, (tiles, 1))))
     cone = np.concatenate([boxes.cone for boxes in found])
-    low = np.concatenate([boxes.low for boxes in found])
-    high = np.concatenate([boxes.high for boxes in found])
+    order = np.argsort(cone, kind="stable")
+    cone = cone[order]
+    low = np.concatenate([boxes.low for boxes in found])[order]
+    high = np.concatenate([boxes.high for boxes in found])[order]
     tilt, bound = cones.tilts_rad[cone], cones.bounds_rad[cone]
     for ends in (low, high):
         ends[:, 0] = np.clip(tilt + bound * ends[:, 0], 0.0, np.pi)
@@ -233,10 +235,11 @@ def split(cones: Cones, boxes: Boxes) -> Boxes:
     """Each box in four: quarters of the angle on a line, else halves both ways."""
     angles, turns = (4, 1) if cones.line else (2, 2)
     quarter = np.stack(np.divmod(np.arange(angles * turns), turns), axis=1)
-    size = (boxes.high - boxes.low) / [angles, turns]
-    low = boxes.low + size * quarter[:, np.newaxis]
-    high = boxes.low + size * (quarter[:, np.newaxis] + 1)
-    return Boxes(np.tile(boxes.cone, len(quarter)), low.reshape(-1, 2), high.reshape(-1, 2))
+    size = ((boxes.high - boxes.low) / [angles, turns])[:, np.newaxis]
+    low = boxes.low[:, np.newaxis] + size * quarter
+    return Boxes(
+        np.repeat(boxes.cone, len(quarter)), low.reshape(-1, 2), (low + size).reshape(-1, 2)
+    )
 
 
 def cells(cones: Cones, boxes: Boxes, caps: int) -> Cells:
@@ -350,11 +353,10 @@ def _angle_rad(inward: FloatArray) -> FloatArray:
 def phasors(cones: Cones, pieces: Cells) -> tuple[ComplexArray, FloatArray | None]:
     """Response of each element to the middle of each cell, (M, C), and its largest change in it.
 
-    The change is None where all elements face alike; their pattern is then left out.
+    The change is None where all elements face alike; their pattern is then left out. Phases are
+    from the origin of the array frame, which is as good a point as any other.
     """
-    phase = cones.array.wavenumber_radpm * (cones.positions_m @ pieces.middles[:, cones.columns].T)
-    received = np.empty(phase.shape, dtype=complex)
-    received.real, received.imag = np.cos(phase), np.sin(phase)
+    received = steering.phase_factors(cones.array, pieces.middles)
     if not faces_apart(cones.array):
         return received, None
     towards = steering.element_directions(cones.array, pieces.middles)

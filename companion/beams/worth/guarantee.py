@@ -9,6 +9,7 @@ largest. See docs/math.md 5.4 and 7.
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -18,7 +19,7 @@ from companion.beams.array.elements import Pattern
 from companion.beams.array.geometry import Array
 from companion.beams.worth import cone
 from companion.beams.worth.cone import Boxes, Cells, Cones
-from companion.values import ComplexArray, FloatArray
+from companion.values import ComplexArray, FloatArray, IntArray
 
 TOLERANCE_DB: Final = 0.05
 """Difference between bound and attained gain at which the search ends."""
@@ -145,13 +146,12 @@ def _over_cells(
     cones: Cones, cells: Cells, weights: ComplexArray, most: bool
 ) -> tuple[FloatArray, FloatArray]:
     received, unsure = cone.phasors(cones, cells)
-    chosen = weights[:, cells.cone]
-    terms = chosen * received
-    responses = terms.sum(axis=0)
-    low, high = cone.response_range(cones, cells, responses, cones.positions_m.T @ terms)
+    sums = _by_cone(cones, weights, received, cells.cone)
+    responses = sums[0]
+    low, high = cone.response_range(cones, cells, responses, sums[1:])
     seen = np.abs(responses)
     if unsure is not None:
-        slack = np.einsum("mc,mc->c", np.abs(chosen), unsure)
+        slack = np.einsum("mc,mc->c", np.abs(weights)[:, cells.cone], unsure)
         return (-high - slack, -seen) if most else (low - slack, seen)
     least, largest = cones.array.element.amplitude_range(cells.caps, cells.caps_rad)
     amplitude = cones.array.element.amplitude(cells.caps)
@@ -160,6 +160,23 @@ def _over_cells(
         return -high * largest.max(axis=1), -seen * attained
     attained = np.where(cells.in_cone, amplitude, np.inf).min(axis=1)
     return low * least.min(axis=1), seen * attained
+
+
+def _by_cone(
+    cones: Cones, weights: ComplexArray, received: ComplexArray, cone_of: IntArray
+) -> ComplexArray:
+    """For each cell the response of its cone's weights, and its moments by position, (1 + B, C).
+
+    Cells are in the order of their cones, so that each cone's are one product of matrices.
+    """
+    parts = np.vstack([np.ones(len(weights)), cones.positions_m.T])
+    first = int(cone_of[0])
+    edges = np.searchsorted(cone_of, np.arange(first, int(cone_of[-1]) + 2)).tolist()
+    found: ComplexArray = np.empty((len(parts), len(cone_of)), dtype=complex)
+    for n, (begin, end) in enumerate(pairwise(edges), first):
+        if begin < end:
+            found[:, begin:end] = (parts * weights[:, n]) @ received[:, begin:end]
+    return found
 
 
 def covered_bounds(

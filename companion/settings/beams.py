@@ -112,7 +112,8 @@ class BeamSettings(Section):
                            within the pointing bound; "guarantee", for the bound: the greatest least
                            gain within it; "no", sharp. Earlier settings' true is "guarantee", their
                            false "no"
-        floor_db           that floor, over an isotropic element, where it leaves 3 dB to the best
+        floor_db           that floor, over an isotropic element, where it leaves 3 dB to the best;
+                           it is given up as it is further out of reach
         power              how beams share the power: "equal", "max-min" (the least SINR is the
                            greatest), "weighted-sum" (of rates); unset: as the normalisation makes
                            them. With it the normalisation is "total" unless it is "antenna"
@@ -133,7 +134,7 @@ class BeamSettings(Section):
     normalisation: Normalisation = Normalisation.UNIT_RESPONSE
     priority: Annotated[tuple[str, ...], AfterValidator(_once)] = ()
     widen: Annotated[Widen, BeforeValidator(_named_width)] = Widen.LIKELY
-    floor_db: Annotated[float, Field(ge=-60, le=60)] = 2.5
+    floor_db: Annotated[float, Field(ge=-60, le=60)] = 2.7
     power: Power | None = None
     rate_weights: dict[str, Annotated[float, Field(gt=0, le=1e6)]] = Field(default_factory=dict)
 

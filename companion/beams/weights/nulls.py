@@ -15,7 +15,8 @@ allowed by
 
 At last all of it is taken back by one factor for each beam until the least gain over its cone, and
 over the likely part of it, has lost no more than ``FLOOR_PRICE_DB``, nor what was above isotropic
-fallen below it. All of this follows the directions without a step. See docs/math.md 5.5.
+fallen below it. A least gain that is below isotropic anyway is worth little, and the nulls may have
+it. All of this follows the directions without a step. See docs/math.md 5.5.
 """
 
 from typing import Final, NamedTuple
@@ -32,8 +33,10 @@ FLOOR_PRICE_DB: Final = 2.5
 
 Between these places it may be half a decibel more, and rarely more than that.
 """
-ABOVE: Final = 1.2
-"""Least gain that is kept if it was there: what is sampled at 1.2 is surely above 1."""
+ABOVE: Final = 1.15
+"""Least gain that is kept if it was there: above isotropic, as it is less between the places."""
+GIVEN_UP: Final = 8.0
+"""Power of the share of ``ABOVE`` that a lesser least gain is, to which it may fall."""
 NOTHING: Final = 1e-9
 """Least gain that is no gain."""
 NULL_WIDTHS: Final = 1.0
@@ -124,7 +127,8 @@ def _power(columns: ComplexArray) -> FloatArray:
 
 def _kept(least: FloatArray) -> FloatArray:
     """The least gains that nulls must leave."""
-    lowered = np.maximum(least * 10 ** (-FLOOR_PRICE_DB / 10), np.minimum(least, ABOVE))
+    lowered = np.maximum(least * 10 ** (-FLOOR_PRICE_DB / 10), ABOVE)
+    lowered *= np.minimum(least / ABOVE, 1.0) ** GIVEN_UP
     kept: FloatArray = np.maximum(lowered, NOTHING)
     return kept
 

@@ -23,6 +23,8 @@ CORNERS: Final = np.indices((2, 2, 2)).reshape(3, 8).T
 """The corners (8, 3) of a cell of three axes."""
 MOST: Final = 0.375
 """Widest beam in natural widths for each element: beyond it they are too far apart to shape one."""
+GIVEN_UP: Final = 2.0
+"""Loss in dB that is accepted for each dB by which a floor is out of reach, and worth less."""
 LEAST_SHARE: Final = 1 / 16
 """Least ratio of the widths on the two axes of a plane that its shapes follow."""
 
@@ -134,7 +136,8 @@ def phases_rad(
         cones     (N, D), widths that a UAV may be off on each axis
         likely    (N, D), widths that it likely is off; None: only the cone counts
         floor_db  least gain over the cone that is wanted beside a likely width, over an isotropic
-                  element; it is kept where it leaves ``losses_db[0]`` to the best that there is
+                  element; it is kept where it leaves the least of ``losses`` to the best that there
+                  is, and given up as it is further out of reach
 
     They follow all of it without a step, to 0 where the widths are 0.
     """
@@ -146,6 +149,8 @@ def phases_rad(
     else:
         best_db = np.interp(np.log(np.maximum(width, 1e-9)), shapes.widths, shapes.least_db)
         loss_db = best_db + 10 * math.log10(len(across.placed)) - floor_db
+        least_db = math.exp(shapes.losses[0])
+        loss_db = np.where(loss_db < least_db, least_db + GIVEN_UP * (least_db - loss_db), loss_db)
         psi = _likely(shapes, width, np.minimum(likely, cones).max(axis=1), loss_db)
     if len(across.axes) == 1:
         found = psi @ across.knots

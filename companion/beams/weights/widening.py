@@ -38,7 +38,7 @@ class Uncertain:
 
     likely_rad: FloatArray
     bounds_rad: FloatArray
-    floor_db: float = 2.5
+    floor_db: float = 2.7
 
 
 @dataclass(frozen=True, slots=True)

@@ -71,6 +71,17 @@ def test_a_likely_shape_has_its_floor_and_gains_by_it(
     assert found[800] > 11.5
 
 
+def test_a_floor_that_is_out_of_reach_is_not_paid_for() -> None:
+    """At most 3.5 dB is had within 12 widths: .5 dB, 3 below it, would cost the middle 2 more."""
+    across, usual = shapes.aperture(line(64)), np.array([[0.8]])
+    middles = []
+    for cone in (5.0, 8.0, 12.0, 20.0):
+        (phases,) = shapes.phases_rad(across, np.array([[cone]]), usual, 2.5)
+        middles.append(gains_db(phases, cone)[800])
+    assert middles == sorted(middles)
+    assert middles[2] > 16.0
+
+
 def test_no_width_is_no_shape() -> None:
     across = shapes.aperture(line(64))
     nothing = shapes.phases_rad(across, np.zeros((2, 1)), np.zeros((2, 1)))

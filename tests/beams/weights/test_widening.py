@@ -190,8 +190,9 @@ def test_nulls_cost_no_least_gain_more_than_their_price(
     ]
     for held in (wide.cones.held, wide.cones.likely):
         before, after = (np.where(held, gain, np.inf).min(axis=1) for gain in gains)
-        assert (after > before * 10**-0.25 - 1e-8).all()
-        assert (after[before > 1.2] > 1.2 - 1e-8).all()
+        worth = before > 1.15
+        assert (after[worth] > np.maximum(before[worth] * 10**-0.25, 1.15) - 1e-8).all()
+        assert (after[~worth] > 1.15 * (before[~worth] / 1.15) ** 8 - 1e-8).all()
 
 
 def test_nulls_seldom_cost_more_between_the_places_that_are_looked_at() -> None:

@@ -24,7 +24,7 @@ from companion.recording.reader import (
 )
 from companion.recording.scene import Scene
 from companion.recording.writer import Writer
-from companion.settings.files import layered
+from companion.settings.files import embedded, layered
 from companion.settings.model import Settings
 from companion.settings.origins import Origin, Origins, changed, of_options
 from companion.values import Estimate, Event, Output, Refuted, Tick, Update
@@ -49,12 +49,13 @@ def layers_for(
 ) -> tuple[Settings, Origins]:
     """The settings as by ``settings_for``, and where each comes from.
 
-    A recording holds every setting: what is at its default there counts as that.
+    A recording holds every setting: what is at its default there counts as that, and so does what
+    does not make estimates or beams (``Settings.from_recording``).
     """
     options = {"center": {"source": center_of(logs, center)}}
     recorded = read_settings(logs[0]) if config is None else None
     if recorded:
-        settings = Settings.from_toml(recorded, str(logs[0]))
+        settings = Settings.from_recording(recorded, str(logs[0]))
         origins = changed(settings, Origin("recording", str(logs[0])))
         return settings.override(**options), {**origins, **of_options(options)}
     return layered(config, options)
@@ -68,7 +69,7 @@ def writer_for(logs: Sequence[Path], settings: Settings, out: Path | None) -> Wr
     weights_hz = None if kept.weights_hz == "all" else kept.weights_hz
     scene = Scene(assembly.array(settings), kept.scene_hz)
     versions = {"companion": companion.__version__}
-    return Writer(where, settings.to_toml(), versions, weights_hz, first_ns, scene)
+    return Writer(where, embedded(settings).to_toml(), versions, weights_hz, first_ns, scene)
 
 
 class Run:

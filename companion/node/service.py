@@ -26,6 +26,7 @@ from companion.recording.recover import recover_leftovers
 from companion.recording.scene import Scene
 from companion.recording.writer import Writer
 from companion.server import area_map
+from companion.settings.files import embedded
 from companion.settings.model import Settings
 from companion.settings.origins import Origins
 from companion.values import Event, Frame, Notice, Output, Severity, Tick, UserError
@@ -58,6 +59,7 @@ class Service:
     def __init__(
         self, settings: Settings, say: Callable[[str], None], origins: Origins | None = None
     ) -> None:
+        settings = embedded(settings)
         self.pipeline = Pipeline(settings)
         self.origins = origins or {}
         self.equipment = assembly.equipment(settings, self.pipeline.array)

@@ -158,16 +158,19 @@ class CodebookSettings(Section):
 
     dft   for lines and rectangles: ``oversampling`` times as many beams as elements on each
           axis
-    file  a .npy file with a row per element (M) and a column per beam
+    file  a .npy file with a row per element (M) and a column per beam, which is read into
+          ``stored`` (its bytes, base64)
     """
 
     kind: Literal["none", "dft", "file"] = "none"
     oversampling: Annotated[int, Field(ge=1, le=16)] = 1
     file: str | None = None
+    stored: str | None = None
 
     @model_validator(mode="after")
     def _named(self) -> Self:
-        if (self.kind == "file") != (self.file is not None):
+        named = self.file is not None or self.stored is not None
+        if (self.kind == "file") != named:
             raise UserError('kind = "file" goes with file, and file with it')
         return self
 
@@ -175,10 +178,12 @@ class CodebookSettings(Section):
 class HardwareSettings(Section):
     """The hardware behind the array.
 
-    ``calibration`` names a table of its channels (CSV: channel, element, phase_deg, gain_db).
+    ``calibration`` names a table of its channels (CSV: channel, element, phase_deg, gain_db), which
+    is read into ``calibration_csv``.
     """
 
     calibration: str | None = None
+    calibration_csv: str | None = None
 
 
 class RadioSettings(Section):

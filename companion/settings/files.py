@@ -1,7 +1,11 @@
 """Settings read from a TOML file, together with the files that they name."""
 
+import base64
+import binascii
+import errno
 from collections.abc import Mapping
 from importlib import resources
+from io import BytesIO
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any, Final
@@ -17,6 +21,8 @@ from companion.tracking.design.gain_table import KinematicDesign
 from companion.values import ComplexArray, FloatArray, UserError
 
 DEFAULT_DESIGN: Final = "kinematic_default.json"
+LARGEST_BYTES: Final = 1 << 24
+"""Most bytes of a file that is read: a codebook of 1024 elements and as many beams."""
 
 
 def load(path: Path | None) -> Settings:
@@ -27,12 +33,20 @@ def load(path: Path | None) -> Settings:
     if path is None:
         return Settings()
     try:
-        text = path.read_text(encoding="utf-8")
+        text = _read(path).decode()
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not TOML: it is not UTF-8 text") from error
-    return _with_design(_with_positions(Settings.from_toml(text, str(path))))
+    return embedded(Settings.from_toml(text, str(path)))
+
+
+def embedded(settings: Settings) -> Settings:
+    """Settings with all files read in that they name, so that a recording of them is complete.
+
+    Raises ``ConfigError`` where one cannot be read.
+    """
+    return _with_codebook(_with_calibration(_with_design(_with_positions(settings))))
 
 
 def layered(path: Path | None, options: Mapping[str, dict[str, Any]]) -> tuple[Settings, Origins]:
@@ -47,7 +61,7 @@ def layered(path: Path | None, options: Mapping[str, dict[str, Any]]) -> tuple[S
 
 
 def _with_positions(settings: Settings) -> Settings:
-    """Settings with the element positions read in, so that a recording of them is complete."""
+    """Settings with the element positions read in."""
     named = settings.array.positions
     if named is None:
         return settings
@@ -70,42 +84,67 @@ def numbers_file(key: str, name: str, columns: int) -> FloatArray:
 
 
 def _text_file(key: str, name: str) -> NDArray[Any]:
+    data = _bytes(key, name)
     try:
-        text = Path(name).read_text(encoding="utf-8")
-        lines = (line.split("#")[0].replace(",", " ").split() for line in text.splitlines())
+        lines = (
+            line.split("#")[0].replace(",", " ").split() for line in data.decode().splitlines()
+        )
         return np.array([[float(word) for word in line] for line in lines if line])
-    except OSError as error:
-        raise ConfigError(f"{key} = {name!r}: {error.strerror}") from error
     except ValueError as error:
         raise ConfigError(f"{key} = {name!r}: not a table of numbers: {error}") from error
 
 
 def _npy_file(key: str, name: str, kinds: str) -> NDArray[Any]:
     """Read the array of a .npy file whose dtype kind is one of the letters in ``kinds``."""
+    return _npy(f"{key} = {name!r}", _bytes(key, name), kinds)
+
+
+def _npy(where: str, data: bytes, kinds: str) -> NDArray[Any]:
+    """The array in the bytes of a .npy file; as ``_npy_file``."""
     try:
-        with Path(name).open("rb") as file:
-            found = np.lib.format.read_array(file, allow_pickle=False)
-    except OSError as error:
-        raise ConfigError(f"{key} = {name!r}: {error.strerror or error}") from error
+        found = np.lib.format.read_array(BytesIO(data), allow_pickle=False)
     except (ValueError, MemoryError, TokenError) as error:  # the header is read as Python text
         first = str(error).splitlines()[0]
-        raise ConfigError(f"{key} = {name!r}: not a .npy file of numbers: {first}") from error
+        raise ConfigError(f"{where}: not a .npy file of numbers: {first}") from error
     if found.dtype.kind not in kinds:
-        raise ConfigError(f"{key} = {name!r}: {found.dtype} are not the numbers that are needed")
+        raise ConfigError(f"{where}: {found.dtype} are not the numbers that are needed")
     return found
 
 
+def _with_codebook(settings: Settings) -> Settings:
+    """Settings with the stored beams read in."""
+    name = settings.codebook.file
+    if name is None or settings.codebook.stored is not None:
+        return settings
+    stored = base64.b64encode(_bytes("codebook.file", name)).decode()
+    return settings.override(codebook={"stored": stored})
+
+
 def codebook_file(settings: Settings) -> ComplexArray:
-    """Read the beams of ``codebook.file``, complex (M, K), one beam per column.
+    """The beams of ``codebook.stored``, else of ``codebook.file``: complex (M, K), a column each.
 
     Raises ``ConfigError`` if the file cannot be read or is not a matrix.
     """
-    name = settings.codebook.file or ""
-    found = _npy_file("codebook.file", name, "fciu")
+    kept = _with_codebook(settings).codebook
+    where = "codebook.stored" if kept.file is None else f"codebook.file = {kept.file!r}"
+    try:
+        data = base64.b64decode(kept.stored or "", validate=True)
+    except binascii.Error as error:
+        raise ConfigError(f"{where}: not base64: {error}") from error
+    found = _npy(where, data, "fciu")
     if found.ndim != 2:
-        raise ConfigError(f"codebook.file = {name!r}: not a matrix, but of shape {found.shape}")
+        raise ConfigError(f"{where}: not a matrix, but of shape {found.shape}")
     beams: ComplexArray = found.astype(np.complex128)
     return beams
+
+
+def _with_calibration(settings: Settings) -> Settings:
+    """Settings with the table of the hardware's channels read in."""
+    name = settings.hardware.calibration
+    if name is None or settings.hardware.calibration_csv is not None:
+        return settings
+    text = _text("hardware.calibration", name)
+    return settings.override(hardware={"calibration_csv": text})
 
 
 def calibration_text(settings: Settings) -> str | None:
@@ -113,29 +152,40 @@ def calibration_text(settings: Settings) -> str | None:
 
     Raises ``ConfigError`` if it cannot be read.
     """
-    name = settings.hardware.calibration
-    if name is None:
-        return None
+    return _with_calibration(settings).hardware.calibration_csv
+
+
+def _text(key: str, name: str) -> str:
+    """The text of a file that a setting names. Raises ``ConfigError``, naming ``key``."""
     try:
-        return Path(name).read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"hardware.calibration = {name!r}: {error.strerror}") from error
+        return _bytes(key, name).decode()
     except UnicodeDecodeError as error:
-        raise ConfigError(f"hardware.calibration = {name!r}: not UTF-8 text") from error
+        raise ConfigError(f"{key} = {name!r}: not UTF-8 text") from error
+
+
+def _bytes(key: str, name: str) -> bytes:
+    """The bytes of a file that a setting names. Raises ``ConfigError``, naming ``key``."""
+    try:
+        return _read(Path(name))
+    except OSError as error:
+        raise ConfigError(f"{key} = {name!r}: {error.strerror}") from error
+
+
+def _read(path: Path) -> bytes:
+    """The bytes of a file. Raises ``OSError`` where it cannot be read or is too large."""
+    with path.open("rb") as file:
+        data = file.read(LARGEST_BYTES + 1)
+    if len(data) > LARGEST_BYTES:
+        raise OSError(errno.EFBIG, f"larger than {LARGEST_BYTES >> 20} MiB")
+    return data
 
 
 def _with_design(settings: Settings) -> Settings:
-    """Settings with the observer's gains read in, so that a recording of them is complete."""
+    """Settings with the observer's gains read in."""
     named = settings.observer.design
-    if named is None:
+    if named is None or settings.observer.design_json is not None:
         return settings
-    try:
-        text = Path(named).read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"observer.design = {named!r}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"observer.design = {named!r}: not UTF-8 text") from error
-    return settings.override(observer={"design_json": text})
+    return settings.override(observer={"design_json": _text("observer.design", named)})
 
 
 def kinematic_design(settings: Settings) -> KinematicDesign:
@@ -143,8 +193,7 @@ def kinematic_design(settings: Settings) -> KinematicDesign:
 
     Their certificate is verified. Raises ``ConfigError`` where they cannot be used.
     """
-    given = _with_design(settings).observer if settings.observer.design_json is None else None
-    given = given or settings.observer
+    given = _with_design(settings).observer
     try:
         if given.design_json is not None:
             return KinematicDesign.from_json(given.design_json)

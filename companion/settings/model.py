@@ -5,6 +5,7 @@ is allowed.
 """
 
 import difflib
+import re
 import tomllib
 from typing import Any, Final, Self
 
@@ -33,6 +34,32 @@ from companion.settings.tracking import ClockSettings, ObserverSettings
 NEAR: Final = 0.7
 """Likeness (difflib's ratio) from which on a setting may have been meant by another name."""
 
+LARGEST: Final = 1 << 20
+"""Most characters of settings without their strings: 4096 elements that face apart take 3/4."""
+_STRINGS: Final = re.compile(
+    r""""{3}[^"\\]*(?:(?:\\.|"(?!""))[^"\\]*)*"{3,5}|"""  # of several lines
+    r"""'{3}(?s:.*?)'{3,5}|"""
+    r""""[^"\\\n]*(?:\\.[^"\\\n]*)*"|'[^'\n]*'|#[^\n]*""",
+    re.DOTALL,
+)
+"""What TOML takes for a string or a comment, wherever it begins."""
+_DEEP: Final = re.compile(r"(?:\.[^.=,\n]*){16}")
+"""More parts in a key than any setting has."""
+MODELLED: Final = frozenset(
+    (
+        "center", "clocks", "observer", "tracks", "array", "beams", "codebook", "hardware", "radio",
+        "link",
+    )
+)  # fmt: skip
+"""Sections that make estimates and beams: what a recording has to say to its replay."""
+EMBEDDED: Final = (
+    ("array", "positions", "positions_m"),
+    ("observer", "design", "design_json"),
+    ("codebook", "file", "stored"),
+    ("hardware", "calibration", "calibration_csv"),
+)
+"""Section; its key that names a file; its key that holds what is in that file."""
+
 
 class Settings(Section):
     """All settings of the service."""
@@ -60,10 +87,28 @@ class Settings(Section):
 
         Raises ``ConfigError``, its message beginning with ``where``, if they cannot be used.
         """
+        return cls._from_sections(sections(text, where), where)
+
+    @classmethod
+    def from_recording(cls, text: str, where: str) -> Self:
+        """The settings of a recording, as far as they make estimates and beams.
+
+        Whoever made the recording is not trusted with anything else: where it listened, what it
+        sent, where it wrote, and any path are left out. What a file held that they name is in the
+        settings themselves. Raises ``ConfigError`` as ``from_toml``, and where it is not.
+        """
+        found = {name: kept for name, kept in sections(text, where).items() if name in MODELLED}
+        for section, key, content in EMBEDDED:
+            keys = found.get(section)
+            if isinstance(keys, dict) and keys.pop(key, None) is not None and content not in keys:
+                said = f"what {section}.{key} named is not in the recording"
+                raise ConfigError(f"{where}: {said}: give the settings with --config")
+        return cls._from_sections(found, where)
+
+    @classmethod
+    def _from_sections(cls, found: dict[str, Any], where: str) -> Self:
         try:
-            return cls.model_validate(tomllib.loads(text))
-        except tomllib.TOMLDecodeError as error:
-            raise ConfigError(f"{where}: not TOML: {error}") from error
+            return cls.model_validate(found)
         except ValidationError as error:
             raise ConfigError(f"{where}: {_first(error)}") from error
 
@@ -86,6 +131,19 @@ class Settings(Section):
             return Settings.model_validate(merged)
         except ValidationError as error:
             raise ConfigError(_first(error)) from error
+
+
+def sections(text: str, where: str) -> dict[str, Any]:
+    """The sections of settings in TOML, unchecked. Raises ``ConfigError`` for what is not TOML."""
+    bare = _STRINGS.sub('""', text)  # a key of many parts costs its reader the square of them
+    if len(bare) > LARGEST or _DEEP.search(bare):
+        raise ConfigError(f"{where}: not settings: too large, or nested too deeply")
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{where}: not TOML: {error}") from error
+    except RecursionError as error:
+        raise ConfigError(f"{where}: not settings: too large, or nested too deeply") from error
 
 
 def _meant(place: tuple[int | str, ...]) -> str:
@@ -121,4 +179,6 @@ def _first(error: ValidationError) -> str:
         return f"{key} is not a setting{_meant(place)}"
     said = [wrong["msg"] for wrong in errors if wrong["loc"][:2] == place]
     allowed = dict.fromkeys(text.removeprefix("Value error, ") for text in said)
-    return f"{key} = {errors[0]['input']!r}: {', or '.join(allowed)}"
+    given = repr(errors[0]["input"])
+    given = given if len(given) <= 200 else f"{given[:200]}…"
+    return f"{key} = {given}: {', or '.join(allowed)}"

@@ -1,11 +1,14 @@
 """The effective settings as the API shows them: each with its default, and where it comes from."""
 
-from typing import Any
+from typing import Any, Final
 
 from companion.settings.model import Settings
 from companion.settings.origins import Origin, Origins
 
 Json = dict[str, Any]
+
+LONGEST: Final = 400
+"""Most characters of a text that is shown whole; what files held may be millions."""
 
 
 def show(settings: Settings, origins: Origins) -> Json:
@@ -29,8 +32,14 @@ def _shown(value: Any, default: Any, origin: Origin | None) -> Json:
     if origin is None and value != default:
         origin = Origin("program")
     return {
-        "value": value,
+        "value": _cut(value),
         "default": default,
         "source": origin.kind if origin else "default",
         "file": origin.name if origin else None,
     }
+
+
+def _cut(value: Any) -> Any:
+    if not isinstance(value, str) or len(value) <= LONGEST:
+        return value
+    return f"{value[:LONGEST]}… ({len(value)} characters)"

@@ -1,0 +1,190 @@
+"""A recording's settings are data: replaying what others made touches no file that they name."""
+
+import json
+import os
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tomli_w
+from support import BIN, HANG_S
+
+from companion.node.replay import settings_for, writer_for
+from companion.pipeline import assembly
+from companion.recording.reader import read_log
+from companion.recording.writer import Writer
+from companion.settings.files import load
+from companion.settings.model import EMBEDDED, MODELLED, Settings
+from companion.settings.section import ConfigError
+from companion.values import Frame
+
+PATHS = {
+    "recording": {"directory": "{}/written", "rotate_s": 1.0},
+    "page": {"map": "{}/fifo"},
+    "signing": {
+        "keys": {"udpin:0.0.0.0:14550": "{}/fifo"}, "timestamps": "{}/written/timestamps.json",
+    },
+    "links": {"urls": ["serial:{}/fifo:57600"]},
+    "server": {"listen": "0.0.0.0:1"},
+    "presence": {"enabled": True, "system_id": 7},
+}  # fmt: skip
+"""What a recording may say that a replay has no business with."""
+SHORT = "companion: nothing was aimed at: the log is shorter than one update\n"
+
+
+def foreign(cut_log: Path, path: Path, sections: dict[str, Any]) -> Path:
+    """A recording of a real flight, with settings of somebody else's making."""
+    text = tomli_w.dumps({"center": {"source": "5:1"}, **sections}).replace("{}", str(path.parent))
+    with Writer(path, text, {}, None, 0) as writer:
+        for event in read_log(cut_log):
+            if isinstance(event, Frame):
+                writer.event(event)
+        writer.close({})
+    return path
+
+
+def replayed(folder: Path, *arguments: object) -> "subprocess.CompletedProcess[str]":
+    """``companion replay`` in a folder, which ends within ``HANG_S`` or fails."""
+    command = [BIN / "companion", "replay", *map(str, arguments), "--json"]
+    return subprocess.run(
+        command, capture_output=True, text=True, check=False, timeout=HANG_S, cwd=folder
+    )
+
+
+def test_a_replay_writes_and_opens_nothing_that_a_recording_names(
+    cut_log: Path, tmp_path: Path
+) -> None:
+    os.mkfifo(tmp_path / "fifo")  # whoever opens it waits for ever
+    (tmp_path / "written").mkdir()
+    log = foreign(cut_log, tmp_path / "theirs.mcap", PATHS)
+    here = tmp_path / "here"
+    here.mkdir()
+    done = replayed(here, log)
+    assert done.stderr == SHORT
+    assert list((tmp_path / "written").iterdir()) == []
+    assert Path(json.loads(done.stdout)["recording"]).parent == Path("recordings")
+    assert [file.suffix for file in (here / "recordings").iterdir()] == [".mcap"]
+
+
+def test_a_file_is_not_replaced_because_a_recording_says_so(cut_log: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "mine.mcap"
+    mine.write_bytes(b"years of work")
+    theirs = {"recording": {"directory": str(mine)}}
+    log = foreign(cut_log, tmp_path / "theirs.mcap", theirs)
+    assert replayed(tmp_path, log).stderr == SHORT
+    assert mine.read_bytes() == b"years of work"
+
+
+@pytest.mark.parametrize("file", ["fifo", "/dev/zero", "settings.toml"])
+@pytest.mark.parametrize(
+    "named",
+    [
+        {"observer": {"design": "{}/FILE"}},
+        {"array": {"kind": "list", "positions": "{}/FILE"}},
+        {"codebook": {"kind": "file", "file": "{}/FILE"}},
+        {"hardware": {"calibration": "{}/FILE"}},
+    ],
+    ids=["design", "positions", "codebook", "calibration"],
+)
+def test_equipment_that_a_recording_only_names_is_refused(
+    cut_log: Path, tmp_path: Path, named: dict[str, Any], file: str
+) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    wanted = file if file.startswith("/") else f"{{}}/{file}"
+    sections = json.loads(json.dumps(named).replace("{}/FILE", wanted))
+    log = foreign(cut_log, tmp_path / "theirs.mcap", sections)
+    with pytest.raises(ConfigError, match=r"is not in the recording: give the settings with"):
+        settings_for([log], None, None)
+    config = tmp_path / "mine.toml"
+    config.write_text("[center]\nsource = '5:1'\n")
+    assert settings_for([log], config, None).center.source == "5:1"
+
+
+def test_what_equipment_files_held_is_in_the_recording(cut_log: Path, tmp_path: Path) -> None:
+    beams = np.exp(1j * np.arange(12.0)).reshape(4, 3)
+    np.save(tmp_path / "beams.npy", beams)
+    table = tmp_path / "measured.csv"
+    lines = [f"{c},{3 - c},{10 * c},0" for c in range(4)]
+    table.write_text("channel,element,phase_deg,gain_db\n" + "\n".join(lines))
+    config = tmp_path / "settings.toml"
+    config.write_text(
+        f"[center]\nsource = '5:1'\n[array]\nelements = 4\n"
+        f"[codebook]\nkind = 'file'\nfile = '{tmp_path}/beams.npy'\n"
+        f"[hardware]\ncalibration = '{table}'\n"
+    )
+    given = load(config)
+    wanted = assembly.equipment(given, assembly.array(given))
+    log = tmp_path / "kept.mcap"
+    with writer_for([cut_log], given, log) as writer:
+        for event in read_log(cut_log):
+            writer.event(event)
+        writer.close({})
+    for file in (table, config, tmp_path / "beams.npy"):
+        file.unlink()
+
+    held = settings_for([log], None, None)
+    found = assembly.equipment(held, assembly.array(held))
+    assert found.codebook is not None
+    assert wanted.codebook is not None
+    assert np.array_equal(found.codebook.weights, wanted.codebook.weights)
+    assert found.calibration is not None
+    assert found.calibration.order == (3, 2, 1, 0)
+    assert (held.codebook.file, held.hardware.calibration) == (None, None)
+    again = tmp_path / "again.mcap"  # a recording of the replay is as complete
+    with writer_for([log], held, again) as writer:
+        writer.event(next(read_log(log)))
+        writer.close({})
+    assert settings_for([again], None, None) == held
+
+
+def test_each_key_that_names_a_file_is_known() -> None:
+    """A new one must say what takes its place in a recording, or stay out of what is taken."""
+    paths = {
+        (section, key)
+        for section in MODELLED
+        for key, field in type(getattr(Settings(), section)).model_fields.items()
+        if field.annotation == str | None and field.metadata == []
+    }
+    named = {(section, key) for section, key, _ in EMBEDDED}
+    contents = {(section, content) for section, _, content in EMBEDDED}
+    assert paths - contents - {("center", "source")} == named
+    assert Settings().model_fields_set == set()
+    assert set(Settings.model_fields) - MODELLED == set(PATHS)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a = " + "[" * 100_000,
+        "a = " + "{a = " * 100_000,
+        "x." * 100_000 + "x = 1",
+        "[" + '"=".' * 100_000 + "x]",
+        'a = """# """"\n' + "'\"'." * 100_000 + 'x = 1 # "',
+        "".join(f"a{number} = 1\n" for number in range(200_000)),
+    ],
+    ids=["arrays", "tables", "key", "header", "quotes", "many"],
+)
+def test_nested_settings_are_refused_in_a_line(text: str) -> None:
+    for read in (Settings.from_toml, Settings.from_recording):
+        with pytest.raises(ConfigError, match=r"^there: ") as caught:
+            read(text, "there")
+        assert len(str(caught.value).splitlines()) == 1
+
+
+def test_the_largest_array_is_not_too_large() -> None:
+    """On one line, as somebody may write it, and as a recording has it."""
+    rows = np.random.default_rng(1).uniform(-1e4, 1e4, (4096, 6)).tolist()
+    text = f"[array]\nkind = 'list'\npositions_m = {rows}\n"
+    found = Settings.from_toml(text, "x")
+    assert Settings.from_recording(found.to_toml(), "x") == found
+
+
+def test_a_file_without_end_is_refused(tmp_path: Path) -> None:
+    config = tmp_path / "settings.toml"
+    config.write_text("[observer]\ndesign = '/dev/zero'\n")
+    with pytest.raises(ConfigError, match=r"/dev/zero.*larger than 16 MiB"):
+        load(config)
+    with pytest.raises(ConfigError, match="larger than 16 MiB"):
+        load(Path("/dev/zero"))

@@ -6,7 +6,8 @@ schemas and channels make up for a damaged chunk that held the originals.
 
 Layout: https://mcap.dev/spec. A chunk counts only when its checksum holds. A damaged chunk in the
 middle of a file is passed over and counted; a record that goes on past the end of the file ends the
-walk.
+walk. No length is believed: each is held against what is there and against the limits below, so
+that memory and time are bounded by the size of the file, whoever made it.
 """
 
 import contextlib
@@ -15,14 +16,14 @@ import zlib
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import IO, Final, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Metadata, Schema, Statistics
-from mcap.stream_reader import get_chunk_data_stream
-from zstandard import ZstdError
+from mcap.records import Attachment, Channel, Metadata, Schema, Statistics
+
+from companion.recording.unpacking import unpacked
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 _HEADER: Final = struct.Struct("<BQ")  # opcode, length of what follows
@@ -34,14 +35,26 @@ Opcode, length, start of the summary, start of its offsets, and CRC-32 from the 
 to just before itself.
 """
 _UNCHECKED: Final = 4 + len(MAGIC)
-_LARGEST_CHUNK: Final = 1 << 28
-"""Largest chunk that is read, bytes, so that a damaged size does not ask for all of the memory.
 
-Chunks of this program are about a mebibyte.
-"""
+LARGEST: Final = 1 << 25
+"""Most bytes of a record, or of a chunk's contents, that are read; chunks of this program have
+about a mebibyte, and the largest settings 27."""
+_LARGEST_MESSAGE: Final = 1 << 24
+_LARGEST_SUMMARY: Final = 1 << 26  # two weeks of a chunk a second
+_DESCRIPTIONS: Final = 1 << 25
+"""Most bytes of all schemas and channels together."""
+_PACKED: Final = 50
+"""Most bytes of contents for each byte of a file, beside one largest chunk: as much as ten times
+what is found in recordings, where a bomb has thousands."""
 
-# What torn or damaged bytes make the libraries raise; a failed checksum is a ValueError.
-_DAMAGE: Final = (McapError, struct.error, ZstdError, ValueError, MemoryError)
+# What torn or damaged bytes make the library raise; a failed checksum is a ValueError.
+_DAMAGE: Final = (McapError, struct.error, ValueError, OverflowError)
+
+
+_READ: Final = frozenset(
+    (Opcode.ATTACHMENT, Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
+)
+"""Records beside chunks that are read; the others are indexes."""
 
 
 class Message(NamedTuple):
@@ -80,82 +93,114 @@ class Walk:
         """Bytes that belong to no readable record."""
         self._path = path
         self._topics = topics
+        self._described_bytes = 0
+        self._room = 0  # bytes that chunks may yet unpack to
 
     def __iter__(self) -> Iterator[Content]:
         self._read_descriptions()
-        for opcode, size, body in self._records():
-            try:
-                contents = self._contents(opcode, body)
-            except _DAMAGE:
-                self.lost_bytes += size
-                yield Damage(size)
-                continue
-            yield from contents
+        with self._path.open("rb") as file:
+            for opcode, length in self._records(file):
+                if not self._is_wanted(opcode):
+                    continue
+                try:
+                    yield from self._contents(opcode, file, length)
+                except _DAMAGE:
+                    self.lost_bytes += _HEADER.size + length
+                    yield Damage(_HEADER.size + length)
 
     def _read_descriptions(self) -> None:
         """Read schemas and channels from the summary, if there is one and its checksum holds."""
         with contextlib.suppress(*_DAMAGE):  # another program's: the data has them as well
-            self._in_chunk(_summary(self._path))
+            for opcode, body in _split(_summary(self._path)):
+                self._describe(opcode, body)
 
-    def _records(self) -> Iterator[tuple[int, int, bytes]]:
-        """(opcode, bytes in the file, body) of the records up to the file's end."""
+    def _records(self, file: IO[bytes]) -> Iterator[tuple[int, int]]:
+        """(opcode, length) of the records up to the file's end, the file standing at the body."""
         size = self._path.stat().st_size
-        with self._path.open("rb") as file:
-            at = len(file.read(len(MAGIC)))
-            while len(header := file.read(_HEADER.size)) == _HEADER.size:
-                opcode, length = _HEADER.unpack(header)
-                stop = at + _HEADER.size + length
-                if stop > size or opcode == 0:
-                    break
-                body = file.read(length)
-                at = stop
-                if opcode == Opcode.FOOTER:
-                    self.complete = file.read(len(MAGIC)) == MAGIC
-                    return
-                yield opcode, _HEADER.size + length, body
+        self._room = LARGEST + _PACKED * size
+        at = len(file.read(len(MAGIC)))
+        while len(header := file.read(_HEADER.size)) == _HEADER.size:
+            opcode, length = _HEADER.unpack(header)
+            stop = at + _HEADER.size + length
+            if stop > size or opcode == 0:
+                break
+            if opcode == Opcode.FOOTER:
+                file.seek(stop)
+                self.complete = file.read(len(MAGIC)) == MAGIC
+                return
+            yield opcode, length
+            file.seek(stop)
+            at = stop
         self.lost_bytes += size - at
 
-    def _contents(self, opcode: int, body: bytes) -> list[Content]:
-        if opcode == Opcode.CHUNK and self._topics != frozenset():
-            chunk = Chunk.read(ReadDataStream(BytesIO(body)))
-            if chunk.uncompressed_size > _LARGEST_CHUNK:
-                raise ValueError("no chunk is that large")
-            stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-            return self._in_chunk(stream.read(size))
-        if opcode == Opcode.ATTACHMENT:
-            return [Attachment.read(ReadDataStream(BytesIO(body)))]
-        if opcode == Opcode.METADATA:
-            return [Metadata.read(ReadDataStream(BytesIO(body)))]
-        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):  # a file without chunks
-            return self._in_chunk(_HEADER.pack(opcode, len(body)) + body)
-        return []
+    def _is_wanted(self, opcode: int) -> bool:
+        if opcode == Opcode.CHUNK:
+            return self._topics != frozenset()
+        return opcode in _READ
 
-    def _in_chunk(self, data: bytes) -> list[Content]:
+    def _contents(self, opcode: int, file: IO[bytes], length: int) -> Iterator[Content]:
+        if length > LARGEST:
+            raise ValueError("no record is that large")
+        body = file.read(length)
+        if opcode == Opcode.CHUNK:
+            data = unpacked(body, min(LARGEST, self._room))
+            self._room -= len(data)
+            yield from self._in_chunk(data)
+        elif opcode == Opcode.ATTACHMENT:
+            yield Attachment.read(ReadDataStream(BytesIO(body)))
+        elif opcode == Opcode.METADATA:
+            yield Metadata.read(ReadDataStream(BytesIO(body)))
+        else:  # a file without chunks
+            yield from self._in_chunk(_HEADER.pack(opcode, len(body)) + body)
+
+    def _in_chunk(self, data: bytes) -> Iterator[Content]:
         """The wanted messages of a chunk; remembers the schemas and channels between them."""
-        found: list[Content] = []
-        at = orphaned = 0
-        while at < len(data):
-            opcode, length = _HEADER.unpack_from(data, at)
-            start, at = at + _HEADER.size, at + _HEADER.size + length
-            if opcode == Opcode.MESSAGE:
-                channel_id, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(data, start)
-                channel = self.channels.get(channel_id)
-                if channel is None or channel.schema_id not in self._described:
-                    orphaned += _HEADER.size + length
-                elif self._topics is None or channel.topic in self._topics:
-                    raw = data[start + _MESSAGE.size : at]
-                    found.append(Message(channel, sequence, log_ns, publish_ns, raw))
-            elif opcode == Opcode.SCHEMA:
-                schema = Schema.read(ReadDataStream(BytesIO(data[start:at])))
-                self.schemas[schema.id] = schema
-                self._described.add(schema.id)
-            elif opcode == Opcode.CHANNEL:
-                channel = Channel.read(ReadDataStream(BytesIO(data[start:at])))
-                self.channels[channel.id] = channel
+        channels, topics = self.channels, self._topics
+        orphaned = 0
+        for opcode, body in _split(data):
+            if opcode != Opcode.MESSAGE:
+                self._describe(opcode, body)
+                continue
+            channel_id, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(body)
+            channel = channels.get(channel_id)
+            if channel is None or channel.schema_id not in self._described:
+                orphaned += _HEADER.size + len(body)
+            elif topics is None or channel.topic in topics:
+                yield Message(channel, sequence, log_ns, publish_ns, body[_MESSAGE.size :])
         if orphaned:  # the chunk that described their channel was damaged
             self.lost_bytes += orphaned
-            found.append(Damage(orphaned))
-        return found
+            yield Damage(orphaned)
+
+    def _describe(self, opcode: int, body: bytes) -> None:
+        """Remember a schema or a channel."""
+        if opcode == Opcode.SCHEMA:
+            schema = Schema.read(ReadDataStream(BytesIO(body)))
+            if schema != self.schemas.get(schema.id):
+                self._take(len(body))
+                self.schemas[schema.id] = schema
+                self._described.add(schema.id)
+        elif opcode == Opcode.CHANNEL:
+            channel = Channel.read(ReadDataStream(BytesIO(body)))
+            if channel != self.channels.get(channel.id):
+                self._take(len(body))
+                self.channels[channel.id] = channel
+
+    def _take(self, size: int) -> None:
+        if self._described_bytes + size > _DESCRIPTIONS:
+            raise ValueError("no file describes so much")
+        self._described_bytes += size
+
+
+def _split(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """(opcode, body) of the records in a chunk. Raises ``ValueError`` where one is not whole."""
+    at, end = 0, len(data)
+    while at < end:
+        opcode, length = _HEADER.unpack_from(data, at)
+        start = at + _HEADER.size
+        at = start + length
+        if at > end or not opcode or (opcode == Opcode.MESSAGE and length > _LARGEST_MESSAGE):
+            raise ValueError("no record, or one that is longer than what holds it")
+        yield opcode, data[start:at]
 
 
 def span_ns(path: Path) -> tuple[int, int] | None:
@@ -163,16 +208,12 @@ def span_ns(path: Path) -> tuple[int, int] | None:
 
     Raises ``OSError`` where the file cannot be read.
     """
-    summary, at = _summary(path), 0
     with contextlib.suppress(*_DAMAGE):
-        while at < len(summary):
-            opcode, length = _HEADER.unpack_from(summary, at)
-            at += _HEADER.size
+        for opcode, body in _split(_summary(path)):
             if opcode == Opcode.STATISTICS:
-                found = Statistics.read(ReadDataStream(BytesIO(summary[at : at + length])))
+                found = Statistics.read(ReadDataStream(BytesIO(body)))
                 times_ns = found.message_start_time, found.message_end_time
                 return times_ns if found.message_count else None
-            at += length
     return None
 
 
@@ -185,7 +226,7 @@ def _summary(path: Path) -> bytes:
         if not end.endswith(MAGIC) or end[0] != Opcode.FOOTER:  # a short file starts otherwise
             return b""
         _, _, summary_at, _, checksum, _ = _END.unpack(end)
-        if not 0 < summary_at <= size - _END.size:
+        if not 0 < summary_at <= size - _END.size or size - summary_at > _LARGEST_SUMMARY:
             return b""
         file.seek(summary_at)
         summary = file.read(size - summary_at)

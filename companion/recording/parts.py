@@ -19,6 +19,10 @@ from companion.values import UserError
 
 PART: Final = "part"
 HOLE: Final = "hole"
+HOLES_MAX: Final = 1000
+"""Holes of a file that are told one by one; what further ones lack is counted with the last."""
+WHY_MAX: Final = 200
+_LATEST_NS: Final = 1 << 62
 
 
 class Part(NamedTuple):
@@ -68,8 +72,14 @@ class Hole(NamedTuple):
 
     @classmethod
     def from_metadata(cls, found: Mapping[str, str]) -> "Hole":
-        """Read a hole. Raises ``KeyError`` or ``ValueError`` where the metadata describe none."""
-        return cls(int(found["t_ns"]), int(found["events"]), found["why"])
+        """Read a hole. Raises ``ValueError`` where the metadata describe none."""
+        try:
+            hole = cls(int(found["t_ns"]), int(found["events"]), found["why"][:WHY_MAX])
+        except KeyError as error:
+            raise ValueError(f"a hole without {error}") from None
+        if not 0 <= hole.t_ns < _LATEST_NS:
+            raise ValueError("a hole beyond all time")
+        return hole
 
 
 class Story(NamedTuple):
@@ -87,12 +97,16 @@ def read_story(path: Path) -> Story:
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             return Story(None, ())
-    part, holes = None, []
+    part: Part | None = None
+    holes: list[Hole] = []
     for record in Walk(path, frozenset()):
         if isinstance(record, Metadata) and record.name == PART:
             part = Part.from_metadata(record.metadata)
         elif isinstance(record, Metadata) and record.name == HOLE:
-            holes.append(Hole.from_metadata(record.metadata))
+            hole = Hole.from_metadata(record.metadata)
+            if len(holes) == HOLES_MAX:
+                hole = hole._replace(events=holes.pop().events + hole.events)
+            holes.append(hole)
     return Story(part, tuple(holes))
 
 

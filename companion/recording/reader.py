@@ -7,14 +7,17 @@ are one flight.
 """
 
 import heapq
+import mmap
+import os
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Final, Literal
+from typing import IO, Final, Literal, cast
 
 from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Metadata
 
+from companion.mavlink.wire.framing import is_shaped
 from companion.recording import codec, schemas, tlog
 from companion.recording.container import MAGIC, Damage, Message, Walk
 from companion.recording.errors import LogError
@@ -27,6 +30,10 @@ __all__ = ["LogError", "LogKind", "center_of", "flights", "log_kind", "read_flig
            "read_parts", "read_settings", "vehicles"]  # fmt: skip
 
 LogKind = Literal["tlog", "mavlink", "mcap", "foreign-mcap", "capture", "dataflash", "ulog", "csv"]
+_MAPPED_BYTES: Final = 1 << 26
+"""Size from which on a log is left to the system's pages rather than read into memory."""
+_LATEST_NS: Final = 1 << 62
+"""Latest time of an event, the year 2116: what is worked out from times stays in 63 bits."""
 _EVENT_TOPICS: Final = frozenset(
     (
         schemas.FRAMES_TOPIC,
@@ -140,13 +147,18 @@ def read_settings(path: Path) -> str | None:
         return None
     for content in Walk(path, frozenset()):
         if isinstance(content, Attachment) and content.name == SETTINGS:
-            return content.data.decode()
+            try:
+                return content.data.decode()
+            except UnicodeDecodeError:
+                raise LogError(f"{path}: its settings are not UTF-8 text") from None
     return None
 
 
 def _open(path: Path) -> tuple[LogKind, bytes]:
     """The kind of a log, and its bytes unless it is one that is read piece by piece."""
     try:
+        if not (path.is_file() or path.is_dir()) and path.exists():
+            raise LogError(f"{path}: not a file")
         with path.open("rb") as file:
             head = file.read(kinds.HEAD_BYTES)
             if head.startswith(MAGIC):
@@ -154,7 +166,7 @@ def _open(path: Path) -> tuple[LogKind, bytes]:
             piecewise = kinds.read_piecewise(head)
             if piecewise is not None:
                 return piecewise, b""
-            data = head + file.read()
+            data = _whole(file)
     except FileNotFoundError:
         raise LogError(f"{path}: no such file") from None
     except IsADirectoryError:
@@ -172,6 +184,16 @@ def _open(path: Path) -> tuple[LogKind, bytes]:
     if kind is None:
         raise LogError(f"{path}: no MAVLink frame in it")
     return kind, data
+
+
+def _whole(file: IO[bytes]) -> bytes:
+    """All bytes of a file; those of a large one are where the system keeps its pages."""
+    size = file.seek(0, os.SEEK_END)
+    if size > _MAPPED_BYTES:
+        # It is read as bytes are: by index, by slice and by regular expressions.
+        return cast(bytes, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+    file.seek(0)
+    return file.read()
 
 
 def _ours(path: Path) -> bool:
@@ -200,6 +222,8 @@ def _recorded(path: Path) -> Iterator[Event]:
             event = _event(content.channel.topic, content.data, sources)
             if event is None:
                 continue
+            if event.t_ns >= _LATEST_NS:
+                raise ValueError("an event that is beyond all time")
             if damaged:
                 yield Rejection(
                     t_ns, path.name, Reason.GARBAGE, damaged, detail="recording damaged"
@@ -215,7 +239,10 @@ def _recorded(path: Path) -> Iterator[Event]:
 
 def _event(topic: str, data: bytes, sources: dict[tuple[int, int], Source]) -> Event | None:
     if topic == schemas.FRAMES_TOPIC:
-        return codec.to_frame(data, sources)
+        frame = codec.to_frame(data, sources)
+        if not is_shaped(frame.raw) or max(frame.source) > 255:
+            raise ValueError("a frame that is none")
+        return frame
     if topic == schemas.TICKS_TOPIC:
         return Tick(schemas.TickMessage.FromString(data).t_ns)
     if topic == schemas.ROUND_TRIPS_TOPIC:

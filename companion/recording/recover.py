@@ -22,6 +22,13 @@ from companion.recording.writer import ACTIVE, free_name, sync_folder
 _PARTIAL: Final = ".recovering"
 
 
+DAMAGED: Final = ".damaged"
+
+
+class UnreadableError(LogError):
+    """The file holds no recording at all."""
+
+
 class BeingRecordedError(LogError):
     """The recording is not a leftover: a process has it open."""
 
@@ -64,7 +71,9 @@ def recover(path: Path) -> Recovered:
 def recover_leftovers(folder: Path) -> list[Recovered | LogError]:
     """Recover every ``*.mcap.active`` in a folder.
 
-    One that cannot be recovered is reported and kept.
+    One that is no recording, or does what nobody has foreseen, is reported and kept as
+    ``x.mcap.damaged``, so that it is not tried again at each start. Where the disk fails it is
+    reported and left.
 
     A file that is being recorded, by whatever process, is left alone and is not in the list.
     """
@@ -74,12 +83,28 @@ def recover_leftovers(folder: Path) -> list[Recovered | LogError]:
             results.append(recover(path))
         except BeingRecordedError:
             continue
+        except UnreadableError as error:
+            results.append(_set_aside(path, str(error)))
         except LogError as error:
             results.append(error)
+        except Exception as error:  # whatever a leftover does, the service starts
+            results.append(_set_aside(path, f"{path}: {type(error).__name__}: {error}"))
     return results
 
 
+def _set_aside(path: Path, why: str) -> LogError:
+    """Rename a leftover to ``x.mcap.damaged``; returns what is to be said."""
+    aside = free_name(path.with_suffix(DAMAGED))
+    try:
+        path.rename(aside)
+    except OSError as error:
+        return LogError(f"{why}; it cannot be renamed: {error.strerror}")
+    return LogError(f"{why}; kept as {aside.name}")
+
+
 def _recover(path: Path) -> Recovered:
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise UnreadableError(f"{path}: not a file")
     with path.open("rb") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -92,7 +117,7 @@ def _rewrite(path: Path, head: bytes) -> Recovered:
     active = path.name.endswith(ACTIVE)
     # A process killed at the very start may leave no more than a piece of the magic bytes.
     if not (head == MAGIC or (active and MAGIC.startswith(head))):
-        raise LogError(f"{path}: not an MCAP recording")
+        raise UnreadableError(f"{path}: not an MCAP recording")
     final = path.with_suffix("") if active else path.with_suffix(".recovered.mcap")
     partial = final.with_name(final.name + _PARTIAL)
     walk = Walk(path)
@@ -168,8 +193,9 @@ class _Copy:
         channel = message.channel
         schema_id = self._schemas.get(channel.schema_id)
         if schema_id is None:
-            schema = self._walk.schemas[channel.schema_id]
-            schema_id = self._mcap.schema(schema.name, schema.encoding, schema.data)
+            schema_id = 0  # of other programs: a channel without one
+            if schema := self._walk.schemas.get(channel.schema_id):
+                schema_id = self._mcap.schema(schema.name, schema.encoding, schema.data)
             self._schemas[channel.schema_id] = schema_id
         channel_id = self._mcap.channel(
             channel.topic, channel.message_encoding, schema_id, channel.metadata

@@ -26,6 +26,8 @@ STAMP: Final = 8
 """Bytes of the stamp before each frame of a telemetry log."""
 _PIECE: Final = 1 << 16
 _MANY_PAIRS: Final = 50
+_SEARCHED_BYTES: Final = 1 << 26
+"""Bytes of a file in which MAVLink is looked for."""
 _REASON: Final = {UNKNOWN_MESSAGE: Reason.UNKNOWN_MESSAGE, BAD_CRC: Reason.BAD_CRC}
 _BOOT_MS_AT: Final = {33: 0, 30: 0, 2: 8}
 """Offset of time_boot_ms in the payloads of GLOBAL_POSITION_INT, ATTITUDE and SYSTEM_TIME."""
@@ -42,7 +44,7 @@ def sniff(data: bytes) -> Literal["tlog", "mavlink"] | None:
     twenty megabytes of noise holds what looks like a frame.
     """
     stamped = bare = 0
-    at, end = 0, len(data)
+    at, end = 0, min(len(data), _SEARCHED_BYTES)
     while at < end and max(stamped, bare) < _MANY_PAIRS:
         at, length = _next_frame(data, at, end)
         after = at + length
@@ -163,26 +165,17 @@ def read_raw(data: bytes, link: str) -> Iterator[Event]:
     It counts from the epoch and never steps back; frames before the first that tells the time get
     the time of that one.
     """
-    timeline: RepairedStamps | None = None
-    clock: Source | None = None
-    early: list[Event] = []
+    frames = (event for event in _split(data, link) if isinstance(event, Frame))
+    first = next((one for one in frames if _boot_ns(one, one.source) is not None), None)
+    clock = None if first is None else first.source
+    timeline = RepairedStamps([] if first is None else [_boot_ns(first, clock) or 0])
     for event in _split(data, link):
         stamp_ns = _boot_ns(event, clock) if isinstance(event, Frame) else None
-        off_ns = None
-        if stamp_ns is not None and isinstance(event, Frame):
-            if timeline is None:
-                timeline, clock = RepairedStamps([stamp_ns]), event.source
-                yield from (_at(before, timeline.t_ns) for before in early)
-                early.clear()
-            off_ns = timeline.place(stamp_ns)
-        if timeline is None:
-            early.append(event)
-            continue
+        off_ns = None if stamp_ns is None else timeline.place(stamp_ns)
         # Messages of one sender may be a little out of step: only more than that is a bad stamp.
         if off_ns is not None and abs(off_ns) > LINGERS_NS:
             yield _bad_stamp(timeline.t_ns, link, off_ns)
         yield _at(event, timeline.t_ns)
-    yield from early
 
 
 def _split(data: bytes, link: str) -> Iterator[Frame | Rejection]:
@@ -202,7 +195,7 @@ def _at(event: Event, t_ns: int) -> Event:
 
 def _boot_ns(frame: Frame, clock: Source | None) -> int | None:
     at = _BOOT_MS_AT.get(frame.msgid)
-    if at is None or clock not in (None, frame.source):
+    if at is None or clock != frame.source:
         return None
     # MAVLink 2 cuts trailing zeros, so what is missing is zero.
     boot_ms = int.from_bytes(frame.payload[at : at + 4], "little")

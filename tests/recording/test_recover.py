@@ -237,7 +237,7 @@ def test_leftovers_are_recovered_and_what_cannot_be_is_told(
         recover(live.path)
     live.close({})
     assert names(folder) == [
-        "a.mcap", "b.mcap.active", "c.mcap", "companion-19700101T000000Z.mcap", "d.mcap",
+        "a.mcap", "b.mcap.damaged", "c.mcap", "companion-19700101T000000Z.mcap", "d.mcap",
     ]  # fmt: skip
 
 

@@ -248,7 +248,8 @@ def test_a_chunk_is_closed_before_it_grows_large(tmp_path: Path) -> None:
     writer = open_writer(tmp_path)
     noise = np.random.default_rng(1)
     frames = [
-        Frame(number, "udp", Source(1, 1), 0, noise.bytes(280)) for number in range(12_000)
+        Frame(number, "udp", Source(1, 1), 0, b"\xfd\xff\1" + noise.bytes(277))
+        for number in range(12_000)
     ]  # fmt: skip
     for frame in frames:
         writer.event(frame)

@@ -27,6 +27,8 @@ MAGIC_V2: Final = 0xFD
 SIGNED: Final = 0x01
 """The only incompatibility flag defined; frames with any other must be dropped."""
 
+SHORTEST: Final = 8
+"""Bytes of a MAVLink 1 frame without a payload."""
 KNOWN_MAX: Final = 8192
 """Distinct pairs of sender and message of which a stream keeps what it knows."""
 
@@ -86,6 +88,11 @@ def claimed_length(buffer: bytes, at: int, end: int) -> int:
     if buffer[at] == MAGIC_V1:
         return 8 + buffer[at + 1]
     return 12 + buffer[at + 1] + (13 if buffer[at + 2] & SIGNED else 0)
+
+
+def is_shaped(raw: bytes) -> bool:
+    """Whether bytes begin and are as long as one frame; nothing is said of what is in it."""
+    return len(raw) >= SHORTEST and claimed_length(raw, 0, len(raw)) == len(raw)
 
 
 def next_magic(buffer: bytes, at: int, end: int) -> int:

@@ -72,9 +72,9 @@ def _link(url: LinkUrl) -> Finding:
     subject = f"link {url}"
     if url.scheme == "serial":
         return _device(subject, Path(url.host))
-    if url.scheme not in ("udpin", "tcpin"):
+    if not url.listens:
         return Finding(subject, Grade.OK, "calls from here")
-    kind = socket.SOCK_DGRAM if url.scheme == "udpin" else socket.SOCK_STREAM
+    kind = socket.SOCK_STREAM if url.scheme == "tcpin" else socket.SOCK_DGRAM
     try:
         bound(url, kind).close()
     except OSError as error:

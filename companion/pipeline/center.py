@@ -7,6 +7,7 @@ import math
 from typing import Final
 
 from companion.beams.aim import AIMABLE
+from companion.pipeline import assembly
 from companion.pipeline.senders import PlacedAttitude, PlacedReport
 from companion.settings.center import (
     CenterPlace,
@@ -54,6 +55,7 @@ class Center:
         self._turns = carrier.Turns()
         self._attitude_bound_rad = math.radians(settings.center.attitude_bound_deg)
         self._attitude_kept_s = settings.tracks.coasting_s
+        self._accuracy_factor = assembly.noise(settings).factor
         if isinstance(self.place, FixedCenter):
             self._begin(self.place)
 
@@ -80,7 +82,14 @@ class Center:
         )
         errors = placed.noise
         if errors is None:
-            errors = noise.relayed(velocity, report.alt_age_s, placed.limits.speed_mps)
+            errors = noise.relayed(
+                velocity,
+                report.alt_age_s,
+                placed.limits.speed_mps,
+                report.accuracy,
+                report.alt_datum,
+                self._accuracy_factor,
+            )
         made = Fix(
             report.uav,
             placed.sender_ns,

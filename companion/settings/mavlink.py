@@ -26,10 +26,10 @@ LinkText = Annotated[str, AfterValidator(_link)]
 
 
 class LinkSettings(Section):
-    """The links on which MAVLink is received.
+    """The links on which MAVLink, and what receivers of other kinds say, is received.
 
-    URLs are ``udpin:``, ``udpout:``, ``tcp:``, ``tcpin:`` or ``sbs:HOST:PORT``, or
-    ``serial:DEVICE:BAUD``.
+    URLs are ``udpin:``, ``udpout:``, ``tcp:`` or ``tcpin:HOST:PORT``, ``serial:DEVICE:BAUD``, and
+    those of other receivers: ``sbs:`` or ``readsb:HOST:PORT``, ``readsb:http://HOST/PATH``.
     """
 
     urls: tuple[LinkText, ...] = ()

@@ -1,10 +1,10 @@
-"""Bounds on the errors of a report, by the autopilot's stated accuracy or for ADS-B."""
+"""Bounds on the errors of a report, by the accuracy that is stated or for relayed aircraft."""
 
 import math
 from dataclasses import dataclass
 from typing import Final
 
-from companion.values import GnssStatus, ReportNoise, Vector
+from companion.values import Accuracy, AltitudeDatum, GnssStatus, ReportNoise, Vector
 
 QUANTISATION: Final = 0.02
 """Least noise bound, m and m/s, whatever accuracy is stated.
@@ -21,6 +21,11 @@ altitude.
 """
 ADSB_VELOCITY_NOISE_MPS: Final = 10.0
 """Bound on the velocity error of an ADS-B report (NACv 1)."""
+GEOID_M: Final = 107.0
+"""Greatest distance between the ellipsoid and mean sea level (EGM96: -107 to 86 m).
+
+Heights above the ellipsoid stand beside telemetry's, which are above mean sea level.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,16 +60,30 @@ def _bound(accuracy: float | None, factor: float, default: float) -> float:
     return default if accuracy is None else max(QUANTISATION, factor * accuracy)
 
 
-def relayed(velocity_ned_mps: Vector | None, alt_age_s: float, speed_max_mps: float) -> ReportNoise:
-    """The noise bounds of an ADS-B report.
+def relayed(
+    velocity_ned_mps: Vector | None,
+    alt_age_s: float,
+    speed_max_mps: float,
+    accuracy: Accuracy | None = None,
+    datum: AltitudeDatum | None = None,
+    factor: float | None = None,
+) -> ReportNoise:
+    """The noise bounds of a relayed aircraft's report.
+
+        accuracy  what it says of itself; what is unknown counts as ADS-B's in general
+        datum     of its height: no accuracy of a height holds for that of the standard pressure
+        factor    multiple of a stated accuracy that is taken as a bound; None: it is ignored
 
     The uncertainty of its time adds the distance flown in it, and an altitude that was true
     ``alt_age_s`` apart adds what can be climbed in that time.
     """
-    if velocity_ned_mps is None:
-        way_m = ADSB_TIME_BOUND_S * speed_max_mps
-    else:
-        way_m = ADSB_TIME_BOUND_S * math.hypot(*velocity_ned_mps)
-    off_m = ADSB_NOISE_M + way_m
-    vertical_m = off_m + alt_age_s * speed_max_mps
-    return ReportNoise(off_m, vertical_m, math.hypot(off_m, vertical_m), ADSB_VELOCITY_NOISE_MPS)
+    known = Accuracy() if accuracy is None or factor is None else accuracy
+    time_s = ADSB_TIME_BOUND_S if known.time_s is None else known.time_s
+    way_m = time_s * (speed_max_mps if velocity_ned_mps is None else math.hypot(*velocity_ned_mps))
+    horizontal_m = _bound(known.horizontal_m, factor or 0.0, ADSB_NOISE_M) + way_m
+    height_m = ADSB_NOISE_M
+    if known.vertical_m is not None and datum is AltitudeDatum.GEOMETRIC:
+        height_m = GEOID_M + _bound(known.vertical_m, factor or 0.0, ADSB_NOISE_M)
+    vertical_m = height_m + way_m + alt_age_s * speed_max_mps
+    velocity_mps = _bound(known.velocity_mps, factor or 0.0, ADSB_VELOCITY_NOISE_MPS)
+    return ReportNoise(horizontal_m, vertical_m, math.hypot(horizontal_m, vertical_m), velocity_mps)

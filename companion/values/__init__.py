@@ -39,6 +39,7 @@ from companion.values.outputs import (
     Update,
 )
 from companion.values.received import (
+    Accuracy,
     AdsbVehicle,
     AltitudeDatum,
     Attitude,
@@ -47,8 +48,6 @@ from companion.values.received import (
     GnssStatus,
     Message,
     Presence,
-    Reason,
-    Rejection,
     Report,
     RoundTrip,
     Source,
@@ -56,6 +55,7 @@ from companion.values.received import (
     Tick,
     reports_itself,
 )
+from companion.values.rejections import Reason, Rejection
 from companion.values.tracked import (
     Carrier,
     Estimate,
@@ -70,6 +70,7 @@ from companion.values.tracked import (
 )
 
 __all__ = [
+    "Accuracy",
     "AdsbVehicle",
     "AltitudeDatum",
     "Attitude",

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from companion.values.aimed import BeamSet
-from companion.values.received import Rejection
+from companion.values.rejections import Rejection
 from companion.values.tracked import Carrier, Estimate, Refuted, Track
 
 

@@ -1,10 +1,11 @@
-"""Values that come in: frames, the messages decoded from them, and what was rejected."""
+"""Values that come in: frames, and the messages decoded from them."""
 
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple, Self
 
 from companion.values.errors import UserError
+from companion.values.rejections import Rejection
 
 
 class Source(NamedTuple):
@@ -30,9 +31,10 @@ class Source(NamedTuple):
 def reports_itself(uav: str) -> bool:
     """True if ``uav`` names a vehicle that sends its own position, False for a relayed aircraft.
 
-    Relayed aircraft are named ``icao:HEX``.
+    Relayed aircraft are named ``icao:HEX`` (ADS-B), ``rid:ID`` (Remote ID) or ``cot:UID`` (Cursor
+    on Target).
     """
-    return not uav.startswith("icao:")
+    return not uav.startswith(("icao:", "rid:", "cot:"))
 
 
 class Frame(NamedTuple):
@@ -73,49 +75,6 @@ class Tick:
     t_ns: int
 
 
-class Reason(StrEnum):
-    """Why something received was not used. The values are shown in recordings and by the API."""
-
-    GARBAGE = "garbage"  # bytes between frames; counted in bytes
-    BAD_CRC = "bad-crc"  # framed like a known message, but the checksum is wrong
-    UNKNOWN_MESSAGE = "unknown-message"  # an id without a known checksum seed: cannot be trusted
-    BAD_STAMP = "bad-stamp"  # a log's own time stamp steps back or leaps; the step was clamped
-    MALFORMED = "malformed"  # a checked frame whose fields cannot be what they say
-    UNREACHABLE = "unreachable"  # farther from the track than it can have flown since
-    ALTITUDE_JUMP = "altitude-jump"  # the same in height alone: the datum has changed
-    FROZEN = "frozen"  # a fresh stamp on an old position, while the velocity says it moves
-    SHARED_ID = "shared-id"  # two vehicles send under one id: neither can be believed
-    ZERO_POSITION = "zero-position"  # within 5 km of 0 N 0 E: what is sent before a fix
-    NO_POSITION = "no-position"  # ADSB_VEHICLE whose flags do not vouch for its coordinates
-    NO_ALTITUDE = "no-altitude"  # a position in the plane only
-    UNPLACED_STAMP = "unplaced-stamp"  # off the sender's clock, and not enough others yet to agree
-    NOT_ALLOWED = "not-allowed"  # a sender that the lists of the settings keep out
-    TOO_MANY = "too-many"  # another sender, where as many are tracked as the settings allow
-    UNSIGNED = "unsigned"  # without a signature, over a link that requires them
-    BAD_SIGNATURE = "bad-signature"  # signed with another key, or altered
-    REPLAYED = "replayed"  # well signed, but not newer than what was heard before
-    SECRET = "secret"  # SETUP_SIGNING carries a key: it is not used, and not recorded
-    SOCKET_OVERFLOW = "socket-overflow"  # lost before it was read: the system's buffer was full
-    DUPLICATE = "duplicate"  # the same report again, over this link or another
-    NO_FIX = "no-fix"  # the first position of all, whose sender's receiver does not vouch for it
-    OUT_OF_ORDER = "out-of-order"  # later than the window for late reports
-
-
-@dataclass(frozen=True, slots=True)
-class Rejection:
-    """Something received that was not used, and why.
-
-    ``count`` is in frames, or in bytes for ``GARBAGE``. ``detail`` is text for the operator.
-    """
-
-    t_ns: int
-    source: str
-    reason: Reason
-    count: int = 1
-    msgid: int | None = None
-    detail: str = ""
-
-
 @dataclass(frozen=True, slots=True)
 class RoundTrip:
     """A TIMESYNC request sent by this node, and its answer.
@@ -154,6 +113,20 @@ class AltitudeDatum(StrEnum):
     GEOMETRIC = "geometric"
 
 
+class Accuracy(NamedTuple):
+    """How exact a report says that it is: radii that hold 68 % of errors, as GNSS receivers say.
+
+    Metres and m/s; None: unknown. What is stated for 95 % is brought to 68 % where it is read
+    (``mavlink/wire/accuracy.py``). ``vertical_m`` is that of a height above the ellipsoid, and
+    ``time_s`` the greatest error of the time at which the position was true.
+    """
+
+    horizontal_m: float | None = None
+    vertical_m: float | None = None
+    velocity_mps: float | None = None
+    time_s: float | None = None
+
+
 @dataclass(frozen=True, slots=True)
 class Report:
     """A position that a UAV sent of itself, or that a receiver relayed of it.
@@ -170,6 +143,7 @@ class Report:
                            ``boot_ms``
         alt_age_s          time between the instants at which position and altitude were true; 0
                            where one message held both
+        accuracy           how exact it says that it is; None where its message has no word for it
 
     None stands for what was not sent.
     """
@@ -189,6 +163,7 @@ class Report:
     boot_ms: int | None
     tslc_s: float | None
     alt_age_s: float = 0.0
+    accuracy: Accuracy | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,6 +180,7 @@ class AdsbVehicle:
         velocity_ne_mps    north and east, in the north-east-down frame at the aircraft
         velocity_down_mps  positive down
         tslc_s             whole seconds since the aircraft was last heard
+        accuracy           how exact the transponder says that it is; None where no relay says
 
     A field whose own validity flag is not set is None.
     """
@@ -222,6 +198,7 @@ class AdsbVehicle:
     velocity_ne_mps: tuple[float, float] | None
     velocity_down_mps: float | None
     tslc_s: int
+    accuracy: Accuracy | None = None
 
     @property
     def uav(self) -> str:

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from companion.mavlink.wire.decode import (
-    ADSB_VEHICLE,
     ATTITUDE,
     GLOBAL_POSITION_INT,
     GPS_RAW_INT,
@@ -19,6 +18,7 @@ from companion.mavlink.wire.decode import (
     SYSTEM_TIME,
 )
 from companion.mavlink.wire.encode import Outgoing
+from companion.mavlink.wire.transponder import ADSB_VEHICLE
 from companion.tracking.geodesy import LocalFrame
 from companion.values import AltitudeDatum
 from sitl_replay.flight.fleet import Vehicle

@@ -5,7 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from companion.tracking.noise import ADSB_NOISE_M, ADSB_VELOCITY_NOISE_MPS, relayed
+from companion.tracking.noise import (
+    ADSB_NOISE_M,
+    ADSB_VELOCITY_NOISE_MPS,
+    GEOID_M,
+    QUANTISATION,
+    relayed,
+)
+from companion.values import Accuracy, AltitudeDatum
 
 
 @pytest.mark.parametrize(
@@ -31,3 +38,31 @@ def test_an_altitude_of_another_time_is_worth_what_can_be_climbed_between(age_s:
     assert old.horizontal_m == fresh.horizontal_m
     assert old.vertical_m == pytest.approx(fresh.vertical_m + 90.0 * age_s)
     assert old.position_m == pytest.approx(math.hypot(old.horizontal_m, old.vertical_m))
+
+
+def test_a_stated_accuracy_takes_the_place_of_what_is_taken_for_granted() -> None:
+    """Field by field, with the factor of the settings; the geoid is no matter of accuracy."""
+    still = np.zeros(3)
+    told = Accuracy(6.0, 20.0, 0.5)
+    found = relayed(still, 0.0, 90.0, told, AltitudeDatum.GEOMETRIC, 3.0)
+    assert found.horizontal_m == pytest.approx(18.0)
+    assert found.vertical_m == pytest.approx(60.0 + GEOID_M)
+    assert found.velocity_mps == pytest.approx(1.5)
+    by_pressure = relayed(still, 0.0, 90.0, told, AltitudeDatum.PRESSURE, 3.0)
+    assert by_pressure.vertical_m == ADSB_NOISE_M
+    partly = relayed(still, 0.0, 90.0, Accuracy(velocity_mps=0.5), AltitudeDatum.GEOMETRIC, 3.0)
+    assert (partly.horizontal_m, partly.vertical_m) == (ADSB_NOISE_M, ADSB_NOISE_M)
+    exact = relayed(still, 0.0, 90.0, Accuracy(0.0, 0.0, 0.0), AltitudeDatum.GEOMETRIC, 3.0)
+    assert (exact.horizontal_m, exact.velocity_mps) == (QUANTISATION, QUANTISATION)
+
+
+def test_settings_that_do_not_follow_accuracies_ignore_them() -> None:
+    told = Accuracy(6.0, 20.0, 0.5, 0.1)
+    found = relayed(np.ones(3), 0.0, 90.0, told, AltitudeDatum.GEOMETRIC, None)
+    assert found == relayed(np.ones(3), 0.0, 90.0)
+
+
+def test_a_time_that_is_better_known_is_worth_less_way() -> None:
+    velocity = np.array([30.0, 40.0, 0.0])
+    found = relayed(velocity, 0.0, 90.0, Accuracy(2.0, time_s=0.1), None, 3.0)
+    assert found.horizontal_m == pytest.approx(6.0 + 5.0)

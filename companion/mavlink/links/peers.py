@@ -18,11 +18,10 @@ frames in order never make such a run.
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from typing import Final
+from typing import Final, Protocol
 
 from companion.mavlink.links.status import ComponentStatus, LinkStatus
 from companion.mavlink.wire.framing import MAGIC_V2, Splitter
-from companion.mavlink.wire.sbs import SbsSplitter
 from companion.values import Frame, Rejection, Source
 
 PEERS_MAX: Final = 4096
@@ -36,6 +35,16 @@ RESTART_RUN: Final = 3
 """Late frames in a row, each further on, that show a restart of the sender."""
 
 _HALF_ROUND: Final = 128
+
+
+class Splits(Protocol):
+    """What makes frames of a peer's bytes: MAVLink's splitter, or one of another format."""
+
+    def feed(self, t_ns: int, data: bytes) -> list[Frame | Rejection]:
+        """Take in bytes that arrived at ``t_ns``; returns what is whole in them."""
+
+    def finish(self, t_ns: int) -> list[Frame | Rejection]:
+        """End the stream; returns what its unfinished end held."""
 
 
 class _Component:
@@ -65,7 +74,7 @@ class Peer:
 
     __slots__ = ("_sequence", "heard_ns", "key", "senders", "splitter", "versions")
 
-    def __init__(self, key: Hashable, splitter: Splitter | SbsSplitter) -> None:
+    def __init__(self, key: Hashable, splitter: Splits) -> None:
         self.key = key
         self.splitter = splitter
         self.senders: dict[Source, _Sender] = {}
@@ -96,7 +105,7 @@ class Peers:
         self,
         status: LinkStatus,
         farewell: Callable[[Peer], None],
-        splitter: Callable[[str], Splitter | SbsSplitter] = Splitter,
+        splitter: Callable[[str], Splits] = Splitter,
     ) -> None:
         self._status = status
         self._splitter = splitter

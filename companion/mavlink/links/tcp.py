@@ -5,6 +5,7 @@ import errno
 import os
 import socket
 from collections.abc import Callable, Collection, Hashable
+from dataclasses import replace
 from typing import Final, cast
 
 from companion.mavlink.links.endpoints import HungUpError, Upcalls, bound, resolved, settle
@@ -87,7 +88,7 @@ class TcpIn:
         """Listen; returns the port. Raises ``OSError`` where the address cannot be had."""
         self._socket = _listening(self._url)
         port = cast(int, self._socket.getsockname()[1])
-        self._url = LinkUrl(self._url.scheme, self._url.host, port)
+        self._url = replace(self._url, port=port)
         return port
 
     async def serve(self) -> None:

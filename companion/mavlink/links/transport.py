@@ -6,6 +6,8 @@
     tcpin:HOST:PORT      listen for connections, any number of them
     serial:DEVICE:BAUD   a serial port, which may be unplugged and plugged in again
     sbs:HOST:PORT        connect to an ADS-B receiver; its lines become ADSB_VEHICLE, none is sent
+    readsb:HOST:PORT     the same of a receiver that speaks Beast
+    readsb:http://...    the same of a receiver's aircraft.json
 
 IPv6 hosts stand in brackets. Every peer has its own splitter: a frame truncated by one peer cannot
 damage another's.
@@ -13,16 +15,20 @@ damage another's.
 
 import asyncio
 from collections.abc import Callable, Hashable
+from dataclasses import replace
 from typing import Final, Protocol
 
 from companion.mavlink.links.endpoints import Endpoint, Upcalls, reason
+from companion.mavlink.links.http_poll import HttpPoll
 from companion.mavlink.links.lag import ArrivalLag
-from companion.mavlink.links.peers import Peer, Peers
+from companion.mavlink.links.peers import Peer, Peers, Splits
 from companion.mavlink.links.serial_port import SerialPort
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.links.tcp import TcpIn, TcpListen, TcpOut
 from companion.mavlink.links.udp import UdpIn, UdpOut
 from companion.mavlink.links.urls import LinkError, LinkUrl
+from companion.mavlink.wire.aircraft_json import AircraftJson
+from companion.mavlink.wire.beast import BeastSplitter
 from companion.mavlink.wire.encode import Outgoing, pack
 from companion.mavlink.wire.framing import Splitter
 from companion.mavlink.wire.sbs import SbsSplitter
@@ -82,8 +88,7 @@ class Link:
         self._notify = notify
         self._guard = guard
         self._lag = lag or ArrivalLag()
-        splitter = SbsSplitter if url.scheme == "sbs" else Splitter
-        self._peers = Peers(self.status, self._finish, splitter)
+        self._peers = Peers(self.status, self._finish, splitter(url))
         upcalls = Upcalls(self._up, self.take, self._hang_up, self._overflow)
         self._endpoint = endpoint(url, self.status, upcalls)
         self._is_out = False
@@ -99,7 +104,7 @@ class Link:
         except OSError as error:
             raise LinkError(f"{self.url}: {reason(error)}") from error
         if port is not None:
-            self.status.url = str(LinkUrl(self.url.scheme, self.url.host, port))
+            self.status.url = str(replace(self.url, port=port))
 
     async def run(self) -> None:
         """Serve until cancelled. A lost link is tried again, ever more rarely until frames come.
@@ -237,6 +242,17 @@ class Link:
             self._steady = None
 
 
+def splitter(url: LinkUrl) -> Callable[[str], Splits]:
+    """What makes frames of what comes over a link; each peer has its own."""
+    match url.scheme:
+        case "sbs":
+            return SbsSplitter
+        case "readsb":
+            return AircraftJson if url.way else BeastSplitter
+        case _:
+            return Splitter
+
+
 def endpoint(url: LinkUrl, status: LinkStatus, upcalls: Upcalls) -> Endpoint:
     """The endpoint of the link's kind, not yet open."""
     match url.scheme:
@@ -248,8 +264,8 @@ def endpoint(url: LinkUrl, status: LinkStatus, upcalls: Upcalls) -> Endpoint:
             return TcpOut(url, upcalls)
         case "tcpin":
             return TcpIn(url, upcalls)
-        case "sbs":
-            return TcpListen(url, upcalls)
+        case "sbs" | "readsb":
+            return HttpPoll(url, upcalls) if url.way else TcpListen(url, upcalls)
         case "serial":
             return SerialPort(url, upcalls)
 

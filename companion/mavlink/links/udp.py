@@ -9,6 +9,7 @@ import struct
 import sys
 import time
 from collections.abc import Collection, Hashable, Iterator
+from dataclasses import replace
 from typing import Final, cast
 
 from companion.mavlink.links import kernel_time
@@ -102,7 +103,7 @@ class UdpIn:
         """Bind; returns the port. Raises ``OSError`` where the address cannot be had."""
         self._socket = self._bound()
         port = cast(int, self._socket.getsockname()[1])
-        self._url = LinkUrl(self._url.scheme, self._url.host, port)
+        self._url = replace(self._url, port=port)
         return port
 
     async def serve(self) -> None:

@@ -6,6 +6,9 @@
     tcpin:HOST:PORT      listen for connections
     serial:DEVICE:BAUD   a serial port, as in serial:/dev/ttyAMA0:921600
     sbs:HOST:PORT        connect to an ADS-B receiver that says BaseStation lines; nothing is sent
+    readsb:HOST:PORT     connect to an ADS-B receiver that speaks Beast; nothing is sent
+    readsb:http://HOST/PATH/aircraft.json
+                         ask such a receiver's web server once a second; https:// too
 
 IPv6 hosts stand in brackets.
 """
@@ -19,13 +22,22 @@ from typing import Final, Literal, cast, get_args
 
 from companion.values import UserError
 
-Scheme = Literal["udpin", "udpout", "tcp", "tcpin", "serial", "sbs"]
+Scheme = Literal["udpin", "udpout", "tcp", "tcpin", "serial", "sbs", "readsb"]
 SCHEMES: Final[tuple[Scheme, ...]] = get_args(Scheme)
+Way = Literal["", "http", "https"]
+"""How a link goes whose scheme may go several ways; empty: as its scheme does of itself."""
 MAVLINK: Final[tuple[Scheme, ...]] = ("udpin", "udpout", "tcp", "tcpin", "serial")
 """Links over which MAVLink goes, in both directions."""
-_LISTENS: Final = ("udpin", "tcpin")
+_FORMS: Final[dict[str, str]] = {
+    "serial": "serial:DEVICE:BAUD",
+    "readsb": "readsb:HOST:PORT, readsb:http://HOST/PATH",
+}
+_USUAL_PORTS: Final = {"sbs": 30003, "readsb": 30005}
+_HTTP_PORTS: Final = {"http": 80, "https": 443}
 _BAUD_MAX: Final = 20_000_000
+_AIRCRAFT_JSON: Final = "readsb:http://radar.lan/tar1090/data/aircraft.json"
 _NUMBER: Final = re.compile(r"[0-9]{1,8}")
+_PATH: Final = re.compile(r"/[A-Za-z0-9._~!$&'()*+,;=:@/?%-]{0,500}")
 _NAME: Final = re.compile(r"[A-Za-z0-9._-]+")
 
 
@@ -37,16 +49,27 @@ class LinkError(UserError):
 class LinkUrl:
     """A parsed link address; ``str`` gives it as the user wrote it.
 
-    ``host`` is the device of a serial link, and ``port`` its baud rate.
+    ``host`` is the device of a serial link, and ``port`` its baud rate. ``path`` is what is asked
+    for over HTTP.
     """
 
     scheme: Scheme
     host: str
     port: int
+    way: Way = ""
+    path: str = ""
 
     def __str__(self) -> str:
         host = f"[{self.host}]" if self.scheme != "serial" and ":" in self.host else self.host
+        if self.way in _HTTP_PORTS:
+            port = "" if self.port == _HTTP_PORTS[self.way] else f":{self.port}"
+            return f"{self.scheme}:{self.way}://{host}{port}{self.path}"
         return f"{self.scheme}:{host}:{self.port}"
+
+    @property
+    def listens(self) -> bool:
+        """Whether others call here, so that an address of this machine is claimed."""
+        return self.scheme in ("udpin", "tcpin")
 
 
 def parse_link(text: str, schemes: Collection[Scheme] = SCHEMES) -> LinkUrl:
@@ -55,6 +78,10 @@ def parse_link(text: str, schemes: Collection[Scheme] = SCHEMES) -> LinkUrl:
     Port 0 is allowed where the link listens: the system then chooses one.
     """
     scheme, _, address = text.partition(":")
+    way: Way = ""
+    path = ""
+    if scheme == "readsb" and address.startswith(("http:", "https:")):
+        way, address, path = _http(text, address)
     host, _, port = address.rpartition(":")
     if scheme not in schemes or not host or not _NUMBER.fullmatch(port):
         raise LinkError(f"{text!r} is not {_forms(schemes)}{_meant(text)}")
@@ -66,9 +93,21 @@ def parse_link(text: str, schemes: Collection[Scheme] = SCHEMES) -> LinkUrl:
         raise LinkError(f"{text!r}: an IPv6 host stands in brackets, as in udpin:[::]:14550")
     if not (_is_ipv6(host) if bracketed else _may_be_a_name(host)):
         raise LinkError(f"{text!r}: {host!r} cannot be the name or address of a host")
-    if int(port) > 65535 or (int(port) == 0 and scheme not in _LISTENS):
+    url = LinkUrl(cast(Scheme, scheme), host, int(port), way, path)
+    if int(port) > 65535 or (int(port) == 0 and not url.listens):
         raise LinkError(f"{text!r}: {port} is not a port, 1 to 65535")
-    return LinkUrl(cast(Scheme, scheme), host, int(port))
+    return url
+
+
+def _http(text: str, address: str) -> tuple[Way, str, str]:
+    """The way, HOST:PORT and the path of ``http://HOST[:PORT]/PATH``."""
+    way, slashes, rest = address.partition("://")
+    host, slash, path = rest.partition("/")
+    if not slashes or not _PATH.fullmatch(slash + path):
+        raise LinkError(f"{text!r} is not readsb:http://HOST/PATH, as in {_AIRCRAFT_JSON}")
+    if ":" not in host.rpartition("]")[2]:
+        host = f"{host}:{_HTTP_PORTS[way]}"
+    return cast(Way, way), host, slash + path
 
 
 def _serial(text: str, device: str, baud: int) -> LinkUrl:
@@ -88,6 +127,10 @@ def _meant(text: str) -> str:
         return f"; a baud rate is missing, as in {text.rstrip(':')}:57600"
     if text.startswith(("/dev/", "COM")):
         return f"; did you mean serial:{text}:57600?"
+    if scheme in _HTTP_PORTS and address.rpartition("/")[2] == "aircraft.json":
+        return f"; did you mean readsb:{text}?"
+    if scheme in ("beast", "dump1090", "adsb"):
+        return f"; did you mean readsb:{address or 'HOST:30005'}?"
     if scheme == "udp":
         return f"; did you mean udpin:{address or '0.0.0.0:14550'}, which listens?"
     if text.isdecimal():
@@ -96,12 +139,12 @@ def _meant(text: str) -> str:
     if near and scheme not in SCHEMES:
         return f"; did you mean {near[0]}:?"
     if scheme in SCHEMES and address and ":" not in address:
-        return f"; did you mean {scheme}:{address}:14550?"
+        return f"; did you mean {scheme}:{address}:{_USUAL_PORTS.get(scheme, 14550)}?"
     return ""
 
 
 def _forms(schemes: Collection[Scheme]) -> str:
-    forms = [f"{one}:DEVICE:BAUD" if one == "serial" else f"{one}:HOST:PORT" for one in schemes]
+    forms = [_FORMS.get(one, f"{one}:HOST:PORT") for one in schemes]
     return forms[0] if len(forms) == 1 else f"{', '.join(forms[:-1])} or {forms[-1]}"
 
 

@@ -21,7 +21,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import Final, TypeVar
 
-from companion.mavlink.wire.decode import ADSB_VEHICLE
+from companion.mavlink.wire.transponder import ADSB_VEHICLE
 from companion.values import AdsbVehicle, AltitudeDatum, Reason, Rejection, Report, Source
 
 _NS: Final = 1_000_000_000
@@ -138,6 +138,7 @@ class _Known:
             boot_ms=None,
             tslc_s=float(said.tslc_s),
             alt_age_s=age_ns * 1e-9,
+            accuracy=said.accuracy,
         )
 
 

@@ -10,6 +10,8 @@ import struct
 from collections.abc import Callable
 from typing import Final
 
+from companion.mavlink.wire import accuracy
+from companion.mavlink.wire.transponder import ADSB_VEHICLE, SENDER
 from companion.values import (
     AdsbVehicle,
     AltitudeDatum,
@@ -29,7 +31,6 @@ SYSTEM_TIME: Final = 2
 GPS_RAW_INT: Final = 24
 ATTITUDE: Final = 30
 GLOBAL_POSITION_INT: Final = 33
-ADSB_VEHICLE: Final = 246
 
 NULL_ISLAND_RADIUS_M: Final = 5000.0
 """Distance from 0 N 0 E within which no position is believed.
@@ -127,7 +128,8 @@ def _adsb_vehicle(frame: Frame) -> AdsbVehicle:
 
     ``ver_velocity`` is positive up; ``heading`` is the course over ground. A speed without a course
     gives no velocity, an altitude of an undefined type no altitude. An address of 0 or of more than
-    24 bits (ICAO Annex 10) is refused.
+    24 bits (ICAO Annex 10) is refused. Accuracies stand behind it where this program put them
+    (``transponder``).
     """
     fields = _ADSB_VEHICLE.unpack(frame.payload.ljust(_ADSB_VEHICLE.size, b"\0")[:38])
     icao, lat, lon, alt_mm, heading_cdeg, speed_cmps, climb_cmps, flags = fields[:8]
@@ -154,6 +156,9 @@ def _adsb_vehicle(frame: Frame) -> AdsbVehicle:
         velocity_ne_mps=velocity_ne_mps,
         velocity_down_mps=-climb_cmps * 1e-2 if flags & _VERTICAL else None,
         tslc_s=tslc_s,
+        accuracy=accuracy.adsb(*frame.payload[38:41].ljust(3, b"\0"))
+        if frame.source == SENDER
+        else None,
     )
 
 

@@ -12,27 +12,17 @@ negative or missing, the line counts as new. How exact a position is, no line sa
 """
 
 import re
-import struct
 from datetime import datetime
 from typing import Final
 
-from companion.mavlink.wire.decode import ADSB_VEHICLE
-from companion.mavlink.wire.encode import Outgoing, pack
-from companion.values import Frame, Reason, Rejection, Source
+from companion.mavlink.wire.transponder import ADSB_VEHICLE, Said, frame
+from companion.values import Frame, Reason, Rejection
 
-SENDER: Final = Source(0, 156)
-"""Who says it: no system, MAV_COMP_ID_ADSB."""
 LINE_MAX: Final = 512
 """Bytes of a line at most; a longer one is garbage."""
 _SILENT: Final = frozenset((b"SEL", b"ID", b"AIR", b"STA", b"CLK"))
 """Lines about the writer's own display."""
 _NUMBER: Final = re.compile(r"-?\d{1,9}(?:\.\d{1,9})?")
-_LAYOUT: Final = struct.Struct("<IiiiHHhHHB9sBB")
-_COORDS, _ALTITUDE, _HEADING, _VELOCITY, _CALLSIGN, _VERTICAL = 1, 2, 4, 8, 16, 128  # ADSB_FLAGS
-_PRESSURE, _GEOMETRIC = 0, 1  # ADSB_ALTITUDE_TYPE
-_FOOT_MM: Final = 304.8
-_KNOT_CMPS: Final = 1852 / 36
-_FPM_CMPS: Final = 30.48 / 60
 
 
 class SbsSplitter:
@@ -78,63 +68,35 @@ class SbsSplitter:
             detail = "MLAT: how exact it is, is not known"
             return [Rejection(t_ns, self.link, Reason.UNKNOWN_MESSAGE, detail=detail)]
         try:
-            payload = adsb_vehicle(line.decode("ascii"))
+            found = frame(t_ns, self.link, said(line.decode("ascii")), self._seq)
         except ValueError as error:
             text = error.reason if isinstance(error, UnicodeDecodeError) else str(error)
             return [Rejection(t_ns, self.link, Reason.MALFORMED, msgid=ADSB_VEHICLE, detail=text)]
-        if payload is None:
+        if found is None:
             return []
-        raw = pack(Outgoing(SENDER, ADSB_VEHICLE, payload), self._seq)
         self._seq = (self._seq + 1) & 0xFF
-        return [Frame(t_ns, self.link, SENDER, ADSB_VEHICLE, raw)]
+        return [found]
 
 
-def adsb_vehicle(line: str) -> bytes | None:
-    """The payload of an ADSB_VEHICLE that says what a MSG line says; None where that is nothing.
-
-    Raises ``ValueError`` where its fields cannot be what they say.
-    """
+def said(line: str) -> Said:
+    """What a MSG line says. Raises ``ValueError`` where its fields cannot be what they say."""
     fields = [field.strip() for field in line.split(",")]
     if len(fields) < 10:
         raise ValueError(f"{len(fields)} fields, of 22")
     fields += [""] * (22 - len(fields))
     if not re.fullmatch(r"[0-9A-Fa-f]{6}", fields[4]):
         raise ValueError(f"{fields[4]!r:.20} is not an ICAO address")
-    callsign, lat_deg, lon_deg = (
-        fields[10],
+    return Said(
+        int(fields[4], 16),
         _number(fields[14], -90, 90),
         _number(fields[15], -180, 180),
-    )
-    geometric = fields[11].endswith("H")
-    altitude_ft = _number(fields[11].removesuffix("H"), -2000, 200_000)
-    speed_kt, track_deg = _number(fields[12], 0, 1200), _number(fields[13], 0, 360)
-    climb_fpm = _number(fields[16], -60_000, 60_000)
-    placed = lat_deg is not None and lon_deg is not None
-    told = (
-        (_COORDS, placed),
-        (_ALTITUDE, altitude_ft is not None),
-        (_HEADING, track_deg is not None),
-        (_VELOCITY, speed_kt is not None),
-        (_CALLSIGN, bool(callsign)),
-        (_VERTICAL, climb_fpm is not None),
-    )
-    flags = sum(flag for flag, there in told if there)
-    if not flags:
-        return None
-    return _LAYOUT.pack(
-        int(fields[4], 16),
-        round((lat_deg or 0.0) * 1e7) if placed else 0,
-        round((lon_deg or 0.0) * 1e7) if placed else 0,
-        round((altitude_ft or 0.0) * _FOOT_MM),
-        round((track_deg or 0.0) * 100),
-        round((speed_kt or 0.0) * _KNOT_CMPS),
-        round((climb_fpm or 0.0) * _FPM_CMPS),
-        flags,
-        0,  # squawk: nobody here reads it
-        _GEOMETRIC if geometric else _PRESSURE,
-        callsign[:8].encode(),
-        0,  # kind of aircraft: not said
-        _age_s(fields[6:10]),
+        _number(fields[11].removesuffix("H"), -2000, 200_000),
+        fields[11].endswith("H"),
+        _number(fields[12], 0, 1200),
+        _number(fields[13], 0, 360),
+        _number(fields[16], -60_000, 60_000),
+        fields[10],
+        age_s=_age_s(fields[6:10]),
     )
 
 
@@ -156,4 +118,4 @@ def _age_s(stamps: list[str]) -> int:
         )
     except ValueError:
         return 0
-    return min(255, max(0, int((written - came).total_seconds())))
+    return max(0, int((written - came).total_seconds()))

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from companion.mavlink.wire.decode import ADSB_VEHICLE, GLOBAL_POSITION_INT, decode
+from companion.mavlink.wire.decode import GLOBAL_POSITION_INT, decode
+from companion.mavlink.wire.transponder import ADSB_VEHICLE
 from companion.recording.tables.columns import Column, Kind, Table
 from companion.values import (
     AdsbVehicle,

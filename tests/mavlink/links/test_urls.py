@@ -23,6 +23,9 @@ from companion.mavlink.links.urls import SCHEMES, LinkError, LinkUrl, parse_link
         ("tcpin:127.0.0.1:0", "tcpin", "127.0.0.1", 0),
         ("udpin:127.0.0.1:65535", "udpin", "127.0.0.1", 65535),
         ("sbs:radar.lan:30003", "sbs", "radar.lan", 30003),
+        ("readsb:radar.lan:30005", "readsb", "radar.lan", 30005),
+        ("readsb:http://radar.lan/data/aircraft.json", "readsb", "radar.lan", 80),
+        ("readsb:https://[::1]:8443/a?b=c", "readsb", "::1", 8443),
         ("serial:/dev/ttyAMA0:921600", "serial", "/dev/ttyAMA0", 921600),
         ("serial:/dev/serial/by-path/a:0-b:57600", "serial", "/dev/serial/by-path/a:0-b", 57600),
         ("serial:/dev/tty µ 1:20000000", "serial", "/dev/tty µ 1", 20_000_000),
@@ -72,6 +75,13 @@ def test_an_address_is_read_and_written_alike(text: str, scheme: str, host: str,
         "serial:/dev/tty\0:57600",
         "serial:/dev/tty\n:57600",
         "serial::57600",
+        "readsb:http://radar.lan",
+        "readsb:http:radar.lan/a",
+        "readsb:http://radar.lan/a b",
+        "readsb:http://radar.lan/a\r\nHost: x",
+        "readsb:http://radar.lan:0/a",
+        "readsb:http://user:word@radar.lan/a",
+        "readsb:ftp://radar.lan/a",
     ],
 )
 def test_a_bad_address_is_one_line_that_names_it(text: str) -> None:
@@ -79,6 +89,22 @@ def test_a_bad_address_is_one_line_that_names_it(text: str) -> None:
         parse_link(text)
     message = str(caught.value)
     assert repr(text) in message and "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("text", "meant"),
+    [
+        ("http://radar.lan/data/aircraft.json", "readsb:http://radar.lan/data/aircraft.json?"),
+        ("beast:radar.lan:30005", "readsb:radar.lan:30005?"),
+        ("readsb:radar.lan", "readsb:radar.lan:30005?"),
+        ("sbs:radar.lan", "sbs:radar.lan:30003?"),
+        ("reedsb:radar.lan:30005", "readsb:?"),
+    ],
+)
+def test_what_was_likely_meant_is_said(text: str, meant: str) -> None:
+    with pytest.raises(LinkError) as caught:
+        parse_link(text)
+    assert str(caught.value).endswith(f"did you mean {meant}")
 
 
 def test_only_the_schemes_that_are_asked_for() -> None:

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
 
 from companion.mavlink.wire.decode import decode
-from companion.mavlink.wire.sbs import LINE_MAX, SENDER, SbsSplitter
+from companion.mavlink.wire.sbs import LINE_MAX, SbsSplitter
+from companion.mavlink.wire.transponder import SENDER
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
 from companion.values import AdsbVehicle, AltitudeDatum, Estimate, Frame, Reason, Rejection, Source

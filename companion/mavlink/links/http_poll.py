@@ -1,0 +1,89 @@
+"""A document that is asked for over HTTP again and again, for a link.                   [shell]"""
+
+import asyncio
+import ssl
+from collections.abc import Collection, Hashable
+from typing import Final
+
+from companion.mavlink.links.endpoints import Upcalls
+from companion.mavlink.links.urls import LinkUrl
+
+PERIOD_S: Final = 1.0
+"""Seconds from one request to the next; receivers write a document about once a second."""
+ANSWER_S: Final = 5.0
+"""Longest time that a request may take."""
+HEAD_MAX: Final = 16 << 10
+BODY_MAX: Final = 16 << 20
+
+
+class HttpPoll:
+    """A link that asks one server for one document; the document is what its one peer sends."""
+
+    def __init__(self, url: LinkUrl, upcalls: Upcalls) -> None:
+        self._url = url
+        self._upcalls = upcalls
+
+    def open(self) -> None:
+        """Do nothing: the server may come later."""
+
+    async def serve(self) -> None:
+        """Ask until an answer fails, which raises ``OSError``."""
+        loop = asyncio.get_running_loop()
+        is_up = False
+        while True:
+            due_s = loop.time() + PERIOD_S
+            try:
+                async with asyncio.timeout(ANSWER_S):
+                    body = await _get(self._url)
+            except (ValueError, EOFError) as error:
+                raise OSError(f"no HTTP that is understood: {error}") from error
+            if not is_up:
+                self._upcalls.up()
+                is_up = True
+            self._upcalls.take(None, body, None)
+            await asyncio.sleep(max(0.0, due_s - loop.time()))
+
+    def peers(self) -> Collection[Hashable]:
+        """Nobody can be sent anything."""
+        return ()
+
+    def write(self, key: Hashable, raw: bytes) -> bool:
+        """Send nothing."""
+        return False
+
+    def fullness(self, key: Hashable) -> float:
+        """0: there is no buffer."""
+        return 0.0
+
+
+async def _get(url: LinkUrl) -> bytes:
+    """The body of a document (HTTP/1.0, RFC 1945: it ends where the server hangs up).
+
+    Raises ``OSError`` where it cannot be had, ``ValueError`` or ``EOFError`` where the answer is
+    no HTTP.
+    """
+    secure = ssl.create_default_context() if url.way == "https" else None
+    reader, writer = await asyncio.open_connection(url.host, url.port, ssl=secure, limit=HEAD_MAX)
+    try:
+        host = f"[{url.host}]" if ":" in url.host else url.host
+        asked = (
+            f"GET {url.path} HTTP/1.0\r\nHost: {host}:{url.port}\r\nAccept: application/json\r\n"
+        )
+        writer.write(f"{asked}Connection: close\r\n\r\n".encode("ascii"))
+        try:
+            head = await reader.readuntil(b"\r\n\r\n")
+        except asyncio.LimitOverrunError as error:
+            raise ValueError("its head does not end") from error
+        status = head.split(None, 2)[1:2]
+        if not head.startswith(b"HTTP/") or not status:
+            raise ValueError("no status")
+        if status != [b"200"]:
+            raise OSError(f"the server answers {status[0][:3].decode('ascii', 'replace')}")
+        body = bytearray()
+        while piece := await reader.read(1 << 16):
+            body += piece
+            if len(body) > BODY_MAX:
+                raise ValueError(f"more than {BODY_MAX} bytes")
+        return bytes(body)
+    finally:
+        writer.transport.abort()

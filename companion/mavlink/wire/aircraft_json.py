@@ -1,0 +1,146 @@
+"""``aircraft.json`` of readsb and dump1090 as the ADSB_VEHICLE of each aircraft in it.
+
+One document is all that a receiver knows, written about once a second; it is asked for again and
+again (``links/http_poll.py``). Its keys: ``README-json.md`` of https://github.com/wiedehopf/readsb.
+Aircraft that others place (TIS-B, multilateration) are refused, for how exact they are is not
+known, and so are addresses that are none of ICAO's (``~``).
+"""
+
+import json
+import math
+from collections import OrderedDict
+from typing import Any, Final
+
+from companion.mavlink.wire.transponder import ADSB_VEHICLE, Said, frame
+from companion.values import Frame, Reason, Rejection
+
+DOCUMENT_MAX: Final = 8 << 20
+"""Bytes of a document at most: some 10 000 aircraft."""
+AIRCRAFT_MAX: Final = 10_000
+"""Aircraft read of one document, and remembered."""
+_NOT_SEEN: Final = ("mlat", "tisb_icao", "tisb_trackfile", "tisb_other", "mode_s", "mode_ac")
+"""Types of an aircraft that said no position itself."""
+
+
+class AircraftJson:
+    """Turns documents into frames; ``feed`` takes a whole one. The face is ``Splitter``'s."""
+
+    def __init__(self, link: str) -> None:
+        self.link = link
+        self._seq = 0
+        self._written: float | None = None
+        self._true_at: OrderedDict[int, float] = OrderedDict()  # by ICAO address
+
+    def feed(self, t_ns: int, data: bytes) -> list[Frame | Rejection]:
+        """Take in a document that came at ``t_ns``; returns what is new in it."""
+        try:
+            if len(data) > DOCUMENT_MAX:
+                raise ValueError(f"{len(data)} bytes")
+            document = json.loads(data)
+            if not isinstance(document, dict):
+                raise ValueError("no object")
+            written = _number(document, "now", 0, 1e11)
+            aircraft = document["aircraft"]
+            if written is None or not isinstance(aircraft, list):
+                raise ValueError("no time, or no aircraft")
+        except (ValueError, KeyError, RecursionError):
+            return [Rejection(t_ns, self.link, Reason.GARBAGE, len(data) or 1)]
+        if written == self._written:  # the same document as before
+            return []
+        self._written = written
+        return [item for one in aircraft[:AIRCRAFT_MAX] for item in self._one(t_ns, one, written)]
+
+    def finish(self, t_ns: int) -> list[Frame | Rejection]:
+        """End the stream: no document is ever half taken in."""
+        return []
+
+    def _one(self, t_ns: int, entry: object, written: float) -> list[Frame | Rejection]:
+        try:
+            said = _said(entry)
+            position_age_s = _number(entry, "seen_pos", 0, 86_400)
+        except (ValueError, OverflowError) as error:
+            detail = str(error)
+            return [Rejection(t_ns, self.link, Reason.MALFORMED, msgid=ADSB_VEHICLE, detail=detail)]
+        if isinstance(said, str):
+            return [Rejection(t_ns, self.link, Reason.UNKNOWN_MESSAGE, detail=said)]
+        if (
+            said is None
+            or position_age_s is None
+            or not self._is_news(said, written - position_age_s)
+        ):
+            return []
+        found = frame(t_ns, self.link, said, self._seq)
+        if found is None:
+            return []
+        self._seq = (self._seq + 1) & 0xFF
+        return [found]
+
+    def _is_news(self, said: Said, true_at: float) -> bool:
+        """Whether a position is newer than what was read before; ages are in tenths of seconds."""
+        before = self._true_at.pop(said.icao, None)
+        self._true_at[said.icao] = true_at
+        if len(self._true_at) > AIRCRAFT_MAX:
+            self._true_at.popitem(last=False)
+        return before is None or not before - 60 < true_at <= before + 0.15
+
+
+def _said(entry: object) -> Said | str | None:
+    """What is said of one aircraft; None: no position. Text: why it is not used.
+
+    Raises ``ValueError`` where its fields cannot be what they say.
+    """
+    if not isinstance(entry, dict):
+        raise ValueError("an aircraft that is no object")
+    name = entry.get("hex")
+    if not isinstance(name, str) or not 6 <= len(name) <= 7:
+        raise ValueError("an aircraft without an address")
+    if name.startswith("~"):
+        return "no address of ICAO's"
+    lat_deg, lon_deg = _number(entry, "lat", -90, 90), _number(entry, "lon", -180, 180)
+    if lat_deg is None or lon_deg is None:
+        return None
+    relayed = [one for key in ("mlat", "tisb") for one in _texts(entry, key)]
+    if entry.get("type") in _NOT_SEEN or "lat" in relayed:
+        return "placed by others: how exact it is, is not known"
+    if entry.get("alt_baro") == "ground":
+        entry = {key: value for key, value in entry.items() if key != "alt_baro"}
+    above_ellipsoid = _number(entry, "alt_geom", -2000, 200_000)
+    altitude_ft = above_ellipsoid
+    if altitude_ft is None:
+        altitude_ft = _number(entry, "alt_baro", -2000, 200_000)
+    climb_fpm = _number(entry, "geom_rate", -60_000, 60_000)
+    if climb_fpm is None:
+        climb_fpm = _number(entry, "baro_rate", -60_000, 60_000)
+    callsign = entry.get("flight", "")
+    age_s = _number(entry, "seen_pos", 0, 86_400)
+    return Said(
+        int(name, 16),
+        lat_deg,
+        lon_deg,
+        altitude_ft,
+        above_ellipsoid is not None,
+        _number(entry, "gs", 0, 1200),
+        _number(entry, "track", 0, 360),
+        climb_fpm,
+        callsign.strip() if isinstance(callsign, str) and callsign.isascii() else "",
+        nac_p=int(_number(entry, "nac_p", 0, 15) or 0),
+        nac_v=int(_number(entry, "nac_v", 0, 7) or 0),
+        gva=int(_number(entry, "gva", 0, 3) or 0),
+        # The document itself is up to a second old: half of it is meant.
+        age_s=math.floor((age_s or 0.0) + 0.5),
+    )
+
+
+def _number(entry: Any, key: str, least: float, most: float) -> float | None:
+    """A number; None where it is not there. Raises ``ValueError`` beyond the limits."""
+    value = entry.get(key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
+        raise ValueError(f"{key} {value!r:.20} is no number from {least:g} to {most:g}")
+    return float(value)
+
+
+def _texts(entry: dict[str, Any], key: str) -> list[str]:
+    value = entry.get(key)
+    return [one for one in value if isinstance(one, str)] if isinstance(value, list) else []

@@ -1,0 +1,130 @@
+"""The Beast protocol (port 30005) as the ADSB_VEHICLE that a MAVLink receiver would send.
+
+A message is 0x1a, its kind, six bytes of the receiver's 12 MHz counter, one of signal strength, and
+a Mode S message of two (kind 1), seven (2) or fourteen bytes (3); a 0x1a within is doubled. Source:
+https://wiki.jetvision.de/wiki/Mode-S_Beast:Data_Output_Formats, and ``net_io.c`` of readsb for kind
+4 (status) and 0xe3 (which receiver, of many). What is read of fourteen bytes: ``mode_s``.
+
+How old a message is, the counter tells: as much as it came later than the least late before it.
+Messages whose counter is that of multilateration (FF 00 4D 4C 41 54) are refused, for how exact
+they are is not known.
+"""
+
+import re
+from typing import Final
+
+from companion.mavlink.wire.mode_s import SIZE, Transponders
+from companion.mavlink.wire.transponder import frame
+from companion.values import Frame, Reason, Rejection
+
+_ESCAPE: Final = b"\x1a"
+_SIZES: Final = {0x31: 9, 0x32: 14, 0x33: 21, 0x34: 21, 0xE3: 8}
+"""Bytes behind a message's kind."""
+_START: Final = re.compile(rb"\x1a(?=[\x31-\x34\xe3])")
+_MLAT: Final = b"\xff\x00MLAT"
+_TICK_NS: Final = 1000 / 12
+_OLDEST_NS: Final = 120_000_000_000
+_DRIFT: Final = 100e-6
+"""Greatest drift of the counter against this clock: ten times a good crystal's."""
+
+
+class BeastSplitter:
+    """Turns the bytes of one connection into frames; ``feed`` and ``finish`` as ``Splitter``'s."""
+
+    def __init__(self, link: str) -> None:
+        self.link = link
+        self._pending = b""
+        self._transponders = Transponders()
+        self._lateness = _Lateness()
+        self._seq = 0
+
+    def feed(self, t_ns: int, data: bytes) -> list[Frame | Rejection]:
+        """Take in bytes that arrived at ``t_ns``; returns what the messages in them say."""
+        data, at, garbage = self._pending + data, 0, 0
+        out: list[Frame | Rejection] = []
+        while True:
+            found = _START.search(data, at)
+            if found is None:
+                keep = 1 if data.endswith(_ESCAPE) and at < len(data) else 0
+                garbage += len(data) - at - keep
+                self._pending = data[len(data) - keep :]
+                break
+            garbage += found.start() - at
+            at = found.start()
+            body, end = _unescaped(data, at + 2, _SIZES[data[at + 1]])
+            if body is None and end == len(data):
+                self._pending = data[at:]
+                break
+            if body is None:  # another message begins within this one
+                garbage += end - at
+            else:
+                out += self._message(t_ns, data[at + 1], body)
+            at = end
+        if garbage:
+            out.append(Rejection(t_ns, self.link, Reason.GARBAGE, garbage))
+        return out
+
+    def finish(self, t_ns: int) -> list[Frame | Rejection]:
+        """End the stream: a message that has no end is given up."""
+        stray, self._pending = len(self._pending), b""
+        return [Rejection(t_ns, self.link, Reason.GARBAGE, stray)] if stray else []
+
+    def _message(self, t_ns: int, kind: int, body: bytes) -> list[Frame | Rejection]:
+        if kind != 0x33:  # too short to hold a position, or not of an aircraft
+            return []
+        if body.startswith(_MLAT):
+            detail = "MLAT: how exact it is, is not known"
+            return [Rejection(t_ns, self.link, Reason.UNKNOWN_MESSAGE, detail=detail)]
+        late_ns = self._lateness.observe(t_ns, int.from_bytes(body[:6], "big"))
+        try:
+            said = self._transponders.read(t_ns - late_ns, body[7 : 7 + SIZE])
+        except ValueError:
+            return [Rejection(t_ns, self.link, Reason.BAD_CRC)]
+        if said is None:
+            return []
+        found = frame(t_ns, self.link, said._replace(age_s=late_ns // 1_000_000_000), self._seq)
+        if found is None:
+            return []
+        self._seq = (self._seq + 1) & 0xFF
+        return [found]
+
+
+def _unescaped(data: bytes, at: int, size: int) -> tuple[bytes | None, int]:
+    """As many bytes as asked for from a place on, and the place behind them.
+
+    None where another message begins there, or where the data end (the place is then their end).
+    """
+    body = bytearray()
+    while len(body) < size:
+        if at >= len(data) or data[at:] == _ESCAPE:
+            return None, len(data)
+        if data[at] == 0x1A:
+            if data[at + 1] != 0x1A:
+                return None, at
+            at += 1
+        body.append(data[at])
+        at += 1
+    return bytes(body), at
+
+
+class _Lateness:
+    """How much later than the least late message one came, by the receiver's counter.
+
+    A counter that leaps by more than what a message may be late has begun anew.
+    """
+
+    def __init__(self) -> None:
+        self._floor_ns: float | None = None
+        self._seen_ns = 0
+
+    def observe(self, t_ns: int, ticks: int) -> int:
+        """Nanoseconds by which a message was late; 0 where the counter does not run."""
+        if ticks == 0:
+            return 0
+        offset_ns = t_ns - ticks * _TICK_NS
+        if self._floor_ns is not None:
+            self._floor_ns += max(0, t_ns - self._seen_ns) * _DRIFT
+        self._seen_ns = t_ns
+        if self._floor_ns is None or not 0 <= offset_ns - self._floor_ns <= _OLDEST_NS:
+            self._floor_ns = offset_ns
+        return round(offset_ns - self._floor_ns)

@@ -1,0 +1,177 @@
+"""ADS-B messages of Mode S (extended squitter, 14 bytes), as far as positions need them.
+
+Format and codes: RTCA DO-260B, 2.2.3 (ICAO Doc 9871 has the same tables); the compact position
+report (CPR) is its appendix A.1.7. Read are identification (type 1-4), airborne positions (9-18
+with pressure altitude, 20-22), velocities over ground (19, subtypes 1 and 2), and operational
+status (31), which has the accuracies. Left out are positions on the ground, which need one to begin
+from; aircraft that ground stations rebroadcast (TIS-B: DF18 with a control field other than 0); and
+the heights of types 20-22, which dump1090 reads in steps of 25 feet and pyModeS in metres.
+"""
+
+import math
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from typing import Final
+
+from companion.mavlink.wire.transponder import Said
+
+SIZE: Final = 14
+"""Bytes of an extended squitter."""
+PAIR_NS: Final = 10_000_000_000
+"""Greatest time between the even and the odd position that are one place (DO-260B, A.1.7.7)."""
+STATUS_NS: Final = 30_000_000_000
+"""How long a stated accuracy holds: it is sent every 2.5 s (DO-260B, 2.2.3.3)."""
+AIRCRAFT_MAX: Final = 2000
+"""Aircraft of which something is kept; beyond it the one not heard for longest is forgotten."""
+_POLYNOMIAL: Final = 0xFFF409
+_CPR: Final = 1 << 17
+_LETTERS: Final = "?ABCDEFGHIJKLMNOPQRSTUVWXYZ????? ???????????????0123456789??????"
+_POLE_DEG: Final = 87.0
+
+
+def parity(message: bytes) -> int:
+    """The remainder of a message by the parity polynomial; 0 where it came whole."""
+    bits = int.from_bytes(message, "big")
+    for at in range(8 * len(message) - 1, 23, -1):
+        if bits >> at & 1:
+            bits ^= (0x1000000 | _POLYNOMIAL) << (at - 24)
+    return bits
+
+
+@dataclass(slots=True)
+class _Heard:
+    """What an aircraft said that later messages need: half positions, accuracies, and when."""
+
+    halves: dict[int, tuple[int, int, int]] = field(default_factory=dict)  # odd: t_ns, lat, lon
+    nac_p: tuple[int, int] = (0, 0)  # value, t_ns
+    gva: tuple[int, int] = (0, 0)
+    nac_v: tuple[int, int] = (0, 0)
+
+
+class Transponders:
+    """Puts messages of many aircraft together. ``read`` takes them in order of arrival."""
+
+    def __init__(self) -> None:
+        self._heard: OrderedDict[int, _Heard] = OrderedDict()
+
+    def read(self, t_ns: int, message: bytes) -> Said | None:
+        """What a message says that came whole at ``t_ns``; None where that is nothing of use.
+
+        Raises ``ValueError`` where its parity is wrong.
+        """
+        kind, control = message[0] >> 3, message[0] & 7
+        if len(message) != SIZE or kind not in (17, 18) or (kind == 18 and control != 0):
+            return None
+        if parity(message):
+            raise ValueError("parity")
+        icao, me = int.from_bytes(message[1:4], "big"), int.from_bytes(message[4:11], "big")
+        if icao == 0:
+            return None
+        heard = self._heard.setdefault(icao, _Heard())
+        self._heard.move_to_end(icao)
+        if len(self._heard) > AIRCRAFT_MAX:
+            self._heard.popitem(last=False)
+        type_code, subtype = me >> 51, me >> 48 & 7
+        if 1 <= type_code <= 4:
+            return Said(icao, callsign=_callsign(me))
+        if 9 <= type_code <= 18 or 20 <= type_code <= 22:
+            return _position(
+                heard, t_ns, icao, me, _altitude_ft(me >> 36 & 0xFFF) if type_code < 20 else None
+            )
+        if type_code == 19 and subtype in (1, 2):
+            heard.nac_v = (me >> 43 & 7, t_ns)
+            return _velocity(icao, me, 4 if subtype == 2 else 1)
+        if type_code == 31 and subtype == 0:
+            _status(heard, t_ns, me)
+        return None
+
+
+def _callsign(me: int) -> str:
+    letters = "".join(_LETTERS[me >> shift & 63] for shift in range(42, -1, -6)).strip()
+    return "" if "?" in letters else letters
+
+
+def _status(heard: _Heard, t_ns: int, me: int) -> None:
+    """Take in the accuracies of an airborne operational status; version 0 has none."""
+    version = me >> 13 & 7
+    if version in (1, 2):
+        heard.nac_p = (me >> 8 & 15, t_ns)
+        heard.gva = (me >> 6 & 3 if version == 2 else 0, t_ns)  # in version 1 another quantity
+
+
+def _position(heard: _Heard, t_ns: int, icao: int, me: int, altitude_ft: float | None) -> Said:
+    odd = me >> 34 & 1
+    heard.halves[odd] = (t_ns, me >> 17 & 0x1FFFF, me & 0x1FFFF)
+    other = heard.halves.get(1 - odd)
+    place = None
+    if other is not None and t_ns - other[0] <= PAIR_NS:
+        place = position_deg(heard.halves[0][1:], heard.halves[1][1:], newest_is_odd=odd == 1)
+    lat_deg, lon_deg = place or (None, None)
+    return Said(
+        icao,
+        lat_deg,
+        lon_deg,
+        altitude_ft,
+        nac_p=_fresh(heard.nac_p, t_ns),
+        nac_v=_fresh(heard.nac_v, t_ns),
+        gva=_fresh(heard.gva, t_ns),
+    )
+
+
+def _fresh(stated: tuple[int, int], t_ns: int) -> int:
+    return stated[0] if t_ns - stated[1] <= STATUS_NS else 0
+
+
+def _altitude_ft(code: int) -> float | None:
+    """Pressure altitude in steps of 25 ft; None where there is none, or in Gillham's code.
+
+    Gillham's is for above 50 175 ft.
+    """
+    if not code & 0x10:
+        return None
+    return 25.0 * (code >> 5 << 4 | code & 15) - 1000.0
+
+
+def _velocity(icao: int, me: int, knots: int) -> Said:
+    """Speed and course over ground, and climb; a field of 0 is unknown."""
+    east, north = me >> 32 & 0x3FF, me >> 21 & 0x3FF
+    speed_kt = track_deg = None
+    if east and north:
+        x = knots * (east - 1) * (-1 if me >> 42 & 1 else 1)
+        y = knots * (north - 1) * (-1 if me >> 31 & 1 else 1)
+        speed_kt, track_deg = math.hypot(x, y), math.degrees(math.atan2(x, y)) % 360.0
+    climb = me >> 10 & 0x1FF
+    climb_fpm = 64.0 * (climb - 1) * (-1 if me >> 19 & 1 else 1) if climb else None
+    return Said(icao, speed_kt=speed_kt, track_deg=track_deg, climb_fpm=climb_fpm)
+
+
+def position_deg(
+    even: tuple[int, ...], odd: tuple[int, ...], *, newest_is_odd: bool
+) -> tuple[float, float] | None:
+    """Latitude and longitude of the newer of an even and an odd position (DO-260B, A.1.7.7).
+
+    None where they lie in zones of different width, or are no place on Earth.
+    """
+    y = [even[0] / _CPR, odd[0] / _CPR]
+    x = [even[1] / _CPR, odd[1] / _CPR]
+    band = math.floor(59 * y[0] - 60 * y[1] + 0.5)
+    lats = [(360 / (60 - i)) * (band % (60 - i) + y[i]) for i in (0, 1)]
+    lats = [lat - 360 if lat >= 270 else lat for lat in lats]
+    if any(abs(lat) > 90 for lat in lats) or zones(lats[0]) != zones(lats[1]):
+        return None
+    i = int(newest_is_odd)
+    wide = zones(lats[i])
+    count = max(wide - i, 1)
+    band = math.floor(x[0] * (wide - 1) - x[1] * wide + 0.5)
+    lon = (360 / count) * (band % count + x[i])
+    return lats[i], (lon + 180) % 360 - 180
+
+
+def zones(lat_deg: float) -> int:
+    """Zones of longitude at a latitude, NL of DO-260B, A.1.7.2."""
+    if abs(lat_deg) >= _POLE_DEG:
+        return 2 if abs(lat_deg) == _POLE_DEG else 1
+    if lat_deg == 0:
+        return 59
+    across = (1 - math.cos(math.pi / 30)) / math.cos(math.radians(lat_deg)) ** 2
+    return math.floor(2 * math.pi / math.acos(1 - across))

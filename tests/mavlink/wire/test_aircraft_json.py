@@ -1,0 +1,148 @@
+"""``aircraft.json``: what is in it, what is new in it, and what is no such document."""
+
+import json
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import all as dialect
+
+from companion.mavlink.wire.aircraft_json import AIRCRAFT_MAX, DOCUMENT_MAX, AircraftJson
+from companion.mavlink.wire.decode import decode
+from companion.values import AdsbVehicle, AltitudeDatum, Frame, Reason, Rejection
+
+# An aircraft as ADS-B Exchange, which runs readsb, gives it.
+ONE: dict[str, Any] = {
+    "hex": "a2fcf2", "type": "adsb_icao", "flight": "ASA541  ", "alt_baro": 5400, "alt_geom": 5650,
+    "gs": 250, "track": 0.69, "baro_rate": -960, "squawk": "3766", "category": "A3",
+    "lat": 47.143753, "lon": -122.320953, "nic": 8, "rc": 186, "seen_pos": 0.5, "version": 2,
+    "nac_p": 10, "nac_v": 2, "sil": 3, "gva": 2, "mlat": [], "tisb": [], "messages": 52561265,
+    "seen": 0, "rssi": -5,
+}  # fmt: skip
+
+
+def document(*aircraft: Any, now: Any = 1_600_000_000.0) -> bytes:
+    return json.dumps({"now": now, "messages": 7, "aircraft": list(aircraft)}).encode()
+
+
+def fed(*aircraft: Any) -> list[Frame | Rejection]:
+    return AircraftJson("x").feed(7, document(*aircraft))
+
+
+def said(**changed: Any) -> AdsbVehicle:
+    (frame,) = fed(ONE | changed)
+    assert isinstance(frame, Frame), frame
+    found = decode(frame)
+    assert isinstance(found, AdsbVehicle)
+    return found
+
+
+def test_an_aircraft_is_read_as_pymavlink_reads_it() -> None:
+    (frame,) = fed(ONE)
+    assert isinstance(frame, Frame)
+    mav: Any = dialect.MAVLink(None)
+    theirs = mav.decode(bytearray(frame.raw))
+    assert (theirs.ICAO_address, theirs.callsign) == (0xA2FCF2, "ASA541")
+    assert (theirs.lat, theirs.lon) == (471_437_530, -1_223_209_530)
+    assert theirs.altitude == round(5650 * 304.8)
+    assert theirs.altitude_type == dialect.ADSB_ALTITUDE_TYPE_GEOMETRIC
+    assert theirs.hor_velocity == round(250 * 1852 / 36)
+    assert (theirs.heading, theirs.ver_velocity, theirs.tslc) == (69, round(-960 * 0.508), 1)
+
+
+def test_its_accuracies_are_limits_of_95_percent() -> None:
+    told = said().accuracy
+    assert told is not None
+    assert told == pytest.approx((0.617 * 10, 0.617 * 45, 0.617 * 3, None), rel=1e-3)
+    assert said(nac_p=0, nac_v=0, gva=0).accuracy is None
+    assert said(nac_p=15, nac_v=7, gva=3).accuracy is None
+
+
+def test_what_is_not_there_is_unknown() -> None:
+    bare = {"hex": "a2fcf2", "lat": 47.0, "lon": -122.0, "seen_pos": 3.9}
+    (frame,) = fed(bare)
+    assert isinstance(frame, Frame)
+    found = decode(frame)
+    assert isinstance(found, AdsbVehicle)
+    assert found.alt_m is found.velocity_ne_mps is found.velocity_down_mps is found.callsign is None
+    assert found.tslc_s == 4
+    assert said(alt_geom=None).alt_datum is AltitudeDatum.PRESSURE
+    assert said(alt_geom=None, alt_baro="ground").alt_m is None
+    for away in ("lat", "lon", "seen_pos"):
+        assert fed({key: value for key, value in ONE.items() if key != away}) == []
+
+
+def test_only_news_is_handed_on() -> None:
+    poll = AircraftJson("x")
+    assert len(poll.feed(1, document(ONE, now=100.0))) == 1
+    assert poll.feed(2, document(ONE | {"seen_pos": 0.2}, now=100.0)) == []  # the same document
+    assert poll.feed(3, document(ONE | {"seen_pos": 1.5}, now=101.0)) == []  # the same position
+    assert len(poll.feed(4, document(ONE | {"seen_pos": 0.1}, now=102.0))) == 1
+    assert len(poll.feed(5, document(ONE, now=5.0))) == 1  # the server's clock was set
+
+
+@pytest.mark.parametrize(
+    ("changed", "why"),
+    [
+        ({"type": "mlat"}, "placed by others"), ({"type": "tisb_icao"}, "placed by others"),
+        ({"mlat": ["lat", "lon"]}, "placed by others"), ({"hex": "~a2fcf2"}, "no address"),
+    ],
+)  # fmt: skip
+def test_who_is_placed_by_others_is_not_used(changed: dict[str, Any], why: str) -> None:
+    (found,) = fed(ONE | changed)
+    assert isinstance(found, Rejection)
+    assert found.reason is Reason.UNKNOWN_MESSAGE and why in found.detail
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"lat": 91}, {"lon": float("nan")}, {"lat": "47"}, {"lat": True}, {"gs": float("inf")},
+        {"alt_geom": 1e300}, {"seen_pos": -1}, {"nac_p": 99}, {"hex": "xyzxyz"}, {"hex": 5},
+        {"hex": None}, {"track": [1]},
+    ],
+)  # fmt: skip
+def test_fields_that_cannot_be_are_refused_and_the_others_are_read(changed: Any) -> None:
+    refused, read = fed(ONE | changed, ONE)
+    assert isinstance(refused, Rejection) and refused.reason is Reason.MALFORMED and refused.detail
+    assert isinstance(read, Frame)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"", b"<html>", b"[]", b"{}", b'{"now": 1}', b'{"now": 1, "aircraft": 5}', b"\xff\xfe",
+        b"[" * 100_000, b'{"now": ' + b"9" * 5000 + b"}", b'{"now": NaN, "aircraft": []}',
+        b'{"now": true, "aircraft": []}', b"null", b" " * (DOCUMENT_MAX + 1),
+    ],
+    ids=range(13),
+)  # fmt: skip
+def test_what_is_no_such_document_is_counted_in_bytes(data: bytes) -> None:
+    (found,) = AircraftJson("x").feed(7, data)
+    assert found == Rejection(7, "x", Reason.GARBAGE, len(data) or 1)
+
+
+def test_more_aircraft_than_there_can_be_take_no_memory() -> None:
+    poll = AircraftJson("x")
+    for start in (0, AIRCRAFT_MAX // 2):
+        many = [
+            {"hex": f"{number + 1:06x}", "lat": 1, "lon": 1, "seen_pos": 0, "alt_geom": 1}
+            for number in range(start, start + AIRCRAFT_MAX + 5)
+        ]
+        found = poll.feed(7, document(*many, now=start))
+        assert len(found) <= AIRCRAFT_MAX
+    assert len(poll._true_at) == AIRCRAFT_MAX
+
+
+_JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=4), inner),
+)
+
+
+@given(st.dictionaries(st.sampled_from(sorted(ONE)), _JSON) | _JSON)
+def test_no_values_are_a_defect(entry: Any) -> None:
+    base = ONE | entry if isinstance(entry, dict) else entry
+    for found in fed(base, entry):
+        assert isinstance(found, Rejection) or isinstance(decode(found), AdsbVehicle | Rejection)

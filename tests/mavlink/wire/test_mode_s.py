@@ -1,0 +1,215 @@
+"""Mode S: messages made here, read as pyModeS reads them; and the Beast stream that brings them."""
+
+import json
+import math
+import random
+from itertools import pairwise
+from typing import Any
+
+import pyModeS
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.mavlink.wire.beast import BeastSplitter
+from companion.mavlink.wire.decode import decode
+from companion.mavlink.wire.mode_s import PAIR_NS, STATUS_NS, Transponders, parity, zones
+from companion.values import AdsbVehicle, Frame, Reason, Rejection
+
+S = 1_000_000_000
+# Of https://mode-s.org/1090mhz: an even and an odd position, a name, a velocity.
+EVEN = bytes.fromhex("8D40621D58C382D690C8AC2863A7")
+ODD = bytes.fromhex("8D40621D58C386435CC412692AD6")
+NAMED = bytes.fromhex("8D4840D6202CC371C32CE0576098")
+MOVING = bytes.fromhex("8D485020994409940838175B284F")
+
+
+def message(me: int, icao: int = 0x40621D, head: int = 0x8D) -> bytes:
+    """An extended squitter with its parity."""
+    body = bytes([head]) + icao.to_bytes(3, "big") + me.to_bytes(7, "big")
+    return body + parity(body + b"\0\0\0").to_bytes(3, "big")
+
+
+def placed(lat_deg: float, lon_deg: float, odd: int, altitude: int = 0xC38) -> bytes:
+    """An airborne position by the encoding side of DO-260B, A.1.7.3."""
+    lat_zone = 360 / (60 - odd)
+    y = math.floor(2**17 * (lat_deg % lat_zone) / lat_zone + 0.5)
+    at = lat_zone * (y / 2**17 + math.floor(lat_deg / lat_zone))
+    lon_zone = 360 / max(zones(at) - odd, 1)
+    x = math.floor(2**17 * (lon_deg % lon_zone) / lon_zone + 0.5)
+    me = 11 << 51 | altitude << 36 | odd << 34 | (y & 0x1FFFF) << 17 | x & 0x1FFFF
+    return message(me)
+
+
+def status(nac_p: int, gva: int = 2, version: int = 2) -> bytes:
+    return message(31 << 51 | version << 13 | nac_p << 8 | gva << 6)
+
+
+def beast(raw: bytes, ticks: int = 1, kind: int = 0x33) -> bytes:
+    body = ticks.to_bytes(6, "big") + b"\x80" + raw
+    return bytes([0x1A, kind]) + body.replace(b"\x1a", b"\x1a\x1a")
+
+
+def fed(data: bytes, t_ns: int = 7) -> list[Frame | Rejection]:
+    return BeastSplitter("readsb:radar:30005").feed(t_ns, data)
+
+
+def said(item: Frame | Rejection) -> AdsbVehicle:
+    assert isinstance(item, Frame), item
+    found = decode(item)
+    assert isinstance(found, AdsbVehicle)
+    return found
+
+
+def test_random_messages_are_read_as_pymodes_reads_them() -> None:
+    """Every field that both have, and the same messages thrown away."""
+    rng = random.Random(3)
+    read = 0
+    for _ in range(3000):
+        kind = rng.choice([1, 2, 3, 4, 9, 11, 13, 18, 19, 19, 20, 31])
+        me = rng.getrandbits(48) | rng.choice([1, 2] if kind == 19 else [0]) << 48 | kind << 51
+        raw = message(me, rng.getrandbits(24) or 1)
+        theirs: dict[str, Any] = dict(pyModeS.decode(raw.hex()))
+        assert theirs["crc_valid"]
+        ours = Transponders().read(0, raw)
+        if ours is None:
+            assert kind == 31  # which tells by the next position
+            continue
+        read += 1
+        assert f"{ours.icao:06X}" == theirs["icao"]
+        if kind <= 4 and ours.callsign:
+            assert ours.callsign == theirs["callsign"].strip()
+        if 9 <= kind <= 18 and ours.altitude_ft is not None:
+            assert ours.altitude_ft == theirs["altitude"]
+        if kind == 19:
+            assert (ours.speed_kt is None) is (theirs.get("groundspeed") is None)
+            if ours.speed_kt is not None and ours.track_deg is not None and ours.speed_kt > 0:
+                assert ours.speed_kt == pytest.approx(theirs["groundspeed"], abs=1)
+                assert ours.track_deg == pytest.approx(theirs["track"] % 360)
+            assert ours.climb_fpm == theirs.get("vertical_rate")
+    assert read > 2000
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_two_halves_are_the_place_that_pymodes_finds_and_that_was_flown(seed: int) -> None:
+    rng = random.Random(seed)
+    lat, lon = rng.uniform(-86.9, 86.9), rng.uniform(-180, 180)
+    pair = [placed(lat, lon, 0), placed(lat, lon, 1)]
+    heard = Transponders()
+    assert heard.read(0, pair[0]).lat_deg is None  # type: ignore[union-attr]
+    ours = heard.read(S, pair[1])
+    assert ours is not None and ours.lat_deg is not None and ours.lon_deg is not None
+    *_, theirs = pyModeS.decode([raw.hex() for raw in pair], timestamps=[0.0, 1.0])
+    assert (ours.lat_deg, ours.lon_deg) == pytest.approx(
+        (theirs["latitude"], theirs["longitude"]), abs=1e-5
+    )
+    assert ours.lat_deg == pytest.approx(lat, abs=3e-5)  # 5 m, DO-260B, A.1.7.1
+    across = math.cos(math.radians(lat)) * ((ours.lon_deg - lon + 180) % 360 - 180)
+    assert across == pytest.approx(0, abs=3e-5 + 360 / 2**17 / max(zones(lat) - 1, 1))
+
+
+def test_published_messages() -> None:
+    """Positions and the rest as https://mode-s.org/1090mhz works them out."""
+    first, second, named, moving = fed(b"".join(map(beast, (EVEN, ODD, NAMED, MOVING))))
+    assert said(first).position_deg is None
+    place = said(second)
+    assert place.position_deg == pytest.approx((52.26578, 3.93891), abs=1e-5)
+    assert place.alt_m == pytest.approx(38_000 * 0.3048)
+    assert place.accuracy is None
+    assert said(named).callsign == "KLM1023"
+    velocity = said(moving)
+    assert velocity.heading_deg == pytest.approx(182.88, abs=0.01)
+    assert velocity.velocity_down_mps == pytest.approx(832 * 0.00508, abs=0.01)
+    assert velocity.velocity_ne_mps is not None
+    assert math.hypot(*velocity.velocity_ne_mps) == pytest.approx(159.2 * 1852 / 3600, abs=0.01)
+
+
+def test_halves_that_are_too_far_apart_in_time_are_no_place() -> None:
+    for apart_ns, there in ((PAIR_NS, True), (PAIR_NS + 1, False)):
+        heard = Transponders()
+        heard.read(0, EVEN)
+        found = heard.read(apart_ns, ODD)
+        assert found is not None and (found.lat_deg is not None) is there
+
+
+@pytest.mark.parametrize(
+    ("nac_p", "gva", "version", "horizontal_m", "vertical_m"),
+    [
+        (10, 2, 2, 10.0, 45.0), (7, 1, 2, 185.2, 150.0), (0, 0, 2, None, None),
+        (12, 3, 2, None, None), (15, 0, 2, None, None), (11, 2, 1, 3.0, None),
+        (9, 2, 0, None, None), (9, 2, 5, None, None),
+    ],
+)  # fmt: skip
+def test_stated_accuracies_come_with_the_position(
+    nac_p: int, gva: int, version: int, horizontal_m: float | None, vertical_m: float | None
+) -> None:
+    """Limits of 95 %, brought to 68 % (Rayleigh: 0.617 of them); unknown codes say nothing."""
+    *_, last = fed(b"".join(map(beast, (status(nac_p, gva, version), EVEN, ODD))))
+    told = said(last).accuracy
+    if horizontal_m is None and vertical_m is None:
+        assert told is None
+        return
+    assert told is not None and told.velocity_mps is None
+    assert told.horizontal_m == pytest.approx(0.617 * (horizontal_m or 0), rel=1e-3)
+    assert told.vertical_m == (
+        None if vertical_m is None else pytest.approx(0.617 * vertical_m, rel=1e-3)
+    )
+
+
+def test_an_accuracy_that_was_stated_long_ago_holds_no_more() -> None:
+    heard = Transponders()
+    heard.read(0, status(10))
+    assert heard.read(STATUS_NS, EVEN).nac_p == 10  # type: ignore[union-attr]
+    assert heard.read(STATUS_NS + 1, ODD).nac_p == 0  # type: ignore[union-attr]
+
+
+def test_a_message_that_is_held_back_is_old() -> None:
+    """By the receiver's counter of 12 MHz, against the least late message so far."""
+    splitter = BeastSplitter("x")
+    (soon,) = splitter.feed(10 * S, beast(EVEN, 600 * 12_000_000))
+    (late,) = splitter.feed(25 * S, beast(ODD, 600 * 12_000_000 + 12_000_000 // 2))
+    assert (said(soon).tslc_s, said(late).tslc_s) == (0, 14)
+    assert said(late).position_deg is not None  # half a second apart when they were sent
+    (again,) = splitter.feed(26 * S, beast(ODD, 5))  # the receiver was started again
+    assert said(again).tslc_s == 0
+
+
+def test_what_is_not_used_is_counted() -> None:
+    damaged = EVEN[:-1] + bytes([EVEN[-1] ^ 1])
+    (refused,) = fed(beast(damaged))
+    assert isinstance(refused, Rejection) and refused.reason is Reason.BAD_CRC
+    (refused,) = fed(b"\x1a3\xff\x00MLAT\x80" + EVEN)
+    assert isinstance(refused, Rejection) and refused.reason is Reason.UNKNOWN_MESSAGE
+    (refused,) = fed(b"GET / HTTP/1.1\r\n")
+    assert refused == Rejection(7, "readsb:radar:30005", Reason.GARBAGE, 16)
+    rebroadcast = message(int.from_bytes(EVEN[4:11], "big"), head=18 << 3 | 2)
+    assert fed(beast(rebroadcast)) == fed(beast(b"\0\0", kind=0x31)) == []
+    garbage, frame = fed(b"\x1a3\x00\x1b" + beast(EVEN))[::-1]  # one that ends within
+    assert isinstance(frame, Frame)
+    assert isinstance(garbage, Rejection) and garbage.count == 4
+
+
+STREAM = b"".join(
+    beast(raw, 26 + 0x1A1A * number)
+    for number, raw in enumerate((EVEN, ODD, NAMED, placed(26.0, 26.1, 0), MOVING, status(26 % 12)))
+)
+
+
+@given(st.lists(st.integers(1, len(STREAM) - 1), max_size=20))
+def test_pieces_say_what_the_whole_says(cuts: list[int]) -> None:
+    at = [0, *sorted(cuts), len(STREAM)]
+    splitter = BeastSplitter("x")
+    pieces = [STREAM[a:b] for a, b in pairwise(at)]
+    whole = BeastSplitter("x").feed(7, STREAM)
+    assert len(whole) == 5
+    assert [one for piece in pieces for one in splitter.feed(7, piece)] == whole
+
+
+@given(st.lists(st.binary(max_size=60) | st.sampled_from([b"\x1a", b"\x1a3", STREAM[:40]])))
+def test_no_bytes_are_a_defect_or_kept_for_long(pieces: list[bytes]) -> None:
+    splitter = BeastSplitter("x")
+    for piece in pieces:
+        for found in splitter.feed(7, piece):
+            assert isinstance(found, Rejection) or isinstance(decode(found), AdsbVehicle)
+        assert len(splitter._pending) <= 2 + 2 * 21  # a whole message, each byte of it doubled
+    json.dumps([one.count for one in splitter.finish(8) if isinstance(one, Rejection)])

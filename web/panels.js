@@ -138,6 +138,7 @@ export const REASONS = {
   "zero-position": "near 0° N 0° E: sent before a fix",
   "no-fix": "the first position of all, before its receiver had a fix",
   "no-position": "ADS-B without valid coordinates",
+  "no-identity": "Remote ID, not named yet",
   "no-altitude": "no altitude known",
   "duplicate": "the same report again",
   "out-of-order": "older than what is known",

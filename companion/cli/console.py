@@ -23,8 +23,9 @@ LINKS = click.option(
     "links",
     metavar="URL",
     multiple=True,
-    help="udpin|udpout|tcp|tcpin:HOST:PORT or serial:DEVICE:BAUD; receivers of ADS-B: "
-    "sbs|readsb:HOST:PORT, readsb:http://HOST/PATH. May be given several times.",
+    help="udpin|udpout|tcp|tcpin:HOST:PORT or serial:DEVICE:BAUD; receivers: "
+    "sbs|readsb|rid:HOST:PORT, readsb:http://HOST/PATH, rid:udp:HOST:PORT. "
+    "May be given several times.",
 )
 LISTEN = click.option(
     "--listen", metavar="HOST:PORT", help="Where HTTP is served [127.0.0.1:8080]."

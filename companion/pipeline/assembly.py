@@ -30,7 +30,6 @@ from companion.values import (
     LimitSource,
     ReportNoise,
     UserError,
-    reports_itself,
 )
 
 
@@ -198,7 +197,8 @@ def assumed(settings: Settings, uav: str, mav_type: int | None, autopilot: int |
     ``mav_type`` and ``autopilot`` are those of its heartbeat; None where none was heard.
     """
     given = settings.observer
-    kind = airframe(mav_type) if reports_itself(uav) else Airframe.ADSB
+    manned = uav.startswith(("icao:", "cot:"))  # or may be
+    kind = Airframe.ADSB if manned else airframe(mav_type)
     known = LIMITS[kind]
     told = [given.uav.get(uav), given.types.get(kind.value), given]
     speed = next((one.speed_max_mps for one in told if one and one.speed_max_mps), None)

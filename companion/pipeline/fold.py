@@ -148,7 +148,7 @@ class Pipeline:
             return [*said, accepted]
         self.refusals.used(fix.uav)
         if not reports_itself(fix.uav):
-            near = filter(reports_itself, self.fleet.near(fix.position_ned_m, NEAR_M))
+            near = self.targets.betters(fix.uav, self.fleet.near(fix.position_ned_m, NEAR_M))
             self.targets.compare(fix, self._tracks(near, fix.t_ns, fix.t_ns))
         if accepted.reacquired:
             said += self.assumptions.jumped(accepted)

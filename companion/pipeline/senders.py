@@ -2,6 +2,8 @@
 
 Each sender has a clock, bounds on the noise of its reports, and a presence. A message leaves here
 with its time on the sender's and on the node's timeline, or as a rejection with its reason.
+
+Over 300 lines: every kind of message comes through here.
 """
 
 import math
@@ -14,6 +16,7 @@ from companion.mavlink.clock.sender_clock import SenderClock
 from companion.mavlink.trust.admission import Admission
 from companion.mavlink.trust.adsb import Aircraft
 from companion.mavlink.trust.dedupe import Dedupe, LinkShare
+from companion.mavlink.trust.remote_id import RemoteIds
 from companion.mavlink.wire.decode import ATTITUDE, decode
 from companion.mavlink.wire.stamps import boot_ms
 from companion.pipeline import assembly
@@ -29,6 +32,7 @@ from companion.values import (
     Presence,
     Reason,
     Rejection,
+    RemoteId,
     Report,
     ReportNoise,
     RoundTrip,
@@ -105,6 +109,7 @@ class Senders:
     def __init__(self, settings: Settings, carrier: str | None) -> None:
         self.presence: dict[Source, Presence] = {}
         self.aircraft = Aircraft()
+        self.remote_ids = RemoteIds()
         self._settings = settings
         self._carrier = carrier
         self._carrier_source = None if carrier is None else Source.parse(carrier)
@@ -138,8 +143,18 @@ class Senders:
                 if not self._admission.admits(message.uav):
                     return _refused(message, Reason.NOT_ALLOWED)
                 return self._relayed(message)
+            case RemoteId():
+                return self._remote_id(frame, message)
             case Attitude():
                 return self._attitude(message)
+            case None:
+                return NOTHING
+            case _:
+                return self._beside(frame, message)
+
+    def _beside(self, frame: Frame, message: GnssStatus | SystemTime | Presence) -> Heard:
+        """Take in what is said beside positions: of a receiver, a clock, a vehicle."""
+        match message:
             case GnssStatus():
                 self._noise[message.source] = noise.reported(message, self._noise_settings)
                 self._receivers[message.source] = message
@@ -175,7 +190,7 @@ class Senders:
         return clock.change
 
     def _telemetry(self, report: Report) -> Heard:
-        """Place a report that a vehicle makes of itself, by its boot time."""
+        """Place a report by its stamp; its noise is a vehicle's own matter if it reports itself."""
         assert report.boot_ms is not None
         uav, t_ns = report.uav, report.t_ns
         stamp, restarted = self._stamp(uav, t_ns, report.boot_ms)
@@ -191,7 +206,8 @@ class Senders:
         lag_ns = round(assumed.lag_middle_s * 1e9)
         errors = replace(errors, time_s=assumed.lag_rest_s)
         true_ns = t_ns - round(stamp.latency_s * 1e9) - lag_ns
-        placed = PlacedReport(report, stamp.sender_ns - lag_ns, true_ns, errors, assumed.limits)
+        known = errors if reports_itself(uav) else None
+        placed = PlacedReport(report, stamp.sender_ns - lag_ns, true_ns, known, assumed.limits)
         return Heard(placed, said, restarted, self._clock(uav).change)
 
     def _relayed(self, said: AdsbVehicle) -> Heard:
@@ -210,6 +226,21 @@ class Senders:
             return Heard(placed)
         text = f"{said.uav} is tracked anew: its altitude is {merged.alt_datum} now, not {datum}"
         return Heard(placed, (Notice(said.t_ns, Severity.INFO, said.uav, text),), said.uav)
+
+    def _remote_id(self, frame: Frame, said: RemoteId) -> Heard:
+        """Place a position that an aircraft broadcasts, by the stamp that it has."""
+        named = self.remote_ids.named(said)
+        if named is None:
+            return NOTHING
+        if isinstance(named, Rejection):
+            return Heard(said=(named,))
+        if not self._admission.admits(named.uav):
+            return _refused(named, Reason.NOT_ALLOWED)
+        if self._dedupe.is_repeat(frame):
+            return _refused(named, Reason.DUPLICATE)
+        if named.boot_ms is None:
+            return _refused(named, Reason.UNPLACED_STAMP)
+        return self._telemetry(named)
 
     def _attitude(self, attitude: Attitude) -> Heard:
         carrier = str(attitude.source)

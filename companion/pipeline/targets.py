@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 
 from companion.settings.model import Settings
 from companion.tracking.identity import Identities
-from companion.values import Fix, Notice, Severity, Track, TrackState, reports_itself
+from companion.values import Fix, Notice, Severity, Track, TrackState, reports_itself, standing
 
 
 class Targets:
@@ -32,18 +32,27 @@ class Targets:
         return [uav for uav in uavs if self.wants(uav)]
 
     def same_as(self, uav: str) -> str | None:
-        """The telemetry track that is the same aircraft as this relayed one.
+        """The better known track that is the same aircraft as this relayed one.
 
         None if there is none.
         """
         return self._identities.same_as(uav)
 
-    def compare(self, relayed: Fix, telemetry: list[Track]) -> None:
-        """Compare a relayed aircraft with the telemetry tracks near it, at its time.
+    def betters(self, uav: str, others: Iterable[str]) -> list[str]:
+        """Those of the others by which a relayed aircraft would rather be known.
+
+        Telemetry before Remote ID, ADS-B and Cursor on Target, in this order; who is known by
+        another track himself is none of them.
+        """
+        own = standing(uav)
+        return [one for one in others if standing(one) < own and self.same_as(one) is None]
+
+    def compare(self, relayed: Fix, better: list[Track]) -> None:
+        """Compare a relayed aircraft with tracks near it that are better known, at its time.
 
         Two beams on one aircraft would make zero forcing all but singular.
         """
-        self._identities.observe(relayed, telemetry)
+        self._identities.observe(relayed, better)
 
     # --- what is said of them ---------------------------------------------------------------
 

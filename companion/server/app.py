@@ -24,7 +24,7 @@ from companion.views.words import rfc3339
 CONTENT_POLICY: Final = b"default-src 'self'; frame-ancestors 'none'"
 DRAWN_POLICY: Final = CONTENT_POLICY + b"; style-src 'self' 'unsafe-inline'; img-src 'self' data:"
 """For ``/docs``: Swagger UI brings pictures in its style sheet, and styles with what it draws."""
-UavId = Annotated[str, PathParameter(description="SYSID:COMPID or icao:HEX")]
+UavId = Annotated[str, PathParameter(description="SYSID:COMPID, icao:HEX, rid:ID or cot:UID")]
 DESCRIPTION: Final = """Location-aware beamforming from MAVLink. Read only.
 
 Angles in degrees, distances in metres; null is not known, never 0. Estimates are worked out for

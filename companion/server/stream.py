@@ -42,7 +42,9 @@ BAD_ARGUMENTS: Final = 4422
 
 RATE_HZ: Final = 10.0
 LEAST_HZ, MOST_HZ = 0.1, 100.0
-_UAV: Final = re.compile(r"\d{1,3}:\d{1,3}|icao:[0-9A-F]{6}", re.ASCII)
+_UAV: Final = re.compile(
+    r"\d{1,3}:\d{1,3}|icao:[0-9A-F]{6}|(rid|cot):[A-Za-z0-9._-]{1,64}", re.ASCII
+)
 SLOTS: Final = 32
 """Number of slots in which clients take turns after an update.
 
@@ -80,7 +82,7 @@ def wanted(query: QueryParams) -> Wanted:
         raise UserError(f"{min(unknown)[:40]!r} is none of uav, topic, rate_hz")
     for uav in query.getlist("uav"):
         if not _UAV.fullmatch(uav):
-            raise UserError(f"uav: {uav[:40]!r} is neither SYSID:COMPID nor icao:HEX")
+            raise UserError(f"uav: {uav[:40]!r} is not SYSID:COMPID, icao:HEX, rid:ID or cot:UID")
     text = query.get("rate_hz", str(RATE_HZ))
     try:
         rate_hz = float(text)

@@ -29,7 +29,8 @@ class LinkSettings(Section):
     """The links on which MAVLink, and what receivers of other kinds say, is received.
 
     URLs are ``udpin:``, ``udpout:``, ``tcp:`` or ``tcpin:HOST:PORT``, ``serial:DEVICE:BAUD``, and
-    those of other receivers: ``sbs:`` or ``readsb:HOST:PORT``, ``readsb:http://HOST/PATH``.
+    those of other receivers: ``sbs:`` or ``readsb:HOST:PORT``, ``readsb:http://HOST/PATH``,
+    ``rid:HOST:PORT``, ``rid:udp:HOST:PORT``.
     """
 
     urls: tuple[LinkText, ...] = ()
@@ -79,12 +80,16 @@ class SigningSettings(Section):
         return links
 
 
-_UAV_PATTERN: Final = re.compile(r"(\d{1,3}|\*):(\d{1,3}|\*)|icao:([0-9A-F]{1,6}|[0-9A-F]{0,5}\*)")
+_UAV_PATTERN: Final = re.compile(
+    r"(\d{1,3}|\*):(\d{1,3}|\*)|icao:([0-9A-F]{1,6}|[0-9A-F]{0,5}\*)|(rid|cot):[A-Za-z0-9._*-]{1,64}"
+)
 
 
 def _uav_pattern(text: str) -> str:
     if not _UAV_PATTERN.fullmatch(text):
-        raise UserError(f"{text!r} is not SYSID:COMPID or icao:HEX; * stands for any")
+        raise UserError(
+            f"{text!r} is not SYSID:COMPID, icao:HEX, rid:ID or cot:UID; * stands for any"
+        )
     return text
 
 
@@ -108,7 +113,8 @@ class TrackSettings(Section):
                            begun again from them
         reacquire_s        time over which they must agree, seconds
 
-    Patterns are ``3:1``, ``3:*``, ``icao:4CA7B3`` or ``icao:*``. The carrier is always followed.
+    Patterns are ``3:1``, ``3:*``, ``icao:4CA7B3``, ``icao:*``, ``rid:*`` or ``cot:*``. The carrier
+    is always followed.
     """
 
     allow: tuple[UavPattern, ...] = ()

@@ -1,8 +1,9 @@
-"""One aircraft under two names: its own telemetry, and its ADS-B report relayed by a receiver.
+"""One aircraft under two names: its own telemetry, and what receivers relay of it.
 
 Two beams on one aircraft would be two nearly equal steering vectors, which ruin zero forcing. A
-relayed aircraft is identified with a telemetry track after several reports in a row that are nearer
-to it than their errors allow to tell apart, and is separated again after as many that are not.
+relayed aircraft is identified with a track by which it would rather be known (telemetry, or Remote
+ID before ADS-B) after several reports in a row that are nearer to it than their errors allow to
+tell apart, and is separated again after as many that are not.
 """
 
 import math
@@ -24,22 +25,22 @@ class _Count:
 
 
 class Identities:
-    """Which relayed aircraft is which telemetry track."""
+    """Which relayed aircraft is which better known track."""
 
     def __init__(self) -> None:
         self._counts: dict[str, _Count] = {}
         self._same: dict[str, str] = {}
 
     def same_as(self, uav: str) -> str | None:
-        """The telemetry track that is the same aircraft as this relayed one.
+        """The better known track that is the same aircraft as this relayed one.
 
         None if there is none.
         """
         return self._same.get(uav)
 
-    def observe(self, relayed: Fix, telemetry: list[Track]) -> None:
-        """Compare a relayed report with the telemetry tracks at its time."""
-        near = [(_apart_m(relayed, track), track.uav) for track in telemetry]
+    def observe(self, relayed: Fix, better: list[Track]) -> None:
+        """Compare a relayed report with the better known tracks at its time."""
+        near = [(_apart_m(relayed, track), track.uav) for track in better]
         nearest = min((pair for pair in near if pair[0] is not None), default=None)
         match = nearest[1] if nearest else ""
         count = self._counts.get(relayed.uav)

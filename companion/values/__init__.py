@@ -24,6 +24,7 @@ from companion.values.aimed import (
 )
 from companion.values.errors import UserError
 from companion.values.health import Blame, Cause, Level, Verdict
+from companion.values.names import Source, reports_itself, standing
 from companion.values.numbers import (
     BoolArray,
     ComplexArray,
@@ -48,12 +49,11 @@ from companion.values.received import (
     GnssStatus,
     Message,
     Presence,
+    RemoteId,
     Report,
     RoundTrip,
-    Source,
     SystemTime,
     Tick,
-    reports_itself,
 )
 from companion.values.rejections import Reason, Rejection
 from companion.values.tracked import (
@@ -103,6 +103,7 @@ __all__ = [
     "Reason",
     "Refuted",
     "Rejection",
+    "RemoteId",
     "Report",
     "ReportNoise",
     "RoundTrip",
@@ -119,5 +120,6 @@ __all__ = [
     "Verdict",
     "Widen",
     "reports_itself",
+    "standing",
     "vector",
 ]

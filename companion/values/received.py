@@ -2,39 +2,10 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
-from companion.values.errors import UserError
+from companion.values.names import Source
 from companion.values.rejections import Rejection
-
-
-class Source(NamedTuple):
-    """The sender of a frame: MAVLink system and component id, written ``SYSID:COMPID``."""
-
-    sysid: int
-    compid: int
-
-    def __str__(self) -> str:
-        return f"{self.sysid}:{self.compid}"
-
-    @classmethod
-    def parse(cls, text: str) -> Self:
-        """Read ``SYSID:COMPID``. Raises ``UserError`` unless both are numbers from 0 to 255."""
-        sysid, colon, compid = text.partition(":")
-        if not (colon and sysid.isdecimal() and compid.isdecimal()):
-            raise UserError(f"{text!r} is not SYSID:COMPID, such as 5:1")
-        if int(sysid) > 255 or int(compid) > 255:
-            raise UserError(f"{text!r}: system and component ids are at most 255")
-        return cls(int(sysid), int(compid))
-
-
-def reports_itself(uav: str) -> bool:
-    """True if ``uav`` names a vehicle that sends its own position, False for a relayed aircraft.
-
-    Relayed aircraft are named ``icao:HEX`` (ADS-B), ``rid:ID`` (Remote ID) or ``cot:UID`` (Cursor
-    on Target).
-    """
-    return not uav.startswith(("icao:", "rid:", "cot:"))
 
 
 class Frame(NamedTuple):
@@ -138,7 +109,8 @@ class Report:
         velocity_ne_mps    north and east, in the north-east-down frame at the UAV
         velocity_down_mps  positive down
         heading_deg        from true north, clockwise
-        boot_ms            the sender's clock since boot when the position was true; None for ADS-B
+        boot_ms            the sender's clock since boot, or another that goes on, when the position
+                           was true; None for ADS-B
         tslc_s             age of the position as stated by an ADS-B receiver, in place of
                            ``boot_ms``
         alt_age_s          time between the instants at which position and altitude were true; 0
@@ -207,6 +179,31 @@ class AdsbVehicle:
 
 
 @dataclass(frozen=True, slots=True)
+class RemoteId:
+    """What a Remote ID receiver heard from one radio: an id, a position, or both.
+
+        heard_as   the radio's address, hexadecimal; empty where the receiver does not say
+        uas_id     the aircraft's id
+        id_kind    MAVLink's MAV_ODID_ID_TYPE of it
+        aircraft   how many aircraft the sender says to stand for
+        report     its position, under the name of the radio
+        is_flat    there was a position, and no height
+
+    None stands for what was not sent.
+    """
+
+    t_ns: int
+    link: str
+    source: Source
+    heard_as: str
+    uas_id: str | None = None
+    id_kind: int | None = None
+    aircraft: int | None = None
+    report: Report | None = None
+    is_flat: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class Attitude:
     """Body attitude and body rates (ATTITUDE).
 
@@ -265,4 +262,4 @@ class SystemTime:
     boot_ms: int
 
 
-Message = Report | AdsbVehicle | Attitude | Presence | GnssStatus | SystemTime
+Message = Report | AdsbVehicle | RemoteId | Attitude | Presence | GnssStatus | SystemTime

@@ -18,6 +18,7 @@ class Reason(StrEnum):
     SHARED_ID = "shared-id"  # two vehicles send under one id: neither can be believed
     ZERO_POSITION = "zero-position"  # within 5 km of 0 N 0 E: what is sent before a fix
     NO_POSITION = "no-position"  # ADSB_VEHICLE whose flags do not vouch for its coordinates
+    NO_IDENTITY = "no-identity"  # a Remote ID position whose sender's id was not heard yet
     NO_ALTITUDE = "no-altitude"  # a position in the plane only
     UNPLACED_STAMP = "unplaced-stamp"  # off the sender's clock, and not enough others yet to agree
     NOT_ALLOWED = "not-allowed"  # a sender that the lists of the settings keep out

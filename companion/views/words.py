@@ -19,6 +19,7 @@ REASONS: Final = {
     Reason.SHARED_ID: "reports of two vehicles under one id",
     Reason.ZERO_POSITION: "reports of 0 N 0 E, which are sent before a fix",
     Reason.NO_POSITION: "relayed aircraft without a valid position",
+    Reason.NO_IDENTITY: "Remote ID before its id was heard",
     Reason.NO_ALTITUDE: "relayed aircraft without a height",
     Reason.UNPLACED_STAMP: "reports whose time fits no clock so far",
     Reason.NOT_ALLOWED: "reports of senders that the settings keep out",

@@ -63,18 +63,6 @@ class TcpOut:
         return cast(_Stream, key).fullness()
 
 
-class TcpListen(TcpOut):
-    """A link that connects to one peer, and only hears it: what it would be sent is no MAVLink."""
-
-    def peers(self) -> Collection[Hashable]:
-        """Nobody can be sent anything."""
-        return ()
-
-    def write(self, key: Hashable, raw: bytes) -> bool:
-        """Send nothing."""
-        return False
-
-
 class TcpIn:
     """A link that listens. Each connection is a peer of its own, which may come and go."""
 

@@ -8,6 +8,8 @@
     sbs:HOST:PORT        connect to an ADS-B receiver; its lines become ADSB_VEHICLE, none is sent
     readsb:HOST:PORT     the same of a receiver that speaks Beast
     readsb:http://...    the same of a receiver's aircraft.json
+    rid:HOST:PORT        connect to a Remote ID receiver; its JSON becomes OPEN_DRONE_ID messages
+    rid:udp:HOST:PORT    listen for such receivers' datagrams
 
 IPv6 hosts stand in brackets. Every peer has its own splitter: a frame truncated by one peer cannot
 damage another's.
@@ -19,18 +21,20 @@ from dataclasses import replace
 from typing import Final, Protocol
 
 from companion.mavlink.links.endpoints import Endpoint, Upcalls, reason
+from companion.mavlink.links.hearing import TcpListen, UdpListen
 from companion.mavlink.links.http_poll import HttpPoll
 from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.peers import Peer, Peers, Splits
 from companion.mavlink.links.serial_port import SerialPort
 from companion.mavlink.links.status import LinkStatus
-from companion.mavlink.links.tcp import TcpIn, TcpListen, TcpOut
+from companion.mavlink.links.tcp import TcpIn, TcpOut
 from companion.mavlink.links.udp import UdpIn, UdpOut
 from companion.mavlink.links.urls import LinkError, LinkUrl
 from companion.mavlink.wire.aircraft_json import AircraftJson
 from companion.mavlink.wire.beast import BeastSplitter
 from companion.mavlink.wire.encode import Outgoing, pack
 from companion.mavlink.wire.framing import Splitter
+from companion.mavlink.wire.rid_json import RidJson
 from companion.mavlink.wire.sbs import SbsSplitter
 from companion.values import Frame, Notice, Reason, Rejection, Severity, Source
 
@@ -249,6 +253,8 @@ def splitter(url: LinkUrl) -> Callable[[str], Splits]:
             return SbsSplitter
         case "readsb":
             return AircraftJson if url.way else BeastSplitter
+        case "rid":
+            return RidJson
         case _:
             return Splitter
 
@@ -266,6 +272,8 @@ def endpoint(url: LinkUrl, status: LinkStatus, upcalls: Upcalls) -> Endpoint:
             return TcpIn(url, upcalls)
         case "sbs" | "readsb":
             return HttpPoll(url, upcalls) if url.way else TcpListen(url, upcalls)
+        case "rid":
+            return UdpListen(url, status, upcalls) if url.way else TcpListen(url, upcalls)
         case "serial":
             return SerialPort(url, upcalls)
 

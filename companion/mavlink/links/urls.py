@@ -9,6 +9,8 @@
     readsb:HOST:PORT     connect to an ADS-B receiver that speaks Beast; nothing is sent
     readsb:http://HOST/PATH/aircraft.json
                          ask such a receiver's web server once a second; https:// too
+    rid:HOST:PORT        connect to a Remote ID receiver that says JSON; nothing is sent
+    rid:udp:HOST:PORT    listen for the datagrams of such receivers; nothing is sent
 
 IPv6 hosts stand in brackets.
 """
@@ -22,17 +24,18 @@ from typing import Final, Literal, cast, get_args
 
 from companion.values import UserError
 
-Scheme = Literal["udpin", "udpout", "tcp", "tcpin", "serial", "sbs", "readsb"]
+Scheme = Literal["udpin", "udpout", "tcp", "tcpin", "serial", "sbs", "readsb", "rid"]
 SCHEMES: Final[tuple[Scheme, ...]] = get_args(Scheme)
-Way = Literal["", "http", "https"]
+Way = Literal["", "udp", "http", "https"]
 """How a link goes whose scheme may go several ways; empty: as its scheme does of itself."""
 MAVLINK: Final[tuple[Scheme, ...]] = ("udpin", "udpout", "tcp", "tcpin", "serial")
 """Links over which MAVLink goes, in both directions."""
 _FORMS: Final[dict[str, str]] = {
     "serial": "serial:DEVICE:BAUD",
     "readsb": "readsb:HOST:PORT, readsb:http://HOST/PATH",
+    "rid": "rid:HOST:PORT, rid:udp:HOST:PORT",
 }
-_USUAL_PORTS: Final = {"sbs": 30003, "readsb": 30005}
+_USUAL_PORTS: Final = {"sbs": 30003, "readsb": 30005, "rid:udp": 32001}
 _HTTP_PORTS: Final = {"http": 80, "https": 443}
 _BAUD_MAX: Final = 20_000_000
 _AIRCRAFT_JSON: Final = "readsb:http://radar.lan/tar1090/data/aircraft.json"
@@ -64,12 +67,12 @@ class LinkUrl:
         if self.way in _HTTP_PORTS:
             port = "" if self.port == _HTTP_PORTS[self.way] else f":{self.port}"
             return f"{self.scheme}:{self.way}://{host}{port}{self.path}"
-        return f"{self.scheme}:{host}:{self.port}"
+        return f"{self.scheme}:{self.way and self.way + ':'}{host}:{self.port}"
 
     @property
     def listens(self) -> bool:
         """Whether others call here, so that an address of this machine is claimed."""
-        return self.scheme in ("udpin", "tcpin")
+        return self.scheme in ("udpin", "tcpin") or self.way == "udp"
 
 
 def parse_link(text: str, schemes: Collection[Scheme] = SCHEMES) -> LinkUrl:
@@ -82,6 +85,8 @@ def parse_link(text: str, schemes: Collection[Scheme] = SCHEMES) -> LinkUrl:
     path = ""
     if scheme == "readsb" and address.startswith(("http:", "https:")):
         way, address, path = _http(text, address)
+    elif scheme == "rid" and address.startswith("udp:"):
+        way, address = "udp", address.removeprefix("udp:")
     host, _, port = address.rpartition(":")
     if scheme not in schemes or not host or not _NUMBER.fullmatch(port):
         raise LinkError(f"{text!r} is not {_forms(schemes)}{_meant(text)}")

@@ -1,8 +1,9 @@
 """Codes by which aircraft say how exact they are, as what a GNSS receiver would say.
 
-NACp, NACv and GVA of ADS-B (RTCA DO-260B, 2.2.3.2.7.2.7, 2.2.3.2.6.1.5, 2.2.3.2.7.2.8) each name a
-limit below which 95 % of errors are. 0 is "unknown, or worse than all of these"; a code without a
-meaning tells nothing either.
+NACp, NACv and GVA of ADS-B (RTCA DO-260B, 2.2.3.2.7.2.7, 2.2.3.2.6.1.5, 2.2.3.2.7.2.8) and the
+accuracies of Remote ID (ASTM F3411-22a, ASD-STAN prEN 4709-002; MAV_ODID_HOR_ACC and the others of
+https://mavlink.io/en/messages/common.html) each name a limit below which 95 % of errors are. 0 is
+"unknown, or worse than all of these"; a code without a meaning tells nothing either.
 """
 
 import math
@@ -21,23 +22,25 @@ _NACP_M: Final = (
     *(miles * _NM_M for miles in (10.0, 4.0, 2.0, 1.0, 0.5, 0.3, 0.1, 0.05)),
     *(30.0, 10.0, 3.0),
 )
+_HORIZONTAL_M: Final = (*_NACP_M, 1.0)
 _VELOCITY_MPS: Final = (None, 10.0, 3.0, 1.0, 0.3)
 _GVA_M: Final = (None, 150.0, 45.0)
+_VERTICAL_M: Final = (*_GVA_M, 25.0, 10.0, 3.0, 1.0)
 
 
 def adsb(nac_p: int, nac_v: int, gva: int) -> Accuracy | None:
     """What NACp, NACv and GVA say; None where all are unknown."""
-    return _accuracy(_of(_NACP_M, nac_p), _of(_GVA_M, gva), _of(_VELOCITY_MPS, nac_v))
+    known = Accuracy(_of(_NACP_M, nac_p), _of(_GVA_M, gva), _of(_VELOCITY_MPS, nac_v))
+    return known if any(known) else None
+
+
+def remote_id(horizontal: int, vertical: int, speed: int) -> Accuracy:
+    """What the codes of a Remote ID location say."""
+    return Accuracy(
+        _of(_HORIZONTAL_M, horizontal), _of(_VERTICAL_M, vertical), _of(_VELOCITY_MPS, speed)
+    )
 
 
 def _of(table: tuple[float | None, ...], code: int) -> float | None:
     limit = table[code] if 0 <= code < len(table) else None
     return None if limit is None else OF_95 * limit
-
-
-def _accuracy(
-    horizontal_m: float | None, vertical_m: float | None, velocity_mps: float | None
-) -> Accuracy | None:
-    if horizontal_m is vertical_m is velocity_mps is None:
-        return None
-    return Accuracy(horizontal_m, vertical_m, velocity_mps)

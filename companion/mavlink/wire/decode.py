@@ -10,7 +10,7 @@ import struct
 from collections.abc import Callable
 from typing import Final
 
-from companion.mavlink.wire import accuracy
+from companion.mavlink.wire import accuracy, remote_id
 from companion.mavlink.wire.transponder import ADSB_VEHICLE, SENDER
 from companion.values import (
     AdsbVehicle,
@@ -22,6 +22,7 @@ from companion.values import (
     Presence,
     Reason,
     Rejection,
+    RemoteId,
     Report,
     SystemTime,
 )
@@ -55,7 +56,7 @@ class _RefusedError(Exception):
 
 
 def decode(frame: Frame) -> Message | Rejection | None:
-    """Decode a frame. Returns None for messages that nobody here reads.
+    """Decode a frame. Returns None for messages that nobody here reads, or that are of no matter.
 
     A frame whose fields cannot be used gives a ``Rejection`` with its reason.
     """
@@ -219,13 +220,21 @@ def _system_time(frame: Frame) -> SystemTime:
     return SystemTime(frame.t_ns, frame.source, unix_us or None, boot_ms)
 
 
-_DECODERS: Final[dict[int, Callable[[Frame], Message]]] = {
+def _remote_id(frame: Frame) -> RemoteId | None:
+    try:
+        return remote_id.remote_id(frame)
+    except ValueError as why:
+        raise _RefusedError(Reason.MALFORMED, str(why)) from why
+
+
+_DECODERS: Final[dict[int, Callable[[Frame], Message | None]]] = {
     HEARTBEAT: _heartbeat,
     SYSTEM_TIME: _system_time,
     GPS_RAW_INT: _gps_raw_int,
     ATTITUDE: _attitude,
     GLOBAL_POSITION_INT: _global_position_int,
     ADSB_VEHICLE: _adsb_vehicle,
+    **dict.fromkeys(remote_id.READ, _remote_id),
 }
 DECODED: Final = frozenset(_DECODERS)
 """Message ids that ``decode`` reads."""

@@ -1,0 +1,83 @@
+"""Remote ID's aircraft: who sent from a radio's address, and what is said of them.
+
+A broadcast names its sender in a message of its own (Basic ID), at least every three seconds; until
+then a position has no name and is not used. Addresses change, and are used by others later: a name
+holds while the address is heard. A sender that says to stand for several aircraft (System) has no
+position that is one's.
+"""
+
+from collections import OrderedDict
+from dataclasses import dataclass, replace
+from typing import Final
+
+from companion.values import AltitudeDatum, Reason, Rejection, RemoteId, Report, Source
+
+NAMED_NS: Final = 60_000_000_000
+"""How long a name holds after its address was last heard."""
+ADDRESSES_MAX: Final = 4096
+"""Addresses remembered; beyond it the one not heard for longest is forgotten."""
+DATUM_NS: Final = 10_000_000_000
+"""How long an aircraft keeps what its heights are measured from."""
+
+
+@dataclass(slots=True)
+class _Known:
+    heard_ns: int
+    uas_id: str | None = None
+    id_kind: int | None = None
+    aircraft: int = 1
+    datum: AltitudeDatum | None = None
+    placed_ns: int = 0
+
+
+class RemoteIds:
+    """What is known of each address, for each receiver. ``named`` takes messages as they arrive."""
+
+    def __init__(self) -> None:
+        self._known: OrderedDict[tuple[Source, str], _Known] = OrderedDict()
+
+    def named(self, said: RemoteId) -> Report | Rejection | None:
+        """The report that a message completes, under its aircraft's name; None if it has none.
+
+        Rejections and their reasons:
+
+            NO_IDENTITY  the address has not said whose it is
+            NO_ALTITUDE  a position without a height, or with one of another datum than before
+            SHARED_ID    it stands for several aircraft
+        """
+        known = self._learned(said)
+        if said.report is None and not said.is_flat:
+            return None
+        if known.uas_id is None:
+            return _rejected(said, f"rid:{said.heard_as}", Reason.NO_IDENTITY)
+        uav = f"rid:{known.uas_id}"
+        if known.aircraft > 1:
+            detail = f"it stands for {known.aircraft} aircraft"
+            return _rejected(said, uav, Reason.SHARED_ID, detail)
+        report = said.report
+        if report is None:
+            return _rejected(said, uav, Reason.NO_ALTITUDE)
+        fresh = said.t_ns - known.placed_ns <= DATUM_NS
+        if known.datum not in (None, report.alt_datum) and fresh:
+            return _rejected(said, uav, Reason.NO_ALTITUDE, f"{known.datum} before")
+        known.datum, known.placed_ns = report.alt_datum, said.t_ns
+        return replace(report, uav=uav)
+
+    def _learned(self, said: RemoteId) -> _Known:
+        key = said.source, said.heard_as
+        known = self._known.pop(key, None)
+        if known is None or said.t_ns - known.heard_ns > NAMED_NS:
+            known = _Known(said.t_ns)
+        self._known[key] = known
+        known.heard_ns = said.t_ns
+        if said.id_kind is not None and said.id_kind <= (known.id_kind or said.id_kind):
+            known.uas_id, known.id_kind = said.uas_id, said.id_kind
+        if said.aircraft is not None:
+            known.aircraft = said.aircraft
+        if len(self._known) > ADDRESSES_MAX:
+            self._known.popitem(last=False)
+        return known
+
+
+def _rejected(said: RemoteId, uav: str, reason: Reason, detail: str = "") -> Rejection:
+    return Rejection(said.t_ns, uav, reason, detail=detail)

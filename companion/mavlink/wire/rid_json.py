@@ -1,0 +1,196 @@
+"""What Remote ID receivers say in JSON, as the OPEN_DRONE_ID messages that one over MAVLink sends.
+
+One object is what was heard of one radio. Two forms are read, told by their keys:
+
+- DroneScout's (https://github.com/BluemarkInnovations/RemoteID-MQTT-subscriber, ``mqtt_sub.py``):
+  ``UASdata`` is the structure ODID_UAS_Data of ``libopendroneid/opendroneid.h``
+  (https://github.com/opendroneid/opendroneid-core-c) in base64, with every accuracy;
+- rid_capture's (https://github.com/sxjack/unix_rid_capture): whole metres, m/s and seconds, and no
+  accuracies.
+
+Objects follow one another, with or without new lines between them.
+"""
+
+import base64
+import json
+import math
+import struct
+from collections.abc import Iterator
+from typing import Any, Final
+
+from companion.mavlink.wire.encode import Outgoing, pack
+from companion.mavlink.wire.remote_id import BASIC_ID, LOCATION, SYSTEM
+from companion.values import Frame, Reason, Rejection, Source
+
+SENDER: Final = Source(0, 236)
+"""Who says it: no system, MAV_COMP_ID_ODID_TXRX_1."""
+OBJECT_MAX: Final = 16 << 10
+"""Bytes of an object at most; a longer one is garbage."""
+_UNKNOWN_STAMP_S: Final = 65_535.0
+_BY_SECOND: Final = 10
+"""MAV_ODID_TIME_ACC of a stamp in whole seconds."""
+_BASIC_ID = struct.Struct("<2x20sBB20s")
+_LOCATION = struct.Struct("<iiffffHHh2x20s7B")
+_SYSTEM = struct.Struct("<24xH4x20s4x")
+_UAS_LOCATION = struct.Struct("<ifffddffifiiiiif")
+_AT = {"location": 64, "system": 808, "valid": 892, "end": 914}
+
+
+class RidJson:
+    """Turns the bytes of one peer into frames; ``feed`` and ``finish`` as ``Splitter``'s."""
+
+    def __init__(self, link: str) -> None:
+        self.link = link
+        self._pending = b""
+        self._overlong = False
+        self._seq = 0
+
+    def feed(self, t_ns: int, data: bytes) -> list[Frame | Rejection]:
+        """Take in bytes that arrived at ``t_ns``; returns what the objects in them say."""
+        *lines, self._pending = (self._pending + data).replace(b"\0", b"\n").split(b"\n")
+        out: list[Frame | Rejection] = []
+        garbage = 0
+        for line in lines:
+            if self._overlong or len(line) > OBJECT_MAX:
+                garbage += len(line) + 1
+                self._overlong = False
+            elif line.strip():
+                out += self._object(t_ns, line)
+        if self._pending.rstrip().endswith(b"}") and not self._overlong:  # a datagram has no end
+            whole = _parsed(self._pending)
+            if whole is not None:
+                out += self._object(t_ns, self._pending)
+                self._pending = b""
+        if len(self._pending) > OBJECT_MAX:
+            garbage += len(self._pending)
+            self._pending, self._overlong = b"", True
+        if garbage:
+            out.append(Rejection(t_ns, self.link, Reason.GARBAGE, garbage))
+        return out
+
+    def finish(self, t_ns: int) -> list[Frame | Rejection]:
+        """End the stream: an object that has no end is given up."""
+        stray, self._pending, self._overlong = len(self._pending), b"", False
+        return [Rejection(t_ns, self.link, Reason.GARBAGE, stray)] if stray else []
+
+    def _object(self, t_ns: int, text: bytes) -> list[Frame | Rejection]:
+        found = _parsed(text)
+        if found is None:
+            return [Rejection(t_ns, self.link, Reason.GARBAGE, len(text) + 1)]
+        try:
+            return [self._frame(t_ns, *one) for one in list(_said(found))]
+        except (ValueError, struct.error, OverflowError) as why:
+            detail = str(why)[:80]
+            return [Rejection(t_ns, self.link, Reason.MALFORMED, msgid=LOCATION, detail=detail)]
+
+    def _frame(self, t_ns: int, msgid: int, payload: bytes) -> Frame:
+        raw = pack(Outgoing(SENDER, msgid, payload), self._seq)
+        self._seq = (self._seq + 1) & 0xFF
+        return Frame(t_ns, self.link, SENDER, msgid, raw)
+
+
+def _parsed(text: bytes) -> dict[str, Any] | None:
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def _said(found: dict[str, Any]) -> Iterator[tuple[int, bytes]]:
+    """Message ids and payloads of what an object says; nothing of one that says something else."""
+    data = found.get("data")
+    if isinstance(data, dict) and isinstance(data.get("UASdata"), str):
+        yield from _uas_data(_mac(data.get("MAC address")), base64.b64decode(data["UASdata"]))
+    elif "uav id" in found or "uav latitude" in found:
+        yield from _captured(_mac(found.get("mac")), found)
+
+
+def _mac(text: object) -> bytes:
+    if not isinstance(text, str) or len(text) > 64:
+        raise ValueError("no address")
+    mac = bytes.fromhex(text.replace(":", "").replace("-", ""))
+    if not 0 < len(mac) <= 20 or not any(mac):
+        raise ValueError("no address")
+    return mac
+
+
+def _uas_data(mac: bytes, uas: bytes) -> Iterator[tuple[int, bytes]]:
+    """What ODID_UAS_Data says: its ids, how many aircraft it stands for, and its position."""
+    if len(uas) < _AT["end"]:
+        raise ValueError(f"{len(uas)} bytes of UASdata, of {_AT['end']}")
+    valid = uas[_AT["valid"] :]
+    for number in (0, 1):
+        if valid[number]:
+            ua_type, kind, name = struct.unpack_from("<ii20s", uas, 32 * number)
+            yield BASIC_ID, _BASIC_ID.pack(mac, _code(kind), _code(ua_type), name)
+    if valid[912 - _AT["valid"]]:
+        (count,) = struct.unpack_from("<H", uas, _AT["system"] + 24)
+        yield SYSTEM, _SYSTEM.pack(count, mac)
+    if valid[2]:
+        status, course, speed, climb, lat, lon, baro, geo, _, height, *more = (
+            _UAS_LOCATION.unpack_from(uas, _AT["location"])
+        )
+        horizontal, vertical, barometer, at_speed, at_time = map(_code, more[:5])
+        yield (
+            LOCATION,
+            _location(
+                *(mac, lat, lon, baro, geo, height, more[5], course, speed, climb, _code(status)),
+                (horizontal, vertical, barometer, at_speed, at_time),
+            ),
+        )
+
+
+def _captured(mac: bytes, found: dict[str, Any]) -> Iterator[tuple[int, bytes]]:
+    """What an object of rid_capture says; its kind of id is not told but by its key."""
+    for key, kind in (("uav id", 1), ("caa registration", 2)):
+        name = found.get(key)
+        if isinstance(name, str) and name:
+            yield BASIC_ID, _BASIC_ID.pack(mac, kind, 0, name.encode()[:20])
+    keys = ("uav latitude", "uav longitude", "uav altitude", "uav heading", "uav speed", "seconds")
+    if any(key in found for key in keys):
+        lat, lon, geo, course, speed, stamp = [_number(found.get(key)) for key in keys]
+        codes = (0, 0, 0, 0, _BY_SECOND)
+        nan = math.nan
+        yield LOCATION, _location(mac, lat, lon, nan, geo, nan, stamp, course, speed, nan, 0, codes)
+
+
+def _number(value: object) -> float:
+    """A number; not a number where there is none."""
+    return float(value) if isinstance(value, int | float) else math.nan
+
+
+def _code(value: int) -> int:
+    return value if 0 <= value <= 255 else 0
+
+
+def _location(
+    mac: bytes,
+    lat_deg: float,
+    lon_deg: float,
+    baro_m: float,
+    geo_m: float,
+    height_m: float,
+    stamp_s: float,
+    course_deg: float,
+    speed_mps: float,
+    climb_mps: float,
+    status: int,
+    codes: tuple[int, int, int, int, int],
+) -> bytes:
+    """The payload of an OPEN_DRONE_ID_LOCATION; what is out of range, or no number, is unknown.
+
+    Raises ``ValueError`` for a place that is none.
+    """
+    if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
+        raise ValueError(f"latitude {lat_deg}, longitude {lon_deg}")
+    return _LOCATION.pack(
+        round(lat_deg * 1e7),
+        round(lon_deg * 1e7),
+        *(one if -1000 <= one <= 31_767.5 else -1000.0 for one in (baro_m, geo_m, height_m)),
+        stamp_s if 0 <= stamp_s <= 3600 else _UNKNOWN_STAMP_S,
+        round(course_deg * 100) if 0 <= course_deg <= 360 else 36_100,
+        round(speed_mps * 100) if 0 <= speed_mps <= 254.25 else 25_500,
+        round(climb_mps * 100) if abs(climb_mps) <= 62 else 6300,
+        *(mac, status, 0, *codes),
+    )

@@ -1,0 +1,175 @@
+"""Aircraft heard otherwise than by telemetry, in the fold: one stays one, and late is late."""
+
+from typing import Any
+
+import pymap3d
+import pytest
+from pymavlink.dialects.v20 import all as dialect
+
+from companion.mavlink.wire.transponder import Said
+from companion.mavlink.wire.transponder import frame as transponder_frame
+from companion.pipeline.fold import Pipeline
+from companion.settings.model import Settings
+from companion.values import Estimate, Frame, Reason, Rejection, Source, Tick, Update
+
+S = 1_000_000_000
+START_NS = 1_760_000_000 * S
+PLACE = (47.4, 8.55, 500.0)
+SERIAL = b"1588E0123456789ABCDE"
+RID = "rid:1588E0123456789ABCDE"
+
+
+def pipeline(**sections: dict[str, Any]) -> Pipeline:
+    beams = {"targets": "all"}
+    return Pipeline(
+        Settings().override(center={"source": "47.4,8.55,500"}, beams=beams, **sections)
+    )
+
+
+def there(t_s: float, aside_m: float = 0.0) -> tuple[float, float, float]:
+    """Where the aircraft is: northwards at 5 m/s, 120 m up."""
+    lat, lon, alt = pymap3d.ned2geodetic(300 + 5 * t_s, 40 + aside_m, -120, *PLACE)
+    return float(lat), float(lon), float(alt)
+
+
+def framed(t_s: float, source: Source, message: Any) -> Frame:
+    mav = dialect.MAVLink(None, srcSystem=source.sysid, srcComponent=source.compid)
+    raw = bytes(message.pack(mav))
+    return Frame(START_NS + round(t_s * S), "udp", source, message.get_msgId(), raw)
+
+
+def telemetry(t_s: float) -> Frame:
+    lat, lon, alt = there(t_s)
+    return framed(t_s, Source(1, 1), dialect.MAVLink_global_position_int_message(
+        round(1000 * (100 + t_s)), round(lat * 1e7), round(lon * 1e7), round(alt * 1e3), 0,
+        500, 0, 0, 65535,
+    ))  # fmt: skip
+
+
+def broadcast(
+    t_s: float, late_s: float = 0.0, receiver: int = 9, aside_m: float = 0.0, horizontal: int = 10
+) -> Frame:
+    lat, lon, alt = there(t_s, aside_m)
+    mac = list(b"\1\2\3\4\5\6".ljust(20, b"\0"))
+    stamp_s = (START_NS / S + t_s) % 3600
+    message = dialect.MAVLink_open_drone_id_location_message(
+        0, 0, mac, 2, 0, 500, 0, round(lat * 1e7), round(lon * 1e7), -1000, alt, 0, 0,
+        horizontal, 4, 0, 4, stamp_s, 1,
+    )  # fmt: skip
+    return framed(t_s + late_s, Source(receiver, 236), message)
+
+
+def naming(t_s: float, receiver: int = 9) -> Frame:
+    mac = list(b"\1\2\3\4\5\6".ljust(20, b"\0"))
+    message = dialect.MAVLink_open_drone_id_basic_id_message(0, 0, mac, 1, 2, list(SERIAL))
+    return framed(t_s, Source(receiver, 236), message)
+
+
+def transponder(t_s: float, **codes: int) -> Frame:
+    lat, lon, alt = there(t_s, 8.0)
+    said = Said(
+        0x4CA7B3, lat, lon, alt / 0.3048, geometric=True, speed_kt=5 * 3600 / 1852, track_deg=0.0,
+        climb_fpm=0.0, **codes,
+    )  # fmt: skip
+    frame = transponder_frame(START_NS + round(t_s * S), "readsb", said, 0)
+    assert frame is not None
+    return frame
+
+
+def updated(fold: Pipeline, t_s: float) -> Update:
+    *_, update = fold.step(Tick(START_NS + round(t_s * S)))
+    assert isinstance(update, Update)
+    return update
+
+
+def estimates(fold: Pipeline, frame: Frame) -> list[Estimate]:
+    return [one for one in fold.step(frame) if isinstance(one, Estimate)]
+
+
+def test_one_aircraft_that_is_heard_three_ways_gets_one_beam() -> None:
+    """Its own telemetry before Remote ID before ADS-B, whichever of them there are."""
+    fold = pipeline()
+    fold.step(naming(0))
+    for n in range(12):
+        fold.step(broadcast(n))
+        fold.step(transponder(n + 0.1))
+        beams = set(updated(fold, n + 0.2).beams.uavs)
+        assert beams == ({RID, "icao:4CA7B3"} if n < 4 else {RID})
+    assert fold.targets.same_as("icao:4CA7B3") == RID
+    for n in range(12, 24):
+        fold.step(telemetry(n))
+        fold.step(broadcast(n + 0.05))
+        fold.step(transponder(n + 0.1))
+    assert set(updated(fold, 24).beams.uavs) == {"1:1"}
+    assert fold.targets.same_as(RID) == fold.targets.same_as("icao:4CA7B3") == "1:1"
+
+
+def test_an_aircraft_elsewhere_is_another_one() -> None:
+    fold = pipeline()
+    fold.step(naming(0))
+    for n in range(12):
+        fold.step(telemetry(n))
+        fold.step(broadcast(n + 0.05, aside_m=80.0))  # far more than either may be off
+    assert set(updated(fold, 12).beams.uavs) == {"1:1", RID}
+
+
+def test_a_broadcast_that_two_receivers_hear_counts_once() -> None:
+    fold = pipeline()
+    for receiver in (9, 10):
+        fold.step(naming(0, receiver))
+    for n in range(6):
+        assert len(estimates(fold, broadcast(n))) == 1
+        (refused,) = fold.step(broadcast(n, late_s=0.3, receiver=10))
+        assert isinstance(refused, Rejection) and refused.reason is Reason.DUPLICATE
+    assert list(fold.fleet.uavs) == [RID]
+
+
+def test_a_position_that_comes_ten_seconds_late_is_of_ten_seconds_ago() -> None:
+    """By its stamp, as with telemetry: what it says is no news of the present."""
+    fold = pipeline(tracks={"window_s": 20.0})
+    fold.step(naming(0))
+    for n in range(20):
+        fold.step(broadcast(n))
+    (late,) = estimates(fold, broadcast(9.5, late_s=10.0))
+    assert late.fix.t_ns == pytest.approx(START_NS + 9.5 * S, abs=0.2 * S)
+    (track,) = fold.tracks(START_NS + 20 * S, START_NS + 20 * S)
+    assert track.position_ned_m[0] == pytest.approx(400, abs=3)
+
+
+@pytest.mark.parametrize(("code", "horizontal_m"), [(10, 18.5), (9, 55.5), (8, 171.3), (0, 100.0)])
+def test_stated_accuracies_are_the_bounds(code: int, horizontal_m: float) -> None:
+    """Three times the radius of 68 %, and the way in 0.15 s, or in the second of ADS-B's ages."""
+    fold = pipeline()
+    fold.step(naming(0))
+    (heard,) = estimates(fold, broadcast(0, horizontal=code))
+    assert heard.fix.noise.horizontal_m == pytest.approx(horizontal_m + 0.15 * 5, abs=0.1)
+    (seen,) = estimates(fold, transponder(0, nac_p=code))
+    assert seen.fix.noise.horizontal_m == pytest.approx(horizontal_m + 5, abs=0.1)
+
+
+def test_what_a_mavlink_relay_puts_behind_its_message_is_no_accuracy() -> None:
+    """Another dialect may have its own fields there; only this program's receivers' are read."""
+    theirs = transponder(0, nac_p=11)
+    raw = bytearray(theirs.raw)
+    raw[5] = 9
+    (seen,) = estimates(pipeline(), theirs._replace(source=Source(9, 156), raw=bytes(raw)))
+    assert seen.fix.noise.horizontal_m == pytest.approx(105, abs=0.1)
+
+
+def test_lists_keep_out_who_is_named_in_them() -> None:
+    fold = pipeline(tracks={"deny": ["rid:*"]})
+    fold.step(naming(0))
+    (refused,) = fold.step(broadcast(0))
+    assert isinstance(refused, Rejection)
+    assert (refused.reason, refused.source) == (Reason.NOT_ALLOWED, RID)
+
+
+def test_a_broadcast_without_a_stamp_has_no_time() -> None:
+    fold = pipeline()
+    fold.step(naming(0))
+    message = dialect.MAVLink_open_drone_id_location_message(
+        0, 0, list(b"\1\2\3\4\5\6".ljust(20, b"\0")), 2, 0, 0, 0, 474_000_000, 85_500_000, -1000,
+        500, 0, 0, 10, 4, 0, 4, 65_535.0, 0,
+    )  # fmt: skip
+    (refused,) = fold.step(framed(1, Source(9, 236), message))
+    assert isinstance(refused, Rejection) and refused.reason is Reason.UNPLACED_STAMP

@@ -24,7 +24,7 @@ LINKS = click.option(
     metavar="URL",
     multiple=True,
     help="udpin|udpout|tcp|tcpin:HOST:PORT or serial:DEVICE:BAUD; receivers: "
-    "sbs|readsb|rid:HOST:PORT, readsb:http://HOST/PATH, rid:udp:HOST:PORT. "
+    "sbs|readsb|rid:HOST:PORT, readsb:http://HOST/PATH, rid|cot:udp:HOST:PORT, cot:tcp:HOST:PORT. "
     "May be given several times.",
 )
 LISTEN = click.option(

@@ -30,7 +30,7 @@ class LinkSettings(Section):
 
     URLs are ``udpin:``, ``udpout:``, ``tcp:`` or ``tcpin:HOST:PORT``, ``serial:DEVICE:BAUD``, and
     those of other receivers: ``sbs:`` or ``readsb:HOST:PORT``, ``readsb:http://HOST/PATH``,
-    ``rid:HOST:PORT``, ``rid:udp:HOST:PORT``.
+    ``rid:HOST:PORT``, ``rid:udp:HOST:PORT``, ``cot:udp:HOST:PORT``, ``cot:tcp:HOST:PORT``.
     """
 
     urls: tuple[LinkText, ...] = ()

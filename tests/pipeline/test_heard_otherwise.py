@@ -1,11 +1,13 @@
 """Aircraft heard otherwise than by telemetry, in the fold: one stays one, and late is late."""
 
+from datetime import UTC, datetime
 from typing import Any
 
 import pymap3d
 import pytest
 from pymavlink.dialects.v20 import all as dialect
 
+from companion.mavlink.wire.cot_link import CotSplitter
 from companion.mavlink.wire.transponder import Said
 from companion.mavlink.wire.transponder import frame as transponder_frame
 from companion.pipeline.fold import Pipeline
@@ -76,6 +78,19 @@ def transponder(t_s: float, **codes: int) -> Frame:
     return frame
 
 
+def event(t_s: float, late_s: float = 0.0, ce: float = 5.0) -> Frame:
+    lat, lon, hae = there(t_s, -5.0)
+    at = datetime.fromtimestamp(START_NS / S + t_s, UTC).isoformat()
+    xml = (
+        f'<event uid="HAWK" type="a-f-A" time="{at}" how="m-g"><point lat="{lat}" lon="{lon}" '
+        f'hae="{hae}" ce="{ce}" le="9"/><detail><track course="0" speed="5" slope="0"/></detail>'
+        "</event>"
+    )
+    (frame,) = CotSplitter("cot").feed(START_NS + round((t_s + late_s) * S), xml.encode())
+    assert isinstance(frame, Frame)
+    return frame
+
+
 def updated(fold: Pipeline, t_s: float) -> Update:
     *_, update = fold.step(Tick(START_NS + round(t_s * S)))
     assert isinstance(update, Update)
@@ -102,6 +117,26 @@ def test_one_aircraft_that_is_heard_three_ways_gets_one_beam() -> None:
         fold.step(transponder(n + 0.1))
     assert set(updated(fold, 24).beams.uavs) == {"1:1"}
     assert fold.targets.same_as(RID) == fold.targets.same_as("icao:4CA7B3") == "1:1"
+
+
+def test_an_event_of_an_aircraft_that_is_known_better_is_that_one() -> None:
+    fold = pipeline()
+    for n in range(12):
+        fold.step(transponder(n))
+        fold.step(event(n))
+    assert set(updated(fold, 12).beams.uavs) == {"icao:4CA7B3"}
+    assert fold.targets.same_as("cot:HAWK") == "icao:4CA7B3"
+
+
+def test_an_events_errors_are_its_bounds_and_late_is_late() -> None:
+    """Three standard deviations, and the way in a second."""
+    fold = pipeline(tracks={"window_s": 20.0})
+    for n in range(20):
+        (heard,) = estimates(fold, event(n))
+    assert heard.fix.noise.horizontal_m == pytest.approx(15 + 5, abs=0.1)
+    (late,) = estimates(fold, event(9.5, late_s=10.0, ce=9_999_999))
+    assert late.fix.noise.horizontal_m == pytest.approx(100 + 5, abs=0.1)
+    assert late.fix.t_ns == pytest.approx(START_NS + 9.5 * S, abs=0.2 * S)
 
 
 def test_an_aircraft_elsewhere_is_another_one() -> None:

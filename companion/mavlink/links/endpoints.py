@@ -6,8 +6,10 @@ happens through ``Upcalls``. A write succeeds at once or not at all.
 """
 
 import asyncio
+import ipaddress
 import os
 import socket
+import struct
 from collections.abc import Callable, Collection, Hashable
 from typing import Any, NamedTuple, Protocol
 
@@ -85,6 +87,7 @@ def bound(url: LinkUrl, kind: socket.SocketKind) -> socket.socket:
     """A socket bound to a listening link's address. Raises ``OSError`` where that cannot be had.
 
     A name is looked up synchronously: this is called before the loop runs, and holds nobody up.
+    At a group's address (multicast) others of this machine may listen too, and the group is joined.
     """
     infos = socket.getaddrinfo(url.host, url.port, type=kind, flags=socket.AI_PASSIVE)
     family, _, _, _, address = infos[0]
@@ -93,11 +96,28 @@ def bound(url: LinkUrl, kind: socket.SocketKind) -> socket.socket:
         sock.setblocking(False)
         if kind == socket.SOCK_STREAM:  # else the port stays taken a minute after a connection
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        group = ipaddress.ip_address(str(address[0]).partition("%")[0])
+        if group.is_multicast:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.bind(address)
+        if group.is_multicast:
+            _join(sock, group, address)
     except OSError:
         sock.close()
         raise
     return sock
+
+
+def _join(
+    sock: socket.socket, group: ipaddress.IPv4Address | ipaddress.IPv6Address, address: Address
+) -> None:
+    if group.version == 4:
+        anywhere = socket.inet_aton("0.0.0.0")
+        joined = group.packed + anywhere
+        sock.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, joined)
+    else:
+        joined = group.packed + struct.pack("@I", address[3])
+        sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_JOIN_GROUP, joined)
 
 
 async def resolved(

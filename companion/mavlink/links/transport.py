@@ -10,6 +10,8 @@
     readsb:http://...    the same of a receiver's aircraft.json
     rid:HOST:PORT        connect to a Remote ID receiver; its JSON becomes OPEN_DRONE_ID messages
     rid:udp:HOST:PORT    listen for such receivers' datagrams
+    cot:tcp:HOST:PORT    connect to who says Cursor on Target; its events become frames
+    cot:udp:HOST:PORT    listen for such datagrams
 
 IPv6 hosts stand in brackets. Every peer has its own splitter: a frame truncated by one peer cannot
 damage another's.
@@ -32,6 +34,7 @@ from companion.mavlink.links.udp import UdpIn, UdpOut
 from companion.mavlink.links.urls import LinkError, LinkUrl
 from companion.mavlink.wire.aircraft_json import AircraftJson
 from companion.mavlink.wire.beast import BeastSplitter
+from companion.mavlink.wire.cot_link import CotSplitter
 from companion.mavlink.wire.encode import Outgoing, pack
 from companion.mavlink.wire.framing import Splitter
 from companion.mavlink.wire.rid_json import RidJson
@@ -255,6 +258,8 @@ def splitter(url: LinkUrl) -> Callable[[str], Splits]:
             return AircraftJson if url.way else BeastSplitter
         case "rid":
             return RidJson
+        case "cot":
+            return CotSplitter
         case _:
             return Splitter
 
@@ -272,8 +277,8 @@ def endpoint(url: LinkUrl, status: LinkStatus, upcalls: Upcalls) -> Endpoint:
             return TcpIn(url, upcalls)
         case "sbs" | "readsb":
             return HttpPoll(url, upcalls) if url.way else TcpListen(url, upcalls)
-        case "rid":
-            return UdpListen(url, status, upcalls) if url.way else TcpListen(url, upcalls)
+        case "rid" | "cot":
+            return UdpListen(url, status, upcalls) if url.listens else TcpListen(url, upcalls)
         case "serial":
             return SerialPort(url, upcalls)
 

@@ -11,6 +11,8 @@
                          ask such a receiver's web server once a second; https:// too
     rid:HOST:PORT        connect to a Remote ID receiver that says JSON; nothing is sent
     rid:udp:HOST:PORT    listen for the datagrams of such receivers; nothing is sent
+    cot:tcp:HOST:PORT    connect to who says Cursor on Target; nothing is sent
+    cot:udp:HOST:PORT    listen for it, as in cot:udp:239.2.3.1:6969; nothing is sent
 
 IPv6 hosts stand in brackets.
 """
@@ -24,9 +26,9 @@ from typing import Final, Literal, cast, get_args
 
 from companion.values import UserError
 
-Scheme = Literal["udpin", "udpout", "tcp", "tcpin", "serial", "sbs", "readsb", "rid"]
+Scheme = Literal["udpin", "udpout", "tcp", "tcpin", "serial", "sbs", "readsb", "rid", "cot"]
 SCHEMES: Final[tuple[Scheme, ...]] = get_args(Scheme)
-Way = Literal["", "udp", "http", "https"]
+Way = Literal["", "tcp", "udp", "http", "https"]
 """How a link goes whose scheme may go several ways; empty: as its scheme does of itself."""
 MAVLINK: Final[tuple[Scheme, ...]] = ("udpin", "udpout", "tcp", "tcpin", "serial")
 """Links over which MAVLink goes, in both directions."""
@@ -34,8 +36,10 @@ _FORMS: Final[dict[str, str]] = {
     "serial": "serial:DEVICE:BAUD",
     "readsb": "readsb:HOST:PORT, readsb:http://HOST/PATH",
     "rid": "rid:HOST:PORT, rid:udp:HOST:PORT",
+    "cot": "cot:udp:HOST:PORT, cot:tcp:HOST:PORT",
 }
-_USUAL_PORTS: Final = {"sbs": 30003, "readsb": 30005, "rid:udp": 32001}
+_WAYS: Final = {"rid": ("udp:",), "cot": ("udp:", "tcp:")}
+_USUAL_PORTS: Final = {"sbs": 30003, "readsb": 30005}
 _HTTP_PORTS: Final = {"http": 80, "https": 443}
 _BAUD_MAX: Final = 20_000_000
 _AIRCRAFT_JSON: Final = "readsb:http://radar.lan/tar1090/data/aircraft.json"
@@ -85,8 +89,11 @@ def parse_link(text: str, schemes: Collection[Scheme] = SCHEMES) -> LinkUrl:
     path = ""
     if scheme == "readsb" and address.startswith(("http:", "https:")):
         way, address, path = _http(text, address)
-    elif scheme == "rid" and address.startswith("udp:"):
-        way, address = "udp", address.removeprefix("udp:")
+    elif address.startswith(_WAYS.get(scheme, ())):
+        name, _, address = address.partition(":")
+        way = cast(Way, name)
+    elif scheme == "cot":
+        raise LinkError(f"{text!r} is not {_FORMS['cot']}{_meant(text)}")
     host, _, port = address.rpartition(":")
     if scheme not in schemes or not host or not _NUMBER.fullmatch(port):
         raise LinkError(f"{text!r} is not {_forms(schemes)}{_meant(text)}")
@@ -134,6 +141,8 @@ def _meant(text: str) -> str:
         return f"; did you mean serial:{text}:57600?"
     if scheme in _HTTP_PORTS and address.rpartition("/")[2] == "aircraft.json":
         return f"; did you mean readsb:{text}?"
+    if scheme == "cot" and address:
+        return f"; did you mean cot:udp:{address}, which listens, or cot:tcp:{address}?"
     if scheme in ("beast", "dump1090", "adsb"):
         return f"; did you mean readsb:{address or 'HOST:30005'}?"
     if scheme == "udp":

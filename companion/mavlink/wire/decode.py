@@ -10,7 +10,7 @@ import struct
 from collections.abc import Callable
 from typing import Final
 
-from companion.mavlink.wire import accuracy, remote_id
+from companion.mavlink.wire import accuracy, cot_link, remote_id
 from companion.mavlink.wire.transponder import ADSB_VEHICLE, SENDER
 from companion.values import (
     AdsbVehicle,
@@ -227,6 +227,13 @@ def _remote_id(frame: Frame) -> RemoteId | None:
         raise _RefusedError(Reason.MALFORMED, str(why)) from why
 
 
+def _tunnel(frame: Frame) -> Report | None:
+    try:
+        return cot_link.report(frame)
+    except (ValueError, struct.error) as why:
+        raise _RefusedError(Reason.MALFORMED, str(why)) from why
+
+
 _DECODERS: Final[dict[int, Callable[[Frame], Message | None]]] = {
     HEARTBEAT: _heartbeat,
     SYSTEM_TIME: _system_time,
@@ -234,6 +241,7 @@ _DECODERS: Final[dict[int, Callable[[Frame], Message | None]]] = {
     ATTITUDE: _attitude,
     GLOBAL_POSITION_INT: _global_position_int,
     ADSB_VEHICLE: _adsb_vehicle,
+    cot_link.TUNNEL: _tunnel,
     **dict.fromkeys(remote_id.READ, _remote_id),
 }
 DECODED: Final = frozenset(_DECODERS)

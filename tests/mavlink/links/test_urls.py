@@ -28,6 +28,8 @@ from companion.mavlink.links.urls import SCHEMES, LinkError, LinkUrl, parse_link
         ("rid:10.0.0.7:9000", "rid", "10.0.0.7", 9000),
         ("rid:udp:0.0.0.0:32001", "rid", "0.0.0.0", 32001),
         ("rid:udp:[::]:0", "rid", "::", 0),
+        ("cot:udp:239.2.3.1:6969", "cot", "239.2.3.1", 6969),
+        ("cot:tcp:tak.lan:8087", "cot", "tak.lan", 8087),
         ("readsb:https://[::1]:8443/a?b=c", "readsb", "::1", 8443),
         ("serial:/dev/ttyAMA0:921600", "serial", "/dev/ttyAMA0", 921600),
         ("serial:/dev/serial/by-path/a:0-b:57600", "serial", "/dev/serial/by-path/a:0-b", 57600),
@@ -88,6 +90,10 @@ def test_an_address_is_read_and_written_alike(text: str, scheme: str, host: str,
         "rid:tls:radar.lan:1",
         "rid:udp:radar.lan",
         "rid:radar.lan:0",
+        "cot:tak.lan:8087",
+        "cot:ssl:tak.lan:8089",
+        "cot:tcp:tak.lan:0",
+        "cot:",
     ],
 )
 def test_a_bad_address_is_one_line_that_names_it(text: str) -> None:
@@ -105,6 +111,7 @@ def test_a_bad_address_is_one_line_that_names_it(text: str) -> None:
         ("readsb:radar.lan", "readsb:radar.lan:30005?"),
         ("sbs:radar.lan", "sbs:radar.lan:30003?"),
         ("reedsb:radar.lan:30005", "readsb:?"),
+        ("cot:tak.lan:8087", "cot:udp:tak.lan:8087, which listens, or cot:tcp:tak.lan:8087?"),
     ],
 )
 def test_what_was_likely_meant_is_said(text: str, meant: str) -> None:

@@ -515,4 +515,4 @@ def test_armed_is_one_bit(base_mode: int, armed: bool) -> None:
 
 def test_other_messages_are_nobodys() -> None:
     assert decode(sent(dialect.MAVLink_ping_message(1, 2, 3, 4))) is None
-    assert {0, 2, 24, 30, 33, 246} | REMOTE_ID == DECODED
+    assert {0, 2, 24, 30, 33, 246, 385} | REMOTE_ID == DECODED

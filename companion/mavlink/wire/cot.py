@@ -1,0 +1,197 @@
+"""Cursor on Target: an event's fields, from XML and from TAK's protobuf, and from nothing else.
+
+Sources: the schema ``Event.xsd`` of MITRE (MP090284) for the fields: ``ce`` and ``le`` are standard
+deviations in metres where they are errors, 9999999 where they are unknown, as is ``hae``; and
+``takproto`` (https://github.com/snstac/takproto) for the protobuf of TAK's protocol, version 1.
+No document type, and so no entity, is read.
+"""
+
+import math
+import re
+import struct
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from typing import Any, Final, NamedTuple
+from xml.parsers import expat
+
+DEPTH_MAX: Final = 32
+"""Elements within one another that are read."""
+UNKNOWN: Final = 9_999_999.0
+OWN: Final = "uav-companion-beams."
+"""What the ids begin with of events that this program says of others."""
+_TIME_MAX_MS: Final = 1 << 48
+_AIR: Final = re.compile(r"a-[a-zA-Z.]-A(-.*)?")
+
+
+class CotEvent(NamedTuple):
+    """An event: who, of which type, how it is known, when (Unix, ms), where, and how it moves.
+
+    ``ce_m`` and ``le_m`` are standard deviations; what is unknown is None.
+    """
+
+    uid: str
+    kind: str
+    how: str
+    time_ms: int
+    lat_deg: float
+    lon_deg: float
+    hae_m: float | None
+    ce_m: float | None
+    le_m: float | None
+    course_deg: float | None = None
+    speed_mps: float | None = None
+    slope_deg: float | None = None
+
+    @property
+    def is_aircraft(self) -> bool:
+        """Whether it is the place of something that flies (type a-?-A)."""
+        return _AIR.fullmatch(self.kind) is not None
+
+
+def from_xml(text: bytes) -> CotEvent:
+    """Read one event. Raises ``ValueError``."""
+    found: dict[str, dict[str, str]] = {}
+    depth = 0
+
+    def begun(name: str, attributes: dict[str, str]) -> None:
+        nonlocal depth
+        depth += 1
+        if depth > DEPTH_MAX:
+            raise ValueError(f"more than {DEPTH_MAX} elements within one another")
+        if name in ("event", "point", "track"):
+            found.setdefault(name, attributes)
+
+    def ended(_: str) -> None:
+        nonlocal depth
+        depth -= 1
+
+    def refused(*_: Any) -> None:
+        raise ValueError("a document type")
+
+    parser = expat.ParserCreate("utf-8")
+    parser.StartElementHandler, parser.EndElementHandler = begun, ended
+    parser.StartDoctypeDeclHandler = refused
+    try:
+        parser.Parse(text, True)
+    except expat.ExpatError as error:
+        raise ValueError(f"no XML: {error}") from error
+    event, point = found.get("event", {}), found.get("point", {})
+    track = found.get("track", {})
+    try:
+        time_ms = _time_ms(event["time"])
+        names = event["uid"], event["type"], event.get("how", "")
+        place = [float(point[key]) for key in ("lat", "lon", "hae", "ce", "le")]
+        motion = [_optional(track.get(key)) for key in ("course", "speed", "slope")]
+    except KeyError as missing:
+        raise ValueError(f"no {missing.args[0]}") from missing
+    return _checked(*names, time_ms, place, motion)
+
+
+def _time_ms(text: str) -> int:
+    at = datetime.fromisoformat(text)
+    return round((at if at.tzinfo else at.replace(tzinfo=UTC)).timestamp() * 1e3)
+
+
+def _optional(text: str | None) -> float:
+    return math.nan if text is None else float(text)
+
+
+def _checked(
+    uid: str, kind: str, how: str, time_ms: int, place: list[float], motion: list[float]
+) -> CotEvent:
+    lat_deg, lon_deg, hae_m, ce_m, le_m = place
+    course_deg, speed_mps, slope_deg = motion
+    if not 0 <= time_ms < _TIME_MAX_MS:
+        raise ValueError(f"time {time_ms} ms")
+    if not uid:
+        raise ValueError("no uid")
+    if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
+        raise ValueError(f"latitude {lat_deg}, longitude {lon_deg}")
+    return CotEvent(
+        uid,
+        kind,
+        how,
+        time_ms,
+        lat_deg,
+        lon_deg,
+        hae_m if -12_000 < hae_m < 100_000 else None,
+        ce_m if 0 < ce_m < UNKNOWN else None,
+        le_m if 0 < le_m < UNKNOWN else None,
+        course_deg if 0 <= course_deg <= 360 else None,
+        speed_mps if 0 <= speed_mps < 1000 else None,
+        slope_deg if -90 < slope_deg < 90 else None,
+    )
+
+
+# --- TAK's protobuf -----------------------------------------------------------------------------
+
+
+def from_protobuf(message: bytes) -> CotEvent | None:
+    """Read a TakMessage; None for one without an event. Raises ``ValueError``."""
+    body = dict(_fields(message)).get(2)
+    if body is None:
+        return None
+    event = dict(_fields(_bytes(body)))
+    detail = dict(_fields(_bytes(event.get(15, b""))))
+    track = dict(_fields(_bytes(detail.get(7, b""))))
+    place = [_double(event.get(number, 0.0)) for number in range(10, 15)]
+    # What is left out of a message is zero: a whole track is left out where there is none.
+    absent = 0.0 if 7 in detail else math.nan
+    motion = [_double(track.get(number, absent)) for number in (2, 1)]
+    names = [_bytes(event.get(number, b"")).decode("utf-8") for number in (5, 1, 9)]
+    time_ms = event.get(6)
+    if not isinstance(time_ms, int):
+        raise ValueError("no time")
+    uid, kind, how = names
+    return _checked(uid, kind, how, time_ms, place, [*motion, math.nan])
+
+
+def _fields(message: bytes) -> Iterator[tuple[int, int | float | bytes]]:
+    """Fields by number (https://protobuf.dev/programming-guides/encoding/), in their order."""
+    at = 0
+    while at < len(message):
+        tag, at = varint(message, at)
+        match tag & 7:
+            case 0:
+                value, at = varint(message, at)
+                yield tag >> 3, value
+            case 1:
+                yield tag >> 3, *struct.unpack_from("<d", _span(message, at, 8))
+                at += 8
+            case 2:
+                size, at = varint(message, at)
+                yield tag >> 3, _span(message, at, size)
+                at += size
+            case 5:
+                _span(message, at, 4)
+                at += 4
+            case _:
+                raise ValueError("no protobuf")
+
+
+def varint(message: bytes, at: int) -> tuple[int, int]:
+    """A number of variable length, and the place behind it. Raises ``ValueError``."""
+    value = 0
+    for number, byte in enumerate(message[at : at + 10]):
+        value |= (byte & 0x7F) << 7 * number
+        if byte < 0x80:
+            return value, at + number + 1
+    raise ValueError("a number without an end")
+
+
+def _span(message: bytes, at: int, size: int) -> bytes:
+    if at + size > len(message):
+        raise ValueError("a field beyond the end")
+    return message[at : at + size]
+
+
+def _bytes(value: object) -> bytes:
+    if not isinstance(value, bytes):
+        raise ValueError("a number in place of text")
+    return value
+
+
+def _double(value: object) -> float:
+    if not isinstance(value, float):
+        raise ValueError("no number where one should be")
+    return value

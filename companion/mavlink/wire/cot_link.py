@@ -1,0 +1,212 @@
+"""Events of Cursor on Target on a link, and the TUNNEL that carries each from there on.
+
+MAVLink has no message for what an event says: a name of any length, errors in metres. A TUNNEL
+with a payload of a vendor's kind (https://mavlink.io/en/messages/common.html#TUNNEL) is what it has
+for the like, so events are recorded, replayed and shown as any frame. ``decode`` reads those of
+``SENDER`` alone.
+
+Peers send XML, one event after the other, or TAK's protocol, version 1: 0xbf, the length, a message
+(a stream), or 0xbf 0x01 0xbf and a message (a datagram).
+"""
+
+import hashlib
+import math
+import re
+import struct
+from typing import Final
+
+from companion.mavlink.wire.cot import OWN, CotEvent, from_protobuf, from_xml, varint
+from companion.mavlink.wire.encode import Outgoing, pack
+from companion.values import (
+    Accuracy,
+    AltitudeDatum,
+    Frame,
+    Reason,
+    Rejection,
+    Report,
+    Source,
+)
+
+TUNNEL: Final = 385
+SENDER: Final = Source(0, 25)
+"""Who says it: no system, MAV_COMP_ID_USER1."""
+EVENT_MAX: Final = 16 << 10
+"""Bytes of an event at most; a longer one is garbage."""
+_KIND: Final = 0xC07A
+_EVENT = struct.Struct("<Qii6f")
+_HEAD = struct.Struct("<HBBB")
+_MAGIC: Final = 0xBF
+_BEGIN: Final = re.compile(rb"<event[\s>]|\xbf")
+_END: Final = re.compile(rb"</event\s*>")
+_PLAIN: Final = re.compile(r"[A-Za-z0-9._-]{1,60}")
+
+
+class CotSplitter:
+    """Turns the bytes of one peer into frames; ``feed`` and ``finish`` as ``Splitter``'s."""
+
+    def __init__(self, link: str) -> None:
+        self.link = link
+        self._pending = b""
+        self._seq = 0
+
+    def feed(self, t_ns: int, data: bytes) -> list[Frame | Rejection]:
+        """Take in bytes that arrived at ``t_ns``; returns what the events in them say."""
+        data, at, garbage = self._pending + data, 0, 0
+        out: list[Frame | Rejection] = []
+        while True:
+            begun = _BEGIN.search(data, at)
+            if begun is None:
+                keep = _beginning(data, at)
+                garbage += _stray(data[at : len(data) - keep])
+                at = len(data) - keep
+                break
+            garbage += _stray(data[at : begun.start()])
+            at = begun.start()
+            end = _tak_end(data, at) if data[at] == _MAGIC else _xml_end(data, at)
+            if end is None and len(data) - at <= EVENT_MAX:
+                break
+            if end is None or end - at > EVENT_MAX:
+                beyond = at + 1 if data[at] == _MAGIC else end or len(data)
+                garbage += beyond - at
+                at = beyond
+                continue
+            out += self._event(t_ns, data[at:end])
+            at = end
+        self._pending = data[at:]
+        if garbage:
+            out.append(Rejection(t_ns, self.link, Reason.GARBAGE, garbage))
+        return out
+
+    def finish(self, t_ns: int) -> list[Frame | Rejection]:
+        """End the stream: an event that has no end is given up."""
+        stray, self._pending = len(self._pending), b""
+        return [Rejection(t_ns, self.link, Reason.GARBAGE, stray)] if stray else []
+
+    def _event(self, t_ns: int, raw: bytes) -> list[Frame | Rejection]:
+        try:
+            event = _tak(raw) if raw[0] == _MAGIC else from_xml(raw)
+        except (ValueError, OverflowError) as why:
+            detail = str(why)[:80]
+            return [Rejection(t_ns, self.link, Reason.MALFORMED, detail=detail)]
+        if event is None:
+            return []
+        unfit = _unfit(event)
+        if unfit:
+            return [Rejection(t_ns, self.link, Reason.UNKNOWN_MESSAGE, detail=unfit)]
+        if event.hae_m is None:
+            return [Rejection(t_ns, f"cot:{_name(event.uid)}", Reason.NO_ALTITUDE)]
+        frame = Frame(t_ns, self.link, SENDER, TUNNEL, pack(_outgoing(event), self._seq))
+        self._seq = (self._seq + 1) & 0xFF
+        return [frame]
+
+
+def _unfit(event: CotEvent) -> str:
+    """Why an event is not used; empty where it is."""
+    if not event.is_aircraft:
+        return "no aircraft"
+    if event.how.startswith("h"):
+        return "placed by hand"
+    return "what a companion made of it" if event.uid.startswith(OWN) else ""
+
+
+def _stray(data: bytes) -> int:
+    """Bytes between events that are none of XML's own: its declaration, and blanks."""
+    return len(re.sub(rb"<\?xml[^>]*\?>|\s", b"", data))
+
+
+def _beginning(data: bytes, at: int) -> int:
+    """Bytes at the end that may be the beginning of an event or of a declaration."""
+    opened = data.rfind(b"<", max(at, len(data) - 200))
+    return 0 if opened < 0 or b">" in data[opened:] else len(data) - opened
+
+
+def _xml_end(data: bytes, at: int) -> int | None:
+    found = _END.search(data, at)
+    return found.end() if found else None
+
+
+def _tak_end(data: bytes, at: int) -> int | None:
+    """The place behind a message of TAK's; None where it is not all there.
+
+    A datagram has no length: its message is what there is.
+    """
+    if data[at + 1 : at + 3] == b"\x01\xbf":
+        return len(data)
+    if len(data) < at + 3:
+        return None
+    try:
+        size, start = varint(data, at + 1)
+    except ValueError:
+        return None
+    return start + size if start + size <= len(data) or size > EVENT_MAX else None
+
+
+def _tak(raw: bytes) -> CotEvent | None:
+    if raw[1:3] == b"\x01\xbf":
+        return from_protobuf(raw[3:])
+    return from_protobuf(raw[varint(raw, 1)[1] :])
+
+
+def _name(uid: str) -> str:
+    """An id that may stand in an address; of another one a part, and what tells it apart."""
+    if _PLAIN.fullmatch(uid):
+        return uid
+    short = re.sub(r"[^A-Za-z0-9._-]", "_", uid)[:40]
+    return f"{short}-{hashlib.sha256(uid.encode('utf-8', 'replace')).hexdigest()[:8]}"
+
+
+def _outgoing(event: CotEvent) -> Outgoing:
+    unknown = math.nan
+    numbers = (event.hae_m, event.ce_m, event.le_m)
+    motion = (event.course_deg, event.speed_mps, event.slope_deg)
+    body = _EVENT.pack(
+        event.time_ms,
+        round(event.lat_deg * 1e7),
+        round(event.lon_deg * 1e7),
+        *(unknown if one is None else one for one in (*numbers, *motion)),
+    ) + _name(event.uid).encode("ascii")
+    head = _HEAD.pack(_KIND, 0, 0, len(body))
+    return Outgoing(SENDER, TUNNEL, head + body.ljust(128, b"\0"))
+
+
+def report(frame: Frame) -> Report | None:
+    """The report that a TUNNEL of ``SENDER`` carries; None of any other. Raises ``ValueError``."""
+    if frame.source != SENDER:
+        return None
+    payload = frame.payload.ljust(_HEAD.size + 128, b"\0")
+    kind, _, _, size = _HEAD.unpack_from(payload)
+    if kind != _KIND:
+        return None
+    body = payload[_HEAD.size : _HEAD.size + size]
+    name = body[_EVENT.size :].decode("ascii", "replace")
+    if not _PLAIN.fullmatch(name):
+        raise ValueError("no name")
+    time_ms, lat, lon, *numbers = _EVENT.unpack_from(body)
+    hae_m, ce_m, le_m, course_deg, speed_mps, slope_deg = (
+        None if math.isnan(one) else one for one in numbers
+    )
+    if hae_m is None or abs(lat) > 900_000_000 or abs(lon) > 1_800_000_000:
+        raise ValueError("no place")
+    velocity = down = None
+    if course_deg is not None and speed_mps is not None:
+        course = math.radians(course_deg)
+        velocity = (speed_mps * math.cos(course), speed_mps * math.sin(course))
+        if slope_deg is not None:
+            down = -speed_mps * math.tan(math.radians(slope_deg))
+    return Report(
+        t_ns=frame.t_ns,
+        link=frame.link,
+        uav=f"cot:{name}",
+        source=frame.source,
+        lat_deg=lat * 1e-7,
+        lon_deg=lon * 1e-7,
+        alt_m=hae_m,
+        alt_datum=AltitudeDatum.GEOMETRIC,
+        relative_alt_m=None,
+        velocity_ne_mps=velocity,
+        velocity_down_mps=down,
+        heading_deg=course_deg,
+        boot_ms=time_ms & 0xFFFF_FFFF,
+        tslc_s=None,
+        accuracy=Accuracy(ce_m, le_m),
+    )

@@ -235,6 +235,8 @@ function planMessage(view, link, now) {
 
 function showPlan(view, link, now) {
   if (format.known(view.carrier?.lat_deg)) ground.place = view.carrier;
+  const message = planMessage(view, link, now);
+  $("legend").toggleAttribute("data-raised", Boolean(message)); // above it
   plan.show({
     uavs: view.uavs,
     beams: view.beams,
@@ -242,7 +244,7 @@ function showPlan(view, link, now) {
     carrier: view.carrier,
     uavsLive: believed(feeds.uavs, link, now),
     beamsLive: believed(feeds.beams, link, now),
-    message: planMessage(view, link, now),
+    message,
     isPast: !timebar.isLive,
     selected,
     at: view.at,

@@ -134,7 +134,10 @@ def _beams(
     natural_rad = array.wavelength_m / max(float(shapes.aperture(array).lengths_m.max()), 1e-9)
     shaped = steady.followed_rad(before, valid_at_ns, uavs, np.array(wanted), natural_rad)
     spread = widening.spread(
-        array, directions, Uncertain(shaped[:, 0], shaped[:, 1], precoder.floor_db), precoder.widen
+        array,
+        directions,
+        Uncertain(shaped[:, 0], shaped[:, 1], precoder.floor_db, precoder.worth_db),
+        precoder.widen,
     )
     matrix = steering.steering_matrix(array, directions) if spread is None else spread.centres
     worths = np.array([precoder.rate_weights.get(uav, 1.0) for uav in uavs])

@@ -1,6 +1,7 @@
 """Builds the parts of the pipeline from the settings."""
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -31,6 +32,9 @@ from companion.values import (
     ReportNoise,
     UserError,
 )
+
+FLOOR_SPARE_DB: Final = 2.7
+"""How much more than the link needs the floor of a likely beam is, unless it is given."""
 
 
 def array(settings: Settings) -> geometry.Array:
@@ -140,6 +144,7 @@ def precoder(settings: Settings) -> Precoder:
     """The method of making weights."""
     given = settings.beams
     budget, antennas = radio(settings)
+    worth_db = 0.0 if settings.link.needed_sinr_db is not None else settings.link.needed_db
     return Precoder(
         given.method,
         given.policy,
@@ -149,11 +154,12 @@ def precoder(settings: Settings) -> Precoder:
         given.normalisation,
         given.priority,
         given.widen,
-        given.floor_db,
+        worth_db + FLOOR_SPARE_DB if given.floor_db is None else given.floor_db,
         given.power,
         given.rate_weights,
         budget,
         antennas,
+        worth_db,
     )
 
 

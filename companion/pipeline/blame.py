@@ -25,12 +25,14 @@ SILENT_INTERVALS: Final = 3.0
 class Evidence:
     """What is known of a UAV beside its track.
 
-    clock_assumed  the constant part of its latency is only assumed
-    refused        why its newest reports were not used; None where they were
+    clock_assumed       the constant part of its latency is only assumed
+    refused             why its newest reports were not used; None where they were
+    attitude_bound_rad  what the carrier's attitudes may be off when they are made
     """
 
     clock_assumed: bool
     refused: Reason | None
+    attitude_bound_rad: float = 0.0
 
 
 def of_left_out(out: LeftOut, track: Track, unfit: str | None) -> Blame:
@@ -60,10 +62,13 @@ def of_beam(
     seen_rad = math.asin(min(1.0, (track.bound_m + carrier.bound_m) / max(beam.range_m, 1e-9)))
     if carrier.attitude_bound_rad > seen_rad:
         known = f"{math.degrees(carrier.attitude_bound_rad):.0f}°"
+        aged_rad = carrier.attitude_bound_rad - evidence.attitude_bound_rad
         return Blame(
             Cause.CARRIER,
             f"the carrier's attitude is only known to {known}",
-            "ask the carrier for ATTITUDE at 10 Hz or more ([presence] attitude_hz)",
+            "ask the carrier for ATTITUDE at 10 Hz or more ([presence] attitude_hz)"
+            if aged_rad > evidence.attitude_bound_rad / 2
+            else "give it a better compass, and say so ([center] attitude_bound_deg)",
         )
     return _far_off(beam, track, carrier, evidence)
 

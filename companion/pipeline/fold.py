@@ -11,6 +11,7 @@ and a relayed aircraft's report also goes to ``targets``, which returns nothing.
 ``fleet`` for the tracks that ``targets`` wants and ``center`` for the array, and aims the beams.
 """
 
+import math
 from collections import Counter
 from collections.abc import Iterable
 from typing import Final
@@ -191,7 +192,8 @@ class Pipeline:
     def _evidence(self, uav: str) -> Evidence:
         clock = self.clock_estimate(uav)
         assumed = clock is not None and clock.guarantee is Guarantee.ASSUMED
-        return Evidence(assumed, self.refusals.unheard(uav))
+        attitude_bound_rad = math.radians(self.settings.center.attitude_bound_deg)
+        return Evidence(assumed, self.refusals.unheard(uav), attitude_bound_rad)
 
     def _drop_silent(self, now_ns: int) -> list[Notice]:
         """Drop tracks that have been silent for long, so that they take no more memory or time."""

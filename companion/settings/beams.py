@@ -113,7 +113,8 @@ class BeamSettings(Section):
                            gain within it; "no", sharp. Earlier settings' true is "guarantee", their
                            false "no"
         floor_db           that floor, over an isotropic element, where it leaves 3 dB to the best;
-                           it is given up as it is further out of reach
+                           it is given up as it is further out of reach. Unset: 2.7 more than the
+                           link needs ([link] needed_db), of which nulls may take most
         power              how beams share the power: "equal", "max-min" (the least SINR is the
                            greatest), "weighted-sum" (of rates); unset: as the normalisation makes
                            them. With it the normalisation is "total" unless it is "antenna"
@@ -134,7 +135,7 @@ class BeamSettings(Section):
     normalisation: Normalisation = Normalisation.UNIT_RESPONSE
     priority: Annotated[tuple[str, ...], AfterValidator(_once)] = ()
     widen: Annotated[Widen, BeforeValidator(_named_width)] = Widen.LIKELY
-    floor_db: Annotated[float, Field(ge=-60, le=60)] = 2.7
+    floor_db: Annotated[float, Field(ge=-60, le=60)] | None = None
     power: Power | None = None
     rate_weights: dict[str, Annotated[float, Field(gt=0, le=1e6)]] = Field(default_factory=dict)
 

@@ -62,6 +62,11 @@ def test_an_assumed_clock_is_helped_by_timesync() -> None:
 def test_the_carrier_is_to_blame_for_its_attitude_and_its_position() -> None:
     turned = blamed(carrier=replace(CARRIER, attitude_bound_rad=0.2))
     assert turned[:2] == (Cause.CARRIER, "the carrier's attitude is only known to 11°")
+    assert "10 Hz" in turned[2]
+    as_given = replace(FINE, attitude_bound_rad=0.18)
+    compass = blamed(carrier=replace(CARRIER, attitude_bound_rad=0.2), evidence=as_given)
+    assert compass[:2] == turned[:2]
+    assert "compass" in compass[2]
     placed = blamed(carrier=replace(CARRIER, bound_m=8.0))
     assert placed[:2] == (Cause.CARRIER, "the carrier's own position is only known to 8 m")
 

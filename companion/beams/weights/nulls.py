@@ -14,9 +14,9 @@ allowed by
   and outside so much less of it as the null is further from the cone.
 
 At last all of it is taken back by one factor for each beam until the least gain over its cone, and
-over the likely part of it, has lost no more than ``FLOOR_PRICE_DB``, nor what was above isotropic
-fallen below it. A least gain that is below isotropic anyway is worth little, and the nulls may have
-it. All of this follows the directions without a step. See docs/math.md 5.5.
+over the likely part of it, has lost no more than ``FLOOR_PRICE_DB``, nor what the link needs fallen
+below that. A least gain of less than the link needs is worth little, and left to the nulls. All of
+this follows the directions without a step. See docs/math.md 5.5.
 """
 
 from typing import Final, NamedTuple
@@ -34,7 +34,7 @@ FLOOR_PRICE_DB: Final = 2.5
 Between these places it may be half a decibel more, and rarely more than that.
 """
 ABOVE: Final = 1.15
-"""Least gain that is kept if it was there: above isotropic, as it is less between the places."""
+"""Least gain that is kept if it was there, over what is worth keeping: places are samples."""
 GIVEN_UP: Final = 8.0
 """Power of the share of ``ABOVE`` that a lesser least gain is, to which it may fall."""
 NOTHING: Final = 1e-9
@@ -68,7 +68,9 @@ def nulled(spread: Spread, noise: FloatArray | None = None, exact: bool = False)
     fields = spread.cones.fields(spread.beams)[places.rows, places.columns]
     power = _power(spread.beams)
     gains = _squared(fields) / power[places.rows]
-    kept, inner = (_kept(places.least(gains, inside)) for inside in (places.held, places.likely))
+    kept, inner = (
+        _kept(places.least(gains, inside), spread.worth) for inside in (places.held, places.likely)
+    )
     shares = _shares(spread, kept, power)
     if exact:
         shares[::each] = 1.0
@@ -125,10 +127,11 @@ def _power(columns: ComplexArray) -> FloatArray:
     return power
 
 
-def _kept(least: FloatArray) -> FloatArray:
+def _kept(least: FloatArray, worth: float) -> FloatArray:
     """The least gains that nulls must leave."""
-    lowered = np.maximum(least * 10 ** (-FLOOR_PRICE_DB / 10), ABOVE)
-    lowered *= np.minimum(least / ABOVE, 1.0) ** GIVEN_UP
+    wanted = ABOVE * worth
+    lowered = np.maximum(least * 10 ** (-FLOOR_PRICE_DB / 10), wanted)
+    lowered *= np.minimum(least / wanted, 1.0) ** GIVEN_UP
     kept: FloatArray = np.maximum(lowered, NOTHING)
     return kept
 

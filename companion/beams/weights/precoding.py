@@ -60,6 +60,7 @@ class Precoder:
     rate_weights     worth of each UAV's rate where their weighted sum counts, by name; else 1
     budget           power and noise of the radio
     uav_antennas     antennas that each UAV combines
+    worth_db         gain from which on a guarantee is worth something
     """
 
     method: Method = Method.ZERO_FORCING
@@ -75,6 +76,7 @@ class Precoder:
     rate_weights: Mapping[str, float] = field(default_factory=dict)
     budget: LinkBudget = field(default_factory=lambda: LinkBudget(20.0, 50e6, 7.0))
     uav_antennas: int = 4
+    worth_db: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,9 @@ CORNERS: Final = np.indices((2, 2, 2)).reshape(3, 8).T
 MOST: Final = 0.375
 """Widest beam in natural widths for each element: beyond it they are too far apart to shape one."""
 GIVEN_UP: Final = 2.0
-"""Loss in dB that is accepted for each dB by which a floor is out of reach, and worth less."""
+"""Loss in dB that is accepted for each dB by which a floor is too low to be worth something."""
+SPARE_DB: Final = 2.5
+"""How far above what is worth something a floor has to be: nulls and places between take some."""
 LEAST_SHARE: Final = 1 / 16
 """Least ratio of the widths on the two axes of a plane that its shapes follow."""
 
@@ -128,7 +130,11 @@ def aperture(array: Array) -> Aperture:
 
 
 def phases_rad(
-    across: Aperture, cones: FloatArray, likely: FloatArray | None, floor_db: float = 0.0
+    across: Aperture,
+    cones: FloatArray,
+    likely: FloatArray | None,
+    floor_db: float = 0.0,
+    worth_db: float = 0.0,
 ) -> FloatArray:
     """Phases (N, M) of N beams.
 
@@ -137,7 +143,8 @@ def phases_rad(
         likely    (N, D), widths that it likely is off; None: only the cone counts
         floor_db  least gain over the cone that is wanted beside a likely width, over an isotropic
                   element; it is kept where it leaves the least of ``losses`` to the best that there
-                  is, and given up as it is further out of reach
+                  is
+        worth_db  least gain that is worth a floor: what is not above it is given up
 
     They follow all of it without a step, to 0 where the widths are 0.
     """
@@ -148,9 +155,10 @@ def phases_rad(
         psi = _sure(shapes, width)
     else:
         best_db = np.interp(np.log(np.maximum(width, 1e-9)), shapes.widths, shapes.least_db)
-        loss_db = best_db + 10 * math.log10(len(across.placed)) - floor_db
+        best_db += 10 * math.log10(len(across.placed))
         least_db = math.exp(shapes.losses[0])
-        loss_db = np.where(loss_db < least_db, least_db + GIVEN_UP * (least_db - loss_db), loss_db)
+        lacking_db = np.maximum(worth_db + SPARE_DB + least_db - best_db, 0.0)
+        loss_db = np.maximum(best_db - floor_db, least_db) + GIVEN_UP * lacking_db
         psi = _likely(shapes, width, np.minimum(likely, cones).max(axis=1), loss_db)
     if len(across.axes) == 1:
         found = psi @ across.knots

@@ -34,11 +34,13 @@ class Uncertain:
     likely_rad  (N,), the angle within which the UAV usually is
     bounds_rad  (N,), that within which it surely is; 0: no such angle counts
     floor_db    least gain that a likely beam keeps within the bound, where it can
+    worth_db    least gain that is worth keeping
     """
 
     likely_rad: FloatArray
     bounds_rad: FloatArray
     floor_db: float = 2.7
+    worth_db: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +55,7 @@ class Spread:
     reached    (N K, N), what the beams radiate to the points
     outside    (N K, N), how far each point is outside each user's cone, in natural widths; 0 within
     cones      where the least gain of each beam is looked for
+    worth      least gain that is worth keeping
     """
 
     beams: ComplexArray
@@ -62,6 +65,7 @@ class Spread:
     reached: ComplexArray
     outside: FloatArray
     cones: Cones
+    worth: float
 
     @property
     def each(self) -> int:
@@ -86,6 +90,7 @@ class Spread:
             self.reached[np.ix_(rows, users)],
             self.outside[np.ix_(rows, users)],
             self.cones.of(users),
+            self.worth,
         )
 
 
@@ -102,8 +107,10 @@ def spread(array: Array, directions: FloatArray, known: Uncertain, widen: Widen)
     around = around.reshape(-1, 3)
     points = steering_matrix(array, around)
     if widen is Widen.LIKELY:
-        wide = [seen.furthest * across.lengths_m / array.wavelength_m for seen in (held, likely)]
-        phases = shapes.phases_rad(across, wide[0], wide[1], known.floor_db)
+        cone, usual = (
+            seen.furthest * across.lengths_m / array.wavelength_m for seen in (held, likely)
+        )
+        phases = shapes.phases_rad(across, cone, usual, known.floor_db, known.worth_db)
     else:
         phases = _for_the_bound_rad(array, across, held)
     turned = np.exp(1j * phases.T)
@@ -116,6 +123,7 @@ def spread(array: Array, directions: FloatArray, known: Uncertain, widen: Widen)
         points.T @ beams,
         cones.outside(across, held, around, array.wavelength_m),
         cones.cones(array, across, directions, held, likely),
+        10 ** (known.worth_db / 10),
     )
 
 

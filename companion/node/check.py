@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Final
 
+from companion.mavlink.links.status import LinkStatus
+from companion.mavlink.links.urls import MAVLINK
 from companion.node import machine
 from companion.node.machine import Finding, Grade
 from companion.node.service import Service
@@ -26,6 +28,13 @@ BUSY: Final = 0.3
 """Share of the time between updates that beams may take before that is worth a thought."""
 NOISY: Final = 0.01
 """Share of frames with a wrong checksum from which on a link is noisy."""
+SAYS: Final = {
+    "sbs": "BaseStation lines (30003)",
+    "readsb": "Beast (30005), or aircraft.json",
+    "rid": "Remote ID in JSON",
+    "cot": "Cursor on Target",
+}
+"""What receivers of other kinds than MAVLink say, by the scheme of their links."""
 SOME: Final = 8
 """Most vehicles that a line names."""
 
@@ -105,7 +114,10 @@ def _links(service: Service) -> Iterator[Finding]:
         subject, heard = f"link {link.url}", sorted(map(str, link.components))
         bad = link.lost.get(str(Reason.BAD_CRC), 0)
         said = f"{link.frames} frames of {', '.join(heard[:SOME]) or 'nobody'}"
-        if link.frames == 0 and link.bytes > 0:
+        scheme = link.url.partition(":")[0]
+        if scheme not in MAVLINK and link.frames == 0 and link.bytes > 0:
+            yield _not_understood(subject, scheme, link)
+        elif link.frames == 0 and link.bytes > 0:
             remedy = "another baud rate? signed with another key? not MAVLink at all?"
             yield Finding(
                 subject, Grade.FAULT, f"{link.bytes} bytes, and no MAVLink in them", remedy
@@ -120,7 +132,18 @@ def _links(service: Service) -> Iterator[Finding]:
             yield Finding(subject, Grade.OK, said)
 
 
+def _not_understood(subject: str, scheme: str, link: LinkStatus) -> Finding:
+    """A receiver of another kind that sent bytes, and no position of anybody."""
+    refused = ", ".join(f"{count} {reason}" for reason, count in link.lost.items())
+    if not refused:
+        return Finding(subject, Grade.DOUBT, f"{link.bytes} bytes, and no aircraft in them yet")
+    said = f"{link.bytes} bytes, and nothing of use in them ({refused})"
+    return Finding(subject, Grade.FAULT, said, f"is this the port that says {SAYS[scheme]}?")
+
+
 def _silent(url: str) -> str:
+    if url.startswith(("rid:udp", "cot:udp")):
+        return f"does anybody send {SAYS[url.partition(':')[0]]} here?"
     if url.startswith(("udpin", "tcpin")):
         port = url.rpartition(":")[2]
         return f"does anybody send here? MAVProxy: --out udp:THIS_MACHINE:{port}"

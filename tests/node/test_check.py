@@ -4,6 +4,7 @@ import json
 import os
 import socket
 import subprocess
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +79,36 @@ def test_silence_and_a_missing_carrier_are_told(tmp_path: Path) -> None:
     assert "MAVProxy" in heard.remedy
     assert found[-1].subject == "carrier"
     assert found[-1].grade is Grade.FAULT
+
+
+@pytest.mark.parametrize(
+    ("said", "grade", "text"),
+    [
+        (b"GET / HTTP/1.1\r\n", Grade.FAULT, "nothing of use in them (16 garbage)"),
+        (b"MSG,8,5,211,4CA2D6,10057,,,,,,,,,,,,,,,,0\r\n", Grade.DOUBT, "no aircraft in them yet"),
+    ],
+)
+def test_a_receiver_that_says_something_else_is_told(said: bytes, grade: Grade, text: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        url = f"sbs:127.0.0.1:{server.getsockname()[1]}"
+        accepted: list[socket.socket] = []
+
+        def speak() -> None:
+            accepted.append(server.accept()[0])
+            accepted[0].sendall(said)
+
+        speaking = threading.Thread(target=speak, daemon=True)
+        speaking.start()
+        settings = Settings().override(
+            links={"urls": [url, "cot:udp:127.0.0.1:0"]}, server={"listen": "127.0.0.1:0"}
+        )
+        found = list(check(settings, 1.0))
+        speaking.join(HANG_S)
+        accepted[0].close()
+    _, judged = (each for each in found if each.subject == f"link {url}")
+    assert judged.grade is grade and text in judged.text
+    (silent,) = (each for each in found if each.text == "heard nothing")
+    assert silent.remedy == "does anybody send Cursor on Target here?"
 
 
 @pytest.mark.full

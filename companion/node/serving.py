@@ -14,6 +14,7 @@ from typing import Any, Final
 import uvicorn
 
 from companion.server.app import create_app
+from companion.server.connections import BoundedProtocol
 from companion.views.state import Node
 
 RATE_WINDOW_S: Final = 2.0
@@ -42,6 +43,7 @@ class Server(uvicorn.Server):
                 app,
                 log_level="warning",
                 lifespan="off",
+                http=BoundedProtocol,
                 access_log=False,
                 ws_max_size=STREAM_TAKES_BYTES,
                 ws_per_message_deflate=False,  # a message is encoded once for all clients

@@ -90,6 +90,56 @@ def bind(listen: str, *, token: str | None, insecure: bool) -> socket.socket:
     return bound
 
 
+def _own_names() -> frozenset[str]:
+    """What this machine is called in its own network; no name of the internet is among them."""
+    name = socket.gethostname().lower().partition(".")[0]
+    return frozenset(("localhost", name, f"{name}.local"))
+
+
+class KnownHosts:
+    """ASGI middleware: requests must name this machine in ``Host``, by address or by a known name.
+
+    A page from anywhere may have its own name resolve to this machine (DNS rebinding) and then read
+    what is served here as if it were its own. Its requests bear that name. Addresses are nobody's
+    name; ``names`` are further ones, as of a reverse proxy. Others are answered with 421, and their
+    WebSockets refused.
+    """
+
+    def __init__(self, app: ASGIApp, names: Collection[str] = ()) -> None:
+        self._app = app
+        self._names = _own_names() | {name.lower() for name in names}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "lifespan" or self._are_known(Headers(scope=scope).getlist("host")):
+            await self._app(scope, receive, send)
+        elif scope["type"] == "websocket":
+            await WebSocket(scope, receive, send).close()  # before it is open: 403
+        else:
+            title = "this name is not known to be of this service: [server] hosts"
+            await problem(421, title)(scope, receive, send)
+
+    def _are_known(self, hosts: list[str]) -> bool:
+        """Whether all are; no browser leaves it out, nor names two."""
+        names = [_host_name(host) for host in hosts]
+        return all(name in self._names or _is_address(name) for name in names)
+
+
+def _host_name(host: str) -> str:
+    """The name or address in a Host header: without port, brackets and the dot of the root."""
+    name = host.strip().lower()
+    if name.startswith("["):
+        return name[1:].partition("]")[0]
+    return name.partition(":")[0].removesuffix(".")
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
 class BearerToken:
     """ASGI middleware: every path needs ``Authorization: Bearer TOKEN``, except ``open_paths``.
 
@@ -116,12 +166,12 @@ class BearerToken:
             await problem(401, title, headers)(scope, receive, send)
 
     def _may(self, scope: Scope) -> bool:
-        given = [Headers(scope=scope).get("authorization", "").encode()]
+        scheme, _, credentials = Headers(scope=scope).get("authorization", "").partition(" ")
+        given = [credentials.strip().encode()] if scheme.lower() == "bearer" else []
         for offered in scope.get("subprotocols", []):
             if offered.startswith(BEARER):
-                given.append(b"Bearer " + _decoded(offered.removeprefix(BEARER)))
-        expected = b"Bearer " + self._token
-        return any(hmac.compare_digest(one, expected) for one in given)
+                given.append(_decoded(offered.removeprefix(BEARER)))
+        return any(hmac.compare_digest(one, self._token) for one in given)
 
 
 def _decoded(text: str) -> bytes:

@@ -12,11 +12,12 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import companion
 from companion.server import area_map, beam_routes, file_routes, models, responses
-from companion.server.access import OPEN_PATHS, BearerToken
+from companion.server.access import OPEN_PATHS, BearerToken, KnownHosts
 from companion.server.metrics import NodeCollector
 from companion.server.responses import answer, answers
 from companion.server.stream import Stream
-from companion.views import link_state, settings, state
+from companion.server.turns import Turns
+from companion.views import link_state, series, settings, state
 from companion.views.design import DesignView
 from companion.views.state import Node
 from companion.views.words import rfc3339
@@ -53,8 +54,9 @@ def create_app(node: Node, token: str | None = None, area: Path | None = None) -
     responses.install(app)
     stream = Stream(node)
     _health_routes(app, node, stream)
-    _state_routes(app, node)
-    beam_routes.add(app, node)
+    turns = Turns()
+    _state_routes(app, node, turns)
+    beam_routes.add(app, node, turns)
     file_routes.add(app, node)
     area_map.add(app, area)
 
@@ -69,7 +71,9 @@ def create_app(node: Node, token: str | None = None, area: Path | None = None) -
     # Not mounted: a mount at / would match before a path whose method is wrong, and hide the 405.
     app.router.default = _Files(StaticFiles(directory=web_directory(), html=True))
     secured: ASGIApp = _Edge(app)
-    return BearerToken(secured, token, OPEN_PATHS | _page_paths()) if token else secured
+    if token:
+        secured = BearerToken(secured, token, OPEN_PATHS | _page_paths())
+    return KnownHosts(secured, node.pipeline.settings.server.hosts)
 
 
 def web_directory() -> Path:
@@ -115,7 +119,7 @@ def _health_routes(app: FastAPI, node: Node, stream: Stream) -> None:
         return Response(generate_latest(registry), media_type="text/plain; version=0.0.4")
 
 
-def _state_routes(app: FastAPI, node: Node) -> None:
+def _state_routes(app: FastAPI, node: Node, turns: Turns) -> None:
     design_view = DesignView(node.pipeline.settings)
 
     @app.get(
@@ -160,10 +164,11 @@ def _state_routes(app: FastAPI, node: Node) -> None:
     @app.get(
         "/v1/history",
         summary="What the charts show, each second of the last five minutes",
-        responses=answers(models.History),
+        responses=answers(models.History, 503),
     )
     async def history() -> Response:
-        return answer(node.series.show(node.now_ns()))
+        samples, now_ns = node.series.samples(), node.now_ns()
+        return await turns.run(lambda: answer(series.show(samples, now_ns)))
 
     @app.get(
         "/v1/settings",

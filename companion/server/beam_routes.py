@@ -1,18 +1,20 @@
 """The routes ``/v1/beams``, ``/v1/beams/weights`` and ``/v1/pattern``, computed when asked for."""
 
 import re
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from fastapi import FastAPI, HTTPException, Query, Request
 from fastapi.responses import Response
-from starlette.concurrency import run_in_threadpool
 
 from companion.server import models
 from companion.server.responses import answer, answers, refusals
+from companion.server.turns import Turns
 from companion.values import Update, UserError
 from companion.views import beam_state, weight_formats
 from companion.views.state import Node
 
+MOST_ANGLES: Final = 20_000
+"""Beams times angles that one answer may hold: more than half a second's work."""
 LeadMs = Annotated[float, Query(ge=0, le=10_000, description="milliseconds ahead of now")]
 Cut = Annotated[
     Literal["azimuth", "elevation"],
@@ -24,8 +26,8 @@ _JSON = {"schema": {"$ref": "#/components/schemas/Weights"}}
 _BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
 
 
-def add(app: FastAPI, node: Node) -> None:
-    """Add the routes to the application."""
+def add(app: FastAPI, node: Node, turns: Turns) -> None:
+    """Add the routes to the application; what they compute is done in ``turns``."""
     pipeline, equipment = node.pipeline, node.equipment
 
     def look(lead_ms: float) -> Update:
@@ -34,12 +36,12 @@ def add(app: FastAPI, node: Node) -> None:
     @app.get(
         "/v1/beams",
         summary="The beams, applied lead_ms from now",
-        responses=answers(models.Beams, 422),
+        responses=answers(models.Beams, 422, 503),
     )
     async def beams(lead_ms: LeadMs = 0.0) -> Response:
         update = look(lead_ms)
-        return answer(
-            await run_in_threadpool(beam_state.beams, pipeline, equipment, update, 0.0, lead_ms)
+        return await turns.run(
+            lambda: answer(beam_state.beams(pipeline, equipment, update, 0.0, lead_ms))
         )
 
     @app.get(
@@ -54,8 +56,8 @@ def add(app: FastAPI, node: Node) -> None:
             raise HTTPException(406, f"weights come as {', '.join(weight_formats.TYPES.values())}")
         beam_set = look(lead_ms).beams
         try:
-            body = await run_in_threadpool(
-                weight_formats.encode, form, beam_set, pipeline.array, equipment, lead_ms
+            body = await turns.run(
+                lambda: weight_formats.encode(form, beam_set, pipeline.array, equipment, lead_ms)
             )
         except UserError as error:  # what the device cannot do, as the beams are now
             raise HTTPException(409, str(error)) from error
@@ -65,7 +67,7 @@ def add(app: FastAPI, node: Node) -> None:
     @app.get(
         "/v1/pattern",
         summary="Array response in dB along a cut through each beam",
-        responses=answers(models.Pattern, 404, 422),
+        responses=answers(models.Pattern, 404, 422, 503),
     )
     async def pattern(
         cut: Cut = "azimuth",
@@ -76,8 +78,11 @@ def add(app: FastAPI, node: Node) -> None:
         update = look(lead_ms)
         if uav is not None and uav not in update.beams.uavs:
             raise HTTPException(404, f"there is no beam on {uav!r}")
-        return answer(
-            await run_in_threadpool(beam_state.pattern, pipeline, update, cut, points, uav, lead_ms)
+        shown = 1 if uav is not None else len(update.beams.uavs)
+        if shown * points > MOST_ANGLES:
+            raise HTTPException(422, f"{shown} beams at {points} angles: say uav, or fewer points")
+        return await turns.run(
+            lambda: answer(beam_state.pattern(pipeline, update, cut, points, uav, lead_ms))
         )
 
 
@@ -85,7 +90,7 @@ def _weight_answers() -> dict[int | str, dict[str, Any]]:
     kinds = dict.fromkeys(weight_formats.TYPES.values(), _BINARY)
     # The model is named for its schema to be in the document; the content says where it applies.
     content = {"model": models.Weights, "content": kinds | {"application/json": _JSON}}
-    return {200: content} | refusals(406, 409, 422)
+    return {200: content} | refusals(406, 409, 422, 503)
 
 
 def accepted(accept: str) -> str | None:

@@ -23,6 +23,7 @@ _MEANINGS: Final = {
     406: "It does not come in any form that is accepted",
     409: "Not as things are now; the title says why",
     416: "The file is shorter",
+    503: "Too many ask at once",
     422: "A parameter is missing, or not of the allowed kind",
 }
 

@@ -9,9 +9,9 @@ Every message is a JSON object: the answer of the path of that name, with ``topi
 so a slow one misses messages, holds nobody up and makes no memory grow. A message is encoded once
 for all who asked for the same. ``events`` come when there is a new one.
 
-Closed with: 1003 the client sent something (the stream takes nothing), 1012 the service ends, 4401
-no or a wrong token (``access``), 4403 a page from elsewhere asked, 4422 bad arguments. The reason
-says more.
+Closed with: 1003 the client sent something (the stream takes nothing), 1012 the service ends, 1013
+too many streams are open, 4401 no or a wrong token (``access``), 4403 a page from elsewhere asked,
+4422 bad arguments. The reason says more.
 """
 
 import asyncio
@@ -37,6 +37,7 @@ from companion.views.words import rfc3339
 Json = dict[str, Any]
 
 TAKES_NOTHING: Final = 1003
+TOO_MANY: Final = 1013
 ELSEWHERE: Final = 4403
 BAD_ARGUMENTS: Final = 4422
 
@@ -45,6 +46,8 @@ LEAST_HZ, MOST_HZ = 0.1, 100.0
 _UAV: Final = re.compile(
     r"\d{1,3}:\d{1,3}|icao:[0-9A-F]{6}|(rid|cot):[A-Za-z0-9._-]{1,64}", re.ASCII
 )
+MOST_CLIENTS: Final = 256
+"""Streams at a time: half of the connections, the others are left for questions."""
 SLOTS: Final = 32
 """Number of slots in which clients take turns after an update.
 
@@ -124,6 +127,9 @@ class Stream:
         await websocket.accept(SUBPROTOCOL if SUBPROTOCOL in offered else None)
         if not _is_from_here(websocket):
             await websocket.close(ELSEWHERE, "a page from elsewhere may not ask")
+            return
+        if self.clients >= MOST_CLIENTS:
+            await websocket.close(TOO_MANY, "too many streams are open")
             return
         try:
             asked = wanted(websocket.query_params)

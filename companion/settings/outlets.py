@@ -39,9 +39,12 @@ class PageSettings(Section):
 class ServerSettings(Section):
     """Where HTTP and the live Foxglove channels are served.
 
-    ``listen`` is HOST:PORT. ``foxglove`` is a port of this machine on which the channels of a
-    recording are served live (None: nowhere, 0: any free port); it needs the extra ``live``.
+    ``listen`` is HOST:PORT. ``hosts`` are names by which clients may call this machine, beside its
+    addresses, its own name and ``localhost``: those of a reverse proxy, say. ``foxglove`` is a port
+    of this machine on which the channels of a recording are served live (None: nowhere, 0: any free
+    port); it needs the extra ``live``.
     """
 
     listen: str = "127.0.0.1:8080"
+    hosts: Annotated[tuple[str, ...], Field(max_length=100)] = ()
     foxglove: Annotated[int, Field(ge=0, le=65535)] | None = None

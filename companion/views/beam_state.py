@@ -26,6 +26,12 @@ AHEAD_S: Final = 30.0
 """How far ahead the next beam of a codebook is looked for."""
 MOST_SAMPLES: Final = 2000
 """Most samples of a direction over that time."""
+FEWEST_SAMPLES: Final = 32
+"""As many there are of each, however large the codebook."""
+MOST_RESPONSES: Final = 2**28
+"""Samples times beams of a codebook times elements, for all UAVs of one answer."""
+FULL_SHARE: Final = 8
+"""UAVs up to which each has all the work that a question may take."""
 MOST_AT_WORST: Final = 16
 """Most beams for which guaranteed SINRs are computed: the leakage between them grows squared."""
 
@@ -181,7 +187,8 @@ def _codebook_entry(
     if codebook is None:
         return None
     (best,), gains = codebooks.best(codebook, array, towards[np.newaxis])
-    swept = codebooks.candidates(codebook, array, towards, beam.pointing_bound_rad)
+    share = min(1.0, FULL_SHARE / len(update.beams.beams))
+    swept = codebooks.candidates(codebook, array, towards, beam.pointing_bound_rad, share)
     following = _next_best(pipeline, equipment, update, beam)
     return {
         "best": int(best),
@@ -214,7 +221,9 @@ def _next_best(
     turned = np.linalg.norm(np.diff(path, axis=0), axis=1)
     fastest_radps = float(turned.max()) / coarse_s[1]
     step_s = codebooks.sampling_step_s(codebook, array, fastest_radps) or AHEAD_S
-    step_s = min(max(step_s, AHEAD_S / MOST_SAMPLES), AHEAD_S)
+    answers = codebook.weights.size * len(update.beams.beams)
+    samples = min(MOST_SAMPLES, max(FEWEST_SAMPLES, MOST_RESPONSES // answers))
+    step_s = min(max(step_s, AHEAD_S / samples), AHEAD_S)
     return codebooks.next_best(codebook, array, directions_at, AHEAD_S, step_s)
 
 

@@ -18,13 +18,15 @@ FIELDS: Final = ("pointing_bound_deg", "innovation_m", "latency_s", "guaranteed_
 """What is kept of each UAV."""
 
 
+Sample = tuple[int, dict[str, tuple[float | None, ...]]]
+"""The time of an update, ns, and what is kept of each UAV."""
+
+
 class Series:
     """The samples. ``add`` is called after every tick."""
 
     def __init__(self) -> None:
-        self._samples: deque[tuple[int, dict[str, tuple[float | None, ...]]]] = deque(
-            maxlen=SAMPLES
-        )
+        self._samples: deque[Sample] = deque(maxlen=SAMPLES)
 
     def add(self, pipeline: Pipeline) -> None:
         """Take a sample of the newest update, if it is time."""
@@ -44,18 +46,23 @@ class Series:
             )
         self._samples.append((update.t_ns, sample))
 
-    def show(self, now_ns: int) -> Json:
-        """The answer of ``/v1/history``: columns, the oldest sample first."""
-        uavs = dict.fromkeys(uav for _, sample in self._samples for uav in sample)
-        nothing = (None,) * len(FIELDS)
-        return {
-            "valid_at": rfc3339(now_ns),
-            "at": [rfc3339(t_ns) for t_ns, _ in self._samples],
-            "uavs": {
-                uav: {
-                    name: [sample.get(uav, nothing)[i] for _, sample in self._samples]
-                    for i, name in enumerate(FIELDS)
-                }
-                for uav in uavs
-            },
-        }
+    def samples(self) -> list[Sample]:
+        """The samples so far, the oldest first; they no longer change."""
+        return list(self._samples)
+
+
+def show(samples: list[Sample], now_ns: int) -> Json:
+    """The answer of ``/v1/history``: columns. May run on any thread."""
+    uavs = dict.fromkeys(uav for _, sample in samples for uav in sample)
+    nothing = (None,) * len(FIELDS)
+    return {
+        "valid_at": rfc3339(now_ns),
+        "at": [rfc3339(t_ns) for t_ns, _ in samples],
+        "uavs": {
+            uav: {
+                name: [sample.get(uav, nothing)[i] for _, sample in samples]
+                for i, name in enumerate(FIELDS)
+            }
+            for uav in uavs
+        },
+    }

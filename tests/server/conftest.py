@@ -117,8 +117,9 @@ class StandIn:
 
 
 def settings(**sections: dict[str, object]) -> Settings:
-    """Those of the log, with what is asked for besides."""
-    return Settings().override(center={"source": "5:1"}, **sections)
+    """Those of the log, with what is asked for besides; test clients call it ``testserver``."""
+    made = Settings().override(center={"source": "5:1"}, server={"hosts": ["testserver"]})
+    return made.override(**sections)
 
 
 @pytest.fixture

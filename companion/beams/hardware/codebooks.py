@@ -24,6 +24,14 @@ LEVELS: Final = 12
 """Most rounds of splitting cells."""
 MOST_RESPONSES: Final = 2**18
 """Beams times cells examined for one question; a round that has begun is finished."""
+MOST_TERMS: Final = 2**26
+"""Beams times cells times elements examined for one question: as many responses up to 256
+elements, and fewer of larger arrays."""
+MOST_TERMS_AT_FIRST: Final = 2**30
+"""The same in the first round, which is finished once begun: half a second. All beams must be swept
+where it would be more."""
+MOST_ENTRIES: Final = 2**22
+"""Elements times beams of a codebook: 64 MB."""
 BLOCK: Final = 2**19
 """Beams times cells, or beams times directions, computed at once: some tens of megabytes."""
 RESOLUTION_S: Final = 1e-3
@@ -77,12 +85,19 @@ def dft(array: Array, oversampling: int = 1) -> Codebook:
         raise UserError(f"a DFT codebook needs a ULA or a URA, not elements of kind {array.kind}")
     if oversampling < 1:
         raise UserError(f"oversampling is 1 or more, not {oversampling}")
+    entries = array.size * math.prod(_beams(count, oversampling) for count in array.grid)
+    if entries > MOST_ENTRIES:
+        raise UserError(f"a codebook of {entries} weights is larger than {MOST_ENTRIES}")
     down, across = (_line(count, oversampling) for count in array.grid)
     return Codebook(Kind.DFT, np.kron(down, across).astype(np.complex128))
 
 
+def _beams(count: int, oversampling: int) -> int:
+    return count * oversampling if count > 1 else 1
+
+
 def _line(count: int, oversampling: int) -> ComplexArray:
-    beams = count * oversampling if count > 1 else 1
+    beams = _beams(count, oversampling)
     # Whole turns are taken out before the sine: exact for any number of elements.
     steps = np.outer(np.arange(count), np.arange(beams)) % beams
     line: ComplexArray = np.exp(-2j * np.pi * steps / beams) / np.sqrt(count)
@@ -133,14 +148,19 @@ def _best(codebook: Codebook, array: Array, unit: FloatArray) -> tuple[IntArray,
 
 
 def candidates(
-    codebook: Codebook, array: Array, direction: FloatArray, pointing_bound_rad: float | None
+    codebook: Codebook,
+    array: Array,
+    direction: FloatArray,
+    pointing_bound_rad: float | None,
+    share: float = 1.0,
 ) -> IntArray:
     """Indices, ascending, of the beams that must be swept to find the best one.
 
     They include the best beam for every true direction within the bound of the unit direction (3,);
     all beams where there is no bound (None). This is proven: a beam is left out of a cell only if
     its largest response there is less than the least of another. Cells are split while they hold a
-    beam that has not been seen to be best somewhere, until the work is spent.
+    beam that has not been seen to be best somewhere, until the work is spent: ``share`` of the most
+    that one question may take.
     """
     if pointing_bound_rad is None:
         return np.arange(codebook.size)
@@ -151,14 +171,16 @@ def candidates(
     alive = np.arange(codebook.size)
     found = np.zeros(codebook.size, dtype=bool)
     boxes = cone.first_boxes(cones)
-    spent = 0
+    if len(boxes.cone) * codebook.weights.size > share * MOST_TERMS_AT_FIRST:
+        return np.arange(codebook.size)
+    spent, most = 0, share * min(MOST_RESPONSES, MOST_TERMS // array.size)
     for level in range(LEVELS):
         possible, seen = _contest(cones, boxes, codebook.weights[:, alive])
         found[alive[seen]] = True
         in_doubt: BoolArray = np.any(possible & ~found[alive, np.newaxis], axis=0)
         alive = alive[possible[:, in_doubt].any(axis=1)]
         spent += possible.size
-        if not in_doubt.any() or spent >= MOST_RESPONSES or level + 1 == LEVELS:
+        if not in_doubt.any() or spent >= most or level + 1 == LEVELS:
             found[alive] = True
             break
         boxes = cone.split(cones, boxes.take(in_doubt))

@@ -1,0 +1,34 @@
+"""Work for requests off the event loop: few at once, some in wait, and the rest is refused."""
+
+import asyncio
+from collections.abc import Callable
+from typing import Final, TypeVar
+
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+
+AT_ONCE: Final = 2
+"""Requests that compute at a time; each takes its turns at the interpreter from the links."""
+WAITING: Final = 64
+"""Requests that wait for their turn; a second's work."""
+
+T = TypeVar("T")
+
+
+class Turns:
+    """One for a node. A request that finds too many before it is told to come again (503)."""
+
+    def __init__(self, at_once: int = AT_ONCE, waiting: int = WAITING) -> None:
+        self._free = asyncio.Semaphore(at_once)
+        self._room = at_once + waiting
+
+    async def run(self, work: Callable[[], T]) -> T:
+        """Do the work on another thread, in turn. Raises ``HTTPException`` 503."""
+        if self._room == 0:
+            raise HTTPException(503, "too many ask at once", {"retry-after": "1"})
+        self._room -= 1
+        try:
+            async with self._free:
+                return await run_in_threadpool(work)
+        finally:
+            self._room += 1

@@ -1,0 +1,358 @@
+"""Clients that mean harm: no head, connection, name or question of theirs holds up the others."""
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import AsyncIterator, Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import websockets
+from starlette.testclient import TestClient
+from support import HANG_S, run_async
+
+from companion.beams.array.geometry import Array
+from companion.beams.hardware import codebooks
+from companion.node.serving import Server
+from companion.pipeline import assembly
+from companion.server import connections
+from companion.server.access import KnownHosts, bind
+from companion.server.app import create_app
+from companion.server.turns import Turns
+from companion.settings.model import Settings
+from companion.values import UserError
+from companion.views import beam_state, series
+from companion.views.series import SAMPLES, Series
+
+REQUEST = b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+
+
+Client = tuple[asyncio.StreamReader, asyncio.StreamWriter]
+OPEN: list[asyncio.StreamWriter] = []
+
+
+@contextlib.asynccontextmanager
+async def served(node: Any, token: str | None = None) -> AsyncIterator[int]:
+    """The service's own server around a node: gives its port."""
+    answering = asyncio.Event()
+    with bind("127.0.0.1:0", token=token, insecure=False) as listening:
+        server = Server(node, token, answering)
+        task = asyncio.create_task(server.serve(sockets=[listening]))
+        await asyncio.wait_for(answering.wait(), HANG_S)
+        try:
+            yield listening.getsockname()[1]
+        finally:
+            for writer in OPEN:
+                writer.close()
+                with contextlib.suppress(ConnectionError):
+                    await asyncio.wait_for(writer.wait_closed(), HANG_S)
+            OPEN.clear()
+            server.should_exit = True
+            await task
+
+
+async def connected(port: int) -> Client:
+    """A connection, which ``served`` closes."""
+    client = await asyncio.wait_for(asyncio.open_connection("127.0.0.1", port), HANG_S)
+    OPEN.append(client[1])
+    return client
+
+
+async def asked(client: Client, request: bytes = REQUEST) -> bytes:
+    """The first line of the answer; empty where the connection was ended."""
+    reader, writer = client
+    with contextlib.suppress(ConnectionError):
+        writer.write(request)
+        return await asyncio.wait_for(reader.readline(), HANG_S)
+    return b""
+
+
+async def ends(client: Client) -> bool:
+    """Wait until the server has ended a connection."""
+    with contextlib.suppress(ConnectionError):
+        await asyncio.wait_for(client[0].read(), HANG_S)
+    return True
+
+
+# --- heads, bodies and waiting --------------------------------------------------------------------
+
+
+def test_a_head_without_end_is_cut_off_before_anything_is_asked(make_node: Any) -> None:
+    """Whoever has no token has no more of the loop than this."""
+    floods = (
+        b"GET /" + b"a" * (1 << 25),
+        b"GET / HTTP/1.1\r\n" + b"x: y\r\n" * (1 << 22),
+        b"GET / HTTP/1.1\r\nx: " + b"y" * (1 << 25),
+        b"GET / HTTP/1.1\r\n" + b"z" * (1 << 25),
+        b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 99999999\r\n\r\n"
+        + b"z" * (1 << 25),
+    )
+
+    async def flooded() -> None:
+        async with served(make_node(flown=False), "secret") as port:
+            for flood in floods:
+                client = await connected(port)
+                client[1].write(flood)
+                assert await ends(client)
+                # What the system still held when it was cut off: far from all that was sent.
+                left = client[1].transport.get_write_buffer_size()
+                assert left > len(flood) / 2 or client[1].transport.is_closing()
+            assert await asked(await connected(port)) == b"HTTP/1.1 200 OK\r\n"
+
+    run_async(flooded())
+
+
+@pytest.mark.parametrize(
+    "half", [b"", b"G", b"GET / HTTP/1.1\r\nHost: ", REQUEST + b"GET /half"], ids=repr
+)
+def test_who_does_not_finish_a_head_is_let_go(
+    make_node: Any, monkeypatch: pytest.MonkeyPatch, half: bytes
+) -> None:
+    """Bytes that trickle do not put it off."""
+    monkeypatch.setattr(connections, "HEAD_S", 0.3)
+
+    async def half_sent() -> None:
+        async with served(make_node(flown=False)) as port:
+            reader, writer = await connected(port)
+            writer.write(half)
+            ended = asyncio.ensure_future(ends((reader, writer)))
+            while not ended.done():
+                await asyncio.wait([ended], timeout=0.05)
+                if half and not writer.transport.is_closing():
+                    writer.write(b"x")
+
+    run_async(half_sent())
+
+
+def test_idle_connections_shut_nobody_out(make_node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The one that has waited longest makes room."""
+    monkeypatch.setattr(connections, "most_connections", lambda: 20)
+
+    async def crowded() -> None:
+        async with served(make_node()) as port:
+            idle = [await connected(port) for _ in range(60)]
+            assert await asked(await connected(port)) == b"HTTP/1.1 200 OK\r\n"
+            gone = [asyncio.ensure_future(ends(client)) for client in idle]
+            await asyncio.wait(gone[:40], timeout=HANG_S)
+            assert all(one.done() for one in gone[:40])
+            assert not any(one.done() for one in gone[42:])
+            for task in gone:
+                task.cancel()
+
+    run_async(crowded())
+
+
+def test_connections_leave_descriptors_for_all_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    for soft, most in ((1024, 512), (256, 160), (90, 8), (-1, 512)):
+        monkeypatch.setattr(connections.resource, "getrlimit", lambda _, soft=soft: (soft, soft))
+        assert connections.most_connections() == most
+
+
+# --- names ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("127.0.0.1:8080", 200), ("localhost:8080", 200), ("LocalHost", 200), ("[::1]:8080", 200),
+        ("192.168.1.7:8080", 200), (f"{socket.gethostname()}:8080", 200), ("mast.example", 200),
+        ("Mast.Example.:443", 200), ("evil.example", 421), ("evil.example:8080", 421),
+        ("127.0.0.1.evil.example", 421), ("localhost.evil.example", 421), ("", 421), ("[", 421),
+        ("127.0.0.1@evil.example", 421),
+    ],
+)  # fmt: skip
+def test_only_names_of_this_machine_are_answered(make_node: Any, host: str, status: int) -> None:
+    """A page whose name was made to resolve to this machine (DNS rebinding) has its own in Host."""
+    node = make_node(flown=False, server={"hosts": ["Mast.example"]})
+    with TestClient(create_app(node)) as client:
+        assert client.get("/v1/uavs", headers={"host": host}).status_code == status
+
+
+def test_a_stream_is_not_opened_under_another_name(make_node: Any) -> None:
+    async def streamed() -> None:
+        async with served(make_node()) as port:
+            address = f"ws://127.0.0.1:{port}/v1/stream"
+            evil = f"evil.example:{port}"
+            origin = websockets.Origin(f"http://{evil}")
+            with pytest.raises(websockets.InvalidStatus, match="HTTP 403"):
+                async with websockets.connect(
+                    f"ws://{evil}/v1/stream", host="127.0.0.1", port=port, origin=origin
+                ):
+                    pass
+            async with websockets.connect(address) as stream:
+                assert await asyncio.wait_for(stream.recv(), HANG_S)
+
+    run_async(streamed())
+
+
+def test_streams_leave_connections_for_questions(
+    make_node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("companion.server.stream.MOST_CLIENTS", 1)
+
+    async def streamed() -> None:
+        async with served(make_node()) as port:
+            address = f"ws://127.0.0.1:{port}/v1/stream"
+            async with websockets.connect(address) as one, websockets.connect(address) as other:
+                assert await asyncio.wait_for(one.recv(), HANG_S)
+                with pytest.raises(websockets.ConnectionClosed, match="too many streams are open"):
+                    await asyncio.wait_for(other.recv(), HANG_S)
+            async with websockets.connect(address) as again:
+                assert await asyncio.wait_for(again.recv(), HANG_S)
+
+    run_async(streamed())
+
+
+@pytest.mark.parametrize("scheme", ["Bearer", "bearer", "BEARER"])
+def test_the_scheme_of_a_token_has_no_case(make_node: Any, scheme: str) -> None:
+    client = TestClient(create_app(make_node(flown=False), "S3cret"), "http://localhost")
+    good = client.get("/v1/uavs", headers={"authorization": f"{scheme} S3cret"})
+    wrong = client.get("/v1/uavs", headers={"authorization": f"{scheme} s3CRET"})
+    other = client.get("/v1/uavs", headers={"authorization": "Basic S3cret"})
+    assert [good.status_code, wrong.status_code, other.status_code] == [200, 401, 401]
+
+
+def test_a_name_is_asked_for_before_a_token(make_node: Any) -> None:
+    assert isinstance(create_app(make_node(flown=False), "secret"), KnownHosts)
+
+
+# --- questions ------------------------------------------------------------------------------------
+
+
+def test_work_is_done_in_turns_and_the_rest_is_told_to_come_again(make_node: Any) -> None:
+    async def crowd() -> list[str]:
+        turns, begun, free = Turns(at_once=2, waiting=3), [], asyncio.Event()
+        loop = asyncio.get_running_loop()
+
+        def work() -> str:
+            begun.append(None)
+            asyncio.run_coroutine_threadsafe(free.wait(), loop).result(HANG_S)
+            assert len(begun) <= 2 or free.is_set()
+            return "done"
+
+        tasks = [asyncio.create_task(turns.run(work)) for _ in range(9)]
+        refused = [task async for task in _first(tasks, 4)]
+        free.set()
+        rest = await asyncio.gather(*(task for task in tasks if task not in refused))
+        assert await turns.run(lambda: "again") == "again"
+        return [*(str(task.exception()) for task in refused), *rest]
+
+    told = run_async(crowd())
+    assert told == ["503: too many ask at once"] * 4 + ["done"] * 5
+
+
+async def _first(tasks: list["asyncio.Task[str]"], many: int) -> AsyncIterator["asyncio.Task[str]"]:
+    waiting: set[asyncio.Task[str]] = set(tasks)
+    found = 0
+    while found < many:
+        done, waiting = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            found += 1
+            yield task
+
+
+def test_a_pattern_of_everything_is_not_drawn(
+    make_node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = make_node()
+    node.tick(0.0)
+    with TestClient(create_app(node), "http://localhost") as client:
+        assert client.get("/v1/pattern?points=3601").status_code == 200
+        monkeypatch.setattr("companion.server.beam_routes.MOST_ANGLES", 14_000)
+        told = client.get("/v1/pattern?points=3601")
+        assert told.status_code == 422
+        assert told.json()["title"] == "4 beams at 3601 angles: say uav, or fewer points"
+        assert client.get("/v1/pattern?points=3601&uav=1:1").status_code == 200
+
+
+def test_a_codebook_is_asked_no_more_than_can_be_answered(
+    make_node: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many elements and stored beams there are: counted in products, not in seconds."""
+    node = make_node(array={"kind": "ura", "rows": 16, "columns": 16}, codebook={"kind": "dft"})
+    node.tick(0.0)
+    work = list[int]()
+    best, contest = codebooks._best, codebooks._contest
+
+    def counted_best(codebook: Any, array: Any, unit: Any) -> Any:
+        work.append(codebook.weights.size * len(unit))
+        return best(codebook, array, unit)
+
+    def counted_contest(cones: Any, boxes: Any, weights: Any) -> Any:
+        work.append(weights.size * len(boxes.cone))
+        return contest(cones, boxes, weights)
+
+    monkeypatch.setattr(codebooks, "_best", counted_best)
+    monkeypatch.setattr(codebooks, "_contest", counted_contest)
+    told = _codebook_answers(node)
+    spent = sum(work)
+    monkeypatch.setattr(codebooks, "MOST_TERMS", 2**20)
+    monkeypatch.setattr(codebooks, "MOST_TERMS_AT_FIRST", 2**22)
+    monkeypatch.setattr(beam_state, "MOST_RESPONSES", 2**20)
+    work.clear()
+    less = _codebook_answers(node)
+    assert sum(work) < spent / 4
+    for wide, narrow in zip(less, told, strict=True):
+        assert wide["best"] == narrow["best"]
+        assert set(wide["candidates"]) >= set(narrow["candidates"])  # proven still
+
+
+def _codebook_answers(node: Any) -> list[dict[str, Any]]:
+    update = node.pipeline.last_update
+    shown = beam_state.beams(node.pipeline, node.equipment, update, 0.0, 0.0)
+    return [beam["codebook"] for beam in shown["beams"]]
+
+
+def test_a_codebook_that_fills_the_memory_is_refused() -> None:
+    def array(side: int) -> Array:
+        return assembly.array(
+            Settings().override(array={"kind": "ura", "rows": side, "columns": side})
+        )
+
+    with pytest.raises(UserError, match="a codebook of 16777216 weights is larger than 4194304"):
+        codebooks.dft(array(64))
+    assert codebooks.dft(array(32), 2).size == 4096
+
+
+def test_the_history_is_five_minutes_and_no_more(make_node: Any) -> None:
+    node = make_node()
+    kept = Series()
+    for _ in range(SAMPLES + 50):
+        node.tick(1.0)
+        kept.add(node.pipeline)
+    samples = kept.samples()
+    newest_ns = node.pipeline.last_update.t_ns
+    assert [t_ns for t_ns, _ in samples] == [
+        newest_ns - (SAMPLES - 1 - i) * 1_000_000_000 for i in range(SAMPLES)
+    ]
+    shown = series.show(samples, newest_ns)
+    node.tick(1.0)
+    kept.add(node.pipeline)  # what was taken for another thread stays as it was
+    assert shown == series.show(samples, newest_ns)
+    assert len(shown["at"]) == SAMPLES == 300
+    columns = [column for uav in shown["uavs"].values() for column in uav.values()]
+    assert columns and all(len(column) == SAMPLES for column in columns)
+    assert np.isfinite([value for column in columns for value in column if value is not None]).all()
+
+
+def test_the_history_is_made_beside_the_loop(
+    make_node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import threading
+
+    seen = list[str]()
+
+    def told(*_: object) -> dict[str, Any]:
+        seen.append(threading.current_thread().name)
+        return {}
+
+    monkeypatch.setattr("companion.views.series.show", told)
+
+    async def ask() -> None:
+        async with served(make_node()) as port:
+            request = b"GET /v1/history HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+            assert await asked(await connected(port), request) == b"HTTP/1.1 200 OK\r\n"
+
+    run_async(ask())
+    assert seen and threading.current_thread().name not in seen

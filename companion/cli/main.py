@@ -64,7 +64,7 @@ def main() -> None:
     help="Live channels for Foxglove and Lichtblick, on this machine. Needs the extra [live].",
 )
 @INSECURE
-@click.option("--silent", is_flag=True, help="Send no MAVLink at all, whatever the settings say.")
+@click.option("--silent", is_flag=True, help="Send nothing over links, whatever the settings say.")
 @JSON_LINES
 def run(
     config: Path | None,
@@ -79,7 +79,7 @@ def run(
 ) -> None:
     """The live service. COMPANION_TOKEN in the environment sets a bearer token for HTTP.
 
-    It sends nothing over MAVLink unless [presence] in the settings allows it.
+    It sends nothing to anybody unless [presence] or [out] in the settings says so.
 
     Example: companion run --link udpin:0.0.0.0:14550 --center 5:1 --record recordings
     """
@@ -90,6 +90,7 @@ def run(
         "center": {"source": center},
         "links": {"urls": list(links) or None},
         "presence": {"enabled": False if silent else None},
+        "out": {"urls": [] if silent else None},
         "server": {"listen": listen, "foxglove": foxglove},
         "recording": {"directory": record},
     }

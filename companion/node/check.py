@@ -74,6 +74,7 @@ def _to_listen(settings: Settings, urls: list[str]) -> Settings:
         update={
             "recording": kept.recording.model_copy(update={"directory": None}),
             "server": kept.server.model_copy(update={"foxglove": None}),
+            "out": kept.out.model_copy(update={"urls": ()}),
             "signing": kept.signing.model_copy(update={"keys": keys}),
         }
     )

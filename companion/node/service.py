@@ -15,6 +15,7 @@ import companion
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.voice.rate_watch import MessageRate
 from companion.node.gateway import Gateway
+from companion.node.outlet import Outlet
 from companion.node.serving import NOTICES_KEPT, Server, Throughput
 from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
@@ -81,7 +82,9 @@ class Service:
         self._live = self._open_live()
         self._traffic = Gateway(settings, self._step, self._notify, self._timeline.now_ns)
         self.arrival_lag = self._traffic.lag
+        self._outlet = Outlet(settings, self.pipeline, self._notify, self._timeline.now_ns)
         self._traffic.open()
+        self._outlet.open()
         self._recorder = self._open_recorder()
 
     async def run(
@@ -105,6 +108,7 @@ class Service:
             async with asyncio.TaskGroup() as group:
                 tasks = [group.create_task(self._tick(), name="ticks")]
                 tasks.append(group.create_task(self._traffic.run(), name="links"))
+                tasks.append(group.create_task(self._outlet.run(), name="out"))
                 tasks.append(group.create_task(self._recover_leftovers(), name="recovery"))
                 tasks.append(group.create_task(self._end_on_defect(), name="defects"))
                 tasks += [group.create_task(other, name="beside") for other in others]

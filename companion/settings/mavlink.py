@@ -12,7 +12,7 @@ from pydantic import (
     model_validator,
 )
 
-from companion.mavlink.links.urls import parse_link
+from companion.mavlink.links.urls import Scheme, parse_link
 from companion.settings.section import Section
 from companion.values import UserError
 
@@ -85,6 +85,9 @@ _UAV_PATTERN: Final = re.compile(
 )
 
 
+_OUT: Final[tuple[Scheme, ...]] = ("udpout", "tcp", "tcpin", "serial", "cot")
+
+
 def _uav_pattern(text: str) -> str:
     if not _UAV_PATTERN.fullmatch(text):
         raise UserError(
@@ -94,6 +97,31 @@ def _uav_pattern(text: str) -> str:
 
 
 UavPattern = Annotated[str, AfterValidator(_uav_pattern)]
+
+
+def _out_link(text: str) -> str:
+    url = parse_link(text, _OUT)
+    if url.port == 0:
+        raise UserError(f"{text!r}: nobody can be found at port 0")
+    return text
+
+
+class OutSettings(Section):
+    """What is known goes on to others, on links of its own: nothing unless ``urls`` are given.
+
+    urls     ``udpout:``, ``tcp:``, ``tcpin:HOST:PORT`` or ``serial:DEVICE:BAUD`` get
+             GLOBAL_POSITION_INT of each vehicle that reports itself; ``cot:udp:HOST:PORT``
+             (sends datagrams there, also to a group) and ``cot:tcp:HOST:PORT`` (connects) get
+             Cursor on Target of every aircraft
+    rate_hz  how often each aircraft is said
+    stale_s  how long an event of Cursor on Target says that it holds, seconds
+    uavs     patterns of those that are said; everyone if empty
+    """
+
+    urls: tuple[Annotated[str, AfterValidator(_out_link)], ...] = ()
+    rate_hz: Annotated[float, Field(ge=0.1, le=50)] = 5.0
+    stale_s: Annotated[float, Field(ge=1, le=600)] = 10.0
+    uavs: tuple[UavPattern, ...] = ()
 
 
 class TrackSettings(Section):

@@ -23,6 +23,7 @@ from companion.settings.beams import (
 from companion.settings.center import CenterSettings
 from companion.settings.mavlink import (
     LinkSettings,
+    OutSettings,
     PresenceSettings,
     SigningSettings,
     TrackSettings,
@@ -67,6 +68,7 @@ class Settings(Section):
     center: CenterSettings = CenterSettings()
     links: LinkSettings = LinkSettings()
     presence: PresenceSettings = PresenceSettings()
+    out: OutSettings = OutSettings()
     signing: SigningSettings = SigningSettings()
     clocks: ClockSettings = ClockSettings()
     observer: ObserverSettings = ObserverSettings()

@@ -195,6 +195,14 @@ class Link:
             peers = [self._peers.at(key) for key in keys]
         return sum([self._send(peer, message) for peer in peers])
 
+    def send_raw(self, raw: bytes) -> None:
+        """Send bytes as they are to every peer that a message would go to."""
+        for key in self._endpoint.peers() or ():
+            if self._endpoint.write(key, raw):
+                self.status.sent += 1
+            else:
+                self.status.send_dropped += 1
+
     def send_to(self, target: Source, message: Outgoing) -> bool:
         """Send to the peer over which ``target`` was last heard on this link.
 

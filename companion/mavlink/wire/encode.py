@@ -16,6 +16,7 @@ from companion.mavlink.wire.framing import MAGIC_V1, MAGIC_V2
 from companion.values import Source
 
 HEARTBEAT: Final = 0
+GLOBAL_POSITION_INT: Final = 33
 REQUEST_DATA_STREAM: Final = 66
 COMMAND_LONG: Final = 76
 TIMESYNC: Final = 111
@@ -60,6 +61,31 @@ def heartbeat(source: Source) -> Outgoing:
         "<IBBBBB", 0, _ONBOARD_CONTROLLER, _NO_AUTOPILOT, 0, _ACTIVE, _MAVLINK_VERSION
     )
     return Outgoing(source, HEARTBEAT, payload)
+
+
+def global_position_int(
+    source: Source,
+    boot_ms: int,
+    place: tuple[float, float, float],
+    relative_alt_m: float,
+    velocity_ned_mps: tuple[float, float, float],
+    heading_deg: float | None,
+) -> Outgoing:
+    """GLOBAL_POSITION_INT: ``place`` is latitude and longitude in degrees, and metres.
+
+    Speeds beyond what the message holds are cut to it.
+    """
+    lat_deg, lon_deg, alt_m = place
+    speeds = (max(-32_767, min(32_767, round(speed * 100))) for speed in velocity_ned_mps)
+    payload = struct.pack(
+        "<IiiiihhhH",
+        boot_ms,
+        *(round(lat_deg * 1e7), round(lon_deg * 1e7)),
+        *(round(alt_m * 1e3), round(relative_alt_m * 1e3)),
+        *speeds,
+        65_535 if heading_deg is None else round(heading_deg * 100) % 36_000,
+    )
+    return Outgoing(source, GLOBAL_POSITION_INT, payload)
 
 
 def set_message_interval(

@@ -1,0 +1,83 @@
+"""What is known, said to others at a steady rate on links of its own ([out]).           [shell]
+
+What comes in over these links is not read.
+"""
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import replace
+
+from companion.mavlink.links.transport import Link
+from companion.mavlink.links.urls import parse_link
+from companion.mavlink.trust.admission import Admission
+from companion.mavlink.wire.encode import pack
+from companion.pipeline.fold import Pipeline
+from companion.settings.model import Settings
+from companion.values import Notice, Source
+from companion.views import passed_on
+
+
+class Outlet:
+    """The links of ``[out]``. Call ``open`` for early errors, then ``run`` until cancelled."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        pipeline: Pipeline,
+        notify: Callable[[Notice], None],
+        now_ns: Callable[[], int],
+    ) -> None:
+        self._settings = settings.out
+        self._pipeline = pipeline
+        self._now_ns = now_ns
+        self._admission = Admission(settings.out.uavs, ())
+        self._positions = passed_on.Positions()
+        self._sequences: dict[Source, int] = {}
+        self._frames: list[Link] = []
+        self._events: list[Link] = []
+        for text in settings.out.urls:
+            url = parse_link(text)
+            says_cot = url.scheme == "cot"
+            if says_cot:
+                url = replace(url, scheme="udpout" if url.way == "udp" else "tcp", way="")
+            link = Link(url, lambda _: None, now_ns, notify)
+            (self._events if says_cot else self._frames).append(link)
+
+    def open(self) -> None:
+        """Claim the addresses of links that listen. Raises ``LinkError`` where one is not free."""
+        for link in (*self._frames, *self._events):
+            link.open()
+
+    async def run(self) -> None:
+        """Serve the links and say what is known, until cancelled."""
+        async with asyncio.TaskGroup() as group:
+            for link in (*self._frames, *self._events):
+                group.create_task(link.run(), name=f"out {link.url}")
+            if self._frames or self._events:
+                group.create_task(self._speak(), name="out")
+
+    async def _speak(self) -> None:
+        """Speak at the rate; times missed while the loop was held up are left out."""
+        loop = asyncio.get_running_loop()
+        period_s = 1 / self._settings.rate_hz
+        due_s = loop.time()
+        while True:
+            self._say()
+            due_s = max(due_s + period_s, loop.time())
+            await asyncio.sleep(due_s - loop.time())
+
+    def _say(self) -> None:
+        now_ns = self._now_ns()
+        named = self._pipeline.tracks(now_ns, now_ns)
+        tracks = [track for track in named if self._admission.admits(track.uav)]
+        if self._frames:
+            for message in self._positions.said(self._pipeline, tracks):
+                number = self._sequences.get(message.source, 0)
+                self._sequences[message.source] = (number + 1) & 0xFF
+                raw = pack(message, number)
+                for link in self._frames:
+                    link.send_raw(raw)
+        if self._events:
+            for text in passed_on.events(self._pipeline, tracks, self._settings.stale_s):
+                for link in self._events:
+                    link.send_raw(text)

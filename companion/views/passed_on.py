@@ -1,0 +1,128 @@
+"""What goes on to others: each aircraft's position at this moment, by all that is known.
+
+Said are tracks that are live or coasting; of the others there is nothing to say. A report that
+comes late changes what is known of the past, and so the next position, but never when it is of: the
+times of what is said of an aircraft only go forward.
+"""
+
+import math
+from collections.abc import Iterable
+from typing import Final
+
+from companion.mavlink.wire import cot_text
+from companion.mavlink.wire.encode import Outgoing, global_position_int
+from companion.pipeline.fold import Pipeline
+from companion.tracking.noise import GEOID_M
+from companion.values import AltitudeDatum, Source, Track, TrackState, reports_itself
+
+KNOWN: Final = (TrackState.LIVE, TrackState.COASTING)
+_REBOOT_MS: Final = 60_000
+"""A step back of a boot clock beyond which its owner has booted anew."""
+
+
+class Positions:
+    """GLOBAL_POSITION_INT of each vehicle that reports itself, as if it had said it now."""
+
+    def __init__(self) -> None:
+        self._boot_ms: dict[str, int] = {}  # of what was said last
+
+    def said(self, pipeline: Pipeline, tracks: Iterable[Track]) -> list[Outgoing]:
+        """What is to be said of the tracks at their time, by their own clocks."""
+        found = [
+            message
+            for track in tracks
+            if reports_itself(track.uav)
+            and track.state in KNOWN
+            and (message := self._one(pipeline, track)) is not None
+        ]
+        for uav in self._boot_ms.keys() - set(pipeline.fleet.uavs):
+            del self._boot_ms[uav]
+        return found
+
+    def _one(self, pipeline: Pipeline, track: Track) -> Outgoing | None:
+        newest = pipeline.fleet.newest(track.uav)
+        place = _place(pipeline, track)
+        velocity = _velocity_ned_mps(pipeline, track, place)
+        if newest is None or velocity is None:
+            return None
+        report = newest.report
+        boot_ms = pipeline.senders.time(track.uav, track.valid_at_ns).sender_ns // 1_000_000
+        last_ms = self._boot_ms.get(track.uav)
+        if last_ms is not None and last_ms - _REBOOT_MS < boot_ms <= last_ms:
+            return None
+        self._boot_ms[track.uav] = boot_ms
+        relative_alt_m = report.relative_alt_m
+        return global_position_int(
+            Source.parse(track.uav),
+            boot_ms & 0xFFFF_FFFF,
+            place,
+            0.0 if relative_alt_m is None else place[2] - (report.alt_m - relative_alt_m),
+            velocity,
+            report.heading_deg,
+        )
+
+
+def events(pipeline: Pipeline, tracks: Iterable[Track], stale_s: float) -> list[bytes]:
+    """An event of Cursor on Target for each aircraft that is known, under its best name alone."""
+    return [
+        _event(pipeline, track, stale_s)
+        for track in tracks
+        if track.state in KNOWN and pipeline.targets.same_as(track.uav) is None
+    ]
+
+
+def _event(pipeline: Pipeline, track: Track, stale_s: float) -> bytes:
+    lat_deg, lon_deg, alt_m = place = _place(pipeline, track)
+    velocity = _velocity_ned_mps(pipeline, track, place)
+    newest = pipeline.fleet.newest(track.uav)
+    datum = AltitudeDatum.PRESSURE if newest is None else newest.report.alt_datum
+    known = datum is not AltitudeDatum.PRESSURE
+    geoid_m = GEOID_M if datum is AltitudeDatum.MSL else 0.0
+    course_deg = speed_mps = None
+    if velocity is not None:
+        course_deg = math.degrees(math.atan2(velocity[1], velocity[0])) % 360
+        speed_mps = math.hypot(velocity[0], velocity[1])
+    where = cot_text.Place(
+        lat_deg,
+        lon_deg,
+        alt_m if known else None,
+        track.horizontal_bound_m,
+        track.vertical_bound_m + geoid_m if known else None,
+        course_deg,
+        speed_mps,
+    )
+    stale_ns = track.valid_at_ns + round(stale_s * 1e9)
+    return cot_text.event(track.uav, track.valid_at_ns, stale_ns, where, _remarks(track, datum))
+
+
+def _remarks(track: Track, datum: AltitudeDatum) -> str:
+    """What the numbers of an event are."""
+    words = [
+        f"ce {track.horizontal_bound_m:.1f} m and le are guaranteed bounds, not standard deviations"
+    ]
+    if track.error_p95_m is not None:
+        words.append(f"95 of 100 errors stay below {track.error_p95_m:.1f} m")
+    words.append(
+        {
+            AltitudeDatum.MSL: f"height above mean sea level: le has {GEOID_M:.0f} m for the geoid",
+            AltitudeDatum.PRESSURE: "height by pressure alone, so none is said",
+            AltitudeDatum.GEOMETRIC: "height above the ellipsoid",
+        }[datum]
+    )
+    return "; ".join([*words, f"newest report {track.age_s:.1f} s old"])
+
+
+def _place(pipeline: Pipeline, track: Track) -> tuple[float, float, float]:
+    assert pipeline.local is not None, "a track is in the local frame"
+    return pipeline.local.place(*track.position_ned_m.tolist())
+
+
+def _velocity_ned_mps(
+    pipeline: Pipeline, track: Track, place: tuple[float, float, float]
+) -> tuple[float, float, float] | None:
+    """North, east and down where the aircraft is."""
+    if track.velocity_ned_mps is None or pipeline.local is None:
+        return None
+    there_from_local = pipeline.local.local_from_ned(place[0], place[1]).T
+    north, east, down = (there_from_local @ track.velocity_ned_mps).tolist()
+    return north, east, down

@@ -1,0 +1,188 @@
+"""What goes on to others: each aircraft at this moment, and times that only go forward."""
+
+import math
+from typing import Any
+from xml.etree import ElementTree
+
+import pymap3d
+import pytest
+from pymavlink.dialects.v20 import all as dialect
+
+from companion.mavlink.wire.cot import UNKNOWN, from_xml
+from companion.mavlink.wire.cot_link import CotSplitter
+from companion.mavlink.wire.encode import pack
+from companion.pipeline.fold import Pipeline
+from companion.settings.model import Settings
+from companion.tracking.noise import GEOID_M
+from companion.values import Frame, Reason, Rejection, Source, Track
+from companion.views import passed_on
+
+S = 1_000_000_000
+START_NS = 1_760_000_000 * S
+PLACE = (47.4, 8.55, 500.0)
+EXACT: dict[str, Any] = {"lag_s": (0.0, 0.0), "acceleration_max_mps2": 5.0, "speed_max_mps": 60.0}
+
+
+def pipeline() -> Pipeline:
+    sections: dict[str, Any] = {"observer": EXACT, "beams": {"targets": "all"}}
+    return Pipeline(Settings().override(center={"source": "47.4,8.55,500"}, **sections))
+
+
+def there(t_s: float) -> tuple[float, float, float]:
+    """Northwards at 20 m/s and eastwards at 15, 120 m up, of 30 km away: north is another there."""
+    lat, lon, alt = pymap3d.ned2geodetic(20 * t_s, 30_000 + 15 * t_s, -120, *PLACE)
+    return float(lat), float(lon), float(alt)
+
+
+def framed(t_s: float, source: Source, message: Any) -> Frame:
+    mav = dialect.MAVLink(None, srcSystem=source.sysid, srcComponent=source.compid)
+    raw = bytes(message.pack(mav))
+    return Frame(START_NS + round(t_s * S), "udp", source, message.get_msgId(), raw)
+
+
+def telemetry(t_s: float, late_s: float = 0.0, boot_s: float = 100.0) -> Frame:
+    lat, lon, alt = there(t_s)
+    return framed(t_s + late_s, Source(3, 1), dialect.MAVLink_global_position_int_message(
+        round(1000 * (boot_s + t_s)), round(lat * 1e7), round(lon * 1e7), round(alt * 1e3),
+        round((alt - 480) * 1e3), 2000, 1500, 0, 3700,
+    ))  # fmt: skip
+
+
+def adsb(t_s: float, datum: int, east_m: float = 0.0) -> Frame:
+    lat, lon, alt = pymap3d.ned2geodetic(5 * t_s, east_m, -120, *PLACE)
+    return framed(t_s, Source(5, 1), dialect.MAVLink_adsb_vehicle_message(
+        0x4CA7B3, round(lat * 1e7), round(lon * 1e7), datum, round(alt * 1e3), 0, 500, 0, b"T",
+        0, 1, 1 | 2 | 4 | 8, 0,
+    ))  # fmt: skip
+
+
+def tracks(fold: Pipeline, t_s: float) -> list[Track]:
+    now_ns = START_NS + round(t_s * S)
+    return fold.tracks(now_ns, now_ns)
+
+
+def said(fold: Pipeline, t_s: float, out: passed_on.Positions | None = None) -> list[Any]:
+    """What is said at a time, as pymavlink reads it."""
+    mav: Any = dialect.MAVLink(None)
+    messages = (out or passed_on.Positions()).said(fold, tracks(fold, t_s))
+    return [mav.decode(bytearray(pack(message, 0))) for message in messages]
+
+
+def test_a_vehicle_is_said_where_it_is_now_by_its_own_clock() -> None:
+    """0.7 s after its newest report; under its own name, with its own north."""
+    fold = pipeline()
+    for n in range(6):
+        fold.step(telemetry(n / 2))
+    (one,) = said(fold, 3.2)
+    lat, lon, alt = there(3.2)
+    assert (one.get_srcSystem(), one.get_srcComponent()) == (3, 1)
+    assert one.time_boot_ms == pytest.approx(103_200, abs=5)
+    off_m = pymap3d.geodetic2ned(one.lat * 1e-7, one.lon * 1e-7, one.alt * 1e-3, lat, lon, alt)
+    assert math.hypot(*off_m) < 0.3
+    assert one.relative_alt == pytest.approx((alt - 480) * 1e3, abs=300)
+    assert (one.vx, one.vy, one.vz) == (
+        pytest.approx(2000, abs=20), pytest.approx(1500, abs=20), pytest.approx(0, abs=20),
+    )  # fmt: skip
+    assert one.hdg == 3700
+
+
+def test_what_is_not_known_any_more_is_not_said() -> None:
+    """Stale after 15 s by default."""
+    fold = pipeline()
+    fold.step(telemetry(0))
+    assert len(said(fold, 14)) == len(passed_on.events(fold, tracks(fold, 14), 10)) == 1
+    assert said(fold, 16) == passed_on.events(fold, tracks(fold, 16), 10) == []
+
+
+def test_times_only_go_forward_but_for_a_reboot() -> None:
+    fold, out = pipeline(), passed_on.Positions()
+    for n in range(6):
+        fold.step(telemetry(n / 2))
+    assert len(said(fold, 3.0, out)) == 1
+    assert said(fold, 3.0, out) == []
+    assert said(fold, 2.9, out) == []
+    assert len(said(fold, 3.1, out)) == 1
+    for n in range(10, 60):
+        fold.step(telemetry(n / 2, boot_s=-4.0))
+    (again,) = said(fold, 30.0, out)
+    assert again.time_boot_ms == pytest.approx(26_000, abs=5)
+
+
+def test_reports_that_come_ten_seconds_late_take_nothing_back() -> None:
+    """Every other one comes late; what is said goes on where it was, at every fifth of a second."""
+    fold, out = pipeline(), passed_on.Positions()
+    frames = sorted(
+        [telemetry(n / 4, late_s=10.0 if n % 2 else 0.0) for n in range(120)],
+        key=lambda frame: frame.t_ns,
+    )
+    last_ms, north_m = 0, -math.inf
+    for n in range(5, 150):
+        now_s = n / 5
+        while frames and frames[0].t_ns <= START_NS + round(now_s * S):
+            fold.step(frames.pop(0))
+        (one,) = said(fold, now_s, out)
+        assert one.time_boot_ms > last_ms
+        lat, lon, alt = there(one.time_boot_ms / 1e3 - 100)
+        at_m = pymap3d.geodetic2ned(one.lat * 1e-7, one.lon * 1e-7, one.alt * 1e-3, *PLACE)
+        off_m = pymap3d.geodetic2ned(one.lat * 1e-7, one.lon * 1e-7, one.alt * 1e-3, lat, lon, alt)
+        assert math.hypot(*off_m) < 0.5
+        assert at_m[0] > north_m
+        last_ms, north_m = one.time_boot_ms, at_m[0]
+
+
+def test_an_event_says_what_its_numbers_are() -> None:
+    """The bound that is guaranteed, not a standard deviation; the geoid, where it is in the way."""
+    fold = pipeline()
+    for n in range(6):
+        fold.step(telemetry(n / 2))
+    (track,) = tracks(fold, 3.2)
+    (text,) = passed_on.events(fold, [track], 10.0)
+    event = from_xml(text)
+    assert event.uid == "uav-companion-beams.3.1" and event.is_aircraft
+    assert event.ce_m == pytest.approx(track.horizontal_bound_m, abs=0.06)
+    assert event.le_m == pytest.approx(track.vertical_bound_m + GEOID_M, abs=0.06)
+    assert (event.course_deg, event.speed_mps) == (
+        pytest.approx(math.degrees(math.atan2(15, 20)), abs=0.5), pytest.approx(25, abs=0.3),
+    )  # fmt: skip
+    root = ElementTree.fromstring(text)
+    remarks = root.findtext("detail/remarks")
+    assert remarks is not None
+    assert "guaranteed bounds, not standard deviations" in remarks and "geoid" in remarks
+    assert root.get("time") == root.get("start") == "2025-10-09T08:53:23.200Z"
+    assert root.get("stale") == "2025-10-09T08:53:33.200Z"
+    contact = root.find("detail/contact")
+    assert contact is not None and contact.get("callsign") == "3:1"
+
+
+def test_a_companion_does_not_take_in_what_a_companion_said() -> None:
+    fold = pipeline()
+    fold.step(telemetry(0))
+    (text,) = passed_on.events(fold, tracks(fold, 1), 10.0)
+    (found,) = CotSplitter("x").feed(7, text)
+    assert isinstance(found, Rejection) and found.reason is Reason.UNKNOWN_MESSAGE
+
+
+@pytest.mark.parametrize(("datum", "told"), [(0, False), (1, True)])
+def test_heights_by_pressure_are_none_above_the_ellipsoid(datum: int, told: bool) -> None:
+    fold = pipeline()
+    fold.step(adsb(0, datum))
+    assert said(fold, 0.5) == []  # it does not report itself
+    (text,) = passed_on.events(fold, tracks(fold, 0.5), 10.0)
+    event = from_xml(text)
+    assert (event.hae_m is not None, event.le_m is not None) == (told, told)
+    assert told or f'hae="{UNKNOWN:.1f}"'.encode() in text
+    assert event.uid == "uav-companion-beams.icao.4CA7B3"
+
+
+def test_an_aircraft_that_is_heard_twice_is_said_once() -> None:
+    fold = pipeline()
+    for n in range(8):
+        fold.step(telemetry(n))
+        lat, lon, alt = there(n)
+        fold.step(framed(n + 0.1, Source(5, 1), dialect.MAVLink_adsb_vehicle_message(
+            0x4CA7B3, round(lat * 1e7), round(lon * 1e7), 1, round(alt * 1e3), 3687, 2500, 0, b"T",
+            0, 1, 1 | 2 | 4 | 8, 0,
+        )))  # fmt: skip
+    assert len(tracks(fold, 8)) == 2
+    (text,) = passed_on.events(fold, tracks(fold, 8), 10.0)
+    assert from_xml(text).uid == "uav-companion-beams.3.1"

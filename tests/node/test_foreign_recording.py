@@ -29,6 +29,7 @@ PATHS = {
     "links": {"urls": ["serial:{}/fifo:57600"]},
     "server": {"listen": "0.0.0.0:1"},
     "presence": {"enabled": True, "system_id": 7},
+    "out": {"urls": ["tcp:192.0.2.1:1"]},
 }  # fmt: skip
 """What a recording may say that a replay has no business with."""
 SHORT = "companion: nothing was aimed at: the log is shorter than one update\n"

@@ -7,7 +7,8 @@ from fastapi import FastAPI, HTTPException, Query, Request
 from fastapi.responses import Response
 
 from companion.server import models
-from companion.server.responses import answer, answers, refusals
+from companion.server.moments import Moments
+from companion.server.responses import answers, as_json, encode, refusals
 from companion.server.turns import Turns
 from companion.values import Update, UserError
 from companion.views import beam_state, weight_formats
@@ -29,9 +30,7 @@ _BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
 def add(app: FastAPI, node: Node, turns: Turns) -> None:
     """Add the routes to the application; what they compute is done in ``turns``."""
     pipeline, equipment = node.pipeline, node.equipment
-
-    def look(lead_ms: float) -> Update:
-        return pipeline.look(node.now_ns(), lead_ms * 1e-3)
+    moments = Moments(node, turns)
 
     @app.get(
         "/v1/beams",
@@ -39,10 +38,10 @@ def add(app: FastAPI, node: Node, turns: Turns) -> None:
         responses=answers(models.Beams, 422, 503),
     )
     async def beams(lead_ms: LeadMs = 0.0) -> Response:
-        update = look(lead_ms)
-        return await turns.run(
-            lambda: answer(beam_state.beams(pipeline, equipment, update, 0.0, lead_ms))
-        )
+        def make(update: Update) -> bytes:
+            return encode(beam_state.beams(pipeline, equipment, update, 0.0, lead_ms))
+
+        return as_json(await moments.made(lead_ms, "beams", make))
 
     @app.get(
         "/v1/beams/weights",
@@ -54,14 +53,16 @@ def add(app: FastAPI, node: Node, turns: Turns) -> None:
         form = accepted(request.headers.get("accept", "*/*"))
         if form is None:
             raise HTTPException(406, f"weights come as {', '.join(weight_formats.TYPES.values())}")
-        beam_set = look(lead_ms).beams
+
+        def make(update: Update) -> tuple[bytes, dict[str, str]]:
+            made = update.beams
+            body = weight_formats.encode(form, made, pipeline.array, equipment, lead_ms)
+            return body, {**weight_formats.headers(made), "vary": "accept"}
+
         try:
-            body = await turns.run(
-                lambda: weight_formats.encode(form, beam_set, pipeline.array, equipment, lead_ms)
-            )
+            body, headers = await moments.made(lead_ms, form, make)
         except UserError as error:  # what the device cannot do, as the beams are now
             raise HTTPException(409, str(error)) from error
-        headers = {**weight_formats.headers(beam_set), "vary": "accept"}
         return Response(body, media_type=weight_formats.TYPES[form], headers=headers)
 
     @app.get(
@@ -75,15 +76,17 @@ def add(app: FastAPI, node: Node, turns: Turns) -> None:
         uav: Only = None,
         lead_ms: LeadMs = 0.0,
     ) -> Response:
-        update = look(lead_ms)
-        if uav is not None and uav not in update.beams.uavs:
+        served = moments.look(lead_ms).beams.uavs
+        if uav is not None and uav not in served:
             raise HTTPException(404, f"there is no beam on {uav!r}")
-        shown = 1 if uav is not None else len(update.beams.uavs)
+        shown = 1 if uav is not None else len(served)
         if shown * points > MOST_ANGLES:
             raise HTTPException(422, f"{shown} beams at {points} angles: say uav, or fewer points")
-        return await turns.run(
-            lambda: answer(beam_state.pattern(pipeline, update, cut, points, uav, lead_ms))
-        )
+
+        def make(update: Update) -> bytes:
+            return encode(beam_state.pattern(pipeline, update, cut, points, uav, lead_ms))
+
+        return as_json(await moments.made(lead_ms, (cut, points, uav), make))
 
 
 def _weight_answers() -> dict[int | str, dict[str, Any]]:

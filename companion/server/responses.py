@@ -35,7 +35,12 @@ def encode(content: object) -> bytes:
 
 def answer(content: object, status: int = 200) -> Response:
     """A response with ``content`` as JSON."""
-    return Response(encode(content), status_code=status, media_type="application/json")
+    return as_json(encode(content), status)
+
+
+def as_json(body: bytes, status: int = 200) -> Response:
+    """A response of what is JSON already."""
+    return Response(body, status_code=status, media_type="application/json")
 
 
 def problem(status: int, title: str, headers: dict[str, str] | None = None) -> JSONResponse:

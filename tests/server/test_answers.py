@@ -268,7 +268,11 @@ def test_a_bearing_is_from_true_north_however_the_carrier_is_turned(
     client: TestClient, shared_node: Any
 ) -> None:
     """By where track and carrier are; angles in the array turn with it."""
-    update = shared_node.pipeline.look(shared_node.now_ns())
+    now_ns, delay_ns = shared_node.now_ns(), 10_000_000
+    headers = client.get("/v1/beams/weights", headers={"accept": "application/x-npy"}).headers
+    later_s = (int(headers["x-valid-at-ns"]) - now_ns - delay_ns) * 1e-9
+    assert 0 <= later_s <= 0.01
+    update = shared_node.pipeline.look(now_ns, later_s)
     positions = {track.uav: track.position_ned_m for track in update.tracks}
     shown = client.get("/v1/beams").json()
     for beam in shown["beams"]:

@@ -1,0 +1,84 @@
+"""What is asked twice for the same moment is made once; nobody is answered for the past."""
+
+import asyncio
+import threading
+from typing import Any
+
+import pytest
+
+from companion.server.moments import EVERY_NS, Moments
+from companion.server.turns import Turns
+from companion.values import Update
+
+pytestmark = pytest.mark.anyio
+
+
+@pytest.fixture
+def moments(shared_node: Any, monkeypatch: pytest.MonkeyPatch) -> Moments:
+    shared_node.looks = []
+    look = shared_node.pipeline.look
+
+    def counted(now_ns: int, lead_s: float = 0.0) -> Update:
+        shared_node.looks.append(lead_s)
+        found: Update = look(now_ns, lead_s)
+        return found
+
+    monkeypatch.setattr(shared_node.pipeline, "look", counted)
+    return Moments(shared_node, Turns())
+
+
+async def test_many_who_ask_at_once_share_one_answer(moments: Moments, shared_node: Any) -> None:
+    made: list[int] = []
+
+    def make(update: Update) -> int:
+        made.append(update.beams.valid_at_ns)
+        return update.beams.valid_at_ns
+
+    found = await asyncio.gather(*(moments.made(20.0, "npy", make) for _ in range(50)))
+    assert len(made) == len(shared_node.looks) == 1
+    delay_ns, now_ns = 10_000_000, shared_node.now_ns()
+    assert set(found) == set(made)
+    assert 0 <= made[0] - delay_ns - now_ns - 20_000_000 < EVERY_NS
+    await moments.made(20.0, "json", make)
+    assert (len(made), len(shared_node.looks)) == (2, 1)  # other things of the same beams
+    await moments.made(30.0, "npy", make)
+    assert (len(made), len(shared_node.looks)) == (3, 2)
+
+
+async def test_the_next_moment_is_made_anew(
+    moments: Moments, shared_node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = moments.look(0.0)
+    assert moments.look(0.0) is first
+    later_ns = shared_node.now_ns() + EVERY_NS
+    monkeypatch.setattr(shared_node, "now_ns", lambda: later_ns)
+    second = moments.look(0.0)
+    assert second.beams.valid_at_ns - first.beams.valid_at_ns == EVERY_NS
+
+
+async def test_one_who_leaves_does_not_take_the_answer_from_the_others(moments: Moments) -> None:
+    begun, go_on = asyncio.Event(), threading.Event()
+    loop = asyncio.get_running_loop()
+
+    def make(_update: Update) -> str:
+        loop.call_soon_threadsafe(begun.set)
+        assert go_on.wait(60)
+        return "made"
+
+    leaves = asyncio.create_task(moments.made(0.0, "npy", make))
+    await asyncio.wait_for(begun.wait(), 60)
+    stays = asyncio.create_task(moments.made(0.0, "npy", make))
+    await asyncio.sleep(0)
+    leaves.cancel()
+    go_on.set()
+    assert await asyncio.wait_for(stays, 60) == "made"
+    assert leaves.cancelled() or leaves.cancelling()
+
+
+async def test_an_error_is_everybody_s(moments: Moments) -> None:
+    def make(_update: Update) -> None:
+        raise ValueError("not so")
+
+    for _ in range(2):
+        with pytest.raises(ValueError, match="not so"):
+            await moments.made(0.0, "npy", make)

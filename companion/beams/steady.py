@@ -21,8 +21,10 @@ PACE_WIDTHS: Final = 3.0
 
 The phases at the ends of the aperture go with the width itself.
 """
-LEAST_RAD: Final = 1e-3
-"""Angle that counts as none: where growth by factors begins."""
+LEAST_WIDTHS: Final = 0.25
+"""Angle in natural widths that shapes nothing: where growth by factors begins."""
+MOST_WIDTHS: Final = 16.0
+"""Angle beyond which a bound shapes nothing more: what is not followed need not be left again."""
 KEPT_NS: Final = 500_000_000
 """Time for which a method and turns are kept."""
 
@@ -77,11 +79,12 @@ def followed_rad(
     wanted_rad   (N, 2), their likely angles and their bounds
     natural_rad  the natural width of the array
     """
+    wanted_rad = np.minimum(wanted_rad, MOST_WIDTHS * natural_rad)
     if before is None:
         return wanted_rad
     passed_s = abs(valid_at_ns - before.valid_at_ns) * 1e-9
     last = np.array([before.shaped.get(uav, (np.nan, np.nan)) for uav in uavs])
-    last = np.maximum(last, LEAST_RAD)
+    last = np.maximum(last, LEAST_WIDTHS * natural_rad)
     further = np.minimum(last * (PACE**passed_s - 1), 2 * PACE_WIDTHS * natural_rad * passed_s)
     nearer = np.minimum(last * (1 - PACE**-passed_s), PACE_WIDTHS * natural_rad * passed_s)
     followed: FloatArray = np.where(

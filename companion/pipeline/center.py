@@ -4,6 +4,7 @@ The local frame begins at a fixed station, or where the first report was made.
 """
 
 import math
+from dataclasses import dataclass
 from typing import Final
 
 from companion.beams.aim import AIMABLE
@@ -37,6 +38,22 @@ HOME_SETTLES_S: Final = 120.0
 HOME_HEIGHT_M: Final = 20.0
 """Least height by which the first one must have been wrong."""
 
+PASSED_LEAST: Final = 4
+"""Attitudes that must go on before the newest to take its place."""
+PASSED_NS: Final = 500_000_000
+"""Time over which they must; attitudes that are resent come all at once."""
+PACE_NS: Final = 250_000_000
+"""By how much arrivals and stamps may differ from one to the next."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """Attitudes one after the other: arrival of the first, arrival and stamp of the last."""
+
+    began_ns: int
+    last: tuple[int, int]
+    count: int
+
 
 class Center:
     """Position and attitude of the array.
@@ -53,6 +70,7 @@ class Center:
         self._home_from: tuple[str, int] | None = None  # who home began with, and when
         self._attitude: tuple[int, Attitude] | None = None  # sender's time, attitude
         self._turns = carrier.Turns()
+        self._passed: _Run | None = None  # attitudes that were stamped before the newest
         self._attitude_bound_rad = math.radians(settings.center.attitude_bound_deg)
         self._attitude_kept_s = settings.tracks.coasting_s
         self._accuracy_factor = assembly.noise(settings).factor
@@ -109,14 +127,34 @@ class Center:
         Returns what it refutes of ``turn_degps2``, the greatest angular acceleration assumed.
         """
         if self._attitude is not None and placed.sender_ns <= self._attitude[0]:
-            return None
+            if not self._goes_on_before(placed):
+                return None
+            self._turns = carrier.Turns()
+        self._passed = None
         self._attitude = placed.sender_ns, placed.attitude
         return self._turns.look(placed.attitude, placed.sender_ns, turn_degps2)
+
+    def _goes_on_before(self, placed: PlacedAttitude) -> bool:
+        """Whether attitudes go on at their pace before the newest, which none has followed.
+
+        The newest was stamped ahead of its time then, and must not keep all others out. A slower
+        link's attitudes lie before those of a faster one too, but these go on meanwhile.
+        """
+        at = (placed.attitude.t_ns, placed.sender_ns)
+        run = self._passed
+        if run is not None:
+            step_ns, sender_step_ns = at[0] - run.last[0], at[1] - run.last[1]
+            if sender_step_ns <= 0 or abs(step_ns - sender_step_ns) > PACE_NS:
+                run = None
+        began_ns, count = (at[0], 0) if run is None else (run.began_ns, run.count)
+        self._passed = _Run(began_ns, at, count + 1)
+        return at[0] - began_ns >= PASSED_NS and count + 1 >= PASSED_LEAST
 
     def restarted(self, uav: str) -> None:
         """Drop the carrier's attitude if the carrier was restarted: its stamps mean nothing now."""
         if uav == self.vehicle:
             self._attitude = None
+            self._passed = None
             self._turns = carrier.Turns()
 
     def _first(self, report: Report) -> Notice:

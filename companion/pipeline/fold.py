@@ -198,10 +198,12 @@ class Pipeline:
     def _drop_silent(self, now_ns: int) -> list[Notice]:
         """Drop tracks that have been silent for long, so that they take no more memory or time."""
         silent = self.fleet.silent(now_ns, self.settings.tracks.dropped_s)
+        dropped = self.targets.dropped(now_ns, silent)
         for uav in silent:
             self._restart(uav)
+            self.targets.forget(uav)
         self.senders.forget_clocks(frozenset(self.fleet.uavs))
-        return self.targets.dropped(now_ns, silent)
+        return dropped
 
     # --- looking ----------------------------------------------------------------------------
 

@@ -303,6 +303,8 @@ class Senders:
     def assumed(self, uav: str) -> assembly.Assumed:
         """What is assumed of a UAV, by its newest heartbeat."""
         if uav not in self._known:
+            if len(self._known) >= CLOCKS_MAX:
+                self._known.clear()  # a cache only
             heard = self.presence.get(Source.parse(uav)) if reports_itself(uav) else None
             what = (None, None) if heard is None else (heard.mav_type, heard.autopilot)
             self._known[uav] = assembly.assumed(self._settings, uav, *what)

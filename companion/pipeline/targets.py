@@ -54,6 +54,10 @@ class Targets:
         """
         self._identities.observe(relayed, better)
 
+    def forget(self, uav: str) -> None:
+        """Forget what a relayed aircraft was compared with."""
+        self._identities.forget(uav)
+
     # --- what is said of them ---------------------------------------------------------------
 
     def changes(self, now_ns: int, states: Mapping[str, TrackState]) -> list[Notice]:

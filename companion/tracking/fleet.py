@@ -34,6 +34,8 @@ from companion.values import (
     Vector,
 )
 
+ESTABLISHED = 50
+"""Reports of a UAV that make it known: when it comes back, those of fewer make room for it."""
 COMMON_ERROR = 0.07
 """Share of the noise bound that is usual in all reports alike, which none of them shows."""
 
@@ -107,6 +109,7 @@ class Fleet:
         self._settings = settings
         self._tracked: dict[str, _Tracked] = {}
         self._refutations: dict[str, Refutations] = {}
+        self._established: set[str] = set()  # whose track is over, and had many reports
 
     # --- reports in -------------------------------------------------------------------------
 
@@ -125,7 +128,9 @@ class Fleet:
     def accept(self, fix: Fix) -> Estimate | Rejection:
         """Add a report to its track, or begin a track; or return the reason why it is not used."""
         tracked = self._tracked.get(fix.uav)
-        if tracked is None and len(self._tracked) >= self._settings.most:
+        full = tracked is None and len(self._tracked) >= self._settings.most
+        if full and not self._make_room(fix.uav):
+            self._refutations.pop(fix.uav, None)
             return _rejected(fix, Reason.TOO_MANY, f"{self._settings.most} tracks are kept")
         if tracked is None or self._is_lost(tracked, fix):
             return self._begin(fix)
@@ -145,6 +150,19 @@ class Fleet:
         if tracked.suspects.goes_on(fix.sender_ns):
             return _rejected(fix, Reason.SHARED_ID, "a second vehicle reports under this id")
         return self._use(tracked, index, fix, predicted)
+
+    def _make_room(self, uav: str) -> bool:
+        """Give up the latest track of few reports for a UAV that was here long before.
+
+        Returns False where there is none, or it was not.
+        """
+        if uav not in self._established:
+            return False
+        for other in reversed(self._tracked):
+            if other not in self._established and self._tracked[other].reports < ESTABLISHED:
+                self.forget(other)
+                return True
+        return False
 
     def _begin(self, fix: Fix, reports: int = 0) -> Estimate:
         history: History[Any] = History(self._observer, fix, round(self._settings.window_s * 1e9))
@@ -241,8 +259,11 @@ class Fleet:
 
     def forget(self, uav: str) -> None:
         """Forget a track, because its sender was restarted or is gone."""
-        self._tracked.pop(uav, None)
+        tracked = self._tracked.pop(uav, None)
         self._refutations.pop(uav, None)
+        room = len(self._established) < self._settings.most  # for whoever was here first
+        if room and tracked is not None and tracked.reports >= ESTABLISHED:
+            self._established.add(uav)
 
     def silent(self, now_ns: int, for_s: float) -> list[str]:
         """UAVs of which no report has arrived for ``for_s`` seconds, node time."""

@@ -38,6 +38,11 @@ class Identities:
         """
         return self._same.get(uav)
 
+    def forget(self, uav: str) -> None:
+        """Forget a relayed aircraft."""
+        self._counts.pop(uav, None)
+        self._same.pop(uav, None)
+
     def observe(self, relayed: Fix, better: list[Track]) -> None:
         """Compare a relayed report with the better known tracks at its time."""
         near = [(_apart_m(relayed, track), track.uav) for track in better]

@@ -11,6 +11,11 @@ QUANTISATION: Final = 0.02
 
 GLOBAL_POSITION_INT has steps of 1.1 cm and 1 cm/s.
 """
+LEAST_ACCURACY_M: Final = {4: 0.2, 5: 0.1, 6: 0.01, 7: 0.01, 8: 0.01}
+"""Least accuracy that a kind of fix (GPS_FIX_TYPE) is believed to have: differential, RTK floating
+and fixed, static, PPP. Some receivers state a millimetre when they mean that they do not know."""
+PLAIN_ACCURACY_M: Final = 0.3
+"""The same of any other fix."""
 ADSB_TIME_BOUND_S: Final = 1.0
 """Uncertainty of the time of an ADS-B report: ``tslc`` is in whole seconds."""
 ADSB_NOISE_M: Final = 100.0
@@ -46,8 +51,9 @@ def reported(status: GnssStatus, settings: NoiseSettings) -> ReportNoise:
     default, factor = settings.default, settings.factor
     if factor is None:
         return default
-    horizontal_m = _bound(status.h_acc_m, factor, default.horizontal_m)
-    vertical_m = _bound(status.v_acc_m, factor, default.vertical_m)
+    least_m = LEAST_ACCURACY_M.get(status.fix_type, PLAIN_ACCURACY_M)
+    horizontal_m = _bound(status.h_acc_m, factor, default.horizontal_m, least_m)
+    vertical_m = _bound(status.v_acc_m, factor, default.vertical_m, least_m)
     return ReportNoise(
         horizontal_m,
         vertical_m,
@@ -56,8 +62,8 @@ def reported(status: GnssStatus, settings: NoiseSettings) -> ReportNoise:
     )
 
 
-def _bound(accuracy: float | None, factor: float, default: float) -> float:
-    return default if accuracy is None else max(QUANTISATION, factor * accuracy)
+def _bound(accuracy: float | None, factor: float, default: float, least: float = 0.0) -> float:
+    return default if accuracy is None else max(QUANTISATION, factor * max(accuracy, least))
 
 
 def relayed(

@@ -1,6 +1,7 @@
 """Own telemetry and ADS-B of one aircraft are one; two aircraft that meet are two."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -95,7 +96,7 @@ def status(h: float | None, v: float | None, vel: float | None) -> GnssStatus:
     [
         ((0.5, 1.0, 0.1), (1.5, 3.0, 3.354, 0.3)),
         ((None, 1.0, None), (3.0, 3.0, 4.243, 0.5)),
-        ((0.001, 0.001, 0.001), (0.02, 0.02, 0.0283, 0.02)),  # finer than what is sent
+        ((0.001, 0.001, 0.001), (0.9, 0.9, 1.273, 0.02)),  # what no fix of the kind can have
     ],
 )
 def test_reported_accuracies_are_bounds_times_a_factor(
@@ -109,3 +110,28 @@ def test_reported_accuracies_are_bounds_times_a_factor(
 def test_reported_accuracies_can_be_ignored() -> None:
     given = noise.NoiseSettings(DEFAULT, None)
     assert noise.reported(status(0.5, 1.0, 0.1), given) == DEFAULT
+
+
+@pytest.mark.parametrize(
+    ("fix_type", "least_m"), [(2, 0.9), (3, 0.9), (4, 0.6), (5, 0.3), (6, 0.03), (8, 0.03)]
+)
+def test_no_fix_is_believed_to_be_better_than_its_kind(fix_type: int, least_m: float) -> None:
+    """Some receivers state a millimetre where they do not know; 30 cm of an RTK fix stands."""
+    claimed = replace(status(0.001, 0.001, None), fix_type=fix_type)
+    found = noise.reported(claimed, noise.NoiseSettings(DEFAULT, 3.0))
+    assert (found.horizontal_m, found.vertical_m) == pytest.approx((least_m, least_m))
+    honest = replace(claimed, h_acc_m=0.3)
+    assert noise.reported(honest, noise.NoiseSettings(DEFAULT, 3.0)).horizontal_m == pytest.approx(
+        0.9
+    )
+
+
+def test_an_aircraft_that_is_forgotten_is_compared_anew(fix: MakeFix) -> None:
+    identities = Identities()
+    telemetry = [track("1:1", [0, 0, -300])]
+    for number in range(20_000):
+        identities.observe(relayed(fix, number, [0, 10, -300]), telemetry)
+    assert identities.same_as(AIRCRAFT) == "1:1"
+    identities.forget(AIRCRAFT)
+    assert identities.same_as(AIRCRAFT) is None
+    assert vars(identities) == vars(Identities())

@@ -21,6 +21,7 @@ from collections.abc import Callable, Hashable
 from typing import Final, Protocol
 
 from companion.mavlink.links.status import ComponentStatus, LinkStatus
+from companion.mavlink.wire.decode import ATTITUDE, GLOBAL_POSITION_INT
 from companion.mavlink.wire.framing import MAGIC_V2, Splitter
 from companion.values import Frame, Rejection, Source
 
@@ -34,6 +35,9 @@ When there are more, all are begun anew, which costs no more than the holes of t
 RESTART_RUN: Final = 3
 """Late frames in a row, each further on, that show a restart of the sender."""
 
+STAMPED: Final = frozenset((GLOBAL_POSITION_INT, ATTITUDE))
+"""Messages whose stamps are those of the clock that TIMESYNC is about."""
+STAMPS_KEPT_NS: Final = 30_000_000_000
 _HALF_ROUND: Final = 128
 
 
@@ -60,13 +64,14 @@ class _Component:
 class _Sender:
     """One source as one peer delivers it: the sequence number due, and the run of late ones."""
 
-    __slots__ = ("component", "due", "late", "run")
+    __slots__ = ("component", "due", "late", "run", "stamped_ns")
 
     def __init__(self, component: _Component, due: int) -> None:
         self.component = component
         self.due = due
         self.late = 0
         self.run = 0
+        self.stamped_ns: int | None = None  # when the peer last brought a stamp of its clock
 
 
 class Peer:
@@ -86,6 +91,12 @@ class Peer:
     def speaks_v1_only(self) -> bool:
         """True if it was heard, and in MAVLink 1 alone."""
         return self.versions == 1
+
+    def brings_stamps(self, source: Source, now_ns: int) -> bool:
+        """Whether this peer has lately brought what a source says with its boot clock's stamp."""
+        sender = self.senders.get(source)
+        stamped_ns = None if sender is None else sender.stamped_ns
+        return stamped_ns is not None and now_ns - stamped_ns <= STAMPS_KEPT_NS
 
     def next_sequence(self) -> int:
         """Take the sequence number of the next frame to this peer."""
@@ -158,7 +169,7 @@ class Peers:
             if isinstance(item, Rejection):
                 status.lost[item.reason] = status.lost.get(item.reason, 0) + item.count
                 continue
-            t_ns, _, source, _, raw = item
+            t_ns, _, source, msgid, raw = item
             if raw[0] == MAGIC_V2:
                 version, number = 2, raw[4]
             else:
@@ -172,6 +183,8 @@ class Peers:
             counts.frames += 1
             counts.heard_ns = t_ns
             counts.version = version
+            if msgid in STAMPED:
+                sender.stamped_ns = t_ns
             peer.versions |= version
             peer.heard_ns = status.heard_ns = t_ns
             status.frames += 1

@@ -35,7 +35,7 @@ from companion.mavlink.links.urls import LinkError, LinkUrl
 from companion.mavlink.wire.aircraft_json import AircraftJson
 from companion.mavlink.wire.beast import BeastSplitter
 from companion.mavlink.wire.cot_link import CotSplitter
-from companion.mavlink.wire.encode import Outgoing, pack
+from companion.mavlink.wire.encode import TIMESYNC, Outgoing, pack
 from companion.mavlink.wire.framing import Splitter
 from companion.mavlink.wire.rid_json import RidJson
 from companion.mavlink.wire.sbs import SbsSplitter
@@ -158,7 +158,7 @@ class Link:
         if self._guard is not None:
             found = [_admitted(self._guard, item) for item in found]
         self._peers.count(peer, found)
-        self._receive(found)
+        self._receive([_answered(peer, item) for item in found])
 
     def _hang_up(self, key: Hashable) -> None:
         """Forget a peer that is gone."""
@@ -289,6 +289,20 @@ def endpoint(url: LinkUrl, status: LinkStatus, upcalls: Upcalls) -> Endpoint:
             return UdpListen(url, status, upcalls) if url.listens else TcpListen(url, upcalls)
         case "serial":
             return SerialPort(url, upcalls)
+
+
+def _answered(peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
+    """The item itself, or the refusal of a TIMESYNC from who does not bring its sender's stamps.
+
+    Whoever else reaches the socket could move a clock by it. Routers bring both.
+    """
+    if isinstance(item, Rejection) or item.msgid != TIMESYNC:
+        return item
+    if peer.brings_stamps(item.source, item.t_ns) or item.payload[:8].strip(b"\0") == b"":
+        return item  # a request is no evidence
+    detail = "TIMESYNC: not from the peer that brings its positions"
+    who = str(item.source)
+    return Rejection(item.t_ns, who, Reason.UNPLACED_STAMP, msgid=TIMESYNC, detail=detail)
 
 
 def _admitted(guard: Guard, item: Frame | Rejection) -> Frame | Rejection:

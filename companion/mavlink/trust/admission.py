@@ -2,6 +2,10 @@
 
 from collections.abc import Iterable
 from fnmatch import fnmatchcase
+from typing import Final
+
+KNOWN_MAX: Final = 8192
+"""Ids whose answer is kept; a cache only, since senders may invent as many as they like."""
 
 
 class Admission:
@@ -22,6 +26,8 @@ class Admission:
         """Whether this UAV may be tracked."""
         known = self._known.get(uav)
         if known is None:
+            if len(self._known) >= KNOWN_MAX:
+                self._known.clear()
             known = self._known.setdefault(uav, self._decide(uav))
         return known
 

@@ -172,11 +172,18 @@ def _callsign(padded: bytes) -> str | None:
 _ATTITUDE = struct.Struct("<Iffffff")
 
 
+TURN_RAD: Final = 6.3
+RATE_MAX_RADPS: Final = 75.0
+"""Rates beyond it are no gyroscope's: the widest range of those aboard is 4000 degrees a second."""
+
+
 def _attitude(frame: Frame) -> Attitude:
     """Decode body attitude (FRD from NED, radians) and body rates (rad/s)."""
     boot_ms, *angles = unpack(frame, _ATTITUDE)
     if not all(map(math.isfinite, angles)):
         raise _RefusedError(Reason.MALFORMED, "an angle or rate is not a number")
+    if max(map(abs, angles[:3])) > TURN_RAD or max(map(abs, angles[3:])) > RATE_MAX_RADPS:
+        raise _RefusedError(Reason.MALFORMED, "an angle or rate that nothing can measure")
     return Attitude(frame.t_ns, frame.source, boot_ms, *angles)
 
 
@@ -189,7 +196,13 @@ def _heartbeat(frame: Frame) -> Presence:
     return Presence(frame.t_ns, frame.source, mav_type, autopilot, status, bool(base_mode & _ARMED))
 
 
+_UNKNOWN: Final = 0xFFFF_FFFF
 _GPS_RAW_INT = struct.Struct("<QiiiHHHHBBiIIIIH")
+
+
+def _stated(thousandths: int) -> float | None:
+    """An accuracy in m or m/s; None where it was not sent, or is all ones."""
+    return None if thousandths in (0, _UNKNOWN) else thousandths * 1e-3
 
 
 def _gps_raw_int(frame: Frame) -> GnssStatus:
@@ -202,9 +215,9 @@ def _gps_raw_int(frame: Frame) -> GnssStatus:
         fix_type=fix_type,
         satellites=None if satellites == 255 else satellites,
         alt_m=fields[3] * 1e-3,
-        h_acc_m=h_acc * 1e-3 or None,
-        v_acc_m=v_acc * 1e-3 or None,
-        vel_acc_mps=vel_acc * 1e-3 or None,
+        h_acc_m=_stated(h_acc),
+        v_acc_m=_stated(v_acc),
+        vel_acc_mps=_stated(vel_acc),
     )
 
 

@@ -471,9 +471,10 @@ def test_version_1_reads_as_version_2() -> None:
 
 
 @pytest.mark.parametrize("field", ["h_acc", "v_acc", "vel_acc"])
-def test_an_accuracy_of_0_is_unknown(field: str) -> None:
+@pytest.mark.parametrize("unknown", [0, 0xFFFF_FFFF])
+def test_an_accuracy_of_0_or_all_ones_is_unknown(field: str, unknown: int) -> None:
     names = {"h_acc": "h_acc_m", "v_acc": "v_acc_m", "vel_acc": "vel_acc_mps"}
-    given_mm = {"h_acc": 1000, "v_acc": 2000, "vel_acc": 3000} | {field: 0}
+    given_mm = {"h_acc": 1000, "v_acc": 2000, "vel_acc": 3000} | {field: unknown}
     found = decode(sent(gps_raw_int(**given_mm)))
     for key, name in names.items():
         want = None if key == field else pytest.approx(given_mm[key] / 1000)
@@ -500,6 +501,17 @@ def test_an_attitude_that_is_no_number_is_malformed(field: int, bad: float) -> N
     assert isinstance(decode(attitude(angles)), Attitude)
     angles[field] = bad
     assert rejected(attitude(angles)) is Reason.MALFORMED
+
+
+@pytest.mark.parametrize("field", range(6))
+def test_an_attitude_that_nothing_can_measure_is_malformed(field: int) -> None:
+    """A rate of turn of 10⁶ rad/s would be carried on to any attitude at all."""
+    for most in (6.29, -6.29) if field < 3 else (70.0, -70.0):
+        angles = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+        angles[field] = most
+        assert isinstance(decode(attitude(angles)), Attitude)
+        angles[field] = most * 1.2
+        assert rejected(attitude(angles)) is Reason.MALFORMED
 
 
 def test_the_fields_of_an_attitude_keep_their_order() -> None:

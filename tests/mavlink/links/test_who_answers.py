@@ -1,0 +1,75 @@
+"""TIMESYNC answers are taken from the peer that brings a sender's positions, and from no other."""
+
+import pytest
+from link_support import frame
+
+from companion.mavlink.links.peers import STAMPS_KEPT_NS
+from companion.mavlink.links.transport import Link
+from companion.mavlink.links.urls import parse_link
+from companion.mavlink.wire.encode import TIMESYNC, pack, timesync
+from companion.mavlink.wire.framing import Splitter
+from companion.values import Frame, Reason, Rejection, Source
+
+VEHICLE = Source(1, 1)
+HOME, ELSEWHERE = ("10.0.0.1", 14550), ("10.0.0.66", 4000)
+
+
+class Taken:
+    """A link that is fed by hand, and what it handed on last."""
+
+    def __init__(self) -> None:
+        self.found: list[Frame | Rejection] = []
+        self.now_ns = 1_000_000_000
+        link = parse_link("udpin:127.0.0.1:0")
+        self.link = Link(link, self.found.extend, lambda: self.now_ns)
+
+    def take(self, peer: object, raw: bytes) -> Frame | Rejection:
+        """What becomes of a frame."""
+        self.found.clear()
+        self.link.take(peer, raw)
+        (one,) = self.found
+        return one
+
+
+def answer(remote_ns: int = 77_000_000_000) -> bytes:
+    """An answer of the vehicle: it takes its id from whoever packs it."""
+    message = timesync(VEHICLE, 5_000_191)
+    payload = remote_ns.to_bytes(8, "little") + message.payload[8:]
+    return pack(message._replace(payload=payload), 0, 2)
+
+
+@pytest.fixture
+def taken() -> Taken:
+    return Taken()
+
+
+def test_an_answer_comes_from_where_the_positions_come(taken: Taken) -> None:
+    assert isinstance(taken.take(HOME, frame(1)), Frame)
+    assert isinstance(taken.take(HOME, answer()), Frame)
+    forged = taken.take(ELSEWHERE, answer())
+    assert isinstance(forged, Rejection)
+    assert (forged.source, forged.reason, forged.msgid) == (
+        "1:1", Reason.UNPLACED_STAMP, TIMESYNC,
+    )  # fmt: skip
+
+
+def test_a_router_that_brings_both_is_believed_over_each_way(taken: Taken) -> None:
+    for number, way in enumerate((HOME, ELSEWHERE)):
+        taken.take(way, frame(number))
+    assert all(isinstance(taken.take(way, answer()), Frame) for way in (HOME, ELSEWHERE))
+
+
+def test_positions_of_another_sender_vouch_for_nothing(taken: Taken) -> None:
+    taken.take(ELSEWHERE, frame(1, sysid=66))
+    assert isinstance(taken.take(ELSEWHERE, answer()), Rejection)
+
+
+def test_who_has_long_been_silent_is_asked_anew(taken: Taken) -> None:
+    taken.take(HOME, frame(1))
+    taken.now_ns += STAMPS_KEPT_NS + 1
+    assert isinstance(taken.take(HOME, answer()), Rejection)
+
+
+def test_a_request_is_no_answer(taken: Taken) -> None:
+    assert isinstance(taken.take(ELSEWHERE, answer(0)), Frame)
+    assert Splitter("x").feed(0, answer(0))

@@ -1,0 +1,164 @@
+"""Strangers who send what they like: others are not locked out, and nothing grows without end."""
+
+import math
+import random
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from companion.mavlink.trust import admission
+from companion.mavlink.trust.admission import Admission
+from companion.pipeline.center import Center
+from companion.pipeline.senders import PlacedAttitude
+from companion.settings.model import Settings
+from companion.tracking.fleet import ESTABLISHED, Fleet, FleetSettings
+from companion.tracking.observers.position import PositionModel, PositionObserver
+from companion.values import (
+    AltitudeDatum,
+    Attitude,
+    Estimate,
+    Fix,
+    Limits,
+    Reason,
+    Rejection,
+    Report,
+    ReportNoise,
+    Source,
+)
+
+S = 1_000_000_000
+MS = 1_000_000
+
+
+# --- the table of tracks ------------------------------------------------------------------------
+
+
+def fix(uav: str, t_s: float) -> Fix:
+    t_ns = round(t_s * S)
+    report = Report(
+        t_ns, "udp", uav, Source(1, 1), 47.0, 8.0, 500.0, AltitudeDatum.MSL, None, None, None,
+        None, 1000, None,
+    )  # fmt: skip
+    place = (10.0 * t_s, 0.0, -50.0)
+    noise = ReportNoise(1.2, 0.9, 1.5, 0.4)
+    return Fix(uav, t_ns, t_ns, t_ns, place, None, noise, report)
+
+
+@pytest.fixture
+def fleet() -> Fleet:
+    observer = PositionObserver(PositionModel(30.0, 8.0, alpha=0.5))
+    return Fleet(observer, FleetSettings(Limits(30.0, 8.0), most=10))
+
+
+def flown(fleet: Fleet, uav: str, reports: int, from_s: float) -> None:
+    for number in range(reports):
+        assert isinstance(fleet.accept(fix(uav, from_s + number * 0.1)), Estimate)
+
+
+def test_who_was_here_before_is_not_shut_out_by_strangers(fleet: Fleet) -> None:
+    flown(fleet, "1:1", ESTABLISHED, 0.0)
+    fleet.forget("1:1")  # behind a hill for ten minutes
+    for number in range(10):
+        flown(fleet, f"200:{number}", 3, 700.0)
+    refused = fleet.accept(fix("201:1", 701.0))
+    assert isinstance(refused, Rejection)
+    assert refused.reason is Reason.TOO_MANY
+    assert isinstance(fleet.accept(fix("1:1", 702.0)), Estimate)
+    assert fleet.uavs == [*(f"200:{number}" for number in range(9)), "1:1"]
+
+
+def test_who_is_tracked_for_long_makes_no_room(fleet: Fleet) -> None:
+    flown(fleet, "1:1", ESTABLISHED, 0.0)
+    fleet.forget("1:1")
+    for number in range(10):
+        flown(fleet, f"2:{number}", ESTABLISHED, 700.0)
+    assert isinstance(fleet.accept(fix("1:1", 710.0)), Rejection)
+
+
+def test_strangers_who_are_refused_leave_nothing_behind(fleet: Fleet) -> None:
+    for number in range(10):
+        flown(fleet, f"2:{number}", 1, 0.0)
+    for number in range(1000):
+        stranger, _ = fleet.refuted(fix(f"icao:{number:06X}", 1.0))
+        assert isinstance(fleet.accept(stranger), Rejection)
+    assert len(fleet._refutations) <= 10
+
+
+def test_only_as_many_are_remembered_as_are_tracked(fleet: Fleet) -> None:
+    for number in range(30):
+        flown(fleet, f"3:{number}", ESTABLISHED, 100.0 * number)
+        fleet.forget(f"3:{number}")
+    assert fleet._established == {f"3:{number}" for number in range(10)}  # whoever was first
+
+
+def test_ids_without_end_do_not_fill_the_lists() -> None:
+    lists = Admission(("1:*", "icao:4*"), ("1:7",))
+    for number in range(3 * admission.KNOWN_MAX):
+        assert lists.admits(f"icao:{number:06X}") is (f"{number:06X}"[0] == "4")
+        assert len(lists._known) <= admission.KNOWN_MAX
+    assert [lists.admits(uav) for uav in ("1:1", "1:7", "2:1")] == [True, False, False]
+
+
+# --- attitudes of the carrier -------------------------------------------------------------------
+
+
+def attitude(arrival_ms: int, stamp_ms: int, yaw_rad: float) -> PlacedAttitude:
+    said = Attitude(
+        arrival_ms * MS, Source(5, 1), stamp_ms, 0.0, 0.0, yaw_rad, 0.0, 0.0, 0.0
+    )  # fmt: skip
+    return PlacedAttitude(said, stamp_ms * MS)
+
+
+@pytest.fixture
+def turning() -> Callable[[list[PlacedAttitude]], list[float]]:
+    """``turning(attitudes)``: the yaw that is known after each, degrees."""
+
+    def run(attitudes: list[PlacedAttitude]) -> list[float]:
+        center = Center(Settings().override(center={"source": "5:1"}))
+        known = []
+        for one in attitudes:
+            center.turn(one, 40.0)
+            assert center._attitude is not None
+            known.append(round(math.degrees(center._attitude[1].yaw_rad), 3))
+        return known
+
+    return run
+
+
+def yaw_rad(ms: int) -> float:
+    return math.radians(ms / 100)
+
+
+def test_an_attitude_from_the_future_does_not_keep_others_out(
+    turning: Callable[[list[PlacedAttitude]], list[float]],
+) -> None:
+    honest = [attitude(t, t, yaw_rad(t)) for t in range(0, 5000, 100)]
+    forged = attitude(1050, 61_050, math.pi)
+    said = sorted([*honest, forged], key=lambda one: one.attitude.t_ns)
+    known = turning(said)
+    assert known[11] == 180.0
+    locked_ms = [
+        one.attitude.t_ns // MS for one, yaw in zip(said, known, strict=True) if yaw == 180
+    ]
+    assert locked_ms[-1] - locked_ms[0] <= 600
+    assert known[-1] == pytest.approx(math.degrees(yaw_rad(4900)))
+
+
+def test_a_slower_link_never_turns_the_carrier_back(
+    turning: Callable[[list[PlacedAttitude]], list[float]],
+) -> None:
+    """Attitudes that come again two seconds late, at their own pace, beside the fresh ones."""
+    rng = random.Random(5)
+    fast = [attitude(t, t, yaw_rad(t)) for t in range(0, 20_000, 100)]
+    slow = [attitude(t + 2000 + rng.randrange(90), t, yaw_rad(t)) for t in range(0, 18_000, 40)]
+    known = turning(sorted([*fast, *slow], key=lambda one: one.attitude.t_ns))
+    assert np.all(np.diff(known) >= 0)
+
+
+def test_attitudes_that_are_resent_at_once_turn_nothing_back(
+    turning: Callable[[list[PlacedAttitude]], list[float]],
+) -> None:
+    fresh = [attitude(t, t, yaw_rad(t)) for t in range(0, 3000, 100)]
+    burst = [attitude(3000 + t // 1000, t, yaw_rad(t)) for t in range(0, 2900, 50)]
+    assert set(turning([*fresh, *burst])[-len(burst) :]) == {29.0}

@@ -273,10 +273,9 @@ class Senders:
         return stamp, name if stamp is not None and stamp.rebooted else None
 
     def _clock(self, name: str) -> SenderClock:
-        clock = self._clocks.get(name)
-        if clock is None:
-            clock = self._clocks.setdefault(name, assembly.clock(self._settings))
-        return clock
+        if name not in self._clocks:
+            self._clocks[name] = assembly.clock(self._settings)
+        return self._clocks[name]
 
     def time(self, uav: str, node_ns: int) -> SenderTime:
         """A node time on a UAV's own timeline; a relayed aircraft's timeline is the node's."""
@@ -303,8 +302,8 @@ class Senders:
     def assumed(self, uav: str) -> assembly.Assumed:
         """What is assumed of a UAV, by its newest heartbeat."""
         if uav not in self._known:
-            if len(self._known) >= CLOCKS_MAX:
-                self._known.clear()  # a cache only
+            if len(self._known) >= CLOCKS_MAX:  # a cache only
+                self._known.clear()
             heard = self.presence.get(Source.parse(uav)) if reports_itself(uav) else None
             what = (None, None) if heard is None else (heard.mav_type, heard.autopilot)
             self._known[uav] = assembly.assumed(self._settings, uav, *what)

@@ -17,7 +17,7 @@ from mcap.records import Attachment, Metadata
 from companion.recording.container import MAGIC, Content, Damage, Message, Walk
 from companion.recording.mcap_file import McapFile
 from companion.recording.reader import LogError
-from companion.recording.writer import ACTIVE, free_name, sync_folder
+from companion.recording.writer import ACTIVE, free_name, opened, sync_folder
 
 _PARTIAL: Final = ".recovering"
 
@@ -123,7 +123,7 @@ def _rewrite(path: Path, head: bytes) -> Recovered:
     walk = Walk(path)
     tally = _Tally()
     try:
-        with partial.open("wb") as out:
+        with opened(partial, os.O_TRUNC | os.O_NOFOLLOW) as out:
             _Copy(McapFile(out), walk, tally).run()
             out.flush()
             os.fsync(out.fileno())

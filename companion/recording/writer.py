@@ -22,6 +22,8 @@ from companion.recording.parts import HOLE, PART, Hole, Part
 from companion.recording.scene import Scene
 from companion.values import Event, Output
 
+FILE_MODE: Final = 0o640
+FOLDER_MODE: Final = 0o750
 ACTIVE: Final = ".active"
 SETTINGS: Final = "settings.toml"
 VERSIONS: Final = "versions"
@@ -208,7 +210,7 @@ def open_alone(path: Path) -> BufferedWriter:
     Raises ``BlockingIOError`` if one is. The lock goes with the process, however that ends, so it
     also tells leftovers from live files.
     """
-    file = path.open("ab")
+    file = opened(path, os.O_APPEND)
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         file.truncate(0)
@@ -219,9 +221,15 @@ def open_alone(path: Path) -> BufferedWriter:
     return file
 
 
+def opened(path: Path, flags: int) -> BufferedWriter:
+    """A file to write, made if missing: where everybody flies is not for all to read."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | flags, FILE_MODE)
+    return os.fdopen(descriptor, "ab" if flags & os.O_APPEND else "wb")
+
+
 def _reserve(folder: Path, started_ns: int) -> Path:
     """A name that no recording has, finished or open; its ``.active`` file now exists."""
-    folder.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
     started = datetime.fromtimestamp(started_ns // 1_000_000_000, tz=UTC)
     name, number = f"companion-{started:%Y%m%dT%H%M%SZ}", 0
     while True:
@@ -230,7 +238,7 @@ def _reserve(folder: Path, started_ns: int) -> Path:
         if path.exists():
             continue
         try:
-            _beside(path).touch(exist_ok=False)
+            _beside(path).touch(FILE_MODE, exist_ok=False)
         except FileExistsError:
             continue
         return path

@@ -17,6 +17,7 @@ from mcap.reader import make_reader
 from support import read_metadata
 
 from companion.recording.reader import log_kind, read_log, read_settings
+from companion.recording.recover import recover
 from companion.recording.writer import Writer
 from companion.values import Estimate, Event, Frame, Rejection, Source, Tick, Update
 
@@ -297,3 +298,22 @@ def test_what_is_salvaged_ends_at_the_last_flush(tmp_path: Path) -> None:
     assert writer.path.stat().st_size == writer.size_bytes
     empty = open_writer(tmp_path / "empty")
     assert empty.salvage() and list(empty.path.parent.iterdir()) == []
+
+
+@pytest.mark.parametrize("umask", [0o000, 0o022, 0o077])
+def test_who_flies_where_is_not_for_all_to_read(tmp_path: Path, umask: int) -> None:
+    """Recordings are for their owner and its group, recovered ones too, and so are new folders."""
+    before = os.umask(umask)
+    try:
+        folder = tmp_path / "recordings"
+        with Writer(folder, "", {}, None, 0) as writer:
+            opened = writer.path.stat().st_mode & 0o777
+            kept = writer.close({})
+        (folder / "torn.mcap.active").write_bytes(kept.read_bytes()[:-20])
+        recovered = recover(folder / "torn.mcap.active").path
+    finally:
+        os.umask(before)
+    wanted = [0o750, 0o640, 0o640, 0o640]
+    found = [folder.stat().st_mode & 0o777, opened]
+    found += [file.stat().st_mode & 0o777 for file in (kept, recovered)]
+    assert found == [mode & ~umask for mode in wanted]

@@ -8,15 +8,16 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable, Coroutine, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import companion
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.voice.rate_watch import MessageRate
 from companion.node.gateway import Gateway
 from companion.node.outlet import Outlet
-from companion.node.serving import NOTICES_KEPT, Server, Throughput
+from companion.node.serving import NOTICES_KEPT, Server, Throughput, aside
 from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
 from companion.recording.background import BackgroundRecorder, Rotation
@@ -37,16 +38,29 @@ from companion.views.lateness import Lateness
 from companion.views.series import Series
 from companion.views.state import RecordingStatus
 
+SET_NS: Final = 500_000_000
+"""Step of the wall clock, between two ticks, that is told."""
+
 
 class NodeClock:
     """Nanoseconds since the Unix epoch, never stepping: the wall clock once, then monotonic."""
 
     def __init__(self) -> None:
         self._start_ns = time.time_ns() - time.monotonic_ns()
+        self._off_ns = 0
 
     def now_ns(self) -> int:
         """The present time on the node's timeline."""
         return self._start_ns + time.monotonic_ns()
+
+    def set_by_ns(self) -> int | None:
+        """By how much the wall clock was set since the start or the last word; None: not at all.
+
+        The timeline goes on as before: intervals and bounds rest on it. Drift is not told.
+        """
+        off_ns = time.time_ns() - self.now_ns()
+        told_ns, self._off_ns = self._off_ns, off_ns
+        return off_ns if abs(off_ns - told_ns) > SET_NS else None
 
 
 class Service:
@@ -181,6 +195,16 @@ class Service:
             text, severity = f"{machine.reason}; {machine.remedy}", Severity.WARNING
         self._notify(Notice(self.now_ns(), severity, "machine", text))
 
+    def _tell_of_wall_clock(self) -> None:
+        """Tell when this machine's clock was set, as by NTP on one without a battery."""
+        off_ns = self._timeline.set_by_ns()
+        if off_ns is not None:
+            text = (
+                f"this machine's clock was set: times of this run and its recordings are"
+                f" {abs(off_ns) * 1e-9:.3f} s {'before' if off_ns > 0 else 'after'} it"
+            )
+            self._notify(Notice(self.now_ns(), Severity.WARNING, "clock", text))
+
     def _show(self, notice: Notice) -> None:
         self.notices.append(notice)
         self._say(notice.text)
@@ -202,6 +226,7 @@ class Service:
                 self._tell_of_recorder(self._recorder)
             self._traffic.speak(not self.unfit(), self.pipeline.reporters())
             self._tell_of_machine()
+            self._tell_of_wall_clock()
             self.series.add(self.pipeline)
             self._ticked.set()  # wakes those who wait now;
             self._ticked.clear()  # later ones wait for the next tick
@@ -288,7 +313,7 @@ class Service:
         directory = self._settings.recording.directory
         if directory is None:
             return
-        for found in await asyncio.to_thread(recover_leftovers, Path(directory)):
+        for found in await aside(partial(recover_leftovers, Path(directory))):
             if isinstance(found, LogError):
                 self._say(str(found))
             else:

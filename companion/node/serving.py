@@ -6,16 +6,20 @@ import gc
 import signal
 import socket
 import sys
+import threading
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import uvicorn
 
 from companion.server.app import create_app
 from companion.server.connections import BoundedProtocol
 from companion.views.state import Node
+
+T = TypeVar("T")
 
 RATE_WINDOW_S: Final = 2.0
 """Time over which frames and updates per second are counted."""
@@ -97,6 +101,26 @@ async def pause(until: asyncio.Event, seconds: float) -> None:
     """Wait for ``seconds``, or until ``until`` is set."""
     with contextlib.suppress(TimeoutError):
         await asyncio.wait_for(until.wait(), seconds)
+
+
+async def aside(work: Callable[[], T]) -> T:
+    """What a function returns, on a thread for which the end of the service does not wait.
+
+    It must leave nothing half done behind that matters.
+    """
+    loop = asyncio.get_running_loop()
+    done: asyncio.Future[T] = loop.create_future()
+
+    def run() -> None:
+        try:
+            settle = partial(done.set_result, work())
+        except Exception as error:
+            settle = partial(done.set_exception, error)
+        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits any more
+            loop.call_soon_threadsafe(lambda: None if done.done() else settle())
+
+    threading.Thread(target=run, name="aside", daemon=True).start()
+    return await done
 
 
 def run_until_told(

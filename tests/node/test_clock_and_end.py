@@ -1,0 +1,154 @@
+"""The clock is set, a port is taken, the end comes at a bad time: said, and nothing is lost."""
+
+import signal
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support import BIN, HANG_S
+
+from companion.node import service
+from companion.node.service import NodeClock, Service
+from companion.recording import schemas
+from companion.recording.container import MAGIC
+from companion.settings.model import Settings
+
+RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "home")
+S = 1_000_000_000
+
+
+class Wall:
+    """A wall clock that can be set, and a monotonic one that cannot."""
+
+    def __init__(self) -> None:
+        self.set_ns = 0
+        self.ns = 0
+
+    def time_ns(self) -> int:
+        return 1_000 * S + self.ns + self.set_ns
+
+    def monotonic_ns(self) -> int:
+        return 5 * S + self.ns
+
+
+@pytest.fixture
+def wall(monkeypatch: pytest.MonkeyPatch) -> Wall:
+    made = Wall()
+    monkeypatch.setattr(service.time, "time_ns", made.time_ns)
+    monkeypatch.setattr(service.time, "monotonic_ns", made.monotonic_ns)
+    return made
+
+
+def test_the_timeline_goes_on_when_the_clock_is_set_and_that_is_told_once(wall: Wall) -> None:
+    clock = NodeClock()
+    told = []
+    for second in range(100):
+        wall.ns = second * S
+        wall.set_ns = 0 if second < 10 else 1_700_000_000 * S if second < 50 else -3600 * S
+        assert clock.now_ns() == 1_000 * S + second * S  # a Pi without a battery begins in 1970
+        told.append(clock.set_by_ns())
+    assert [(at, off) for at, off in enumerate(told) if off is not None] == [
+        (10, 1_700_000_000 * S), (50, -3600 * S),
+    ]  # fmt: skip
+
+
+def test_slow_discipline_is_not_told(wall: Wall) -> None:
+    clock = NodeClock()
+    for tick in range(10_000):
+        wall.ns = tick * S // 10
+        wall.set_ns = tick * 50_000  # 500 ppm, as fast as NTP slews
+        assert clock.set_by_ns() is None
+
+
+def test_a_set_clock_is_said_to_the_operator(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    settings = Settings().override(center={"source": "home"}, links={"urls": ["udpin:127.0.0.1:0"]})
+    node = Service(settings, said.append)
+    before_ns, real = node.now_ns(), time.time_ns
+    monkeypatch.setattr(service.time, "time_ns", lambda: real() + 7 * S)
+    for _ in range(3):
+        node._tell_of_wall_clock()
+    assert said == [
+        "this machine's clock was set: times of this run and its recordings are 7.000 s before it"
+    ]
+    assert 0 <= node.now_ns() - before_ns < 3600 * S
+    node._traffic.close()
+    for link in node._traffic.links:
+        link._endpoint._socket.close()  # type: ignore[attr-defined]
+
+
+def started_in_the_background(*arguments: str) -> "subprocess.Popen[str]":
+    """As by ``companion run … &`` in a script: the shell has it ignore SIGINT."""
+    ignoring = "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN);"
+    code = f"{ignoring} os.execv(sys.argv[1], sys.argv[1:])"
+    return subprocess.Popen(
+        [sys.executable, "-c", code, str(BIN / "companion"), *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def test_a_start_in_the_background_ends_on_sigterm(tmp_path: Path) -> None:
+    with started_in_the_background(*RUN, "--record", str(tmp_path)) as process:
+        assert process.stdout is not None
+        assert "serves" in process.stdout.readline()
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(HANG_S) == 0
+    assert [file.suffix for file in tmp_path.iterdir()] == [".mcap"]
+
+
+@pytest.mark.full
+def test_the_end_does_not_wait_for_a_leftover(tmp_path: Path, start_node: Any) -> None:
+    """Half a minute's work of recovery: its leftover is there for the next start."""
+    leftover = tmp_path / "companion-1.mcap.active"
+    leftover.write_bytes(MAGIC + _many_messages() * 10)
+    node = start_node(*RUN, "--record", str(tmp_path))
+    partial = tmp_path / "companion-1.mcap.recovering"
+    until = time.monotonic() + HANG_S
+    while not partial.exists() and time.monotonic() < until:
+        time.sleep(0.01)  # between two looks at what another process does
+    assert partial.exists()
+    returncode, _, err = node.stop()
+    assert returncode == 0, err
+    assert leftover.exists()  # recovery was not waited for
+
+
+def _many_messages() -> bytes:
+    """A chunk of half a million messages, not packed."""
+    name, protobuf = schemas.FRAMES_TOPIC.encode(), b"protobuf"
+    schema = struct.pack("<H", 1) + _text(b"companion.Frame") + _text(protobuf) + _text(b"")
+    channel = struct.pack("<HH", 1, 1) + _text(name) + _text(protobuf) + _text(b"")
+    contents = _record(3, schema) + _record(4, channel)
+    contents += _record(5, struct.pack("<HIQQ", 1, 0, 1, 1) + b"\x09" + bytes(8)) * 500_000
+    head = struct.pack("<QQQI", 0, 0, len(contents), 0) + _text(b"")
+    return _record(6, head + struct.pack("<Q", len(contents)) + contents)
+
+
+def _text(value: bytes) -> bytes:
+    return struct.pack("<I", len(value)) + value
+
+
+def _record(opcode: int, body: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(body)) + body
+
+
+def test_a_second_service_on_the_same_ports_is_refused_in_a_line(start_node: Any) -> None:
+    node = start_node(*RUN)
+    http = node.url.removeprefix("http://")
+    other = f"udpin:127.0.0.1:{node.udp_port}"
+    for arguments, named in (
+        (("--link", other, "--listen", "127.0.0.1:0"), other),
+        (("--link", "udpin:127.0.0.1:0", "--listen", http), http),
+    ):
+        done = subprocess.run(
+            [BIN / "companion", "run", *arguments, "--center", "home"],
+            capture_output=True, text=True, check=False, timeout=HANG_S,
+        )  # fmt: skip
+        assert done.returncode == 1
+        assert done.stderr == f"companion: {named}: Address already in use\n"
+    assert node.get("/healthz")[0] == 200

@@ -44,12 +44,21 @@ def test_the_picture_of_the_rooms_is_up_to_date() -> None:
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("drawn", ["make_api.py", "make_researcher.py"])
+@pytest.mark.parametrize("drawn", ["make_api.py", "make_notice.py", "make_researcher.py"])
 def test_a_page_that_is_written_by_a_program_is_up_to_date(drawn: str) -> None:
-    """The API's reference; the researcher's notebook, whose cells are run."""
+    """The API's reference, what is redistributed, and the notebook, whose cells are run."""
     making = [sys.executable, DOCS / drawn, "--check"]
     done = subprocess.run(making, capture_output=True, text=True, check=False, timeout=HANG_S)
     assert done.returncode == 0, done.stderr
+
+
+def test_every_threat_has_a_test_that_is_there() -> None:
+    rows = re.findall(r"^\|.*\| `?([^|`]*)`? \|$", (DOCS / "security.md").read_text("utf-8"), re.M)
+    cited = [one for one in rows if one not in ("test", "---") and not one.startswith("---")]
+    assert len(cited) > 20
+    for one in cited:
+        file, _, name = one.partition("::")
+        assert f"def {name}(" in (ROOT / file).read_text(encoding="utf-8"), one
 
 
 def test_reasons_of_refusals_are_those_that_there_are() -> None:

@@ -24,10 +24,10 @@ from companion.cli.console import (
 @click.option(
     "--format",
     "form",
-    type=click.Choice(("csv", "parquet")),
+    type=click.Choice(("csv", "parquet", "rerun")),
     default="csv",
     show_default=True,
-    help="parquet needs the extra [parquet].",
+    help="parquet needs the extra [parquet]; rerun: tracks and beams in space, as an MCAP file.",
 )
 @click.option(
     "--out",
@@ -67,7 +67,10 @@ def export(
     tell_vehicles(logs)
     show = of_log(progress, replaying.length_s(logs))
     try:
-        summary = exporting.export(logs, settings, out, form, show, latency_s)
+        if form == "rerun":
+            summary = exporting.export_space(logs, settings, out, show, latency_s)
+        else:
+            summary = exporting.export(logs, settings, out, form, show, latency_s)
     except KeyboardInterrupt:
         raise InterruptedByUser("interrupted; nothing was exported") from None
     progress.clear()
@@ -77,14 +80,15 @@ def export(
 
 
 def _text(summary: dict[str, Any]) -> str:
-    *tables, contents = summary["files"]
-    counts = zip(summary["rows"].values(), tables, strict=True)
+    *tables, last = summary["files"]
+    clouds = summary["rows"].get("clouds")
+    counts = zip(summary["rows"].values(), tables, strict=clouds is None)
     lines = [
         f"{summary['frames']} frames, {summary['duration_s']:.0f} s of log in"
         f" {summary['wall_s']:.1f} s; center {summary['center']}",
         *(f"  {rows:8} rows  {file}" for rows, file in counts),
         *(f"  missing: {line}" for line in summary["missing"]),
-        f"  whole, by {contents}",
+        f"  whole, by {last}" if clouds is None else f"  {clouds:8} clouds of points  {last}",
         f"digest {summary['digest']}",
     ]
     return "\n".join(lines)

@@ -7,10 +7,16 @@ from typing import Any, Final
 
 import companion
 from companion.node.replay import Run, log_events, missing, told
+from companion.recording.scene import Scene
+from companion.recording.space_file import SpaceFile
 from companion.recording.tables.folder import TableFolder
+from companion.recording.writer import ACTIVE
 from companion.settings.model import Settings
+from companion.values import Update
 from companion.views.tables.said import TABLES, rows
 
+SPACE: Final = "space.mcap"
+"""The file of an export for Rerun."""
 SHOW_EVERY_S: Final = 0.5
 """Time between two calls of ``progress``."""
 
@@ -50,3 +56,38 @@ def export(
         said = {"companion": companion.__version__, "from": [log.name for log in logs]}
         files = folder.close(said | {"summary": summary, "settings": settings.to_toml()})
     return summary | {"files": [str(file) for file in files]}
+
+
+def export_space(
+    logs: Sequence[Path],
+    settings: Settings,
+    where: Path,
+    progress: Callable[[int, float, float], None],
+    latency_s: float = 0.0,
+) -> dict[str, Any]:
+    """Write tracks and beams in space to a file of a folder, for Rerun; returns a summary.
+
+    Arguments and errors are those of ``export``; the file gets its name when it is whole.
+    """
+    events = log_events(logs, settings, latency_s)
+    run = Run(settings, None)
+    due_s = time.monotonic()
+    where.mkdir(parents=True, exist_ok=True)
+    whole = where / SPACE
+    made = whole.with_name(SPACE + ACTIVE)
+    scene = Scene(run.pipeline.array, settings.recording.scene_hz)
+    try:
+        with SpaceFile(made, scene) as file:
+            for event in events:
+                for output in run.step(event):
+                    if isinstance(output, Update):
+                        file.add(output, run.pipeline.local)
+                if time.monotonic() >= due_s:
+                    due_s += SHOW_EVERY_S
+                    progress(run.pipeline.frames, run.at_s, run.took_s)
+        made.rename(whole)
+    finally:
+        made.unlink(missing_ok=True)
+    summary = run.finish() | {"logs": told(logs), "missing": missing(logs)}
+    del summary["recording"]
+    return summary | {"rows": {"clouds": file.clouds}, "files": [str(whole)]}

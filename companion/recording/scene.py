@@ -38,8 +38,8 @@ Van Trees, Optimum Array Processing, 2.4: 0.891 for ten elements and 0.886 in th
 """
 
 _UP: Final = np.diag([1.0, -1.0, -1.0])  # forward-left-up from forward-right-down, and back
-_ENU_FROM_NED: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-_COLOURS: Final = {
+ENU_FROM_NED: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+COLOURS: Final = {
     TrackState.LIVE: (0.1, 0.8, 0.4),
     TrackState.COASTING: (1.0, 0.7, 0.1),
     TrackState.STALE: (0.9, 0.3, 0.2),
@@ -66,7 +66,7 @@ class Scene:
         turned = _map_from_carrier(carrier)
         on_carrier = _UP @ self.array.array_from_body.T @ _UP
         return [
-            _transform(at, MAP, CARRIER, _ENU_FROM_NED @ carrier.position_ned_m, turned),
+            _transform(at, MAP, CARRIER, ENU_FROM_NED @ carrier.position_ned_m, turned),
             _transform(at, CARRIER, ARRAY, _UP @ self.array.lever_arm_m, on_carrier),
         ]
 
@@ -77,7 +77,7 @@ class Scene:
         the sea are taken for heights above the ellipsoid, as everywhere here.
         """
         stands = LocalFrame(lat_deg, lon_deg, alt_m).origin_ecef_m
-        ecef_from_map = (_ENU_FROM_NED @ ned_from_ecef(lat_deg, lon_deg)).T
+        ecef_from_map = (ENU_FROM_NED @ ned_from_ecef(lat_deg, lon_deg)).T
         return _transform(timestamp(t_ns), FRAME_ID, MAP, stands, ecef_from_map)
 
     def picture(self, update: Update) -> Any:
@@ -94,8 +94,8 @@ class Scene:
 
     def _uav(self, track: Track, t_ns: int) -> Any:
         """A name, a point, and the upright cylinder that holds the UAV, where it is finite."""
-        place = _ENU_FROM_NED @ track.position_ned_m
-        colour = _COLOURS[track.state]
+        place = ENU_FROM_NED @ track.position_ned_m
+        colour = COLOURS[track.state]
         entity = self._entity(f"uav {track.uav}", t_ns)
         entity.texts.add(
             pose=_pose(place), billboard=True, font_size=14, scale_invariant=True,
@@ -114,11 +114,11 @@ class Scene:
         self, beam: Beam, direction: FloatArray, carrier: Carrier, state: TrackState, t_ns: int
     ) -> Any:
         """A cone from the array to the range of its UAV, as wide as the beam at half power."""
-        map_from_array = _ENU_FROM_NED @ carrier.body_from_local.T @ self.array.array_from_body.T
-        begin = _ENU_FROM_NED @ line_of_sight.place_ned_m(carrier, self.array)
+        map_from_array = ENU_FROM_NED @ carrier.body_from_local.T @ self.array.array_from_body.T
+        begin = ENU_FROM_NED @ line_of_sight.place_ned_m(carrier, self.array)
         along, right, down = (map_from_array @ axis for axis in _axes(direction))
         widths = [2 * beam.range_m * math.tan(angle / 2) for angle in self.widths_rad(direction)]
-        colour = _COLOURS[state]
+        colour = COLOURS[state]
         entity = self._entity(f"beam {beam.uav}", t_ns)
         entity.cylinders.add(
             pose=_pose(begin + along * beam.range_m / 2, np.array([right, down, along]).T),
@@ -165,7 +165,7 @@ def _axes(direction: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _map_from_carrier(carrier: Carrier) -> FloatArray:
-    turned: FloatArray = _ENU_FROM_NED @ carrier.body_from_local.T @ _UP
+    turned: FloatArray = ENU_FROM_NED @ carrier.body_from_local.T @ _UP
     return turned
 
 

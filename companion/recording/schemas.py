@@ -15,6 +15,7 @@ from typing import Any, Final, NamedTuple
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.descriptor_pb2 import (
@@ -124,6 +125,7 @@ WeightsMessage: Final = _message("Weights")
 LocationFixMessage: Final[Any] = LocationFix
 LogMessage: Final[Any] = Log
 FrameTransformMessage: Final[Any] = FrameTransform
+PointCloudMessage: Final[Any] = PointCloud
 SceneEntityMessage: Final[Any] = SceneEntity
 SceneUpdateMessage: Final[Any] = SceneUpdate
 
@@ -162,6 +164,7 @@ LOCATION_FIX: Final = _with_dependencies(LocationFixMessage)
 LOG: Final = _with_dependencies(LogMessage)
 FRAME_TRANSFORM: Final = _with_dependencies(FrameTransformMessage)
 SCENE_UPDATE: Final = _with_dependencies(SceneUpdateMessage)
+POINT_CLOUD: Final = _with_dependencies(PointCloudMessage)
 
 FRAMES_TOPIC: Final = "/mavlink/frames"
 TICKS_TOPIC: Final = "/ticks"

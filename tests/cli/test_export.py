@@ -9,8 +9,11 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import numpy
 import pytest
 from click.testing import CliRunner, Result
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from mcap.reader import make_reader
 from pymavlink import mavutil  # the oracle: tests alone may import it
 from pymavlink.dialects.v20 import all as dialect
 from support import ROOT
@@ -234,6 +237,39 @@ def test_what_was_refused_and_said_is_there(as_parquet: Path, outputs: list[Outp
     assert [row["proven"] for row in events if row["kind"] == "refuted"] == [
         out.proven for out in outputs if isinstance(out, Refuted)
     ]
+
+
+def test_space_holds_each_track_and_beam_as_points(tmp_path: Path, outputs: list[Output]) -> None:
+    """Read by mcap and Foxglove's own class: a beam's last point is where its UAV is."""
+    where = exported(tmp_path / "space", LOG, "--format", "rerun", *CENTER)
+    updates = {one.t_ns: one for one in outputs if isinstance(one, Update)}
+    seen: Counter[str] = Counter()
+    with (where / "space.mcap").open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            assert schema is not None
+            if schema.name != "foxglove.PointCloud":
+                assert (schema.name, channel.topic) == ("foxglove.FrameTransform", "/tf")
+                continue
+            cloud = PointCloud.FromString(message.data)
+            assert (cloud.frame_id, cloud.point_stride, len(cloud.data) % 16) == ("map", 16, 0)
+            points = numpy.frombuffer(cloud.data, "<f4").reshape(-1, 4)[:, :3]
+            _, _, kind, uav = channel.topic.split("/")
+            (track,) = [t for t in updates[message.log_time].tracks if t.uav == uav]
+            north, east, down = track.position_ned_m
+            assert numpy.linalg.norm(points[-1] - (east, north, -down)) < 1.0
+            if kind == "beam":
+                steps = numpy.linalg.norm(numpy.diff(points, axis=0), axis=1)
+                assert len(points) == 64 and numpy.ptp(steps) < 0.01
+            seen[kind] += 1
+    assert seen["uav"] == seen["beam"] > 100
+    assert sorted(path.name for path in where.iterdir()) == ["space.mcap"]
+
+
+def test_space_leaves_nothing_of_a_log_that_cannot_be_read(tmp_path: Path) -> None:
+    (tmp_path / "x.tlog").write_bytes(b"")
+    done = export(tmp_path / "x.tlog", "--out", tmp_path / "space", "--format", "rerun")
+    assert done.exit_code != 0
+    assert not list(tmp_path.glob("space/*"))
 
 
 def test_a_recording_gives_the_same_tables(tmp_path: Path, as_csv: Path) -> None:

@@ -13,6 +13,7 @@ from companion.mavlink.wire.transponder import frame as transponder_frame
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
 from companion.values import Estimate, Frame, Reason, Rejection, Source, Tick, Update
+from companion.views.tables.reports import heard
 
 S = 1_000_000_000
 START_NS = 1_760_000_000 * S
@@ -208,3 +209,20 @@ def test_a_broadcast_without_a_stamp_has_no_time() -> None:
     )  # fmt: skip
     (refused,) = fold.step(framed(1, Source(9, 236), message))
     assert isinstance(refused, Rejection) and refused.reason is Reason.UNPLACED_STAMP
+
+
+def test_an_export_has_a_row_of_each_report_whatever_its_message() -> None:
+    fold = pipeline(tracks={"deny": ["cot:*"]})
+    found = []
+    frames = [broadcast(0), naming(0), broadcast(1), transponder(1), event(1), telemetry(1)]
+    mav = dialect.MAVLink(None, srcSystem=9, srcComponent=25)
+    other = dialect.MAVLink_tunnel_message(0, 0, 1, 3, [7] * 128)
+    frames.append(Frame(START_NS + S, "udp", Source(9, 25), 385, bytes(other.pack(mav))))
+    for frame in frames:
+        found += [heard(frame, fold.step(frame))]
+    rows = [(one.uav, one.estimate is not None) for one in found if one is not None]
+    assert rows == [
+        ("rid:010203040506", False), (RID, True), ("icao:4CA7B3", True), ("cot:HAWK", False),
+        ("1:1", True),
+    ]  # fmt: skip
+    assert all(one.position_deg is not None for one in found if one is not None)

@@ -1,10 +1,12 @@
 """The table of reports: every position that was received, used or not."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
+from companion.mavlink.wire.cot_link import TUNNEL
 from companion.mavlink.wire.decode import GLOBAL_POSITION_INT, decode
+from companion.mavlink.wire.remote_id import LOCATION, MESSAGE_PACK
 from companion.mavlink.wire.transponder import ADSB_VEHICLE
 from companion.recording.tables.columns import Column, Kind, Table
 from companion.values import (
@@ -14,6 +16,7 @@ from companion.values import (
     Frame,
     Output,
     Rejection,
+    RemoteId,
     Report,
     ReportNoise,
 )
@@ -21,8 +24,11 @@ from companion.values import (
 MESSAGES: Final = {
     GLOBAL_POSITION_INT: "GLOBAL_POSITION_INT",
     ADSB_VEHICLE: "ADSB_VEHICLE",
+    LOCATION: "OPEN_DRONE_ID_LOCATION",
+    MESSAGE_PACK: "OPEN_DRONE_ID_MESSAGE_PACK",
+    TUNNEL: "TUNNEL",
 }
-"""Messages that are reports, by id."""
+"""Messages that are reports, or may be, by id."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +73,13 @@ def heard(frame: Frame, outputs: Sequence[Output]) -> Heard | None:
             return Heard(frame, output, None, output.fix.report)
     refused = next((one for one in outputs if isinstance(one, Rejection)), None)
     said = decode(frame)
+    if isinstance(
+        said, RemoteId
+    ):  # what it was refused for names its aircraft, where that is known
+        report, named = said.report, None if refused is None else refused.source
+        said = replace(report, uav=named) if report is not None and named is not None else report
+    if refused is None and said is None:  # a message that may be a report, and was none
+        return None
     return Heard(frame, None, refused, said if isinstance(said, Report | AdsbVehicle) else None)
 
 
@@ -111,7 +124,7 @@ def _of_estimate(heard: Heard, name: str) -> float | None:
 _T, _N, _TIME, _INT, _TRUTH = Kind.TEXT, Kind.NUMBER, Kind.TIME, Kind.INTEGER, Kind.TRUTH
 
 # fmt: off
-REPORTS: Final = Table("reports", "a report received (GLOBAL_POSITION_INT, ADSB_VEHICLE)", (
+REPORTS: Final = Table("reports", "a report received, over whatever message", (
     Column("arrival_ns", _INT, "ns", "when it arrived, since 1970", lambda h: h.frame.t_ns),
     Column("arrival_utc", _TIME, "UTC", "the same", lambda h: h.frame.t_ns),
     Column("uav", _T, "", "whose position it is", lambda h: h.uav),

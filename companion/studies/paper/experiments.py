@@ -9,6 +9,7 @@ Over 300 lines: it is a list, an experiment a function.
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -19,7 +20,7 @@ from companion.beams.array.steering import steering_matrix
 from companion.beams.hardware import quantise
 from companion.beams.worth import patterns
 from companion.studies.paper import circles as published_scenario
-from companion.studies.paper import link, mavlink, published
+from companion.studies.paper import link, mavlink, published, shown
 from companion.studies.paper.circles import Flight, PaperScenario, Tracked
 from companion.studies.paper.link import Compared
 from companion.tracking.design import closed_form
@@ -32,6 +33,11 @@ PAPER_INFEASIBLE_S: Final = {0.05: 0.89, 0.25: 1.01, 1.0: 1.3}
 GRID_S: Final = 0.01
 ALPHAS: Final = (0.5, 0.1, 0.01)
 PAPER_ALPHA: Final = 0.5
+PAPER_SUBCARRIERS: Final = 234
+PAPER_CYCLIC_PREFIX: Final = 64
+PAPER_BITS: Final = 4
+"""Bits of a symbol, by 16-QAM."""
+PAPER_CODE_RATE: Final = 1 / 3
 SIZES: Final = (64, 128)
 INSTANTS: Final = (14, 58)
 """Steps at which the patterns are drawn: no UAV is near another's mirror image there."""
@@ -91,11 +97,14 @@ def study(seed: int, progress: Progress) -> tuple[dict[str, Any], Material]:
         "designs": obtained,
         "limits": _limits(),
         "unknown_input": _unknown_input(flight, tracked),
+        "alphas": _alphas(flight, alphas),
+        "waveform": _waveform(),
         "irregular": _irregular(flight.scenario, rng),
         "array": _array(flight),
         "rates": {name: _rate_numbers(found) for name, found in compared_before.items()},
         "blockage": _blockage(compared),
         "mavlink": asdict(agreement),
+        "paper": shown.told(),
     }
     material = Material(
         flight,
@@ -134,6 +143,7 @@ def _scenario(flight: Flight) -> dict[str, Any]:
         "feedthrough_matrix_rows": flight.input_mps[0].size,
         "input_sup_mps": flight.largest_input_mps,
         "input_sup_gust_as_velocity_mps": other.largest_input_mps,
+        "farthest_m": float(np.linalg.norm(flight.position_m, axis=-1).max()),
         "fastest_mps": float(np.linalg.norm(flight.input_mps, axis=-1).max()),
         "literal_gust_excess_mps": float(gust.max()),
     }
@@ -176,7 +186,7 @@ def _designs(flight: Flight) -> tuple[list[dict[str, Any]], dict[float, Tracked]
     """Gains by a solver asked for feasibility, and for the least mu, beside the closed form.
 
     Also returns the observer at each alpha with the gain that the solver found feasible at mu <=
-    0.05.
+    0.25, as in the paper's figure 4.
     """
     from companion.tracking.design import lmi
 
@@ -208,8 +218,35 @@ def _designs(flight: Flight) -> tuple[list[dict[str, Any]], dict[float, Tracked]
                     "right_sign_eigenvalue": _decay_eigenvalue(b, d, alpha, feasible, -1.0),
                 }
             )
-        tracked[alpha] = published_scenario.track(flight, rows[-3]["feasible_gain"])
+        tracked[alpha] = published_scenario.track(flight, rows[-2]["feasible_gain"])
     return rows, tracked
+
+
+def _alphas(flight: Flight, alphas: dict[float, Tracked]) -> dict[str, Any]:
+    """Largest errors at each alpha over many steps, with the gain of the figure."""
+    long_flight = published_scenario.fly(replace(flight.scenario, steps=LONG))
+    found = {}
+    for alpha, one in alphas.items():
+        steady = published_scenario.track(long_flight, one.gain)
+        place_m = published_scenario.stacked(steady.estimate_m - long_flight.position_m)
+        miss_mps = published_scenario.stacked(steady.input_b0_mps - long_flight.input_mps)
+        found[f"{alpha:g}"] = {
+            "gain": one.gain,
+            "error_sup_m": float(place_m.max()),
+            "input_error_sup_mps": float(miss_mps.max()),
+        }
+    errors = [row["error_sup_m"] for row in found.values()]
+    return {**found, "least_step_down": float(min(a / b for a, b in pairwise(errors)))}
+
+
+def _waveform() -> dict[str, float]:
+    """What the stated waveform carries at most: bits of a symbol over its time and bandwidth.
+
+    The transform has at least as many points as there are subcarriers.
+    """
+    samples = PAPER_SUBCARRIERS + PAPER_CYCLIC_PREFIX
+    carried = PAPER_BITS * PAPER_CODE_RATE * PAPER_SUBCARRIERS / samples
+    return {"most_bit_s_hz": carried}
 
 
 def _decay_eigenvalue(b: float, d: float, alpha: float, solution: Any, sign: float) -> float:
@@ -306,6 +343,7 @@ def _array(flight: Flight) -> dict[str, Any]:
         "conjugated_response_max_in_scenario": float(own_printed.max()),
         "arccos_wrong_share": float(np.mean(flight.position_m[..., 1] < 0)),
         "arccos_error_deg": _arccos_error_deg(flight.position_m),
+        "opposite_sines_apart": _opposite_sines_apart(flight.position_m),
         "zero_forcing_unsolved": int(np.sum(loss_db > 120)),
         "zero_forcing_over_3_db_share": float(np.mean(loss_db > 3)),
     }
@@ -318,6 +356,16 @@ def _arccos_error_deg(position_m: FloatArray) -> float:
     true = np.arctan2(position_m[..., 1], position_m[..., 0])
     off = np.abs(np.angle(np.exp(1j * (angle - true))))
     return float(np.degrees(off.max()))
+
+
+def _opposite_sines_apart(position_m: FloatArray) -> float:
+    """Largest difference of sin(arccos(x / r)) between UAVs that face each other.
+
+    This is what the printed steering vectors are made of: |y| / r.
+    """
+    sines = np.abs(position_m[..., 1]) / np.linalg.norm(position_m, axis=-1)
+    half = sines.shape[1] // 2
+    return float(np.abs(sines[:, :half] - sines[:, half:]).max())
 
 
 def _phase_loss_db(array: Array, bits: int) -> float:

@@ -49,7 +49,7 @@ def drawings(answer: Answer, material: Material) -> dict[str, tuple[str, Callabl
         ),
         "alphas": (
             "The same at α = 0.5, 0.1 and 0.01, with the gain that the solver finds feasible for"
-            " μ ≤ 0.05 s². The optimum is L = 0.30 at every α, without error.",
+            " μ ≤ 0.25 s². The optimum is L = 0.30 at every α, without error.",
             lambda: _alphas(material),
         ),
         "limits": (

@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Callable
+from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -74,6 +75,35 @@ def test_the_solver_finds_what_the_closed_form_says(answer: dict[str, Any]) -> N
         assert row["optimal_gain"] == pytest.approx(row["closed_form_gain"], abs=1e-3)
         assert row["right_sign_eigenvalue"] < 1e-6
         assert row["printed_sign_eigenvalue"] > 1
+
+
+def test_what_the_text_says_in_passing_is_held_to_numbers(answer: dict[str, Any]) -> None:
+    """Levels by the formula of docs/math.md 2.2; the waveform by its own numbers."""
+    published = {"L = 0.39": 0.21, "L = 0.60": 0.47, "L = 0.76": 0.96}
+    for name, gamma_s in published.items():
+        gain = answer["levels"][name]["gain"]
+        least_s = abs(0.5 * gain - 0.15) / math.sqrt(0.5 * (1 - (1 - gain) ** 2 / 0.5))
+        assert answer["levels"][name]["gamma_s"] == pytest.approx(least_s)
+        assert 1 < gamma_s / least_s < 3  # what was published is a bound, and up to three times so
+    gains = [answer["alphas"][alpha]["gain"] for alpha in ("0.5", "0.1", "0.01")]
+    errors = [answer["alphas"][alpha]["error_sup_m"] for alpha in ("0.5", "0.1", "0.01")]
+    assert gains == sorted(gains, reverse=True) and errors == sorted(errors, reverse=True)
+    level = [row["feasible_gain"] for row in answer["designs"] if row["mu_max_s2"] == 0.25]
+    assert gains == level
+    assert answer["waveform"]["most_bit_s_hz"] == pytest.approx(4 / 3 * 234 / 298)
+    assert answer["array"]["opposite_sines_apart"] < 1e-12
+    assert 250 < answer["scenario"]["farthest_m"] < 500
+
+
+def test_every_figure_of_the_paper_is_held_against_ours(answer: dict[str, Any], made: Path) -> None:
+    figures = answer["paper"]["figures"]
+    assert [one["number"] for one in figures] == list(range(1, 11))
+    assert {one["likeness"] for one in figures} == {"same", "differs", "cannot be told"}
+    page = unescape((made / "paper.html").read_text("utf-8"))
+    for one in figures:
+        assert one["shows"] in page and one["why"] in page
+    for one in answer["paper"]["guesses"]:
+        assert one["setting"] in page and one["taken"] in page
 
 
 # --- the scenario and its bounds ----------------------------------------------------------------

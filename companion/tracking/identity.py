@@ -12,6 +12,8 @@ from typing import Final
 
 from companion.values import Fix, Track
 
+RELAYED_MAX: Final = 8192
+"""Relayed aircraft remembered; beyond it the one heard first is forgotten."""
 REPORTS_TO_DECIDE: Final = 5
 """Reports in a row that identify, or separate, two tracks."""
 SPEED_APART_MPS: Final = 15.0
@@ -51,6 +53,10 @@ class Identities:
         count = self._counts.get(relayed.uav)
         if count is None or count.uav != match:
             count = self._counts[relayed.uav] = _Count(match)
+            if len(self._counts) > RELAYED_MAX:
+                oldest = next(iter(self._counts))
+                del self._counts[oldest]
+                self._same.pop(oldest, None)
         count.in_a_row += 1
         if count.in_a_row >= REPORTS_TO_DECIDE:
             if match:

@@ -1,5 +1,6 @@
 """Aircraft heard otherwise than by telemetry, in the fold: one stays one, and late is late."""
 
+from collections import Counter
 from datetime import UTC, datetime
 from typing import Any
 
@@ -11,6 +12,7 @@ from companion.mavlink.wire.cot_link import CotSplitter
 from companion.mavlink.wire.transponder import Said
 from companion.mavlink.wire.transponder import frame as transponder_frame
 from companion.pipeline.fold import Pipeline
+from companion.pipeline.senders import CLOCKS_MAX
 from companion.settings.model import Settings
 from companion.values import Estimate, Frame, Reason, Rejection, Source, Tick, Update
 from companion.views.tables.reports import heard
@@ -226,3 +228,20 @@ def test_an_export_has_a_row_of_each_report_whatever_its_message() -> None:
         ("1:1", True),
     ]  # fmt: skip
     assert all(one.position_deg is not None for one in found if one is not None)
+
+
+def test_made_up_names_take_no_memory() -> None:
+    """Of events, whose names are anybody's: what is kept of them has an end."""
+    fold = pipeline()
+    template = event(0).raw
+    at = template.index(b"HAWK")
+    seen: Counter[str] = Counter()
+    for number in range(3 * CLOCKS_MAX):
+        raw = template[:at] + f"{number:04x}".encode() + template[at + 4 :]
+        for said in fold.step(event(0)._replace(raw=raw)):
+            seen[said.reason if isinstance(said, Rejection) else "used"] += 1
+    senders = fold.senders
+    assert len(senders._clocks) <= CLOCKS_MAX
+    assert len(senders._known) <= CLOCKS_MAX
+    assert len(fold.fleet._refutations) == len(fold.fleet.uavs) == seen["used"] == 2000
+    assert seen[Reason.TOO_MANY] == 3 * CLOCKS_MAX - 2000

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import ArrayLike
 
 from companion.tracking import noise
-from companion.tracking.identity import REPORTS_TO_DECIDE, Identities
+from companion.tracking.identity import RELAYED_MAX, REPORTS_TO_DECIDE, Identities
 from companion.values import Fix, GnssStatus, Limits, ReportNoise, Source, Track, TrackState
 
 MakeFix = Callable[..., Fix]
@@ -135,3 +135,16 @@ def test_an_aircraft_that_is_forgotten_is_compared_anew(fix: MakeFix) -> None:
     identities.forget(AIRCRAFT)
     assert identities.same_as(AIRCRAFT) is None
     assert vars(identities) == vars(Identities())
+
+
+def test_made_up_names_take_no_memory(fix: MakeFix) -> None:
+    """The one heard first is forgotten, and decided upon again when it is heard."""
+    identities = Identities()
+    here = [20.0, 0, -300]
+    for n in range(REPORTS_TO_DECIDE):
+        identities.observe(relayed(fix, n, here), [track("1:1", here)])
+    assert identities.same_as(AIRCRAFT) == "1:1"
+    for number in range(RELAYED_MAX):
+        identities.observe(replace(relayed(fix, 9, here), uav=f"cot:{number}"), [])
+    assert len(identities._counts) == RELAYED_MAX
+    assert identities.same_as(AIRCRAFT) is None

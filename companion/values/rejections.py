@@ -27,7 +27,7 @@ class Reason(StrEnum):
     BAD_SIGNATURE = "bad-signature"  # signed with another key, or altered
     REPLAYED = "replayed"  # well signed, but not newer than what was heard before
     SECRET = "secret"  # SETUP_SIGNING carries a key: it is not used, and not recorded
-    SOCKET_OVERFLOW = "socket-overflow"  # lost before it was read: the system's buffer was full
+    SOCKET_OVERFLOW = "socket-overflow"  # lost before it was read: a full buffer, or too old
     DUPLICATE = "duplicate"  # the same report again, over this link or another
     NO_FIX = "no-fix"  # the first position of all, whose sender's receiver does not vouch for it
     OUT_OF_ORDER = "out-of-order"  # later than the window for late reports

@@ -51,7 +51,8 @@ class LinkStatus:
                       or "read", the time at which it was read here
         misstamped    datagrams whose stamp could not be true, as when the wall clock was set: they
                       count as arrived when they were read
-        overflowed    datagrams that the system dropped because its receive buffer was full
+        overflowed    datagrams that the system dropped because its receive buffer was full, or that
+                      had waited too long
         heard_ns      time of the last frame
         components    counts of each component
 

@@ -27,6 +27,8 @@ OVERFLOW_CHECK_S: Final = 1.0
 OVERFLOW_CHECK_DATAGRAMS: Final = 1024
 """Datagrams after which the drop counter is read even before that time."""
 
+STALE_NS: Final = 2_000_000_000
+"""Age at which a datagram is let go unread: a busy machine then sees what is new, not a backlog."""
 READ_AT_ONCE: Final = 32
 """Datagrams read at most before others have their turn, as in libuv."""
 DATAGRAM_BYTES: Final = 1 << 16
@@ -205,6 +207,7 @@ class _Datagrams:
         self._lost: asyncio.Future[Exception] = asyncio.get_running_loop().create_future()
         self._wall_clock = kernel_time.SetWatch()
         self._dropped = 0
+        self._stale = 0
         self._unchecked = 0
 
     async def serve(self) -> None:
@@ -256,6 +259,9 @@ class _Datagrams:
                 self._note_error(error)
                 return
             age_ns = self._age_ns(ancillary, was_set)
+            if age_ns is not None and age_ns > STALE_NS:
+                self._stale += 1
+                continue
             try:
                 self._upcalls.take(None if self._connected else address, data, age_ns)
             except Exception as fault:  # of the program: it is to end the link, not to vanish
@@ -289,6 +295,7 @@ class _Datagrams:
             return
         more = (dropped - self._dropped) & 0xFFFF_FFFF
         self._dropped = dropped
+        more, self._stale = more + self._stale, 0
         self._status.overflowed = (self._status.overflowed or 0) + more
         if more:
             self._upcalls.overflow(more)

@@ -49,3 +49,18 @@ CRC_EXTRA: dict[int, int] = {
     60045: 14, 60046: 171, 60047: 55, 60050: 220, 60051: 245, 60052: 101, 60053: 45,
 }
 # fmt: on
+
+LONGEST: bytes = bytes.fromhex(
+    "092b0cff0e1c0320ffffff06ffffffffffffffff140219173465181d10101c30"
+    "1c1c161625070726050406030503020415142505ff051b19ffffffffff481ab5"
+    "e12a0604ff1e26ffff261423210affffff16272535333533ff1c382a2151ffff"
+    "ffffffff22757539743f2c415c09fe100c272c4018060e0c6102027139064f23"
+    "23180dff27122b081610782b2920f3105dff64364e3c2a08080c0f0d060f0fff"
+    "0c03091c2c0309160c122242620830130314181d2f042802ce071dffffffff1b"
+    "361a2125ffffffff2a0effffffffffffffffffffffff080303060702202a032f"
+    "2d4908ffffff2a2841b6282affffffffff203c3d06022613fe241e12123609ff"
+)
+"""Bytes of the longest payload, extensions included, of each message that MAVLink 1 can carry.
+
+255 for an id without a message.
+"""

@@ -19,7 +19,7 @@ from typing import Final
 
 from fastcrc import crc16
 
-from companion.mavlink.wire.crc_extra import CRC_EXTRA
+from companion.mavlink.wire.crc_extra import CRC_EXTRA, LONGEST
 from companion.values import Frame, Reason, Rejection, Source
 
 MAGIC_V1: Final = 0xFE
@@ -44,6 +44,7 @@ _REASON: Final = {
 _SEED: Final = {msgid: bytes([seed]) for msgid, seed in CRC_EXTRA.items()}
 _mcrf4xx = crc16.mcrf4xx
 _find_magic = re.compile(b"[\xfd\xfe]").search
+_find_start = re.compile(rb"\xfd(?:.[\x00\x01]|.?\Z)|\xfe", re.DOTALL).search
 
 
 def examine(buffer: bytes, at: int, end: int) -> int:
@@ -77,6 +78,8 @@ def examine(buffer: bytes, at: int, end: int) -> int:
         return UNKNOWN_MESSAGE
     if stop > end:
         return INCOMPLETE
+    if magic == MAGIC_V1 and buffer[at + 1] > LONGEST[msgid]:
+        return BAD_CRC  # MAVLink 1 carries no more, and the sum would cost as much as a frame
     crc = buffer[crc_at] | buffer[crc_at + 1] << 8
     return stop - at if _mcrf4xx(buffer[at + 1 : crc_at] + seed) == crc else BAD_CRC
 
@@ -99,6 +102,22 @@ def next_magic(buffer: bytes, at: int, end: int) -> int:
     """Index of the next magic byte at or after ``at``; ``end`` when there is none."""
     found = _find_magic(buffer, at, end)
     return found.start() if found else end
+
+
+def _next_start(buffer: bytes, at: int, end: int, claimed_to: int) -> int:
+    """Index of the next byte at or after ``at`` where a frame can begin; ``end`` without one.
+
+    What cannot be a frame is passed over here, as long as it would be counted no differently: any
+    flags that are undefined, and in what a failed frame laid claim to, lengths that no message of
+    MAVLink 1 has. A flood of magic bytes then costs no more than frames do.
+    """
+    while found := _find_start(buffer, at, end):
+        at = found.start()
+        inside = at + 5 < end and at < claimed_to and buffer[at] == MAGIC_V1
+        if not inside or buffer[at + 1] <= LONGEST[buffer[at + 5]]:
+            return at
+        at += 1
+    return end
 
 
 Checked = tuple[Source, int, bytes]
@@ -198,7 +217,11 @@ class Splitter:
                 continue
             if found == INCOMPLETE and not last:
                 break
-            resume = next_magic(buffer, at + 1, end)
+            if found in _REASON and at >= claimed_to:
+                claims_to = at + claimed_length(buffer, at, end)
+            else:
+                claims_to = claimed_to
+            resume = _next_start(buffer, at + 1, end, claims_to)
             claimed_to = self._count(lost, found, at, resume, claimed_to, buffer)
             at = resume
         self._pending = buffer[at:]

@@ -13,11 +13,11 @@ from collections.abc import Iterator
 import pytest
 from link_support import LOOPS, Run, frame, port_of, runner, running, stamping, until_true
 
-from companion.mavlink.links import kernel_time
+from companion.mavlink.links import kernel_time, udp
 from companion.mavlink.links.transport import Link
 from companion.mavlink.links.urls import parse_link
 from companion.mavlink.wire.encode import heartbeat
-from companion.values import Source
+from companion.values import Reason, Source
 
 BLOCKED_S = 0.5
 SOON_S = 0.25
@@ -73,6 +73,29 @@ def test_a_frame_that_waited_arrived_when_the_system_had_it(run: Run) -> None:
                 assert min(late) >= -0.001 and max(late) < SOON_S
                 assert late[0] < BLOCKED_S / 2
                 assert (link.status.arrival, link.status.misstamped) == ("kernel", 0)
+
+    run(test())
+
+
+@linux
+def test_a_backlog_is_let_go_from_its_old_end_and_counted(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is read is then what is new, not what has waited for seconds."""
+    monkeypatch.setattr(udp, "STALE_NS", round(BLOCKED_S * 0.55e9))
+    monkeypatch.setattr(udp, "OVERFLOW_CHECK_S", 0.1)
+
+    async def test() -> None:
+        with peer() as sender:
+            async with running("udpin:127.0.0.1:0", time.monotonic_ns) as (link, inbox):
+                to = ("127.0.0.1", port_of(link))
+                sent_ns = await sent_while_blocked(link, sender, to)
+                await until_true(lambda: bool(link.status.overflowed))
+                await until_true(lambda: len(inbox.frames) + link.status.overflowed == 10)
+                assert 1 <= link.status.overflowed <= 9
+                assert link.status.lost == {Reason.SOCKET_OVERFLOW: link.status.overflowed}
+                newest = late_s(sent_ns[-1:], [inbox.frames[-1].t_ns])
+                assert abs(newest[0]) < SOON_S
 
     run(test())
 

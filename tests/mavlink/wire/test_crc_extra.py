@@ -2,7 +2,7 @@
 
 from pymavlink.dialects.v20 import all as dialect
 
-from companion.mavlink.wire.crc_extra import CRC_EXTRA
+from companion.mavlink.wire.crc_extra import CRC_EXTRA, LONGEST
 
 
 def as_source(table: dict[int, int], width: int = 100) -> str:
@@ -28,3 +28,9 @@ def test_the_printed_table_can_be_pasted() -> None:
     exec(text, scope)
     assert scope["CRC_EXTRA"] == CRC_EXTRA
     assert max(map(len, text.splitlines())) <= 100
+
+
+def test_the_longest_payloads_are_those_of_the_dialect() -> None:
+    kinds = dialect.mavlink_map
+    expected = bytes(kinds[i].unpacker.size if i in kinds else 255 for i in range(256))
+    assert expected == LONGEST, f"\nthe dialect has another table:\n\n{expected.hex()}\n"

@@ -2,9 +2,10 @@
 
 Two laws. *Accounting*: every byte is in a frame, or in what a failed frame laid claim to, or is
 garbage; a failed frame counts once (an unknown id as such, a known one as a bad checksum), and a
-start inside a claim does not count. A claim ends with the next good frame. *Nothing else is
-lost*: a frame whose bytes are untouched is found, unless a frame found in front of it, whose
-checksum holds, reaches into it; one false start in 65 536 does that.
+start inside a claim does not count. A claim ends with the next good frame. A frame of MAVLink 1
+that is longer than its message is a failed one, whatever its checksum. *Nothing else is lost*: a
+frame whose bytes are untouched is found, unless a frame found in front of it, whose checksum holds,
+reaches into it; one false start in 65 536 does that.
 
 The oracle (``account``) is written here from the wire format: it looks at the whole stream at
 once, with the seeds of pymavlink's dialect and the checksum of the standard library.
@@ -74,7 +75,8 @@ def judge(data: bytes, at: int) -> tuple[Reason | str, int]:
     holds = (
         checksum(data[at + 1 : at + checked], SEEDS[msgid]) == data[at + checked : at + checked + 2]
     )
-    return ("good" if holds else Reason.BAD_CRC), size
+    fits = v2 or head[1] <= dialect.mavlink_map[msgid].unpacker.size  # MAVLink 1 has no more
+    return ("good" if holds and fits else Reason.BAD_CRC), size
 
 
 @dataclass
@@ -549,3 +551,39 @@ def test_a_damaged_whole_log_gives_what_is_untouched(
     for _ in range(200):
         piece = cut(rng, data, rng.choice((500, 5000, 20_000)))
         read_spoilt(rng, piece, cut_log, tmp_path / "x.tlog", rounds=10)
+
+
+# --- what a flood costs -------------------------------------------------------------------------
+
+DATAGRAM = 1400
+MAGIC_FLOODS = {
+    "v1": b"\xfe",
+    "v2": b"\xfd",
+    "mixed": b"\xfe\xfd",
+    "long": b"\xfe\xff",
+    "signed": b"\xfd\xff\x01",
+}
+
+
+@pytest.mark.parametrize("name", MAGIC_FLOODS)
+def test_a_flood_of_magic_bytes_costs_no_more_sums_than_frames(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sums of up to 255 bytes at each byte would be a hundred times what frames take."""
+    from companion.mavlink.wire import framing
+
+    summed, mcrf4xx = [0], framing._mcrf4xx
+
+    def counted(data: bytes) -> int:
+        summed[0] += len(data)
+        return int(mcrf4xx(data))
+
+    monkeypatch.setattr(framing, "_mcrf4xx", counted)
+    splitter = Splitter("x")
+    for _ in range(50):
+        splitter.feed(0, (MAGIC_FLOODS[name] * DATAGRAM)[:DATAGRAM])
+    assert summed[0] <= 2 * 50 * DATAGRAM
+    # And a frame among all that is found.
+    raw = bytes(dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3).pack(dialect.MAVLink(None, 1)))
+    found = splitter.feed(0, MAGIC_FLOODS[name] * 40 + raw + bytes(600))
+    assert raw in [item.raw for item in found if isinstance(item, Frame)]

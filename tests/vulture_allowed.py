@@ -18,3 +18,4 @@ status.of_s  # written to the API by its fields
 clock.timesync_refused, clock.gnss_refused  # why evidence was not used, for who debugs a clock
 one_uav, streamed, healthz, readyz, listing, download, list_scenarios, prediction  # by decorators
 exception  # the name of an argument of `__exit__`
+row.shows, row.likeness, row.bears_on  # read by the template of the paper's page

@@ -12,6 +12,7 @@ field.type_name, field.proto3_optional, field.oneof_index  # fields of a protobu
 Severity.publish_time_ns  # the layout of a record of MCAP
 Device.RX, Normalisation.ANTENNA, Policy.DROP  # members chosen by their value in the settings
 sample.codebook_best  # written to the study's JSON by its fields
+one.shows, one.likeness, one.bears_on  # the same
 found.rejections  # the same
 presence.system_status, presence.armed  # what a heartbeat says, for who looks at `senders.presence`
 status.of_s  # written to the API by its fields

@@ -14,6 +14,26 @@ const MOST_NAMED = 5;
 export const rankOf = (uav) => (LEVELS.includes(uav.verdict)
   ? LEVELS.indexOf(uav.verdict) : LEVELS.length);
 
+const COLLATOR = new Intl.Collator("en", { numeric: true });
+const STEP_DB = 6; // links that differ by less are alike: rows must not change places all the time
+
+export const byId = (a, b) => COLLATOR.compare(a.id, b.id);
+
+/** How much gain a link has beyond what it needs, in steps; what is not known is the least. */
+function spareOf({ health }, gain) {
+  const spareDb = (health?.[gain] ?? NaN) - (health?.needed_gain_db ?? NaN);
+  return Number.isFinite(spareDb) ? Math.floor(spareDb / STEP_DB) : -Infinity;
+}
+
+const bySpare = (a, b, gain) => {
+  const [one, other] = [spareOf(a, gain), spareOf(b, gain)];
+  return one === other ? 0 : one - other;
+};
+
+/** The worst link first: by verdict, then by the gain that is sure, then by the likely one. */
+export const worstFirst = (a, b) => rankOf(a) - rankOf(b)
+  || bySpare(a, b, "guaranteed_gain_db") || bySpare(a, b, "likely_gain_db") || byId(a, b);
+
 const of = (uavs, level) => uavs.filter((uav) => uav.verdict === level);
 
 /** The one line that says it all, and how bad it is. */
@@ -35,7 +55,7 @@ export function showHeadline(uavs) {
 /** Links that are not good, those with one cause together, the worst first. */
 export function troublesOf(uavs) {
   const alike = new Map();
-  for (const uav of [...uavs].sort((a, b) => rankOf(a) - rankOf(b))) {
+  for (const uav of [...uavs].sort(worstFirst)) {
     if (!["none", "weak"].includes(uav.verdict)) continue;
     const { cause, reason, remedy } = uav.health ?? {};
     const key = `${uav.verdict} ${cause}`;

@@ -1,17 +1,21 @@
 // The names beside the symbols of the plan view.
 
 import * as format from "./format.js";
-import { MARKS } from "./health.js";
+import { MARKS, worstFirst } from "./health.js";
 
 const CROWD = 8; // with more UAVs than this, a label without room is left away
 
-/** Labels go where they cover nothing; in a crowd the second line goes, then the label. */
+/**
+ * Labels go where they cover nothing; in a crowd the second line goes, then the label. The chosen
+ * UAV has its own first, then the worst links.
+ */
 export function drawLabels(view, ringLabels) {
   const [x, y] = view.centre;
   const taken = [...ringLabels, [x - 12, y - 12, x + 12, y + 12]];
   taken.push(...view.hits.map((hit) => [hit.x - 9, hit.y - 9, hit.x + 9, hit.y + 9]));
   const isChosen = ({ uav }) => uav.id === view.scene.selected;
-  for (const hit of [...view.hits].sort((a, b) => isChosen(b) - isChosen(a))) {
+  const before = (a, b) => isChosen(b) - isChosen(a) || worstFirst(a.uav, b.uav);
+  for (const hit of [...view.hits].sort(before)) {
     const lines = labelOf(hit);
     const label = findPlace(view, hit, lines, taken)
       ?? findPlace(view, hit, lines.slice(0, 1), taken)

@@ -9,7 +9,7 @@ import { Drawer } from "./drawer.js";
 import { csvOf, save } from "./export.js";
 import { Focus } from "./focus.js";
 import * as format from "./format.js";
-import { headlineOf, showHeadline, showTroubles } from "./health.js";
+import { headlineOf, showHeadline, showTroubles, worstFirst } from "./health.js";
 import { History } from "./history.js";
 import { setUpKeys } from "./keys.js";
 import { LastKnown, carrierOf, placedBy } from "./last_known.js";
@@ -17,7 +17,6 @@ import { showEvents, showLinks, showRecordings } from "./lists.js";
 import {
   showBeams, showConnection, showFault, showReadiness, showStatus, Rejections,
 } from "./panels.js";
-import { worstFirst } from "./order.js";
 import { Ground } from "./ground.js";
 import { PlanView } from "./plan.js";
 import { showSettings } from "./settings.js";

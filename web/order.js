@@ -2,15 +2,9 @@
 
 import { $ } from "./dom.js";
 import { known } from "./format.js";
-import { rankOf } from "./health.js";
+import { byId, worstFirst } from "./health.js";
 
-const COLLATOR = new Intl.Collator("en", { numeric: true });
 const FEW = 6; // up to so many are seen at once: there is nothing to search
-
-const byId = (a, b) => COLLATOR.compare(a.id, b.id);
-
-/** The worst link first. */
-export const worstFirst = (a, b) => rankOf(a) - rankOf(b) || byId(a, b);
 
 export class Order {
   constructor(head, columns, onChange) {

@@ -7,7 +7,7 @@ import { load, openBrowser } from "./browser.mjs";
 import { uav, weak } from "./service.mjs";
 import { BEAT_MS, openPage } from "./whole_page.mjs";
 
-const { headlineOf, troublesOf, showTroubles } = await load("health.js");
+const { headlineOf, troublesOf, showTroubles, worstFirst } = await load("health.js");
 
 test("the headline says how many links are good, and how bad the worst is", () => {
   const said = (...verdicts) => headlineOf(verdicts.map((verdict) => ({ verdict })));
@@ -22,6 +22,17 @@ test("links of one cause stand together, the worst first, and the good are not l
     uav("4:1", weak("weak", { reason: "reports 2.0 s apart" }))];
   assert.deepEqual(troublesOf(uavs).map(({ level, ids }) => [level, ids]),
     [["none", ["3:1"]], ["weak", ["1:1", "4:1"]]]);
+});
+
+test("among links of one verdict the least sure stands first, and a decibel moves nobody", () => {
+  const gains = (guaranteed, likely = 12) => ({ ...weak("weak"),
+    health: { needed_gain_db: 3, guaranteed_gain_db: guaranteed, likely_gain_db: likely } });
+  const order = (...given) => given.map((one, i) => uav(`${i + 1}:1`, one)).sort(worstFirst)
+    .map(({ id }) => id.split(":")[0]).join("");
+  assert.equal(order(gains(2.9), gains(-9), gains(null)), "321");
+  assert.equal(order(gains(2.9), gains(2.0), gains(2.5)), "123");
+  assert.equal(order(gains(null), gains(null, -20), gains(null, null)), "321");
+  assert.equal(order(gains(-40), weak("none")), "21");
 });
 
 test("what to do is shown, and its UAVs can be chosen; without trouble the panel goes", () => {

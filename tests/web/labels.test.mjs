@@ -97,3 +97,10 @@ test("in a crowd names without room are left away, but never that of the chosen 
   assert.ok(names.length < 12, `${names.length} names`);
   assert.equal(names[0], "30:1"); // it had the first choice of place
 });
+
+test("in a crowd the worst link has its name after the chosen one", async () => {
+  const uavs = crowd(30).map((one) => (one.id === "29:1" ? { ...one, verdict: "none" } : one));
+  const picture = await show(uavs, { selected: "30:1" });
+  assert.deepEqual(picture.texts.filter((text) => text.endsWith(":1")).slice(0, 2),
+    ["30:1", "✕ 29:1"]);
+});

@@ -16,6 +16,8 @@ from companion.values import BeamSet, Cause, FloatArray, Method
 
 PACE: Final = 3.0
 """Most by which the angles of a shape grow or shrink in a second, as a factor."""
+FOLLOWED_S: Final = 60.0
+"""Longest time that is followed: a process may be stopped for days, whose powers are no number."""
 PACE_WIDTHS: Final = 3.0
 """Most by which they shrink in a second, in natural widths, and half of what they grow.
 
@@ -82,7 +84,7 @@ def followed_rad(
     wanted_rad = np.minimum(wanted_rad, MOST_WIDTHS * natural_rad)
     if before is None:
         return wanted_rad
-    passed_s = abs(valid_at_ns - before.valid_at_ns) * 1e-9
+    passed_s = min(abs(valid_at_ns - before.valid_at_ns) * 1e-9, FOLLOWED_S)
     last = np.array([before.shaped.get(uav, (np.nan, np.nan)) for uav in uavs])
     last = np.maximum(last, LEAST_WIDTHS * natural_rad)
     further = np.minimum(last * (PACE**passed_s - 1), 2 * PACE_WIDTHS * natural_rad * passed_s)

@@ -103,3 +103,13 @@ def test_turns_do_not_change_to_and_fro(policy: Policy) -> None:
     ]
     assert np.count_nonzero(np.diff(fresh)) > 10
     assert np.count_nonzero(np.diff(sizes)) <= 8
+
+
+@pytest.mark.parametrize("stopped_s", [100.0, 1000.0, 86_400.0, 2.0**31])
+def test_beams_go_on_after_any_pause(stopped_s: float) -> None:
+    """A process that was stopped (SIGSTOP) or a machine that was suspended ticks on much later."""
+    before = Steady(0, {"1:1": (0.01, 0.2)}, {"1:1": 0}, frozenset({"1:1"}), 0, None)
+    wanted = np.array([[0.05, 0.3]])
+    at_ns = round(stopped_s * 1e9)
+    for then_ns in (at_ns, -at_ns):
+        assert np.array_equal(steady.followed_rad(before, then_ns, ["1:1"], wanted, 0.1), wanted)

@@ -83,7 +83,7 @@ def test_refusals_have_a_status_and_a_title(start_node: Any) -> None:
     assert raised.value.status == 422
     with pytest.raises(ServiceError, match="404: no UAV '9:9' has been heard"):
         client.get("/v1/uavs/9:9")
-    with pytest.raises(ServiceError, match="4422: uav: 'x' is neither") as raised:
+    with pytest.raises(ServiceError, match="4422: uav: 'x' is not SYSID:COMPID") as raised:
         next(client.stream(uavs=["x"]))
     assert raised.value.status == 4422
     empty = client.weights()

@@ -193,6 +193,8 @@ class Senders:
         """Place a report by its stamp; its noise is a vehicle's own matter if it reports itself."""
         assert report.boot_ms is not None
         uav, t_ns = report.uav, report.t_ns
+        if uav not in self._clocks and len(self._clocks) >= CLOCKS_MAX and not reports_itself(uav):
+            return _refused(report, Reason.TOO_MANY)  # any number of names can be made up
         stamp, restarted = self._stamp(uav, t_ns, report.boot_ms)
         said = _restart_notice(t_ns, uav, report.boot_ms) if restarted else ()
         if self._clock(uav).is_shared(t_ns):

@@ -26,7 +26,6 @@ OVERFLOW_CHECK_S: Final = 1.0
 """Longest time between two looks at the system's drop counter."""
 OVERFLOW_CHECK_DATAGRAMS: Final = 1024
 """Datagrams after which the drop counter is read even before that time."""
-
 STALE_NS: Final = 2_000_000_000
 """Age at which a datagram is let go unread: a busy machine then sees what is new, not a backlog."""
 READ_AT_ONCE: Final = 32

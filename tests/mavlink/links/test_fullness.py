@@ -12,8 +12,8 @@ from link_support import LOOPS, Run, runner, until_true
 
 from companion.mavlink.links import udp
 from companion.mavlink.links.endpoints import Endpoint, Upcalls
+from companion.mavlink.links.kinds import endpoint
 from companion.mavlink.links.status import LinkStatus
-from companion.mavlink.links.transport import endpoint
 from companion.mavlink.links.urls import parse_link
 
 

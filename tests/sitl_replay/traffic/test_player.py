@@ -361,7 +361,10 @@ def test_a_serial_port_gets_the_stream() -> None:
     os.close(near)
     try:
         tally = run_async(player.play(log_of([0.0, 0.05, 0.1]), [url]))
-        assert os.read(far, 4096) == b"".join(frame.raw for frame in log_of([0.0, 0.05, 0.1]))
+        sent, got = b"".join(frame.raw for frame in log_of([0.0, 0.05, 0.1])), b""
+        while len(got) < len(sent):  # a terminal gives what it has
+            got += os.read(far, 4096)
+        assert got == sent
     finally:
         os.close(far)
     assert (tally.frames, tally.dropped) == (3, 0)

@@ -1,0 +1,53 @@
+"""What a link's scheme stands for: how bytes come, and what makes frames of them.        [shell]"""
+
+from collections.abc import Callable
+
+from companion.mavlink.links.endpoints import Endpoint, Upcalls
+from companion.mavlink.links.hearing import TcpListen, UdpListen
+from companion.mavlink.links.http_poll import HttpPoll
+from companion.mavlink.links.peers import Splits
+from companion.mavlink.links.serial_port import SerialPort
+from companion.mavlink.links.status import LinkStatus
+from companion.mavlink.links.tcp import TcpIn, TcpOut
+from companion.mavlink.links.udp import UdpIn, UdpOut
+from companion.mavlink.links.urls import LinkUrl
+from companion.mavlink.wire.aircraft_json import AircraftJson
+from companion.mavlink.wire.beast import BeastSplitter
+from companion.mavlink.wire.cot_link import CotSplitter
+from companion.mavlink.wire.framing import Splitter
+from companion.mavlink.wire.rid_json import RidJson
+from companion.mavlink.wire.sbs import SbsSplitter
+
+
+def splitter(url: LinkUrl) -> Callable[[str], Splits]:
+    """What makes frames of what comes over a link; each peer has its own."""
+    match url.scheme:
+        case "sbs":
+            return SbsSplitter
+        case "readsb":
+            return AircraftJson if url.way else BeastSplitter
+        case "rid":
+            return RidJson
+        case "cot":
+            return CotSplitter
+        case _:
+            return Splitter
+
+
+def endpoint(url: LinkUrl, status: LinkStatus, upcalls: Upcalls) -> Endpoint:
+    """The endpoint of the link's kind, not yet open."""
+    match url.scheme:
+        case "udpin":
+            return UdpIn(url, status, upcalls)
+        case "udpout":
+            return UdpOut(url, status, upcalls)
+        case "tcp":
+            return TcpOut(url, upcalls)
+        case "tcpin":
+            return TcpIn(url, upcalls)
+        case "sbs" | "readsb":
+            return HttpPoll(url, upcalls) if url.way else TcpListen(url, upcalls)
+        case "rid" | "cot":
+            return UdpListen(url, status, upcalls) if url.listens else TcpListen(url, upcalls)
+        case "serial":
+            return SerialPort(url, upcalls)

@@ -49,6 +49,7 @@ site: .venv/.dev
 	$(BIN)/python docs/make_site.py
 
 # Tests marked `benchmark` and `soak`, which `make test` leaves out. No such test: status 5.
+# The figures are kept in build/bench.json (or BENCH_JSON), and compared with those there before.
 bench: .venv/.dev
 	$(PYTEST) -q -s -m benchmark
 

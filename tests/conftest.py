@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from figures import FILE, Figures
 from hypothesis import settings
 from support import BIN, HANG_S, ROOT, Node, end
 
@@ -52,8 +53,12 @@ STDERR = pytest.StashKey[int]()
 """Where the process writes its errors, whatever is captured."""
 
 
+FIGURES = pytest.StashKey[Figures]()
+
+
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[STDERR] = os.dup(2)
+    config.stash[FIGURES] = Figures()
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
@@ -116,6 +121,21 @@ def studied(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
         return out
 
     return study
+
+
+@pytest.fixture(scope="session")
+def figures(pytestconfig: pytest.Config) -> Figures:
+    """Where benchmarks put what they found."""
+    return pytestconfig.stash[FIGURES]
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    """What benchmarks found, and what is not as it was."""
+    found = config.stash[FIGURES]
+    if found.found:
+        terminalreporter.section(f"figures: {FILE}")
+        for line in found.write():
+            terminalreporter.write_line(line)
 
 
 @pytest.fixture

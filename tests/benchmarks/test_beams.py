@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 import pytest
+from figures import Figures
 from scipy.optimize import linprog
 
 from companion.beams.aim import aim
@@ -147,16 +148,18 @@ def took_s(how: Precoder, elements: int, users: int, apart_rad: float, rounds: i
 
 
 @pytest.mark.parametrize(("elements", "users", "most"), [(64, 4, 6.0), (256, 32, 9.0)])
-def test_widened_beams_against_sharp_ones(elements: int, users: int, most: float) -> None:
+def test_widened_beams_against_sharp_ones(
+    elements: int, users: int, most: float, figures: Figures
+) -> None:
     sharp_s = took_s(Precoder(widen=Widen.NO), elements, users, 0.05, 60)
     for widen in (Widen.LIKELY, Widen.GUARANTEE):
         wide_s = took_s(Precoder(widen=widen), elements, users, 0.05, 60)
-        print(f"\n{elements}x{users}: {widen} takes {wide_s / sharp_s:.1f} times {sharp_s:.2g} s")
-        assert wide_s < most * sharp_s
+        name = f"aim {elements}x{users}, {widen} over sharp"
+        assert figures.note(name, wide_s / sharp_s, "times", "less") < most
+    figures.note(f"aim {elements}x{users}, sharp", sharp_s * 1e6, "us", "less")
 
 
-def test_groups_of_three_hundred() -> None:
+def test_groups_of_three_hundred(figures: Figures) -> None:
     how = Precoder(policy=Policy.GROUP, widen=Widen.NO)
     seconds = took_s(how, 64, 300, 0.008, 5)
-    print(f"\nan update of 300 UAVs in turns: {seconds * 1e3:.0f} ms")
-    assert seconds < 0.2
+    assert figures.note("an update of 300 UAVs in turns", seconds * 1e3, "ms", "less") < 200

@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from figures import Figures
 from support import BIN, HANG_S, shared_log
 
 from companion.beams.array import geometry, steering
 from companion.beams.weights import zero_forcing
 from companion.mavlink.wire.framing import Splitter
 from companion.pipeline import assembly
+from companion.recording.reader import read_log
 from companion.settings.model import Settings
 from companion.values import (
     AltitudeDatum,
@@ -32,18 +34,18 @@ pytestmark = pytest.mark.benchmark
 ROUNDS = 5
 
 
-def interleaved_s(*works: Callable[[], object], rounds: int = ROUNDS) -> list[float]:
-    """Median seconds of each, one after the other in turn, so that a slow spell hits all."""
+def interleaved(*works: Callable[[], object], rounds: int = ROUNDS) -> list[list[float]]:
+    """Seconds of each in each round, one after the other in turn, so that a slow spell hits all."""
     took: list[list[float]] = [[] for _ in works]
     for _ in range(rounds):
         for times, work in zip(took, works, strict=True):
             begin = time.perf_counter()
             work()
             times.append(time.perf_counter() - begin)
-    return [statistics.median(times) for times in took]
+    return took
 
 
-def test_replay_against_reading_the_log(tmp_path: Path) -> None:
+def test_replay_against_reading_the_log(tmp_path: Path, figures: Figures) -> None:
     """The whole command, against mavlogdump that prints the reports of the same log."""
     log = shared_log("sitl_4circle.tlog")
     ours = [BIN / "companion", "replay", log, "--center", "5:1", "--json"]
@@ -59,28 +61,44 @@ def test_replay_against_reading_the_log(tmp_path: Path) -> None:
         return work
 
     recorded = [*ours, "--out", tmp_path / "x.mcap"]
-    recorded_s, plain_s, dump_s = interleaved_s(
+    recorded_s, plain_s, dump_s = interleaved(
         runs(recorded), runs([*ours, "--no-record"]), runs(theirs), rounds=3
     )
-    print(f"\nrecorded {recorded_s / dump_s:.1f}, not recorded {plain_s / dump_s:.1f} times")
-    print(f"as long as mavlogdump; {flown_s[0] / recorded_s:.0f} and", end=" ")
-    print(f"{flown_s[0] / plain_s:.0f} times the flight's speed on this machine")
-    assert recorded_s < 16 * dump_s
+    for name, took_s in (("recorded", recorded_s), ("--no-record", plain_s)):
+        figures.note(f"replay, {name}", [flown_s[0] / s for s in took_s], "x the flight", "more")
+    figures.ratio("replay, --no-record, over mavlogdump", plain_s, dump_s)
+    assert figures.ratio("replay, recorded, over mavlogdump", recorded_s, dump_s) < 16
 
 
-def test_splitting_against_pymavlink() -> None:
+def test_splitting_against_pymavlink(figures: Figures) -> None:
+    from pymavlink import mavutil
     from pymavlink.dialects.v20 import all as dialect
 
-    data = shared_log("sitl_4circle.tlog").read_bytes()[:2_000_000]
+    log = shared_log("sitl_4circle.tlog")
+    data = log.read_bytes()[:2_000_000]
 
     def peer() -> None:
         parser = dialect.MAVLink(None)
         parser.robust_parsing = True
         parser.parse_buffer(data)
 
-    ours_s, theirs_s = interleaved_s(lambda: Splitter("bench").feed(0, data), peer)
-    print(f"\nsplitting: {theirs_s / ours_s:.1f} times as fast as pymavlink's parse_buffer")
-    assert theirs_s / ours_s > 5
+    ours_s, theirs_s = interleaved(lambda: Splitter("bench").feed(0, data), peer)
+    assert figures.ratio("splitting, parse_buffer over ours", theirs_s, ours_s, "more") > 5
+
+    def received(types: list[str] | None) -> None:
+        reader = mavutil.mavlink_connection(str(log))
+        while reader.recv_match(type=types) is not None:
+            pass
+        reader.close()
+
+    ours_s, all_s, some_s = interleaved(
+        lambda: sum(1 for _ in read_log(log)),
+        lambda: received(None),
+        lambda: received(["GLOBAL_POSITION_INT"]),
+        rounds=3,
+    )
+    figures.ratio("reading a log, recv_match() over ours", all_s, ours_s, "more")
+    figures.ratio("reading a log, recv_match(type=...) over ours", some_s, ours_s, "more")
 
 
 def users_of_a_line(elements: int, users: int) -> ComplexArray:
@@ -94,7 +112,7 @@ def users_of_a_line(elements: int, users: int) -> ComplexArray:
 @pytest.mark.parametrize(
     ("elements", "users"), [(64, 4), (64, 16), (128, 4), (256, 32), (1024, 64), (1024, 256)]
 )
-def test_zero_forcing_against_pinv(elements: int, users: int) -> None:
+def test_zero_forcing_against_pinv(elements: int, users: int, figures: Figures) -> None:
     """From the steering matrix to weights and loss factors."""
     matrix = users_of_a_line(elements, users)
     many = max(1, 25_000 // (elements * users))
@@ -106,21 +124,21 @@ def test_zero_forcing_against_pinv(elements: int, users: int) -> None:
 
         return works
 
-    theirs_s, ours_s = interleaved_s(
+    theirs_s, ours_s = interleaved(
         repeated(lambda: np.linalg.pinv(matrix.T), many),
         repeated(lambda: zero_forcing.solve(matrix), 5 * many),
         rounds=3 * ROUNDS,
     )
-    faster = theirs_s / ours_s * 5
-    print(f"\n{elements}x{users}: pinv {theirs_s / many * 1e6:.0f} us; {faster:.1f} times as fast")
-    assert faster >= 5
+    each_s = [seconds / 5 for seconds in ours_s]
+    name = f"zero forcing {elements}x{users}, pinv over ours"
+    assert figures.ratio(name, theirs_s, each_s, "more") >= 5
 
 
 @pytest.mark.parametrize("uavs", [4, 64])
-def test_a_kinematic_update_with_prediction_and_bound(uavs: int) -> None:
+def test_a_kinematic_update_with_prediction_and_bound(uavs: int, figures: Figures) -> None:
     """One report taken in and one prediction made; the cost must not grow with the fleet."""
     each_us = {count: _update_us(count) for count in (4, uavs)}
-    print(f"\n{each_us[uavs]:.0f} us for an update and a prediction with {uavs} UAVs")
+    figures.note(f"update and prediction, {uavs} UAVs", each_us[uavs], "us each", "less")
     assert each_us[uavs] < 2 * each_us[4]
 
 
@@ -149,16 +167,15 @@ def _update_us(uavs: int) -> float:
                 fleet.track(name, t_ns, SenderTime(later_ns, later_ns, 0.01, 0.01))
         begin_ns += rounds * 100_000_000
 
-    (seconds,) = interleaved_s(fly)
-    return seconds / (rounds * uavs) * 1e6
+    (seconds,) = interleaved(fly)
+    return statistics.median(seconds) / (rounds * uavs) * 1e6
 
 
-def test_reading_a_vehicles_own_log_against_the_formats_own_readers() -> None:
+def test_reading_a_vehicles_own_log_against_the_formats_own_readers(figures: Figures) -> None:
     """All frames of a log, against its own reader: of all messages, and of those that are used."""
     from pymavlink.DFReader import DFReader_binary
 
     from companion.recording.foreign import ardupilot, px4
-    from companion.recording.reader import read_log
 
     used = [
         "POS",
@@ -186,24 +203,22 @@ def test_reading_a_vehicles_own_log_against_the_formats_own_readers() -> None:
 
     for name in ("sitl_planes_circle_1.bin", "sitl_planes_circle_5.bin"):
         log = shared_log(name)
-        ours_s, all_s, used_s = interleaved_s(
+        ours_s, all_s, used_s = interleaved(
             partial(ours, log),
             partial(dataflash, log, None),
             partial(dataflash, log, used),
             rounds=3,
         )
-        print(f"\n{name}: {ours_s / all_s:.2f} times as long as DFReader reads,", end=" ")
-        print(f"{ours_s / used_s:.2f} of the messages that are used")
-        assert ours_s < 1.2 * all_s and ours_s < 1.2 * used_s
+        assert figures.ratio(f"{name} over DFReader", ours_s, all_s) < 1.2
+        assert figures.ratio(f"{name} over DFReader, what is used", ours_s, used_s) < 1.2
     assert set(used) <= {*ardupilot._WANTED}
 
     pyulog = pytest.importorskip("pyulog")
     log = shared_log("px4_sample_small.ulg")
-    ours_s, all_s, used_s = interleaved_s(
+    ours_s, all_s, used_s = interleaved(
         partial(ours, log),
         lambda: pyulog.ULog(str(log)),
         lambda: pyulog.ULog(str(log), list(px4._WANTED)),
     )
-    print(f"{log.name}: {ours_s / all_s:.2f} times as long as pyulog reads,", end=" ")
-    print(f"{ours_s / used_s:.2f} of the topics that are used")
-    assert ours_s < 1.5 * all_s
+    figures.ratio(f"{log.name} over pyulog, what is used", ours_s, used_s)
+    assert figures.ratio(f"{log.name} over pyulog", ours_s, all_s) < 1.5

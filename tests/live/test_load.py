@@ -101,10 +101,10 @@ def test_half_a_minute_of_it_and_the_service_stays_at_hand(
     status = heard(node, sent)
     took_s = sorted(watch.took_s)
     p50, p99 = took_s[len(took_s) // 2], took_s[len(took_s) * 99 // 100]
-    load = "10 000 frames/s, recorded" if recorded else "10 000 frames/s"
+    busy = "10 000 frames/s, recorded" if recorded else "10 000 frames/s"
     for what, seconds in (("median", p50), ("p99", p99), ("longest", took_s[-1])):
-        figures.note(f"/healthz at {load}, {what}", seconds * 1e3, "ms", "less")
-    figures.note(f"frames lost at {load}", sent - status["frames"], "of 300 000", "less")
+        figures.note(f"/healthz at {busy}, {what}", seconds * 1e3, "ms", "less")
+    figures.note(f"frames lost at {busy}", sent - status["frames"], "of 300 000", "less")
     assert status["frames"] == sent
     assert status["rejected"] == {}
     assert status["recording"]["dropped"] == 0

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from companion.tracking.gate import GateSettings, Suspects, is_frozen, refusal
-from companion.tracking.hindsight import WAYS, WINDOWS, Hindsight, fading
+from companion.tracking.hindsight import WAYS, WINDOWS, Hindsight, fed
 from companion.tracking.history import History
 from companion.tracking.limits import Refutations
 from companion.tracking.observers.estimates import Observer, Prediction
@@ -398,21 +398,17 @@ def _fed(
     ahead_s = (at.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
     if tracked.acceleration is None or ahead_s <= 0:
         return position, velocity
-    way_s2, gain_s = fading(ahead_s, tracked.hindsight.way.fades_s)
-    return (
-        _further(position, way_s2, tracked.acceleration),
-        _further(velocity, gain_s, tracked.acceleration),
-    )
+    moved, gained = fed(tracked.hindsight.way, tracked.acceleration, velocity, ahead_s)
+    return _sum(position, moved), _sum(velocity, gained)
 
 
 def _array(vector: Vector | None) -> FloatArray | None:
     return None if vector is None else np.array(vector)
 
 
-def _further(vector: Vector, by: float, along: Vector) -> Vector:
-    """``vector + by * along``."""
-    (x, y, z), (a, b, c) = vector, along
-    return x + by * a, y + by * b, z + by * c
+def _sum(one: Vector, other: Vector) -> Vector:
+    (x, y, z), (a, b, c) = one, other
+    return x + a, y + b, z + c
 
 
 def _cut(acceleration: Vector | None, most_mps2: float) -> Vector | None:

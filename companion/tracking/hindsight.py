@@ -25,20 +25,28 @@ class Way:
     window_s  time over which the slope of the reported velocities is taken; 0: none is fed
     fewest    least number of velocities
     fades_s   time constant with which the acceleration fades
+    turns     what is across the velocity turns with it, in the plane, and does not fade; what is
+              along it is left away, as most of it is from before the turn went so far
     """
 
     window_s: float
     fewest: int
     fades_s: float
+    turns: bool = False
 
 
 PLAIN: Final = Way(0.0, 0, 1.0)
-WAYS: Final = (PLAIN, Way(1.0, 3, 3.0), Way(1.0, 3, 10.0), Way(2.5, 3, 10.0), Way(5.0, 5, 3.0))
-"""None; a quick turn, soon over or not; one that goes on; a slow one over noisy reports."""
+WAYS: Final = (
+    PLAIN, Way(1.0, 3, 3.0), Way(1.0, 3, 10.0), Way(2.5, 3, 10.0), Way(5.0, 5, 3.0),
+    Way(1.0, 3, 3.0, turns=True), Way(2.5, 3, 3.0, turns=True), Way(5.0, 5, 3.0, turns=True),
+)  # fmt: skip
+"""None; a quick turn, soon over or not; one that goes on; a slow one, noisy reports; circles."""
 WINDOWS: Final = ((1.0, 3), (2.5, 3), (5.0, 5))
 """Windows of the ways and the velocities they need, each once, ascending."""
-JUDGED_S: Final = 1.0
-"""Least age of the predictions by which ways are judged."""
+TURNS_MPS: Final = 1.0
+"""Speed in the plane below which there is no direction that could turn."""
+JUDGED_S: Final = (1.0, 2.0)
+"""Least ages of the predictions by which ways are judged: soon, and as over a slow radio."""
 MEMORY_S: Final = 20.0
 """Time constant with which what was seen is forgotten."""
 BETTER: Final = 0.9
@@ -73,10 +81,8 @@ class _Made:
         for way in ways:
             given, north, east, down = self.accelerations[way], n, e, d
             if given is not None:
-                gain = fading(ahead_s, WAYS[way].fades_s)[0]
-                north += gain * given[0]
-                east += gain * given[1]
-                down += gain * given[2]
+                (by_n, by_e, by_d), _ = fed(WAYS[way], given, self.velocity, ahead_s)
+                north, east, down = north + by_n, east + by_e, down + by_d
             found.append(math.sqrt(north * north + east * east + down * down))
         return found
 
@@ -148,14 +154,16 @@ class Hindsight:
         return None
 
     def _judge(self, sender_ns: int, there: Vector) -> None:
-        made = self._older(sender_ns, JUDGED_S)
+        made = self._older(sender_ns, JUDGED_S[0])
         if made is None or made.sender_ns <= self._judged_ns:
             return
         memory = math.exp(-(made.sender_ns - self._judged_ns) * 1e-9 / MEMORY_S)
         self._judged_ns = made.sender_ns
-        ahead_s = (sender_ns - made.sender_ns) * 1e-9
-        off_m = made.off_m(range(len(WAYS)), there, ahead_s)
-        self._costs = [memory * c + m * m for c, m in zip(self._costs, off_m, strict=True)]
+        self._costs = [memory * cost for cost in self._costs]
+        for one in (made, self._older(sender_ns, JUDGED_S[1])):
+            if one is not None:
+                off_m = one.off_m(range(len(WAYS)), there, (sender_ns - one.sender_ns) * 1e-9)
+                self._costs = [c + m * m for c, m in zip(self._costs, off_m, strict=True)]
         self._judged += 1
         if self._judged < JUDGED:
             return
@@ -180,6 +188,29 @@ class Hindsight:
                 return a_m + (b_m - a_m) * (age_s - a_s) / (b_s - a_s)
         last_s, last_m = known[-1]
         return last_m * (age_s / last_s) ** 2
+
+
+def fed(way: Way, acceleration: Vector, velocity: Vector, ahead_s: float) -> tuple[Vector, Vector]:
+    """What an acceleration adds to straight flight within a time: metres, and metres per second.
+
+    A turn in the plane at the rate w = (v x a) / v^2 turns the velocity by w t, and the way is the
+    integral of that (docs/math.md 5.1).
+    """
+    way_s2, gain_s = fading(ahead_s, way.fades_s)
+    (a, b, c), (north, east, _) = acceleration, velocity
+    level = north * north + east * east
+    if not way.turns or level < TURNS_MPS**2:
+        return (way_s2 * a, way_s2 * b, way_s2 * c), (gain_s * a, gain_s * b, gain_s * c)
+    rate = (north * b - east * a) / level
+    angle = min(max(rate * ahead_s, -math.pi), math.pi)
+    along, across = math.sin(angle), 1.0 - math.cos(angle)
+    # Of angles that vanish the series: (sin x / x - 1) t and (1 - cos x) / x t.
+    less = ahead_s * (along / angle - 1.0 if abs(angle) > 1e-3 else -angle * angle / 6.0)
+    aside = ahead_s * (across / angle if abs(angle) > 1e-3 else angle / 2.0)
+    return (
+        (less * north - aside * east, less * east + aside * north, way_s2 * c),
+        (-across * north - along * east, -across * east + along * north, gain_s * c),
+    )
 
 
 def fading(ahead_s: float, fades_s: float) -> tuple[float, float]:

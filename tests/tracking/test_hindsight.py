@@ -5,8 +5,10 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from companion.tracking.hindsight import PLAIN, WAYS, WINDOWS, Hindsight, fading
+from companion.tracking.hindsight import PLAIN, WAYS, WINDOWS, Hindsight, Way, fading, fed
 from companion.tracking.history import History
 from companion.tracking.observers.kinematic import KinematicModel, KinematicObserver
 from companion.values import Fix
@@ -91,6 +93,46 @@ def test_the_usual_error_covers_what_comes(fix: Callable[..., Fix]) -> None:
     assert 0.9 <= covered / count <= 0.99
     ages = [hindsight.usual_m(age) for age in (0.0, 0.25, 1.0, 3.0, 10.0)]
     assert ages == sorted(ages)  # type: ignore[type-var]
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.floats(1.1, 40.0), st.floats(-3.2, 3.2), st.floats(-16.0, 16.0), st.floats(-16.0, 16.0),
+    st.floats(0.0, 10.0),
+)  # fmt: skip
+def test_in_a_turn_the_velocity_turns(
+    speed_mps: float, heading: float, across_mps2: float, along_mps2: float, ahead_s: float
+) -> None:
+    """Against small steps; and no further from straight flight than what is across could go."""
+    way = Way(1.0, 3, 3.0, turns=True)
+    direction = np.array([math.cos(heading), math.sin(heading)])
+    aside = np.array([-direction[1], direction[0]])
+    given = along_mps2 * direction + across_mps2 * aside
+    velocity = speed_mps * direction
+    (north, east, down), gained = fed(
+        way, (*given.tolist(), 1.0), (*velocity.tolist(), 0.0), ahead_s
+    )
+    turned = max(min(across_mps2 / speed_mps * ahead_s, math.pi), -math.pi)
+    angles = heading + turned * (np.arange(2000) + 0.5) / 2000
+    headings = np.array([np.cos(angles), np.sin(angles)])
+    expected = speed_mps * ahead_s * (headings.mean(axis=1) - direction)
+    assert np.allclose([north, east], expected, atol=1e-4 * (1 + speed_mps * ahead_s))
+    last = speed_mps * np.array([math.cos(heading + turned), math.sin(heading + turned)])
+    assert np.allclose(velocity + gained[:2], last, atol=1e-6)
+    assert math.hypot(north, east) <= abs(across_mps2) * ahead_s**2 / 2 + 1e-6
+    assert (down, gained[2]) == fading(ahead_s, 3.0)
+
+
+def test_who_stands_has_no_direction_to_turn() -> None:
+    turning, straight = Way(1.0, 3, 3.0, turns=True), Way(1.0, 3, 3.0)
+    stands = (0.5, -0.5, 1.0)
+    for ahead_s in (0.1, 2.0):
+        found = (fed(way, (1.0, 2.0, -1.0), stands, ahead_s) for way in (turning, straight))
+        assert next(found) == next(found)
+
+
+def test_in_a_steady_circle_the_turn_is_fed(fix: Callable[..., Fix]) -> None:
+    assert flown(fix, circling(60.0, 12.0), 0.8, 60, noise_mps=0.05, noise_m=0.05).way.turns
 
 
 @pytest.mark.parametrize("fades_s", [3.0, 10.0])

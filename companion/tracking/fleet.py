@@ -246,6 +246,8 @@ class Fleet:
         Accelerations are cut to the greatest possible size.
         """
         hindsight = tracked.hindsight
+        if self._settings.feed_forward:
+            hindsight.smooth(fix)
         if not hindsight.is_due(fix.sender_ns):
             return
         if not self._settings.feed_forward:
@@ -394,8 +396,9 @@ def _rejected(fix: Fix, reason: Reason, detail: str) -> Rejection:
 def _fed(
     tracked: _Tracked, at: SenderTime, position: Vector, velocity: Vector
 ) -> tuple[Vector, Vector]:
-    """A predicted position and velocity with the acceleration fed forward, if there is one."""
+    """A predicted position and velocity with what hindsight has chosen to add."""
     ahead_s = (at.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
+    position = _sum(position, tracked.hindsight.aside)
     if tracked.acceleration is None or ahead_s <= 0:
         return position, velocity
     moved, gained = fed(tracked.hindsight.way, tracked.acceleration, velocity, ahead_s)

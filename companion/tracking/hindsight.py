@@ -2,7 +2,8 @@
 
 Every report shows how far earlier predictions for its time were off. That chooses, for each UAV,
 the way of feeding an acceleration forward that would have predicted its own last reports best, or
-none: what helps in a steady turn hurts where velocities are sparse or noisy. And it says what error
+none: what helps in a steady turn hurts where velocities are sparse or noisy. Likewise whether its
+positions are taken as reported, or smoothed along the reported velocities. And it says what error
 is usual at a given age, as a quantile of those of the near past: no law of errors is assumed, only
 that the near future resembles the near past.
 """
@@ -45,6 +46,11 @@ WINDOWS: Final = ((1.0, 3), (2.5, 3), (5.0, 5))
 """Windows of the ways and the velocities they need, each once, ascending."""
 TURNS_MPS: Final = 1.0
 """Speed in the plane below which there is no direction that could turn."""
+SMOOTHED: Final = 0.35
+"""Share of the newest report in a smoothed position."""
+SMOOTHED_S: Final = 5.0
+"""Gap between reports over which positions are not smoothed."""
+NOWHERE: Final = (0.0, 0.0, 0.0)
 JUDGED_S: Final = (1.0, 2.0)
 """Least ages of the predictions by which ways are judged: soon, and as over a slow radio."""
 MEMORY_S: Final = 20.0
@@ -72,16 +78,24 @@ class _Made:
     position: Vector
     velocity: Vector
     accelerations: tuple[Vector | None, ...]
+    aside: Vector  # of the smoothed position from the reported one
 
     def off_m(self, ways: Sequence[int], there: Vector, ahead_s: float) -> list[float]:
-        """How far predictions by some ways are from a position reported later."""
+        """How far predictions by some ways are from a position reported later.
+
+        The numbers of ways are those of ``WAYS``, and then once more over smoothed positions.
+        """
         (n, e, d), (vn, ve, vd), (tn, te, td) = self.position, self.velocity, there
         n, e, d = n + vn * ahead_s - tn, e + ve * ahead_s - te, d + vd * ahead_s - td
         found = []
         for way in ways:
-            given, north, east, down = self.accelerations[way], n, e, d
+            which = way % len(WAYS)
+            given, north, east, down = self.accelerations[which], n, e, d
             if given is not None:
-                (by_n, by_e, by_d), _ = fed(WAYS[way], given, self.velocity, ahead_s)
+                (by_n, by_e, by_d), _ = fed(WAYS[which], given, self.velocity, ahead_s)
+                north, east, down = north + by_n, east + by_e, down + by_d
+            if way != which:
+                (by_n, by_e, by_d) = self.aside
                 north, east, down = north + by_n, east + by_e, down + by_d
             found.append(math.sqrt(north * north + east * east + down * down))
         return found
@@ -113,16 +127,45 @@ class Hindsight:
 
     def __init__(self) -> None:
         self._made: deque[_Made] = deque(maxlen=_KEPT)
-        self._costs = [0.0] * len(WAYS)
+        self._costs = [0.0] * (2 * len(WAYS))
         self._judged = 0
         self._judged_ns = 0
         self._way = 0
         self._errors = tuple(_Errors() for _ in AGES_S)
+        self._smoothed: tuple[int, Vector, Vector] | None = None  # when, the place, the velocity
+        self._aside: Vector = NOWHERE
 
     @property
     def way(self) -> Way:
         """The way of feeding forward that is in use."""
-        return WAYS[self._way]
+        return WAYS[self._way % len(WAYS)]
+
+    @property
+    def aside(self) -> Vector:
+        """Where the UAV is taken to be, from its newest reported position; m, local frame."""
+        return self._aside if self._way >= len(WAYS) else NOWHERE
+
+    def smooth(self, fix: Fix) -> None:
+        """Take the newest report into the smoothed position: every one, before ``add``."""
+        before, velocity = self._smoothed, fix.velocity_ned_mps
+        self._smoothed, self._aside = None, NOWHERE
+        if velocity is None:
+            return
+        place = fix.position_ned_m
+        if before is not None:
+            then_ns, (n, e, d), (v_n, v_e, v_d) = before
+            dt_s = (fix.sender_ns - then_ns) * 1e-9
+            if 0 < dt_s <= SMOOTHED_S:
+                (z_n, z_e, z_d), (w_n, w_e, w_d) = place, velocity
+                half, rest = dt_s / 2.0, 1.0 - SMOOTHED
+                self._aside = (
+                    rest * (n + half * (v_n + w_n) - z_n),
+                    rest * (e + half * (v_e + w_e) - z_e),
+                    rest * (d + half * (v_d + w_d) - z_d),
+                )
+                aside = self._aside
+                place = (z_n + aside[0], z_e + aside[1], z_d + aside[2])
+        self._smoothed = (fix.sender_ns, place, velocity)
 
     def is_due(self, sender_ns: int) -> bool:
         """Whether a report of this time is to be added."""
@@ -142,7 +185,8 @@ class Hindsight:
                 age_s = (fix.sender_ns - made.sender_ns) * 1e-9
                 errors.add(made.off_m((self._way,), there, age_s)[0], age_s)
         if fix.velocity_ned_mps is not None:
-            self._made.append(_Made(fix.sender_ns, there, fix.velocity_ned_mps, accelerations))
+            velocity, aside = fix.velocity_ned_mps, self._aside
+            self._made.append(_Made(fix.sender_ns, there, velocity, accelerations, aside))
 
     def _older(self, sender_ns: int, least_s: float) -> _Made | None:
         """The newest of what is remembered that is at least so old, and not twice as old."""
@@ -162,12 +206,13 @@ class Hindsight:
         self._costs = [memory * cost for cost in self._costs]
         for one in (made, self._older(sender_ns, JUDGED_S[1])):
             if one is not None:
-                off_m = one.off_m(range(len(WAYS)), there, (sender_ns - one.sender_ns) * 1e-9)
+                ahead_s = (sender_ns - one.sender_ns) * 1e-9
+                off_m = one.off_m(range(len(self._costs)), there, ahead_s)
                 self._costs = [c + m * m for c, m in zip(self._costs, off_m, strict=True)]
         self._judged += 1
         if self._judged < JUDGED:
             return
-        best = min(range(len(WAYS)), key=self._costs.__getitem__)
+        best = min(range(len(self._costs)), key=self._costs.__getitem__)
         if self._costs[best] < BETTER * self._costs[self._way]:
             self._way = best
 

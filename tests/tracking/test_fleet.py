@@ -417,9 +417,9 @@ def errors_m(fix: MakeFix, feed_mps2: float | None, ahead_s: float) -> float:
 
 
 def test_an_acceleration_fed_forward_helps_in_a_turn(fix: MakeFix) -> None:
-    """Two seconds ahead: 2.4 m/s^2 are 4.8 m that would be missed."""
-    assert errors_m(fix, 5.0, 2.0) < 0.7 * errors_m(fix, None, 2.0)
-    assert errors_m(fix, 5.0, 0.0) == errors_m(fix, None, 0.0)
+    """Two seconds ahead: 2.4 m/s^2 are 4.8 m that would be missed. Noise is smoothed besides."""
+    assert errors_m(fix, 5.0, 2.0) < 0.6 * errors_m(fix, None, 2.0)
+    assert errors_m(fix, 5.0, 0.0) < 0.6 * errors_m(fix, None, 0.0)
 
 
 def test_what_is_fed_forward_is_within_the_bound(fix: MakeFix) -> None:

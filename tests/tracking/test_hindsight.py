@@ -48,6 +48,7 @@ def flown(
             history = History(OBSERVER, made, 5 * S)
         else:
             history.insert(len(history.entries), made)
+        hindsight.smooth(made)
         if hindsight.is_due(made.sender_ns):
             slopes = dict(zip([w[0] for w in WINDOWS], history.accelerations(WINDOWS), strict=True))
             hindsight.add(made, tuple(slopes.get(way.window_s) for way in WAYS))
@@ -85,7 +86,8 @@ def test_the_usual_error_covers_what_comes(fix: Callable[..., Fix]) -> None:
         t_s = rng.uniform(0, 100)
         position, velocity = (np.array(one) for one in place(t_s))
         later, _ = place(t_s + 1.0)
-        told = position + rng.normal(0, 0.5, 3) + (velocity + rng.normal(0, 0.2, 3))
+        noise_m = 0.5 if hindsight.aside == (0.0, 0.0, 0.0) else 0.5 * math.sqrt(0.35 / 1.65)
+        told = position + rng.normal(0, noise_m, 3) + (velocity + rng.normal(0, 0.2, 3))
         acceleration = np.array([-velocity[1], velocity[0], 0]) * 8.0 / 60.0
         told = told + acceleration * (0.0 if hindsight.way is PLAIN else 0.48)
         seen = np.array(later) + rng.normal(0, 0.5, 3)
@@ -133,6 +135,36 @@ def test_who_stands_has_no_direction_to_turn() -> None:
 
 def test_in_a_steady_circle_the_turn_is_fed(fix: Callable[..., Fix]) -> None:
     assert flown(fix, circling(60.0, 12.0), 0.8, 60, noise_mps=0.05, noise_m=0.05).way.turns
+
+
+def test_positions_of_a_poor_receiver_are_smoothed(fix: Callable[..., Fix]) -> None:
+    """Half of the noise is gone, in a turn as well; and a good receiver is believed."""
+    straight: Place = lambda t_s: ([10 * t_s, 0, 0], [10, 0, 0])  # noqa: E731
+    for place in (straight, circling(60.0, 8.0)):
+        rng, history, hindsight, off = np.random.default_rng(3), None, Hindsight(), []
+        for n in range(200):
+            t_s = 0.8 * n
+            position, velocity = (np.array(one) for one in place(t_s))
+            made = fix(round(t_s * S), position + rng.normal(0, 3.0, 3), velocity)
+            history = history or History(OBSERVER, made, 5 * S)
+            hindsight.smooth(made)
+            hindsight.add(made, (None,) * len(WAYS))
+            off.append(
+                [np.array(made.position_ned_m) - position,
+                 np.array(made.position_ned_m) + hindsight.aside - position]
+            )  # fmt: skip
+        reported, taken = (np.array(off)[100:, which] for which in (0, 1))
+        assert np.sqrt((taken**2).mean()) < 0.65 * np.sqrt((reported**2).mean())
+    assert math.hypot(*flown(fix, circling(60.0, 8.0), 0.8, 60).aside) < 0.05
+
+
+def test_over_a_gap_nothing_is_smoothed(fix: Callable[..., Fix]) -> None:
+    hindsight = Hindsight()
+    for n in range(60):
+        made = fix(round(n * 6.0 * S), np.array([5.0 * (-1) ** n, 0, 0]), np.zeros(3))
+        hindsight.smooth(made)
+        hindsight.add(made, (None,) * len(WAYS))
+        assert hindsight.aside == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("fades_s", [3.0, 10.0])

@@ -17,6 +17,7 @@ from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.voice.rate_watch import MessageRate
 from companion.node.gateway import Gateway
 from companion.node.outlet import Outlet
+from companion.node.push import Push
 from companion.node.serving import NOTICES_KEPT, Server, Throughput, aside
 from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
@@ -97,8 +98,11 @@ class Service:
         self._traffic = Gateway(settings, self._step, self._notify, self._timeline.now_ns)
         self.arrival_lag = self._traffic.lag
         self._outlet = Outlet(settings, self.pipeline, self._notify, self._timeline.now_ns)
+        now_ns = self._timeline.now_ns
+        self._push = Push(settings.records, self.pipeline, self._notify, now_ns)
         self._traffic.open()
         self._outlet.open()
+        self._push.open()
         self._recorder = self._open_recorder()
 
     async def run(
@@ -123,6 +127,7 @@ class Service:
                 tasks = [group.create_task(self._tick(), name="ticks")]
                 tasks.append(group.create_task(self._traffic.run(), name="links"))
                 tasks.append(group.create_task(self._outlet.run(), name="out"))
+                tasks.append(group.create_task(self._push.run(), name="records"))
                 tasks.append(group.create_task(self._recover_leftovers(), name="recovery"))
                 tasks.append(group.create_task(self._end_on_defect(), name="defects"))
                 tasks += [group.create_task(other, name="beside") for other in others]
@@ -134,6 +139,7 @@ class Service:
                     task.cancel()
         finally:
             try:
+                self._push.close()
                 self._traffic.close()
             finally:  # a disk that takes no timestamps is no reason to lose the recording
                 await self._finish()
@@ -221,6 +227,8 @@ class Service:
         while True:
             began_s = loop.time()
             self._step(Tick(self._timeline.now_ns()))
+            if self.pipeline.last_update:
+                self._push.newest(self.pipeline.last_update)
             self._rates.count(self.now_ns(), self.pipeline.frames, self.pipeline.updates)
             if self._recorder:
                 self._tell_of_recorder(self._recorder)

@@ -28,7 +28,12 @@ from companion.settings.mavlink import (
     SigningSettings,
     TrackSettings,
 )
-from companion.settings.outlets import PageSettings, RecordingSettings, ServerSettings
+from companion.settings.outlets import (
+    PageSettings,
+    RecordingSettings,
+    RecordSettings,
+    ServerSettings,
+)
 from companion.settings.section import ConfigError, Section
 from companion.settings.tracking import ClockSettings, ObserverSettings
 
@@ -80,6 +85,7 @@ class Settings(Section):
     radio: RadioSettings = RadioSettings()
     link: NeedSettings = NeedSettings()
     recording: RecordingSettings = RecordingSettings()
+    records: RecordSettings = RecordSettings()
     server: ServerSettings = ServerSettings()
     page: PageSettings = PageSettings()
 

@@ -1,10 +1,47 @@
-"""Settings of recording, of serving and of the page."""
+"""Settings of recording, of serving, of records for machines and of the page."""
 
-from typing import Annotated, Literal
+import ipaddress
+import re
+from typing import Annotated, Final, Literal
 
-from pydantic import Field, PositiveFloat
+from pydantic import AfterValidator, Field, PositiveFloat
 
 from companion.settings.section import Section
+from companion.values import UserError
+
+_ADDRESS: Final = re.compile(r"(?:\[([0-9A-Fa-f:.]+)\]|([0-9.]+)):([0-9]{1,5})")
+
+
+def host_and_port(text: str) -> tuple[str, int]:
+    """The parts of IP:PORT, IPv6 in brackets. Raises ``UserError`` for anything else."""
+    found = _ADDRESS.fullmatch(text)
+    try:
+        host = str(ipaddress.ip_address(found[1] or found[2])) if found else ""
+    except ValueError:
+        host = ""
+    if not host or not found or not 1 <= int(found[3]) <= 65535:
+        raise UserError(f"{text!r} is not IP:PORT, such as 127.0.0.1:9000 or [::1]:9000")
+    return host, int(found[3])
+
+
+def _addresses(texts: tuple[str, ...]) -> tuple[str, ...]:
+    for text in texts:
+        host_and_port(text)
+    return texts
+
+
+class RecordSettings(Section):
+    """Where the weights of each update are pushed to machines, as records of one fixed layout.
+
+    udp            addresses (IP:PORT) to which datagrams are sent
+    shared_memory  file of a ring of records, such as /dev/shm/uav-beams
+    guaranteed     whether records say the guaranteed gain, which takes milliseconds to compute; it
+                   is NaN without
+    """
+
+    udp: Annotated[tuple[str, ...], Field(max_length=16), AfterValidator(_addresses)] = ()
+    shared_memory: str | None = None
+    guaranteed: bool = False
 
 
 class RecordingSettings(Section):

@@ -5,7 +5,6 @@ therefore run on any thread.
 """
 
 import functools
-from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -14,10 +13,11 @@ from companion.beams import line_of_sight
 from companion.beams.aim import directions
 from companion.beams.array.geometry import Array
 from companion.beams.hardware import codebooks
-from companion.beams.worth import guarantee, link_budget, patterns
+from companion.beams.worth import link_budget, patterns
 from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
 from companion.values import Beam, BeamSet, FloatArray, Update
+from companion.views import guaranteed_gain
 from companion.views.words import degrees, rfc3339
 
 Json = dict[str, Any]
@@ -32,8 +32,6 @@ MOST_RESPONSES: Final = 2**28
 """Samples times beams of a codebook times elements, for all UAVs of one answer."""
 FULL_SHARE: Final = 8
 """UAVs up to which each has all the work that a question may take."""
-MOST_AT_WORST: Final = 16
-"""Most beams for which guaranteed SINRs are computed: the leakage between them grows squared."""
 
 
 def beams(
@@ -106,7 +104,9 @@ def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[J
     )
     seen_locally = towards @ array.array_from_body @ carrier.body_from_local
     bearings = np.degrees(np.arctan2(seen_locally[:, 1], seen_locally[:, 0])) % 360
-    guaranteed, guaranteed_sinr = _guaranteed_db(pipeline, equipment, update, towards, powers_w)
+    guaranteed, guaranteed_sinr = guaranteed_gain.of_beams(
+        pipeline, equipment, update, towards, powers_w
+    )
     powers_dbm = 10 * np.log10(np.maximum(powers_w, 1e-30)) + 30
     turns_db = 10 * np.log10(beam_set.groups)
     return [
@@ -135,48 +135,6 @@ def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[J
         }
         for i, beam in enumerate(beam_set.beams)
     ]
-
-
-def _guaranteed_db(
-    pipeline: Pipeline,
-    equipment: Equipment,
-    update: Update,
-    towards: FloatArray,
-    powers_w: FloatArray,
-) -> tuple[Sequence[float | None], Sequence[float | None]]:
-    """Least gain and least SINR of each beam, wherever the UAVs truly are.
-
-    None where a UAV may be out of coverage, in a null, or anywhere. The SINR is None for all where
-    there are more than ``MOST_AT_WORST`` beams.
-    """
-    array, beam_set = pipeline.array, update.beams
-    bounds = guarantee.covered_bounds(
-        array, pipeline.coverage, towards, [beam.pointing_bound_rad for beam in beam_set.beams]
-    )
-    gains_db = guarantee.guaranteed_gains_db(array, towards, bounds, beam_set.weights)
-    known = [i for i, gain_db in enumerate(gains_db) if gain_db is not None]
-    unknown: list[float | None] = [None] * len(bounds)
-    if not known or len(bounds) > MOST_AT_WORST or update.carrier is None:
-        return gains_db, unknown
-    farthest_m = {track.uav: track.bound_m + update.carrier.bound_m for track in update.tracks}
-    ranges_m = np.array([beam.range_m + farthest_m[beam.uav] for beam in beam_set.beams])
-    leaks = guarantee.leakage_bounds(
-        array, towards[known], [bounds[i] for i in known], beam_set.weights
-    )
-    sinr_db = link_budget.least_sinr_db(
-        10 ** (np.array([gains_db[i] for i in known], dtype=float) / 10),
-        leaks,
-        np.array(known),
-        ranges_m[known],
-        np.array([beam.group for beam in beam_set.beams]),
-        powers_w,
-        equipment.budget,
-        array.wavelength_m,
-        equipment.uav_antennas,
-    )
-    for i, value in zip(known, sinr_db.tolist(), strict=True):
-        unknown[i] = value
-    return gains_db, unknown
 
 
 def _codebook_entry(

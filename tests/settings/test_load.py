@@ -48,6 +48,8 @@ WRONG = [
     ("out", "urls", '["udpin:0.0.0.0:1"]', "udpin:0.0.0.0:1", "udpout:HOST:PORT"),
     ("out", "urls", '["cot:udp:10.0.0.1:0"]', "cot:udp:10.0.0.1:0", "port 0"),
     ("out", "urls", '["sbs:radar:30003"]', "sbs:radar:30003", "cot:udp:HOST:PORT"),
+    ("records", "udp", '["radio:9000"]', "radio:9000", "IP:PORT"),
+    ("records", "udp", '["127.0.0.1:0"]', "127.0.0.1:0", "IP:PORT"),
     ("out", "rate_hz", "51", "51", "less than or equal to 50"),
     ("out", "uavs", '["me"]', "me", "SYSID:COMPID"),
     ("signing", "keys", '{"radio" = "key"}', "radio", "serial:DEVICE:BAUD"),

@@ -1,0 +1,116 @@
+"""Weights pushed to machines as each update is made, over UDP and shared memory.          [shell]
+
+Nobody is waited for, and nothing is queued: while a guarantee is computed, updates that come are
+left out but for the newest.
+"""
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from companion.node.ring import LARGEST_RECORD, Ring
+from companion.node.serving import aside
+from companion.pipeline.fold import Pipeline
+from companion.settings.outlets import RecordSettings, host_and_port
+from companion.values import Notice, Severity, Update, UserError
+from companion.views import guaranteed_gain, records
+
+LARGEST_DATAGRAM: Final = 65_000
+"""Bytes that fit into a datagram of either family with room to spare."""
+WELL: Final = 50
+"""Datagrams that go out in a row before it is said: a refusal is told to one that comes later."""
+
+
+class Push:
+    """The ways of ``[records]``. Call ``open`` for early errors, then ``run`` until cancelled.
+
+    ``sequence`` is the number of the next update.
+    """
+
+    def __init__(
+        self,
+        settings: RecordSettings,
+        pipeline: Pipeline,
+        notify: Callable[[Notice], None],
+        now_ns: Callable[[], int],
+    ) -> None:
+        self.sequence = 0
+        self._settings = settings
+        self._pipeline = pipeline
+        self._notify = notify
+        self._now_ns = now_ns
+        self._sockets: dict[str, socket.socket] = {}
+        self._refused: dict[str, int] = {}  # datagrams since the last refusal
+        self._ring: Ring | None = None
+        self._newest: Update | None = None
+        self._fresh = asyncio.Event()
+
+    def open(self) -> None:
+        """Open all ways. Raises ``UserError`` where one cannot be opened."""
+        for text in self._settings.udp:
+            host, port = host_and_port(text)
+            family = socket.AF_INET6 if ":" in host else socket.AF_INET
+            sock = self._sockets[text] = socket.socket(family, socket.SOCK_DGRAM)
+            sock.setblocking(False)
+            try:
+                sock.connect((host, port))
+            except OSError as error:
+                raise UserError(f"records.udp {text}: {error.strerror}") from error
+        if self._settings.shared_memory is not None:
+            self._ring = Ring(Path(self._settings.shared_memory))
+
+    def newest(self, update: Update) -> None:
+        """Push this update next."""
+        if self._sockets or self._ring:
+            self._newest = update
+            self._fresh.set()
+
+    async def run(self) -> None:
+        """Push updates as they come, until cancelled."""
+        while True:
+            await self._fresh.wait()
+            self._fresh.clear()
+            update, sure = self._newest, None
+            assert update is not None
+            if self._settings.guaranteed:
+                sure = await aside(partial(guaranteed_gain.gains_db, self._pipeline, update))
+            self._send(update, sure)
+            self.sequence += 1
+
+    def _send(self, update: Update, sure: list[float | None] | None) -> None:
+        encode = partial(records.encode, update.beams, self.sequence, sure)
+        if self._ring:
+            for record in encode(LARGEST_RECORD):
+                self._ring.put(record)
+        for record in encode(LARGEST_DATAGRAM) if self._sockets else ():
+            for text, sock in self._sockets.items():
+                self._say(text, sock, record)
+
+    def _say(self, text: str, sock: socket.socket, record: bytes) -> None:
+        try:
+            sock.send(record)
+        except OSError as error:  # nobody listens there, or the line is full: the next is newer
+            if text not in self._refused:
+                self._tell(Severity.WARNING, f"records to {text} are refused: {error.strerror}")
+            self._refused[text] = 0
+        else:
+            if text in self._refused:
+                self._refused[text] += 1
+                if self._refused[text] >= WELL:
+                    del self._refused[text]
+                    self._tell(Severity.INFO, f"records to {text} go out")
+
+    def _tell(self, severity: Severity, text: str) -> None:
+        self._notify(Notice(self._now_ns(), severity, "records", text))
+
+    def close(self) -> None:
+        """Close all ways."""
+        for sock in self._sockets.values():
+            with contextlib.suppress(OSError):
+                sock.close()
+        if self._ring:
+            self._ring.close()

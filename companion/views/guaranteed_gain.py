@@ -1,0 +1,72 @@
+"""Least gain and least SINR of beams wherever the UAVs truly are, as the API shows them."""
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from companion.beams.aim import directions
+from companion.beams.worth import guarantee, link_budget
+from companion.pipeline.assembly import Equipment
+from companion.pipeline.fold import Pipeline
+from companion.values import FloatArray, Update
+
+MOST_AT_WORST: Final = 16
+"""Most beams for which guaranteed SINRs are computed: the leakage between them grows squared."""
+
+
+def gains_db(pipeline: Pipeline, update: Update) -> list[float | None]:
+    """The guaranteed gain of each beam of one update, as the API shows it."""
+    if not update.beams.beams:
+        return []
+    return list(_least(pipeline, update, directions(update.beams))[1])
+
+
+def of_beams(
+    pipeline: Pipeline,
+    equipment: Equipment,
+    update: Update,
+    towards: FloatArray,
+    powers_w: FloatArray,
+) -> tuple[Sequence[float | None], Sequence[float | None]]:
+    """Least gain and least SINR of each beam, wherever the UAVs truly are.
+
+    None where a UAV may be out of coverage, in a null, or anywhere. The SINR is None for all where
+    there are more than ``MOST_AT_WORST`` beams.
+    """
+    array, beam_set = pipeline.array, update.beams
+    bounds, gains_db = _least(pipeline, update, towards)
+    known = [i for i, gain_db in enumerate(gains_db) if gain_db is not None]
+    unknown: list[float | None] = [None] * len(bounds)
+    if not known or len(bounds) > MOST_AT_WORST or update.carrier is None:
+        return gains_db, unknown
+    farthest_m = {track.uav: track.bound_m + update.carrier.bound_m for track in update.tracks}
+    ranges_m = np.array([beam.range_m + farthest_m[beam.uav] for beam in beam_set.beams])
+    leaks = guarantee.leakage_bounds(
+        array, towards[known], [bounds[i] for i in known], beam_set.weights
+    )
+    sinr_db = link_budget.least_sinr_db(
+        10 ** (np.array([gains_db[i] for i in known], dtype=float) / 10),
+        leaks,
+        np.array(known),
+        ranges_m[known],
+        np.array([beam.group for beam in beam_set.beams]),
+        powers_w,
+        equipment.budget,
+        array.wavelength_m,
+        equipment.uav_antennas,
+    )
+    for i, value in zip(known, sinr_db.tolist(), strict=True):
+        unknown[i] = value
+    return gains_db, unknown
+
+
+def _least(
+    pipeline: Pipeline, update: Update, towards: FloatArray
+) -> tuple[Sequence[float | None], Sequence[float | None]]:
+    """Pointing bound of each beam, None where it leaves the coverage, and least gain within it."""
+    array, beam_set = pipeline.array, update.beams
+    bounds = guarantee.covered_bounds(
+        array, pipeline.coverage, towards, [beam.pointing_bound_rad for beam in beam_set.beams]
+    )
+    return bounds, guarantee.guaranteed_gains_db(array, towards, bounds, beam_set.weights)

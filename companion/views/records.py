@@ -1,0 +1,148 @@
+"""Updates as records for machines: one fixed little-endian layout that says what it holds.
+
+A record is a header, an entry for each beam, and the weights: beam after beam, complex64 by
+element. ``examples/c/uav_beams.h`` reads the same layout. Unknown is NaN. A record of more bytes
+than a way out can carry is said in parts, each a whole record of some of the beams.
+"""
+
+import math
+import zlib
+from collections.abc import Iterator, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.values import BeamSet, Normalisation
+
+MAGIC: Final = b"UAVBEAMS"
+VERSION: Final = 1
+COMPLEX64: Final = 1
+"""``dtype`` of weights that are pairs of float32, real part first."""
+WIDENED: Final = 1
+"""Flag of a beam whose main lobe was broadened."""
+EXACT: Final = 1
+"""Flag of a record in which each UAV lies in a null of all other beams of its turn."""
+CHECKED_FROM: Final = 20
+"""First byte that the checksum (CRC-32 as of zlib) covers; it ends with the record."""
+ID_BYTES: Final = 72
+
+HEADER: Final = np.dtype(
+    [
+        ("magic", "S8"),
+        ("version", "<u4"),
+        ("bytes", "<u4"),  # of the whole record
+        ("crc32", "<u4"),
+        ("header_bytes", "<u4"),
+        ("sequence", "<u8"),  # of the update, from 0
+        ("made_at_ns", "<i8"),  # ns since the Unix epoch, on the service's clock
+        ("valid_at_ns", "<i8"),
+        ("elements", "<u4"),  # M
+        ("beams", "<u4"),  # N in this record
+        ("first_beam", "<u4"),  # number of its first beam among all of the update
+        ("all_beams", "<u4"),
+        ("dtype", "<u4"),
+        ("beam_bytes", "<u4"),  # of an entry
+        ("beams_at", "<u4"),  # offset of the first entry
+        ("weights_at", "<u4"),  # offset of the weights
+        ("normalisation", "<u4"),
+        ("flags", "<u4"),
+        ("reserved", "<u8"),
+    ]
+)
+BEAM: Final = np.dtype(
+    [
+        ("uav", f"S{ID_BYTES}"),  # ends with at least one 0
+        ("group", "<u4"),
+        ("flags", "<u4"),
+        ("azimuth_rad", "<f8"),
+        ("elevation_rad", "<f8"),
+        ("azimuth_rate_radps", "<f8"),
+        ("elevation_rate_radps", "<f8"),
+        ("range_m", "<f8"),
+        ("pointing_bound_rad", "<f8"),
+        ("gain_db", "<f8"),
+        ("guaranteed_gain_db", "<f8"),
+    ]
+)
+NORMALISATIONS: Final = tuple(Normalisation)
+"""What ``normalisation`` counts: unit-response is 0, then stream, total, antenna."""
+
+
+def encode(
+    beam_set: BeamSet,
+    sequence: int,
+    guaranteed_db: Sequence[float | None] | None = None,
+    most_bytes: int | None = None,
+) -> Iterator[bytes]:
+    """The records of one update: one, or as many as ``most_bytes`` makes necessary.
+
+        sequence       number of the update
+        guaranteed_db  guaranteed gain of each beam; None: not asked for
+        most_bytes     largest record; a beam of 4096 elements takes 33 kB
+
+    Raises ``ValueError`` where not even one beam fits, or for a name that is too long.
+    """
+    size, count = beam_set.weights.shape
+    each = BEAM.itemsize + 8 * size
+    fit = max(count, 1) if most_bytes is None else (most_bytes - HEADER.itemsize) // each
+    if fit < 1:
+        raise ValueError(f"a beam of {size} elements does not fit into {most_bytes} bytes")
+    entries = _entries(beam_set, guaranteed_db)
+    weights = beam_set.weights.T.astype("<c8", order="C")
+    for first in range(0, max(count, 1), fit):
+        part = slice(first, first + fit)
+        yield _record(beam_set, sequence, first, entries[part], weights[part])
+
+
+def _entries(beam_set: BeamSet, guaranteed_db: Sequence[float | None] | None) -> NDArray[Any]:
+    """The entries (N,) of all beams."""
+    known = guaranteed_db or [None] * len(beam_set.beams)
+    rows = [
+        (
+            _name(beam.uav),
+            beam.group,
+            WIDENED if beam.widened else 0,
+            beam.azimuth_rad,
+            beam.elevation_rad,
+            _number(beam.azimuth_rate_radps),
+            _number(beam.elevation_rate_radps),
+            beam.range_m,
+            _number(beam.pointing_bound_rad),
+            beam.gain_db,
+            _number(guaranteed),
+        )
+        for beam, guaranteed in zip(beam_set.beams, known, strict=True)
+    ]
+    return np.array(rows, dtype=BEAM)
+
+
+def _record(
+    beam_set: BeamSet, sequence: int, first: int, entries: NDArray[Any], weights: NDArray[Any]
+) -> bytes:
+    header = np.zeros((), dtype=HEADER)
+    header["magic"], header["version"] = MAGIC, VERSION
+    header["sequence"] = sequence
+    header["made_at_ns"], header["valid_at_ns"] = beam_set.t_ns, beam_set.valid_at_ns
+    header["elements"], header["all_beams"] = beam_set.weights.shape
+    header["beams"], header["first_beam"] = len(entries), first
+    header["dtype"], header["beam_bytes"] = COMPLEX64, BEAM.itemsize
+    header["header_bytes"] = header["beams_at"] = HEADER.itemsize
+    header["weights_at"] = HEADER.itemsize + entries.nbytes
+    header["bytes"] = HEADER.itemsize + entries.nbytes + weights.nbytes
+    header["normalisation"] = NORMALISATIONS.index(beam_set.normalisation)
+    header["flags"] = EXACT if beam_set.exact else 0
+    body = header.tobytes() + entries.tobytes() + weights.tobytes()
+    crc = zlib.crc32(memoryview(body)[CHECKED_FROM:])
+    return body[:16] + crc.to_bytes(4, "little") + body[CHECKED_FROM:]
+
+
+def _name(uav: str) -> bytes:
+    name = uav.encode()
+    if len(name) >= ID_BYTES:
+        raise ValueError(f"UAV {uav!r}: its name is longer than {ID_BYTES - 1} bytes")
+    return name
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value

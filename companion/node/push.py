@@ -14,6 +14,7 @@ from typing import Final
 
 from companion.node.ring import LARGEST_RECORD, Ring
 from companion.node.serving import aside
+from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
 from companion.settings.outlets import RecordSettings, host_and_port
 from companion.values import Notice, Severity, Update, UserError
@@ -35,12 +36,14 @@ class Push:
         self,
         settings: RecordSettings,
         pipeline: Pipeline,
+        equipment: Equipment,
         notify: Callable[[Notice], None],
         now_ns: Callable[[], int],
     ) -> None:
         self.sequence = 0
         self._settings = settings
         self._pipeline = pipeline
+        self._equipment = equipment
         self._notify = notify
         self._now_ns = now_ns
         self._sockets: dict[str, socket.socket] = {}
@@ -77,7 +80,9 @@ class Push:
             update, sure = self._newest, None
             assert update is not None
             if self._settings.guaranteed:
-                sure = await aside(partial(guaranteed_gain.gains_db, self._pipeline, update))
+                sure = await aside(
+                    partial(guaranteed_gain.gains_db, self._pipeline, self._equipment, update)
+                )
             self._send(update, sure)
             self.sequence += 1
 

@@ -99,7 +99,7 @@ class Service:
         self.arrival_lag = self._traffic.lag
         self._outlet = Outlet(settings, self.pipeline, self._notify, self._timeline.now_ns)
         now_ns = self._timeline.now_ns
-        self._push = Push(settings.records, self.pipeline, self._notify, now_ns)
+        self._push = Push(settings.records, self.pipeline, self.equipment, self._notify, now_ns)
         self._traffic.open()
         self._outlet.open()
         self._push.open()

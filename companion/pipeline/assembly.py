@@ -1,6 +1,6 @@
 """Builds the parts of the pipeline from the settings."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -9,13 +9,19 @@ from companion.beams.array import geometry
 from companion.beams.array.coverage import Coverage, Sector
 from companion.beams.array.elements import Element, Pattern
 from companion.beams.hardware import codebooks
-from companion.beams.hardware.calibration import Calibration, parse_calibration
+from companion.beams.hardware.calibration import Calibration, channel_error, parse_calibration
 from companion.beams.hardware.codebooks import Codebook
+from companion.beams.hardware.devices import Device
 from companion.beams.weights.precoding import Precoder
 from companion.beams.worth.link_budget import LinkBudget
 from companion.mavlink.clock.estimates import ClockAssumptions
 from companion.mavlink.clock.sender_clock import SenderClock
-from companion.settings.files import calibration_text, codebook_file, kinematic_design
+from companion.settings.files import (
+    calibration_text,
+    codebook_file,
+    coupling_file,
+    kinematic_design,
+)
 from companion.settings.model import Settings
 from companion.settings.section import ConfigError
 from companion.tracking.carrier import body_from_ned
@@ -35,10 +41,66 @@ from companion.values import (
 
 FLOOR_SPARE_DB: Final = 2.7
 """How much more than the link needs the floor of a likely beam is, unless it is given."""
+WORST_COUPLING: Final = 1e6
+"""Condition number of a coupling matrix above which it tells nothing apart."""
 
 
 def array(settings: Settings) -> geometry.Array:
-    """The antenna array on its mount. Raises ``ConfigError``."""
+    """The antenna array on its mount, and what its elements and channels do.
+
+    Raises ``ConfigError``.
+    """
+    placed = _placed(settings)
+    size, dead = placed.size, sorted(set(settings.array.dead))
+    live = None
+    if dead:
+        if dead[-1] >= size or len(dead) == size:
+            raise ConfigError(f"array.dead: {dead[-1]} of {size} elements from 0, not all of them")
+        live = np.ones(size, dtype=bool)
+        live[dead] = False
+    coupling = coupling_file(settings)
+    if coupling is not None:
+        if coupling.shape != (size, size) or not np.isfinite(coupling).all():
+            shape = f"{coupling.shape} for {size} elements"
+            raise ConfigError(f"array.coupling: finite numbers, a row and a column each: {shape}")
+        if np.linalg.cond(coupling) > WORST_COUPLING:
+            raise ConfigError("array.coupling: elements that it makes alike are none of their own")
+    return replace(
+        placed, live=live, coupling=coupling, channel_error=_channel_error(settings, size)
+    )
+
+
+def _channel_error(settings: Settings, size: int) -> FloatArray | None:
+    """Most that each channel is off (M,), by the calibration's own word or the settings'."""
+    given, table = settings.hardware, calibration(settings, size)
+    if table is not None and table.phase_error_rad:
+        return channel_error(np.array(table.phase_error_rad), np.array(table.gain_error_db))
+    if not given.phase_error_deg and not given.gain_error_db:
+        return None
+    all_of_them = np.ones(size)
+    return channel_error(
+        np.radians(given.phase_error_deg) * all_of_them, given.gain_error_db * all_of_them
+    )
+
+
+def calibration(settings: Settings, size: int) -> Calibration | None:
+    """The calibration of the channels of ``size`` elements; None without one.
+
+    Raises ``ConfigError``.
+    """
+    text = calibration_text(settings)
+    try:
+        found = None if text is None else parse_calibration(text)
+    except UserError as error:
+        raise ConfigError(f"hardware.calibration: {error}") from error
+    if found is not None and len(found.order) != size:
+        channels = f"{len(found.order)} channels for {size} elements"
+        raise ConfigError(f"hardware.calibration: {channels}")
+    return found
+
+
+def _placed(settings: Settings) -> geometry.Array:
+    """The elements on their mount."""
     given = settings.array
     mount = body_from_ned(
         *np.radians([given.mount_roll_deg, given.mount_pitch_deg, given.mount_yaw_deg])
@@ -105,12 +167,14 @@ class Equipment:
     calibration   calibration of the hardware; None without
     budget        power, bandwidth and noise figure of the radio link
     uav_antennas  antennas that each UAV combines
+    device        what the weights are quantised for; None: nothing
     """
 
     codebook: Codebook | None
     calibration: Calibration | None
     budget: LinkBudget
     uav_antennas: int
+    device: Device | None = None
 
 
 def equipment(settings: Settings, antenna: geometry.Array) -> Equipment:
@@ -119,7 +183,7 @@ def equipment(settings: Settings, antenna: geometry.Array) -> Equipment:
     Raises ``ConfigError``.
     """
     kept = settings.codebook
-    codebook, calibration = None, None
+    codebook = None
     try:
         if kept.kind == "dft":
             codebook = codebooks.dft(antenna, kept.oversampling)
@@ -129,15 +193,8 @@ def equipment(settings: Settings, antenna: geometry.Array) -> Equipment:
         raise
     except UserError as error:
         raise ConfigError(f"codebook: {error}") from error
-    text = calibration_text(settings)
-    try:
-        calibration = None if text is None else parse_calibration(text)
-    except UserError as error:
-        raise ConfigError(f"hardware.calibration: {error}") from error
-    if calibration is not None and len(calibration.order) != antenna.size:
-        channels = f"{len(calibration.order)} channels for {antenna.size} elements"
-        raise ConfigError(f"hardware.calibration: {channels}")
-    return Equipment(codebook, calibration, *radio(settings))
+    device = None if settings.hardware.device is None else Device(settings.hardware.device)
+    return Equipment(codebook, calibration(settings, antenna.size), *radio(settings), device)
 
 
 def precoder(settings: Settings) -> Precoder:

@@ -61,6 +61,10 @@ class ArraySettings(Section):
     limits are those of the hardware's steering, in the array frame. ``hidden_deg`` lists sectors
     that the airframe hides, in the body frame: azimuth from and to (clockwise from the nose),
     elevation from and to.
+
+    ``dead`` lists elements, from 0, that radiate nothing: weights are made without them.
+    ``coupling`` is a .npy file of the matrix C (M, M) by which elements carry C f when they are fed
+    with f; it is read into ``coupling_stored`` (its bytes, base64).
     """
 
     kind: Literal["ula", "ura", "uca", "list"] = "ula"
@@ -82,6 +86,9 @@ class ArraySettings(Section):
     azimuth_limits_deg: Annotated[Interval, AfterValidator(_rising)] | None = None
     elevation_limits_deg: Annotated[Interval, AfterValidator(_rising)] | None = None
     hidden_deg: tuple[HiddenSector, ...] = ()
+    dead: Annotated[tuple[Annotated[int, Field(ge=0, le=4095)], ...], Field(max_length=4095)] = ()
+    coupling: str | None = None
+    coupling_stored: str | None = None
 
     @model_validator(mode="after")
     def _listed(self) -> Self:
@@ -179,12 +186,19 @@ class CodebookSettings(Section):
 class HardwareSettings(Section):
     """The hardware behind the array.
 
-    ``calibration`` names a table of its channels (CSV: channel, element, phase_deg, gain_db), which
-    is read into ``calibration_csv``.
+    ``calibration`` names a table of its channels (CSV: channel, element, phase_deg, gain_db, and if
+    known phase_error_deg, gain_error_db), which is read into ``calibration_csv``.
+    ``phase_error_deg`` and ``gain_error_db`` are the most that each channel is off after it: bounds
+    for which guaranteed gains then hold. A table that says bounds of its own has the last word.
+    ``device`` is what the weights are quantised for: guaranteed gains in the API are then of what
+    it radiates.
     """
 
     calibration: str | None = None
     calibration_csv: str | None = None
+    phase_error_deg: Annotated[float, Field(ge=0, le=180)] = 0.0
+    gain_error_db: Annotated[float, Field(ge=0, le=60)] = 0.0
+    device: Literal["adar1000", "tmytek", "sivers"] | None = None
 
 
 class RadioSettings(Section):

@@ -46,7 +46,8 @@ def embedded(settings: Settings) -> Settings:
 
     Raises ``ConfigError`` where one cannot be read.
     """
-    return _with_codebook(_with_calibration(_with_design(_with_positions(settings))))
+    placed = _with_coupling(_with_positions(settings))
+    return _with_codebook(_with_calibration(_with_design(placed)))
 
 
 def layered(path: Path | None, options: Mapping[str, dict[str, Any]]) -> tuple[Settings, Origins]:
@@ -120,6 +121,29 @@ def _with_codebook(settings: Settings) -> Settings:
     return settings.override(codebook={"stored": stored})
 
 
+def _with_coupling(settings: Settings) -> Settings:
+    """Settings with the coupling matrix read in."""
+    name = settings.array.coupling
+    if name is None or settings.array.coupling_stored is not None:
+        return settings
+    stored = base64.b64encode(_bytes("array.coupling", name)).decode()
+    return settings.override(array={"coupling_stored": stored})
+
+
+def coupling_file(settings: Settings) -> ComplexArray | None:
+    """The matrix of ``array.coupling_stored``, else of ``array.coupling``; None without.
+
+    Raises ``ConfigError`` if the file cannot be read or is not a matrix.
+    """
+    kept = _with_coupling(settings).array
+    if kept.coupling_stored is None:
+        return None
+    where = (
+        "array.coupling_stored" if kept.coupling is None else f"array.coupling = {kept.coupling!r}"
+    )
+    return _matrix(where, kept.coupling_stored)
+
+
 def codebook_file(settings: Settings) -> ComplexArray:
     """The beams of ``codebook.stored``, else of ``codebook.file``: complex (M, K), a column each.
 
@@ -127,8 +151,13 @@ def codebook_file(settings: Settings) -> ComplexArray:
     """
     kept = _with_codebook(settings).codebook
     where = "codebook.stored" if kept.file is None else f"codebook.file = {kept.file!r}"
+    return _matrix(where, kept.stored or "")
+
+
+def _matrix(where: str, stored: str) -> ComplexArray:
+    """The matrix in the bytes (base64) of a .npy file. Raises ``ConfigError``."""
     try:
-        data = base64.b64decode(kept.stored or "", validate=True)
+        data = base64.b64decode(stored, validate=True)
     except binascii.Error as error:
         raise ConfigError(f"{where}: not base64: {error}") from error
     found = _npy(where, data, "fciu")

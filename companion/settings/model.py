@@ -60,6 +60,7 @@ MODELLED: Final = frozenset(
 """Sections that make estimates and beams: what a recording has to say to its replay."""
 EMBEDDED: Final = (
     ("array", "positions", "positions_m"),
+    ("array", "coupling", "coupling_stored"),
     ("observer", "design", "design_json"),
     ("codebook", "file", "stored"),
     ("hardware", "calibration", "calibration_csv"),

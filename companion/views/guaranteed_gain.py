@@ -9,17 +9,21 @@ from companion.beams.aim import directions
 from companion.beams.worth import guarantee, link_budget
 from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
-from companion.values import FloatArray, Update
+from companion.values import ComplexArray, FloatArray, Update, UserError
+from companion.views.quantised import device_table
 
 MOST_AT_WORST: Final = 16
 """Most beams for which guaranteed SINRs are computed: the leakage between them grows squared."""
 
 
-def gains_db(pipeline: Pipeline, update: Update) -> list[float | None]:
+def gains_db(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[float | None]:
     """The guaranteed gain of each beam of one update, as the API shows it."""
     if not update.beams.beams:
         return []
-    return list(_least(pipeline, update, directions(update.beams))[1])
+    weights = _radiated(pipeline, equipment, update)
+    if weights is None:
+        return [None] * len(update.beams.beams)
+    return list(_least(pipeline, update, directions(update.beams), weights)[1])
 
 
 def of_beams(
@@ -35,16 +39,17 @@ def of_beams(
     there are more than ``MOST_AT_WORST`` beams.
     """
     array, beam_set = pipeline.array, update.beams
-    bounds, gains_db = _least(pipeline, update, towards)
+    weights = _radiated(pipeline, equipment, update)
+    if weights is None:
+        return [None] * len(beam_set.beams), [None] * len(beam_set.beams)
+    bounds, gains_db = _least(pipeline, update, towards, weights)
     known = [i for i, gain_db in enumerate(gains_db) if gain_db is not None]
     unknown: list[float | None] = [None] * len(bounds)
     if not known or len(bounds) > MOST_AT_WORST or update.carrier is None:
         return gains_db, unknown
     farthest_m = {track.uav: track.bound_m + update.carrier.bound_m for track in update.tracks}
     ranges_m = np.array([beam.range_m + farthest_m[beam.uav] for beam in beam_set.beams])
-    leaks = guarantee.leakage_bounds(
-        array, towards[known], [bounds[i] for i in known], beam_set.weights
-    )
+    leaks = guarantee.leakage_bounds(array, towards[known], [bounds[i] for i in known], weights)
     sinr_db = link_budget.least_sinr_db(
         10 ** (np.array([gains_db[i] for i in known], dtype=float) / 10),
         leaks,
@@ -62,11 +67,20 @@ def of_beams(
 
 
 def _least(
-    pipeline: Pipeline, update: Update, towards: FloatArray
+    pipeline: Pipeline, update: Update, towards: FloatArray, weights: ComplexArray
 ) -> tuple[Sequence[float | None], Sequence[float | None]]:
     """Pointing bound of each beam, None where it leaves the coverage, and least gain within it."""
-    array, beam_set = pipeline.array, update.beams
-    bounds = guarantee.covered_bounds(
-        array, pipeline.coverage, towards, [beam.pointing_bound_rad for beam in beam_set.beams]
-    )
-    return bounds, guarantee.guaranteed_gains_db(array, towards, bounds, beam_set.weights)
+    angles = [beam.pointing_bound_rad for beam in update.beams.beams]
+    bounds = guarantee.covered_bounds(pipeline.array, pipeline.coverage, towards, angles)
+    return bounds, guarantee.guaranteed_gains_db(pipeline.array, towards, bounds, weights)
+
+
+def _radiated(pipeline: Pipeline, equipment: Equipment, update: Update) -> ComplexArray | None:
+    """The weights, as the device has them if there is one; None where it cannot have them."""
+    if equipment.device is None:
+        return update.beams.weights
+    try:
+        table = device_table(equipment.device, update.beams, pipeline.array, equipment)
+    except UserError:  # who asks for the device's table is told why
+        return None
+    return table.weights

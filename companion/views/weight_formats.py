@@ -6,15 +6,13 @@ from typing import Final
 
 import numpy as np
 
-from companion.beams.aim import directions
 from companion.beams.array.geometry import SPEED_OF_LIGHT_MPS, Array
-from companion.beams.array.steering import steering_matrix
 from companion.beams.hardware import tables
-from companion.beams.hardware.calibration import Calibration
 from companion.beams.hardware.devices import MEDIA_TYPES, Device
 from companion.pipeline.assembly import Equipment
 from companion.values import BeamSet
 from companion.views import beam_state
+from companion.views.quantised import device_table
 from companion.views.words import rfc3339
 
 TYPES: Final = {
@@ -64,28 +62,3 @@ def encode(
     table = device_table(Device(form), beam_set, array, equipment)
     frequency_hz = SPEED_OF_LIGHT_MPS / array.wavelength_m
     return tables.encode(table, frequency_hz).encode()
-
-
-def device_table(
-    device: Device, beam_set: BeamSet, array: Array, equipment: Equipment
-) -> tables.DeviceTable:
-    """The settings of a device that come nearest to the weights.
-
-    Each beam is fitted towards its own UAV and away from the others of its group. Raises
-    ``UserError``, with the reason, for what the device cannot do.
-    """
-    steering = steering_matrix(array, directions(beam_set))
-    wanted = []
-    for i, beam in enumerate(beam_set.beams):
-        others = [j for j, one in enumerate(beam_set.beams) if j != i and one.group == beam.group]
-        wanted.append(
-            tables.WantedBeam(
-                beam.uav,
-                beam_set.weights[:, i],
-                beam.azimuth_rad,
-                beam.elevation_rad,
-                steering[:, [i, *others]],
-            )
-        )
-    calibration = equipment.calibration or Calibration.ideal(range(array.size))
-    return tables.fit(device, wanted, calibration)

@@ -21,7 +21,7 @@ from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
 from companion.values import Update
-from companion.views import weight_formats
+from companion.views import quantised, weight_formats
 
 AT_S = 3.0
 CENTER = ("--center", "5:1")
@@ -96,7 +96,7 @@ def test_a_device_s_table_reads_back_as_what_was_fitted(
     ideal = Calibration.ideal(range(64))
     read = parse(Device.ADAR1000, text, ideal)
     equipment = assembly.equipment(pipeline.settings, pipeline.array)
-    fitted = weight_formats.device_table(Device.ADAR1000, update.beams, pipeline.array, equipment)
+    fitted = quantised.device_table(Device.ADAR1000, update.beams, pipeline.array, equipment)
     assert read.uavs == update.beams.uavs
     assert np.array_equal(read.codes, fitted.codes)
     for i, wanted in enumerate(update.beams.weights.T):

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from companion.beams.array.elements import ISOTROPIC, Element, Pattern
-from companion.values import FloatArray, UserError
+from companion.values import BoolArray, ComplexArray, FloatArray, UserError
 
 SPEED_OF_LIGHT_MPS: Final = 299_792_458.0
 SAME_PLACE_WAVELENGTHS: Final = 1e-9
@@ -35,6 +35,10 @@ class Array:
         element_from_array  (M, 3, 3), turns the array frame to where each element faces; None: all
                             along boresight
         grid                rows and columns of a ULA or URA, elements row by row; else None
+        live                (M,), whether an element works; None: all do
+        coupling            C (M, M): fed with f, the elements carry C f; None: they carry f
+        channel_error       (M,), most that a channel's factor is off, |actual / wanted - 1|; None:
+                            nothing
 
     Computed from these:
 
@@ -51,6 +55,9 @@ class Array:
     element: Element = ISOTROPIC
     element_from_array: FloatArray | None = None
     grid: tuple[int, int] | None = None
+    live: BoolArray | None = None
+    coupling: ComplexArray | None = None
+    channel_error: FloatArray | None = None
     centred_m: FloatArray = field(init=False)
     variance_m2: FloatArray = field(init=False)
     axis: FloatArray | None = field(init=False)
@@ -68,6 +75,15 @@ class Array:
     def size(self) -> int:
         """M, the number of elements."""
         return len(self.elements_m)
+
+    def fed(self, weights: ComplexArray) -> ComplexArray:
+        """Weights (M, K) without those of dead elements, which are fed in vain."""
+        return weights if self.live is None else weights * self.live[:, np.newaxis]
+
+    def carried(self, weights: ComplexArray) -> ComplexArray:
+        """What the elements carry, (M, K), when they are fed with weights (M, K)."""
+        live = self.fed(weights)
+        return live if self.coupling is None else self.coupling @ live
 
     @property
     def wavenumber_radpm(self) -> float:

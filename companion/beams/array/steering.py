@@ -6,7 +6,9 @@ Angles of a unit direction u in the array frame: azimuth = atan2(u_y, u_x), to t
     a(u)_m = g_m(u) exp(+j 2 pi / wavelength  p_m . u)
 
 with p_m the position of element m and g_m its amplitude (docs/math.md 7). For isotropic elements
-along y this is the published exp(j 2 pi / wavelength d m sin theta).
+along y this is the published exp(j 2 pi / wavelength d m sin theta). Where elements couple, and
+carry C f when they are fed with f, the vector is C^T a(u): what each channel does. It is 0 where an
+element is dead.
 """
 
 import math
@@ -41,7 +43,9 @@ def steering_matrix(array: Array, directions: FloatArray) -> ComplexArray:
     matrix = phase_factors(array, directions)
     if array.element.pattern is not Pattern.ISOTROPIC:
         matrix *= amplitudes(array, directions)
-    return matrix
+    if array.coupling is not None:
+        matrix = array.coupling.T @ matrix
+    return array.fed(matrix)
 
 
 def phase_factors(array: Array, directions: FloatArray) -> ComplexArray:

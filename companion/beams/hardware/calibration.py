@@ -7,9 +7,11 @@ from typing import Final, Self
 
 import numpy as np
 
-from companion.values import ComplexArray, UserError
+from companion.values import ComplexArray, FloatArray, UserError
 
 CALIBRATION_HEADER: Final = "channel,element,phase_deg,gain_db"
+BOUNDED_HEADER: Final = f"{CALIBRATION_HEADER},phase_error_deg,gain_error_db"
+"""The header of a table that says how far its numbers may be off."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,6 +21,8 @@ class Calibration:
         phase_rad  by element: phase that the channel adds to its setting
         gain_db    by element: gain that the channel adds to its setting
         order      by channel: element that it drives, counted from 0
+        phase_error_rad, gain_error_db
+                   by element: most that the two are off; empty: not said
 
     A setting is therefore the wanted value less these. Raises ``UserError`` for lengths that
     differ, values that are not finite, or an order that is no permutation.
@@ -27,6 +31,8 @@ class Calibration:
     phase_rad: tuple[float, ...]
     gain_db: tuple[float, ...]
     order: tuple[int, ...]
+    phase_error_rad: tuple[float, ...] = ()
+    gain_error_db: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         size = len(self.order)
@@ -37,6 +43,11 @@ class Calibration:
             )
         if sorted(self.order) != list(range(size)):
             raise UserError(f"order {self.order} is not each of 0 to {size - 1} once")
+        errors = (self.phase_error_rad, self.gain_error_db)
+        if errors != ((), ()) and [len(found) for found in errors] != [size, size]:
+            raise UserError(f"bounds on errors go with each of {size} elements, or with none")
+        if any(not 0 <= most < math.inf for found in errors for most in found):
+            raise UserError("bounds on errors are finite numbers, 0 or more")
         for name, values in (("phase", self.phase_rad), ("gain", self.gain_db)):
             for element, value in enumerate(values):
                 if not math.isfinite(value):
@@ -55,15 +66,28 @@ class Calibration:
         return factors
 
 
+def channel_error(phase_error_rad: FloatArray, gain_error_db: FloatArray) -> FloatArray:
+    """Most that a channel's factor is off, |actual / wanted - 1|, for bounds on both its errors.
+
+    It is greatest at a corner: the phase at its end, the gain at one of its two.
+    """
+    turned = np.exp(1j * np.minimum(phase_error_rad, np.pi))
+    ends = [np.abs(10 ** (sign * gain_error_db / 20) * turned - 1) for sign in (1.0, -1.0)]
+    most: FloatArray = np.maximum(*ends)
+    return most
+
+
 def parse_calibration(text: str) -> Calibration:
     """Read CSV with the header ``channel,element,phase_deg,gain_db`` and a line for each channel.
 
-    Both count from 0; lines may come in any order. Raises ``UserError`` that names the line and the
+    ``,phase_error_deg,gain_error_db`` may follow: most that the two are off. Channels and elements
+    count from 0; lines may come in any order. Raises ``UserError`` that names the line and the
     value.
     """
     order: dict[int, int] = {}
-    measured: dict[int, tuple[float, float]] = {}
-    for number, found in fields(text, CALIBRATION_HEADER):
+    measured: dict[int, tuple[float, ...]] = {}
+    bounded = text.lstrip().startswith(BOUNDED_HEADER)
+    for number, found in fields(text, BOUNDED_HEADER if bounded else CALIBRATION_HEADER):
         channel = whole(number, "channel", found[0], 0, 99_999)
         element = whole(number, "element", found[1], 0, 99_999)
         if channel in order:
@@ -72,6 +96,9 @@ def parse_calibration(text: str) -> Calibration:
             raise UserError(f"line {number}: element {element} stands twice")
         phase_deg = real(number, "phase_deg", found[2])
         measured[element] = math.radians(phase_deg), real(number, "gain_db", found[3])
+        if bounded:
+            off_deg = real(number, "phase_error_deg", found[4])
+            measured[element] += math.radians(off_deg), real(number, "gain_error_db", found[5])
         order[channel] = element
     for name, seen in (("channel", order), ("element", measured)):
         missing = set(range(len(order))) - set(seen)
@@ -82,6 +109,8 @@ def parse_calibration(text: str) -> Calibration:
         tuple(measured[m][0] for m in elements),
         tuple(measured[m][1] for m in elements),
         tuple(order[c] for c in elements),
+        tuple(measured[m][2] for m in elements) if bounded else (),
+        tuple(measured[m][3] for m in elements) if bounded else (),
     )
 
 

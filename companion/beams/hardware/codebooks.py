@@ -138,7 +138,7 @@ def best(codebook: Codebook, array: Array, directions: FloatArray) -> tuple[IntA
 
 
 def _best(codebook: Codebook, array: Array, unit: FloatArray) -> tuple[IntArray, FloatArray]:
-    if cone.faces_apart(array):
+    if cone.faces_apart(array) or array.live is not None or array.coupling is not None:
         power = np.abs(codebook.weights.T @ steering.steering_matrix(array, unit)) ** 2
         return power.argmax(axis=0), power.max(axis=0)
     phase = array.wavenumber_radpm * (array.elements_m @ unit.T)
@@ -166,7 +166,8 @@ def candidates(
         return np.arange(codebook.size)
     bounds = np.array([pointing_bound_rad])
     unit = cone.unit_directions(direction[np.newaxis], bounds)
-    largest = np.abs(codebook.weights).max(axis=1, keepdims=True)  # holds for every beam
+    carried = array.carried(codebook.weights)
+    largest = np.abs(carried).max(axis=1, keepdims=True)  # holds for every beam
     cones = cone.cones_around(array, unit, bounds, largest)
     alive = np.arange(codebook.size)
     found = np.zeros(codebook.size, dtype=bool)
@@ -175,7 +176,7 @@ def candidates(
         return np.arange(codebook.size)
     spent, most = 0, share * min(MOST_RESPONSES, MOST_TERMS // array.size)
     for level in range(LEVELS):
-        possible, seen = _contest(cones, boxes, codebook.weights[:, alive])
+        possible, seen = _contest(cones, boxes, carried[:, alive])
         found[alive[seen]] = True
         in_doubt: BoolArray = np.any(possible & ~found[alive, np.newaxis], axis=0)
         alive = alive[possible[:, in_doubt].any(axis=1)]

@@ -102,7 +102,7 @@ def cones(
 ) -> Cones:
     """Where the beams towards unit directions (N, 3) are looked at."""
     apart = array.element_from_array is not None and array.element.pattern is not Pattern.ISOTROPIC
-    if array.grid is None or apart:
+    if array.grid is None or apart or array.coupling is not None:
         return _asked(array, across, directions, held, likely)
     nothing: ComplexArray = np.empty((0, 0, 0), dtype=complex)
     rows, columns = array.grid

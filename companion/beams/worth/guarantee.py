@@ -14,6 +14,7 @@ from typing import Final
 
 import numpy as np
 
+from companion.beams.array import steering
 from companion.beams.array.coverage import Coverage, margin_rad
 from companion.beams.array.elements import Pattern
 from companion.beams.array.geometry import Array
@@ -49,19 +50,22 @@ def guaranteed_gains_db(
         pointing_bounds_rad  (N,), half angles of the cones; None: any direction
         weights              (M, N), column n for row n of the directions
 
-    Element patterns are included. A result is None where nothing is proven: the cone holds a null,
-    or has no bound. The true minimum is at most ``TOLERANCE_DB`` above the result, unless it lies
-    ``NOTHING_DB`` down or the work is spent: over cones many beams wide, or where directive
+    Element patterns and coupling are included, and what the channels may be off; the power is that
+    of the weights, dead elements left out. A result is None where nothing is proven: the cone holds
+    a null, or has no bound. The true minimum is at most ``TOLERANCE_DB`` above the result, unless
+    it lies ``NOTHING_DB`` down or the work is spent: over cones many beams wide, or where directive
     elements face apart and the weights set them against one another (tenths of a dB). Raises
     ``ValueError`` for weights that are zero or do not fit.
     """
     unit, bounds = _cones(directions, pointing_bounds_rad)
-    powered = cone.unit_power(array, weights)
+    powered = cone.unit_power(array, array.fed(weights))
     if weights.shape[1] != len(unit):
         raise ValueError(f"{weights.shape[1]} columns of weights for {len(unit)} directions")
     found: list[float | None] = [None] * len(unit)
     bounded = np.flatnonzero([bound is not None for bound in pointing_bounds_rad])
-    least = _extremes(array, unit[bounded], bounds[bounded], powered[:, bounded], most=False)
+    within = unit[bounded], bounds[bounded]
+    least = _extremes(array, *within, array.carried(powered[:, bounded]), most=False)
+    least = least - _off(array, *within, powered[:, bounded])
     for n, amplitude in zip(bounded.tolist(), least.tolist(), strict=True):
         if amplitude > 0:
             found[n] = 20 * math.log10(amplitude)
@@ -84,9 +88,11 @@ def leakage_bounds(
     most ``TOLERANCE_DB`` below, with the exceptions of ``guaranteed_gains_db``.
     """
     unit, bounds = _cones(directions, pointing_bounds_rad)
-    powered = cone.unit_power(array, weights)
+    powered = cone.unit_power(array, array.fed(weights))
     row, column = np.indices((len(unit), weights.shape[1])).reshape(2, -1)
-    largest = _extremes(array, unit[row], bounds[row], powered[:, column], most=True)
+    within = unit[row], bounds[row]
+    largest = _extremes(array, *within, array.carried(powered)[:, column], most=True)
+    largest = largest - _off(array, *within, powered[:, column])
     return (largest**2).reshape(len(unit), weights.shape[1])
 
 
@@ -94,6 +100,24 @@ def _cones(directions: FloatArray, given: Sequence[float | None]) -> tuple[Float
     """Unit directions and their bounds, checked; no bound becomes half a turn."""
     bounds = np.array([np.pi if bound is None else bound for bound in given], dtype=float)
     return cone.unit_directions(directions, bounds), bounds
+
+
+def _off(
+    array: Array, unit: FloatArray, bounds: FloatArray, weights: ComplexArray
+) -> FloatArray | float:
+    """Most (N,) that errors of the channels change the response of column n over cone n.
+
+    The sum of what each may do to its element's part, as if all errors added up.
+    """
+    if array.channel_error is None:
+        return 0.0
+    towards = steering.element_directions(array, unit)
+    most = array.element.amplitude_range(towards, bounds)[1]
+    if array.coupling is not None:
+        most = np.abs(array.coupling).T @ np.broadcast_to(most, (array.size, len(unit)))
+    parts = array.channel_error[:, np.newaxis] * np.abs(weights) * most
+    off: FloatArray = parts.sum(axis=0)
+    return off
 
 
 def _extremes(

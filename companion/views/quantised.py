@@ -1,0 +1,35 @@
+"""Weights as a device can be set to them."""
+
+from companion.beams.aim import directions
+from companion.beams.array.geometry import Array
+from companion.beams.array.steering import steering_matrix
+from companion.beams.hardware import tables
+from companion.beams.hardware.calibration import Calibration
+from companion.beams.hardware.devices import Device
+from companion.pipeline.assembly import Equipment
+from companion.values import BeamSet
+
+
+def device_table(
+    device: Device, beam_set: BeamSet, array: Array, equipment: Equipment
+) -> tables.DeviceTable:
+    """The settings of a device that come nearest to the weights.
+
+    Each beam is fitted towards its own UAV and away from the others of its group. Raises
+    ``UserError``, with the reason, for what the device cannot do.
+    """
+    steering = steering_matrix(array, directions(beam_set))
+    wanted = []
+    for i, beam in enumerate(beam_set.beams):
+        others = [j for j, one in enumerate(beam_set.beams) if j != i and one.group == beam.group]
+        wanted.append(
+            tables.WantedBeam(
+                beam.uav,
+                beam_set.weights[:, i],
+                beam.azimuth_rad,
+                beam.elevation_rad,
+                steering[:, [i, *others]],
+            )
+        )
+    calibration = equipment.calibration or Calibration.ideal(range(array.size))
+    return tables.fit(device, wanted, calibration)

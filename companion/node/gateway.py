@@ -13,6 +13,7 @@ from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.signing_store import Timestamps, key_warning, load_key
 from companion.mavlink.links.transport import Link
 from companion.mavlink.links.urls import LinkError, parse_link
+from companion.mavlink.trust.twins import Twins
 from companion.mavlink.voice.component import HEARD, Component, ComponentSpec
 from companion.mavlink.voice.rate_watch import MessageRate
 from companion.mavlink.wire.encode import Outgoing
@@ -52,6 +53,8 @@ class Gateway:
         self._component = component(settings)
         self._hear = HEARD if self._component else frozenset()
         self._timestamps: Timestamps | None = None
+        signed = set(settings.signing.keys) - set(settings.signing.allow_unsigned)
+        self._twins = Twins({*settings.links.routers, *signed})
         self._settings = settings
         self.links: list[Link] = []
         self.lag = ArrivalLag()
@@ -88,7 +91,9 @@ class Gateway:
                 self._notify(Notice(now_ns, Severity.WARNING, url, warning))
             unsigned = url in signing.allow_unsigned
             guard = self._timestamps.guard(url, key, number % 256, now_ns, allow_unsigned=unsigned)
-        return Link(parsed, self._received, self._now_ns, self._notify, guard, self.lag)
+        return Link(
+            parsed, self._received, self._now_ns, self._notify, guard, self.lag, self._twins
+        )
 
     async def run(self) -> None:
         """Serve all links until cancelled."""
@@ -138,6 +143,16 @@ class Gateway:
                         self._notify(found)
                     else:
                         self._step(found)
+        self._tell_of_twins()
+
+    def _tell_of_twins(self) -> None:
+        for who, peers in self._twins.told:
+            text = (
+                f"{who} is heard from {' and '.join(peers)}, which contradict each other: not"
+                " believed; [links] routers names whom to believe"
+            )
+            self._notify(Notice(self._now_ns(), Severity.WARNING, who, text))
+        self._twins.told.clear()
 
     def speak(self, fit: bool, uavs: Iterable[Source]) -> None:
         """Send what is due. Call it some ten times a second.

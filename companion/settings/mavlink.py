@@ -31,9 +31,14 @@ class LinkSettings(Section):
     URLs are ``udpin:``, ``udpout:``, ``tcp:`` or ``tcpin:HOST:PORT``, ``serial:DEVICE:BAUD``, and
     those of other receivers: ``sbs:`` or ``readsb:HOST:PORT``, ``readsb:http://HOST/PATH``,
     ``rid:HOST:PORT``, ``rid:udp:HOST:PORT``, ``cot:udp:HOST:PORT``, ``cot:tcp:HOST:PORT``.
+
+    ``routers`` are peers that are believed where another one contradicts them in where a vehicle
+    is: a link as in ``urls``, HOST, or HOST:PORT. Two peers that tell of one vehicle alike need no
+    word here.
     """
 
     urls: tuple[LinkText, ...] = ()
+    routers: Annotated[tuple[str, ...], Field(max_length=100)] = ()
 
 
 class PresenceSettings(Section):

@@ -3,13 +3,14 @@
 import asyncio
 import socket
 
+import pytest
 from link_support import frame, port_of, runner, until_true
 from pymavlink.dialects.v20 import all as dialect
 
 from companion.mavlink.wire.encode import COMMAND_LONG, HEARTBEAT
 from companion.node.gateway import Gateway
 from companion.settings.model import Settings
-from companion.values import Event, Frame, Reason, Rejection, Source
+from companion.values import Event, Frame, Notice, Reason, Rejection, Source
 
 SECRET = bytes(range(100, 132))
 
@@ -100,3 +101,42 @@ def test_a_uav_is_asked_over_the_link_on_which_it_was_heard_last() -> None:
         gateway.close()
 
     runner("asyncio")(test())
+
+
+def where(north_m: float, boot_ms: int) -> bytes:
+    """1:1 says that it stands so far north of a place."""
+    mav = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
+    lat = 473977419 + round(north_m * 1e7 / 111_195.0)
+    return bytes(
+        dialect.MAVLink_global_position_int_message(
+            boot_ms, lat, 85455938, 488_000, 25_000, 0, 0, 0, 0
+        ).pack(mav)
+    )
+
+
+@pytest.mark.parametrize("routers", [[], ["127.0.0.1:5"]])
+def test_two_peers_that_contradict_each_other_are_said_once_and_not_believed(
+    routers: list[str],
+) -> None:
+    """The second copies the clock, and says to be 20 m beside: less than the gate can tell."""
+    stepped: list[Event] = []
+    said: list[Notice] = []
+    now_ms = 100_000
+    urls = ["udpin:127.0.0.1:0", "tcpin:127.0.0.1:0"]
+    settings = Settings().override(links={"urls": urls, "routers": routers})
+    gateway = Gateway(settings, stepped.append, said.append, lambda: now_ms * 1_000_000)
+    gateway.open()
+    try:
+        for number in range(100):
+            now_ms += 100
+            gateway.links[0].take(("127.0.0.1", 5), where(0, now_ms))
+            gateway.links[1].take(("127.0.0.1", 6), where(20 * (number > 20), now_ms))
+    finally:
+        for link in gateway.links:
+            link._endpoint._socket.close()  # type: ignore[attr-defined]
+    refused = [one for one in stepped if isinstance(one, Rejection)]
+    assert {one.reason for one in refused} == {Reason.SHARED_ID}
+    believed = [one for one in stepped[-50:] if isinstance(one, Frame)]
+    assert len(believed) == (25 if routers else 0)
+    (told,) = said
+    assert "1:1 is heard from 127.0.0.1:5 and 127.0.0.1:6, which contradict" in told.text

@@ -74,6 +74,14 @@ def reason(error: OSError) -> str:
     return error.strerror or str(error) or "timed out"
 
 
+def address_text(address: Address | None) -> str:
+    """HOST:PORT of a socket address; empty where there is none, as on a local socket."""
+    if not address:
+        return ""
+    host, port = address[:2]
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
 def settle(lost: asyncio.Future[Exception], why: Exception) -> None:
     """Record why a connection is lost.
 

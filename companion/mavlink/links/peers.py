@@ -20,6 +20,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from typing import Final, Protocol
 
+from companion.mavlink.links.endpoints import address_text
 from companion.mavlink.links.status import ComponentStatus, LinkStatus
 from companion.mavlink.wire.decode import ATTITUDE, GLOBAL_POSITION_INT
 from companion.mavlink.wire.framing import MAGIC_V2, Splitter
@@ -75,12 +76,16 @@ class _Sender:
 
 
 class Peer:
-    """A party that a link hears and sends to; ``key`` is the endpoint's name for it."""
+    """A party that a link hears and sends to; ``key`` is the endpoint's name for it.
 
-    __slots__ = ("_sequence", "heard_ns", "key", "senders", "splitter", "versions")
+    ``address`` is its HOST:PORT; empty where the endpoint knows of one party alone.
+    """
+
+    __slots__ = ("_sequence", "address", "heard_ns", "key", "senders", "splitter", "versions")
 
     def __init__(self, key: Hashable, splitter: Splits) -> None:
         self.key = key
+        self.address = address_text(key) if isinstance(key, tuple) else str(key or "")
         self.splitter = splitter
         self.senders: dict[Source, _Sender] = {}
         self.heard_ns: int | None = None

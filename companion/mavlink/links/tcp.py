@@ -8,7 +8,14 @@ from collections.abc import Callable, Collection, Hashable
 from dataclasses import replace
 from typing import Final, cast
 
-from companion.mavlink.links.endpoints import HungUpError, Upcalls, bound, resolved, settle
+from companion.mavlink.links.endpoints import (
+    HungUpError,
+    Upcalls,
+    address_text,
+    bound,
+    resolved,
+    settle,
+)
 from companion.mavlink.links.urls import LinkUrl
 
 WRITE_BUFFER_BYTES: Final = 64 << 10
@@ -138,9 +145,14 @@ class _Stream(asyncio.Protocol):
         self._parted = parted
         self._transport: asyncio.Transport | None = None
         self._welcome = welcome
+        self._address = ""
+
+    def __str__(self) -> str:
+        return self._address
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)
+        self._address = address_text(transport.get_extra_info("peername"))
         if not self._welcome:
             self._transport.abort()
 

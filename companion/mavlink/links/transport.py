@@ -28,6 +28,7 @@ from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.peers import Peer, Peers
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.links.urls import LinkError, LinkUrl
+from companion.mavlink.trust.twins import REFUSED, Twins
 from companion.mavlink.wire.encode import TIMESYNC, Outgoing, pack
 from companion.values import Frame, Notice, Reason, Rejection, Severity, Source
 
@@ -65,6 +66,7 @@ class Link:
         notify   called once when the link is lost, and once when it is back
         guard    refuses frames and signs what is sent; None: no signing
         lag      observes how late datagrams are processed
+        twins    refuses what peers say that contradict each other; shared by all links
 
     All methods but ``open`` must be called on the event loop; ``open`` is called before it runs.
     """
@@ -77,6 +79,7 @@ class Link:
         notify: Notify | None = None,
         guard: Guard | None = None,
         lag: ArrivalLag | None = None,
+        twins: Twins | None = None,
     ) -> None:
         self.url = url
         self.status = LinkStatus(str(url))
@@ -85,6 +88,7 @@ class Link:
         self._notify = notify
         self._guard = guard
         self._lag = lag or ArrivalLag()
+        self._twins = twins or Twins()
         self._peers = Peers(self.status, self._finish, splitter(url))
         upcalls = Upcalls(self._up, self.take, self._hang_up, self._overflow)
         self._endpoint = endpoint(url, self.status, upcalls)
@@ -148,7 +152,16 @@ class Link:
         if self._guard is not None:
             found = [_admitted(self._guard, item) for item in found]
         self._peers.count(peer, found)
-        self._receive([_answered(peer, item) for item in found])
+        self._receive([self._believed(peer, _answered(peer, item)) for item in found])
+
+    def _believed(self, peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
+        """The item itself, or the refusal of what its sender's peers contradict each other in."""
+        if isinstance(item, Rejection) or item.msgid not in REFUSED:
+            return item
+        if not self._twins.refuses(str(self.url), peer.address or str(self.url), item):
+            return item
+        who, detail = str(item.source), "two peers contradict each other"
+        return Rejection(item.t_ns, who, Reason.SHARED_ID, msgid=item.msgid, detail=detail)
 
     def _hang_up(self, key: Hashable) -> None:
         """Forget a peer that is gone."""

@@ -1,0 +1,203 @@
+"""One id from two peers: whether they tell of one vehicle. The adversary copies clock and path."""
+
+import math
+import random
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import pytest
+
+from companion.mavlink.trust import twins
+from companion.mavlink.trust.twins import KEPT_NS, Twins
+from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
+from companion.mavlink.wire.encode import Outgoing, pack
+from companion.mavlink.wire.framing import Splitter
+from companion.values import Frame, Source
+
+S = 1_000_000_000
+LINK = "udpin:0.0.0.0:14550"
+HOME, OTHER = "10.0.0.1:14550", "10.0.0.66:4000"
+
+
+class Place(NamedTuple):
+    """Where a vehicle is, m north and east of a place, and its velocity."""
+
+    north_m: float
+    east_m: float
+    north_mps: float
+    east_mps: float
+
+
+def circle(t_s: float) -> Place:
+    """20 m/s, 60 m wide: 13 m/s² to its middle, more than most can."""
+    angle, speed = t_s / 3, 20.0
+    return Place(
+        60 * math.cos(angle), 60 * math.sin(angle), -speed * math.sin(angle),
+        speed * math.cos(angle),
+    )  # fmt: skip
+
+
+def report(t_ns: int, boot_s: float, place: Place, sysid: int = 1) -> Frame:
+    source, payload = Source(sysid, 1), bytearray()
+    degrees = place.north_m / 111_195.0, place.east_m / 111_195.0 / math.cos(math.radians(47.0))
+    payload += round(boot_s * 1000).to_bytes(4, "little")
+    for value in (47e7 + degrees[0] * 1e7, 8e7 + degrees[1] * 1e7, 488_000, 25_000):
+        payload += round(value).to_bytes(4, "little", signed=True)
+    for value in (place.north_mps * 100, place.east_mps * 100, 0):
+        payload += round(value).to_bytes(2, "little", signed=True)
+    raw = pack(Outgoing(source, GLOBAL_POSITION_INT, bytes(payload) + b"\1\0"), 0, 2)
+    (frame,) = Splitter("x").feed(t_ns, raw)
+    assert isinstance(frame, Frame)
+    return frame
+
+
+Stream = Iterable[tuple[float, float, str, Place]]
+"""When it arrives, what its clock says, who brings it, where it says to be."""
+
+
+def refused(judge: Twins, *streams: Stream) -> dict[str, list[float]]:
+    """When something of each peer was refused, of streams that come together."""
+    found: dict[str, list[float]] = {HOME: [], OTHER: []}
+    for arrives_s, boot_s, peer, place in sorted(one for stream in streams for one in stream):
+        if judge.refuses(LINK, peer, report(round(arrives_s * S), boot_s, place)):
+            found[peer].append(arrives_s)
+    return found
+
+
+def heard(
+    peer: str,
+    hz: float,
+    lasts_s: float = 60.0,
+    delay_s: Callable[[], float] = lambda: 0.05,
+    begins_s: float = 0.0,
+    told: Callable[[float], Place] = circle,
+) -> Stream:
+    for number in range(round((lasts_s - begins_s) * hz)):
+        t_s = begins_s + number / hz
+        yield t_s + delay_s(), 100 + t_s, peer, told(t_s)
+
+
+def beside(metres: float) -> Callable[[float], Place]:
+    return lambda t_s: circle(t_s)._replace(north_m=circle(t_s).north_m + metres)
+
+
+# --- one vehicle ----------------------------------------------------------------------------------
+
+
+def test_the_same_reports_over_two_routes_are_of_one(delays: random.Random) -> None:
+    judge = Twins()
+    slow = heard(OTHER, 10, delay_s=lambda: 0.3 + 2 * delays.random())
+    assert refused(judge, heard(HOME, 10), slow) == {HOME: [], OTHER: []}
+    assert judge.told == []
+
+
+@pytest.fixture
+def delays() -> random.Random:
+    return random.Random(5)
+
+
+@pytest.mark.parametrize("hz", [1, 2.5, 10, 50])
+def test_a_second_port_has_stamps_of_its_own(hz: float) -> None:
+    judge = Twins()
+    found = refused(judge, heard(HOME, 4, begins_s=0.01), heard(OTHER, hz, begins_s=0.137))
+    assert found == {HOME: [], OTHER: []}
+
+
+def test_a_radio_that_starts_again_has_another_address() -> None:
+    judge = Twins()
+    found = refused(
+        judge, heard(HOME, 10, 20), heard(OTHER, 10, 60, begins_s=20.1),
+    )  # fmt: skip
+    assert found == {HOME: [], OTHER: []}
+
+
+def test_a_position_that_is_reset_now_and_then_is_no_second_vehicle() -> None:
+    def glitches(t_s: float) -> Place:
+        return beside(30.0 if t_s % 20 > 10 else 0.0)(t_s)
+
+    judge = Twins()
+    both = heard(HOME, 4, told=glitches), heard(OTHER, 5, told=glitches)
+    assert refused(judge, *both) == {HOME: [], OTHER: []}
+
+
+def test_a_restart_is_no_second_vehicle() -> None:
+    def again(stream: Stream) -> Stream:
+        return ((at + 61, boot - 99, peer, beside(500)(at)) for at, boot, peer, _ in stream)
+
+    judge = Twins()
+    slow = heard(OTHER, 5, delay_s=lambda: 2.0)
+    both = heard(HOME, 4), slow, again(heard(HOME, 4)), again(heard(OTHER, 5))
+    assert refused(judge, *both) == {HOME: [], OTHER: []}
+
+
+# --- two senders ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("forged_hz", [1, 4, 20])
+@pytest.mark.parametrize("metres", [8.0, -8.0, 30.0])
+def test_who_copies_the_clock_and_stays_near_is_found(forged_hz: float, metres: float) -> None:
+    judge = Twins()
+    forged = heard(OTHER, forged_hz, begins_s=10.03, told=beside(metres))
+    found = refused(judge, heard(HOME, 4), forged)
+    for peer in (HOME, OTHER):
+        assert 12 < found[peer][0] < 17, "from then on neither is believed"
+        assert found[peer][-1] > 58
+    assert judge.told == [("1:1", (HOME, OTHER))]
+
+
+def test_a_velocity_that_is_none_is_found_too() -> None:
+    def drifts(t_s: float) -> Place:
+        return circle(t_s)._replace(east_mps=circle(t_s).east_mps + 10)
+
+    judge = Twins()
+    assert refused(judge, heard(HOME, 4), heard(OTHER, 4, begins_s=10.1, told=drifts))[OTHER]
+
+
+def test_stamps_ahead_and_stamps_behind_are_held_against_the_path() -> None:
+    for delay_s in (0.0, 1.5):
+        judge = Twins()
+        late = heard(OTHER, 5, told=beside(10), delay_s=lambda by_s=delay_s: by_s)
+        assert refused(judge, heard(HOME, 5, delay_s=lambda: 0.7), late)[OTHER]
+
+
+@pytest.mark.parametrize("named", [HOME, "10.0.0.1"])
+def test_a_named_router_is_believed_and_the_other_is_not(named: str) -> None:
+    judge = Twins([named])
+    found = refused(judge, heard(HOME, 4), heard(OTHER, 4, begins_s=10.1, told=beside(20)))
+    assert found[HOME] == []
+    assert len(found[OTHER]) > 150
+
+
+def test_of_a_named_link_all_are_believed() -> None:
+    judge = Twins([LINK])
+    found = refused(judge, heard(HOME, 4), heard(OTHER, 4, begins_s=10.1, told=beside(20)))
+    assert found == {HOME: [], OTHER: []}
+
+
+def test_who_agree_again_are_believed_again_and_a_second_time_is_told() -> None:
+    def two_visits(t_s: float) -> bool:
+        return 10 < t_s < 20 or 60 < t_s < 70
+
+    judge = Twins()
+    visits = (one for one in heard(OTHER, 4, 110, told=beside(20)) if two_visits(one[0]))
+    found = refused(judge, heard(HOME, 4, 120), visits)
+    assert not [t_s for t_s in found[HOME] if 51 < t_s < 60 or t_s > 101]
+    assert len(judge.told) == 2
+
+
+# --- bounds ---------------------------------------------------------------------------------------
+
+
+def test_ids_and_addresses_without_end_take_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(twins, "SENDERS_MAX", 8)
+    judge = Twins()
+    for number in range(200):
+        peer, sysid = f"10.0.0.9:{number}", number % 100 + 1
+        judge.refuses(LINK, peer, report(number, number, circle(0), sysid))
+        judge.refuses(LINK, peer, report(number, number, circle(0)))
+    assert len(judge._senders) == 8
+    assert max(len(sender.paths) for sender in judge._senders.values()) <= twins.PEERS_MAX
+    assert judge._senders.keys() == {(number, 1) for number in range(1, 9)}
+    later_ns = 200 + KEPT_NS
+    judge.refuses(LINK, HOME, report(later_ns, 1, circle(0), 99))
+    assert (99, 1) in judge._senders

@@ -18,7 +18,11 @@ would be false only if that program's clock is ahead of ours.
 times 1000) and of PX4 (mavlink_timesync.cpp: ``hrt_absolute_time()`` times 1000), the clock of the
 milliseconds in their positions. Ground stations and other programs answer with Unix time, which
 says nothing of any boot clock. Answers of senders without a position or attitude are therefore not
-read, and answers far off the sender's boot clock are refused. See docs/field-notes.md 1.
+read, and answers far off the sender's boot clock are refused. An answer is used ``HELD_NS`` after
+it came: if a second one to the same question cannot be of the same clock, neither is. See
+docs/field-notes.md 1.
+
+Over 300 lines: everything that the service hears and says as a component passes here.
 """
 
 import struct
@@ -67,6 +71,8 @@ LONGEST_TRIP_NS: Final = 10 * _NS
 """Longest round trip that is used."""
 KEPT_NS: Final = 30 * _NS
 """How long sent messages and senders' newest stamps are remembered."""
+HELD_NS: Final = 2 * _NS
+"""How long an answer waits for another one that contradicts it: as long as a slow radio takes."""
 CLOCKS_APART_NS: Final = 60 * _NS
 """Largest distance of an answer from the sender's boot clock.
 
@@ -133,7 +139,9 @@ class Component:
         self._heartbeat_ns = 0  # no heartbeat before this time
         self._timesync_ns = 0
         self._timesyncs = 0
-        self._answered: dict[int, set[Source]] = {}  # who answered, by time of sending
+        self._answered: dict[int, dict[Source, RoundTrip]] = {}  # by time of sending
+        self._held: list[RoundTrip] = []  # answers that others may still contradict, in order
+        self._doubted: dict[Source, int] = {}  # when contradictions of a source were last told
         self._sent: dict[tuple[int, bytes], int] = {}  # own messages by content: when last sent
         self._stamps: dict[Source, tuple[int, int]] = {}  # arrival ns and boot ms of the newest
         self._purge_ns = 0
@@ -161,6 +169,8 @@ class Component:
                 self._command_long(frame)
             elif frame.msgid == REQUEST_DATA_STREAM:
                 self._request_data_stream(frame)
+        while self._held and frame.t_ns - self._held[0].t_ns >= HELD_NS:
+            said.append(self._held.pop(0))
         if self._rates.notices:
             said += self._rates.notices
             self._rates.notices.clear()
@@ -184,7 +194,7 @@ class Component:
             self._timesyncs += 1
             self._timesync_ns = now_ns + TIMESYNC_NS[self._timesyncs >= TIMESYNC_FIRST]
             sent_ns = now_ns - (now_ns - self._source.sysid) % 1000
-            self._answered[sent_ns] = set()
+            self._answered[sent_ns] = {}
             out.append((timesync(self._source, sent_ns), None))
         out += self._rates.due(now_ns, uavs)
         for message, _ in out:
@@ -202,6 +212,8 @@ class Component:
         self._answered = {t_ns: who for t_ns, who in self._answered.items() if t_ns >= oldest_ns}
         self._sent = {content: t_ns for content, t_ns in self._sent.items() if t_ns >= oldest_ns}
         self._stamps = {who: at for who, at in self._stamps.items() if at[0] >= oldest_ns}
+        told = {who: at for who, at in self._doubted.items() if oldest_ns - at < CONFLICT_AGAIN_NS}
+        self._doubted = told
 
     def _own_name(self, frame: Frame, said: list[RoundTrip | Rejection | Notice]) -> None:
         """Handle a frame under this service's id: one of its own come back, or a stranger's."""
@@ -224,15 +236,31 @@ class Component:
             refused, detail = Reason.OUT_OF_ORDER, f"TIMESYNC: it took {trip_s:.1f} s"
         elif not _is_boot_time(remote_ns, frame.t_ns, *stamp):
             refused, detail = Reason.UNPLACED_STAMP, "TIMESYNC: not the clock of its positions"
-        elif frame.source in answered:
-            refused, detail = Reason.DUPLICATE, "TIMESYNC: answered before"
         else:
-            answered.add(frame.source)
-            said.append(RoundTrip(frame.t_ns, frame.source, sent_ns, remote_ns))
-            return
-        said.append(
-            Rejection(frame.t_ns, str(frame.source), refused, msgid=TIMESYNC, detail=detail)
-        )
+            trip = RoundTrip(frame.t_ns, frame.source, sent_ns, remote_ns)
+            first = answered.setdefault(frame.source, trip)
+            if first is trip:
+                self._held.append(trip)
+                return
+            if not _agree(first, trip):
+                self._contradicted(first, trip, said)
+                return
+            refused, detail = Reason.DUPLICATE, "TIMESYNC: answered before"
+        said.append(_refused(frame.t_ns, frame.source, refused, detail))
+
+    def _contradicted(
+        self, first: RoundTrip, second: RoundTrip, said: list[RoundTrip | Rejection | Notice]
+    ) -> None:
+        """Discard both of two answers that cannot be of one clock; one that waits no more stays."""
+        discarded = [first, second] if first in self._held else [second]
+        self._held = [trip for trip in self._held if trip is not first]
+        detail = "TIMESYNC: two answers contradict each other"
+        said += [_refused(one.t_ns, one.source, Reason.SHARED_ID, detail) for one in discarded]
+        t_ns, source = second.t_ns, second.source
+        if t_ns - self._doubted.get(source, -CONFLICT_AGAIN_NS) >= CONFLICT_AGAIN_NS:
+            self._doubted[source] = t_ns
+            text = f"two answer TIMESYNC as {source}, and their clocks differ: neither is used"
+            said.append(Notice(t_ns, Severity.WARNING, str(source), text))
 
     def _command_ack(self, frame: Frame) -> None:
         command, result, _, _, *target = unpack(frame, _COMMAND_ACK)
@@ -259,6 +287,21 @@ class Component:
             _BROADCAST,
             self._source.compid,
         )
+
+
+def _refused(t_ns: int, source: Source, why: Reason, detail: str) -> Rejection:
+    return Rejection(t_ns, str(source), why, msgid=TIMESYNC, detail=detail)
+
+
+def _agree(one: RoundTrip, other: RoundTrip) -> bool:
+    """Whether two answers to one question can be of one clock, however long each was on its way.
+
+    A question that goes several ways is answered several times. Each answer holds the offset
+    between two bounds, and of one clock both hold the same, but for a millisecond of rounding.
+    """
+    high_ns = min(one.t_ns - one.remote_ns, other.t_ns - other.remote_ns)
+    low_ns = max(one.sent_ns - one.remote_ns, other.sent_ns - other.remote_ns)
+    return low_ns <= high_ns + 1_000_000
 
 
 def _content(msgid: int, payload: bytes) -> tuple[int, bytes]:

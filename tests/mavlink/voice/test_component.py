@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
 
 from companion.mavlink.clock.sender_clock import ClockKind, SenderClock
-from companion.mavlink.voice.component import HEARD, Component, ComponentSpec
+from companion.mavlink.voice.component import HEARD, HELD_NS, Component, ComponentSpec
 from companion.mavlink.wire.encode import Outgoing, pack
 from companion.mavlink.wire.framing import Splitter
 from companion.values import Frame, Notice, Reason, Rejection, RoundTrip, Severity, Source
@@ -63,6 +63,12 @@ def addressed(t_ns: int, sent_ns: int, remote_ns: int, target: Source) -> Frame:
     """As newer programs answer: the dialect at hand has no target fields yet."""
     payload = struct.pack("<qqBB", remote_ns, sent_ns, *target)
     return echo(t_ns, Outgoing(UAV, TIMESYNC, payload))
+
+
+def heard(node: Component, one: Frame) -> Said:
+    """What comes of a frame once nothing can contradict it any more."""
+    settled = dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
+    return node.hear(one) + node.hear(frame(one.t_ns + HELD_NS, GCS, settled))
 
 
 def ticks(start_ns: int, seconds: float, every_ms: int = 100) -> Iterator[int]:
@@ -184,7 +190,9 @@ def test_an_answer_is_a_round_trip_of_any_length(trip_ms: int) -> None:
     t_ns = EPOCH_NS + trip_ms * MS
     node.hear(position(t_ns))
     remote_ns = t_ns - BOOT_NS - trip_ms * MS // 2
-    assert node.hear(answer(t_ns, sent_ns, remote_ns)) == [RoundTrip(t_ns, UAV, sent_ns, remote_ns)]
+    assert heard(node, answer(t_ns, sent_ns, remote_ns)) == [
+        RoundTrip(t_ns, UAV, sent_ns, remote_ns)
+    ]
 
 
 def test_one_that_took_too_long_is_rejected_and_later_unknown() -> None:
@@ -193,12 +201,12 @@ def test_one_that_took_too_long_is_rejected_and_later_unknown() -> None:
     for late_s, reasons in ((10.001, [Reason.OUT_OF_ORDER]), (29.0, [Reason.OUT_OF_ORDER])):
         t_ns = EPOCH_NS + round(late_s * S)
         node.hear(position(t_ns))
-        said = node.hear(answer(t_ns, sent_ns, t_ns - BOOT_NS))
+        said = heard(node, answer(t_ns, sent_ns, t_ns - BOOT_NS))
         assert [r.reason for r in said if isinstance(r, Rejection)] == reasons
     node.due(EPOCH_NS + 40 * S, False, [])
     t_ns = EPOCH_NS + 41 * S
     node.hear(position(t_ns))
-    assert node.hear(answer(t_ns, sent_ns, t_ns - BOOT_NS)) == []
+    assert heard(node, answer(t_ns, sent_ns, t_ns - BOOT_NS)) == []
 
 
 def test_answers_to_others_and_requests_of_others_are_nothing() -> None:
@@ -207,11 +215,11 @@ def test_answers_to_others_and_requests_of_others_are_nothing() -> None:
     t_ns = EPOCH_NS + 5 * MS
     node.hear(position(t_ns))
     for ts1 in (sent_ns - 1, sent_ns + 1, 0, -1):
-        assert node.hear(answer(t_ns, ts1, t_ns - BOOT_NS)) == []
-    assert node.hear(answer(t_ns, sent_ns, 0)) == []
+        assert heard(node, answer(t_ns, ts1, t_ns - BOOT_NS)) == []
+    assert heard(node, answer(t_ns, sent_ns, 0)) == []
     for target in (GCS, Source(5, 1), Source(9, 191)):
-        assert node.hear(addressed(t_ns, sent_ns, t_ns - BOOT_NS, target)) == []
-    assert len(node.hear(addressed(t_ns, sent_ns, t_ns - BOOT_NS, OURS))) == 1
+        assert heard(node, addressed(t_ns, sent_ns, t_ns - BOOT_NS, target)) == []
+    assert len(heard(node, addressed(t_ns, sent_ns, t_ns - BOOT_NS, OURS))) == 1
 
 
 def test_the_first_of_two_answers_counts_and_each_source_has_its_own() -> None:
@@ -220,14 +228,49 @@ def test_the_first_of_two_answers_counts_and_each_source_has_its_own() -> None:
     t_ns = EPOCH_NS + 5 * MS
     for source in (UAV, CARRIER):
         node.hear(position(t_ns, source))
-        said = node.hear(answer(t_ns, sent_ns, t_ns - BOOT_NS, source))
+        said = heard(node, answer(t_ns, sent_ns, t_ns - BOOT_NS, source))
         assert [type(x) for x in said] == [RoundTrip]
-    (again,) = node.hear(answer(t_ns + 90 * MS, sent_ns, t_ns - BOOT_NS + 40 * MS))
+    (again,) = heard(node, answer(t_ns + 90 * MS, sent_ns, t_ns - BOOT_NS + 40 * MS))
     assert isinstance(again, Rejection)
     assert (again.reason, again.source, again.msgid) == (Reason.DUPLICATE, "3:1", TIMESYNC)
     later_ns = request(node, EPOCH_NS + S)
     t_ns += S
-    assert [type(x) for x in node.hear(answer(t_ns, later_ns, t_ns - BOOT_NS))] == [RoundTrip]
+    assert [type(x) for x in heard(node, answer(t_ns, later_ns, t_ns - BOOT_NS))] == [RoundTrip]
+
+
+@pytest.mark.parametrize("forged_first", [False, True])
+@pytest.mark.parametrize("off_ms", [1000, -1000, 60])
+def test_of_two_answers_that_contradict_each_other_neither_is_used(
+    forged_first: bool, off_ms: int
+) -> None:
+    """The true one took 50 ms; the other comes from its own address, and none is early."""
+    node, said = component(), []
+    for number in range(3):
+        now_ns = EPOCH_NS + number * 5 * S
+        node.hear(position(now_ns))
+        sent_ns = request(node, now_ns)
+        first_ns, second_ns = now_ns + 30 * MS, now_ns + 50 * MS
+        remotes_ns = [now_ns + 25 * MS - BOOT_NS + off_ms * MS, now_ns + 25 * MS - BOOT_NS]
+        first, second = remotes_ns if forged_first else remotes_ns[::-1]
+        assert node.hear(answer(first_ns, sent_ns, first)) == []
+        said += heard(node, answer(second_ns, sent_ns, second))
+    refused = [one for one in said if isinstance(one, Rejection)]
+    assert [one.reason for one in refused] == [Reason.SHARED_ID] * 6
+    (told,) = [one for one in said if isinstance(one, Notice)]
+    assert "answer TIMESYNC as 3:1" in told.text
+    assert not [one for one in said if isinstance(one, RoundTrip)]
+
+
+def test_one_that_contradicts_long_after_is_refused_alone() -> None:
+    node = component()
+    node.hear(position(EPOCH_NS))
+    sent_ns = request(node, EPOCH_NS)
+    (trip,) = heard(node, answer(EPOCH_NS + 10 * MS, sent_ns, EPOCH_NS - BOOT_NS))
+    assert isinstance(trip, RoundTrip)
+    later_ns = EPOCH_NS + 3 * S
+    refused, told = heard(node, answer(later_ns, sent_ns, later_ns - BOOT_NS + 50 * S))
+    assert isinstance(refused, Rejection) and isinstance(told, Notice)
+    assert refused.t_ns == later_ns
 
 
 @pytest.mark.parametrize(
@@ -248,12 +291,12 @@ def test_only_the_clock_of_its_positions_counts(remote_ns: int, good: bool) -> N
     node = component()
     sent_ns = request(node, EPOCH_NS)
     node.hear(position(EPOCH_NS))
-    (said,) = node.hear(answer(EPOCH_NS, sent_ns, remote_ns))
+    (said,) = heard(node, answer(EPOCH_NS, sent_ns, remote_ns))
     assert isinstance(said, RoundTrip if good else Rejection)
     if isinstance(said, Rejection):
         assert (said.reason, said.source) == (Reason.UNPLACED_STAMP, "3:1")
         good_one = answer(EPOCH_NS + MS, sent_ns, 1000 * S)
-        assert isinstance(node.hear(good_one)[0], RoundTrip)  # that one did not count
+        assert isinstance(heard(node, good_one)[0], RoundTrip)  # that one did not count
 
 
 def test_the_stamp_is_taken_on_to_the_answer() -> None:
@@ -261,7 +304,7 @@ def test_the_stamp_is_taken_on_to_the_answer() -> None:
     node.hear(position(EPOCH_NS))
     sent_ns = request(node, EPOCH_NS + 25 * S)
     remote_ns = 1000 * S + 25 * S + 55 * S
-    (said,) = node.hear(answer(EPOCH_NS + 25 * S, sent_ns, remote_ns))
+    (said,) = heard(node, answer(EPOCH_NS + 25 * S, sent_ns, remote_ns))
     assert isinstance(said, RoundTrip)
 
 
@@ -269,12 +312,12 @@ def test_who_sends_no_position_has_no_clock_here() -> None:
     """A ground station answers too, with its Unix time."""
     node = component()
     sent_ns = request(node, EPOCH_NS)
-    assert node.hear(answer(EPOCH_NS + MS, sent_ns, EPOCH_NS, GCS)) == []
-    assert node.hear(answer(EPOCH_NS + MS, sent_ns, 1000 * S, UAV)) == []
+    assert heard(node, answer(EPOCH_NS + MS, sent_ns, EPOCH_NS, GCS)) == []
+    assert heard(node, answer(EPOCH_NS + MS, sent_ns, 1000 * S, UAV)) == []
     node.hear(position(EPOCH_NS + MS))
     node.due(EPOCH_NS + 40 * S, False, [])
     sent_ns = request(node, EPOCH_NS + 50 * S)
-    assert node.hear(answer(EPOCH_NS + 50 * S, sent_ns, 1050 * S, UAV)) == []
+    assert heard(node, answer(EPOCH_NS + 50 * S, sent_ns, 1050 * S, UAV)) == []
 
 
 def test_an_attitude_gives_the_clock_as_well() -> None:
@@ -282,7 +325,7 @@ def test_an_attitude_gives_the_clock_as_well() -> None:
     sent_ns = request(node, EPOCH_NS)
     attitude = dialect.MAVLink_attitude_message(1_000_000, 0, 0, 0, 0, 0, 0)
     node.hear(frame(EPOCH_NS, UAV, attitude))
-    assert isinstance(node.hear(answer(EPOCH_NS, sent_ns, 1000 * S))[0], RoundTrip)
+    assert isinstance(heard(node, answer(EPOCH_NS, sent_ns, 1000 * S))[0], RoundTrip)
 
 
 @settings(max_examples=60, deadline=None)
@@ -301,13 +344,14 @@ def test_the_true_offset_is_in_every_round_trip(
     node, trips = component(), []
     for n, (out_ms, home_ms, links) in enumerate(ways):
         now_ns = EPOCH_NS + sub_ns + n * 10 * S
-        node.hear(position(now_ns))
+        trips += [x for x in node.hear(position(now_ns)) if isinstance(x, RoundTrip)]
         sent_ns = request(node, now_ns)
         for link in range(links):
             answered_ns = now_ns + 300 + out_ms * MS + link * 17 * MS
             t_ns = answered_ns + home_ms * MS
             said = node.hear(answer(t_ns, sent_ns, answered_ns - BOOT_NS))
-            trips += [x for x in said if isinstance(x, RoundTrip)]
+            assert all(isinstance(x, Rejection) and x.reason is Reason.DUPLICATE for x in said)
+    trips += [x for x in heard(node, position(now_ns + 9 * S)) if isinstance(x, RoundTrip)]
     assert len(trips) == len(ways)
     for trip in trips:
         assert trip.sent_ns - trip.remote_ns <= BOOT_NS <= trip.t_ns - trip.remote_ns
@@ -319,14 +363,14 @@ def test_round_trips_are_what_a_clock_needs() -> None:
     for t_ns in ticks(EPOCH_NS, 30):
         seen = position(t_ns)
         arrival_ns = t_ns + 400 * MS + round(rng.random() * 50 * MS)
-        node.hear(seen._replace(t_ns=arrival_ns))
+        for said in node.hear(seen._replace(t_ns=arrival_ns)):
+            assert isinstance(said, RoundTrip)
+            clock.timesync(said.sent_ns, said.t_ns, said.remote_ns)
         clock.observe(arrival_ns, (t_ns - BOOT_NS) // MS)
         for message, _ in node.due(arrival_ns, False, []):
             (asked,) = dialect.MAVLink(None).parse_buffer(pack(message, 0))
             back_ns = arrival_ns + 30 * MS
-            for said in node.hear(answer(back_ns, asked.ts1, arrival_ns + 15 * MS - BOOT_NS)):
-                assert isinstance(said, RoundTrip)
-                clock.timesync(said.sent_ns, said.t_ns, said.remote_ns)
+            node.hear(answer(back_ns, asked.ts1, arrival_ns + 15 * MS - BOOT_NS))
     known = clock.estimate()
     assert known is not None
     assert known.kind is ClockKind.TIMESYNC

@@ -14,6 +14,8 @@ line while it is less than ``late_max_ns`` off it:
   than ``late_max_ns``, and goes on.
 - Stamps off the line that lie on a line of their own for three seconds, while the first line
   advances between them, belong to a second clock: two senders share one id.
+- A stamp that is more than a second early on a line of 20 says that all before it were late. It
+  counts once three of them do, over at least half a second; until then they have no time.
 - Frames of the previous line, which come for up to ``late_max_ns`` after it was left, have no time.
 
 A reboot is therefore reported once, at the stamp that confirms it. One case is not told apart: a
@@ -33,6 +35,8 @@ WRAP_NS: Final = _WRAP_MS * _NS_PER_MS
 """Period of a boot clock: its 32-bit milliseconds wrap after 49.7 days."""
 _EARLY_NS: Final = -_NS
 """Least lateness of a stamp that fits an established line; negative: it may be 1 s early."""
+_ESTABLISHED: Final = 20
+"""Stamps from which on a line is not moved by a single one."""
 _RUN_KEPT: Final = 64
 """Stamps kept of a run."""
 _RIVAL_LASTS_NS: Final = 3 * _NS
@@ -170,9 +174,12 @@ class BootLine:
         self.newest_ns = max(self.newest_ns, x_ns)
         return Placed(x_ns)
 
-    def _near(self, arrival_ns: int, boot_ms: int, x_ns: int) -> Placed:
+    def _near(self, arrival_ns: int, boot_ms: int, x_ns: int) -> Placed | None:
         """Place a stamp on the line: in order, late, or in the first seconds of a second boot."""
         if x_ns > self.newest_ns:
+            early = self.late_ns(arrival_ns, x_ns) < _EARLY_NS
+            if early and self.floor.count >= _ESTABLISHED:
+                return self._ahead(arrival_ns, boot_ms)
             self._run.stamps.clear()
         elif (
             x_ns < self.newest_ns
@@ -182,6 +189,19 @@ class BootLine:
         ):
             return self._begin_again(rebooted=True)
         return self._accept(arrival_ns, x_ns)
+
+    def _ahead(self, arrival_ns: int, boot_ms: int) -> Placed | None:
+        """Place a stamp that shows all before it to have been late, once others confirm it.
+
+        One alone would move the clock by all that it is ahead, whoever made it up.
+        """
+        if not (self._run.add(arrival_ns, boot_ms, _NS) and self._run.lasts(3, _NS // 2)):
+            return None
+        for at_ns, stamp_ms in self._run.stamps[:-1]:
+            x_ns = _unwrap(stamp_ms, self.newest_ns)
+            self.floor.add(x_ns, at_ns - x_ns)
+        self._run.stamps.clear()
+        return self._accept(arrival_ns, _unwrap(boot_ms, self.newest_ns))
 
     def _stalled(self, arrival_ns: int, boot_ms: int, x_ns: int) -> Placed:
         """Place a stamp in order but too late: the link stalled, or the clock stood still."""

@@ -51,6 +51,35 @@ def test_a_link_that_lags_by_seconds_is_no_reboot() -> None:
     assert not reboots(observe_all(fast + run(20_000, 316_000, 40)))
 
 
+@pytest.mark.parametrize("ahead_ms", [1_100, 4_900])
+@pytest.mark.parametrize("again_ms", [0, 10, 1_000])
+def test_stamps_from_the_future_do_not_move_the_clock(ahead_ms: int, again_ms: int) -> None:
+    """A single forged one, two of a moment, and one a second: the vehicle's own go on as before."""
+    honest = run(0, 300_000, 50)
+    times = [10_050] if not again_ms else [10_050 + n * again_ms for n in range(2)]
+    forged = [(at, 300_000 + at + ahead_ms) for at in times]
+    clock = SenderClock()
+    observe_all(honest, clock)
+    before = clock.estimate()
+    seen = sorted([*run(10_000, 310_000, 50), *forged])
+    stamps = dict(zip(seen, observe_all(seen, clock), strict=True))
+    assert [stamps[one] for one in forged] == [None] * len(forged)
+    assert all(stamp is not None for one, stamp in stamps.items() if one not in forged)
+    after = clock.estimate()
+    assert before is not None and after is not None
+    assert after.offset_ns == pytest.approx(before.offset_ns, abs=2 * MS)
+
+
+def test_a_link_that_was_late_is_followed_when_it_is_not() -> None:
+    """All of half a minute came 3 s late: half a second later the clock knows."""
+    late, prompt = run(3_000, 300_000, 150), run(33_000, 333_000, 20)
+    stamps = observe_all([*late, *prompt])
+    assert [n for n, stamp in enumerate(stamps) if stamp is None] == [150, 151, 152]
+    assert not reboots(stamps)
+    latencies = [stamp.latency_s for stamp in stamps[153:] if stamp is not None]
+    assert max(latencies) < 0.31  # a tenth of what was seen is taken for what is not
+
+
 @pytest.mark.parametrize("boot_ms", [0, 12_000])
 @pytest.mark.parametrize("back_ms", [48_000, 260_000])
 def test_a_reboot_is_one_event_and_begins_anew(back_ms: int, boot_ms: int) -> None:

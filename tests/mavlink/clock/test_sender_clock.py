@@ -509,24 +509,27 @@ def stamps_of(data: bytes, name: str, ids: set[int]) -> dict[str, list[tuple[int
 
 @pytest.mark.parametrize("ids", [{33}, {30, 33}, {2, 30, 33}])
 @pytest.mark.parametrize(
-    ("name", "reboots"),
+    ("name", "reboots", "leaps"),
     [
-        ("real_dronekit_flight2015.tlog", 1),
-        ("real_devmangrani_flight54.tlog", 0),
-        ("real_eagle_c2_gui.tlog", 0),
-        ("real_bluerobotics_server.tlog", 0),
-        ("sitl_4circle.tlog", 0),
+        ("real_dronekit_flight2015.tlog", 1, 0),
+        ("real_devmangrani_flight54.tlog", 0, 0),
+        ("real_eagle_c2_gui.tlog", 0, 0),
+        ("real_bluerobotics_server.tlog", 0, 1),
+        ("sitl_4circle.tlog", 0, 0),
     ],
 )
 def test_reboots_of_real_logs(
-    shared_log: Callable[[str], bytes], name: str, reboots: int, ids: set[int]
+    shared_log: Callable[[str], bytes], name: str, reboots: int, leaps: int, ids: set[int]
 ) -> None:
-    """A second later at most every stamp has its time, and the doubt is no more than the link's."""
+    """A second later at most every stamp has its time, and the doubt is no more than the link's.
+
+    One leaps ahead of its line by more than a second, once.
+    """
     for seen in stamps_of(shared_log(name), name, ids).values():
         clock = SenderClock()
         stamps = [clock.observe(*stamp) for stamp in seen]
         assert sum(s.rebooted for s in stamps if s is not None) == reboots
-        assert stamps.count(None) <= 10 * reboots
+        assert stamps.count(None) <= 10 * (reboots + leaps)
         assert known(clock).drift_ppm == 0.0
         assert known(clock).uncertainty_s < 1.0
 

@@ -865,3 +865,18 @@ def test_clocks_of_those_without_a_track_are_bounded(monkeypatch: pytest.MonkeyP
     run(pipeline, [tick(n / 100) for n in range(100)])
     known = [f"{sysid}:1" for sysid in range(1, 61) if pipeline.clock_estimate(f"{sysid}:1")]
     assert known == ["5:1", "11:1", "12:1", *(f"{sysid}:1" for sysid in range(51, 61))]
+
+
+def test_pauses_without_end_are_not_ticked_through() -> None:
+    """A thousand of an hour each: 36 million ticks, were they all made."""
+    hour_ns = 3_590 * S
+    garbage = [Rejection(n * hour_ns, "log", Reason.GARBAGE) for n in range(1_000)]
+    ticks = sum(isinstance(event, Tick) for event in with_ticks(garbage, 10.0))
+    assert 4 * 35_000 < ticks < 4 * 36_100 + 1_000
+
+
+def test_pauses_of_a_flight_are_ticked_through_however_many() -> None:
+    """Each is less than a minute, and all together are a day."""
+    garbage = [Rejection(n * 50 * S, "log", Reason.GARBAGE) for n in range(1_728)]
+    ticks = sum(isinstance(event, Tick) for event in with_ticks(garbage, 1.0))
+    assert ticks == 1_727 * 50

@@ -18,5 +18,6 @@ presence.system_status, presence.armed  # what a heartbeat says, for who looks a
 status.of_s  # written to the API by its fields
 clock.timesync_refused, clock.gnss_refused  # why evidence was not used, for who debugs a clock
 one_uav, streamed, healthz, readyz, listing, download, list_scenarios, prediction  # by decorators
+served.readable, served.readinto  # `io` calls them
 exception  # the name of an argument of `__exit__`
 row.shows, row.likeness, row.bears_on  # read by the template of the paper's page

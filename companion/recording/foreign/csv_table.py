@@ -11,13 +11,17 @@ that begin with ``#`` may give ``sysid``, ``compid`` and ``mav_type``. See docs/
 """
 
 import csv
+import io
 import math
+from array import array
 from collections.abc import Iterable, Iterator
 from datetime import datetime
-from typing import Final
+from functools import partial
+from typing import Any, Final
 
 import numpy as np
 
+from companion.recording.foreign.dataflash import Bytes
 from companion.recording.foreign.gps_time import FIRST_UNIX_US, LAST_UNIX_US, GpsTime
 from companion.recording.foreign.onboard import (
     Attitudes,
@@ -29,6 +33,7 @@ from companion.recording.foreign.onboard import (
     on_earth,
     turned,
 )
+from companion.recording.foreign.thinned import Thinned
 from companion.values import FloatArray, IntArray, Reason
 
 TIMES: Final = ("unix_s", "time", "t_s")
@@ -50,9 +55,12 @@ class NoTableError(Exception):
     """Raised with one line for the user where the text is no such table."""
 
 
-def read(text: bytes) -> Onboard:
-    """The samples of a table. Raises ``NoTableError`` where its header does not describe them."""
-    lines = iter(text.decode("utf-8-sig", errors="replace").splitlines())
+def read(text: bytes | Bytes) -> Onboard:
+    """The samples of a table. Raises ``NoTableError`` where its header does not describe them.
+
+    Of very many lines every n-th is read.
+    """
+    lines = _lines(text)
     said, header = _header(lines)
     names = [name.strip().lower() for name in _cells(header)]
     timed = next((name for name in TIMES if name in names), None)
@@ -70,6 +78,30 @@ def read(text: bytes) -> Onboard:
     return _onboard(table, timed, said, lost, notes)
 
 
+class _Reading(io.RawIOBase):
+    """Bytes as a file, which copies no more of them than is asked for."""
+
+    def __init__(self, data: bytes | Bytes) -> None:
+        self._data = memoryview(data) if isinstance(data, bytes) else data.data
+        self._at = 0
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, room: Any) -> int:
+        some = self._data[self._at : self._at + len(room)]
+        room[: len(some)] = some
+        self._at += len(some)
+        return len(some)
+
+
+def _lines(data: bytes | Bytes) -> Iterator[str]:
+    """The lines of a text; of one that is longer than any should be, pieces."""
+    raw = io.BufferedReader(_Reading(data))
+    text = io.TextIOWrapper(raw, encoding="utf-8-sig", errors="replace")
+    return iter(partial(text.readline, _LINE_MAX), "")
+
+
 def _header(lines: Iterator[str]) -> tuple[dict[str, int], str]:
     """What the lines before the header say, and the header."""
     said: dict[str, int] = {}
@@ -79,7 +111,7 @@ def _header(lines: Iterator[str]) -> tuple[dict[str, int], str]:
         if not line.strip():
             continue
         if not line.startswith("#"):
-            return said, line[:_LINE_MAX]
+            return said, line.rstrip("\n")
         name, equals, value = (part.strip() for part in line[1:].partition("="))
         if equals and name in _SAID:
             if not value.isdecimal() or not 0 < int(value[:9]) <= _SAID[name]:
@@ -101,17 +133,18 @@ def _rows(
     An empty cell is NaN.
     """
     divider = max(",;\t", key=header.count)
-    found: list[list[float]] = []
+    found: Thinned[array[float]] = Thinned([])
     bad = 0
     for line in lines:
         if not line.strip() or line.startswith("#"):
             continue
         try:
-            cells = next(csv.reader([line[:_LINE_MAX]], delimiter=divider))
-            found.append([_number(cells[number], name, timed) for number, name in used])
+            cells = next(csv.reader([line], delimiter=divider))
+            row = [_number(cells[number], name, timed) for number, name in used]
+            found.add(array("d", row))
         except (ValueError, IndexError, csv.Error, OverflowError):
             bad += 1
-    return np.array(found, dtype=np.float64).reshape(-1, len(used)), bad
+    return np.array(found.kept, dtype=np.float64).reshape(-1, len(used)), bad
 
 
 def _number(cell: str, name: str, timed: str) -> float:

@@ -10,12 +10,14 @@ each to the next. Fields are read where they lie, for the messages that are aske
 """
 
 import re
+from array import array
 from collections.abc import Collection, Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.recording.foreign.thinned import Thinned
 from companion.values import IntArray
 
 MAGIC: Final = b"\xa3\x95"
@@ -52,7 +54,8 @@ class Walked(NamedTuple):
     """What a log holds.
 
     formats  by type
-    at       where the messages of each wanted type begin, in the order of the file
+    at       where the messages of each wanted type begin, in the order of the file; of very many
+             every n-th
     lost     bytes that belong to no message
     refused  descriptions of messages that cannot be: of another length, or twice and different
     """
@@ -121,14 +124,13 @@ def walk(data: Bytes, wanted: Collection[str]) -> Walked:
     asked = np.zeros(256, dtype=bool)
     for number, layout in formats.items():
         lengths[number], asked[number] = layout.length, layout.name in wanted
-    found: dict[int, list[IntArray]] = {n: [] for n, each in formats.items() if asked[n]}
+    found = {n: Thinned(array("q")) for n in formats if asked[n]}
     covered = 0
     for at, types in _chains(data, lengths):
         covered += int(lengths[types].sum())
         for number in np.unique(types[asked[types]]).tolist():
-            found[number].append(at[types == number])
-    none = np.zeros(0, dtype=np.int64)
-    places = {number: np.concatenate([none, *parts]) for number, parts in found.items()}
+            found[number].extend(at[types == number].tolist())
+    places = {number: np.array(each.kept, dtype=np.int64) for number, each in found.items()}
     return Walked(formats, places, data.size - covered, refused)
 
 

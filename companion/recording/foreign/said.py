@@ -25,6 +25,7 @@ from companion.recording.stamps import RepairedStamps
 from companion.values import Event, FloatArray, Frame, IntArray, Reason, Rejection, Source
 
 _EACH_US: Final = 1_000_000
+_BLOCK: Final = 1 << 14
 _PRESENCES_MAX: Final = 10 * 86_400
 _ARMED: Final = 128
 _ACTIVE: Final = 4
@@ -73,14 +74,14 @@ def frames(log: Onboard, link: str, source: Source, latency_s: float) -> Iterato
         kinds = _kinds(log)
     order, boots = _in_order(kinds)
     unix_us = boots if log.clock is None else log.clock.unix_us(boots)
-    times_ns = (unix_us * 1000).tolist()
-    timeline = RepairedStamps(times_ns[:3])
+    times_ns = unix_us * 1000
+    timeline = RepairedStamps(times_ns[:3].tolist())
     first_ns = timeline.t_ns + latency_ns
     for reason, count in log.lost.items():
         yield Rejection(first_ns, link, reason, count)
     tables = [(kind.msgid, kind.payloads.tobytes(), kind.payloads.itemsize) for kind in kinds]
     seq = 0
-    for (kind, row), t_ns in zip(order.tolist(), times_ns, strict=True):
+    for (kind, row), t_ns in _rows(order, times_ns):
         off_ns = timeline.place(t_ns)
         if off_ns is not None:
             detail = f"{abs(off_ns) / 1e9:.6g} s {'back' if off_ns < 0 else 'ahead'}, clamped"
@@ -89,6 +90,13 @@ def frames(log: Onboard, link: str, source: Source, latency_s: float) -> Iterato
         raw = pack(Outgoing(source, msgid, table[row * size : (row + 1) * size]), seq)
         seq = (seq + 1) & 0xFF
         yield Frame(timeline.t_ns + latency_ns, link, source, msgid, raw)
+
+
+def _rows(order: IntArray, times_ns: IntArray) -> Iterator[tuple[tuple[int, int], int]]:
+    """(kind, row) and time of every message, made from some of the arrays at a time."""
+    for begin in range(0, len(order), _BLOCK):
+        some = slice(begin, begin + _BLOCK)
+        yield from zip(order[some].tolist(), times_ns[some].tolist(), strict=True)
 
 
 def _in_order(kinds: list[_Said]) -> tuple[IntArray, IntArray]:

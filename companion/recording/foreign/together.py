@@ -25,7 +25,7 @@ from companion.values import Event, IntArray, Source
 READERS: Final[dict[str, Callable[[Bytes], Onboard]]] = {
     "dataflash": ardupilot.read,
     "ulog": px4.read,
-    "csv": lambda data: csv_table.read(data.tobytes()),
+    "csv": csv_table.read,
 }
 """What reads the log of one vehicle, by the kind of log."""
 KEPT: Final = 8

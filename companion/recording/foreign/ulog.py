@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.recording.foreign.dataflash import Bytes
+from companion.recording.foreign.thinned import Thinned
 from companion.values import FloatArray, IntArray
 
 MAGIC: Final = b"ULog\x01\x12\x35"
@@ -44,12 +45,16 @@ _candidates = re.compile(rb"(?=[\s\S]{2}[BFIMPQARDLCSO])").finditer
 
 
 class Topic(NamedTuple):
-    """One instance of a topic: its fields, and where its samples lie in the file."""
+    """One instance of a topic: its fields, and where its samples lie in the file.
+
+    Of very many samples it is every n-th.
+    """
 
     name: str
     instance: int
     fields: np.dtype[np.void]
     at: "array[int]"
+    samples: Thinned[int]
 
 
 @dataclass(slots=True)
@@ -175,7 +180,7 @@ class _Walker:
                 if sizes is not None and sizes[0] <= size <= sizes[1]:
                     topic = self._topics[number]
                     if topic is not None:
-                        topic.at.append(at + 5)
+                        topic.samples.add(at + 5)
                     at = stop
                     continue
             elif self._fits(at, end) and kind != _DATA:
@@ -238,7 +243,9 @@ class _Walker:
         self._sizes[number] = least + 2, most + 2
         layout = _layout(fields) if name in self._wanted else None
         self._found.refused += name in self._wanted and layout is None
-        self._topics[number] = None if layout is None else Topic(name, instance, layout, array("q"))
+        at = array("q")
+        topic = None if layout is None else Topic(name, instance, layout, at, Thinned(at))
+        self._topics[number] = topic
 
     def _size(self, name: str, depth: int) -> tuple[int, int]:
         """Bytes of a topic at least (without the padding at its end) and at most; 0 if unknown."""

@@ -2,13 +2,15 @@
 
 import random
 import struct
+import subprocess
+import sys
 import time
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from support import ROOT
+from support import HANG_S, ROOT
 from ulog_support import flight
 
 from companion.recording.reader import LogError, read_log
@@ -133,3 +135,67 @@ def test_absurd_files_are_bounded(make: Callable[[], bytes], tmp_path: Path) -> 
         tracemalloc.stop()
     assert time.monotonic() - begin < SLOWEST_S
     assert peak < 60_000_000 + 8 * len(data)
+
+
+# --- counts without end --------------------------------------------------------------------------
+
+MOST_MB = 300
+"""Memory in which any log is read, the program's own 70 MB and the file's pages included."""
+MANY = 1_500_000
+_READ = r"""
+import re, sys
+from pathlib import Path
+from companion.recording.reader import read_log
+frames = sum(1 for _ in read_log(sys.argv[1]))
+peak_kb = re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text())[1]
+print(frames, int(peak_kb) // 1000)
+"""
+
+
+def many_lines() -> bytes:
+    return b"t_s,lat_deg,lon_deg,alt_m\n" + b"".join(
+        b"%d,47,8,1\n" % (n // 10) for n in range(MANY)
+    )
+
+
+def many_messages() -> bytes:
+    def described(number: int, name: bytes, letters: bytes, columns: bytes) -> bytes:
+        body = struct.pack("<BB4s16s64s", number, 23, name, letters, columns)
+        return b"\xa3\x95\x80" + body
+
+    head = described(65, b"ATT", b"Qfff", b"TimeUS,Roll,Pitch,Yaw")
+    head += described(66, b"POS", b"QLLf", b"TimeUS,Lat,Lng,Alt")
+    place = struct.pack("<iif", 473977419, 85455938, 488.0)
+    turned = struct.pack("<fff", 1.0, 2.0, 3.0)
+    return head + b"".join(
+        b"\xa3\x95%c%b%b"
+        % (65 + n % 2, (1000 + n * 20).to_bytes(8, "little"), (turned, place)[n % 2])
+        for n in range(MANY)
+    )
+
+
+def many_samples() -> bytes:
+    """Of the topic that a flight describes first."""
+    body = struct.pack("<ddf", 47.0, 8.0, 500.0)
+    return flight(seconds=10).data + b"".join(
+        b"\x1e\x00D\x00\x00" + (20_000_000 + n * 100).to_bytes(8, "little") + body
+        for n in range(MANY)
+    )
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("name", "made"), [("a.csv", many_lines), ("a.bin", many_messages), ("a.ulg", many_samples)]
+)
+def test_counts_without_end_take_no_more_memory_than_there_is(
+    tmp_path: Path, name: str, made: Callable[[], bytes]
+) -> None:
+    """Every n-th is read: of all there were, a gigabyte and a half."""
+    path = tmp_path / name
+    path.write_bytes(made())
+    command = [sys.executable, "-c", _READ, str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=HANG_S)
+    assert done.returncode == 0, done.stderr
+    frames, peak_mb = map(int, done.stdout.split())
+    assert frames > 90_000
+    assert peak_mb < MOST_MB

@@ -1,0 +1,40 @@
+"""Every n-th of what comes: a log is as long as its maker likes, and memory is not."""
+
+from collections.abc import Iterable, MutableSequence, Sequence
+from typing import Final, Generic, TypeVar
+
+SAMPLES_MAX: Final = 200_000
+"""Most samples of one kind that are kept of a log: more than an hour at 50 Hz."""
+
+T = TypeVar("T")
+
+
+class Thinned(Generic[T]):
+    """Keeps all that is added while there is room, and then every second, fourth, ...
+
+    ``kept`` is where it is kept, empty at first.
+    """
+
+    __slots__ = ("_seen", "kept", "stride")
+
+    def __init__(self, kept: MutableSequence[T]) -> None:
+        self.kept = kept
+        self.stride = 1
+        self._seen = 0
+
+    def add(self, one: T) -> None:
+        """Add one."""
+        if self._seen % self.stride == 0:
+            self._keep((one,))
+        self._seen += 1
+
+    def extend(self, some: Sequence[T]) -> None:
+        """Add some, in order."""
+        self._keep(some[-self._seen % self.stride :: self.stride])
+        self._seen += len(some)
+
+    def _keep(self, some: Iterable[T]) -> None:
+        self.kept.extend(some)
+        while len(self.kept) > SAMPLES_MAX:
+            del self.kept[1::2]
+            self.stride *= 2

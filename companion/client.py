@@ -99,6 +99,12 @@ class Client:
         groups = tuple(int(turn) for turn in headers["x-groups"].split(",") if turn)
         return Weights(uavs, matrix, int(headers["x-valid-at-ns"]), groups)
 
+    def table(self, media_type: str, lead_ms: float = 0.0) -> str:
+        """The weights applied in ``lead_ms`` milliseconds as the text that a device reads."""
+        query = urlencode({"lead_ms": lead_ms})
+        with self._open(f"/v1/beams/weights?{query}", media_type) as answer:
+            return _read(answer).decode()
+
     def get(self, path: str, **query: object) -> Json:
         """The answer of any path of the API that returns a JSON object."""
         address = quote(path) + ("?" + urlencode(query, doseq=True) if query else "")

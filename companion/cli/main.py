@@ -31,6 +31,7 @@ from companion.cli.console import (
     tell_vehicles,
 )
 from companion.cli.design import design
+from companion.cli.drive import drive
 from companion.cli.export import export
 from companion.cli.recover import recover
 from companion.cli.study import study
@@ -277,6 +278,7 @@ def _number(value: float | None) -> str:
 
 main.add_command(check)
 main.add_command(design)
+main.add_command(drive)
 main.add_command(export)
 main.add_command(recover)
 main.add_command(study)

@@ -19,7 +19,7 @@ from companion.node.serving import run_until_told
 from companion.pipeline.fold import Pipeline
 from companion.server.access import bind
 from companion.settings.model import Settings
-from companion.settings.outlets import RecordSettings
+from companion.settings.outlets import DriveSettings, RecordSettings
 from companion.values import Level, Reason, Verdict, reports_itself
 from companion.views import state
 
@@ -76,6 +76,7 @@ def _to_listen(settings: Settings, urls: list[str]) -> Settings:
             "recording": kept.recording.model_copy(update={"directory": None}),
             "server": kept.server.model_copy(update={"foxglove": None}),
             "records": RecordSettings(),
+            "drive": DriveSettings(),
             "out": kept.out.model_copy(update={"urls": ()}),
             "signing": kept.signing.model_copy(update={"keys": keys}),
         }

@@ -15,6 +15,10 @@ from typing import Any, Final
 import companion
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.voice.rate_watch import MessageRate
+from companion.node.drive import targets
+from companion.node.drive.loop import Drive, Safe
+from companion.node.drive.running import beside
+from companion.node.drive.sources import OfThisProcess, Wanted
 from companion.node.gateway import Gateway
 from companion.node.outlet import Outlet
 from companion.node.push import Push
@@ -99,6 +103,8 @@ class Service:
         self.arrival_lag = self._traffic.lag
         self._outlet = Outlet(settings, self.pipeline, self._notify, self._timeline.now_ns)
         now_ns = self._timeline.now_ns
+        target = settings.drive.target
+        self._device = None if target is None else targets.device(target, self._say)
         self._push = Push(settings.records, self.pipeline, self.equipment, self._notify, now_ns)
         self._traffic.open()
         self._outlet.open()
@@ -128,6 +134,7 @@ class Service:
                 tasks.append(group.create_task(self._traffic.run(), name="links"))
                 tasks.append(group.create_task(self._outlet.run(), name="out"))
                 tasks.append(group.create_task(self._push.run(), name="records"))
+                tasks.append(group.create_task(self._driven(), name="drive"))
                 tasks.append(group.create_task(self._recover_leftovers(), name="recovery"))
                 tasks.append(group.create_task(self._end_on_defect(), name="defects"))
                 tasks += [group.create_task(other, name="beside") for other in others]
@@ -166,6 +173,32 @@ class Service:
         for output in outputs:
             if isinstance(output, Notice):
                 self._show(output)
+
+    async def _driven(self) -> None:
+        """Drive the device of ``[drive]``; its mistakes end it, and not the service."""
+        if self._device is None:
+            return
+        loop, kept = asyncio.get_running_loop(), self._settings
+        uavs = kept.drive.uavs or kept.beams.priority
+
+        def say(text: str) -> None:
+            notice = Notice(self.now_ns(), Severity.INFO, "drive", text)
+            loop.call_soon_threadsafe(self._notify, notice)
+
+        source = OfThisProcess(
+            loop,
+            self.pipeline,
+            self.equipment,
+            self.now_ns,
+            Wanted(uavs, not kept.drive.uavs, self._device.takes_registers),
+        )
+        try:
+            safe = Safe(kept.drive.on_stale)
+            drive = Drive(source, self._device, kept.beams.update_hz, safe, self.now_ns, say)
+            await beside(drive)
+        except UserError as error:
+            text = f"the device is driven no more: {error}"
+            self._notify(Notice(self.now_ns(), Severity.ERROR, "drive", text))
 
     async def _end_on_defect(self) -> None:
         """Wait for a defect of the fold and raise it, which ends the service.

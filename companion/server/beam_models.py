@@ -30,6 +30,7 @@ class BeamState(BaseModel):
     elevation_deg: Annotated[float, Field(examples=[8.0])]
     range_m: Annotated[float, Field(examples=[412.0])]
     bearing_deg: float
+    above_horizon_deg: float
     azimuth_rate_dps: float | None
     elevation_rate_dps: float | None
     range_rate_mps: float | None

@@ -29,6 +29,7 @@ from companion.settings.mavlink import (
     TrackSettings,
 )
 from companion.settings.outlets import (
+    DriveSettings,
     PageSettings,
     RecordingSettings,
     RecordSettings,
@@ -87,6 +88,7 @@ class Settings(Section):
     link: NeedSettings = NeedSettings()
     recording: RecordingSettings = RecordingSettings()
     records: RecordSettings = RecordSettings()
+    drive: DriveSettings = DriveSettings()
     server: ServerSettings = ServerSettings()
     page: PageSettings = PageSettings()
 

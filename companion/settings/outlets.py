@@ -1,4 +1,4 @@
-"""Settings of recording, of serving, of records for machines and of the page."""
+"""Settings of recording, of serving, of records for machines, of a device and of the page."""
 
 import ipaddress
 import re
@@ -61,6 +61,19 @@ class RecordingSettings(Section):
     scene_hz: Annotated[float, Field(gt=0, le=100)] = 2.0
     rotate_mb: Annotated[float, Field(ge=0.1, le=1e6)] | None = None
     rotate_s: Annotated[float, Field(ge=1, le=1e7)] = 3600.0
+
+
+class DriveSettings(Section):
+    """A device that the service drives itself.
+
+    target    as ``companion drive`` has it, such as rotctld:HOST:PORT; None: nothing is driven
+    uavs      whom to follow, in descending order; empty: by [beams] priority, then anybody
+    on_stale  what the device does without beams, and at the end
+    """
+
+    target: str | None = None
+    uavs: Annotated[tuple[str, ...], Field(max_length=1000)] = ()
+    on_stale: Literal["hold", "boresight", "mute"] = "hold"
 
 
 class PageSettings(Section):

@@ -83,6 +83,22 @@ def left_out(beam_set: BeamSet, unfit: str | None = None) -> list[Json]:
     return [{"uav": out.uav, "reason": unfit or out.reason} for out in beam_set.left_out]
 
 
+def pointing(pipeline: Pipeline, update: Update) -> list[Json]:
+    """Where each beam points over the ground: name, bearing and angle above the horizon."""
+    carrier, beam_set = update.carrier, update.beams
+    if carrier is None or not beam_set.beams:
+        return []
+    ned = directions(beam_set) @ pipeline.array.array_from_body @ carrier.body_from_local
+    bearings = np.degrees(np.arctan2(ned[:, 1], ned[:, 0])) % 360
+    above = np.degrees(np.arcsin(np.clip(-ned[:, 2], -1.0, 1.0)))
+    return [
+        {"uav": uav, "bearing_deg": bearing, "above_horizon_deg": angle}
+        for uav, bearing, angle in zip(
+            beam_set.uavs, bearings.tolist(), above.tolist(), strict=True
+        )
+    ]
+
+
 def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[Json]:
     beam_set, carrier = update.beams, update.carrier
     if carrier is None or not beam_set.beams:
@@ -102,8 +118,7 @@ def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[J
         equipment.budget,
         equipment.uav_antennas,
     )
-    seen_locally = towards @ array.array_from_body @ carrier.body_from_local
-    bearings = np.degrees(np.arctan2(seen_locally[:, 1], seen_locally[:, 0])) % 360
+    pointed = pointing(pipeline, update)
     guaranteed, guaranteed_sinr = guaranteed_gain.of_beams(
         pipeline, equipment, update, towards, powers_w
     )
@@ -115,7 +130,8 @@ def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[J
             "azimuth_deg": degrees(beam.azimuth_rad),
             "elevation_deg": degrees(beam.elevation_rad),
             "range_m": beam.range_m,
-            "bearing_deg": float(bearings[i]),
+            "bearing_deg": pointed[i]["bearing_deg"],
+            "above_horizon_deg": pointed[i]["above_horizon_deg"],
             "azimuth_rate_dps": degrees(beam.azimuth_rate_radps),
             "elevation_rate_dps": degrees(beam.elevation_rate_radps),
             "range_rate_mps": beam.range_rate_mps,

@@ -1,0 +1,95 @@
+"""The command ``companion drive``: beams of a running service applied to a device."""
+
+import json
+import os
+import time
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from companion.node.drive.loop import Told
+
+
+@click.command()
+@click.argument("target")
+@click.option(
+    "--service",
+    metavar="URL",
+    default="http://127.0.0.1:8080",
+    show_default=True,
+    help="Whose beams: the service's address. COMPANION_TOKEN is its bearer token.",
+)
+@click.option("--uav", "uavs", multiple=True, help="Whom to follow, in descending order [anybody].")
+@click.option(
+    "--rate",
+    "update_hz",
+    type=click.FloatRange(0.1, 1000),
+    default=10.0,
+    show_default=True,
+    help="Updates a second.",
+)
+@click.option(
+    "--on-stale",
+    type=click.Choice(["hold", "boresight", "mute"]),
+    default="hold",
+    show_default=True,
+    help="What the device does without beams, and at the end.",
+)
+@click.option("--dry-run", is_flag=True, help="Print what would be sent, and send nothing.")
+@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after so long.")
+@click.option("--json", "as_json", is_flag=True, help="How it goes, one JSON object a second.")
+def drive(
+    target: str,
+    service: str,
+    uavs: tuple[str, ...],
+    update_hz: float,
+    on_stale: str,
+    dry_run: bool,
+    seconds: float | None,
+    as_json: bool,
+) -> None:
+    """Apply the beams of a running service to a device.
+
+    TARGET is rotctld:HOST:PORT, phaser:URI (extra [phaser]) or adar1000:BUS.DEVICE[,...] (extra
+    [spi]). Beams are asked for as far ahead as the device takes to apply them.
+
+    Example: companion drive rotctld:127.0.0.1:4533 --uav 1:1
+    """
+    from companion.client import Client
+    from companion.node.drive import running, targets
+    from companion.node.drive.loop import Drive, Safe
+    from companion.node.drive.sources import OverHttp, Wanted
+
+    device = targets.device(target, lambda text: click.echo(text, err=True))
+    if dry_run:
+        kind = "adar1000" if device.takes_registers else "pointing"
+        device = targets.device(f"none:{kind}", click.echo)
+    client = Client(service, os.environ.get("COMPANION_TOKEN"))
+    driven = Drive(
+        OverHttp(client, Wanted(uavs, not uavs, device.takes_registers)),
+        device,
+        update_hz,
+        Safe(on_stale),
+        time.time_ns,
+        lambda text: click.echo(text, err=True),
+    )
+
+    def show(told: "Told") -> None:
+        if as_json:
+            click.echo(json.dumps(asdict(told)))
+
+    running.until_told(driven, show, seconds)
+    click.echo(_text(driven.told()), err=as_json)
+
+
+def _text(told: "Told") -> str:
+    times = ""
+    if told.p50_ms is not None:
+        times = f", to apply p50 {told.p50_ms:.1f} ms p99 {told.p99_ms:.1f} ms"
+    rate = "" if told.rate_hz is None else f" at {told.rate_hz:.1f} Hz"
+    return (
+        f"{told.applied} updates{rate}{times}, lead {told.lead_ms:.0f} ms;"
+        f" {told.late} late, {told.skipped} skipped, {told.failures} failures"
+    )

@@ -1,0 +1,1 @@
+"""Beams applied to hardware: the loop, where beams come from, and a file for each device."""

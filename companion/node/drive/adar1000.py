@@ -1,0 +1,97 @@
+"""ADAR1000 chips on Linux's SPI: ``adar1000:0.0,0.1``.                                  [shell]
+
+Registers of the data sheet, as the Linux driver (iio/beamformer/adar1000) has them: a word of 24
+bits, 0 to write, the chip's address, 13 bits of register, 8 of value; gains on receive from 0x10,
+vector modulator on receive from 0x14 (I and Q by turns), 0x28 to load what was written (bit 0 for
+receive). Chips that share a chip select are told apart by address: here the place of the chip in
+the table, modulo 4. It was never on the air: what is tested is what a chip's registers would hold.
+"""
+
+from typing import Any, Final
+
+from companion.beams.hardware.devices import ADAR1000_CHANNELS, vector_modulator
+from companion.node.drive.loop import DeviceError, Safe, Shot, require
+from companion.values import IntArray, UserError
+
+RX_GAIN: Final = 0x10
+RX_MODULATOR: Final = 0x14
+LOAD: Final = 0x28
+LOAD_RX: Final = 0x01
+BYPASSED: Final = 0x80
+"""Bit of a gain register that takes the attenuator out."""
+FULL_GAIN: Final = BYPASSED | 127
+CLOCK_HZ: Final = 10_000_000
+
+
+class Chips:
+    """Chips by bus and device number, in the order of the table's chips."""
+
+    takes_registers = True
+    lead_s = None
+
+    def __init__(self, places: list[tuple[int, int]]) -> None:
+        self._places = places
+        self._lines: list[Any] = []
+
+    def check(self, safe: Safe) -> None:
+        """They have them all."""
+        require(safe, tuple(Safe), "an ADAR1000")
+
+    def open(self) -> None:
+        """Open the lines. Raises ``UserError`` without spidev."""
+        try:
+            import spidev
+        except ImportError as error:
+            raise UserError(f"ADAR1000 over SPI needs spidev: {error}") from error
+        try:
+            for bus, number in self._places:
+                line = spidev.SpiDev()
+                line.open(bus, number)
+                line.max_speed_hz, line.mode = CLOCK_HZ, 0
+                self._lines.append(line)
+        except OSError as error:
+            raise DeviceError(f"SPI {bus}.{number}: {error.strerror or error}") from error
+
+    def apply(self, shot: Shot) -> None:
+        """Write gain, I and Q of every channel, then one load pulse to each chip."""
+        assert shot.registers is not None
+        self._write(shot.registers)
+
+    def rest(self, safe: Safe) -> None:
+        """Hold, look along boresight, or silence every channel."""
+        if safe is Safe.HOLD:
+            return
+        i, q = vector_modulator(0)
+        gain = FULL_GAIN if safe is Safe.BORESIGHT else 0
+        self._send([[(gain, i, q)] * ADAR1000_CHANNELS for _ in self._places])
+
+    def close(self) -> None:
+        """Let go of the lines."""
+        for line in self._lines:
+            line.close()
+        self._lines = []
+
+    def _write(self, registers: IntArray) -> None:
+        chips: list[list[tuple[int, int, int]]] = [[] for _ in self._places]
+        if registers[:, 0].max() >= len(chips):
+            have = f"{len(chips)} chips for {registers[:, 0].max() + 1} of the array"
+            raise UserError(f"adar1000: {have}")
+        for chip, _, _, _, gain, attenuated, i, q in registers.tolist():
+            chips[chip].append((gain | (0 if attenuated else BYPASSED), i, q))
+        self._send(chips)
+
+    def _send(self, chips: list[list[tuple[int, int, int]]]) -> None:
+        """Registers of all chips first, then the pulses close together."""
+        try:
+            for place, (line, channels) in enumerate(zip(self._lines, chips, strict=True)):
+                for number, (gain, i, q) in enumerate(channels):
+                    self._put(line, place, RX_GAIN + number, gain)
+                    self._put(line, place, RX_MODULATOR + 2 * number, i)
+                    self._put(line, place, RX_MODULATOR + 2 * number + 1, q)
+            for place, line in enumerate(self._lines):
+                self._put(line, place, LOAD, LOAD_RX)
+        except OSError as error:
+            raise DeviceError(f"SPI: {error.strerror or error}") from error
+
+    def _put(self, line: Any, place: int, register: int, value: int) -> None:
+        line.xfer2([(place % 4) << 5 | register >> 8, register & 0xFF, value])

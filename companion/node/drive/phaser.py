@@ -1,0 +1,84 @@
+"""An Analog Devices CN0566 Phaser, by pyadi-iio: ``phaser:ip:phaser.local``.             [shell]
+
+Eight elements on two ADAR1000, on receive. Phase, gain and attenuator of every element are written
+and then latched once: ``set_chan_phase``, ``set_chan_gain`` and ``set_all_gain`` of ``adi.CN0566``
+latch at each call, and are not used. Its own calibration is left out, since the service's is in the
+registers already. Which chip and channel an element has is ``adi.CN0566``'s own map; elements count
+from 1 there. It was never on the air: what is tested is its own class over attributes of a libiio
+that records.
+"""
+
+from typing import Any, Final
+
+from companion.node.drive.loop import DeviceError, Safe, Shot, require
+from companion.values import UserError
+
+ELEMENTS: Final = 8
+DEGREES: Final = 360 / 128
+FULL_GAIN: Final = 127
+
+
+class Phaser:
+    """A Phaser, found by a URI of libiio."""
+
+    takes_registers = True
+    lead_s = None
+
+    def __init__(self, uri: str) -> None:
+        self._uri = uri
+        self._phaser: Any = None
+        self._shown: dict[int, tuple[int, int, int]] = {}
+
+    def check(self, safe: Safe) -> None:
+        """It has them all."""
+        require(safe, tuple(Safe), "a Phaser")
+
+    def open(self) -> None:
+        """Connect and put it on receive. Raises ``UserError`` without pyadi-iio."""
+        try:
+            from adi import CN0566
+        except (ImportError, AttributeError, OSError) as error:  # OSError: no libiio beneath it
+            raise UserError(f"a Phaser needs pyadi-iio and libiio: {error}") from error
+        try:
+            self._phaser = CN0566(uri=self._uri)
+            self._phaser.configure(device_mode="rx")
+        except Exception as error:  # pyadi-iio raises no other
+            raise DeviceError(f"no Phaser at {self._uri}: {error}") from error
+        self._shown = {}
+
+    def apply(self, shot: Shot) -> None:
+        """Write what has changed, and latch once."""
+        assert shot.registers is not None
+        rows = shot.registers[:, 2:6].tolist()
+        if sorted(element for element, *_ in rows) != list(range(ELEMENTS)):
+            raise UserError(f"a Phaser has {ELEMENTS} elements, the array has {len(rows)}")
+        self._set({element: (phase, gain, off) for element, phase, gain, off in rows})
+
+    def rest(self, safe: Safe) -> None:
+        """Hold, look along boresight, or silence every element."""
+        match safe:
+            case Safe.BORESIGHT:
+                self._set(dict.fromkeys(range(ELEMENTS), (0, FULL_GAIN, 0)))
+            case Safe.MUTE:
+                self._set(dict.fromkeys(range(ELEMENTS), (0, 0, 1)))
+            case Safe.HOLD:
+                pass
+
+    def close(self) -> None:
+        """Let go of it."""
+        self._phaser = None
+
+    def _set(self, wanted: dict[int, tuple[int, int, int]]) -> None:
+        try:
+            for element, (phase, gain, attenuated) in wanted.items():
+                if self._shown.get(element) == (phase, gain, attenuated):
+                    continue
+                one = self._phaser.elements[element + 1]
+                one.rx_phase = phase * DEGREES
+                one.rx_gain = gain
+                one.rx_attenuator = bool(attenuated)
+            self._phaser.latch_rx_settings()
+        except OSError as error:
+            self._shown = {}
+            raise DeviceError(f"the Phaser at {self._uri}: {error}") from error
+        self._shown = dict(wanted)

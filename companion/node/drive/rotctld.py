@@ -1,0 +1,121 @@
+"""A rotator behind hamlib's rotctld: ``rotctld:HOST:PORT``.                              [shell]
+
+Its protocol is lines of text (rotctld(1) of hamlib): ``P AZ EL`` points, ``p`` asks where it
+points, ``S`` stops; answers end with ``RPRT 0``, or another number for an error.
+"""
+
+import math
+import re
+import socket
+import time
+from collections.abc import Callable
+from typing import Final
+
+from companion.node.drive.lag import MountLag
+from companion.node.drive.loop import DeviceError, Safe, Shot, require
+
+TIMEOUT_S: Final = 2.0
+
+
+class Rotator:
+    """Commanded to where the UAV will be after its own lag, within its limits.
+
+    Its boresight is azimuth and elevation 0.
+    """
+
+    takes_registers = False
+
+    def __init__(self, host: str, port: int, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self._address = host, port
+        self._now_ns = now_ns
+        self._lag = MountLag()
+        self._socket: socket.socket | None = None
+        self._limits_deg = (0.0, 360.0, 0.0, 90.0)
+        self._last_deg = 0.0
+        self._unread = b""
+
+    @property
+    def lead_s(self) -> float:
+        """Its lag, as its own reports show it; 0 before it has moved."""
+        return self._lag.lag_s
+
+    def check(self, safe: Safe) -> None:
+        """A rotator radiates nothing that could be muted."""
+        require(safe, (Safe.HOLD, Safe.BORESIGHT), "a rotator")
+
+    def open(self) -> None:
+        """Connect, and ask for its limits."""
+        try:
+            self._socket = socket.create_connection(self._address, TIMEOUT_S)
+        except OSError as error:
+            host, port = self._address
+            raise DeviceError(f"rotctld at {host}:{port}: {error.strerror or error}") from error
+        self._unread = b""
+        text = self._ask("+\\dump_caps")
+        found = [re.search(rf"{name}:\s*(-?[\d.]+)", text) for name in _LIMITS]
+        if all(found):
+            low, high, least, most = (float(one[1]) for one in found if one)
+            self._limits_deg = low, high, least, most
+        self._last_deg = self._where_deg()[0]
+
+    def apply(self, shot: Shot) -> None:
+        """Point, and note where it points now."""
+        azimuth_deg = self._near(math.degrees(shot.bearing_rad))
+        self._point(azimuth_deg, math.degrees(shot.above_rad))
+        self._lag.told(self._now_ns(), math.radians(azimuth_deg))
+        seen_deg = self._where_deg()[0]
+        self._lag.seen(self._now_ns(), math.radians(seen_deg))
+
+    def rest(self, safe: Safe) -> None:
+        """Stop where it is, or go to its park position."""
+        if safe is Safe.HOLD:
+            self._ask("+S")
+        else:
+            self._point(0.0, 0.0)
+
+    def close(self) -> None:
+        """Hang up."""
+        if self._socket:
+            self._socket.close()
+            self._socket = None
+
+    def _near(self, azimuth_deg: float) -> float:
+        """The same azimuth within its limits, by the shortest way where there are two."""
+        low, high, _, _ = self._limits_deg
+        turns = [azimuth_deg + 360.0 * n for n in (-2, -1, 0, 1, 2)]
+        within = [one for one in turns if low <= one <= high]
+        near = min(within or [low, high], key=lambda one: abs(one - self._last_deg))
+        self._last_deg = near
+        return near
+
+    def _point(self, azimuth_deg: float, elevation_deg: float) -> None:
+        _, _, low, high = self._limits_deg
+        self._ask(f"+P {azimuth_deg:.3f} {min(max(elevation_deg, low), high):.3f}")
+
+    def _where_deg(self) -> tuple[float, float]:
+        text = self._ask("+p")
+        found = re.search(r"Azimuth:\s*(-?[\d.]+)\s+Elevation:\s*(-?[\d.]+)", text)
+        if found is None:
+            raise DeviceError(f"rotctld does not say where it points: {text[:80]!r}")
+        return float(found[1]), float(found[2])
+
+    def _ask(self, command: str) -> str:
+        """The answer to a command in the extended form, which ends with RPRT."""
+        if self._socket is None:
+            raise DeviceError("not connected")
+        try:
+            self._socket.sendall(command.encode() + b"\n")
+            while not (found := re.search(rb"RPRT (-?\d+)\n", self._unread)):
+                more = self._socket.recv(4096)
+                if not more:
+                    raise DeviceError("rotctld hung up")
+                self._unread += more
+        except OSError as error:
+            raise DeviceError(f"rotctld: {error}") from error
+        text, self._unread = self._unread[: found.end()], self._unread[found.end() :]
+        if found[1] != b"0":
+            raise DeviceError(f"rotctld refuses {command!r}: error {found[1].decode()}")
+        return text.decode(errors="replace")
+
+
+_LIMITS: Final = ("Min Azimuth", "Max Azimuth", "Min Elevation", "Max Elevation")

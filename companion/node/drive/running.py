@@ -1,0 +1,68 @@
+"""A drive as a command, and beside a service.                                           [shell]"""
+
+import asyncio
+import signal
+import threading
+from collections.abc import Callable
+from typing import Final
+
+from companion.node.drive.loop import Drive, Told
+
+TOLD_EVERY_S: Final = 1.0
+ENDS_S: Final = 5.0
+"""Time for a device to go to its safe state at the end."""
+
+
+def until_told(drive: Drive, show: Callable[[Told], None], seconds: float | None) -> None:
+    """Drive until SIGINT, SIGTERM or ``seconds`` have passed; ``show`` is called once a second.
+
+    Raises what ended the drive.
+    """
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    failed: list[BaseException] = []
+    thread = threading.Thread(target=_run, args=(drive, stop, failed), name="drive", daemon=True)
+    thread.start()
+    left_s = seconds
+    while thread.is_alive() and not stop.is_set():
+        step_s = TOLD_EVERY_S if left_s is None else min(TOLD_EVERY_S, left_s)
+        if stop.wait(step_s):
+            break
+        show(drive.told())
+        if left_s is not None:
+            left_s -= step_s
+            if left_s <= 0:
+                stop.set()
+    stop.set()
+    thread.join(ENDS_S)
+    if failed:
+        raise failed[0]
+
+
+async def beside(drive: Drive) -> None:
+    """Drive on a thread until cancelled; raises what ended it."""
+    stop, failed = threading.Event(), list[BaseException]()
+    loop, ended = asyncio.get_running_loop(), asyncio.Event()
+
+    def run() -> None:
+        _run(drive, stop, failed)
+        loop.call_soon_threadsafe(ended.set)
+
+    thread = threading.Thread(target=run, name="drive", daemon=True)
+    thread.start()
+    try:
+        await ended.wait()
+    finally:
+        stop.set()
+        await asyncio.to_thread(thread.join, ENDS_S)
+    if failed:
+        raise failed[0]
+
+
+def _run(drive: Drive, stop: threading.Event, failed: list[BaseException]) -> None:
+    try:
+        drive.run(stop)
+    except Exception as error:
+        failed.append(error)
+        stop.set()

@@ -1,0 +1,134 @@
+"""Where a drive takes its beams: a service over HTTP, or the one of this process.        [shell]"""
+
+import asyncio
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from companion.beams.hardware.devices import MEDIA_TYPES, Device
+from companion.client import Client, ServiceError
+from companion.node.drive.loop import Shot, SourceLostError
+from companion.pipeline.assembly import Equipment
+from companion.pipeline.fold import Pipeline
+from companion.values import IntArray, Update, UserError
+from companion.views import beam_state, weight_formats
+
+ADAR1000: Final = MEDIA_TYPES[Device.ADAR1000]
+ANSWERS_S: Final = 5.0
+"""Time after which an event loop that does not answer is lost."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """Whom to follow: the first of these that has a beam, else anybody if so; and for what."""
+
+    uavs: tuple[str, ...]
+    anybody: bool
+    registers: bool
+
+
+class OverHttp:
+    """Beams of a service elsewhere."""
+
+    def __init__(self, client: Client, wanted: Wanted) -> None:
+        self._client = client
+        self._wanted = wanted
+
+    def ask(self, lead_s: float) -> Shot:
+        """What is to be applied so long from now, in two questions for one moment at most."""
+        lead_ms = min(max(lead_s, 0.0), 10.0) * 1e3
+        valid_at_ns = time.time_ns() + round(lead_ms * 1e6)
+        try:
+            told = self._client.beams(lead_ms)
+            text = self._client.table(ADAR1000, lead_ms) if self._wanted.registers else None
+        except ServiceError as error:
+            if error.status == 409:
+                return Shot(valid_at_ns, error.title)
+            raise SourceLostError(str(error)) from error
+        return chosen(told, text, self._wanted, valid_at_ns)
+
+
+class OfThisProcess:
+    """Beams of the pipeline of this process, which lives on an event loop."""
+
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        pipeline: Pipeline,
+        equipment: Equipment,
+        now_ns: Callable[[], int],
+        wanted: Wanted,
+    ) -> None:
+        self._loop = loop
+        self._pipeline = pipeline
+        self._equipment = equipment
+        self._now_ns = now_ns
+        self._wanted = wanted
+
+    def ask(self, lead_s: float) -> Shot:
+        """What is to be applied so long from now: made on the loop, worded here."""
+        asked = asyncio.run_coroutine_threadsafe(self._look(lead_s), self._loop)
+        try:
+            update = asked.result(ANSWERS_S)
+        except (TimeoutError, asyncio.CancelledError) as error:
+            raise SourceLostError("it does not answer") from error
+        return shot_of(self._pipeline, self._equipment, update, self._wanted)
+
+    async def _look(self, lead_s: float) -> Update:
+        return self._pipeline.look(self._now_ns(), lead_s)
+
+
+def shot_of(pipeline: Pipeline, equipment: Equipment, update: Update, wanted: Wanted) -> Shot:
+    """What is to be applied of one update."""
+    beams, text = update.beams, None
+    if update.unfit is not None:
+        return Shot(beams.valid_at_ns, update.unfit)
+    if wanted.registers and beams.beams:
+        try:
+            text = weight_formats.encode(
+                Device.ADAR1000, beams, pipeline.array, equipment, 0.0
+            ).decode()
+        except UserError as error:
+            return Shot(beams.valid_at_ns, str(error))
+    told = {"unfit": None, "beams": beam_state.pointing(pipeline, update)}
+    return chosen(told, text, wanted, beams.valid_at_ns)
+
+
+def chosen(told: dict[str, Any], text: str | None, wanted: Wanted, valid_at_ns: int) -> Shot:
+    """The shot for whom is wanted, of what the API says."""
+    if told["unfit"] is not None:
+        return Shot(valid_at_ns, str(told["unfit"]))
+    named = {beam["uav"]: beam for beam in told["beams"]}
+    uav = next((one for one in wanted.uavs if one in named), None)
+    if uav is None and wanted.anybody:
+        uav = next(iter(named), None)
+    if uav is None:
+        return Shot(valid_at_ns, "nobody who is to be followed has a beam")
+    beam, rows = named[uav], None if text is None else registers_of(text, uav)
+    if rows is not None and not len(rows):
+        return Shot(valid_at_ns, f"{uav} has no beam in the device's table")
+    return Shot(
+        valid_at_ns,
+        None,
+        uav,
+        math.radians(beam["bearing_deg"]),
+        math.radians(beam["above_horizon_deg"]),
+        rows,
+    )
+
+
+def registers_of(text: str, uav: str) -> IntArray:
+    """The registers (M, 8) of one UAV's beam in the text for ADAR1000; empty where it has none."""
+    rows = [line.split(",") for line in text.splitlines()[1:]]
+    return np.array(
+        [
+            [*map(int, (*row[2:6], row[7], row[8])), int(row[9], 16), int(row[10], 16)]
+            for row in rows
+            if row[1] == uav
+        ],
+        dtype=np.int64,
+    ).reshape(-1, 8)

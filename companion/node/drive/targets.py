@@ -1,0 +1,73 @@
+"""What a drive can be told to drive; a device's file is loaded when it is asked for.      [shell]
+
+rotctld:HOST:PORT       a rotator behind hamlib's rotctld
+phaser:URI              an Analog Devices CN0566 (ip:phaser.local), by pyadi-iio
+adar1000:BUS.DEVICE...  ADAR1000 chips on Linux's SPI, in the order of the table's chips
+none:pointing           nothing: a dry run prints what would be sent
+none:adar1000
+"""
+
+import re
+from collections.abc import Callable
+
+from companion.node.drive.loop import Device, Safe, Shot
+from companion.values import UserError
+
+FORMS = "rotctld:HOST:PORT, phaser:URI, adar1000:BUS.DEVICE[,...], none:pointing, none:adar1000"
+
+
+def device(target: str, say: Callable[[str], None]) -> Device:
+    """The device of a target; ``say`` gets what a dry run would send. Raises ``UserError``."""
+    kind, _, where = target.partition(":")
+    match kind:
+        case "rotctld":
+            host, _, port = where.rpartition(":")
+            if host and port.isdecimal() and 0 < int(port) < 65536:
+                from companion.node.drive.rotctld import Rotator
+
+                return Rotator(host.strip("[]"), int(port))
+        case "phaser" if where:
+            from companion.node.drive.phaser import Phaser
+
+            return Phaser(where)
+        case "adar1000" if re.fullmatch(r"\d{1,3}\.\d{1,3}(,\d{1,3}\.\d{1,3})*", where):
+            from companion.node.drive.adar1000 import Chips
+
+            places = [tuple(map(int, one.split("."))) for one in where.split(",")]
+            return Chips([(bus, number) for bus, number in places])
+        case "none" if where in ("pointing", "adar1000"):
+            return DryRun(where == "adar1000", say)
+    raise UserError(f"{target!r} is none of {FORMS}")
+
+
+class DryRun:
+    """A device that takes everything and only says it."""
+
+    lead_s = None
+
+    def __init__(self, takes_registers: bool, say: Callable[[str], None]) -> None:
+        self.takes_registers = takes_registers
+        self._say = say
+
+    def check(self, safe: Safe) -> None:
+        """Any state will do."""
+
+    def open(self) -> None:
+        """There is nothing to open."""
+
+    def apply(self, shot: Shot) -> None:
+        """Say what would be sent."""
+        if shot.registers is None:
+            degrees = 57.29577951308232
+            bearing, above = shot.bearing_rad * degrees, shot.above_rad * degrees
+            self._say(f"{shot.uav}: bearing {bearing:.2f}, {above:.2f} above the horizon")
+            return
+        sets = [f"{one[2]}:{one[3]}/{one[4]}{'a' if one[5] else ''}" for one in shot.registers]
+        self._say(f"{shot.uav}: element:phase/gain {' '.join(sets)}")
+
+    def rest(self, safe: Safe) -> None:
+        """Say where it would go."""
+        self._say(f"safe state: {safe}")
+
+    def close(self) -> None:
+        """There is nothing to close."""

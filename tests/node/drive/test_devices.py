@@ -1,0 +1,378 @@
+"""Devices as they are driven: a chip that decodes its registers, the Phaser's own class over a
+libiio that records, and codes as the device's text has them."""
+
+import sys
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from device_reading import parse
+from support import ROOT
+
+from companion.beams.hardware.calibration import Calibration
+from companion.beams.hardware.devices import Device
+from companion.node import moment
+from companion.node.drive import targets
+from companion.node.drive.loop import DeviceError, Drive, Safe, Shot, SourceLostError
+from companion.node.drive.sources import Wanted, shot_of
+from companion.pipeline import assembly
+from companion.settings.model import Settings
+from companion.values import UserError
+from companion.views import weight_formats
+
+EIGHT = Settings().override(center={"source": "5:1"}, array={"elements": 8, "frequency_hz": 10.5e9})
+
+
+@pytest.fixture(scope="module")
+def flown() -> tuple[Shot, Any, str]:
+    """A shot of a real flight, its UAV's beam as the device's text reads back, and that text."""
+    log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
+    pipeline, update = moment.look([log], EIGHT, "3")
+    equipment = assembly.equipment(EIGHT, pipeline.array)
+    wanted = Wanted(("3:1",), False, True)
+    shot = shot_of(pipeline, equipment, update, wanted)
+    text = weight_formats.encode("adar1000", update.beams, pipeline.array, equipment, 0).decode()
+    read = parse(Device.ADAR1000, text, Calibration.ideal(range(8)))
+    return shot, read, text
+
+
+class Always:
+    """A source that has always the same; None is a service that is lost."""
+
+    def __init__(self, *shots: Shot | None) -> None:
+        self._shots = list(shots)
+        self.leads_s: list[float] = []
+
+    def ask(self, lead_s: float) -> Shot:
+        self.leads_s.append(lead_s)
+        shot = self._shots.pop(0) if len(self._shots) > 1 else self._shots[0]
+        if shot is None:
+            raise SourceLostError("connection refused")
+        return shot
+
+
+class Ticking:
+    """A clock that is told how time passes."""
+
+    def __init__(self) -> None:
+        self.t_ns = 0
+
+    def now_ns(self) -> int:
+        return self.t_ns
+
+
+# --- ADAR1000 over SPI --------------------------------------------------------------------------
+
+
+class Chip:
+    """What an ADAR1000 would hold: registers as written, and what is loaded from them."""
+
+    def __init__(self) -> None:
+        self.registers: dict[int, int] = {}
+        self.loads = 0
+        self.radiates: list[tuple[int, int, int]] = []
+        self.closed = False
+        self.max_speed_hz = self.mode = 0
+
+    def open(self, bus: int, number: int) -> None:
+        if bus == 9:
+            raise FileNotFoundError(2, "No such file or directory")
+        CHIPS[bus, number] = self
+
+    def xfer2(self, word: list[int]) -> list[int]:
+        assert len(word) == 3
+        assert word[0] & 0x80 == 0  # a write
+        register = (word[0] & 0x1F) << 8 | word[1]
+        self.address = word[0] >> 5 & 3
+        self.registers[register] = word[2]
+        if register == 0x28 and word[2] & 1:
+            self.loads += 1
+            kept = self.registers
+            self.radiates = [
+                (kept[0x10 + n], kept[0x14 + 2 * n], kept[0x15 + 2 * n]) for n in range(4)
+            ]
+        return [0, 0, 0]
+
+    def close(self) -> None:
+        self.closed = True
+
+
+CHIPS: dict[tuple[int, int], Chip] = {}
+
+
+@pytest.fixture
+def spidev(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[tuple[int, int], Chip]]:
+    module = ModuleType("spidev")
+    module.SpiDev = Chip  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "spidev", module)
+    CHIPS.clear()
+    yield CHIPS
+
+
+def factor(gain: int, i: int, q: int) -> complex:
+    """What a channel's registers radiate, by the data sheet's tables alone: sign and magnitude."""
+    signed = [(value & 0x1F) * (1 if value & 0x20 else -1) for value in (i, q)]
+    amplitude = (gain & 0x7F) / 127 * (1.0 if gain & 0x80 else 10 ** (-15 / 20))
+    turned = complex(*signed)
+    return amplitude * turned / abs(turned)
+
+
+def test_registers_of_chips_radiate_what_the_text_says(
+    spidev: dict[tuple[int, int], Chip], flown: tuple[Shot, Any, str]
+) -> None:
+    shot, read, _ = flown
+    device = targets.device("adar1000:0.0,0.1", print)
+    clock = Ticking()
+    drive = Drive(Always(shot), device, 100.0, Safe.MUTE, clock.now_ns, lambda _: None)
+    for n in range(1, 4):
+        drive.step()
+        assert [chip.loads for chip in spidev.values()] == [n, n]  # one pulse an update
+    got = [factor(*one) for key in ((0, 0), (0, 1)) for one in spidev[key].radiates]
+    wanted = read.weights[:, list(read.uavs).index("3:1")]
+    turn = np.vdot(got, wanted)
+    assert abs(turn) / (np.linalg.norm(got) * np.linalg.norm(wanted)) > 0.9995
+    steps = np.angle(np.array(got) * turn / wanted)  # a modulator's magnitudes are of 5 bits
+    assert np.abs(steps).max() < np.radians(2.8)
+    np.testing.assert_allclose(np.abs(got), np.abs(wanted), rtol=1e-9)
+    assert [spidev[0, n].address for n in (0, 1)] == [0, 1]
+    drive.end()
+    assert all(gain == 0 for chip in spidev.values() for gain, _, _ in chip.radiates)
+    assert all(chip.closed for chip in spidev.values())
+
+
+def test_too_few_chips_are_a_mistake_of_one_line(
+    spidev: dict[tuple[int, int], Chip], flown: tuple[Shot, Any, str]
+) -> None:
+    device = targets.device("adar1000:0.0", print)
+    drive = Drive(Always(flown[0]), device, 100.0, Safe.HOLD, Ticking().now_ns, print)
+    with pytest.raises(UserError, match="1 chips for 2 of the array"):
+        drive.run(threading.Event())
+
+
+def test_a_line_that_is_not_there_is_tried_again_each_second(
+    spidev: dict[tuple[int, int], Chip], flown: tuple[Shot, Any, str]
+) -> None:
+    clock, said = Ticking(), list[str]()
+    device = targets.device("adar1000:9.0", print)
+    drive = Drive(Always(flown[0]), device, 100.0, Safe.HOLD, clock.now_ns, said.append)
+    for _ in range(300):  # three seconds
+        drive.step()
+        clock.t_ns += 10_000_000
+    assert drive.told().failures == 3
+    assert said == ["the device failed: SPI 9.0: No such file or directory"]
+
+
+# --- the Phaser ---------------------------------------------------------------------------------
+
+
+class Attribute:
+    def __init__(self, log: list[tuple[str, str, str]], where: str, name: str, value: str) -> None:
+        self._log, self._where, self._name, self._value = log, where, name, value
+
+    @property
+    def value(self) -> str:
+        return self._value
+
+    @value.setter
+    def value(self, value: str) -> None:
+        self._value = value
+        self._log.append((self._where, self._name, value))
+
+
+class Attributes(dict[str, Attribute]):
+    """Attributes of a device or channel: all there are, each writable, and every write noted."""
+
+    def __init__(self, log: list[tuple[str, str, str]], where: str) -> None:
+        super().__init__()
+        self._log, self._where = log, where
+
+    def __missing__(self, name: str) -> Attribute:
+        value = "disabled PFD" if name.endswith("_available") else "0"
+        self[name] = Attribute(self._log, self._where, name, value)
+        return self[name]
+
+
+class IioDevice:
+    def __init__(self, log: list[tuple[str, str, str]], name: str, label: str) -> None:
+        self.name, self.label, self._log = name, label, log
+        self.attrs = self.debug_attrs = Attributes(log, label or name)
+        self.channels = [SimpleNamespace(id=f"voltage{n}", attrs={}) for n in range(8)]
+
+    def find_channel(self, name: str, output: bool = False) -> Any:
+        where = f"{self.label or self.name}/{'out' if output else 'in'}/{name}"
+        return SimpleNamespace(id=name, attrs=Attributes(self._log, where), output=output)
+
+    def reg_write(self, register: int, value: int) -> None:
+        self._log.append((self.label, f"reg {register:#x}", str(value)))
+
+
+CONTEXT: list[Any] = []
+
+
+@pytest.fixture
+def iio(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str, str]]:
+    """What is written to libiio: device, or channel of one, attribute, value."""
+    log: list[tuple[str, str, str]] = []
+    names = [
+        ("adf4159", ""),
+        ("adar1000", "BEAM0"),
+        ("adar1000", "BEAM1"),
+        ("one-bit-adc-dac", ""),
+        ("ad7291", ""),
+    ]
+    made = [IioDevice(log, *name) for name in names]
+    context = SimpleNamespace(
+        devices=made,
+        find_device=lambda name: next((one for one in made if one.name == name), None),
+    )
+    CONTEXT[:] = [context]  # adi keeps the module that it was loaded with
+    module = ModuleType("iio")
+    module.version = (0, 26, "recording")  # type: ignore[attr-defined]
+    module.Context = lambda uri: CONTEXT[0]  # type: ignore[attr-defined]
+    module.Device = IioDevice  # type: ignore[attr-defined]
+    module.__getattr__ = lambda name: type(name, (), {})  # type: ignore[method-assign]
+    monkeypatch.setitem(sys.modules, "iio", module)
+    adi = pytest.importorskip("adi")
+    monkeypatch.setattr("adi.cn0566.sleep", lambda _: None)
+    monkeypatch.setattr(adi, "one_bit_adc_dac", lambda uri: SimpleNamespace(gpio_muxout=0))
+    monkeypatch.setattr(adi, "ad7291", lambda uri: SimpleNamespace())
+    return log
+
+
+MAP = {"BEAM0": [7, 8, 5, 6], "BEAM1": [3, 4, 1, 2]}
+"""Elements of the channels of both chips, as Analog Devices' class has them."""
+
+
+def test_a_phaser_gets_the_codes_of_the_text_and_one_latch_an_update(
+    iio: list[tuple[str, str, str]], flown: tuple[Shot, Any, str]
+) -> None:
+    shot, read, text = flown
+    device = targets.device("phaser:ip:phaser.local", print)
+    drive = Drive(Always(shot), device, 100.0, Safe.BORESIGHT, Ticking().now_ns, print)
+    drive.step()
+    configured = len(iio)
+    before = [entry for entry in iio if entry[1] == "rx_load_spi"]
+    codes = {
+        int(row[4]): (float(row[6]), int(row[7]), int(row[8]))
+        for row in (line.split(",") for line in text.splitlines()[1:])
+        if row[1] == "3:1"
+    }
+    assert len(before) == 2 * 2  # configuring latches each chip once; the update once
+    last = {(where, name): value for where, name, value in iio}
+    for chip, elements in MAP.items():
+        for channel, element in enumerate(elements):
+            where = f"{chip}/in/voltage{channel}"
+            phase, gain, attenuated = codes[element - 1]
+            assert float(last[where, "phase"]) == pytest.approx(phase, abs=1e-4)
+            assert int(float(last[where, "hardwaregain"])) == gain
+            assert int(last[where, "attenuation"]) == 1 - attenuated
+    drive.step()
+    latched = Counter(name for _, name, _ in iio[configured:])
+    assert latched == {"rx_load_spi": 2}  # of what has not changed nothing is written again
+    drive.end()
+    last = {(where, name): value for where, name, value in iio}
+    assert {value for (_, name), value in last.items() if name == "phase"} == {"0.0"}
+    assert read.uavs == ("1:1", "2:1", "3:1", "4:1") or "3:1" in read.uavs
+
+
+def test_an_array_that_is_no_phaser_is_refused(
+    iio: list[tuple[str, str, str]], flown: tuple[Shot, Any, str]
+) -> None:
+    shot = flown[0]
+    assert shot.registers is not None
+    half = Shot(shot.valid_at_ns, None, shot.uav, 0.0, 0.0, shot.registers[:4])
+    device = targets.device("phaser:ip:phaser.local", print)
+    drive = Drive(Always(half), device, 100.0, Safe.HOLD, Ticking().now_ns, print)
+    with pytest.raises(UserError, match="8 elements, the array has 4"):
+        drive.step()
+
+
+# --- the loop -----------------------------------------------------------------------------------
+
+
+class Recorder:
+    """A device that notes what is asked of it, and takes its time."""
+
+    takes_registers = False
+    lead_s = None
+
+    def __init__(self, clock: Ticking, takes_s: float = 0.0) -> None:
+        self.did: list[str] = []
+        self.fails = False
+        self._clock, self._takes_ns = clock, round(takes_s * 1e9)
+
+    def check(self, safe: Safe) -> None: ...
+
+    def open(self) -> None:
+        self.did.append("open")
+
+    def apply(self, shot: Shot) -> None:
+        if self.fails:
+            raise DeviceError("cable")
+        self._clock.t_ns += self._takes_ns
+        self.did.append("apply")
+
+    def rest(self, safe: Safe) -> None:
+        self.did.append(str(safe))
+
+    def close(self) -> None:
+        self.did.append("close")
+
+
+def test_a_device_rests_once_while_there_is_nothing_and_at_the_end() -> None:
+    clock = Ticking()
+    device, said = Recorder(clock), list[str]()
+    fit, stale = Shot(0, None, "1:1"), Shot(0, "its attitude is too old")
+    source = Always(fit, stale, stale, None, None, fit, fit)
+    drive = Drive(source, device, 10.0, Safe.MUTE, clock.now_ns, said.append)
+    for _ in range(7):
+        drive.step()
+    drive.end()
+    assert device.did == ["open", "apply", "mute", "apply", "apply", "mute", "close"]
+    assert said == [
+        "the device is reached",
+        "mute: its attitude is too old",
+        "mute: the service is lost: connection refused",
+        "beams are applied",
+    ]
+
+
+def test_the_lead_is_the_device_s_own_time_and_late_ones_are_counted() -> None:
+    clock = Ticking()
+    device, source = Recorder(clock, 0.03), Always(Shot(0, None, "1:1"))
+    drive = Drive(source, device, 10.0, Safe.HOLD, clock.now_ns, print)
+    for _ in range(5):
+        drive.step()
+    assert source.leads_s == pytest.approx([0.0, 0.03, 0.03, 0.03, 0.03])
+    told = drive.told()
+    assert (told.p50_ms, told.p99_ms) == pytest.approx((30.0, 30.0))
+    assert told.late == 5  # they were all right at 0
+
+
+def test_a_device_that_fails_is_opened_again_and_rests_again() -> None:
+    clock = Ticking()
+    device, said = Recorder(clock), list[str]()
+    source = Always(Shot(0, "no carrier"), Shot(0, None, "1:1"), Shot(0, "no carrier"))
+    drive = Drive(source, device, 10.0, Safe.BORESIGHT, clock.now_ns, said.append)
+    drive.step()
+    device.fails = True
+    drive.step()
+    device.fails = False
+    drive.step()  # not yet
+    clock.t_ns += 1_000_000_000
+    drive.step()
+    assert device.did == ["open", "boresight", "close", "open", "boresight"]
+    assert drive.told().failures == 1
+
+
+@pytest.mark.parametrize(
+    "target",
+    ["rotctld:here", "rotctld:h:0", "adar1000:0", "phaser:", "none:", "laser:1", "adar1000:0.0,"],
+)
+def test_a_target_that_is_none_is_refused(target: str) -> None:
+    with pytest.raises(UserError, match="is none of rotctld:HOST:PORT"):
+        targets.device(target, print)

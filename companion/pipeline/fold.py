@@ -138,8 +138,9 @@ class Pipeline:
         return [*self.assumptions.clock(t_ns, sender, change, drift_max_ppm)]
 
     def _report(self, placed: PlacedReport) -> list[Output]:
-        if self.center.seeks_home and not self.senders.vouched(placed.report):
-            report = placed.report
+        report = placed.report
+        begins = self.center.seeks_home or report.uav not in self.fleet
+        if begins and not self.senders.vouched(report, self.center.seeks_home):
             return [Rejection(report.t_ns, report.uav, Reason.NO_FIX)]
         fix, begun = self.center.fix(placed)
         fix, refuted = self.fleet.refuted(fix)
@@ -172,6 +173,7 @@ class Pipeline:
         self.fleet.forget(uav)
         self.assumptions.forget(uav)
         self.refusals.forget(uav)
+        self.senders.forget(uav)
         self.center.restarted(uav)
 
     def _tick(self, now_ns: int) -> list[Output]:

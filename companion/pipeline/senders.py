@@ -45,6 +45,8 @@ from companion.values import (
 
 CLOCKS_MAX: Final = 4096
 """Clocks kept. Beyond it those of senders without a track are forgotten, the oldest first."""
+WAITS_NS: Final = 10_000_000_000
+"""Time for which a track waits for its receiver to vouch for it."""
 FIX_3D: Final = 3
 """GPS_FIX_TYPE_3D_FIX; better fixes have greater numbers."""
 NEAR_HEIGHT_M: Final = 50.0
@@ -121,6 +123,7 @@ class Senders:
         self._shared: set[str] = set()
         self._known: dict[str, assembly.Assumed] = {}  # by UAV
         self._receivers: dict[Source, GnssStatus] = {}
+        self._waits: dict[str, int] = {}  # since when a UAV's receiver does not vouch for it
 
     # --- what they say ----------------------------------------------------------------------
 
@@ -260,12 +263,21 @@ class Senders:
         text = f"two vehicles share the id {uav}: neither is believed"
         return Notice(t_ns, Severity.WARNING, uav, text), refused
 
-    def vouched(self, report: Report) -> bool:
-        """Whether a sender's receiver, if one was heard, has a 3-D fix near its report's height."""
+    def vouched(self, report: Report, always: bool) -> bool:
+        """Whether a sender's receiver, if one was heard, has a 3-D fix near its report's height.
+
+        A track need not wait for that for more than ``WAITS_NS``: heights may be of other data for
+        good. Home does, ``always``.
+        """
         receiver = self._receivers.get(report.source)
         if receiver is None or not reports_itself(report.uav):
             return True
-        return receiver.fix_type >= FIX_3D and abs(receiver.alt_m - report.alt_m) < NEAR_HEIGHT_M
+        if receiver.fix_type >= FIX_3D and abs(receiver.alt_m - report.alt_m) < NEAR_HEIGHT_M:
+            self._waits.pop(report.uav, None)
+            return True
+        return not always and report.t_ns - self._waits.setdefault(report.uav, report.t_ns) >= (
+            WAITS_NS
+        )
 
     # --- when they said it ------------------------------------------------------------------
 
@@ -312,6 +324,10 @@ class Senders:
         return self._known[uav]
 
     # --- memory -----------------------------------------------------------------------------
+
+    def forget(self, uav: str) -> None:
+        """Forget for how long a sender's receiver has not vouched for it: it begins anew."""
+        self._waits.pop(uav, None)
 
     def forget_clocks(self, wanted: Container[str]) -> None:
         """Keep ``CLOCKS_MAX`` clocks and those that are wanted, dropping the oldest others."""

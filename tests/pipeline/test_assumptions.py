@@ -127,7 +127,7 @@ def test_reports_of_a_fast_aircraft_with_a_good_receiver_are_all_used() -> None:
     """150 m/s at 20 Hz and a centimetre of accuracy: a millisecond is worth more than that."""
     into = pipeline(observer={"speed_max_mps": 160.0})
     good = dialect.MAVLink_gps_raw_int_message(
-        0, 6, 0, 0, round(ALT_M * 1e3), 100, 100, 0, 0, 12, 0, 10, 10, 10
+        0, 6, 0, 0, round((ALT_M + 100) * 1e3), 100, 100, 0, 0, 12, 0, 10, 10, 10
     )
     out = run(into, [heartbeat(0, "1:1", 1, 12), sent(0, "1:1", good)])
     rng = np.random.default_rng(1)
@@ -198,6 +198,23 @@ def test_home_waits_for_a_receiver_that_vouches() -> None:
     assert into.local is not None
     (update,) = (one for one in into.step(Tick(START_NS + 3 * S)) if isinstance(one, Update))
     assert update.carrier is not None
+
+
+def test_a_track_waits_for_a_receiver_that_vouches_but_not_for_ever() -> None:
+    """Its height is 500 m off for three seconds; another's is so for good."""
+    into = pipeline("9:1")
+    for uav, wrong_s in (("1:1", 3.0), ("2:1", 99.0)):
+        out: list[Output] = []
+        for n in range(75):
+            t_s = n / 5
+            off_m = 500.2 if t_s < wrong_s else 0.0
+            said = [receiver(t_s, uav, 3, ALT_M)] if n % 5 == 0 else []
+            out += run(into, [*said, position(t_s + 0.05, uav, (0, 0, off_m))])
+        begun = next(one for one in out if isinstance(one, Estimate))
+        waited_s = (begun.fix.t_ns - START_NS) * 1e-9
+        assert waited_s == pytest.approx(min(wrong_s, 10.0), abs=0.3)
+        refused = [one for one in out if isinstance(one, Rejection)]
+        assert {one.reason for one in refused} == {Reason.NO_FIX}
 
 
 def test_home_moves_where_its_first_height_was_wrong() -> None:

@@ -11,16 +11,22 @@ from companion.values import BeamSet
 
 
 def device_table(
-    device: Device, beam_set: BeamSet, array: Array, equipment: Equipment
+    device: Device,
+    beam_set: BeamSet,
+    array: Array,
+    equipment: Equipment,
+    only: str | None = None,
 ) -> tables.DeviceTable:
     """The settings of a device that come nearest to the weights.
 
-    Each beam is fitted towards its own UAV and away from the others of its group. Raises
-    ``UserError``, with the reason, for what the device cannot do.
+    Each beam, or only that of one UAV, is fitted towards its own UAV and away from the others of
+    its group. Raises ``UserError``, with the reason, for what the device cannot do.
     """
     steering = steering_matrix(array, directions(beam_set))
     wanted = []
     for i, beam in enumerate(beam_set.beams):
+        if only not in (None, beam.uav):
+            continue
         others = [j for j, one in enumerate(beam_set.beams) if j != i and one.group == beam.group]
         wanted.append(
             tables.WantedBeam(

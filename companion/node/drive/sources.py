@@ -3,19 +3,21 @@
 import asyncio
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
+from companion.beams.hardware import tables
 from companion.beams.hardware.devices import MEDIA_TYPES, Device
 from companion.client import Client, ServiceError
 from companion.node.drive.loop import Shot, SourceLostError
 from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
 from companion.values import IntArray, Update, UserError
-from companion.views import beam_state, weight_formats
+from companion.views import beam_state
+from companion.views.quantised import device_table
 
 ADAR1000: Final = MEDIA_TYPES[Device.ADAR1000]
 ANSWERS_S: Final = 5.0
@@ -83,19 +85,23 @@ class OfThisProcess:
 
 
 def shot_of(pipeline: Pipeline, equipment: Equipment, update: Update, wanted: Wanted) -> Shot:
-    """What is to be applied of one update."""
+    """What is to be applied of one update. Only the beam that is wanted is fitted to the device."""
     beams, text = update.beams, None
-    if update.unfit is not None:
-        return Shot(beams.valid_at_ns, update.unfit)
-    if wanted.registers and beams.beams:
+    uav = followed(beams.uavs, wanted)
+    if update.unfit is None and uav is not None and wanted.registers:
         try:
-            text = weight_formats.encode(
-                Device.ADAR1000, beams, pipeline.array, equipment, 0.0
-            ).decode()
+            table = device_table(Device.ADAR1000, beams, pipeline.array, equipment, uav)
+            text = tables.encode(table)
         except UserError as error:
             return Shot(beams.valid_at_ns, str(error))
-    told = {"unfit": None, "beams": beam_state.pointing(pipeline, update)}
+    told = {"unfit": update.unfit, "beams": beam_state.pointing(pipeline, update)}
     return chosen(told, text, wanted, beams.valid_at_ns)
+
+
+def followed(uavs: Collection[str], wanted: Wanted) -> str | None:
+    """Who of those that have beams is served; None where nobody is."""
+    uav = next((one for one in wanted.uavs if one in uavs), None)
+    return next(iter(uavs), None) if uav is None and wanted.anybody else uav
 
 
 def chosen(told: dict[str, Any], text: str | None, wanted: Wanted, valid_at_ns: int) -> Shot:
@@ -103,9 +109,7 @@ def chosen(told: dict[str, Any], text: str | None, wanted: Wanted, valid_at_ns: 
     if told["unfit"] is not None:
         return Shot(valid_at_ns, str(told["unfit"]))
     named = {beam["uav"]: beam for beam in told["beams"]}
-    uav = next((one for one in wanted.uavs if one in named), None)
-    if uav is None and wanted.anybody:
-        uav = next(iter(named), None)
+    uav = followed(named, wanted)
     if uav is None:
         return Shot(valid_at_ns, "nobody who is to be followed has a beam")
     beam, rows = named[uav], None if text is None else registers_of(text, uav)

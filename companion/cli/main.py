@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import companion
+from companion.cli.calibrate import calibrate
 from companion.cli.check import check
 from companion.cli.console import (
     CENTER,
@@ -276,6 +277,7 @@ def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
 
 
+main.add_command(calibrate)
 main.add_command(check)
 main.add_command(design)
 main.add_command(drive)

@@ -1,0 +1,133 @@
+"""Calibration from measured responses: one source at known directions, each channel by itself.
+
+In direction k channel c, which drives element m, answers
+
+    y_kc = s_k h_m a_m(u_k) + noise
+
+with a the steering vector, h_m what the channel adds, and s_k the source, known neither in phase
+nor in level. With z = y / a the best s and h in the sense of least squares are the first singular
+vectors of z (Eckart and Young). Only ratios of h can be told: phases are over that of element 0,
+gains over the mean in dB.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from companion.beams.array.geometry import Array
+from companion.beams.array.steering import steering_matrix, unit_directions
+from companion.beams.hardware.calibration import (
+    BOUNDED_HEADER,
+    Calibration,
+    channel_error,
+    fields,
+    real,
+    whole,
+)
+from companion.values import ComplexArray, FloatArray, UserError
+
+MEASURED_HEADER: Final = "azimuth_deg,elevation_deg,channel,phase_deg,gain_db"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Responses:
+    """Responses (K, M) of channels by themselves to a source at unit directions (K, 3)."""
+
+    directions: FloatArray
+    responses: ComplexArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """A calibration with bounds, and what it leaves.
+
+    phase_deg, gain_db  largest errors that remain, of all channels and directions
+    cost_db             most that a matched beam's guarantee loses to them
+    """
+
+    calibration: Calibration
+    phase_deg: float
+    gain_db: float
+    cost_db: float
+
+
+def parse_responses(text: str) -> Responses:
+    """Read CSV with the header ``MEASURED_HEADER``: a line for each direction and channel.
+
+    Raises ``UserError`` that names the line, or what is missing.
+    """
+    found: dict[tuple[float, float], dict[int, complex]] = {}
+    for number, row in fields(text, MEASURED_HEADER):
+        towards = real(number, "azimuth_deg", row[0]), real(number, "elevation_deg", row[1])
+        channel = whole(number, "channel", row[2], 0, 4095)
+        phase_deg, gain_db = real(number, "phase_deg", row[3]), real(number, "gain_db", row[4])
+        channels = found.setdefault(towards, {})
+        if channel in channels:
+            raise UserError(f"line {number}: channel {channel} stands twice at {towards}")
+        channels[channel] = 10 ** (gain_db / 20) * np.exp(1j * np.radians(phase_deg))
+    size = max((len(channels) for channels in found.values()), default=0)
+    for towards, channels in found.items():
+        missing = set(range(size)) - set(channels)
+        if missing:
+            raise UserError(f"channel {min(missing)} of {size} has no response at {towards}")
+    if not found:
+        raise UserError("there is no response at all")
+    angles = np.radians(np.array(list(found)))
+    responses = np.array([[one[c] for c in range(size)] for one in found.values()])
+    return Responses(unit_directions(angles[:, 0], angles[:, 1]), responses)
+
+
+def fitted(measured: Responses, array: Array, order: Sequence[int]) -> Found:
+    """The calibration nearest to the responses; ``order`` is the element of each channel.
+
+    Its bounds are the largest errors that remain for each channel: of what was measured, no more.
+    Raises ``UserError`` where responses do not fit the array.
+    """
+    responses, places = measured.responses, list(order)
+    if responses.shape[1] != array.size:
+        raise UserError(f"{responses.shape[1]} channels for {array.size} elements")
+    if len(responses) < 2:
+        raise UserError("one direction shows no error: measure two or more")
+    steering = steering_matrix(array, measured.directions).T[:, places]
+    if not steering.all():
+        raise UserError("an element answers nothing in one of these directions, or is dead")
+    seen = responses / steering
+    u, s, vh = np.linalg.svd(seen, full_matrices=False)
+    source, channel = u[:, 0] * s[0], vh[0]
+    if not channel.all() or not source.all():
+        raise UserError("a channel, or the source in one direction, answered nothing")
+    off = seen / np.outer(source, channel)
+    factors = np.empty(array.size, dtype=complex)
+    factors[places] = channel
+    phase_off, gain_off = np.empty(array.size), np.empty(array.size)
+    phase_off[places] = np.abs(np.angle(off)).max(axis=0)
+    gain_off[places] = np.abs(20 * np.log10(np.abs(off))).max(axis=0)
+    gains = 20 * np.log10(np.abs(factors))
+    calibration = Calibration(
+        tuple(np.angle(factors / factors[0]).tolist()),
+        tuple((gains - gains.mean()).tolist()),
+        tuple(places),
+        tuple(phase_off.tolist()),
+        tuple(gain_off.tolist()),
+    )
+    share = 1 - float(channel_error(phase_off, gain_off).mean())
+    return Found(
+        calibration,
+        float(np.degrees(phase_off.max())),
+        float(gain_off.max()),
+        -20 * float(np.log10(share)) if share > 0 else np.inf,
+    )
+
+
+def as_text(calibration: Calibration) -> str:
+    """The CSV that ``parse_calibration`` reads, with bounds."""
+    errors = calibration.phase_error_rad, calibration.gain_error_db
+    phase_off, gain_off = (found or (0.0,) * len(calibration.order) for found in errors)
+    lines = [BOUNDED_HEADER]
+    for channel, m in enumerate(calibration.order):
+        numbers = (np.degrees(calibration.phase_rad[m]), calibration.gain_db[m])
+        bounds = (np.degrees(phase_off[m]), gain_off[m])
+        lines.append(",".join([f"{channel},{m}", *(f"{x:.6f}" for x in (*numbers, *bounds))]))
+    return "\n".join(lines) + "\n"

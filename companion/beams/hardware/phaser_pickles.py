@@ -1,0 +1,83 @@
+"""The calibration that a CN0566 Phaser keeps: pickles of numbers, read without trusting them.
+
+``adi.CN0566`` (pyadi-iio) adds ``phase_cal_val.pkl``, degrees, to each element's wanted phase, and
+multiplies its gain code by ``gain_cal_val.pkl``; both are lists of eight. What its channels add is
+therefore the opposite. A pickle may name any function to be called: here only numbers, lists and
+numpy's scalars are let through.
+"""
+
+import io
+import math
+import pickle
+import struct
+from typing import Any, Final
+
+from companion.beams.hardware.calibration import Calibration
+from companion.values import UserError
+
+ELEMENTS: Final = 8
+ORDER: Final = (6, 7, 4, 5, 2, 3, 0, 1)
+"""Element of each channel: BEAM0 has 7, 8, 5, 6, and BEAM1 3, 4, 1, 2, counted from 1."""
+LARGEST_BYTES: Final = 10_000
+_SCALARS: Final = {"f8": "d", "f4": "f", "i8": "q", "i4": "i"}
+
+
+def calibration(phases: bytes, gains: bytes) -> Calibration:
+    """The calibration in the two pickles. Raises ``UserError`` for what is not eight numbers."""
+    added_deg = numbers("phase calibration", phases)
+    factors = numbers("gain calibration", gains)
+    if not all(factor > 0 for factor in factors):
+        raise UserError("gain calibration: a factor is not above 0")
+    return Calibration(
+        tuple(math.radians(-phase) for phase in added_deg),
+        tuple(-20 * math.log10(factor) for factor in factors),
+        ORDER,
+    )
+
+
+def numbers(what: str, data: bytes) -> list[float]:
+    """The eight numbers in a pickle. Raises ``UserError`` for anything else."""
+    if len(data) > LARGEST_BYTES:
+        raise UserError(f"{what}: more than a list of {ELEMENTS} numbers")
+    try:
+        found = _Numbers(io.BytesIO(data)).load()
+    except UserError:
+        raise
+    except Exception as error:  # a damaged pickle raises whatever it likes
+        raise UserError(f"{what}: not a pickle of numbers: {error}") from error
+    good = isinstance(found, list) and len(found) == ELEMENTS
+    if not good or not all(type(one) in (int, float) and math.isfinite(one) for one in found):
+        raise UserError(f"{what}: not a list of {ELEMENTS} finite numbers")
+    return [float(one) for one in found]
+
+
+class _Numbers(pickle.Unpickler):
+    """Lets numbers through, and numpy's scalars by functions of our own."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        """Stand-ins for what numpy's scalars need; nothing else."""
+        if module in ("numpy.core.multiarray", "numpy._core.multiarray") and name == "scalar":
+            return _scalar
+        if (module, name) == ("numpy", "dtype"):
+            return _Kind
+        raise UserError(f"the pickle would call {module}.{name}: only numbers are read")
+
+
+class _Kind:
+    """A kind of number by its name; the state that numpy gives it says only its byte order."""
+
+    def __init__(self, name: object, *_: object) -> None:
+        self.name = name
+
+    def __setstate__(self, state: object) -> None:
+        """Refuse numbers that are not little-endian."""
+        if not (isinstance(state, tuple) and len(state) > 1 and state[1] == "<"):
+            raise UserError("numbers of an unknown byte order")
+
+
+def _scalar(kind: object, data: object) -> float:
+    letter = _SCALARS.get(str(kind.name)) if isinstance(kind, _Kind) else None
+    if letter is None or not isinstance(data, bytes):
+        raise UserError("the pickle holds what is not a number")
+    (value,) = struct.unpack("<" + letter, data)
+    return float(value)

@@ -52,8 +52,9 @@ def drive(
 ) -> None:
     """Apply the beams of a running service to a device.
 
-    TARGET is rotctld:HOST:PORT, phaser:URI (extra [phaser]) or adar1000:BUS.DEVICE[,...] (extra
-    [spi]). Beams are asked for as far ahead as the device takes to apply them.
+    TARGET is rotctld:HOST:PORT, gimbal:HOST:PORT:SYSID:COMPID, phaser:URI (extra [phaser]) or
+    adar1000:BUS.DEVICE[,...] (extra [spi]). Beams are asked for as far ahead as the device takes
+    to apply them.
 
     Example: companion drive rotctld:127.0.0.1:4533 --uav 1:1
     """

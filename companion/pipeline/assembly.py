@@ -10,7 +10,6 @@ import numpy as np
 
 from companion.beams.array import geometry
 from companion.beams.array.coverage import Coverage, Sector
-from companion.beams.array.elements import Element, Pattern
 from companion.beams.hardware import codebooks
 from companion.beams.hardware.calibration import Calibration, channel_error, parse_calibration
 from companion.beams.hardware.codebooks import Codebook
@@ -19,6 +18,7 @@ from companion.beams.weights.precoding import Precoder
 from companion.beams.worth.link_budget import LinkBudget
 from companion.mavlink.clock.estimates import ClockAssumptions
 from companion.mavlink.clock.sender_clock import SenderClock
+from companion.pipeline import elements
 from companion.settings.files import (
     calibration_text,
     codebook_file,
@@ -27,7 +27,6 @@ from companion.settings.files import (
 )
 from companion.settings.model import Settings
 from companion.settings.section import ConfigError
-from companion.tracking.carrier import body_from_ned
 from companion.tracking.fleet import Ages, Fleet, FleetSettings
 from companion.tracking.gate import GateSettings
 from companion.tracking.limits import LIMITS, Airframe, airframe, lag_s
@@ -53,7 +52,7 @@ def array(settings: Settings) -> geometry.Array:
 
     Raises ``ConfigError``.
     """
-    placed = _placed(settings)
+    placed = elements.placed(settings)
     size, dead = placed.size, sorted(set(settings.array.dead))
     live = None
     if dead:
@@ -100,47 +99,6 @@ def calibration(settings: Settings, size: int) -> Calibration | None:
         channels = f"{len(found.order)} channels for {size} elements"
         raise ConfigError(f"hardware.calibration: {channels}")
     return found
-
-
-def _placed(settings: Settings) -> geometry.Array:
-    """The elements on their mount."""
-    given = settings.array
-    mount = body_from_ned(
-        *np.radians([given.mount_roll_deg, given.mount_pitch_deg, given.mount_yaw_deg])
-    )
-    element = Element(Pattern(given.element), given.element_exponent)
-    lever_arm_m = np.array(given.lever_arm_m)
-    spacing = given.spacing_wavelengths
-    if given.spacing_m is not None:
-        spacing = given.spacing_m * given.frequency_hz / geometry.SPEED_OF_LIGHT_MPS
-    on_carrier = (mount, element, lever_arm_m)
-    try:
-        match given.kind:
-            case "ula":
-                return geometry.uniform_linear(
-                    given.elements, given.frequency_hz, spacing, *on_carrier
-                )
-            case "ura":
-                return geometry.uniform_rectangular(
-                    given.rows, given.columns, given.frequency_hz, spacing, *on_carrier
-                )
-            case "uca":
-                return geometry.uniform_circular(
-                    given.elements, given.frequency_hz, spacing, *on_carrier
-                )
-            case "list":
-                placed = _rows(given.positions_m or ())
-                outward = placed[:, 3:6] if placed.shape[1] == 6 else None
-                return geometry.listed(placed[:, :3], given.frequency_hz, *on_carrier, outward)
-    except UserError as error:
-        raise ConfigError(f"array: {error}") from error
-
-
-def _rows(positions_m: tuple[tuple[float, ...], ...]) -> FloatArray:
-    lengths = {len(row) for row in positions_m}
-    if lengths not in ({3}, {6}):
-        raise UserError("positions_m are rows of 3 numbers, or all of 6")
-    return np.array(positions_m)
 
 
 def coverage(settings: Settings) -> Coverage:

@@ -17,7 +17,7 @@ def run(*arguments: str) -> Any:
 
 
 def test_the_commands_are_the_documented_ones() -> None:
-    documented = "demo run replay check design drive export recover study weights"
+    documented = "calibrate demo drive run replay check design export recover study weights"
     assert set(COMMANDS) == set(documented.split())
 
 

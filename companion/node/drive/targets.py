@@ -1,19 +1,28 @@
 """What a drive can be told to drive; a device's file is loaded when it is asked for.      [shell]
 
-rotctld:HOST:PORT       a rotator behind hamlib's rotctld
-phaser:URI              an Analog Devices CN0566 (ip:phaser.local), by pyadi-iio
-adar1000:BUS.DEVICE...  ADAR1000 chips on Linux's SPI, in the order of the table's chips
-none:pointing           nothing: a dry run prints what would be sent
-none:adar1000
+    rotctld:HOST:PORT       a rotator behind hamlib's rotctld
+    gimbal:HOST:PORT:SYSID:COMPID
+                            a gimbal, by MAVLink's gimbal manager over UDP
+    phaser:URI              an Analog Devices CN0566 (ip:phaser.local), by pyadi-iio
+    adar1000:BUS.DEVICE...  ADAR1000 chips on Linux's SPI, in the order of the table's chips
+    none:pointing           nothing: a dry run prints what would be sent
+    none:adar1000           the same of registers
+
+IPv6 hosts stand in brackets.
 """
 
 import re
 from collections.abc import Callable
+from typing import Final
 
 from companion.node.drive.loop import Device, Safe, Shot
-from companion.values import UserError
+from companion.values import Source, UserError
 
-FORMS = "rotctld:HOST:PORT, phaser:URI, adar1000:BUS.DEVICE[,...], none:pointing, none:adar1000"
+FORMS: Final = (
+    "rotctld:HOST:PORT, gimbal:HOST:PORT:SYSID:COMPID, phaser:URI, adar1000:BUS.DEVICE[,...], "
+    "none:pointing, none:adar1000"
+)
+_GIMBAL: Final = re.compile(r"(.+):(\d{1,5}):(\d{1,3}):(\d{1,3})")
 
 
 def device(target: str, say: Callable[[str], None]) -> Device:
@@ -26,6 +35,13 @@ def device(target: str, say: Callable[[str], None]) -> Device:
                 from companion.node.drive.rotctld import Rotator
 
                 return Rotator(host.strip("[]"), int(port))
+        case "gimbal":
+            found = _GIMBAL.fullmatch(where)
+            numbers = [int(one) for one in found.groups()[1:]] if found else []
+            if found and 0 < numbers[0] < 65536 and max(numbers[1:]) < 256:
+                from companion.node.drive.gimbal import Gimbal
+
+                return Gimbal(found[1].strip("[]"), numbers[0], Source(*numbers[1:]))
         case "phaser" if where:
             from companion.node.drive.phaser import Phaser
 

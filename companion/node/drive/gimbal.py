@@ -1,0 +1,133 @@
+"""A gimbal by MAVLink's gimbal manager: ``gimbal:HOST:PORT:SYSID:COMPID``.              [shell]
+
+GIMBAL_MANAGER_SET_PITCHYAW points it, yaw from north and pitch from the horizon
+(https://mavlink.io/en/services/gimbal_v2.html); where the gimbal says its own attitude
+(GIMBAL_DEVICE_ATTITUDE_STATUS), its lag is found from it. Messages are sent under
+MAV_COMP_ID_ONBOARD_COMPUTER of that system. It was never on the air: what is tested is what
+pymavlink reads of it.
+"""
+
+import math
+import socket
+import struct
+import time
+from collections.abc import Callable
+from typing import Final
+
+from companion.mavlink.wire.encode import Outgoing, pack
+from companion.mavlink.wire.framing import Splitter
+from companion.node.drive.lag import MountLag
+from companion.node.drive.loop import DeviceError, Safe, Shot, require
+from companion.values import Frame, Source
+
+SET_PITCHYAW: Final = 287
+ATTITUDE_STATUS: Final = 285
+IN_EARTH_FRAME: Final = 4 | 8 | 16 | 64
+"""GIMBAL_MANAGER_FLAGS: roll, pitch and yaw locked, and yaw from north."""
+YAW_FROM_NORTH: Final = 16 | 64
+"""GIMBAL_DEVICE_FLAGS of an attitude whose yaw is from north: either says so."""
+ONBOARD_COMPUTER: Final = 191
+
+
+class Gimbal:
+    """A gimbal; its boresight is north, level."""
+
+    takes_registers = False
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        target: Source,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self._address = host, port
+        self._target = target
+        self._now_ns = now_ns
+        self._lag = MountLag()
+        self._socket: socket.socket | None = None
+        self._splitter = Splitter("gimbal", frozenset((ATTITUDE_STATUS,)))
+        self._sequence = 0
+        self._last_rad = self._seen_rad = 0.0
+
+    @property
+    def lead_s(self) -> float:
+        """Its lag, as its own attitude shows it; 0 before that, or where it says none."""
+        return self._lag.lag_s
+
+    def check(self, safe: Safe) -> None:
+        """A gimbal radiates nothing that could be muted."""
+        require(safe, (Safe.HOLD, Safe.BORESIGHT), "a gimbal")
+
+    def open(self) -> None:
+        """Open a socket to it; whether it is there is not known."""
+        host, port = self._address
+        try:
+            found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+            self._socket = socket.socket(found[0], socket.SOCK_DGRAM)
+            self._socket.setblocking(False)
+            self._socket.connect(found[4])
+        except OSError as error:
+            self.close()
+            raise DeviceError(f"gimbal at {host}:{port}: {error.strerror or error}") from error
+
+    def apply(self, shot: Shot) -> None:
+        """Hear where it points, and point."""
+        self._hear()
+        yaw_rad = _near(shot.bearing_rad, self._last_rad)
+        self._last_rad = yaw_rad
+        self._say(shot.bearing_rad, shot.above_rad)
+        self._lag.told(self._now_ns(), yaw_rad)
+
+    def rest(self, safe: Safe) -> None:
+        """Stay where it was told to point last, or go to its boresight."""
+        if safe is Safe.BORESIGHT:
+            self._say(0.0, 0.0)
+
+    def close(self) -> None:
+        """Let go of the socket."""
+        if self._socket:
+            self._socket.close()
+            self._socket = None
+
+    def _say(self, bearing_rad: float, above_rad: float) -> None:
+        yaw_rad = math.remainder(bearing_rad, 2 * math.pi)
+        rates = math.nan, math.nan  # of pitch and yaw: not commanded
+        whom = *self._target, 0  # every gimbal of that manager
+        payload = struct.pack("<I4f3B", IN_EARTH_FRAME, above_rad, yaw_rad, *rates, *whom)
+        own = Source(self._target[0], ONBOARD_COMPUTER)
+        raw = pack(Outgoing(own, SET_PITCHYAW, payload), self._sequence)
+        self._sequence = (self._sequence + 1) & 0xFF
+        try:
+            if self._socket is None:
+                raise DeviceError("no socket to the gimbal")
+            self._socket.send(raw)
+        except OSError as error:
+            raise DeviceError(f"gimbal: {error.strerror or error}") from error
+
+    def _hear(self) -> None:
+        """Take the attitudes that have come."""
+        while self._socket is not None:
+            try:
+                data = self._socket.recv(2048)
+            except BlockingIOError:
+                return
+            except OSError as error:
+                raise DeviceError(f"gimbal: {error.strerror or error}") from error
+            for frame in self._splitter.feed(self._now_ns(), data):
+                if isinstance(frame, Frame) and frame.source.sysid == self._target.sysid:
+                    self._note(frame)
+
+    def _note(self, frame: Frame) -> None:
+        payload = frame.raw[10 : 10 + frame.raw[1]].ljust(40, b"\0")
+        w, x, y, z = struct.unpack_from("<4f", payload, 4)
+        (flags,) = struct.unpack_from("<H", payload, 36)
+        yaw_rad = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        if flags & YAW_FROM_NORTH and math.isfinite(yaw_rad):
+            self._seen_rad = _near(yaw_rad, self._seen_rad)
+            self._lag.seen(frame.t_ns, self._seen_rad)
+
+
+def _near(angle_rad: float, other_rad: float) -> float:
+    """The same angle within half a turn of another one."""
+    return other_rad + math.remainder(angle_rad - other_rad, 2 * math.pi)

@@ -1,0 +1,51 @@
+"""Builds the elements of the array from the settings."""
+
+import numpy as np
+
+from companion.beams.array import geometry
+from companion.beams.array.elements import Element, Pattern
+from companion.settings.model import Settings
+from companion.settings.section import ConfigError
+from companion.tracking.carrier import body_from_ned
+from companion.values import FloatArray, UserError
+
+
+def placed(settings: Settings) -> geometry.Array:
+    """The elements on their mount. Raises ``ConfigError``."""
+    given = settings.array
+    mount = body_from_ned(
+        *np.radians([given.mount_roll_deg, given.mount_pitch_deg, given.mount_yaw_deg])
+    )
+    element = Element(Pattern(given.element), given.element_exponent)
+    lever_arm_m = np.array(given.lever_arm_m)
+    spacing = given.spacing_wavelengths
+    if given.spacing_m is not None:
+        spacing = given.spacing_m * given.frequency_hz / geometry.SPEED_OF_LIGHT_MPS
+    on_carrier = (mount, element, lever_arm_m)
+    try:
+        match given.kind:
+            case "ula":
+                return geometry.uniform_linear(
+                    given.elements, given.frequency_hz, spacing, *on_carrier
+                )
+            case "ura":
+                return geometry.uniform_rectangular(
+                    given.rows, given.columns, given.frequency_hz, spacing, *on_carrier
+                )
+            case "uca":
+                return geometry.uniform_circular(
+                    given.elements, given.frequency_hz, spacing, *on_carrier
+                )
+            case "list":
+                placed = _rows(given.positions_m or ())
+                outward = placed[:, 3:6] if placed.shape[1] == 6 else None
+                return geometry.listed(placed[:, :3], given.frequency_hz, *on_carrier, outward)
+    except UserError as error:
+        raise ConfigError(f"array: {error}") from error
+
+
+def _rows(positions_m: tuple[tuple[float, ...], ...]) -> FloatArray:
+    lengths = {len(row) for row in positions_m}
+    if lengths not in ({3}, {6}):
+        raise UserError("positions_m are rows of 3 numbers, or all of 6")
+    return np.array(positions_m)

@@ -1,0 +1,86 @@
+"""A gimbal as pymavlink has it: what it is told, and what is made of its own attitude."""
+
+import math
+import socket
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import all as dialect
+from support import HANG_S
+
+from companion.node.drive import targets
+from companion.node.drive.gimbal import Gimbal
+from companion.node.drive.loop import DeviceError, Safe, Shot
+from companion.values import Source, UserError
+
+
+@pytest.fixture
+def heard() -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        sock.settimeout(HANG_S)
+        yield sock
+
+
+def message(sock: socket.socket) -> tuple[Any, Any]:
+    data, sender = sock.recvfrom(2048)
+    return dialect.MAVLink(None).decode(bytearray(data)), sender
+
+
+def test_it_is_told_where_to_look(heard: socket.socket) -> None:
+    port = heard.getsockname()[1]
+    gimbal = targets.device(f"gimbal:127.0.0.1:{port}:7:154", print)
+    gimbal.open()
+    gimbal.apply(Shot(0, None, "1:1", math.radians(270), math.radians(12)))
+    said, _ = message(heard)
+    assert said.get_type() == "GIMBAL_MANAGER_SET_PITCHYAW"
+    assert (said.target_system, said.target_component, said.gimbal_device_id) == (7, 154, 0)
+    assert (said.get_srcSystem(), said.get_srcComponent()) == (7, 191)
+    assert math.degrees(said.yaw) == pytest.approx(-90, abs=1e-4)
+    assert math.degrees(said.pitch) == pytest.approx(12, abs=1e-4)
+    assert math.isnan(said.pitch_rate)
+    flags = dialect.GIMBAL_MANAGER_FLAGS_YAW_IN_EARTH_FRAME | dialect.GIMBAL_MANAGER_FLAGS_YAW_LOCK
+    assert said.flags & flags == flags
+    gimbal.rest(Safe.HOLD)
+    gimbal.rest(Safe.BORESIGHT)
+    said, _ = message(heard)
+    assert (said.yaw, said.pitch) == (0.0, 0.0)
+    gimbal.close()
+    with pytest.raises(DeviceError, match="no socket"):
+        gimbal.apply(Shot(0, None))
+
+
+@pytest.mark.parametrize("from_north", [True, False])
+def test_its_lag_is_found_from_its_attitude(heard: socket.socket, from_north: bool) -> None:
+    """Over north, where angles leap; an attitude relative to the vehicle says nothing."""
+    clock = [0]
+    gimbal = Gimbal("127.0.0.1", heard.getsockname()[1], Source(7, 154), lambda: clock[0])
+    gimbal.open()
+    mav = dialect.MAVLink(None, srcSystem=7, srcComponent=154)
+    flags = dialect.GIMBAL_DEVICE_FLAGS_YAW_LOCK if from_north else 32
+    for n in range(150):
+        t_s = 0.1 * n
+        clock[0] = round(t_s * 1e9)
+        gimbal.apply(Shot(0, None, "1:1", math.sin(0.5 * t_s), 0.0))
+        _, sender = message(heard)
+        half = math.sin(0.5 * (t_s + 0.1 - 0.3)) / 2
+        told = mav.gimbal_device_attitude_status_encode(
+            0, 0, 0, flags, [math.cos(half), 0, 0, math.sin(half)], 0, 0, 0, 0
+        )
+        heard.sendto(told.pack(mav), sender)
+    assert gimbal.lead_s == pytest.approx(0.3 if from_north else 0.0, abs=0.03)
+    gimbal.close()
+
+
+def test_a_gimbal_is_not_muted() -> None:
+    with pytest.raises(UserError, match="hold or boresight, not mute"):
+        targets.device("gimbal:127.0.0.1:1:1:154", print).check(Safe.MUTE)
+
+
+@pytest.mark.parametrize(
+    "target", ["gimbal:here", "gimbal:h:1:1", "gimbal:h:0:1:1", "gimbal:h:1:256:1"]
+)
+def test_what_is_no_gimbal_is_refused(target: str) -> None:
+    with pytest.raises(UserError, match="is none of"):
+        targets.device(target, print)

@@ -13,6 +13,7 @@ from companion.beams.array.geometry import uniform_rectangular
 from companion.beams.array.steering import steering_matrix, unit_directions
 from companion.beams.hardware.calibration import BOUNDED_HEADER, parse_calibration
 from companion.beams.hardware.devices import Device
+from companion.beams.worth.guarantee import guaranteed_gains_db
 from companion.cli.main import main
 from companion.pipeline import assembly
 from companion.settings.files import embedded, load
@@ -59,6 +60,10 @@ def test_no_device_within_its_calibration_s_bounds_has_less(cut_log: Path, tmp_p
             np.radians([beam["azimuth_deg"]]), np.radians([beam["elevation_deg"]])
         )
         bound = np.radians(beam["pointing_bound_deg"])
+        (of_the_table,) = guaranteed_gains_db(
+            assembly.array(load(config)), towards, [bound], device.weights[:, [i]]
+        )
+        assert beam["guaranteed_gain_db"] == pytest.approx(of_the_table, abs=1e-3)
         for _ in range(300):
             aside = np.cross(towards, rng.standard_normal((20, 3)))
             aside /= np.linalg.norm(aside, axis=1, keepdims=True)

@@ -127,3 +127,13 @@ def test_an_error_of_a_channel_is_bounded_by_its_corners() -> None:
     assert off.max() <= bound
     assert off.max() > 0.98 * bound
     assert channel_error(np.array([4.0]), np.array([0.0])) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("name", sorted(ARRAYS))
+def test_a_steering_vector_is_what_each_channel_does_by_itself(name: str) -> None:
+    array = faulty(ARRAYS[name], "all")
+    fed = np.eye(array.size, dtype=complex)
+    carried = array.carried(fed)  # the currents that a unit in each channel makes
+    pristine = replace(array, live=None, coupling=None, channel_error=None)
+    heard = steering_matrix(pristine, AHEAD).T @ carried
+    np.testing.assert_allclose(steering_matrix(array, AHEAD), heard.T, atol=1e-12)

@@ -144,6 +144,20 @@ def test_registers_of_chips_radiate_what_the_text_says(
     assert all(chip.closed for chip in spidev.values())
 
 
+def test_an_attenuated_channel_is_15_db_down(
+    spidev: dict[tuple[int, int], Chip], flown: tuple[Shot, Any, str]
+) -> None:
+    registers = flown[0].registers
+    assert registers is not None
+    weak = registers[:4].copy()
+    weak[:, 4], weak[:, 5] = 127, [0, 1, 0, 1]
+    shot = Shot(0, None, "3:1", 0.0, 0.0, weak)
+    device = targets.device("adar1000:0.0", print)
+    Drive(Always(shot), device, 100.0, Safe.HOLD, Ticking().now_ns, print).step()
+    got = [abs(factor(*one)) for one in spidev[0, 0].radiates]
+    assert 20 * np.log10(got) == pytest.approx([0, -15, 0, -15])
+
+
 def test_too_few_chips_are_a_mistake_of_one_line(
     spidev: dict[tuple[int, int], Chip], flown: tuple[Shot, Any, str]
 ) -> None:

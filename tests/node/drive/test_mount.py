@@ -260,6 +260,15 @@ def test_a_lag_is_found_from_reports(lag_s: float) -> None:
     assert lag.lag_s == pytest.approx(lag_s, abs=0.03)
 
 
+def test_a_lag_is_found_where_reports_count_from_another_turn() -> None:
+    lag = MountLag()
+    for n in range(100):
+        t_s = 0.1 * n
+        lag.told(round(t_s * 1e9), 0.3 * t_s)
+        lag.seen(round(t_s * 1e9), 0.3 * (t_s - 0.4) + 2 * math.pi)
+    assert lag.lag_s == pytest.approx(0.4, abs=0.02)
+
+
 def test_a_mount_that_stands_still_shows_no_lag() -> None:
     lag = MountLag()
     for n in range(200):

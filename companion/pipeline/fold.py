@@ -204,7 +204,7 @@ class Pipeline:
         for uav in silent:
             self._restart(uav)
             self.targets.forget(uav)
-        self.senders.forget_clocks(frozenset(self.fleet.uavs))
+        self.senders.forget_clocks(frozenset(self.fleet.uavs), now_ns)
         return dropped
 
     # --- looking ----------------------------------------------------------------------------

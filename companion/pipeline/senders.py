@@ -47,6 +47,8 @@ CLOCKS_MAX: Final = 4096
 """Clocks kept. Beyond it those of senders without a track are forgotten, the oldest first."""
 WAITS_NS: Final = 10_000_000_000
 """Time for which a track waits for its receiver to vouch for it."""
+CLOCK_KEPT_NS: Final = 3_600_000_000_000
+"""How long the clock of a sender without a track is kept: each takes some 50 kB."""
 FIX_3D: Final = 3
 """GPS_FIX_TYPE_3D_FIX; better fixes have greater numbers."""
 NEAR_HEIGHT_M: Final = 50.0
@@ -118,6 +120,7 @@ class Senders:
         self._noise_settings = assembly.noise(settings)
         self._noise: dict[Source, ReportNoise] = {}
         self._clocks: dict[str, SenderClock] = {}  # by SYSID:COMPID
+        self._stamped_ns: dict[str, int] = {}  # when each of them was last told its time
         self._dedupe = Dedupe()
         self._admission = Admission(settings.tracks.allow, settings.tracks.deny)
         self._shared: set[str] = set()
@@ -284,6 +287,7 @@ class Senders:
     def _stamp(self, name: str, arrival_ns: int, boot_ms: int) -> tuple[Stamp | None, str | None]:
         """Place a stamp on the sender's timeline; also returns the sender's name if it rebooted."""
         stamp = self._clock(name).observe(arrival_ns, boot_ms)
+        self._stamped_ns[name] = arrival_ns
         return stamp, name if stamp is not None and stamp.rebooted else None
 
     def _clock(self, name: str) -> SenderClock:
@@ -329,11 +333,17 @@ class Senders:
         """Forget for how long a sender's receiver has not vouched for it: it begins anew."""
         self._waits.pop(uav, None)
 
-    def forget_clocks(self, wanted: Container[str]) -> None:
-        """Keep ``CLOCKS_MAX`` clocks and those that are wanted, dropping the oldest others."""
-        for name in list(self._clocks)[: max(0, len(self._clocks) - CLOCKS_MAX)]:
+    def forget_clocks(self, wanted: Container[str], now_ns: int) -> None:
+        """Keep ``CLOCKS_MAX`` clocks and those that are wanted, dropping the oldest others.
+
+        Those that were long silent go in any case: who comes and goes all day takes no memory.
+        """
+        silent_ns = now_ns - CLOCK_KEPT_NS
+        names = [name for name in self._clocks if self._stamped_ns.get(name, now_ns) < silent_ns]
+        for name in (*names, *list(self._clocks)[: max(0, len(self._clocks) - CLOCKS_MAX)]):
             if name not in wanted and name != self._carrier:
-                del self._clocks[name]
+                self._clocks.pop(name, None)
+                self._stamped_ns.pop(name, None)
 
     def link_share(self, link: str) -> LinkShare:
         """What a link has contributed to the reports so far."""

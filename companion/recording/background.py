@@ -27,6 +27,8 @@ QUEUE_MAX: Final = 50_000
 """Events waiting to be written at most: some seconds of the busiest stream."""
 FLUSH_S: Final = 1.0
 """Time between two flushes to disk."""
+FLUSH_FIRST_S: Final = 0.1
+"""The same where a file begins, and twice as long after each: a short life leaves something too."""
 RETRY_FIRST_S: Final = 1.0
 """Time before the first new attempt after a disk error; it doubles from one to the next."""
 RETRY_MAX_S: Final = 30.0
@@ -210,7 +212,8 @@ class BackgroundRecorder:
             self._tell(Severity.INFO, f"recording again, into {self.file}")
 
     def _write_until_stopped(self) -> None:
-        flush_due_s = time.monotonic() + FLUSH_S
+        every_s = FLUSH_FIRST_S
+        flush_due_s = time.monotonic() + every_s
         while not (self._stopping.is_set() and self._queue.empty()):
             try:
                 item = self._queue.get(timeout=max(0.0, flush_due_s - time.monotonic()))
@@ -222,7 +225,8 @@ class BackgroundRecorder:
             if time.monotonic() >= flush_due_s or len(self._unsafe) >= self._queue_max:
                 self._flush()
                 self._rotate_if_due()
-                flush_due_s = time.monotonic() + FLUSH_S
+                every_s = min(2 * every_s, FLUSH_S)
+                flush_due_s = time.monotonic() + every_s
 
     def _write(self, item: _Item) -> None:
         if item.missed:

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from companion.mavlink.clock.estimates import ClockKind
 from companion.pipeline.digest import Digest
-from companion.pipeline.fold import Pipeline
+from companion.pipeline.fold import DROP_EVERY, Pipeline
 from companion.pipeline.ticks import with_ticks
 from companion.settings.center import FixedCenter
 from companion.settings.model import Settings
@@ -880,3 +880,14 @@ def test_pauses_of_a_flight_are_ticked_through_however_many() -> None:
     garbage = [Rejection(n * 50 * S, "log", Reason.GARBAGE) for n in range(1_728)]
     ticks = sum(isinstance(event, Tick) for event in with_ticks(garbage, 1.0))
     assert ticks == 1_727 * 50
+
+
+def test_the_clock_of_who_is_long_gone_is_forgotten() -> None:
+    """But for the carrier's, and not while it may come back within the hour."""
+    pipeline = Pipeline(settings())
+    run(pipeline, [position(0.0, "5:1"), position(0.0, "7:1")])
+    run(pipeline, [tick(3_500.0 + n * 0.05) for n in range(DROP_EVERY)])
+    assert pipeline.clock_estimate("7:1") is not None
+    run(pipeline, [tick(3_700.0 + n * 0.05) for n in range(DROP_EVERY)])
+    assert pipeline.clock_estimate("7:1") is None
+    assert pipeline.clock_estimate("5:1") is not None

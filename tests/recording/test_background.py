@@ -15,6 +15,7 @@ import pytest
 from support import HANG_S, ROOT, read_metadata
 
 from companion.node.replay import log_events, missing
+from companion.recording import background
 from companion.recording.background import BackgroundRecorder, Rotation
 from companion.recording.parts import Hole, Part, read_story
 from companion.recording.reader import read_log
@@ -87,6 +88,18 @@ def hand_over(made: BackgroundRecorder, events: list[Event]) -> list[Event]:
 def parts_of(folder: Path) -> list[Path]:
     found = [path for path in folder.iterdir() if ".mcap" in path.name]
     return sorted(found, key=lambda path: read_story(path).part or Part("", 0, ""))
+
+
+def test_who_lives_for_a_moment_leaves_what_it_heard(tmp_path: Path) -> None:
+    """Before a second has passed, the first events are on the disk; later they may wait for it."""
+    made = recorder(tmp_path)
+    made.start()
+    begun_s = time.monotonic()
+    hand_over(made, ticks(0, 5))
+    wait_until(lambda: on_disk(made) >= 5)
+    took_s = time.monotonic() - begun_s
+    made.stop({})
+    assert took_s < background.FLUSH_S
 
 
 @pytest.fixture

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 from figures import FILE, Figures
 from hypothesis import settings
+from soak_table import table  # noqa: F401 - a fixture
 from support import BIN, HANG_S, ROOT, Node, end
 
 # How fast this machine is, and what else it does, is no property of the code: no deadlines.

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from companion.values import UserError
+
 if TYPE_CHECKING:
     from companion.node.drive.loop import Told
 
@@ -82,7 +84,10 @@ def drive(
             click.echo(json.dumps(asdict(told)))
 
     running.until_told(driven, show, seconds)
-    click.echo(_text(driven.told()), err=as_json)
+    told = driven.told()
+    click.echo(_text(told), err=as_json)
+    if not told.applied:
+        raise UserError("nothing was applied: there were no beams, or the device took none")
 
 
 def _text(told: "Told") -> str:

@@ -140,7 +140,7 @@ class Pipeline:
     def _report(self, placed: PlacedReport) -> list[Output]:
         report = placed.report
         begins = self.center.seeks_home or report.uav not in self.fleet
-        if begins and not self.senders.vouched(report, self.center.seeks_home):
+        if begins and not self.senders.vouch(report, self.center.seeks_home):
             return [Rejection(report.t_ns, report.uav, Reason.NO_FIX)]
         fix, begun = self.center.fix(placed)
         fix, refuted = self.fleet.refuted(fix)

@@ -266,11 +266,12 @@ class Senders:
         text = f"two vehicles share the id {uav}: neither is believed"
         return Notice(t_ns, Severity.WARNING, uav, text), refused
 
-    def vouched(self, report: Report, always: bool) -> bool:
-        """Whether a sender's receiver, if one was heard, has a 3-D fix near its report's height.
+    def vouch(self, report: Report, always: bool) -> bool:
+        """Take in a report that would begin a track. Returns whether one may begin with it.
 
-        A track need not wait for that for more than ``WAITS_NS``: heights may be of other data for
-        good. Home does, ``always``.
+        Its sender's receiver, if one was heard, has to have a 3-D fix near the report's height. For
+        that no more than ``WAITS_NS`` are waited, as heights may be of other data for good; home
+        waits ``always``.
         """
         receiver = self._receivers.get(report.source)
         if receiver is None or not reports_itself(report.uav):

@@ -9,7 +9,7 @@ Over 300 lines: reports in and tracks out share the state of a track.
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -34,9 +34,9 @@ from companion.values import (
     Vector,
 )
 
-ESTABLISHED = 50
+ESTABLISHED: Final = 50
 """Reports of a UAV that make it known: when it comes back, those of fewer make room for it."""
-COMMON_ERROR = 0.07
+COMMON_ERROR: Final = 0.07
 """Share of the noise bound that is usual in all reports alike, which none of them shows."""
 
 

@@ -1,6 +1,7 @@
 """Commands: help with an example, mistakes in one line, ``design`` with its fields."""
 
 import json
+import socket
 from typing import Any
 
 import pytest
@@ -96,3 +97,14 @@ def test_design_by_lmi_agrees() -> None:
     assert solved["mu"] == pytest.approx(closed["mu"], abs=1e-5)
     assert solved["L"] == pytest.approx(closed["L"], abs=1e-3)
     assert solved["residual"] > -1e-6
+
+
+def test_a_drive_that_applied_nothing_did_not_do_what_was_asked() -> None:
+    """Nobody listens at that port."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    service = f"http://127.0.0.1:{port}"
+    answer = run("drive", "none:pointing", "--service", service, "--seconds", "0.3")
+    assert answer.exit_code == 1
+    assert "nothing was applied" in answer.stderr
+    assert "Traceback" not in answer.stderr

@@ -44,6 +44,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.xdist_group("alone"))
         elif item.nodeid.startswith("tests/studies/"):
             item.add_marker(pytest.mark.xdist_group("studies"))
+        else:  # what a file's tests share is made once
+            item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
 
 
 # --- the last resort against a test that hangs ---------------------------------------------------

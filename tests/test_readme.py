@@ -14,14 +14,14 @@ import signal
 import socket
 import subprocess
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
-from support import BIN, HANG_S, ROOT, line_of, started
+from support import BIN, HANG_S, ROOT, Node, end, line_of, started
 
 from companion.settings.model import Settings
 
@@ -89,10 +89,8 @@ def make(words: list[str], _: Path, start_node: Started) -> None:
     assert does[words[1]] in done.stdout
 
 
-def curl(words: list[str], where: Path, start_node: Started) -> None:
+def curl(words: list[str], where: Path, node: Node) -> None:
     """Asked of a demo that runs, by Python."""
-    node = start_node("demo", "--port", "0", "--seconds", "60")
-    node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
     (url,) = [word for word in words if word.startswith("http://127.0.0.1:8080/")]
     headers = dict(words[i + 1].split(": ") for i, word in enumerate(words) if word == "-H")
     request = urllib.request.Request(url.replace("http://127.0.0.1:8080", node.url), None, headers)
@@ -204,7 +202,7 @@ def forwarded(words: list[str], where: Path, start_node: Started) -> None:
         assert option.split("=")[0] in done.stdout, option
 
 
-RUNNERS: dict[str, Callable[[list[str], Path, Started], None]] = {
+RUNNERS: dict[str, Callable[[list[str], Path, Any], None]] = {
     "make": make,
     "curl": curl,
     "companion replay": to_its_end,
@@ -221,6 +219,8 @@ RUNNERS: dict[str, Callable[[list[str], Path, Started], None]] = {
     "sitl-replay play": traffic,
     "docker compose": compose,
 }
+WITH = {"companion study": "studied", "curl": "demo"}
+"""The fixture that a way of running is given; the others start nodes of their own."""
 FULL = {"companion study prediction", "companion check"}
 """Said in the text as a name, without its arguments."""
 
@@ -242,6 +242,26 @@ def marked(command: str) -> Any:
     return pytest.param(command, marks=pytest.mark.full if long else ())
 
 
+@pytest.fixture(scope="module")
+def demo() -> Iterator[Node]:
+    """The demo, once all its UAVs have beams."""
+    node = Node("demo", "--port", "0", "--seconds", "3600")
+    try:
+        node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
+        yield node
+    finally:
+        end(node.process)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the replay of the short flight recorded."""
+    made = tmp_path_factory.mktemp("readme") / "recording.mcap"
+    log = str(ROOT / "tests" / "data" / "sitl_4circle_cut.tlog")
+    run(["companion", "replay", log, "--out", str(made)], made.parent)
+    return made
+
+
 @pytest.mark.parametrize("command", [marked(command) for command in sorted(set(COMMANDS) - FULL)])
 def test_the_command_does_what_it_should(
     command: str,
@@ -249,28 +269,23 @@ def test_the_command_does_what_it_should(
     cut_log: Path,
     aeroplane: Path,
     carrier: Path,
-    start_node: Started,
-    studied: Callable[..., Path],
+    request: pytest.FixtureRequest,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     shutil.copy(cut_log, tmp_path / "flight.tlog")
     shutil.copy(aeroplane, tmp_path / "uav.bin")
     shutil.copy(carrier, tmp_path / "carrier.bin")
     if "recording.mcap" in command:
-        run(["companion", "replay", "flight.tlog", "--out", "recording.mcap"], tmp_path)
+        shutil.copy(request.getfixturevalue("recording"), tmp_path)
     monkeypatch.chdir(tmp_path)  # `recordings` and the like are made here
     words = ["12" if word == "120" else word for word in words_of(command)]  # it is 25 s long
-    runner = RUNNERS[runner_of(command)]
-    runner(words, tmp_path, studied if runner is study else start_node)
+    way = runner_of(command)
+    RUNNERS[way](words, tmp_path, request.getfixturevalue(WITH.get(way, "start_node")))
 
 
-def test_python_does_what_it_should(
-    start_node: Started, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_python_does_what_it_should(demo: Node, capsys: pytest.CaptureFixture[str]) -> None:
     (block,) = (block for block in PYTHON if "companion.client" in block)
-    node = start_node("demo", "--port", "0", "--seconds", "60")
-    node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
-    exec(block.replace("http://127.0.0.1:8080", node.url), {})
+    exec(block.replace("http://127.0.0.1:8080", demo.url), {})
     weights, beams = capsys.readouterr().out.splitlines()
     assert weights.startswith("('1:1', ") and "(64, 4)" in weights
     assert beams.startswith("beams 20")

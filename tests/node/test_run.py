@@ -64,7 +64,9 @@ def true_bearings_deg(tlog: Path) -> dict[str, Any]:
     return bearings
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [pytest.param(signal.SIGINT, marks=pytest.mark.full), signal.SIGTERM]
+)
 def test_follows_flying_vehicles_and_stops_cleanly(
     start_node: Any, tmp_path: Path, number: signal.Signals
 ) -> None:

@@ -19,6 +19,7 @@ from support import BIN, HANG_S, ROOT, run_async
 from companion.node import systemd
 from companion.node.service import Service
 from companion.settings.model import Settings
+from companion.values import UserError
 
 RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
 WATCHDOG_S = 1.0
@@ -187,18 +188,23 @@ def test_how_much_silence_it_bears(watchdog: dict[str, str], expected_s: float |
         {"NOTIFY_SOCKET": "/run/notify", "WATCHDOG_USEC": "-1"},
     ],
 )
-def test_an_environment_that_makes_no_sense_is_one_line(environ: dict[str, str]) -> None:
+def test_an_environment_that_makes_no_sense_is_a_mistake(environ: dict[str, str]) -> None:
+    name, value = list(environ.items())[-1]
+    with pytest.raises(UserError, match=f"^{name}: '{value}' is "):
+        systemd.manager(environ)
+
+
+def test_a_mistake_in_the_environment_is_one_line() -> None:
     done = subprocess.run(
         [BIN / "companion", *RUN],
-        env=os.environ | environ,
+        env=os.environ | {"NOTIFY_SOCKET": "run/notify"},
         capture_output=True,
         text=True,
         timeout=HANG_S,
         check=False,
     )
-    name, value = list(environ.items())[-1]
     assert done.returncode == 1
-    assert done.stderr.startswith(f"companion: {name}: '{value}' is ")
+    assert done.stderr.startswith("companion: NOTIFY_SOCKET: 'run/notify' is ")
     assert len(done.stderr.splitlines()) == 1
 
 

@@ -20,9 +20,23 @@ CUT = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
 SETTINGS = Settings().override(center={"source": "5:1"})
 
 
+WORDS = ["study", "beams", str(CUT), "--center", "5:1", "--hz", "1", "--links"]
+
+
 @pytest.fixture(scope="module")
-def rows() -> dict[str, modes.Row]:
-    return {row["beams"]: row for row in modes.compare(CUT, SETTINGS, CLEAN)}
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the command wrote of its comparison."""
+    out = tmp_path_factory.mktemp("modes")
+    done = CliRunner().invoke(main, [*WORDS, "clean", "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    assert "kalman-peng, sharp" in done.output
+    return out
+
+
+@pytest.fixture(scope="module")
+def rows(report: Path) -> dict[str, modes.Row]:
+    told = json.loads((report / "beams.json").read_text(encoding="utf-8"))
+    return {row["beams"]: row for row in told["modes"]}
 
 
 def test_each_width_gives_what_it_is_for(rows: dict[str, modes.Row]) -> None:
@@ -77,15 +91,12 @@ def test_over_a_radio_the_carrier_is_heard_as_it_was() -> None:
     assert len(observed["1:1"]) < 0.5 * len(logged["1:1"])
 
 
-def test_the_command_compares_over_the_links_that_are_named(tmp_path: Path) -> None:
-    words = ["study", "beams", str(CUT), "--center", "5:1", "--hz", "1", "--links", "clean"]
-    done = CliRunner().invoke(main, [*words, "--out", str(tmp_path)])
-    assert done.exit_code == 0, done.output
-    assert "kalman-peng, sharp" in done.output
-    told = json.loads((tmp_path / "beams.json").read_text(encoding="utf-8"))
-    assert [row["beams"] for row in told["modes"]][:3] == ["likely", "guarantee", "no"]
-    assert "Three widths" in (tmp_path / "beams.html").read_text(encoding="utf-8")
-    wrong = CliRunner().invoke(main, [*words[:-1], "best", "--out", str(tmp_path)])
+def test_the_command_compares_over_the_links_that_are_named(
+    report: Path, rows: dict[str, modes.Row], tmp_path: Path
+) -> None:
+    assert list(rows)[:3] == ["likely", "guarantee", "no"]
+    assert "Three widths" in (report / "beams.html").read_text(encoding="utf-8")
+    wrong = CliRunner().invoke(main, [*WORDS, "best", "--out", str(tmp_path)])
     assert wrong.exit_code != 0
     assert "links are some of clean, radio, hostile, noisy" in str(wrong.output) + str(
         wrong.exception

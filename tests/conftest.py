@@ -99,6 +99,9 @@ def _watch(item: pytest.Item) -> None:
 
 # --- fixtures -----------------------------------------------------------------------------------
 
+SHORT_BYTES = 100_000
+"""Of ``short_log``: some 5 s."""
+
 
 @pytest.fixture(scope="session")
 def studied(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
@@ -145,6 +148,15 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
 def cut_log() -> Path:
     """A short cut-out of a simulated flight that comes with the tests."""
     return ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
+
+
+@pytest.fixture(scope="session")
+def short_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its first seconds, for what does not depend on how long it is; the last frame is torn."""
+    log = tmp_path_factory.mktemp("logs") / "short.tlog"
+    cut = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
+    log.write_bytes(cut.read_bytes()[:SHORT_BYTES])
+    return log
 
 
 @pytest.fixture

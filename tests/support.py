@@ -33,6 +33,11 @@ LONGEST_FRAME = 10 + 255 + 2 + 13
 """Bytes of a MAVLink 2 frame at most: header, payload, checksum, signature."""
 
 
+def examples(most: int) -> int:
+    """Of a property that wants ``most`` of them: all in `make test-all`, else a quarter."""
+    return most if os.environ.get("HYPOTHESIS_PROFILE") == "full" else min(most, max(10, most // 4))
+
+
 def shared_log(name: str) -> Path:
     """A recording that is not part of the product; the test is skipped where it is missing."""
     path = SHARED / name

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from support import examples
 
 from companion.beams.aim import aim
 from companion.beams.array.coverage import Coverage, Sector
@@ -206,7 +207,7 @@ def assert_same_beams(a: BeamSet, b: BeamSet) -> None:
         assert one.pointing_bound_rad == pytest.approx(other.pointing_bound_rad)
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(st.integers(0, 2**32 - 1))
 def test_turning_the_carrier_is_turning_the_world_the_other_way(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -239,7 +240,7 @@ def test_a_mount_that_looks_right_sees_the_right_ahead() -> None:
 # --- the array on its carrier -------------------------------------------------------------------
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(st.integers(0, 2**32 - 1))
 def test_the_lever_arm_turns_with_the_carrier(seed: int) -> None:
     """An array beside the navigation point is an array at that place."""
@@ -265,7 +266,7 @@ def test_the_lever_arm_is_in_the_body_frame() -> None:
     assert other.reason == "it is within 1 m of the array"
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(st.integers(0, 2**32 - 1))
 def test_turning_array_and_carrier_is_turning_the_world_for_every_array(seed: int) -> None:
     """Weights and all: any geometry, elements that face somewhere, a lever arm."""
@@ -438,7 +439,7 @@ def integrated(rates: FloatArray, seconds: float) -> FloatArray:
     return turned
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(st.integers(0, 2**32 - 1))
 def test_rates_are_those_of_positions_and_of_the_turning_carrier(seed: int) -> None:
     """Central differences of what is aimed at a moment earlier and later."""

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from support import examples
 
 from companion.beams import line_of_sight
 from companion.beams.array.geometry import uniform_linear
@@ -19,7 +20,7 @@ def flying(rng: np.random.Generator, acceleration: FloatArray | None) -> Track:
     )  # fmt: skip
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(st.integers(0, 2**32 - 1), st.booleans())
 def test_directions_ahead_are_those_of_positions_ahead(seed: int, accelerates: bool) -> None:
     """Velocities, acceleration, turning body, lever arm and mount, one time after the other."""

@@ -62,14 +62,6 @@ def exported(where: Path, log: Path, *arguments: str) -> Path:
 
 
 @pytest.fixture(scope="module")
-def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first seconds of it, for what is not about its numbers; its last frame is torn."""
-    log = tmp_path_factory.mktemp("short") / "short.tlog"
-    log.write_bytes(LOG.read_bytes()[:100_000])
-    return log
-
-
-@pytest.fixture(scope="module")
 def as_csv(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return exported(tmp_path_factory.mktemp("csv"), LOG, *CENTER)
 
@@ -280,9 +272,9 @@ def test_space_leaves_nothing_of_a_log_that_cannot_be_read(tmp_path: Path) -> No
     assert not list(tmp_path.glob("space/*"))
 
 
-def test_a_recording_gives_the_same_tables(tmp_path: Path, short: Path) -> None:
-    recording, as_csv = tmp_path / "flight.mcap", exported(tmp_path / "csv", short, *CENTER)
-    done = CliRunner().invoke(main, ["replay", str(short), *CENTER, "--out", str(recording)])
+def test_a_recording_gives_the_same_tables(tmp_path: Path, short_log: Path) -> None:
+    recording, as_csv = tmp_path / "flight.mcap", exported(tmp_path / "csv", short_log, *CENTER)
+    done = CliRunner().invoke(main, ["replay", str(short_log), *CENTER, "--out", str(recording)])
     assert done.exit_code == 0
     again = exported(tmp_path / "tables", recording)
     digests = [json.loads((at / folder.CONTENTS).read_text())["summary"]["digest"]
@@ -382,7 +374,7 @@ def left(where: Path) -> dict[str, bytes]:
     ],
 )
 def test_an_export_cut_short_leaves_what_was_there(
-    form: str, failure: BaseException, status: int, says: str, short: Path,
+    form: str, failure: BaseException, status: int, says: str, short_log: Path,
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     where, steps, before = tmp_path / "out", 0, dict[str, bytes]()
@@ -400,32 +392,32 @@ def test_an_export_cut_short_leaves_what_was_there(
     def cut_short() -> dict[str, bytes]:
         with monkeypatch.context() as patched:
             patched.setattr(replaying.Run, "step", failing)
-            done = export(short, "--out", where, *CENTER, "--format", form)
+            done = export(short_log, "--out", where, *CENTER, "--format", form)
         assert done.exit_code == status
         assert says in done.stderr
         return left(where)
 
     assert cut_short() == {}
-    before = left(exported(where, short, *CENTER, "--format", form))
+    before = left(exported(where, short_log, *CENTER, "--format", form))
     steps = 0
     assert cut_short() == before
 
 
 def test_a_disk_that_fills_at_the_end_leaves_no_new_names(
-    short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    short_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(_descriptor: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(folder.os, "fsync", full)
-    done = export(short, "--out", tmp_path / "out", *CENTER)
+    done = export(short_log, "--out", tmp_path / "out", *CENTER)
     assert (done.exit_code, left(tmp_path / "out")) == (1, {})
     assert "No space left" in done.stderr
 
 
-def test_two_exports_do_not_share_a_folder(short: Path, tmp_path: Path) -> None:
+def test_two_exports_do_not_share_a_folder(short_log: Path, tmp_path: Path) -> None:
     with folder.TableFolder(tmp_path, "csv", TABLES):
-        done = export(short, "--out", tmp_path, *CENTER)
+        done = export(short_log, "--out", tmp_path, *CENTER)
         assert done.exit_code == 1
         assert done.stderr.count("\n") == 1
         assert (tmp_path / "reports.csv.active").exists()
@@ -433,10 +425,10 @@ def test_two_exports_do_not_share_a_folder(short: Path, tmp_path: Path) -> None:
 
 
 def test_without_pyarrow_it_says_what_to_install(
-    short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    short_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    done = export(short, "--out", tmp_path / "out", *CENTER, "--format", "parquet")
+    done = export(short_log, "--out", tmp_path / "out", *CENTER, "--format", "parquet")
     assert done.exit_code == 1
     assert "pip install 'uav-companion-beams[parquet]'" in done.stderr
     assert done.stderr.count("\n") == 1
@@ -444,10 +436,10 @@ def test_without_pyarrow_it_says_what_to_install(
 
 
 def test_parquet_is_written_group_by_group(
-    short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    short_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(parquet_file, "BATCH", 50)
-    where = exported(tmp_path / "out", short, *CENTER, "--format", "parquet")
+    where = exported(tmp_path / "out", short_log, *CENTER, "--format", "parquet")
     found = parquet.ParquetFile(where / "tracks.parquet")
     groups = [found.metadata.row_group(i).num_rows for i in range(found.num_row_groups)]
     found.close()

@@ -59,9 +59,9 @@ def test_counts_are_those_of_pymavlink(tmp_path: Path) -> None:
     assert of_recording["rejected"] == summary["rejected"]
 
 
-def test_a_short_flight_replays_to_the_same_digest(cut_log: Path, tmp_path: Path) -> None:
+def test_a_short_flight_replays_to_the_same_digest(short_log: Path, tmp_path: Path) -> None:
     recording = tmp_path / "cut.mcap"
-    first = json.loads(replay(cut_log, "--center", "5:1", "--out", recording, "--json").stdout)
+    first = json.loads(replay(short_log, "--center", "5:1", "--out", recording, "--json").stdout)
     second = json.loads(replay(recording, "--no-record", "--json").stdout)
     assert second["digest"] == first["digest"]
     assert second["recording"] is None
@@ -72,7 +72,7 @@ def test_a_short_flight_replays_to_the_same_digest(cut_log: Path, tmp_path: Path
     assert first["uavs"]["1:1"]["state"] == "live"
     assert first["uavs"]["1:1"]["dt_median_s"] == pytest.approx(0.1, abs=0.01)
     assert first["uavs"]["1:1"]["restarts"] == first["uavs"]["1:1"]["reacquired"] == 0
-    other = json.loads(replay(cut_log, "--center", "home", "--no-record", "--json").stdout)
+    other = json.loads(replay(short_log, "--center", "home", "--no-record", "--json").stdout)
     assert other["digest"] != first["digest"]
 
 

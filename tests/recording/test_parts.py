@@ -33,11 +33,11 @@ def write(path: Path, part: Part | None, events: list[Event], hole: Hole | None 
 
 
 @pytest.fixture
-def run_in_three(tmp_path: Path, cut_log: Path) -> tuple[list[Path], list[Event], str]:
+def run_in_three(tmp_path: Path, short_log: Path) -> tuple[list[Path], list[Event], str]:
     """A flight in three parts whose names are not in order, its events and its digest."""
     settings = Settings()
     pipeline = Pipeline(settings)
-    events = list(with_ticks(read_log(cut_log), settings.beams.update_hz))
+    events = list(with_ticks(read_log(short_log), settings.beams.update_hz))
     for event in events:
         pipeline.step(event)
     part, logs = Part.first(), []
@@ -122,7 +122,7 @@ def test_nonsense_about_parts_is_none() -> None:
     assert missing({}, []) == []
 
 
-def test_a_recording_holds_the_gains_of_its_observer(tmp_path: Path, cut_log: Path) -> None:
+def test_a_recording_holds_the_gains_of_its_observer(tmp_path: Path, short_log: Path) -> None:
     """The file that the settings name may be another one, or none, when it is replayed."""
     from importlib import resources
 
@@ -135,7 +135,7 @@ def test_a_recording_holds_the_gains_of_its_observer(tmp_path: Path, cut_log: Pa
     settings = load(config)
     path = tmp_path / "a.mcap"
     digest = replay(
-        [cut_log], settings, lambda: Writer(path, settings.to_toml(), {}, None, START_NS)
+        [short_log], settings, lambda: Writer(path, settings.to_toml(), {}, None, START_NS)
     )["digest"]
     design.write_text("another")
     held = settings_for([path], None, None)

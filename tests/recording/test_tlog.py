@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
+from support import examples
 
 from companion.mavlink.wire.crc_extra import CRC_EXTRA
 from companion.recording.reader import LogError, log_kind, read_log, read_settings
@@ -197,7 +198,7 @@ def test_a_bad_first_stamp_leaves_the_others_alone(wire: Wire) -> None:
     assert times == [(START_US + max(n, 1) * 10_000) * 1000 for n in range(10)]
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(st.lists(st.binary(max_size=40) | st.sampled_from([UNKNOWN, b"\xfd", b"\xfe\x09"])))
 def test_any_bytes_at_all(pieces: list[bytes]) -> None:
     """Nothing raises, time never steps back, and no more is lost than was there."""

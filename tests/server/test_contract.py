@@ -13,6 +13,7 @@ from hypothesis import settings as run_with
 from hypothesis import strategies as st
 from hypothesis.errors import Unsatisfiable
 from starlette.testclient import TestClient
+from support import examples
 
 from companion.server.app import create_app
 from companion.server.responses import PROBLEM_TYPE
@@ -73,7 +74,12 @@ QUERIES = ["lead_ms", "points", "cut", "uav", "rate_hz", "x"]
 
 
 @pytest.mark.full
-@run_with(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck), database=None)
+@run_with(
+    max_examples=examples(150),
+    deadline=None,
+    suppress_health_check=list(HealthCheck),
+    database=None,
+)
 @seed(2)
 @given(
     method=st.sampled_from(["GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "TRACE", "NOPE"]),

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from support import examples
 
 from companion.tracking import carrier
 from companion.tracking.geodesy import LocalFrame
@@ -133,7 +134,7 @@ def _at(make: Callable[..., Fix], lat_deg: float, lon_deg: float) -> Fix:
     return replace(made, report=replace(made.report, lat_deg=lat_deg, lon_deg=lon_deg))
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(
     st.tuples(*[st.floats(-3.0, 3.0)] * 3),
     st.tuples(*[st.floats(-1.0, 1.0)] * 3),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.tracking.hindsight import PLAIN, WAYS, WINDOWS, Hindsight, Way, fading, fed
 from companion.tracking.history import History
@@ -97,7 +98,7 @@ def test_the_usual_error_covers_what_comes(fix: Callable[..., Fix]) -> None:
     assert ages == sorted(ages)  # type: ignore[type-var]
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 @given(
     st.floats(1.1, 40.0), st.floats(-3.2, 3.2), st.floats(-16.0, 16.0), st.floats(-16.0, 16.0),
     st.floats(0.0, 10.0),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.tracking.history import History
 from companion.tracking.observers.kinematic import KinematicModel, KinematicObserver, KinematicState
@@ -54,7 +55,7 @@ def same_state(one: object, other: object) -> bool:
     )
 
 
-@settings(max_examples=150)
+@settings(max_examples=examples(150))
 @given(
     seed=st.integers(0, 2**32 - 1),
     gaps_ms=st.lists(st.integers(1, 900), min_size=2, max_size=40),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.pipeline import assembly
 from companion.settings.model import Settings
@@ -63,7 +64,7 @@ def test_the_nearest_setting_wins() -> None:
     assert relayed.lag_s == (0.0, 0.0)
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(
     st.lists(
         st.tuples(st.floats(0.05, 2.0), *[st.floats(-1, 1)] * 3, *[st.floats(-1, 1)] * 3),

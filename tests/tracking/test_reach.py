@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.tracking.reach import reach
 from companion.values import Fix, FloatArray, Limits, ReportNoise, SenderTime
@@ -23,7 +24,7 @@ def unit(vector: tuple[float, ...]) -> FloatArray:
     return np.array(vector) / size if size > 1e-3 else np.array([1.0, 0.0, 0.0])
 
 
-@settings(max_examples=500)
+@settings(max_examples=examples(500))
 @given(
     VECTOR, st.floats(0, 25), st.floats(0, 3), st.floats(0, 1), st.floats(0, 1), st.floats(0, 1),
     VECTOR, VECTOR, VECTOR, VECTOR, st.floats(0, 4),

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as generated
+from support import examples
 
 from companion.server.responses import encode
 from companion.values import Frame, Source
@@ -80,7 +81,7 @@ def test_arrays_and_what_is_not_a_number() -> None:
     assert message["repr_offset_q"] == [0.5] * 4
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 @given(data=st.data())
 def test_every_message_decodes_as_pymavlink_decodes_it(data: st.DataObject) -> None:
     msgid = data.draw(st.sampled_from(sorted(generated.mavlink_map)))

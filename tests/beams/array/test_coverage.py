@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.beams.array.coverage import Coverage, Sector, margin_rad, refusals
 from companion.values import FloatArray
@@ -194,7 +195,7 @@ def cone_edge(half_rad: float, points: int) -> FloatArray:
 
 
 @given(SEEDS)
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(300), deadline=None)
 def test_the_margin_is_the_nearest_edge_and_nothing_nearer_is_refused(seed: int) -> None:
     """All limits together, the array mounted at random on the body."""
     rng = np.random.default_rng(seed)

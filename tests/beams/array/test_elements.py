@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.beams.array.elements import ISOTROPIC, Element, Pattern
 from companion.values import FloatArray
@@ -122,7 +123,7 @@ def random_direction(rng: np.random.Generator) -> FloatArray:
 
 @pytest.mark.parametrize("element", ELEMENTS)
 @given(seed=SEEDS)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 def test_no_direction_within_the_radius_is_out_of_the_range(element: Element, seed: int) -> None:
     rng = np.random.default_rng(seed)
     direction = random_direction(rng)
@@ -142,7 +143,7 @@ def test_no_direction_within_the_radius_is_out_of_the_range(element: Element, se
 
 
 @given(seed=SEEDS)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 def test_the_range_is_attained_by_the_cosine(seed: int) -> None:
     """Straight towards outward and straight away from it."""
     rng = np.random.default_rng(seed)

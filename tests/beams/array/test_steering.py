@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.beams.array import steering
 from companion.beams.array.elements import Element, Pattern
@@ -97,7 +98,7 @@ FACING = {
 
 @pytest.mark.parametrize("name", FACING)
 @given(angles=DIRECTIONS)
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 def test_steering_has_each_elements_gain(name: str, angles: list[tuple[float, float]]) -> None:
     array = FACING[name]
     directions = np.array([unit(*pair) for pair in angles])

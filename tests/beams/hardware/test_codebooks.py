@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.beams.array import steering
 from companion.beams.array.elements import Element, Pattern
@@ -175,7 +176,7 @@ def test_behind_the_elements_the_order_of_beams_is_that_without_their_pattern() 
 # --- what must be swept --------------------------------------------------------------------------
 
 
-@settings(max_examples=180, deadline=None)
+@settings(max_examples=examples(180), deadline=None)
 @given(
     st.sampled_from(sorted(BOOKS)),
     st.floats(math.log(1e-6), math.log(60)).map(math.exp),
@@ -197,7 +198,7 @@ def test_the_best_beam_is_always_among_the_candidates(
     assert set(true) <= set(found)
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=examples(80), deadline=None)
 @given(st.sampled_from(sorted(BOOKS)), st.floats(-9, -1), st.integers(0, 2**32 - 1))
 def test_a_beam_that_is_best_just_inside_the_rim_is_a_candidate(
     name: str, exponent: float, seed: int

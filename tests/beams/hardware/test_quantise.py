@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.beams.hardware.quantise import (
     EMPHASIS,
@@ -164,7 +165,7 @@ def test_levels_fall_from_full(levels: tuple[float, ...]) -> None:
 # --- the search ---------------------------------------------------------------------------------
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(SEEDS, st.sampled_from(KINDS), st.integers(1, 20), st.integers(1, 3))
 def test_it_is_never_worse_than_rounding_and_says_what_it_costs(
     seed: int, kind: SettableStates, elements: int, directions: int
@@ -179,7 +180,7 @@ def test_it_is_never_worse_than_rounding_and_says_what_it_costs(
     assert paid <= cost(rounded(weights, kind), weights, towards) + 1e-12
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(SEEDS, st.sampled_from(KINDS), st.integers(1, 12))
 def test_the_result_cannot_be_bettered_by_one_element(
     seed: int, kind: SettableStates, elements: int
@@ -272,7 +273,7 @@ def test_nulls_are_deeper_than_by_rounding(kind: SettableStates, deeper_db: floa
 # --- channels, scale, order ---------------------------------------------------------------------
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(SEEDS, st.sampled_from(KINDS))
 def test_a_common_factor_changes_no_code(seed: int, kind: SettableStates) -> None:
     """Any level; any turn by a whole period of the settings turns the codes alone."""
@@ -284,7 +285,7 @@ def test_a_common_factor_changes_no_code(seed: int, kind: SettableStates) -> Non
     assert turned.cost == pytest.approx(found.cost, rel=0.3, abs=1e-6)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(SEEDS)
 def test_channels_are_taken_out(seed: int) -> None:
     """Fine settings behind any channels radiate what was wanted."""
@@ -299,7 +300,7 @@ def test_channels_are_taken_out(seed: int) -> None:
     assert np.abs(weights - beta * found.weights).max() < 3e-3
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(SEEDS, st.sampled_from(KINDS), st.integers(1, 20))
 def test_the_strongest_element_has_full_gain(
     seed: int, kind: SettableStates, elements: int

@@ -8,6 +8,7 @@ import pytest
 from device_reading import parse
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.beams.hardware import devices
 from companion.beams.hardware.calibration import Calibration, parse_calibration
@@ -216,7 +217,7 @@ def test_channels_that_differ_too_much_or_do_not_match_are_refused() -> None:
 # --- the texts ----------------------------------------------------------------------------------
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(SEEDS, st.sampled_from(list(Device)), st.integers(1, 4))
 def test_what_is_written_is_read_back(seed: int, device: Device, count: int) -> None:
     size = SIZES[device]
@@ -234,7 +235,7 @@ def test_what_is_written_is_read_back(seed: int, device: Device, count: int) -> 
     assert written(device, found) == written(device, table) or not named
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(SEEDS, st.sampled_from(list(Device)))
 def test_every_code_survives(seed: int, device: Device) -> None:
     """Any codes at all, off and lowest among them; full gain somewhere, as every beam has it."""

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.beams.weights.grouping import (
     LENIENT_DB,
@@ -43,7 +44,7 @@ def outside(candidate: ComplexArray, group: ComplexArray) -> float:
     return float(np.sum(np.abs(rest) ** 2) / np.sum(np.abs(candidate) ** 2))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(st.integers(0, 2**16), st.integers(1, 14), st.integers(3, 16))
 def test_each_takes_in_who_is_most_apart_while_all_fit(
     seed: int, users: int, elements: int
@@ -65,7 +66,7 @@ def test_each_takes_in_who_is_most_apart_while_all_fit(
     assert [group.tolist() for group in groups] == expected
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(st.integers(0, 2**16), st.integers(1, 9))
 def test_those_are_kept_who_fit_with_all_of_higher_priority(seed: int, users: int) -> None:
     steering = drawn(seed, 8, users)
@@ -77,7 +78,7 @@ def test_those_are_kept_who_fit_with_all_of_higher_priority(seed: int, users: in
         assert (user in found) == (not before or fit(steering, [*before, user]))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(st.integers(0, 2**16), st.integers(1, 9))
 def test_what_is_lost_is_that_of_the_pseudo_inverse(seed: int, users: int) -> None:
     steering = drawn(seed, 8, users)

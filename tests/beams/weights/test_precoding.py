@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
+from support import examples
 
 from companion.beams.array import steering
 from companion.beams.array.elements import Element, Pattern
@@ -72,7 +73,7 @@ def any_array(seed: int) -> Array:
             return listed(rng.uniform(-0.03, 0.03, (16, 3)), 30e9, EYE, element)
 
 
-@settings(max_examples=150)
+@settings(max_examples=examples(150))
 @given(st.integers(1, 16), st.integers(0, 2**16), st.booleans(), st.data())
 def test_zero_forcing_gives_each_its_own_and_nothing_of_the_others(
     users: int, seed: int, widen: bool, data: st.DataObject
@@ -97,7 +98,7 @@ def test_zero_forcing_gives_each_its_own_and_nothing_of_the_others(
         assert np.linalg.cond(a) > 100 * (1 - 1e-9) or plain.max() > 3 - 1e-9
 
 
-@settings(max_examples=150)
+@settings(max_examples=examples(150))
 @given(st.integers(1, 16), st.integers(0, 2**16), st.sampled_from([0.5, 3.0, 10.0]), st.data())
 def test_no_user_loses_more_than_the_limit(
     users: int, seed: int, limit_db: float, data: st.DataObject
@@ -231,7 +232,7 @@ def test_through_the_mirror_direction_no_user_loses_more_than_3_db(policy: Polic
     assert plain_db > 40.0
 
 
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 @given(st.integers(1, 20), st.integers(0, 2**16), st.data())
 def test_groups_serve_everybody_once_and_each_is_within_the_limits(
     users: int, seed: int, data: st.DataObject
@@ -347,7 +348,7 @@ def test_who_cannot_be_told_apart_at_all_is_not_said_to_cost_inf_db() -> None:
 # --- power --------------------------------------------------------------------------------------
 
 
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 @given(
     st.integers(1, 8),
     st.integers(0, 2**16),

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.beams.array.geometry import Array, listed, uniform_linear, uniform_rectangular
 from companion.beams.weights import shapes
@@ -89,7 +90,7 @@ def test_no_width_is_no_shape() -> None:
     assert np.abs(shapes.phases_rad(across, np.zeros((1, 1)), None)).max() < 1e-9
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=examples(100), deadline=None)
 @given(st.floats(0.01, 30.0), st.floats(0.01, 1.0), st.floats(-5.0, 8.0), st.booleans())
 def test_shapes_follow_widths_without_a_step(
     cone: float, ratio: float, floor_db: float, plane: bool

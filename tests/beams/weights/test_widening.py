@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.beams.array.elements import Element, Pattern
 from companion.beams.array.geometry import (
@@ -170,7 +171,7 @@ def crowded(
     return wide, crowds
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=examples(80), deadline=None)
 @given(
     st.integers(2, 10),
     st.integers(0, 2**16),
@@ -235,7 +236,7 @@ def test_where_nothing_stands_in_the_way_nulls_are_exact() -> None:
         assert np.abs(a.T @ found.weights - np.eye(4)).max() < 1e-9
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(st.integers(0, 2**16), st.sampled_from(list(Widen)[:2]))
 def test_beams_follow_directions_without_a_step(seed: int, widen: Widen) -> None:
     """Through bounds that overlap and past one another: no loading begins or ends suddenly."""
@@ -314,7 +315,7 @@ EVERY = {
 
 
 @pytest.mark.parametrize("array", EVERY.values(), ids=EVERY)
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(data=st.data())
 def test_weights_are_finite_whatever_the_array_and_the_uavs(
     array: Array, data: st.DataObject

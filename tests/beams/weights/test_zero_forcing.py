@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.beams.array import geometry, steering
 from companion.beams.array.elements import Element, Pattern
@@ -107,7 +108,7 @@ def test_any_memory_order(size: int, users: int) -> None:
 
 
 @given(st.integers(0, 10**6), st.integers(1, 40), st.floats(-6, 6))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 def test_loss_factors_do_not_depend_on_how_columns_are_scaled(
     seed: int, users: int, decades: float
 ) -> None:
@@ -163,7 +164,7 @@ def test_more_users_than_elements_have_no_answer(users: int) -> None:
 
 
 @given(st.floats(-12, 0), st.sampled_from(SIZES))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 def test_what_is_nearly_singular_shows_in_the_loss_factors(
     separation: float, numbers: tuple[int, int]
 ) -> None:

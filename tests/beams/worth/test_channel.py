@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.beams.array import steering
 from companion.beams.array.elements import Element, Pattern
@@ -278,7 +279,7 @@ def test_what_overlaps_or_touches_is_one() -> None:
 TIMES = st.integers(0, 40).map(lambda q: q / 4)
 
 
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 @given(st.lists(st.tuples(TIMES, TIMES).map(lambda p: (min(p), max(p))), max_size=8))
 def test_it_is_what_a_walk_through_the_list_finds(intervals: list[tuple[float, float]]) -> None:
     blockages = Blockages(tuple(intervals))

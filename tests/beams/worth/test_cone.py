@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.beams.array import steering
 from companion.beams.array.elements import Element, Pattern
@@ -89,7 +90,7 @@ def holders(cells: Cells, direction: FloatArray) -> FloatArray:
     return held
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 @given(st.sampled_from(sorted(ARRAYS)), BOUNDS, st.integers(0, 2**32 - 1), st.booleans())
 def test_every_direction_of_a_cone_is_in_a_cell(
     kind: str, bound_rad: float, seed: int, endfire: bool
@@ -119,7 +120,7 @@ def test_the_frame_is_right_handed_and_holds_the_predicted_direction(kind: str) 
         assert np.abs(made - direction).max() < 3e-15
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=examples(100), deadline=None)
 @given(st.sampled_from(sorted(ARRAYS)), BOUNDS, st.integers(0, 2**32 - 1))
 def test_responses_stay_within_the_bounds_of_their_cell(
     kind: str, bound_rad: float, seed: int

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.beams.array import steering
 from companion.beams.array.elements import Element, Pattern
@@ -80,7 +81,7 @@ def test_a_budget_that_is_none_is_refused(values: tuple[float, ...], name: str) 
 # --- power --------------------------------------------------------------------------------------
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(st.integers(0, 1000), st.lists(st.integers(0, 2), min_size=1, max_size=6))
 def test_each_group_sends_the_whole_power_in_equal_streams(seed: int, turns: list[int]) -> None:
     rng = np.random.default_rng(seed)
@@ -136,7 +137,7 @@ def test_it_is_what_a_receiver_measures_on_random_symbols() -> None:
         assert found[i] == pytest.approx(abs(part) ** 2 / rest, rel=0.03)
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(st.integers(0, 1000), st.lists(st.integers(0, 2), min_size=1, max_size=6))
 def test_it_is_the_sum_written_out(seed: int, turns: list[int]) -> None:
     rng = np.random.default_rng(seed)
@@ -334,7 +335,7 @@ def test_no_uavs_and_no_antennas() -> None:
         predicted_sinr_db(ARRAY, APART, RANGES_M, nothing, None, BUDGET, uav_antennas=0)
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(st.integers(0, 2**32 - 1), st.booleans())
 def test_no_link_within_the_bounds_is_worse_than_the_least(seed: int, turns: bool) -> None:
     """True directions and ranges anywhere in their bounds, against the worst of each together."""

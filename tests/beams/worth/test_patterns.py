@@ -11,6 +11,7 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.signal import find_peaks
 from scipy.signal.windows import chebwin
 from scipy.special import j0
+from support import examples
 
 from companion.beams.array import steering
 from companion.beams.array.elements import Element, Pattern
@@ -58,7 +59,7 @@ def dirichlet(count: int, half_phase: FloatArray) -> FloatArray:
 
 
 @given(SEEDS)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 def test_the_response_is_the_sum_written_out(seed: int) -> None:
     rng = np.random.default_rng(seed)
     array = listed(rng.uniform(-0.05, 0.05, (6, 3)), 30e9, EYE)
@@ -122,7 +123,7 @@ def test_the_golden_steering_vector_gives_the_full_gain_and_no_more_anywhere() -
 
 
 @given(SEEDS, st.sampled_from([Element(), TR38901, Element(Pattern.COSINE, 1.5)]))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=examples(20), deadline=None)
 def test_no_weights_have_more_gain_than_the_matched_ones(seed: int, element: Element) -> None:
     rng = np.random.default_rng(seed)
     array = uniform_circular(8, 30e9, 0.5, EYE, element)
@@ -426,7 +427,7 @@ def check_null(scan: FloatArray, fallen: int, null: float) -> int:
 
 @pytest.mark.parametrize("name", ARRAYS)
 @given(seed=SEEDS)
-@settings(max_examples=12, deadline=None, derandomize=True)
+@settings(max_examples=examples(12), deadline=None, derandomize=True)
 def test_a_lobe_is_what_a_dense_scan_shows(name: str, seed: int) -> None:
     """Any weights, any direction: peak, widths, nulls and side lobe of the exact pattern."""
     rng = np.random.default_rng(seed)
@@ -481,7 +482,7 @@ def _cut(azimuth: FloatArray, elevation: FloatArray) -> tuple[FloatArray, FloatA
 
 
 @given(SEEDS)
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 def test_the_peak_of_a_matched_beam_is_found_from_anywhere_on_its_hill(seed: int) -> None:
     rng = np.random.default_rng(seed)
     array = uniform_rectangular(8, 8, 30e9, 0.5, EYE)

@@ -5,6 +5,7 @@ from itertools import pairwise
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.mavlink.clock.estimates import Stamp
 from companion.mavlink.clock.sender_clock import SenderClock
@@ -203,7 +204,7 @@ def test_a_reboot_after_any_uptime(uptime_ms: int, wrapped: bool) -> None:
     assert stamps[-1] is not None and stamps[-1].sender_ns == 2_500 * MS
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(
     st.lists(
         st.tuples(st.integers(0, 100_000), st.integers(0, WRAP_MS - 1) | st.integers(0, 60_000)),

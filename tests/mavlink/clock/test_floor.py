@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.mavlink.clock.estimates import ClockChange, ClockEstimate
 from companion.mavlink.clock.floor import RECENT, Floor
@@ -109,7 +110,7 @@ def test_there_is_no_cliff_where_the_last_fast_frame_leaves_the_window() -> None
     assert max(abs(b - a) for a, b in pairwise(doubts)) < 0.05
 
 
-@settings(max_examples=150)
+@settings(max_examples=examples(150))
 @given(
     st.lists(st.tuples(st.floats(0.3, 15), st.floats(0, 1.5), st.floats(0, 0.3)), min_size=1,
              max_size=12),
@@ -212,7 +213,7 @@ def test_poor_trips_do_not_beat_good_stamps() -> None:
 # --- the floor itself ---------------------------------------------------------------------------
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(
     st.lists(st.tuples(st.integers(1, 3 * S), st.integers(0, 2 * S)), min_size=1, max_size=120),
     st.floats(-250e-6, 250e-6),

@@ -10,6 +10,7 @@ from statistics import fmean
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.mavlink.clock.estimates import (
     ClockAssumptions,
@@ -142,7 +143,7 @@ def test_at_least_as_good_as_the_peer(sky: Link, best_s: float, drift: float) ->
 
 
 @pytest.mark.parametrize("drift", [0.0, 1e-4, 2.4e-4, -2.4e-4])
-@pytest.mark.parametrize("sky", [radio, wifi])
+@pytest.mark.parametrize("sky", [radio, pytest.param(wifi, marks=pytest.mark.full)])
 def test_the_uncertainty_holds(sky: Link, drift: float) -> None:
     """At every moment, within the drift assumed; later it is no more than the link's own scale."""
     for seed in range(12):
@@ -157,7 +158,7 @@ def test_the_uncertainty_holds(sky: Link, drift: float) -> None:
         assert known(clock).uncertainty_s < (1.5 if sky is radio else 0.08)
 
 
-@pytest.mark.parametrize("drift", [0.0246, -0.0234])
+@pytest.mark.parametrize("drift", [0.0246, pytest.param(-0.0234, marks=pytest.mark.full)])
 def test_a_steady_drift_beyond_the_greatest_is_followed_after_a_minute(drift: float) -> None:
     clock = SenderClock()
     for arrival_ns, boot_ms in wifi(1, drift):
@@ -196,7 +197,7 @@ SKIES = st.builds(
 )
 
 
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 @given(SKIES, st.lists(st.integers(-1_000 * S, 1_000 * S), min_size=2, max_size=20))
 def test_the_mapping_is_monotone_and_has_an_inverse(
     sky: tuple[list[tuple[int, int]], float], away: list[int]
@@ -211,7 +212,7 @@ def test_the_mapping_is_monotone_and_has_an_inverse(
         assert abs(clock.node_ns(clock.sender_ns(node_ns)) - node_ns) <= 3
 
 
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 @given(SKIES)
 def test_no_stamp_of_the_window_is_later_than_its_arrival(
     sky: tuple[list[tuple[int, int]], float],
@@ -507,7 +508,9 @@ def stamps_of(data: bytes, name: str, ids: set[int]) -> dict[str, list[tuple[int
     return out
 
 
-@pytest.mark.parametrize("ids", [{33}, {30, 33}, {2, 30, 33}])
+@pytest.mark.parametrize(
+    "ids", [*(pytest.param(ids, marks=pytest.mark.full) for ids in ({33}, {30, 33})), {2, 30, 33}]
+)
 @pytest.mark.parametrize(
     ("name", "reboots", "leaps"),
     [

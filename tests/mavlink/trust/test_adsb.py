@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
+from support import examples
 
 from companion.mavlink.trust.adsb import AIRCRAFT_MAX, POSITIONS_KEPT, RELAYS_KEPT, Aircraft
 from companion.mavlink.wire.decode import ADSB_VEHICLE, decode
@@ -515,7 +516,7 @@ MESSAGES = st.fixed_dictionaries(
 
 
 @pytest.mark.full
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=examples(400), deadline=None)
 @given(st.lists(st.tuples(STEPS, MESSAGES), max_size=30))
 def test_every_answer_is_what_all_messages_together_say(
     flow: list[tuple[float, dict[str, object]]],

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
+from support import examples
 
 from companion.mavlink.trust.signing import (
     FOLLOWED_MAX,
@@ -358,7 +359,7 @@ SEQUENCES = st.lists(
 )
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(SEQUENCES)
 def test_sequences_by_brute_force(sequence: list[tuple]) -> None:  # type: ignore[type-arg]
     ours, now_ns = guard(), NOW_NS
@@ -457,7 +458,7 @@ LIVES = st.lists(
 )
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=examples(400), deadline=None)
 @given(LIVES, st.integers(0, 2))
 def test_nothing_is_taken_twice_and_no_timestamp_sent_twice(
     life: list[tuple[Callable[..., object], ...]], write_s: int

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
+from support import examples
 
 from companion.mavlink.voice.component import Component, ComponentSpec
 from companion.mavlink.voice.message_rates import MessageRates
@@ -656,7 +657,7 @@ EVENTS = st.one_of(
 )
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(st.lists(EVENTS, max_size=40))
 def test_whatever_is_heard_there_are_never_more_requests_than_allowed(events: list[Any]) -> None:
     """Per message never within 5 s, in total at most 5 a second, and hundreds of seconds of

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
+from support import examples
 
 from companion.mavlink.wire.decode import DECODED, decode
 from companion.mavlink.wire.remote_id import READ as REMOTE_ID
@@ -313,7 +314,7 @@ def test_the_flags_are_those_of_the_dialect() -> None:
         assert there == {name, "alt_datum" if name == "alt_m" else name} - {None}
 
 
-@settings(max_examples=400)
+@settings(max_examples=examples(400))
 @given(
     flags=st.integers(0, 0xFFFF),
     altitude_type=st.integers(0, 3),
@@ -410,7 +411,7 @@ def test_a_callsign_is_what_can_be_read(padded: bytes, callsign: str | None) -> 
 # --- what is cut off, and what is missing -------------------------------------------------------
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(
     hdg=st.sampled_from([0, 1, 255, 256, 35_999]),
     v=st.lists(st.sampled_from([0, 0, 1, -1, 256]), min_size=3, max_size=3),

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
-from support import LONGEST_FRAME
+from support import LONGEST_FRAME, examples
 
 from companion.mavlink.wire import encode
 from companion.mavlink.wire.crc_extra import CRC_EXTRA
@@ -194,7 +194,7 @@ PIECES = st.lists(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(300), deadline=None)
 @given(pieces=PIECES, cuts=st.lists(st.integers(0, 2000), max_size=20))
 def test_frames_and_counts_do_not_depend_on_the_cuts(
     scan: Scan, pieces: list[bytes], cuts: list[int]
@@ -211,7 +211,7 @@ def test_frames_and_counts_do_not_depend_on_the_cuts(
     assert lost[Reason.GARBAGE] <= len(data) - sum(map(len, raws(frames)))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(300), deadline=None)
 @given(st.lists(st.binary(max_size=600), max_size=5))
 def test_random_bytes_never_raise(pieces: list[bytes]) -> None:
     frames, lost = split(pieces)

@@ -26,7 +26,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
-from support import LONGEST_FRAME
+from support import LONGEST_FRAME, examples
 
 from companion.mavlink.wire.framing import Splitter
 from companion.recording.reader import LogError, read_log
@@ -440,7 +440,7 @@ GARBAGE = (
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(300), deadline=None)
 @given(
     st.lists(st.tuples(GARBAGE, frames_of_the_dialect()), max_size=6),
     GARBAGE,

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymap3d.vincenty import vdist
 from pymavlink.dialects.v20 import all as dialect
+from support import examples
 
 from sitl_replay.faults.content import (
     TIME_BOOT_MS_AT,
@@ -87,7 +88,7 @@ def test_every_boot_clock_is_rewritten_and_nothing_else(kind: Any, v1: bool) -> 
 
 
 @given(old_ms=st.integers(0, 2**32 - 1), new_ms=st.integers(0, 2**32 - 1), lon=st.integers(-9, 9))
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 def test_zeros_at_the_end_of_a_payload_are_cut_and_put_back(
     old_ms: int, new_ms: int, lon: int
 ) -> None:
@@ -223,7 +224,7 @@ def test_frozen_before_any_report_repeats_the_first() -> None:
     lon_deg=st.floats(-180.0, 180.0),
     seed=st.integers(0, 5),
 )
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 def test_glitch(metres: float, lat_deg: float, lon_deg: float, seed: int) -> None:
     glitch = Glitch(1.0, metres, 3, str(seed))
     lat, lon = round(lat_deg * 1e7), round(lon_deg * 1e7)

@@ -8,6 +8,7 @@ from itertools import pairwise
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from sitl_replay.faults.link import (
     BitErrors,
@@ -60,7 +61,7 @@ def test_a_share_is_lost_doubled_held_cut_and_littered(share: float) -> None:
 
 
 @given(low=st.floats(0.0, 1.0), high=st.floats(0.0, 1.0))
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 def test_a_larger_share_takes_what_a_smaller_one_takes(low: float, high: float) -> None:
     low, high = sorted((low, high))
     for make in (Loss, Duplication, Reordering, Truncation, Garbage):

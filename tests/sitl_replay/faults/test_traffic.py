@@ -7,6 +7,7 @@ from itertools import pairwise, permutations
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from sitl_replay.faults.asked import KINDS, Fault
 from sitl_replay.faults.content import boot_ms_of, msgid_of, sender_of
@@ -67,7 +68,7 @@ TIMING = ["delay=0.3", "jitter=0.4", "burst=0.3:1", "reordering=0.3", "jitter@1=
 
 
 @given(st.sets(st.sampled_from(TIMING)), st.integers(0, 3))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 def test_being_late_loses_and_invents_nothing(texts: set[str], seed: int) -> None:
     out, touched = through(parsed(*texts), seed=seed)
     assert Counter(frames(out)) == Counter(RAWS)
@@ -236,7 +237,7 @@ def test_senders_touch_what_they_change() -> None:
 
 
 @given(st.lists(st.sampled_from([k.example for k in KINDS.values()]), unique=True), st.integers())
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=examples(20), deadline=None)
 def test_any_faults_together_come_in_order_of_time(texts: list[str], seed: int) -> None:
     stream = random.Random(seed).choices(STREAM, k=300)
     stream.sort()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.values import FloatArray
 from sitl_replay.flight import scenario
@@ -38,7 +39,7 @@ def path_of(uav: Vehicle) -> Path:
     st.integers(3, 40),
     st.floats(0.0, 7200.0),
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 def test_each_derivative_is_that_of_the_one_before(
     name: str, seed: int, uavs: int, t_s: float
 ) -> None:

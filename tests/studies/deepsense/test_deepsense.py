@@ -46,6 +46,7 @@ def test_choices_are_made_within_what_is_learned_from() -> None:
     assert np.sum(parts, axis=0).tolist() == (~tested).astype(int).tolist()
 
 
+@pytest.mark.full
 def test_no_predictor_sees_what_is_tested() -> None:
     """Other beams where it is tested change nothing of what is predicted there."""
     place, beam = flown(1)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.beams.array import steering
 from companion.beams.array.elements import Element, Pattern
@@ -339,7 +340,7 @@ def test_a_weaker_echo_is_a_worse_one() -> None:
     assert np.std(errors) == pytest.approx(wanted, rel=0.05)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1), st.floats(0.1, 1))
 def test_whatever_happens_the_state_is_sound(seed: int, rate_gain: float, gain: float) -> None:
     """Random flights through random blockages: unit vectors, rates across, sweeps of known cost."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.beams.array.elements import Element, Pattern
 from companion.pipeline import assembly
@@ -62,7 +63,7 @@ def test_the_frame_faces_the_uav_and_is_level() -> None:
         assert turn[1, 2] == 0
 
 
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=examples(50))
 @given(st.floats(-180, 180), st.floats(-80, 80), st.floats(-30, 30), st.floats(-40, 40))
 def test_never_a_gain(azimuth: float, elevation: float, off: float, snr_db: float) -> None:
     truly, towards = direction(azimuth, elevation), direction(azimuth + off, elevation)

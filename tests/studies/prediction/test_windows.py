@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import examples
 
 from companion.studies.prediction import made_up
 from companion.studies.prediction.baselines import Observed
@@ -48,7 +49,7 @@ def test_a_window_by_hand() -> None:
     assert found[0] == pytest.approx([-2, ahead, right, down, 10 / SPEED_UNIT_MPS, 0, 0])
 
 
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=examples(50))
 @given(st.integers(0, 2**32 - 1), st.floats(-np.pi, np.pi))
 def test_neither_place_nor_north_nor_order_matters(seed: int, turn: float) -> None:
     rng = np.random.default_rng(seed)

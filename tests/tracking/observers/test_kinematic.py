@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from support import examples
 
 from companion.settings.files import kinematic_design
 from companion.settings.model import Settings
@@ -315,7 +316,7 @@ def test_over_a_long_gap_the_greatest_speed_says_more(fix: MakeFix, gap_s: float
     check(limited, (np.array([5 - 30 * gap_s, 5, 5]), np.array([-30.0, 0, 0])))
 
 
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 @given(seed=st.integers(0, 2**32 - 1), told=st.booleans(), name=st.sampled_from(list(GAINS)))
 def test_turning_the_plane_turns_the_estimates(
     fix: MakeFix, seed: int, told: bool, name: str

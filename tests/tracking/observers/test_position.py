@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from support import examples
 
 from companion.tracking.observers.position import PositionModel, PositionObserver, PositionState
 from companion.values import Fix, FloatArray, ReportNoise
@@ -291,7 +292,7 @@ def test_the_first_report_is_the_estimate(fix: MakeFix) -> None:
     assert state.bound_m == pytest.approx(1.5 + 0.5 * 30.0)
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(
     seed=st.integers(0, 2**32 - 1),
     told=st.booleans(),

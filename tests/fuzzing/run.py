@@ -1,0 +1,65 @@
+"""Searches for bytes at which a target fails, guided by what code they reach.
+
+    make fuzz                                every target, FUZZ_SECONDS (600) each
+    python tests/fuzzing/run.py fold 60      one of them for a minute
+
+It begins with the corpus beside this file and keeps what reaches new code in ``build/fuzz/TARGET``;
+bytes at which it fails are left there as ``crash-…`` and are its exit status. Afterwards the least
+set of files that reaches the same code is written back to the corpus, with ``--keep``.
+"""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+CORPUS = HERE / "corpus"
+LONGEST = 4096
+"""Bytes of a try."""
+SLOWEST_S = 30
+"""A try that takes longer hangs, and is a failure."""
+MEMORY_MB = 1500
+"""What a process may take, the instrumentation and sanitizer's own included."""
+
+
+def main() -> int:
+    """Search one target for some seconds."""
+    name, seconds, *options = sys.argv[1:]
+    work = ROOT / "build" / "fuzz" / name
+    work.mkdir(parents=True, exist_ok=True)
+    (CORPUS / name).mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, str(HERE / "run.py"), "--child", name, str(work), str(CORPUS / name)]
+    limits = [f"-max_len={LONGEST}", f"-timeout={SLOWEST_S}", f"-rss_limit_mb={MEMORY_MB}"]
+    ended = subprocess.run(
+        [*command, *limits, f"-max_total_time={seconds}", f"-artifact_prefix={work}/"],
+        check=False,
+    ).returncode
+    if ended == 0 and "--keep" in options:
+        least = work.with_suffix(".least")
+        shutil.rmtree(least, ignore_errors=True)
+        least.mkdir()
+        merge = [*command[:4], str(least), str(CORPUS / name), str(work), *limits, "-merge=1"]
+        subprocess.run(merge, check=True)
+        shutil.rmtree(CORPUS / name)
+        shutil.copytree(least, CORPUS / name)
+    return ended
+
+
+def child() -> None:
+    """The process in which the code is instrumented."""
+    import atheris
+
+    sys.path[:0] = [str(HERE), str(HERE.parent), str(ROOT)]
+    with atheris.instrument_imports(include=["companion"]):
+        from targets import TARGETS
+    atheris.Setup([sys.argv[0], *sys.argv[3:]], TARGETS[sys.argv[2]])
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "--child":
+        child()
+    else:
+        sys.exit(main())

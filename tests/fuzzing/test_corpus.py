@@ -1,0 +1,16 @@
+"""What the search of ``run.py`` has kept: bytes that reach different code, former failures."""
+
+from pathlib import Path
+
+import pytest
+from fuzzing.targets import TARGETS
+
+CORPUS = Path(__file__).parent / "corpus"
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_what_was_found_holds(name: str) -> None:
+    files = sorted((CORPUS / name).iterdir())
+    assert len(files) > 5
+    for file in files:
+        TARGETS[name](file.read_bytes())

@@ -15,7 +15,7 @@ export OPENBLAS_NUM_THREADS
 # Tests of pure rooms on two workers; those that start services share one, one after the other.
 WORKERS = -n 2 --dist loadgroup
 
-.PHONY: demo test test-all check site bench soak format lock clean FORCE
+.PHONY: demo test test-all check site bench soak fuzz format lock clean FORCE
 
 demo: .venv/.runtime
 	$(BIN)/companion demo
@@ -55,6 +55,12 @@ bench: .venv/.dev
 
 soak: .venv/.dev
 	$(PYTEST) -q -s -m soak --timeout=0
+
+# What fails is left in build/fuzz/TARGET/crash-…; what reaches new code goes into the corpus.
+FUZZ_SECONDS = 600
+fuzz: .venv/.dev
+	@for target in framing fold recovery settings http; do \
+	    $(BIN)/python tests/fuzzing/run.py $$target $(FUZZ_SECONDS) --keep || exit 1; done
 
 format: .venv/.dev
 	$(BIN)/ruff format .

@@ -12,15 +12,16 @@ from typing import Final
 
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.links.urls import MAVLINK
-from companion.node import machine
+from companion.node import capacity, machine
 from companion.node.machine import Finding, Grade
 from companion.node.service import Service
 from companion.node.serving import run_until_told
 from companion.pipeline.fold import Pipeline
 from companion.server.access import bind
+from companion.settings.files import embedded
 from companion.settings.model import Settings
 from companion.settings.outlets import DriveSettings, RecordSettings
-from companion.values import Level, Reason, Verdict, reports_itself
+from companion.values import Level, Reason, UserError, Verdict, reports_itself
 from companion.views import state
 
 LOOKS: Final = 5
@@ -57,6 +58,8 @@ def check(
         if finding.grade is Grade.FAULT:
             faulty.add(finding.subject.removeprefix("link "))
         yield finding
+    show("measuring what this machine carries")
+    yield _capacity(settings)
     urls = [url for url in settings.links.urls if url not in faulty]
     if not settings.links.urls:
         yield Finding("links", Grade.FAULT, "none", "say --link udpin:0.0.0.0:14550")
@@ -64,6 +67,22 @@ def check(
         show(f"listening for {seconds:g} s")
         service = _listen(_to_listen(settings, urls), seconds)
         yield from _heard(service, settings)
+
+
+def _capacity(settings: Settings) -> Finding:
+    try:
+        found = capacity.measure(embedded(settings))
+    except UserError as error:
+        return Finding("settings", Grade.FAULT, str(error), "mend them, or the file they name")
+    most = f"more than {capacity.MOST}" if found.uavs is None else f"some {found.uavs}"
+    text = (
+        f"carries {most} UAVs at {capacity.RATE_HZ} reports a second each"
+        f" (a report takes {found.report_s * 1e3:.2f} ms,"
+        f" an update of {capacity.MORE} beams {found.update_s * 1e3:.1f} ms)"
+    )
+    if found.uavs is not None and found.uavs < capacity.FEW:
+        return Finding("capacity", Grade.DOUBT, text, "lower [beams] update_hz")
+    return Finding("capacity", Grade.OK, text)
 
 
 def _to_listen(settings: Settings, urls: list[str]) -> Settings:

@@ -1,0 +1,99 @@
+"""How many UAVs this machine carries, measured with a sky of its own.                    [shell]
+
+UAVs that fly straight report to a pipeline in this process, few of them and then more. What reports
+and updates take of a processor grows with their number; the number is told at which they take
+``SHARE`` of it. The rest is for recording, answers and what else the machine does.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Final
+
+from companion.mavlink.wire.encode import global_position_int, pack
+from companion.pipeline.fold import Pipeline
+from companion.settings.model import Settings
+from companion.tracking.geodesy import LocalFrame
+from companion.values import Event, Frame, Source, Tick
+
+SHARE: Final = 0.5
+"""Share of one processor that reports and updates may take."""
+RATE_HZ: Final = 10
+"""Reports a second of each UAV."""
+FEW: Final = 4
+MORE: Final = 16
+"""UAVs that are flown to tell how the time grows with them."""
+MOST: Final = 250
+"""UAVs beyond which nothing is told: they are too many more than were flown."""
+SETTLED_S: Final = 2
+MEASURED_S: Final = 3
+"""Flight before it is measured, and while it is."""
+HOME: Final = (47.0, 8.0, 500.0)
+_S: Final = 1_000_000_000
+_BEGIN_NS: Final = 1_700_000_000 * _S
+
+
+@dataclass(frozen=True, slots=True)
+class Capacity:
+    """What was measured.
+
+    uavs      UAVs that take ``SHARE`` of a processor; None: more than ``MOST``
+    report_s  time that a report takes
+    update_s  time that an update of ``MORE`` beams takes
+    """
+
+    uavs: int | None
+    report_s: float
+    update_s: float
+
+
+def measure(settings: Settings, clock_s: Callable[[], float] = time.process_time) -> Capacity:
+    """Fly ``FEW`` and then ``MORE`` UAVs about an array of these settings; takes a second or so."""
+    update_hz = settings.beams.update_hz
+    few, more = (_flown(settings, number, clock_s) for number in (FEW, MORE))
+    report_s = (few.report_s + more.report_s) / 2
+    each_s = max(0.0, (more.update_s - few.update_s) / (MORE - FEW))
+    alone_s = max(0.0, more.update_s - MORE * each_s)
+    spare = SHARE - update_hz * alone_s
+    uavs = int(max(0.0, spare) / (RATE_HZ * report_s + update_hz * each_s))
+    return Capacity(None if uavs > MOST else uavs, report_s, more.update_s)
+
+
+@dataclass(frozen=True, slots=True)
+class _Took:
+    report_s: float
+    update_s: float
+
+
+def _flown(settings: Settings, number: int, clock_s: Callable[[], float]) -> _Took:
+    """Mean times of a report and of an update with so many UAVs in the sky."""
+    center = {"source": ",".join(map(str, HOME))}
+    pipeline = Pipeline(settings.override(center=center, beams={"targets": "all"}))
+    took_s, counts = {Frame: 0.0, Tick: 0.0}, {Frame: 0, Tick: 0}
+    for event in _sky(number, settings.beams.update_hz):
+        began_s = clock_s()
+        pipeline.step(event)
+        if event.t_ns >= _BEGIN_NS + SETTLED_S * _S:
+            took_s[type(event)] += clock_s() - began_s
+            counts[type(event)] += 1
+    return _Took(took_s[Frame] / counts[Frame], took_s[Tick] / counts[Tick])
+
+
+def _sky(number: int, update_hz: float) -> Iterator[Event]:
+    """Reports and ticks in the order of time; the UAVs fly outwards, each its own way."""
+    frame = LocalFrame(*HOME)
+    update_ns, due_ns = round(_S / update_hz), _BEGIN_NS
+    for step in range((SETTLED_S + MEASURED_S) * RATE_HZ):
+        t_s = step / RATE_HZ
+        for uav in range(number):
+            t_ns = _BEGIN_NS + round(t_s * _S) + uav * 1_000_000
+            while due_ns <= t_ns:
+                yield Tick(due_ns)
+                due_ns += update_ns
+            north, east = (uav % 4 - 1.5), (uav // 4 + 0.5)
+            far_m = 200.0 + 8.0 * t_s
+            place = frame.place(north * far_m, east * far_m, -60.0)
+            velocity = (8.0 * north, 8.0 * east, 0.0)
+            source = Source(1 + uav, 1)
+            said = global_position_int(source, round(t_s * 1e3) + 5000, place, 60.0, velocity, None)
+            yield Frame(t_ns, "sky", source, said.msgid, pack(said, step % 256))

@@ -20,6 +20,8 @@ LONGEST = 4096
 """Bytes of a try."""
 SLOWEST_S = 30
 """A try that takes longer hangs, and is a failure."""
+AFTER_S = 1800
+"""What a search may take beyond its time, and the choice of what is kept."""
 MEMORY_MB = 1500
 """What a process may take, the instrumentation and sanitizer's own included."""
 
@@ -32,16 +34,14 @@ def main() -> int:
     (CORPUS / name).mkdir(parents=True, exist_ok=True)
     command = [sys.executable, str(HERE / "run.py"), "--child", name, str(work), str(CORPUS / name)]
     limits = [f"-max_len={LONGEST}", f"-timeout={SLOWEST_S}", f"-rss_limit_mb={MEMORY_MB}"]
-    ended = subprocess.run(
-        [*command, *limits, f"-max_total_time={seconds}", f"-artifact_prefix={work}/"],
-        check=False,
-    ).returncode
+    search = [*command, *limits, f"-max_total_time={seconds}", f"-artifact_prefix={work}/"]
+    ended = subprocess.run(search, check=False, timeout=int(seconds) + AFTER_S).returncode
     if ended == 0 and "--keep" in options:
         least = work.with_suffix(".least")
         shutil.rmtree(least, ignore_errors=True)
         least.mkdir()
         merge = [*command[:4], str(least), str(CORPUS / name), str(work), *limits, "-merge=1"]
-        subprocess.run(merge, check=True)
+        subprocess.run(merge, check=True, timeout=AFTER_S)
         shutil.rmtree(CORPUS / name)
         shutil.copytree(least, CORPUS / name)
     return ended

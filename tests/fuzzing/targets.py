@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from support import HANG_S
 
 from companion.mavlink.wire.decode import DECODED
 from companion.mavlink.wire.framing import Splitter
@@ -160,14 +161,14 @@ async def _answer(path: bytes, query: bytes, headers: list[tuple[bytes, bytes]])
     async def receive() -> dict[str, Any]:
         for part in body:
             return part
-        await asyncio.Event().wait()  # the client stays, and is waited for until it is cancelled
+        await asyncio.sleep(HANG_S)  # the client stays; this is cancelled
         raise AssertionError
 
     async def send(message: dict[str, Any]) -> None:
         if message["type"] == "http.response.start":
             sent.append(message["status"])
 
-    await asyncio.wait_for(_app()(scope, receive, send), 60)
+    await asyncio.wait_for(_app()(scope, receive, send), HANG_S)
     (status,) = sent
     return status
 

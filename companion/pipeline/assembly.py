@@ -14,6 +14,7 @@ from companion.beams.hardware import codebooks
 from companion.beams.hardware.calibration import Calibration, channel_error, parse_calibration
 from companion.beams.hardware.codebooks import Codebook
 from companion.beams.hardware.devices import Device
+from companion.beams.hardware.unit_gains import RELATIVE, UnitGains, parse_unit_gains
 from companion.beams.weights.precoding import Precoder
 from companion.beams.worth.link_budget import LinkBudget
 from companion.mavlink.clock.estimates import ClockAssumptions
@@ -24,6 +25,7 @@ from companion.settings.files import (
     codebook_file,
     coupling_file,
     kinematic_design,
+    unit_text,
 )
 from companion.settings.model import Settings
 from companion.settings.section import ConfigError
@@ -129,6 +131,7 @@ class Equipment:
     budget        power, bandwidth and noise figure of the radio link
     uav_antennas  antennas that each UAV combines
     device        what the weights are quantised for; None: nothing
+    unit_gains    what a TMYTEK unit's channels can have
     """
 
     codebook: Codebook | None
@@ -136,6 +139,7 @@ class Equipment:
     budget: LinkBudget
     uav_antennas: int
     device: Device | None = None
+    unit_gains: UnitGains = RELATIVE
 
 
 def equipment(settings: Settings, antenna: geometry.Array) -> Equipment:
@@ -155,7 +159,13 @@ def equipment(settings: Settings, antenna: geometry.Array) -> Equipment:
     except UserError as error:
         raise ConfigError(f"codebook: {error}") from error
     device = None if settings.hardware.device is None else Device(settings.hardware.device)
-    return Equipment(codebook, calibration(settings, antenna.size), *radio(settings), device)
+    text = unit_text(settings)
+    try:
+        gains = RELATIVE if text is None else parse_unit_gains(text)
+    except UserError as error:
+        raise ConfigError(f"hardware.unit: {error}") from error
+    channels = calibration(settings, antenna.size)
+    return Equipment(codebook, channels, *radio(settings), device, gains)
 
 
 def precoder(settings: Settings) -> Precoder:

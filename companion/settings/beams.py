@@ -191,7 +191,8 @@ class HardwareSettings(Section):
     ``phase_error_deg`` and ``gain_error_db`` are the most that each channel is off after it: bounds
     for which guaranteed gains then hold. A table that says bounds of its own has the last word.
     ``device`` is what the weights are quantised for: guaranteed gains in the API are then of what
-    it radiates.
+    it radiates. ``unit`` names a file of what gains a TMYTEK unit can have
+    (``companion/beams/hardware/unit_gains.py``), which is read into ``unit_toml``.
     """
 
     calibration: str | None = None
@@ -199,6 +200,8 @@ class HardwareSettings(Section):
     phase_error_deg: Annotated[float, Field(ge=0, le=180)] = 0.0
     gain_error_db: Annotated[float, Field(ge=0, le=60)] = 0.0
     device: Literal["adar1000", "tmytek", "sivers"] | None = None
+    unit: str | None = None
+    unit_toml: str | None = None
 
 
 class RadioSettings(Section):

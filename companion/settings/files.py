@@ -47,7 +47,7 @@ def embedded(settings: Settings) -> Settings:
     Raises ``ConfigError`` where one cannot be read.
     """
     placed = _with_coupling(_with_positions(settings))
-    return _with_codebook(_with_calibration(_with_design(placed)))
+    return _with_unit(_with_codebook(_with_calibration(_with_design(placed))))
 
 
 def layered(path: Path | None, options: Mapping[str, dict[str, Any]]) -> tuple[Settings, Origins]:
@@ -182,6 +182,22 @@ def calibration_text(settings: Settings) -> str | None:
     Raises ``ConfigError`` if it cannot be read.
     """
     return _with_calibration(settings).hardware.calibration_csv
+
+
+def _with_unit(settings: Settings) -> Settings:
+    """Settings with the gains of a unit read in."""
+    name = settings.hardware.unit
+    if name is None or settings.hardware.unit_toml is not None:
+        return settings
+    return settings.override(hardware={"unit_toml": _text("hardware.unit", name)})
+
+
+def unit_text(settings: Settings) -> str | None:
+    """The text of a unit's gains; None if the settings name none.
+
+    Raises ``ConfigError`` if it cannot be read.
+    """
+    return _with_unit(settings).hardware.unit_toml
 
 
 def _text(key: str, name: str) -> str:

@@ -65,6 +65,7 @@ EMBEDDED: Final = (
     ("observer", "design", "design_json"),
     ("codebook", "file", "stored"),
     ("hardware", "calibration", "calibration_csv"),
+    ("hardware", "unit", "unit_toml"),
 )
 """Section; its key that names a file; its key that holds what is in that file."""
 

@@ -38,4 +38,4 @@ def device_table(
             )
         )
     calibration = equipment.calibration or Calibration.ideal(range(array.size))
-    return tables.fit(device, wanted, calibration)
+    return tables.fit(device, wanted, calibration, equipment.unit_gains)

@@ -123,6 +123,22 @@ def test_a_calibration_turns_a_device_s_settings(cut_log: Path, tmp_path: Path) 
         assert abs(np.vdot(a, b)) > 0.99 * np.linalg.norm(a) * np.linalg.norm(b)
 
 
+def test_a_unit_s_gains_are_those_of_its_file(cut_log: Path, tmp_path: Path) -> None:
+    config, unit = tmp_path / "settings.toml", tmp_path / "unit.toml"
+    unit.write_text(
+        'mode = "TX"\ncommon_db = [[-1, 9.5], [-1, 9.5], [-1, 9.5], [-1, 9.5]]\n'
+        "element_db = [4.0, 4.0, 4.0, 4.0]\n"
+    )
+    config.write_text(f'{SMALL}field_of_view_deg = 90.0\n[hardware]\nunit = "{unit}"\n')
+    text = weights(cut_log, "--config", str(config), "--format", "tmytek").decode()
+    gains = [float(line.split(",")[8]) for line in text.splitlines()[1:]]
+    assert max(gains) == 13.5
+    assert min(gains) >= 9.5
+    unit.write_text("mode = 'TX'\n")
+    said = mistake(cut_log, "--config", str(config), "--format", "tmytek")
+    assert said.startswith("hardware.unit: the keys are common_db, element_db, mode")
+
+
 def test_a_file_holds_what_stdout_would(cut_log: Path, tmp_path: Path) -> None:
     out = tmp_path / "w.npy"
     assert weights(cut_log, "--format", "npy", "--out", str(out)) == b""

@@ -11,6 +11,8 @@ import pytest
 import tomli_w
 from support import BIN, HANG_S
 
+from companion.beams.hardware.devices import Mode
+from companion.beams.hardware.unit_gains import UnitGains
 from companion.node.replay import settings_for, writer_for
 from companion.pipeline import assembly
 from companion.recording.reader import read_log
@@ -111,11 +113,15 @@ def test_what_equipment_files_held_is_in_the_recording(cut_log: Path, tmp_path: 
     table = tmp_path / "measured.csv"
     lines = [f"{c},{3 - c},{10 * c},0" for c in range(4)]
     table.write_text("channel,element,phase_deg,gain_db\n" + "\n".join(lines))
+    unit = tmp_path / "unit.toml"
+    unit.write_text(
+        "mode = 'RX'\ncommon_db = [[0, 9], [0, 9], [0, 9], [0, 9]]\nelement_db = [4, 4, 4, 4]\n"
+    )
     config = tmp_path / "settings.toml"
     config.write_text(
         f"[center]\nsource = '5:1'\n[array]\nelements = 4\n"
         f"[codebook]\nkind = 'file'\nfile = '{tmp_path}/beams.npy'\n"
-        f"[hardware]\ncalibration = '{table}'\n"
+        f"[hardware]\ncalibration = '{table}'\nunit = '{unit}'\n"
     )
     given = load(config)
     wanted = assembly.equipment(given, assembly.array(given))
@@ -124,7 +130,7 @@ def test_what_equipment_files_held_is_in_the_recording(cut_log: Path, tmp_path: 
         for event in read_log(cut_log):
             writer.event(event)
         writer.close({})
-    for file in (table, config, tmp_path / "beams.npy"):
+    for file in (table, unit, config, tmp_path / "beams.npy"):
         file.unlink()
 
     held = settings_for([log], None, None)
@@ -134,6 +140,7 @@ def test_what_equipment_files_held_is_in_the_recording(cut_log: Path, tmp_path: 
     assert np.array_equal(found.codebook.weights, wanted.codebook.weights)
     assert found.calibration is not None
     assert found.calibration.order == (3, 2, 1, 0)
+    assert found.unit_gains == wanted.unit_gains == UnitGains(Mode.RX, 13.0, 4.0)
     assert (held.codebook.file, held.hardware.calibration) == (None, None)
     again = tmp_path / "again.mcap"  # a recording of the replay is as complete
     with writer_for([log], held, again) as writer:

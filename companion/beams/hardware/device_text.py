@@ -16,11 +16,10 @@ from companion.beams.hardware.devices import (
     SIVERS_ANTENNAS,
     SIVERS_OFFSET,
     SIVERS_ROWS,
-    TMYTEK_SETTINGS,
     TMYTEK_STEP_DB,
-    Mode,
     vector_modulator,
 )
+from companion.beams.hardware.unit_gains import UnitGains
 from companion.values import IntArray, UserError
 
 ADAR1000_HEADER: Final = (
@@ -57,21 +56,19 @@ def write_adar1000(uavs: Sequence[str], codes: IntArray, order: Sequence[int]) -
     return "\n".join(lines) + "\n"
 
 
-def write_tmytek(codes: IntArray, mode: Mode, full_gain_db: float) -> str:
+def write_tmytek(codes: IntArray, gains: UnitGains) -> str:
     """CSV for TLKCore with a line for each beam and channel (BeamType 1); beams count from 1.
 
-    ``full_gain_db`` is ``ch_db`` of an element at full gain: the top of the range that the unit
-    states for its channels, in half decibels. The format has no room for names.
+    A channel that is off keeps a gain of the unit, the lowest: its board's others are judged by it.
+    The format has no room for names.
     """
-    if not np.isfinite(full_gain_db) or full_gain_db % TMYTEK_STEP_DB:
-        raise UserError(f"full gain {full_gain_db} dB is not in steps of {TMYTEK_STEP_DB} dB")
-    lowest = len(TMYTEK_SETTINGS.levels) - 2
+    lowest = round(gains.range_db / TMYTEK_STEP_DB)
     lines = [TMYTEK_HEADER]
     for beam, row in enumerate(codes.tolist(), start=1):
         for channel, (degrees, level) in enumerate(row, start=1):
-            gain_db = full_gain_db - TMYTEK_STEP_DB * min(level, lowest)
+            gain_db = gains.full_gain_db - TMYTEK_STEP_DB * min(level, lowest)
             off = int(level > lowest)
-            lines.append(f"{mode},{beam},1,,,,{channel},{off},{gain_db:.1f},{degrees}")
+            lines.append(f"{gains.mode},{beam},1,,,,{channel},{off},{gain_db:.1f},{degrees}")
     return "\n".join(lines) + "\n"
 
 

@@ -96,13 +96,15 @@ def vector_modulator(phase_code: int) -> tuple[int, int]:
 # TLKCore examples of the maker: the columns and their meaning, 64 beams, theta 0 to 45 and phi 0 to
 # 359 whole degrees, channels from 1 (16 of them in the 4 x 4 antenna kits, which state -45 to 45
 # degrees), ch_sw 0 on and 1 off, ch_deg whole degrees, ch_db in half decibels. What gains a unit
-# can have lies in its own calibration tables; the 7.5 dB taken here are what the channels of the
-# maker's example span. Theta is the angle off boresight and phi the angle about it, counted here
-# from the array's right (y) towards up (-z); only theta matters to tables of channels.
+# can have lies in its own calibration tables: ``unit_gains`` reads what it says of them. Theta is
+# the angle off boresight and phi the angle about it, counted here from the array's right (y)
+# towards up (-z); only theta matters to tables of channels.
 
 TMYTEK_CHANNELS: Final = 16
 TMYTEK_STEP_DB: Final = 0.5
-TMYTEK_SETTINGS: Final = stepped(360, TMYTEK_STEP_DB, 7.5, off=True)
+TMYTEK_RANGE_DB: Final = 7.5
+"""What the channels of the maker's example span."""
+TMYTEK_SETTINGS: Final = stepped(360, TMYTEK_STEP_DB, TMYTEK_RANGE_DB, off=True)
 
 
 class Mode(StrEnum):
@@ -140,7 +142,7 @@ SETTINGS: Final[dict[Device, SettableStates]] = {
 
 LIMITS: Final = {
     Device.ADAR1000: Limits(None, 121, None, 31.0),
-    Device.TMYTEK: Limits(TMYTEK_CHANNELS, 64, math.radians(45), 7.5),
+    Device.TMYTEK: Limits(TMYTEK_CHANNELS, 64, math.radians(45), TMYTEK_RANGE_DB),
     Device.SIVERS: Limits(SIVERS_ANTENNAS, SIVERS_ROWS, None, 20 * math.log10(SIVERS_OFFSET)),
 }
 """Limits of each device. An ADAR1000 array has as many chips as it needs."""

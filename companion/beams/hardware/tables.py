@@ -11,8 +11,9 @@ import numpy as np
 
 from companion.beams.hardware import device_text
 from companion.beams.hardware.calibration import Calibration
-from companion.beams.hardware.devices import LIMITS, SETTINGS, Device, Mode
+from companion.beams.hardware.devices import LIMITS, SETTINGS, Device
 from companion.beams.hardware.quantise import quantise
+from companion.beams.hardware.unit_gains import RELATIVE, UnitGains
 from companion.beams.weights.precoding import gain_db
 from companion.values import ComplexArray, IntArray, UserError
 
@@ -45,6 +46,7 @@ class DeviceTable:
              and what feeds the array divides the power among beams
     loss_db  array gain that each beam lost towards its own direction by the settings; None
              where the wanted weights are not known
+    gains    what the channels of a TMYTEK unit can have
     """
 
     device: Device
@@ -53,16 +55,23 @@ class DeviceTable:
     order: tuple[int, ...]
     weights: ComplexArray
     loss_db: tuple[float, ...] | None
+    gains: UnitGains = RELATIVE
 
 
-def fit(device: Device, beams: Sequence[WantedBeam], calibration: Calibration) -> DeviceTable:
-    """The settings nearest to the wanted beams.
+def fit(
+    device: Device,
+    beams: Sequence[WantedBeam],
+    calibration: Calibration,
+    gains: UnitGains = RELATIVE,
+) -> DeviceTable:
+    """The settings nearest to the wanted beams; ``gains`` are those of a TMYTEK unit.
 
     Raises ``UserError``, with the reason, for what the device cannot do.
     """
-    _check(device, beams, calibration)
+    _check(device, beams, calibration, gains)
     factors = calibration.factors
-    found = [quantise(b.weights, SETTINGS[device], b.steering, factors) for b in beams]
+    states = gains.settings if device is Device.TMYTEK else SETTINGS[device]
+    found = [quantise(b.weights, states, b.steering, factors) for b in beams]
     codes = np.stack([one.codes[list(calibration.order)] for one in found])
     losses = tuple(
         float((gain_db(own, wanted) - gain_db(own, sent))[0])
@@ -73,43 +82,40 @@ def fit(device: Device, beams: Sequence[WantedBeam], calibration: Calibration) -
     )
     weights = np.stack([one.weights for one in found], axis=1)
     uavs = tuple(device_text.check_name(beam.uav) for beam in beams)
-    return DeviceTable(device, uavs, codes, calibration.order, weights, losses)
+    return DeviceTable(device, uavs, codes, calibration.order, weights, losses, gains)
 
 
-def encode(
-    table: DeviceTable,
-    frequency_hz: float | None = None,
-    full_gain_db: float = 0.0,
-    mode: Mode = Mode.TX,
-) -> str:
+def encode(table: DeviceTable, frequency_hz: float | None = None) -> str:
     """The table as the text of its device (``companion.beams.hardware.device_text``).
 
-    ``frequency_hz`` is needed by Sivers alone; ``full_gain_db`` and ``mode`` (TX or RX) are
-    TMYTEK's. Raises ``UserError`` for a value that the text cannot hold.
+    ``frequency_hz`` is needed by Sivers alone. Raises ``UserError`` for a value that the text
+    cannot hold.
     """
     match table.device:
         case Device.ADAR1000:
             return device_text.write_adar1000(table.uavs, table.codes, table.order)
         case Device.TMYTEK:
-            return device_text.write_tmytek(table.codes, mode, full_gain_db)
+            return device_text.write_tmytek(table.codes, table.gains)
         case Device.SIVERS:
             if frequency_hz is None:
                 raise UserError("a Sivers beam book needs the frequency that it is for")
             return device_text.write_sivers(table.uavs, table.codes, frequency_hz)
 
 
-def _check(device: Device, beams: Sequence[WantedBeam], calibration: Calibration) -> None:
+def _check(
+    device: Device, beams: Sequence[WantedBeam], calibration: Calibration, gains: UnitGains
+) -> None:
     """Raise ``UserError`` for what the device cannot do."""
     limits, size = LIMITS[device], len(calibration.order)
+    range_db = gains.range_db if device is Device.TMYTEK else limits.gain_range_db
     if limits.elements is not None and size != limits.elements:
         raise UserError(f"{device} drives {limits.elements} elements, the array has {size}")
     if not 1 <= len(beams) <= limits.beams:
         raise UserError(f"{device} stores 1 to {limits.beams} beams, not {len(beams)}")
     spread_db = max(calibration.gain_db) - min(calibration.gain_db)
-    if spread_db > limits.gain_range_db:
+    if spread_db > range_db:
         raise UserError(
-            f"the channels differ by {spread_db:.1f} dB, {device} can level "
-            f"{limits.gain_range_db:.1f} dB"
+            f"the channels differ by {spread_db:.1f} dB, {device} can level {range_db:.1f} dB"
         )
     for beam in beams:
         if beam.weights.shape != (size,) or beam.steering.ndim != 2 or not beam.steering.size:

@@ -20,6 +20,7 @@ from companion.beams.hardware.devices import (
     Mode,
 )
 from companion.beams.hardware.tables import DeviceTable, WantedBeam, encode, fit
+from companion.beams.hardware.unit_gains import UnitGains
 from companion.values import ComplexArray
 
 SIZES = {Device.ADAR1000: 8, Device.TMYTEK: 16, Device.SIVERS: 16}
@@ -313,8 +314,9 @@ def test_the_tmytek_table() -> None:
         Device.TMYTEK,
         [WantedBeam("1:1", np.array([1.0, 0.5, 0.0, 1j] * 4), 0.0, 0.0, line([0.0], 16))] * 2,
         Calibration.ideal(range(16)),
+        UnitGains(Mode.RX, 11.5, 7.5),
     )
-    header, *lines = encode(table, full_gain_db=11.5, mode=Mode.RX).splitlines()
+    header, *lines = encode(table).splitlines()
     assert header == "Mode,BeamID,BeamType,beam_db,beam_theta,beam_phi,ch,ch_sw,ch_db,ch_deg"
     assert len(lines) == 32
     first = [line.split(",") for line in lines[:16]]
@@ -323,8 +325,6 @@ def test_the_tmytek_table() -> None:
     assert [row[7] for row in first] == ["0", "0", "1", "0"] * 4
     assert first[0][8] == "11.5"
     assert lines[16].startswith("RX,2,1,,,,1,")
-    with pytest.raises(ValueError, match=r"full gain 0\.3 dB"):
-        encode(table, full_gain_db=0.3)
 
 
 def test_blank_lines_of_a_tmytek_table_are_skipped() -> None:

@@ -1,0 +1,96 @@
+"""Gains that a TMYTEK unit can have: its own limits, from a described file for each unit.
+
+A channel's gain is the common gain of its board, four channels, and an element gain of its own,
+from 0 to the board's limit. TLKCore says both at the operating frequency (``getCOMDR``,
+``getELEDR``), and checks each beam by them: the elements of a board differ by no more than the
+element limit, and its common gain is within its range. The file is TOML:
+
+    mode = "TX"                                 # or "RX"
+    common_db = [[-1.0, 9.5], [-1.0, 9.5], [-1.0, 9.5], [-1.0, 9.5]]
+    element_db = [4.0, 4.0, 4.0, 4.0]
+
+All boards are driven within one span, that of the weakest: its top is what every board reaches, and
+each beam has its strongest element there.
+"""
+
+import math
+import tomllib
+from dataclasses import dataclass
+from typing import Any, Final
+
+from companion.beams.hardware.devices import (
+    TMYTEK_CHANNELS,
+    TMYTEK_RANGE_DB,
+    TMYTEK_STEP_DB,
+    Mode,
+)
+from companion.beams.hardware.quantise import Resolution, stepped
+from companion.values import UserError
+
+BOARD_CHANNELS: Final = 4
+BOARDS: Final = TMYTEK_CHANNELS // BOARD_CHANNELS
+KEYS: Final = {"mode", "common_db", "element_db"}
+
+
+@dataclass(frozen=True, slots=True)
+class UnitGains:
+    """The gains of all channels of a unit.
+
+    mode          transmission or reception: each has limits of its own
+    full_gain_db  gain of an element at full gain, in steps of ``TMYTEK_STEP_DB``
+    range_db      how far below that an element can be, in such steps
+    """
+
+    mode: Mode
+    full_gain_db: float
+    range_db: float
+
+    @property
+    def settings(self) -> Resolution:
+        """What one channel can be set to."""
+        step_db = TMYTEK_STEP_DB if self.range_db else None
+        return stepped(360, step_db, self.range_db, off=True)
+
+
+RELATIVE: Final = UnitGains(Mode.TX, 0.0, TMYTEK_RANGE_DB)
+"""Gains over the loudest element, for a unit of which nothing is known: it may refuse them."""
+
+
+def parse_unit_gains(text: str) -> UnitGains:
+    """Read the file described above. Raises ``UserError`` that names the key."""
+    try:
+        told = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise UserError(f"not TOML: {error}") from error
+    if set(told) != KEYS:
+        raise UserError(f"the keys are {', '.join(sorted(KEYS))}, not {', '.join(sorted(told))}")
+    if told["mode"] not in tuple(Mode):
+        raise UserError(f'mode = {told["mode"]!r} is not "TX" or "RX"')
+    common = [_numbers("common_db", pair, 2) for pair in _by_board("common_db", told["common_db"])]
+    element = _numbers("element_db", _by_board("element_db", told["element_db"]), BOARDS)
+    if any(low > high for low, high in common) or min(element) < 0:
+        raise UserError("common_db is the least and the greatest of a board, element_db 0 or more")
+    full_db = _floor(min(high + more for (_, high), more in zip(common, element, strict=True)))
+    range_db = _floor(min(*element, full_db - max(low for low, _ in common)))
+    if range_db < 0:
+        raise UserError("the boards have no gain in common")
+    return UnitGains(Mode(told["mode"]), full_db, range_db)
+
+
+def _by_board(key: str, given: Any) -> list[Any]:
+    if not isinstance(given, list) or len(given) != BOARDS:
+        raise UserError(f"{key} has one entry for each of {BOARDS} boards")
+    return given
+
+
+def _numbers(key: str, given: Any, count: int) -> list[float]:
+    if isinstance(given, list) and len(given) == count:
+        values = [float(one) for one in given if type(one) in (int, float) and math.isfinite(one)]
+        if len(values) == count:
+            return values
+    raise UserError(f"{key}: {given!r} is not {count} finite numbers")
+
+
+def _floor(gain_db: float) -> float:
+    """The step at or below a gain."""
+    return math.floor(gain_db / TMYTEK_STEP_DB + 1e-9) * TMYTEK_STEP_DB

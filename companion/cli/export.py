@@ -17,9 +17,26 @@ from companion.cli.console import (
     of_log,
     tell_vehicles,
 )
+from companion.cli.export_beams import beams
 
 
-@click.command()
+class _OrBeams(click.Command):
+    """The command on logs, which leaves to another what begins with the word ``beams``."""
+
+    def make_context(
+        self,
+        info_name: str | None,
+        args: list[str],
+        parent: click.Context | None = None,
+        **extra: Any,
+    ) -> click.Context:
+        """As ``click.Command.make_context``."""
+        if args[:1] == ["beams"]:
+            return beams.make_context(f"{info_name} beams", args[1:], parent, **extra)
+        return super().make_context(info_name, args, parent, **extra)
+
+
+@click.command(cls=_OrBeams)
 @click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(
     "--format",
@@ -52,7 +69,8 @@ def export(
     """Logs as tables, for pandas, DuckDB and other programs, by way of a replay.
 
     A table each of reports, tracks, beams, updates, rejections and events: what is in their
-    columns is said in docs/export.md. Where a folder has export.json, it is whole.
+    columns is said in docs/export.md. Where a folder has export.json, it is whole. In place of
+    logs, the word beams exports a codebook: companion export beams --help.
 
     Example: companion export flight.tlog --center 5:1 --format csv --out tables
     """

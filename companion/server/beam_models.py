@@ -19,6 +19,7 @@ class StoredBeam(BaseModel):
     next: int | None
     next_in_s: float | None
     candidates: list[int]
+    ssb_candidates: list[int]
     sweep_share: float
 
 

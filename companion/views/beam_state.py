@@ -170,6 +170,7 @@ def _codebook_entry(
         "next": None if following is None else following.next_index,
         "next_in_s": None if following is None else following.after_s,
         "candidates": swept.tolist(),
+        "ssb_candidates": codebooks.strongest_first(codebook, array, towards, swept).tolist(),
         "sweep_share": len(swept) / codebook.size,
     }
 

@@ -169,7 +169,8 @@ def test_beams_say_what_they_are_worth(start_node: Any, tmp_path: Path) -> None:
             assert beam["cost_db"] == beam["loss_db"] >= -1e-9
             assert -40 < beam["sinr_db"] < 80
             stored = beam["codebook"]
-            assert stored["best"] in stored["candidates"]
+            assert stored["best"] == stored["ssb_candidates"][0]
+            assert sorted(stored["ssb_candidates"]) == stored["candidates"]
             assert stored["sweep_share"] == len(stored["candidates"]) / 64
             assert stored["next"] is None or stored["next_in_s"] > 0
     assert pattern["angles_deg"][0] == -180

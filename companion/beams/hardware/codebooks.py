@@ -138,13 +138,28 @@ def best(codebook: Codebook, array: Array, directions: FloatArray) -> tuple[IntA
 
 
 def _best(codebook: Codebook, array: Array, unit: FloatArray) -> tuple[IntArray, FloatArray]:
+    power, pattern = _gains(codebook, array, unit)
+    return power.argmax(axis=0), power.max(axis=0) * pattern
+
+
+def _gains(codebook: Codebook, array: Array, unit: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Gains (K, N) of all beams towards unit directions, and the factor (N,) that they share."""
     if cone.faces_apart(array) or array.live is not None or array.coupling is not None:
         power = np.abs(codebook.weights.T @ steering.steering_matrix(array, unit)) ** 2
-        return power.argmax(axis=0), power.max(axis=0)
+        return power, np.ones(len(unit))
     phase = array.wavenumber_radpm * (array.elements_m @ unit.T)
     power = np.abs(codebook.weights.T @ np.exp(1j * phase)) ** 2
-    pattern = steering.amplitudes(array, unit)[0] ** 2
-    return power.argmax(axis=0), power.max(axis=0) * pattern
+    return power, steering.amplitudes(array, unit)[0] ** 2
+
+
+def strongest_first(
+    codebook: Codebook, array: Array, direction: FloatArray, indices: IntArray
+) -> IntArray:
+    """Indices by their gain towards a unit direction (3,), the greatest first, lower of equals."""
+    unit = cone.unit_directions(direction[np.newaxis], np.zeros(1))
+    power = _gains(codebook, array, unit)[0][indices, 0]
+    ordered: IntArray = indices[np.argsort(-power, kind="stable")]
+    return ordered
 
 
 def candidates(

@@ -16,7 +16,15 @@ from companion.beams.array.geometry import Array, listed, uniform_circular
 from companion.beams.array.geometry import uniform_linear as line
 from companion.beams.array.geometry import uniform_rectangular as grid
 from companion.beams.hardware import codebooks
-from companion.beams.hardware.codebooks import Codebook, NextBest, best, candidates, dft, next_best
+from companion.beams.hardware.codebooks import (
+    Codebook,
+    NextBest,
+    best,
+    candidates,
+    dft,
+    next_best,
+    strongest_first,
+)
 from companion.values import FloatArray
 
 EYE = np.eye(3)
@@ -284,6 +292,21 @@ def test_a_sharp_beam_beside_a_broad_one_is_not_missed() -> None:
         sine = 0.37 - 2 * lobe / 16
         bound_rad = math.asin(0.37) - math.asin(sine)
         assert list(candidates(book, LINE, in_plane(sine), bound_rad)) == [0, 1]
+
+
+@pytest.mark.parametrize("name", BOOKS)
+def test_a_sweep_begins_with_the_strongest(name: str) -> None:
+    """Also behind the elements, where their pattern is as good as nothing."""
+    array, book = BOOKS[name]
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        towards = unit(rng)
+        held = candidates(book, array, towards, 0.2)
+        order = strongest_first(book, array, towards, held)
+        assert sorted(order) == held.tolist()
+        assert order[0] == best(book, array, towards[np.newaxis])[0][0]
+        gains = np.abs(book.weights.T @ steering.steering_matrix(array, towards[np.newaxis])) ** 2
+        assert (np.diff(gains[order, 0]) <= 1e-12 + 1e-9 * gains.max()).all()
 
 
 def test_equal_beams_are_all_candidates_without_endless_work() -> None:

@@ -416,6 +416,18 @@ def test_a_station(cut: Path) -> None:
 # --- codebooks ----------------------------------------------------------------------------------
 
 
+@pytest.mark.full
+def test_a_sweep_of_a_tenth_of_a_panel_s_beams_holds_the_best(cut: Path) -> None:
+    """The 64 beams of 8 × 8 elements, once a track has its bound."""
+    panel = on_carrier(array={"kind": "ura"}, codebook={"kind": "dft"})
+    samples = watch(cut, panel, 5.0).samples
+    assert not any(sample.missed for sample in samples)
+    assert sum(sample.missed is False for sample in samples) > 440
+    shares = [s.sweep_share for s in samples if s.t_s > 3 and s.sweep_share is not None]
+    assert len(shares) > 400
+    assert max(shares) <= 0.1
+
+
 def test_the_codebook_of_the_settings_and_none(short: Path) -> None:
     fine = watch(short, on_carrier(codebook={"kind": "dft", "oversampling": 2}), 0.5)
     assert fine.codebook_beams == 128

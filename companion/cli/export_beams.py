@@ -1,0 +1,49 @@
+"""The command ``companion export beams``: a codebook for other programs."""
+
+from pathlib import Path
+
+import click
+
+from companion.cli.console import CONFIG
+
+
+@click.command()
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(("oai-dbt",)),
+    default="oai-dbt",
+    show_default=True,
+    help="oai-dbt: OpenAirInterface's digital beam table, CSV of ids and a weight for each port.",
+)
+@click.option(
+    "--out", type=click.Path(path_type=Path, dir_okay=False), help="The file to write [stdout]."
+)
+@CONFIG
+def beams(form: str, out: Path | None, config: Path | None) -> None:
+    """The stored beams of the settings, [codebook], for a base station that chooses among them.
+
+    Ports are the array's elements, or the channels of [hardware] calibration. Ids are those of the
+    API, which says for each UAV which of them to sweep (ssb_candidates).
+
+    Example: companion export beams --format oai-dbt --config panel.toml --out beams.csv
+    """
+    from companion.beams.hardware.calibration import Calibration
+    from companion.beams.hardware.digital_beams import write_oai_dbt
+    from companion.pipeline import assembly
+    from companion.settings.files import load
+    from companion.values import UserError
+
+    settings = load(config)
+    array = assembly.array(settings)
+    equipment = assembly.equipment(settings, array)
+    if equipment.codebook is None:
+        raise UserError('there are no stored beams: [codebook] kind = "dft", or "file"')
+    text = write_oai_dbt(
+        equipment.codebook, equipment.calibration or Calibration.ideal(range(array.size))
+    )
+    if out is None:
+        click.echo(text, nl=False)
+    else:
+        out.write_text(text, encoding="utf-8")
+        click.echo(f"{out}: {equipment.codebook.size} beams of {array.size} ports")

@@ -13,7 +13,8 @@ import io
 import json
 import urllib.error
 import urllib.request
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from http.client import HTTPException, HTTPResponse
 from typing import Any, Final
@@ -123,6 +124,26 @@ class Client:
         A consumer that is slow between two messages misses some. Close the iterator to end the
         stream. If the service ends, ``ServiceError`` is raised with the status 1012.
         """
+        topics = tuple(topics)
+        if "records" in topics:
+            raise UserError("records are binary: Client.records has them")
+        with closing(self._messages(uavs, topics, rate_hz)) as messages:
+            for message in messages:
+                yield json.loads(message)
+
+    def records(self, uavs: Iterable[str] = (), rate_hz: float = 100.0) -> Iterator[bytes]:
+        """Updates as they are made, each as one record (``companion.views.records``).
+
+        As ``stream`` in all else.
+        """
+        with closing(self._messages(uavs, ["records"], rate_hz)) as messages:
+            for message in messages:
+                assert isinstance(message, bytes)
+                yield message
+
+    def _messages(
+        self, uavs: Iterable[str], topics: Iterable[str], rate_hz: float
+    ) -> Generator[str | bytes, None, None]:
         asked = urlencode({"uav": list(uavs), "topic": list(topics), "rate_hz": rate_hz}, True)
         address = f"ws{self._url.removeprefix('http')}/v1/stream?{asked}"
         protocols: Any = [SUBPROTOCOL]
@@ -138,8 +159,7 @@ class Client:
                 max_queue=1,
                 compression=None,
             ) as websocket:
-                for message in websocket:
-                    yield json.loads(message)
+                yield from websocket
         except ConnectionClosed as error:
             raise _closed(error) from error
         except (OSError, WebSocketException) as error:

@@ -14,6 +14,8 @@ import pytest
 from support import HANG_S, Node
 
 from companion.client import Client, ServiceError
+from companion.values import UserError
+from companion.views.records import HEADER
 
 RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
 
@@ -50,6 +52,12 @@ def test_a_stream_goes_on_until_it_is_closed(flying: Node) -> None:
     stamps = [message["valid_at"] for message in heard if message["topic"] == "uavs"]
     assert stamps == sorted(set(stamps))
     assert all(message["uavs"] == ["1:1"] for message in heard if message["topic"] == "weights")
+    with closing(client.records(["3:1", "1:1"])) as stream:
+        heads = [np.frombuffer(record, HEADER, 1)[0] for record in itertools.islice(stream, 4)]
+    assert [(head["beams"], head["elements"]) for head in heads] == [(2, 64)] * 4
+    assert (np.diff([int(head["sequence"]) for head in heads]) >= 1).all()
+    with pytest.raises(UserError, match=r"records are binary: Client\.records has them"):
+        next(client.stream(topics=["records"]))
 
 
 @pytest.mark.full

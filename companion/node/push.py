@@ -27,10 +27,7 @@ WELL: Final = 50
 
 
 class Push:
-    """The ways of ``[records]``. Call ``open`` for early errors, then ``run`` until cancelled.
-
-    ``sequence`` is the number of the next update.
-    """
+    """The ways of ``[records]``. Call ``open`` for early errors, then ``run`` until cancelled."""
 
     def __init__(
         self,
@@ -40,7 +37,6 @@ class Push:
         notify: Callable[[Notice], None],
         now_ns: Callable[[], int],
     ) -> None:
-        self.sequence = 0
         self._settings = settings
         self._pipeline = pipeline
         self._equipment = equipment
@@ -49,7 +45,7 @@ class Push:
         self._sockets: dict[str, socket.socket] = {}
         self._refused: dict[str, int] = {}  # datagrams since the last refusal
         self._ring: Ring | None = None
-        self._newest: Update | None = None
+        self._newest: tuple[Update, int] | None = None
         self._fresh = asyncio.Event()
 
     def open(self) -> None:
@@ -66,10 +62,10 @@ class Push:
         if self._settings.shared_memory is not None:
             self._ring = Ring(Path(self._settings.shared_memory))
 
-    def newest(self, update: Update) -> None:
-        """Push this update next."""
+    def newest(self, update: Update, number: int) -> None:
+        """Push this update next; updates are numbered from 0."""
         if self._sockets or self._ring:
-            self._newest = update
+            self._newest = update, number
             self._fresh.set()
 
     async def run(self) -> None:
@@ -77,17 +73,16 @@ class Push:
         while True:
             await self._fresh.wait()
             self._fresh.clear()
-            update, sure = self._newest, None
-            assert update is not None
+            assert self._newest is not None
+            (update, number), sure = self._newest, None
             if self._settings.guaranteed:
                 sure = await aside(
                     partial(guaranteed_gain.gains_db, self._pipeline, self._equipment, update)
                 )
-            self._send(update, sure)
-            self.sequence += 1
+            self._send(update, number, sure)
 
-    def _send(self, update: Update, sure: list[float | None] | None) -> None:
-        encode = partial(records.encode, update.beams, self.sequence, sure)
+    def _send(self, update: Update, number: int, sure: list[float | None] | None) -> None:
+        encode = partial(records.encode, update.beams, number, sure)
         if self._ring:
             for record in encode(LARGEST_RECORD):
                 self._ring.put(record)

@@ -261,7 +261,7 @@ class Service:
             began_s = loop.time()
             self._step(Tick(self._timeline.now_ns()))
             if self.pipeline.last_update:
-                self._push.newest(self.pipeline.last_update)
+                self._push.newest(self.pipeline.last_update, self.pipeline.updates - 1)
             self._rates.count(self.now_ns(), self.pipeline.frames, self.pipeline.updates)
             if self._recorder:
                 self._tell_of_recorder(self._recorder)

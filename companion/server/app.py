@@ -31,7 +31,7 @@ DESCRIPTION: Final = """Location-aware beamforming from MAVLink. Read only.
 Angles in degrees, distances in metres; null is not known, never 0. Estimates are worked out for
 the moment at which they are asked for: `valid_at` says which, so no answer has an ETag. Errors are
 `application/problem+json` (RFC 9457). `WS /v1/stream?uav=…&topic=…&rate_hz=…` sends `uavs`,
-`beams`, `weights`, `status`, `links` and `events` as they change.
+`beams`, `weights`, `status`, `links` and `events` as they change, and `records` in binary.
 """
 
 

@@ -1,13 +1,15 @@
 """The WebSocket ``/v1/stream``: the state as it changes, always the newest.
 
     ?uav=1:1&uav=2:1     only these UAVs (default: all)
-    &topic=uavs          uavs, beams, weights, status, links, events (default: uavs and beams)
+    &topic=uavs          uavs, beams, weights, records, status, links, events (default: uavs and
+                         beams)
     &rate_hz=10          greatest rate of each topic; never more than updates
 
 Every message is a JSON object: the answer of the path of that name, with ``topic`` and
-``valid_at``. Nothing is queued: a client that has taken one message is given what is newest then,
-so a slow one misses messages, holds nobody up and makes no memory grow. A message is encoded once
-for all who asked for the same. ``events`` come when there is a new one.
+``valid_at``. ``records`` are the exception: binary messages, each the whole record of an update
+(``companion.views.records``). Nothing is queued: a client that has taken one message is given what
+is newest then, so a slow one misses messages, holds nobody up and makes no memory grow. A message
+is encoded once for all who asked for the same. ``events`` come when there is a new one.
 
 Closed with: 1003 the client sent something (the stream takes nothing), 1012 the service ends, 1013
 too many streams are open, 4401 no or a wrong token (``access``), 4403 a page from elsewhere asked,
@@ -16,23 +18,18 @@ too many streams are open, 4401 no or a wrong token (``access``), 4403 a page fr
 
 import asyncio
 import re
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from enum import StrEnum
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import QueryParams
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-import companion
+from companion.server import topics
 from companion.server.access import SUBPROTOCOL
-from companion.server.responses import encode
+from companion.server.topics import Topic
 from companion.values import UserError
-from companion.views import beam_state, link_state, state
 from companion.views.state import Node
-from companion.views.words import rfc3339
 
 Json = dict[str, Any]
 
@@ -56,17 +53,6 @@ hold up everything else. A few clients do not wait.
 """
 _EARLY: Final = 0.25
 """Fraction of its period by which a message may be early; updates are not exact."""
-
-
-class Topic(StrEnum):
-    """What can be streamed; each topic is the answer of the path of that name."""
-
-    UAVS = "uavs"
-    BEAMS = "beams"
-    WEIGHTS = "weights"
-    STATUS = "status"
-    LINKS = "links"
-    EVENTS = "events"
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +93,7 @@ class Snapshot:
 
     number: int
     bodies: dict[Topic, "asyncio.Task[Json]"] = field(default_factory=dict)
-    texts: dict[tuple[Topic, frozenset[str]], str] = field(default_factory=dict)
+    messages: dict[tuple[Topic, frozenset[str]], str | bytes] = field(default_factory=dict)
 
 
 class Stream:
@@ -174,7 +160,11 @@ class Stream:
                     version = self._version(topic)
                     if said.get(topic) != version:
                         said[topic] = version
-                        await websocket.send_text(await self._text(topic, asked.uavs))
+                        message = await self._message(topic, asked.uavs)
+                        if isinstance(message, bytes):
+                            await websocket.send_bytes(message)
+                        else:
+                            await websocket.send_text(message)
                         self.sent += 1
             # What came while it was sent to a slow client does not wait for another tick.
             if self._node.pipeline.updates == updates:
@@ -189,87 +179,18 @@ class Stream:
             return events[-1] if events else "none yet"
         return self._node.pipeline.updates
 
-    async def _text(self, topic: Topic, uavs: frozenset[str]) -> str:
+    async def _message(self, topic: Topic, uavs: frozenset[str]) -> str | bytes:
         """The message, made when it is first asked for."""
         if self._snapshot.number != self._node.pipeline.updates:
             self._snapshot = Snapshot(self._node.pipeline.updates)
         snapshot = self._snapshot
         if topic not in snapshot.bodies:
-            snapshot.bodies[topic] = asyncio.create_task(_BODIES[topic](self._node))
+            snapshot.bodies[topic] = asyncio.create_task(topics.BODIES[topic](self._node))
         body = await asyncio.shield(snapshot.bodies[topic])  # others may wait for it too
-        text = snapshot.texts.get((topic, uavs))
-        if text is None:
-            shown = only(topic, body, uavs) if uavs else body
-            text = encode({"topic": topic, **shown}).decode()
-            snapshot.texts[topic, uavs] = text
-        return text
-
-
-def only(topic: Topic, body: Json, uavs: frozenset[str]) -> Json:
-    """A message without the other UAVs; what concerns no UAV stays."""
-    match topic:
-        case Topic.UAVS:
-            return body | {"uavs": [one for one in body["uavs"] if one["id"] in uavs]}
-        case Topic.BEAMS:
-            parts = {
-                key: [one for one in body[key] if one["uav"] in uavs]
-                for key in ("beams", "left_out")
-            }
-            return body | parts
-        case Topic.WEIGHTS:
-            columns = [i for i, uav in enumerate(body["uavs"]) if uav in uavs]
-            return body | {
-                "uavs": [body["uavs"][i] for i in columns],
-                "groups": [body["groups"][i] for i in columns],
-                "re": [[row[i] for i in columns] for row in body["re"]],
-                "im": [[row[i] for i in columns] for row in body["im"]],
-            }
-        case _:
-            return body
-
-
-# --- one function a topic ---------------------------------------------------------------------
-
-
-async def _uavs(node: Node) -> Json:
-    return {"valid_at": rfc3339(node.now_ns()), "uavs": state.uavs(node)}
-
-
-async def _beams(node: Node) -> Json:
-    update = node.pipeline.last_update or node.pipeline.look(node.now_ns())
-    age_s = (node.now_ns() - update.t_ns) * 1e-9
-    return await run_in_threadpool(
-        beam_state.beams, node.pipeline, node.equipment, update, age_s, 0.0
-    )
-
-
-async def _weights(node: Node) -> Json:
-    update = node.pipeline.last_update or node.pipeline.look(node.now_ns())
-    return beam_state.weights(update.beams, 0.0)
-
-
-async def _status(node: Node) -> Json:
-    shown = state.status(node, companion.__version__)
-    return {"valid_at": shown["time"], **shown}
-
-
-async def _links(node: Node) -> Json:
-    return state.links(node)
-
-
-async def _events(node: Node) -> Json:
-    events = [link_state.event(notice) for notice in node.events()]
-    return {"valid_at": rfc3339(node.now_ns()), "events": events}
-
-
-_BODIES: Final[dict[Topic, Callable[[Node], Any]]] = {
-    Topic.UAVS: _uavs,
-    Topic.BEAMS: _beams,
-    Topic.WEIGHTS: _weights,
-    Topic.STATUS: _status,
-    Topic.LINKS: _links,
-    Topic.EVENTS: _events,
-}
+        message = snapshot.messages.get((topic, uavs))
+        if message is None:
+            message = snapshot.messages[topic, uavs] = topics.message(topic, body, uavs)
+        return message
 
 
 def _is_from_here(websocket: WebSocket) -> bool:

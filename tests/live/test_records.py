@@ -1,10 +1,12 @@
 """Records for machines from a running service: over UDP, and in shared memory by the example."""
 
+import itertools
 import json
 import re
 import shutil
 import socket
 import subprocess
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +14,14 @@ import numpy as np
 import pytest
 from support import BIN, HANG_S, ROOT, line_of, started
 
+from companion.client import Client
 from companion.views import records
 
 RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
+
+
+def sequence(record: bytes) -> int:
+    return int(np.frombuffer(record, records.HEADER, 1)[0]["sequence"])
 
 
 def test_records_come_with_each_update_and_hold_what_the_api_says(
@@ -50,6 +57,13 @@ def test_records_come_with_each_update_and_hold_what_the_api_says(
                 beams = np.frombuffer(body, records.BEAM, head["beams"], head["beams_at"])
                 full += len(beams) == 4
             told = node.json("/v1/beams")
+            with closing(Client(node.url).records()) as stream:
+                streamed = {sequence(record): record for record in itertools.islice(stream, 20)}
+            count, last = len(streamed), max(streamed)
+            while sequence(body) < last:
+                body = heard.recv(1 << 16)
+                assert streamed.pop(sequence(body), body) == body  # the same, byte for byte
+            assert len(streamed) < count  # either way may have left some out
             node.stop()
             said = process.communicate(timeout=HANG_S)[0]
     assert [name.decode() for name in beams["uav"]] == [one["uav"] for one in told["beams"]]

@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 import uvloop
 from starlette.datastructures import QueryParams
@@ -16,7 +17,9 @@ from websockets.exceptions import ConnectionClosed
 from websockets.typing import Subprotocol
 
 from companion.server import models, stream
-from companion.server.stream import Topic, Wanted, wanted
+from companion.server.stream import Wanted, wanted
+from companion.server.topics import Topic
+from companion.views import guaranteed_gain, records
 
 LOOPS: list[Callable[[], asyncio.AbstractEventLoop] | None] = [None, uvloop.new_event_loop]
 SOON_S = HANG_S
@@ -55,6 +58,39 @@ def test_the_state_comes_at_once_and_with_every_update(
             assert len(second[1]["beams"]) == 4
 
     run_async(check(), loop)
+
+
+def test_records_are_binary_and_those_of_each_update(make_node: Any, serving: Any) -> None:
+    async def check() -> None:
+        node = make_node(records={"guaranteed": True})
+        node.tick()
+        query = "topic=records&topic=uavs&rate_hz=100"
+        async with (
+            serving(node) as at,
+            connect(f"ws://{at}/v1/stream?{query}") as websocket,
+            connect(f"ws://{at}/v1/stream?{query}&uav=4:1&uav=2:1") as other,
+        ):
+            for _ in range(3):
+                update, number = node.pipeline.last_update, node.pipeline.updates - 1
+                sure = guaranteed_gain.gains_db(node.pipeline, node.equipment, update)
+                (whole,) = records.encode(update.beams, number, sure)
+                assert await asyncio.wait_for(websocket.recv(), SOON_S) == whole
+                assert (await said(websocket))["topic"] == "uavs"
+                some = await asyncio.wait_for(other.recv(), SOON_S)
+                head = np.frombuffer(some, records.HEADER, 1)[0]
+                assert (head["beams"], head["all_beams"], head["bytes"]) == (2, 2, len(some))
+                kept = np.frombuffer(some, records.BEAM, 2, head["beams_at"])
+                columns = [update.beams.uavs.index(uav.decode()) for uav in kept["uav"]]
+                assert {update.beams.uavs[i] for i in columns} == {"2:1", "4:1"}
+                assert kept["guaranteed_gain_db"].tolist() == [sure[i] for i in columns]
+                weights = np.frombuffer(some, "<c8", offset=head["weights_at"]).reshape(2, -1)
+                wanted = update.beams.weights[:, columns].T.astype(np.complex64)
+                np.testing.assert_array_equal(weights, wanted)
+                assert (await said(other))["topic"] == "uavs"
+                await asyncio.sleep(0.02)  # more than the period that was asked for
+                node.tick()
+
+    run_async(check())
 
 
 def test_only_those_uavs_and_topics_that_are_asked_for(make_node: Any, serving: Any) -> None:

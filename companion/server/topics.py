@@ -1,0 +1,123 @@
+"""What ``/v1/stream`` sends: a body for each topic, and the part of it that a client asked for."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from enum import StrEnum
+from typing import Any, Final
+
+from starlette.concurrency import run_in_threadpool
+
+import companion
+from companion.server.responses import encode
+from companion.values import BeamSet
+from companion.views import beam_state, guaranteed_gain, link_state, records, state
+from companion.views.state import Node
+from companion.views.words import rfc3339
+
+Json = dict[str, Any]
+
+
+class Topic(StrEnum):
+    """What can be streamed; each topic is the answer of the path of that name."""
+
+    UAVS = "uavs"
+    BEAMS = "beams"
+    WEIGHTS = "weights"
+    RECORDS = "records"
+    STATUS = "status"
+    LINKS = "links"
+    EVENTS = "events"
+
+
+def message(topic: Topic, body: Json, uavs: frozenset[str]) -> str | bytes:
+    """A body as it is sent: binary for records, else JSON; of these UAVs alone if there are any."""
+    if topic is Topic.RECORDS:
+        return _record(body, uavs)
+    return encode({"topic": topic, **(_only(topic, body, uavs) if uavs else body)}).decode()
+
+
+def _record(body: Json, uavs: frozenset[str]) -> bytes:
+    """The record of one update, of these UAVs alone if there are any."""
+    made: BeamSet = body["beams"]
+    kept = [i for i, uav in enumerate(made.uavs) if not uavs or uav in uavs]
+    shown = replace(made, beams=tuple(made.beams[i] for i in kept), weights=made.weights[:, kept])
+    sure = body["guaranteed_db"]
+    held = None if sure is None else [sure[i] for i in kept]
+    (whole,) = records.encode(shown, body["sequence"], held)
+    return whole
+
+
+def _only(topic: Topic, body: Json, uavs: frozenset[str]) -> Json:
+    """A message without the other UAVs; what concerns no UAV stays."""
+    match topic:
+        case Topic.UAVS:
+            return body | {"uavs": [one for one in body["uavs"] if one["id"] in uavs]}
+        case Topic.BEAMS:
+            parts = {
+                key: [one for one in body[key] if one["uav"] in uavs]
+                for key in ("beams", "left_out")
+            }
+            return body | parts
+        case Topic.WEIGHTS:
+            columns = [i for i, uav in enumerate(body["uavs"]) if uav in uavs]
+            return body | {
+                "uavs": [body["uavs"][i] for i in columns],
+                "groups": [body["groups"][i] for i in columns],
+                "re": [[row[i] for i in columns] for row in body["re"]],
+                "im": [[row[i] for i in columns] for row in body["im"]],
+            }
+        case _:
+            return body
+
+
+async def _uavs(node: Node) -> Json:
+    return {"valid_at": rfc3339(node.now_ns()), "uavs": state.uavs(node)}
+
+
+async def _beams(node: Node) -> Json:
+    update = node.pipeline.last_update or node.pipeline.look(node.now_ns())
+    age_s = (node.now_ns() - update.t_ns) * 1e-9
+    return await run_in_threadpool(
+        beam_state.beams, node.pipeline, node.equipment, update, age_s, 0.0
+    )
+
+
+async def _weights(node: Node) -> Json:
+    update = node.pipeline.last_update or node.pipeline.look(node.now_ns())
+    return beam_state.weights(update.beams, 0.0)
+
+
+async def _records(node: Node) -> Json:
+    """What ``record`` needs of the newest update."""
+    pipeline = node.pipeline
+    update, number = pipeline.last_update, max(pipeline.updates - 1, 0)
+    update = update or pipeline.look(node.now_ns())
+    sure = None
+    if pipeline.settings.records.guaranteed:
+        sure = await run_in_threadpool(guaranteed_gain.gains_db, pipeline, node.equipment, update)
+    return {"beams": update.beams, "sequence": number, "guaranteed_db": sure}
+
+
+async def _status(node: Node) -> Json:
+    shown = state.status(node, companion.__version__)
+    return {"valid_at": shown["time"], **shown}
+
+
+async def _links(node: Node) -> Json:
+    return state.links(node)
+
+
+async def _events(node: Node) -> Json:
+    events = [link_state.event(notice) for notice in node.events()]
+    return {"valid_at": rfc3339(node.now_ns()), "events": events}
+
+
+BODIES: Final[dict[Topic, Callable[[Node], Any]]] = {
+    Topic.UAVS: _uavs,
+    Topic.BEAMS: _beams,
+    Topic.WEIGHTS: _weights,
+    Topic.RECORDS: _records,
+    Topic.STATUS: _status,
+    Topic.LINKS: _links,
+    Topic.EVENTS: _events,
+}

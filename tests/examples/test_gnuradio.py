@@ -1,0 +1,126 @@
+"""The GNU Radio example: samples through real flowgraphs, against numpy."""
+
+import shutil
+import socket
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support import HANG_S, ROOT, line_of, started
+
+from companion.values import Beam, BeamSet, ComplexArray, Method, Normalisation
+from companion.views import records
+
+PYTHON = shutil.which("python3", path="/usr/bin")
+"""Debian's own, for which GNU Radio is built there."""
+FOLDER = ROOT / "examples" / "gnuradio"
+COUNT = 4000
+
+
+@pytest.fixture(scope="module")
+def python() -> str:
+    """A Python that has GNU Radio."""
+    known = PYTHON and subprocess.run(
+        [PYTHON, "-c", "import gnuradio.blocks"], capture_output=True, check=False, timeout=HANG_S
+    )
+    if not PYTHON or not known or known.returncode:
+        pytest.skip("no GNU Radio on this machine")
+    return PYTHON
+
+
+def record(number: int, uavs: list[str], weights: ComplexArray) -> bytes:
+    beams = tuple(
+        Beam(uav, 0.0, 0.0, 1.0, None, None, None, None, 0.0, 0.0, group=0) for uav in uavs
+    )
+    made = BeamSet(0, 0, beams, weights, Method.MATCHED, Normalisation.STREAM, 1.0, ())
+    return next(records.encode(made, number))
+
+
+def noise(rng: np.random.Generator, rows: int, columns: int) -> ComplexArray:
+    parts = rng.normal(size=(2, rows, columns))
+    made: ComplexArray = (parts[0] + 1j * parts[1]).astype(np.complex64)
+    return made
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("uavs", [["1:1", "icao:4CA7B3"], ["2:1"]])
+def test_streams_go_out_by_the_newest_weights(python: str, tmp_path: Path, uavs: list[str]) -> None:
+    """Records change between blocks of samples; damaged and foreign ones change nothing."""
+    rng, elements = np.random.default_rng(3), 8
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [python, FOLDER / "transmit.py", str(port), str(elements), *uavs]
+    pipe = subprocess.PIPE
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as says,
+        started(command, stdin=pipe, stdout=pipe, stderr=pipe) as process,
+    ):
+        says.connect(("127.0.0.1", port))
+        while line_of(process, process.stderr) != b"open\n":
+            pass
+        assert process.stdin
+        assert process.stdout
+
+        def through(samples: ComplexArray) -> ComplexArray:
+            """The samples of all elements, (M, n), for those of all UAVs, (N, n)."""
+            process.stdin.write(samples.T.astype(np.complex64).tobytes())
+            process.stdin.flush()
+            found = process.stdout.read(8 * elements * samples.shape[1])
+            return np.frombuffer(found, np.complex64).reshape(-1, elements).T
+
+        silent = through(noise(rng, len(uavs), COUNT))
+        assert not silent.any()  # no record yet
+        for number in range(5):
+            weights = noise(rng, elements, len(uavs) + 1)
+            whole = record(number, ["9:9", *uavs], weights)
+            says.send(whole)
+            bad = bytearray(record(99, ["9:9", *uavs], 2 * weights))
+            bad[-1] ^= 1
+            for other in (bytes(bad), b"hello", whole[:-8], record(99, uavs, weights[:4, 1:])):
+                says.send(other)
+            samples = noise(rng, len(uavs), COUNT)
+            got, wanted = through(samples), weights[:, 1:].astype(np.complex128) @ samples
+            assert np.abs(got - wanted).max() < 1e-6 * np.abs(wanted).max()
+        says.send(record(5, ["9:9"], noise(rng, elements, 1)))
+        assert not through(noise(rng, len(uavs), COUNT)).any()  # nobody of ours has a beam
+        process.stdin.close()
+        assert process.stdout.read() == b""
+        assert process.wait(HANG_S) == 0
+
+
+@pytest.mark.full
+def test_weights_that_are_too_old_are_silence(python: str) -> None:
+    """In GNU Radio's own process: a block whose records stop is muted, and speaks again."""
+    weights = noise(np.random.default_rng(1), 2, 1)
+    first, second = (record(n, ["1:1"], weights).hex() for n in (1, 2))
+    done = subprocess.run(
+        [python, "-c", STALE, str(FOLDER), first, second],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=HANG_S,
+    )
+    assert done.stdout.split() == ["True", "False", "True"], done.stderr
+
+
+STALE = """
+import sys, time
+import numpy as np
+sys.path.insert(0, sys.argv[1])
+from uav_beams import Beams
+block = Beams(["1:1"], 2, 0, stale_s=10.0)
+def sends():
+    out = [np.zeros(4, np.complex64) for _ in range(2)]
+    block.work([np.ones(4, np.complex64)], out)
+    return all(one.any() for one in out)
+now = 100.0
+time.monotonic = lambda: now
+block._take(bytes.fromhex(sys.argv[2]))
+print(sends())
+now = 111.0
+print(sends())
+block._take(bytes.fromhex(sys.argv[3]))
+print(sends())
+"""

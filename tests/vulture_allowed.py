@@ -16,6 +16,7 @@ numbers.find_class  # pickle asks by it
 told.resting  # written to JSON by its fields
 line.max_speed_hz  # spidev's line looks at it
 one.rx_phase, one.rx_gain, one.rx_attenuator  # pyadi-iio writes them to the chip
+one.rx_beam_state, chip.beam_mem_enable  # the same
 one.shows, one.likeness, one.bears_on  # the same
 found.rejections  # the same
 presence.system_status, presence.armed  # what a heartbeat says, for who looks at `senders.presence`

@@ -4,14 +4,17 @@ import json
 import os
 import time
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from companion.cli.console import CONFIG
 from companion.values import UserError
 
 if TYPE_CHECKING:
     from companion.node.drive.loop import Told
+    from companion.values import IntArray
 
 
 @click.command()
@@ -23,6 +26,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="Whose beams: the service's address. COMPANION_TOKEN is its bearer token.",
 )
+@CONFIG
 @click.option("--uav", "uavs", multiple=True, help="Whom to follow, in descending order [anybody].")
 @click.option(
     "--rate",
@@ -45,6 +49,7 @@ if TYPE_CHECKING:
 def drive(
     target: str,
     service: str,
+    config: Path | None,
     uavs: tuple[str, ...],
     update_hz: float,
     on_stale: str,
@@ -54,24 +59,34 @@ def drive(
 ) -> None:
     """Apply the beams of a running service to a device.
 
-    TARGET is rotctld:HOST:PORT, gimbal:HOST:PORT:SYSID:COMPID, phaser:URI (extra [phaser]) or
-    adar1000:BUS.DEVICE[,...] (extra [spi]). Beams are asked for as far ahead as the device takes
-    to apply them.
+    TARGET is rotctld:HOST:PORT, gimbal:HOST:PORT:SYSID:COMPID, phaser:URI or phaser-memory:URI
+    (extra [phaser]) or adar1000:BUS.DEVICE[,...] (extra [spi]). Beams are asked for as far ahead as
+    the device takes to apply them. A Phaser's memory holds the [codebook] of --config, which must
+    be the service's own.
 
     Example: companion drive rotctld:127.0.0.1:4533 --uav 1:1
     """
     from companion.client import Client
     from companion.node.drive import running, targets
     from companion.node.drive.loop import Drive, Safe
-    from companion.node.drive.sources import OverHttp, Wanted
+    from companion.node.drive.sources import OverHttp, Wanted, stored_registers
+    from companion.pipeline import assembly
+    from companion.settings.files import load
 
-    device = targets.device(target, lambda text: click.echo(text, err=True))
+    stored: list[IntArray] = []
+
+    def codebook() -> "list[IntArray]":
+        settings = load(config)
+        array = assembly.array(settings)
+        stored.extend(stored_registers(array, assembly.equipment(settings, array)))
+        return stored
+
+    device = targets.device(target, lambda text: click.echo(text, err=True), codebook)
     if dry_run:
-        kind = "adar1000" if device.takes_registers else "pointing"
-        device = targets.device(f"none:{kind}", click.echo)
+        device = targets.device(f"none:{device.takes}", click.echo, codebook)
     client = Client(service, os.environ.get("COMPANION_TOKEN"))
     driven = Drive(
-        OverHttp(client, Wanted(uavs, not uavs, device.takes_registers)),
+        OverHttp(client, Wanted(uavs, not uavs, device.takes, len(stored) or None)),
         device,
         update_hz,
         Safe(on_stale),

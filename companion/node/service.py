@@ -18,7 +18,7 @@ from companion.mavlink.voice.rate_watch import MessageRate
 from companion.node.drive import targets
 from companion.node.drive.loop import Drive, Safe
 from companion.node.drive.running import beside
-from companion.node.drive.sources import OfThisProcess, Wanted
+from companion.node.drive.sources import OfThisProcess, Wanted, stored_registers
 from companion.node.gateway import Gateway
 from companion.node.outlet import Outlet
 from companion.node.push import Push
@@ -104,7 +104,8 @@ class Service:
         self._outlet = Outlet(settings, self.pipeline, self._notify, self._timeline.now_ns)
         now_ns = self._timeline.now_ns
         target = settings.drive.target
-        self._device = None if target is None else targets.device(target, self._say)
+        stored = partial(stored_registers, self.pipeline.array, self.equipment)
+        self._device = None if target is None else targets.device(target, self._say, stored)
         self._push = Push(settings.records, self.pipeline, self.equipment, self._notify, now_ns)
         self._traffic.open()
         self._outlet.open()
@@ -190,7 +191,7 @@ class Service:
             self.pipeline,
             self.equipment,
             self.now_ns,
-            Wanted(uavs, not kept.drive.uavs, self._device.takes_registers),
+            Wanted(uavs, not kept.drive.uavs, self._device.takes),
         )
         try:
             safe = Safe(kept.drive.on_stale)

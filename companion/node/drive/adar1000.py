@@ -10,7 +10,7 @@ the table, modulo 4. It was never on the air: what is tested is what a chip's re
 from typing import Any, Final
 
 from companion.beams.hardware.devices import ADAR1000_CHANNELS, vector_modulator
-from companion.node.drive.loop import DeviceError, Safe, Shot, require
+from companion.node.drive.loop import DeviceError, Safe, Shot, Takes, require
 from companion.values import IntArray, UserError
 
 RX_GAIN: Final = 0x10
@@ -26,7 +26,7 @@ CLOCK_HZ: Final = 10_000_000
 class Chips:
     """Chips by bus and device number, in the order of the table's chips."""
 
-    takes_registers = True
+    takes = Takes.REGISTERS
     lead_s = None
 
     def __init__(self, places: list[tuple[int, int]]) -> None:

@@ -17,7 +17,7 @@ from typing import Final
 from companion.mavlink.wire.encode import Outgoing, pack
 from companion.mavlink.wire.framing import Splitter
 from companion.node.drive.lag import MountLag
-from companion.node.drive.loop import DeviceError, Safe, Shot, require
+from companion.node.drive.loop import DeviceError, Safe, Shot, Takes, require
 from companion.values import Frame, Source
 
 SET_PITCHYAW: Final = 287
@@ -32,7 +32,7 @@ ONBOARD_COMPUTER: Final = 191
 class Gimbal:
     """A gimbal; its boresight is north, level."""
 
-    takes_registers = False
+    takes = Takes.POINTING
 
     def __init__(
         self,

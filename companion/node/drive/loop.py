@@ -35,6 +35,14 @@ class Safe(StrEnum):
     MUTE = "mute"
 
 
+class Takes(StrEnum):
+    """What a device takes of an update, beside where its beam points."""
+
+    POINTING = "pointing"
+    REGISTERS = "adar1000"
+    STORED = "stored"
+
+
 class DeviceError(Exception):
     """A device that failed, or that cannot be reached; it is tried again."""
 
@@ -54,6 +62,7 @@ class Shot:
     above_rad    above the horizon
     registers    (M, 8), as the text for ADAR1000 has them: chip, channel, element, phase code,
                  gain code, attenuator, I and Q; None where nobody asked
+    stored       index of the codebook's best beam; None where nobody asked
     """
 
     valid_at_ns: int
@@ -62,6 +71,7 @@ class Shot:
     bearing_rad: float = 0.0
     above_rad: float = 0.0
     registers: IntArray | None = None
+    stored: int | None = None
 
 
 class Source(Protocol):
@@ -74,11 +84,11 @@ class Source(Protocol):
 class Device(Protocol):
     """What beams are applied to. Every method may raise ``DeviceError``.
 
-    takes_registers  whether a shot needs registers
-    lead_s           lag that the device shows by itself; None: the time to apply is all
+    takes   what a shot needs to say
+    lead_s  lag that the device shows by itself; None: the time to apply is all
     """
 
-    takes_registers: bool
+    takes: Takes
 
     @property
     def lead_s(self) -> float | None: ...

@@ -10,8 +10,8 @@ that records.
 
 from typing import Any, Final
 
-from companion.node.drive.loop import DeviceError, Safe, Shot, require
-from companion.values import UserError
+from companion.node.drive.loop import DeviceError, Safe, Shot, Takes, require
+from companion.values import IntArray, UserError
 
 ELEMENTS: Final = 8
 DEGREES: Final = 360 / 128
@@ -21,7 +21,7 @@ FULL_GAIN: Final = 127
 class Phaser:
     """A Phaser, found by a URI of libiio."""
 
-    takes_registers = True
+    takes = Takes.REGISTERS
     lead_s = None
 
     def __init__(self, uri: str) -> None:
@@ -49,10 +49,15 @@ class Phaser:
     def apply(self, shot: Shot) -> None:
         """Write what has changed, and latch once."""
         assert shot.registers is not None
-        rows = shot.registers[:, 2:6].tolist()
+        self._set(self.settings_of(shot.registers))
+
+    @staticmethod
+    def settings_of(registers: IntArray) -> dict[int, tuple[int, int, int]]:
+        """Phase code, gain code and attenuator of each element. Raises ``UserError``."""
+        rows = registers[:, 2:6].tolist()
         if sorted(element for element, *_ in rows) != list(range(ELEMENTS)):
             raise UserError(f"a Phaser has {ELEMENTS} elements, the array has {len(rows)}")
-        self._set({element: (phase, gain, off) for element, phase, gain, off in rows})
+        return {element: (phase, gain, off) for element, phase, gain, off in rows}
 
     def rest(self, safe: Safe) -> None:
         """Hold, look along boresight, or silence every element."""

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Final
 
 from companion.node.drive.lag import MountLag
-from companion.node.drive.loop import DeviceError, Safe, Shot, require
+from companion.node.drive.loop import DeviceError, Safe, Shot, Takes, require
 
 TIMEOUT_S: Final = 2.0
 
@@ -23,7 +23,7 @@ class Rotator:
     Its boresight is azimuth and elevation 0.
     """
 
-    takes_registers = False
+    takes = Takes.POINTING
 
     def __init__(self, host: str, port: int, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self._address = host, port

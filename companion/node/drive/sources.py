@@ -9,10 +9,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from companion.beams.hardware import tables
+from companion.beams.aim import directions
+from companion.beams.array.geometry import Array
+from companion.beams.hardware import codebooks, tables
+from companion.beams.hardware.calibration import Calibration
 from companion.beams.hardware.devices import MEDIA_TYPES, Device
 from companion.client import Client, ServiceError
-from companion.node.drive.loop import Shot, SourceLostError
+from companion.node.drive.loop import Shot, SourceLostError, Takes
 from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
 from companion.values import IntArray, Update, UserError
@@ -26,11 +29,15 @@ ANSWERS_S: Final = 5.0
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """Whom to follow: the first of these that has a beam, else anybody if so; and for what."""
+    """Whom to follow: the first of these that has a beam, else anybody if so; and for what.
+
+    ``stored_beams`` is the size of the codebook that the device holds; None: it holds none.
+    """
 
     uavs: tuple[str, ...]
     anybody: bool
-    registers: bool
+    takes: Takes
+    stored_beams: int | None = None
 
 
 class OverHttp:
@@ -46,7 +53,11 @@ class OverHttp:
         valid_at_ns = time.time_ns() + round(lead_ms * 1e6)
         try:
             told = self._client.beams(lead_ms)
-            text = self._client.table(ADAR1000, lead_ms) if self._wanted.registers else None
+            text = (
+                self._client.table(ADAR1000, lead_ms)
+                if self._wanted.takes is Takes.REGISTERS
+                else None
+            )
         except ServiceError as error:
             if error.status == 409:
                 return Shot(valid_at_ns, error.title)
@@ -88,14 +99,37 @@ def shot_of(pipeline: Pipeline, equipment: Equipment, update: Update, wanted: Wa
     """What is to be applied of one update. Only the beam that is wanted is fitted to the device."""
     beams, text = update.beams, None
     uav = followed(beams.uavs, wanted)
-    if update.unfit is None and uav is not None and wanted.registers:
+    if update.unfit is None and uav is not None and wanted.takes is Takes.REGISTERS:
         try:
             table = device_table(Device.ADAR1000, beams, pipeline.array, equipment, uav)
             text = tables.encode(table)
         except UserError as error:
             return Shot(beams.valid_at_ns, str(error))
-    told = {"unfit": update.unfit, "beams": beam_state.pointing(pipeline, update)}
+    pointed, codebook = beam_state.pointing(pipeline, update), equipment.codebook
+    if wanted.takes is Takes.STORED and codebook is not None and pointed:
+        best, _ = codebooks.best(codebook, pipeline.array, directions(beams))
+        for beam, index in zip(pointed, best.tolist(), strict=True):
+            beam["codebook"] = {"best": index}
+    size = None if codebook is None else codebook.size
+    told = {"unfit": update.unfit, "beams": pointed, "codebook_beams": size}
     return chosen(told, text, wanted, beams.valid_at_ns)
+
+
+def stored_registers(array: Array, equipment: Equipment) -> list[IntArray]:
+    """The registers (M, 8) of each beam of the codebook. Raises ``UserError`` where there is none.
+
+    Each is fitted towards where it is strongest.
+    """
+    codebook = equipment.codebook
+    if codebook is None:
+        raise UserError('there are no stored beams: [codebook] kind = "dft", or "file"')
+    wanted = [
+        tables.WantedBeam(str(k), column, 0.0, 0.0, column.conj()[:, np.newaxis])
+        for k, column in enumerate(codebook.weights.T)
+    ]
+    calibration = equipment.calibration or Calibration.ideal(range(array.size))
+    text = tables.encode(tables.fit(Device.ADAR1000, wanted, calibration))
+    return [registers_of(text, beam.uav) for beam in wanted]
 
 
 def followed(uavs: Collection[str], wanted: Wanted) -> str | None:
@@ -115,6 +149,12 @@ def chosen(told: dict[str, Any], text: str | None, wanted: Wanted, valid_at_ns: 
     beam, rows = named[uav], None if text is None else registers_of(text, uav)
     if rows is not None and not len(rows):
         return Shot(valid_at_ns, f"{uav} has no beam in the device's table")
+    stored = None
+    if wanted.takes is Takes.STORED:
+        size = told["codebook_beams"]
+        if size is None or wanted.stored_beams not in (None, size):
+            return Shot(valid_at_ns, "the service has another codebook, or none")
+        stored = beam["codebook"]["best"]
     return Shot(
         valid_at_ns,
         None,
@@ -122,6 +162,7 @@ def chosen(told: dict[str, Any], text: str | None, wanted: Wanted, valid_at_ns: 
         math.radians(beam["bearing_deg"]),
         math.radians(beam["above_horizon_deg"]),
         rows,
+        stored,
     )
 
 

@@ -4,29 +4,37 @@
     gimbal:HOST:PORT:SYSID:COMPID
                             a gimbal, by MAVLink's gimbal manager over UDP
     phaser:URI              an Analog Devices CN0566 (ip:phaser.local), by pyadi-iio
+    phaser-memory:URI       the same by its beam memory, which holds the codebook
     adar1000:BUS.DEVICE...  ADAR1000 chips on Linux's SPI, in the order of the table's chips
     none:pointing           nothing: a dry run prints what would be sent
     none:adar1000           the same of registers
+    none:stored             the same of the codebook's beams
 
 IPv6 hosts stand in brackets.
 """
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
-from companion.node.drive.loop import Device, Safe, Shot
-from companion.values import Source, UserError
+from companion.node.drive.loop import Device, Safe, Shot, Takes
+from companion.values import IntArray, Source, UserError
 
 FORMS: Final = (
-    "rotctld:HOST:PORT, gimbal:HOST:PORT:SYSID:COMPID, phaser:URI, adar1000:BUS.DEVICE[,...], "
-    "none:pointing, none:adar1000"
+    "rotctld:HOST:PORT, gimbal:HOST:PORT:SYSID:COMPID, phaser:URI, phaser-memory:URI, "
+    "adar1000:BUS.DEVICE[,...], none:pointing, none:adar1000, none:stored"
 )
 _GIMBAL: Final = re.compile(r"(.+):(\d{1,5}):(\d{1,3}):(\d{1,3})")
 
 
-def device(target: str, say: Callable[[str], None]) -> Device:
-    """The device of a target; ``say`` gets what a dry run would send. Raises ``UserError``."""
+def device(
+    target: str, say: Callable[[str], None], codebook: Callable[[], Sequence[IntArray]]
+) -> Device:
+    """The device of a target. Raises ``UserError``.
+
+    say       gets what a dry run would send
+    codebook  gives the registers (M, 8) of each stored beam; called where they are needed
+    """
     kind, _, where = target.partition(":")
     match kind:
         case "rotctld":
@@ -46,13 +54,17 @@ def device(target: str, say: Callable[[str], None]) -> Device:
             from companion.node.drive.phaser import Phaser
 
             return Phaser(where)
+        case "phaser-memory" if where:
+            from companion.node.drive.phaser_memory import PhaserMemory
+
+            return PhaserMemory(where, codebook())
         case "adar1000" if re.fullmatch(r"\d{1,3}\.\d{1,3}(,\d{1,3}\.\d{1,3})*", where):
             from companion.node.drive.adar1000 import Chips
 
             places = [tuple(map(int, one.split("."))) for one in where.split(",")]
             return Chips([(bus, number) for bus, number in places])
-        case "none" if where in ("pointing", "adar1000"):
-            return DryRun(where == "adar1000", say)
+        case "none" if where in tuple(Takes):
+            return DryRun(Takes(where), say)
     raise UserError(f"{target!r} is none of {FORMS}")
 
 
@@ -61,8 +73,8 @@ class DryRun:
 
     lead_s = None
 
-    def __init__(self, takes_registers: bool, say: Callable[[str], None]) -> None:
-        self.takes_registers = takes_registers
+    def __init__(self, takes: Takes, say: Callable[[str], None]) -> None:
+        self.takes = takes
         self._say = say
 
     def check(self, safe: Safe) -> None:
@@ -73,6 +85,9 @@ class DryRun:
 
     def apply(self, shot: Shot) -> None:
         """Say what would be sent."""
+        if shot.stored is not None:
+            self._say(f"{shot.uav}: stored beam {shot.stored}")
+            return
         if shot.registers is None:
             degrees = 57.29577951308232
             bearing, above = shot.bearing_rad * degrees, shot.above_rad * degrees

@@ -5,6 +5,7 @@ import sys
 import threading
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -17,12 +18,12 @@ from companion.beams.hardware.calibration import Calibration
 from companion.beams.hardware.devices import Device
 from companion.node import moment
 from companion.node.drive import targets
-from companion.node.drive.loop import DeviceError, Drive, Safe, Shot, SourceLostError
-from companion.node.drive.sources import Wanted, shot_of
+from companion.node.drive.loop import DeviceError, Drive, Safe, Shot, SourceLostError, Takes
+from companion.node.drive.sources import Wanted, chosen, shot_of, stored_registers
 from companion.pipeline import assembly
 from companion.settings.model import Settings
 from companion.values import UserError
-from companion.views import weight_formats
+from companion.views import beam_state, weight_formats
 
 EIGHT = Settings().override(center={"source": "5:1"}, array={"elements": 8, "frequency_hz": 10.5e9})
 
@@ -33,7 +34,7 @@ def flown() -> tuple[Shot, Any, str]:
     log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
     pipeline, update = moment.look([log], EIGHT, "3")
     equipment = assembly.equipment(EIGHT, pipeline.array)
-    wanted = Wanted(("3:1",), False, True)
+    wanted = Wanted(("3:1",), False, Takes.REGISTERS)
     shot = shot_of(pipeline, equipment, update, wanted)
     text = weight_formats.encode("adar1000", update.beams, pipeline.array, equipment, 0).decode()
     read = parse(Device.ADAR1000, text, Calibration.ideal(range(8)))
@@ -125,7 +126,7 @@ def test_registers_of_chips_radiate_what_the_text_says(
     spidev: dict[tuple[int, int], Chip], flown: tuple[Shot, Any, str]
 ) -> None:
     shot, read, _ = flown
-    device = targets.device("adar1000:0.0,0.1", print)
+    device = targets.device("adar1000:0.0,0.1", print, list)
     clock = Ticking()
     drive = Drive(Always(shot), device, 100.0, Safe.MUTE, clock.now_ns, lambda _: None)
     for n in range(1, 4):
@@ -152,7 +153,7 @@ def test_an_attenuated_channel_is_15_db_down(
     weak = registers[:4].copy()
     weak[:, 4], weak[:, 5] = 127, [0, 1, 0, 1]
     shot = Shot(0, None, "3:1", 0.0, 0.0, weak)
-    device = targets.device("adar1000:0.0", print)
+    device = targets.device("adar1000:0.0", print, list)
     Drive(Always(shot), device, 100.0, Safe.HOLD, Ticking().now_ns, print).step()
     got = [abs(factor(*one)) for one in spidev[0, 0].radiates]
     assert 20 * np.log10(got) == pytest.approx([0, -15, 0, -15])
@@ -161,7 +162,7 @@ def test_an_attenuated_channel_is_15_db_down(
 def test_too_few_chips_are_a_mistake_of_one_line(
     spidev: dict[tuple[int, int], Chip], flown: tuple[Shot, Any, str]
 ) -> None:
-    device = targets.device("adar1000:0.0", print)
+    device = targets.device("adar1000:0.0", print, list)
     drive = Drive(Always(flown[0]), device, 100.0, Safe.HOLD, Ticking().now_ns, print)
     with pytest.raises(UserError, match="1 chips for 2 of the array"):
         drive.run(threading.Event())
@@ -171,7 +172,7 @@ def test_a_line_that_is_not_there_is_tried_again_each_second(
     spidev: dict[tuple[int, int], Chip], flown: tuple[Shot, Any, str]
 ) -> None:
     clock, said = Ticking(), list[str]()
-    device = targets.device("adar1000:9.0", print)
+    device = targets.device("adar1000:9.0", print, list)
     drive = Drive(Always(flown[0]), device, 100.0, Safe.HOLD, clock.now_ns, said.append)
     for _ in range(300):  # three seconds
         drive.step()
@@ -265,7 +266,7 @@ def test_a_phaser_gets_the_codes_of_the_text_and_one_latch_an_update(
     iio: list[tuple[str, str, str]], flown: tuple[Shot, Any, str]
 ) -> None:
     shot, read, text = flown
-    device = targets.device("phaser:ip:phaser.local", print)
+    device = targets.device("phaser:ip:phaser.local", print, list)
     drive = Drive(Always(shot), device, 100.0, Safe.BORESIGHT, Ticking().now_ns, print)
     drive.step()
     configured = len(iio)
@@ -299,10 +300,81 @@ def test_an_array_that_is_no_phaser_is_refused(
     shot = flown[0]
     assert shot.registers is not None
     half = Shot(shot.valid_at_ns, None, shot.uav, 0.0, 0.0, shot.registers[:4])
-    device = targets.device("phaser:ip:phaser.local", print)
+    device = targets.device("phaser:ip:phaser.local", print, list)
     drive = Drive(Always(half), device, 100.0, Safe.HOLD, Ticking().now_ns, print)
     with pytest.raises(UserError, match="8 elements, the array has 4"):
         drive.step()
+
+
+def test_a_phaser_s_memory_holds_the_codebook_and_an_update_names_a_beam(
+    iio: list[tuple[str, str, str]],
+) -> None:
+    settings = EIGHT.override(codebook={"kind": "dft", "oversampling": 4})
+    log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
+    pipeline, update = moment.look([log], settings, "3")
+    equipment = assembly.equipment(settings, pipeline.array)
+    stored = stored_registers(pipeline.array, equipment)
+    wanted = Wanted(("3:1",), False, Takes.STORED, 32)
+    shot = shot_of(pipeline, equipment, update, wanted)
+    told = beam_state.beams(pipeline, equipment, update, 0.0, 0.0)
+    (beam,) = [one for one in told["beams"] if one["uav"] == "3:1"]
+    assert shot.stored == beam["codebook"]["best"]
+    assert chosen(told, None, wanted, 0).stored == shot.stored  # the same over HTTP
+
+    device = targets.device("phaser-memory:ip:phaser.local", print, lambda: stored)
+    other = replace(shot, stored=(shot.stored + 5) % 32)
+    source = Always(shot, shot, other, Shot(0, "no carrier"))
+    drive = Drive(source, device, 100.0, Safe.MUTE, Ticking().now_ns, lambda _: None)
+    drive.step()
+    saved = {
+        where + "/" + value.split(",")[0]: value
+        for where, name, value in iio
+        if name == "beam_pos_save"
+    }
+    assert len(saved) == 8 * (32 + 2)
+    for index, registers in enumerate(stored):
+        for _, _, element, phase, gain, attenuated, _, _ in registers.tolist():
+            chip = next(name for name, elements in MAP.items() if element + 1 in elements)
+            place = f"{chip}/in/voltage{MAP[chip].index(element + 1)}"
+            state, through, level, degrees = saved[f"{place}/{index}"].split(", ")
+            assert (int(state), int(through), int(level)) == (index, 1 - attenuated, gain)
+            assert float(degrees) == pytest.approx(phase * 360 / 128)
+    assert ("BEAM0", "beam_mem_enable", "1") in iio
+    assert ("BEAM1", "beam_mem_enable", "1") in iio
+
+    def said() -> tuple[set[str], Counter[str]]:
+        """Positions, and how often what was written, by one more update."""
+        begun = len(iio)
+        drive.step()
+        positions = {value for _, name, value in iio[begun:] if name == "beam_pos_load"}
+        return positions, Counter(name for _, name, _ in iio[begun:])
+
+    assert said() == (set(), {"rx_load_spi": 2})  # as it was: one latch of each chip
+    assert said() == ({str(other.stored)}, {"beam_pos_load": 8, "rx_load_spi": 2})
+    assert said() == ({"120"}, {"beam_pos_load": 8, "rx_load_spi": 2})
+    assert {value for key, value in saved.items() if key.endswith("/120")} == {"120, 0, 0, 0.0"}
+
+
+def test_beams_of_another_codebook_are_not_pointed_to() -> None:
+    beam = {"uav": "1:1", "bearing_deg": 0.0, "above_horizon_deg": 0.0, "codebook": {"best": 3}}
+    told = {"unfit": None, "beams": [beam], "codebook_beams": 64}
+    fits = chosen(told, None, Wanted((), True, Takes.STORED, 64), 0)
+    assert (fits.unfit, fits.stored) == (None, 3)
+    for size, held in ((64, 32), (None, 32), (None, None)):
+        shot = chosen(
+            told | {"codebook_beams": size}, None, Wanted((), True, Takes.STORED, held), 0
+        )
+        assert shot.unfit == "the service has another codebook, or none"
+
+
+def test_what_a_phaser_cannot_store_is_said() -> None:
+    array = assembly.array(EIGHT)
+    with pytest.raises(UserError, match="there are no stored beams"):
+        stored_registers(array, assembly.equipment(EIGHT, array))
+    many = EIGHT.override(codebook={"kind": "dft", "oversampling": 15})
+    held = stored_registers(array, assembly.equipment(many, array))
+    with pytest.raises(UserError, match="a Phaser stores 119 beams, the codebook has 120"):
+        targets.device("phaser-memory:ip:x", print, lambda: held)
 
 
 # --- the loop -----------------------------------------------------------------------------------
@@ -311,7 +383,7 @@ def test_an_array_that_is_no_phaser_is_refused(
 class Recorder:
     """A device that notes what is asked of it, and takes its time."""
 
-    takes_registers = False
+    takes = Takes.POINTING
     lead_s = None
 
     def __init__(self, clock: Ticking, takes_s: float = 0.0) -> None:
@@ -385,8 +457,17 @@ def test_a_device_that_fails_is_opened_again_and_rests_again() -> None:
 
 @pytest.mark.parametrize(
     "target",
-    ["rotctld:here", "rotctld:h:0", "adar1000:0", "phaser:", "none:", "laser:1", "adar1000:0.0,"],
+    [
+        "rotctld:here",
+        "rotctld:h:0",
+        "adar1000:0",
+        "phaser:",
+        "none:",
+        "laser:1",
+        "adar1000:0.0,",
+        "phaser-memory:",
+    ],
 )
 def test_a_target_that_is_none_is_refused(target: str) -> None:
     with pytest.raises(UserError, match="is none of rotctld:HOST:PORT"):
-        targets.device(target, print)
+        targets.device(target, print, list)

@@ -30,7 +30,7 @@ def message(sock: socket.socket) -> tuple[Any, Any]:
 
 def test_it_is_told_where_to_look(heard: socket.socket) -> None:
     port = heard.getsockname()[1]
-    gimbal = targets.device(f"gimbal:127.0.0.1:{port}:7:154", print)
+    gimbal = targets.device(f"gimbal:127.0.0.1:{port}:7:154", print, list)
     gimbal.open()
     gimbal.apply(Shot(0, None, "1:1", math.radians(270), math.radians(12)))
     said, _ = message(heard)
@@ -75,7 +75,7 @@ def test_its_lag_is_found_from_its_attitude(heard: socket.socket, from_north: bo
 
 def test_a_gimbal_is_not_muted() -> None:
     with pytest.raises(UserError, match="hold or boresight, not mute"):
-        targets.device("gimbal:127.0.0.1:1:1:154", print).check(Safe.MUTE)
+        targets.device("gimbal:127.0.0.1:1:1:154", print, list).check(Safe.MUTE)
 
 
 @pytest.mark.parametrize(
@@ -83,4 +83,4 @@ def test_a_gimbal_is_not_muted() -> None:
 )
 def test_what_is_no_gimbal_is_refused(target: str) -> None:
     with pytest.raises(UserError, match="is none of"):
-        targets.device(target, print)
+        targets.device(target, print, list)

@@ -17,7 +17,7 @@ from support import HANG_S, started
 
 from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
 from companion.node.drive.lag import MountLag
-from companion.node.drive.loop import DeviceError, Drive, Safe, Shot
+from companion.node.drive.loop import DeviceError, Drive, Safe, Shot, Takes
 from companion.node.drive.rotctld import Rotator
 from companion.node.drive.sources import Wanted, shot_of
 from companion.pipeline import assembly
@@ -137,7 +137,7 @@ def test_a_mount_is_off_by_half_of_what_one_is_that_follows_reports(
     settings = Settings().override(center={"source": "5:1"}, observer={"lag_s": (0.0, 0.0)})
     pipeline = Pipeline(settings)
     equipment = assembly.equipment(settings, pipeline.array)
-    wanted = Wanted(("1:1",), False, False)
+    wanted = Wanted(("1:1",), False, Takes.POINTING)
 
     class Here:
         def ask(self, lead_s: float) -> Shot:

@@ -29,6 +29,13 @@ if TYPE_CHECKING:
 @CONFIG
 @click.option("--uav", "uavs", multiple=True, help="Whom to follow, in descending order [anybody].")
 @click.option(
+    "--aim",
+    type=click.Choice(["first", "centre"]),
+    default="first",
+    show_default=True,
+    help="centre: a mount looks at the middle of all of them that have a beam.",
+)
+@click.option(
     "--rate",
     "update_hz",
     type=click.FloatRange(0.1, 1000),
@@ -51,6 +58,7 @@ def drive(
     service: str,
     config: Path | None,
     uavs: tuple[str, ...],
+    aim: str,
     update_hz: float,
     on_stale: str,
     dry_run: bool,
@@ -59,10 +67,10 @@ def drive(
 ) -> None:
     """Apply the beams of a running service to a device.
 
-    TARGET is rotctld:HOST:PORT, gimbal:HOST:PORT:SYSID:COMPID, phaser:URI or phaser-memory:URI
-    (extra [phaser]) or adar1000:BUS.DEVICE[,...] (extra [spi]). Beams are asked for as far ahead as
-    the device takes to apply them. A Phaser's memory holds the [codebook] of --config, which must
-    be the service's own.
+    TARGET is rotctld:HOST:PORT, gimbal: or gimbal-roi:HOST:PORT:SYSID:COMPID, phaser:URI or
+    phaser-memory:URI (extra [phaser]) or adar1000:BUS.DEVICE[,...] (extra [spi]). Beams are asked
+    for as far ahead as the device takes to apply them. A Phaser's memory holds the [codebook] of
+    --config, which must be the service's own.
 
     Example: companion drive rotctld:127.0.0.1:4533 --uav 1:1
     """
@@ -86,7 +94,9 @@ def drive(
         device = targets.device(f"none:{device.takes}", click.echo, codebook)
     client = Client(service, os.environ.get("COMPANION_TOKEN"))
     driven = Drive(
-        OverHttp(client, Wanted(uavs, not uavs, device.takes, len(stored) or None)),
+        OverHttp(
+            client, Wanted(uavs, not uavs, device.takes, len(stored) or None, aim == "centre")
+        ),
         device,
         update_hz,
         Safe(on_stale),

@@ -186,14 +186,10 @@ class Service:
             notice = Notice(self.now_ns(), Severity.INFO, "drive", text)
             loop.call_soon_threadsafe(self._notify, notice)
 
-        source = OfThisProcess(
-            loop,
-            self.pipeline,
-            self.equipment,
-            self.now_ns,
-            Wanted(uavs, not kept.drive.uavs, self._device.takes),
-        )
         try:
+            centre = kept.drive.aim == "centre"
+            wanted = Wanted(uavs, not kept.drive.uavs, self._device.takes, centre=centre)
+            source = OfThisProcess(loop, self.pipeline, self.equipment, self.now_ns, wanted)
             safe = Safe(kept.drive.on_stale)
             drive = Drive(source, self._device, kept.beams.update_hz, safe, self.now_ns, say)
             await beside(drive)

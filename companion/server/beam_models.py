@@ -32,6 +32,9 @@ class BeamState(BaseModel):
     range_m: Annotated[float, Field(examples=[412.0])]
     bearing_deg: float
     above_horizon_deg: float
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
     azimuth_rate_dps: float | None
     elevation_rate_dps: float | None
     range_rate_mps: float | None

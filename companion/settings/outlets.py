@@ -68,11 +68,14 @@ class DriveSettings(Section):
 
     target    as ``companion drive`` has it, such as rotctld:HOST:PORT; None: nothing is driven
     uavs      whom to follow, in descending order; empty: by [beams] priority, then anybody
+    aim       "first": the first of them that has a beam; "centre": a mount looks at the middle of
+              all that have one
     on_stale  what the device does without beams, and at the end
     """
 
     target: str | None = None
     uavs: Annotated[tuple[str, ...], Field(max_length=1000)] = ()
+    aim: Literal["first", "centre"] = "first"
     on_stale: Literal["hold", "boresight", "mute"] = "hold"
 
 

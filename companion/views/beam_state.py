@@ -84,19 +84,18 @@ def left_out(beam_set: BeamSet, unfit: str | None = None) -> list[Json]:
 
 
 def pointing(pipeline: Pipeline, update: Update) -> list[Json]:
-    """Where each beam points over the ground: name, bearing and angle above the horizon."""
+    """Where each beam points over the ground: bearing, angle above the horizon, and the place."""
     carrier, beam_set = update.carrier, update.beams
     if carrier is None or not beam_set.beams:
         return []
+    tracked = {track.uav: track.position_ned_m for track in update.tracks}
+    places = pipeline.geodetic(np.array([tracked[uav] for uav in beam_set.uavs]))
     ned = directions(beam_set) @ pipeline.array.array_from_body @ carrier.body_from_local
     bearings = np.degrees(np.arctan2(ned[:, 1], ned[:, 0])) % 360
     above = np.degrees(np.arcsin(np.clip(-ned[:, 2], -1.0, 1.0)))
-    return [
-        {"uav": uav, "bearing_deg": bearing, "above_horizon_deg": angle}
-        for uav, bearing, angle in zip(
-            beam_set.uavs, bearings.tolist(), above.tolist(), strict=True
-        )
-    ]
+    names = "uav", "bearing_deg", "above_horizon_deg", "lat_deg", "lon_deg", "alt_m"
+    columns = bearings.tolist(), above.tolist(), *(one.tolist() for one in places)
+    return [dict(zip(names, row, strict=True)) for row in zip(beam_set.uavs, *columns, strict=True)]
 
 
 def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[Json]:
@@ -126,12 +125,10 @@ def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[J
     turns_db = 10 * np.log10(beam_set.groups)
     return [
         {
-            "uav": beam.uav,
             "azimuth_deg": degrees(beam.azimuth_rad),
             "elevation_deg": degrees(beam.elevation_rad),
             "range_m": beam.range_m,
-            "bearing_deg": pointed[i]["bearing_deg"],
-            "above_horizon_deg": pointed[i]["above_horizon_deg"],
+            **pointed[i],
             "azimuth_rate_dps": degrees(beam.azimuth_rate_radps),
             "elevation_rate_dps": degrees(beam.elevation_rate_radps),
             "range_rate_mps": beam.range_rate_mps,

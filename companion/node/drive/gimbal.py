@@ -1,7 +1,9 @@
-"""A gimbal by MAVLink's gimbal manager: ``gimbal:HOST:PORT:SYSID:COMPID``.              [shell]
+"""A gimbal by MAVLink: ``gimbal:HOST:PORT:SYSID:COMPID``, and ``gimbal-roi:``.          [shell]
 
 GIMBAL_MANAGER_SET_PITCHYAW points it, yaw from north and pitch from the horizon
-(https://mavlink.io/en/services/gimbal_v2.html); where the gimbal says its own attitude
+(https://mavlink.io/en/services/gimbal_v2.html). Or DO_SET_ROI_LOCATION tells it the place of the
+UAV, and it points there by its own position and attitude: for one that is elsewhere than the array,
+or moves. Where the gimbal says its own attitude
 (GIMBAL_DEVICE_ATTITUDE_STATUS), its lag is found from it. Messages are sent under
 MAV_COMP_ID_ONBOARD_COMPUTER of that system. It was never on the air: what is tested is what
 pymavlink reads of it.
@@ -20,6 +22,9 @@ from companion.node.drive.lag import MountLag
 from companion.node.drive.loop import DeviceError, Safe, Shot, Takes, require
 from companion.values import Frame, Source
 
+COMMAND_INT: Final = 75
+DO_SET_ROI_LOCATION: Final = 195
+DO_SET_ROI_NONE: Final = 197
 SET_PITCHYAW: Final = 287
 ATTITUDE_STATUS: Final = 285
 IN_EARTH_FRAME: Final = 4 | 8 | 16 | 64
@@ -42,7 +47,7 @@ class Gimbal:
         now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._address = host, port
-        self._target = target
+        self.target = target
         self._now_ns = now_ns
         self._lag = MountLag()
         self._socket: socket.socket | None = None
@@ -76,13 +81,13 @@ class Gimbal:
         self._hear()
         yaw_rad = _near(shot.bearing_rad, self._last_rad)
         self._last_rad = yaw_rad
-        self._say(shot.bearing_rad, shot.above_rad)
+        self._point(shot)
         self._lag.told(self._now_ns(), yaw_rad)
 
     def rest(self, safe: Safe) -> None:
         """Stay where it was told to point last, or go to its boresight."""
         if safe is Safe.BORESIGHT:
-            self._say(0.0, 0.0)
+            self._point(Shot(0, None))
 
     def close(self) -> None:
         """Let go of the socket."""
@@ -90,13 +95,18 @@ class Gimbal:
             self._socket.close()
             self._socket = None
 
-    def _say(self, bearing_rad: float, above_rad: float) -> None:
-        yaw_rad = math.remainder(bearing_rad, 2 * math.pi)
+    def _point(self, shot: Shot) -> None:
+        """Say where to point; the direction of a shot that says none is its boresight."""
+        yaw_rad = math.remainder(shot.bearing_rad, 2 * math.pi)
         rates = math.nan, math.nan  # of pitch and yaw: not commanded
-        whom = *self._target, 0  # every gimbal of that manager
-        payload = struct.pack("<I4f3B", IN_EARTH_FRAME, above_rad, yaw_rad, *rates, *whom)
-        own = Source(self._target[0], ONBOARD_COMPUTER)
-        raw = pack(Outgoing(own, SET_PITCHYAW, payload), self._sequence)
+        whom = *self.target, 0  # every gimbal of that manager
+        angles = shot.above_rad, yaw_rad
+        self.say(SET_PITCHYAW, struct.pack("<I4f3B", IN_EARTH_FRAME, *angles, *rates, *whom))
+
+    def say(self, msgid: int, payload: bytes) -> None:
+        """Send a message to it."""
+        own = Source(self.target[0], ONBOARD_COMPUTER)
+        raw = pack(Outgoing(own, msgid, payload), self._sequence)
         self._sequence = (self._sequence + 1) & 0xFF
         try:
             if self._socket is None:
@@ -115,7 +125,7 @@ class Gimbal:
             except OSError as error:
                 raise DeviceError(f"gimbal: {error.strerror or error}") from error
             for frame in self._splitter.feed(self._now_ns(), data):
-                if isinstance(frame, Frame) and frame.source.sysid == self._target.sysid:
+                if isinstance(frame, Frame) and frame.source.sysid == self.target.sysid:
                     self._note(frame)
 
     def _note(self, frame: Frame) -> None:
@@ -126,6 +136,18 @@ class Gimbal:
         if flags & YAW_FROM_NORTH and math.isfinite(yaw_rad):
             self._seen_rad = _near(yaw_rad, self._seen_rad)
             self._lag.seen(frame.t_ns, self._seen_rad)
+
+
+class RoiGimbal(Gimbal):
+    """A gimbal that is told places; at its boresight it is free of them."""
+
+    def _point(self, shot: Shot) -> None:
+        """Say which place to look at, or none."""
+        lat_deg, lon_deg, alt_m = shot.place or (0.0, 0.0, 0.0)
+        command = DO_SET_ROI_NONE if shot.place is None else DO_SET_ROI_LOCATION
+        where = round(lat_deg * 1e7), round(lon_deg * 1e7), alt_m
+        whom = *self.target, 0, 0, 0  # MAV_FRAME_GLOBAL: above mean sea level; not of a mission
+        self.say(COMMAND_INT, struct.pack("<4f2ifH5B", 0.0, 0.0, 0.0, 0.0, *where, command, *whom))
 
 
 def _near(angle_rad: float, other_rad: float) -> float:

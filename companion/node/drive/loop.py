@@ -60,6 +60,8 @@ class Shot:
     uav          who is served
     bearing_rad  from true north, clockwise
     above_rad    above the horizon
+    place        of the UAV: latitude and longitude in degrees, height above mean sea level in
+                 metres; None where it is not known
     registers    (M, 8), as the text for ADAR1000 has them: chip, channel, element, phase code,
                  gain code, attenuator, I and Q; None where nobody asked
     stored       index of the codebook's best beam; None where nobody asked
@@ -70,6 +72,7 @@ class Shot:
     uav: str = ""
     bearing_rad: float = 0.0
     above_rad: float = 0.0
+    place: tuple[float, float, float] | None = None
     registers: IntArray | None = None
     stored: int | None = None
 

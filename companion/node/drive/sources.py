@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+import statistics
 import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -23,6 +24,8 @@ from companion.views import beam_state
 from companion.views.quantised import device_table
 
 ADAR1000: Final = MEDIA_TYPES[Device.ADAR1000]
+LEAST_MEAN: Final = 0.1
+"""Length of the mean of unit directions below which they have no middle."""
 ANSWERS_S: Final = 5.0
 """Time after which an event loop that does not answer is lost."""
 
@@ -31,13 +34,21 @@ ANSWERS_S: Final = 5.0
 class Wanted:
     """Whom to follow: the first of these that has a beam, else anybody if so; and for what.
 
-    ``stored_beams`` is the size of the codebook that the device holds; None: it holds none.
+    centre        a mount looks at the middle of all of them instead
+    stored_beams  size of the codebook that the device holds; None: it holds none
+
+    Raises ``UserError`` for a beam that is asked to look at a middle.
     """
 
     uavs: tuple[str, ...]
     anybody: bool
     takes: Takes
     stored_beams: int | None = None
+    centre: bool = False
+
+    def __post_init__(self) -> None:
+        if self.centre and self.takes is not Takes.POINTING:
+            raise UserError('only a mount looks at the centre of several: aim = "first"')
 
 
 class OverHttp:
@@ -146,6 +157,9 @@ def chosen(told: dict[str, Any], text: str | None, wanted: Wanted, valid_at_ns: 
     uav = followed(named, wanted)
     if uav is None:
         return Shot(valid_at_ns, "nobody who is to be followed has a beam")
+    if wanted.centre:
+        several = named if wanted.anybody else wanted.uavs
+        return _middle([named[one] for one in several if one in named], valid_at_ns)
     beam, rows = named[uav], None if text is None else registers_of(text, uav)
     if rows is not None and not len(rows):
         return Shot(valid_at_ns, f"{uav} has no beam in the device's table")
@@ -161,8 +175,36 @@ def chosen(told: dict[str, Any], text: str | None, wanted: Wanted, valid_at_ns: 
         uav,
         math.radians(beam["bearing_deg"]),
         math.radians(beam["above_horizon_deg"]),
+        (beam["lat_deg"], beam["lon_deg"], beam["alt_m"]),
         rows,
         stored,
+    )
+
+
+def _middle(beams: list[dict[str, Any]], valid_at_ns: int) -> Shot:
+    """The mean direction of these beams, and the mean of their places, which are near together."""
+    bearing = np.radians([beam["bearing_deg"] for beam in beams])
+    above = np.radians([beam["above_horizon_deg"] for beam in beams])
+    level = np.cos(above)
+    north, east, up = (
+        float(part.sum())
+        for part in (level * np.cos(bearing), level * np.sin(bearing), np.sin(above))
+    )
+    if math.hypot(north, east, up) < LEAST_MEAN * len(beams):
+        return Shot(valid_at_ns, "they are all around: there is no direction to the middle of them")
+    lat_deg, alt_m = (
+        statistics.fmean(beam[name] for beam in beams) for name in ("lat_deg", "alt_m")
+    )
+    first_deg = beams[0]["lon_deg"]
+    east_deg = [math.remainder(beam["lon_deg"] - first_deg, 360.0) for beam in beams]
+    lon_deg = math.remainder(first_deg + statistics.fmean(east_deg), 360.0)
+    return Shot(
+        valid_at_ns,
+        None,
+        "+".join(beam["uav"] for beam in beams),
+        math.atan2(east, north),
+        math.atan2(up, math.hypot(north, east)),
+        (lat_deg, lon_deg, alt_m),
     )
 
 

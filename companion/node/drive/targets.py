@@ -3,6 +3,8 @@
     rotctld:HOST:PORT       a rotator behind hamlib's rotctld
     gimbal:HOST:PORT:SYSID:COMPID
                             a gimbal, by MAVLink's gimbal manager over UDP
+    gimbal-roi:HOST:PORT:SYSID:COMPID
+                            the same, told places instead of directions
     phaser:URI              an Analog Devices CN0566 (ip:phaser.local), by pyadi-iio
     phaser-memory:URI       the same by its beam memory, which holds the codebook
     adar1000:BUS.DEVICE...  ADAR1000 chips on Linux's SPI, in the order of the table's chips
@@ -21,8 +23,8 @@ from companion.node.drive.loop import Device, Safe, Shot, Takes
 from companion.values import IntArray, Source, UserError
 
 FORMS: Final = (
-    "rotctld:HOST:PORT, gimbal:HOST:PORT:SYSID:COMPID, phaser:URI, phaser-memory:URI, "
-    "adar1000:BUS.DEVICE[,...], none:pointing, none:adar1000, none:stored"
+    "rotctld:HOST:PORT, gimbal:HOST:PORT:SYSID:COMPID, gimbal-roi:..., phaser:URI, "
+    "phaser-memory:URI, adar1000:BUS.DEVICE[,...], none:pointing, none:adar1000, none:stored"
 )
 _GIMBAL: Final = re.compile(r"(.+):(\d{1,5}):(\d{1,3}):(\d{1,3})")
 
@@ -43,13 +45,14 @@ def device(
                 from companion.node.drive.rotctld import Rotator
 
                 return Rotator(host.strip("[]"), int(port))
-        case "gimbal":
+        case "gimbal" | "gimbal-roi":
             found = _GIMBAL.fullmatch(where)
             numbers = [int(one) for one in found.groups()[1:]] if found else []
             if found and 0 < numbers[0] < 65536 and max(numbers[1:]) < 256:
-                from companion.node.drive.gimbal import Gimbal
+                from companion.node.drive.gimbal import Gimbal, RoiGimbal
 
-                return Gimbal(found[1].strip("[]"), numbers[0], Source(*numbers[1:]))
+                made = Gimbal if kind == "gimbal" else RoiGimbal
+                return made(found[1].strip("[]"), numbers[0], Source(*numbers[1:]))
         case "phaser" if where:
             from companion.node.drive.phaser import Phaser
 

@@ -152,7 +152,7 @@ def test_an_attenuated_channel_is_15_db_down(
     assert registers is not None
     weak = registers[:4].copy()
     weak[:, 4], weak[:, 5] = 127, [0, 1, 0, 1]
-    shot = Shot(0, None, "3:1", 0.0, 0.0, weak)
+    shot = Shot(0, None, "3:1", registers=weak)
     device = targets.device("adar1000:0.0", print, list)
     Drive(Always(shot), device, 100.0, Safe.HOLD, Ticking().now_ns, print).step()
     got = [abs(factor(*one)) for one in spidev[0, 0].radiates]
@@ -299,7 +299,7 @@ def test_an_array_that_is_no_phaser_is_refused(
 ) -> None:
     shot = flown[0]
     assert shot.registers is not None
-    half = Shot(shot.valid_at_ns, None, shot.uav, 0.0, 0.0, shot.registers[:4])
+    half = Shot(shot.valid_at_ns, None, shot.uav, registers=shot.registers[:4])
     device = targets.device("phaser:ip:phaser.local", print, list)
     drive = Drive(Always(half), device, 100.0, Safe.HOLD, Ticking().now_ns, print)
     with pytest.raises(UserError, match="8 elements, the array has 4"):
@@ -356,7 +356,8 @@ def test_a_phaser_s_memory_holds_the_codebook_and_an_update_names_a_beam(
 
 
 def test_beams_of_another_codebook_are_not_pointed_to() -> None:
-    beam = {"uav": "1:1", "bearing_deg": 0.0, "above_horizon_deg": 0.0, "codebook": {"best": 3}}
+    beam = dict.fromkeys(("bearing_deg", "above_horizon_deg", "lat_deg", "lon_deg", "alt_m"), 0.0)
+    beam |= {"uav": "1:1", "codebook": {"best": 3}}
     told = {"unfit": None, "beams": [beam], "codebook_beams": 64}
     fits = chosen(told, None, Wanted((), True, Takes.STORED, 64), 0)
     assert (fits.unfit, fits.stored) == (None, 3)
@@ -365,6 +366,57 @@ def test_beams_of_another_codebook_are_not_pointed_to() -> None:
             told | {"codebook_beams": size}, None, Wanted((), True, Takes.STORED, held), 0
         )
         assert shot.unfit == "the service has another codebook, or none"
+
+
+def test_a_mount_looks_at_the_middle_of_several(flown: tuple[Shot, Any, str]) -> None:
+    """Against their own directions and places; who is not wanted does not count."""
+    log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
+    pipeline, update = moment.look([log], EIGHT, "3")
+    equipment = assembly.equipment(EIGHT, pipeline.array)
+    told = beam_state.beams(pipeline, equipment, update, 0.0, 0.0)
+    two = [beam for beam in told["beams"] if beam["uav"] in ("1:1", "2:1")]
+    angles = [np.radians([beam["bearing_deg"], beam["above_horizon_deg"]]) for beam in two]
+    mean = sum(
+        np.array([np.cos(e) * np.cos(b), np.cos(e) * np.sin(b), np.sin(e)]) for b, e in angles
+    )
+    wanted = Wanted(("9:9", "2:1", "1:1"), False, Takes.POINTING, centre=True)
+    for shot in (shot_of(pipeline, equipment, update, wanted), chosen(told, None, wanted, 0)):
+        assert shot.uav == "2:1+1:1"
+        assert shot.bearing_rad == pytest.approx(np.arctan2(mean[1], mean[0]))
+        assert shot.above_rad == pytest.approx(np.arcsin(mean[2] / np.linalg.norm(mean)))
+        assert shot.place is not None
+        seen = pipeline.local.position_ned_m(*shot.place)
+        mid = np.mean([t.position_ned_m for t in update.tracks if t.uav in ("1:1", "2:1")], axis=0)
+        np.testing.assert_allclose(seen, mid, atol=0.01)
+    everybody = Wanted(("1:1",), True, Takes.POINTING, centre=True)
+    around = shot_of(pipeline, equipment, update, everybody)
+    assert "they are all around" in (around.unfit or "")  # four on one circle
+    with pytest.raises(UserError, match="only a mount looks at the centre"):
+        Wanted((), True, Takes.REGISTERS, centre=True)
+
+
+@pytest.mark.parametrize(("lon_deg", "middle_deg"), [((179.9, -179.7), -179.9), ((7.0, 8.0), 7.5)])
+def test_a_middle_is_between_also_at_the_edge_of_the_map(
+    lon_deg: tuple[float, float], middle_deg: float
+) -> None:
+    one = {
+        "uav": "1:1",
+        "bearing_deg": 350.0,
+        "above_horizon_deg": 0.0,
+        "lat_deg": 1.0,
+        "alt_m": 5.0,
+    }
+    beams = [
+        one | {"lon_deg": lon_deg[0]},
+        one | {"uav": "2:1", "bearing_deg": 20.0, "lon_deg": lon_deg[1]},
+    ]
+    told = {"unfit": None, "beams": beams, "codebook_beams": None}
+    wanted = Wanted((), True, Takes.POINTING, centre=True)
+    shot = chosen(told, None, wanted, 0)
+    assert np.degrees(shot.bearing_rad) == pytest.approx(5.0)
+    assert shot.place == pytest.approx((1.0, middle_deg, 5.0))
+    beams[1]["bearing_deg"] = 170.0
+    assert "they are all around" in (chosen(told, None, wanted, 0).unfit or "")
 
 
 def test_what_a_phaser_cannot_store_is_said() -> None:

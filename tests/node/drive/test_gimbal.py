@@ -51,6 +51,24 @@ def test_it_is_told_where_to_look(heard: socket.socket) -> None:
         gimbal.apply(Shot(0, None))
 
 
+def test_it_is_told_places_where_it_is_asked_to(heard: socket.socket) -> None:
+    port = heard.getsockname()[1]
+    gimbal = targets.device(f"gimbal-roi:127.0.0.1:{port}:7:154", print, list)
+    gimbal.open()
+    gimbal.apply(Shot(0, None, "1:1", 1.0, 0.1, (-47.1234567, 170.7654321, 612.25)))
+    said, _ = message(heard)
+    assert said.get_type() == "COMMAND_INT"
+    assert said.command == dialect.MAV_CMD_DO_SET_ROI_LOCATION
+    assert (said.target_system, said.target_component) == (7, 154)
+    assert said.frame == dialect.MAV_FRAME_GLOBAL
+    assert (said.x, said.y, said.z) == (-471234567, 1707654321, 612.25)
+    gimbal.rest(Safe.HOLD)
+    gimbal.rest(Safe.BORESIGHT)
+    said, _ = message(heard)
+    assert said.command == dialect.MAV_CMD_DO_SET_ROI_NONE
+    gimbal.close()
+
+
 @pytest.mark.parametrize("from_north", [True, False])
 def test_its_lag_is_found_from_its_attitude(heard: socket.socket, from_north: bool) -> None:
     """Over north, where angles leap; an attitude relative to the vehicle says nothing."""
@@ -79,7 +97,8 @@ def test_a_gimbal_is_not_muted() -> None:
 
 
 @pytest.mark.parametrize(
-    "target", ["gimbal:here", "gimbal:h:1:1", "gimbal:h:0:1:1", "gimbal:h:1:256:1"]
+    "target",
+    ["gimbal:here", "gimbal:h:1:1", "gimbal:h:0:1:1", "gimbal:h:1:256:1", "gimbal-roi:h:1:1"],
 )
 def test_what_is_no_gimbal_is_refused(target: str) -> None:
     with pytest.raises(UserError, match="is none of"):

@@ -11,7 +11,8 @@ import numpy as np
 from companion.beams.array import geometry
 from companion.beams.array.coverage import Coverage, Sector
 from companion.beams.hardware import codebooks
-from companion.beams.hardware.calibration import Calibration, channel_error, parse_calibration
+from companion.beams.hardware.calibration import Calibration, channel_error
+from companion.beams.hardware.calibration_tables import calibration_at
 from companion.beams.hardware.codebooks import Codebook
 from companion.beams.hardware.devices import Device
 from companion.beams.hardware.unit_gains import RELATIVE, UnitGains, parse_unit_gains
@@ -94,7 +95,7 @@ def calibration(settings: Settings, size: int) -> Calibration | None:
     """
     text = calibration_text(settings)
     try:
-        found = None if text is None else parse_calibration(text)
+        found = None if text is None else calibration_at(text, settings.array.frequency_hz)
     except UserError as error:
         raise ConfigError(f"hardware.calibration: {error}") from error
     if found is not None and len(found.order) != size:

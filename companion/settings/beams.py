@@ -187,7 +187,8 @@ class HardwareSettings(Section):
     """The hardware behind the array.
 
     ``calibration`` names a table of its channels (CSV: channel, element, phase_deg, gain_db, and if
-    known phase_error_deg, gain_error_db), which is read into ``calibration_csv``.
+    known phase_error_deg, gain_error_db), or TOML with a table for each of several frequencies
+    (``companion/beams/hardware/calibration_tables.py``). It is read into ``calibration_csv``.
     ``phase_error_deg`` and ``gain_error_db`` are the most that each channel is off after it: bounds
     for which guaranteed gains then hold. A table that says bounds of its own has the last word.
     ``device`` is what the weights are quantised for: guaranteed gains in the API are then of what

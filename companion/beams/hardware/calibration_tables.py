@@ -1,0 +1,160 @@
+"""Calibration as a file has it: one table as CSV, or tables of several frequencies as TOML.
+
+    order = [6, 7, 4, 5, 2, 3, 0, 1]          # element of each channel, from 0
+
+    [[table]]
+    frequency_hz = 10.0e9
+    phase_deg = [0.0, 3.1, ...]               # by channel, as in the CSV
+    gain_db = [0.0, -0.4, ...]
+    phase_error_deg = [1.0, 1.2, ...]         # if known, in all tables: most that they are off
+    gain_error_db = [0.1, 0.1, ...]
+
+Between two frequencies phases are interpolated the shorter way about, and gains in dB; bounds are
+the larger of the two, so what a channel does between them that no table shows is not in them.
+Outside of the tables nothing is known.
+"""
+
+import itertools
+import math
+import tomllib
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from companion.beams.hardware.calibration import (
+    CALIBRATION_HEADER,
+    Calibration,
+    parse_calibration,
+)
+from companion.values import FloatArray, UserError
+
+FARTHEST_DEG: Final = 90.0
+"""Most that a channel's phase may differ from one frequency to the next, over channel 0's."""
+SAME: Final = 1e-9
+"""Share of a frequency by which it may miss a table's and still be the same."""
+REQUIRED: Final = ("phase_deg", "gain_db")
+BOUNDS: Final = ("phase_error_deg", "gain_error_db")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Table:
+    """One table: columns (M,) by channel, bounds None where they are not said."""
+
+    frequency_hz: float
+    phase_deg: FloatArray
+    gain_db: FloatArray
+    phase_error_deg: FloatArray | None
+    gain_error_db: FloatArray | None
+
+
+def calibration_at(text: str, frequency_hz: float) -> Calibration:
+    """The calibration for a frequency; that of CSV is for any. Raises ``UserError``."""
+    if text.lstrip().startswith(CALIBRATION_HEADER):
+        return parse_calibration(text)
+    order, tables = _read(text)
+    return _interpolated(order, tables, frequency_hz)
+
+
+def _read(text: str) -> tuple[list[int], list[_Table]]:
+    """Order and tables, by rising frequency."""
+    try:
+        told = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        header = f"a CSV file begins with {CALIBRATION_HEADER}"
+        raise UserError(f"neither calibration as CSV nor as TOML: {error}; {header}") from error
+    order, given = told.get("order"), told.get("table")
+    if (
+        set(told) != {"order", "table"}
+        or not isinstance(order, list)
+        or not isinstance(given, list)
+    ):
+        raise UserError("TOML of a calibration has an order and a [[table]] for each frequency")
+    if not all(type(element) is int for element in order):
+        raise UserError(f"order {order} is not of whole numbers")
+    tables = sorted((_table(one, len(order)) for one in given), key=lambda one: one.frequency_hz)
+    for low, high in itertools.pairwise(tables):
+        where = f"{low.frequency_hz:.9g} Hz and {high.frequency_hz:.9g} Hz"
+        if low.frequency_hz == high.frequency_hz:
+            raise UserError(f"{low.frequency_hz:.9g} Hz has two tables")
+        if (low.phase_error_deg is None) != (high.phase_error_deg is None):
+            raise UserError(f"tables for {where}: bounds are said in all of them, or in none")
+    return order, tables
+
+
+def _table(given: Any, size: int) -> _Table:
+    if not isinstance(given, dict):
+        raise UserError("[[table]] is not a table")
+    bounded = bool(set(given) & set(BOUNDS))
+    names = (*REQUIRED, *(BOUNDS if bounded else ()))
+    if set(given) != {"frequency_hz", *names}:
+        raise UserError(f"a table has frequency_hz, {', '.join(names)}, not {', '.join(given)}")
+    frequency = given["frequency_hz"]
+    if type(frequency) not in (int, float) or not 0 < frequency < math.inf:
+        raise UserError(f"frequency_hz = {frequency!r} is not above 0")
+    columns = []
+    for name in names:
+        column = given[name]
+        numbers = isinstance(column, list) and all(type(one) in (int, float) for one in column)
+        if not numbers or len(column) != size or not np.isfinite(column).all():
+            raise UserError(f"{name} at {frequency:.9g} Hz is not {size} finite numbers")
+        columns.append(np.array(column, dtype=float))
+    return _Table(float(frequency), *columns, *([] if bounded else [None, None]))
+
+
+def _interpolated(order: list[int], tables: list[_Table], frequency_hz: float) -> Calibration:
+    if not tables:
+        raise UserError("there is no [[table]]")
+    low = tables[0].frequency_hz * (1 - SAME)
+    if not low <= frequency_hz <= tables[-1].frequency_hz * (1 + SAME):
+        known = f"{tables[0].frequency_hz:.9g} to {tables[-1].frequency_hz:.9g} Hz"
+        raise UserError(f"{frequency_hz:.9g} Hz is outside of the tables, {known}")
+    for one in tables:
+        if abs(one.frequency_hz - frequency_hz) <= SAME * frequency_hz:
+            return _calibration(order, one)
+    above = next(n for n, one in enumerate(tables) if one.frequency_hz > frequency_hz)
+    return _calibration(order, _between(tables[above - 1], tables[above], frequency_hz))
+
+
+def _between(low: _Table, high: _Table, frequency_hz: float) -> _Table:
+    share = (frequency_hz - low.frequency_hz) / (high.frequency_hz - low.frequency_hz)
+    turned_deg = (high.phase_deg - low.phase_deg + 180) % 360 - 180
+    apart_deg = (turned_deg - turned_deg[0] + 180) % 360 - 180
+    if np.abs(apart_deg).max() > FARTHEST_DEG:
+        worst = int(np.abs(apart_deg).argmax())
+        raise UserError(
+            f"channel {worst} turns by {apart_deg[worst]:.0f} degrees over channel 0 from"
+            f" {low.frequency_hz:.9g} to {high.frequency_hz:.9g} Hz: too far to interpolate"
+        )
+    phase_error, gain_error = None, None
+    if low.phase_error_deg is not None and high.phase_error_deg is not None:
+        phase_error = np.maximum(low.phase_error_deg, high.phase_error_deg)
+    if low.gain_error_db is not None and high.gain_error_db is not None:
+        gain_error = np.maximum(low.gain_error_db, high.gain_error_db)
+    return _Table(
+        frequency_hz,
+        low.phase_deg + share * (turned_deg[0] + apart_deg),
+        low.gain_db + share * (high.gain_db - low.gain_db),
+        phase_error,
+        gain_error,
+    )
+
+
+def _calibration(order: list[int], table: _Table) -> Calibration:
+    """The table by element."""
+
+    def by_element(column: FloatArray | None) -> tuple[float, ...]:
+        if column is None:
+            return ()
+        return tuple(float(column[order.index(element)]) for element in range(len(order)))
+
+    if sorted(order) != list(range(len(order))):
+        raise UserError(f"order {order} is not each of 0 to {len(order) - 1} once")
+    off_deg = by_element(table.phase_error_deg)
+    return Calibration(
+        tuple(math.radians(phase) for phase in by_element(table.phase_deg)),
+        by_element(table.gain_db),
+        tuple(order),
+        tuple(math.radians(phase) for phase in off_deg),
+        by_element(table.gain_error_db),
+    )

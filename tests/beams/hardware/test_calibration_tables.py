@@ -1,0 +1,125 @@
+"""Calibrations of several frequencies: what stands in a file, and what is between."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.beams.hardware.calibration import Calibration, parse_calibration
+from companion.beams.hardware.calibration_tables import calibration_at
+from companion.pipeline import assembly
+from companion.settings.files import load
+from companion.settings.section import ConfigError
+from companion.values import UserError
+
+TWO = """
+order = [1, 0, 2]
+[[table]]
+frequency_hz = 10.5e9
+phase_deg = [10.0, -170.0, 30.0]
+gain_db = [0.2, 1.0, -1.0]
+phase_error_deg = [1.0, 3.0, 1.0]
+gain_error_db = [0.3, 0.1, 0.1]
+[[table]]
+frequency_hz = 10e9
+phase_deg = [0.0, 170.0, 50.0]
+gain_db = [0.0, 2.0, -1.0]
+phase_error_deg = [2.0, 2.0, 1.0]
+gain_error_db = [0.1, 0.2, 0.1]
+"""
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def test_a_table_s_own_frequency_is_that_table() -> None:
+    found = calibration_at(TWO, 10e9)
+    assert found.order == (1, 0, 2)
+    assert np.degrees(found.phase_rad) == pytest.approx([170, 0, 50])  # by element
+    assert found.gain_db == (2.0, 0.0, -1.0)
+    assert np.degrees(found.phase_error_rad) == pytest.approx([2, 2, 1])
+    assert found.gain_error_db == (0.2, 0.1, 0.1)
+    assert calibration_at(TWO, 10.5e9).gain_db == (1.0, 0.2, -1.0)
+
+
+def test_between_tables_phases_go_the_shorter_way_and_bounds_are_the_larger() -> None:
+    found = calibration_at(TWO, 10.1e9)
+    turned = np.exp(1j * (np.array(found.phase_rad) - np.radians([174, 2, 46])))
+    assert turned == pytest.approx([1, 1, 1])
+    assert found.gain_db == pytest.approx((1.8, 0.04, -1.0))
+    assert np.degrees(found.phase_error_rad) == pytest.approx([3, 2, 1])
+    assert found.gain_error_db == (0.2, 0.3, 0.1)
+
+
+@given(SEEDS, st.floats(0, 1))
+def test_cables_are_interpolated_whatever_their_length(seed: int, share: float) -> None:
+    """Delays common to all channels turn them by any angle; what tells them apart stays small."""
+    rng = np.random.default_rng(seed)
+    common_s, own_s = rng.uniform(-1e-8, 1e-8), rng.uniform(-2e-11, 2e-11, 4)
+    order, ends = rng.permutation(4).tolist(), (10e9, 10.5e9)
+
+    def phases_deg(frequency_hz: float) -> list[float]:
+        turned = 360 * frequency_hz * (common_s + own_s)
+        wrapped = (turned + 180) % 360 - 180
+        return [float(one) for one in wrapped]
+
+    text = f"order = {order}\n" + "".join(
+        f"[[table]]\nfrequency_hz = {end}\nphase_deg = {phases_deg(end)}\ngain_db = [0, 0, 0, 0]\n"
+        for end in ends
+    )
+    at_hz = ends[0] + share * (ends[1] - ends[0])
+    found = calibration_at(text, at_hz).factors[order]
+    wanted = np.exp(1j * np.radians(phases_deg(at_hz)))
+    assert abs(np.vdot(found, wanted)) == pytest.approx(4.0)  # but for what all have in common
+
+
+def test_csv_is_for_any_frequency() -> None:
+    text = "channel,element,phase_deg,gain_db\n0,1,90,-1.5\n1,0,0,0\n"
+    assert calibration_at(text, 1e9) == calibration_at(text, 2e9) == parse_calibration(text)
+
+
+ONE = "order = [0, 1]\n[[table]]\nfrequency_hz = 1e9\nphase_deg = [0, 1]\ngain_db = [0, 0]\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "at_hz", "said"),
+    [
+        (TWO, 9.99e9, "9.99e+09 Hz is outside of the tables, 1e+10 to 1.05e+10 Hz"),
+        (TWO, 10.51e9, "is outside of the tables"),
+        (ONE, 1.01e9, "is outside of the tables, 1e+09 to 1e+09 Hz"),
+        (TWO.replace("50.0]", "150.0]"), 10.1e9, "channel 2 turns by -130 degrees over channel 0"),
+        (TWO.replace("10.5e9", "10e9"), 10e9, "1e+10 Hz has two tables"),
+        (TWO.replace("[1, 0, 2]", "[1, 0, 1]"), 10e9, "order [1, 0, 1] is not each of 0 to 2"),
+        (TWO.replace("[1, 0, 2]", "[1, 0, 2.0]"), 10e9, "is not of whole numbers"),
+        (TWO.replace("[1, 0, 2]", "[1, 0]"), 10e9, "is not 2 finite numbers"),
+        (TWO.replace("30.0]", "nan]"), 10e9, "phase_deg at 1.05e+10 Hz is not 3 finite numbers"),
+        (TWO.replace("30.0]", "true]"), 10e9, "phase_deg at 1.05e+10 Hz is not 3 finite"),
+        (TWO.replace("10.5e9", "-1"), 10e9, "frequency_hz = -1 is not above 0"),
+        (TWO.replace("gain_error_db = [0.1, 0.2, 0.1]", ""), 10e9, "a table has frequency_hz"),
+        (f"{ONE}[[table]]\nfrequency_hz = 2e9\nphase_deg = [0, 1]\ngain_db = [0, 0]\n"
+         "phase_error_deg = [1, 1]\ngain_error_db = [0, 0]\n", 1e9, "bounds are said in all"),
+        (TWO.replace("1.0, 3.0, 1.0", "-1.0, 3.0, 1.0"), 10.5e9, "0 or more"),
+        ("order = [0]\ntable = []\n", 1e9, "there is no [[table]]"),
+        ("order = [0]\ntable = [1]\n", 1e9, "[[table]] is not a table"),
+        ("order = [0]\n", 1e9, "has an order and a [[table]]"),
+        ("chanel,element\n", 1e9, "neither calibration as CSV nor as TOML"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_said(text: str, at_hz: float, said: str) -> None:
+    with pytest.raises(UserError) as error:
+        calibration_at(text, at_hz)
+    assert said in str(error.value)
+
+
+def test_the_frequency_is_that_of_the_array(tmp_path: Path) -> None:
+    table, config = tmp_path / "measured.toml", tmp_path / "settings.toml"
+    table.write_text(TWO)
+    three = f'elements = 3\n[hardware]\ncalibration = "{table}"\n'
+    config.write_text(f"[array]\nfrequency_hz = 10.25e9\n{three}")
+    found = assembly.calibration(load(config), 3)
+    assert isinstance(found, Calibration)
+    assert found.phase_rad[1] == pytest.approx(math.radians(5))
+    config.write_text(f"[array]\nfrequency_hz = 28e9\n{three}")
+    with pytest.raises(ConfigError, match=r"^hardware\.calibration: 2\.8e\+10 Hz is outside"):
+        assembly.calibration(load(config), 3)

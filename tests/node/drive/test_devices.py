@@ -6,12 +6,13 @@ import threading
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from device_reading import parse
+from device_stand_ins import CHIPS, Chip, iio_module, spidev_module
 from support import ROOT
 
 from companion.beams.hardware.calibration import Calibration
@@ -69,47 +70,9 @@ class Ticking:
 # --- ADAR1000 over SPI --------------------------------------------------------------------------
 
 
-class Chip:
-    """What an ADAR1000 would hold: registers as written, and what is loaded from them."""
-
-    def __init__(self) -> None:
-        self.registers: dict[int, int] = {}
-        self.loads = 0
-        self.radiates: list[tuple[int, int, int]] = []
-        self.closed = False
-        self.max_speed_hz = self.mode = 0
-
-    def open(self, bus: int, number: int) -> None:
-        if bus == 9:
-            raise FileNotFoundError(2, "No such file or directory")
-        CHIPS[bus, number] = self
-
-    def xfer2(self, word: list[int]) -> list[int]:
-        assert len(word) == 3
-        assert word[0] & 0x80 == 0  # a write
-        register = (word[0] & 0x1F) << 8 | word[1]
-        self.address = word[0] >> 5 & 3
-        self.registers[register] = word[2]
-        if register == 0x28 and word[2] & 1:
-            self.loads += 1
-            kept = self.registers
-            self.radiates = [
-                (kept[0x10 + n], kept[0x14 + 2 * n], kept[0x15 + 2 * n]) for n in range(4)
-            ]
-        return [0, 0, 0]
-
-    def close(self) -> None:
-        self.closed = True
-
-
-CHIPS: dict[tuple[int, int], Chip] = {}
-
-
 @pytest.fixture
 def spidev(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[tuple[int, int], Chip]]:
-    module = ModuleType("spidev")
-    module.SpiDev = Chip  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "spidev", module)
+    monkeypatch.setitem(sys.modules, "spidev", spidev_module())
     CHIPS.clear()
     yield CHIPS
 
@@ -184,73 +147,11 @@ def test_a_line_that_is_not_there_is_tried_again_each_second(
 # --- the Phaser ---------------------------------------------------------------------------------
 
 
-class Attribute:
-    def __init__(self, log: list[tuple[str, str, str]], where: str, name: str, value: str) -> None:
-        self._log, self._where, self._name, self._value = log, where, name, value
-
-    @property
-    def value(self) -> str:
-        return self._value
-
-    @value.setter
-    def value(self, value: str) -> None:
-        self._value = value
-        self._log.append((self._where, self._name, value))
-
-
-class Attributes(dict[str, Attribute]):
-    """Attributes of a device or channel: all there are, each writable, and every write noted."""
-
-    def __init__(self, log: list[tuple[str, str, str]], where: str) -> None:
-        super().__init__()
-        self._log, self._where = log, where
-
-    def __missing__(self, name: str) -> Attribute:
-        value = "disabled PFD" if name.endswith("_available") else "0"
-        self[name] = Attribute(self._log, self._where, name, value)
-        return self[name]
-
-
-class IioDevice:
-    def __init__(self, log: list[tuple[str, str, str]], name: str, label: str) -> None:
-        self.name, self.label, self._log = name, label, log
-        self.attrs = self.debug_attrs = Attributes(log, label or name)
-        self.channels = [SimpleNamespace(id=f"voltage{n}", attrs={}) for n in range(8)]
-
-    def find_channel(self, name: str, output: bool = False) -> Any:
-        where = f"{self.label or self.name}/{'out' if output else 'in'}/{name}"
-        return SimpleNamespace(id=name, attrs=Attributes(self._log, where), output=output)
-
-    def reg_write(self, register: int, value: int) -> None:
-        self._log.append((self.label, f"reg {register:#x}", str(value)))
-
-
-CONTEXT: list[Any] = []
-
-
 @pytest.fixture
 def iio(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str, str]]:
     """What is written to libiio: device, or channel of one, attribute, value."""
     log: list[tuple[str, str, str]] = []
-    names = [
-        ("adf4159", ""),
-        ("adar1000", "BEAM0"),
-        ("adar1000", "BEAM1"),
-        ("one-bit-adc-dac", ""),
-        ("ad7291", ""),
-    ]
-    made = [IioDevice(log, *name) for name in names]
-    context = SimpleNamespace(
-        devices=made,
-        find_device=lambda name: next((one for one in made if one.name == name), None),
-    )
-    CONTEXT[:] = [context]  # adi keeps the module that it was loaded with
-    module = ModuleType("iio")
-    module.version = (0, 26, "recording")  # type: ignore[attr-defined]
-    module.Context = lambda uri: CONTEXT[0]  # type: ignore[attr-defined]
-    module.Device = IioDevice  # type: ignore[attr-defined]
-    module.__getattr__ = lambda name: type(name, (), {})  # type: ignore[method-assign]
-    monkeypatch.setitem(sys.modules, "iio", module)
+    monkeypatch.setitem(sys.modules, "iio", iio_module(log))
     adi = pytest.importorskip("adi")
     monkeypatch.setattr("adi.cn0566.sleep", lambda _: None)
     monkeypatch.setattr(adi, "one_bit_adc_dac", lambda uri: SimpleNamespace(gpio_muxout=0))

@@ -14,8 +14,8 @@ no cliff at the end of a window.
 
 A clock that stands still for a moment and a link that is slower from now on look alike: every y is
 higher. Which of them it was cannot be told, so both are kept: ``sure`` holds if the clock ran on,
-``line`` begins again where all frames of a second or more lie above it, far beyond what their
-spread explains. Before that has lasted, the least of the last few frames is taken for possible: the
+``line`` begins again where all frames have lain above it for long, far beyond what their spread
+explains (``lateness.py``). Before that, the least of the last few frames is taken for possible: the
 offset is below it whatever the clock did before them.
 """
 
@@ -25,18 +25,10 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from companion.mavlink.clock.latencies import RESOLUTION_NS, Latencies
+from companion.mavlink.clock.lateness import CHANGE, LEAST_CHANGE_NS, Late, Lateness
 
-CHANGE: Final = 20.0
-"""Negative logarithm of the probability below which frames that are all late are a change.
-
-By exponential latencies n frames are all later than r with exp(-n r / mean).
-"""
-CHANGE_NS: Final = 750_000_000
-"""Least time over which all frames must be late to be a change: a busy host is late for less."""
 LIKELY_DRIFT: Final = 50e-6
 """Drift of an ordinary crystal, by which the most likely line rises while no frame touches it."""
-LEAST_CHANGE_NS: Final = 5e6
-"""Least change that is looked for: some milliseconds are the stamps' own steps."""
 FEWEST, RECENT = 3, 8
 """Frames the least of which limits the offset whatever the clock did before.
 
@@ -46,9 +38,6 @@ WORST_LATENCY_NS: Final = 5e9
 """Greatest latency of a frame; radios have been seen to deliver 4.8 s late."""
 START_NS: Final = 250_000_000
 """Time that counts as one frame at the start, where the first few may all be slow together."""
-_BLOCK_NS: Final = 250_000_000
-_BLOCKS: Final = 240
-_BLOCK_COUNT: Final = 4  # frames of a block that count as independent
 _RARE: Final = 7.0
 """Once in 1000 the least of n exponential latencies exceeds the true minimum by 7/n of a mean."""
 
@@ -66,18 +55,6 @@ class Heights(NamedTuple):
     highest: int
     line: int
     least: int
-
-
-class _Block:
-    """Stamps of a quarter of a second: how many, and the least height above the line."""
-
-    __slots__ = ("count", "first_ns", "gap_ns", "height", "index", "x_ns")
-
-    def __init__(self, index: int, x_ns: int) -> None:
-        self.index = index
-        self.first_ns = self.x_ns = x_ns
-        self.count = 0
-        self.gap_ns = self.height = np.inf
 
 
 class Floor:
@@ -112,7 +89,7 @@ class Floor:
         self._since_ns = 0  # x from which the line is what it is
         self._risen = -np.inf  # height of the last few frames, where they are suspiciously late
         self._recent: deque[tuple[int, float]] = deque(maxlen=RECENT)
-        self._blocks: deque[_Block] = deque(maxlen=_BLOCKS)
+        self._lateness = Lateness(drift_max)
         self._visible = Latencies(window_ns, drift_max)
         self._looked = 0
 
@@ -144,14 +121,13 @@ class Floor:
         gap = as_of_now - self._line
         self._line = min(self._line, as_of_now)
         self._recent.append((x_ns, height))
-        spread = self._visible.median_ns + RESOLUTION_NS
-        late = gap > LEAST_CHANGE_NS and gap > CHANGE / RECENT * spread
+        late = gap > LEAST_CHANGE_NS and gap > CHANGE / RECENT * self._spread
         self._risen = self._suspicious() if late else -np.inf
         self._visible.add(x_ns, height)
-        if ahead_ns > 0 and gap > 0.0:
-            self._watch(x_ns, height, gap)
-        elif ahead_ns > 0:  # it is the line
-            self._blocks.clear()
+        if ahead_ns > 0:
+            late_spell = self._lateness.add(x_ns, height, gap, self._spread)
+            if late_spell is not None:
+                self._all_late(late_spell)
         if self._line - self._sure > WORST_LATENCY_NS:
             self._sure, self._touched_ns = (
                 self._line,
@@ -159,6 +135,11 @@ class Floor:
             )  # no frame is as late as that: the clock did change
         if self.count < 4 * RECENT or self.count - self._looked >= 64 or gap < -RESOLUTION_NS:
             self._measure()
+
+    @property
+    def _spread(self) -> float:
+        """What is usual of a frame's height above the line, ns."""
+        return self._visible.median_ns + RESOLUTION_NS
 
     def _height(self, x_ns: int, y_ns: int) -> float:
         x0_ns, y0_ns = self._base
@@ -169,49 +150,23 @@ class Floor:
         heights = [
             height + self._drift_max * (self.newest_ns - at_ns) for at_ns, height in self._recent
         ]
-        spread = self._visible.median_ns + RESOLUTION_NS
         for count in range(FEWEST, len(heights) + 1):
             least = min(heights[-count:])
             if (
-                count * (least - self._line) > CHANGE * spread
+                count * (least - self._line) > CHANGE * self._spread
                 and least - self._line > LEAST_CHANGE_NS
             ):
                 return least
         return -np.inf
 
-    def _watch(self, x_ns: int, height: float, gap: float) -> None:
-        """Note how far above the line a stamp lies; look for a change as a block ends."""
-        blocks, index = self._blocks, x_ns // _BLOCK_NS
-        if not blocks or blocks[-1].index != index:
-            if blocks:
-                self._look_for_change(x_ns)
-            blocks.append(_Block(index, x_ns))
-        block = blocks[-1]
-        block.count += 1
-        if gap < block.gap_ns:
-            block.gap_ns, block.height, block.x_ns = gap, height, x_ns
-
-    def _look_for_change(self, x_ns: int) -> None:
-        """Begin the line again if all frames since some time are too late for their spread."""
-        spread = self._visible.median_ns + RESOLUTION_NS
-        count, least, line = 0, np.inf, np.inf
-        for block in reversed(self._blocks):
-            count += min(block.count, _BLOCK_COUNT)
-            least = min(least, block.gap_ns)
-            line = min(line, block.height + self._drift_max * (x_ns - block.x_ns))
-            lasted = self._blocks[-1].x_ns - block.first_ns >= CHANGE_NS
-            if least < LEAST_CHANGE_NS:
-                return
-            if lasted and count >= RECENT and count * least > CHANGE * spread:
-                break
-        else:
-            return
-        rose_ns = line - max(self._line, self._sure)
-        self.rose_ns = rose_ns if rose_ns > LEAST_CHANGE_NS else 0.0
-        self._line = line
-        self._since_ns = block.first_ns
-        self._visible.keep_median()
-        self._blocks.clear()
+    def _all_late(self, spell: Late) -> None:
+        """Tell that all frames are late, once; begin the line again there in time."""
+        if spell.is_news:
+            rose_ns = spell.height - max(self._line, self._sure)
+            self.rose_ns = rose_ns if rose_ns > LEAST_CHANGE_NS else 0.0
+        if spell.followed:
+            self._line, self._since_ns = spell.height, spell.since_ns
+            self._visible.keep_median()
 
     def _measure(self) -> None:
         """Measure the visible latencies anew, and follow a steady drift if they show one."""
@@ -231,7 +186,7 @@ class Floor:
             height + self._drift_max * (newest_ns - at_ns) for at_ns, height in points
         )
         self._since_ns = self._touched_ns = points[0][0]
-        self._blocks.clear()
+        self._lateness.clear()
         self._recent.clear()
 
     # --- what they show ---------------------------------------------------------------------
@@ -285,5 +240,5 @@ class Floor:
         self._sure = self._line = measured + self._drift_max * abs(self.newest_ns - x_ns)
         self._since_ns = self._touched_ns = x_ns
         self._risen = -np.inf
-        self._blocks.clear()
+        self._lateness.clear()
         self._recent.clear()

@@ -18,6 +18,7 @@ from support import examples
 
 from companion.mavlink.clock.estimates import ClockChange, ClockEstimate
 from companion.mavlink.clock.floor import RECENT, Floor
+from companion.mavlink.clock.lateness import FOLLOWED, FOLLOWED_NS
 from companion.mavlink.clock.sender_clock import SenderClock
 
 MS = 1_000_000
@@ -105,7 +106,7 @@ def test_no_link_leads_the_interval_away(name: str, rate_hz: float) -> None:
 
 def test_there_is_no_cliff_where_the_last_fast_frame_leaves_the_window() -> None:
     found = answers(LINKS["the last fast frame long ago"], seconds=200)
-    doubts = [one.uncertainty_s for at, _, one, _ in found if at > 20]
+    doubts = [one.uncertainty_s for at, _, one, _ in found if at > 30]  # the late are followed
     assert min(doubts) > 0.45
     assert max(abs(b - a) for a, b in pairwise(doubts)) < 0.05
 
@@ -157,7 +158,10 @@ def test_a_link_that_sends_in_batches_hides_no_latency_behind_their_rhythm(batch
 def test_a_clock_that_stood_still_is_told_within_a_second(rate_hz: float, stood_s: float) -> None:
     """Three frames show it; the interval holds what it was before, too: it may be the link."""
     found = answers(
-        jitter(0.003, 0.007), rate_hz=rate_hz, moved=lambda t: min(stood_s, max(0.0, t - 20))
+        jitter(0.003, 0.007),
+        seconds=30 + 20 * stood_s,
+        rate_hz=rate_hz,
+        moved=lambda t: min(stood_s, max(0.0, t - 20)),
     )
     told = [at for at, _, _, change in found if change is not None]
     assert len(told) >= 1
@@ -165,7 +169,33 @@ def test_a_clock_that_stood_still_is_told_within_a_second(rate_hz: float, stood_
     for at, off, estimate, _ in found:
         if not 20 <= at <= 20 + stood_s + 3 / rate_hz + 0.04:
             assert outside_s(off, estimate) <= 0, at
-    assert all(abs(off) < 0.02 for at, off, _, _ in found if at > 22 + stood_s)
+    followed_s = 22 + stood_s + 1.5 * min(FOLLOWED * stood_s, FOLLOWED_NS / S)
+    assert all(abs(off) < 0.02 for at, off, _, _ in found if at > followed_s)
+
+
+@pytest.mark.parametrize("slower_s", [0.1, 0.3, 1.0])
+def test_a_link_that_is_slow_for_a_while_is_not_followed(slower_s: float) -> None:
+    """It is told as a change that may be, and the most likely offset stays."""
+    lasts_s = 0.6 * min(FOLLOWED * slower_s, FOLLOWED_NS / S)
+
+    def latency(t: float, rng: random.Random) -> float:
+        return rng.uniform(0.003, 0.007) + slower_s * (20 < t % 40 < 20 + lasts_s)
+
+    found = answers(latency, seconds=90)
+    assert 1 <= sum(change is not None for *_, change in found) <= 2
+    assert all(abs(off) < 0.02 for at, off, *_ in found if at > 1)
+
+
+def test_after_a_quick_spell_the_line_is_where_it_was() -> None:
+    """Frames that were put down before they can have come are an exception, not the rule."""
+
+    def latency(t: float, rng: random.Random) -> float:
+        return rng.uniform(0.303, 0.307) - 0.25 * (round(20 * t) in (500, 501, 900))
+
+    found = answers(latency)
+    for at, off, *_ in found:
+        exception = any(0 <= at - quick_s < 2.2 for quick_s in (25.0, 45.0))
+        assert at < 2 or exception or abs(off + 0.3) < 0.03, at
 
 
 def test_a_steady_link_tells_of_no_change() -> None:

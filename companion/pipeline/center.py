@@ -4,7 +4,7 @@ The local frame begins at a fixed station, or where the first report was made.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from companion.beams.aim import AIMABLE
@@ -21,6 +21,7 @@ from companion.settings.model import Settings
 from companion.tracking import carrier, noise
 from companion.tracking.geodesy import LocalFrame
 from companion.values import (
+    AltitudeDatum,
     Attitude,
     Carrier,
     Estimate,
@@ -74,6 +75,8 @@ class Center:
         self._attitude_bound_rad = math.radians(settings.center.attitude_bound_deg)
         self._attitude_kept_s = settings.tracks.coasting_s
         self._accuracy_factor = assembly.noise(settings).factor
+        self._geoid_m = settings.observer.geoid_m
+        self._geoid_error_m = settings.observer.geoid_error_m
         if isinstance(self.place, FixedCenter):
             self._begin(self.place)
 
@@ -89,7 +92,7 @@ class Center:
 
         With the first report of all, a notice says where it begins.
         """
-        report = placed.report
+        report = self._levelled(placed.report)
         said = (self._first(report),) if self.local is None else ()
         assert self.local is not None
         there = None
@@ -107,6 +110,7 @@ class Center:
                 report.accuracy,
                 report.alt_datum,
                 self._accuracy_factor,
+                self._geoid_error_m,
             )
         made = Fix(
             report.uav,
@@ -120,6 +124,13 @@ class Center:
             placed.limits,
         )
         return made, said
+
+    def _levelled(self, report: Report) -> Report:
+        """A report whose height is above mean sea level, where that can be told."""
+        if self._geoid_m is None or report.alt_datum is not AltitudeDatum.GEOMETRIC:
+            return report
+        above_sea_m = report.alt_m - self._geoid_m
+        return replace(report, alt_m=above_sea_m, alt_datum=AltitudeDatum.MSL)
 
     def turn(self, placed: PlacedAttitude, turn_degps2: float) -> Refuted | None:
         """Take in an attitude of the carrier, unless it is older than the newest.

@@ -82,6 +82,10 @@ class ObserverSettings(LimitSettings):
     velocity_noise_mps     greatest error of a reported velocity, norm of a 3-vector
     follow_accuracy        where the autopilot states its accuracy (GPS_RAW_INT), use
     accuracy_factor        this many times that accuracy as the noise instead
+    geoid_m                height of mean sea level above the ellipsoid where this flies, metres
+                           (the undulation, by EGM96 or EGM2008): heights above the ellipsoid are
+                           brought to mean sea level by it; None: they stay, with wider bounds
+    geoid_error_m          most that it is off, over all of the area
     """
 
     model: Literal["kinematic", "position"] = "kinematic"
@@ -97,3 +101,5 @@ class ObserverSettings(LimitSettings):
     velocity_noise_mps: PositiveFloat = 0.5
     follow_accuracy: bool = True
     accuracy_factor: PositiveFloat = 3.0
+    geoid_m: Annotated[float, Field(ge=-120, le=100)] | None = None
+    geoid_error_m: Annotated[float, Field(ge=0, le=120)] = 5.0

@@ -29,7 +29,8 @@ ADSB_VELOCITY_NOISE_MPS: Final = 10.0
 GEOID_M: Final = 107.0
 """Greatest distance between the ellipsoid and mean sea level (EGM96: -107 to 86 m).
 
-Heights above the ellipsoid stand beside telemetry's, which are above mean sea level.
+Heights above the ellipsoid stand beside telemetry's, which are above mean sea level. Where the
+geoid's height is not known they are left as they are, and may be that far off.
 """
 
 
@@ -73,12 +74,15 @@ def relayed(
     accuracy: Accuracy | None = None,
     datum: AltitudeDatum | None = None,
     factor: float | None = None,
+    geoid_error_m: float = 0.0,
 ) -> ReportNoise:
     """The noise bounds of a relayed aircraft's report.
 
         accuracy  what it says of itself; what is unknown counts as ADS-B's in general
         datum     of its height: no accuracy of a height holds for that of the standard pressure
         factor    multiple of a stated accuracy that is taken as a bound; None: it is ignored
+        geoid_error_m
+                  most that a height above mean sea level is off that was brought there
 
     The uncertainty of its time adds the distance flown in it, and an altitude that was true
     ``alt_age_s`` apart adds what can be climbed in that time.
@@ -88,8 +92,9 @@ def relayed(
     way_m = time_s * (speed_max_mps if velocity_ned_mps is None else math.hypot(*velocity_ned_mps))
     horizontal_m = _bound(known.horizontal_m, factor or 0.0, ADSB_NOISE_M) + way_m
     height_m = ADSB_NOISE_M
-    if known.vertical_m is not None and datum is AltitudeDatum.GEOMETRIC:
-        height_m = GEOID_M + _bound(known.vertical_m, factor or 0.0, ADSB_NOISE_M)
+    if datum in (AltitudeDatum.GEOMETRIC, AltitudeDatum.MSL):
+        geoid_m = GEOID_M if datum is AltitudeDatum.GEOMETRIC else geoid_error_m
+        height_m = geoid_m + _bound(known.vertical_m, factor or 0.0, ADSB_NOISE_M)
     vertical_m = height_m + way_m + alt_age_s * speed_max_mps
     velocity_mps = _bound(known.velocity_mps, factor or 0.0, ADSB_VELOCITY_NOISE_MPS)
     return ReportNoise(horizontal_m, vertical_m, math.hypot(horizontal_m, vertical_m), velocity_mps)

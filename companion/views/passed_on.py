@@ -77,7 +77,9 @@ def _event(pipeline: Pipeline, track: Track, stale_s: float) -> bytes:
     newest = pipeline.fleet.newest(track.uav)
     datum = AltitudeDatum.PRESSURE if newest is None else newest.report.alt_datum
     known = datum is not AltitudeDatum.PRESSURE
-    geoid_m = GEOID_M if datum is AltitudeDatum.MSL else 0.0
+    undulation_m, geoid_m = 0.0, 0.0  # the schema's height is above the ellipsoid
+    if datum is AltitudeDatum.MSL:
+        undulation_m, geoid_m = _geoid(pipeline)
     course_deg = speed_mps = None
     if velocity is not None:
         course_deg = math.degrees(math.atan2(velocity[1], velocity[0])) % 360
@@ -85,17 +87,25 @@ def _event(pipeline: Pipeline, track: Track, stale_s: float) -> bytes:
     where = cot_text.Place(
         lat_deg,
         lon_deg,
-        alt_m if known else None,
+        alt_m + undulation_m if known else None,
         track.horizontal_bound_m,
         track.vertical_bound_m + geoid_m if known else None,
         course_deg,
         speed_mps,
     )
     stale_ns = track.valid_at_ns + round(stale_s * 1e9)
-    return cot_text.event(track.uav, track.valid_at_ns, stale_ns, where, _remarks(track, datum))
+    return cot_text.event(
+        track.uav, track.valid_at_ns, stale_ns, where, _remarks(track, datum, geoid_m)
+    )
 
 
-def _remarks(track: Track, datum: AltitudeDatum) -> str:
+def _geoid(pipeline: Pipeline) -> tuple[float, float]:
+    """Height of mean sea level above the ellipsoid, and most that it is off."""
+    given = pipeline.settings.observer
+    return (0.0, GEOID_M) if given.geoid_m is None else (given.geoid_m, given.geoid_error_m)
+
+
+def _remarks(track: Track, datum: AltitudeDatum, geoid_m: float) -> str:
     """What the numbers of an event are."""
     words = [
         f"ce {track.horizontal_bound_m:.1f} m and le are guaranteed bounds, not standard deviations"
@@ -104,7 +114,7 @@ def _remarks(track: Track, datum: AltitudeDatum) -> str:
         words.append(f"95 of 100 errors stay below {track.error_p95_m:.1f} m")
     words.append(
         {
-            AltitudeDatum.MSL: f"height above mean sea level: le has {GEOID_M:.0f} m for the geoid",
+            AltitudeDatum.MSL: f"height above mean sea level: le has {geoid_m:.0f} m for the geoid",
             AltitudeDatum.PRESSURE: "height by pressure alone, so none is said",
             AltitudeDatum.GEOMETRIC: "height above the ellipsoid",
         }[datum]

@@ -51,7 +51,7 @@ def test_a_stated_accuracy_takes_the_place_of_what_is_taken_for_granted() -> Non
     by_pressure = relayed(still, 0.0, 90.0, told, AltitudeDatum.PRESSURE, 3.0)
     assert by_pressure.vertical_m == ADSB_NOISE_M
     partly = relayed(still, 0.0, 90.0, Accuracy(velocity_mps=0.5), AltitudeDatum.GEOMETRIC, 3.0)
-    assert (partly.horizontal_m, partly.vertical_m) == (ADSB_NOISE_M, ADSB_NOISE_M)
+    assert (partly.horizontal_m, partly.vertical_m) == (ADSB_NOISE_M, ADSB_NOISE_M + GEOID_M)
     exact = relayed(still, 0.0, 90.0, Accuracy(0.0, 0.0, 0.0), AltitudeDatum.GEOMETRIC, 3.0)
     assert (exact.horizontal_m, exact.velocity_mps) == (QUANTISATION, QUANTISATION)
 
@@ -59,7 +59,15 @@ def test_a_stated_accuracy_takes_the_place_of_what_is_taken_for_granted() -> Non
 def test_settings_that_do_not_follow_accuracies_ignore_them() -> None:
     told = Accuracy(6.0, 20.0, 0.5, 0.1)
     found = relayed(np.ones(3), 0.0, 90.0, told, AltitudeDatum.GEOMETRIC, None)
-    assert found == relayed(np.ones(3), 0.0, 90.0)
+    assert found == relayed(np.ones(3), 0.0, 90.0, None, AltitudeDatum.GEOMETRIC)
+
+
+def test_a_height_that_was_brought_to_the_sea_has_what_that_may_be_off() -> None:
+    still, told = np.zeros(3), Accuracy(6.0, 20.0, 0.5)
+    found = relayed(still, 0.0, 90.0, told, AltitudeDatum.MSL, 3.0, geoid_error_m=4.0)
+    assert found.vertical_m == pytest.approx(60.0 + 4.0)
+    unstated = relayed(still, 0.0, 90.0, None, AltitudeDatum.MSL, 3.0, geoid_error_m=4.0)
+    assert unstated.vertical_m == ADSB_NOISE_M + 4.0
 
 
 def test_a_time_that_is_better_known_is_worth_less_way() -> None:

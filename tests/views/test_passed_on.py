@@ -23,8 +23,9 @@ PLACE = (47.4, 8.55, 500.0)
 EXACT: dict[str, Any] = {"lag_s": (0.0, 0.0), "acceleration_max_mps2": 5.0, "speed_max_mps": 60.0}
 
 
-def pipeline() -> Pipeline:
-    sections: dict[str, Any] = {"observer": EXACT, "beams": {"targets": "all"}}
+def pipeline(observer: dict[str, Any] | None = None) -> Pipeline:
+    known = EXACT | (observer or {})
+    sections: dict[str, Any] = {"observer": known, "beams": {"targets": "all"}}
     return Pipeline(Settings().override(center={"source": "47.4,8.55,500"}, **sections))
 
 
@@ -152,6 +153,30 @@ def test_an_event_says_what_its_numbers_are() -> None:
     assert root.get("stale") == "2025-10-09T08:53:33.200Z"
     contact = root.find("detail/contact")
     assert contact is not None and contact.get("callsign") == "3:1"
+
+
+@pytest.mark.parametrize("datum", ["telemetry", "geometric"])
+def test_where_the_geoid_is_known_heights_are_brought_from_one_to_the_other(datum: str) -> None:
+    """Within: above mean sea level. Without: above the ellipsoid, with what that may be off."""
+    fold = pipeline({"geoid_m": 48.0, "geoid_error_m": 3.0})
+    for n in range(6):
+        fold.step(telemetry(n / 2) if datum == "telemetry" else adsb(n / 2, 1))
+    (track,) = tracks(fold, 3.0)
+    alt_m = fold.geodetic(track.position_ned_m[None])[2][0]
+    above_sea_m = there(3.0)[2] if datum == "telemetry" else 620.0 - 48.0
+    assert alt_m == pytest.approx(above_sea_m, abs=1.0)
+    newest = fold.fleet.newest(track.uav)
+    assert newest is not None and newest.report.alt_datum == "msl"
+    event = from_xml(passed_on.events(fold, [track], 10.0)[0])
+    assert event.hae_m == pytest.approx(alt_m + 48.0, abs=0.06)
+    assert event.le_m == pytest.approx(track.vertical_bound_m + 3.0, abs=0.06)
+    if datum == "geometric":
+        bare = pipeline()
+        for n in range(6):
+            bare.step(adsb(n / 2, 1))
+        (other,) = tracks(bare, 3.0)
+        assert bare.geodetic(other.position_ned_m[None])[2][0] == pytest.approx(620.0, abs=1.0)
+        assert other.vertical_bound_m > track.vertical_bound_m + 100  # 107 m less 3
 
 
 def test_a_companion_does_not_take_in_what_a_companion_said() -> None:

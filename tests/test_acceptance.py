@@ -13,6 +13,7 @@ from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
 from companion.recording.reader import read_log
 from companion.settings.model import Settings
+from companion.studies.prediction import violations
 from companion.studies.prediction.comparison import LEADS_S
 from companion.studies.prediction.delivery import deliver
 from companion.studies.prediction.pointing import (
@@ -117,6 +118,20 @@ def test_where_gps_wanders_violations_are_in_the_faults() -> None:
         faults = [event["unix"] for event in events if f"{event['sysid']}:1" == uav]
         for at_s in plan.now_ns[beyond.any(axis=0)] * 1e-9:
             assert any(-1 <= at_s - begun_s <= 14 for begun_s in faults), (uav, at_s)
+
+
+@pytest.mark.full
+def test_where_gps_wanders_it_is_told_before_a_bound_is_broken() -> None:
+    """By default the receiver is believed to 0.9 m, until its positions stray."""
+    flown = vehicles.load(shared_log("sitl_4circle_wander.tlog"), "5:1")
+    answers = broken = 0
+    for _, plan, given in asked(flown, OURS, CLEAN, Settings()):
+        for lead in range(len(plan.leads_ns)):
+            counts = violations.counted(plan, given, lead)
+            assert counts["announced"] == counts["violations"]
+            answers, broken = answers + counts["answers"], broken + counts["violations"]
+    assert answers > 10_000
+    assert broken < 0.01 * answers
 
 
 def late(events: list[Event], seed: int) -> list[Event]:

@@ -305,5 +305,6 @@ def fleet(settings: Settings) -> Fleet:
             kept.window_s,
             feeds,
             kept.most,
+            noise(settings),
         ),
     )

@@ -36,12 +36,7 @@ class Assumptions:
             key = (one.uav, one.setting)
             if one.proven > AGAIN * self._told.get(key, 0.0):
                 self._told[key] = one.proven
-                unit = _UNITS[one.setting]
-                text = (
-                    f"{one.uav} does {one.proven:.3g} {unit}, more than {one.setting}"
-                    f" ({one.limit:.3g}): {one.raised_to:.3g} is assumed now"
-                )
-                out.append(Notice(one.t_ns, Severity.WARNING, one.uav, text))
+                out.append(Notice(one.t_ns, Severity.WARNING, one.uav, _said(one)))
         return out
 
     def clock(
@@ -84,3 +79,15 @@ class Assumptions:
         self._told_ns.pop(uav, None)
         for key in [key for key in self._told if key[0] == uav]:
             del self._told[key]
+
+
+def _said(one: Refuted) -> str:
+    if one.setting == "observer.follow_accuracy":
+        return (
+            f"the receiver of {one.uav} states {one.limit:.2g} m, but strays by {one.proven:.2g} m "
+            f"from its velocities ({one.setting}): {one.raised_to:.2g} m is assumed now"
+        )
+    return (
+        f"{one.uav} does {one.proven:.3g} {_UNITS[one.setting]}, more than {one.setting}"
+        f" ({one.limit:.3g}): {one.raised_to:.3g} is assumed now"
+    )

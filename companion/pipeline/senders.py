@@ -58,6 +58,10 @@ Before an autopilot stands by its height it may be hundreds of metres off (docs/
 """
 
 
+APART_SHARE: Final = 0.1
+"""Share of the newest report in how far the two heights are apart of late."""
+
+
 @dataclass(frozen=True, slots=True)
 class PlacedReport:
     """A report with its time.
@@ -126,6 +130,7 @@ class Senders:
         self._shared: set[str] = set()
         self._known: dict[str, assembly.Assumed] = {}  # by UAV
         self._receivers: dict[Source, GnssStatus] = {}
+        self._apart_m2: dict[Source, float] = {}  # receiver's height less the autopilot's, squared
         self._waits: dict[str, int] = {}  # since when a UAV's receiver does not vouch for it
 
     # --- what they say ----------------------------------------------------------------------
@@ -212,11 +217,23 @@ class Senders:
         errors = self._noise.get(report.source, self._noise_settings.default)
         assumed = self.assumed(uav)
         lag_ns = round(assumed.lag_middle_s * 1e9)
-        errors = replace(errors, time_s=assumed.lag_rest_s)
+        errors = replace(errors, time_s=assumed.lag_rest_s, apart_m=self._apart(report))
         true_ns = t_ns - round(stamp.latency_s * 1e9) - lag_ns
         known = errors if reports_itself(uav) else None
         placed = PlacedReport(report, stamp.sender_ns - lag_ns, true_ns, known, assumed.limits)
         return Heard(placed, said, restarted, self._clock(uav).change)
+
+    def _apart(self, report: Report) -> float:
+        """By how much a receiver's own heights differ from its autopilot's of late, in metres."""
+        receiver = self._receivers.get(report.source)
+        if receiver is None or receiver.fix_type < FIX_3D or report.alt_m is None:
+            return 0.0
+        before = self._apart_m2.get(report.source)
+        apart_m2 = (report.alt_m - receiver.alt_m) ** 2
+        if before is not None:
+            apart_m2 = before + APART_SHARE * (apart_m2 - before)
+        self._apart_m2[report.source] = apart_m2
+        return math.sqrt(apart_m2)
 
     def _relayed(self, said: AdsbVehicle) -> Heard:
         """Place a report of an aircraft that a receiver relays.

@@ -17,9 +17,11 @@ from companion.tracking.gate import GateSettings, Suspects, is_frozen, refusal
 from companion.tracking.hindsight import WAYS, WINDOWS, Hindsight, fed
 from companion.tracking.history import History
 from companion.tracking.limits import Refutations
+from companion.tracking.noise import NoiseSettings
 from companion.tracking.observers.estimates import Observer, Prediction
 from companion.tracking.pace import Pace
 from companion.tracking.reach import Reach, reach
+from companion.tracking.straying import Straying
 from companion.values import (
     Estimate,
     Fix,
@@ -28,6 +30,7 @@ from companion.values import (
     Reason,
     Refuted,
     Rejection,
+    ReportNoise,
     SenderTime,
     Track,
     TrackState,
@@ -36,8 +39,6 @@ from companion.values import (
 
 ESTABLISHED: Final = 50
 """Reports of a UAV that make it known: when it comes back, those of fewer make room for it."""
-COMMON_ERROR: Final = 0.07
-"""Share of the noise bound that is usual in all reports alike, which none of them shows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +72,7 @@ class FleetSettings:
     window_s               how late a report may come and still be put in order
     feed_forward           whether an estimated acceleration enters predictions
     most                   largest number of tracks
+    noise                  how the bounds on the reports' noise were made; None: they are believed
     """
 
     limits: Limits
@@ -79,6 +81,7 @@ class FleetSettings:
     window_s: float = 5.0
     feed_forward: bool = False
     most: int = 2000
+    noise: NoiseSettings | None = None
 
 
 @dataclass(slots=True)
@@ -109,12 +112,13 @@ class Fleet:
         self._settings = settings
         self._tracked: dict[str, _Tracked] = {}
         self._refutations: dict[str, Refutations] = {}
+        self._straying: dict[str, Straying] = {}
         self._established: set[str] = set()  # whose track is over, and had many reports
 
     # --- reports in -------------------------------------------------------------------------
 
     def refuted(self, fix: Fix) -> tuple[Fix, list[Refuted]]:
-        """What a report refutes of its aircraft's limits, and the report with the limits raised."""
+        """What a report refutes of its aircraft and receiver; the report with the bounds raised."""
         if fix.limits is None:
             fix = replace(fix, limits=self._settings.limits)
         known = self._refutations.get(fix.uav)
@@ -123,7 +127,22 @@ class Fleet:
         found = known.look(fix)
         assert fix.limits is not None
         limits = known.limits(fix.limits, fix.sender_ns)
-        return (fix if limits is fix.limits else replace(fix, limits=limits)), found
+        noise, strays = self._doubted(fix)
+        if strays is not None:
+            found.append(strays)
+        if limits is fix.limits and noise is fix.noise:
+            return fix, found
+        return replace(fix, limits=limits, noise=noise), found
+
+    def _doubted(self, fix: Fix) -> tuple[ReportNoise, Refuted | None]:
+        """The bounds on a report's noise, by what was seen of its receiver, and what is news."""
+        if self._settings.noise is None:
+            return fix.noise, None
+        known = self._straying.get(fix.uav)
+        if known is None:
+            known = self._straying.setdefault(fix.uav, Straying(self._settings.noise))
+        found = known.look(fix)
+        return known.noise(fix.noise), found
 
     def accept(self, fix: Fix) -> Estimate | Rejection:
         """Add a report to its track, or begin a track; or return the reason why it is not used."""
@@ -131,6 +150,7 @@ class Fleet:
         full = tracked is None and len(self._tracked) >= self._settings.most
         if full and not self._make_room(fix.uav):
             self._refutations.pop(fix.uav, None)
+            self._straying.pop(fix.uav, None)
             return _rejected(fix, Reason.TOO_MANY, f"{self._settings.most} tracks are kept")
         if tracked is None or self._is_lost(tracked, fix):
             return self._begin(fix)
@@ -263,6 +283,7 @@ class Fleet:
         """Forget a track, because its sender was restarted or is gone."""
         tracked = self._tracked.pop(uav, None)
         self._refutations.pop(uav, None)
+        self._straying.pop(uav, None)
         room = len(self._established) < self._settings.most  # for whoever was here first
         if room and tracked is not None and tracked.reports >= ESTABLISHED:
             self._established.add(uav)
@@ -341,7 +362,9 @@ class Fleet:
         if seen_m is None:
             return None
         if velocity is not None:
-            common_m = COMMON_ERROR * tracked.history.newest.fix.noise.position_m
+            newest = tracked.history.newest.fix
+            straying = self._straying.get(newest.uav)
+            common_m = 0.0 if straying is None else straying.usual_m(newest.noise)
             seen_m = math.hypot(seen_m, common_m, math.hypot(*velocity) * at.usual_s)
         return min(seen_m, bound_m)
 

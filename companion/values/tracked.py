@@ -17,6 +17,8 @@ class ReportNoise:
     velocity_mps  norm of the velocity error
     time_s        by how much the report may be older or newer than the time it is put at: what is
                   left of its lag
+    apart_m       by how much the receiver's own heights differ from those reported, of late: which
+                  of them is off is not known; 0 where they are not
     """
 
     horizontal_m: float
@@ -24,6 +26,7 @@ class ReportNoise:
     position_m: float
     velocity_mps: float
     time_s: float = 0.0
+    apart_m: float = 0.0
 
 
 class LimitSource(StrEnum):

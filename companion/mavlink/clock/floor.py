@@ -218,6 +218,11 @@ class Floor:
         """Median of the visible part of the latency, over an even sample of the window."""
         return self._visible.median_ns
 
+    @property
+    def late_ns(self) -> float:
+        """By how much all frames are late now, by the clock or by the link; 0 if they are not."""
+        return max(0.0, self._lateness.height - self._line)
+
     def residual_ns(self) -> float:
         """What a short time of listening may have missed of the fastest frame.
 

@@ -59,19 +59,22 @@ class _Block:
 
 
 class Lateness:
-    """How far the frames of one sender lie above its line. ``add`` takes the newest ones."""
+    """How far the frames of one sender lie above its line. ``add`` takes the newest ones.
+
+    ``height`` is that of the spell that goes on, -inf without one.
+    """
 
     def __init__(self, drift_max: float) -> None:
         self._drift_max = drift_max
         self._blocks: deque[_Block] = deque(maxlen=_BLOCKS)
-        self._told = False
+        self.height = -math.inf
         self._before = math.inf  # height of the line before one quick spell
         self._dropped_ns = 0  # sender time of that
 
     def clear(self) -> None:
         """Begin again, as the line does."""
         self._blocks.clear()
-        self._told = False
+        self.height = -math.inf
 
     def add(self, x_ns: int, height: float, gap: float, spread: float) -> Late | None:
         """Take in the newest frame: its height, and how far it is above the line before it.
@@ -111,8 +114,8 @@ class Lateness:
             as_before = abs(height - self._before) < LEAST_CHANGE_NS
             followed = as_before or lasted_ns >= min(FOLLOWED * least, FOLLOWED_NS)
             if found is None or followed:
-                found = Late(height, block.first_ns, not self._told, followed)
+                found = Late(height, block.first_ns, self.height == -math.inf, followed)
             if followed:
                 break
-        self._told = self._told or found is not None
+        self.height = self.height if found is None else found.height
         return found

@@ -255,7 +255,8 @@ class SenderClock:
         """By how much the most likely offset usually is off: as much as is guessed of it."""
         if kind is not ClockKind.ENVELOPE:
             return (high_ns - low_ns) / 4 * 1e-9
-        return (INVISIBLE * self._line.floor.median_ns + _NS_PER_MS) * 1e-9
+        floor = self._line.floor
+        return math.hypot(INVISIBLE * floor.median_ns + _NS_PER_MS, floor.late_ns) * 1e-9
 
     def _interval(self, x_ns: int) -> tuple[ClockKind, int, int, int]:
         """What is known of the offset at a sender time: kind, least, greatest and most likely; ns.

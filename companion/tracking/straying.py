@@ -1,0 +1,107 @@
+"""Receivers that are worse than they say: positions that stray from the way of the velocities.
+
+A receiver states the radius within which two of three of its positions lie, and the bound on a
+report's error rests on it. Velocities are measured apart from positions, by Doppler. Within a few
+seconds two positions of a receiver hardly err differently: where they stray from where the reported
+velocities lead by more than two independent errors of the stated size would, the statement is not
+believed. That is no proof, for velocities may err for long; so nothing is refused by it. The bound
+becomes that of a receiver that states nothing, or more where more was seen.
+"""
+
+import math
+from collections import deque
+from dataclasses import replace
+from typing import Final
+
+from companion.tracking.noise import NoiseSettings
+from companion.values import Fix, Refuted, ReportNoise
+
+WITHIN_NS: Final = 5_000_000_000
+"""Time within which positions are compared."""
+APART_NS: Final = 500_000_000
+"""Longest time between two reports over which the way is known from their velocities."""
+STRAYS_M: Final = 0.4
+"""What good receivers' positions stray, whatever they state: velocities err, too."""
+COMMON_ERROR: Final = 0.07
+"""Share of the noise bound that is usual in all reports alike, which none of them shows."""
+STRAYED_ERROR: Final = 0.82
+"""The same of a receiver that strays: 95 of 100 lie within 2.45 deviations in the plane, of 3."""
+AGAIN: Final = 1.25
+"""Multiple of what was seen last from which it is told again."""
+
+
+class Straying:
+    """The reports of one UAV, beside the way of their velocities. ``look`` takes the newest.
+
+    ``settings`` are those by which the bounds on their noise were made.
+    """
+
+    def __init__(self, settings: NoiseSettings) -> None:
+        self._settings = settings
+        self._seen: deque[tuple[int, float, float]] = deque()  # sender time, off the way, m
+        self._newest: Fix | None = None
+        self._strayed_m = 0.0
+
+    def look(self, fix: Fix) -> Refuted | None:
+        """Take in a report. Returns what it says against its receiver, if that is news."""
+        factor, before = self._settings.factor, self._newest
+        velocity = fix.velocity_ned_mps
+        if factor is None or velocity is None or not self._rests_on_statement(fix.noise):
+            return None
+        if before is not None and fix.sender_ns <= before.sender_ns:
+            return None
+        self._newest = fix
+        if before is None or fix.sender_ns - before.sender_ns > APART_NS:
+            self._seen.clear()
+            self._seen.append((fix.sender_ns, 0.0, 0.0))
+            return None
+        strayed_m = self._strays(before, fix)
+        stated_m = fix.noise.horizontal_m / factor
+        lag_m = 2.0 * fix.noise.time_s * math.hypot(*velocity)
+        if strayed_m <= max(STRAYS_M, math.sqrt(2.0) * stated_m) + lag_m:
+            return None
+        if strayed_m <= AGAIN * self._strayed_m:
+            return None
+        self._strayed_m = strayed_m
+        to_m = self.noise(fix.noise).horizontal_m
+        name = "observer.follow_accuracy"
+        return Refuted(fix.arrival_ns, fix.uav, name, stated_m, strayed_m, to_m)
+
+    def _strays(self, before: Fix, fix: Fix) -> float:
+        """How far the newest position is off the way from the one some seconds before, in metres.
+
+        In the plane: heights come from a barometer.
+        """
+        assert before.velocity_ned_mps is not None and fix.velocity_ned_mps is not None
+        half_s = (fix.sender_ns - before.sender_ns) * 0.5e-9
+        (n, e, _), (from_n, from_e, _) = fix.position_ned_m, before.position_ned_m
+        (v_n, v_e, _), (was_n, was_e, _) = fix.velocity_ned_mps, before.velocity_ned_mps
+        seen = self._seen
+        _, north, east = seen[-1]
+        north += n - from_n - half_s * (v_n + was_n)
+        east += e - from_e - half_s * (v_e + was_e)
+        seen.append((fix.sender_ns, north, east))
+        while fix.sender_ns - seen[0][0] > WITHIN_NS:
+            seen.popleft()
+        return math.hypot(north - seen[0][1], east - seen[0][2])
+
+    def _rests_on_statement(self, noise: ReportNoise) -> bool:
+        return noise.horizontal_m < self._settings.default.horizontal_m
+
+    def noise(self, stated: ReportNoise) -> ReportNoise:
+        """The bounds on a report's noise, by what its receiver states and what was seen of it."""
+        factor = self._settings.factor
+        if not self._strayed_m or factor is None:
+            return stated
+        level_m = max(self._settings.default.horizontal_m, factor * self._strayed_m)
+        if level_m <= stated.horizontal_m:
+            return stated
+        return replace(
+            stated, horizontal_m=level_m, position_m=math.hypot(level_m, stated.vertical_m)
+        )
+
+    def usual_m(self, noise: ReportNoise) -> float:
+        """What positions usually err by alike, so that reports do not show it."""
+        if self._strayed_m:
+            return STRAYED_ERROR * noise.horizontal_m
+        return min(noise.apart_m, noise.vertical_m) or COMMON_ERROR * noise.position_m

@@ -7,6 +7,7 @@ import asyncio
 from collections.abc import Callable
 from dataclasses import replace
 
+from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.links.transport import Link
 from companion.mavlink.links.urls import parse_link
 from companion.mavlink.trust.admission import Admission
@@ -31,17 +32,30 @@ class Outlet:
         self._pipeline = pipeline
         self._now_ns = now_ns
         self._admission = Admission(settings.out.uavs, ())
-        self._positions = passed_on.Positions()
+        self._positions = passed_on.Positions(
+            utm=settings.out.message == "UTM_GLOBAL_POSITION", every_s=1 / settings.out.rate_hz
+        )
         self._sequences: dict[Source, int] = {}
         self._frames: list[Link] = []
         self._events: list[Link] = []
+        self._named: list[str] = []
         for text in settings.out.urls:
             url = parse_link(text)
             says_cot = url.scheme == "cot"
             if says_cot:
                 url = replace(url, scheme="udpout" if url.way == "udp" else "tcp", way="")
             link = Link(url, lambda _: None, now_ns, notify)
-            (self._events if says_cot else self._frames).append(link)
+            if says_cot:
+                self._events.append(link)
+                self._named.append(text)
+            else:
+                self._frames.append(link)
+
+    def links(self) -> list[LinkStatus]:
+        """Counts of each link; those for events go by the names that the settings have."""
+        named = zip(self._events, self._named, strict=True)
+        events = [replace(link.status, url=text) for link, text in named]
+        return [*(link.status for link in self._frames), *events]
 
     def open(self) -> None:
         """Claim the addresses of links that listen. Raises ``LinkError`` where one is not free."""

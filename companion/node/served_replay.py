@@ -227,6 +227,10 @@ class ServedReplay:
             link.status.state = "down" if self._finished else "up"
         return [link.status for link in self._links.values()]
 
+    def out_links(self) -> list[LinkStatus]:
+        """A replay passes nothing on."""
+        return []
+
     def recording(self) -> RecordingStatus:
         """State of the replay's recording."""
         writer = self._run.writer

@@ -291,6 +291,10 @@ class Service:
         """Counts of each link."""
         return [link.status for link in self._traffic.links]
 
+    def out_links(self) -> list[LinkStatus]:
+        """Counts of each link of ``[out]``."""
+        return self._outlet.links()
+
     def events(self) -> list[Notice]:
         """The newest notices, the oldest of them first."""
         return list(self.notices)

@@ -254,6 +254,16 @@ class HeardLink(LinkState):
     components: list[Component]
 
 
+class OutLink(BaseModel):
+    """One link of ``[out]``, on which only is spoken."""
+
+    url: Link
+    state: Literal["up", "connecting", "down"]
+    peers: int
+    sent: int
+    send_dropped: int
+
+
 class MessageRate(BaseModel):
     """A message whose rate is asked of a UAV."""
 
@@ -271,6 +281,7 @@ class Links(BaseModel):
 
     valid_at: Time
     links: list[HeardLink]
+    out: list[OutLink]
     message_rates: list[MessageRate]
 
 

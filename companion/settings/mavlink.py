@@ -1,7 +1,7 @@
 """Settings of the links: who is heard, who is tracked, and what is sent."""
 
 import re
-from typing import Annotated, Final, Self
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -115,15 +115,17 @@ class OutSettings(Section):
     """What is known goes on to others, on links of its own: nothing unless ``urls`` are given.
 
     urls     ``udpout:``, ``tcp:``, ``tcpin:HOST:PORT`` or ``serial:DEVICE:BAUD`` get
-             GLOBAL_POSITION_INT of each vehicle that reports itself; ``cot:udp:HOST:PORT``
+             ``message`` of each vehicle that reports itself; ``cot:udp:HOST:PORT``
              (sends datagrams there, also to a group) and ``cot:tcp:HOST:PORT`` (connects) get
              Cursor on Target of every aircraft
+    message  as what positions are said
     rate_hz  how often each aircraft is said
     stale_s  how long an event of Cursor on Target says that it holds, seconds
     uavs     patterns of those that are said; everyone if empty
     """
 
     urls: tuple[Annotated[str, AfterValidator(_out_link)], ...] = ()
+    message: Literal["GLOBAL_POSITION_INT", "UTM_GLOBAL_POSITION"] = "GLOBAL_POSITION_INT"
     rate_hz: Annotated[float, Field(ge=0.1, le=50)] = 5.0
     stale_s: Annotated[float, Field(ge=1, le=600)] = 10.0
     uavs: tuple[UavPattern, ...] = ()

@@ -37,6 +37,17 @@ def link(item: LinkStatus, share: LinkShare, now_ns: int) -> Json:
     }
 
 
+def out(item: LinkStatus) -> Json:
+    """One link on which only is spoken."""
+    return {
+        "url": item.url,
+        "state": item.state,
+        "peers": item.peers,
+        "sent": item.sent,
+        "send_dropped": item.send_dropped,
+    }
+
+
 def _reports(share: LinkShare) -> Json:
     """A link's contribution to the reports, and how old they were."""
     total, latencies = share.first + share.repeats, list(share.latencies_s)

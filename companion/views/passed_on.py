@@ -10,7 +10,12 @@ from collections.abc import Iterable
 from typing import Final
 
 from companion.mavlink.wire import cot_text
-from companion.mavlink.wire.encode import Outgoing, global_position_int
+from companion.mavlink.wire.encode import (
+    Outgoing,
+    UtmPosition,
+    global_position_int,
+    utm_global_position,
+)
 from companion.pipeline.fold import Pipeline
 from companion.tracking.noise import GEOID_M
 from companion.values import AltitudeDatum, Source, Track, TrackState, reports_itself
@@ -21,9 +26,14 @@ _REBOOT_MS: Final = 60_000
 
 
 class Positions:
-    """GLOBAL_POSITION_INT of each vehicle that reports itself, as if it had said it now."""
+    """The position of each vehicle that reports itself, as if it had said it now.
 
-    def __init__(self) -> None:
+    ``utm``: as UTM_GLOBAL_POSITION, ``every_s`` apart, else as GLOBAL_POSITION_INT.
+    """
+
+    def __init__(self, *, utm: bool = False, every_s: float = 0.0) -> None:
+        self._utm = utm
+        self._every_s = every_s
         self._boot_ms: dict[str, int] = {}  # of what was said last
 
     def said(self, pipeline: Pipeline, tracks: Iterable[Track]) -> list[Outgoing]:
@@ -52,14 +62,41 @@ class Positions:
             return None
         self._boot_ms[track.uav] = boot_ms
         relative_alt_m = report.relative_alt_m
+        if relative_alt_m is not None:
+            relative_alt_m += place[2] - report.alt_m
+        if self._utm:
+            return self._as_utm(pipeline, track, place, relative_alt_m, velocity)
         return global_position_int(
             Source.parse(track.uav),
             boot_ms & 0xFFFF_FFFF,
             place,
-            0.0 if relative_alt_m is None else place[2] - (report.alt_m - relative_alt_m),
+            relative_alt_m or 0.0,
             velocity,
             report.heading_deg,
         )
+
+    def _as_utm(
+        self,
+        pipeline: Pipeline,
+        track: Track,
+        place: tuple[float, float, float],
+        relative_alt_m: float | None,
+        velocity_ned_mps: tuple[float, float, float],
+    ) -> Outgoing:
+        """Its height is above the ellipsoid: it is said where the geoid's height is known."""
+        known = pipeline.settings.observer.geoid_m is not None
+        undulation_m, off_m = _geoid(pipeline) if known else (0.0, 0.0)
+        said = UtmPosition(
+            track.valid_at_ns,
+            *place[:2],
+            place[2] + undulation_m if known else None,
+            relative_alt_m,
+            velocity_ned_mps,
+            track.horizontal_bound_m,
+            track.vertical_bound_m + off_m,
+            self._every_s,
+        )
+        return utm_global_position(Source.parse(track.uav), said)
 
 
 def events(pipeline: Pipeline, tracks: Iterable[Track], stale_s: float) -> list[bytes]:

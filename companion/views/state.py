@@ -80,6 +80,7 @@ class Node(Protocol):
     def now_ns(self) -> int: ...
     def uptime_s(self) -> float: ...
     def links(self) -> list[LinkStatus]: ...
+    def out_links(self) -> list[LinkStatus]: ...
     def recording(self) -> RecordingStatus: ...
     def rates(self) -> Mapping[str, float | None]: ...
     def unfit(self) -> list[str]: ...
@@ -90,15 +91,16 @@ class Node(Protocol):
 
 
 def links(node: Node) -> Json:
-    """The answer of ``/v1/links``: who is heard over each, and the message rates asked for."""
+    """The answer of ``/v1/links``: who is heard over each, what goes out, the rates asked for."""
     now_ns = node.now_ns()
     shown = [
         link_state.link(item, node.pipeline.senders.link_share(item.url), now_ns)
         | {"components": link_state.components(item, now_ns)}
         for item in node.links()
     ]
+    out = [link_state.out(item) for item in node.out_links()]
     rates = [link_state.rate(rate) for rate in node.message_rates()]
-    return {"valid_at": rfc3339(now_ns), "links": shown, "message_rates": rates}
+    return {"valid_at": rfc3339(now_ns), "links": shown, "out": out, "message_rates": rates}
 
 
 def vector(values: FloatArray | None) -> list[float] | None:

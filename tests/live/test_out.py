@@ -133,6 +133,11 @@ def test_events_go_out_as_xml_that_takproto_reads(start_node: Any, tmp_path: Pat
                 sender.sendto(bytes(message.pack(mav)), ("127.0.0.1", port))
             text = far_end.recv(4000)
             streamed = connection.makefile("rb").readline()
+            out = node.wait_until(
+                "/v1/links", lambda answer: all(one["sent"] for one in answer["out"])
+            )["out"]
+            assert [one["url"] for one in out] == urls
+            assert {one["state"] for one in out} == {"up"}
         status, _, errors = node.stop()
     assert status == 0, errors
     for one in (text, streamed):

@@ -505,7 +505,9 @@ def test_a_relayed_report_is_as_good_as_transponders_are() -> None:
         9000, 4000, 300, b"TEST", 0, 1, 1 | 2 | 4 | 8 | 128, 0,
     )  # fmt: skip
     pipeline.step(sent(1.1, "5:1", told))
-    assert noise_of(pipeline, "icao:4CA7B3") == pytest.approx((140.1, 140.1 + GEOID_M, 10.0), abs=0.1)
+    assert noise_of(pipeline, "icao:4CA7B3") == pytest.approx(
+        (140.1, 140.1 + GEOID_M, 10.0), abs=0.1
+    )
     now_ns = tick(1.2).t_ns
     (track,) = pipeline.tracks(now_ns, now_ns)
     assert track.clock_bound_s == 1.0

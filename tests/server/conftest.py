@@ -91,6 +91,10 @@ class StandIn:
         one.components = heard
         return [one, LinkStatus("serial:/dev/ttyS0:57600", "connecting")]
 
+    def out_links(self) -> list[LinkStatus]:
+        """One that has said something."""
+        return [LinkStatus("cot:udp:127.0.0.1:6969", "up", peers=1, sent=12, send_dropped=3)]
+
     def recording(self) -> RecordingStatus:
         """As the test says."""
         return self.current

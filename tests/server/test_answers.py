@@ -75,6 +75,9 @@ def test_what_is_compared_is_not_empty(client: TestClient) -> None:
     links = client.get("/v1/links").json()
     assert links["links"][0]["components"]
     assert links["message_rates"]
+    assert links["out"] == [
+        {"url": "cot:udp:127.0.0.1:6969", "state": "up", "peers": 1, "sent": 12, "send_dropped": 3}
+    ]
     assert client.get("/v1/events").json()["events"]
 
 

@@ -87,6 +87,40 @@ def test_a_vehicle_is_said_where_it_is_now_by_its_own_clock() -> None:
     assert one.hdg == 3700
 
 
+@pytest.mark.parametrize("geoid_m", [None, -30.0])
+def test_a_vehicle_is_said_to_traffic_management(geoid_m: float | None) -> None:
+    """By pymavlink's eyes; a height above the ellipsoid only where the geoid's is known."""
+    fold = pipeline({"geoid_m": geoid_m, "geoid_error_m": 2.0} if geoid_m else None)
+    for n in range(6):
+        fold.step(telemetry(n / 2))
+    (one,) = said(fold, 3.2, passed_on.Positions(utm=True, every_s=0.2))
+    assert one.get_type() == "UTM_GLOBAL_POSITION"
+    (track,) = tracks(fold, 3.2)
+    lat, lon, alt = there(3.2)
+    off_m = pymap3d.geodetic2ned(one.lat * 1e-7, one.lon * 1e-7, alt, lat, lon, alt)
+    assert math.hypot(*off_m) < 0.3
+    assert one.time == (START_NS + 3_200_000_000) // 1000
+    assert one.relative_alt == pytest.approx((alt - 480) * 1e3, abs=300)
+    assert (one.vx, one.vy) == (pytest.approx(2000, abs=20), pytest.approx(1500, abs=20))
+    assert one.h_acc == math.ceil(track.horizontal_bound_m * 1e3)
+    assert (one.update_rate, one.vel_acc, bytes(one.uas_id)) == (20, 0, bytes(18))
+    known = {
+        name.removeprefix("UTM_DATA_AVAIL_FLAGS_").removesuffix("_AVAILABLE")
+        for name, value in vars(dialect).items()
+        if name.startswith("UTM_DATA_AVAIL_FLAGS_")
+        and isinstance(value, int)
+        and value <= 128
+        and one.flags & value
+    }
+    has = {"TIME_VALID", "POSITION", "RELATIVE_ALTITUDE", "HORIZONTAL_VELO", "VERTICAL_VELO"}
+    assert known == has | ({"ALTITUDE"} if geoid_m else set())
+    if geoid_m is None:
+        assert one.alt == 0
+    else:
+        assert one.alt == pytest.approx((alt - 30) * 1e3, abs=300)
+        assert one.v_acc == math.ceil((track.vertical_bound_m + 2) * 1e3)
+
+
 def test_what_is_not_known_any_more_is_not_said() -> None:
     """Stale after 15 s by default."""
     fold = pipeline()

@@ -6,7 +6,9 @@ its own. Fields are laid out as on the wire: by size, largest first, then extens
 every message with pymavlink's generated dialect.
 """
 
+import math
 import struct
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from fastcrc import crc16
@@ -20,6 +22,7 @@ GLOBAL_POSITION_INT: Final = 33
 REQUEST_DATA_STREAM: Final = 66
 COMMAND_LONG: Final = 76
 TIMESYNC: Final = 111
+UTM_GLOBAL_POSITION: Final = 340
 
 MAV_CMD_SET_MESSAGE_INTERVAL: Final = 511
 
@@ -86,6 +89,58 @@ def global_position_int(
         65_535 if heading_deg is None else round(heading_deg * 100) % 36_000,
     )
     return Outgoing(source, GLOBAL_POSITION_INT, payload)
+
+
+@dataclass(frozen=True, slots=True)
+class UtmPosition:
+    """What UTM_GLOBAL_POSITION says; None: not known.
+
+    utc_ns            time of the position
+    lat_deg, lon_deg  WGS84
+    hae_m             height above the ellipsoid
+    relative_alt_m    height above home
+    velocity_ned_mps  over ground
+    horizontal_m, vertical_m
+                      said as its uncertainties
+    every_s           time between two of them
+    """
+
+    utc_ns: int
+    lat_deg: float
+    lon_deg: float
+    hae_m: float | None
+    relative_alt_m: float | None
+    velocity_ned_mps: tuple[float, float, float]
+    horizontal_m: float
+    vertical_m: float
+    every_s: float
+
+
+def utm_global_position(source: Source, said: UtmPosition) -> Outgoing:
+    """UTM_GLOBAL_POSITION: its flags (UTM_DATA_AVAIL_FLAGS) say what of it is known.
+
+    The vehicle's own UAS id is not, and stays empty. What is beyond what the message holds is cut.
+    """
+    flags = 1 | 4 | 32 | 64  # time, position, both velocities
+    flags |= 0 if said.hae_m is None else 8
+    flags |= 0 if said.relative_alt_m is None else 16
+    speeds = (max(-32_767, min(32_767, round(speed * 100))) for speed in said.velocity_ned_mps)
+    off = (min(65_535, math.ceil(one * 1e3)) for one in (said.horizontal_m, said.vertical_m))
+    payload = struct.pack(
+        "<Q7i3h4H18sBB",
+        said.utc_ns // 1000,
+        *(round(said.lat_deg * 1e7), round(said.lon_deg * 1e7)),
+        *(round((one or 0.0) * 1e3) for one in (said.hae_m, said.relative_alt_m)),
+        *(0, 0, 0),  # of the next waypoint
+        *speeds,
+        *off,
+        0,  # accuracy of the velocity: not known
+        min(65_535, round(said.every_s * 100)),
+        b"",
+        0,  # UTM_FLIGHT_STATE_UNKNOWN
+        flags,
+    )
+    return Outgoing(source, UTM_GLOBAL_POSITION, payload)
 
 
 def set_message_interval(

@@ -2,10 +2,11 @@
 
 Format and codes: RTCA DO-260B, 2.2.3 (ICAO Doc 9871 has the same tables); the compact position
 report (CPR) is its appendix A.1.7. Read are identification (type 1-4), airborne positions (9-18
-with pressure altitude, 20-22), velocities over ground (19, subtypes 1 and 2), and operational
-status (31), which has the accuracies. Left out are positions on the ground, which need one to begin
-from; aircraft that ground stations rebroadcast (TIS-B: DF18 with a control field other than 0); and
-the heights of types 20-22, which dump1090 reads in steps of 25 feet and pyModeS in metres.
+with pressure altitude, 20-22), velocities over ground (19, subtypes 1 and 2), operational status
+(31), which has the accuracies, and positions on the ground (5-8): these count from a place that the
+aircraft had before, some minutes ago at most, and have no height. Left out are aircraft that ground
+stations rebroadcast (TIS-B: DF18 with a control field other than 0), and the heights of types
+20-22, which dump1090 reads in steps of 25 feet and pyModeS in metres.
 """
 
 import math
@@ -23,10 +24,18 @@ STATUS_NS: Final = 30_000_000_000
 """How long a stated accuracy holds: it is sent every 2.5 s (DO-260B, 2.2.3.3)."""
 AIRCRAFT_MAX: Final = 2000
 """Aircraft of which something is kept; beyond it the one not heard for longest is forgotten."""
+GROUND_NS: Final = 240_000_000_000
+"""Age of a place from which one on the ground is counted: at 340 m/s it is 45 nautical miles away,
+half of what the position repeats itself by."""
 _POLYNOMIAL: Final = 0xFFF409
 _CPR: Final = 1 << 17
 _LETTERS: Final = "?ABCDEFGHIJKLMNOPQRSTUVWXYZ????? ???????????????0123456789??????"
 _POLE_DEG: Final = 87.0
+_MOVEMENT: Final = (
+    (1, 0.0, 0.0), (2, 0.125, 0.125), (9, 1.0, 0.25), (13, 2.0, 0.5), (39, 15.0, 1.0),
+    (94, 70.0, 2.0), (109, 100.0, 5.0), (124, 175.0, 0.0),
+)  # fmt: skip
+"""First code, its speed and the steps of the codes behind it, knots."""
 
 
 def parity(message: bytes) -> int:
@@ -46,6 +55,7 @@ class _Heard:
     nac_p: tuple[int, int] = (0, 0)  # value, t_ns
     gva: tuple[int, int] = (0, 0)
     nac_v: tuple[int, int] = (0, 0)
+    place: tuple[int, float, float] | None = None  # the newest: t_ns, lat, lon
 
 
 class Transponders:
@@ -78,11 +88,13 @@ class Transponders:
             return _position(
                 heard, t_ns, icao, me, _altitude_ft(me >> 36 & 0xFFF) if type_code < 20 else None
             )
+        if 5 <= type_code <= 8:
+            return _on_ground(heard, t_ns, icao, me)
         if type_code == 19 and subtype in (1, 2):
             heard.nac_v = (me >> 43 & 7, t_ns)
             return _velocity(icao, me, 4 if subtype == 2 else 1)
-        if type_code == 31 and subtype == 0:
-            _status(heard, t_ns, me)
+        if type_code == 31 and subtype in (0, 1):
+            _status(heard, t_ns, me, airborne=subtype == 0)
         return None
 
 
@@ -91,12 +103,13 @@ def _callsign(me: int) -> str:
     return "" if "?" in letters else letters
 
 
-def _status(heard: _Heard, t_ns: int, me: int) -> None:
-    """Take in the accuracies of an airborne operational status; version 0 has none."""
+def _status(heard: _Heard, t_ns: int, me: int, *, airborne: bool) -> None:
+    """Take in the accuracies of an operational status; version 0 has none, the ground no GVA."""
     version = me >> 13 & 7
     if version in (1, 2):
         heard.nac_p = (me >> 8 & 15, t_ns)
-        heard.gva = (me >> 6 & 3 if version == 2 else 0, t_ns)  # in version 1 another quantity
+        known = version == 2 and airborne  # in version 1 another quantity
+        heard.gva = (me >> 6 & 3 if known else 0, t_ns)
 
 
 def _position(heard: _Heard, t_ns: int, icao: int, me: int, altitude_ft: float | None) -> Said:
@@ -107,6 +120,8 @@ def _position(heard: _Heard, t_ns: int, icao: int, me: int, altitude_ft: float |
     if other is not None and t_ns - other[0] <= PAIR_NS:
         place = position_deg(heard.halves[0][1:], heard.halves[1][1:], newest_is_odd=odd == 1)
     lat_deg, lon_deg = place or (None, None)
+    if place is not None:
+        heard.place = t_ns, *place
     return Said(
         icao,
         lat_deg,
@@ -116,6 +131,46 @@ def _position(heard: _Heard, t_ns: int, icao: int, me: int, altitude_ft: float |
         nac_v=_fresh(heard.nac_v, t_ns),
         gva=_fresh(heard.gva, t_ns),
     )
+
+
+def _on_ground(heard: _Heard, t_ns: int, icao: int, me: int) -> Said:
+    """A position on the ground, near the newest place that is known, and how it moves."""
+    place = None
+    if heard.place is not None and t_ns - heard.place[0] <= GROUND_NS:
+        half = me >> 17 & 0x1FFFF, me & 0x1FFFF
+        place = ground_deg(half, heard.place[1:], odd=me >> 34 & 1)
+    lat_deg, lon_deg = place or (None, None)
+    if place is not None:
+        heard.place = t_ns, *place
+    return Said(
+        icao,
+        lat_deg,
+        lon_deg,
+        speed_kt=ground_speed_kt(me >> 44 & 0x7F),
+        track_deg=(me >> 36 & 0x7F) * 360 / 128 if me >> 43 & 1 else None,
+        nac_p=_fresh(heard.nac_p, t_ns),
+    )
+
+
+def ground_deg(half: tuple[int, int], near: tuple[float, float], odd: int) -> tuple[float, float]:
+    """The place with such a position on the ground nearest to another (DO-260B, A.1.7.6)."""
+    lat_deg = _nearest(half[0] / _CPR, near[0], 90 / (60 - odd))
+    lon_deg = _nearest(half[1] / _CPR, near[1], 90 / max(zones(lat_deg) - odd, 1))
+    return max(-90.0, min(90.0, lat_deg)), (lon_deg + 180) % 360 - 180
+
+
+def _nearest(part: float, near_deg: float, zone_deg: float) -> float:
+    """The angle at a part of a zone that is nearest to another angle."""
+    within = near_deg % zone_deg / zone_deg
+    return zone_deg * (math.floor(near_deg / zone_deg) + math.floor(0.5 + within - part) + part)
+
+
+def ground_speed_kt(code: int) -> float | None:
+    """Speed on the ground, the low end of its step (DO-260B, 2.2.3.2.4.2); None: not known."""
+    if not 1 <= code <= 124:
+        return None
+    first, speed_kt, step_kt = next(row for row in reversed(_MOVEMENT) if code >= row[0])
+    return speed_kt + (code - first) * step_kt
 
 
 def _fresh(stated: tuple[int, int], t_ns: int) -> int:

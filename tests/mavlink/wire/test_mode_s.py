@@ -13,7 +13,15 @@ from hypothesis import strategies as st
 
 from companion.mavlink.wire.beast import BeastSplitter
 from companion.mavlink.wire.decode import decode
-from companion.mavlink.wire.mode_s import PAIR_NS, STATUS_NS, Transponders, parity, zones
+from companion.mavlink.wire.mode_s import (
+    PAIR_NS,
+    STATUS_NS,
+    Transponders,
+    ground_deg,
+    ground_speed_kt,
+    parity,
+    zones,
+)
 from companion.values import AdsbVehicle, Frame, Reason, Rejection
 
 S = 1_000_000_000
@@ -66,7 +74,7 @@ def test_random_messages_are_read_as_pymodes_reads_them() -> None:
     rng = random.Random(3)
     read = 0
     for _ in range(3000):
-        kind = rng.choice([1, 2, 3, 4, 9, 11, 13, 18, 19, 19, 20, 31])
+        kind = rng.choice([1, 2, 3, 4, 7, 9, 11, 13, 18, 19, 19, 20, 31])
         me = rng.getrandbits(48) | rng.choice([1, 2] if kind == 19 else [0]) << 48 | kind << 51
         raw = message(me, rng.getrandbits(24) or 1)
         theirs: dict[str, Any] = dict(pyModeS.decode(raw.hex()))
@@ -81,6 +89,8 @@ def test_random_messages_are_read_as_pymodes_reads_them() -> None:
             assert ours.callsign == theirs["callsign"].strip()
         if 9 <= kind <= 18 and ours.altitude_ft is not None:
             assert ours.altitude_ft == theirs["altitude"]
+        if kind == 7:
+            assert ours.track_deg == theirs.get("track")
         if kind == 19:
             assert (ours.speed_kt is None) is (theirs.get("groundspeed") is None)
             if ours.speed_kt is not None and ours.track_deg is not None and ours.speed_kt > 0:
@@ -122,6 +132,58 @@ def test_published_messages() -> None:
     assert velocity.velocity_down_mps == pytest.approx(832 * 0.00508, abs=0.01)
     assert velocity.velocity_ne_mps is not None
     assert math.hypot(*velocity.velocity_ne_mps) == pytest.approx(159.2 * 1852 / 3600, abs=0.01)
+
+
+def on_ground(lat_deg: float, lon_deg: float, odd: int, movement: int = 42) -> bytes:
+    """A position on the ground by the encoding side of DO-260B, A.1.7.3: zones of a quarter."""
+    lat_zone = 90 / (60 - odd)
+    y = math.floor(2**17 * (lat_deg % lat_zone) / lat_zone + 0.5)
+    at = lat_zone * (y / 2**17 + math.floor(lat_deg / lat_zone))
+    lon_zone = 90 / max(zones(at) - odd, 1)
+    x = math.floor(2**17 * (lon_deg % lon_zone) / lon_zone + 0.5)
+    me = 7 << 51 | movement << 44 | 1 << 43 | 50 << 36 | odd << 34
+    return message(me | (y & 0x1FFFF) << 17 | x & 0x1FFFF)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_position_on_the_ground_counts_from_the_one_in_the_air(seed: int) -> None:
+    """Up to 40 nautical miles on, as pyModeS has it with the place to begin from."""
+    rng = random.Random(seed)
+    lat, lon = rng.uniform(-80, 80), rng.uniform(-180, 180)
+    there = lat + rng.uniform(-0.66, 0.66), lon
+    heard = Transponders()
+    raw = on_ground(*there, odd=seed % 2)
+    lost = heard.read(0, raw)
+    assert lost is not None and lost.lat_deg is None  # nowhere to count from
+    for odd in (0, 1):
+        heard.read(0, placed(lat, lon, odd))
+    ours = heard.read(239 * S, raw)
+    assert ours is not None and ours.lat_deg is not None and ours.lon_deg is not None
+    theirs = pyModeS.decode(raw.hex(), surface_ref=(lat, lon))
+    assert ours.lat_deg == pytest.approx(theirs["latitude"], abs=1e-6)
+    assert (ours.lon_deg - theirs["longitude"] + 180) % 360 - 180 == pytest.approx(0, abs=1e-6)
+    assert ours.lat_deg == pytest.approx(there[0], abs=1e-5)
+    assert (ours.speed_kt, ours.track_deg) == (theirs["groundspeed"], theirs["track"])
+    assert ours.altitude_ft is None
+    again = heard.read(478 * S, raw)  # from the place on the ground
+    assert again is not None and again.lat_deg == pytest.approx(ours.lat_deg)
+    late = heard.read(800 * S, raw)
+    assert late is not None and late.lat_deg is None
+
+
+def test_a_published_position_on_the_ground() -> None:
+    """Of https://mode-s.org/1090mhz: 52.32061 north, 4.73473 east, near 51.990, 4.375."""
+    me = int.from_bytes(bytes.fromhex("8C4841753A8A35323FAEBDAC702D")[4:11], "big")
+    half = me >> 17 & 0x1FFFF, me & 0x1FFFF
+    assert ground_deg(half, (51.990, 4.375), me >> 34 & 1) == pytest.approx(
+        (52.32061, 4.73473), abs=1e-5
+    )
+
+
+def test_speeds_on_the_ground_are_those_of_pymodes() -> None:
+    for code in range(128):
+        theirs = pyModeS.decode(on_ground(1.0, 1.0, 0, code).hex()).get("groundspeed")
+        assert ground_speed_kt(code) == (None if theirs is None else pytest.approx(theirs, abs=0.6))
 
 
 def test_halves_that_are_too_far_apart_in_time_are_no_place() -> None:

@@ -14,8 +14,13 @@ COPY . ./
 # What only builds is taken away again, pip last.
 RUN /opt/venv/bin/pip install --no-deps --no-build-isolation . \
     && /opt/venv/bin/pip uninstall --yes editables hatchling pathspec pluggy trove-classifiers \
-    && /opt/venv/bin/pip check \
-    && /opt/venv/bin/pip uninstall --yes setuptools pip
+    && /opt/venv/bin/pip check
+# What packages ask for and nothing here uses: solvers beside Clarabel, what generates MAVLink; then
+# their own tests, and dialects that nobody speaks here. It is half of all.
+RUN /opt/venv/bin/pip uninstall --yes highspy lxml scs setuptools sparsediffpy pip \
+    && find /opt/venv/lib -type d -name tests -prune -exec rm -r {} + \
+    && find /opt/venv/lib -path '*/pymavlink/dialects/v*' -type f \
+        ! -path '*/v20/*__init__*' ! -path '*/v20/*all.*' ! -path '*/v20/*ardupilotmega.*' -delete
 
 FROM ${BASE}
 COPY --from=build /opt/venv /opt/venv

@@ -196,6 +196,35 @@ def test_the_image_installs_and_runs_from_what_it_is_given(tmp_path: Path) -> No
     assert len(list(record.glob("*.mcap"))) == 1
 
 
+@pytest.mark.full
+def test_what_the_image_leaves_out_is_not_missed(tmp_path: Path) -> None:
+    """A design by the LMI, a study with its figures and a replay, without those packages."""
+    (line,) = re.findall(r"pip uninstall --yes (highspy .*) pip ", DOCKERFILE)
+    gone = [name for name in line.split() if name != "setuptools"]
+    code = (
+        "import sys\n"
+        "class Gone:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        f"        if name.partition('.')[0] in {gone!r}:\n"
+        "            raise ModuleNotFoundError(name, name=name)\n"
+        "sys.meta_path.insert(0, Gone())\n"
+        "from companion.cli.main import main\n"
+        "main(sys.argv[1:])\n"
+    )
+    log = str(ROOT / "tests" / "data" / "sitl_4circle_cut.tlog")
+    for words in (
+        ["design", "--method", "lmi", "--dt", "0.2"],
+        ["study", "dt", "--out", "report"],
+        ["replay", log, "--center", "5:1"],
+    ):
+        done = subprocess.run(
+            [sys.executable, "-c", code, *words], cwd=tmp_path, capture_output=True, text=True,
+            timeout=HANG_S, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+    assert list((tmp_path / "report").glob("*.png")) or list((tmp_path / "report").glob("*.html"))
+
+
 def test_services_are_tested_one_at_a_time(request: pytest.FixtureRequest) -> None:
     """The group of ``conftest.ALONE`` reaches xdist, which reads it from the test's id."""
     if "PYTEST_XDIST_WORKER" in os.environ:

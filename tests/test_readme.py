@@ -245,7 +245,7 @@ def marked(command: str) -> Any:
 @pytest.fixture(scope="module")
 def demo() -> Iterator[Node]:
     """The demo, once all its UAVs have beams."""
-    node = Node("demo", "--port", "0", "--seconds", "3600")
+    node = Node("demo", "--port", "0", "--seconds", "36000")
     try:
         node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
         yield node

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support import Node, end
+from support import HANG_MS, Node, end
 
 CHROMIUM = Path("/usr/bin/chromium")
 QUIET = (
@@ -33,7 +33,7 @@ def start_demo(directory: Path, port: int = 0) -> Node:
     before = Path.cwd()
     os.chdir(directory)  # it records to ./recordings
     try:
-        node = Node("demo", "--port", str(port), "--seconds", "240")
+        node = Node("demo", "--port", str(port), "--seconds", "36000")
     finally:
         os.chdir(before)
     node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
@@ -63,6 +63,7 @@ def open_page(chromium: Any) -> Iterator[Any]:
         url: str, viewport: dict[str, int], *, loses_service: bool = False, theme: Any = "dark"
     ) -> Any:
         page = chromium.new_page(viewport=viewport, color_scheme=theme)
+        page.set_default_timeout(HANG_MS)
         complaints: list[str] = []
         page.on("console", lambda said: is_complaint(said) and complaints.append(said.text))
         page.on("pageerror", lambda error: complaints.append(str(error)))

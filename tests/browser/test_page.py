@@ -77,7 +77,7 @@ def test_everything_is_shown_and_moves_without_flooding(demo: Node, open_page: A
     page.wait_for_function(f"before => {AZIMUTHS} !== before", arg=before, timeout=HANG_MS)
     page.locator("#pattern-facts [data-fact=peak]").get_by_text("dB").wait_for(timeout=HANG_MS)
     page.locator("#links").get_by_text("udpin:").wait_for(timeout=HANG_MS)
-    page.locator("#events").get_by_text("4:1 is live").wait_for(timeout=HANG_MS)
+    page.locator("#events").get_by_text("4:1 is live").first.wait_for(timeout=HANG_MS)
     page.wait_for_timeout(6000)  # so that the series and the rate of requests say something
     times = page.evaluate("performance.getEntriesByType('resource')"
                           ".filter(one => one.initiatorType === 'fetch')"

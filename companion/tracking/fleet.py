@@ -127,21 +127,21 @@ class Fleet:
         found = known.look(fix)
         assert fix.limits is not None
         limits = known.limits(fix.limits, fix.sender_ns)
-        noise, strays = self._doubted(fix)
+        noise, strays = self._doubted(fix, limits.acceleration_mps2)
         if strays is not None:
             found.append(strays)
         if limits is fix.limits and noise is fix.noise:
             return fix, found
         return replace(fix, limits=limits, noise=noise), found
 
-    def _doubted(self, fix: Fix) -> tuple[ReportNoise, Refuted | None]:
+    def _doubted(self, fix: Fix, acceleration_mps2: float) -> tuple[ReportNoise, Refuted | None]:
         """The bounds on a report's noise, by what was seen of its receiver, and what is news."""
         if self._settings.noise is None:
             return fix.noise, None
         known = self._straying.get(fix.uav)
         if known is None:
             known = self._straying.setdefault(fix.uav, Straying(self._settings.noise))
-        found = known.look(fix)
+        found = known.look(fix, acceleration_mps2)
         return known.noise(fix.noise), found
 
     def accept(self, fix: Fix) -> Estimate | Rejection:

@@ -4,8 +4,9 @@ A receiver states the radius within which two of three of its positions lie, and
 report's error rests on it. Velocities are measured apart from positions, by Doppler. Within a few
 seconds two positions of a receiver hardly err differently: where they stray from where the reported
 velocities lead by more than two independent errors of the stated size would, the statement is not
-believed. That is no proof, for velocities may err for long; so nothing is refused by it. The bound
-becomes that of a receiver that states nothing, or more where more was seen.
+believed. Between two reports the velocity is taken for even, and what an aircraft may have done
+meanwhile is left to it. That is no proof, for velocities may err for long; so nothing is refused by
+it. The bound becomes that of a receiver that states nothing, or more where more was seen.
 """
 
 import math
@@ -22,6 +23,11 @@ APART_NS: Final = 500_000_000
 """Longest time between two reports over which the way is known from their velocities."""
 STRAYS_M: Final = 0.4
 """What good receivers' positions stray, whatever they state: velocities err, too."""
+UNSEEN: Final = 0.5
+"""Multiple of the root of the sum of squares of what may be flown unseen between the reports.
+
+It is hardly ever the most that the aircraft can do.
+"""
 COMMON_ERROR: Final = 0.07
 """Share of the noise bound that is usual in all reports alike, which none of them shows."""
 STRAYED_ERROR: Final = 0.82
@@ -38,12 +44,16 @@ class Straying:
 
     def __init__(self, settings: NoiseSettings) -> None:
         self._settings = settings
-        self._seen: deque[tuple[int, float, float]] = deque()  # sender time, off the way, m
+        # Sender time, off the way north and east in m, sum of squares of what was unseen till then.
+        self._seen: deque[tuple[int, float, float, float]] = deque()
         self._newest: Fix | None = None
         self._strayed_m = 0.0
 
-    def look(self, fix: Fix) -> Refuted | None:
-        """Take in a report. Returns what it says against its receiver, if that is news."""
+    def look(self, fix: Fix, acceleration_mps2: float) -> Refuted | None:
+        """Take in a report. Returns what it says against its receiver, if that is news.
+
+        ``acceleration_mps2`` is the greatest that the aircraft is taken for able to have.
+        """
         factor, before = self._settings.factor, self._newest
         velocity = fix.velocity_ned_mps
         if factor is None or velocity is None or not self._rests_on_statement(fix.noise):
@@ -53,12 +63,12 @@ class Straying:
         self._newest = fix
         if before is None or fix.sender_ns - before.sender_ns > APART_NS:
             self._seen.clear()
-            self._seen.append((fix.sender_ns, 0.0, 0.0))
+            self._seen.append((fix.sender_ns, 0.0, 0.0, 0.0))
             return None
-        strayed_m = self._strays(before, fix)
+        strayed_m, unseen_m = self._strays(before, fix, acceleration_mps2)
         stated_m = fix.noise.horizontal_m / factor
         lag_m = 2.0 * fix.noise.time_s * math.hypot(*velocity)
-        if strayed_m <= max(STRAYS_M, math.sqrt(2.0) * stated_m) + lag_m:
+        if strayed_m <= max(STRAYS_M, math.sqrt(2.0) * stated_m) + lag_m + UNSEEN * unseen_m:
             return None
         if strayed_m <= AGAIN * self._strayed_m:
             return None
@@ -67,8 +77,9 @@ class Straying:
         name = "observer.follow_accuracy"
         return Refuted(fix.arrival_ns, fix.uav, name, stated_m, strayed_m, to_m)
 
-    def _strays(self, before: Fix, fix: Fix) -> float:
-        """How far the newest position is off the way from the one some seconds before, in metres.
+    def _strays(self, before: Fix, fix: Fix, acceleration_mps2: float) -> tuple[float, float]:
+        """How far the newest position is off the way from the one some seconds before, in metres;
+        and how far the way may be another one, since no velocity is known between two reports.
 
         In the plane: heights come from a barometer.
         """
@@ -77,13 +88,15 @@ class Straying:
         (n, e, _), (from_n, from_e, _) = fix.position_ned_m, before.position_ned_m
         (v_n, v_e, _), (was_n, was_e, _) = fix.velocity_ned_mps, before.velocity_ned_mps
         seen = self._seen
-        _, north, east = seen[-1]
+        _, north, east, unseen_m2 = seen[-1]
         north += n - from_n - half_s * (v_n + was_n)
         east += e - from_e - half_s * (v_e + was_e)
-        seen.append((fix.sender_ns, north, east))
+        unseen_m2 += (acceleration_mps2 * half_s**2) ** 2  # away, and back again, at full power
+        seen.append((fix.sender_ns, north, east, unseen_m2))
         while fix.sender_ns - seen[0][0] > WITHIN_NS:
             seen.popleft()
-        return math.hypot(north - seen[0][1], east - seen[0][2])
+        _, north_0, east_0, before_m2 = seen[0]
+        return math.hypot(north - north_0, east - east_0), math.sqrt(unseen_m2 - before_m2)
 
     def _rests_on_statement(self, noise: ReportNoise) -> bool:
         return noise.horizontal_m < self._settings.default.horizontal_m

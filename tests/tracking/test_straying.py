@@ -11,6 +11,7 @@ from companion.tracking.straying import STRAYS_M, Straying
 from companion.values import Fix, FloatArray, Refuted, ReportNoise
 
 S = 1_000_000_000
+ACCELERATION_MPS2 = 5.0
 DEFAULT = ReportNoise(3.0, 3.0, 3.0, 0.5)
 SETTINGS = NoiseSettings(DEFAULT, 3.0)
 STATED = ReportNoise(0.9, 0.9, 1.27, 0.5)
@@ -32,7 +33,7 @@ def flown(
 
 
 def told(straying: Straying, fixes: Iterator[Fix]) -> list[tuple[float, Refuted]]:
-    looked = ((one.sender_ns / S, straying.look(one)) for one in fixes)
+    looked = ((one.sender_ns / S, straying.look(one, ACCELERATION_MPS2)) for one in fixes)
     return [(at_s, found) for at_s, found in looked if found is not None]
 
 
@@ -84,6 +85,22 @@ def test_what_is_left_of_the_lag_is_no_fault_of_the_receiver(fix: MakeFix) -> No
         return -off_m * math.sin(turn), off_m * math.cos(turn)
 
     assert told(Straying(SETTINGS), flown(fix, lag, late)) == []
+
+
+def test_what_is_flown_between_two_reports_is_no_fault_of_the_receiver(fix: MakeFix) -> None:
+    """Gusts at 5 rad/s, 25 m/s strong, reported half a second apart: no velocity tells of them."""
+
+    def gusty() -> Iterator[Fix]:
+        for n in range(120):
+            t_s, rate = 0.45 * n, 5.0
+            place = np.array([25 / rate * math.sin(rate * t_s), 0.0, 0.0])
+            velocity: FloatArray = np.array([25 * math.cos(rate * t_s), 0.0, 0.0])
+            yield fix(round(t_s * S), place, velocity, noise=STATED)
+
+    straying = Straying(SETTINGS)
+    assert [found for one in gusty() if (found := straying.look(one, 125.0))] == []
+    careless = Straying(SETTINGS)
+    assert [found for one in gusty() if (found := careless.look(one, 0.0))]
 
 
 def test_reports_that_are_far_apart_tell_nothing(fix: MakeFix) -> None:

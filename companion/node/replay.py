@@ -58,7 +58,12 @@ def layers_for(
         settings = Settings.from_recording(recorded, str(logs[0]))
         origins = changed(settings, Origin("recording", str(logs[0])))
         return settings.override(**options), {**origins, **of_options(options)}
-    return layered(config, options)
+    settings, origins = layered(config, options)
+    several = vehicles(logs)
+    if len(several) > 1:
+        apart = {str(one.source): one.apart_s for one in several if one.apart_s}
+        settings = settings.override(clocks={"apart_s": apart | settings.clocks.apart_s})
+    return settings, origins
 
 
 def writer_for(logs: Sequence[Path], settings: Settings, out: Path | None) -> Writer:

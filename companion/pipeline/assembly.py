@@ -245,6 +245,8 @@ def assumed(settings: Settings, uav: str, mav_type: int | None, autopilot: int |
     limits = Limits(speed or known.speed_mps, most or known.acceleration_mps2, source)
     if lag is None:
         lag = lag_s(kind, autopilot) if kind is not Airframe.ADSB else known.lag_s
+    apart_s = settings.clocks.apart_s.get(uav, 0.0)
+    lag = lag[0] - apart_s, lag[1] + apart_s
     turn_degps2 = settings.center.turn_acceleration_max_degps2
     return Assumed(limits, lag, known.turn_degps2 if turn_degps2 is None else turn_degps2)
 

@@ -19,6 +19,8 @@ class ClockSettings(Section):
         trust_gnss        believe SYSTEM_TIME where it passes its checks
         node_utc_error_s  bound on the error of the node's own UTC, seconds; needed by
                           ``trust_gnss``
+        apart_s           most that all times of a UAV may be off beside those of others, seconds,
+                          by its id: a replay of vehicles' own logs says it of each
 
     By how much a position is older or newer than its own stamp is ``observer.lag_s``. See
     docs/math.md 6.
@@ -29,6 +31,7 @@ class ClockSettings(Section):
     window_s: Annotated[float, Field(ge=5, le=3600)] = 60.0
     trust_gnss: bool = False
     node_utc_error_s: Annotated[float, Field(ge=0, le=10)] | None = None
+    apart_s: dict[str, Annotated[float, Field(ge=0, le=10)]] = Field(default_factory=dict)
 
 
 Lag = tuple[

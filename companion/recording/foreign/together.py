@@ -41,6 +41,17 @@ class Vehicle(NamedTuple):
     source: Source
     log: Onboard
 
+    @property
+    def apart_s(self) -> float:
+        """Most that its times may be off beside another log's; 0 where they are taken as they are.
+
+        Receivers deliver up to ``RECEIVER_LAG_S`` late: each is half of that off its middle.
+        """
+        clock = self.log.clock
+        if clock is None or self.kind == "csv":
+            return 0.0
+        return clock.uncertainty_s + RECEIVER_LAG_S / 2
+
     def told(self) -> str:
         """One line for the user: who it is, how well its time is known, what was made up for."""
         clock = self.log.clock

@@ -12,6 +12,7 @@ from support import shared_log
 
 from companion import Pipeline, Settings
 from companion.cli.main import main
+from companion.node.replay import settings_for
 from companion.pipeline.ticks import with_ticks
 from companion.recording.reader import (
     LogError,
@@ -133,6 +134,46 @@ def test_the_truth_in_the_logs_is_used(aeroplane: Path, carrier: Path) -> None:
     place, _ = flight.truth.at(flight.made_ns)
     error_m = np.linalg.norm(place - flight.position_ned_m, axis=1)
     assert np.nanmedian(error_m) < 1.5 and np.isfinite(error_m).mean() > 0.95
+
+
+def test_how_well_logs_lie_beside_one_another_is_in_the_settings_of_their_replay(
+    aeroplane: Path, carrier: Path, tmp_path: Path
+) -> None:
+    """0.001 s by the fixes and half of what receivers differ; a log alone lies beside none."""
+    config = tmp_path / "settings.toml"
+    config.write_text('[clocks.apart_s]\n"5:1" = 0.02\n')
+    both = [aeroplane, carrier]
+    assert settings_for(both, None, "5:1").clocks.apart_s == {"1:1": 0.101, "5:1": 0.101}
+    assert settings_for(both, config, "5:1").clocks.apart_s == {"1:1": 0.101, "5:1": 0.02}
+    assert settings_for([aeroplane], None, "home").clocks.apart_s == {}
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_timeline_that_is_off_is_in_the_bounds(aeroplane: Path, carrier: Path, sign: int) -> None:
+    """An adversary moves all of one vehicle's log by as much as is said: 0.8 s at 22 m/s."""
+    off_ns, tracks_at = sign * 800_000_000, {}
+    for name, apart_s, moved_ns in (("true", {}, 0), ("bare", {}, off_ns),
+                                    ("said", {"1:1": 0.8}, off_ns)):  # fmt: skip
+        place = {"center": {"source": "47.3977419,8.5455937,488.1"}, "clocks": {"apart_s": apart_s}}
+        pipeline = Pipeline(Settings().override(**place))
+        events = [
+            event._replace(t_ns=event.t_ns + moved_ns)
+            for event in read_flight([aeroplane])
+            if isinstance(event, Frame)
+        ]
+        middle_ns = events[len(events) // 2].t_ns - moved_ns
+        for event in events:
+            if event.t_ns > middle_ns:
+                break
+            pipeline.step(event)
+        (tracks_at[name],) = pipeline.tracks(middle_ns, middle_ns)
+    off_m = {
+        name: np.linalg.norm(track.position_ned_m - tracks_at["true"].position_ned_m)
+        for name, track in tracks_at.items()
+    }
+    assert off_m["bare"] > tracks_at["bare"].bound_m
+    assert off_m["said"] <= tracks_at["said"].bound_m
+    assert off_m["said"] == pytest.approx(off_m["bare"], rel=0.01)  # the estimate is the same
 
 
 # --- the same flight in another format ------------------------------------------------------------

@@ -14,6 +14,7 @@ _UNITS: Final = {
     "observer.position_noise_m": "m",
     "clocks.drift_max_ppm": "ppm",
     "center.turn_acceleration_max_degps2": "°/s²",
+    "center.attitude_bound_deg": "°",
 }
 SILENT_NS: Final = 60_000_000_000
 """Time for which a change of a clock or link is not told again."""
@@ -86,6 +87,11 @@ def _said(one: Refuted) -> str:
         return (
             f"the receiver of {one.uav} states {one.limit:.2g} m, but strays by {one.proven:.2g} m "
             f"from its velocities ({one.setting}): {one.raised_to:.2g} m is assumed now"
+        )
+    if one.setting == "center.attitude_bound_deg":
+        return (
+            f"the attitude of {one.uav} is taken to be off by up to {one.raised_to:.0f}°, not "
+            f"{one.limit:.3g} ({one.setting}): its estimator doubts it or its compass"
         )
     return (
         f"{one.uav} does {one.proven:.3g} {_UNITS[one.setting]}, more than {one.setting}"

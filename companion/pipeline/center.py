@@ -25,6 +25,7 @@ from companion.values import (
     Attitude,
     Carrier,
     Estimate,
+    EstimatorStatus,
     Fix,
     Notice,
     Refuted,
@@ -39,6 +40,8 @@ HOME_SETTLES_S: Final = 120.0
 HOME_HEIGHT_M: Final = 20.0
 """Least height by which the first one must have been wrong."""
 
+AGAIN: Final = 1.25
+"""Multiple of the bound on attitudes that was told last above which it is told again."""
 PASSED_LEAST: Final = 4
 """Attitudes that must go on before the newest to take its place."""
 PASSED_NS: Final = 500_000_000
@@ -72,7 +75,9 @@ class Center:
         self._attitude: tuple[int, Attitude] | None = None  # sender's time, attitude
         self._turns = carrier.Turns()
         self._passed: _Run | None = None  # attitudes that were stamped before the newest
-        self._attitude_bound_rad = math.radians(settings.center.attitude_bound_deg)
+        self._least_bound_rad = math.radians(settings.center.attitude_bound_deg)
+        self._estimator: EstimatorStatus | None = None
+        self._doubted_rad = self._least_bound_rad  # the most that was told
         self._attitude_kept_s = settings.tracks.coasting_s
         self._accuracy_factor = assembly.noise(settings).factor
         self._geoid_m = settings.observer.geoid_m
@@ -145,6 +150,22 @@ class Center:
         self._attitude = placed.sender_ns, placed.attitude
         return self._turns.look(placed.attitude, placed.sender_ns, turn_degps2)
 
+    @property
+    def attitude_bound_rad(self) -> float:
+        """The bound on reported attitudes of the carrier."""
+        return carrier.reported_bound_rad(self._estimator, self._least_bound_rad)
+
+    def trust(self, status: EstimatorStatus) -> Refuted | None:
+        """Take in what the carrier's estimator says of its attitude. Returns it if it is news."""
+        self._estimator = status
+        if self.attitude_bound_rad <= AGAIN * self._doubted_rad:
+            return None
+        self._doubted_rad = self.attitude_bound_rad
+        least_deg, doubted_deg = map(math.degrees, (self._least_bound_rad, self._doubted_rad))
+        name = "center.attitude_bound_deg"
+        uav = str(status.source)
+        return Refuted(status.t_ns, uav, name, least_deg, doubted_deg, doubted_deg)
+
     def _goes_on_before(self, placed: PlacedAttitude) -> bool:
         """Whether attitudes go on at their pace before the newest, which none has followed.
 
@@ -165,6 +186,7 @@ class Center:
         """Drop the carrier's attitude if the carrier was restarted: its stamps mean nothing now."""
         if uav == self.vehicle:
             self._attitude = None
+            self._estimator = None
             self._passed = None
             self._turns = carrier.Turns()
 
@@ -238,6 +260,6 @@ class Center:
         if now.sender_ns - made_ns > self._attitude_kept_s * 1e9:
             return f"the attitude of the carrier {self.vehicle} is too old"
         turn_degps2 = self._turns.limit_degps2(turn_degps2, at.sender_ns)
-        bounds = carrier.AttitudeBounds(self._attitude_bound_rad, math.radians(turn_degps2))
+        bounds = carrier.AttitudeBounds(self.attitude_bound_rad, math.radians(turn_degps2))
         since_ns = at.sender_ns - made_ns
         return carrier.moving(self.local, track, newest, attitude, since_ns, at.bound_s, bounds)

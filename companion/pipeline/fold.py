@@ -11,7 +11,6 @@ and a relayed aircraft's report also goes to ``targets``, which returns nothing.
 ``fleet`` for the tracks that ``targets`` wants and ``center`` for the array, and aims the beams.
 """
 
-import math
 from collections import Counter
 from collections.abc import Iterable
 from typing import Final
@@ -36,6 +35,7 @@ from companion.tracking.geodesy import LocalFrame
 from companion.values import (
     Carrier,
     Estimate,
+    EstimatorStatus,
     Event,
     FloatArray,
     Frame,
@@ -128,6 +128,9 @@ class Pipeline:
             turn_degps2 = self.senders.assumed(str(frame.source)).turn_degps2
             refuted = self.center.turn(heard.message, turn_degps2)
             said += self.assumptions.told([] if refuted is None else [refuted])
+        elif isinstance(heard.message, EstimatorStatus):
+            refuted = self.center.trust(heard.message)
+            said += self.assumptions.told([] if refuted is None else [refuted])
         return said
 
     def _changed(self, t_ns: int, sender: str, change: ClockChange) -> list[Output]:
@@ -194,8 +197,7 @@ class Pipeline:
     def _evidence(self, uav: str) -> Evidence:
         clock = self.clock_estimate(uav)
         assumed = clock is not None and clock.guarantee is Guarantee.ASSUMED
-        attitude_bound_rad = math.radians(self.settings.center.attitude_bound_deg)
-        return Evidence(assumed, self.refusals.unheard(uav), attitude_bound_rad)
+        return Evidence(assumed, self.refusals.unheard(uav), self.center.attitude_bound_rad)
 
     def _drop_silent(self, now_ns: int) -> list[Notice]:
         """Drop tracks that have been silent for long, so that they take no more memory or time."""

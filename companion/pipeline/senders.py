@@ -25,6 +25,7 @@ from companion.tracking import noise
 from companion.values import (
     AdsbVehicle,
     Attitude,
+    EstimatorStatus,
     Frame,
     GnssStatus,
     Limits,
@@ -98,7 +99,7 @@ class Heard:
     change     what the frame showed of a change of its sender's clock; None where it showed none
     """
 
-    message: PlacedReport | PlacedAttitude | None = None
+    message: PlacedReport | PlacedAttitude | EstimatorStatus | None = None
     said: tuple[Notice | Rejection, ...] = ()
     restarted: str | None = None
     change: ClockChange | None = None
@@ -158,6 +159,9 @@ class Senders:
                 return self._remote_id(frame, message)
             case Attitude():
                 return self._attitude(message)
+            case EstimatorStatus():
+                carries = message.source == self._carrier_source
+                return Heard(message) if carries else NOTHING
             case None:
                 return NOTHING
             case _:

@@ -78,7 +78,8 @@ def _center_text(text: str) -> str:
 class CenterSettings(Section):
     """What carries the array. The ``run`` command refuses to start without it.
 
-    ``attitude_bound_deg`` bounds the angular error of a vehicle's attitude, mounting included;
+    ``attitude_bound_deg`` bounds the angular error of a vehicle's attitude, mounting included; it
+    is raised while its estimator contradicts its compass or does not stand by its attitude;
     ``turn_acceleration_max_degps2`` its angular acceleration since its newest attitude; by its type
     (HEARTBEAT) unless given, and raised where reported rates refute it.
     Autopilots' headings are off by a degree or more (simulated: 1.1 degrees in the median;

@@ -11,7 +11,15 @@ import numpy as np
 
 from companion.tracking.geodesy import LocalFrame
 from companion.tracking.limits import MOST, Raised
-from companion.values import Attitude, Carrier, Fix, FloatArray, Refuted, Track
+from companion.values import (
+    Attitude,
+    Carrier,
+    EstimatorStatus,
+    Fix,
+    FloatArray,
+    Refuted,
+    Track,
+)
 
 
 def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> FloatArray:
@@ -96,6 +104,26 @@ class AttitudeBounds:
         furthest_s = abs(age_s) + doubt_s
         turned = self.acceleration_radps2 * furthest_s * furthest_s / 2.0
         return min(math.pi, self.attitude_rad + rate_radps * doubt_s + turned)
+
+
+COMPASS_RAD: Final = 0.6
+"""What compass and attitude contradict one another by at a ratio of 1, as an angle.
+
+ArduPilot accepts 3 deviations of 0.05 gauss; of the Earth's field 0.25 are level (0.15 to 0.4).
+"""
+
+
+def reported_bound_rad(status: EstimatorStatus | None, least_rad: float) -> float:
+    """The bound on reported attitudes, by what the autopilot's estimator says of them.
+
+    A ratio shows what compass and gyroscopes disagree by and nothing of what they err by alike, so
+    it never makes the bound less (docs/math.md 5.3).
+    """
+    if status is None:
+        return least_rad
+    if not status.knows_attitude:
+        return math.pi
+    return min(math.pi, max(least_rad, COMPASS_RAD * status.compass_ratio))
 
 
 RATES_APART_S: Final = 0.05

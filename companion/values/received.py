@@ -262,4 +262,28 @@ class SystemTime:
     boot_ms: int
 
 
-Message = Report | AdsbVehicle | RemoteId | Attitude | Presence | GnssStatus | SystemTime
+@dataclass(frozen=True, slots=True)
+class EstimatorStatus:
+    """What an autopilot's estimator says of its attitude (EKF_STATUS_REPORT).
+
+    knows_attitude  whether it stands by its attitude at all
+    compass_ratio   how far compass and attitude contradict one another, over what the estimator
+                    accepts: beyond 1 it refuses its compass
+    """
+
+    t_ns: int
+    source: Source
+    knows_attitude: bool
+    compass_ratio: float
+
+
+Message = (
+    Report
+    | AdsbVehicle
+    | RemoteId
+    | Attitude
+    | Presence
+    | GnssStatus
+    | SystemTime
+    | EstimatorStatus
+)

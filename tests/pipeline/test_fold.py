@@ -334,6 +334,41 @@ def test_a_carrier_that_restarts_has_no_attitude_until_it_sends_one() -> None:
     assert bearing_deg(updated(pipeline, 7.7)) == pytest.approx(-90, abs=0.02)
 
 
+def estimator(t_s: float, ratio: float, flags: int = 831, source: str = "5:1") -> Frame:
+    message = dialect.MAVLink_ekf_status_report_message(flags, 0.01, 0.02, 0.03, ratio, 0.04)
+    return sent(t_s, source, message)
+
+
+def test_the_attitude_is_as_sure_as_its_estimator_is() -> None:
+    """A ratio makes the bound wider, never narrower; without an attitude every one is possible."""
+    held = {"source": "5:1", "turn_acceleration_max_degps2": 0.0}
+    pipeline, at_s = Pipeline(settings().override(center=held)), 0.1
+
+    def bound_deg(*frames: Frame) -> float:
+        nonlocal at_s
+        said = run(pipeline, [position(at_s, "5:1"), attitude(at_s, "5:1"), *frames])
+        notices.extend(one for one in said if isinstance(one, Notice) and "estimator" in one.text)
+        at_s += 0.1
+        carrier = updated(pipeline, at_s - 0.1).carrier
+        assert carrier is not None
+        return math.degrees(carrier.attitude_bound_rad)
+
+    notices: list[Notice] = []
+    assert bound_deg() == pytest.approx(3.0)
+    assert bound_deg(estimator(at_s, 0.03)) == pytest.approx(3.0)
+    assert bound_deg(estimator(at_s, 0.9, source="1:1")) == pytest.approx(3.0)
+    assert notices == []
+    assert bound_deg(estimator(at_s, 0.5)) == pytest.approx(math.degrees(0.3))
+    assert bound_deg(estimator(at_s, 0.4)) == pytest.approx(math.degrees(0.24))
+    assert len(notices) == 1
+    assert "17°" in notices[0].text
+    assert bound_deg(estimator(at_s, 0.0)) == pytest.approx(3.0)
+    for flags in (830, 831 | 1024):
+        assert bound_deg(estimator(at_s, 0.0, flags)) == 180.0
+    assert len(notices) == 2
+    assert bound_deg(estimator(at_s, 0.0)) == pytest.approx(3.0)
+
+
 def test_the_carrier_is_never_its_own_target() -> None:
     pipeline = Pipeline(settings(beams={"targets": "all"}))
     run(pipeline, [position(0, "5:1"), attitude(0, "5:1"), position(0, "1:1", (99, 0, 0))])

@@ -16,6 +16,7 @@ from companion.values import (
     AdsbVehicle,
     AltitudeDatum,
     Attitude,
+    EstimatorStatus,
     Frame,
     GnssStatus,
     Message,
@@ -32,6 +33,7 @@ SYSTEM_TIME: Final = 2
 GPS_RAW_INT: Final = 24
 ATTITUDE: Final = 30
 GLOBAL_POSITION_INT: Final = 33
+EKF_STATUS_REPORT: Final = 193
 
 NULL_ISLAND_RADIUS_M: Final = 5000.0
 """Distance from 0 N 0 E within which no position is believed.
@@ -233,6 +235,19 @@ def _system_time(frame: Frame) -> SystemTime:
     return SystemTime(frame.t_ns, frame.source, unix_us or None, boot_ms)
 
 
+_EKF_STATUS_REPORT = struct.Struct("<fffffH")
+_KNOWS_ATTITUDE, _UNINITIALIZED = 1, 1024
+
+
+def _ekf_status_report(frame: Frame) -> EstimatorStatus:
+    """Decode what ArduPilot's estimator says of its attitude; ``compass_variance`` is a ratio."""
+    *_, compass_ratio, _, flags = unpack(frame, _EKF_STATUS_REPORT)
+    if not math.isfinite(compass_ratio) or compass_ratio < 0.0:
+        raise _RefusedError(Reason.MALFORMED, "a compass ratio that is none")
+    knows = bool(flags & _KNOWS_ATTITUDE) and not flags & _UNINITIALIZED
+    return EstimatorStatus(frame.t_ns, frame.source, knows, compass_ratio)
+
+
 def _remote_id(frame: Frame) -> RemoteId | None:
     try:
         return remote_id.remote_id(frame)
@@ -253,6 +268,7 @@ _DECODERS: Final[dict[int, Callable[[Frame], Message | None]]] = {
     GPS_RAW_INT: _gps_raw_int,
     ATTITUDE: _attitude,
     GLOBAL_POSITION_INT: _global_position_int,
+    EKF_STATUS_REPORT: _ekf_status_report,
     ADSB_VEHICLE: _adsb_vehicle,
     cot_link.TUNNEL: _tunnel,
     **dict.fromkeys(remote_id.READ, _remote_id),

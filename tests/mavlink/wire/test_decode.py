@@ -18,6 +18,7 @@ from companion.values import (
     AdsbVehicle,
     AltitudeDatum,
     Attitude,
+    EstimatorStatus,
     Frame,
     GnssStatus,
     Message,
@@ -146,6 +147,9 @@ def expected(m: dialect.MAVLink_message, t_ns: int, link: str) -> Message | None
         case "ATTITUDE":
             rates = (m.rollspeed, m.pitchspeed, m.yawspeed)
             return Attitude(t_ns, source, m.time_boot_ms, m.roll, m.pitch, m.yaw, *rates)
+        case "EKF_STATUS_REPORT":
+            knows = m.flags & dialect.EKF_ATTITUDE != 0
+            return EstimatorStatus(t_ns, source, knows, m.compass_variance)
         case "GPS_RAW_INT":
             accuracies = [value / 1000 or None for value in (m.h_acc, m.v_acc, m.vel_acc)]
             return GnssStatus(
@@ -196,6 +200,7 @@ def test_the_whole_cut_equals_pymavlink(cut_frames: list[bytes]) -> None:
         "GPS_RAW_INT": 625,
         "HEARTBEAT": 250,
         "SYSTEM_TIME": 125,
+        "EKF_STATUS_REPORT": 125,
         "ADSB_VEHICLE": 125,
     }
 
@@ -471,6 +476,25 @@ def test_version_1_reads_as_version_2() -> None:
     assert decode(sent_v1(message, 28)) == decode(sent(message))
 
 
+@pytest.mark.parametrize(
+    ("flags", "knows"), [(0, False), (1, True), (831, True), (830, False), (831 | 1024, False)]
+)
+def test_an_estimator_knows_its_attitude_or_not(flags: int, knows: bool) -> None:
+    message = dialect.MAVLink_ekf_status_report_message(flags, 0.1, 0.2, 0.3, 0.4, 0.5)
+    found = decode(sent(message))
+    assert isinstance(found, EstimatorStatus)
+    assert found.knows_attitude is knows
+    assert found.compass_ratio == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize("ratio", [math.nan, math.inf, -0.1])
+def test_a_compass_ratio_that_is_none_is_malformed(ratio: float) -> None:
+    message = dialect.MAVLink_ekf_status_report_message(831, 0.1, 0.2, 0.3, ratio, 0.5)
+    found = decode(sent(message))
+    assert isinstance(found, Rejection)
+    assert found.reason is Reason.MALFORMED
+
+
 @pytest.mark.parametrize("field", ["h_acc", "v_acc", "vel_acc"])
 @pytest.mark.parametrize("unknown", [0, 0xFFFF_FFFF])
 def test_an_accuracy_of_0_or_all_ones_is_unknown(field: str, unknown: int) -> None:
@@ -528,4 +552,4 @@ def test_armed_is_one_bit(base_mode: int, armed: bool) -> None:
 
 def test_other_messages_are_nobodys() -> None:
     assert decode(sent(dialect.MAVLink_ping_message(1, 2, 3, 4))) is None
-    assert {0, 2, 24, 30, 33, 246, 385} | REMOTE_ID == DECODED
+    assert {0, 2, 24, 30, 33, 193, 246, 385} | REMOTE_ID == DECODED

@@ -54,6 +54,7 @@ from companion.studies.prediction.spectral import SNR_DB
 from companion.studies.prediction.tuning import DENSITIES, Case, tune
 from companion.studies.running import fan_out
 from companion.studies.truth import vehicles
+from companion.studies.truth.trajectory import Kind
 from companion.studies.truth.vehicles import Flown
 from companion.values import UserError
 
@@ -170,7 +171,8 @@ def compare(
     for (flight, delivery, asked), name in product_of(cases, (*MODELS, *makes)):
         progress(f"{where}: {name} on {flight.uav}")
         if name in MODELS:
-            asks = product(setting.settings, name, flight.uav, flown.origin)
+            settings = as_true(setting.settings, flight.truth.kind)
+            asks = product(settings, name, flight.uav, flown.origin)
             given = product_answers(asks, delivery.events, asked)
         else:
             given = answers(makes[name](), delivery.observed, asked)
@@ -183,6 +185,14 @@ def compare(
                 counts = violations.counted(asked, given, lead)
                 rows.append(head | figures | counts | {"truth": flight.truth.kind})
     return Compared(flown.log, flown.center, link, tuple(rows), tuned)
+
+
+def as_true(settings: Settings, kind: Kind) -> Settings:
+    """The settings under which the product is judged by a kind of truth.
+
+    Where the truth is made of the reports themselves, they do not lag behind it.
+    """
+    return settings.override(observer={"lag_s": (0.0, 0.0)}) if kind == "reports" else settings
 
 
 def rivals(setting: PredictionStudy, tuned: Mapping[str, Tuning]) -> dict[str, Make]:

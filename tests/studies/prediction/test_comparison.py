@@ -24,6 +24,7 @@ from companion.studies.prediction.comparison import (
     LEADS_S,
     Compared,
     PredictionStudy,
+    as_true,
     compare,
 )
 from companion.studies.prediction.delivery import deliver
@@ -180,6 +181,14 @@ def test_a_straight_flight_is_all_latency(straight_flight: Callable[..., Flight]
             assert rms["dead-reckoning-arrival", 0.0] > 0.6 * speed_mps
         assert rms["hold", 1.0] > speed_mps
         assert all(row["violations"] in (None, 0) for row in found.rows)
+
+
+def test_a_truth_that_is_made_of_reports_does_not_lag_behind_them() -> None:
+    given = Settings()
+    assert as_true(given, "SIM_STATE") is given
+    reports = as_true(given, "reports")
+    assert assembly.assumed(reports, "1:1", 2, 3).lag_s == (0.0, 0.0)
+    assert assembly.assumed(given, "1:1", 2, 3).lag_s != (0.0, 0.0)
 
 
 def test_the_grid_is_searched(straight_flight: Callable[..., Flight]) -> None:

@@ -3,18 +3,17 @@
 The adversary chooses what nothing excludes: accelerations of the greatest size, errors of reports
 on the edge of their bounds, the lag of positions within its interval, a clock that drifts to and
 fro, how long every frame takes, and how long the two ways of every TIMESYNC answer take.
-``Flight`` makes a flight of numbers from 0 to 1, so that a search can turn them; ``worst`` says
-how near to its bound any answer came, and what good report was refused.
+``Flight`` makes a flight of numbers from 0 to 1, so that a search (``adversary_search``) can turn
+them; ``worst`` says how near to its bound any answer came, and what good report was refused.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import pymap3d
-from numpy.random import Generator
 from pymavlink.dialects.v20 import all as dialect
 
 from companion.pipeline.fold import Pipeline
@@ -278,24 +277,3 @@ def worst(flight: Flight) -> Worst:
             if isinstance(said, Notice) and "limit" in said.text:
                 refuted.append(said.text)
     return Worst(ratio, outside, at, queries, tuple(refused), tuple(refuted))
-
-
-def search(
-    harm: Callable[[FloatArray, int], float], size: int, rng: Generator, flights: int
-) -> None:
-    """Try flights one after the other: new ones, and changes of the worst so far.
-
-    harm     how bad a flight is by its genes, (``size``,), and a seed
-    """
-    best: list[tuple[float, FloatArray]] = []
-    for seed in range(flights):
-        if len(best) < 6 or rng.random() < 0.35:
-            genes = rng.random(size)
-            genes = np.where(rng.random(size) < 0.5, np.round(genes), genes)
-        else:
-            _, parent = best[int(rng.integers(len(best)))]
-            changed = rng.random(size) < rng.choice([0.02, 0.1, 0.3])
-            genes = np.where(changed, rng.random(size), parent + 0.05 * rng.normal(size=size))
-            genes = np.clip(genes, 0.0, 1.0)
-        best.append((harm(genes, seed), genes))
-        best = sorted(best, key=lambda one: -one[0])[:12]

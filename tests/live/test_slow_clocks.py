@@ -112,6 +112,6 @@ def test_clocks_that_run_slow_for_seconds_break_no_bound(
     assert len(found["ratios"]) > 500
     assert max(found["ratios"]) <= 1.0
     assert np.median(found["clocks_s"]) <= 0.05
-    assert np.median(found["bounds_m"]) <= 3.0
+    assert figures["p99 bound, m"] <= 3.0
     if not busy:
         assert figures["p99 clock, s"] <= 0.05

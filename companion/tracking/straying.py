@@ -62,12 +62,15 @@ class Straying:
             return None
         self._newest = fix
         if before is None or fix.sender_ns - before.sender_ns > APART_NS:
-            self._seen.clear()
-            self._seen.append((fix.sender_ns, 0.0, 0.0, 0.0))
+            self._begin(fix)
             return None
-        strayed_m, unseen_m = self._strays(before, fix, acceleration_mps2)
         stated_m = fix.noise.horizontal_m / factor
         lag_m = 2.0 * fix.noise.time_s * math.hypot(*velocity)
+        north_m, east_m, unseen_m = _aside(before, fix, acceleration_mps2)
+        if math.hypot(north_m, east_m) > 2.0 * fix.noise.horizontal_m + lag_m + unseen_m:
+            self._begin(fix)  # a leap, which the gate judges
+            return None
+        strayed_m, unseen_m = self._strays(fix.sender_ns, north_m, east_m, unseen_m)
         if strayed_m <= max(STRAYS_M, math.sqrt(2.0) * stated_m) + lag_m + UNSEEN * unseen_m:
             return None
         if strayed_m <= AGAIN * self._strayed_m:
@@ -77,25 +80,21 @@ class Straying:
         name = "observer.follow_accuracy"
         return Refuted(fix.arrival_ns, fix.uav, name, stated_m, strayed_m, to_m)
 
-    def _strays(self, before: Fix, fix: Fix, acceleration_mps2: float) -> tuple[float, float]:
-        """How far the newest position is off the way from the one some seconds before, in metres;
-        and how far the way may be another one, since no velocity is known between two reports.
+    def _begin(self, fix: Fix) -> None:
+        self._seen.clear()
+        self._seen.append((fix.sender_ns, 0.0, 0.0, 0.0))
 
-        In the plane: heights come from a barometer.
-        """
-        assert before.velocity_ned_mps is not None and fix.velocity_ned_mps is not None
-        half_s = (fix.sender_ns - before.sender_ns) * 0.5e-9
-        (n, e, _), (from_n, from_e, _) = fix.position_ned_m, before.position_ned_m
-        (v_n, v_e, _), (was_n, was_e, _) = fix.velocity_ned_mps, before.velocity_ned_mps
+    def _strays(
+        self, sender_ns: int, north_m: float, east_m: float, unseen_m: float
+    ) -> tuple[float, float]:
+        """How far the newest position is off the way from the one some seconds before, in metres;
+        and how far that way may be another one. Takes what ``_aside`` says of the newest."""
         seen = self._seen
         _, north, east, unseen_m2 = seen[-1]
-        north += n - from_n - half_s * (v_n + was_n)
-        east += e - from_e - half_s * (v_e + was_e)
-        unseen_m2 += (acceleration_mps2 * half_s**2) ** 2  # away, and back again, at full power
-        seen.append((fix.sender_ns, north, east, unseen_m2))
-        while fix.sender_ns - seen[0][0] > WITHIN_NS:
+        seen.append((sender_ns, north + north_m, east + east_m, unseen_m2 + unseen_m**2))
+        while sender_ns - seen[0][0] > WITHIN_NS:
             seen.popleft()
-        _, north_0, east_0, before_m2 = seen[0]
+        (_, north_0, east_0, before_m2), (_, north, east, unseen_m2) = seen[0], seen[-1]
         return math.hypot(north - north_0, east - east_0), math.sqrt(unseen_m2 - before_m2)
 
     def _rests_on_statement(self, noise: ReportNoise) -> bool:
@@ -118,3 +117,20 @@ class Straying:
         if self._strayed_m:
             return STRAYED_ERROR * noise.horizontal_m
         return min(noise.apart_m, noise.vertical_m) or COMMON_ERROR * noise.position_m
+
+
+def _aside(before: Fix, fix: Fix, acceleration_mps2: float) -> tuple[float, float, float]:
+    """How far a position is off the way from the one before it, north and east in metres; and how
+    far that way may be another one, since no velocity is known between two reports.
+
+    In the plane: heights come from a barometer.
+    """
+    assert before.velocity_ned_mps is not None and fix.velocity_ned_mps is not None
+    half_s = (fix.sender_ns - before.sender_ns) * 0.5e-9
+    (north, east, _), (from_north, from_east, _) = fix.position_ned_m, before.position_ned_m
+    (v_north, v_east, _), (was_north, was_east, _) = fix.velocity_ned_mps, before.velocity_ned_mps
+    return (
+        north - from_north - half_s * (v_north + was_north),
+        east - from_east - half_s * (v_east + was_east),
+        acceleration_mps2 * half_s**2,  # away, and back again, at full power
+    )

@@ -47,7 +47,9 @@ def test_counts_are_those_of_pymavlink(tmp_path: Path) -> None:
     assert summary["frames"] == frames == 116_764
     assert placed.pop("5:1") > 0
     telemetry = {uav: n for uav, n in summary["reports"].items() if not uav.startswith("icao:")}
-    assert telemetry == dict(placed)
+    waited = {uav: placed[uav] - n for uav, n in telemetry.items()}  # for a receiver that vouches
+    assert all(0 <= n <= 5 for n in waited.values())
+    assert sum(waited.values()) <= summary["rejected"].get("no-fix", 0)
     assert set(telemetry) == {"1:1", "2:1", "3:1", "4:1"}
     assert set(summary["uavs"]) == set(summary["reports"])
     assert summary["rejected"]["zero-position"] == zero.total() == 255

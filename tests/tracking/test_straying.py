@@ -103,6 +103,11 @@ def test_what_is_flown_between_two_reports_is_no_fault_of_the_receiver(fix: Make
     assert [found for one in gusty() if (found := careless.look(one, 0.0))]
 
 
+def test_a_leap_is_left_to_the_gate(fix: MakeFix) -> None:
+    """It says nothing against the receiver, there nor back again."""
+    assert told(Straying(SETTINGS), flown(fix, lambda t_s: (25.0 * (20 < t_s < 22), 0.0))) == []
+
+
 def test_reports_that_are_far_apart_tell_nothing(fix: MakeFix) -> None:
     assert told(Straying(SETTINGS), flown(fix, wave(3.0, 15), step_s=0.8)) == []
 

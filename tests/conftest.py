@@ -17,7 +17,7 @@ import pytest
 from figures import FILE, Figures
 from hypothesis import settings
 from soak_table import table  # noqa: F401 - a fixture
-from support import BIN, HANG_S, ROOT, Node, end
+from support import BIN, HANG_S, ROOT, Node, dummy_rotator, end
 
 # How fast this machine is, and what else it does, is no property of the code: no deadlines.
 settings.register_profile("quick", deadline=None, max_examples=25)
@@ -169,6 +169,13 @@ def aeroplane() -> Path:
 def carrier() -> Path:
     """The same of the copter that it circles."""
     return ROOT / "tests" / "data" / "sitl_planes_cut_5.bin"
+
+
+@pytest.fixture
+def rotctld() -> Iterator[int]:
+    """Port of hamlib's rotctld with its dummy rotator."""
+    with dummy_rotator() as port:
+        yield port
 
 
 @pytest.fixture

@@ -5,7 +5,9 @@ import contextlib
 import json
 import os
 import re
+import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -75,6 +77,19 @@ def started(command: Any, **options: Any) -> "Iterator[subprocess.Popen[Any]]":
         yield process
     finally:
         end(process)
+
+
+@contextlib.contextmanager
+def dummy_rotator() -> Iterator[int]:
+    """Port of hamlib's rotctld with its dummy rotator; skips where there is none."""
+    if shutil.which("rotctld") is None:
+        pytest.skip("hamlib's rotctld is not here")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = ["rotctld", "-m", "1", "-T", "127.0.0.1", "-t", str(port)]
+    with started(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL):
+        yield port
 
 
 def line_of(process: "subprocess.Popen[Any]", pipe: IO[Any] | None) -> Any:

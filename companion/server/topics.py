@@ -88,7 +88,7 @@ async def _weights(node: Node) -> Json:
 
 
 async def _records(node: Node) -> Json:
-    """What ``record`` needs of the newest update."""
+    """What ``_record`` needs of the newest update."""
     pipeline = node.pipeline
     update, number = pipeline.last_update, max(pipeline.updates - 1, 0)
     update = update or pipeline.look(node.now_ns())

@@ -138,9 +138,9 @@ class Fleet:
         """The bounds on a report's noise, by what was seen of its receiver, and what is news."""
         if self._settings.noise is None:
             return fix.noise, None
-        known = self._straying.get(fix.uav)
-        if known is None:
-            known = self._straying.setdefault(fix.uav, Straying(self._settings.noise))
+        if fix.uav not in self._straying:
+            self._straying[fix.uav] = Straying(self._settings.noise)
+        known = self._straying[fix.uav]
         found = known.look(fix, acceleration_mps2)
         return known.noise(fix.noise), found
 

@@ -2,12 +2,10 @@
 
 import json
 import re
-import shutil
 import signal
 import socket
 import subprocess
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +14,6 @@ from support import BIN, HANG_S, line_of, started
 
 RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
 EIGHT = "[array]\nelements = 8\nfrequency_hz = 10.5e9\n"
-
-
-@pytest.fixture
-def rotctld() -> Iterator[int]:
-    """Port of hamlib's rotctld with its dummy rotator."""
-    if shutil.which("rotctld") is None:
-        pytest.skip("hamlib's rotctld is not here")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    command = ["rotctld", "-m", "1", "-T", "127.0.0.1", "-t", str(port)]
-    with started(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL):
-        yield port
 
 
 def where_deg(port: int) -> tuple[float, float]:

@@ -5,7 +5,6 @@ import json
 import os
 import re
 import shlex
-import shutil
 import socket
 import subprocess
 from collections import Counter
@@ -16,7 +15,7 @@ from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import all as dialect
-from support import BIN, HANG_S, ROOT, Node, end, started
+from support import BIN, HANG_S, ROOT, Node, dummy_rotator, end, started
 
 from companion.settings.model import Settings
 
@@ -55,13 +54,7 @@ Check = Callable[[subprocess.CompletedProcess[str], dict[str, Any]], None]
 @contextmanager
 def rotator(words: list[str]) -> Iterator[tuple[str, Check]]:
     """Hamlib's own dummy: it has left its rest."""
-    if shutil.which("rotctld") is None:
-        pytest.skip("hamlib's rotctld is not here")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    command = ["rotctld", "-m", "1", "-T", "127.0.0.1", "-t", str(port)]
-    with started(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL):
+    with dummy_rotator() as port:
 
         def check(done: subprocess.CompletedProcess[str], told: dict[str, Any]) -> None:
             with socket.create_connection(("127.0.0.1", port), HANG_S) as line:

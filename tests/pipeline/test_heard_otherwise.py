@@ -245,5 +245,6 @@ def test_made_up_names_take_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
             seen[said.reason if isinstance(said, Rejection) else "used"] += 1
     assert len(fold.senders._clocks) <= CLOCKS_MAX
     assert len(fold.senders._known) <= CLOCKS_MAX
+    assert len(fold.fleet._straying) == len(fold.fleet._refutations)
     assert len(fold.fleet._refutations) == len(fold.fleet.uavs) == seen["used"] == TRACKS_MAX
     assert seen[Reason.TOO_MANY] == 3 * CLOCKS_MAX - TRACKS_MAX

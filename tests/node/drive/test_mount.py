@@ -2,10 +2,8 @@
 follows UAVs over a slow radio, against a mount that points to the newest report."""
 
 import math
-import shutil
 import socket
 import socketserver
-import subprocess
 import threading
 from collections.abc import Iterator
 from typing import Any
@@ -13,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import all as dialect
-from support import HANG_S, started
+from support import HANG_S
 
 from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
 from companion.node.drive.lag import MountLag
@@ -183,19 +181,6 @@ def test_a_mount_is_off_by_half_of_what_one_is_that_follows_reports(
 
 
 # --- hamlib -------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def rotctld() -> Iterator[int]:
-    """Port of hamlib's rotctld with its dummy rotator."""
-    if shutil.which("rotctld") is None:
-        pytest.skip("hamlib's rotctld is not here")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    command = ["rotctld", "-m", "1", "-T", "127.0.0.1", "-t", str(port)]
-    with started(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL):
-        yield port
 
 
 def opened(port: int) -> Rotator:

@@ -59,12 +59,16 @@ class Rotator:
         self._last_deg = self._where_deg()[0]
 
     def apply(self, shot: Shot) -> None:
-        """Point, and note where it points now."""
+        """Note where it points now, and point.
+
+        Asked first: a rotator that begins its motion anew at each command has had the whole time
+        since the one before.
+        """
+        seen_deg = self._where_deg()[0]
+        self._lag.seen(self._now_ns(), math.radians(seen_deg))
         azimuth_deg = self._near(math.degrees(shot.bearing_rad))
         self._point(azimuth_deg, math.degrees(shot.above_rad))
         self._lag.told(self._now_ns(), math.radians(azimuth_deg))
-        seen_deg = self._where_deg()[0]
-        self._lag.seen(self._now_ns(), math.radians(seen_deg))
 
     def rest(self, safe: Safe) -> None:
         """Stop where it is, or go to its park position."""

@@ -287,7 +287,7 @@ BAD = [
     (impurities, BEAMS, "data = open('x')"),
     (impurities, BEAMS, "data = p.read_text()"),
     (impurities, VALUES, "from datetime import datetime\nt = datetime.now()"),
-    (impurities, "companion/tracking/fleet.py", "t = time.time_ns(); import time"),
+    (impurities, "companion/tracking/tracker.py", "t = time.time_ns(); import time"),
     (impurities, "companion/pipeline/fold.py", "import threading"),
     (impurities, "companion/mavlink/wire/framing.py", "import selectors"),
     (impurities, "companion/settings/model.py", "import os"),

@@ -103,14 +103,14 @@ def _unaimed(pipeline: Pipeline, tally: Tally) -> str | None:
     if update is None:
         return "the log is shorter than one update"
     carrier = pipeline.center.vehicle
-    if carrier is not None and carrier not in pipeline.fleet:
+    if carrier is not None and carrier not in pipeline.tracker:
         return f"no position from the carrier {carrier}"
-    if update.unfit is not None and pipeline.fleet.uavs:
+    if update.unfit is not None and pipeline.tracker.uavs:
         return update.unfit
     if update.beams.left_out:
         first = update.beams.left_out[0]
         return f"{first.uav}: {first.reason}"
-    others = [uav for uav in pipeline.fleet.uavs if uav != pipeline.center.vehicle]
+    others = [uav for uav in pipeline.tracker.uavs if uav != pipeline.center.vehicle]
     if others and not any(map(reports_itself, others)):
         return 'only relayed aircraft were heard, and [beams] targets is not "all"'
     if others:

@@ -30,12 +30,12 @@ from companion.settings.files import (
 )
 from companion.settings.model import Settings
 from companion.settings.section import ConfigError
-from companion.tracking.fleet import Ages, Fleet, FleetSettings
 from companion.tracking.gate import GateSettings
 from companion.tracking.limits import LIMITS, Airframe, airframe, lag_s
 from companion.tracking.noise import NoiseSettings
 from companion.tracking.observers.kinematic import KinematicModel, KinematicObserver, scheduled
 from companion.tracking.observers.position import PositionModel, PositionObserver
+from companion.tracking.tracker import Ages, Tracker, TrackerSettings
 from companion.values import (
     FloatArray,
     Limits,
@@ -287,15 +287,15 @@ def clock(settings: Settings) -> SenderClock:
     )
 
 
-def fleet(settings: Settings) -> Fleet:
+def tracker(settings: Settings) -> Tracker:
     """The tracks of all UAVs, with none yet."""
     given, kept, limits = settings.observer, settings.tracks, anyone(settings)
     leads = given.model == "position"
     lead_m = abs(given.feedthrough_s) * limits.speed_mps if leads else 0.0
     feeds = given.model == "kinematic" and given.feed_forward
-    return Fleet(
+    return Tracker(
         observer(settings),
-        FleetSettings(
+        TrackerSettings(
             limits,
             Ages(kept.coasting_s, kept.stale_s, kept.lost_s),
             GateSettings(

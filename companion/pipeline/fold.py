@@ -5,10 +5,10 @@ digest, whoever feeds them. A report passes through these parts in the order of 
 
 1. ``senders``: who sent it, and when it was true; or why it is rejected;
 2. ``center``: where that is in the local frame;
-3. ``fleet``: the track that it belongs to, and the estimate;
+3. ``tracker``: the track that it belongs to, and the estimate;
 
 and a relayed aircraft's report also goes to ``targets``, which returns nothing. A tick asks
-``fleet`` for the tracks that ``targets`` wants and ``center`` for the array, and aims the beams.
+``tracker`` for the tracks that ``targets`` wants and ``center`` for the array, and aims the beams.
 """
 
 from collections import Counter
@@ -80,7 +80,7 @@ class Pipeline:
         self.precoder = assembly.precoder(settings)
         self.center = Center(settings)
         self.senders = Senders(settings, self.center.vehicle)
-        self.fleet = assembly.fleet(settings)
+        self.tracker = assembly.tracker(settings)
         self.targets = Targets(settings, self.center.vehicle)
         self.assumptions = Assumptions()
         site = Site(self.array, self.coverage, *assembly.radio(settings))
@@ -135,25 +135,25 @@ class Pipeline:
 
     def _changed(self, t_ns: int, sender: str, change: ClockChange) -> list[Output]:
         """Tell that a sender's clock, or its link, changed, if it is one that is tracked."""
-        if sender not in self.fleet:
+        if sender not in self.tracker:
             return []
         drift_max_ppm = self.settings.clocks.drift_max_ppm
         return [*self.assumptions.clock(t_ns, sender, change, drift_max_ppm)]
 
     def _report(self, placed: PlacedReport) -> list[Output]:
         report = placed.report
-        begins = self.center.seeks_home or report.uav not in self.fleet
+        begins = self.center.seeks_home or report.uav not in self.tracker
         if begins and not self.senders.vouch(report, self.center.seeks_home):
             return [Rejection(report.t_ns, report.uav, Reason.NO_FIX)]
         fix, begun = self.center.fix(placed)
-        fix, refuted = self.fleet.refuted(fix)
+        fix, refuted = self.tracker.refuted(fix)
         said: list[Output] = [*begun, *self.assumptions.told(refuted)]
-        accepted = self.fleet.accept(fix)
+        accepted = self.tracker.accept(fix)
         if isinstance(accepted, Rejection):
             return [*said, accepted]
         self.refusals.used(fix.uav)
         if not reports_itself(fix.uav):
-            near = self.targets.betters(fix.uav, self.fleet.near(fix.position_ned_m, NEAR_M))
+            near = self.targets.betters(fix.uav, self.tracker.near(fix.position_ned_m, NEAR_M))
             self.targets.compare(fix, self._tracks(near, fix.t_ns, fix.t_ns))
         if accepted.reacquired:
             said += self.assumptions.jumped(accepted)
@@ -167,13 +167,13 @@ class Pipeline:
         moved = self.center.moved(placed, anew)
         if moved is None:
             return []
-        for uav in self.fleet.uavs:
+        for uav in self.tracker.uavs:
             self._restart(uav)
         return [moved]
 
     def _restart(self, uav: str) -> None:
         """Forget the past of a sender."""
-        self.fleet.forget(uav)
+        self.tracker.forget(uav)
         self.assumptions.forget(uav)
         self.refusals.forget(uav)
         self.senders.forget(uav)
@@ -188,7 +188,7 @@ class Pipeline:
         states = {track.uav: track.state for track in self.last_update.tracks}
         if self.center.vehicle is not None:
             now = self.senders.time(self.center.vehicle, now_ns)
-            state = self.fleet.state(self.center.vehicle, now)
+            state = self.tracker.state(self.center.vehicle, now)
             states |= {} if state is None else {self.center.vehicle: state}
         said = self.targets.changes(now_ns, states)
         judged = self.health.judge(self.last_update, self._evidence)
@@ -201,12 +201,12 @@ class Pipeline:
 
     def _drop_silent(self, now_ns: int) -> list[Notice]:
         """Drop tracks that have been silent for long, so that they take no more memory or time."""
-        silent = self.fleet.silent(now_ns, self.settings.tracks.dropped_s)
+        silent = self.tracker.silent(now_ns, self.settings.tracks.dropped_s)
         dropped = self.targets.dropped(now_ns, silent)
         for uav in silent:
             self._restart(uav)
             self.targets.forget(uav)
-        self.senders.forget_clocks(frozenset(self.fleet.uavs), now_ns)
+        self.senders.forget_clocks(frozenset(self.tracker.uavs), now_ns)
         return dropped
 
     # --- looking ----------------------------------------------------------------------------
@@ -215,7 +215,7 @@ class Pipeline:
         """Targets and beams at the actuation delay plus ``lead_s`` from now. Changes nothing."""
         delay_s = self.settings.beams.actuation_delay_s + lead_s
         valid_at_ns = now_ns + round(delay_s * 1e9)
-        tracks = self._tracks(self.targets.among(self.fleet.uavs), now_ns, valid_at_ns)
+        tracks = self._tracks(self.targets.among(self.tracker.uavs), now_ns, valid_at_ns)
         found = self.carrier(now_ns, valid_at_ns)
         known, unfit = (None, found) if isinstance(found, str) else (found, None)
         parts = (self.array, self.precoder, self.coverage, self._steady)
@@ -224,11 +224,13 @@ class Pipeline:
 
     def tracks(self, now_ns: int, valid_at_ns: int) -> list[Track]:
         """Every UAV heard of, target or not, predicted to ``valid_at_ns``; without the carrier."""
-        others = [uav for uav in self.fleet.uavs if uav != self.center.vehicle]
+        others = [uav for uav in self.tracker.uavs if uav != self.center.vehicle]
         return self._tracks(others, now_ns, valid_at_ns)
 
     def _tracks(self, uavs: Iterable[str], now_ns: int, valid_at_ns: int) -> list[Track]:
-        found = (self.fleet.track(uav, now_ns, self.senders.time(uav, valid_at_ns)) for uav in uavs)
+        found = (
+            self.tracker.track(uav, now_ns, self.senders.time(uav, valid_at_ns)) for uav in uavs
+        )
         return [track for track in found if track is not None]
 
     def carrier(self, now_ns: int, valid_at_ns: int) -> Carrier | str:
@@ -237,14 +239,14 @@ class Pipeline:
         if vehicle is None:
             return self.center.station(valid_at_ns)
         at = self.senders.time(vehicle, valid_at_ns)
-        track = self.fleet.track(vehicle, now_ns, at)
+        track = self.tracker.track(vehicle, now_ns, at)
         now = self.senders.time(vehicle, now_ns)
         turn_degps2 = self.senders.assumed(vehicle).turn_degps2
-        return self.center.aboard(track, self.fleet.newest(vehicle), now, at, turn_degps2)
+        return self.center.aboard(track, self.tracker.newest(vehicle), now, at, turn_degps2)
 
     def reporters(self) -> list[Source]:
         """Senders that report their own position, the carrier among them."""
-        return [Source.parse(uav) for uav in filter(reports_itself, self.fleet.uavs)]
+        return [Source.parse(uav) for uav in filter(reports_itself, self.tracker.uavs)]
 
     def clock_estimate(self, uav: str) -> ClockEstimate | None:
         """The state of a UAV's clock; None for a UAV that has none."""

@@ -64,7 +64,7 @@ class DesignView:
         }
 
     def _row(self, pipeline: Pipeline, track: Track, dt_s: float) -> Json:
-        given, newest = self._observer, pipeline.fleet.newest(track.uav)
+        given, newest = self._observer, pipeline.tracker.newest(track.uav)
         has_velocity = newest is not None and newest.velocity_ned_mps is not None
         if self._table is not None:
             bounds = _bounds(given, track.limits)

@@ -45,12 +45,12 @@ class Positions:
             and track.state in KNOWN
             and (message := self._one(pipeline, track)) is not None
         ]
-        for uav in self._boot_ms.keys() - set(pipeline.fleet.uavs):
+        for uav in self._boot_ms.keys() - set(pipeline.tracker.uavs):
             del self._boot_ms[uav]
         return found
 
     def _one(self, pipeline: Pipeline, track: Track) -> Outgoing | None:
-        newest = pipeline.fleet.newest(track.uav)
+        newest = pipeline.tracker.newest(track.uav)
         place = _place(pipeline, track)
         velocity = _velocity_ned_mps(pipeline, track, place)
         if newest is None or velocity is None:
@@ -111,7 +111,7 @@ def events(pipeline: Pipeline, tracks: Iterable[Track], stale_s: float) -> list[
 def _event(pipeline: Pipeline, track: Track, stale_s: float) -> bytes:
     lat_deg, lon_deg, alt_m = place = _place(pipeline, track)
     velocity = _velocity_ned_mps(pipeline, track, place)
-    newest = pipeline.fleet.newest(track.uav)
+    newest = pipeline.tracker.newest(track.uav)
     datum = AltitudeDatum.PRESSURE if newest is None else newest.report.alt_datum
     known = datum is not AltitudeDatum.PRESSURE
     undulation_m, geoid_m = 0.0, 0.0  # the schema's height is above the ellipsoid

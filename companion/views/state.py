@@ -178,7 +178,7 @@ def uav(
     north, east, down = (None, None, None) if offset is None else map(float, offset)
     velocity = vector(track.velocity_ned_mps)
     refused = pipeline.refusals.of(track.uav)
-    newest = pipeline.fleet.newest(track.uav)
+    newest = pipeline.tracker.newest(track.uav)
     cylinder = [track.horizontal_bound_m] * 2 + [track.vertical_bound_m]
     return {
         "id": track.uav,

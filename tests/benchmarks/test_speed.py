@@ -136,7 +136,7 @@ def test_zero_forcing_against_pinv(elements: int, users: int, figures: Figures) 
 
 @pytest.mark.parametrize("uavs", [4, 64])
 def test_a_kinematic_update_with_prediction_and_bound(uavs: int, figures: Figures) -> None:
-    """One report taken in and one prediction made; the cost must not grow with the fleet."""
+    """A report taken in and a prediction made; its cost must not grow with the UAVs."""
     each_us = {count: _update_us(count) for count in (4, uavs)}
     figures.note(f"update and prediction, {uavs} UAVs", each_us[uavs], "us each", "less")
     assert each_us[uavs] < 2 * each_us[4]
@@ -144,7 +144,7 @@ def test_a_kinematic_update_with_prediction_and_bound(uavs: int, figures: Figure
 
 def _update_us(uavs: int) -> float:
     settings = Settings()
-    fleet = assembly.fleet(settings)
+    tracker = assembly.tracker(settings)
     noise = ReportNoise(1.0, 1.0, 1.4, 0.3)
     report = Report(
         0, "bench", "", Source(1, 1), 47.0, 8.0, 500.0, AltitudeDatum.MSL, None, None, None, None,
@@ -162,9 +162,9 @@ def _update_us(uavs: int) -> float:
             position = (5.0 * (t_ns * 1e-9), 0.0, 0.0)
             for uav in range(uavs):
                 name = str(uav)
-                fleet.accept(Fix(name, t_ns, t_ns, t_ns, position, velocity, noise, report))
+                tracker.accept(Fix(name, t_ns, t_ns, t_ns, position, velocity, noise, report))
                 later_ns = t_ns + 50_000_000
-                fleet.track(name, t_ns, SenderTime(later_ns, later_ns, 0.01, 0.01))
+                tracker.track(name, t_ns, SenderTime(later_ns, later_ns, 0.01, 0.01))
         begin_ns += rounds * 100_000_000
 
     (seconds,) = interleaved(fly)

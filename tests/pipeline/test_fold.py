@@ -480,7 +480,7 @@ def test_reports_that_waited_together_are_not_out_of_order() -> None:
         made = position(2.0, "1:1", (100, number, 0), boot_s=100 + 0.1 * number)
         pipeline.step(made)
     assert not pipeline.refusals.total
-    newest = pipeline.fleet.newest("1:1")
+    newest = pipeline.tracker.newest("1:1")
     assert newest is not None
     assert newest.position_ned_m[1] == pytest.approx(4, abs=0.02)
 
@@ -495,7 +495,7 @@ def accuracy(t_s: float, source: str, h_acc_m: float, v_acc_m: float, vel_mps: f
 
 
 def noise_of(pipeline: Pipeline, uav: str) -> tuple[float, float, float]:
-    newest = pipeline.fleet.newest(uav)
+    newest = pipeline.tracker.newest(uav)
     assert newest is not None
     return newest.noise.horizontal_m, newest.noise.vertical_m, newest.noise.velocity_mps
 
@@ -748,7 +748,7 @@ def test_looking_changes_nothing(paper: list[Event]) -> None:
                 watched.look(event.t_ns + number, lead_s)
             watched.tracks(event.t_ns + S, event.t_ns + 2 * S)
             watched.carrier(event.t_ns + S, event.t_ns)
-            watched.fleet.newest("1:1")
+            watched.tracker.newest("1:1")
     assert quiet.digest.hexdigest() == watched.digest.hexdigest()
     assert quiet.updates == watched.updates
     last = watched.last_update
@@ -816,7 +816,7 @@ def test_who_is_denied_is_not_tracked_and_that_is_counted() -> None:
         run(pipeline, [adsb(t_s, (500.0, 0.0, -50.0))])
     now_ns = START_NS + 2 * S
     assert [track.uav for track in pipeline.tracks(now_ns, now_ns)] == ["1:1"]
-    assert pipeline.fleet.newest("5:1") is not None  # the carrier always is
+    assert pipeline.tracker.newest("5:1") is not None  # the carrier always is
     refused = {
         uav: pipeline.refusals.of(uav).counts[Reason.NOT_ALLOWED]
         for uav in pipeline.refusals.senders()

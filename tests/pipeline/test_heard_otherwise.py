@@ -161,7 +161,7 @@ def test_a_broadcast_that_two_receivers_hear_counts_once() -> None:
         assert len(estimates(fold, broadcast(n))) == 1
         (refused,) = fold.step(broadcast(n, late_s=0.3, receiver=10))
         assert isinstance(refused, Rejection) and refused.reason is Reason.DUPLICATE
-    assert list(fold.fleet.uavs) == [RID]
+    assert list(fold.tracker.uavs) == [RID]
 
 
 def test_a_position_that_comes_ten_seconds_late_is_of_ten_seconds_ago() -> None:
@@ -245,6 +245,6 @@ def test_made_up_names_take_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
             seen[said.reason if isinstance(said, Rejection) else "used"] += 1
     assert len(fold.senders._clocks) <= CLOCKS_MAX
     assert len(fold.senders._known) <= CLOCKS_MAX
-    assert len(fold.fleet._straying) == len(fold.fleet._refutations)
-    assert len(fold.fleet._refutations) == len(fold.fleet.uavs) == seen["used"] == TRACKS_MAX
+    assert len(fold.tracker._straying) == len(fold.tracker._refutations)
+    assert len(fold.tracker._refutations) == len(fold.tracker.uavs) == seen["used"] == TRACKS_MAX
     assert seen[Reason.TOO_MANY] == 3 * CLOCKS_MAX - TRACKS_MAX

@@ -12,8 +12,8 @@ from companion.mavlink.trust.admission import Admission
 from companion.pipeline.center import Center
 from companion.pipeline.senders import PlacedAttitude
 from companion.settings.model import Settings
-from companion.tracking.fleet import ESTABLISHED, Fleet, FleetSettings
 from companion.tracking.observers.position import PositionModel, PositionObserver
+from companion.tracking.tracker import ESTABLISHED, Tracker, TrackerSettings
 from companion.values import (
     AltitudeDatum,
     Attitude,
@@ -46,50 +46,50 @@ def fix(uav: str, t_s: float) -> Fix:
 
 
 @pytest.fixture
-def fleet() -> Fleet:
+def tracker() -> Tracker:
     observer = PositionObserver(PositionModel(30.0, 8.0, alpha=0.5))
-    return Fleet(observer, FleetSettings(Limits(30.0, 8.0), most=10))
+    return Tracker(observer, TrackerSettings(Limits(30.0, 8.0), most=10))
 
 
-def flown(fleet: Fleet, uav: str, reports: int, from_s: float) -> None:
+def flown(tracker: Tracker, uav: str, reports: int, from_s: float) -> None:
     for number in range(reports):
-        assert isinstance(fleet.accept(fix(uav, from_s + number * 0.1)), Estimate)
+        assert isinstance(tracker.accept(fix(uav, from_s + number * 0.1)), Estimate)
 
 
-def test_who_was_here_before_is_not_shut_out_by_strangers(fleet: Fleet) -> None:
-    flown(fleet, "1:1", ESTABLISHED, 0.0)
-    fleet.forget("1:1")  # behind a hill for ten minutes
+def test_who_was_here_before_is_not_shut_out_by_strangers(tracker: Tracker) -> None:
+    flown(tracker, "1:1", ESTABLISHED, 0.0)
+    tracker.forget("1:1")  # behind a hill for ten minutes
     for number in range(10):
-        flown(fleet, f"200:{number}", 3, 700.0)
-    refused = fleet.accept(fix("201:1", 701.0))
+        flown(tracker, f"200:{number}", 3, 700.0)
+    refused = tracker.accept(fix("201:1", 701.0))
     assert isinstance(refused, Rejection)
     assert refused.reason is Reason.TOO_MANY
-    assert isinstance(fleet.accept(fix("1:1", 702.0)), Estimate)
-    assert fleet.uavs == [*(f"200:{number}" for number in range(9)), "1:1"]
+    assert isinstance(tracker.accept(fix("1:1", 702.0)), Estimate)
+    assert tracker.uavs == [*(f"200:{number}" for number in range(9)), "1:1"]
 
 
-def test_who_is_tracked_for_long_makes_no_room(fleet: Fleet) -> None:
-    flown(fleet, "1:1", ESTABLISHED, 0.0)
-    fleet.forget("1:1")
+def test_who_is_tracked_for_long_makes_no_room(tracker: Tracker) -> None:
+    flown(tracker, "1:1", ESTABLISHED, 0.0)
+    tracker.forget("1:1")
     for number in range(10):
-        flown(fleet, f"2:{number}", ESTABLISHED, 700.0)
-    assert isinstance(fleet.accept(fix("1:1", 710.0)), Rejection)
+        flown(tracker, f"2:{number}", ESTABLISHED, 700.0)
+    assert isinstance(tracker.accept(fix("1:1", 710.0)), Rejection)
 
 
-def test_strangers_who_are_refused_leave_nothing_behind(fleet: Fleet) -> None:
+def test_strangers_who_are_refused_leave_nothing_behind(tracker: Tracker) -> None:
     for number in range(10):
-        flown(fleet, f"2:{number}", 1, 0.0)
+        flown(tracker, f"2:{number}", 1, 0.0)
     for number in range(1000):
-        stranger, _ = fleet.refuted(fix(f"icao:{number:06X}", 1.0))
-        assert isinstance(fleet.accept(stranger), Rejection)
-    assert len(fleet._refutations) <= 10
+        stranger, _ = tracker.refuted(fix(f"icao:{number:06X}", 1.0))
+        assert isinstance(tracker.accept(stranger), Rejection)
+    assert len(tracker._refutations) <= 10
 
 
-def test_only_as_many_are_remembered_as_are_tracked(fleet: Fleet) -> None:
+def test_only_as_many_are_remembered_as_are_tracked(tracker: Tracker) -> None:
     for number in range(30):
-        flown(fleet, f"3:{number}", ESTABLISHED, 100.0 * number)
-        fleet.forget(f"3:{number}")
-    assert fleet._established == {f"3:{number}" for number in range(10)}  # whoever was first
+        flown(tracker, f"3:{number}", ESTABLISHED, 100.0 * number)
+        tracker.forget(f"3:{number}")
+    assert tracker._established == {f"3:{number}" for number in range(10)}  # whoever was first
 
 
 def test_ids_without_end_do_not_fill_the_lists() -> None:

@@ -1,4 +1,4 @@
-"""Reports, accepted, as the observer and the fleet take them."""
+"""Reports, accepted, as the observer and the tracker take them."""
 
 import math
 from collections.abc import Callable

@@ -199,7 +199,7 @@ def test_where_the_geoid_is_known_heights_are_brought_from_one_to_the_other(datu
     alt_m = fold.geodetic(track.position_ned_m[None])[2][0]
     above_sea_m = there(3.0)[2] if datum == "telemetry" else 620.0 - 48.0
     assert alt_m == pytest.approx(above_sea_m, abs=1.0)
-    newest = fold.fleet.newest(track.uav)
+    newest = fold.tracker.newest(track.uav)
     assert newest is not None and newest.report.alt_datum == "msl"
     event = from_xml(passed_on.events(fold, [track], 10.0)[0])
     assert event.hae_m == pytest.approx(alt_m + 48.0, abs=0.06)

@@ -22,7 +22,7 @@ from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
 from companion.studies.beams.flight import updates
-from companion.studies.link.fleet_predictor import FleetPredictor
+from companion.studies.link.track_predictor import TrackPredictor
 from companion.studies.prediction.baselines import Hold, Observed, Predictor
 from companion.studies.truth import array_truth
 from companion.values import FloatArray, Method, Update, UserError
@@ -190,7 +190,7 @@ def _flown(
 ) -> dict[Positions, FloatArray]:
     """Positions (K, 3) of one UAV at the times of use (K,), by kind."""
     rivals: dict[Positions, Predictor] = {
-        Positions.PREDICTED: FleetPredictor(settings),
+        Positions.PREDICTED: TrackPredictor(settings),
         Positions.HELD: Hold(),
     }
     found: dict[Positions, list[FloatArray]] = {kind: [] for kind in Positions}
@@ -276,7 +276,7 @@ def _seen(
     tracks = [tracks[i] for i in known]
     held = []
     for track in tracks:
-        fix = pipeline.fleet.newest(track.uav)
+        fix = pipeline.tracker.newest(track.uav)
         if fix is None:
             return None
         held.append(replace(track, position_ned_m=np.array(fix.position_ned_m)))

@@ -171,6 +171,6 @@ def test_an_aircraft_that_a_mavlink_relay_hears_too_stays_one() -> None:
     (one,) = [out for out in pipeline.step(first) if isinstance(out, Estimate)]
     (two,) = [out for out in pipeline.step(second) if isinstance(out, Estimate)]
     assert one.fix.uav == two.fix.uav == "icao:4CA2D6"
-    assert list(pipeline.fleet.uavs) == ["icao:4CA2D6"]
+    assert list(pipeline.tracker.uavs) == ["icao:4CA2D6"]
     assert set(pipeline.senders.aircraft.relays("icao:4CA2D6")) == {SENDER, Source(9, 156)}
     assert math.isclose(one.fix.noise.horizontal_m, two.fix.noise.horizontal_m)

@@ -63,7 +63,7 @@ class Ages:
 
 
 @dataclass(frozen=True, slots=True)
-class FleetSettings:
+class TrackerSettings:
     """How tracks are kept.
 
     limits                 what aircraft can do whose reports have no limits of their own
@@ -99,7 +99,7 @@ class _Tracked:
     hindsight: Hindsight = field(default_factory=Hindsight)
 
 
-class Fleet:
+class Tracker:
     """All tracks, by UAV id. ``accept`` takes reports; ``track`` predicts to a time.
 
     Tracks live on each sender's own timeline, so that what a link does to a report's arrival
@@ -107,7 +107,7 @@ class Fleet:
     timeline.
     """
 
-    def __init__(self, observer: Observer[Any], settings: FleetSettings) -> None:
+    def __init__(self, observer: Observer[Any], settings: TrackerSettings) -> None:
         self._observer = observer
         self._settings = settings
         self._tracked: dict[str, _Tracked] = {}

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from companion.tracking.fleet import Ages, Fleet, FleetSettings
 from companion.tracking.gate import GateSettings
 from companion.tracking.observers.kinematic import KinematicModel, KinematicObserver
 from companion.tracking.observers.position import PositionModel, PositionObserver
+from companion.tracking.tracker import Ages, Tracker, TrackerSettings
 from companion.values import (
     Estimate,
     Fix,
@@ -29,7 +29,7 @@ MakeFix = Callable[..., Fix]
 S = 1_000_000_000
 OBSERVER = PositionObserver(PositionModel(30.0, 8.0, alpha=0.5))
 AGES = Ages(2.0, 15.0, 60.0)
-SETTINGS = FleetSettings(Limits(30.0, 8.0), AGES)
+SETTINGS = TrackerSettings(Limits(30.0, 8.0), AGES)
 
 
 def same_time(node_ns: int, bound_s: float = 0.0) -> SenderTime:
@@ -38,8 +38,8 @@ def same_time(node_ns: int, bound_s: float = 0.0) -> SenderTime:
 
 
 @pytest.fixture
-def fleet() -> Fleet:
-    return Fleet(OBSERVER, SETTINGS)
+def tracker() -> Tracker:
+    return Tracker(OBSERVER, SETTINGS)
 
 
 @pytest.mark.parametrize(
@@ -49,25 +49,25 @@ def fleet() -> Fleet:
         (15.001, "stale"), (59.999, "stale"), (60.001, "lost"), (1e6, "lost"),
     ],
 )  # fmt: skip
-def test_tracks_age(fleet: Fleet, fix: MakeFix, age_s: float, state: str) -> None:
-    fleet.accept(fix(100 * S, [0, 0, 0]))
+def test_tracks_age(tracker: Tracker, fix: MakeFix, age_s: float, state: str) -> None:
+    tracker.accept(fix(100 * S, [0, 0, 0]))
     now_ns = 100 * S + round(age_s * 1e9)
-    track = fleet.track("1:1", now_ns, same_time(now_ns + S))
+    track = tracker.track("1:1", now_ns, same_time(now_ns + S))
     assert track is not None
     assert track.state == state
-    assert fleet.state("1:1", same_time(now_ns)) is TrackState(state)
-    assert fleet.state("2:1", same_time(now_ns)) is None
+    assert tracker.state("1:1", same_time(now_ns)) is TrackState(state)
+    assert tracker.state("2:1", same_time(now_ns)) is None
     # The time asked for is another matter.
     assert track.age_s == pytest.approx(age_s + 1.0)
 
 
-def test_a_first_report_is_its_own_estimate(fleet: Fleet, fix: MakeFix) -> None:
-    first = fleet.accept(fix(100 * S, [1, 2, 3], late_ns=S // 4))
+def test_a_first_report_is_its_own_estimate(tracker: Tracker, fix: MakeFix) -> None:
+    first = tracker.accept(fix(100 * S, [1, 2, 3], late_ns=S // 4))
     assert isinstance(first, Estimate)
     assert first.position_ned_m == (1, 2, 3)
     assert (first.innovation_m, first.dt_s) == (None, None)
     assert first.bound_m == pytest.approx(1.5)
-    track = fleet.track("1:1", 100 * S, same_time(100 * S))
+    track = tracker.track("1:1", 100 * S, same_time(100 * S))
     assert track is not None
     assert (track.reports, track.dt_s, track.gamma, track.innovation_m) == (1, None, None, None)
     assert track.unknown_input_mps is None
@@ -76,18 +76,18 @@ def test_a_first_report_is_its_own_estimate(fleet: Fleet, fix: MakeFix) -> None:
 
 
 def test_a_second_report_is_judged_by_the_prediction_made_for_it(
-    fleet: Fleet, fix: MakeFix
+    tracker: Tracker, fix: MakeFix
 ) -> None:
     first, second = fix(100 * S, [0, 0, 0], [10, 0, 0]), fix(101 * S, [13, 4, 0], [10, 0, 0])
-    fleet.accept(first)
-    found = fleet.accept(second)
+    tracker.accept(first)
+    found = tracker.accept(second)
     assert isinstance(found, Estimate)
     expected = OBSERVER.predict(OBSERVER.begin(first), 101 * S)
     assert found.position_ned_m == pytest.approx([10, 0, 0])
     assert found.bound_m == expected.bound_m
     assert found.innovation_m == pytest.approx(5.0)
     assert found.dt_s == pytest.approx(1.0)
-    track = fleet.track("1:1", 101 * S, same_time(102 * S))
+    track = tracker.track("1:1", 101 * S, same_time(102 * S))
     assert track is not None
     assert track.reports == 2
     assert track.dt_s == pytest.approx(1.0)
@@ -95,14 +95,14 @@ def test_a_second_report_is_judged_by_the_prediction_made_for_it(
     assert track.velocity_ned_mps == pytest.approx(np.array([10.0, 0, 0]))
     assert track.unknown_input_mps == pytest.approx([10, 0, 0])
     assert not found.reacquired
-    assert fleet.newest("1:1") is second
+    assert tracker.newest("1:1") is second
 
 
-def test_gamma_is_that_of_the_worst_interval(fleet: Fleet, fix: MakeFix) -> None:
+def test_gamma_is_that_of_the_worst_interval(tracker: Tracker, fix: MakeFix) -> None:
     """Without feedthrough and velocity mu* = b^2 / alpha: the longest interval counts."""
     for t_s in (100, 101, 104, 105):
-        fleet.accept(fix(t_s * S, [0, 0, 0]))
-    track = fleet.track("1:1", 105 * S, same_time(105 * S))
+        tracker.accept(fix(t_s * S, [0, 0, 0]))
+    track = tracker.track("1:1", 105 * S, same_time(105 * S))
     assert track is not None
     # (b^2 - (1 - a) 0) / a at b = 3, a = .5
     assert track.gamma == pytest.approx(np.sqrt(9 / 0.5))
@@ -114,28 +114,28 @@ def test_gamma_is_that_of_the_worst_interval(fleet: Fleet, fix: MakeFix) -> None
     [(0, Reason.DUPLICATE), (5 * S + 1, Reason.OUT_OF_ORDER), (50 * S, Reason.OUT_OF_ORDER)],
 )
 def test_a_report_that_is_too_old_or_came_twice_is_rejected_and_changes_nothing(
-    fleet: Fleet, fix: MakeFix, older_ns: int, reason: Reason
+    tracker: Tracker, fix: MakeFix, older_ns: int, reason: Reason
 ) -> None:
-    fleet.accept(fix(100 * S, [0, 0, 0]))
+    tracker.accept(fix(100 * S, [0, 0, 0]))
     newest = fix(101 * S, [1, 0, 0])
-    fleet.accept(newest)
-    before = fleet.track("1:1", 102 * S, same_time(102 * S))
-    late = fleet.accept(fix(101 * S - older_ns, [3, 0, 0], late_ns=3 * S))
+    tracker.accept(newest)
+    before = tracker.track("1:1", 102 * S, same_time(102 * S))
+    late = tracker.accept(fix(101 * S - older_ns, [3, 0, 0], late_ns=3 * S))
     assert isinstance(late, Rejection)
     assert (late.reason, late.source) == (reason, "1:1")
     assert late.t_ns == 104 * S - older_ns
-    after = fleet.track("1:1", 102 * S, same_time(102 * S))
+    after = tracker.track("1:1", 102 * S, same_time(102 * S))
     assert before is not None
     assert after is not None
     assert after.position_ned_m.tolist() == before.position_ned_m.tolist()
     assert (after.reports, after.latency_s) == (2, before.latency_s)
-    assert fleet.newest("1:1") is newest
+    assert tracker.newest("1:1") is newest
 
 
 def test_a_late_report_is_put_in_its_place(fix: MakeFix) -> None:
     """And leaves what a report in time would have left."""
     made = [fix(n * S, [10 * n, n * n, 0], [10, 2 * n, 0], late_ns=S // 8) for n in range(100, 106)]
-    one, other = Fleet(OBSERVER, SETTINGS), Fleet(OBSERVER, SETTINGS)
+    one, other = Tracker(OBSERVER, SETTINGS), Tracker(OBSERVER, SETTINGS)
     for n in range(6):
         assert isinstance(one.accept(made[n]), Estimate)
     for n in (0, 1, 3, 2, 5):
@@ -157,23 +157,23 @@ def test_a_late_report_is_put_in_its_place(fix: MakeFix) -> None:
     )  # fmt: skip
 
 
-def test_a_restart_begins_anew(fleet: Fleet, fix: MakeFix) -> None:
-    fleet.accept(fix(100 * S, [0, 0, 0]))
-    fleet.accept(fix(100 * S, [0, 0, 0], uav="2:1"))
-    assert fleet.uavs == ["1:1", "2:1"]
-    fleet.forget("1:1")
-    fleet.forget("9:1")  # never seen
-    assert fleet.uavs == ["2:1"]
-    assert fleet.track("1:1", 0, same_time(0)) is None
-    assert fleet.newest("1:1") is None
-    assert fleet.state("1:1", same_time(0)) is None
-    found = fleet.accept(fix(50 * S, [7, 0, 0]))
+def test_a_restart_begins_anew(tracker: Tracker, fix: MakeFix) -> None:
+    tracker.accept(fix(100 * S, [0, 0, 0]))
+    tracker.accept(fix(100 * S, [0, 0, 0], uav="2:1"))
+    assert tracker.uavs == ["1:1", "2:1"]
+    tracker.forget("1:1")
+    tracker.forget("9:1")  # never seen
+    assert tracker.uavs == ["2:1"]
+    assert tracker.track("1:1", 0, same_time(0)) is None
+    assert tracker.newest("1:1") is None
+    assert tracker.state("1:1", same_time(0)) is None
+    found = tracker.accept(fix(50 * S, [7, 0, 0]))
     assert isinstance(found, Estimate)
     assert found.dt_s is None
 
 
 def test_tracks_do_not_touch_one_another(fix: MakeFix) -> None:
-    both, alone = Fleet(OBSERVER, SETTINGS), Fleet(OBSERVER, SETTINGS)
+    both, alone = Tracker(OBSERVER, SETTINGS), Tracker(OBSERVER, SETTINGS)
     for t_s in range(100, 110):
         made = fix(t_s * S, [t_s, 0, 0])
         both.accept(made)
@@ -196,10 +196,10 @@ NOISE = ReportNoise(2.0, 2.0, math.hypot(2.0, 2.0), 0.4)
 CRUISE_MPS = 12.0
 
 
-def tracking(feed_mps2: float | None = None, ages: Ages = AGES, **gate: float) -> Fleet:
+def tracking(feed_mps2: float | None = None, ages: Ages = AGES, **gate: float) -> Tracker:
     limits = Limits(30.0, feed_mps2 or 5.0)
-    given = FleetSettings(limits, ages, GateSettings(**gate), feed_forward=feed_mps2 is not None)
-    return Fleet(KINEMATIC, given)
+    given = TrackerSettings(limits, ages, GateSettings(**gate), feed_forward=feed_mps2 is not None)
+    return Tracker(KINEMATIC, given)
 
 
 def circling(t_s: float, radius_m: float = 60.0) -> tuple[FloatArray, FloatArray]:
@@ -228,8 +228,8 @@ def flight(
     return made
 
 
-def seen(fleet: Fleet, t_s: float, doubt_s: float = 0.0) -> Track:
-    found = fleet.track("1:1", round(t_s * S), same_time(round(t_s * S), doubt_s))
+def seen(tracker: Tracker, t_s: float, doubt_s: float = 0.0) -> Track:
+    found = tracker.track("1:1", round(t_s * S), same_time(round(t_s * S), doubt_s))
     assert found is not None
     return found
 
@@ -253,11 +253,11 @@ def every(interval_s: float, start_s: float, end_s: float) -> list[float]:
 
 def test_one_bad_report_is_refused_and_nothing_is_gated_on_it(fix: MakeFix) -> None:
     """The good ones that follow lie far from the bad one, and near what was accepted before it."""
-    fleet = tracking()
+    tracker = tracking()
     made = flight(
         fix, every(0.2, 0, 30), lambda t_s: (500, 0, 0) if abs(t_s - 10) < 0.05 else (0, 0, 0)
     )
-    outcomes = [fleet.accept(one) for one in made]
+    outcomes = [tracker.accept(one) for one in made]
     assert reasons(outcomes) == {None: 149, Reason.UNREACHABLE: 1}
     refused = outcomes[50]
     assert isinstance(refused, Rejection)
@@ -267,26 +267,26 @@ def test_one_bad_report_is_refused_and_nothing_is_gated_on_it(fix: MakeFix) -> N
 
 def test_a_glitch_is_sat_out(fix: MakeFix) -> None:
     """25 m to the north for .8 s: none of it enters, and the bounds go on to hold."""
-    fleet = tracking()
+    tracker = tracking()
     for one in flight(
         fix, every(0.2, 0, 40), lambda t_s: (25, 0, 0) if 9.9 < t_s < 10.7 else (0, 0, 0)
     ):
         t_s = one.sender_ns * 1e-9
-        outcome = fleet.accept(one)
+        outcome = tracker.accept(one)
         glitch = 9.9 < t_s < 10.7
         assert isinstance(outcome, Rejection if glitch else Estimate)
         if isinstance(outcome, Estimate):
             assert not outcome.reacquired
         for later_s in (0.0, 0.1):
-            holds(seen(fleet, t_s + later_s), circling(t_s + later_s)[0])
-    assert seen(fleet, 40).reports == 196
+            holds(seen(tracker, t_s + later_s), circling(t_s + later_s)[0])
+    assert seen(tracker, 40).reports == 196
 
 
 def test_a_jump_that_lasts_is_followed_once(fix: MakeFix) -> None:
     """Refused for as long as it takes to be believed; then the track begins anew from it."""
-    fleet = tracking()
+    tracker = tracking()
     jumped = flight(fix, every(0.2, 0, 40), lambda t_s: (25, 0, 0) if t_s > 9.9 else (0, 0, 0))
-    outcomes = [fleet.accept(one) for one in jumped]
+    outcomes = [tracker.accept(one) for one in jumped]
     again = [n for n, one in enumerate(outcomes) if isinstance(one, Estimate) and one.reacquired]
     refused = [n for n, one in enumerate(outcomes) if isinstance(one, Rejection)]
     assert len(again) == 1
@@ -295,51 +295,51 @@ def test_a_jump_that_lasts_is_followed_once(fix: MakeFix) -> None:
     assert {outcomes[n].reason for n in refused} == {Reason.UNREACHABLE}
     assert isinstance(outcomes[again[0]], Estimate)
     assert outcomes[again[0]].fix is jumped[again[0]]
-    assert fleet.newest("1:1") is jumped[-1]
-    track = seen(fleet, 40)
+    assert tracker.newest("1:1") is jumped[-1]
+    track = seen(tracker, 40)
     assert track.reports == 200  # those that were refused count: the track begins with them
     holds(track, circling(40)[0] + np.array([25, 0, 0]))
 
 
 @pytest.mark.parametrize("rate_hz", [5, 10, 25, 50])
 def test_a_jump_is_followed_at_any_rate(fix: MakeFix, rate_hz: int) -> None:
-    fleet = tracking()
+    tracker = tracking()
     times_s = every(1 / rate_hz, 0, 10)
     jumped = flight(fix, times_s, lambda t_s: (400, 0, 0) if t_s > 4.99 else (0, 0, 0))
-    outcomes = [fleet.accept(one) for one in jumped]
+    outcomes = [tracker.accept(one) for one in jumped]
     assert sum(isinstance(one, Estimate) and one.reacquired for one in outcomes) == 1
 
 
 def test_a_change_of_the_height_s_datum_has_its_own_reason(fix: MakeFix) -> None:
-    fleet = tracking()
+    tracker = tracking()
     made = flight(fix, every(0.2, 0, 20), lambda t_s: (0, 0, -40) if t_s > 9.9 else (0, 0, 0))
-    found = reasons(fleet.accept(one) for one in made)
+    found = reasons(tracker.accept(one) for one in made)
     assert set(found) == {None, Reason.ALTITUDE_JUMP}
     assert 4 <= found[Reason.ALTITUDE_JUMP] <= 6
-    holds(seen(fleet, 20), circling(20)[0] - np.array([0, 0, 40.0]))
+    holds(seen(tracker, 20), circling(20)[0] - np.array([0, 0, 40.0]))
 
 
 def test_positions_that_are_sent_again_are_not_used(fix: MakeFix) -> None:
     """Fresh stamps and velocities, old positions: for three seconds, then it flies on."""
-    fleet, outcomes = tracking(), []
+    tracker, outcomes = tracking(), []
     made = flight(fix, every(0.2, 0, 20))
     for number, one in enumerate(made):
         frozen = 50 <= number < 65
         place = made[49] if frozen else one
         told = replace(one, position_ned_m=place.position_ned_m, report=place.report)
-        outcomes.append(fleet.accept(told))
-        holds(seen(fleet, number / 5 + 0.1), circling(number / 5 + 0.1)[0])
+        outcomes.append(tracker.accept(told))
+        holds(seen(tracker, number / 5 + 0.1), circling(number / 5 + 0.1)[0])
     assert reasons(outcomes) == {None: 85, Reason.FROZEN: 15}
     assert all(isinstance(one, Rejection) for one in outcomes[50:65])
 
 
 def test_a_position_sent_again_just_after_a_jump_was_believed_is_not_used(fix: MakeFix) -> None:
-    fleet = tracking()
+    tracker = tracking()
     for one in flight(fix, every(0.2, 0, 20), lambda t_s: (400, 0, 0) if t_s > 9.9 else (0, 0, 0)):
-        outcome = fleet.accept(one)
+        outcome = tracker.accept(one)
         if isinstance(outcome, Estimate) and outcome.reacquired:
             break
-    again = fleet.accept(replace(one, sender_ns=one.sender_ns + S // 5))
+    again = tracker.accept(replace(one, sender_ns=one.sender_ns + S // 5))
     assert isinstance(again, Rejection)
     assert again.reason is Reason.FROZEN
 
@@ -353,8 +353,8 @@ def two_under_one_id(fix: MakeFix, end_s: float) -> list[Fix]:
 
 def test_two_vehicles_under_one_id_are_said(fix: MakeFix) -> None:
     """At first the second one's reports are refused, then, while both go on, everyone's."""
-    fleet = tracking()
-    outcomes = [fleet.accept(one) for one in two_under_one_id(fix, 5.9)]
+    tracker = tracking()
+    outcomes = [tracker.accept(one) for one in two_under_one_id(fix, 5.9)]
     early = reasons(outcomes[:30])
     assert early == {None: 15, Reason.UNREACHABLE: 15}
     late = reasons(outcomes[34:])
@@ -364,27 +364,27 @@ def test_two_vehicles_under_one_id_are_said(fix: MakeFix) -> None:
 
 def test_of_two_vehicles_under_one_id_neither_becomes_the_track(fix: MakeFix) -> None:
     """As long as both go on, the track does not leap from the one to the other."""
-    fleet = tracking()
-    outcomes = [fleet.accept(one) for one in two_under_one_id(fix, 20)]
+    tracker = tracking()
+    outcomes = [tracker.accept(one) for one in two_under_one_id(fix, 20)]
     assert not any(isinstance(one, Estimate) and one.reacquired for one in outcomes)
 
 
 def test_a_hole_is_coasted_over(fix: MakeFix) -> None:
     """12 s without a report: the bound grows, and holds; the first report after it is taken."""
-    fleet = tracking()
+    tracker = tracking()
     for one in flight(fix, every(0.2, 0, 10)):
-        assert isinstance(fleet.accept(one), Estimate)
+        assert isinstance(tracker.accept(one), Estimate)
     bounds = []
     for t_s in every(0.5, 10, 22):
-        track = seen(fleet, t_s)
+        track = seen(tracker, t_s)
         holds(track, circling(t_s)[0])
         bounds.append(track.horizontal_bound_m)
         assert track.state is (TrackState.LIVE if t_s < 11.9 else TrackState.COASTING)
     assert bounds == sorted(bounds)
     assert bounds[-1] > 20 * bounds[0]
     after = flight(fix, every(0.2, 22, 25))
-    assert reasons(fleet.accept(one) for one in after) == {None: 15}
-    track = seen(fleet, 25)
+    assert reasons(tracker.accept(one) for one in after) == {None: 15}
+    track = seen(tracker, 25)
     assert track.state is TrackState.LIVE
     holds(track, circling(25)[0])
     assert track.horizontal_bound_m < 5.0
@@ -393,13 +393,13 @@ def test_a_hole_is_coasted_over(fix: MakeFix) -> None:
 @pytest.mark.parametrize(("gap_s", "anew"), [(59.9, False), (60.1, True)])
 def test_a_lost_track_begins_anew(fix: MakeFix, gap_s: float, anew: bool) -> None:
     """Wherever it comes back: there is nothing left to compare it with."""
-    fleet = tracking()
-    fleet.accept(fix(0, [0, 0, 0], [0, 0, 0]))
-    found = fleet.accept(fix(round(gap_s * S), [20_000, 0, 0], [0, 0, 0]))
+    tracker = tracking()
+    tracker.accept(fix(0, [0, 0, 0], [0, 0, 0]))
+    found = tracker.accept(fix(round(gap_s * S), [20_000, 0, 0], [0, 0, 0]))
     assert isinstance(found, Estimate if anew else Rejection)
     if isinstance(found, Estimate):
         assert (found.dt_s, found.reacquired) == (None, False)
-        assert seen(fleet, gap_s).reports == 1
+        assert seen(tracker, gap_s).reports == 1
 
 
 # --- what is added to the observer --------------------------------------------------------------
@@ -407,12 +407,12 @@ def test_a_lost_track_begins_anew(fix: MakeFix, gap_s: float, anew: bool) -> Non
 
 def errors_m(fix: MakeFix, feed_mps2: float | None, ahead_s: float) -> float:
     """The mean error over a circle, ``ahead_s`` past the newest report."""
-    fleet, off = tracking(feed_mps2), []
+    tracker, off = tracking(feed_mps2), []
     for one in flight(fix, every(0.2, 0, 60)):
-        assert isinstance(fleet.accept(one), Estimate)
+        assert isinstance(tracker.accept(one), Estimate)
         t_s = one.sender_ns * 1e-9 + ahead_s
         if one.sender_ns > 5 * S:
-            off.append(holds(seen(fleet, t_s), circling(t_s)[0]))
+            off.append(holds(seen(tracker, t_s), circling(t_s)[0]))
     return float(np.mean(off))
 
 
@@ -444,12 +444,12 @@ def test_what_is_fed_forward_is_within_the_bound(fix: MakeFix) -> None:
 
 
 def test_no_more_is_fed_forward_than_is_possible(fix: MakeFix) -> None:
-    fleet = tracking(3.0)
+    tracker = tracking(3.0)
     for n in range(31):  # 5 m/s^2
         t_s = n / 5
         place = [0, 1.5 * t_s * t_s, 2.0 * t_s * t_s]
-        fleet.accept(fix(n * S // 5, place, [0, 3.0 * t_s, 4.0 * t_s], noise=NOISE))
-    assert seen(fleet, 6).acceleration_ned_mps2 == pytest.approx([0, 1.8, 2.4])
+        tracker.accept(fix(n * S // 5, place, [0, 3.0 * t_s, 4.0 * t_s], noise=NOISE))
+    assert seen(tracker, 6).acceleration_ned_mps2 == pytest.approx([0, 1.8, 2.4])
 
 
 @pytest.mark.parametrize("doubt_s", [0.0, 0.4])
@@ -458,14 +458,14 @@ def test_no_adversary_leaves_what_the_fleet_says(fix: MakeFix, doubt_s: float) -
     and the truth stays in the bounds."""
     for seed in range(150):
         rng = np.random.default_rng(seed)
-        fleet = tracking(5.0)
+        tracker = tracking(5.0)
         position, velocity, t_s = np.zeros(3), rng.normal(0, 5, 3), 0.0
         for _ in range(25):
             plane, fast = rng.normal(0, 1, 2), rng.normal(0, 1, 3)
             plane, fast = plane * 2 / math.hypot(*plane), fast * 0.4 / math.hypot(*fast)
             wrong = np.array([*plane, 2 * rng.choice([-1, 1])]) * (1 - 1e-9)
             made = fix(round(t_s * S), position + wrong, velocity + fast, noise=NOISE)
-            assert isinstance(fleet.accept(made), Estimate)
+            assert isinstance(tracker.accept(made), Estimate)
             step_s = round(float(10 ** rng.uniform(-1.5, 0.5)), 9)
             push = (
                 rng.normal(0, 1, 3) if seed % 2 else rng.choice([-1, 1]) * np.array([0, 0.6, 0.8])
@@ -477,15 +477,15 @@ def test_no_adversary_leaves_what_the_fleet_says(fix: MakeFix, doubt_s: float) -
                 off_s = rng.choice([-1, 1]) * min(doubt_s, ahead_s, step_s - ahead_s)
                 true_s = ahead_s + off_s
                 truth = position + velocity * true_s + push * true_s**2 / 2
-                holds(seen(fleet, t_s + ahead_s, doubt_s), truth)
+                holds(seen(tracker, t_s + ahead_s, doubt_s), truth)
             position = position + velocity * step_s + push * step_s**2 / 2
             velocity, t_s = velocity + push * step_s, round(t_s + step_s, 9)
 
 
 def test_doubt_of_the_clock_is_worth_the_way_flown_in_it(fix: MakeFix) -> None:
-    fleet = tracking()
-    fleet.accept(fix(0, [0, 0, 0], [10, 0, 0], noise=NOISE))
-    a, b = seen(fleet, 1), seen(fleet, 1, doubt_s=0.5)
+    tracker = tracking()
+    tracker.accept(fix(0, [0, 0, 0], [10, 0, 0], noise=NOISE))
+    a, b = seen(tracker, 1), seen(tracker, 1, doubt_s=0.5)
     assert (a.clock_bound_s, b.clock_bound_s) == (0.0, 0.5)
     # At the later end: 10 m/s by the report, 0.4 by its noise, and its acceleration since.
     widened_m = 0.5 * (10 + 0.4) + 5.0 * (1.5**2 - 1) / 2
@@ -493,64 +493,64 @@ def test_doubt_of_the_clock_is_worth_the_way_flown_in_it(fix: MakeFix) -> None:
     assert b.horizontal_bound_m - a.horizontal_bound_m == pytest.approx(widened_m)
     # The way flown is level: only what is not known of it may be up or down.
     assert b.vertical_bound_m - a.vertical_bound_m == pytest.approx(widened_m - 0.5 * 10)
-    a, b = seen(fleet, 40), seen(fleet, 40, doubt_s=0.5)
+    a, b = seen(tracker, 40), seen(tracker, 40, doubt_s=0.5)
     assert b.horizontal_bound_m - a.horizontal_bound_m == pytest.approx(0.5 * 30.0)
 
 
 def test_doubt_of_the_clock_covers_an_acceleration_in_it(fix: MakeFix) -> None:
     """At full acceleration, asked a second too early: 2.5 m beyond the way at its speed."""
-    fleet = tracking()
-    fleet.accept(
+    tracker = tracking()
+    tracker.accept(
         fix(0, [0, 0, 0], [0, 0, 0], noise=replace(NOISE, horizontal_m=1e-6, velocity_mps=1e-6))
     )
     for ahead_s in (0.0, 0.5, 2.0):
         true_s = ahead_s + 1.0
-        holds(seen(fleet, ahead_s, doubt_s=1.0), np.array([5.0 * true_s**2 / 2, 0, 0]))
+        holds(seen(tracker, ahead_s, doubt_s=1.0), np.array([5.0 * true_s**2 / 2, 0, 0]))
 
 
 def test_doubt_of_the_clock_covers_a_turn_that_ends_in_it(fix: MakeFix) -> None:
     """It brakes at 4 m/s^2, which is fed forward, and from the last report on it speeds up at 5;
     3.4 s after that, where it was asked for 0.4 s earlier, it is still in the bounds."""
-    fleet, exact = tracking(5.0), replace(NOISE, horizontal_m=1e-6, velocity_mps=1e-6)
+    tracker, exact = tracking(5.0), replace(NOISE, horizontal_m=1e-6, velocity_mps=1e-6)
     for n in range(11):
         t_s = 0.2 * n
         place = [20 * t_s - 2 * t_s**2, 0, 0]
-        fleet.accept(fix(n * S // 5, place, [20 - 4 * t_s, 0, 0], noise=exact))
+        tracker.accept(fix(n * S // 5, place, [20 - 4 * t_s, 0, 0], noise=exact))
     for ahead_s in (0.0, 1.0, 3.0):
         true_s = ahead_s + 0.4
         truth = np.array([32 + 12 * true_s + 5.0 * true_s**2 / 2, 0, 0])
-        holds(seen(fleet, 2 + ahead_s, doubt_s=0.4), truth)
+        holds(seen(tracker, 2 + ahead_s, doubt_s=0.4), truth)
 
 
 def test_who_is_near_is_told_by_the_newest_reports(fix: MakeFix) -> None:
     """In space, and nearer than the distance: 100 m off by 60 m east and 80 m up."""
-    fleet = tracking()
-    fleet.accept(fix(0, [900, 0, 0], uav="1:1"))
-    fleet.accept(fix(0, [1000, 60, -80], uav="2:1"))
-    fleet.accept(fix(0, [4000, 0, 0], uav="3:1"))
+    tracker = tracking()
+    tracker.accept(fix(0, [900, 0, 0], uav="1:1"))
+    tracker.accept(fix(0, [1000, 60, -80], uav="2:1"))
+    tracker.accept(fix(0, [4000, 0, 0], uav="3:1"))
     place = np.array([1000.0, 0, 0])
-    assert fleet.near(place, 99.9) == []
-    assert fleet.near(place, 100.1) == ["1:1", "2:1"]
-    assert fleet.near(place, 3001.0) == ["1:1", "2:1", "3:1"]
-    fleet.accept(fix(10 * S, [700, 0, 0], uav="1:1"))
-    assert fleet.near(place, 150.0) == ["2:1"]
+    assert tracker.near(place, 99.9) == []
+    assert tracker.near(place, 100.1) == ["1:1", "2:1"]
+    assert tracker.near(place, 3001.0) == ["1:1", "2:1", "3:1"]
+    tracker.accept(fix(10 * S, [700, 0, 0], uav="1:1"))
+    assert tracker.near(place, 150.0) == ["2:1"]
 
 
 def test_without_a_velocity_doubt_is_worth_the_greatest_speed(fix: MakeFix) -> None:
-    fleet = Fleet(OBSERVER, SETTINGS)
-    fleet.accept(fix(0, [0, 0, 0]))
-    a, b = seen(fleet, 1), seen(fleet, 1, doubt_s=0.5)
+    tracker = Tracker(OBSERVER, SETTINGS)
+    tracker.accept(fix(0, [0, 0, 0]))
+    a, b = seen(tracker, 1), seen(tracker, 1, doubt_s=0.5)
     assert b.bound_m - a.bound_m == pytest.approx(0.5 * 30.0)
 
 
 def test_what_is_usual_is_within_what_is_possible(fix: MakeFix) -> None:
     """Of a clock that was usually off by more than it can be off now."""
-    fleet = Fleet(KinematicObserver(KinematicModel(30.0, 8.0)), SETTINGS)
+    tracker = Tracker(KinematicObserver(KinematicModel(30.0, 8.0)), SETTINGS)
     for t_s in range(100, 130):
-        fleet.accept(fix(t_s * S, [20 * t_s, 0, 0], [20, 0, 0]))
+        tracker.accept(fix(t_s * S, [20 * t_s, 0, 0], [20, 0, 0]))
     for usual_s, is_less in ((0.01, True), (5.0, False)):
         at = replace(same_time(129 * S + S // 10, 0.02), usual_s=usual_s)
-        track = fleet.track("1:1", at.node_ns, at)
+        track = tracker.track("1:1", at.node_ns, at)
         assert track is not None
         assert track.error_p95_m is not None
         assert (track.error_p95_m < track.bound_m) is is_less

@@ -79,14 +79,19 @@ def started(command: Any, **options: Any) -> "Iterator[subprocess.Popen[Any]]":
         end(process)
 
 
+def free_port() -> int:
+    """A port of loopback that nobody has now, for a program that cannot say which one it got."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
 @contextlib.contextmanager
 def dummy_rotator() -> Iterator[int]:
     """Port of hamlib's rotctld with its dummy rotator; skips where there is none."""
     if shutil.which("rotctld") is None:
         pytest.skip("hamlib's rotctld is not here")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     command = ["rotctld", "-m", "1", "-T", "127.0.0.1", "-t", str(port)]
     with started(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL):
         yield port

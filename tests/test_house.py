@@ -410,6 +410,7 @@ def test_the_rooms_import_in_the_order_of_the_flow() -> None:
         ("companion/studies/bad.py", "def f():\n    import torch"),
         ("companion/tracking/bad.py", "from torch import nn"),
         ("companion/studies/bad.py", "import distributed"),
+        ("companion/node/bad.py", "def f():\n    import zenoh"),
     ],
 )
 def test_import_linter_refuses(tmp_path: Path, path: str, text: str) -> None:

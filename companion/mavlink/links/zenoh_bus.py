@@ -1,0 +1,299 @@
+"""One Zenoh session: what is published, heard, asked and answered, and who is alive.       [shell]
+
+The only file that knows Zenoh (https://zenoh.io, the extra ``[fleet]``). Its callbacks come on
+threads of its own. What they bring waits in one queue and wakes the event loop once for all that
+waits; only answers to questions are given on Zenoh's thread, since a clock must not wait for a busy
+loop. Nothing here waits for the network but ``open`` and ``close``, which belong on a thread.
+"""
+
+import asyncio
+import contextlib
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+from companion.mavlink.links.zenoh_config import BusConfig, Priority, sections
+from companion.values import UserError
+from companion.values.extras import needs
+
+if TYPE_CHECKING:
+    import zenoh
+
+QUEUE_MAX: Final = 20_000
+"""Things heard that may wait for the loop; what comes beyond is dropped and counted."""
+AT_ONCE: Final = 256
+"""Things handed over in one turn of the loop, so that other work comes between."""
+PUBLISHERS_MAX: Final = 1024
+"""Keys declared, so that their names go over the wire once; beyond it, all are begun anew."""
+
+NO_ROUTER: Final = "Unable to connect"
+"""What Zenoh says when a client reaches none of its endpoints."""
+
+
+@dataclass(slots=True)
+class BusStatus:
+    """Counts, which only grow.
+
+    sent     samples given to Zenoh. What it then drops at a congested link it does not tell: number
+             what is published, and the other end sees the holes
+    refused  samples that Zenoh did not take, or after ``close``
+    heard    samples, answers and signs of life handed over
+    dropped  those that came while ``QUEUE_MAX`` waited
+    """
+
+    sent: int = 0
+    refused: int = 0
+    heard: int = 0
+    dropped: int = 0
+
+
+class Bus:
+    """A Zenoh session. All methods but ``open`` and ``close`` are called on the loop.
+
+    ``run`` raises what a callback raised: after that nothing more is handed over.
+    """
+
+    def __init__(self, config: BusConfig, loop: asyncio.AbstractEventLoop) -> None:
+        self.status = BusStatus()
+        self._config = config
+        self._loop = loop
+        self._lock = threading.Lock()
+        self._waiting: deque[Callable[[], None]] = deque()
+        self._is_woken = False
+        self._is_over = False
+        self._ended = threading.Event()
+        self._fault: asyncio.Future[None] = loop.create_future()
+        self._session: zenoh.Session | None = None
+        self._publishers: dict[tuple[str, Priority, bool], zenoh.Publisher] = {}
+        self._declared: list[Any] = []  # what ends when nobody holds it any more
+
+    def open(self) -> None:
+        """Open the session; blocks. An absent neighbour is no error: it is tried again and again.
+
+        A client has no session without its router, so this waits for it; ``close`` ends that.
+        Raises ``UserError`` where the package is missing, an endpoint or a file is wrong, or an
+        address cannot be had.
+        """
+        with needs("zenoh", "fleet", "Zenoh"):
+            import zenoh
+        config = _configured(self._config)
+        while not self._ended.is_set():
+            try:
+                self._session = zenoh.open(config)
+                break
+            except zenoh.ZError as error:
+                if self._config.mode != "client" or NO_ROUTER not in str(error):
+                    raise UserError(f"Zenoh: {_said(error)}") from error
+            self._ended.wait(self._config.retry_s)
+        if self._ended.is_set() and self._session is not None:  # closed meanwhile
+            _close(self._session)
+
+    async def run(self) -> None:
+        """Wait until cancelled; raises what a callback raised."""
+        await asyncio.shield(self._fault)
+
+    def close(self) -> None:
+        """End the session; blocks until others were told. Nothing is handed over afterwards."""
+        self._is_over = True
+        self._ended.set()
+        self._waiting.clear()
+        if self._session is not None:
+            _close(self._session)
+
+    # --- publishing and asking ---------------------------------------------------------------
+
+    def put(
+        self, key: str, payload: bytes, *, express: bool = False, priority: Priority = "data"
+    ) -> None:
+        """Publish a sample; what a congested link has no room for is dropped.
+
+        ``express`` sends it at once rather than with what follows, for single samples: of a burst
+        only ``QUEUED`` find room.
+        """
+        import zenoh
+
+        try:
+            publisher = self._publishers.get((key, priority, express))
+            if publisher is None:
+                publisher = self._publisher(key, priority, express)
+            publisher.put(payload)
+        except zenoh.ZError:
+            self.status.refused += 1
+            return
+        self.status.sent += 1
+
+    def ask(
+        self, key: str, payload: bytes, timeout_s: float, take: Callable[[bytes, int], None]
+    ) -> None:
+        """Ask who serves ``key``; ``take`` is called with each answer, if one comes in time.
+
+        Its second argument is the monotonic time, ns, at which Zenoh's thread had the answer.
+        """
+        import zenoh
+
+        def answered(reply: "zenoh.Reply") -> None:
+            arrived_ns = time.monotonic_ns()
+            if reply.ok is not None:
+                answer = reply.ok.payload.to_bytes()
+                self._post(lambda: take(answer, arrived_ns))
+
+        self._opened().get(
+            key,
+            zenoh.handlers.Callback(answered, indirect=False),
+            payload=payload,
+            timeout=timeout_s,
+            # Else an answer is held back until nobody can give another.
+            consolidation=zenoh.ConsolidationMode.NONE,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.REAL_TIME,
+            express=True,
+        )
+
+    # --- hearing and answering ---------------------------------------------------------------
+
+    def subscribe(self, key_expr: str, take: Callable[[str, bytes], None]) -> None:
+        """Have ``take`` called with the key and the payload of every sample from others."""
+        import zenoh
+
+        def heard(sample: "zenoh.Sample") -> None:
+            if sample.kind == zenoh.SampleKind.PUT:
+                key, payload = str(sample.key_expr), sample.payload.to_bytes()
+                self._post(lambda: take(key, payload))
+
+        self._declared.append(
+            self._opened().declare_subscriber(
+                key_expr,
+                zenoh.handlers.Callback(heard, indirect=False),
+                allowed_origin=zenoh.Locality.REMOTE,
+            )
+        )
+
+    def serve(self, key: str, answer: Callable[[str, bytes], bytes | None]) -> None:
+        """Have questions about ``key`` answered, at once, on Zenoh's own thread.
+
+        ``answer`` is given the key that was asked for and the payload; None: no answer.
+        """
+        import zenoh
+
+        def asked(query: "zenoh.Query") -> None:
+            try:
+                payload = b"" if query.payload is None else query.payload.to_bytes()
+                said = answer(str(query.key_expr), payload)
+                if said is not None:
+                    query.reply(key, said, express=True)
+            except zenoh.ZError:  # who asked is gone, or this session
+                return
+            except Exception as fault:
+                self._post(partial(self._fail, fault))
+
+        self._declared.append(
+            self._opened().declare_queryable(
+                key, zenoh.handlers.Callback(asked, indirect=False), complete=True
+            )
+        )
+
+    def alive(self, key: str) -> None:
+        """Say that this node is there, until ``close`` or until others miss its signs of life."""
+        self._declared.append(self._opened().liveliness().declare_token(key))
+
+    def watch(self, key_expr: str, take: Callable[[str, bool], None]) -> None:
+        """Have ``take`` called with each key that is alive, True, and when it is no more, False."""
+        import zenoh
+
+        def seen(sample: "zenoh.Sample") -> None:
+            key, is_alive = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
+            self._post(lambda: take(key, is_alive))
+
+        callback = zenoh.handlers.Callback(seen, indirect=False)
+        liveliness = self._opened().liveliness()
+        self._declared.append(liveliness.declare_subscriber(key_expr, callback, history=True))
+
+    # --- from Zenoh's threads to the loop ----------------------------------------------------
+
+    def _post(self, item: Callable[[], None]) -> None:
+        """Hand something to the loop, from any thread: one wake-up for all that waits."""
+        with self._lock:
+            if self._is_over:
+                return
+            if len(self._waiting) >= QUEUE_MAX:
+                self.status.dropped += 1
+                return
+            self._waiting.append(item)
+            if self._is_woken:
+                return
+            self._is_woken = True
+        try:
+            self._loop.call_soon_threadsafe(self._hand_over)
+        except RuntimeError:  # the loop has ended, and with it whoever would listen
+            self._is_over = True
+
+    def _hand_over(self) -> None:
+        with self._lock:
+            batch = [self._waiting.popleft() for _ in range(min(AT_ONCE, len(self._waiting)))]
+            self._is_woken = bool(self._waiting)
+            if self._is_woken:
+                self._loop.call_soon(self._hand_over)
+        for item in batch:
+            if self._is_over:
+                return
+            try:
+                item()
+            except Exception as fault:
+                self._fail(fault)
+                return
+            self.status.heard += 1
+
+    def _fail(self, fault: Exception) -> None:
+        """End who runs this by a callback's defect, which must not vanish."""
+        self._is_over = True
+        if not self._fault.done():
+            self._fault.set_exception(fault)
+
+    # --- the session ------------------------------------------------------------------------
+
+    def _opened(self) -> "zenoh.Session":
+        assert self._session is not None, "open comes first"
+        return self._session
+
+    def _publisher(self, key: str, priority: Priority, express: bool) -> "zenoh.Publisher":
+        import zenoh
+
+        if len(self._publishers) >= PUBLISHERS_MAX:
+            self._publishers.clear()
+        publisher = self._opened().declare_publisher(
+            key,
+            priority=getattr(zenoh.Priority, priority.upper()),
+            congestion_control=zenoh.CongestionControl.DROP,
+            express=express,
+        )
+        self._publishers[key, priority, express] = publisher
+        return publisher
+
+
+def _close(session: "zenoh.Session") -> None:
+    import zenoh
+
+    # It may find that others do not listen; they then miss its signs of life.
+    with contextlib.suppress(zenoh.ZError):
+        session.close()  # type: ignore[no-untyped-call]
+
+
+def _said(error: Exception) -> str:
+    """What an error of Zenoh says, in one line without the places in its source."""
+    return " ".join(str(error).split(" at ")[0].split())
+
+
+def _configured(config: BusConfig) -> "zenoh.Config":
+    import zenoh
+
+    made = zenoh.Config()
+    for place, text in sections(config).items():
+        try:
+            made.insert_json5(place, text)
+        except zenoh.ZError as error:
+            raise UserError(f"Zenoh's configuration, {place}: {_said(error)}") from error
+    return made

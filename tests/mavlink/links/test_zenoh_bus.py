@@ -1,0 +1,314 @@
+"""Zenoh sessions on loopback: what one says, the other hears; what goes wrong is said."""
+
+import asyncio
+import contextlib
+import sys
+import time
+from collections.abc import AsyncIterator, Iterator
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import pytest
+from link_support import LOOPS, Run, runner
+from support import free_port, run_async
+
+from companion.mavlink.links import zenoh_bus
+from companion.mavlink.links.zenoh_bus import Bus
+from companion.mavlink.links.zenoh_config import QUEUED, BusConfig, BusTls
+from companion.values import UserError
+
+pytest.importorskip("zenoh")
+
+
+@pytest.fixture(params=LOOPS)
+def run(request: pytest.FixtureRequest) -> Run:
+    """``run(test())`` on one loop and on the other."""
+    return runner(request.param)
+
+
+@contextlib.asynccontextmanager
+async def opened(config: BusConfig) -> AsyncIterator[Bus]:
+    bus = Bus(config, asyncio.get_running_loop())
+    await asyncio.to_thread(bus.open)
+    try:
+        yield bus
+    finally:
+        await asyncio.to_thread(bus.close)
+
+
+@contextlib.asynccontextmanager
+async def pair() -> AsyncIterator[tuple[Bus, Bus]]:
+    """Two peers; the second connects to the first."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    async with (
+        opened(BusConfig(listen=(endpoint,))) as one,
+        opened(BusConfig(connect=(endpoint,))) as other,
+    ):
+        yield one, other
+
+
+class Heard(list[Any]):
+    """What callbacks were called with."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._came = asyncio.Event()
+
+    def take(self, *what: Any) -> None:
+        self.append(what)
+        self._came.set()
+
+    async def until(self, count: int) -> None:
+        while len(self) < count:
+            self._came.clear()
+            await self._came.wait()
+
+
+async def joined(speaker: Bus, listener: Bus) -> None:
+    """Both know of each other: what is declared is declared, and what is put arrives."""
+    heard = Heard()
+    listener.watch("joined/*", heard.take)
+    speaker.alive("joined/speaker")
+    await heard.until(1)
+
+
+def test_samples_arrive_whole_and_in_order(run: Run) -> None:
+    async def test() -> None:
+        async with pair() as (one, other):
+            heard = Heard()
+            one.subscribe("site/*/frames", heard.take)
+            await joined(one, other)  # the subscription went before
+            sent = [bytes([n % 256]) * (n % 50) for n in range(zenoh_bus.AT_ONCE * 3)]
+            for payload in sent:
+                other.put("site/b/frames", payload)
+                other.put("site/b/tracks", b"nobody listens")
+            await heard.until(len(sent))
+            assert heard == [("site/b/frames", payload) for payload in sent]
+            assert other.status.sent == 2 * len(sent)
+            assert one.status.dropped == other.status.refused == 0
+
+    run(test())
+
+
+def test_nobody_hears_himself(run: Run) -> None:
+    async def test() -> None:
+        async with pair() as (one, other):
+            heard, elsewhere = Heard(), Heard()
+            one.subscribe("site/a", heard.take)
+            other.subscribe("site/a", elsewhere.take)
+            await joined(other, one)
+            one.put("site/a", b"mine")
+            await elsewhere.until(1)
+            other.put("site/a", b"yours")
+            await heard.until(1)
+            assert list(heard) == [("site/a", b"yours")]
+
+    run(test())
+
+
+def test_who_comes_later_learns_who_is_there_and_who_leaves(run: Run) -> None:
+    async def test() -> None:
+        endpoint = f"tcp/127.0.0.1:{free_port()}"
+        async with opened(BusConfig(listen=(endpoint,))) as stays:
+            seen, late = Heard(), Heard()
+            stays.watch("alive/*", seen.take)
+            async with opened(BusConfig(connect=(endpoint,))) as leaves:
+                leaves.alive("alive/b")
+                await seen.until(1)
+                stays.watch("alive/*", late.take)
+                await late.until(1)
+            await seen.until(2)
+            await late.until(2)
+            assert seen == late == [("alive/b", True), ("alive/b", False)]
+
+    run(test())
+
+
+def test_a_question_is_answered_while_the_loop_is_busy(run: Run) -> None:
+    async def test() -> None:
+        async with pair() as (one, other):
+            answers = Heard()
+            served: list[int] = []
+
+            def answer(key: str, payload: bytes) -> bytes:
+                served.append(time.monotonic_ns())
+                return key.encode() + payload
+
+            one.serve("site/a/clock", answer)
+            await joined(one, other)
+            asked_ns = time.monotonic_ns()
+            other.ask("site/a/clock", b"?", 20.0, answers.take)
+            while not served:  # the loop does nothing else
+                time.sleep(0.001)
+            await answers.until(1)
+            [(said, arrived_ns)] = answers
+            assert said == b"site/a/clock?"
+            assert asked_ns < served[0] < arrived_ns < time.monotonic_ns()
+
+    run(test())
+
+
+def test_a_question_may_go_unanswered(run: Run) -> None:
+    async def test() -> None:
+        async with pair() as (one, other):
+            answers = Heard()
+            one.serve("site/a/clock", lambda key, payload: payload or None)
+            await joined(one, other)
+            other.ask("site/a/clock", b"", 0.05, answers.take)
+            other.ask("site/nobody/clock", b"!", 0.05, answers.take)
+            other.ask("site/a/clock", b"!", 20.0, answers.take)
+            await answers.until(1)
+            assert answers[0][0] == b"!"
+
+    run(test())
+
+
+def test_a_defect_in_a_callback_ends_who_runs_the_bus(run: Run) -> None:
+    async def test() -> None:
+        async with pair() as (one, other):
+            calls = Heard()
+
+            def breaks(key: str, payload: bytes) -> None:
+                calls.take(payload)
+                raise ZeroDivisionError
+
+            one.subscribe("site/*", breaks)
+            await joined(one, other)
+            other.put("site/b", b"1")
+            other.put("site/b", b"2")
+            with pytest.raises(ZeroDivisionError):
+                await one.run()
+            assert list(calls) == [(b"1",)]
+
+    run(test())
+
+
+def test_a_defect_in_an_answer_does_too(run: Run) -> None:
+    async def test() -> None:
+        async with pair() as (one, other):
+            one.serve("site/a", lambda key, payload: bytes([1 // len(payload)]))
+            await joined(one, other)
+            other.ask("site/a", b"", 0.02, lambda answer, t_ns: None)
+            with pytest.raises(ZeroDivisionError):
+                await one.run()
+
+    run(test())
+
+
+def test_what_waits_is_bounded(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(zenoh_bus, "QUEUE_MAX", 10)
+
+    async def test() -> None:
+        async with pair() as (one, other):
+            heard = Heard()
+            one.subscribe("site/b", heard.take)
+            await joined(one, other)
+            for n in range(100):
+                other.put("site/b", bytes([n]))
+            while one.status.dropped < 90:  # the loop does nothing else meanwhile
+                time.sleep(0.001)
+            await heard.until(10)
+            assert [payload[0] for _, payload in heard] == list(range(10))
+            assert one.status.dropped == 90
+
+    run(test())
+
+
+def test_after_the_end_nothing_is_taken_and_nothing_raised(run: Run) -> None:
+    async def test() -> None:
+        async with opened(BusConfig()) as bus:
+            bus.put("site/a", b"1")
+        bus.put("site/a", b"2")
+        bus.put("site/b", b"3")
+        assert (bus.status.sent, bus.status.refused) == (1, 2)
+
+    run(test())
+
+
+def test_a_burst_of_urgent_samples_arrives(run: Run) -> None:
+    async def test() -> None:
+        async with pair() as (one, other):
+            heard = Heard()
+            one.subscribe("site/b", heard.take)
+            await joined(one, other)
+            for n in range(QUEUED - 4):
+                other.put("site/b", bytes([n]), express=True)
+            await heard.until(QUEUED - 4)
+
+    run(test())
+
+
+def test_many_keys_go_out_all_the_same(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(zenoh_bus, "PUBLISHERS_MAX", 2)
+
+    async def test() -> None:
+        async with pair() as (one, other):
+            heard = Heard()
+            one.subscribe("site/*", heard.take)
+            await joined(one, other)
+            for n in range(5):
+                other.put(f"site/{n}", b"", express=True, priority="real_time")
+            await heard.until(5)
+            assert sorted(heard) == [(f"site/{n}", b"") for n in range(5)]
+
+    run(test())
+
+
+def test_a_client_waits_for_its_router_until_it_is_closed(run: Run) -> None:
+    async def test() -> None:
+        nobody = f"tcp/127.0.0.1:{free_port()}"
+        bus = Bus(BusConfig("client", connect=(nobody,)), asyncio.get_running_loop())
+        opening = asyncio.create_task(asyncio.to_thread(bus.open))
+        await asyncio.to_thread(bus.close)
+        await opening
+
+    run(test())
+
+
+def test_a_neighbour_that_comes_later_is_found(run: Run) -> None:
+    async def test() -> None:
+        endpoint = f"tcp/127.0.0.1:{free_port()}"
+        config = BusConfig(connect=(endpoint,), retry_s=0.02)
+        async with (
+            opened(config) as early,
+            opened(BusConfig(listen=(endpoint,))) as late,
+        ):
+            await joined(early, late)
+
+    run(test())
+
+
+def wrong_configurations(nowhere: Path) -> Iterator[tuple[BusConfig, str]]:
+    """Mistakes, and a word of what is said of each."""
+    yield BusConfig(listen=("tpc/127.0.0.1:0",)), "tpc"
+    yield BusConfig(listen=("tcp/192.0.2.1:7447",)), "192.0.2.1"
+    yield BusConfig(connect=("nonsense",)), "nonsense"
+    yield BusConfig(listen=("tls/127.0.0.1:0",)), "TLS private key"
+    yield BusConfig(listen=("tls/127.0.0.1:0",), tls=BusTls(nowhere, nowhere, nowhere)), "TLS"
+    yield BusConfig(access_control=nowhere), str(nowhere)
+    yield BusConfig(access_control=Path(__file__)), "configuration"
+
+
+def test_a_mistake_is_one_line(tmp_path: Path) -> None:
+    async def said(config: BusConfig) -> str:
+        with pytest.raises(UserError) as error:
+            await asyncio.to_thread(Bus(config, asyncio.get_running_loop()).open)
+        return str(error.value)
+
+    for config, word in wrong_configurations(tmp_path / "missing"):
+        message = run_async(said(config))
+        assert word in message, message
+        assert "\n" not in message
+        assert "cargo" not in message
+
+
+def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in chain(sys.modules, ["zenoh"]) if name.startswith("zenoh")]:
+        monkeypatch.setitem(sys.modules, name, None)
+
+    async def test() -> None:
+        Bus(BusConfig(), asyncio.get_running_loop()).open()
+
+    with pytest.raises(UserError, match=r"needs the package zenoh: pip install '.*\[fleet\]'"):
+        run_async(test())

@@ -96,6 +96,7 @@ def sections(config: BusConfig) -> dict[str, str]:
             },
         },
         "scouting/multicast/enabled": config.scouting,
+        "scouting/delay": 0,  # a session is open before its neighbours are found
         "transport/link/tx/lease": round(config.lease_s * 1000),
         "transport/link/tx/keep_alive": config.keep_alive,
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,

@@ -1,7 +1,8 @@
 """Tracks to beams: which UAVs get one, where it points, and the weights of all of them together."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -13,7 +14,14 @@ from companion.beams.array.elements import Pattern
 from companion.beams.array.geometry import Array
 from companion.beams.steady import Steady
 from companion.beams.weights import shapes, widening
-from companion.beams.weights.precoding import Precoder, Precoding, Radio, gain_db, precode
+from companion.beams.weights.precoding import (
+    Precoder,
+    Precoding,
+    Radio,
+    gain_db,
+    normalise,
+    precode,
+)
 from companion.beams.weights.widening import Uncertain
 from companion.beams.worth import link_budget
 from companion.values import (
@@ -95,6 +103,21 @@ def aim(
         left_out,
         made.exact,
     )
+
+
+def without(beam_set: BeamSet, uavs: Collection[str]) -> BeamSet:
+    """The beams of all others: the UAVs named keep the nulls that those have on them, and no beam.
+
+    What of the power was theirs goes to the others of their turn.
+    """
+    kept = [i for i, beam in enumerate(beam_set.beams) if beam.uav not in uavs]
+    weights = beam_set.weights[:, kept]
+    beams = tuple(beam_set.beams[i] for i in kept)
+    if kept:
+        turns = np.unique([beam.group for beam in beams], return_inverse=True)[1]
+        normalise(weights, beam_set.normalisation, turns)
+    left_out = tuple(one for one in beam_set.left_out if one.uav not in uavs)
+    return replace(beam_set, beams=beams, weights=weights, left_out=left_out)
 
 
 def directions(beam_set: BeamSet) -> FloatArray:

@@ -262,6 +262,9 @@ class ServedReplay:
         """Return after the next update of the log."""
         await self._ticked.wait()
 
+    def fleet_status(self) -> None:
+        """None: a recording has no more of a fleet than who was served."""
+
     def replay(self) -> ReplayStatus:
         """Progress of the replay."""
         state = "finished" if self._finished else "running"

@@ -19,6 +19,7 @@ from companion.node.drive import targets
 from companion.node.drive.loop import Drive, Safe
 from companion.node.drive.running import beside
 from companion.node.drive.sources import OfThisProcess, Wanted, stored_registers
+from companion.node.fleet.live import FleetNode
 from companion.node.gateway import Gateway
 from companion.node.outlet import Outlet
 from companion.node.push import Push
@@ -37,6 +38,7 @@ from companion.settings.files import embedded
 from companion.settings.model import Settings
 from companion.settings.origins import Origins
 from companion.values import Event, Frame, Notice, Output, Severity, Tick, UserError
+from companion.views.fleet import FleetStatus
 from companion.views.health import behind
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
@@ -99,13 +101,14 @@ class Service:
         self._defects: asyncio.Queue[Exception] = asyncio.Queue()
         self._recorder: BackgroundRecorder | None = None
         self._live = self._open_live()
-        self._traffic = Gateway(settings, self._step, self._notify, self._timeline.now_ns)
+        self._traffic = Gateway(settings, self._hear, self._notify, self._timeline.now_ns)
         self.arrival_lag = self._traffic.lag
         self._outlet = Outlet(settings, self.pipeline, self._notify, self._timeline.now_ns)
         now_ns = self._timeline.now_ns
         target = settings.drive.target
         stored = partial(stored_registers, self.pipeline.array, self.equipment)
         self._device = None if target is None else targets.device(target, self._say, stored)
+        self.fleet = self._fleet_node(settings)
         self._push = Push(settings.records, self.pipeline, self.equipment, self._notify, now_ns)
         self._traffic.open()
         self._outlet.open()
@@ -136,6 +139,8 @@ class Service:
                 tasks.append(group.create_task(self._outlet.run(), name="out"))
                 tasks.append(group.create_task(self._push.run(), name="records"))
                 tasks.append(group.create_task(self._driven(), name="drive"))
+                if self.fleet is not None:
+                    tasks.append(group.create_task(self.fleet.run(), name="fleet"))
                 tasks.append(group.create_task(self._recover_leftovers(), name="recovery"))
                 tasks.append(group.create_task(self._end_on_defect(), name="defects"))
                 tasks += [group.create_task(other, name="beside") for other in others]
@@ -160,7 +165,19 @@ class Service:
             await asyncio.to_thread(self._recorder.stop, metadata)
             self._tell_of_recorder(self._recorder)
 
+    def _fleet_node(self, settings: Settings) -> FleetNode | None:
+        if settings.fleet.node is None:
+            return None
+        now_ns = self._timeline.now_ns
+        return FleetNode(settings.fleet, self.pipeline, self._step, self._notify, now_ns)
+
     # --- what drives the pipeline -----------------------------------------------------------
+
+    def _hear(self, event: Event) -> None:
+        """Take in what came over this node's own links."""
+        self._step(event)
+        if self.fleet is not None:
+            self.fleet.heard(event)
 
     def _step(self, event: Event) -> None:
         if isinstance(event, Frame):
@@ -257,6 +274,8 @@ class Service:
         while True:
             began_s = loop.time()
             self._step(Tick(self._timeline.now_ns()))
+            if self.fleet is not None:
+                self.fleet.ticked(self.now_ns())
             if self.pipeline.last_update:
                 self._push.newest(self.pipeline.last_update, self.pipeline.updates - 1)
             self._rates.count(self.now_ns(), self.pipeline.frames, self.pipeline.updates)
@@ -346,6 +365,10 @@ class Service:
 
     def replay(self) -> None:
         """None: this is a live run."""
+
+    def fleet_status(self) -> FleetStatus | None:
+        """This node's place in a fleet; None where it is part of none."""
+        return None if self.fleet is None else self.fleet.status()
 
     async def _recover_leftovers(self) -> None:
         """Recover recordings that an earlier run left open when it was killed.

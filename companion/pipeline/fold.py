@@ -11,12 +11,13 @@ and a relayed aircraft's report also goes to ``targets``, which returns nothing.
 ``tracker`` for the tracks that ``targets`` wants and ``center`` for the array, and aims the beams.
 """
 
+import math
 from collections import Counter
 from collections.abc import Iterable
 from typing import Final
 
 from companion.beams import steady
-from companion.beams.aim import aim
+from companion.beams.aim import aim, without
 from companion.beams.steady import Steady
 from companion.mavlink.clock.estimates import ClockChange, ClockEstimate, Guarantee
 from companion.mavlink.wire.decode import DECODED
@@ -34,6 +35,7 @@ from companion.settings.model import Settings
 from companion.tracking.geodesy import LocalFrame
 from companion.values import (
     Carrier,
+    Duty,
     Estimate,
     EstimatorStatus,
     Event,
@@ -53,6 +55,8 @@ from companion.values import (
 
 DROP_EVERY: Final = 100
 """Updates between two searches for tracks that have been silent for too long."""
+SPARED_SHARE: Final = 4
+"""Elements of the array for each UAV of another node that beams spare: a null costs one."""
 NEAR_M: Final = 2000.0
 """Largest distance between two reports of one aircraft, whatever its speed and their latency."""
 
@@ -96,6 +100,8 @@ class Pipeline:
             outputs = self._tick(event.t_ns)
         elif isinstance(event, Rejection):
             outputs = [event]
+        elif isinstance(event, Duty):
+            self.targets.duty, outputs = event, []
         else:
             change = self.senders.round_trip(event)
             source = str(event.source)
@@ -219,12 +225,32 @@ class Pipeline:
         found = self.carrier(now_ns, valid_at_ns)
         known, unfit = (None, found) if isinstance(found, str) else (found, None)
         parts = (self.array, self.precoder, self.coverage, self._steady)
-        beams = aim(now_ns, valid_at_ns, tracks, known, *parts)
+        spared = self._spared(now_ns, valid_at_ns, known)
+        beams = aim(now_ns, valid_at_ns, [*tracks, *spared], known, *parts)
+        if spared:
+            beams = without(beams, {track.uav for track in spared})
         return Update(now_ns, known, unfit, tuple(tracks), beams)
 
-    def tracks(self, now_ns: int, valid_at_ns: int) -> list[Track]:
-        """Every UAV heard of, target or not, predicted to ``valid_at_ns``; without the carrier."""
-        others = [uav for uav in self.tracker.uavs if uav != self.center.vehicle]
+    def _spared(self, now_ns: int, valid_at_ns: int, carrier: Carrier | None) -> list[Track]:
+        """UAVs of other nodes that the beams spare: the nearest, as many as cost little.
+
+        There are some in a fleet alone, where ``[fleet] nulls`` asks for them.
+        """
+        spared = self._tracks(self.targets.spared(self.tracker.uavs), now_ns, valid_at_ns)
+        if carrier is None or not spared:
+            return []
+        spared.sort(key=lambda one: math.dist(one.position_ned_m, carrier.position_ned_m))
+        return spared[: self.array.size // SPARED_SHARE]
+
+    def tracks(
+        self, now_ns: int, valid_at_ns: int, uavs: Iterable[str] | None = None
+    ) -> list[Track]:
+        """Every UAV heard of, target or not, predicted to ``valid_at_ns``; without the carrier.
+
+        ``uavs`` names those that are wanted; None: all.
+        """
+        others = self.tracker.uavs if uavs is None else uavs
+        others = [uav for uav in others if uav != self.center.vehicle]
         return self._tracks(others, now_ns, valid_at_ns)
 
     def _tracks(self, uavs: Iterable[str], now_ns: int, valid_at_ns: int) -> list[Track]:

@@ -150,7 +150,7 @@ class Senders:
                     return _refused(message, Reason.DUPLICATE)
                 if message.uav != self._carrier and not self._admission.admits(message.uav):
                     return _refused(message, Reason.NOT_ALLOWED)
-                return self._telemetry(message)
+                return self._telemetry(message, frame.doubt_ns)
             case AdsbVehicle():
                 if not self._admission.admits(message.uav):
                     return _refused(message, Reason.NOT_ALLOWED)
@@ -204,13 +204,16 @@ class Senders:
         clock.timesync(event.sent_ns, event.t_ns, event.remote_ns)
         return clock.change
 
-    def _telemetry(self, report: Report) -> Heard:
-        """Place a report by its stamp; its noise is a vehicle's own matter if it reports itself."""
+    def _telemetry(self, report: Report, doubt_ns: int = 0) -> Heard:
+        """Place a report by its stamp; its noise is a vehicle's own matter if it reports itself.
+
+        ``doubt_ns`` is that of its frame.
+        """
         assert report.boot_ms is not None
         uav, t_ns = report.uav, report.t_ns
         if uav not in self._clocks and len(self._clocks) >= CLOCKS_MAX and not reports_itself(uav):
             return _refused(report, Reason.TOO_MANY)  # any number of names can be made up
-        stamp, restarted = self._stamp(uav, t_ns, report.boot_ms)
+        stamp, restarted = self._stamp(uav, t_ns, report.boot_ms, doubt_ns)
         said = _restart_notice(t_ns, uav, report.boot_ms) if restarted else ()
         if self._clock(uav).is_shared(t_ns):
             return Heard(None, (*said, *self._shared_id(uav, t_ns)), restarted)
@@ -306,9 +309,11 @@ class Senders:
 
     # --- when they said it ------------------------------------------------------------------
 
-    def _stamp(self, name: str, arrival_ns: int, boot_ms: int) -> tuple[Stamp | None, str | None]:
+    def _stamp(
+        self, name: str, arrival_ns: int, boot_ms: int, doubt_ns: int = 0
+    ) -> tuple[Stamp | None, str | None]:
         """Place a stamp on the sender's timeline; also returns the sender's name if it rebooted."""
-        stamp = self._clock(name).observe(arrival_ns, boot_ms)
+        stamp = self._clock(name).observe(arrival_ns, boot_ms, doubt_ns)
         self._stamped_ns[name] = arrival_ns
         return stamp, name if stamp is not None and stamp.rebooted else None
 

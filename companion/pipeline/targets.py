@@ -4,14 +4,24 @@ from collections.abc import Iterable, Mapping
 
 from companion.settings.model import Settings
 from companion.tracking.identity import Identities
-from companion.values import Fix, Notice, Severity, Track, TrackState, reports_itself, standing
+from companion.values import (
+    Duty,
+    Fix,
+    Notice,
+    Severity,
+    Track,
+    TrackState,
+    reports_itself,
+    standing,
+)
 
 
 class Targets:
     """Decides for which UAVs beams are wanted.
 
     Wanted are UAVs that report themselves, relayed aircraft only if the settings say so, and never
-    the carrier (``carrier`` is its id, None for a station).
+    the carrier (``carrier`` is its id, None for a station). Of a fleet's node it is those that are
+    its ``duty``; None: there is no fleet.
     """
 
     def __init__(self, settings: Settings, carrier: str | None) -> None:
@@ -20,6 +30,7 @@ class Targets:
         self._dropped_s = settings.tracks.dropped_s
         self._identities = Identities()
         self._states: Mapping[str, TrackState] = {}
+        self.duty: Duty | None = None
 
     def wants(self, uav: str) -> bool:
         """Whether a beam is wanted for this UAV."""
@@ -29,7 +40,16 @@ class Targets:
 
     def among(self, uavs: Iterable[str]) -> list[str]:
         """The UAVs for which beams are wanted, in the order given."""
-        return [uav for uav in uavs if self.wants(uav)]
+        wanted = [uav for uav in uavs if self.wants(uav)]
+        if self.duty is None:
+            return wanted
+        served = frozenset(self.duty.serves)
+        return [uav for uav in wanted if uav in served]
+
+    def spared(self, uavs: Iterable[str]) -> list[str]:
+        """The UAVs that others serve, on which beams are to have nulls, in the order given."""
+        spares = frozenset(self.duty.spares if self.duty else ())
+        return [uav for uav in uavs if uav in spares and self.wants(uav)]
 
     def same_as(self, uav: str) -> str | None:
         """The better known track that is the same aircraft as this relayed one.

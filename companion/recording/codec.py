@@ -8,6 +8,7 @@ import numpy as np
 from companion.recording import schemas
 from companion.values import (
     BeamSet,
+    Duty,
     Fix,
     FloatArray,
     Frame,
@@ -180,6 +181,11 @@ def round_trip(value: RoundTrip) -> Any:
     )
 
 
+def duty(value: Duty) -> Any:
+    """Whom a node of a fleet serves from then on."""
+    return schemas.DutyMessage(t_ns=value.t_ns, serves=value.serves, spares=value.spares)
+
+
 # --- and back -----------------------------------------------------------------------------------
 
 
@@ -193,7 +199,8 @@ def to_frame(data: bytes, sources: dict[tuple[int, int], Source]) -> Frame:
     source = sources.get(ids)
     if source is None:
         source = sources.setdefault(ids, Source(*ids))
-    return Frame(message.t_ns, message.link, source, message.msgid, message.raw)
+    doubt_ns = message.doubt_ns
+    return Frame(message.t_ns, message.link, source, message.msgid, message.raw, doubt_ns)
 
 
 def to_round_trip(data: bytes) -> RoundTrip:
@@ -201,6 +208,12 @@ def to_round_trip(data: bytes) -> RoundTrip:
     message = schemas.RoundTripMessage.FromString(data)
     source = Source(message.sysid, message.compid)
     return RoundTrip(message.t_ns, source, message.sent_ns, message.remote_ns)
+
+
+def to_duty(data: bytes) -> Duty:
+    """Read a duty. Raises ``DecodeError`` for bytes that are no such message."""
+    message = schemas.DutyMessage.FromString(data)
+    return Duty(message.t_ns, tuple(message.serves), tuple(message.spares))
 
 
 def to_rejection(data: bytes) -> Rejection | None:

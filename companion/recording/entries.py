@@ -14,6 +14,7 @@ from companion.recording.scene import Scene
 from companion.recording.schemas import Schema
 from companion.values import (
     BeamSet,
+    Duty,
     Estimate,
     Event,
     FloatArray,
@@ -99,6 +100,9 @@ class Encoder:
             case RoundTrip():
                 data = codec.round_trip(event).SerializeToString()
                 self._emit(schemas.ROUND_TRIPS_TOPIC, schemas.ROUND_TRIP, event.t_ns, data)
+            case Duty():
+                data = codec.duty(event).SerializeToString()
+                self._emit(schemas.DUTIES_TOPIC, schemas.DUTY, event.t_ns, data)
 
     def output(self, output: Output, geodetic: Geodetic) -> None:
         """Send an output. A rejection that is the last event itself is not sent twice.

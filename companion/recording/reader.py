@@ -34,12 +34,15 @@ _MAPPED_BYTES: Final = 1 << 26
 """Size from which on a log is left to the system's pages rather than read into memory."""
 _LATEST_NS: Final = 1 << 62
 """Latest time of an event, the year 2116: what is worked out from times stays in 63 bits."""
+_DOUBT_MAX_NS: Final = 3_600_000_000_000
+"""Greatest doubt of a frame's arrival: what is worked out from it stays in 63 bits."""
 _EVENT_TOPICS: Final = frozenset(
     (
         schemas.FRAMES_TOPIC,
         schemas.TICKS_TOPIC,
         schemas.REJECTIONS_TOPIC,
         schemas.ROUND_TRIPS_TOPIC,
+        schemas.DUTIES_TOPIC,
     )
 )
 
@@ -240,11 +243,13 @@ def _recorded(path: Path) -> Iterator[Event]:
 def _event(topic: str, data: bytes, sources: dict[tuple[int, int], Source]) -> Event | None:
     if topic == schemas.FRAMES_TOPIC:
         frame = codec.to_frame(data, sources)
-        if not is_shaped(frame.raw) or max(frame.source) > 255:
+        if not is_shaped(frame.raw) or max(frame.source) > 255 or frame.doubt_ns > _DOUBT_MAX_NS:
             raise ValueError("a frame that is none")
         return frame
     if topic == schemas.TICKS_TOPIC:
         return Tick(schemas.TickMessage.FromString(data).t_ns)
     if topic == schemas.ROUND_TRIPS_TOPIC:
         return codec.to_round_trip(data)
+    if topic == schemas.DUTIES_TOPIC:
+        return codec.to_duty(data)
     return codec.to_rejection(data)

@@ -33,7 +33,7 @@ from companion.values import Frame
 # only ever appended: a number that has been written once keeps its meaning.
 _MESSAGES: Final[dict[str, list[str]]] = {
     "Frame": ["fixed64 t_ns", "string link", "uint32 sysid", "uint32 compid", "uint32 msgid",
-              "bytes raw"],
+              "bytes raw", "uint64 doubt_ns"],
     "Tick": ["fixed64 t_ns"],
     "Rejection": ["fixed64 t_ns", "string source", "string reason", "uint64 count",
                   "optional uint32 msgid", "string detail", "bool is_event"],
@@ -57,6 +57,19 @@ _MESSAGES: Final[dict[str, list[str]]] = {
     "Weights": ["fixed64 t_ns", "fixed64 valid_at_ns", "repeated string uavs", "uint32 elements",
                 "bytes weights_complex64", "string method", "optional double condition_number",
                 "repeated Beam beam", "repeated LeftOut left_out", "string normalisation"],
+    "Duty": ["fixed64 t_ns", "repeated string serves", "repeated string spares"],
+    "SharedFrame": ["uint64 after_ns", "bytes raw"],
+    "Shared": ["fixed64 first_ns", "repeated SharedFrame frame", "repeated RoundTrip trip",
+               "fixed64 told_ns"],
+    "Served": ["string uav", "double worth_db"],
+    "Handing": ["string uav", "string to"],
+    "Standing": ["string node", "fixed64 started_ns", "fixed64 t_ns", "repeated double place",
+                 "optional double reach_m", "uint32 most", "repeated Served serves",
+                 "repeated Handing handing"],
+    "Offer": ["string uav", "optional double sure_db", "optional double likely_db",
+              "optional double sinr_db", "optional double heard_s"],
+    "Offers": ["repeated Offer offer"],
+    "Tracks": ["repeated Track track"],
 }  # fmt: skip
 """Fields of this program's own messages.
 
@@ -66,6 +79,10 @@ _MESSAGES: Final[dict[str, list[str]]] = {
     Rejection  ``is_event``: made while framing, so that it drove the pipeline; others were made by
                the pipeline
     RoundTrip  a TIMESYNC request of the service and its answer
+    Frame      ``doubt_ns``: of a frame that another node heard, by how much ``t_ns`` may be late
+    Shared, Standing, Offers   what the nodes of a fleet tell one another (docs/fleet.md); they are
+               in no recording
+    Duty       whom this node of a fleet serves from then on, and whom its beams spare
 """
 
 _TYPES: Final = {
@@ -120,6 +137,11 @@ FrameMessage: Final = _message("Frame")
 TickMessage: Final = _message("Tick")
 RejectionMessage: Final = _message("Rejection")
 RoundTripMessage: Final = _message("RoundTrip")
+DutyMessage: Final = _message("Duty")
+SharedMessage: Final = _message("Shared")
+StandingMessage: Final = _message("Standing")
+OffersMessage: Final = _message("Offers")
+TracksMessage: Final = _message("Tracks")
 TrackMessage: Final = _message("Track")
 WeightsMessage: Final = _message("Weights")
 LocationFixMessage: Final[Any] = LocationFix
@@ -158,6 +180,8 @@ FRAME: Final = _with_dependencies(FrameMessage)
 TICK: Final = _with_dependencies(TickMessage)
 REJECTION: Final = _with_dependencies(RejectionMessage)
 ROUND_TRIP: Final = _with_dependencies(RoundTripMessage)
+DUTY: Final = _with_dependencies(DutyMessage)
+SHARED: Final = _with_dependencies(SharedMessage)
 TRACK: Final = _with_dependencies(TrackMessage)
 WEIGHTS: Final = _with_dependencies(WeightsMessage)
 LOCATION_FIX: Final = _with_dependencies(LocationFixMessage)
@@ -170,6 +194,7 @@ FRAMES_TOPIC: Final = "/mavlink/frames"
 TICKS_TOPIC: Final = "/ticks"
 REJECTIONS_TOPIC: Final = "/rejections"
 ROUND_TRIPS_TOPIC: Final = "/timesync"
+DUTIES_TOPIC: Final = "/fleet/duty"
 TRACKS_TOPIC: Final = "/tracks"
 WEIGHTS_TOPIC: Final = "/beams/weights"
 LOG_TOPIC: Final = "/log"
@@ -180,7 +205,9 @@ SCENE_TOPIC: Final = "/scene"
 RAW_MAX: Final = 280
 """Most bytes of a frame: 10 of head, 255 of payload, 2 of checksum, 13 of signature."""
 _TIME = struct.Struct("<BQ")
-_T_NS, _LINK, _SYSID, _COMPID, _MSGID, _RAW = 0x09, 0x12, 0x18, 0x20, 0x28, 0x32
+_T_NS, _LINK, _SYSID, _COMPID, _MSGID, _RAW, _DOUBT_NS = (
+    0x09, 0x12, 0x18, 0x20, 0x28, 0x32, 0x38,
+)  # fmt: skip
 
 
 def _varint(value: int) -> bytes:
@@ -225,6 +252,8 @@ class FrameEncoder:
         size = len(raw)
         length = _RAW_HEADS[size] if size <= RAW_MAX else bytes((_RAW,)) + _varint(size)
         time = _TIME.pack(_T_NS, t_ns) if t_ns else b""
+        if frame.doubt_ns:
+            return b"".join((time, head, length, raw, _number(_DOUBT_NS, frame.doubt_ns)))
         return b"".join((time, head, length, raw))
 
     @staticmethod

@@ -17,6 +17,7 @@ from companion.server.metrics import NodeCollector
 from companion.server.responses import answer, answers
 from companion.server.stream import Stream
 from companion.server.turns import Turns
+from companion.views import fleet as fleet_view
 from companion.views import link_state, series, settings, state
 from companion.views.design import DesignView
 from companion.views.state import Node
@@ -31,7 +32,7 @@ DESCRIPTION: Final = """Location-aware beamforming from MAVLink. Read only.
 Angles in degrees, distances in metres; null is not known, never 0. Estimates are worked out for
 the moment at which they are asked for: `valid_at` says which, so no answer has an ETag. Errors are
 `application/problem+json` (RFC 9457). `WS /v1/stream?uav=…&topic=…&rate_hz=…` sends `uavs`,
-`beams`, `weights`, `status`, `links` and `events` as they change, and `records` in binary.
+`beams`, `weights`, `status`, `links`, `fleet` and `events` as they change, and `records` in binary.
 """
 
 
@@ -152,6 +153,14 @@ def _state_routes(app: FastAPI, node: Node, turns: Turns) -> None:
     )
     async def links() -> Response:
         return answer(state.links(node))
+
+    @app.get(
+        "/v1/fleet",
+        summary="The nodes of the fleet, and who serves whom",
+        responses=answers(models.Fleet),
+    )
+    async def fleet() -> Response:
+        return answer(fleet_view.fleet(node.fleet_status(), node.now_ns()))
 
     @app.get(
         "/v1/events",

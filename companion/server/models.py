@@ -317,6 +317,75 @@ class Throughput(BaseModel):
     updates_hz: float | None
 
 
+class FleetPlace(BaseModel):
+    """Where a node's array is."""
+
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
+
+
+class FleetNode(BaseModel):
+    """A node of the fleet: this one, then the others by name."""
+
+    node: str
+    is_self: bool
+    state: Literal["here", "there", "silent", "aside"]
+    reason: str | None
+    place: FleetPlace | None
+    reach_m: float | None
+    serves: int
+    most: int | None
+    heard_s: float | None
+    clock_offset_s: float | None
+    clock_doubt_s: float | None
+    frames: int | None
+    used: int | None
+
+
+class FleetOffer(BaseModel):
+    """What a node's array would have towards a UAV, if it served it alone."""
+
+    node: str
+    sure_db: float | None
+    likely_db: float | None
+    sinr_db: float | None
+    heard_s: float | None
+
+
+class FleetUav(BaseModel):
+    """A UAV, who serves it, and what each node offers it."""
+
+    uav: Uav
+    served_by: list[str]
+    handing_to: str | None
+    unconfirmed: bool
+    offers: list[FleetOffer]
+
+
+class FleetHandover(BaseModel):
+    """A change of who serves a UAV, that this node took part in."""
+
+    time: Time
+    uav: Uav
+    before: str | None
+    after: str | None
+
+
+class Fleet(BaseModel):
+    """The fleet as this node knows it; ``node`` is null where there is none."""
+
+    valid_at: Time
+    node: str | None
+    site: str | None
+    nodes: list[FleetNode]
+    uavs: list[FleetUav]
+    handovers: list[FleetHandover]
+    sent_bps: float | None
+    heard_bps: float | None
+    damaged: int
+
+
 class Replay(BaseModel):
     """How far a replay is: seconds of the log, of how many; ``speed`` null: as fast as it goes."""
 

@@ -1,8 +1,8 @@
 """The WebSocket ``/v1/stream``: the state as it changes, always the newest.
 
     ?uav=1:1&uav=2:1     only these UAVs (default: all)
-    &topic=uavs          uavs, beams, weights, records, status, links, events (default: uavs and
-                         beams)
+    &topic=uavs          uavs, beams, weights, records, status, links, fleet, events (default:
+                         uavs and beams)
     &rate_hz=10          greatest rate of each topic; never more than updates
 
 Every message is a JSON object: the answer of the path of that name, with ``topic`` and

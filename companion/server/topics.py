@@ -11,6 +11,7 @@ import companion
 from companion.server.responses import encode
 from companion.values import BeamSet
 from companion.views import beam_state, guaranteed_gain, link_state, records, state
+from companion.views import fleet as fleet_view
 from companion.views.state import Node
 from companion.views.words import rfc3339
 
@@ -26,6 +27,7 @@ class Topic(StrEnum):
     RECORDS = "records"
     STATUS = "status"
     LINKS = "links"
+    FLEET = "fleet"
     EVENTS = "events"
 
 
@@ -107,6 +109,10 @@ async def _links(node: Node) -> Json:
     return state.links(node)
 
 
+async def _fleet(node: Node) -> Json:
+    return fleet_view.fleet(node.fleet_status(), node.now_ns())
+
+
 async def _events(node: Node) -> Json:
     events = [link_state.event(notice) for notice in node.events()]
     return {"valid_at": rfc3339(node.now_ns()), "events": events}
@@ -119,5 +125,6 @@ BODIES: Final[dict[Topic, Callable[[Node], Any]]] = {
     Topic.RECORDS: _records,
     Topic.STATUS: _status,
     Topic.LINKS: _links,
+    Topic.FLEET: _fleet,
     Topic.EVENTS: _events,
 }

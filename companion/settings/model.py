@@ -21,6 +21,7 @@ from companion.settings.beams import (
     RadioSettings,
 )
 from companion.settings.center import CenterSettings
+from companion.settings.fleet import FleetSettings
 from companion.settings.mavlink import (
     LinkSettings,
     OutSettings,
@@ -91,6 +92,7 @@ class Settings(Section):
     records: RecordSettings = RecordSettings()
     drive: DriveSettings = DriveSettings()
     server: ServerSettings = ServerSettings()
+    fleet: FleetSettings = FleetSettings()
     page: PageSettings = PageSettings()
 
     @classmethod

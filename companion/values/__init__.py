@@ -23,6 +23,8 @@ from companion.values.aimed import (
     Widen,
 )
 from companion.values.errors import UserError
+from companion.values.events import Duty, Event, RoundTrip, Tick
+from companion.values.fleet import Offer, Shared, SharedFrame, Standing
 from companion.values.health import Blame, Cause, Level, Verdict
 from companion.values.names import Source, reports_itself, standing
 from companion.values.numbers import (
@@ -45,16 +47,13 @@ from companion.values.received import (
     AltitudeDatum,
     Attitude,
     EstimatorStatus,
-    Event,
     Frame,
     GnssStatus,
     Message,
     Presence,
     RemoteId,
     Report,
-    RoundTrip,
     SystemTime,
-    Tick,
 )
 from companion.values.rejections import Reason, Rejection
 from companion.values.tracked import (
@@ -82,6 +81,7 @@ __all__ = [
     "Carrier",
     "Cause",
     "ComplexArray",
+    "Duty",
     "Estimate",
     "EstimatorStatus",
     "Event",
@@ -98,6 +98,7 @@ __all__ = [
     "Method",
     "Normalisation",
     "Notice",
+    "Offer",
     "Output",
     "Policy",
     "Power",
@@ -111,7 +112,10 @@ __all__ = [
     "RoundTrip",
     "SenderTime",
     "Severity",
+    "Shared",
+    "SharedFrame",
     "Source",
+    "Standing",
     "SystemTime",
     "Tick",
     "Track",

@@ -5,15 +5,15 @@ from enum import StrEnum
 from typing import NamedTuple
 
 from companion.values.names import Source
-from companion.values.rejections import Rejection
 
 
 class Frame(NamedTuple):
     """One MAVLink frame whose checksum is right.
 
     ``raw`` is the whole frame, from the magic byte to the checksum or signature; ``t_ns`` is when
-    it arrived, node time. It is a tuple because one is made for every frame received, wanted or
-    not.
+    it arrived, node time; of one that another node heard, the latest time at which that can have
+    been, which may be too late by ``doubt_ns``. It is a tuple because one is made for every frame
+    received, wanted or not.
     """
 
     t_ns: int
@@ -21,6 +21,7 @@ class Frame(NamedTuple):
     source: Source
     msgid: int
     raw: bytes
+    doubt_ns: int = 0
 
     @property
     def version(self) -> int:
@@ -37,40 +38,6 @@ class Frame(NamedTuple):
         """The payload as sent; MAVLink 2 senders cut trailing zeros."""
         start = 10 if self.raw[0] == 0xFD else 6
         return self.raw[start : start + self.raw[1]]
-
-
-@dataclass(frozen=True, slots=True)
-class Tick:
-    """The timer event at which beams are due."""
-
-    t_ns: int
-
-
-@dataclass(frozen=True, slots=True)
-class RoundTrip:
-    """A TIMESYNC request sent by this node, and its answer.
-
-    t_ns       when the answer was received, node time
-    source     who answered
-    sent_ns    when the request was sent, node time
-    remote_ns  the sender's clock since boot, read at some time between ``sent_ns`` and ``t_ns``
-    """
-
-    t_ns: int
-    source: Source
-    sent_ns: int
-    remote_ns: int
-
-
-Event = Frame | Tick | Rejection | RoundTrip
-"""Everything that drives the pipeline, in the order in which it was taken in.
-
-That is the order of time, but that a frame's time is its arrival: where the node was busy, a tick
-of a later time may have been taken in before it.
-
-A rejection made while framing is an event too: its bytes are gone, but that they came must be
-recorded. A round trip is an event because only the service knows which requests were its own.
-"""
 
 
 class AltitudeDatum(StrEnum):

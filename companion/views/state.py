@@ -15,6 +15,7 @@ from companion.pipeline.fold import Pipeline
 from companion.settings.origins import Origins
 from companion.values import Blame, Carrier, Fix, FloatArray, Notice, Track
 from companion.views import center_state, health, link_state
+from companion.views.fleet import FleetStatus
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
 from companion.views.series import Series
@@ -66,7 +67,7 @@ class ReplayStatus:
 class Node(Protocol):
     """What the server reads: the running service, a replay, or a test's substitute for them.
 
-    ``replay`` returns None where the node is live.
+    ``replay`` returns None where the node is live, ``fleet_status`` where it is part of no fleet.
     """
 
     pipeline: Pipeline
@@ -87,6 +88,7 @@ class Node(Protocol):
     def message_rates(self) -> list[MessageRate]: ...
     def events(self) -> list[Notice]: ...
     def replay(self) -> ReplayStatus | None: ...
+    def fleet_status(self) -> FleetStatus | None: ...
     def ticked(self) -> Awaitable[None]: ...
 
 

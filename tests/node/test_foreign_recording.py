@@ -33,6 +33,7 @@ PATHS = {
     "presence": {"enabled": True, "system_id": 7},
     "out": {"urls": ["tcp:192.0.2.1:1"]},
     "drive": {"target": "rotctld:192.0.2.1:1"},
+    "fleet": {"node": "north", "ca": "{}/fifo", "certificate": "{}/fifo", "key": "{}/fifo"},
     "records": {"udp": ["192.0.2.1:1"], "shared_memory": "{}/written/ring"},
 }  # fmt: skip
 """What a recording may say that a replay has no business with."""

@@ -17,6 +17,7 @@ FRAMES = st.builds(
     st.builds(Source, BYTE, BYTE),
     st.integers(0, 2**24 - 1),
     st.binary(max_size=300),
+    st.just(0) | st.integers(0, 2**63 - 1),
 )
 REJECTIONS = st.builds(
     Rejection,
@@ -41,6 +42,7 @@ def test_a_hand_packed_frame_is_the_generated_one(frame: Frame) -> None:
         compid=frame.source.compid,
         msgid=frame.msgid,
         raw=frame.raw,
+        doubt_ns=frame.doubt_ns,
     )
     encoder = schemas.FrameEncoder()
     encoder.encode(frame._replace(t_ns=7, raw=b"another"))  # its head is kept
@@ -90,7 +92,8 @@ def test_the_numbers_of_the_fields_stay() -> None:
     }
     assert numbers == {
         ("Frame", "t_ns"): 1, ("Frame", "link"): 2, ("Frame", "sysid"): 3, ("Frame", "compid"): 4,
-        ("Frame", "msgid"): 5, ("Frame", "raw"): 6, ("Rej", "t_ns"): 1, ("Rej", "source"): 2,
+        ("Frame", "msgid"): 5, ("Frame", "raw"): 6, ("Frame", "doubt_ns"): 7,
+        ("Rej", "t_ns"): 1, ("Rej", "source"): 2,
         ("Rej", "reason"): 3, ("Rej", "count"): 4, ("Rej", "msgid"): 5, ("Rej", "detail"): 6,
         ("Rej", "is_event"): 7,
     }  # fmt: skip

@@ -19,6 +19,7 @@ from companion.server.app import create_app
 from companion.settings.model import Settings
 from companion.settings.origins import Origins
 from companion.values import Frame, Notice, Severity, Source, Tick
+from companion.views.fleet import FleetStatus
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
 from companion.views.series import Series
@@ -42,6 +43,7 @@ class StandIn:
         self.notices: list[Notice] = []
         self.current = RecordingStatus("off", None, 0, 0, 0)
         self.replayed: ReplayStatus | None = None
+        self.fleet: FleetStatus | None = None
         self._ticked = asyncio.Event()
         self._now_ns = 1_800_000_000_000_000_000
         if flown:
@@ -114,6 +116,10 @@ class StandIn:
     def events(self) -> list[Notice]:
         """What was said."""
         return list(self.notices)
+
+    def fleet_status(self) -> FleetStatus | None:
+        """As the test says."""
+        return self.fleet
 
     def replay(self) -> ReplayStatus | None:
         """As the test says."""

@@ -26,6 +26,7 @@ PATHS: dict[str, Any] = {
     "/v1/uavs": models.Uavs,
     "/v1/uavs/1:1": models.UavState,
     "/v1/links": models.Links,
+    "/v1/fleet": models.Fleet,
     "/v1/history": models.History,
     "/v1/settings": models.EffectiveSettings,
     "/v1/events": models.Events,

@@ -163,7 +163,7 @@ def precode(
         weights[:, np.searchsorted(served, group)] = shared
     method = max((one.method for one in made), key=_METHODS.index)
     condition = max(one.condition_number for one in made)
-    _normalise(weights, settings.normalisation, turns[served])
+    normalise(weights, settings.normalisation, turns[served])
     return Precoding(
         weights, method, settings.normalisation, condition, served, turns[served], dropped,
         method is Method.ZERO_FORCING,
@@ -417,8 +417,11 @@ def _least_loading(a: ComplexArray, gram: ComplexArray, settings: Precoder) -> f
     return float(max(found, least))
 
 
-def _normalise(weights: ComplexArray, how: Normalisation, turns: IntArray) -> None:
-    """Scale columns of unit response in place; the columns of one turn share one factor."""
+def normalise(weights: ComplexArray, how: Normalisation, turns: IntArray) -> None:
+    """Scale columns in place; the columns of one turn share one factor.
+
+    Those of unit response stay as they are.
+    """
     if how is Normalisation.UNIT_RESPONSE:
         return
     if how is Normalisation.STREAM:

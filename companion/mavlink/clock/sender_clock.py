@@ -8,7 +8,8 @@ sender time, is an interval, and every stamp and every answer narrows it:
 - TIMESYNC round trips hold it on both sides, and so does GNSS time at both ends where the settings
   trust it (``evidence.py``);
 - where neither is there, the lower side is an assumption: that the least latency, which nothing
-  that is only heard can show, is no longer than the median of its visible part.
+  that is only heard can show, is no longer than the median of its visible part; stamps that another
+  node heard may have arrived earlier by their doubt, which is added.
 
 The interval is as of the time asked for, and grows while nothing comes. No report is ever placed
 later than it arrived. See docs/math.md 6. ``epochs.py`` decides which stamps belong to one line,
@@ -70,10 +71,11 @@ class SenderClock:
         self._gnss = Evidence(drift_max)
         self._gnss_plausible = 0
         self._latency_s = 0.0
+        self._doubt_ns = 0  # the greatest of the line's stamps
         self._known: tuple[ClockKind, int, int, int] | None = None  # as of the newest stamp
 
-    def observe(self, arrival_ns: int, boot_ms: int) -> Stamp | None:
-        """Place a stamp.
+    def observe(self, arrival_ns: int, boot_ms: int, doubt_ns: int = 0) -> Stamp | None:
+        """Place a stamp; ``doubt_ns`` is by how much its frame may have arrived earlier.
 
         Returns None for a frame of the boot before, and for a stamp off the line that others have
         not confirmed so far: that report has no time and cannot be used.
@@ -86,6 +88,8 @@ class SenderClock:
             self._timesync.clear()
             self._gnss.clear()
             self._gnss_plausible = 0
+            self._doubt_ns = 0
+        self._doubt_ns = max(self._doubt_ns, doubt_ns)
         self._note_change()
         latency_s = max(0.0, (arrival_ns - self.node_ns(placed.x_ns)) * 1e-9)
         if placed.x_ns == self._line.newest_ns:
@@ -270,6 +274,7 @@ class SenderClock:
         delay_ns = self._constant_delay_ns
         best = ClockKind.ENVELOPE
         low_ns = least_ns - max(delay_ns, median_ns, UNSEEN_NS) - floor.residual_ns()
+        low_ns -= self._doubt_ns
         low_ns = max(low_ns, sure_ns - _DEEPEST_NS)
         high_ns: float = sure_ns - delay_ns
         likely_ns = line_ns - delay_ns - INVISIBLE * max(0.0, median_ns - delay_ns)

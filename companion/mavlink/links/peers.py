@@ -174,7 +174,7 @@ class Peers:
             if isinstance(item, Rejection):
                 status.lost[item.reason] = status.lost.get(item.reason, 0) + item.count
                 continue
-            t_ns, _, source, msgid, raw = item
+            t_ns, _, source, msgid, raw, _ = item
             if raw[0] == MAGIC_V2:
                 version, number = 2, raw[4]
             else:

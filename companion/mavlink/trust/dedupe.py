@@ -55,7 +55,7 @@ class Dedupe:
         share = self.shares.get(frame.link)
         if share is None:
             share = self.shares.setdefault(frame.link, LinkShare())
-        key = _content(frame)
+        key = content(frame.raw)
         first = self._seen.get(key)
         if first is None:
             first = self._seen[key] = _First(frame.t_ns, frame.link)
@@ -78,9 +78,11 @@ class Dedupe:
             del self._seen[key]
 
 
-def _content(frame: Frame) -> bytes:
-    """Sender, message id and payload without the zeros at its end, which MAVLink 2 cuts."""
-    raw = frame.raw
+def content(raw: bytes) -> bytes:
+    """Sender, message id and payload of a frame, without the zeros at the payload's end.
+
+    MAVLink 2 cuts those; MAVLink 1 has one byte for the message id, and they are brought alike.
+    """
     if raw[0] == 0xFD:  # they stand one after the other
         return raw[5 : 10 + raw[1]].rstrip(b"\0")
-    return (bytes(frame.source) + frame.msgid.to_bytes(3, "little") + frame.payload).rstrip(b"\0")
+    return (raw[3:6] + b"\0\0" + raw[6 : 6 + raw[1]]).rstrip(b"\0")

@@ -1,0 +1,1 @@
+"""This node's place in a fleet, over Zenoh."""

@@ -1,0 +1,288 @@
+"""The live node in a fleet: Zenoh on one side, a ``Member`` and the pipeline on the other.  [shell]
+
+What is said, how often and under which keys is described in docs/fleet.md.
+"""
+
+import asyncio
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from companion.mavlink.links.zenoh_bus import Bus
+from companion.mavlink.links.zenoh_config import BusConfig, BusTls
+from companion.node.fleet import messages
+from companion.node.fleet.messages import FleetMessageError
+from companion.pipeline.fleet.member import Member
+from companion.pipeline.fleet.offers import Offers
+from companion.pipeline.fleet.surroundings import Surroundings
+from companion.pipeline.fold import Pipeline
+from companion.recording import codec, schemas
+from companion.settings.fleet import FleetSettings
+from companion.settings.section import ConfigError
+from companion.values import Event, Frame, Notice, RoundTrip, Severity
+from companion.views.fleet import FleetStatus
+
+PREFIX: Final = "companion"
+STANDING_S: Final = 0.2
+"""Time between two words of this node on what it does."""
+ASKED_S: Final = 0.5
+"""Time between two questions for another node's clock."""
+OFFERED_S: Final = 1.0
+"""Time between two tellings of offers, and of tracks."""
+_CLOCK: Final = struct.Struct("<qq")
+"""Answer to a question for the clock: when the node started, and its time now; ns."""
+
+
+class _Rate:
+    """Bits per second, by the bytes between two looks."""
+
+    def __init__(self) -> None:
+        self.bytes = 0
+        self.bps = 0.0
+        self._before: tuple[int, int] | None = None
+
+    def look(self, now_ns: int) -> None:
+        """Work out the rate since the last look."""
+        if self._before is not None and now_ns > self._before[0]:
+            t_ns, had = self._before
+            self.bps = 8e9 * (self.bytes - had) / (now_ns - t_ns)
+        self._before = now_ns, self.bytes
+
+
+class FleetNode:
+    """This node among others. ``open`` blocks; ``run`` serves until cancelled.
+
+        settings  [fleet], with a name
+        pipeline  what is shared and what is decided is about it
+        step      takes events for the pipeline
+        notify    takes messages for the operator
+        now_ns    the node's timeline
+
+    Raises ``ConfigError`` for settings that do not make sense together.
+    """
+
+    def __init__(
+        self,
+        settings: FleetSettings,
+        pipeline: Pipeline,
+        step: Callable[[Event], None],
+        notify: Callable[[Notice], None],
+        now_ns: Callable[[], int],
+    ) -> None:
+        assert settings.node is not None
+        self.name = settings.node
+        self.settings = settings
+        self.damaged = 0
+        self._sent = _Rate()
+        self._heard = _Rate()
+        self._pipeline = pipeline
+        self._step = step
+        self._notify = notify
+        self._now_ns = now_ns
+        self._started_ns = now_ns()
+        self._config = bus_config(settings)
+        self.member = Member(self.name, settings, pipeline.array.size, self._started_ns)
+        self._around = Surroundings(pipeline, self.member)
+        self._offers = Offers(pipeline, self.member.hearing.silent_s)
+        self._bus: Bus | None = None
+        self._flushing: asyncio.TimerHandle | None = None
+        self._has_twin = False
+
+    # --- while it runs ----------------------------------------------------------------------
+
+    async def run(self) -> None:
+        """Take part until cancelled. Raises ``UserError`` where Zenoh cannot be had."""
+        bus = Bus(self._config, asyncio.get_running_loop())
+        try:
+            await asyncio.to_thread(bus.open)
+            self._bus = bus
+            self._declare(bus)
+            async with asyncio.TaskGroup() as group:
+                group.create_task(bus.run(), name="zenoh")
+                group.create_task(self._repeat(STANDING_S, self._stand), name="standing")
+                group.create_task(self._repeat(ASKED_S, self._ask), name="clocks")
+                group.create_task(self._repeat(OFFERED_S, self._offer), name="offers")
+        finally:
+            self._bus = None
+            if self._flushing is not None:
+                self._flushing.cancel()
+            await asyncio.to_thread(bus.close)
+
+    async def _repeat(self, period_s: float, what: Callable[[int], None]) -> None:
+        while True:
+            what(self._now_ns())
+            await asyncio.sleep(period_s)
+
+    def _declare(self, bus: Bus) -> None:
+        base = f"{PREFIX}/{self.settings.site}"
+        bus.serve(f"{base}/{self.name}/time", self._time)
+        bus.serve(f"{base}/{self.name}/schema", lambda key, payload: schemas.SHARED.descriptor_set)
+        bus.subscribe(f"{base}/*/heard", self._taking(self._shared))
+        bus.subscribe(f"{base}/*/standing", self._taking(self._stands))
+        bus.subscribe(f"{base}/*/offers", self._taking(self._offered))
+        bus.watch(f"{base}/*/alive", self._seen)
+        bus.alive(f"{base}/{self.name}/alive")
+
+    def _time(self, key: str, payload: bytes) -> bytes:
+        return _CLOCK.pack(self._started_ns, self._now_ns())
+
+    # --- what this node hears itself, and decides -------------------------------------------
+
+    def heard(self, event: Event) -> None:
+        """Take in what came over this node's own links, after the pipeline had it."""
+        if isinstance(event, Frame):
+            self.member.heard(event)
+        elif isinstance(event, RoundTrip):
+            self.member.answered(event)
+        else:
+            return
+        if self._flushing is None and self.member.neighbours and self._bus is not None:
+            self._flush_soon()
+
+    def ticked(self, now_ns: int) -> None:
+        """Decide whom this node serves. Call it at every update, after the pipeline had it."""
+        self._offers.look(now_ns)
+        duty, notices = self.member.decide(now_ns)
+        if duty is not None:
+            self._step(duty)
+        self._tell(notices)
+
+    def _flush_soon(self) -> None:
+        loop = asyncio.get_running_loop()
+        self._flushing = loop.call_later(1 / self.settings.share_hz, self._flush)
+
+    def _flush(self) -> None:
+        self._flushing = None
+        said = self.member.sharing.due(self._now_ns())
+        if said is not None:
+            self._put("heard", messages.shared(said), express=True)
+        if self.member.sharing.next_ns is not None:
+            self._flush_soon()
+
+    # --- what it says -----------------------------------------------------------------------
+
+    def _put(self, what: str, payload: bytes, *, express: bool = False) -> None:
+        if self._bus is not None:
+            self._sent.bytes += len(payload)
+            key = f"{PREFIX}/{self.settings.site}/{self.name}/{what}"
+            self._bus.put(key, payload, express=express, priority="data_high")
+
+    def _stand(self, now_ns: int) -> None:
+        said = self.member.says(now_ns, self._around.place(), self._around.reach_m(now_ns))
+        self._put("standing", messages.standing(said))
+
+    def _offer(self, now_ns: int) -> None:
+        """Tell this node's offers and the tracks of those it serves, and look for phantoms."""
+        offers = dict(self._offers.made)
+        self.member.offer(offers)
+        self._put("offers", messages.offers(offers))
+        update = self._pipeline.last_update
+        if update is not None:
+            said = schemas.TracksMessage(
+                track=[codec.track(one, update.t_ns) for one in update.tracks]
+            )
+            self._put("tracks", said.SerializeToString())
+        self._tell(self._around.phantoms(now_ns))
+        self._sent.look(now_ns)
+        self._heard.look(now_ns)
+
+    def _ask(self, now_ns: int) -> None:
+        if self._bus is None:
+            return
+        for node in self.member.neighbours:
+            key = f"{PREFIX}/{self.settings.site}/{node}/time"
+            self._bus.ask(key, b"", ASKED_S, self._reading(node, self._now_ns()))
+
+    def _reading(self, node: str, sent_ns: int) -> Callable[[bytes, int], None]:
+        """What takes the answer to a question that is sent now."""
+
+        def take(answer: bytes, arrived_ns: int) -> None:
+            if len(answer) != _CLOCK.size:
+                self.damaged += 1
+                return
+            started_ns, remote_ns = _CLOCK.unpack(answer)
+            received_ns = self._now_ns() - (time.monotonic_ns() - arrived_ns)
+            self._tell(self.member.read_clock(node, started_ns, sent_ns, received_ns, remote_ns))
+
+        return take
+
+    # --- what it hears of others ------------------------------------------------------------
+
+    def _taking(self, take: Callable[[str, bytes], None]) -> Callable[[str, bytes], None]:
+        """What takes samples of other nodes, counts them, and refuses those that are none."""
+
+        def taken(key: str, payload: bytes) -> None:
+            node = key.split("/")[-2]
+            self._heard.bytes += len(payload)
+            try:
+                take(node, payload)
+            except FleetMessageError:
+                self.damaged += 1
+
+        return taken
+
+    def _shared(self, node: str, payload: bytes) -> None:
+        now_ns = self._now_ns()
+        events, notices = self.member.shared(now_ns, node, messages.to_shared(payload))
+        for event in events:
+            self._step(event)
+        self._tell(notices)
+
+    def _stands(self, node: str, payload: bytes) -> None:
+        said = messages.to_standing(payload, node)
+        if node == self.name:
+            self._tell_of_twin()
+            return
+        self._tell(self.member.stands(self._now_ns(), said))
+
+    def _offered(self, node: str, payload: bytes) -> None:
+        self.member.offered(self._now_ns(), node, messages.to_offers(payload))
+
+    def _seen(self, key: str, is_alive: bool) -> None:
+        node = key.split("/")[-2]
+        if node == self.name:
+            return
+        if not is_alive:
+            self._tell(self.member.left(self._now_ns(), node))
+        elif node not in self.member.neighbours:
+            text = f"node {node} is there"
+            self.member.came(node)
+            self._notify(Notice(self._now_ns(), Severity.INFO, f"node {node}", text))
+
+    def _tell_of_twin(self) -> None:
+        if not self._has_twin:
+            self._has_twin = True
+            text = f"another node says that it is {self.name} too: give each a name of its own"
+            self._notify(Notice(self._now_ns(), Severity.ERROR, "fleet", text))
+
+    def _tell(self, notices: list[Notice]) -> None:
+        for notice in notices:
+            self._notify(notice)
+
+    # --- what it knows ----------------------------------------------------------------------
+
+    def status(self) -> FleetStatus:
+        """This node's place in the fleet."""
+        rates = self._sent.bps, self._heard.bps
+        return FleetStatus(self.member, self.settings.site, *rates, self.damaged)
+
+
+def bus_config(settings: FleetSettings) -> BusConfig:
+    """What the settings say of the Zenoh session. Raises ``ConfigError``."""
+    tls = None
+    if settings.ca is not None:
+        if settings.certificate is None or settings.key is None:
+            raise ConfigError("fleet.ca: a certificate and its key are needed as well")
+        tls = BusTls(Path(settings.ca), Path(settings.certificate), Path(settings.key))
+    elif settings.certificate is not None or settings.key is not None:
+        raise ConfigError("fleet.certificate: fleet.ca is needed as well")
+    return BusConfig(
+        mode=settings.mode,
+        listen=settings.listen if settings.mode == "peer" else (),
+        connect=settings.connect,
+        tls=tls,
+        access_control=None if settings.access_control is None else Path(settings.access_control),
+        lease_s=settings.lease_s,
+    )

@@ -1,0 +1,146 @@
+"""What nodes tell one another, as protobuf described like a recording's messages.          [shell]
+
+Version 1 of the contract in docs/fleet.md: fields are only ever added. What comes from others is
+read with limits, and anything that is no such message is a ``FleetMessageError``.
+"""
+
+import math
+from typing import Final
+
+from google.protobuf.message import DecodeError
+
+from companion.recording import codec, schemas
+from companion.values import Offer, Shared, SharedFrame, Standing
+
+FRAMES_MAX: Final = 4096
+"""Most frames, or round trips, of one message."""
+OFFERS_MAX: Final = 10_000
+NAME_MAX: Final = 64
+_LATEST_NS: Final = 1 << 62
+
+
+class FleetMessageError(ValueError):
+    """Bytes that are none of these messages, or that say what cannot be."""
+
+
+def shared(said: Shared) -> bytes:
+    """What a node heard of late. Frames bear the nanoseconds since the first one."""
+    message = schemas.SharedMessage()
+    first_ns = min((frame.heard_ns for frame in said.frames), default=0)
+    message.first_ns, message.told_ns = first_ns, said.told_ns
+    for frame in said.frames:
+        message.frame.add(after_ns=frame.heard_ns - first_ns, raw=frame.raw)
+    message.trip.extend(codec.round_trip(trip) for trip in said.trips)
+    found: bytes = message.SerializeToString()
+    return found
+
+
+def to_shared(data: bytes) -> Shared:
+    """Read what another node heard. Raises ``FleetMessageError``."""
+    try:
+        message = schemas.SharedMessage.FromString(data)
+    except DecodeError as error:
+        raise FleetMessageError("no message of frames") from error
+    if len(message.frame) > FRAMES_MAX or len(message.trip) > FRAMES_MAX:
+        raise FleetMessageError("too many frames at once")
+    first_ns = message.first_ns
+    frames = tuple(SharedFrame(_time(first_ns + one.after_ns), one.raw) for one in message.frame)
+    trips = tuple(codec.to_round_trip(one.SerializeToString()) for one in message.trip)
+    if any(max(trip.source) > 255 or max(trip.t_ns, trip.sent_ns) > _LATEST_NS for trip in trips):
+        raise FleetMessageError("a round trip with nobody")
+    return Shared(_time(message.told_ns), frames, trips)
+
+
+def standing(said: Standing) -> bytes:
+    """What a node says of itself."""
+    message = schemas.StandingMessage(
+        node=said.node,
+        started_ns=said.started_ns,
+        t_ns=said.t_ns,
+        place=said.place or (),
+        reach_m=said.reach_m,
+        most=said.most,
+    )
+    for uav, worth_db in said.serves:
+        message.serves.add(uav=uav, worth_db=worth_db)
+    for uav, to in said.handing:
+        message.handing.add(uav=uav, to=to)
+    found: bytes = message.SerializeToString()
+    return found
+
+
+def to_standing(data: bytes, node: str) -> Standing:
+    """Read what a node says of itself, under its own key. Raises ``FleetMessageError``."""
+    try:
+        message = schemas.StandingMessage.FromString(data)
+    except DecodeError as error:
+        raise FleetMessageError("no message of a node") from error
+    if message.node != node:
+        raise FleetMessageError(f"it speaks for {message.node[:NAME_MAX]!r}")
+    if len(message.serves) > OFFERS_MAX or len(message.handing) > OFFERS_MAX:
+        raise FleetMessageError("more UAVs than there can be")
+    place = tuple(message.place)
+    if len(place) not in (0, 3) or not all(map(math.isfinite, place)):
+        raise FleetMessageError("a place that is none")
+    reach_m = message.reach_m if message.HasField("reach_m") else None
+    return Standing(
+        node,
+        _time(message.started_ns),
+        _time(message.t_ns),
+        (place[0], place[1], place[2]) if place else None,
+        None if reach_m is None else _number(reach_m),
+        min(message.most, OFFERS_MAX),
+        tuple((_name(one.uav), _number(one.worth_db)) for one in message.serves),
+        tuple((_name(one.uav), _name(one.to)) for one in message.handing),
+    )
+
+
+def offers(said: dict[str, Offer]) -> bytes:
+    """A node's offers, all of them."""
+    message = schemas.OffersMessage()
+    for one in said.values():
+        message.offer.add(
+            uav=one.uav,
+            sure_db=one.sure_db,
+            likely_db=one.likely_db,
+            sinr_db=one.sinr_db,
+            heard_s=one.heard_s,
+        )
+    found: bytes = message.SerializeToString()
+    return found
+
+
+def to_offers(data: bytes) -> tuple[Offer, ...]:
+    """Read another node's offers. Raises ``FleetMessageError``."""
+    try:
+        message = schemas.OffersMessage.FromString(data)
+    except DecodeError as error:
+        raise FleetMessageError("no message of offers") from error
+    if len(message.offer) > OFFERS_MAX:
+        raise FleetMessageError("more offers than there can be")
+    names = ("sure_db", "likely_db", "sinr_db", "heard_s")
+    return tuple(
+        Offer(
+            _name(one.uav),
+            *(_number(getattr(one, name)) if one.HasField(name) else None for name in names),
+        )
+        for one in message.offer
+    )
+
+
+def _time(t_ns: int) -> int:
+    if t_ns > _LATEST_NS:
+        raise FleetMessageError("a time that is beyond all time")
+    return t_ns
+
+
+def _number(value: float) -> float:
+    if not math.isfinite(value) or abs(value) > 1e9:
+        raise FleetMessageError(f"{value} where a number is wanted")
+    return value
+
+
+def _name(text: str) -> str:
+    if not text or len(text) > NAME_MAX or not text.isprintable():
+        raise FleetMessageError("a name that is none")
+    return text

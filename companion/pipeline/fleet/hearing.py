@@ -1,0 +1,162 @@
+"""What this node hears itself, and what it takes from others: its own ears first.
+
+A report that another node heard is used only of a vehicle that is silent here: one that sends
+wrong reports in a vehicle's name can then do nothing to those whom this node hears. What is told of
+a vehicle that is heard here is held against what is heard (``mavlink/trust/twins.py``); what was
+missed here is taken up when the vehicle falls silent.
+"""
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Final
+
+from companion.mavlink.trust.dedupe import content
+from companion.mavlink.trust.twins import Twins
+from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
+from companion.mavlink.wire.framing import MAGIC_V2, SHORTEST, examine
+from companion.pipeline.fleet.neighbours import NeighbourClock
+from companion.values import Frame, SharedFrame, Source
+
+HEARTBEAT: Final = 0
+GPS_RAW_INT: Final = 24
+SHARED: Final = frozenset((HEARTBEAT, GPS_RAW_INT, GLOBAL_POSITION_INT))
+"""Messages that nodes tell one another: where a vehicle is, how exact, and what it is."""
+KEPT_NS: Final = 10_000_000_000
+"""How long it is remembered what was heard, and by whom."""
+SILENT_INTERVALS: Final = 2.5
+"""Usual intervals without a report after which a vehicle is silent here."""
+SILENT_NS: Final = (200_000_000, 2_000_000_000)
+"""Least and greatest time for that."""
+MISSED: Final = 64
+"""Reports kept of each vehicle that were told by others and not heard here."""
+VEHICLES_MAX: Final = 4096
+"""Vehicles followed; one more is followed by nobody's ears, and its reports are taken as told."""
+FUTURE_NS: Final = 1_000_000
+"""By how much a frame may have been heard after now, by all that is known of the clocks."""
+HERE: Final = "here"
+
+
+class Recent:
+    """Contents of frames, each remembered for ``KEPT_NS`` after it was first noted."""
+
+    def __init__(self) -> None:
+        self._seen: dict[bytes, int] = {}
+        self._order: deque[tuple[int, bytes]] = deque()
+
+    def note(self, now_ns: int, key: bytes) -> bool:
+        """Note a content. Returns whether it is new."""
+        while self._order and self._order[0][0] < now_ns - KEPT_NS:
+            self._seen.pop(self._order.popleft()[1], None)
+        if key in self._seen:
+            return False
+        self._seen[key] = now_ns
+        self._order.append((now_ns, key))
+        return True
+
+    def __contains__(self, key: bytes) -> bool:
+        return key in self._seen
+
+
+@dataclass(slots=True)
+class _Ears:
+    """A vehicle as it is heard here: when last, at what interval, and what others told beside."""
+
+    heard_ns: int
+    interval_ns: float = 0.0
+    missed: deque[Frame] = field(default_factory=lambda: deque(maxlen=MISSED))
+
+    def is_silent(self, now_ns: int) -> bool:
+        least_ns, most_ns = SILENT_NS
+        wait_ns = min(max(SILENT_INTERVALS * self.interval_ns, least_ns), most_ns)
+        return now_ns - self.heard_ns > wait_ns
+
+
+class Hearing:
+    """What was heard here, and what of the others' frames the pipeline is to have.
+
+    ``contradicted`` and ``early`` hold names of nodes whose frames contradicted what is heard here
+    or another node, or came before they can have been heard; whoever reads them empties them.
+    """
+
+    def __init__(self) -> None:
+        self.contradicted: list[str] = []
+        self.early: list[str] = []
+        self._heard = Recent()
+        self._told = Recent()
+        self._ears: dict[Source, _Ears] = {}
+        self._twins = Twins({HERE})
+
+    def heard(self, frame: Frame) -> bytes:
+        """Take in a frame heard here, of a message in ``SHARED``. Returns its content."""
+        key = content(frame.raw)
+        if frame.msgid != GLOBAL_POSITION_INT:
+            return key
+        self._heard.note(frame.t_ns, key)
+        self._twins.refuses(HERE, HERE, frame)
+        ears = self._ears.get(frame.source)
+        if ears is None:
+            if len(self._ears) < VEHICLES_MAX:
+                self._ears[frame.source] = _Ears(frame.t_ns)
+            return key
+        gap_ns = frame.t_ns - ears.heard_ns
+        if gap_ns > 0:
+            usual_ns = ears.interval_ns
+            ears.interval_ns = gap_ns if not usual_ns else usual_ns + 0.2 * (gap_ns - usual_ns)
+            ears.heard_ns = frame.t_ns
+        return key
+
+    def placed(
+        self, now_ns: int, node: str, clock: NeighbourClock, shared: SharedFrame
+    ) -> Frame | None:
+        """A frame that another node heard, with its arrival there on this node's timeline.
+
+        None for one that is damaged, that is of no message in ``SHARED``, or that cannot be placed.
+        """
+        raw = shared.raw
+        ahead = clock.ahead(shared.heard_ns)
+        if ahead is None or len(raw) < SHORTEST or examine(raw, 0, len(raw)) != len(raw):
+            return None
+        if raw[0] == MAGIC_V2:
+            source, msgid = Source(raw[5], raw[6]), int.from_bytes(raw[7:10], "little")
+        else:
+            source, msgid = Source(raw[3], raw[4]), raw[5]
+        if msgid not in SHARED:
+            return None
+        least_ns, most_ns = shared.heard_ns + ahead.low_ns, shared.heard_ns + ahead.high_ns
+        if least_ns > now_ns + FUTURE_NS:
+            self.early.append(node)
+            return None
+        t_ns = min(most_ns, max(now_ns, least_ns))
+        return Frame(t_ns, f"fleet:{node}", source, msgid, raw, t_ns - least_ns)
+
+    def told(self, now_ns: int, node: str, frame: Frame, key: bytes) -> list[Frame]:
+        """What the pipeline is to have, now that another node told a frame; mostly nothing."""
+        if frame.msgid == GLOBAL_POSITION_INT:
+            return self._report(now_ns, node, frame, key)
+        ears = self._ears.get(frame.source)
+        return [frame] if ears is None or ears.is_silent(now_ns) else []
+
+    def _report(self, now_ns: int, node: str, frame: Frame, key: bytes) -> list[Frame]:
+        if key in self._heard or not self._told.note(now_ns, key):
+            return []
+        if self._twins.refuses(node, node, frame):
+            self.contradicted.append(node)
+            return []
+        ears = self._ears.get(frame.source)
+        if ears is None:
+            return [frame]
+        ears.missed.append(frame)
+        if not ears.is_silent(now_ns):
+            return []
+        missed = [one for one in ears.missed if one.t_ns > ears.heard_ns]
+        ears.missed.clear()
+        return missed
+
+    def silent_s(self, uav: str, now_ns: int) -> float | None:
+        """How long ago a vehicle was heard here; None: never."""
+        ears = self._ears.get(Source.parse(uav))
+        return None if ears is None else (now_ns - ears.heard_ns) * 1e-9
+
+    def forget(self, now_ns: int, after_ns: int) -> None:
+        """Forget vehicles that were not heard here for so long."""
+        self._ears = {k: v for k, v in self._ears.items() if now_ns - v.heard_ns < after_ns}

@@ -1,0 +1,279 @@
+"""One node of a fleet: everything that it does beside its own pipeline, without any network.
+
+Pure: time is an argument, what others say comes in by methods, what is to be said comes out. The
+live node and the study of many nodes in virtual time use the same class.
+"""
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from companion.mavlink.trust.dedupe import content
+from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
+from companion.pipeline.fleet.assignment import worth_db
+from companion.pipeline.fleet.duties import Duties, Handover
+from companion.pipeline.fleet.hearing import SHARED, Hearing
+from companion.pipeline.fleet.neighbours import TOLD_APART_NS, NeighbourClock, here
+from companion.pipeline.fleet.sharing import Sharing
+from companion.pipeline.fleet.trust import Told, Trust, Witness
+from companion.settings.fleet import FleetSettings
+from companion.values import (
+    Duty,
+    Frame,
+    Notice,
+    Offer,
+    RoundTrip,
+    Severity,
+    Shared,
+    Standing,
+    Vector,
+)
+
+NODES_MAX: Final = 256
+"""Other nodes followed; one more is not heard."""
+HANDOVERS_KEPT: Final = 500
+OFFERS_KEPT_NS: Final = 10_000_000_000
+"""How long a node's offers stand while it says nothing new of them."""
+FORGET_NS: Final = 600_000_000_000
+
+Place = tuple[float, float, float]
+ToLocal = Callable[[Place], Vector]
+
+
+@dataclass(slots=True)
+class Neighbour:
+    """Another node, as it is known here.
+
+    clock       its clock
+    standing    what it said last of itself; None before it did
+    offers      its offers by UAV
+    frames      frames that it told, ``used`` those that the pipeline had
+    """
+
+    clock: NeighbourClock
+    started_ns: int | None = None
+    standing: Standing | None = None
+    heard_ns: int = 0
+    offered_ns: int = 0
+    offers: dict[str, Offer] | None = None
+    frames: int = 0
+    used: int = 0
+    apart_told: bool = False
+
+
+class Member:
+    """One node's part. ``name`` is its name; ``elements`` is the size of its array.
+
+    ``neighbours`` are the other nodes by name, ``offers`` this node's own, ``handovers`` the newest
+    changes of who serves whom that this node took part in; ``place`` and ``reach_m`` are what it
+    said last of where its array is and how far it hears.
+    """
+
+    def __init__(self, name: str, settings: FleetSettings, elements: int, started_ns: int) -> None:
+        self.name = name
+        self.neighbours: dict[str, Neighbour] = {}
+        self.offers: dict[str, Offer] = {}
+        self.handovers: deque[Handover] = deque(maxlen=HANDOVERS_KEPT)
+        self.hearing = Hearing()
+        self.sharing = Sharing(name)
+        self.trust = Trust()
+        self.most = settings.most or max(elements // 2, 1)
+        self.duties = Duties(name, self.most, round(settings.lease_s * 1e9), settings.hysteresis_db)
+        self.place: Place | None = None
+        self.reach_m: float | None = None
+        self._nulls = settings.nulls
+        self._started_ns = started_ns
+        self._duty: tuple[tuple[str, ...], tuple[str, ...]] | None = None
+        self._looked_ns = started_ns
+
+    # --- what this node hears itself --------------------------------------------------------
+
+    def heard(self, frame: Frame) -> None:
+        """Take in a frame that came over one of this node's own links."""
+        if frame.msgid in SHARED:
+            key = self.hearing.heard(frame)
+            if self.neighbours:
+                self.sharing.heard(frame, key)
+
+    def answered(self, trip: RoundTrip) -> None:
+        """Take in a TIMESYNC round trip of this node's own."""
+        if self.neighbours:
+            self.sharing.answered(trip)
+
+    # --- what other nodes say ---------------------------------------------------------------
+
+    def came(self, node: str) -> list[Notice]:
+        """Another node is there."""
+        self._neighbour(node)
+        return []
+
+    def left(self, now_ns: int, node: str) -> list[Notice]:
+        """Another node is gone: its process ended, or its connection did."""
+        self.duties.gone(now_ns, node)
+        if self.neighbours.pop(node, None) is None:
+            return []
+        if not self.neighbours:
+            self.sharing.alone()
+        text = f"node {node} is gone"
+        return [Notice(now_ns, Severity.WARNING, f"node {node}", text)]
+
+    def read_clock(
+        self, node: str, started_ns: int, sent_ns: int, received_ns: int, remote_ns: int
+    ) -> list[Notice]:
+        """Take in a reading of another node's clock, between two times of this one's."""
+        known = self._neighbour(node)
+        if known is None:
+            return []
+        if known.started_ns != started_ns:  # another life has another timeline
+            known.started_ns, known.clock = started_ns, NeighbourClock()
+        if known.clock.answered(sent_ns, received_ns, remote_ns) is not None:
+            return self.trust.against(received_ns, node, "has a clock that contradicts itself")
+        ahead = known.clock.newest()
+        if known.apart_told or ahead is None:
+            return []
+        apart_ns = max(ahead.low_ns, -ahead.high_ns)
+        if apart_ns < TOLD_APART_NS:
+            return []
+        known.apart_told = True
+        way = "behind" if ahead.low_ns > 0 else "ahead of"
+        text = (
+            f"node {node}'s clock is {apart_ns * 1e-9:.3f} s {way} this one's; that is allowed for"
+        )
+        return [Notice(received_ns, Severity.WARNING, f"node {node}", text)]
+
+    def shared(
+        self, now_ns: int, node: str, said: Shared
+    ) -> tuple[list[Frame | RoundTrip], list[Notice]]:
+        """Take in what another node heard. Returns what the pipeline is to have, and notices."""
+        known = self._neighbour(node)
+        if known is None or not self.trust.believes(node):
+            return [], []
+        ahead = known.clock.ahead(said.told_ns)
+        if ahead is None:
+            return [], []
+        way_ns = max(now_ns - said.told_ns - ahead.low_ns, 0)
+        events: list[Frame | RoundTrip] = []
+        for one in said.frames:
+            frame = self.hearing.placed(now_ns, node, known.clock, one)
+            known.frames += 1
+            if frame is None:
+                continue
+            key = content(frame.raw)
+            if frame.msgid == GLOBAL_POSITION_INT:
+                self.sharing.told(now_ns, node, frame.source, key, way_ns)
+            events += self.hearing.told(now_ns, node, frame, key)
+        for trip in said.trips:
+            silent_s = self.hearing.silent_s(str(trip.source), now_ns)
+            placed = here(trip, known.clock) if silent_s is None or silent_s > 1.0 else None
+            if placed is not None:
+                events.append(placed)
+        known.used += len(events)
+        return events, self._contradictions(now_ns)
+
+    def _contradictions(self, now_ns: int) -> list[Notice]:
+        notices = []
+        for node in self.hearing.early:
+            notices += self.trust.against(now_ns, node, "tells frames before they can be heard")
+        for node in self.hearing.contradicted:
+            notices += self.trust.against(now_ns, node, "tells reports that contradict others")
+        self.hearing.early.clear()
+        self.hearing.contradicted.clear()
+        return notices
+
+    def stands(self, now_ns: int, said: Standing) -> list[Notice]:
+        """Take in what another node says of itself."""
+        known = self._neighbour(said.node)
+        if known is None:
+            return []
+        known.standing, known.heard_ns = said, now_ns
+        self.duties.hear(now_ns, said)
+        return []
+
+    def offered(self, now_ns: int, node: str, offers: tuple[Offer, ...]) -> None:
+        """Take in another node's offers, all of them."""
+        known = self._neighbour(node)
+        if known is not None:
+            known.offers = {offer.uav: offer for offer in offers}
+            known.offered_ns = now_ns
+
+    # --- what follows -----------------------------------------------------------------------
+
+    def offer(self, offers: Mapping[str, Offer]) -> None:
+        """Take in this node's own offers, as it tells them to the others."""
+        self.offers = dict(offers)
+
+    def decide(self, now_ns: int) -> tuple[Duty | None, list[Notice]]:
+        """Decide whom this node serves: its new duty, None where it is as before; and notices."""
+        notices = self.trust.again(now_ns)
+        trusted = frozenset(node for node in self.neighbours if self.trust.believes(node))
+        offers = {self.name: _worths(self.offers)}
+        for node in trusted:
+            known = self.neighbours[node]
+            if known.offers is not None and now_ns - known.offered_ns < OFFERS_KEPT_NS:
+                offers[node] = _worths(known.offers)
+        changes = self.duties.decide(now_ns, offers, trusted)
+        self.handovers += changes
+        standing = self.duties.others(now_ns)
+        elsewhere = {uav for n, said in standing.items() if n in trusted for uav, _ in said.serves}
+        spares = tuple(sorted(elsewhere - self.duties.serves.keys())) if self._nulls else ()
+        duty = tuple(sorted(self.duties.serves)), spares
+        if now_ns - self._looked_ns > FORGET_NS // 10:
+            self._looked_ns = now_ns
+            self.hearing.forget(now_ns, FORGET_NS)
+        if duty == self._duty:
+            return None, notices
+        self._duty = duty
+        return Duty(now_ns, *duty), notices
+
+    def look_for_phantoms(
+        self, now_ns: int, positions: Mapping[str, Vector], own: Witness, local: ToLocal
+    ) -> list[Notice]:
+        """Hold vehicles that only one other node has heard against all who ought to hear them.
+
+        ``positions`` are those of all vehicles known here, ``own`` is what this node can say.
+        """
+        witnesses = {self.name: own}
+        hearers = dict[str, list[str]]()
+        for node, known in self.neighbours.items():
+            said = known.standing
+            if not self.trust.believes(node) or known.offers is None or said is None:
+                continue
+            heard = frozenset(u for u, offer in known.offers.items() if offer.heard_s is not None)
+            for uav in heard:
+                hearers.setdefault(uav, []).append(node)
+            if said.place is not None and said.reach_m is not None:
+                witnesses[node] = Witness(local(said.place), said.reach_m, heard)
+        told = [
+            Told(uav, nodes[0], positions[uav])
+            for uav, nodes in hearers.items()
+            if len(nodes) == 1 and uav not in own.heard and uav in positions
+        ]
+        return self.trust.vehicles(now_ns, told, witnesses)
+
+    def says(self, now_ns: int, place: Place | None, reach_m: float | None) -> Standing:
+        """What this node says of itself: where its array is, and how far it hears."""
+        self.place, self.reach_m = place, reach_m
+        return Standing(
+            self.name,
+            self._started_ns,
+            now_ns,
+            place,
+            reach_m,
+            self.most,
+            tuple(self.duties.serves.items()),
+            tuple(self.duties.handing.items()),
+        )
+
+    def _neighbour(self, node: str) -> Neighbour | None:
+        if node == self.name:
+            return None
+        known = self.neighbours.get(node)
+        if known is None and len(self.neighbours) < NODES_MAX:
+            known = self.neighbours.setdefault(node, Neighbour(NeighbourClock()))
+        return known
+
+
+def _worths(offers: Mapping[str, Offer]) -> dict[str, float]:
+    found = ((uav, worth_db(offer)) for uav, offer in offers.items())
+    return {uav: worth for uav, worth in found if worth is not None}

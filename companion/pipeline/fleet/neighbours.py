@@ -1,0 +1,71 @@
+"""Clocks of other nodes, on this node's timeline.
+
+Each node's timeline is its own. A question sent at s and answered at r, with the other clock's
+reading x in between, proves that
+
+    s - x  <=  this timeline less the other  <=  r - x
+
+(docs/math.md 6). What the other heard is put at the latest time at which it can have been, with
+the width of that interval as its doubt: "arrived by then" stays true whatever the clocks do within
+their drift.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from companion.mavlink.clock.evidence import DriftProven, Evidence, Interval
+from companion.values import RoundTrip
+
+DRIFT_MAX: Final = 200e-6
+"""Greatest drift between two nodes' clocks, a ratio: two ordinary crystals, disciplined or not."""
+TOLD_APART_NS: Final = 100_000_000
+"""Difference of two nodes' clocks from which on it is told: with NTP there is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ahead:
+    """By how much this node's timeline is ahead of another's: an interval, ns."""
+
+    low_ns: int
+    high_ns: int
+
+    @property
+    def doubt_ns(self) -> int:
+        """The width of the interval."""
+        return self.high_ns - self.low_ns
+
+
+class NeighbourClock:
+    """The clock of one other node."""
+
+    def __init__(self) -> None:
+        self._evidence = Evidence(DRIFT_MAX)
+        self._newest_ns: int | None = None
+
+    def answered(self, sent_ns: int, received_ns: int, remote_ns: int) -> DriftProven | None:
+        """Take in a reading of the other clock; returns what it contradicts, None where nothing."""
+        self._newest_ns = remote_ns
+        return self._evidence.add(Interval(remote_ns, sent_ns - remote_ns, received_ns - remote_ns))
+
+    def ahead(self, remote_ns: int) -> Ahead | None:
+        """What is known at a time of the other node; None before the first answer."""
+        known = self._evidence.at(remote_ns)
+        return None if known is None else Ahead(math.floor(known.low_ns), math.ceil(known.high_ns))
+
+    def newest(self) -> Ahead | None:
+        """What was known at the newest answer; None before the first."""
+        return None if self._newest_ns is None else self.ahead(self._newest_ns)
+
+
+def here(trip: RoundTrip, clock: NeighbourClock) -> RoundTrip | None:
+    """A round trip of another node on this node's timeline, not shorter than it was.
+
+    None while that node's clock is not known.
+    """
+    sent, received = clock.ahead(trip.sent_ns), clock.ahead(trip.t_ns)
+    if sent is None or received is None:
+        return None
+    return RoundTrip(
+        trip.t_ns + received.high_ns, trip.source, trip.sent_ns + sent.low_ns, trip.remote_ns
+    )

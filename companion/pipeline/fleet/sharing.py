@@ -1,0 +1,117 @@
+"""What this node tells the others: each report is told once, by whoever is its speaker.
+
+Nodes that hear the same vehicle would all tell the same. So one of them speaks for it, at once; the
+others hold what they heard for a moment and tell it only if nobody has. Who had to tell two in a
+row becomes the speaker; of two speakers the one whose name comes first stays. No message is needed
+for that, and what only one hears is never lost: a vehicle that only B hears has B for its speaker
+after two reports.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
+from companion.pipeline.fleet.hearing import VEHICLES_MAX, Recent
+from companion.values import Frame, RoundTrip, Shared, SharedFrame, Source
+
+HOLD_NS: Final = (60_000_000, 2_000_000_000)
+"""Least and greatest time for which a report is held back: longer than a word from another node."""
+HOLD: Final = 1.5
+"""Multiple of the longest way of another's word for which a report is held."""
+FADES: Final = 0.999
+"""Share of that time that is left after each report that another told in time."""
+SPEAKS_AFTER: Final = 2
+"""Reports in a row that nobody else told, after which this node speaks for the vehicle."""
+HELD_MAX: Final = 20_000
+
+
+@dataclass(slots=True)
+class _Voice:
+    """Whether this node speaks for a vehicle, and how many reports in a row it told late."""
+
+    mine: bool = False
+    late: int = 0
+
+
+class _Held(NamedTuple):
+    due_ns: int
+    key: bytes
+    frame: Frame
+
+
+class Sharing:
+    """Decides what is told. ``name`` is this node's."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._voices: dict[Source, _Voice] = {}
+        self._hold_ns: float = HOLD_NS[0]
+        self._held: deque[_Held] = deque()
+        self._by_others = Recent()
+        self._by_me = Recent()
+        self._frames: list[SharedFrame] = []
+        self._trips: list[RoundTrip] = []
+
+    def heard(self, frame: Frame, key: bytes) -> None:
+        """Take in a frame heard here, with its content."""
+        voice = self._voices.get(frame.source)
+        if voice is None:
+            if len(self._voices) >= VEHICLES_MAX:
+                return
+            voice = self._voices.setdefault(frame.source, _Voice())
+        if voice.mine:
+            self._tell(frame.t_ns, key, frame)
+        elif key in self._by_others:
+            voice.late = 0
+        elif frame.msgid == GLOBAL_POSITION_INT and len(self._held) < HELD_MAX:
+            self._held.append(_Held(frame.t_ns + round(self._hold_ns), key, frame))
+
+    def answered(self, trip: RoundTrip) -> None:
+        """Take in a round trip with a vehicle for which this node speaks."""
+        voice = self._voices.get(trip.source)
+        if voice is not None and voice.mine:
+            self._trips.append(trip)
+
+    def told(self, now_ns: int, node: str, source: Source, key: bytes, way_ns: int) -> None:
+        """Take in that another node told a report, and for how long that was on its way at most."""
+        self._by_others.note(now_ns, key)
+        if key in self._by_me:
+            voice = self._voices.get(source)
+            if voice is not None and node < self._name:
+                voice.mine, voice.late = False, 0
+            self._hold_ns = min(max(self._hold_ns, HOLD * way_ns), HOLD_NS[1])
+        else:
+            self._hold_ns = max(FADES * self._hold_ns, HOLD_NS[0])
+
+    def due(self, now_ns: int) -> Shared | None:
+        """What is to be told now; None where it is nothing."""
+        while self._held and self._held[0].due_ns <= now_ns:
+            _, key, frame = self._held.popleft()
+            voice = self._voices[frame.source]
+            if key in self._by_others:
+                voice.late = 0
+                continue
+            voice.late += 1
+            voice.mine = voice.mine or voice.late >= SPEAKS_AFTER
+            self._tell(now_ns, key, frame)
+        if not self._frames and not self._trips:
+            return None
+        shared = Shared(now_ns, tuple(self._frames), tuple(self._trips))
+        self._frames, self._trips = [], []
+        return shared
+
+    @property
+    def next_ns(self) -> int | None:
+        """When something held falls due; None where nothing is held."""
+        return self._held[0].due_ns if self._held else None
+
+    def alone(self) -> None:
+        """Nobody else is there: whoever comes will find everybody without a speaker."""
+        self._voices.clear()
+        self._held.clear()
+        self._hold_ns = HOLD_NS[0]
+
+    def _tell(self, now_ns: int, key: bytes, frame: Frame) -> None:
+        self._by_me.note(now_ns, key)
+        self._frames.append(SharedFrame(frame.t_ns, frame.raw))

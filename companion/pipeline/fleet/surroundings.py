@@ -1,0 +1,62 @@
+"""What is around a node: where its array is, how far it hears, and vehicles that none else hears."""
+
+import math
+from typing import Final
+
+from companion.pipeline.fleet.member import Member, Place
+from companion.pipeline.fleet.trust import Witness
+from companion.pipeline.fold import Pipeline
+from companion.values import Notice, Vector
+
+HEARD_S: Final = 5.0
+"""How long ago a vehicle may have been heard that shows how far this node hears."""
+
+
+class Surroundings:
+    """The sky of one node, as its pipeline has it, for its part in the fleet."""
+
+    def __init__(self, pipeline: Pipeline, member: Member) -> None:
+        self._pipeline = pipeline
+        self._member = member
+
+    def place(self) -> Place | None:
+        """Where this node's array is: latitude, longitude, height; None: not known."""
+        carrier, local = self._pipeline.last_carrier, self._pipeline.local
+        if carrier is None or local is None:
+            return None
+        place = local.place(*carrier.position_ned_m.tolist())
+        return place.lat_deg, place.lon_deg, place.alt_m
+
+    def reach_m(self, now_ns: int) -> float | None:
+        """Distance of the farthest vehicle that is heard here; None: none is."""
+        carrier = self._pipeline.last_carrier
+        if carrier is None:
+            return None
+        here, hearing = carrier.position_ned_m.tolist(), self._member.hearing
+        away_m = [
+            math.dist(here, position)
+            for uav, position in self._positions().items()
+            if (silent_s := hearing.silent_s(uav, now_ns)) is not None and silent_s < HEARD_S
+        ]
+        return max(away_m, default=None)
+
+    def phantoms(self, now_ns: int) -> list[Notice]:
+        """Hold vehicles that only one other node has heard against who ought to hear them."""
+        local, carrier = self._pipeline.local, self._pipeline.last_carrier
+        if local is None or carrier is None:
+            return []
+        positions, hearing = self._positions(), self._member.hearing
+        heard = frozenset(u for u in positions if hearing.silent_s(u, now_ns) is not None)
+        north, east, down = carrier.position_ned_m.tolist()
+        own = Witness((north, east, down), self.reach_m(now_ns) or 0.0, heard)
+
+        def to_local(place: Place) -> Vector:
+            return local.localise(*place, None)[0]
+
+        return self._member.look_for_phantoms(now_ns, positions, own, to_local)
+
+    def _positions(self) -> dict[str, Vector]:
+        """Where every vehicle that reports itself was last, in the local frame."""
+        tracker, names = self._pipeline.tracker, map(str, self._pipeline.reporters())
+        found = ((name, tracker.newest(name)) for name in names)
+        return {uav: newest.position_ned_m for uav, newest in found if newest is not None}

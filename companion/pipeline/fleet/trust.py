@@ -1,0 +1,124 @@
+"""Which nodes are believed: found by contradiction, put aside with a notice, tried again later.
+
+A node is put aside that
+
+- tells frames before they can have been heard, by all that is known of its clock;
+- has a clock that contradicts itself: round trips that no drift explains, again and again;
+- tells reports that contradict what is heard here, or what others tell;
+- tells of several vehicles that only it has ever heard, though they are said to be where others
+  hear everybody: ``PHANTOMS`` of them for ``UNHEARD_NS``. One such vehicle may be hidden.
+"""
+
+import math
+from collections import deque
+from collections.abc import Iterable, Mapping
+from typing import Final, NamedTuple
+
+from companion.values import Notice, Severity
+
+TIMES: Final = 3
+"""Contradictions within ``WITHIN_NS`` after which a node is put aside."""
+WITHIN_NS: Final = 30_000_000_000
+ASIDE_NS: Final = 300_000_000_000
+"""How long a node is put aside before it is tried again."""
+PHANTOMS: Final = 2
+"""Vehicles that nobody else can hear, from which on their node is put aside."""
+UNHEARD_NS: Final = 8_000_000_000
+"""Time after which a vehicle that others ought to hear is one that they cannot."""
+REACH_SHARE: Final = 0.7
+"""Share of the distance to the farthest vehicle that a node hears, within which it hears all."""
+
+
+class Witness(NamedTuple):
+    """A node that can say whether a vehicle is where another says.
+
+    place_ned_m  of its array, in the local frame
+    reach_m      distance of the farthest vehicle that it hears itself
+    heard        vehicles that it has heard itself
+    """
+
+    place_ned_m: tuple[float, float, float]
+    reach_m: float
+    heard: frozenset[str]
+
+
+class Told(NamedTuple):
+    """A vehicle that only one other node has told of: which, and where it is said to be."""
+
+    uav: str
+    node: str
+    position_ned_m: tuple[float, float, float]
+
+
+class Trust:
+    """Who is believed. ``aside`` holds the nodes that are not, with the reason."""
+
+    def __init__(self) -> None:
+        self.aside: dict[str, str] = {}
+        self._until_ns: dict[str, int] = {}
+        self._times: dict[tuple[str, str], deque[int]] = {}
+        self._unheard: dict[str, tuple[str, int]] = {}
+
+    def believes(self, node: str) -> bool:
+        """Whether a node is believed."""
+        return node not in self.aside
+
+    def against(self, now_ns: int, node: str, what: str) -> list[Notice]:
+        """Take in a contradiction, in words that go on after "it"."""
+        times = self._times.setdefault((node, what), deque(maxlen=TIMES))
+        times.append(now_ns)
+        if len(times) < TIMES or now_ns - times[0] > WITHIN_NS:
+            return []
+        return self._put_aside(now_ns, node, what)
+
+    def vehicles(
+        self, now_ns: int, told: Iterable[Told], witnesses: Mapping[str, Witness]
+    ) -> list[Notice]:
+        """Hold vehicles that only one other node tells of against who ought to hear them."""
+        before, self._unheard = self._unheard, {}
+        for one in told:
+            others = [w for name, w in witnesses.items() if name != one.node]
+            if others and all(_denies(w, one) for w in others):
+                node, since_ns = before.get(one.uav, (one.node, now_ns))
+                self._unheard[one.uav] = (one.node, since_ns if node == one.node else now_ns)
+        phantoms = dict[str, list[str]]()
+        for uav, (node, since_ns) in self._unheard.items():
+            if now_ns - since_ns >= UNHEARD_NS:
+                phantoms.setdefault(node, []).append(uav)
+        said = []
+        for node, uavs in phantoms.items():
+            if len(uavs) >= PHANTOMS:
+                names = ", ".join(sorted(uavs)[:6])
+                what = f"tells of vehicles where nobody else hears one: {names}"
+                said += self._put_aside(now_ns, node, what)
+        return said
+
+    @property
+    def unconfirmed(self) -> frozenset[str]:
+        """Vehicles of which only one node tells, where others ought to hear them."""
+        return frozenset(self._unheard)
+
+    def again(self, now_ns: int) -> list[Notice]:
+        """Try again those whose time is over."""
+        over = [node for node, until_ns in self._until_ns.items() if now_ns >= until_ns]
+        for node in over:
+            del self._until_ns[node], self.aside[node]
+        return [_notice(now_ns, node, "is believed again", Severity.INFO) for node in over]
+
+    def _put_aside(self, now_ns: int, node: str, what: str) -> list[Notice]:
+        if node in self.aside:
+            return []
+        self.aside[node] = what
+        self._until_ns[node] = now_ns + ASIDE_NS
+        text = f"is not believed for {ASIDE_NS / 60e9:.0f} minutes: it {what}"
+        return [_notice(now_ns, node, text, Severity.WARNING)]
+
+
+def _denies(witness: Witness, told: Told) -> bool:
+    """Whether a node ought to hear a vehicle where it is said to be, and never has."""
+    away_m = math.dist(witness.place_ned_m, told.position_ned_m)
+    return told.uav not in witness.heard and away_m < REACH_SHARE * witness.reach_m
+
+
+def _notice(t_ns: int, node: str, what: str, severity: Severity) -> Notice:
+    return Notice(t_ns, severity, f"node {node}", f"node {node} {what}")

@@ -1,0 +1,87 @@
+"""UAVs on circles over a grid of nodes: where they are, what they report, what each node offers."""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from pymavlink.dialects.v20 import common
+
+from companion.pipeline.fleet.assignment import STEP_DB
+from companion.values import FloatArray, Offer
+
+SNR_AT_1_KM_DB: Final = 20.0
+GAIN_DB: Final = 18.0
+NEAREST_M: Final = 50.0
+
+
+@dataclass(frozen=True, slots=True)
+class Sky:
+    """What is flown around which nodes, and over which network.
+
+    nodes, uavs   how many
+    spacing_m     between neighbouring nodes, on a square grid
+    reach_m       distance at which a node hears a UAV, and can serve it
+    report_hz     reports of a UAV
+    sampled       UAVs whose reports are told; the others are counted as alike
+    delay_s       one way between two nodes
+    loss          share of messages lost, 0 to 1
+    """
+
+    nodes: int
+    uavs: int
+    spacing_m: float = 1500.0
+    reach_m: float = 2500.0
+    report_hz: float = 10.0
+    sampled: int = 50
+    delay_s: float = 0.02
+    loss: float = 0.0
+    seed: int = 1
+
+
+class Flight:
+    """The sky in time; times are seconds since its start.
+
+    ``names`` are the nodes, ``uavs`` the UAVs, ``places_m`` (nodes, 2) where the nodes stand.
+    """
+
+    def __init__(self, sky: Sky, random: np.random.Generator) -> None:
+        self.names = [f"n{number:03d}" for number in range(sky.nodes)]
+        self.uavs = [f"{1 + number // 250}:{1 + number % 250}" for number in range(sky.uavs)]
+        self._reach_m = sky.reach_m
+        side = math.ceil(math.sqrt(sky.nodes))
+        grid = [(number // side, number % side) for number in range(sky.nodes)]
+        self.places_m = sky.spacing_m * np.array(grid, dtype=float)
+        size_m = side * sky.spacing_m
+        self._centres_m = random.uniform(-0.3 * sky.spacing_m, size_m, (sky.uavs, 2))
+        self._radii_m = random.uniform(50, 600, sky.uavs)
+        self._speeds_mps = random.uniform(5, 25, sky.uavs)
+        self._phases = random.uniform(0, 2 * np.pi, sky.uavs)
+        self._mav = common.MAVLink(None)
+
+    def ranges_m(self, t_s: float) -> FloatArray:
+        """Distances (nodes, UAVs)."""
+        angles = self._phases + self._speeds_mps / self._radii_m * t_s
+        around = np.column_stack([np.cos(angles), np.sin(angles)])
+        positions_m = self._centres_m + self._radii_m[:, np.newaxis] * around
+        apart_m = self.places_m[:, np.newaxis] - positions_m[np.newaxis]
+        found: FloatArray = np.hypot(apart_m[..., 0], apart_m[..., 1])
+        return found
+
+    def offers(self, ranges_m: FloatArray) -> dict[str, Offer]:
+        """What a node at these distances (UAVs,) offers those within its reach."""
+        found = {}
+        for i in np.flatnonzero(ranges_m < self._reach_m).tolist():
+            loss_db = 20 * math.log10(max(float(ranges_m[i]), NEAREST_M) / 1000)
+            sinr_db = round((SNR_AT_1_KM_DB - loss_db) / STEP_DB) * STEP_DB
+            found[self.uavs[i]] = Offer(self.uavs[i], GAIN_DB, GAIN_DB, sinr_db, 0.1)
+        return found
+
+    def report(self, uav: str, boot_ms: int) -> bytes:
+        """A report of a UAV; its fields say nothing, its stamp makes it one of its own."""
+        self._mav.srcSystem, self._mav.srcComponent = map(int, uav.split(":"))
+        message = common.MAVLink_global_position_int_message(
+            boot_ms, 473977000, 85456000, 500000, 50000, 100, 100, 10, 9000
+        )
+        packed: bytes = message.pack(self._mav)
+        return packed

@@ -1,0 +1,271 @@
+"""Nodes, UAVs and the network between the nodes, in virtual time.
+
+The nodes are the real ones (``pipeline/fleet``) without their pipelines: what they offer is worked
+out from where the UAVs are, and what they tell one another is encoded as it is live, so that it can
+be counted. Reports of a sample of the UAVs are told, and counted for all.
+"""
+
+import heapq
+from collections import Counter, defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import count
+from typing import Any, Final
+
+import numpy as np
+
+from companion.mavlink.wire.decode import GLOBAL_POSITION_INT as REPORT
+from companion.node.fleet import messages
+from companion.pipeline.fleet.member import Member
+from companion.settings.fleet import FleetSettings
+from companion.studies.fleet.sky import Flight, Sky
+from companion.values import FloatArray, Frame, Source
+
+SECOND_NS: Final = 1_000_000_000
+START_NS: Final = 1_800_000_000 * SECOND_NS
+TICK_NS: Final = 100_000_000
+FLUSH_NS: Final = 5_000_000
+STANDING_TICKS: Final = 2
+OFFER_TICKS: Final = 10
+ASK_TICKS: Final = 5
+ENTRY_S: Final = 2.0
+"""Time from a UAV's coming within reach until it counts as served or not."""
+STAGGER_NS: Final = 7_919_000
+"""Time by which the reports of two UAVs are apart."""
+HEADER_BYTES: Final = 110
+"""Ethernet, IP and TCP heads, and Zenoh's own, of a sample on its way: measured on loopback."""
+
+
+@dataclass(slots=True)
+class Counted:
+    """What was counted; the UAVs' counts are of UAVs that some node could serve, at ticks.
+
+    A UAV counts once it has been within reach for ``ENTRY_S``: so long a new one may wait.
+
+    served, twice, unserved   by one node, by several, by none
+    handovers                 changes from one node to another
+    sent                      bytes by what was told, without heads
+    samples                   messages by what was told
+    received                  bytes that reached a node, heads included
+    cpu_s                     processor time of each node
+    """
+
+    served: int = 0
+    twice: int = 0
+    unserved: int = 0
+    handovers: int = 0
+    sent: Counter[str] = field(default_factory=Counter)
+    samples: Counter[str] = field(default_factory=Counter)
+    received: Counter[str] = field(default_factory=Counter)
+    cpu_s: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+
+
+class World:
+    """A fleet in virtual time; ``run`` takes it on, ``cpu_s`` reads the processor time used."""
+
+    def __init__(
+        self, sky: Sky, settings: FleetSettings, cpu_s: Callable[[], float] = lambda: 0.0
+    ) -> None:
+        self.sky = sky
+        self._cpu_s = cpu_s
+        self.counted = Counted()
+        self.now_ns = START_NS
+        self.dead: set[str] = set()
+        self.parted: Callable[[str, str], bool] = lambda one, other: False
+        self.handovers: list[tuple[int, str, str | None, str | None]] = []
+        self._random = np.random.default_rng(sky.seed)
+        self._flight = Flight(sky, self._random)
+        self._names = self._flight.names
+        self.members = {
+            name: Member(name, settings, 128, START_NS + number)
+            for number, name in enumerate(self._names)
+        }
+        self._clock_ns = self._random.integers(-3, 3, sky.nodes) * SECOND_NS
+        self._since: dict[str, int] = {}
+        self._flushing: set[str] = set()
+        self._queue: list[tuple[int, int, Callable[[], None]]] = []
+        self._order = count()
+        self._tick = 0
+        for name in self._names:
+            for other in self._names:
+                if other != name:
+                    self.members[name].came(other)
+
+    # --- time -------------------------------------------------------------------------------
+
+    def run(self, seconds: float, watch: Callable[[], None] = lambda: None) -> None:
+        """Take the world on by so long; ``watch`` is called at every tick."""
+        for _ in range(round(seconds * SECOND_NS / TICK_NS)):
+            end_ns = self.now_ns + TICK_NS
+            self._report(end_ns)
+            while self._queue and self._queue[0][0] <= end_ns:
+                self.now_ns, _, deliver = heapq.heappop(self._queue)
+                deliver()
+            self.now_ns = end_ns
+            for number, name in enumerate(self._names):
+                if name not in self.dead:
+                    self._timed(name, partial(self._act, name, number))
+            self._count()
+            self._tick += 1
+            watch()
+
+    def kill(self, name: str, seen_s: float = 0.05) -> None:
+        """End a node's process; the others see its liveliness go after so long."""
+        self.dead.add(name)
+        at_ns = self.now_ns + round(seen_s * SECOND_NS)
+        for other in self._names:
+            if other not in self.dead:
+                member = self.members[other]
+                self._at(at_ns, partial(self._lose, member, name))
+
+    def _lose(self, member: Member, node: str) -> None:
+        member.left(self._local_ns(member.name), node)
+
+    def clock_ns(self, name: str) -> int:
+        """By how much a node's timeline is ahead of the world's."""
+        return int(self._clock_ns[self._names.index(name)])
+
+    def _local_ns(self, name: str) -> int:
+        return self.now_ns + self.clock_ns(name)
+
+    def _at(self, t_ns: int, what: Callable[[], Any]) -> None:
+        heapq.heappush(self._queue, (t_ns, next(self._order), what))
+
+    def _timed(self, name: str, what: Callable[[], None]) -> None:
+        began = self._cpu_s()
+        what()
+        spent = self.counted.cpu_s
+        spent[name] = spent[name] + self._cpu_s() - began
+
+    # --- what nodes do ----------------------------------------------------------------------
+
+    def _act(self, name: str, number: int) -> None:
+        member, now_ns = self.members[name], self._local_ns(name)
+        turn = self._tick + number
+        if turn % OFFER_TICKS == 0:
+            member.offer(self._flight.offers(self._ranges_m()[number]))
+            self._tell(name, "offers", messages.offers(member.offers))
+        member.decide(now_ns)
+        for one in member.handovers:
+            self.handovers.append((self.now_ns, one.uav, one.before, one.after))
+            self.counted.handovers += one.after == name and one.before is not None
+        member.handovers.clear()
+        if turn % STANDING_TICKS == 0:
+            lat_deg, lon_deg = (self._flight.places_m[number] * 1e-5).tolist()
+            said = member.says(now_ns, (lat_deg, lon_deg, 0.0), self.sky.reach_m)
+            self._tell(name, "standing", messages.standing(said))
+        if turn % ASK_TICKS == 0:
+            for other in member.neighbours:
+                self._ask(name, other)
+
+    def _flush(self, name: str) -> None:
+        """Tell what is due of what was heard, as the live node does 200 times a second."""
+        self._flushing.discard(name)
+        if name in self.dead:
+            return
+        sharing = self.members[name].sharing
+        said = sharing.due(self._local_ns(name))
+        if said is not None:
+            self._tell(name, "heard", messages.shared(said))
+        if sharing.next_ns is not None:
+            self._flush_soon(name)
+
+    def _flush_soon(self, name: str) -> None:
+        if name not in self._flushing:
+            self._flushing.add(name)
+            flush = partial(self._timed, name, partial(self._flush, name))
+            self._at(self.now_ns + FLUSH_NS, flush)
+
+    def _tell(self, name: str, what: str, payload: bytes) -> None:
+        self.counted.sent[what] += len(payload)
+        self.counted.samples[what] += 1
+        for other in self._names:
+            if other != name and other not in self.dead and self._arrives(name, other):
+                self.counted.received[what] += len(payload) + HEADER_BYTES
+                self._at(self._arrival_ns(), partial(self._take, other, name, what, payload))
+
+    def _arrives(self, name: str, other: str) -> bool:
+        return not self.parted(name, other) and self._random.random() >= self.sky.loss
+
+    def _arrival_ns(self) -> int:
+        return self.now_ns + round(self.sky.delay_s * SECOND_NS * self._random.uniform(1.0, 1.5))
+
+    def _take(self, name: str, node: str, what: str, payload: bytes) -> None:
+        if name not in self.dead:
+            self._timed(name, partial(self._taken, name, node, what, payload))
+
+    def _taken(self, name: str, node: str, what: str, payload: bytes) -> None:
+        member, now_ns = self.members[name], self._local_ns(name)
+        match what:
+            case "heard":
+                member.shared(now_ns, node, messages.to_shared(payload))
+            case "standing":
+                member.stands(now_ns, messages.to_standing(payload, node))
+            case "offers":
+                member.offered(now_ns, node, messages.to_offers(payload))
+
+    def _ask(self, name: str, other: str) -> None:
+        if other in self.dead or not (self._arrives(name, other) and self._arrives(other, name)):
+            return
+        sent_ns, there_ns = self.now_ns, self._arrival_ns()
+        back_ns = 2 * there_ns - sent_ns
+        own, theirs = self.clock_ns(name), self.clock_ns(other)
+        member = self.members[name]
+        reading = START_NS, sent_ns + own, back_ns + own, there_ns + theirs
+        self._at(back_ns, lambda: member.read_clock(other, *reading))
+
+    # --- UAVs -------------------------------------------------------------------------------
+
+    def _ranges_m(self) -> FloatArray:
+        """Distances (nodes, UAVs) now."""
+        return self._flight.ranges_m((self.now_ns - START_NS) / SECOND_NS)
+
+    def _report(self, end_ns: int) -> None:
+        """Have the sampled UAVs heard by the nodes in whose reach they are."""
+        period_ns = round(SECOND_NS / self.sky.report_hz)
+        ranges_m = self._ranges_m()
+        for i, uav in enumerate(self._flight.uavs[: self.sky.sampled]):
+            hearers = np.flatnonzero(ranges_m[:, i] < self.sky.reach_m).tolist()
+            at_ns = self.now_ns + i * STAGGER_NS % period_ns
+            while at_ns < end_ns:
+                raw = self._flight.report(uav, (at_ns - START_NS) // 1_000_000 + 60_000)
+                for number in hearers:
+                    self._at(at_ns, partial(self._hear, self._names[number], raw, uav))
+                at_ns += period_ns
+
+    def _hear(self, name: str, raw: bytes, uav: str) -> None:
+        if name not in self.dead:
+            frame = Frame(self._local_ns(name), "udp", Source.parse(uav), REPORT, raw)
+            self._timed(name, partial(self.members[name].heard, frame))
+            self._flush_soon(name)
+
+    # --- counting ---------------------------------------------------------------------------
+
+    def served_by(self) -> dict[str, list[str]]:
+        """The living nodes that serve each UAV now."""
+        found: dict[str, list[str]] = {}
+        for name, member in self.members.items():
+            if name not in self.dead:
+                for uav in member.duties.serves:
+                    found.setdefault(uav, []).append(name)
+        return found
+
+    def servable(self) -> set[str]:
+        """UAVs within reach of a living node."""
+        alive = [number for number, name in enumerate(self._names) if name not in self.dead]
+        if not alive:
+            return set()
+        near = (self._ranges_m()[alive] < self.sky.reach_m).any(axis=0)
+        return {self._flight.uavs[i] for i in np.flatnonzero(near).tolist()}
+
+    def _count(self) -> None:
+        by, near = self.served_by(), self.servable()
+        self._since = {uav: self._since.get(uav, self.now_ns) for uav in near}
+        for uav, since_ns in self._since.items():
+            if self.now_ns - since_ns < ENTRY_S * SECOND_NS:
+                continue
+            nodes = len(by.get(uav, ()))
+            self.counted.served += nodes == 1
+            self.counted.twice += nodes > 1
+            self.counted.unserved += nodes == 0

@@ -1,0 +1,55 @@
+"""Everything that drives the pipeline: frames, and what the node itself adds to them."""
+
+from dataclasses import dataclass
+
+from companion.values.names import Source
+from companion.values.received import Frame
+from companion.values.rejections import Rejection
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """The timer event at which beams are due."""
+
+    t_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class RoundTrip:
+    """A TIMESYNC request sent by this node, and its answer.
+
+    t_ns       when the answer was received, node time
+    source     who answered
+    sent_ns    when the request was sent, node time
+    remote_ns  the sender's clock since boot, read at some time between ``sent_ns`` and ``t_ns``
+    """
+
+    t_ns: int
+    source: Source
+    sent_ns: int
+    remote_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Duty:
+    """The UAVs that this node serves from now on, and those that it spares; an event.
+
+    t_ns    since when, node time
+    serves  UAVs that get a beam
+    spares  UAVs that another node serves, on which beams are to have nulls
+    """
+
+    t_ns: int
+    serves: tuple[str, ...]
+    spares: tuple[str, ...] = ()
+
+
+Event = Frame | Tick | Rejection | RoundTrip | Duty
+"""Everything that drives the pipeline, in the order in which it was taken in.
+
+That is the order of time, but that a frame's time is its arrival: where the node was busy, a tick
+of a later time may have been taken in before it.
+
+A rejection made while framing is an event too: its bytes are gone, but that they came must be
+recorded. A round trip is an event because only the service knows which requests were its own.
+"""

@@ -1,0 +1,149 @@
+"""The fleet as the API shows it: nodes, who serves whom, what each offers, handovers."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from companion.pipeline.fleet.member import Member, Neighbour
+from companion.values import Offer
+from companion.views.words import rfc3339
+
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class FleetStatus:
+    """This node's place in a fleet.
+
+    member      what it knows and decides
+    site        name of the fleet
+    sent_bps    bits per second that it tells, by what it gave to Zenoh over the last second
+    heard_bps   bits per second that others told it
+    damaged     samples of others that were none
+    """
+
+    member: Member
+    site: str
+    sent_bps: float
+    heard_bps: float
+    damaged: int
+
+
+def fleet(status: FleetStatus | None, now_ns: int) -> Json:
+    """The answer of ``/v1/fleet``; ``node`` is null where there is no fleet."""
+    if status is None:
+        return {
+            "valid_at": rfc3339(now_ns),
+            "node": None,
+            "site": None,
+            "nodes": [],
+            "uavs": [],
+            "handovers": [],
+            "sent_bps": None,
+            "heard_bps": None,
+            "damaged": 0,
+        }
+    member = status.member
+    return {
+        "valid_at": rfc3339(now_ns),
+        "node": member.name,
+        "site": status.site,
+        "nodes": _nodes(member, now_ns),
+        "uavs": _uavs(member, now_ns),
+        "handovers": [
+            {"time": rfc3339(one.t_ns), "uav": one.uav, "before": one.before, "after": one.after}
+            for one in member.handovers
+        ],
+        "sent_bps": status.sent_bps,
+        "heard_bps": status.heard_bps,
+        "damaged": status.damaged,
+    }
+
+
+def _nodes(member: Member, now_ns: int) -> list[Json]:
+    """This node, then the others by name."""
+    own = {
+        "node": member.name,
+        "is_self": True,
+        "state": "here",
+        "reason": None,
+        "place": _place(member.place),
+        "reach_m": member.reach_m,
+        "serves": len(member.duties.serves),
+        "most": member.most,
+        "heard_s": None,
+        "clock_offset_s": None,
+        "clock_doubt_s": None,
+        "frames": None,
+        "used": None,
+    }
+    return [own, *(_node(name, member, now_ns) for name in sorted(member.neighbours))]
+
+
+def _node(name: str, member: Member, now_ns: int) -> Json:
+    known: Neighbour = member.neighbours[name]
+    said, ahead = known.standing, known.clock.newest()
+    reason = member.trust.aside.get(name)
+    standing = member.duties.others(now_ns)
+    state = "aside" if reason is not None else "there" if name in standing else "silent"
+    return {
+        "node": name,
+        "is_self": False,
+        "state": state,
+        "reason": reason,
+        "place": None if said is None else _place(said.place),
+        "reach_m": None if said is None else said.reach_m,
+        "serves": 0 if said is None else len(said.serves),
+        "most": None if said is None else said.most,
+        "heard_s": None if said is None else (now_ns - known.heard_ns) * 1e-9,
+        "clock_offset_s": None if ahead is None else -(ahead.low_ns + ahead.high_ns) / 2e9,
+        "clock_doubt_s": None if ahead is None else ahead.doubt_ns * 1e-9,
+        "frames": known.frames,
+        "used": known.used,
+    }
+
+
+def _place(place: tuple[float, float, float] | None) -> Json | None:
+    return None if place is None else dict(zip(("lat_deg", "lon_deg", "alt_m"), place, strict=True))
+
+
+def _uavs(member: Member, now_ns: int) -> list[Json]:
+    """Every UAV that some node offers to serve or serves, and by whom it is served."""
+    offers: dict[str, dict[str, Offer]] = {}
+    for uav, offer in member.offers.items():
+        offers.setdefault(uav, {})[member.name] = offer
+    served: dict[str, list[str]] = {uav: [member.name] for uav in member.duties.serves}
+    handing = dict(member.duties.handing)
+    for name in sorted(member.neighbours):
+        for uav, offer in (member.neighbours[name].offers or {}).items():
+            offers.setdefault(uav, {})[name] = offer
+    for name, said in sorted(member.duties.others(now_ns).items()):
+        for uav, _ in said.serves:
+            served.setdefault(uav, []).append(name)
+        handing |= dict(said.handing)
+    unconfirmed = member.trust.unconfirmed
+    return [
+        {
+            "uav": uav,
+            "served_by": served.get(uav, []),
+            "handing_to": handing.get(uav),
+            "unconfirmed": uav in unconfirmed,
+            "offers": [
+                {
+                    "node": name,
+                    "sure_db": offer.sure_db,
+                    "likely_db": offer.likely_db,
+                    "sinr_db": offer.sinr_db,
+                    "heard_s": offer.heard_s,
+                }
+                for name, offer in sorted(offers.get(uav, {}).items())
+            ],
+        }
+        for uav in sorted({*offers, *served}, key=_natural)
+    ]
+
+
+def _natural(uav: str) -> tuple[int, int, str]:
+    """Telemetry by its numbers, then the others by name."""
+    sysid, _, compid = uav.partition(":")
+    is_plain = sysid.isdecimal() and compid.isdecimal()
+    return (int(sysid), int(compid), uav) if is_plain else (256, 0, uav)

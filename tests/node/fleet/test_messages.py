@@ -1,0 +1,105 @@
+"""What nodes tell one another: said and read back alike; anything else is refused by its reason."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support import examples
+
+from companion.node.fleet import messages
+from companion.node.fleet.messages import FleetMessageError
+from companion.recording import schemas
+from companion.values import Offer, RoundTrip, Shared, SharedFrame, Source, Standing
+
+TIMES = st.integers(0, 1 << 62)
+NAMES = st.text("abc:0123456789", min_size=1, max_size=20)
+NUMBERS = st.floats(-1e9, 1e9, allow_nan=False)
+UNSURE = st.none() | NUMBERS
+FRAMES = st.lists(st.builds(SharedFrame, st.integers(0, 1 << 61), st.binary(max_size=300)))
+TRIPS = st.lists(
+    st.builds(
+        RoundTrip,
+        TIMES,
+        st.builds(Source, st.integers(0, 255), st.integers(0, 255)),
+        TIMES,
+        st.integers(-(1 << 62), 1 << 62),
+    ),
+    max_size=5,
+)
+
+
+@given(st.builds(Shared, TIMES, FRAMES.map(tuple), TRIPS.map(tuple)))
+@settings(max_examples=examples(100))
+def test_what_was_heard_comes_back(said: Shared) -> None:
+    assert messages.to_shared(messages.shared(said)) == said
+
+
+@given(
+    st.builds(
+        Standing,
+        st.just("north"),
+        TIMES,
+        TIMES,
+        st.none() | st.tuples(NUMBERS, NUMBERS, NUMBERS),
+        UNSURE,
+        st.integers(0, 10_000),
+        st.lists(st.tuples(NAMES, NUMBERS)).map(tuple),
+        st.lists(st.tuples(NAMES, NAMES)).map(tuple),
+    )
+)
+@settings(max_examples=examples(100))
+def test_what_a_node_says_of_itself_comes_back_exactly(said: Standing) -> None:
+    """To the last bit: two nodes that compare a worth must have the same number."""
+    assert messages.to_standing(messages.standing(said), "north") == said
+
+
+@given(st.lists(st.builds(Offer, NAMES, UNSURE, UNSURE, UNSURE, UNSURE), unique_by=lambda o: o.uav))
+@settings(max_examples=examples(100))
+def test_offers_come_back(said: list[Offer]) -> None:
+    assert list(messages.to_offers(messages.offers({o.uav: o for o in said}))) == said
+
+
+@given(st.binary(max_size=400))
+@settings(max_examples=examples(300))
+def test_any_bytes_are_read_or_refused(data: bytes) -> None:
+    for read in (
+        messages.to_shared,
+        messages.to_offers,
+        lambda some: messages.to_standing(some, "north"),
+    ):
+        try:
+            read(data)
+        except FleetMessageError:
+            continue
+
+
+def test_what_cannot_be_is_refused() -> None:
+    def standing(**fields: object) -> bytes:
+        made: bytes = schemas.StandingMessage(node="north", **fields).SerializeToString()
+        return made
+
+    assert messages.to_standing(standing(), "north").serves == ()
+    for wrong, node in (
+        (standing(), "south"),  # it speaks for another
+        (standing(place=[1.0]), "north"),
+        (standing(place=[1.0, float("nan"), 0.0]), "north"),
+        (standing(t_ns=1 << 63), "north"),
+        (standing(serves=[{"uav": "1:1", "worth_db": float("inf")}]), "north"),
+        (standing(serves=[{"uav": "", "worth_db": 1.0}]), "north"),
+        (standing(serves=[{"uav": "x" * 65, "worth_db": 1.0}]), "north"),
+        (standing(handing=[{"uav": "1:1", "to": "\n"}]), "north"),
+    ):
+        with pytest.raises(FleetMessageError):
+            messages.to_standing(wrong, node)
+    many = schemas.SharedMessage(frame=[{}] * (messages.FRAMES_MAX + 1)).SerializeToString()
+    with pytest.raises(FleetMessageError):
+        messages.to_shared(many)
+
+
+def test_the_contract_is_described() -> None:
+    """Every message that is told is in the schema that a node hands out, and in the docs."""
+    page = (Path(__file__).parents[3] / "docs" / "fleet.md").read_text(encoding="utf-8")
+    for name in ("Shared", "Standing", "Offers", "Tracks"):
+        assert f"companion.{name}" in page
+        assert name.encode() in schemas.SHARED.descriptor_set

@@ -1,0 +1,135 @@
+"""Claims, leases and handovers of two nodes that hear each other's word when the test says so."""
+
+from dataclasses import dataclass
+
+from companion.pipeline.fleet.duties import GRACE_NS, SETTLED_NS, Duties, Handover
+from companion.values import Standing
+
+MS = 1_000_000
+S = 1000 * MS
+LEASE_NS = 1500 * MS
+NODES = frozenset("ab")
+
+
+@dataclass
+class Pair:
+    """Nodes a and b, 18 dB and what the test gives to each UAV; ``talk`` passes their words."""
+
+    offers: dict[str, dict[str, float]]
+    now_ns: int = 1000 * S
+
+    def __post_init__(self) -> None:
+        self.nodes = {name: Duties(name, 50, LEASE_NS, 3.0) for name in sorted(NODES)}
+        self.changes: list[Handover] = []
+
+    def says(self, name: str) -> Standing:
+        duties = self.nodes[name]
+        serves, handing = tuple(duties.serves.items()), tuple(duties.handing.items())
+        return Standing(name, 0, self.now_ns, None, None, 50, serves, handing)
+
+    def step(self, talk: bool = True, alive: str = "ab") -> list[list[str]]:
+        """One tick of 100 ms. Returns who serves what after each node's decision."""
+        self.now_ns += 100 * MS
+        seen = []
+        words = {name: self.says(name) for name in alive}
+        for name in alive:
+            other = "b" if name == "a" else "a"
+            if talk and other in alive:
+                self.nodes[name].hear(self.now_ns, words[other])
+            known = self.offers if talk else {name: self.offers[name]}
+            self.changes += self.nodes[name].decide(self.now_ns, known, NODES - {name})
+            seen.append([one for one in alive if self.nodes[one].serves])
+        return seen
+
+    def run(self, seconds: float, talk: bool = True, alive: str = "ab") -> list[list[str]]:
+        """Some seconds of ticks."""
+        return [one for _ in range(round(10 * seconds)) for one in self.step(talk, alive)]
+
+
+def test_a_new_fleet_listens_first_and_then_serves_once() -> None:
+    pair = Pair({"a": {"1:1": 20.0}, "b": {"1:1": 25.0}})
+    seen = pair.run(5)
+    assert not any(seen[: 2 * LEASE_NS // (100 * MS) - 2])
+    assert seen[-1] == ["b"]
+    assert ["a", "b"] not in seen
+
+
+def test_a_handover_is_made_before_the_old_beam_is_given_up() -> None:
+    pair = Pair({"a": {"1:1": 20.0}, "b": {"1:1": 10.0}})
+    pair.run(5)
+    assert list(pair.nodes["a"].serves) == ["1:1"]
+    pair.offers["b"]["1:1"] = 22.0  # better, and not by enough
+    assert set(map(tuple, pair.run(5))) == {("a",)}
+    pair.offers["b"]["1:1"] = 25.0
+    began_ns = pair.now_ns
+    seen = pair.run(5)
+    assert [] not in seen
+    assert seen[-1] == ["b"]
+    assert seen.count(["a", "b"]) <= 2
+    taken = [one for one in pair.changes if one.t_ns > began_ns and one.after == "b"]
+    assert taken[0].before == "a"
+    assert taken[0].t_ns - began_ns <= SETTLED_NS + S
+
+
+def test_a_node_that_dies_is_followed_at_once() -> None:
+    pair = Pair({"a": {"1:1": 20.0}, "b": {"1:1": 10.0}})
+    pair.run(5)
+    died_ns = pair.now_ns
+    pair.nodes["b"].gone(died_ns, "a")
+    pair.run(1, talk=False, alive="b")
+    (taken,) = [one for one in pair.changes if one.t_ns > died_ns]
+    assert (taken.before, taken.after) == (None, "b")
+    assert taken.t_ns - died_ns <= 200 * MS
+
+
+def test_a_node_that_falls_silent_is_followed_after_its_lease() -> None:
+    pair = Pair({"a": {"1:1": 20.0}, "b": {"1:1": 10.0}})
+    pair.run(5)
+    silent_ns = pair.now_ns
+    pair.run(3, talk=False, alive="b")
+    (taken,) = [one for one in pair.changes if one.t_ns > silent_ns]
+    assert LEASE_NS <= taken.t_ns - silent_ns <= LEASE_NS + 300 * MS
+
+
+def test_parted_both_serve_and_healed_one_does_and_never_none() -> None:
+    for worth in (8.0, 20.0, 26.0):  # less, as much, more than the other's
+        pair = Pair({"a": {"1:1": 20.0}, "b": {"1:1": worth}})
+        pair.run(5)
+        pair.offers["a"]["1:1"] = 5.0  # it flies while they are parted
+        seen = pair.run(5, talk=False)
+        assert [] not in seen
+        assert seen[-1] == ["a", "b"]
+        healed = pair.run(1)
+        assert [] not in healed
+        assert len(healed[-1]) == 1
+        assert [] not in pair.run(6)
+
+
+def test_who_can_serve_it_no_more_hands_it_over_at_once() -> None:
+    pair = Pair({"a": {"1:1": 20.0}, "b": {"1:1": 10.0}})
+    pair.run(5)
+    del pair.offers["a"]["1:1"]
+    seen = pair.run(1.5)
+    assert [] not in seen
+    assert seen[-1] == ["b"]
+    del pair.offers["b"]["1:1"]
+    assert pair.run(1)[-1] == []
+
+
+def test_a_full_node_takes_nobody_more() -> None:
+    pair = Pair({"a": {}, "b": {f"{n}:1": 10.0 for n in range(5)}})
+    pair.nodes["b"] = Duties("b", 3, LEASE_NS, 3.0)
+    pair.run(6)
+    assert len(pair.nodes["b"].serves) == 3
+
+
+def test_the_second_takes_what_the_first_does_not() -> None:
+    """The node that the assignment names may not see it: nobody waits for it for ever."""
+    pair = Pair({"a": {"1:1": 20.0}, "b": {"1:1": 10.0}})
+    said = Standing("a", 0, 0, None, None, 50, ())
+    for _ in range(60):
+        pair.now_ns += 100 * MS
+        pair.nodes["b"].hear(pair.now_ns, said)
+        pair.nodes["b"].decide(pair.now_ns, pair.offers, frozenset("a"))
+    assert list(pair.nodes["b"].serves) == ["1:1"]
+    assert GRACE_NS < LEASE_NS

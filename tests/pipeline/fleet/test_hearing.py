@@ -1,0 +1,110 @@
+"""Own ears first: what others tell is used of those who are silent here, and held against them."""
+
+from pymavlink.dialects.v20 import common
+
+from companion.mavlink.trust.dedupe import content
+from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
+from companion.pipeline.fleet.hearing import Hearing
+from companion.pipeline.fleet.neighbours import NeighbourClock
+from companion.values import Frame, SharedFrame, Source
+
+MS = 1_000_000
+S = 1000 * MS
+UAV = Source(1, 1)
+
+
+def raw(boot_ms: int, north_m: float = 0.0, msg: str = "position") -> bytes:
+    mav = common.MAVLink(None, srcSystem=1, srcComponent=1)
+    if msg == "heartbeat":
+        packed: bytes = common.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3).pack(mav)
+        return packed
+    lat = 473977000 + round(north_m / 0.0111195)
+    message = common.MAVLink_global_position_int_message(boot_ms, lat, 85456000, 0, 0, 0, 0, 0, 0)
+    return bytes(message.pack(mav))
+
+
+def clock(behind_ns: int = 3 * S, width_ns: int = 2 * MS) -> NeighbourClock:
+    """A node whose clock is so much behind this one's, known within ``width_ns``."""
+    made = NeighbourClock()
+    made.answered(10 * S, 10 * S + width_ns, 10 * S + width_ns // 2 - behind_ns)
+    return made
+
+
+def tell(hearing: Hearing, now_ns: int, data: bytes, heard_ns: int, node: str = "b") -> list[Frame]:
+    """Frames that the pipeline is to have, when a node 3 s behind tells one that it heard."""
+    frame = hearing.placed(now_ns, node, clock(), SharedFrame(heard_ns - 3 * S, data))
+    return [] if frame is None else hearing.told(now_ns, node, frame, content(frame.raw))
+
+
+def hear(hearing: Hearing, now_ns: int, boot_ms: int) -> None:
+    hearing.heard(Frame(now_ns, "udp", UAV, GLOBAL_POSITION_INT, raw(boot_ms)))
+
+
+def test_of_a_vehicle_that_is_heard_here_nothing_else_is_used() -> None:
+    hearing = Hearing()
+    for number in range(20):
+        hear(hearing, 11 * S + number * 100 * MS, 1000 + 100 * number)
+    now_ns = 11 * S + 1910 * MS
+    assert tell(hearing, now_ns, raw(2900), now_ns - 5 * MS) == []  # heard here too
+    assert tell(hearing, now_ns, raw(2850, 1.0), now_ns - 5 * MS) == []
+    assert tell(hearing, now_ns, raw(0, msg="heartbeat"), now_ns - 5 * MS) == []
+
+
+def test_of_one_that_falls_silent_what_was_missed_is_taken_up() -> None:
+    hearing = Hearing()
+    for number in range(20):
+        hear(hearing, 11 * S + number * 100 * MS, 1000 + 100 * number)
+    taken = []
+    for number in range(20, 30):
+        at_ns = 11 * S + number * 100 * MS
+        taken.append(tell(hearing, at_ns + 5 * MS, raw(1000 + 100 * number), at_ns))
+    assert [len(one) for one in taken[:4]] == [0, 0, 3, 1]
+    first = taken[2][0]
+    assert first.link == "fleet:b"
+    assert first.source == UAV
+    # It was heard 3 s behind, within the clock's width: at most so late, and never too early.
+    at_ns = 11 * S + 2000 * MS
+    assert at_ns <= first.t_ns <= at_ns + 3 * MS
+    assert first.t_ns - first.doubt_ns <= at_ns
+    assert tell(hearing, 15 * S, raw(0, msg="heartbeat"), 15 * S - 5 * MS)
+    # Heard again, it is its own ears that count.
+    hear(hearing, 16 * S, 6000)
+    assert tell(hearing, 16 * S + 50 * MS, raw(6040), 16 * S + 40 * MS) == []
+
+
+def test_who_was_never_heard_here_is_taken_from_others_once() -> None:
+    hearing = Hearing()
+    assert len(tell(hearing, 12 * S, raw(1000), 12 * S - 5 * MS, "b")) == 1
+    assert tell(hearing, 12 * S, raw(1000), 12 * S - 5 * MS, "c") == []
+    assert len(tell(hearing, 12 * S, raw(1100), 12 * S - 5 * MS, "c")) == 1
+
+
+def test_what_comes_before_it_can_be_heard_is_a_contradiction() -> None:
+    hearing = Hearing()
+    assert tell(hearing, 12 * S, raw(1000), 12 * S + 50 * MS) == []
+    assert hearing.early == ["b"]
+    # Without a clock nothing is placed, and nothing is wrong.
+    shared = SharedFrame(12 * S, raw(1000))
+    assert hearing.placed(12 * S, "c", NeighbourClock(), shared) is None
+    assert hearing.early == ["b"]
+
+
+def test_a_liar_about_a_vehicle_that_is_heard_here_is_seen() -> None:
+    hearing = Hearing()
+    for number in range(80):
+        now_ns = 11 * S + number * 100 * MS
+        hear(hearing, now_ns, 1000 + 100 * number)
+        false = raw(1000 + 100 * number + 40, 300.0)
+        assert tell(hearing, now_ns + 50 * MS, false, now_ns + 40 * MS) == []
+    assert set(hearing.contradicted) == {"b"}
+    assert len(hearing.contradicted) >= 3
+
+
+def test_damaged_frames_are_none() -> None:
+    hearing = Hearing()
+    whole = raw(1000)
+    for broken in (b"", whole[:-1], whole[:20] + b"\x55" + whole[21:], whole + b"\0", b"\xfd" * 40):
+        assert hearing.placed(12 * S, "b", clock(), SharedFrame(9 * S, broken)) is None
+    attitude = common.MAVLink_attitude_message(1, 0, 0, 0, 0, 0, 0)
+    packed = attitude.pack(common.MAVLink(None, srcSystem=1, srcComponent=1))
+    assert hearing.placed(12 * S, "b", clock(), SharedFrame(9 * S, bytes(packed))) is None

@@ -1,0 +1,55 @@
+"""Clocks of other nodes: the truth is always within what is told, whatever link and drift do."""
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support import examples
+
+from companion.pipeline.fleet.neighbours import DRIFT_MAX, NeighbourClock, here
+from companion.values import RoundTrip, Source
+
+MS = 1_000_000
+START_NS = 1_800_000_000_000_000_000
+
+
+@given(
+    offset_ms=st.integers(-5_000_000, 5_000_000),
+    drift=st.floats(-0.9 * DRIFT_MAX, 0.9 * DRIFT_MAX),
+    ways=st.lists(st.tuples(st.integers(0, 400), st.integers(0, 400)), min_size=1, max_size=30),
+    asked_ms=st.integers(-2000, 20_000),
+)
+@settings(max_examples=examples(200))
+def test_the_truth_is_within(
+    offset_ms: int, drift: float, ways: list[tuple[int, int]], asked_ms: int
+) -> None:
+    def remote(t_ns: int) -> int:
+        return t_ns - offset_ms * MS + round(drift * (t_ns - START_NS))
+
+    clock = NeighbourClock()
+    t_ns = START_NS
+    for there_ms, back_ms in ways:
+        sent_ns, read_ns = t_ns, t_ns + there_ms * MS
+        received_ns = read_ns + back_ms * MS
+        assert clock.answered(sent_ns, received_ns, remote(read_ns)) is None
+        t_ns = received_ns + 500 * MS
+    then_ns = t_ns + asked_ms * MS
+    ahead = clock.ahead(remote(then_ns))
+    assert ahead is not None
+    assert ahead.low_ns - 2 <= then_ns - remote(then_ns) <= ahead.high_ns + 2
+    # No wider than the best round trip and what drift can have added since.
+    best_ns = min(there + back for there, back in ways) * MS
+    aged_ns = 2 * DRIFT_MAX * (abs(then_ns - START_NS) + 25_000 * MS)
+    assert ahead.doubt_ns <= best_ns + aged_ns
+
+
+def test_a_round_trip_of_another_node_is_no_shorter_here() -> None:
+    clock = NeighbourClock()
+    trip = RoundTrip(500 * MS, Source(1, 1), 400 * MS, 77)
+    assert here(trip, clock) is None
+    # The other clock is 1 s behind; the question took 4 ms, the answer 6 ms.
+    clock.answered(1000 * MS, 1010 * MS, 4 * MS)
+    placed = here(trip, clock)
+    assert placed is not None
+    assert placed.sent_ns <= 1400 * MS
+    assert placed.t_ns >= 1500 * MS
+    assert placed.t_ns - placed.sent_ns <= 100 * MS + 10 * MS + 4 * DRIFT_MAX * 500 * MS
+    assert placed.remote_ns == 77

@@ -1,0 +1,104 @@
+"""What is told: each report once where all hear it, at once where one alone does."""
+
+import struct
+from dataclasses import dataclass, field
+
+from pymavlink.dialects.v20 import common
+
+from companion.mavlink.trust.dedupe import content
+from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
+from companion.pipeline.fleet.sharing import HOLD_NS, Sharing
+from companion.values import Frame, RoundTrip, Source
+
+MS = 1_000_000
+UAV = Source(1, 1)
+
+
+def report(at_ns: int, boot_ms: int, source: Source = UAV) -> Frame:
+    mav = common.MAVLink(None, srcSystem=source.sysid, srcComponent=source.compid)
+    message = common.MAVLink_global_position_int_message(boot_ms, 1, 2, 3, 4, 5, 6, 7, 8)
+    return Frame(at_ns, "udp", source, GLOBAL_POSITION_INT, message.pack(mav))
+
+
+@dataclass
+class Nodes:
+    """Nodes on one clock, with a way between them; each report is told to all that hear it."""
+
+    names: tuple[str, ...]
+    way_ns: int = 2 * MS
+    told: list[tuple[str, int, int]] = field(default_factory=list)
+    """Who told a report, its number, and how long after it was heard."""
+
+    def __post_init__(self) -> None:
+        self.sharing = {name: Sharing(name) for name in self.names}
+        self._on_the_way: list[tuple[int, str, Frame]] = []
+        self.now_ns = 0
+
+    def fly(self, reports: int, hearers: tuple[str, ...], first: int = 0) -> None:
+        for number in range(first, first + reports):
+            frame = report(self.now_ns, 1000 + 100 * number)
+            for name in hearers:
+                self.sharing[name].heard(frame, content(frame.raw))
+            for _ in range(20):
+                self._pass(5 * MS)
+
+    def _pass(self, ns: int) -> None:
+        self.now_ns += ns
+        for at_ns, teller, frame in [one for one in self._on_the_way if one[0] <= self.now_ns]:
+            self._on_the_way.remove((at_ns, teller, frame))
+            for name in self.names:
+                if name != teller:
+                    key = content(frame.raw)
+                    self.sharing[name].told(self.now_ns, teller, UAV, key, self.way_ns)
+        for name in self.names:
+            said = self.sharing[name].due(self.now_ns)
+            for one in said.frames if said else ():
+                (boot_ms,) = struct.unpack_from("<I", one.raw, 10)
+                late_ns = self.now_ns - one.heard_ns
+                self.told.append((name, (boot_ms - 1000) // 100, late_ns))
+                frame = Frame(one.heard_ns, "", UAV, GLOBAL_POSITION_INT, one.raw)
+                self._on_the_way.append((self.now_ns + self.way_ns, name, frame))
+
+
+def test_one_speaks_for_a_vehicle_that_all_hear() -> None:
+    nodes = Nodes(("a", "b", "c"))
+    nodes.fly(50, ("a", "b", "c"))
+    later = [one for one in nodes.told if one[1] >= 10]
+    assert {name for name, _, _ in later} == {"a"}
+    assert sorted(number for _, number, _ in later) == list(range(10, 50))
+    assert max(late for _, _, late in later) <= 5 * MS
+
+
+def test_who_alone_hears_a_vehicle_speaks_for_it_at_once() -> None:
+    nodes = Nodes(("a", "b", "c"))
+    nodes.fly(20, ("a", "b", "c"))
+    nodes.told.clear()
+    nodes.fly(20, ("b",), first=20)  # behind a building for the others
+    assert sorted(number for _, number, _ in nodes.told) == list(range(20, 40))
+    first = [late for _, number, late in nodes.told if number < 22]
+    assert max(first) <= HOLD_NS[0] + 5 * MS
+    assert max(late for _, number, late in nodes.told if number >= 22) <= 5 * MS
+    nodes.told.clear()
+    nodes.fly(20, ("a", "b"), first=40)
+    assert len({name for name, number, _ in nodes.told if number >= 50}) == 1
+    assert sorted(number for _, number, _ in nodes.told if number >= 50) == list(range(50, 60))
+
+
+def test_far_apart_they_still_find_one_speaker() -> None:
+    nodes = Nodes(("a", "b", "c"), way_ns=300 * MS)
+    nodes.fly(120, ("a", "b", "c"))
+    late = [one for one in nodes.told if one[1] >= 80]
+    assert len(late) <= 1.1 * 40
+    assert {number for _, number, _ in late} == set(range(80, 120))
+
+
+def test_round_trips_are_told_by_the_speaker() -> None:
+    nodes = Nodes(("a", "b"))
+    nodes.fly(20, ("a", "b"))
+    trip = RoundTrip(nodes.now_ns, UAV, nodes.now_ns - MS, 5)
+    nodes.sharing["a"].answered(trip)
+    nodes.sharing["b"].answered(trip)
+    assert nodes.sharing["b"].due(nodes.now_ns) is None
+    said = nodes.sharing["a"].due(nodes.now_ns)
+    assert said is not None
+    assert said.trips == (trip,)

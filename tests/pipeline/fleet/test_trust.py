@@ -1,0 +1,57 @@
+"""Who is believed: contradictions put a node aside, a hidden vehicle does not."""
+
+from companion.pipeline.fleet.trust import ASIDE_NS, TIMES, UNHEARD_NS, Told, Trust, Witness
+
+S = 1_000_000_000
+HERE = Witness((0.0, 0.0, 0.0), 1000.0, frozenset({"1:1"}))
+
+
+def look(trust: Trust, told: list[Told], witnesses: dict[str, Witness], seconds: int) -> list[str]:
+    said = []
+    for second in range(seconds):
+        said += trust.vehicles(second * S, told, witnesses)
+    return [notice.text for notice in said]
+
+
+def test_one_contradiction_is_none_and_several_are() -> None:
+    trust = Trust()
+    for number in range(TIMES - 1):
+        assert trust.against(number * S, "b", "lies") == []
+    assert trust.believes("b")
+    assert trust.against(100 * S, "b", "lies") == []  # the others are long ago
+    (notice, *_) = [n for t in range(TIMES) for n in trust.against((101 + t) * S, "b", "lies")]
+    assert "node b is not believed for 5 minutes: it lies" in notice.text
+    assert not trust.believes("b")
+    assert trust.believes("c")
+    assert trust.again(110 * S) == []
+    (again,) = trust.again(110 * S + ASIDE_NS)
+    assert "believed again" in again.text
+    assert trust.believes("b")
+
+
+def test_vehicles_that_nobody_else_can_hear_put_their_node_aside() -> None:
+    trust = Trust()
+    phantoms = [Told("66:1", "b", (300.0, 0.0, 0.0)), Told("67:1", "b", (0.0, 400.0, 0.0))]
+    said = look(trust, phantoms, {"a": HERE}, UNHEARD_NS // S + 2)
+    assert len(said) == 1
+    assert "node b is not believed" in said[0]
+    assert "66:1, 67:1" in said[0]
+
+
+def test_one_hidden_vehicle_is_unconfirmed_and_no_lie() -> None:
+    trust = Trust()
+    hidden = [Told("66:1", "b", (300.0, 0.0, 0.0))]
+    assert look(trust, hidden, {"a": HERE}, 60) == []
+    assert trust.unconfirmed == {"66:1"}
+    assert trust.believes("b")
+
+
+def test_who_is_far_away_or_was_heard_before_is_no_phantom() -> None:
+    trust = Trust()
+    far = [Told(f"6{n}:1", "b", (900.0 + n, 0.0, 0.0)) for n in range(5)]
+    assert look(trust, far, {"a": HERE}, 60) == []
+    near = [Told(f"6{n}:1", "b", (100.0 + n, 0.0, 0.0)) for n in range(5)]
+    heard = Witness((0.0, 0.0, 0.0), 1000.0, frozenset(one.uav for one in near))
+    assert look(trust, near, {"a": HERE, "c": heard}, 60) == []
+    assert look(trust, near, {"b": HERE}, 60) == []  # nobody is its own witness
+    assert trust.unconfirmed == frozenset()

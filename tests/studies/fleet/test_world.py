@@ -1,0 +1,91 @@
+"""Fleets in virtual time, with links that delay and lose, partitions and deaths."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support import examples
+
+from companion.settings.fleet import FleetSettings
+from companion.studies.fleet.sky import Sky
+from companion.studies.fleet.world import Counted, World
+
+SETTINGS = FleetSettings(node="any")
+
+
+def shares(counted: Counted) -> tuple[float, float, float]:
+    """Shares of one, several, and no node."""
+    found = counted.served, counted.twice, counted.unserved
+    return tuple(one / sum(found) for one in found)  # type: ignore[return-value]
+
+
+def settled(sky: Sky) -> World:
+    world = World(sky, SETTINGS)
+    world.run(8)
+    world.counted = Counted()
+    return world
+
+
+def test_every_uav_has_one_node() -> None:
+    world = settled(Sky(3, 100, sampled=10, loss=0.02))
+    world.run(10)
+    once, _, none = shares(world.counted)
+    assert once >= 0.999
+    assert none == 0
+
+
+def test_clocks_apart_by_seconds_are_found_and_no_lies() -> None:
+    world = settled(Sky(4, 20, sampled=10))
+    for name, member in world.members.items():
+        for other, known in member.neighbours.items():
+            ahead = known.clock.newest()
+            assert ahead is not None
+            apart_ns = world.clock_ns(name) - world.clock_ns(other)
+            assert ahead.low_ns <= apart_ns <= ahead.high_ns
+            assert ahead.doubt_ns < 70_000_000
+        assert not member.trust.aside
+
+
+def test_a_death_leaves_nobody_alone_for_two_seconds() -> None:
+    world = settled(Sky(3, 60, sampled=0, spacing_m=500))
+    victim = max(world.members, key=lambda name: len(world.members[name].duties.serves))
+    orphans = set(world.members[victim].duties.serves)
+    assert orphans
+    world.kill(victim)
+    world.run(2)
+    assert not (orphans & world.servable()) - world.served_by().keys()
+
+
+@given(
+    nodes=st.integers(2, 5),
+    loss=st.floats(0, 0.3),
+    delay_s=st.floats(0.001, 0.25),
+    cut=st.integers(1, 4),
+    seed=st.integers(0, 1000),
+)
+@settings(max_examples=examples(16))
+def test_parted_nobody_is_unserved_and_it_heals(
+    nodes: int, loss: float, delay_s: float, cut: int, seed: int
+) -> None:
+    sky = Sky(nodes, 20, 400.0, loss=loss, delay_s=delay_s, sampled=0, seed=seed)
+    world = settled(sky)
+    left = set(list(world.members)[:cut])
+    world.parted = lambda one, other: (one in left) != (other in left)
+    world.run(5)
+    _, _, none = shares(world.counted)
+    assert none == 0
+    world.parted = lambda one, other: False
+    world.counted = Counted()
+    world.run(SETTINGS.lease_s + 2 * delay_s)
+    assert shares(world.counted)[2] == 0
+    handed = {uav for one in world.members.values() for uav in one.duties.handing}
+    assert [uav for uav, by in world.served_by().items() if len(by) > 1 and uav not in handed] == []
+
+
+@pytest.mark.parametrize("sampled", [40])
+def test_reports_are_told_about_once(sampled: int) -> None:
+    """All hear all; after the first moments each report is told by one of them."""
+    world = settled(Sky(3, sampled, 300.0, sampled=sampled))
+    world.run(5)
+    bits = 8 * world.counted.sent["heard"] / 5
+    frames = sampled * world.sky.report_hz
+    assert bits <= 1.15 * frames * 8 * (40 + 8)

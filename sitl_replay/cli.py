@@ -84,8 +84,9 @@ def sending_options(command: Callable[..., None]) -> Callable[..., None]:
         required=True,
         callback=as_links,
         help="Where to send: udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD, tcpin:HOST:PORT"
-        " (serves those who connect) or udpin:HOST:PORT (answers those who send it anything)."
-        " The last two wait for their first peer before it begins. May be given several times.",
+        " (serves those who connect), udpin:HOST:PORT (answers those who send it anything) or"
+        " zenoh:KEY?as=hub. The last three wait for their first peer before it begins. May be"
+        " given several times.",
     )(command)
 
 
@@ -229,9 +230,9 @@ def play(
     metavar="URL",
     callback=as_source,
     required=True,
-    help="What to listen to: udpin:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT, serial:DEVICE:BAUD or"
-    " udpout:HOST:PORT. Nothing is sent there; only over udpout an empty datagram each second,"
-    " until something is heard, since the peer cannot know of us otherwise.",
+    help="What to listen to: udpin:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT, serial:DEVICE:BAUD,"
+    " zenoh:KEY or udpout:HOST:PORT. Nothing is sent there; only over udpout an empty datagram each"
+    " second, until something is heard, since the peer cannot know of us otherwise.",
 )
 @click.option(
     "--out",

@@ -79,9 +79,9 @@ def started(command: Any, **options: Any) -> "Iterator[subprocess.Popen[Any]]":
         end(process)
 
 
-def free_port() -> int:
+def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
     """A port of loopback that nobody has now, for a program that cannot say which one it got."""
-    with socket.socket() as free:
+    with socket.socket(socket.AF_INET, kind) as free:
         free.bind(("127.0.0.1", 0))
         return int(free.getsockname()[1])
 

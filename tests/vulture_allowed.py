@@ -26,4 +26,3 @@ one_uav, streamed, healthz, readyz, listing, download, list_scenarios, predictio
 served.readable, served.readinto  # `io` calls them
 exception  # the name of an argument of `__exit__`
 row.shows, row.likeness, row.bears_on  # read by the template of the paper's page
-Bus, bus.subscribe  # for who shares over Zenoh

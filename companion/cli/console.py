@@ -23,7 +23,7 @@ LINKS = click.option(
     "links",
     metavar="URL",
     multiple=True,
-    help="udpin|udpout|tcp|tcpin:HOST:PORT or serial:DEVICE:BAUD; receivers: "
+    help="udpin|udpout|tcp|tcpin:HOST:PORT or serial:DEVICE:BAUD, zenoh:KEY; receivers: "
     "sbs|readsb|rid:HOST:PORT, readsb:http://HOST/PATH, rid|cot:udp:HOST:PORT, cot:tcp:HOST:PORT. "
     "May be given several times.",
 )

@@ -170,6 +170,8 @@ def _silent(url: str) -> str:
     if url.startswith(("udpin", "tcpin")):
         port = url.rpartition(":")[2]
         return f"does anybody send here? MAVProxy: --out udp:THIS_MACHINE:{port}"
+    if url.startswith("zenoh"):
+        return f"does anybody say {url.partition(':')[2].partition('?')[0]}/out there?"
     if url.startswith("serial"):
         return "is MAVLink on that port of the autopilot (SERIALn_PROTOCOL = 2), at this baud rate?"
     return "does anybody answer there?"

@@ -13,6 +13,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
+from companion.mavlink.links import zenoh_bus, zenoh_link
 from companion.mavlink.links.endpoints import bound, reason
 from companion.mavlink.links.urls import LinkUrl, parse_link
 from companion.server.access import bind
@@ -72,6 +73,8 @@ def _link(url: LinkUrl) -> Finding:
     subject = f"link {url}"
     if url.scheme == "serial":
         return _device(subject, Path(url.host))
+    if url.scheme == "zenoh":
+        return _zenoh(subject, url)
     if not url.listens:
         return Finding(subject, Grade.OK, "calls from here")
     kind = socket.SOCK_STREAM if url.scheme == "tcpin" else socket.SOCK_DGRAM
@@ -83,6 +86,14 @@ def _link(url: LinkUrl) -> Finding:
             remedy = "name an address of this machine, such as 0.0.0.0"
         return Finding(subject, Grade.FAULT, reason(error), remedy)
     return Finding(subject, Grade.OK, "can be listened on")
+
+
+def _zenoh(subject: str, url: LinkUrl) -> Finding:
+    try:
+        zenoh_bus.check(zenoh_link.configuration(url))
+    except UserError as error:
+        return Finding(subject, Grade.FAULT, str(error))
+    return Finding(subject, Grade.OK, "Zenoh is here, and can read its endpoints")
 
 
 def _device(subject: str, device: Path) -> Finding:

@@ -28,8 +28,8 @@ LinkText = Annotated[str, AfterValidator(_link)]
 class LinkSettings(Section):
     """The links on which MAVLink, and what receivers of other kinds say, is received.
 
-    URLs are ``udpin:``, ``udpout:``, ``tcp:`` or ``tcpin:HOST:PORT``, ``serial:DEVICE:BAUD``, and
-    those of other receivers: ``sbs:`` or ``readsb:HOST:PORT``, ``readsb:http://HOST/PATH``,
+    URLs are ``udpin:``, ``udpout:``, ``tcp:`` or ``tcpin:HOST:PORT``, ``serial:DEVICE:BAUD``,
+    ``zenoh:KEY``, and those of other receivers: ``sbs:`` or ``readsb:HOST:PORT``, ``readsb:http://HOST/PATH``,
     ``rid:HOST:PORT``, ``rid:udp:HOST:PORT``, ``cot:udp:HOST:PORT``, ``cot:tcp:HOST:PORT``.
 
     ``routers`` are peers that are believed where another one contradicts them in where a vehicle
@@ -90,7 +90,7 @@ _UAV_PATTERN: Final = re.compile(
 )
 
 
-_OUT: Final[tuple[Scheme, ...]] = ("udpout", "tcp", "tcpin", "serial", "cot")
+_OUT: Final[tuple[Scheme, ...]] = ("udpout", "tcp", "tcpin", "serial", "zenoh", "cot")
 
 
 def _uav_pattern(text: str) -> str:
@@ -114,7 +114,7 @@ def _out_link(text: str) -> str:
 class OutSettings(Section):
     """What is known goes on to others, on links of its own: nothing unless ``urls`` are given.
 
-    urls     ``udpout:``, ``tcp:``, ``tcpin:HOST:PORT`` or ``serial:DEVICE:BAUD`` get
+    urls     ``udpout:``, ``tcp:``, ``tcpin:HOST:PORT``, ``serial:DEVICE:BAUD`` or ``zenoh:KEY`` get
              ``message`` of each vehicle that reports itself; ``cot:udp:HOST:PORT``
              (sends datagrams there, also to a group) and ``cot:tcp:HOST:PORT`` (connects) get
              Cursor on Target of every aircraft

@@ -5,6 +5,7 @@ udpin:HOST:PORT       to everybody who has sent something here, as to a vehicle'
 tcp:HOST:PORT         connect, once
 tcpin:HOST:PORT       serve everybody who connects, from then on, as SITL does
 serial:DEVICE:BAUD    a serial port
+zenoh:KEY             to whoever listens over Zenoh; ?as=hub is the end that vehicles are at
 
 A peer that is lost is not tried again. Sending never waits for a peer that is behind: a frame that
 it does not take is dropped and counted. Who would rather wait asks ``writable`` before.

@@ -11,6 +11,7 @@ from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.links.tcp import TcpIn, TcpOut
 from companion.mavlink.links.udp import UdpIn, UdpOut
 from companion.mavlink.links.urls import LinkUrl
+from companion.mavlink.links.zenoh_link import ZenohLink
 from companion.mavlink.wire.aircraft_json import AircraftJson
 from companion.mavlink.wire.beast import BeastSplitter
 from companion.mavlink.wire.cot_link import CotSplitter
@@ -51,3 +52,5 @@ def endpoint(url: LinkUrl, status: LinkStatus, upcalls: Upcalls) -> Endpoint:
             return UdpListen(url, status, upcalls) if url.listens else TcpListen(url, upcalls)
         case "serial":
             return SerialPort(url, upcalls)
+        case "zenoh":
+            return ZenohLink(url, upcalls)

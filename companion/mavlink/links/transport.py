@@ -12,6 +12,7 @@
     rid:udp:HOST:PORT    listen for such receivers' datagrams
     cot:tcp:HOST:PORT    connect to who says Cursor on Target; its events become frames
     cot:udp:HOST:PORT    listen for such datagrams
+    zenoh:KEY            raw frames over Zenoh, in both directions
 
 IPv6 hosts stand in brackets. Every peer has its own splitter: a frame truncated by one peer cannot
 damage another's.

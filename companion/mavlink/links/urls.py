@@ -13,6 +13,9 @@
     rid:udp:HOST:PORT    listen for the datagrams of such receivers; nothing is sent
     cot:tcp:HOST:PORT    connect to who says Cursor on Target; nothing is sent
     cot:udp:HOST:PORT    listen for it, as in cot:udp:239.2.3.1:6969; nothing is sent
+    zenoh:KEY            hear KEY/out and say KEY/in over Zenoh's router on this machine; what else
+                         it may be stands behind a question mark, as in
+                         zenoh:site/raw?connect=tcp/10.0.0.7:7447 (see ``zenoh_link``)
 
 IPv6 hosts stand in brackets.
 """
@@ -26,14 +29,17 @@ from typing import Final, Literal, cast, get_args
 
 from companion.values import UserError
 
-Scheme = Literal["udpin", "udpout", "tcp", "tcpin", "serial", "sbs", "readsb", "rid", "cot"]
+Scheme = Literal[
+    "udpin", "udpout", "tcp", "tcpin", "serial", "zenoh", "sbs", "readsb", "rid", "cot"
+]
 SCHEMES: Final[tuple[Scheme, ...]] = get_args(Scheme)
 Way = Literal["", "tcp", "udp", "http", "https"]
 """How a link goes whose scheme may go several ways; empty: as its scheme does of itself."""
-MAVLINK: Final[tuple[Scheme, ...]] = ("udpin", "udpout", "tcp", "tcpin", "serial")
+MAVLINK: Final[tuple[Scheme, ...]] = ("udpin", "udpout", "tcp", "tcpin", "serial", "zenoh")
 """Links over which MAVLink goes, in both directions."""
 _FORMS: Final[dict[str, str]] = {
     "serial": "serial:DEVICE:BAUD",
+    "zenoh": "zenoh:KEY",
     "readsb": "readsb:HOST:PORT, readsb:http://HOST/PATH",
     "rid": "rid:HOST:PORT, rid:udp:HOST:PORT",
     "cot": "cot:udp:HOST:PORT, cot:tcp:HOST:PORT",
@@ -45,6 +51,10 @@ _BAUD_MAX: Final = 20_000_000
 _AIRCRAFT_JSON: Final = "readsb:http://radar.lan/tar1090/data/aircraft.json"
 _NUMBER: Final = re.compile(r"[0-9]{1,8}")
 _PATH: Final = re.compile(r"/[A-Za-z0-9._~!$&'()*+,;=:@/?%-]{0,500}")
+_KEY: Final = re.compile(r"[A-Za-z0-9_.~%+-]{1,100}(/[A-Za-z0-9_.~%+-]{1,100}){0,20}")
+_OPTION: Final = re.compile(
+    r"as=hub|(connect|listen)=(tcp|tls|udp|quic|ws)/[A-Za-z0-9_.:\[\]%-]+:[0-9]{1,5}([?#][^\s&]*)?"
+)
 _NAME: Final = re.compile(r"[A-Za-z0-9._-]+")
 
 
@@ -56,8 +66,9 @@ class LinkError(UserError):
 class LinkUrl:
     """A parsed link address; ``str`` gives it as the user wrote it.
 
-    ``host`` is the device of a serial link, and ``port`` its baud rate. ``path`` is what is asked
-    for over HTTP.
+    ``host`` is the device of a serial link, and ``port`` its baud rate; ``host`` is the key of a
+    Zenoh link, whose ``port`` is 0. ``path`` is what is asked for over HTTP, or a Zenoh link's
+    options.
     """
 
     scheme: Scheme
@@ -67,6 +78,8 @@ class LinkUrl:
     path: str = ""
 
     def __str__(self) -> str:
+        if self.scheme == "zenoh":
+            return f"zenoh:{self.host}{self.path and '?'}{self.path}"
         host = f"[{self.host}]" if self.scheme != "serial" and ":" in self.host else self.host
         if self.way in _HTTP_PORTS:
             port = "" if self.port == _HTTP_PORTS[self.way] else f":{self.port}"
@@ -85,6 +98,8 @@ def parse_link(text: str, schemes: Collection[Scheme] = SCHEMES) -> LinkUrl:
     Port 0 is allowed where the link listens: the system then chooses one.
     """
     scheme, _, address = text.partition(":")
+    if scheme == "zenoh" and scheme in schemes:
+        return _zenoh(text, address)
     way: Way = ""
     path = ""
     if scheme == "readsb" and address.startswith(("http:", "https:")):
@@ -120,6 +135,17 @@ def _http(text: str, address: str) -> tuple[Way, str, str]:
     if ":" not in host.rpartition("]")[2]:
         host = f"{host}:{_HTTP_PORTS[way]}"
     return cast(Way, way), host, slash + path
+
+
+def _zenoh(text: str, address: str) -> LinkUrl:
+    key, mark, options = address.partition("?")
+    if not _KEY.fullmatch(key):
+        raise LinkError(f"{text!r} is not zenoh:KEY, a key without wildcards such as mavlink_raw")
+    wrong = [one for one in options.split("&") if not _OPTION.fullmatch(one)] if mark else []
+    if wrong:
+        known = "connect=tcp/HOST:PORT, listen=tcp/HOST:PORT and as=hub"
+        raise LinkError(f"{text!r}: {wrong[0]!r} is none of {known}, with & between them")
+    return LinkUrl("zenoh", key, 0, "", options)
 
 
 def _serial(text: str, device: str, baud: int) -> LinkUrl:

@@ -1,21 +1,21 @@
 """One Zenoh session: what is published, heard, asked and answered, and who is alive.       [shell]
 
 The only file that knows Zenoh (https://zenoh.io, the extra ``[fleet]``). Its callbacks come on
-threads of its own. What they bring waits in one queue and wakes the event loop once for all that
-waits; only answers to questions are given on Zenoh's thread, since a clock must not wait for a busy
-loop. Nothing here waits for the network but ``open`` and ``close``, which belong on a thread.
+threads of its own; what they bring is handed to the event loop. Only answers to questions are given
+on Zenoh's thread, since a clock must not wait for a busy loop. Nothing here waits for the network
+but ``open`` and ``close``, which belong on a thread.
 """
 
 import asyncio
 import contextlib
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
+from companion.mavlink.links.to_loop import ToLoop
 from companion.mavlink.links.zenoh_config import BusConfig, Priority, sections
 from companion.values import UserError
 from companion.values.extras import needs
@@ -23,10 +23,6 @@ from companion.values.extras import needs
 if TYPE_CHECKING:
     import zenoh
 
-QUEUE_MAX: Final = 20_000
-"""Things heard that may wait for the loop; what comes beyond is dropped and counted."""
-AT_ONCE: Final = 256
-"""Things handed over in one turn of the loop, so that other work comes between."""
 PUBLISHERS_MAX: Final = 1024
 """Keys declared, so that their names go over the wire once; beyond it, all are begun anew."""
 
@@ -34,7 +30,7 @@ NO_ROUTER: Final = "Unable to connect"
 """What Zenoh says when a client reaches none of its endpoints."""
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class BusStatus:
     """Counts, which only grow.
 
@@ -42,13 +38,13 @@ class BusStatus:
              what is published, and the other end sees the holes
     refused  samples that Zenoh did not take, or after ``close``
     heard    samples, answers and signs of life handed over
-    dropped  those that came while ``QUEUE_MAX`` waited
+    dropped  those for which there was no room while the loop was busy
     """
 
-    sent: int = 0
-    refused: int = 0
-    heard: int = 0
-    dropped: int = 0
+    sent: int
+    refused: int
+    heard: int
+    dropped: int
 
 
 class Bus:
@@ -58,15 +54,11 @@ class Bus:
     """
 
     def __init__(self, config: BusConfig, loop: asyncio.AbstractEventLoop) -> None:
-        self.status = BusStatus()
         self._config = config
-        self._loop = loop
-        self._lock = threading.Lock()
-        self._waiting: deque[Callable[[], None]] = deque()
-        self._is_woken = False
-        self._is_over = False
+        self._sent = 0
+        self._refused = 0
+        self._to_loop = ToLoop(loop)
         self._ended = threading.Event()
-        self._fault: asyncio.Future[None] = loop.create_future()
         self._session: zenoh.Session | None = None
         self._publishers: dict[tuple[str, Priority, bool], zenoh.Publisher] = {}
         self._declared: list[Any] = []  # what ends when nobody holds it any more
@@ -92,15 +84,19 @@ class Bus:
         if self._ended.is_set() and self._session is not None:  # closed meanwhile
             _close(self._session)
 
+    @property
+    def status(self) -> BusStatus:
+        queue = self._to_loop
+        return BusStatus(self._sent, self._refused, queue.handed_over, queue.dropped)
+
     async def run(self) -> None:
         """Wait until cancelled; raises what a callback raised."""
-        await asyncio.shield(self._fault)
+        await self._to_loop.run()
 
     def close(self) -> None:
         """End the session; blocks until others were told. Nothing is handed over afterwards."""
-        self._is_over = True
+        self._to_loop.end()
         self._ended.set()
-        self._waiting.clear()
         if self._session is not None:
             _close(self._session)
 
@@ -108,11 +104,11 @@ class Bus:
 
     def put(
         self, key: str, payload: bytes, *, express: bool = False, priority: Priority = "data"
-    ) -> None:
-        """Publish a sample; what a congested link has no room for is dropped.
+    ) -> bool:
+        """Publish a sample; False if Zenoh did not take it.
 
-        ``express`` sends it at once rather than with what follows, for single samples: of a burst
-        only ``QUEUED`` find room.
+        What a congested link has no room for is dropped, unseen. ``express`` sends it at once
+        rather than with what follows, for single samples: of a burst only ``QUEUED`` find room.
         """
         import zenoh
 
@@ -122,9 +118,21 @@ class Bus:
                 publisher = self._publisher(key, priority, express)
             publisher.put(payload)
         except zenoh.ZError:
-            self.status.refused += 1
-            return
-        self.status.sent += 1
+            self._refused += 1
+            return False
+        self._sent += 1
+        return True
+
+    def is_wanted(self, key: str) -> bool:
+        """Whether somebody listens to what ``put`` publishes under ``key``, as data."""
+        import zenoh
+
+        try:
+            publisher = self._publishers.get((key, "data", False))
+            status: Any = (publisher or self._publisher(key, "data", False)).matching_status
+            return bool(status.matching)  # its annotation says that it is a bool, and it is not
+        except zenoh.ZError:
+            return False
 
     def ask(
         self, key: str, payload: bytes, timeout_s: float, take: Callable[[bytes, int], None]
@@ -139,7 +147,7 @@ class Bus:
             arrived_ns = time.monotonic_ns()
             if reply.ok is not None:
                 answer = reply.ok.payload.to_bytes()
-                self._post(lambda: take(answer, arrived_ns))
+                self._to_loop.post(lambda: take(answer, arrived_ns))
 
         self._opened().get(
             key,
@@ -162,7 +170,7 @@ class Bus:
         def heard(sample: "zenoh.Sample") -> None:
             if sample.kind == zenoh.SampleKind.PUT:
                 key, payload = str(sample.key_expr), sample.payload.to_bytes()
-                self._post(lambda: take(key, payload))
+                self._to_loop.post(lambda: take(key, payload))
 
         self._declared.append(
             self._opened().declare_subscriber(
@@ -188,7 +196,7 @@ class Bus:
             except zenoh.ZError:  # who asked is gone, or this session
                 return
             except Exception as fault:
-                self._post(partial(self._fail, fault))
+                self._to_loop.post(partial(self._to_loop.fail, fault))
 
         self._declared.append(
             self._opened().declare_queryable(
@@ -206,52 +214,26 @@ class Bus:
 
         def seen(sample: "zenoh.Sample") -> None:
             key, is_alive = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
-            self._post(lambda: take(key, is_alive))
+            self._to_loop.post(lambda: take(key, is_alive))
 
         callback = zenoh.handlers.Callback(seen, indirect=False)
         liveliness = self._opened().liveliness()
         self._declared.append(liveliness.declare_subscriber(key_expr, callback, history=True))
 
-    # --- from Zenoh's threads to the loop ----------------------------------------------------
+    def neighbours(self, take: Callable[[str, bool], None]) -> None:
+        """Have ``take`` called with the id of each session that this one is, or no more, joined to.
 
-    def _post(self, item: Callable[[], None]) -> None:
-        """Hand something to the loop, from any thread: one wake-up for all that waits."""
-        with self._lock:
-            if self._is_over:
-                return
-            if len(self._waiting) >= QUEUE_MAX:
-                self.status.dropped += 1
-                return
-            self._waiting.append(item)
-            if self._is_woken:
-                return
-            self._is_woken = True
-        try:
-            self._loop.call_soon_threadsafe(self._hand_over)
-        except RuntimeError:  # the loop has ended, and with it whoever would listen
-            self._is_over = True
+        Those through a router are none.
+        """
+        import zenoh
 
-    def _hand_over(self) -> None:
-        with self._lock:
-            batch = [self._waiting.popleft() for _ in range(min(AT_ONCE, len(self._waiting)))]
-            self._is_woken = bool(self._waiting)
-            if self._is_woken:
-                self._loop.call_soon(self._hand_over)
-        for item in batch:
-            if self._is_over:
-                return
-            try:
-                item()
-            except Exception as fault:
-                self._fail(fault)
-                return
-            self.status.heard += 1
+        def seen(event: "zenoh.TransportEvent") -> None:
+            who, is_joined = str(event.transport.zid), event.kind == zenoh.SampleKind.PUT
+            self._to_loop.post(lambda: take(who, is_joined))
 
-    def _fail(self, fault: Exception) -> None:
-        """End who runs this by a callback's defect, which must not vanish."""
-        self._is_over = True
-        if not self._fault.done():
-            self._fault.set_exception(fault)
+        callback = zenoh.handlers.Callback(seen, indirect=False)
+        info = self._opened().info
+        self._declared.append(info.declare_transport_events_listener(callback, history=True))
 
     # --- the session ------------------------------------------------------------------------
 
@@ -272,6 +254,13 @@ class Bus:
         )
         self._publishers[key, priority, express] = publisher
         return publisher
+
+
+def check(config: BusConfig) -> None:
+    """See that Zenoh is here and can read a configuration. Raises ``UserError`` where not."""
+    with needs("zenoh", "fleet", "Zenoh"):
+        import zenoh  # noqa: F401
+    _configured(config)
 
 
 def _close(session: "zenoh.Session") -> None:

@@ -13,7 +13,7 @@ import pytest
 from link_support import LOOPS, Run, runner
 from support import free_port, run_async
 
-from companion.mavlink.links import zenoh_bus
+from companion.mavlink.links import to_loop, zenoh_bus
 from companion.mavlink.links.zenoh_bus import Bus
 from companion.mavlink.links.zenoh_config import QUEUED, BusConfig, BusTls
 from companion.values import UserError
@@ -79,7 +79,7 @@ def test_samples_arrive_whole_and_in_order(run: Run) -> None:
             heard = Heard()
             one.subscribe("site/*/frames", heard.take)
             await joined(one, other)  # the subscription went before
-            sent = [bytes([n % 256]) * (n % 50) for n in range(zenoh_bus.AT_ONCE * 3)]
+            sent = [bytes([n % 256]) * (n % 50) for n in range(to_loop.AT_ONCE * 3)]
             for payload in sent:
                 other.put("site/b/frames", payload)
                 other.put("site/b/tracks", b"nobody listens")
@@ -197,7 +197,7 @@ def test_a_defect_in_an_answer_does_too(run: Run) -> None:
 
 
 def test_what_waits_is_bounded(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(zenoh_bus, "QUEUE_MAX", 10)
+    monkeypatch.setattr(to_loop, "QUEUE_MAX", 10)
 
     async def test() -> None:
         async with pair() as (one, other):
@@ -251,6 +251,24 @@ def test_many_keys_go_out_all_the_same(run: Run, monkeypatch: pytest.MonkeyPatch
                 other.put(f"site/{n}", b"", express=True, priority="real_time")
             await heard.until(5)
             assert sorted(heard) == [(f"site/{n}", b"") for n in range(5)]
+
+    run(test())
+
+
+def test_whether_somebody_listens_and_who_is_near_is_known(run: Run) -> None:
+    async def test() -> None:
+        async with pair() as (stays, leaves):
+            near = Heard()
+            stays.neighbours(near.take)
+            leaves.subscribe("site/a", lambda key, payload: None)
+            await joined(leaves, stays)
+            await near.until(1)
+            assert stays.is_wanted("site/a") and not stays.is_wanted("site/b")
+            await asyncio.to_thread(leaves.close)
+            await near.until(2)
+            assert [is_joined for _, is_joined in near] == [True, False]
+            assert near[0][0] == near[1][0]
+            assert not stays.is_wanted("site/a") and not leaves.is_wanted("site/a")
 
     run(test())
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
-from support import HANG_S, run_async
+from support import HANG_S, free_port, run_async
 
 from companion.mavlink.links.urls import LinkError, LinkUrl, parse_link
 from companion.values import Frame, Reason, Source
@@ -80,12 +80,6 @@ def test_a_flight_is_recorded_as_it_was_sent(tmp_path: Path) -> None:
     assert max(late_s) - min(late_s) < 3e-6
 
 
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 # Sent until somebody listens; no scenario has this message.
 KNOCK = dialect.MAVLink_ping_message(1, 2, 3, 4).pack(dialect.MAVLink(None, 9, 9))
 
@@ -100,7 +94,7 @@ async def until(heard: recorder.Heard, count: int) -> None:
 def test_udp_is_recorded_peer_by_peer(tmp_path: Path, frames: list[bytes]) -> None:
     # One peer sends half a frame, then another peer whole ones: those must not suffer.
     tlog = tmp_path / "heard.tlog"
-    port = free_port()
+    port = free_port(socket.SOCK_DGRAM)
     heard = recorder.Heard()
 
     async def scene() -> None:
@@ -184,7 +178,7 @@ def test_a_peer_that_leaves_before_the_duration_is_an_error(
 
 
 def test_the_duration_ends_a_recording(tmp_path: Path) -> None:
-    url = LinkUrl("udpin", "127.0.0.1", free_port())
+    url = LinkUrl("udpin", "127.0.0.1", free_port(socket.SOCK_DGRAM))
     heard = run_async(recorder.record(url, tmp_path / "silence.tlog", 0.05))
     assert heard.frames == 0
     assert 0.05 <= heard.duration_s < 1.0
@@ -201,7 +195,7 @@ def test_a_taken_port_is_told(tmp_path: Path) -> None:
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_full_disk_is_an_error(frames: list[bytes]) -> None:
     # It ends the recording at once, though more could come.
-    port = free_port()
+    port = free_port(socket.SOCK_DGRAM)
     url = LinkUrl("udpin", "127.0.0.1", port)
 
     async def scene() -> None:
@@ -271,6 +265,25 @@ def test_what_is_played_over_any_link_is_recorded(
     assert abs(read[0][0] - time.time()) < 60.0
 
 
+def test_what_is_played_over_zenoh_is_recorded(tmp_path: Path, frames: list[bytes]) -> None:
+    pytest.importorskip("zenoh")
+    tlog, heard = tmp_path / "heard.tlog", recorder.Heard()
+    log = [Frame(10**18, "", Source(1, 1), 0, raw) for raw in frames[:ENOUGH]]
+
+    async def scene() -> None:
+        endpoint = f"tcp/127.0.0.1:{free_port()}"
+        hub = f"zenoh:site/raw?as=hub&listen={endpoint}"
+        playing = asyncio.create_task(player.play(log, [hub]))
+        url = parse_link(f"zenoh:site/raw?connect={endpoint}")
+        task = asyncio.create_task(recorder.record(url, tlog, heard=heard))
+        await playing
+        with pytest.raises(LinkError, match="router is gone"):
+            await asyncio.wait_for(task, HANG_S)
+
+    run_async(scene())
+    assert [raw for _, raw in read_by_mavutil(tlog)] == frames[:ENOUGH]
+
+
 def has_ipv6() -> bool:
     with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as probe:
         try:
@@ -337,7 +350,7 @@ def test_what_was_heard_is_on_disk_when_it_falls_silent(
     tmp_path: Path, frames: list[bytes]
 ) -> None:
     """So that a killed process loses a second, not what came since the last flush."""
-    tlog, port = tmp_path / "a.tlog", free_port()
+    tlog, port = tmp_path / "a.tlog", free_port(socket.SOCK_DGRAM)
     heard = recorder.Heard()
 
     async def scene() -> None:

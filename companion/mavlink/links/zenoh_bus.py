@@ -251,6 +251,7 @@ class Bus:
             priority=getattr(zenoh.Priority, priority.upper()),
             congestion_control=zenoh.CongestionControl.DROP,
             express=express,
+            allowed_destination=zenoh.Locality.REMOTE,
         )
         self._publishers[key, priority, express] = publisher
         return publisher

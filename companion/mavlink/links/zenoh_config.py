@@ -58,6 +58,7 @@ class BusConfig:
     lease_s         silence after which a neighbour is given up
     keep_alive      signs of life in one lease
     retry_s         time from one attempt to connect to the next
+    attempt_s       longest time that an attempt takes
     """
 
     mode: Mode = "peer"
@@ -69,6 +70,7 @@ class BusConfig:
     lease_s: float = 1.5
     keep_alive: int = 4
     retry_s: float = 0.5
+    attempt_s: float = 1.0
 
 
 def sections(config: BusConfig) -> dict[str, str]:
@@ -97,6 +99,9 @@ def sections(config: BusConfig) -> dict[str, str]:
         },
         "scouting/multicast/enabled": config.scouting,
         "scouting/delay": 0,  # a session is open before its neighbours are found
+        # Else an attempt to connect hangs on, ever more rarely heard, after the network is back.
+        "transport/unicast/open_timeout": round(config.attempt_s * 1000),
+        "transport/unicast/accept_timeout": round(config.attempt_s * 1000),
         "transport/link/tx/lease": round(config.lease_s * 1000),
         "transport/link/tx/keep_alive": config.keep_alive,
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,

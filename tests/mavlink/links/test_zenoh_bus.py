@@ -261,6 +261,7 @@ def test_whether_somebody_listens_and_who_is_near_is_known(run: Run) -> None:
             near = Heard()
             stays.neighbours(near.take)
             leaves.subscribe("site/a", lambda key, payload: None)
+            stays.subscribe("site/*", lambda key, payload: None)  # of his own nobody is asked
             await joined(leaves, stays)
             await near.until(1)
             assert stays.is_wanted("site/a") and not stays.is_wanted("site/b")
@@ -293,6 +294,32 @@ def test_a_neighbour_that_comes_later_is_found(run: Run) -> None:
             opened(BusConfig(listen=(endpoint,))) as late,
         ):
             await joined(early, late)
+
+    run(test())
+
+
+def listening() -> dict[str, str]:
+    """Sockets of this process that take what comes: by inode, the table and the address."""
+    mine = set()
+    for descriptor in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(OSError):  # the one that the folder was read by
+            mine.add(str(descriptor.readlink()))
+    found = {}
+    for table, state in (("tcp", "0A"), ("tcp6", "0A"), ("udp", "07"), ("udp6", "07")):
+        for line in Path(f"/proc/net/{table}").read_text("ascii").splitlines()[1:]:
+            fields = line.split()
+            if fields[3] == state and f"socket:[{fields[9]}]" in mine:
+                found[fields[9]] = f"{table} {fields[1].split(':')[0]}"
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="the system has no such list")
+def test_unless_told_otherwise_it_listens_on_this_machine_alone(run: Run) -> None:
+    async def test() -> None:
+        before = listening()
+        async with opened(BusConfig()):
+            new = {inode: at for inode, at in listening().items() if inode not in before}
+            assert list(new.values()) == ["tcp 0100007F"]  # 127.0.0.1
 
     run(test())
 

@@ -1,4 +1,4 @@
-"""What is around a node: where its array is, how far it hears, and vehicles that none else hears."""
+"""What is around a node: where its array is, how far it hears, vehicles that none else hears."""
 
 import math
 from typing import Final

@@ -48,4 +48,6 @@ class JsonLines:
         """Print the object."""
         fresh = [notice for notice in service.events() if notice.t_ns > self._seen_ns]
         self._seen_ns = max([self._seen_ns, *(notice.t_ns for notice in fresh)])
-        click.echo(json.dumps(glance.glance(service) | {"events": glance.events(fresh)}))
+        click.echo(
+            json.dumps(glance.glance(service) | {"events": glance.events(service.pipeline, fresh)})
+        )

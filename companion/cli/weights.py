@@ -87,9 +87,11 @@ def weights(
         raise click.ClickException(f"no beams at {at}: {update.unfit}")
     if form == "json":
         told = beam_state.beams(pipeline, equipment, update, 0.0, lead_ms)
-        body = json.dumps(told | beam_state.weights(update.beams, lead_ms)).encode() + b"\n"
+        body = (
+            json.dumps(told | beam_state.weights(pipeline, update.beams, lead_ms)).encode() + b"\n"
+        )
     else:
-        body = weight_formats.encode(form, update.beams, pipeline.array, equipment, lead_ms)
+        body = weight_formats.encode(form, update.beams, pipeline, equipment, lead_ms)
     if out is None:
         click.echo(body, nl=False)
     else:

@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import companion
 from companion.node.replay import Run, log_events, missing, told
+from companion.recording.reader import utc_offset_ns
 from companion.recording.scene import Scene
 from companion.recording.space_file import SpaceFile
 from companion.recording.tables.folder import TableFolder
@@ -40,13 +41,13 @@ def export(
     missing, ``OSError`` where the folder cannot be written.
     """
     events = log_events(logs, settings, latency_s)
-    run = Run(settings, None)
+    run, offset_ns = Run(settings, None), utc_offset_ns(logs)
     due_s = time.monotonic()
     with TableFolder(where, form, TABLES) as folder:
         for event in events:
             outputs = run.step(event)
             for table, item in rows(event, outputs, run.pipeline.local):
-                folder.add(table, item)
+                folder.add(table, item, offset_ns)
             if time.monotonic() >= due_s:
                 due_s += SHOW_EVERY_S
                 progress(run.pipeline.frames, run.at_s, run.took_s)

@@ -8,6 +8,7 @@ from typing import Final
 from companion.node.replay import log_events
 from companion.pipeline.fold import Pipeline
 from companion.recording import ends
+from companion.recording.reader import utc_offset_ns
 from companion.settings.model import Settings
 from companion.values import Update, UserError
 
@@ -34,7 +35,8 @@ def look(
 
         logs      as for a replay
         settings  as for a replay
-        at        seconds from the log's first event, or a time with its date and zone (RFC 3339)
+        at        seconds from the log's first event, or a time with its date and zone (RFC 3339),
+                  by the node's wall clock as it was set last
         lead_s    how far ahead of that time the beams are applied
         progress  called now and then with seconds of log
         latency_s as for a replay
@@ -42,14 +44,14 @@ def look(
     Raises ``MomentError`` for text that is no time or a time that the log does not reach;
     ``LogError`` and ``ConfigError`` as for a replay.
     """
-    span_ns = ends.span_ns(logs)
+    span_ns, offset_ns = ends.span_ns(logs), utc_offset_ns(logs)
     if span_ns is not None:
-        _require_within(at, span_ns)
+        _require_within(at, span_ns, offset_ns)
     pipeline, at_ns, seen, t_ns = Pipeline(settings), None, 0, 0
     begins_ns = 0
     for event in log_events(logs, settings, latency_s):
         if at_ns is None:
-            begins_ns, at_ns = event.t_ns, _time_ns(at, event.t_ns)
+            begins_ns, at_ns = event.t_ns, _time_ns(at, event.t_ns, offset_ns)
         if event.t_ns > at_ns:
             break
         pipeline.step(event)
@@ -64,17 +66,17 @@ def look(
     return pipeline, pipeline.look(at_ns, lead_s)
 
 
-def _require_within(at: str, span_ns: tuple[int, int]) -> None:
+def _require_within(at: str, span_ns: tuple[int, int], utc_offset_ns: int) -> None:
     """Refuse a time that lies far outside the ends of the logs, before they are read."""
     first_ns, last_ns = span_ns
-    at_ns = _time_ns(at, first_ns)
+    at_ns = _time_ns(at, first_ns, utc_offset_ns)
     if at_ns > last_ns + ENDS_NS:
         raise MomentError(f"--at {at}: the log is {(last_ns - first_ns) * 1e-9:.1f} s long")
     if at_ns < first_ns - ENDS_NS:
         raise MomentError(f"--at {at}: the log begins later")
 
 
-def _time_ns(text: str, begins_ns: int) -> int:
+def _time_ns(text: str, begins_ns: int, utc_offset_ns: int) -> int:
     try:
         return begins_ns + round(float(text) * 1e9)
     except (ValueError, OverflowError):
@@ -88,4 +90,4 @@ def _time_ns(text: str, begins_ns: int) -> int:
         ) from error
     if then.tzinfo is None:
         raise MomentError(f"--at {text}: say the zone, such as Z")
-    return round(then.timestamp() * 1e9)
+    return round(then.timestamp() * 1e9) - utc_offset_ns

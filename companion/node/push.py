@@ -82,7 +82,8 @@ class Push:
             self._send(update, number, sure)
 
     def _send(self, update: Update, number: int, sure: list[float | None] | None) -> None:
-        encode = partial(records.encode, update.beams, number, sure)
+        beams = records.in_utc(self._pipeline, update.beams)
+        encode = partial(records.encode, beams, number, sure)
         if self._ring:
             for record in encode(LARGEST_RECORD):
                 self._ring.put(record)

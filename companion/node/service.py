@@ -5,16 +5,16 @@ Over 300 lines: it holds the parts of the running service together.
 
 import asyncio
 import socket
-import time
 from collections import deque
 from collections.abc import Callable, Coroutine, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import companion
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.voice.rate_watch import MessageRate
+from companion.node.clock import NodeClock
 from companion.node.drive import targets
 from companion.node.drive.loop import Drive, Safe
 from companion.node.drive.running import beside
@@ -37,7 +37,7 @@ from companion.server import area_map
 from companion.settings.files import embedded
 from companion.settings.model import Settings
 from companion.settings.origins import Origins
-from companion.values import Event, Frame, Notice, Output, Severity, Tick, UserError
+from companion.values import ClockSet, Event, Frame, Notice, Output, Severity, Tick, UserError
 from companion.views.fleet import FleetStatus
 from companion.views.health import behind
 from companion.views.last_messages import LastMessages
@@ -45,33 +45,11 @@ from companion.views.lateness import Lateness
 from companion.views.series import Series
 from companion.views.state import RecordingStatus
 
-SET_NS: Final = 500_000_000
-"""Step of the wall clock, between two ticks, that is told."""
-
-
-class NodeClock:
-    """Nanoseconds since the Unix epoch, never stepping: the wall clock once, then monotonic."""
-
-    def __init__(self) -> None:
-        self._start_ns = time.time_ns() - time.monotonic_ns()
-        self._off_ns = 0
-
-    def now_ns(self) -> int:
-        """The present time on the node's timeline."""
-        return self._start_ns + time.monotonic_ns()
-
-    def set_by_ns(self) -> int | None:
-        """By how much the wall clock was set since the start or the last word; None: not at all.
-
-        The timeline goes on as before: intervals and bounds rest on it. Drift is not told.
-        """
-        off_ns = time.time_ns() - self.now_ns()
-        told_ns, self._off_ns = self._off_ns, off_ns
-        return off_ns if abs(off_ns - told_ns) > SET_NS else None
-
 
 class Service:
     """A running node, as the HTTP server sees it. ``answering`` is set once HTTP is served.
+
+    ``clock`` is this machine's unless a test brings another one.
 
     ``say`` gets one line for the operator whenever something changes. Raises ``LinkError`` if a
     link cannot be opened, ``ConfigError`` if the settings cannot be used, ``OSError`` if the
@@ -79,7 +57,11 @@ class Service:
     """
 
     def __init__(
-        self, settings: Settings, say: Callable[[str], None], origins: Origins | None = None
+        self,
+        settings: Settings,
+        say: Callable[[str], None],
+        origins: Origins | None = None,
+        clock: NodeClock | None = None,
     ) -> None:
         settings = embedded(settings)
         self.pipeline = Pipeline(settings)
@@ -95,7 +77,7 @@ class Service:
         self._is_behind = False
         self._settings = settings
         self._say = say
-        self._timeline = NodeClock()
+        self._timeline = clock or NodeClock()
         self._started_ns = self._timeline.now_ns()
         self._rates = Throughput()
         self._defects: asyncio.Queue[Exception] = asyncio.Queue()
@@ -192,6 +174,12 @@ class Service:
             if isinstance(output, Notice):
                 self._show(output)
 
+    def _follow_wall_clock(self) -> None:
+        """Have the times that are said follow this machine's clock, where that was set."""
+        offset_ns = self._timeline.set_to_ns()
+        if offset_ns is not None:
+            self._step(ClockSet(self._timeline.now_ns(), offset_ns))
+
     async def _driven(self) -> None:
         """Drive the device of ``[drive]``; its mistakes end it, and not the service."""
         if self._device is None:
@@ -248,16 +236,6 @@ class Service:
             text, severity = f"{machine.reason}; {machine.remedy}", Severity.WARNING
         self._notify(Notice(self.now_ns(), severity, "machine", text))
 
-    def _tell_of_wall_clock(self) -> None:
-        """Tell when this machine's clock was set, as by NTP on one without a battery."""
-        off_ns = self._timeline.set_by_ns()
-        if off_ns is not None:
-            text = (
-                f"this machine's clock was set: times of this run and its recordings are"
-                f" {abs(off_ns) * 1e-9:.3f} s {'before' if off_ns > 0 else 'after'} it"
-            )
-            self._notify(Notice(self.now_ns(), Severity.WARNING, "clock", text))
-
     def _show(self, notice: Notice) -> None:
         self.notices.append(notice)
         self._say(notice.text)
@@ -273,6 +251,7 @@ class Service:
         due_s = loop.time()
         while True:
             began_s = loop.time()
+            self._follow_wall_clock()
             self._step(Tick(self._timeline.now_ns()))
             if self.fleet is not None:
                 self.fleet.ticked(self.now_ns())
@@ -283,7 +262,6 @@ class Service:
                 self._tell_of_recorder(self._recorder)
             self._traffic.speak(not self.unfit(), self.pipeline.reporters())
             self._tell_of_machine()
-            self._tell_of_wall_clock()
             self.series.add(self.pipeline)
             self._ticked.set()  # wakes those who wait now;
             self._ticked.clear()  # later ones wait for the next tick
@@ -417,7 +395,7 @@ class Service:
             self._settings.to_toml(),
             {"companion": companion.__version__},
             None if kept.weights_hz == "all" else kept.weights_hz,
-            self._started_ns if part.number == 1 else self.now_ns(),
+            self.pipeline.utc_ns(self._started_ns if part.number == 1 else self.now_ns()),
             self._scene(),
             part,
         )

@@ -35,6 +35,7 @@ from companion.settings.model import Settings
 from companion.tracking.geodesy import LocalFrame
 from companion.values import (
     Carrier,
+    ClockSet,
     Duty,
     Estimate,
     EstimatorStatus,
@@ -50,6 +51,7 @@ from companion.values import (
     Tick,
     Track,
     Update,
+    UtcNs,
     reports_itself,
 )
 
@@ -57,6 +59,8 @@ DROP_EVERY: Final = 100
 """Updates between two searches for tracks that have been silent for too long."""
 SPARED_SHARE: Final = 4
 """Elements of the array for each UAV of another node that beams spare: a null costs one."""
+TOLD_STEP_S: Final = 0.5
+"""Step of the wall clock that is told; shorter ones are followed in silence."""
 NEAR_M: Final = 2000.0
 """Largest distance between two reports of one aircraft, whatever its speed and their latency."""
 
@@ -73,6 +77,7 @@ class Pipeline:
         self.settings = settings
         self.frames = 0
         self.updates = 0
+        self.utc_offset_ns = 0
         self.restarts: Counter[str] = Counter()
         self.last_update: Update | None = None
         self.last_carrier: Carrier | None = None
@@ -102,6 +107,8 @@ class Pipeline:
             outputs = [event]
         elif isinstance(event, Duty):
             self.targets.duty, outputs = event, []
+        elif isinstance(event, ClockSet):
+            outputs = self._clock_set(event)
         else:
             change = self.senders.round_trip(event)
             source = str(event.source)
@@ -113,6 +120,18 @@ class Pipeline:
             elif isinstance(output, Estimate | Update):
                 self.digest.add(output)
         return [*outputs, *filter(None, told)] if told else outputs
+
+    def _clock_set(self, event: ClockSet) -> list[Output]:
+        step_s = (event.utc_offset_ns - self.utc_offset_ns) * 1e-9
+        self.utc_offset_ns = event.utc_offset_ns
+        self.senders.utc_is(event.utc_offset_ns)
+        if abs(step_s) < TOLD_STEP_S:
+            return []
+        way = "forward" if step_s > 0 else "back"
+        text = (
+            f"this machine's clock was set {way} by {abs(step_s):.3f} s: all times are said by it"
+        )
+        return [Notice(event.t_ns, Severity.WARNING, "clock", text)]
 
     def _frame(self, frame: Frame) -> list[Output]:
         self.frames += 1
@@ -269,6 +288,10 @@ class Pipeline:
         now = self.senders.time(vehicle, now_ns)
         turn_degps2 = self.senders.assumed(vehicle).turn_degps2
         return self.center.aboard(track, self.tracker.newest(vehicle), now, at, turn_degps2)
+
+    def utc_ns(self, t_ns: int) -> UtcNs:
+        """A time of the node's timeline in UTC, by the wall clock as it was set last."""
+        return UtcNs(t_ns + self.utc_offset_ns)
 
     def reporters(self) -> list[Source]:
         """Senders that report their own position, the carrier among them."""

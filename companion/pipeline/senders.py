@@ -132,6 +132,7 @@ class Senders:
         self._known: dict[str, assembly.Assumed] = {}  # by UAV
         self._receivers: dict[Source, GnssStatus] = {}
         self._apart_m2: dict[Source, float] = {}  # receiver's height less the autopilot's, squared
+        self._utc_offset_ns = 0  # UTC less the node's timeline
         self._waits: dict[str, int] = {}  # since when a UAV's receiver does not vouch for it
 
     # --- what they say ----------------------------------------------------------------------
@@ -177,7 +178,8 @@ class Senders:
                 change = self.notice(frame)
                 if message.unix_us is not None:
                     clock = self._clock(str(message.source))
-                    clock.system_time(message.t_ns, message.unix_us, message.boot_ms)
+                    on_timeline_us = message.unix_us - self._utc_offset_ns // 1000
+                    clock.system_time(message.t_ns, on_timeline_us, message.boot_ms)
                 return NOTHING if change is None else Heard(change=change)
             case Presence():
                 self.presence[message.source] = message
@@ -203,6 +205,12 @@ class Senders:
         clock = self._clock(str(event.source))
         clock.timesync(event.sent_ns, event.t_ns, event.remote_ns)
         return clock.change
+
+    def utc_is(self, offset_ns: int) -> None:
+        """Take in by how much UTC is beyond the node's timeline, from now on."""
+        self._utc_offset_ns = offset_ns
+        for clock in self._clocks.values():
+            clock.forget_gnss()
 
     def _telemetry(self, report: Report, doubt_ns: int = 0) -> Heard:
         """Place a report by its stamp; its noise is a vehicle's own matter if it reports itself.

@@ -15,13 +15,13 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 from companion.recording.entries import Geodetic
 from companion.recording.parts import Hole, Part
 from companion.recording.writer import Writer
-from companion.values import Event, Output, Severity
+from companion.values import ClockSet, Event, Output, Severity
 
 QUEUE_MAX: Final = 50_000
 """Events waiting to be written at most: some seconds of the busiest stream."""
@@ -104,6 +104,7 @@ class BackgroundRecorder:
         self._missed = 0
         self._overrun = False
         self._unsafe: list[_Item] = []  # written, but not yet on the disk
+        self._clock_set: ClockSet | None = None
         self._lost = 0  # events that may or may not be on a disk
         self._why = _TOO_SLOW
         self._retry_s = RETRY_FIRST_S
@@ -201,7 +202,7 @@ class BackgroundRecorder:
     def _go_on(self) -> None:
         """Begin a file with what the file before did not get."""
         if self._lost:
-            t_ns = next((item.t_ns for item in self._unsafe if item.t_ns), time.time_ns())
+            t_ns = next((item.t_ns for item in self._unsafe if item.t_ns), self.written_ns or 0)
             self._writer.hole(Hole(t_ns, self._lost, self._why))
         for item in self._unsafe:
             self._write(item)
@@ -232,10 +233,19 @@ class BackgroundRecorder:
         if item.missed:
             self._writer.hole(Hole(item.t_ns, item.missed, self._why))
         if item.event is not None:
+            self._say_utc(item.event)
             self._writer.event(item.event)
             self.written_ns = item.event.t_ns
         for output in item.outputs:
             self._writer.output(output, self._geodetic)
+
+    def _say_utc(self, event: Event) -> None:
+        """Begin each file with what its times lack to be UTC, so that it can be read alone."""
+        known = self._clock_set
+        if isinstance(event, ClockSet):
+            self._clock_set = event
+        elif known is not None and not self._writer.messages:
+            self._writer.event(replace(known, t_ns=event.t_ns))
 
     def _flush(self) -> None:
         self._writer.flush()
@@ -245,7 +255,7 @@ class BackgroundRecorder:
 
     def _finish(self) -> None:
         if self._missed:
-            self._writer.hole(Hole(time.time_ns(), self._missed, self._why))
+            self._writer.hole(Hole(self.written_ns or 0, self._missed, self._why))
         self._flush()
         self._writer.close(self._metadata)
         self.bytes = self._writer.size_bytes

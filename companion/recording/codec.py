@@ -8,6 +8,7 @@ import numpy as np
 from companion.recording import schemas
 from companion.values import (
     BeamSet,
+    ClockSet,
     Duty,
     Fix,
     FloatArray,
@@ -23,6 +24,8 @@ from companion.values import (
 
 FRAME_ID: Final = "wgs84"
 """Frame of every LocationFix: the Earth's own, x through 0° E, z through the north pole."""
+OFFSET_MAX_NS: Final = 1 << 62
+"""Most that UTC can be off a timeline: 146 years, so that their sum has a date."""
 _LEVEL: Final = {
     Severity.INFO: schemas.LogMessage.INFO,
     Severity.WARNING: schemas.LogMessage.WARNING,
@@ -186,6 +189,11 @@ def duty(value: Duty) -> Any:
     return schemas.DutyMessage(t_ns=value.t_ns, serves=value.serves, spares=value.spares)
 
 
+def clock_set(value: ClockSet) -> Any:
+    """By how much UTC is beyond the node's timeline from here on."""
+    return schemas.ClockSetMessage(t_ns=value.t_ns, utc_offset_ns=value.utc_offset_ns)
+
+
 # --- and back -----------------------------------------------------------------------------------
 
 
@@ -214,6 +222,14 @@ def to_duty(data: bytes) -> Duty:
     """Read a duty. Raises ``DecodeError`` for bytes that are no such message."""
     message = schemas.DutyMessage.FromString(data)
     return Duty(message.t_ns, tuple(message.serves), tuple(message.spares))
+
+
+def to_clock_set(data: bytes) -> ClockSet:
+    """Read that the clock was set. Raises ``DecodeError``, or ``ValueError`` beyond all time."""
+    message = schemas.ClockSetMessage.FromString(data)
+    if abs(message.utc_offset_ns) > OFFSET_MAX_NS:
+        raise ValueError("a clock that was set beyond all time")
+    return ClockSet(message.t_ns, message.utc_offset_ns)
 
 
 def to_rejection(data: bytes) -> Rejection | None:

@@ -14,6 +14,7 @@ from companion.recording.scene import Scene
 from companion.recording.schemas import Schema
 from companion.values import (
     BeamSet,
+    ClockSet,
     Duty,
     Estimate,
     Event,
@@ -103,6 +104,9 @@ class Encoder:
             case Duty():
                 data = codec.duty(event).SerializeToString()
                 self._emit(schemas.DUTIES_TOPIC, schemas.DUTY, event.t_ns, data)
+            case ClockSet():
+                data = codec.clock_set(event).SerializeToString()
+                self._emit(schemas.CLOCK_TOPIC, schemas.CLOCK_SET, event.t_ns, data)
 
     def output(self, output: Output, geodetic: Geodetic) -> None:
         """Send an output. A rejection that is the last event itself is not sent twice.

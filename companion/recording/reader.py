@@ -27,7 +27,7 @@ from companion.recording.writer import SETTINGS
 from companion.values import Event, Frame, Reason, Rejection, Source, Tick
 
 __all__ = ["LogError", "LogKind", "center_of", "flights", "log_kind", "read_flight", "read_log",
-           "read_parts", "read_settings", "vehicles"]  # fmt: skip
+           "read_parts", "read_settings", "utc_offset_ns", "vehicles"]  # fmt: skip
 
 LogKind = Literal["tlog", "mavlink", "mcap", "foreign-mcap", "capture", "dataflash", "ulog", "csv"]
 _MAPPED_BYTES: Final = 1 << 26
@@ -43,6 +43,7 @@ _EVENT_TOPICS: Final = frozenset(
         schemas.REJECTIONS_TOPIC,
         schemas.ROUND_TRIPS_TOPIC,
         schemas.DUTIES_TOPIC,
+        schemas.CLOCK_TOPIC,
     )
 )
 
@@ -157,6 +158,20 @@ def read_settings(path: Path) -> str | None:
     return None
 
 
+def utc_offset_ns(paths: Sequence[Path]) -> int:
+    """UTC less the timeline of recordings, by the last word in them; 0 where there is none."""
+    offset_ns = 0
+    for path in paths:
+        walk = Walk(path, frozenset())
+        next(iter(walk), None)  # the end of the file, where it is there, has all channels
+        topics = {channel.topic for channel in walk.channels.values()}
+        if log_kind(path) == "mcap" and (not topics or schemas.CLOCK_TOPIC in topics):
+            for content in Walk(path, frozenset((schemas.CLOCK_TOPIC,))):
+                if isinstance(content, Message):
+                    offset_ns = codec.to_clock_set(content.data).utc_offset_ns
+    return offset_ns
+
+
 def _open(path: Path) -> tuple[LogKind, bytes]:
     """The kind of a log, and its bytes unless it is one that is read piece by piece."""
     try:
@@ -252,4 +267,6 @@ def _event(topic: str, data: bytes, sources: dict[tuple[int, int], Source]) -> E
         return codec.to_round_trip(data)
     if topic == schemas.DUTIES_TOPIC:
         return codec.to_duty(data)
+    if topic == schemas.CLOCK_TOPIC:
+        return codec.to_clock_set(data)
     return codec.to_rejection(data)

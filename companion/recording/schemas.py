@@ -70,6 +70,7 @@ _MESSAGES: Final[dict[str, list[str]]] = {
               "optional double sinr_db", "optional double heard_s"],
     "Offers": ["repeated Offer offer"],
     "Tracks": ["repeated Track track"],
+    "ClockSet": ["fixed64 t_ns", "sfixed64 utc_offset_ns"],
 }  # fmt: skip
 """Fields of this program's own messages.
 
@@ -83,6 +84,7 @@ _MESSAGES: Final[dict[str, list[str]]] = {
     Shared, Standing, Offers   what the nodes of a fleet tell one another (docs/fleet.md); they are
                in no recording
     Duty       whom this node of a fleet serves from then on, and whom its beams spare
+    ClockSet   the wall clock was set: what is added from here on to any time to have it in UTC
 """
 
 _TYPES: Final = {
@@ -142,6 +144,7 @@ SharedMessage: Final = _message("Shared")
 StandingMessage: Final = _message("Standing")
 OffersMessage: Final = _message("Offers")
 TracksMessage: Final = _message("Tracks")
+ClockSetMessage: Final = _message("ClockSet")
 TrackMessage: Final = _message("Track")
 WeightsMessage: Final = _message("Weights")
 LocationFixMessage: Final[Any] = LocationFix
@@ -182,6 +185,7 @@ REJECTION: Final = _with_dependencies(RejectionMessage)
 ROUND_TRIP: Final = _with_dependencies(RoundTripMessage)
 DUTY: Final = _with_dependencies(DutyMessage)
 SHARED: Final = _with_dependencies(SharedMessage)
+CLOCK_SET: Final = _with_dependencies(ClockSetMessage)
 TRACK: Final = _with_dependencies(TrackMessage)
 WEIGHTS: Final = _with_dependencies(WeightsMessage)
 LOCATION_FIX: Final = _with_dependencies(LocationFixMessage)
@@ -195,6 +199,7 @@ TICKS_TOPIC: Final = "/ticks"
 REJECTIONS_TOPIC: Final = "/rejections"
 ROUND_TRIPS_TOPIC: Final = "/timesync"
 DUTIES_TOPIC: Final = "/fleet/duty"
+CLOCK_TOPIC: Final = "/clock"
 TRACKS_TOPIC: Final = "/tracks"
 WEIGHTS_TOPIC: Final = "/beams/weights"
 LOG_TOPIC: Final = "/log"

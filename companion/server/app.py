@@ -18,7 +18,7 @@ from companion.server.responses import answer, answers
 from companion.server.stream import Stream
 from companion.server.turns import Turns
 from companion.views import fleet as fleet_view
-from companion.views import link_state, series, settings, state
+from companion.views import glance, series, settings, state
 from companion.views.design import DesignView
 from companion.views.state import Node
 from companion.views.words import rfc3339
@@ -133,7 +133,8 @@ def _state_routes(app: FastAPI, node: Node, turns: Turns) -> None:
 
     @app.get("/v1/uavs", summary="Every UAV as it is now", responses=answers(models.Uavs))
     async def uavs() -> Response:
-        return answer({"valid_at": rfc3339(node.now_ns()), "uavs": state.uavs(node)})
+        valid_at = rfc3339(node.pipeline.utc_ns(node.now_ns()))
+        return answer({"valid_at": valid_at, "uavs": state.uavs(node)})
 
     @app.get(
         "/v1/uavs/{uav}",
@@ -160,7 +161,7 @@ def _state_routes(app: FastAPI, node: Node, turns: Turns) -> None:
         responses=answers(models.Fleet),
     )
     async def fleet() -> Response:
-        return answer(fleet_view.fleet(node.fleet_status(), node.now_ns()))
+        return answer(fleet_view.fleet(node.pipeline, node.fleet_status(), node.now_ns()))
 
     @app.get(
         "/v1/events",
@@ -168,7 +169,7 @@ def _state_routes(app: FastAPI, node: Node, turns: Turns) -> None:
         responses=answers(models.Events),
     )
     async def events() -> Response:
-        return answer({"events": [link_state.event(notice) for notice in node.events()]})
+        return answer({"events": glance.events(node.pipeline, node.events())})
 
     @app.get(
         "/v1/history",
@@ -177,7 +178,8 @@ def _state_routes(app: FastAPI, node: Node, turns: Turns) -> None:
     )
     async def history() -> Response:
         samples, now_ns = node.series.samples(), node.now_ns()
-        return await turns.run(lambda: answer(series.show(samples, now_ns)))
+        utc_ns = node.pipeline.utc_ns
+        return await turns.run(lambda: answer(series.show(samples, now_ns, utc_ns)))
 
     @app.get(
         "/v1/settings",

@@ -56,8 +56,8 @@ def add(app: FastAPI, node: Node, turns: Turns) -> None:
 
         def make(update: Update) -> tuple[bytes, dict[str, str]]:
             made = update.beams
-            body = weight_formats.encode(form, made, pipeline.array, equipment, lead_ms)
-            return body, {**weight_formats.headers(made), "vary": "accept"}
+            body = weight_formats.encode(form, made, pipeline, equipment, lead_ms)
+            return body, {**weight_formats.headers(pipeline, made), "vary": "accept"}
 
         try:
             body, headers = await moments.made(lead_ms, form, make)

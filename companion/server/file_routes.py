@@ -78,7 +78,7 @@ def _recordings(app: FastAPI, node: Node) -> None:
 
 
 def _mavlink(app: FastAPI, node: Node) -> None:
-    kept = node.last_messages
+    kept, utc_ns = node.last_messages, node.pipeline.utc_ns
 
     @app.get(
         "/v1/mavlink/vehicles",
@@ -86,7 +86,8 @@ def _mavlink(app: FastAPI, node: Node) -> None:
         responses=answers(dict[str, models.MavlinkVehicle]),
     )
     async def vehicles() -> Response:
-        return answer(await run_in_threadpool(mavlink_messages.vehicles, kept.by_sender()))
+        shown = mavlink_messages.vehicles
+        return answer(await run_in_threadpool(shown, kept.by_sender(), utc_ns))
 
     @app.get(
         "/v1/mavlink/vehicles/{sys}/components/{comp}/messages",
@@ -97,7 +98,7 @@ def _mavlink(app: FastAPI, node: Node) -> None:
         found = kept.by_sender().get(Source(sys, comp))
         if found is None:
             raise HTTPException(404, f"nothing has been heard of {sys}:{comp}")
-        return answer(await run_in_threadpool(mavlink_messages.messages, found))
+        return answer(await run_in_threadpool(mavlink_messages.messages, found, utc_ns))
 
     @app.get(
         "/v1/mavlink/vehicles/{sys}/components/{comp}/messages/{name}",
@@ -110,4 +111,4 @@ def _mavlink(app: FastAPI, node: Node) -> None:
         found = None if msgid is None else kept.find(Source(sys, comp), msgid)
         if found is None:
             raise HTTPException(404, f"{sys}:{comp} has sent no {name!r}")
-        return answer(dialect.message(found))
+        return answer(dialect.message(found, utc_ns))

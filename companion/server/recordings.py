@@ -16,6 +16,7 @@ from typing import Any, BinaryIO, Final
 from starlette.concurrency import run_in_threadpool
 
 from companion.recording.writer import ACTIVE
+from companion.values import UtcNs
 from companion.views.words import rfc3339
 
 Json = dict[str, Any]
@@ -80,9 +81,9 @@ def _shown(entry: os.DirEntry[str], current: Current) -> Json:
     }
 
 
-def _utc_ns(text: str) -> int:
+def _utc_ns(text: str) -> UtcNs:
     at = datetime.strptime(text, "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
-    return int(at.timestamp()) * 1_000_000_000
+    return UtcNs(int(at.timestamp()) * 1_000_000_000)
 
 
 def opened(where: str | None, name: str, current: Current) -> tuple[BinaryIO, int] | None:

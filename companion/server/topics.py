@@ -10,7 +10,7 @@ from starlette.concurrency import run_in_threadpool
 import companion
 from companion.server.responses import encode
 from companion.values import BeamSet
-from companion.views import beam_state, guaranteed_gain, link_state, records, state
+from companion.views import beam_state, glance, guaranteed_gain, records, state
 from companion.views import fleet as fleet_view
 from companion.views.state import Node
 from companion.views.words import rfc3339
@@ -73,7 +73,7 @@ def _only(topic: Topic, body: Json, uavs: frozenset[str]) -> Json:
 
 
 async def _uavs(node: Node) -> Json:
-    return {"valid_at": rfc3339(node.now_ns()), "uavs": state.uavs(node)}
+    return {"valid_at": rfc3339(node.pipeline.utc_ns(node.now_ns())), "uavs": state.uavs(node)}
 
 
 async def _beams(node: Node) -> Json:
@@ -86,7 +86,7 @@ async def _beams(node: Node) -> Json:
 
 async def _weights(node: Node) -> Json:
     update = node.pipeline.last_update or node.pipeline.look(node.now_ns())
-    return beam_state.weights(update.beams, 0.0)
+    return beam_state.weights(node.pipeline, update.beams, 0.0)
 
 
 async def _records(node: Node) -> Json:
@@ -97,7 +97,11 @@ async def _records(node: Node) -> Json:
     sure = None
     if pipeline.settings.records.guaranteed:
         sure = await run_in_threadpool(guaranteed_gain.gains_db, pipeline, node.equipment, update)
-    return {"beams": update.beams, "sequence": number, "guaranteed_db": sure}
+    return {
+        "beams": records.in_utc(pipeline, update.beams),
+        "sequence": number,
+        "guaranteed_db": sure,
+    }
 
 
 async def _status(node: Node) -> Json:
@@ -110,12 +114,12 @@ async def _links(node: Node) -> Json:
 
 
 async def _fleet(node: Node) -> Json:
-    return fleet_view.fleet(node.fleet_status(), node.now_ns())
+    return fleet_view.fleet(node.pipeline, node.fleet_status(), node.now_ns())
 
 
 async def _events(node: Node) -> Json:
-    events = [link_state.event(notice) for notice in node.events()]
-    return {"valid_at": rfc3339(node.now_ns()), "events": events}
+    valid_at = rfc3339(node.pipeline.utc_ns(node.now_ns()))
+    return {"valid_at": valid_at, "events": glance.events(node.pipeline, node.events())}
 
 
 BODIES: Final[dict[Topic, Callable[[Node], Any]]] = {

@@ -2,7 +2,8 @@
 
 Conventions, here and everywhere:
 
-* Time is integer nanoseconds since the Unix epoch on the node's own clock (``_ns``).
+* Time is integer nanoseconds since the Unix epoch on the node's own timeline (``_ns``), which
+  is the wall clock of its start, and never steps; ``UtcNs`` is UTC, by the wall clock as set last.
 * The *local frame* is north-east-down (NED), metres, tangent to WGS84 at a fixed origin.
 * The *body frame* is forward-right-down (FRD), as MAVLink has it; so is the *array frame*, with
   x along boresight.
@@ -22,6 +23,7 @@ from companion.values.aimed import (
     Power,
     Widen,
 )
+from companion.values.clock import ClockSet, UtcNs
 from companion.values.errors import UserError
 from companion.values.events import Duty, Event, RoundTrip, Tick
 from companion.values.fleet import Offer, Shared, SharedFrame, Standing
@@ -80,6 +82,7 @@ __all__ = [
     "BoolArray",
     "Carrier",
     "Cause",
+    "ClockSet",
     "ComplexArray",
     "Duty",
     "Estimate",
@@ -122,6 +125,7 @@ __all__ = [
     "TrackState",
     "Update",
     "UserError",
+    "UtcNs",
     "Vector",
     "Verdict",
     "Widen",

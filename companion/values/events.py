@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from companion.values.clock import ClockSet
 from companion.values.names import Source
 from companion.values.received import Frame
 from companion.values.rejections import Rejection
@@ -44,12 +45,14 @@ class Duty:
     spares: tuple[str, ...] = ()
 
 
-Event = Frame | Tick | Rejection | RoundTrip | Duty
+Event = Frame | Tick | Rejection | RoundTrip | ClockSet | Duty
 """Everything that drives the pipeline, in the order in which it was taken in.
 
 That is the order of time, but that a frame's time is its arrival: where the node was busy, a tick
 of a later time may have been taken in before it.
 
 A rejection made while framing is an event too: its bytes are gone, but that they came must be
-recorded. A round trip is an event because only the service knows which requests were its own.
+recorded. A round trip is an event because only the service knows which requests were its own; a
+clock that was set, because a replay is to say the times that the service said; a duty, because it
+is decided with other nodes.
 """

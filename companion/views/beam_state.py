@@ -45,7 +45,7 @@ def beams(
         boresight = float(np.degrees(np.arctan2(array_from_local[0, 1], array_from_local[0, 0])))
     azimuth_width, elevation_width = _beamwidths_rad(array)
     return {
-        "valid_at": rfc3339(beam_set.valid_at_ns),
+        "valid_at": rfc3339(pipeline.utc_ns(beam_set.valid_at_ns)),
         "age_s": age_s,
         "lead_ms": lead_ms,
         "beams": _entries(pipeline, equipment, update),
@@ -199,10 +199,10 @@ def _next_best(
     return codebooks.next_best(codebook, array, directions_at, AHEAD_S, step_s)
 
 
-def weights(beam_set: BeamSet, lead_ms: float) -> Json:
+def weights(pipeline: Pipeline, beam_set: BeamSet, lead_ms: float) -> Json:
     """The answer of ``/v1/beams/weights`` as JSON: M rows, columns in the order of ``uavs``."""
     return {
-        "valid_at": rfc3339(beam_set.valid_at_ns),
+        "valid_at": rfc3339(pipeline.utc_ns(beam_set.valid_at_ns)),
         "lead_ms": lead_ms,
         "uavs": list(beam_set.uavs),
         "groups": [beam.group for beam in beam_set.beams],
@@ -231,7 +231,7 @@ def pattern(
             angles, response_db = patterns.elevation_cut(array, column, beam.azimuth_rad, points)
         entries.append(_pattern_entry(pipeline, beam_set, i, cut, response_db, towards))
     return {
-        "valid_at": rfc3339(beam_set.valid_at_ns),
+        "valid_at": rfc3339(pipeline.utc_ns(beam_set.valid_at_ns)),
         "lead_ms": lead_ms,
         "cut": cut,
         "method": str(beam_set.method),

@@ -31,7 +31,10 @@ def center(pipeline: Pipeline, now_ns: int) -> Json:
     if isinstance(found, str):
         last = pipeline.last_carrier
         if last is not None:
-            view["last_known"] = {"at": rfc3339(last.valid_at_ns), **_pose(pipeline, last)}
+            view["last_known"] = {
+                "at": rfc3339(pipeline.utc_ns(last.valid_at_ns)),
+                **_pose(pipeline, last),
+            }
         return view | {"unfit": found}
     return view | _pose(pipeline, found) | {"age_s": found.age_s, "bound_m": found.bound_m}
 

@@ -52,7 +52,7 @@ class DesignView:
         """
         given = self._observer
         return {
-            "valid_at": rfc3339(now_ns),
+            "valid_at": rfc3339(pipeline.utc_ns(now_ns)),
             "model": given.model,
             "assumed": self._anyone._asdict(),
             "certificate": None if self._table is None else _certificate(self._table, self._anyone),

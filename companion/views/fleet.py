@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from companion.pipeline.fleet.member import Member, Neighbour
+from companion.pipeline.fold import Pipeline
 from companion.values import Offer
 from companion.views.words import rfc3339
 
@@ -28,11 +29,11 @@ class FleetStatus:
     damaged: int
 
 
-def fleet(status: FleetStatus | None, now_ns: int) -> Json:
+def fleet(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Json:
     """The answer of ``/v1/fleet``; ``node`` is null where there is no fleet."""
     if status is None:
         return {
-            "valid_at": rfc3339(now_ns),
+            "valid_at": rfc3339(pipeline.utc_ns(now_ns)),
             "node": None,
             "site": None,
             "nodes": [],
@@ -44,13 +45,18 @@ def fleet(status: FleetStatus | None, now_ns: int) -> Json:
         }
     member = status.member
     return {
-        "valid_at": rfc3339(now_ns),
+        "valid_at": rfc3339(pipeline.utc_ns(now_ns)),
         "node": member.name,
         "site": status.site,
         "nodes": _nodes(member, now_ns),
         "uavs": _uavs(member, now_ns),
         "handovers": [
-            {"time": rfc3339(one.t_ns), "uav": one.uav, "before": one.before, "after": one.after}
+            {
+                "time": rfc3339(pipeline.utc_ns(one.t_ns)),
+                "uav": one.uav,
+                "before": one.before,
+                "after": one.after,
+            }
             for one in member.handovers
         ],
         "sent_bps": status.sent_bps,

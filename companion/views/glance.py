@@ -4,6 +4,7 @@ lines."""
 from collections.abc import Sequence
 from typing import Any, Final
 
+from companion.pipeline.fold import Pipeline
 from companion.values import Level, Notice, Verdict, reports_itself
 from companion.views import health, link_state
 from companion.views.state import Node
@@ -22,7 +23,7 @@ def glance(node: Node) -> Json:
     machine = health.behind(node.arrival_lag.seen(now_ns))
     recording = node.recording()
     return {
-        "at": rfc3339(now_ns),
+        "at": rfc3339(pipeline.utc_ns(now_ns)),
         **health.summary(verdicts.values(), machine),
         "unfit": node.unfit(),
         "links": [
@@ -31,7 +32,7 @@ def glance(node: Node) -> Json:
         "uavs": [
             {"id": track.uav, "state": str(track.state), "age_s": track.age_s}
             | {"bound_m": track.bound_m}
-            | health.verdict(verdicts.get(track.uav), machine)
+            | health.verdict(verdicts.get(track.uav), machine, pipeline.utc_ns)
             for track in (update.tracks if update else ())
             if reports_itself(track.uav)
         ],
@@ -64,9 +65,9 @@ def line(node: Node) -> str:
     return " · ".join(parts)
 
 
-def events(notices: Sequence[Notice]) -> list[Json]:
+def events(pipeline: Pipeline, notices: Sequence[Notice]) -> list[Json]:
     """Notices as ``/v1/events`` has them."""
-    return [link_state.event(notice) for notice in notices]
+    return [link_state.event(notice, pipeline.utc_ns(notice.t_ns)) for notice in notices]
 
 
 def _worst_first(verdicts: list[Verdict]) -> list[Verdict]:

@@ -5,11 +5,11 @@ then is that news is old.
 """
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from companion.mavlink.links.lag import LagSeen
-from companion.values import Blame, Cause, Level, Verdict
+from companion.values import Blame, Cause, Level, UtcNs, Verdict
 from companion.views.words import rfc3339
 
 Json = dict[str, Any]
@@ -26,7 +26,7 @@ def behind(seen: LagSeen) -> Blame | None:
     )
 
 
-def verdict(found: Verdict | None, machine: Blame | None) -> Json:
+def verdict(found: Verdict | None, machine: Blame | None, utc_ns: Callable[[int], UtcNs]) -> Json:
     """The fields of one UAV: ``verdict``, and ``health`` with what is behind it."""
     if found is None:
         return {"verdict": None, "health": None}
@@ -37,7 +37,7 @@ def verdict(found: Verdict | None, machine: Blame | None) -> Json:
             "cause": None if why is None else str(why.cause),
             "reason": None if why is None else why.reason,
             "remedy": None if why is None else why.remedy,
-            "since": rfc3339(found.since_ns),
+            "since": rfc3339(utc_ns(found.since_ns)),
             "needed_gain_db": found.needed_db,
             "guaranteed_gain_db": found.guaranteed_db,
             "likely_gain_db": found.likely_db,

@@ -7,7 +7,7 @@ import numpy as np
 from companion.mavlink.links.status import ComponentStatus, LinkStatus
 from companion.mavlink.trust.dedupe import LinkShare
 from companion.mavlink.voice.rate_watch import MessageRate
-from companion.values import Notice, Source
+from companion.values import Notice, Source, UtcNs
 from companion.views.words import rfc3339
 
 Json = dict[str, Any]
@@ -89,10 +89,10 @@ def rate(item: MessageRate) -> Json:
     }
 
 
-def event(notice: Notice) -> Json:
+def event(notice: Notice, at_ns: UtcNs) -> Json:
     """One entry of ``/v1/events``."""
     return {
-        "at": rfc3339(notice.t_ns),
+        "at": rfc3339(at_ns),
         "severity": str(notice.severity),
         "subject": notice.subject,
         "text": notice.text,

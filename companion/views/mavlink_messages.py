@@ -11,12 +11,12 @@ loop's.
 """
 
 import functools
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Final
 
 import numpy as np
 
-from companion.values import Source
+from companion.values import Source, UtcNs
 from companion.views.last_messages import Kept
 from companion.views.words import rfc3339
 
@@ -38,7 +38,7 @@ class Dialect:
         """The id of a message; None for a name that is not known."""
         return self._ids.get(name)
 
-    def message(self, kept: Kept) -> Json | None:
+    def message(self, kept: Kept, utc_ns: Callable[[int], UtcNs]) -> Json | None:
         """One message and its status; None for an id that is not known."""
         kind = self._classes.get(kept.frame.msgid)
         if kind is None:
@@ -51,8 +51,8 @@ class Dialect:
             "message": {"type": kind.msgname, **fields},
             "status": {
                 "time": {
-                    "first_update": rfc3339(kept.first_ns),
-                    "last_update": rfc3339(kept.frame.t_ns),
+                    "first_update": rfc3339(utc_ns(kept.first_ns)),
+                    "last_update": rfc3339(utc_ns(kept.frame.t_ns)),
                     "counter": kept.count,
                     "frequency": kept.frequency_hz,
                 }
@@ -92,17 +92,17 @@ def dialect() -> Dialect:
     return Dialect()
 
 
-def messages(kept: Iterable[Kept]) -> Json:
+def messages(kept: Iterable[Kept], utc_ns: Callable[[int], UtcNs]) -> Json:
     """The messages of one component, by message name."""
-    shown = (dialect().message(one) for one in kept)
+    shown = (dialect().message(one, utc_ns) for one in kept)
     return {one["message"]["type"]: one for one in shown if one is not None}
 
 
-def vehicles(by_sender: dict[Source, list[Kept]]) -> Json:
+def vehicles(by_sender: dict[Source, list[Kept]], utc_ns: Callable[[int], UtcNs]) -> Json:
     """All vehicles, their components, and the last messages of these."""
     found: Json = {}
     for source, kept in by_sender.items():
         vehicle = found.setdefault(str(source.sysid), {"id": source.sysid, "components": {}})
-        component = {"id": source.compid, "messages": messages(kept)}
+        component = {"id": source.compid, "messages": messages(kept, utc_ns)}
         vehicle["components"][str(source.compid)] = component
     return found

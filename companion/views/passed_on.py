@@ -87,7 +87,7 @@ class Positions:
         known = pipeline.settings.observer.geoid_m is not None
         undulation_m, off_m = _geoid(pipeline) if known else (0.0, 0.0)
         said = UtmPosition(
-            track.valid_at_ns,
+            pipeline.utc_ns(track.valid_at_ns),
             *place[:2],
             place[2] + undulation_m if known else None,
             relative_alt_m,
@@ -130,10 +130,9 @@ def _event(pipeline: Pipeline, track: Track, stale_s: float) -> bytes:
         course_deg,
         speed_mps,
     )
-    stale_ns = track.valid_at_ns + round(stale_s * 1e9)
-    return cot_text.event(
-        track.uav, track.valid_at_ns, stale_ns, where, _remarks(track, datum, geoid_m)
-    )
+    at_ns = pipeline.utc_ns(track.valid_at_ns)
+    stale_ns = at_ns + round(stale_s * 1e9)
+    return cot_text.event(track.uav, at_ns, stale_ns, where, _remarks(track, datum, geoid_m))
 
 
 def _geoid(pipeline: Pipeline) -> tuple[float, float]:

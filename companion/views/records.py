@@ -8,11 +8,13 @@ than a way out can carry is said in parts, each a whole record of some of the be
 import math
 import zlib
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.pipeline.fold import Pipeline
 from companion.values import BeamSet, Normalisation
 
 MAGIC: Final = b"UAVBEAMS"
@@ -35,7 +37,7 @@ HEADER: Final = np.dtype(
         ("crc32", "<u4"),
         ("header_bytes", "<u4"),
         ("sequence", "<u8"),  # of the update, from 0
-        ("made_at_ns", "<i8"),  # ns since the Unix epoch, on the service's clock
+        ("made_at_ns", "<i8"),  # UTC, ns since the Unix epoch, by the service's wall clock
         ("valid_at_ns", "<i8"),
         ("elements", "<u4"),  # M
         ("beams", "<u4"),  # N in this record
@@ -67,6 +69,12 @@ BEAM: Final = np.dtype(
 )
 NORMALISATIONS: Final = tuple(Normalisation)
 """What ``normalisation`` counts: unit-response is 0, then stream, total, antenna."""
+
+
+def in_utc(pipeline: Pipeline, beam_set: BeamSet) -> BeamSet:
+    """The same with its times in UTC, as machines elsewhere count them."""
+    t_ns, valid_at_ns = map(pipeline.utc_ns, (beam_set.t_ns, beam_set.valid_at_ns))
+    return replace(beam_set, t_ns=t_ns, valid_at_ns=valid_at_ns)
 
 
 def encode(

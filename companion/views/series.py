@@ -4,9 +4,11 @@ The page keeps its own minutes; these are for a page that has just been opened.
 """
 
 from collections import deque
+from collections.abc import Callable
 from typing import Any, Final
 
 from companion.pipeline.fold import Pipeline
+from companion.values import UtcNs
 from companion.views.words import degrees, rfc3339
 
 Json = dict[str, Any]
@@ -51,13 +53,13 @@ class Series:
         return list(self._samples)
 
 
-def show(samples: list[Sample], now_ns: int) -> Json:
+def show(samples: list[Sample], now_ns: int, utc_ns: Callable[[int], UtcNs]) -> Json:
     """The answer of ``/v1/history``: columns. May run on any thread."""
     uavs = dict.fromkeys(uav for _, sample in samples for uav in sample)
     nothing = (None,) * len(FIELDS)
     return {
-        "valid_at": rfc3339(now_ns),
-        "at": [rfc3339(t_ns) for t_ns, _ in samples],
+        "valid_at": rfc3339(utc_ns(now_ns)),
+        "at": [rfc3339(utc_ns(t_ns)) for t_ns, _ in samples],
         "uavs": {
             uav: {
                 name: [sample.get(uav, nothing)[i] for _, sample in samples]

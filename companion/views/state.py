@@ -102,7 +102,12 @@ def links(node: Node) -> Json:
     ]
     out = [link_state.out(item) for item in node.out_links()]
     rates = [link_state.rate(rate) for rate in node.message_rates()]
-    return {"valid_at": rfc3339(now_ns), "links": shown, "out": out, "message_rates": rates}
+    return {
+        "valid_at": rfc3339(node.pipeline.utc_ns(now_ns)),
+        "links": shown,
+        "out": out,
+        "message_rates": rates,
+    }
 
 
 def vector(values: FloatArray | None) -> list[float] | None:
@@ -116,7 +121,7 @@ def status(node: Node, version: str) -> Json:
     recording, replay = node.recording(), node.replay()
     return {
         "version": version,
-        "time": rfc3339(now_ns),
+        "time": rfc3339(pipeline.utc_ns(now_ns)),
         "uptime_s": node.uptime_s(),
         "center": center_state.center(pipeline, now_ns),
         "health": health.summary(
@@ -185,14 +190,14 @@ def uav(
     return {
         "id": track.uav,
         "state": str(track.state),
-        **health.verdict(pipeline.health.verdicts.get(track.uav), machine),
+        **health.verdict(pipeline.health.verdicts.get(track.uav), machine, pipeline.utc_ns),
         "target": pipeline.targets.wants(track.uav),
         "same_as": pipeline.targets.same_as(track.uav),
         "callsign": pipeline.senders.aircraft.callsign(track.uav),
         "relays": [str(relay) for relay in pipeline.senders.aircraft.relays(track.uav)],
         "altitude_datum": str(newest.report.alt_datum) if newest else None,
-        "fix": None if newest is None else fix(newest),
-        "valid_at": rfc3339(track.valid_at_ns),
+        "fix": None if newest is None else fix(pipeline, newest),
+        "valid_at": rfc3339(pipeline.utc_ns(track.valid_at_ns)),
         "age_s": track.age_s,
         "lat_deg": place[0],
         "lon_deg": place[1],
@@ -226,17 +231,21 @@ def uav(
         "reports": track.reports,
         "rejected": {str(reason): count for reason, count in sorted(refused.counts.items())},
         "recent_rejections": [
-            {"at": rfc3339(one.t_ns), "reason": str(one.reason), "detail": one.detail}
+            {
+                "at": rfc3339(pipeline.utc_ns(one.t_ns)),
+                "reason": str(one.reason),
+                "detail": one.detail,
+            }
             for one in refused.recent
         ],
     }
 
 
-def fix(newest: Fix) -> Json:
+def fix(pipeline: Pipeline, newest: Fix) -> Json:
     """The last reported position of a UAV."""
     report = newest.report
     return {
-        "at": rfc3339(newest.t_ns),
+        "at": rfc3339(pipeline.utc_ns(newest.t_ns)),
         "lat_deg": report.lat_deg,
         "lon_deg": report.lon_deg,
         "alt_m": report.alt_m,

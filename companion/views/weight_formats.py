@@ -6,10 +6,11 @@ from typing import Final
 
 import numpy as np
 
-from companion.beams.array.geometry import SPEED_OF_LIGHT_MPS, Array
+from companion.beams.array.geometry import SPEED_OF_LIGHT_MPS
 from companion.beams.hardware import tables
 from companion.beams.hardware.devices import MEDIA_TYPES, Device
 from companion.pipeline.assembly import Equipment
+from companion.pipeline.fold import Pipeline
 from companion.values import BeamSet
 from companion.views import beam_state
 from companion.views.quantised import device_table
@@ -28,23 +29,24 @@ TYPES: Final = {
 """
 
 
-def headers(beam_set: BeamSet) -> dict[str, str]:
+def headers(pipeline: Pipeline, beam_set: BeamSet) -> dict[str, str]:
     """What describes the weights, as HTTP headers: with ``raw`` they are all that does."""
+    valid_at_ns = pipeline.utc_ns(beam_set.valid_at_ns)
     return {
         "x-format": "complex64-le-row-major-1",
         "x-elements": str(beam_set.weights.shape[0]),
         "x-beams": str(beam_set.weights.shape[1]),
         "x-uavs": ",".join(beam_set.uavs),
         "x-groups": ",".join(str(beam.group) for beam in beam_set.beams),
-        "x-valid-at": rfc3339(beam_set.valid_at_ns),
-        "x-valid-at-ns": str(beam_set.valid_at_ns),
+        "x-valid-at": rfc3339(valid_at_ns),
+        "x-valid-at-ns": str(valid_at_ns),
         "x-method": str(beam_set.method),
         "x-normalisation": str(beam_set.normalisation),
     }
 
 
 def encode(
-    form: str, beam_set: BeamSet, array: Array, equipment: Equipment, lead_ms: float
+    form: str, beam_set: BeamSet, pipeline: Pipeline, equipment: Equipment, lead_ms: float
 ) -> bytes:
     """The weights in one of ``TYPES``.
 
@@ -52,13 +54,14 @@ def encode(
     """
     match form:
         case "json":
-            return json.dumps(beam_state.weights(beam_set, lead_ms)).encode()
+            return json.dumps(beam_state.weights(pipeline, beam_set, lead_ms)).encode()
         case "npy":
             file = io.BytesIO()
             np.save(file, np.ascontiguousarray(beam_set.weights), allow_pickle=False)
             return file.getvalue()
         case "raw":
             return beam_set.weights.astype("<c8").tobytes("C")
+    array = pipeline.array
     table = device_table(Device(form), beam_set, array, equipment)
     frequency_hz = SPEED_OF_LIGHT_MPS / array.wavelength_m
     return tables.encode(table, frequency_hz).encode()

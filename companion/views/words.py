@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from companion.values import Reason
+from companion.values import Reason, UtcNs
 
 REASONS: Final = {
     Reason.GARBAGE: "bytes between frames that belong to none",
@@ -36,7 +36,7 @@ REASONS: Final = {
 """What was counted, in plain words: as many of these were not used."""
 
 
-def rfc3339(t_ns: int) -> str:
+def rfc3339(t_ns: UtcNs) -> str:
     """A time in UTC with milliseconds: 2026-11-20T13:00:00.123Z."""
     seconds, milliseconds = divmod(t_ns // 1_000_000, 1000)
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{milliseconds:03d}Z"

@@ -1,4 +1,4 @@
-"""The clock is set, a port is taken, the end comes at a bad time: said, and nothing is lost."""
+"""A port is taken, the end comes at a bad time: said, and nothing is lost."""
 
 import signal
 import struct
@@ -11,74 +11,10 @@ from typing import Any
 import pytest
 from support import BIN, HANG_S
 
-from companion.node import service
-from companion.node.service import NodeClock, Service
 from companion.recording import schemas
 from companion.recording.container import MAGIC
-from companion.settings.model import Settings
 
 RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "home")
-S = 1_000_000_000
-
-
-class Wall:
-    """A wall clock that can be set, and a monotonic one that cannot."""
-
-    def __init__(self) -> None:
-        self.set_ns = 0
-        self.ns = 0
-
-    def time_ns(self) -> int:
-        return 1_000 * S + self.ns + self.set_ns
-
-    def monotonic_ns(self) -> int:
-        return 5 * S + self.ns
-
-
-@pytest.fixture
-def wall(monkeypatch: pytest.MonkeyPatch) -> Wall:
-    made = Wall()
-    monkeypatch.setattr(service.time, "time_ns", made.time_ns)
-    monkeypatch.setattr(service.time, "monotonic_ns", made.monotonic_ns)
-    return made
-
-
-def test_the_timeline_goes_on_when_the_clock_is_set_and_that_is_told_once(wall: Wall) -> None:
-    clock = NodeClock()
-    told = []
-    for second in range(100):
-        wall.ns = second * S
-        wall.set_ns = 0 if second < 10 else 1_700_000_000 * S if second < 50 else -3600 * S
-        assert clock.now_ns() == 1_000 * S + second * S  # a Pi without a battery begins in 1970
-        told.append(clock.set_by_ns())
-    assert [(at, off) for at, off in enumerate(told) if off is not None] == [
-        (10, 1_700_000_000 * S), (50, -3600 * S),
-    ]  # fmt: skip
-
-
-def test_slow_discipline_is_not_told(wall: Wall) -> None:
-    clock = NodeClock()
-    for tick in range(10_000):
-        wall.ns = tick * S // 10
-        wall.set_ns = tick * 50_000  # 500 ppm, as fast as NTP slews
-        assert clock.set_by_ns() is None
-
-
-def test_a_set_clock_is_said_to_the_operator(monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[str] = []
-    settings = Settings().override(center={"source": "home"}, links={"urls": ["udpin:127.0.0.1:0"]})
-    node = Service(settings, said.append)
-    before_ns, real = node.now_ns(), time.time_ns
-    monkeypatch.setattr(service.time, "time_ns", lambda: real() + 7 * S)
-    for _ in range(3):
-        node._tell_of_wall_clock()
-    assert said == [
-        "this machine's clock was set: times of this run and its recordings are 7.000 s before it"
-    ]
-    assert 0 <= node.now_ns() - before_ns < 3600 * S
-    node._traffic.close()
-    for link in node._traffic.links:
-        link._endpoint._socket.close()  # type: ignore[attr-defined]
 
 
 def started_in_the_background(*arguments: str) -> "subprocess.Popen[str]":

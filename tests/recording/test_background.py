@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,10 +19,11 @@ from companion.node.replay import log_events, missing
 from companion.recording import background
 from companion.recording.background import BackgroundRecorder, Rotation
 from companion.recording.parts import Hole, Part, read_story
-from companion.recording.reader import read_log
+from companion.recording.reader import read_log, utc_offset_ns
 from companion.recording.writer import Writer
 from companion.settings.model import Settings
 from companion.values import (
+    ClockSet,
     Event,
     FloatArray,
     Frame,
@@ -360,6 +362,19 @@ def test_a_hole_in_a_broken_file_counts_events_alone(
     assert list(read_log(path)) == ticks(3, 4)
     (hole,) = read_story(path).holes
     assert (hole.events, hole.why) == (2, os.strerror(errno.EIO))
+
+
+def test_a_part_says_by_itself_what_its_times_lack_to_be_utc(tmp_path: Path) -> None:
+    made = recorder(tmp_path, Rotation(1.0, None))
+    made.start()
+    clock_set = ClockSet(START_NS, -5)
+    hand_over(made, [clock_set, *ticks(0, 10)])
+    wait_for_part(made, 2)
+    events = hand_over(made, ticks(10, 20))
+    made.stop({})
+    logs = parts_of(tmp_path)
+    assert list(read_log(logs[1])) == [replace(clock_set, t_ns=events[0].t_ns), *events]
+    assert utc_offset_ns(logs) == utc_offset_ns(logs[1:2]) == -5
 
 
 @pytest.mark.parametrize("rotation", [Rotation(1.0, None), Rotation(None, 0.5)])

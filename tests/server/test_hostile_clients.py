@@ -21,7 +21,7 @@ from companion.server.access import KnownHosts, bind
 from companion.server.app import create_app
 from companion.server.turns import Turns
 from companion.settings.model import Settings
-from companion.values import UserError
+from companion.values import UserError, UtcNs
 from companion.views import beam_state, series
 from companion.views.series import SAMPLES, Series
 
@@ -326,10 +326,10 @@ def test_the_history_is_five_minutes_and_no_more(make_node: Any) -> None:
     assert [t_ns for t_ns, _ in samples] == [
         newest_ns - (SAMPLES - 1 - i) * 1_000_000_000 for i in range(SAMPLES)
     ]
-    shown = series.show(samples, newest_ns)
+    shown = series.show(samples, newest_ns, UtcNs)
     node.tick(1.0)
     kept.add(node.pipeline)  # what was taken for another thread stays as it was
-    assert shown == series.show(samples, newest_ns)
+    assert shown == series.show(samples, newest_ns, UtcNs)
     assert len(shown["at"]) == SAMPLES == 300
     columns = [column for uav in shown["uavs"].values() for column in uav.values()]
     assert columns and all(len(column) == SAMPLES for column in columns)

@@ -1,7 +1,7 @@
 """Verdicts as the API shows them."""
 
 from companion.mavlink.links.lag import LagSeen
-from companion.values import Blame, Cause, Level, Verdict
+from companion.values import Blame, Cause, Level, UtcNs, Verdict
 from companion.views import health
 
 WEAK = Verdict(
@@ -10,7 +10,7 @@ WEAK = Verdict(
 
 
 def test_a_verdict_is_shown_with_its_reason_and_the_gains() -> None:
-    assert health.verdict(WEAK, None) == {
+    assert health.verdict(WEAK, None, UtcNs) == {
         "verdict": "weak",
         "health": {
             "cause": "rate",
@@ -22,16 +22,16 @@ def test_a_verdict_is_shown_with_its_reason_and_the_gains() -> None:
             "likely_gain_db": 4.5,
         },
     }
-    assert health.verdict(None, None) == {"verdict": None, "health": None}
+    assert health.verdict(None, None, UtcNs) == {"verdict": None, "health": None}
 
 
 def test_a_machine_that_is_behind_is_to_blame_for_what_is_not_good() -> None:
     machine = health.behind(LagSeen(7.0, 7.0, 7.04, behind=True))
     assert machine is not None
     assert machine.reason == "this machine is behind: frames wait 7.0 s for it"
-    assert health.verdict(WEAK, machine)["health"]["reason"] == machine.reason
+    assert health.verdict(WEAK, machine, UtcNs)["health"]["reason"] == machine.reason
     good = Verdict("1:1", Level.GOOD, None, 0, 2.0, 3.0, 4.5)
-    assert health.verdict(good, machine)["health"]["reason"] is None
+    assert health.verdict(good, machine, UtcNs)["health"]["reason"] is None
     assert health.behind(LagSeen(7.0, 7.0, 7.04, behind=False)) is None
 
 

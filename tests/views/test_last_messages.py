@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import all as generated
 from support import examples
 
 from companion.server.responses import encode
-from companion.values import Frame, Source
+from companion.values import Frame, Source, UtcNs
 from companion.views import mavlink_messages
 from companion.views.last_messages import LastMessages
 
@@ -34,7 +34,7 @@ def shown(message: Any) -> Any:
     """As it comes over HTTP."""
     found = kept(message).find(SENDER, message.get_msgId())
     assert found is not None
-    return json.loads(encode(mavlink_messages.dialect().message(found)))
+    return json.loads(encode(mavlink_messages.dialect().message(found, UtcNs)))
 
 
 def test_a_heartbeat_is_as_mavlink2rest_has_it() -> None:
@@ -94,7 +94,7 @@ def test_every_message_decodes_as_pymavlink_decodes_it(data: st.DataObject) -> N
     store.add(frame)
     one = store.find(SENDER, msgid)
     assert one is not None
-    message = json.loads(encode(mavlink_messages.dialect().message(one)))["message"]
+    message = json.loads(encode(mavlink_messages.dialect().message(one, UtcNs)))["message"]
     assert message.pop("type") == kind.msgname
     # its own order, from the same bytes with the zeros that MAVLink 2 cuts off
     values = kind.unpacker.unpack(payload.ljust(size, b"\0"))

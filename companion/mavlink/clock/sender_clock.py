@@ -86,8 +86,7 @@ class SenderClock:
             return None
         if placed.new_line:
             self._timesync.clear()
-            self._gnss.clear()
-            self._gnss_plausible = 0
+            self.forget_gnss()
             self._doubt_ns = 0
         self._doubt_ns = max(self._doubt_ns, doubt_ns)
         self._note_change()
@@ -135,6 +134,8 @@ class SenderClock:
     def system_time(self, arrival_ns: int, unix_us: int, boot_ms: int) -> None:
         """Take in one SYSTEM_TIME: the sender's Unix time in microseconds beside its boot time.
 
+        ``unix_us`` counts on the node's timeline: what that is off UTC is taken off before.
+
         It is used only if the settings trust it and the node keeps UTC, and only after five in a
         row have implied latencies between -20 ms and 5 s (each limit widened by the node's own
         error).
@@ -142,8 +143,13 @@ class SenderClock:
         self.change = self._known = None
         self.gnss_refused = self._system_time(arrival_ns, unix_us, boot_ms)
         if self.gnss_refused is not None:
-            self._gnss_plausible = 0
-            self._gnss.clear()
+            self.forget_gnss()
+
+    def forget_gnss(self) -> None:
+        """Forget what SYSTEM_TIME has shown, as when the node's own clock was set."""
+        self._known = None
+        self._gnss_plausible = 0
+        self._gnss.clear()
 
     def _system_time(self, arrival_ns: int, unix_us: int, boot_ms: int) -> str | None:
         """Take in a SYSTEM_TIME. Returns None, or the reason for which it was not used."""

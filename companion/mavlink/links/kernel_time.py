@@ -17,11 +17,11 @@ from typing import Final
 
 SO_TIMESTAMPNS: Final[int] = getattr(socket, "SO_TIMESTAMPNS", 35)
 """Linux, include/uapi/asm-generic/socket.h; the type of the control message as well."""
-OLDEST_NS: Final = 60_000_000_000
-"""Age beyond which a stamp is not believed."""
 SET_NS: Final = 1_000_000
 """Step of the wall clock that counts; a shorter one does no harm."""
 
+_BOOTTIME: Final[int] = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
+"""Linux's clock that goes on in a sleep; elsewhere the one that stands still in it."""
 _TIMESPEC: Final = struct.Struct("@ll")
 ANCILLARY_BYTES: Final[int] = socket.CMSG_SPACE(_TIMESPEC.size)
 """Room that ``recvmsg`` needs for the stamp."""
@@ -53,10 +53,15 @@ def stamp_ns(ancillary: Ancillary) -> int | None:
     return None
 
 
-class SetWatch:
-    """Tells whether the wall clock was set since ``note``, by its distance from the monotonic one.
+def since_boot_ns() -> int:
+    """Time since the machine booted, ns: it never steps, and goes on while the machine sleeps."""
+    return time.clock_gettime_ns(_BOOTTIME)
 
-    Both are disciplined alike; only a step, or a time asleep, moves them apart.
+
+class SetWatch:
+    """Tells whether the wall clock was set since ``note``, by its distance from ``since_boot_ns``.
+
+    Both are disciplined alike, and both go on in a machine's sleep; only a step moves them apart.
     """
 
     def __init__(self) -> None:
@@ -73,7 +78,7 @@ class SetWatch:
 
 
 def _distance_ns() -> tuple[int, int]:
-    """Wall clock less monotonic clock, ns: at least and at most, for reading them takes time."""
-    before_ns = time.monotonic_ns()
+    """Wall clock less time since boot, ns: at least and at most, for reading them takes time."""
+    before_ns = since_boot_ns()
     wall_ns = time.time_ns()
-    return wall_ns - time.monotonic_ns(), wall_ns - before_ns
+    return wall_ns - since_boot_ns(), wall_ns - before_ns

@@ -277,7 +277,7 @@ class _Datagrams:
             self._status.arrival = "read"
             return None
         age_ns = time.time_ns() - stamp_ns
-        if was_set or not 0 <= age_ns <= kernel_time.OLDEST_NS:
+        if was_set or age_ns < 0 or (age_ns > STALE_NS and self._wall_clock.was_set()):
             self._status.misstamped += 1
             return None
         return age_ns

@@ -15,7 +15,8 @@ class Kind(StrEnum):
 
     TEXT     words; empty words are unknown
     NUMBER   64-bit floating point; what is not finite is unknown
-    TIME     UTC; the value is nanoseconds since 1970, written with microseconds, cut off
+    TIME     the value is nanoseconds on the node's timeline, written in UTC with microseconds, cut
+             off
     INTEGER  64 bits, always known: programs that read CSV make floats of integers with gaps, and
              nanoseconds since 1970 do not fit into one
     TRUTH    true or false, always known, likewise
@@ -54,12 +55,18 @@ class Table:
     row_is: str
     columns: tuple[Column, ...]
 
-    def row(self, item: Any) -> list[Value]:
+    def row(self, item: Any, utc_offset_ns: int) -> list[Value]:
         """The values of one row, in the order of the columns.
 
+        ``utc_offset_ns`` is what a time of the node's timeline lacks to be UTC.
         Raises ``TypeError`` where one that is always known is not: a defect of the program.
         """
-        return [_CLEAN[column.kind](column.of(item)) for column in self.columns]
+        values = [_CLEAN[column.kind](column.of(item)) for column in self.columns]
+        if utc_offset_ns:
+            for i, (column, value) in enumerate(zip(self.columns, values, strict=True)):
+                if column.kind is Kind.TIME and isinstance(value, int):
+                    values[i] = value + utc_offset_ns
+        return values
 
 
 def _text(value: object) -> str | None:

@@ -63,9 +63,12 @@ class TableFolder:
             self.abandon()
             raise
 
-    def add(self, table: str, item: Any) -> None:
-        """Write a row, made of ``item``. Raises ``OSError`` where it cannot be written."""
-        self._files[table].add(self._tables[table].row(item))
+    def add(self, table: str, item: Any, utc_offset_ns: int = 0) -> None:
+        """Write a row, made of ``item``: see ``Table.row``.
+
+        Raises ``OSError`` where it cannot be written.
+        """
+        self._files[table].add(self._tables[table].row(item, utc_offset_ns))
         self.rows[table] += 1
 
     def close(self, said: Mapping[str, Any]) -> list[Path]:

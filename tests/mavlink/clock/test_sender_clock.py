@@ -472,6 +472,13 @@ def test_one_bad_time_ends_the_trust() -> None:
     assert known(clock).kind is ClockKind.ENVELOPE
 
 
+def test_what_was_shown_before_the_nodes_own_clock_was_set_is_forgotten() -> None:
+    clock = told_the_time(TRUSTED)
+    assert known(clock).kind is ClockKind.GNSS
+    clock.forget_gnss()
+    assert known(clock).kind is ClockKind.ENVELOPE
+
+
 def test_a_sender_that_sets_its_clock_is_believed_once_its_times_agree() -> None:
     """Until then the doubt holds both."""
     clock, doubts = told_the_time(TRUSTED), []

@@ -1,0 +1,153 @@
+"""The node's clock: a timeline that never steps, and times that follow the wall clock."""
+
+import asyncio
+import csv
+from pathlib import Path
+
+from support import run_async
+
+from companion import __version__
+from companion.node.clock import NodeClock
+from companion.node.export import export
+from companion.node.moment import look
+from companion.node.served_replay import Asked, ServedReplay
+from companion.node.service import Service
+from companion.pipeline.fold import Pipeline
+from companion.pipeline.ticks import with_ticks
+from companion.recording.reader import read_log
+from companion.settings.model import Settings
+from companion.values import ClockSet, Frame, Tick
+from companion.views import state
+
+S = 1_000_000_000
+
+
+class Machine:
+    """A wall clock that can be set, and the time since boot, which cannot."""
+
+    def __init__(self) -> None:
+        self.set_ns = 0
+        self.ns = 0
+
+    def wall_ns(self) -> int:
+        return 1_000 * S + self.ns + self.set_ns
+
+    def since_boot_ns(self) -> int:
+        return 5 * S + self.ns
+
+    def clock(self) -> NodeClock:
+        return NodeClock(self.wall_ns, self.since_boot_ns)
+
+
+def test_the_timeline_goes_on_when_the_clock_is_set_and_that_is_told_once() -> None:
+    machine = Machine()
+    clock = machine.clock()
+    told = []
+    for second in range(100):
+        machine.ns = second * S
+        machine.set_ns = 0 if second < 10 else 1_700_000_000 * S if second < 50 else -3600 * S
+        assert clock.now_ns() == 1_000 * S + second * S  # a Pi without a battery begins in 1970
+        told.append(clock.set_to_ns())
+    assert [(at, offset) for at, offset in enumerate(told) if offset is not None] == [
+        (10, 1_700_000_000 * S), (50, -3600 * S),
+    ]  # fmt: skip
+
+
+def test_a_machine_that_sleeps_has_its_clock_not_set() -> None:
+    """Both clocks count the time asleep, so all that was heard before is that much older."""
+    machine = Machine()
+    clock = machine.clock()
+    before_ns = clock.now_ns()
+    machine.ns += 3600 * S
+    assert clock.now_ns() - before_ns == 3600 * S
+    assert clock.set_to_ns() is None
+
+
+def test_a_pause_between_two_clocks_is_no_step() -> None:
+    machine = Machine()
+
+    def slowly_ns() -> int:
+        machine.ns += S
+        return machine.since_boot_ns()
+
+    clock = NodeClock(machine.wall_ns, slowly_ns)
+    assert [clock.set_to_ns() for _ in range(5)] == [None] * 5
+
+
+SETTINGS = Settings().override(center={"source": "5:1"}, links={"urls": ["udpin:127.0.0.1:0"]})
+NTP_NS = 1_700_000_000 * S
+
+
+def flown(log: Path, machine: Machine, recordings: Path, said: list[str]) -> Service:
+    """A service that heard a log, and whose clock was set in the middle of it."""
+    settings = SETTINGS.override(recording={"directory": str(recordings)})
+    node = Service(settings, said.append, clock=machine.clock())
+    assert node._recorder is not None
+    node._recorder.start()
+    events = [event for event in read_log(log) if isinstance(event, Frame)]
+    begins_ns = events[0].t_ns - node.now_ns()
+    due_ns = node.now_ns()
+    for number, frame in enumerate(events):
+        machine.ns += max(0, frame.t_ns - begins_ns - node.now_ns())
+        if number == len(events) // 2:
+            machine.set_ns = NTP_NS
+        node._step(frame._replace(t_ns=node.now_ns()))
+        if node.now_ns() >= due_ns:
+            node._follow_wall_clock()
+            node._step(Tick(node.now_ns()))
+            due_ns += S // 10
+    node._traffic.close()
+    for link in node._traffic.links:
+        link._endpoint._socket.close()  # type: ignore[attr-defined]
+    run_async(node._finish())
+    return node
+
+
+def test_times_follow_the_clock_that_was_set_live_and_in_a_replay(
+    short_log: Path, tmp_path: Path
+) -> None:
+    machine, said = Machine(), list[str]()
+    node = flown(short_log, machine, tmp_path / "recordings", said)
+    told = [text for text in said if "clock" in text]
+    assert told == [
+        "this machine's clock was set forward by 1700000000.000 s: all times are said by it"
+    ]
+    shown = state.status(node, __version__)
+    assert shown["time"].startswith("2023-11-14T22:")  # 1 700 000 000 s, and some of the first
+    uavs = state.uavs(node)
+    assert uavs
+    assert {one["valid_at"][:14] for one in uavs} == {"2023-11-14T22:"}
+    assert {one["fix"]["at"][:14] for one in uavs} == {"2023-11-14T22:"}  # also of before
+    assert min(one["age_s"] for one in uavs) < 1  # the timeline has not moved
+
+    (log,) = (tmp_path / "recordings").iterdir()
+    assert sum(isinstance(event, ClockSet) for event in read_log(log)) == 1
+    again = ServedReplay(Asked([log], SETTINGS, None, None), said.append)
+    run_async(again._replay(asyncio.Event()))
+    assert again.pipeline.digest.hexdigest() == node.pipeline.digest.hexdigest()
+    assert state.uavs(again)[0]["fix"] == uavs[0]["fix"]
+    assert said.count(told[0]) == 2
+
+    tables = tmp_path / "tables"
+    export([log], SETTINGS, tables, "csv", lambda *_: None)
+    with (tables / "updates.csv").open() as file:
+        assert {row["t_utc"][:14] for row in csv.DictReader(file)} == {"2023-11-14T22:"}
+    pipeline, update = look([log], SETTINGS, shown["time"])
+    assert (
+        pipeline.utc_ns(update.t_ns) // 1_000_000
+        == node.pipeline.utc_ns(node.now_ns()) // 1_000_000
+    )
+
+
+def test_a_clock_that_is_set_changes_no_estimate(short_log: Path) -> None:
+    """The fold's own axis goes on as it does under a clock that is left alone."""
+    events = list(with_ticks(read_log(short_log), 10.0))
+    middle = len(events) // 2
+    alone, followed = Pipeline(SETTINGS), Pipeline(SETTINGS)
+    for number, event in enumerate(events):
+        if number == middle:
+            followed.step(ClockSet(event.t_ns, NTP_NS))
+        alone.step(event)
+        followed.step(event)
+    assert followed.digest.hexdigest() == alone.digest.hexdigest()
+    assert (alone.utc_ns(0), followed.utc_ns(0)) == (0, NTP_NS)

@@ -7,6 +7,7 @@ own place, reports it at 10 Hz, and sends the rest of what an autopilot sends be
 are made by hand, for pymavlink's encoder would be the slower one of the two processes.
 """
 
+import contextlib
 import json
 import math
 import socket
@@ -60,7 +61,8 @@ class Vehicle:
         """Send the next frame."""
         msgid = self.turns[self.sent % len(self.turns)]
         payload = self._payload(msgid, time.monotonic_ns() // 1_000_000 % 2**32)
-        self.socket.send(frame(self.ids, self.sent % 256, msgid, payload))
+        with contextlib.suppress(ConnectionRefusedError):  # who listened has ended
+            self.socket.send(frame(self.ids, self.sent % 256, msgid, payload))
         self.sent += 1
 
     def _payload(self, msgid: int, boot_ms: int) -> bytes:

@@ -59,7 +59,7 @@ class TrafficLink:
         self._receive = receive
         self._up = asyncio.Event()
         self._heard: dict[Hashable, None] = {}  # the one heard last comes last
-        upcalls = Upcalls(self._up.set, self._take, self._hang_up, lambda _: None)
+        upcalls = Upcalls(self._up.set, self._take, lambda *_: None, self._hang_up, lambda _: None)
         self._endpoint = transport.endpoint(url, LinkStatus(str(url)), upcalls)
 
     async def open(self) -> None:

@@ -25,12 +25,14 @@ class Upcalls(NamedTuple):
     up        a connection stands
     take      a peer, named by the endpoint's key for it, sent bytes; the last argument is how long
               ago they arrived by the system's own stamp, ns, or None where they bear none
+    stale     bytes of a peer that had waited for too long to be believed
     hang_up   that peer is gone
     overflow  the system has dropped this many more datagrams
     """
 
     up: Callable[[], None]
     take: Callable[[Hashable, bytes, int | None], None]
+    stale: Callable[[Hashable, bytes], None]
     hang_up: Callable[[Hashable], None]
     overflow: Callable[[int], None]
 

@@ -11,6 +11,7 @@ from collections.abc import Collection, Hashable
 from typing import Any, Final, cast
 
 from companion.mavlink.links.endpoints import Upcalls, settle
+from companion.mavlink.links.held_up import HeldUp
 from companion.mavlink.links.urls import LinkUrl
 
 WRITE_BUFFER_BYTES: Final = 4096
@@ -29,6 +30,7 @@ class SerialPort:
         self._upcalls = upcalls
         self._descriptor: int | None = None
         self._lost: asyncio.Future[Exception] | None = None
+        self._held_up: HeldUp | None = None
         self._unsent = bytearray()
 
     def open(self) -> None:
@@ -41,12 +43,15 @@ class SerialPort:
         self._descriptor = descriptor = port.fileno()
         self._lost = loop.create_future()
         self._unsent.clear()
+        self._held_up = HeldUp(descriptor)
+        self._held_up.watch()
         loop.add_reader(descriptor, self._read, descriptor)
         self._upcalls.up()
         try:
             raise await self._lost
         finally:
             self._descriptor = None
+            self._held_up.close()
             loop.remove_reader(descriptor)
             loop.remove_writer(descriptor)
             _close(port)
@@ -84,8 +89,13 @@ class SerialPort:
         if not data:
             self._lose(OSError(errno.ENODEV, os.strerror(errno.ENODEV)))
             return
+        assert self._held_up is not None
+        stale = self._held_up.stale(data)
         try:
-            self._upcalls.take(None, data, None)
+            if stale:
+                self._upcalls.stale(None, data[:stale])
+            if len(data) > stale:
+                self._upcalls.take(None, data[stale:], None)
         except Exception as fault:  # of the program: it is to end the link, not to vanish
             self._lose(fault)
 

@@ -16,6 +16,7 @@ from companion.mavlink.links.endpoints import (
     resolved,
     settle,
 )
+from companion.mavlink.links.held_up import HeldUp
 from companion.mavlink.links.urls import LinkUrl
 
 WRITE_BUFFER_BYTES: Final = 64 << 10
@@ -146,6 +147,7 @@ class _Stream(asyncio.Protocol):
         self._transport: asyncio.Transport | None = None
         self._welcome = welcome
         self._address = ""
+        self._held_up: HeldUp | None = None
 
     def __str__(self) -> str:
         return self._address
@@ -153,14 +155,22 @@ class _Stream(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)
         self._address = address_text(transport.get_extra_info("peername"))
+        self._held_up = HeldUp(transport.get_extra_info("socket").fileno())
+        self._held_up.watch()
         if not self._welcome:
             self._transport.abort()
 
     def data_received(self, data: bytes) -> None:
-        self._upcalls.take(self, data, None)
+        stale = self._held_up.stale(data) if self._held_up else 0
+        if stale:
+            self._upcalls.stale(self, data[:stale])
+        if len(data) > stale:
+            self._upcalls.take(self, data[stale:] if stale else data, None)
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._transport = None
+        if self._held_up:
+            self._held_up.close()
         self._parted(self, exc or HungUpError("the peer hung up"))
         self._upcalls.hang_up(self)
 

@@ -91,7 +91,7 @@ class Link:
         self._lag = lag or ArrivalLag()
         self._twins = twins or Twins()
         self._peers = Peers(self.status, self._finish, splitter(url))
-        upcalls = Upcalls(self._up, self.take, self._hang_up, self._overflow)
+        upcalls = Upcalls(self._up, self.take, self._pass_over, self._hang_up, self._overflow)
         self._endpoint = endpoint(url, self.status, upcalls)
         self._is_out = False
         self._steady: asyncio.TimerHandle | None = None
@@ -149,6 +149,15 @@ class Link:
         if found:
             self._hand_on(peer, found)
 
+    def _pass_over(self, key: Hashable, data: bytes) -> None:
+        """Count the frames in bytes that are too old, and keep in step with the stream."""
+        self.status.bytes += len(data)
+        found = self._peers.at(key).splitter.feed(self._now_ns(), data)
+        frames = sum(isinstance(item, Frame) for item in found)
+        if frames:
+            self.status.overflowed = (self.status.overflowed or 0) + frames
+            self._overflow(frames)
+
     def _hand_on(self, peer: Peer, found: list[Frame | Rejection]) -> None:
         if self._guard is not None:
             found = [_admitted(self._guard, item) for item in found]
@@ -178,7 +187,7 @@ class Link:
             self._hand_on(peer, found)
 
     def _overflow(self, count: int) -> None:
-        """Count datagrams that the system dropped; their senders are unknown."""
+        """Count datagrams or frames that were let go; their senders are not asked for."""
         lost = self.status.lost
         lost[Reason.SOCKET_OVERFLOW] = lost.get(Reason.SOCKET_OVERFLOW, 0) + count
         reject = Rejection(self._now_ns(), self.status.url, Reason.SOCKET_OVERFLOW, count)

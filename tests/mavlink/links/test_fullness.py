@@ -26,7 +26,9 @@ def run(request: pytest.FixtureRequest) -> Run:
 @contextlib.asynccontextmanager
 async def serving(url: str) -> AsyncIterator[Endpoint]:
     """An endpoint at work; nobody hears what comes."""
-    upcalls = Upcalls(lambda: None, lambda *_: None, lambda _: None, lambda _: None)
+    upcalls = Upcalls(
+        lambda: None, lambda *_: None, lambda *_: None, lambda _: None, lambda _: None
+    )
     made = endpoint(parse_link(url), LinkStatus(url), upcalls)
     made.open()
     task = asyncio.create_task(made.serve())

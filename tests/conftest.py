@@ -145,6 +145,20 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
 
 
 @pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A real file system of 20 MB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounting = ["mount", "-t", "tmpfs", "-o", "size=20m", "none", folder]
+    try:
+        subprocess.run(mounting, check=True, capture_output=True, timeout=HANG_S)
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("no file system can be mounted here")
+    yield folder
+    subprocess.run(["umount", "--lazy", folder], check=True, timeout=HANG_S)
+
+
+@pytest.fixture
 def cut_log() -> Path:
     """A short cut-out of a simulated flight that comes with the tests."""
     return ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"

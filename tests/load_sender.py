@@ -1,8 +1,9 @@
 """Sends what many vehicles send, at a rate, from one socket each; run as a process of its own.
 
-    python tests/load_sender.py PORT SENDERS FRAMES_PER_SECOND SECONDS
+    python tests/load_sender.py PORT SENDERS FRAMES_PER_SECOND SECONDS [FIRST]
 
-Prints, as JSON, how many frames were sent and over how many seconds. Each vehicle hovers in its
+FIRST counts the vehicles from 0. Prints, as JSON, how many frames were sent and over how many
+seconds. Each vehicle hovers in its
 own place, reports it at 10 Hz, and sends the rest of what an autopilot sends besides. The frames
 are made by hand, for pymavlink's encoder would be the slower one of the two processes.
 """
@@ -85,9 +86,9 @@ class Vehicle:
                 return bytes(SIZES[msgid] - 1) + b"\1"
 
 
-def main(port: int, senders: int, rate_hz: float, seconds: float) -> None:
+def main(port: int, senders: int, rate_hz: float, seconds: float, first: int = 0) -> None:
     """Send, evenly spread, and say how much."""
-    vehicles = [Vehicle(index, port, rate_hz / senders) for index in range(senders)]
+    vehicles = [Vehicle(index, port, rate_hz / senders) for index in range(first, first + senders)]
     start = time.monotonic()
     sent, due = 0, 0
     while due < round(rate_hz * seconds):
@@ -103,4 +104,4 @@ def main(port: int, senders: int, rate_hz: float, seconds: float) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]), float(sys.argv[4]))
+    main(*map(int, sys.argv[1:3]), *map(float, sys.argv[3:5]), *map(int, sys.argv[5:]))

@@ -31,6 +31,8 @@ BIN = Path(sys.executable).parent
 HANG_S = 300.0
 """What takes longer hangs. No limit on time in a test says how fast the machine has to be."""
 HANG_MS = HANG_S * 1000
+BALLAST = "ballast"
+"""What fills a disk in tests."""
 LONGEST_FRAME = 10 + 255 + 2 + 13
 """Bytes of a MAVLink 2 frame at most: header, payload, checksum, signature."""
 
@@ -46,6 +48,16 @@ def shared_log(name: str) -> Path:
     if not path.exists():
         pytest.skip(f"{name} is not here: it is not part of the product")
     return path
+
+
+def fill(folder: Path) -> None:
+    """Not a byte is left."""
+    with (folder / BALLAST).open("wb", buffering=0) as file:
+        try:
+            while True:
+                file.write(bytes(1 << 16))
+        except OSError as error:
+            assert error.errno == 28
 
 
 def read_metadata(path: Path) -> dict[str, dict[str, str]]:

@@ -71,7 +71,11 @@ class Writer:
         self._channel_ids: dict[str, int] = {}
         self._file = open_alone(_beside(self._final))
         self._mcap = McapFile(self._file)
-        self._write_head(settings_toml, versions, max(0, started_ns), part)
+        try:
+            self._write_head(settings_toml, versions, max(0, started_ns), part)
+        except OSError:
+            self.salvage()  # a file without a head would be recovered as a recording of nothing
+            raise
 
     def _write_head(
         self, settings_toml: str, versions: Mapping[str, str], at_ns: int, part: Part | None

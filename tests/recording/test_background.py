@@ -6,14 +6,14 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support import HANG_S, ROOT, read_metadata
+from support import BALLAST, HANG_S, ROOT, fill, read_metadata
 
 from companion.node.replay import log_events, missing
 from companion.recording import background
@@ -37,7 +37,6 @@ from companion.values import (
 
 RAW = b"\xfe\x00\x00\x01\x01\x00\x00\x00"
 START_NS = 1_700_000_000_000_000_000
-BALLAST = "ballast"
 
 
 def nowhere(positions: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -104,30 +103,6 @@ def test_who_lives_for_a_moment_leaves_what_it_heard(tmp_path: Path) -> None:
     assert took_s < background.FLUSH_S
 
 
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A real file system of 20 MB."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mounting = ["mount", "-t", "tmpfs", "-o", "size=20m", "none", folder]
-    try:
-        subprocess.run(mounting, check=True, capture_output=True, timeout=HANG_S)
-    except (OSError, subprocess.CalledProcessError):
-        pytest.skip("no file system can be mounted here")
-    yield folder
-    subprocess.run(["umount", "--lazy", folder], check=True, timeout=HANG_S)
-
-
-def fill(folder: Path) -> None:
-    """Not a byte is left."""
-    with (folder / BALLAST).open("wb", buffering=0) as file:
-        try:
-            while True:
-                file.write(bytes(1 << 16))
-        except OSError as error:
-            assert error.errno == 28
-
-
 def test_what_is_put_is_in_the_file_in_order(tmp_path: Path) -> None:
     made = recorder(tmp_path)
     made.start()
@@ -168,6 +143,14 @@ def test_a_full_disk_that_is_emptied_leaves_no_hole(small_disk: Path) -> None:
     assert missing([second]) == [f"{second}: part 1 of the run is not here"]
     assert read_metadata(second)["summary"] == {"digest": "d"}
     assert made.messages == len(events)
+
+
+def test_a_full_disk_keeps_no_file_of_nothing(small_disk: Path) -> None:
+    """One was left by each new attempt, to be recovered as a recording without a frame."""
+    fill(small_disk)
+    with pytest.raises(OSError, match="No space left"):
+        Writer(small_disk, "", {}, None, START_NS)
+    assert [path.name for path in small_disk.iterdir()] == [BALLAST]
 
 
 def test_an_outage_longer_than_the_queue_is_a_hole_that_is_told(small_disk: Path) -> None:

@@ -341,6 +341,8 @@ class FleetNode(BaseModel):
     clock_doubt_s: float | None
     frames: int | None
     used: int | None
+    way_p50_ms: float | None
+    way_p99_ms: float | None
 
 
 class FleetOffer(BaseModel):

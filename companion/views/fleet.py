@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from companion.pipeline.fleet.member import Member, Neighbour
 from companion.pipeline.fold import Pipeline
 from companion.values import Offer
@@ -81,6 +83,8 @@ def _nodes(member: Member, now_ns: int) -> list[Json]:
         "clock_doubt_s": None,
         "frames": None,
         "used": None,
+        "way_p50_ms": None,
+        "way_p99_ms": None,
     }
     return [own, *(_node(name, member, now_ns) for name in sorted(member.neighbours))]
 
@@ -105,7 +109,13 @@ def _node(name: str, member: Member, now_ns: int) -> Json:
         "clock_doubt_s": None if ahead is None else ahead.doubt_ns * 1e-9,
         "frames": known.frames,
         "used": known.used,
+        "way_p50_ms": _way_ms(known, 50),
+        "way_p99_ms": _way_ms(known, 99),
     }
+
+
+def _way_ms(known: Neighbour, percentile: float) -> float | None:
+    return float(np.percentile(known.ways_ns, percentile)) * 1e-6 if known.ways_ns else None
 
 
 def _place(place: tuple[float, float, float] | None) -> Json | None:

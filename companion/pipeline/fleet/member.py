@@ -6,7 +6,7 @@ live node and the study of many nodes in virtual time use the same class.
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from companion.mavlink.trust.dedupe import content
@@ -32,6 +32,7 @@ from companion.values import (
 
 NODES_MAX: Final = 256
 """Other nodes followed; one more is not heard."""
+WAYS_KEPT: Final = 2000
 HANDOVERS_KEPT: Final = 500
 OFFERS_KEPT_NS: Final = 10_000_000_000
 """How long a node's offers stand while it says nothing new of them."""
@@ -49,6 +50,7 @@ class Neighbour:
     standing    what it said last of itself; None before it did
     offers      its offers by UAV
     frames      frames that it told, ``used`` those that the pipeline had
+    ways_ns     how long the newest of them took from being heard there to being here, at most
     """
 
     clock: NeighbourClock
@@ -59,6 +61,7 @@ class Neighbour:
     offers: dict[str, Offer] | None = None
     frames: int = 0
     used: int = 0
+    ways_ns: deque[int] = field(default_factory=lambda: deque(maxlen=WAYS_KEPT))
     apart_told: bool = False
 
 
@@ -159,6 +162,7 @@ class Member:
             known.frames += 1
             if frame is None:
                 continue
+            known.ways_ns.append(now_ns - frame.t_ns + frame.doubt_ns)
             key = content(frame.raw)
             if frame.msgid == GLOBAL_POSITION_INT:
                 self.sharing.told(now_ns, node, frame.source, key, way_ns)

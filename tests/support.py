@@ -140,13 +140,14 @@ def run_async(
 class Node:
     """A ``companion`` process that serves, and its address."""
 
-    def __init__(self, *arguments: str) -> None:
+    def __init__(self, *arguments: str, code: str | None = None) -> None:
+        """``code`` is run in place of the command, with its arguments; None: the command is."""
         # A file: a full pipe that nobody reads would hold the service up.
         self._errors, name = tempfile.mkstemp()
         Path(name).unlink()
         weakref.finalize(self, os.close, self._errors)
         self.process = subprocess.Popen(
-            [BIN / "companion", *arguments],
+            [*([BIN / "companion"] if code is None else [sys.executable, "-c", code]), *arguments],
             stdout=subprocess.PIPE,
             stderr=self._errors,
             text=True,

@@ -78,7 +78,8 @@ class Trust:
         before, self._unheard = self._unheard, {}
         for one in told:
             others = [w for name, w in witnesses.items() if name != one.node]
-            if others and all(_denies(w, one) for w in others):
+            has_been_heard = any(one.uav in w.heard for w in others)
+            if not has_been_heard and any(_ought_to_hear(w, one) for w in others):
                 node, since_ns = before.get(one.uav, (one.node, now_ns))
                 self._unheard[one.uav] = (one.node, since_ns if node == one.node else now_ns)
         phantoms = dict[str, list[str]]()
@@ -114,10 +115,10 @@ class Trust:
         return [_notice(now_ns, node, text, Severity.WARNING)]
 
 
-def _denies(witness: Witness, told: Told) -> bool:
-    """Whether a node ought to hear a vehicle where it is said to be, and never has."""
+def _ought_to_hear(witness: Witness, told: Told) -> bool:
+    """Whether a vehicle is said to be where a node hears everybody."""
     away_m = math.dist(witness.place_ned_m, told.position_ned_m)
-    return told.uav not in witness.heard and away_m < REACH_SHARE * witness.reach_m
+    return away_m < REACH_SHARE * witness.reach_m
 
 
 def _notice(t_ns: int, node: str, what: str, severity: Severity) -> Notice:

@@ -32,7 +32,8 @@ def test_one_contradiction_is_none_and_several_are() -> None:
 def test_vehicles_that_nobody_else_can_hear_put_their_node_aside() -> None:
     trust = Trust()
     phantoms = [Told("66:1", "b", (300.0, 0.0, 0.0)), Told("67:1", "b", (0.0, 400.0, 0.0))]
-    said = look(trust, phantoms, {"a": HERE}, UNHEARD_NS // S + 2)
+    far = Witness((5000.0, 0.0, 0.0), 1000.0, frozenset())  # it can say nothing
+    said = look(trust, phantoms, {"a": HERE, "c": far}, UNHEARD_NS // S + 2)
     assert len(said) == 1
     assert "node b is not believed" in said[0]
     assert "66:1, 67:1" in said[0]
@@ -54,4 +55,6 @@ def test_who_is_far_away_or_was_heard_before_is_no_phantom() -> None:
     heard = Witness((0.0, 0.0, 0.0), 1000.0, frozenset(one.uav for one in near))
     assert look(trust, near, {"a": HERE, "c": heard}, 60) == []
     assert look(trust, near, {"b": HERE}, 60) == []  # nobody is its own witness
+    deaf = Witness((0.0, 0.0, 0.0), 10.0, frozenset())
+    assert look(trust, near, {"a": deaf}, 60) == []
     assert trust.unconfirmed == frozenset()

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 PUBLISHERS_MAX: Final = 1024
 """Keys declared, so that their names go over the wire once; beyond it, all are begun anew."""
-
 NO_ROUTER: Final = "Unable to connect"
 """What Zenoh says when a client reaches none of its endpoints."""
 
@@ -60,7 +59,7 @@ class Bus:
         self._to_loop = ToLoop(loop)
         self._ended = threading.Event()
         self._session: zenoh.Session | None = None
-        self._publishers: dict[tuple[str, Priority, bool], zenoh.Publisher] = {}
+        self._publishers: dict[tuple[str, Priority, bool, bool], zenoh.Publisher] = {}
         self._declared: list[Any] = []  # what ends when nobody holds it any more
 
     def open(self) -> None:
@@ -103,20 +102,25 @@ class Bus:
     # --- publishing and asking ---------------------------------------------------------------
 
     def put(
-        self, key: str, payload: bytes, *, express: bool = False, priority: Priority = "data"
+        self,
+        key: str,
+        payload: bytes,
+        *,
+        express: bool = False,
+        priority: Priority = "data",
+        reliable: bool = True,
     ) -> bool:
         """Publish a sample; False if Zenoh did not take it.
 
         What a congested link has no room for is dropped, unseen. ``express`` sends it at once
         rather than with what follows, for single samples: of a burst only ``QUEUED`` find room.
+        Not ``reliable``: over an endpoint ``?rel=0`` where there is one, with no wait for what was
+        lost before.
         """
         import zenoh
 
         try:
-            publisher = self._publishers.get((key, priority, express))
-            if publisher is None:
-                publisher = self._publisher(key, priority, express)
-            publisher.put(payload)
+            self._publisher(key, priority, express, reliable).put(payload)
         except zenoh.ZError:
             self._refused += 1
             return False
@@ -128,8 +132,7 @@ class Bus:
         import zenoh
 
         try:
-            publisher = self._publishers.get((key, "data", False))
-            status: Any = (publisher or self._publisher(key, "data", False)).matching_status
+            status: Any = self._publisher(key, "data", False, True).matching_status
             return bool(status.matching)  # its annotation says that it is a bool, and it is not
         except zenoh.ZError:
             return False
@@ -241,9 +244,15 @@ class Bus:
         assert self._session is not None, "open comes first"
         return self._session
 
-    def _publisher(self, key: str, priority: Priority, express: bool) -> "zenoh.Publisher":
+    def _publisher(
+        self, key: str, priority: Priority, express: bool, reliable: bool
+    ) -> "zenoh.Publisher":
+        """The publisher for these, declared when it is first asked for."""
         import zenoh
 
+        publisher = self._publishers.get((key, priority, express, reliable))
+        if publisher is not None:
+            return publisher
         if len(self._publishers) >= PUBLISHERS_MAX:
             self._publishers.clear()
         publisher = self._opened().declare_publisher(
@@ -251,9 +260,10 @@ class Bus:
             priority=getattr(zenoh.Priority, priority.upper()),
             congestion_control=zenoh.CongestionControl.DROP,
             express=express,
+            reliability=getattr(zenoh.Reliability, "RELIABLE" if reliable else "BEST_EFFORT"),
             allowed_destination=zenoh.Locality.REMOTE,
         )
-        self._publishers[key, priority, express] = publisher
+        self._publishers[key, priority, express, reliable] = publisher
         return publisher
 
 

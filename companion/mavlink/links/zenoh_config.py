@@ -12,6 +12,8 @@ QUEUED: Final = 16
 
 With its own 2, and without waiting for room, of 5 samples in a row sent express 2 arrive.
 """
+LINKS_MAX: Final = 4
+"""Links to one neighbour: two of each kind, where both connect to each other."""
 
 Priority = Literal[
     "real_time",
@@ -50,7 +52,8 @@ class BusConfig:
     mode            "peer" speaks with every other peer directly, and no router passes on what two
                     peers say; "client" speaks through one router
     listen          endpoints of this node, as in tcp/127.0.0.1:7447; empty: it only connects. A
-                    client has none
+                    client has none. Beside one with ?rel=1 one with ?rel=0 may stand, ``udp/`` or
+                    ``quic/`` (datagrams, by TLS), for what need not be reliable
     connect         endpoints of others or of routers
     tls             certificates; None: endpoints are not ``tls/``
     access_control  a file with Zenoh's section ``access_control``; None: who connects may do all
@@ -58,7 +61,8 @@ class BusConfig:
     lease_s         silence after which a neighbour is given up
     keep_alive      signs of life in one lease
     retry_s         time from one attempt to connect to the next
-    attempt_s       longest time that an attempt takes
+    attempt_s       longest time that an attempt takes: 3 round trips over TCP, 5 with TLS. TCP asks
+                    a second time after 1 s; with 2 s, both of its questions have their time
     """
 
     mode: Mode = "peer"
@@ -69,8 +73,8 @@ class BusConfig:
     scouting: bool = False
     lease_s: float = 1.5
     keep_alive: int = 4
-    retry_s: float = 0.5
-    attempt_s: float = 1.0
+    retry_s: float = 0.25
+    attempt_s: float = 2.0
 
 
 def sections(config: BusConfig) -> dict[str, str]:
@@ -80,6 +84,7 @@ def sections(config: BusConfig) -> dict[str, str]:
     """
     retry_ms = round(config.retry_s * 1000)
     is_peer = config.mode == "peer"
+    has_unreliable = any("rel=0" in one for one in (*config.listen, *config.connect))
     made: dict[str, Any] = {
         "mode": config.mode,
         "listen": {
@@ -99,6 +104,7 @@ def sections(config: BusConfig) -> dict[str, str]:
         },
         "scouting/multicast/enabled": config.scouting,
         "scouting/delay": 0,  # a session is open before its neighbours are found
+        "transport/unicast/max_links": LINKS_MAX if has_unreliable else 1,
         # Else an attempt to connect hangs on, ever more rarely heard, after the network is back.
         "transport/unicast/open_timeout": round(config.attempt_s * 1000),
         "transport/unicast/accept_timeout": round(config.attempt_s * 1000),

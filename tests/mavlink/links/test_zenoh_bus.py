@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import socket
 import sys
 import time
 from collections.abc import AsyncIterator, Iterator
@@ -235,6 +236,32 @@ def test_a_burst_of_urgent_samples_arrives(run: Run) -> None:
             for n in range(QUEUED - 4):
                 other.put("site/b", bytes([n]), express=True)
             await heard.until(QUEUED - 4)
+
+    run(test())
+
+
+def test_what_need_not_be_reliable_goes_by_datagrams(run: Run) -> None:
+    async def test() -> None:
+        ports = free_port(), free_port(socket.SOCK_DGRAM)
+        endpoints = (f"tcp/127.0.0.1:{ports[0]}?rel=1", f"udp/127.0.0.1:{ports[1]}?rel=0")
+        async with (
+            opened(BusConfig(listen=endpoints)) as one,
+            opened(BusConfig(listen=(), connect=endpoints)) as other,
+        ):
+            heard = Heard()
+            one.subscribe("site/b", heard.take)
+            await joined(one, other)
+            while len(other._opened().info.links()) < 2:
+                await asyncio.sleep(0.001)
+            kinds = {link.dst[:3]: link.reliability for link in other._opened().info.links()}
+            assert [str(kinds["tcp"]), str(kinds["udp"])] == [
+                "Reliability.RELIABLE",
+                "Reliability.BEST_EFFORT",
+            ]
+            other.put("site/b", b"", reliable=False)
+            await heard.until(1)
+            (publisher,) = other._publishers.values()
+            assert str(publisher.reliability) == "Reliability.BEST_EFFORT"
 
     run(test())
 

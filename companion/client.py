@@ -77,6 +77,10 @@ class Client:
         self._token = token
         self._timeout_s = timeout_s
 
+    def fleet(self) -> Json:
+        """The nodes of the fleet and who serves whom: ``/v1/fleet``."""
+        return self.get("/v1/fleet")
+
     def status(self) -> Json:
         """``/v1/status``: version, uptime, links, center, recording, rates."""
         return self.get("/v1/status")

@@ -32,13 +32,13 @@ class FleetSky:
     def __post_init__(self) -> None:
         self.names = [f"{number + 1}:1" for number in range(self.uavs)]
         self.heard_at = {name: set(self.ports) for name in self.names}
-        self._begun_s = time.monotonic()
+        self.begun_s = time.monotonic()
         self._utc_s = time.time() - time.monotonic()
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def __enter__(self) -> "FleetSky":
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._thread.start()
         return self
 
@@ -65,8 +65,8 @@ class FleetSky:
 
     def report(self, number: int, t_s: float) -> bytes:
         """A vehicle's report at a time of the monotonic clock, rounded to its milliseconds."""
-        boot_ms = round((t_s - self._begun_s) * 1e3) + 10_000 * (number + 1)
-        t_s = self._begun_s + (boot_ms - 10_000 * (number + 1)) / 1e3
+        boot_ms = round((t_s - self.begun_s) * 1e3) + 10_000 * (number + 1)
+        t_s = self.begun_s + (boot_ms - 10_000 * (number + 1)) / 1e3
         (lat, lon, alt_m), (north, east) = self._state(number, t_s)
         mav = common.MAVLink(None, srcSystem=number + 1, srcComponent=1)
         message = common.MAVLink_global_position_int_message(
@@ -89,9 +89,9 @@ class FleetSky:
 
     def _run(self) -> None:
         due_s = {
-            number: self._begun_s + number / (self.uavs * self.hz) for number in range(self.uavs)
+            number: self.begun_s + number / (self.uavs * self.hz) for number in range(self.uavs)
         }
-        beat_s = self._begun_s
+        beat_s = self.begun_s
         while not self._over.is_set():
             now_s = time.monotonic()
             if now_s >= beat_s:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import companion
+from companion.cli import replay_text
 from companion.cli.calibrate import calibrate
 from companion.cli.check import check
 from companion.cli.console import (
@@ -34,10 +35,12 @@ from companion.cli.console import (
 from companion.cli.design import design
 from companion.cli.drive import drive
 from companion.cli.export import export
+from companion.cli.fleet import fleet as fleet_commands
+from companion.cli.fleet import replay as replay_fleet
 from companion.cli.recover import recover
 from companion.cli.study import study
 from companion.cli.weights import weights
-from companion.values import Reason, UserError, reports_itself
+from companion.values import UserError
 
 if TYPE_CHECKING:
     from companion.node.start import Voice
@@ -148,6 +151,9 @@ def demo(seconds: float | None, port: int, open_page: bool, as_json: bool) -> No
     "--speed", metavar="max|X", help="Pace, in times of the log's own [max; 1 if served]."
 )
 @LATENCY
+@click.option(
+    "--fleet", is_flag=True, help="The logs are recordings of a fleet's nodes, one of each."
+)
 @click.option("--serve", is_flag=True, help="The page and the API over it, until stopped.")
 @LISTEN
 @INSECURE
@@ -160,6 +166,7 @@ def replay(
     no_record: bool,
     speed: str | None,
     latency_s: float,
+    fleet: bool,
     serve: bool,
     listen: str | None,
     insecure: bool,
@@ -177,11 +184,19 @@ def replay(
     Example: companion replay flight.tlog --center 5:1 --json
 
     Example: companion replay uav.bin carrier.bin --center carrier.bin
+
+    With --fleet each node's recording is replayed with its own settings and held against its own
+    digest; no recording is written.
     """
     from companion.node import replay as replaying
 
     if not serve and (listen or insecure):
         raise click.UsageError("--listen and --insecure go with --serve")
+    if fleet:
+        if config or center or out or speed or serve:
+            raise click.UsageError("--fleet takes recordings as they are: no settings, no --serve")
+        replay_fleet(logs, as_json)
+        return
     pace = _speed(speed or ("1" if serve else "max"))
     gc.set_threshold(200_000)  # millions of short-lived values, and no cycles among them
     progress = Progress()
@@ -229,7 +244,7 @@ def _left_behind(begun: "list[Writer]") -> str:
 
 
 def _show_replay(as_json: bool, summary: dict[str, Any]) -> None:
-    click.echo(json.dumps(summary) if as_json else _replay_text(summary))
+    click.echo(json.dumps(summary) if as_json else replay_text.text(summary))
 
 
 def _speed(text: str) -> float | None:
@@ -244,44 +259,12 @@ def _speed(text: str) -> float | None:
     return factor
 
 
-def _replay_text(summary: dict[str, Any]) -> str:
-    from companion.views.words import REASONS
-
-    lines = [
-        f"{summary['frames']} frames, {summary['duration_s']:.0f} s of log in"
-        f" {summary['wall_s']:.1f} s; center {summary['center']}"
-    ]
-    own = {uav: seen for uav, seen in summary["uavs"].items() if reports_itself(uav)}
-    relayed = [seen["reports"] for uav, seen in summary["uavs"].items() if uav not in own]
-    for uav, seen in own.items():
-        lines.append(
-            f"  {uav:12} {seen['state']:9} {seen['reports']:6} reports"
-            f"  dt {_number(seen['dt_median_s'])} s  latency p95 {_number(seen['latency_p95_s'])} s"
-            f"  innovation {_number(seen['innovation_rms_m'])} m rms"
-        )
-    if relayed:
-        lines.append(f"  {len(relayed)} relayed aircraft (ADS-B), {sum(relayed)} reports")
-    beams = summary["beams"]
-    lines.append(
-        f"{beams['updates']} beam updates, {beams['regularised']} regularised,"
-        f" condition number to {_number(beams['condition_number_max'])}"
-    )
-    lines += [f"  not used: {n} {REASONS[Reason(why)]}" for why, n in summary["rejected"].items()]
-    lines += [f"  missing: {line}" for line in summary["missing"]]
-    if summary["recording"]:
-        lines.append(f"recording {summary['recording']}")
-    return "\n".join([*lines, f"digest {summary['digest']}"])
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
-
-
 main.add_command(calibrate)
 main.add_command(check)
 main.add_command(design)
 main.add_command(drive)
 main.add_command(export)
+main.add_command(fleet_commands, "fleet")
 main.add_command(recover)
 main.add_command(study)
 main.add_command(weights)

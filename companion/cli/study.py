@@ -5,6 +5,7 @@ import click
 from companion.cli.learned import train
 from companion.cli.study_beams import beams
 from companion.cli.study_deepsense import deepsense
+from companion.cli.study_fleet import fleet
 from companion.cli.study_link import link
 from companion.cli.study_paper import dt, paper
 from companion.cli.study_prediction import prediction
@@ -18,5 +19,5 @@ def study() -> None:
     """
 
 
-for command in (prediction, beams, link, paper, dt, deepsense, train):
+for command in (prediction, beams, link, paper, dt, deepsense, fleet, train):
     study.add_command(command)

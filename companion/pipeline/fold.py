@@ -9,6 +9,8 @@ digest, whoever feeds them. A report passes through these parts in the order of 
 
 and a relayed aircraft's report also goes to ``targets``, which returns nothing. A tick asks
 ``tracker`` for the tracks that ``targets`` wants and ``center`` for the array, and aims the beams.
+
+Over 300 lines: every event comes in here, and every look goes out.
 """
 
 import math

@@ -23,7 +23,7 @@ from companion.recording.container import MAGIC, Damage, Message, Walk
 from companion.recording.errors import LogError
 from companion.recording.foreign import capture, kinds, together
 from companion.recording.foreign.together import Vehicle
-from companion.recording.writer import SETTINGS
+from companion.recording.writer import SETTINGS, SUMMARY
 from companion.values import Event, Frame, Reason, Rejection, Source, Tick
 
 __all__ = ["LogError", "LogKind", "center_of", "flights", "log_kind", "read_flight", "read_log",
@@ -155,6 +155,16 @@ def read_settings(path: Path) -> str | None:
                 return content.data.decode()
             except UnicodeDecodeError:
                 raise LogError(f"{path}: its settings are not UTF-8 text") from None
+    return None
+
+
+def digest_of(path: Path) -> str | None:
+    """The digest to which the run came that a recording is of; None where it was cut short."""
+    if log_kind(path) != "mcap":
+        return None
+    for content in Walk(path, frozenset()):
+        if isinstance(content, Metadata) and content.name == SUMMARY:
+            return content.metadata.get("digest")
     return None
 
 

@@ -28,6 +28,8 @@ class FleetSettings(Section):
     mode           "peer" speaks with every other node directly, "client" through one router
     most           UAVs that this node serves at most; None: half of its elements
     lease_s        time for which a node's word holds: after it others serve its UAVs
+    attempt_s      longest time of an attempt to connect: 3 round trips over TCP, 5 with TLS; longer
+                   ones make a fleet whole again later
     hysteresis_db  least gain for which a UAV changes its node
     nulls          whether beams have nulls on UAVs that other nodes serve
     share_hz       how often what was heard is told, at most
@@ -43,6 +45,7 @@ class FleetSettings(Section):
     mode: Literal["peer", "client"] = "peer"
     most: Annotated[int, Field(ge=1, le=10_000)] | None = None
     lease_s: Annotated[float, Field(ge=0.5, le=60)] = 1.5
+    attempt_s: Annotated[float, Field(ge=0.1, le=60)] = 1.0
     hysteresis_db: Annotated[float, Field(ge=0, le=60)] = 3.0
     nulls: bool = False
     share_hz: Annotated[PositiveFloat, Field(le=1000)] = 200.0

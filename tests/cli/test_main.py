@@ -18,7 +18,7 @@ def run(*arguments: str) -> Any:
 
 
 def test_the_commands_are_the_documented_ones() -> None:
-    documented = "calibrate demo drive run replay check design export recover study weights"
+    documented = "calibrate demo drive fleet run replay check design export recover study weights"
     assert set(COMMANDS) == set(documented.split())
 
 

@@ -8,12 +8,11 @@ sender time, is an interval, and every stamp and every answer narrows it:
 - TIMESYNC round trips hold it on both sides, and so does GNSS time at both ends where the settings
   trust it (``evidence.py``);
 - where neither is there, the lower side is an assumption: that the least latency, which nothing
-  that is only heard can show, is no longer than the median of its visible part; stamps that another
-  node heard may have arrived earlier by their doubt, which is added.
+  that is only heard can show, is no longer than the median of its visible part; and what another
+  node heard may have arrived earlier by its doubt.
 
 The interval is as of the time asked for, and grows while nothing comes. No report is ever placed
-later than it arrived. See docs/math.md 6. ``epochs.py`` decides which stamps belong to one line,
-and what is a reboot.
+later than it arrived. See docs/math.md 6. ``epochs.py`` tells which stamps are of one line.
 """
 
 import math

@@ -157,17 +157,19 @@ class FleetNode:
         self._flushing = None
         said = self.member.sharing.due(self._now_ns())
         if said is not None:
-            self._put("heard", messages.shared(said), express=True)
+            self._put("heard", messages.shared(said), express=True, reliable=False)
         if self.member.sharing.next_ns is not None:
             self._flush_soon()
 
     # --- what it says -----------------------------------------------------------------------
 
-    def _put(self, what: str, payload: bytes, *, express: bool = False) -> None:
+    def _put(
+        self, what: str, payload: bytes, *, express: bool = False, reliable: bool = True
+    ) -> None:
         if self._bus is not None:
             self._sent.bytes += len(payload)
             key = f"{PREFIX}/{self.settings.site}/{self.name}/{what}"
-            self._bus.put(key, payload, express=express, priority="data_high")
+            self._bus.put(key, payload, express=express, priority="data_high", reliable=reliable)
 
     def _stand(self, now_ns: int) -> None:
         said = self.member.says(now_ns, self._around.place(), self._around.reach_m(now_ns))
@@ -285,4 +287,5 @@ def bus_config(settings: FleetSettings) -> BusConfig:
         tls=tls,
         access_control=None if settings.access_control is None else Path(settings.access_control),
         lease_s=settings.lease_s,
+        attempt_s=settings.attempt_s,
     )

@@ -7,8 +7,9 @@ by all that it serves, so a place at a node that has n already costs all of them
     10 (n + 1) log10(n + 1) - 10 n log10(n)   dB.
 
 From what is, UAVs without a node are placed first, those with the least choice before the others;
-then single UAVs move while a move gains more than ``hysteresis_db`` in all. No order of arrival, no
-chance and no leader is in it.
+where all that could serve one are full, the best of them gives one to another node. Then single
+UAVs move while a move gains more than ``hysteresis_db`` in all. No order of arrival, no chance and
+no leader is in it.
 """
 
 from collections.abc import Mapping
@@ -82,10 +83,32 @@ def _place(worth: FloatArray, room: IntArray, at: IntArray, load: IntArray) -> N
         spare[has_choice] = (best - second)[has_choice]
     for i in free[np.argsort(-spare, kind="stable")]:
         net = np.where(load < room, worth[i] - _price_db(load), -np.inf)
-        node = int(np.argmax(net))
-        if np.isfinite(net[node]):
+        node = int(np.argmax(net if np.isfinite(net).any() else worth[i]))
+        if np.isfinite(net[node]) or _make_room(worth, room, at, load, i):
             at[i] = node
             load[node] += 1
+
+
+def _make_room(worth: FloatArray, room: IntArray, at: IntArray, load: IntArray, uav: int) -> bool:
+    """Move one of those at a UAV's best node elsewhere, the one that loses least by it.
+
+    The node is full, and so are all others that could serve the UAV. Returns whether there is one.
+    """
+    node = int(np.argmax(worth[uav]))
+    there = np.flatnonzero(at == node)
+    if not there.size or not np.isfinite(worth[uav, node]):
+        return False
+    elsewhere = np.where(load < room, worth[there] - _price_db(load), -np.inf)
+    elsewhere[:, node] = -np.inf
+    lost = worth[there, node] - elsewhere.max(axis=1)
+    least = int(np.argmin(lost))
+    if not np.isfinite(lost[least]):
+        return False
+    to = int(np.argmax(elsewhere[least]))
+    at[there[least]] = to
+    load[to] += 1
+    load[node] -= 1
+    return True
 
 
 def _move(

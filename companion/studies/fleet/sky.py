@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from pymavlink.dialects.v20 import common
@@ -57,7 +57,7 @@ class Flight:
         self._radii_m = random.uniform(50, 600, sky.uavs)
         self._speeds_mps = random.uniform(5, 25, sky.uavs)
         self._phases = random.uniform(0, 2 * np.pi, sky.uavs)
-        self._mav = common.MAVLink(None)
+        self._mavs: dict[str, Any] = {}
 
     def ranges_m(self, t_s: float) -> FloatArray:
         """Distances (nodes, UAVs)."""
@@ -79,9 +79,10 @@ class Flight:
 
     def report(self, uav: str, boot_ms: int) -> bytes:
         """A report of a UAV; its fields say nothing, its stamp makes it one of its own."""
-        self._mav.srcSystem, self._mav.srcComponent = map(int, uav.split(":"))
+        sysid, compid = map(int, uav.split(":"))
+        mav = self._mavs.setdefault(uav, common.MAVLink(None, sysid, compid))
         message = common.MAVLink_global_position_int_message(
             boot_ms, 473977000, 85456000, 500000, 50000, 100, 100, 10, 9000
         )
-        packed: bytes = message.pack(self._mav)
+        packed: bytes = message.pack(mav)
         return packed

@@ -49,6 +49,7 @@ class Counted:
     samples                   messages by what was told
     received                  bytes that reached a node, heads included
     cpu_s                     processor time of each node
+    frames_cpu_s              that part of it which reports take
     """
 
     served: int = 0
@@ -59,6 +60,7 @@ class Counted:
     samples: Counter[str] = field(default_factory=Counter)
     received: Counter[str] = field(default_factory=Counter)
     cpu_s: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+    frames_cpu_s: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
 
 
 class World:
@@ -132,11 +134,13 @@ class World:
     def _at(self, t_ns: int, what: Callable[[], Any]) -> None:
         heapq.heappush(self._queue, (t_ns, next(self._order), what))
 
-    def _timed(self, name: str, what: Callable[[], None]) -> None:
-        began = self._cpu_s()
+    def _timed(self, name: str, what: Callable[[], None], *, of_frames: bool = False) -> None:
+        began_s = self._cpu_s()
         what()
-        spent = self.counted.cpu_s
-        spent[name] = spent[name] + self._cpu_s() - began
+        spent_s = self._cpu_s() - began_s
+        self.counted.cpu_s[name] += spent_s
+        if of_frames:
+            self.counted.frames_cpu_s[name] += spent_s
 
     # --- what nodes do ----------------------------------------------------------------------
 
@@ -174,7 +178,7 @@ class World:
     def _flush_soon(self, name: str) -> None:
         if name not in self._flushing:
             self._flushing.add(name)
-            flush = partial(self._timed, name, partial(self._flush, name))
+            flush = partial(self._timed, name, partial(self._flush, name), of_frames=True)
             self._at(self.now_ns + FLUSH_NS, flush)
 
     def _tell(self, name: str, what: str, payload: bytes) -> None:
@@ -193,7 +197,8 @@ class World:
 
     def _take(self, name: str, node: str, what: str, payload: bytes) -> None:
         if name not in self.dead:
-            self._timed(name, partial(self._taken, name, node, what, payload))
+            taken = partial(self._taken, name, node, what, payload)
+            self._timed(name, taken, of_frames=what == "heard")
 
     def _taken(self, name: str, node: str, what: str, payload: bytes) -> None:
         member, now_ns = self.members[name], self._local_ns(name)
@@ -237,7 +242,7 @@ class World:
     def _hear(self, name: str, raw: bytes, uav: str) -> None:
         if name not in self.dead:
             frame = Frame(self._local_ns(name), "udp", Source.parse(uav), REPORT, raw)
-            self._timed(name, partial(self.members[name].heard, frame))
+            self._timed(name, partial(self.members[name].heard, frame), of_frames=True)
             self._flush_soon(name)
 
     # --- counting ---------------------------------------------------------------------------

@@ -95,6 +95,13 @@ def test_no_node_has_more_than_its_room() -> None:
     assert sorted(found.values()) == ["a"] * 2 + ["b"] * 4
 
 
+def test_a_full_node_makes_room_for_who_has_no_other() -> None:
+    offers = {"a": {"1:1": 30.0, "2:1": 20.0, "3:1": 10.0}, "b": {"1:1": 5.0, "2:1": 12.0}}
+    held = {"1:1": "a", "2:1": "a"}
+    assert assign(offers, held, {"a": 2, "b": 2}, 3.0) == {"1:1": "a", "2:1": "b", "3:1": "a"}
+    assert "3:1" not in assign(offers, held, {"a": 2, "b": 0}, 3.0)
+
+
 @pytest.mark.parametrize(
     ("sure", "likely", "sinr", "worth"),
     [

@@ -1,0 +1,39 @@
+"""What ``companion replay`` says at its end."""
+
+from typing import Any
+
+from companion.values import Reason, reports_itself
+
+
+def text(summary: dict[str, Any]) -> str:
+    """The summary of a replay as lines of text."""
+    from companion.views.words import REASONS
+
+    lines = [
+        f"{summary['frames']} frames, {summary['duration_s']:.0f} s of log in"
+        f" {summary['wall_s']:.1f} s; center {summary['center']}"
+    ]
+    own = {uav: seen for uav, seen in summary["uavs"].items() if reports_itself(uav)}
+    relayed = [seen["reports"] for uav, seen in summary["uavs"].items() if uav not in own]
+    for uav, seen in own.items():
+        lines.append(
+            f"  {uav:12} {seen['state']:9} {seen['reports']:6} reports"
+            f"  dt {_number(seen['dt_median_s'])} s  latency p95 {_number(seen['latency_p95_s'])} s"
+            f"  innovation {_number(seen['innovation_rms_m'])} m rms"
+        )
+    if relayed:
+        lines.append(f"  {len(relayed)} relayed aircraft (ADS-B), {sum(relayed)} reports")
+    beams = summary["beams"]
+    lines.append(
+        f"{beams['updates']} beam updates, {beams['regularised']} regularised,"
+        f" condition number to {_number(beams['condition_number_max'])}"
+    )
+    lines += [f"  not used: {n} {REASONS[Reason(why)]}" for why, n in summary["rejected"].items()]
+    lines += [f"  missing: {line}" for line in summary["missing"]]
+    if summary["recording"]:
+        lines.append(f"recording {summary['recording']}")
+    return "\n".join([*lines, f"digest {summary['digest']}"])
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"

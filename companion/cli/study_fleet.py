@@ -1,0 +1,83 @@
+"""The command ``companion study fleet``: many nodes and UAVs in virtual time."""
+
+import json
+import time
+from pathlib import Path
+
+import click
+
+from companion.cli.console import JSON, Progress
+
+
+def _span(_context: click.Context, _option: click.Parameter, text: str) -> tuple[int, int]:
+    first, dots, last = text.partition("..")
+    try:
+        found = int(first), int(last if dots else first)
+    except ValueError as error:
+        raise click.BadParameter(f"{text!r} is not FROM..TO, such as 3..100") from error
+    if not 1 <= found[0] <= found[1] <= 62_500:
+        raise click.BadParameter(f"{text!r}: from 1 to 62500, the smaller first")
+    return found
+
+
+def _steps(span: tuple[int, int], steps: int) -> list[int]:
+    """Numbers from the first to the last, each as many times the one before."""
+    first, last = span
+    if steps == 1 or first == last:
+        return [last] * steps
+    return [round(first * (last / first) ** (n / (steps - 1))) for n in range(steps)]
+
+
+@click.command()
+@click.option("--nodes", callback=_span, metavar="FROM..TO", default="3..30", show_default=True)
+@click.option("--uavs", callback=_span, metavar="FROM..TO", default="100..1000", show_default=True)
+@click.option("--steps", type=click.IntRange(1, 20), default=3, show_default=True, help="Sizes.")
+@click.option(
+    "--seconds", type=click.FloatRange(1, 3600), default=10.0, show_default=True,
+    help="Virtual time for which each size is watched.",
+)  # fmt: skip
+@click.option(
+    "--delay", type=click.FloatRange(0, 5), default=0.02, show_default=True,
+    help="Seconds from one node to another.",
+)  # fmt: skip
+@click.option(
+    "--loss", type=click.FloatRange(0, 0.9), default=0.02, show_default=True,
+    help="Share of messages between nodes that is lost.",
+)  # fmt: skip
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
+@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
+@JSON
+def fleet(
+    nodes: tuple[int, int],
+    uavs: tuple[int, int],
+    steps: int,
+    seconds: float,
+    delay: float,
+    loss: float,
+    seed: int,
+    out: Path,
+    as_json: bool,
+) -> None:
+    """What a fleet of many nodes costs as it grows, and how it hands over.
+
+    In one process and virtual time: traffic, processor time of a node, share of the time in which
+    every UAV has one node, what a death and a partition do. Writes DIR/fleet.json, DIR/fleet.html
+    and the figures as PNG and SVG.
+
+    Example: companion study fleet --nodes 3..30 --uavs 100..1000 --out report
+    """
+    from companion.studies.fleet import report, study
+
+    progress = Progress()
+    sizes = tuple(zip(_steps(nodes, steps), _steps(uavs, steps), strict=True))
+    asked = study.Asked(sizes, seconds, delay, loss, seed=seed)
+    out.mkdir(parents=True, exist_ok=True)
+    found = list(study.run(asked, time.process_time, progress.show))
+    spans = f"--nodes {nodes[0]}..{nodes[1]} --uavs {uavs[0]}..{uavs[1]} --steps {steps}"
+    command = f"companion study fleet {spans} --seconds {seconds:g} --delay {delay:g}"
+    answer = study.answer(asked, found, f"{command} --loss {loss:g} --seed {seed}")
+    (out / "fleet.json").write_text(json.dumps(answer, indent=1), encoding="utf-8")
+    for name, content in report.files(asked, found, answer, progress.show).items():
+        (out / name).write_bytes(content)
+    progress.clear()
+    click.echo(json.dumps(answer) if as_json else report.text(found))

@@ -1,0 +1,137 @@
+"""Recordings of a fleet's nodes, replayed together: their digests, and who served whom.    [shell]
+
+Each recording holds all that its node used, what others told it included, so that each is replayed
+by itself. What is seen together is who served whom, on the nodes' own clocks.
+"""
+
+import tomllib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from companion.node import replay as replaying
+from companion.recording.reader import LogError, digest_of, read_settings
+from companion.values import Duty, Frame
+
+TOLD_EVERY: Final = 20_000
+"""Frames between two calls of ``progress``."""
+SAMPLE_NS: Final = 100_000_000
+"""Time between two looks at who serves whom."""
+
+
+@dataclass(slots=True)
+class NodeRun:
+    """One node's recording: its name, its digest now and as recorded, and its duties in order."""
+
+    node: str
+    log: Path
+    digest: str = ""
+    recorded: str | None = None
+    frames: int = 0
+    told: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    duties: list[Duty] = field(default_factory=list)
+
+    def serves(self, t_ns: int) -> tuple[str, ...]:
+        """Whom the node serves at a time."""
+        past = [duty for duty in self.duties if duty.t_ns <= t_ns]
+        return past[-1].serves if past else ()
+
+
+def replay(
+    logs: Sequence[Path], progress: Callable[[int, float, float], None] | None = None
+) -> dict[str, Any]:
+    """Replay each recording, and sum up, as ``companion replay --fleet --json`` prints it.
+
+    ``progress`` is as for ``companion.node.replay.replay``. Raises ``LogError`` for a log that is
+    no node's recording, or where two are of one node.
+    """
+    names = [_name(log) for log in logs]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise LogError(f"{logs[0]}: two recordings are of node {min(twice)}: one after the other")
+    runs = [_run(name, log, progress) for name, log in zip(names, logs, strict=True)]
+    return {
+        "nodes": [
+            {
+                "node": run.node,
+                "log": str(run.log),
+                "frames": run.frames,
+                "told_by_others": run.told,
+                "digest": run.digest,
+                "recorded_digest": run.recorded,
+                "same": None if run.recorded is None else run.digest == run.recorded,
+                "duties": len(run.duties),
+            }
+            for run in runs
+        ],
+        **_together(runs),
+    }
+
+
+def _name(log: Path) -> str:
+    settings = read_settings(log)
+    try:
+        name = tomllib.loads(settings or "").get("fleet", {}).get("node")
+    except tomllib.TOMLDecodeError:
+        name = None
+    if not isinstance(name, str):
+        raise LogError(f"{log}: not a recording of a fleet's node: it has no [fleet] node")
+    return name
+
+
+def _run(name: str, log: Path, progress: Callable[[int, float, float], None] | None) -> NodeRun:
+    settings = replaying.settings_for([log], None, None)
+    found = NodeRun(name, log, recorded=digest_of(log))
+    run = replaying.Run(settings, None)
+    for event in replaying.log_events([log], settings):
+        run.step(event)
+        if isinstance(event, Duty):
+            found.duties.append(event)
+        elif isinstance(event, Frame):
+            found.told += event.link.startswith("fleet:")
+            if progress and run.pipeline.frames % TOLD_EVERY == 0:
+                progress(run.pipeline.frames, run.at_s, run.took_s)
+    found.digest = run.pipeline.digest.hexdigest()
+    found.frames = run.pipeline.frames
+    found.first_ns, found.last_ns = run.tally.first_ns or 0, run.tally.last_ns
+    return found
+
+
+def _together(runs: Sequence[NodeRun]) -> dict[str, Any]:
+    """Shares of the time that all recorded in which UAVs had one node, several, or none.
+
+    A UAV counts from the first time on at which any node serves it.
+    """
+    begins_ns = max(run.first_ns for run in runs)
+    ends_ns = min(run.last_ns for run in runs)
+    seen: dict[str, int] = {}
+    once = twice = none = handovers = 0
+    before: dict[str, frozenset[str]] = {}
+    for t_ns in range(begins_ns, ends_ns, SAMPLE_NS):
+        by: dict[str, set[str]] = {}
+        for run in runs:
+            for uav in run.serves(t_ns):
+                by.setdefault(uav, set()).add(run.node)
+        for uav in by:
+            seen.setdefault(uav, t_ns)
+        for uav in seen:
+            nodes = frozenset(by.get(uav, ()))
+            once, twice, none = (
+                once + (len(nodes) == 1),
+                twice + (len(nodes) > 1),
+                none + (not nodes),
+            )
+            was = before.get(uav, frozenset())
+            handovers += len(nodes) == 1 and bool(was) and was.isdisjoint(nodes)
+            before[uav] = nodes if len(nodes) == 1 else was
+    samples = once + twice + none
+    share = {"once": once, "twice": twice, "none": none}
+    return {
+        "seconds": max(ends_ns - begins_ns, 0) * 1e-9,
+        "uavs": len(seen),
+        "served": {name: n / samples if samples else None for name, n in share.items()},
+        "handovers": handovers,
+    }

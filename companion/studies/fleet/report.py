@@ -1,0 +1,109 @@
+"""Reports of the fleet study: a table as text, one HTML page, and figures."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+from companion.studies.figures import plotting
+from companion.studies.fleet.sky import Sky
+from companion.studies.fleet.study import Asked, Grown
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLUMNS: Final = (
+    "nodes", "UAVs", "served by one", "by several", "by none", "handovers/min",
+    "tells, kbit/s", "is told, kbit/s", "CPU of a node", "takeover, s", "parted: none", "heals, s",
+)  # fmt: skip
+CAPTIONS: Final = {
+    "traffic": "What a node tells and what it is told, by size of the fleet.",
+    "time": "Processor time of a node beside its pipeline, and time to take over from a dead one.",
+}
+
+
+def cells(one: Grown) -> list[str]:
+    """One size as a row of the table."""
+    return [
+        str(one.nodes),
+        str(one.uavs),
+        f"{one.served:.3%}",
+        f"{one.twice:.3%}",
+        f"{one.none:.3%}",
+        f"{one.handovers_per_min:.0f}",
+        f"{sum(one.told_kbps.values()):.0f}",
+        f"{one.link_kbps:.0f}",
+        f"{one.cpu_share:.1%}",
+        "-" if one.takeover_s is None else f"{one.takeover_s:.1f}",
+        f"{one.parted_none:.3%}",
+        f"{one.heal_s:.1f}",
+    ]
+
+
+def text(found: Sequence[Grown]) -> str:
+    """The table as text."""
+    rows = [list(COLUMNS), *map(cells, found)]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(COLUMNS))]
+    return "\n".join(
+        "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True))
+        for row in rows
+    )
+
+
+def files(
+    asked: Asked, found: Sequence[Grown], answer: dict[str, Any], progress: Callable[[str], None]
+) -> dict[str, bytes]:
+    """The page and every figure as SVG and PNG, by file name."""
+    drawings = {
+        "traffic": (CAPTIONS["traffic"], partial(_traffic, found)),
+        "time": (CAPTIONS["time"], partial(_time, found)),
+    }
+    told = {
+        "spacing_m": f"{Sky(1, 1).spacing_m:g}",
+        "delay_ms": f"{1000 * asked.delay_s:g}",
+        "loss": f"{asked.loss:.0%}",
+    }
+    values = {"answer": answer, "asked": told, "head": COLUMNS, "rows": list(map(cells, found))}
+    return plotting.files("fleet", "fleet/report.html.j2", drawings, values, progress)
+
+
+def _traffic(found: Sequence[Grown]) -> "Figure":
+    figure, (left, right) = plotting.new(1, 2, (7.2, 3.0))
+    nodes = [one.nodes for one in found]
+    for number, what in enumerate(found[0].told_kbps):
+        values = [one.told_kbps[what] for one in found]
+        left.plot(nodes, values, label=what, **plotting.marked(number))
+    right.plot(nodes, [one.link_kbps for one in found], **plotting.marked(0))
+    for axes, title in ((left, "a node tells"), (right, "a node is told")):
+        _sized(axes, nodes)
+        axes.set(yscale="log", ylabel="kbit/s", title=title)
+        _plain(axes)
+    left.legend()
+    return figure
+
+
+def _time(found: Sequence[Grown]) -> "Figure":
+    figure, (left, right) = plotting.new(1, 2, (7.2, 3.0))
+    nodes = [one.nodes for one in found]
+    left.plot(nodes, [100 * one.cpu_share for one in found], **plotting.marked(0))
+    left.set(yscale="log", ylabel="% of a core", title="time")
+    _plain(left)
+    known = [(one.nodes, one.takeover_s) for one in found if one.takeover_s is not None]
+    right.plot([n for n, _ in known], [s for _, s in known], **plotting.marked(1))
+    right.set(ylabel="s", title="takeover", ylim=(0, None))
+    for axes in (left, right):
+        _sized(axes, nodes)
+    return figure
+
+
+def _sized(axes: "Axes", nodes: Sequence[int]) -> None:
+    """Nodes along the axis, each size by its number."""
+    axes.set(xscale="log", xlabel="nodes")
+    axes.set_xticks(nodes, labels=map(str, nodes))
+    axes.set_xticks([], minor=True)
+
+
+def _plain(axes: "Axes") -> None:
+    """Plain numbers along the logarithmic axis of values."""
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter("{x:g}")

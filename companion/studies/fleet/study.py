@@ -1,0 +1,164 @@
+"""How a fleet does as it grows: bandwidth, processor time, time served, times to take over."""
+
+import platform
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+import companion
+from companion.settings.fleet import FleetSettings
+from companion.studies.fleet.sky import Sky
+from companion.studies.fleet.world import Counted, World
+
+SETTLE_S = 8.0
+"""Virtual time that a fleet has to find who serves whom."""
+AFTER_S = 4.0
+"""Virtual time for which a fleet is watched after a node has died."""
+HALF = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Grown:
+    """A fleet of one size.
+
+    nodes, uavs         how many
+    served              share of the time in which a UAV within reach had one node
+    twice, none         in which it had several, or none
+    handovers_per_min   of all UAVs
+    told_kbps           kilobits per second that a node tells, heads left out, by what it is
+    link_kbps           kilobits per second to a node, of all others together, heads included
+    cpu_share           processor time of a node over time, beside its pipeline
+    takeover_s          time to the last of a dead node's UAVs being served, where any node can
+    orphans             UAVs that the dead node served
+    parted_none         share of the time unserved while the fleet is in two parts
+    heal_s              time from the end of that until no UAV has two nodes
+    """
+
+    nodes: int
+    uavs: int
+    served: float
+    twice: float
+    none: float
+    handovers_per_min: float
+    told_kbps: dict[str, float]
+    link_kbps: float
+    cpu_share: float
+    takeover_s: float | None
+    orphans: int
+    parted_none: float
+    heal_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What is to be studied: sizes as (nodes, UAVs), over how much virtual time, on which links."""
+
+    sizes: tuple[tuple[int, int], ...]
+    seconds: float = 10.0
+    delay_s: float = 0.02
+    loss: float = 0.02
+    sampled: int = 50
+    seed: int = 1
+
+
+def run(
+    asked: Asked, cpu_s: Callable[[], float], progress: Callable[[str], None] = lambda text: None
+) -> Iterator[Grown]:
+    """Fly the fleet at each size; ``cpu_s`` reads the processor time used."""
+    for nodes, uavs in asked.sizes:
+        progress(f"{nodes} nodes, {uavs} UAVs")
+        sampled = min(asked.sampled, uavs)
+        sky = Sky(
+            nodes, uavs, sampled=sampled, delay_s=asked.delay_s, loss=asked.loss, seed=asked.seed
+        )
+        yield _grown(World(sky, FleetSettings(node="any"), cpu_s), asked.seconds)
+
+
+def _grown(world: World, seconds: float) -> Grown:
+    sky = world.sky
+    world.run(SETTLE_S)
+    steady = _counted(world, seconds)
+    # Frames of the sample alone were told: all UAVs' are as many times as much.
+    scale = {"heard": sky.uavs / sky.sampled if sky.sampled else 1.0}
+    told = {
+        what: 8e-3 * size * scale.get(what, 1.0) / seconds / sky.nodes
+        for what, size in sorted(steady.sent.items())
+    }
+    received = sum(size * scale.get(what, 1.0) for what, size in steady.received.items())
+    cpu_s = sum(steady.cpu_s.values()) + sum(steady.frames_cpu_s.values()) * (scale["heard"] - 1)
+    takeover_s, orphans = _death(world)
+    names = list(world.members)
+    left = set(names[: round(HALF * len(names))])
+    world.parted = lambda one, other: (one in left) != (other in left)
+    parted = _counted(world, seconds)
+    world.parted = lambda one, other: False
+    served = steady.served + steady.twice + steady.unserved or 1
+    unserved = parted.served + parted.twice + parted.unserved or 1
+    return Grown(
+        sky.nodes,
+        sky.uavs,
+        steady.served / served,
+        steady.twice / served,
+        steady.unserved / served,
+        60 * steady.handovers / seconds,
+        told,
+        8e-3 * received / seconds / sky.nodes,
+        cpu_s / seconds / sky.nodes,
+        takeover_s,
+        orphans,
+        parted.unserved / unserved,
+        _healed_s(world),
+    )
+
+
+def _counted(world: World, seconds: float) -> Counted:
+    """What is counted over so long."""
+    world.counted = counted = Counted()
+    world.run(seconds)
+    world.counted = Counted()  # what comes later is counted elsewhere
+    return counted
+
+
+def _death(world: World) -> tuple[float | None, int]:
+    """How long the UAVs of the busiest node are unserved when it dies, and how many it served."""
+    victim = max(world.members, key=lambda name: len(world.members[name].duties.serves))
+    orphans = set(world.members[victim].duties.serves)
+    began_ns, taken = world.now_ns, dict[str, float]()
+
+    def watch() -> None:
+        for uav in orphans & world.served_by().keys():
+            taken.setdefault(uav, (world.now_ns - began_ns) * 1e-9)
+
+    world.kill(victim)
+    watched = orphans & world.servable()
+    world.run(AFTER_S, watch)
+    left = (watched & world.servable()) - taken.keys()
+    times = [taken[uav] for uav in watched if uav in taken]
+    return (None if left or not times else max(times)), len(orphans)
+
+
+def _healed_s(world: World) -> float:
+    """Time until every UAV has one node, handovers apart."""
+    began_ns, last_ns = world.now_ns, world.now_ns
+
+    def watch() -> None:
+        nonlocal last_ns
+        handed = {uav for one in world.members.values() for uav in one.duties.handing}
+        if any(len(by) > 1 and uav not in handed for uav, by in world.served_by().items()):
+            last_ns = world.now_ns
+
+    world.run(AFTER_S, watch)
+    return (last_ns - began_ns) * 1e-9
+
+
+def answer(asked: Asked, found: Sequence[Grown], command: str) -> dict[str, Any]:
+    """What was asked and found, as JSON has it."""
+    versions = {
+        "companion": companion.__version__,
+        "numpy": np.__version__,
+        "python": platform.python_version(),
+    }
+    sizes = [asdict(one) for one in found]
+    return {"sizes": sizes, "asked": asdict(asked), "command": command, "versions": versions}

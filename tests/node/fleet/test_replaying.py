@@ -1,0 +1,85 @@
+"""Recordings of a fleet's nodes, replayed together."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fleet_sky import FleetSky
+
+from companion.mavlink.wire.framing import Splitter
+from companion.node.fleet import replaying
+from companion.pipeline.fold import Pipeline
+from companion.recording.reader import LogError, read_log
+from companion.recording.writer import Writer
+from companion.settings.model import Settings
+from companion.values import Duty, Event, Frame, Tick
+
+S = 1_000_000_000
+START_NS = 1_800_000_000 * S
+
+
+def events(shift_ns: int, duties: list[tuple[float, tuple[str, ...]]]) -> list[Event]:
+    """Six seconds of two vehicles, on a clock of the node's own, and its duties."""
+    sky = FleetSky([], uavs=2)
+    found: list[Event] = []
+    for step in range(60):
+        now_ns = START_NS + shift_ns + step * S // 10
+        for number in range(2):
+            raw = sky.report(number, sky.begun_s + step / 10)
+            frame = Splitter("udp").feed(now_ns, raw)[0]
+            assert isinstance(frame, Frame)
+            doubt_ns = 700_000 if number and shift_ns else 0
+            found.append(frame._replace(doubt_ns=doubt_ns))
+        found.append(Tick(now_ns + 1))
+    found += [Duty(START_NS + round(at_s * S), uavs) for at_s, uavs in duties]
+    return sorted(found, key=lambda event: event.t_ns)
+
+
+def record(path: Path, node: str | None, made: list[Event]) -> Path:
+    """A node's recording, with the digest to which it came."""
+    settings = Settings().override(center={"source": "47.3977,8.5456,480"}, fleet={"node": node})
+    pipeline = Pipeline(settings)
+    with Writer(path, settings.to_toml(), {}, None, START_NS) as writer:
+        for event in made:
+            pipeline.step(event)
+            writer.event(event)
+        writer.close({"digest": pipeline.digest.hexdigest()})
+    return path
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("fleet")
+    a = events(0, [(0.5, ("1:1", "2:1")), (3.05, ("1:1",))])
+    b = events(5_000, [(0.5, ()), (3.0, ("2:1",)), (5.0, ("1:1", "2:1"))])
+    return [record(folder / "a.mcap", "a", a), record(folder / "b.mcap", "b", b)]
+
+
+def test_each_comes_to_its_digest_and_together_they_say_who_served_whom(
+    recorded: list[Path],
+) -> None:
+    found: dict[str, Any] = replaying.replay(recorded)
+    assert [(node["node"], node["same"]) for node in found["nodes"]] == [("a", True), ("b", True)]
+    assert found["uavs"] == 2
+    assert found["handovers"] == 1  # 2:1 from a to b
+    served = found["served"]
+    assert served["none"] == 0
+    assert served["once"] + served["twice"] == pytest.approx(1.0)
+    assert 0.05 < served["twice"] < 0.2  # 1:1 by both over the last of 5.5 seconds
+
+
+def test_a_duty_and_a_doubt_come_back_from_a_recording(recorded: list[Path]) -> None:
+    read = list(read_log(recorded[1]))
+    assert [event.serves for event in read if isinstance(event, Duty)] == [
+        (), ("2:1",), ("1:1", "2:1"),
+    ]  # fmt: skip
+    doubts = {event.doubt_ns for event in read if isinstance(event, Frame)}
+    assert doubts == {0, 700_000}
+
+
+def test_what_is_no_fleet_is_said(recorded: list[Path], tmp_path: Path) -> None:
+    alone = record(tmp_path / "alone.mcap", None, events(0, []))
+    with pytest.raises(LogError, match=r"no \[fleet\] node"):
+        replaying.replay([recorded[0], alone])
+    with pytest.raises(LogError, match="two recordings are of node a"):
+        replaying.replay([recorded[0], recorded[0]])

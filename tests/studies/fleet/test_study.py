@@ -1,0 +1,61 @@
+"""The command ``companion study fleet``: what it says, and that it says the same again."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from companion.cli.main import main
+from companion.studies.fleet import study
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    out = tmp_path_factory.mktemp("fleet")
+    sizes = ["--nodes", "2..4", "--uavs", "10..40", "--steps", "2", "--seconds", "3"]
+    ran = CliRunner().invoke(main, ["study", "fleet", *sizes, "--out", str(out), "--json"])
+    assert ran.exit_code == 0, ran.output
+    return out, json.loads(ran.stdout)
+
+
+def test_every_uav_has_one_node_and_a_death_is_followed(
+    found: tuple[Path, dict[str, Any]],
+) -> None:
+    _, answer = found
+    assert [(one["nodes"], one["uavs"]) for one in answer["sizes"]] == [(2, 10), (4, 40)]
+    for one in answer["sizes"]:
+        assert one["served"] >= 0.99
+        assert one["none"] == one["parted_none"] == 0
+        assert one["takeover_s"] is None or one["takeover_s"] <= 2.0
+        assert one["heal_s"] <= 1.5
+        assert one["told_kbps"].keys() == {"heard", "offers", "standing"}
+    small, large = answer["sizes"]
+    assert large["link_kbps"] > small["link_kbps"]
+
+
+def test_the_page_and_its_figures_are_there(found: tuple[Path, dict[str, Any]]) -> None:
+    out, answer = found
+    page = (out / "fleet.html").read_text(encoding="utf-8")
+    assert answer["command"] in page
+    assert "<td>40</td>" in page
+    for name in ("traffic", "time"):
+        assert (out / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    kept = json.loads((out / "fleet.json").read_text(encoding="utf-8"))
+    assert kept == answer
+
+
+def test_the_same_again_is_the_same(found: tuple[Path, dict[str, Any]]) -> None:
+    _, answer = found
+    asked = study.Asked(((2, 10),), seconds=3.0)
+    (again,) = study.answer(asked, list(study.run(asked, lambda: 0.0)), "")["sizes"]
+    before = answer["sizes"][0] | {"cpu_share": 0.0}
+    assert again == before
+
+
+@pytest.mark.parametrize("span", ["x", "3..", "0..5", "9..3", "1..99999"])
+def test_a_span_that_is_none_is_said(span: str, tmp_path: Path) -> None:
+    ran = CliRunner().invoke(main, ["study", "fleet", "--nodes", span, "--out", str(tmp_path)])
+    assert ran.exit_code == 2
+    assert "Traceback" not in ran.output

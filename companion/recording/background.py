@@ -35,6 +35,8 @@ RETRY_MAX_S: Final = 30.0
 """Longest time between two attempts."""
 STOP_MAX_S: Final = 30.0
 """How long the end of the service waits for a disk that does not answer."""
+GO_ON_WITH: Final = 2000
+"""Events that are written at once where a recording goes on: some hundred kilobytes."""
 ROOM_BYTES: Final = 8 << 20
 """Free space needed to resume a recording; with less it would soon end again."""
 
@@ -204,8 +206,12 @@ class BackgroundRecorder:
         if self._lost:
             t_ns = next((item.t_ns for item in self._unsafe if item.t_ns), self.written_ns or 0)
             self._writer.hole(Hole(t_ns, self._lost, self._why))
-        for item in self._unsafe:
-            self._write(item)
+        waiting = self._unsafe
+        for begin in range(0, len(waiting), GO_ON_WITH):  # what fits into little room is kept
+            for item in waiting[begin : begin + GO_ON_WITH]:
+                self._write(item)
+            self._writer.flush()
+            self._unsafe, self._lost = waiting[begin + GO_ON_WITH :], 0
         self._flush()
         self._lost = 0
         if self.failure is not None:

@@ -153,6 +153,31 @@ def test_a_full_disk_keeps_no_file_of_nothing(small_disk: Path) -> None:
     assert [path.name for path in small_disk.iterdir()] == [BALLAST]
 
 
+def test_what_fits_into_little_room_is_kept_of_what_waits(
+    small_disk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All that waited had to fit at once, and was written anew by each attempt."""
+    monkeypatch.setattr(background, "RETRY_FIRST_S", 0.05)
+    monkeypatch.setattr(background, "RETRY_MAX_S", 0.05)
+    monkeypatch.setattr(background, "ROOM_BYTES", 0)
+    monkeypatch.setattr(background, "GO_ON_WITH", 100)
+    made = recorder(small_disk)
+    made.start()
+    events = hand_over(made, ticks(1, 100))
+    wait_until(lambda: on_disk(made) == 99)
+    fill(small_disk)
+    events += hand_over(made, ticks(100, 5000))
+    wait_until(lambda: made.failure is not None)
+    before, free = made._finished_messages + on_disk(made), 20_000
+    os.truncate(small_disk / BALLAST, (small_disk / BALLAST).stat().st_size - free)
+    wait_until(lambda: made._finished_messages + on_disk(made) > before + 99)
+    (small_disk / BALLAST).unlink()
+    wait_until(lambda: made.failure is None)
+    made.stop({})
+    assert made.dropped == 0
+    assert list(log_events(parts_of(small_disk), Settings())) == events
+
+
 def test_an_outage_longer_than_the_queue_is_a_hole_that_is_told(small_disk: Path) -> None:
     made = recorder(small_disk, queue_max=1000)
     made.start()

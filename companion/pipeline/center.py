@@ -19,6 +19,7 @@ from companion.settings.center import (
 )
 from companion.settings.model import Settings
 from companion.tracking import carrier, noise
+from companion.tracking.carrier import Contradiction
 from companion.tracking.geodesy import LocalFrame
 from companion.values import (
     AltitudeDatum,
@@ -73,6 +74,7 @@ class Center:
         self.vehicle = str(self.place) if isinstance(self.place, VehicleCenter) else None
         self._home_from: tuple[str, int] | None = None  # who home began with, and when
         self._attitude: tuple[int, Attitude] | None = None  # sender's time, attitude
+        self._contradicted: Contradiction | None = None  # of the newest and the one before
         self._turns = carrier.Turns()
         self._passed: _Run | None = None  # attitudes that were stamped before the newest
         self._least_bound_rad = math.radians(settings.center.attitude_bound_deg)
@@ -146,9 +148,21 @@ class Center:
             if not self._goes_on_before(placed):
                 return None
             self._turns = carrier.Turns()
+            self._attitude = None
         self._passed = None
+        self._contradicted = self._contradicts(placed, turn_degps2)
         self._attitude = placed.sender_ns, placed.attitude
         return self._turns.look(placed.attitude, placed.sender_ns, turn_degps2)
+
+    def _contradicts(self, placed: PlacedAttitude, turn_degps2: float) -> Contradiction | None:
+        """What the newest attitude and this one are apart beyond reason: one of them is wrong."""
+        if self._attitude is None:
+            return None
+        before_ns, before = self._attitude
+        limit_degps2 = self._turns.limit_degps2(turn_degps2, placed.sender_ns)
+        bounds = carrier.AttitudeBounds(self.attitude_bound_rad, math.radians(limit_degps2))
+        apart_s = (placed.sender_ns - before_ns) * 1e-9
+        return carrier.contradiction(before, placed.attitude, apart_s, bounds)
 
     @property
     def attitude_bound_rad(self) -> float:
@@ -186,6 +200,7 @@ class Center:
         """Drop the carrier's attitude if the carrier was restarted: its stamps mean nothing now."""
         if uav == self.vehicle:
             self._attitude = None
+            self._contradicted = None
             self._estimator = None
             self._passed = None
             self._turns = carrier.Turns()
@@ -262,4 +277,5 @@ class Center:
         turn_degps2 = self._turns.limit_degps2(turn_degps2, at.sender_ns)
         bounds = carrier.AttitudeBounds(self.attitude_bound_rad, math.radians(turn_degps2))
         since_ns = at.sender_ns - made_ns
-        return carrier.moving(self.local, track, newest, attitude, since_ns, at.bound_s, bounds)
+        doubt = (at.bound_s, bounds, self._contradicted)
+        return carrier.moving(self.local, track, newest, attitude, since_ns, *doubt)

@@ -379,6 +379,22 @@ class Senders:
             if name not in wanted and name != self._carrier:
                 self._clocks.pop(name, None)
                 self._stamped_ns.pop(name, None)
+        self._forget_beside(wanted, silent_ns)
+
+    def _forget_beside(self, wanted: Container[str], silent_ns: int) -> None:
+        """Forget what senders without a track have said beside positions, as their clocks are."""
+        for heard in (self._receivers, self.presence):
+            gone = [source for source, said in heard.items() if said.t_ns < silent_ns]
+            for source in (*gone, *list(heard)[: max(0, len(heard) - CLOCKS_MAX)]):
+                name = str(source)
+                if name in wanted or name == self._carrier:
+                    continue
+                heard.pop(source, None)
+                self._known.pop(name, None)
+                if heard is self._receivers:
+                    self._noise.pop(source, None)
+                    self._apart_m2.pop(source, None)
+        self._shared = {uav for uav in self._shared if uav in wanted or uav in self._clocks}
 
     def link_share(self, link: str) -> LinkShare:
         """What a link has contributed to the reports so far."""

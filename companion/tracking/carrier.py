@@ -106,6 +106,59 @@ class AttitudeBounds:
         return min(math.pi, self.attitude_rad + rate_radps * doubt_s + turned)
 
 
+@dataclass(frozen=True, slots=True)
+class Contradiction:
+    """Two attitudes of which one at least is wrong: neither follows from the other at its rates.
+
+    apart_rad  by how much, as an angle
+    apart_s    time between them
+    """
+
+    apart_rad: float
+    apart_s: float
+
+    def at(self, age_s: float) -> float:
+        """The bound on the newer one after a time, whichever is right; rad.
+
+        A rate of turn that is wrong shows by ``apart_rad`` in ``apart_s``.
+        """
+        return min(math.pi, self.apart_rad * (1.0 + abs(age_s) / self.apart_s))
+
+
+APART_MAX_S: Final = 1.0
+"""Longest time between attitudes that are held against one another."""
+
+
+def contradiction(
+    before: Attitude, after: Attitude, apart_s: float, bounds: AttitudeBounds
+) -> Contradiction | None:
+    """Whether an attitude contradicts the one before it, beyond what both may be off.
+
+    Each is carried on to the other's time at its own rates: forward shows a wrong angle, back a
+    wrong rate. ``apart_s`` is positive.
+    """
+    if apart_s > APART_MAX_S:
+        return None
+    first = body_from_ned(before.roll_rad, before.pitch_rad, before.yaw_rad)
+    second = body_from_ned(after.roll_rad, after.pitch_rad, after.yaw_rad)
+    forward = later_body_from_body(_rates(before), apart_s) @ first @ second.T
+    back = later_body_from_body(_rates(after), -apart_s) @ second @ first.T
+    apart_rad = max(_angle(forward), _angle(back))
+    if apart_rad <= bounds.at(0.0, apart_s, STAMP_S) + bounds.attitude_rad:
+        return None
+    return Contradiction(apart_rad, apart_s)
+
+
+def _rates(attitude: Attitude) -> FloatArray:
+    return np.array([attitude.rollspeed_radps, attitude.pitchspeed_radps, attitude.yawspeed_radps])
+
+
+def _angle(rotation: FloatArray) -> float:
+    return math.acos(min(1.0, max(-1.0, (float(np.trace(rotation)) - 1.0) / 2.0)))
+
+
+STAMP_S: Final = 1e-3
+"""What a stamp of whole milliseconds may be off."""
 COMPASS_RAD: Final = 0.6
 """What compass and attitude contradict one another by at a ratio of 1, as an angle.
 
@@ -177,27 +230,33 @@ def moving(
     since_ns: int,
     doubt_s: float,
     bounds: AttitudeBounds,
+    contradicted: Contradiction | None,
 ) -> Carrier:
     """The carrier aboard a vehicle, at the time of its track.
 
-    track     the vehicle's track, which gives position, velocity and bound
-    newest    its newest report; north and down are taken there, a few metres away
-    attitude  its newest attitude, carried on at its body rates
-    since_ns  age of that attitude at the track's time
-    doubt_s   bound on the error of that age
-    bounds    bounds on the attitude and on its acceleration
+    track         the vehicle's track, which gives position, velocity and bound
+    newest        its newest report; north and down are taken there, a few metres away
+    attitude      its newest attitude, carried on at its body rates
+    since_ns      age of that attitude at the track's time
+    doubt_s       bound on the error of that age
+    bounds        bounds on the attitude and on its acceleration
+    contradicted  how the attitude before contradicts it; None: it does not
     """
-    rates = np.array([attitude.rollspeed_radps, attitude.pitchspeed_radps, attitude.yawspeed_radps])
+    rates = _rates(attitude)
+    age_s = since_ns * 1e-9
+    bound_rad = bounds.at(math.hypot(*rates.tolist()), age_s, doubt_s)
+    if contradicted is not None:
+        bound_rad = min(math.pi, bound_rad + contradicted.at(abs(age_s) + doubt_s))
     then = body_from_ned(attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad)
     local_from_ned = local.local_from_ned(newest.report.lat_deg, newest.report.lon_deg)
     return Carrier(
         track.valid_at_ns,
         track.position_ned_m,
         track.velocity_ned_mps,
-        later_body_from_body(rates, since_ns * 1e-9) @ then @ local_from_ned.T,
+        later_body_from_body(rates, age_s) @ then @ local_from_ned.T,
         rates,
         track.bound_m,
-        bounds.at(math.hypot(*rates.tolist()), since_ns * 1e-9, doubt_s),
+        bound_rad,
         track.age_s,
         track.error_p95_m,
         USUAL_ATTITUDE * bounds.attitude_rad,

@@ -10,7 +10,7 @@ import pytest
 from companion.mavlink.trust import admission
 from companion.mavlink.trust.admission import Admission
 from companion.pipeline.center import Center
-from companion.pipeline.senders import PlacedAttitude
+from companion.pipeline.senders import CLOCKS_MAX, PlacedAttitude, Senders
 from companion.settings.model import Settings
 from companion.tracking.observers.position import PositionModel, PositionObserver
 from companion.tracking.tracker import ESTABLISHED, Tracker, TrackerSettings
@@ -19,7 +19,9 @@ from companion.values import (
     Attitude,
     Estimate,
     Fix,
+    GnssStatus,
     Limits,
+    Presence,
     Reason,
     Rejection,
     Report,
@@ -98,6 +100,26 @@ def test_ids_without_end_do_not_fill_the_lists() -> None:
         assert lists.admits(f"icao:{number:06X}") is (f"{number:06X}"[0] == "4")
         assert len(lists._known) <= admission.KNOWN_MAX
     assert [lists.admits(uav) for uav in ("1:1", "1:7", "2:1")] == [True, False, False]
+
+
+def test_what_is_said_beside_positions_is_forgotten() -> None:
+    senders = Senders(Settings(), "5:1")
+
+    def heard(second: int, number: int) -> None:
+        source = Source(1 + number % 250, 1 + number // 250)
+        beside = GnssStatus(second * S, source, 3, None, 0.0, None, None, None)
+        senders._receivers[source] = beside
+        senders._noise[source] = ReportNoise(1.0, 1.0, 1.0, 1.0)
+        senders._apart_m2[source] = 1.0
+        senders.presence[source] = Presence(second * S, source, 2, 3, 4, False)
+
+    for number in range(CLOCKS_MAX + 100):
+        heard(1, number)
+    tables = (senders._receivers, senders._noise, senders._apart_m2, senders.presence)
+    senders.forget_clocks(frozenset(["1:1"]), 2 * S)
+    assert [len(table) for table in tables] == [CLOCKS_MAX + 2] * 4
+    senders.forget_clocks(frozenset(["1:1"]), 4000 * S)
+    assert [set(map(str, table)) for table in tables] == [{"1:1", "5:1"}] * 4
 
 
 # --- attitudes of the carrier -------------------------------------------------------------------

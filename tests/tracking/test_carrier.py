@@ -113,7 +113,7 @@ def test_a_vehicle_s_attitude_is_carried_on_to_the_time_of_use(fix: Callable[...
     )  # fmt: skip
     attitude = Attitude(0, Source(5, 1), 0, 0.2, -0.1, 1.0, 0.3, -0.2, 0.5)
     newest = _at(fix, *far)
-    found = carrier.moving(local, track, newest, attitude, S + S // 4, 0.0, HELD)
+    found = carrier.moving(local, track, newest, attitude, S + S // 4, 0.0, HELD, None)
     rates = np.array([0.3, -0.2, 0.5])
     then = oracle(0.2, -0.1, 1.0) @ local.local_from_ned(*far).T
     assert found.body_from_local == pytest.approx(integrated(rates, 1.25) @ then, abs=1e-9)
@@ -125,7 +125,7 @@ def test_a_vehicle_s_attitude_is_carried_on_to_the_time_of_use(fix: Callable[...
     assert found.velocity_ned_mps.tolist() == [4, 5, 6]
     assert found.body_rates_radps.tolist() == [0.3, -0.2, 0.5]
     silent = replace(track, velocity_ned_mps=None)
-    unknown = carrier.moving(local, silent, newest, attitude, S + S // 4, 0.0, HELD)
+    unknown = carrier.moving(local, silent, newest, attitude, S + S // 4, 0.0, HELD, None)
     assert unknown.velocity_ned_mps is None
 
 

@@ -47,14 +47,19 @@ class Capacity:
     update_s: float
 
 
-def measure(settings: Settings, clock_s: Callable[[], float] = time.process_time) -> Capacity:
-    """Fly ``FEW`` and then ``MORE`` UAVs about an array of these settings; takes a second or so."""
+def measure(
+    settings: Settings, clock_s: Callable[[], float] = time.process_time, processor: float = 1.0
+) -> Capacity:
+    """Fly ``FEW`` and then ``MORE`` UAVs about an array of these settings; takes a second or so.
+
+    ``processor`` is the share of one that this process is allowed at all.
+    """
     update_hz = settings.beams.update_hz
     few, more = (_flown(settings, number, clock_s) for number in (FEW, MORE))
     report_s = (few.report_s + more.report_s) / 2
     each_s = max(0.0, (more.update_s - few.update_s) / (MORE - FEW))
     alone_s = max(0.0, more.update_s - MORE * each_s)
-    spare = SHARE - update_hz * alone_s
+    spare = SHARE * processor - update_hz * alone_s
     uavs = int(max(0.0, spare) / (RATE_HZ * report_s + update_hz * each_s))
     return Capacity(None if uavs > MOST else uavs, report_s, more.update_s)
 

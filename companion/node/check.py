@@ -71,7 +71,8 @@ def check(
 
 def _capacity(settings: Settings) -> Finding:
     try:
-        found = capacity.measure(embedded(settings))
+        share = machine.processor_share()
+        found = capacity.measure(embedded(settings), processor=share)
     except UserError as error:
         return Finding("settings", Grade.FAULT, str(error), "mend them, or the file they name")
     most = f"more than {capacity.MOST}" if found.uavs is None else f"some {found.uavs}"
@@ -80,6 +81,8 @@ def _capacity(settings: Settings) -> Finding:
         f" (a report takes {found.report_s * 1e3:.2f} ms,"
         f" an update of {capacity.MORE} beams {found.update_s * 1e3:.1f} ms)"
     )
+    if share < 1:
+        text += f"; this process is allowed {share * 100:.0f} % of a processor"
     if found.uavs is not None and found.uavs < capacity.FEW:
         return Finding("capacity", Grade.DOUBT, text, "lower [beams] update_hz")
     return Finding("capacity", Grade.OK, text)

@@ -3,6 +3,7 @@
 import ctypes
 import errno
 import grp
+import math
 import os
 import shutil
 import socket
@@ -135,6 +136,41 @@ def _disk(folder: Path) -> Finding:
     if free < SCARCE_BYTES:
         return Finding(subject, Grade.DOUBT, text, "make room: a full disk ends a recording")
     return Finding(subject, Grade.OK, text)
+
+
+def processor_share(root: Path = Path("/")) -> float:
+    """The share of one processor that this process may have by its control groups; 1: all of it.
+
+    A quota, as of a container, stops the process for a part of the time, of which the time that it
+    takes of a processor knows nothing. ``root`` is where the system's files are.
+    """
+    try:
+        lines = (root / "proc/self/cgroup").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return 1.0  # not Linux
+    shares = [1.0]
+    for line in lines:
+        _, kinds, path = line.split(":", 2)
+        if kinds and "cpu" not in kinds.split(","):
+            continue
+        top = root / "sys/fs/cgroup" / ("cpu" if kinds else "")
+        inner = top / path.lstrip("/")
+        shares += [
+            _quota(folder) for folder in (inner, *inner.parents) if top in (folder, *folder.parents)
+        ]
+    return min(shares)
+
+
+def _quota(folder: Path) -> float:
+    """The quota of one control group, of either version; infinite where it has none."""
+    names = (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us"))
+    for name in names:
+        try:
+            quota, period = " ".join((folder / one).read_text() for one in name).split()
+            return float(quota) / float(period) if float(quota) > 0 else math.inf
+        except (OSError, ValueError):  # none, "max", or the other version
+            continue
+    return math.inf
 
 
 def _clock() -> Iterator[Finding]:

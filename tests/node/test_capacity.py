@@ -1,8 +1,11 @@
 """What a machine carries, by a clock that is the test's own."""
 
+from pathlib import Path
+
 import pytest
 
 from companion.node import capacity
+from companion.node.machine import processor_share
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
 from companion.values import Rejection
@@ -45,3 +48,31 @@ def test_the_sky_is_one_that_the_pipeline_believes() -> None:
     assert refused == []
     assert pipeline.last_update is not None
     assert len(pipeline.last_update.beams.beams) == capacity.MORE
+
+
+@pytest.mark.parametrize(
+    ("groups", "files", "share"),
+    [
+        ("0::/\n", {"cpu.max": "50000 100000\n"}, 0.5),
+        ("0::/a/b\n", {"a/cpu.max": "20000 100000\n", "a/b/cpu.max": "max 100000\n"}, 0.2),
+        ("4:cpu,cpuacct:/x\n1:pids:/\n",
+         {"cpu/x/cpu.cfs_quota_us": "75000\n", "cpu/x/cpu.cfs_period_us": "100000\n"}, 0.75),
+        ("4:cpu:/\n", {"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"}, 1.0),
+        ("0::/\n", {"cpu.max": "300000 100000\n"}, 1.0),
+        ("0::/gone\n", {}, 1.0),
+    ],
+)  # fmt: skip
+def test_a_quota_of_the_processor_is_known(
+    tmp_path: Path, groups: str, files: dict[str, str], share: float
+) -> None:
+    made = {f"sys/fs/cgroup/{name}": text for name, text in files.items()}
+    for name, text in {"proc/self/cgroup": groups, **made}.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert processor_share(tmp_path) == share
+
+
+def test_half_a_processor_carries_about_half() -> None:
+    found = capacity.measure(Settings(), Slow(0.0011), processor=0.5)
+    spare = 0.5 * capacity.SHARE - 10 * 0.0011
+    assert found.uavs == int(spare / (capacity.RATE_HZ * 0.0011))

@@ -92,7 +92,9 @@ class Page(threading.Thread):
         self._url = node.url.replace("http", "ws") + STREAM
 
     def run(self) -> None:
-        run_async(self._read())
+        while not self.until.is_set():  # a hang is a shorter time than a soak
+            with contextlib.suppress(TimeoutError):
+                run_async(self._read())
 
     async def _read(self) -> None:
         async with connect(self._url, max_size=None) as stream:
@@ -167,6 +169,8 @@ def tell(table: Any, seconds: float, seen: Seen) -> None:
     health_ms = float(np.percentile(seen.healthy_s, 99)) * 1e3
     age_s = float(np.percentile(seen.ages_s, 99))
     name = f"{seconds:.0f} s of all faults: "
+    tenth = max(1, len(seen.memory_mb) // 10)
+    print("MB by the tenth:", *(f"{mb:.0f}" for mb in seen.memory_mb[::tenth]))
     table.add(name + "memory at the end", seen.memory_mb[-1], "MB", "flat")
     table.add(name + "grown since a quarter", grown_mb, "MB", f"< {GROWS_MB:g} MB")
     table.add(name + "/healthz, p99", health_ms, "ms", "-")

@@ -29,6 +29,8 @@ STANDING_S: Final = 0.2
 """Time between two words of this node on what it does."""
 ASKED_S: Final = 0.5
 """Time between two questions for another node's clock."""
+LOOK_S: Final = 0.3
+"""Time between two looks at what to offer; its multiples are not those of updates."""
 OFFERED_S: Final = 1.0
 """Time between two tellings of offers, and of tracks."""
 _CLOCK: Final = struct.Struct("<qq")
@@ -104,6 +106,7 @@ class FleetNode:
                 group.create_task(self._repeat(STANDING_S, self._stand), name="standing")
                 group.create_task(self._repeat(ASKED_S, self._ask), name="clocks")
                 group.create_task(self._repeat(OFFERED_S, self._offer), name="offers")
+                group.create_task(self._repeat(LOOK_S, self._offers.look), name="looks")
         finally:
             self._bus = None
             if self._flushing is not None:
@@ -143,7 +146,6 @@ class FleetNode:
 
     def ticked(self, now_ns: int) -> None:
         """Decide whom this node serves. Call it at every update, after the pipeline had it."""
-        self._offers.look(now_ns)
         duty, notices = self.member.decide(now_ns)
         if duty is not None:
             self._step(duty)

@@ -95,6 +95,8 @@ class Service:
         self._traffic.open()
         self._outlet.open()
         self._push.open()
+        if self.fleet is not None:
+            self.fleet.open()
         self._recorder = self._open_recorder()
 
     async def run(

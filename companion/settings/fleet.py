@@ -11,8 +11,13 @@ from companion.values import UserError
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
 
 
+def is_node_name(text: str) -> bool:
+    """Whether a node may have this name."""
+    return _NAME.fullmatch(text) is not None
+
+
 def _name(text: str) -> str:
-    if not _NAME.fullmatch(text):
+    if not is_node_name(text):
         raise UserError(f"{text!r}: letters, digits, dot, dash and underscore, at most 32")
     return text
 

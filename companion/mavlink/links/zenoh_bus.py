@@ -46,19 +46,36 @@ class BusStatus:
     dropped: int
 
 
+def open_peer(config: BusConfig) -> "zenoh.Session":
+    """The session of a peer, before there is a loop; blocks. Raises ``UserError`` as ``open``."""
+    with needs("zenoh", "fleet", "Zenoh"):
+        import zenoh
+    try:
+        return zenoh.open(_configured(config))
+    except zenoh.ZError as error:
+        raise UserError(f"Zenoh: {_said(error)}") from error
+
+
 class Bus:
     """A Zenoh session. All methods but ``open`` and ``close`` are called on the loop.
+
+    ``session`` is one that is open already (``open_peer``); None: ``open`` opens one.
 
     ``run`` raises what a callback raised: after that nothing more is handed over.
     """
 
-    def __init__(self, config: BusConfig, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(
+        self,
+        config: BusConfig,
+        loop: asyncio.AbstractEventLoop,
+        session: "zenoh.Session | None" = None,
+    ) -> None:
         self._config = config
         self._sent = 0
         self._refused = 0
         self._to_loop = ToLoop(loop)
         self._ended = threading.Event()
-        self._session: zenoh.Session | None = None
+        self._session = session
         self._publishers: dict[tuple[str, Priority, bool, bool], zenoh.Publisher] = {}
         self._declared: list[Any] = []  # what ends when nobody holds it any more
 

@@ -8,9 +8,9 @@ import struct
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from companion.mavlink.links.zenoh_bus import Bus
+from companion.mavlink.links.zenoh_bus import Bus, open_peer
 from companion.mavlink.links.zenoh_config import BusConfig, BusTls
 from companion.node.fleet import messages
 from companion.node.fleet.messages import FleetMessageError
@@ -19,9 +19,9 @@ from companion.pipeline.fleet.offers import Offers
 from companion.pipeline.fleet.surroundings import Surroundings
 from companion.pipeline.fold import Pipeline
 from companion.recording import codec, schemas
-from companion.settings.fleet import FleetSettings
+from companion.settings.fleet import FleetSettings, is_node_name
 from companion.settings.section import ConfigError
-from companion.values import Event, Frame, Notice, RoundTrip, Severity
+from companion.values import Event, Frame, Notice, RoundTrip, Severity, UserError
 from companion.views.fleet import FleetStatus
 
 PREFIX: Final = "companion"
@@ -88,17 +88,28 @@ class FleetNode:
         self.member = Member(self.name, settings, pipeline.array.size, self._started_ns)
         self._around = Surroundings(pipeline, self.member)
         self._offers = Offers(pipeline, self.member.hearing.silent_s)
-        self._bus: Bus | None = None
+        self._session: Any = None  # of a peer, opened before there was a loop
+        self._bus: Bus | None = None  # once all is declared
         self._flushing: asyncio.TimerHandle | None = None
         self._has_twin = False
 
     # --- while it runs ----------------------------------------------------------------------
 
+    def open(self) -> None:
+        """Claim what can be had before the loop runs; blocks.
+
+        Raises ``UserError`` where Zenoh or an endpoint cannot be had. A client's session needs its
+        router, for which nobody waits here.
+        """
+        if self.settings.mode == "peer":
+            self._session = open_peer(self._config)
+
     async def run(self) -> None:
-        """Take part until cancelled. Raises ``UserError`` where Zenoh cannot be had."""
-        bus = Bus(self._config, asyncio.get_running_loop())
+        """Take part until cancelled; a client that cannot says so, and serves alone."""
+        bus = Bus(self._config, asyncio.get_running_loop(), self._session)
         try:
-            await asyncio.to_thread(bus.open)
+            if self._session is None:
+                await asyncio.to_thread(bus.open)
             self._bus = bus
             self._declare(bus)
             async with asyncio.TaskGroup() as group:
@@ -107,6 +118,8 @@ class FleetNode:
                 group.create_task(self._repeat(ASKED_S, self._ask), name="clocks")
                 group.create_task(self._repeat(OFFERED_S, self._offer), name="offers")
                 group.create_task(self._repeat(LOOK_S, self._offers.look), name="looks")
+        except UserError as error:
+            self._notify(Notice(self._now_ns(), Severity.ERROR, "fleet", f"no fleet: {error}"))
         finally:
             self._bus = None
             if self._flushing is not None:
@@ -214,14 +227,23 @@ class FleetNode:
 
     # --- what it hears of others ------------------------------------------------------------
 
+    def _node(self, key: str) -> str | None:
+        """The node that a key is of; None, and counted, where its name is none."""
+        node = key.split("/")[-2]
+        if is_node_name(node):
+            return node
+        self.damaged += 1
+        return None
+
     def _taking(self, take: Callable[[str, bytes], None]) -> Callable[[str, bytes], None]:
         """What takes samples of other nodes, counts them, and refuses those that are none."""
 
         def taken(key: str, payload: bytes) -> None:
-            node = key.split("/")[-2]
+            node = self._node(key)
             self._heard.bytes += len(payload)
             try:
-                take(node, payload)
+                if node is not None:
+                    take(node, payload)
             except FleetMessageError:
                 self.damaged += 1
 
@@ -245,8 +267,8 @@ class FleetNode:
         self.member.offered(self._now_ns(), node, messages.to_offers(payload))
 
     def _seen(self, key: str, is_alive: bool) -> None:
-        node = key.split("/")[-2]
-        if node == self.name:
+        node = self._node(key)
+        if node is None or node == self.name:
             return
         if not is_alive:
             self._tell(self.member.left(self._now_ns(), node))
@@ -282,6 +304,8 @@ def bus_config(settings: FleetSettings) -> BusConfig:
         tls = BusTls(Path(settings.ca), Path(settings.certificate), Path(settings.key))
     elif settings.certificate is not None or settings.key is not None:
         raise ConfigError("fleet.certificate: fleet.ca is needed as well")
+    if settings.mode == "client" and not settings.connect:
+        raise ConfigError("fleet.connect: a client needs a router to connect to")
     return BusConfig(
         mode=settings.mode,
         listen=settings.listen if settings.mode == "peer" else (),

@@ -7,12 +7,11 @@ import asyncio
 import struct
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Final
 
 from companion.mavlink.links.zenoh_bus import Bus, open_peer
-from companion.mavlink.links.zenoh_config import BusConfig, BusTls
 from companion.node.fleet import messages
+from companion.node.fleet.config import bus_config
 from companion.node.fleet.messages import FleetMessageError
 from companion.pipeline.fleet.member import Member
 from companion.pipeline.fleet.offers import Offers
@@ -20,7 +19,6 @@ from companion.pipeline.fleet.surroundings import Surroundings
 from companion.pipeline.fold import Pipeline
 from companion.recording import codec, schemas
 from companion.settings.fleet import FleetSettings, is_node_name
-from companion.settings.section import ConfigError
 from companion.values import Event, Frame, Notice, RoundTrip, Severity, UserError
 from companion.views.fleet import FleetStatus
 
@@ -293,25 +291,3 @@ class FleetNode:
         """This node's place in the fleet."""
         rates = self._sent.bps, self._heard.bps
         return FleetStatus(self.member, self.settings.site, *rates, self.damaged)
-
-
-def bus_config(settings: FleetSettings) -> BusConfig:
-    """What the settings say of the Zenoh session. Raises ``ConfigError``."""
-    tls = None
-    if settings.ca is not None:
-        if settings.certificate is None or settings.key is None:
-            raise ConfigError("fleet.ca: a certificate and its key are needed as well")
-        tls = BusTls(Path(settings.ca), Path(settings.certificate), Path(settings.key))
-    elif settings.certificate is not None or settings.key is not None:
-        raise ConfigError("fleet.certificate: fleet.ca is needed as well")
-    if settings.mode == "client" and not settings.connect:
-        raise ConfigError("fleet.connect: a client needs a router to connect to")
-    return BusConfig(
-        mode=settings.mode,
-        listen=settings.listen if settings.mode == "peer" else (),
-        connect=settings.connect,
-        tls=tls,
-        access_control=None if settings.access_control is None else Path(settings.access_control),
-        lease_s=settings.lease_s,
-        attempt_s=settings.attempt_s,
-    )

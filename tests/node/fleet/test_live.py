@@ -4,7 +4,8 @@ import socket
 
 import pytest
 
-from companion.node.fleet.live import FleetNode, bus_config
+from companion.node.fleet.config import bus_config
+from companion.node.fleet.live import FleetNode
 from companion.pipeline.fold import Pipeline
 from companion.settings.fleet import FleetSettings
 from companion.settings.model import Settings

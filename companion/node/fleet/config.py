@@ -1,4 +1,4 @@
-"""What the settings of a fleet say of its Zenoh session.                                  [shell]"""
+"""What the settings of a fleet say of its Zenoh session."""
 
 from pathlib import Path
 

@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from companion.values import Beam, Blame, Carrier, Cause, LeftOut, Reason, Track
+from companion.values import Beam, Blame, Carrier, Cause, LeftOut, Reason, Track, TrackState
 
 CROWDED_DB: Final = 3.0
 """Loss against a beam for a UAV alone from which on the other UAVs are to blame."""
@@ -47,6 +47,24 @@ def of_left_out(out: LeftOut, track: Track, unfit: str | None) -> Blame:
         case _:
             remedy = "turn the array or its carrier, or fly elsewhere"
     return Blame(out.cause, out.reason, remedy)
+
+
+def of_unserved(track: Track, *, reached: bool, full: bool) -> Blame:
+    """Why no node of the fleet serves a UAV.
+
+    reached  some node's array has a gain towards it
+    full     each of those serves as many as it may
+    """
+    if track.state in (TrackState.STALE, TrackState.LOST):
+        return _silent(track)
+    if not reached:
+        remedy = "turn an array, or fly elsewhere"
+        return Blame(Cause.COVERAGE, "no node of the fleet reaches it", remedy)
+    if full:
+        remedy = "raise [fleet] most, or add a node"
+        return Blame(Cause.UNSERVED, "every node that reaches it is full", remedy)
+    remedy = "one takes it within seconds; if not, see the fleet's nodes"
+    return Blame(Cause.UNSERVED, "no node of the fleet serves it", remedy)
 
 
 def of_beam(

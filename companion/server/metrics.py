@@ -15,6 +15,7 @@ from prometheus_client.core import (
 from prometheus_client.registry import Collector
 
 import companion
+from companion.server.fleet_metrics import fleet_metrics
 from companion.server.stream import Stream
 from companion.values import Level
 from companion.views.state import Node
@@ -34,6 +35,7 @@ class NodeCollector(Collector):
         yield from self._links()
         yield from self._uavs()
         yield from self._verdicts()
+        yield from fleet_metrics(self._node)
         yield from self._recording()
 
     def _service(self) -> Iterator[Metric]:

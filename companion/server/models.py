@@ -98,12 +98,13 @@ class LinkHealth(BaseModel):
             "coverage",
             "range",
             "machine",
+            "unserved",
         ]
         | None
     )
     reason: Annotated[str | None, Field(examples=["reports 1.1 s apart"])]
     remedy: Annotated[str | None, Field(examples=["ask for 10 Hz ([presence] position_hz)"])]
-    since: Time
+    since: Time | None
     needed_gain_db: float | None
     guaranteed_gain_db: float | None
     likely_gain_db: float | None
@@ -127,6 +128,7 @@ class UavState(BaseModel):
     verdict: Literal["good", "weak", "none"] | None
     health: LinkHealth | None
     target: bool
+    served_by: list[str] | None
     same_as: Uav | None
     callsign: Annotated[str | None, Field(examples=["SWR12A"])]
     relays: list[str]
@@ -402,6 +404,7 @@ class Status(BaseModel):
     """The service at a glance; ``replay`` is null where it is live."""
 
     version: str
+    node: Annotated[str | None, Field(examples=["north"])]
     time: Time
     uptime_s: float
     center: Center

@@ -32,6 +32,7 @@ class Cause(StrEnum):
     COVERAGE  the array does not reach that direction
     RANGE     the whole gain of the array would not be enough there
     MACHINE   this machine does not keep up
+    UNSERVED  no node of the fleet serves it
     """
 
     CARRIER = "carrier"
@@ -46,6 +47,7 @@ class Cause(StrEnum):
     COVERAGE = "coverage"
     RANGE = "range"
     MACHINE = "machine"
+    UNSERVED = "unserved"
 
 
 @dataclass(frozen=True, slots=True)

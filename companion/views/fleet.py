@@ -1,16 +1,22 @@
 """The fleet as the API shows it: nodes, who serves whom, what each offers, handovers."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
+from companion.pipeline import blame
+from companion.pipeline.fleet.assignment import worth_db
 from companion.pipeline.fleet.member import Member, Neighbour
 from companion.pipeline.fold import Pipeline
-from companion.values import Offer
+from companion.values import Blame, Offer, Standing
 from companion.views.words import rfc3339
 
 Json = dict[str, Any]
+
+STATES: Final = ("here", "there", "silent", "aside")
+"""What a node is: this one; another, whose word holds; one that says nothing; one not believed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +35,46 @@ class FleetStatus:
     sent_bps: float
     heard_bps: float
     damaged: int
+
+
+@dataclass(frozen=True, slots=True)
+class Served:
+    """Who serves the UAVs for which beams are wanted.
+
+    node       this node
+    by         nodes that serve each UAV, those put aside not among them
+    nobody     why nobody serves a UAV, for each such UAV
+    elsewhere  how many other nodes serve, and this one does not
+    """
+
+    node: str
+    by: Mapping[str, list[str]]
+    nobody: Mapping[str, Blame]
+    elsewhere: int
+
+    def is_here(self, uav: str) -> bool:
+        """Whether this node serves a UAV. A verdict on another is of the time when it did."""
+        return self.node in self.by.get(uav, [])
+
+
+def served(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Served | None:
+    """Who serves whom, and why nobody does; None where there is no fleet."""
+    if status is None:
+        return None
+    member = status.member
+    by = _served_by(member, now_ns)
+    wanted = [uav for uav in pipeline.tracker.uavs if pipeline.targets.wants(uav)]
+    alone = [uav for uav in wanted if uav not in by]
+    tracks = pipeline.tracks(now_ns, now_ns, alone) if alone else []
+    full = _full(member, now_ns) if tracks else {}
+    offers = _offers(member) if tracks else {}
+    nobody = dict[str, Blame]()
+    for track in tracks:
+        given = offers.get(track.uav, {})
+        able = [full.get(node, False) for node, one in given.items() if worth_db(one) is not None]
+        nobody[track.uav] = blame.of_unserved(track, reached=bool(able), full=all(able))
+    elsewhere = sum(uav in by and member.name not in by[uav] for uav in wanted)
+    return Served(member.name, by, nobody, elsewhere)
 
 
 def fleet(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Json:
@@ -50,7 +96,7 @@ def fleet(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Json:
         "valid_at": rfc3339(pipeline.utc_ns(now_ns)),
         "node": member.name,
         "site": status.site,
-        "nodes": _nodes(member, now_ns),
+        "nodes": nodes(member, now_ns),
         "uavs": _uavs(member, now_ns),
         "handovers": [
             {
@@ -67,7 +113,7 @@ def fleet(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Json:
     }
 
 
-def _nodes(member: Member, now_ns: int) -> list[Json]:
+def nodes(member: Member, now_ns: int) -> list[Json]:
     """This node, then the others by name."""
     own = {
         "node": member.name,
@@ -122,25 +168,50 @@ def _place(place: tuple[float, float, float] | None) -> Json | None:
     return None if place is None else dict(zip(("lat_deg", "lon_deg", "alt_m"), place, strict=True))
 
 
+def _offers(member: Member) -> dict[str, dict[str, Offer]]:
+    """What each node that is believed offers, by UAV and node."""
+    found: dict[str, dict[str, Offer]] = {}
+    for uav, offer in member.offers.items():
+        found.setdefault(uav, {})[member.name] = offer
+    for name in sorted(filter(member.trust.believes, member.neighbours)):
+        for uav, offer in (member.neighbours[name].offers or {}).items():
+            found.setdefault(uav, {})[name] = offer
+    return found
+
+
+def _standing(member: Member, now_ns: int) -> dict[str, Standing]:
+    """The other nodes that are there and believed, by name."""
+    others = sorted(member.duties.others(now_ns).items())
+    return {name: said for name, said in others if member.trust.believes(name)}
+
+
+def _full(member: Member, now_ns: int) -> dict[str, bool]:
+    """Whether each node that is there serves as many as it may."""
+    others = _standing(member, now_ns).items()
+    full = {name: len(said.serves) >= said.most for name, said in others}
+    return full | {member.name: len(member.duties.serves) >= member.most}
+
+
+def _served_by(member: Member, now_ns: int) -> dict[str, list[str]]:
+    """The nodes that serve each UAV, this one first; nodes put aside are not believed."""
+    served_by: dict[str, list[str]] = {uav: [member.name] for uav in member.duties.serves}
+    for name, said in _standing(member, now_ns).items():
+        for uav, _ in said.serves:
+            served_by.setdefault(uav, []).append(name)
+    return served_by
+
+
 def _uavs(member: Member, now_ns: int) -> list[Json]:
     """Every UAV that some node offers to serve or serves, and by whom it is served."""
-    offers: dict[str, dict[str, Offer]] = {}
-    for uav, offer in member.offers.items():
-        offers.setdefault(uav, {})[member.name] = offer
-    served: dict[str, list[str]] = {uav: [member.name] for uav in member.duties.serves}
+    offers, by = _offers(member), _served_by(member, now_ns)
     handing = dict(member.duties.handing)
-    for name in sorted(member.neighbours):
-        for uav, offer in (member.neighbours[name].offers or {}).items():
-            offers.setdefault(uav, {})[name] = offer
-    for name, said in sorted(member.duties.others(now_ns).items()):
-        for uav, _ in said.serves:
-            served.setdefault(uav, []).append(name)
+    for said in _standing(member, now_ns).values():
         handing |= dict(said.handing)
     unconfirmed = member.trust.unconfirmed
     return [
         {
             "uav": uav,
-            "served_by": served.get(uav, []),
+            "served_by": by.get(uav, []),
             "handing_to": handing.get(uav),
             "unconfirmed": uav in unconfirmed,
             "offers": [
@@ -154,7 +225,7 @@ def _uavs(member: Member, now_ns: int) -> list[Json]:
                 for name, offer in sorted(offers.get(uav, {}).items())
             ],
         }
-        for uav in sorted({*offers, *served}, key=_natural)
+        for uav in sorted({*offers, *by}, key=_natural)
     ]
 
 

@@ -7,7 +7,7 @@ from typing import Any, Final
 from companion.pipeline.fold import Pipeline
 from companion.values import Level, Notice, Verdict, reports_itself
 from companion.views import health, link_state
-from companion.views.state import Node
+from companion.views.state import Node, summary
 from companion.views.words import rfc3339
 
 Json = dict[str, Any]
@@ -24,7 +24,7 @@ def glance(node: Node) -> Json:
     recording = node.recording()
     return {
         "at": rfc3339(pipeline.utc_ns(now_ns)),
-        **health.summary(verdicts.values(), machine),
+        **summary(node, now_ns),
         "unfit": node.unfit(),
         "links": [
             {"url": link.url, "state": link.state, "frames": link.frames} for link in node.links()
@@ -52,7 +52,7 @@ def line(node: Node) -> str:
     if frames_hz is not None:
         parts[0] += f", {frames_hz:.0f} frames/s"
     machine = health.behind(node.arrival_lag.seen(now_ns))
-    parts.append(health.summary(verdicts.values(), machine)["headline"])
+    parts.append(summary(node, now_ns)["headline"])
     if machine is not None:
         parts.append(machine.reason)
     elif node.unfit():

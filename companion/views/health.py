@@ -26,8 +26,18 @@ def behind(seen: LagSeen) -> Blame | None:
     )
 
 
-def verdict(found: Verdict | None, machine: Blame | None, utc_ns: Callable[[int], UtcNs]) -> Json:
-    """The fields of one UAV: ``verdict``, and ``health`` with what is behind it."""
+def verdict(
+    found: Verdict | None,
+    machine: Blame | None,
+    utc_ns: Callable[[int], UtcNs],
+    unserved: Blame | None = None,
+) -> Json:
+    """The fields of one UAV: ``verdict``, and ``health`` with what is behind it.
+
+    ``unserved`` is why no node of the fleet serves it, where none does: it has no link then.
+    """
+    if unserved is not None:
+        return {"verdict": str(Level.NONE), "health": _behind_none(machine or unserved)}
     if found is None:
         return {"verdict": None, "health": None}
     why = None if found.level is Level.GOOD else machine or found.blame
@@ -45,14 +55,35 @@ def verdict(found: Verdict | None, machine: Blame | None, utc_ns: Callable[[int]
     }
 
 
-def summary(verdicts: Iterable[Verdict], machine: Blame | None) -> Json:
-    """How many links there are of each level, the same in words, and whether all of it is late."""
+def _behind_none(why: Blame) -> Json:
+    """``health`` of a UAV that nobody serves: since when is not kept, and there are no gains."""
+    return {
+        "cause": str(why.cause),
+        "reason": why.reason,
+        "remedy": why.remedy,
+        "since": None,
+        "needed_gain_db": None,
+        "guaranteed_gain_db": None,
+        "likely_gain_db": None,
+    }
+
+
+def summary(
+    verdicts: Iterable[Verdict], machine: Blame | None, *, unserved: int = 0, elsewhere: int = 0
+) -> Json:
+    """How many links there are of each level, the same in words, and whether all of it is late.
+
+    ``unserved`` UAVs no node of the fleet serves; ``elsewhere`` are with other nodes.
+    """
     counts = Counter(found.level for found in verdicts)
+    counts[Level.NONE] += unserved
     good, total = counts[Level.GOOD], counts.total()
+    parts = [f"{good} of {total} links good"] if total else []
+    parts += [f"{elsewhere} with other nodes"] if elsewhere else []
     return {
         "good": good,
         "weak": counts[Level.WEAK],
         "none": counts[Level.NONE],
-        "headline": f"{good} of {total} links good" if total else "no UAV to aim at",
+        "headline": ", ".join(parts) or "no UAV to aim at",
         "behind": None if machine is None else machine.reason,
     }

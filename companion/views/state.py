@@ -15,7 +15,8 @@ from companion.pipeline.fold import Pipeline
 from companion.settings.origins import Origins
 from companion.values import Blame, Carrier, Fix, FloatArray, Notice, Track
 from companion.views import center_state, health, link_state
-from companion.views.fleet import FleetStatus
+from companion.views import fleet as fleet_view
+from companion.views.fleet import FleetStatus, Served
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
 from companion.views.series import Series
@@ -119,14 +120,14 @@ def status(node: Node, version: str) -> Json:
     """The answer of ``/v1/status``."""
     pipeline, now_ns = node.pipeline, node.now_ns()
     recording, replay = node.recording(), node.replay()
+    fleet_status = node.fleet_status()
     return {
         "version": version,
+        "node": None if fleet_status is None else fleet_status.member.name,
         "time": rfc3339(pipeline.utc_ns(now_ns)),
         "uptime_s": node.uptime_s(),
         "center": center_state.center(pipeline, now_ns),
-        "health": health.summary(
-            pipeline.health.verdicts.values(), health.behind(node.arrival_lag.seen(now_ns))
-        ),
+        "health": summary(node, now_ns),
         "links": [
             link_state.link(item, pipeline.senders.link_share(item.url), now_ns)
             for item in node.links()
@@ -150,6 +151,18 @@ def status(node: Node, version: str) -> Json:
     }
 
 
+def summary(node: Node, now_ns: int) -> Json:
+    """How good the links are, those included that no node of a fleet serves."""
+    pipeline = node.pipeline
+    served = fleet_view.served(pipeline, node.fleet_status(), now_ns)
+    verdicts, machine = pipeline.health.verdicts, health.behind(node.arrival_lag.seen(now_ns))
+    if served is None:
+        return health.summary(verdicts.values(), machine)
+    here = [one for uav, one in verdicts.items() if served.is_here(uav)]
+    nobody, elsewhere = len(served.nobody), served.elsewhere
+    return health.summary(here, machine, unserved=nobody, elsewhere=elsewhere)
+
+
 def uavs(node: Node, only: str | None = None) -> list[Json]:
     """Every UAV, or one, as it is now."""
     pipeline, now_ns = node.pipeline, node.now_ns()
@@ -163,8 +176,9 @@ def uavs(node: Node, only: str | None = None) -> list[Json]:
     places = np.array([track.position_ned_m for track in tracks])
     geodetic = zip(*pipeline.local.geodetic(places), strict=True)
     machine = health.behind(node.arrival_lag.seen(now_ns))
+    served = fleet_view.served(pipeline, node.fleet_status(), now_ns)
     return [
-        uav(pipeline, track, carrier, tuple(map(float, place)), machine)
+        uav(pipeline, track, carrier, tuple(map(float, place)), machine, served)
         for track, place in zip(tracks, geodetic, strict=True)
     ]
 
@@ -175,23 +189,29 @@ def uav(
     carrier: Carrier | None,
     place: tuple[float, ...],
     machine: Blame | None,
+    served: Served | None,
 ) -> Json:
     """One entry of ``/v1/uavs``.
 
     ``place`` is latitude, longitude and height; ``machine`` is to blame for all links where it is
-    behind.
+    behind; ``served`` says which node of the fleet serves whom.
     """
     offset = None if carrier is None else track.position_ned_m - carrier.position_ned_m
     north, east, down = (None, None, None) if offset is None else map(float, offset)
     velocity = vector(track.velocity_ned_mps)
     refused = pipeline.refusals.of(track.uav)
+    is_target = pipeline.targets.wants(track.uav)
+    is_here = served is None or served.is_here(track.uav)
+    judged = pipeline.health.verdicts.get(track.uav) if is_here else None
+    unserved = None if served is None else served.nobody.get(track.uav)
     newest = pipeline.tracker.newest(track.uav)
     cylinder = [track.horizontal_bound_m] * 2 + [track.vertical_bound_m]
     return {
         "id": track.uav,
         "state": str(track.state),
-        **health.verdict(pipeline.health.verdicts.get(track.uav), machine, pipeline.utc_ns),
-        "target": pipeline.targets.wants(track.uav),
+        **health.verdict(judged, machine, pipeline.utc_ns, unserved),
+        "target": is_target,
+        "served_by": served.by.get(track.uav, []) if served and is_target else None,
         "same_as": pipeline.targets.same_as(track.uav),
         "callsign": pipeline.senders.aircraft.callsign(track.uav),
         "relays": [str(relay) for relay in pipeline.senders.aircraft.relays(track.uav)],

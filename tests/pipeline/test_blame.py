@@ -103,3 +103,16 @@ def test_without_a_beam_the_reason_of_the_beams_is_told() -> None:
     stale = replace(TRACK, state=TrackState.STALE, age_s=12.0)
     found = blame.of_left_out(LeftOut("3:1", Cause.SILENT, "its reports are stale"), stale, None)
     assert (found.cause, found.reason) == (Cause.SILENT, "no report for 12.0 s")
+
+
+def test_who_is_silent_everywhere_is_not_missed_for_want_of_a_node() -> None:
+    stale = replace(TRACK, state=TrackState.STALE, age_s=12.0)
+    for track, reached, full, cause in (
+        (stale, True, True, Cause.SILENT),
+        (TRACK, False, True, Cause.COVERAGE),
+        (TRACK, True, True, Cause.UNSERVED),
+        (TRACK, True, False, Cause.UNSERVED),
+    ):
+        found = blame.of_unserved(track, reached=reached, full=full)
+        assert found.cause is cause
+        assert ("full" in found.reason) is (cause is Cause.UNSERVED and full)

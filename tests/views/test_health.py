@@ -42,3 +42,10 @@ def test_the_headline_counts_what_is_good() -> None:
         "behind": None,
     }  # fmt: skip
     assert health.summary([], None)["headline"] == "no UAV to aim at"
+
+
+def test_the_headline_counts_whom_no_node_serves_and_names_whom_others_do() -> None:
+    good = Verdict("2:1", Level.GOOD, None, 0)
+    found = health.summary([good], None, unserved=2, elsewhere=3)
+    assert (found["none"], found["headline"]) == (2, "1 of 3 links good, 3 with other nodes")
+    assert health.summary([], None, elsewhere=3)["headline"] == "3 with other nodes"

@@ -69,8 +69,8 @@ class Member:
     """One node's part. ``name`` is its name; ``elements`` is the size of its array.
 
     ``neighbours`` are the other nodes by name, ``offers`` this node's own, ``handovers`` the newest
-    changes of who serves whom that this node took part in; ``place`` and ``reach_m`` are what it
-    said last of where its array is and how far it hears.
+    changes of who serves whom that this node took part in, of ``handed_over`` in all; ``place`` and
+    ``reach_m`` are what it said last of where its array is and how far it hears.
     """
 
     def __init__(self, name: str, settings: FleetSettings, elements: int, started_ns: int) -> None:
@@ -78,6 +78,7 @@ class Member:
         self.neighbours: dict[str, Neighbour] = {}
         self.offers: dict[str, Offer] = {}
         self.handovers: deque[Handover] = deque(maxlen=HANDOVERS_KEPT)
+        self.handed_over = 0
         self.hearing = Hearing()
         self.sharing = Sharing(name)
         self.trust = Trust()
@@ -218,6 +219,7 @@ class Member:
                 offers[node] = _worths(known.offers)
         changes = self.duties.decide(now_ns, offers, trusted)
         self.handovers += changes
+        self.handed_over += len(changes)
         standing = self.duties.others(now_ns)
         elsewhere = {uav for n, said in standing.items() if n in trusted for uav, _ in said.serves}
         spares = tuple(sorted(elsewhere - self.duties.serves.keys())) if self._nulls else ()

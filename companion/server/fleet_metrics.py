@@ -1,0 +1,64 @@
+"""Prometheus metrics of the fleet: none where the node is part of none."""
+
+from collections import Counter
+from collections.abc import Iterator
+
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+
+from companion.views import fleet
+from companion.views.state import Node
+
+
+def fleet_metrics(node: Node) -> Iterator[Metric]:
+    """Who is there, who serves whom, and the way between the nodes."""
+    status, now_ns = node.fleet_status(), node.now_ns()
+    served = fleet.served(node.pipeline, status, now_ns)
+    if status is None or served is None:
+        return
+    member = status.member
+    shown = fleet.nodes(member, now_ns)
+    states = Counter(one["state"] for one in shown)
+    nodes = GaugeMetricFamily(
+        "companion_fleet_nodes",
+        "Nodes of the fleet by state, this one being here",
+        labels=["state"],
+    )
+    for state in fleet.STATES:
+        nodes.add_metric([state], states[state])
+    yield nodes
+    yield GaugeMetricFamily(
+        "companion_fleet_serves", "UAVs that this node serves", value=len(member.duties.serves)
+    )
+    yield GaugeMetricFamily(
+        "companion_fleet_most", "UAVs that this node serves at most", value=member.most
+    )
+    yield GaugeMetricFamily(
+        "companion_fleet_elsewhere", "UAVs that other nodes alone serve", value=served.elsewhere
+    )
+    yield GaugeMetricFamily(
+        "companion_fleet_unserved", "UAVs that no node serves", value=len(served.nobody)
+    )
+    yield CounterMetricFamily(
+        "companion_fleet_handovers",
+        "UAVs that this node took or gave up",
+        value=member.handed_over,
+    )
+    yield CounterMetricFamily(
+        "companion_fleet_damaged", "Samples of other nodes that were none", value=status.damaged
+    )
+    ways = GaugeMetricFamily(
+        "companion_fleet_way_p99_seconds",
+        "How long frames of another node are on their way, 99 of 100 at most",
+        labels=["node"],
+    )
+    doubts = GaugeMetricFamily(
+        "companion_fleet_clock_doubt_seconds",
+        "How closely another node's clock is known",
+        labels=["node"],
+    )
+    for one in shown:
+        if one["way_p99_ms"] is not None:
+            ways.add_metric([one["node"]], one["way_p99_ms"] * 1e-3)
+        if one["clock_doubt_s"] is not None:
+            doubts.add_metric([one["node"]], one["clock_doubt_s"])
+    yield from (ways, doubts)

@@ -1,0 +1,121 @@
+"""A node of a fleet over HTTP: who serves whom, and what that makes of the verdicts and metrics."""
+
+from collections.abc import Iterator
+
+import pytest
+from starlette.testclient import TestClient
+
+from companion.pipeline.fleet.member import Member
+from companion.server import models
+from companion.server.app import create_app
+from companion.settings.fleet import FleetSettings
+from companion.values import Duty, Offer, Standing
+from companion.views.fleet import FleetStatus
+
+from .conftest import StandIn, settings
+
+
+def offer(uav: str, sinr_db: float | None = 30.0) -> Offer:
+    return Offer(uav, sinr_db, sinr_db, sinr_db, 0.1)
+
+
+@pytest.fixture(scope="module")
+def flown() -> StandIn:
+    """A node that has heard some UAVs."""
+    return StandIn(settings())
+
+
+@pytest.fixture
+def north(flown: StandIn) -> Iterator[StandIn]:
+    """It serves 1:1 in a fleet; another, south, serves 2:1, and nobody serves the rest."""
+    now_ns = flown.now_ns()
+    member = Member("north", FleetSettings(node="north"), 16, now_ns)
+    member.duties.serves["1:1"] = 20.0
+    place = (47.0, 8.0, 480.0)
+    member.stands(now_ns, Standing("south", now_ns, now_ns, place, 900.0, 1, (("2:1", 25.0),)))
+    flown.fleet = FleetStatus(member, "harbour", 1e3, 2e3, 0)
+    flown.pipeline.step(Duty(now_ns, ("1:1",)))
+    flown.tick(0.0)
+    yield flown
+    flown.fleet = None
+
+
+def client(node: StandIn) -> TestClient:
+    return TestClient(create_app(node))
+
+
+def uavs(node: StandIn) -> dict[str, models.UavState]:
+    answer = models.Uavs.model_validate(client(node).get("/v1/uavs").json())
+    return {uav.id: uav for uav in answer.uavs}
+
+
+def test_who_serves_a_uav_is_said_of_it(north: StandIn) -> None:
+    found = uavs(north)
+    assert found["1:1"].served_by == ["north"]
+    assert found["1:1"].verdict is not None
+    assert found["2:1"].served_by == ["south"]
+    assert (found["2:1"].verdict, found["2:1"].health) == (None, None)
+
+
+def test_who_is_served_by_nobody_has_no_link_and_why(north: StandIn) -> None:
+    assert north.fleet is not None
+    alone = next(uav for uav, one in uavs(north).items() if one.served_by == [])
+
+    def said() -> tuple[str | None, str | None]:
+        one = uavs(north)[alone]
+        assert one.verdict == "none"
+        assert one.health is not None
+        return one.health.cause, one.health.reason
+
+    assert said() == ("coverage", "no node of the fleet reaches it")
+    member = north.fleet.member
+    member.offered(north.now_ns(), "south", (offer(alone), offer("2:1")))
+    assert said() == ("unserved", "every node that reaches it is full")
+    member.offer({alone: offer(alone)})
+    assert said() == ("unserved", "no node of the fleet serves it")
+
+
+def test_the_headline_counts_those_of_nobody_and_names_the_others(north: StandIn) -> None:
+    found = uavs(north).values()
+    alone = sum(one.served_by == [] for one in found)
+    status = models.Status.model_validate(client(north).get("/v1/status").json())
+    assert status.node == "north"
+    assert status.health.none >= alone
+    assert status.health.headline.endswith("links good, 1 with other nodes")
+    assert f"of {1 + alone} links" in status.health.headline
+
+
+def test_a_node_put_aside_serves_nobody(north: StandIn) -> None:
+    assert north.fleet is not None
+    north.fleet.member.trust.aside["south"] = "has a clock that contradicts itself"
+    assert uavs(north)["2:1"].served_by == []
+    answer = models.Fleet.model_validate(client(north).get("/v1/fleet").json())
+    assert [node.state for node in answer.nodes] == ["here", "aside"]
+    assert all("south" not in uav.served_by for uav in answer.uavs)
+
+
+def test_without_a_fleet_nobody_is_said_to_serve(shared_node: StandIn) -> None:
+    assert {one.served_by for one in uavs(shared_node).values()} == {None}
+    assert client(shared_node).get("/v1/status").json()["node"] is None
+    assert "companion_fleet" not in client(shared_node).get("/metrics").text
+
+
+def test_the_metrics_have_what_one_is_woken_for(north: StandIn) -> None:
+    assert north.fleet is not None
+    member = north.fleet.member
+    member.neighbours["south"].ways_ns.extend([10_000_000] * 100)
+    member.handed_over = 3
+    alone = sum(one.served_by == [] for one in uavs(north).values())
+    lines = client(north).get("/metrics").text.splitlines()
+    for line in (
+        'companion_fleet_nodes{state="here"} 1.0',
+        'companion_fleet_nodes{state="there"} 1.0',
+        'companion_fleet_nodes{state="aside"} 0.0',
+        "companion_fleet_serves 1.0",
+        "companion_fleet_most 8.0",
+        "companion_fleet_elsewhere 1.0",
+        f"companion_fleet_unserved {alone}.0",
+        "companion_fleet_handovers_total 3.0",
+        'companion_fleet_way_p99_seconds{node="south"} 0.01',
+    ):
+        assert line in lines

@@ -1,9 +1,9 @@
 """One Zenoh session: what is published, heard, asked and answered, and who is alive.       [shell]
 
-Over 300 lines: the only file that knows Zenoh (https://zenoh.io, the extra ``[fleet]``). Its callbacks come on
-threads of its own; what they bring is handed to the event loop. Only answers to questions are given
-on Zenoh's thread, since a clock must not wait for a busy loop. Nothing here waits for the network
-but ``open`` and ``close``, which belong on a thread.
+Over 300 lines: the only file that knows Zenoh (https://zenoh.io, the extra ``[fleet]``). Its
+callbacks come on threads of its own; what they bring is handed to the event loop. Only answers to
+questions are given on Zenoh's thread, since a clock must not wait for a busy loop. Nothing here
+waits for the network but ``open`` and ``close``, which belong on a thread.
 """
 
 import asyncio

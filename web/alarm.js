@@ -51,7 +51,9 @@ export class Alarm {
 
   /** Look at what is true now; `isLost`: nothing is known of it any more. */
   watch(uavs, isLost, now) {
-    const worse = uavs.filter((uav) => rankOf(uav) < (this.ranks.get(uav.id) ?? -1));
+    // One that is good is no alarm, though it had no verdict before, as while another node served it.
+    const worse = uavs.filter((uav) => uav.verdict !== "good"
+      && rankOf(uav) < (this.ranks.get(uav.id) ?? -1));
     if (!isLost) this.ranks = new Map(uavs.map((uav) => [uav.id, rankOf(uav)]));
     if (!this.isOn) return;
     if (isLost && !this.wasLost) this.unseen = "the connection to the service is lost";

@@ -4,7 +4,7 @@
 //
 // All feeds beat in time, on multiples of BEAT_MS: what is drawn together (UAVs, beams, pattern)
 // is asked at the same moment, or a fast UAV would seem to be beside its own beam. In all they are
-// five requests a second.
+// five requests a second, six in a fleet.
 
 import { authorised, setUpToken } from "./token.js";
 
@@ -60,6 +60,11 @@ const FEEDS = {
   events: {
     path: "/v1/events", beats: 6, offset: 4, what: "events",
     accepts: (data) => isListOf(data?.events, "text"),
+  },
+  fleet: {
+    path: ({ inFleet }) => inFleet && "/v1/fleet",
+    beats: 2, offset: 1, what: "the fleet",
+    stamp: (data) => data.valid_at, accepts: (data) => isListOf(data?.nodes, "node"),
   },
   recordings: {
     path: ({ hasRecordings }) => hasRecordings && "/v1/recordings",
@@ -182,8 +187,8 @@ function describe(error) {
 }
 
 /**
- * Start polling. `context()` gives `{beamed}`, the UAV whose beam is looked at; `onAnswer(name)` is
- * called after each answer. Returns the feeds by name.
+ * Start polling. `context()` gives `{beamed}`, the UAV whose beam is looked at, and `{inFleet}`,
+ * whether this node is part of a fleet; `onAnswer(name)` is called after each answer. Returns the feeds by name.
  */
 export function startPolling(context, onAnswer) {
   const feeds = {};

@@ -3,7 +3,7 @@
 import { askOnce } from "./api.js";
 import { $, make, setChildren, setText } from "./dom.js";
 import * as format from "./format.js";
-import { LEVEL_OF } from "./health.js";
+import { LEVEL_OF, elsewhere } from "./health.js";
 import { modeOf } from "./modes.js";
 
 const ASK_MS = 2000;
@@ -78,8 +78,13 @@ export class Drawer {
 function showVerdict(uav) {
   const { reason, remedy } = uav.health ?? {};
   $("drawer-verdict").dataset.level = LEVEL_OF[uav.verdict] ?? "wait";
-  setText($("drawer-verdict"), uav.verdict ? `link ${uav.verdict}` : "no link to judge");
+  setText($("drawer-verdict"), verdictOf(uav));
   setText($("drawer-why"), [reason, remedy && `→ ${remedy}`].filter(Boolean).join(" "));
+}
+
+function verdictOf(uav) {
+  if (uav.verdict) return `link ${uav.verdict}`;
+  return elsewhere(uav) ? `served by ${elsewhere(uav)}` : "no link to judge";
 }
 
 /** As maps and other programs take them: decimal degrees, and metres. */

@@ -98,6 +98,11 @@ export function bytes(value) {
   return withUnit(scaled, unit === 0 || scaled >= 99.95 ? 0 : 1, NBSP + units[unit]);
 }
 
+export function bitsPerSecond(value) {
+  return known(value) && value >= 999.5 ? withUnit(value / 1000, value < 99_950 ? 1 : 0, `${NBSP}kbit/s`)
+    : withUnit(value, 0, `${NBSP}bit/s`);
+}
+
 /** A whole count, thousands apart by a narrow space: 12 345. */
 export function count(value) {
   if (!known(value)) return UNKNOWN;

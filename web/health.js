@@ -30,6 +30,10 @@ const bySpare = (a, b, gain) => {
   return one === other ? 0 : one - other;
 };
 
+/** Who else serves a UAV, where this node does not: its link is judged there. */
+export const elsewhere = (uav) => (!uav.verdict && uav.served_by?.length
+  ? uav.served_by.join(", ") : null);
+
 /** The worst link first: by verdict, then by the gain that is sure, then by the likely one. */
 export const worstFirst = (a, b) => rankOf(a) - rankOf(b)
   || bySpare(a, b, "guaranteed_gain_db") || bySpare(a, b, "likely_gain_db") || byId(a, b);
@@ -39,9 +43,11 @@ const of = (uavs, level) => uavs.filter((uav) => uav.verdict === level);
 /** The one line that says it all, and how bad it is. */
 export function headlineOf(uavs) {
   const judged = uavs.filter((uav) => rankOf(uav) < LEVELS.length);
-  if (!judged.length) return { text: "no link to judge yet", level: "wait" };
+  const others = uavs.filter(elsewhere).length;
+  const besides = others ? `${others} with other nodes` : "";
+  if (!judged.length) return { text: besides || "no link to judge yet", level: "wait" };
   const good = of(judged, "good").length;
-  const text = `${good} of ${judged.length} links good`;
+  const text = [`${good} of ${judged.length} links good`, besides].filter(Boolean).join(" · ");
   const worst = LEVELS.find((level) => of(judged, level).length);
   return { text, level: LEVEL_OF[worst] };
 }
@@ -91,6 +97,8 @@ export function showTroubles(uavs, onSelect) {
 
 /** The gains behind a verdict, in words: for the pointer, and for the reader of a screen. */
 export function explain(uav) {
+  const others = elsewhere(uav);
+  if (others) return `Served by ${others}, which judges its link`;
   const { reason, remedy, needed_gain_db: needed } = uav.health ?? {};
   if (uav.verdict === "good") {
     return known(needed) ? `It surely has the ${needed.toFixed(1)} dB that it needs` : "";

@@ -7,12 +7,20 @@ const CROWD = 8; // with more UAVs than this, a label without room is left away
 
 /**
  * Labels go where they cover nothing; in a crowd the second line goes, then the label. The chosen
- * UAV has its own first, then the worst links.
+ * UAV has its own first, then the worst links. The names of other nodes are always there.
  */
-export function drawLabels(view, ringLabels) {
+export function drawLabels(view, ringLabels, nodes = []) {
   const [x, y] = view.centre;
   const taken = [...ringLabels, [x - 12, y - 12, x + 12, y + 12]];
   taken.push(...view.hits.map((hit) => [hit.x - 9, hit.y - 9, hit.x + 9, hit.y + 9]));
+  taken.push(...nodes.map(({ x, y }) => [x - 7, y - 7, x + 7, y + 7]));
+  for (const node of nodes) {
+    const label = findPlace(view, node, [node.text], taken) ?? findPlace(view, node, [node.text], []);
+    if (!label) continue;
+    taken.push(label.box);
+    const [left, top] = label.box;
+    view.write(node.text, left, top + 8, { colour: node.colour, size: 12, weight: 700 });
+  }
   const isChosen = ({ uav }) => uav.id === view.scene.selected;
   const before = (a, b) => isChosen(b) - isChosen(a) || worstFirst(a.uav, b.uav);
   for (const hit of [...view.hits].sort(before)) {

@@ -2,6 +2,7 @@
 // for nothing tells an operator less than an empty picture.
 
 import { known } from "./format.js";
+import { elsewhere } from "./health.js";
 import { metresPerDegree, wrapDegrees } from "./trails.js";
 
 export class LastKnown {
@@ -21,10 +22,14 @@ export class LastKnown {
     }
   }
 
-  /** The present beams, and after them the last ones of UAVs that have none, with their age. */
+  /**
+   * The present beams, and after them the last ones of UAVs that have none, with their age; of one
+   * that another node serves now there is none to be missed.
+   */
   beamsOf(uavs, beams, now) {
     const fresh = new Set(beams.map(({ uav }) => uav));
-    const old = uavs.filter(({ id }) => !fresh.has(id) && this.beams.has(id)).map(({ id }) => {
+    const isOld = (uav) => !fresh.has(uav.id) && this.beams.has(uav.id) && !elsewhere(uav);
+    const old = uavs.filter(isOld).map(({ id }) => {
       const { beam, at } = this.beams.get(id);
       return { ...beam, oldS: (now - at) / 1000 };
     });

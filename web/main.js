@@ -8,6 +8,7 @@ import { $, setText, toggleAttribute } from "./dom.js";
 import { Drawer } from "./drawer.js";
 import { csvOf, save } from "./export.js";
 import { Focus } from "./focus.js";
+import { FleetView, nodesAround, slimFleet } from "./fleet.js";
 import * as format from "./format.js";
 import { headlineOf, showHeadline, showTroubles, worstFirst } from "./health.js";
 import { History } from "./history.js";
@@ -31,7 +32,7 @@ const GATHER_MS = 60; // answers of one beat come together: they are shown toget
 const SAME_BEAT_MS = 400;
 const STATE_ORDER = ["live", "coasting", "stale", "lost"];
 const COLLATOR = new Intl.Collator("en", { numeric: true });
-const KEPT = ["beams", "pattern", "weights", "links", "events", "status"];
+const KEPT = ["beams", "pattern", "weights", "links", "events", "status", "fleet"];
 
 let selected = null;
 let faulted = false;
@@ -45,12 +46,15 @@ const plan = new PlanView($("plan"), history, pick, markPlan);
 const ground = new Ground($("ground"), () => plan.colour);
 const drawer = new Drawer();
 const table = new UavTable($("uavs"), pick, refresh);
+const fleet = new FleetView(pick);
 const focus = new Focus();
 const rejections = new Rejections();
 const timebar = new TimeBar(history, refresh);
 const alarm = new Alarm();
 const charts = new Charts((at) => timebar.showAt(at));
-const feeds = startPolling(() => ({ beamed: beamedUav(feeds.beams.data) }), take);
+const feeds = startPolling(() => ({
+  beamed: beamedUav(feeds.beams.data), inFleet: Boolean(feeds.status.data?.node),
+}), take);
 
 // --- what is shown -----------------------------------------------------------------------------
 
@@ -71,6 +75,7 @@ function presentMoment(now) {
     stamp: feeds.uavs.data?.valid_at ?? null,
     uavs: [...feeds.uavs.data?.uavs ?? []].sort(worstFirst),
     answer: answers.beams,
+    fleet: slimFleet(answers.fleet),
     beams: answers.beams?.beams ?? [],
     patternBeams: beamsAt(answers.pattern?.valid_at),
   };
@@ -182,6 +187,7 @@ function showMoment(view, link, now) {
   showBeams(view.answer);
   showLinks(view.links);
   showEvents(view.events);
+  fleet.show(view.fleet, selected);
   showCount(view.uavs);
   showHeadline(view.uavs);
   showTroubles(view.uavs, pick);
@@ -241,6 +247,7 @@ function showPlan(view, link, now) {
     beams: view.beams,
     array: view.answer?.array ?? last.array ?? null,
     carrier: view.carrier,
+    nodes: nodesAround(view.fleet, view.carrier),
     uavsLive: believed(feeds.uavs, link, now),
     beamsLive: believed(feeds.beams, link, now),
     message,
@@ -252,10 +259,12 @@ function showPlan(view, link, now) {
 }
 
 /** The tab's title and the picture's name tell the state to whoever does not see the page. */
-function nameThePage({ uavs, beams }, link) {
+function nameThePage({ uavs, beams, status }, link) {
   const trouble = { lost: "CONNECTION LOST", partial: "CONNECTION FAILING", frozen: "STOPPED" };
   const state = trouble[link.state] ?? (timebar.isLive ? "" : "PAUSED");
-  const title = `${state || headlineOf(uavs).text} · companion`;
+  setText($("node-name"), status?.node ?? "");
+  const title = [state || headlineOf(uavs).text, status?.node, "companion"].filter(Boolean)
+    .join(" · ");
   if (document.title !== title) document.title = title;
   const name = `Plan view: ${uavs.length} UAVs, ${beams.length} beams`
     + (state ? `, not live: ${state.toLowerCase()}` : "");

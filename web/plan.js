@@ -4,6 +4,7 @@ import { drawCompass, drawRingLabels, drawRings } from "./backdrop.js";
 import * as format from "./format.js";
 import { setUpGestures } from "./gestures.js";
 import { drawLabels } from "./labels.js";
+import { drawNodes, drawServing } from "./nodes.js";
 import { Scale } from "./scale.js";
 import { fontOf, readColours } from "./surface.js";
 import { drawCarrier, drawUav } from "./symbols.js";
@@ -151,12 +152,14 @@ export class PlanView {
     drawCompass(this);
     const uavs = this.scene.uavs.filter(placed);
     drawBeams(this, uavs);
+    drawServing(this, uavs);
     uavs.forEach((uav) => this.drawTrail(uav));
     uavs.forEach((uav) => this.drawFixes(uav));
     uavs.forEach((uav) => this.drawBound(uav));
+    const nodes = drawNodes(this);
     drawCarrier(this);
     this.hits = uavs.map((uav) => drawUav(this, uav));
-    drawLabels(this, drawRingLabels(this));
+    drawLabels(this, drawRingLabels(this), nodes);
     this.drawMessage();
   }
 

@@ -2,7 +2,7 @@
 
 import { $, make, setAttribute, setText, toggleAttribute } from "./dom.js";
 import * as format from "./format.js";
-import { explain, rankOf } from "./health.js";
+import { elsewhere, explain, rankOf } from "./health.js";
 import { Order } from "./order.js";
 
 const halfWidthDeg = (array) =>
@@ -53,6 +53,9 @@ function age(context) {
   return { text: `▲ ${text}`, level: "warn", title: "No report lately" };
 }
 
+/** Whom no beam of this array is for, for another node serves it. */
+const servedBy = (uav) => (elsewhere(uav) ? `by ${elsewhere(uav)}` : null);
+
 const STATES = ["live", "coasting", "stale", "lost"];
 
 /**
@@ -62,7 +65,8 @@ const STATES = ["live", "coasting", "stale", "lost"];
 const COLUMNS = [
   { key: "verdict", label: "Link", feed: "uavs", title: "Whether its beam has the gain it needs",
     by: ({ uav }) => rankOf(uav),
-    show: ({ uav }) => ({ text: uav.verdict ?? format.UNKNOWN, title: explain(uav) }) },
+    show: ({ uav }) => ({ text: uav.verdict ?? servedBy(uav) ?? format.UNKNOWN,
+      title: explain(uav) }) },
   { key: "state", label: "State", feed: "uavs", by: ({ uav }) => STATES.indexOf(uav.state),
     show: ({ uav }) => ({ text: uav.state }) },
   { key: "range", label: "Range", feed: "uavs", title: "Slant range from the carrier",
@@ -173,6 +177,7 @@ export class UavTable {
   fill(row, context, isSelected) {
     setAttribute(row.line, "data-state", context.uav.state);
     setAttribute(row.line, "data-verdict", context.uav.verdict ?? "");
+    toggleAttribute(row.line, "data-elsewhere", Boolean(elsewhere(context.uav)));
     toggleAttribute(row.line, "data-old", ageOf(context) > OLD_S);
     toggleAttribute(row.line, "data-selected", isSelected);
     setAttribute(row.button, "aria-pressed", String(isSelected));

@@ -17,7 +17,8 @@ OVERLAPS = """() => {
     const groups = ["header > *, header .facts div", ".zoom, .legend-fold", ".time > *",
         ".focus h2, .focus canvas, .focus dl", ".side section", ".charts figure, #series-key",
         "thead th", "tbody tr:nth-child(-n+12) :is(td, th):not(:first-child)", ".events li",
-        ".find > *", "main > *:not(.side, .time), .side section"];
+        ".find > *", "main > *:not(.side, .time), .side section", "#fleet-nodes *",
+        "#fleet-uavs tr:nth-child(-n+4) :is(td, th)", ".fleet > div"];
     const seen = one => {
         let { left, top, right, bottom } = one.getBoundingClientRect();
         for (let at = one.parentElement; at; at = at.parentElement) {

@@ -27,7 +27,7 @@ export const uav = (id, fields = {}) => ({
   valid_at: stampAt(0), age_s: 0.2, lat_deg: LAT + 0.0009, lon_deg: LON, alt_m: 500,
   north_m: 100, east_m: 0, down_m: -50, velocity_ned_mps: [0, 0, 0], speed_mps: 0,
   bound_m: 4.2, bound_cylinder_ned_m: [4, 4, 2], clock: null, dt_s: 0.25, latency_s: 0.03,
-  verdict: "good", health: health(), innovation_m: 0.4, gamma: 1, reports: 10, rejected: {}, recent_rejections: [], ...fields,
+  verdict: "good", health: health(), served_by: null, innovation_m: 0.4, gamma: 1, reports: 10, rejected: {}, recent_rejections: [], ...fields,
 });
 
 /** One beam as /v1/beams has it, due north. */
@@ -59,7 +59,7 @@ export const patternAnswer = (id, fields = {}) => ({
 });
 
 export const statusAnswer = (fields = {}) => ({
-  version: "1.2.3", time: stampAt(0), uptime_s: 65,
+  version: "1.2.3", node: null, time: stampAt(0), uptime_s: 65,
   center: { source: "5:1", fixed: false, lat_deg: LAT, lon_deg: LON, alt_m: 450, heading_deg: 90,
     attitude_deg: null, age_s: 0.1, bound_m: 1, unfit: null, last_known: null },
   health: { good: 1, weak: 0, none: 0, headline: "1 of 1 links good", behind: null },
@@ -73,6 +73,36 @@ export const linkAnswer = (fields = {}) => ({
   url: "udpin:0.0.0.0:14550", state: "up", age_s: 0.1, frames: 12345, bad_crc: 0, gaps: 3,
   reports: { total: 10, first: 5, first_share: 0.5, latency_p50_s: 0.002, latency_p95_s: 0.005 },
   components: [{ id: "1:1" }], ...fields,
+});
+
+/** A node of the fleet as /v1/fleet has it, another one by default. */
+export const otherNode = (node, fields = {}) => ({
+  node, is_self: false, state: "there", reason: null,
+  place: { lat_deg: LAT + 0.001, lon_deg: LON, alt_m: 450 }, reach_m: 900, serves: 1, most: 8,
+  heard_s: 0.1, clock_offset_s: 0.0015, clock_doubt_s: 0.0008, frames: 100, used: 7,
+  way_p50_ms: 5, way_p99_ms: 12, ...fields,
+});
+
+/** A UAV of it, which north serves. */
+export const fleetUav = (id, fields = {}) => ({
+  uav: id, served_by: ["north"], handing_to: null, unconfirmed: false,
+  offers: [
+    { node: "north", sure_db: 11, likely_db: 12, sinr_db: 30, heard_s: 0.1 },
+    { node: "south", sure_db: null, likely_db: 9.5, sinr_db: 20, heard_s: null },
+  ], ...fields,
+});
+
+/** North and south; nobody serves 10:1. */
+export const fleetAnswer = (fields = {}) => ({
+  valid_at: null, node: "north", site: "harbour",
+  nodes: [otherNode("north", { is_self: true, state: "here" }), otherNode("south")],
+  uavs: [fleetUav("1:1"), fleetUav("2:1", { served_by: ["south"] }),
+    fleetUav("10:1", { served_by: [], offers: [] })],
+  handovers: [
+    { time: stampAt(1), uav: "1:1", before: null, after: "north" },
+    { time: stampAt(2), uav: "2:1", before: "north", after: "south" },
+  ],
+  sent_bps: 14_000, heard_bps: 900, damaged: 0, ...fields,
 });
 
 export class Service {

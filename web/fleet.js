@@ -1,0 +1,199 @@
+// The fleet, where this node is part of one: which nodes are there, who serves whom, what each node
+// offers each UAV, and the newest handovers.
+
+import { $, make, setAttribute, setChildren, setText, toggleAttribute } from "./dom.js";
+import * as format from "./format.js";
+import { byId } from "./health.js";
+import { placedBy } from "./last_known.js";
+
+const HANDOVERS_KEPT = 30;
+/** How bad it is that a node is so. */
+export const NODE_LEVELS = { here: "good", there: "good", silent: "warn", aside: "bad" };
+
+/** What is kept of an answer for looking back: of the handovers the newest. */
+export const slimFleet = (answer) => answer
+  && { ...answer, handovers: answer.handovers.slice(-HANDOVERS_KEPT) };
+
+/** The other nodes whose place is known, seen from the carrier: for the plan view. */
+export function nodesAround(answer, carrier) {
+  return (answer?.nodes ?? []).filter((one) => !one.is_self && one.place)
+    .map(({ node, state, place }) => placedBy({ node, state, ...place }, carrier))
+    .filter(({ north_m: north, east_m: east }) => format.known(north) && format.known(east));
+}
+
+// --- nodes --------------------------------------------------------------------------------------
+
+function clockOf({ clock_offset_s: offsetS, clock_doubt_s: doubtS }) {
+  if (!format.known(offsetS)) return format.UNKNOWN;
+  const isFar = Math.abs(offsetS) >= 1; // in seconds then
+  const [unit, each] = isFar ? ["s", 1] : ["ms", 1000];
+  return [format.fixed(offsetS * each, isFar ? 3 : 1, { signed: true }), "±",
+    format.fixed((doubtS / 2) * each, isFar ? 3 : 1), unit].join("\u00a0");
+}
+
+const NODE_FACTS = [
+  ["Clock", clockOf, "Its clock less this node's, and how closely that is known"],
+  ["Way p99", ({ way_p99_ms: ms }) => format.milliseconds(format.known(ms) ? ms / 1000 : null),
+    "From its hearing a frame to this node's having it: 99 of 100, at most"],
+  ["Used", ({ used }) => format.count(used),
+    "Reports of UAVs that were silent here, and that it told"],
+];
+
+function nodeItem(one) {
+  const most = format.known(one.most) ? ` of ${one.most}` : "";
+  const silent = one.state === "silent" && format.known(one.heard_s)
+    ? ` ${format.duration(one.heard_s)}` : "";
+  const head = make("p", { class: "link-head", "data-level": NODE_LEVELS[one.state] ?? "warn" },
+    make("span", {}, one.node), make("b", {}, one.is_self ? "this node" : one.state + silent));
+  const facts = [["Serves", () => `${one.serves}${most}`, "UAVs that it serves, and at most"],
+    ...(one.is_self ? [] : NODE_FACTS)].map(([label, show, title]) => make(
+    "div", { title }, make("dt", {}, label), make("dd", {}, show(one)),
+  ));
+  const item = make("li", {}, head, make("dl", { class: "link-facts" }, ...facts));
+  if (one.reason) item.append(make("p", { class: "muted" }, `not believed: it ${one.reason}`));
+  return item;
+}
+
+function trafficOf({ sent_bps: sent, heard_bps: heard, damaged }) {
+  const parts = [`tells ${format.bitsPerSecond(sent)}`, `hears ${format.bitsPerSecond(heard)}`];
+  if (damaged) parts.push(`▲ ${format.count(damaged)} damaged`);
+  return parts.join(" · ");
+}
+
+// --- who serves whom ----------------------------------------------------------------------------
+
+/** Who serves a UAV, in words, and how bad that is; `rank`: the worst has the least. */
+export function servingOf({ served_by: by, handing_to: to, unconfirmed }) {
+  const parts = [by.join(" and ") || "nobody"];
+  if (by.length > 1) parts[0] = `twice: ${parts[0]}`;
+  if (to && !by.includes(to)) parts[0] += ` → ${to}`;
+  if (unconfirmed) parts.push("unconfirmed");
+  const bad = by.length === 0;
+  const warn = by.length > 1 || unconfirmed;
+  const title = [
+    bad ? "No node serves it" : "",
+    by.length > 1 ? "During a handover, or while the fleet is parted" : "",
+    to ? `To be taken over by ${to}` : "",
+    unconfirmed ? "One node alone tells of it, where others ought to hear it" : "",
+  ].filter(Boolean).join(". ");
+  return { text: parts.join(" · "), title, level: bad ? "bad" : warn ? "warn" : "",
+    rank: bad ? 0 : warn ? 1 : to ? 2 : 3 };
+}
+
+/** An offer: the gain that is sure, the likely one, the SINR with it. */
+function offerOf(offer) {
+  if (!offer) return { text: format.UNKNOWN, title: "no offer" };
+  const { sure_db: sure, likely_db: likely, sinr_db: sinr, heard_s: heardS } = offer;
+  const heard = format.known(heardS) ? `heard ${format.seconds(heardS)} ago` : "never heard there";
+  if (!format.known(sinr)) return { text: format.UNKNOWN, title: `cannot serve it; ${heard}` };
+  return {
+    text: `${format.fixed(sure, 1)} / ${format.fixed(likely, 1)} · ${format.fixed(sinr)}`,
+    title: `sure ${format.decibels(sure)}, likely ${format.decibels(likely)}, SINR ${
+      format.decibels(sinr)}; ${heard}`,
+  };
+}
+
+const asId = ({ uav }) => ({ id: uav });
+const ORDERS = {
+  id: (a, b) => byId(asId(a), asId(b)),
+  served: (a, b) => servingOf(a).rank - servingOf(b).rank || ORDERS.id(a, b),
+};
+
+export class FleetView {
+  constructor(onSelect) {
+    Object.assign(this, { onSelect, rows: new Map(), nodes: null, order: "served", last: null });
+    [this.head, this.body] = [$("fleet-uavs").tHead.rows[0], $("fleet-uavs").tBodies[0]];
+    this.head.addEventListener("click", (event) => {
+      const key = event.target.closest("th")?.dataset.key;
+      if (!(key in ORDERS)) return;
+      this.order = key;
+      if (this.last) this.show(...this.last);
+    });
+  }
+
+  /** Show an answer of /v1/fleet; nothing of it is there where this node is part of none. */
+  show(answer, selected) {
+    this.last = [answer, selected];
+    const has = Boolean(answer?.node);
+    for (const id of ["fleet-panel", "fleet"]) $(id).hidden = !has;
+    for (const one of $("legend").querySelectorAll("[data-fleet]")) one.hidden = !has;
+    if (!has) return;
+    setText($("fleet-site"), answer.site ?? "");
+    setChildren($("fleet-nodes"), answer.nodes, () => answer.nodes.map(nodeItem));
+    setText($("fleet-traffic"), trafficOf(answer));
+    this.showUavs(answer, selected);
+    showHandovers(answer.handovers);
+  }
+
+  showUavs({ nodes, uavs }, selected) {
+    const names = nodes.filter(({ state }) => state !== "aside").map(({ node }) => node);
+    this.makeColumns(names);
+    const present = new Set(uavs.map(({ uav }) => uav));
+    for (const [id, { line }] of this.rows) {
+      if (present.has(id)) continue;
+      line.remove();
+      this.rows.delete(id);
+    }
+    [...uavs].sort(ORDERS[this.order]).forEach((uav, index) => {
+      const row = this.rows.get(uav.uav) ?? this.addRow(uav.uav, names);
+      if (this.body.rows[index] !== row.line) {
+        this.body.insertBefore(row.line, this.body.rows[index] ?? null);
+      }
+      fill(row, uav, names, uav.uav === selected);
+    });
+    $("fleet-empty").hidden = uavs.length > 0;
+  }
+
+  /** A column for each node; the rows are made anew where the nodes are others. */
+  makeColumns(names) {
+    setAttribute(this.head.children[0], "aria-sort", this.order === "id" ? "ascending" : "none");
+    setAttribute(this.head.children[1], "aria-sort",
+      this.order === "served" ? "ascending" : "none");
+    if (names.join() === this.nodes) return;
+    this.nodes = names.join();
+    const fixed = [...this.head.children].slice(0, 2);
+    this.head.replaceChildren(...fixed, ...names.map((name) => make(
+      "th", { scope: "col", role: "columnheader" }, name,
+    )));
+    for (const { line } of this.rows.values()) line.remove();
+    this.rows.clear();
+  }
+
+  addRow(id, names) {
+    const button = make("button", { type: "button", class: "pick" }, id);
+    button.addEventListener("click", () => this.onSelect(id));
+    const cells = ["Served by", ...names].map((label, index) => make("td", {
+      role: "cell", "data-label": label, "data-key": index ? "offer" : "served",
+    }, make("span", {}, "")));
+    const line = make("tr", { role: "row" },
+      make("th", { scope: "row", role: "rowheader" }, button), ...cells);
+    const row = { line, button, cells };
+    this.rows.set(id, row);
+    return row;
+  }
+}
+
+function fill({ line, button, cells: [served, ...offers] }, uav, names, isSelected) {
+  setAttribute(button, "aria-pressed", String(isSelected));
+  toggleAttribute(line, "data-selected", isSelected);
+  const { text, title, level } = servingOf(uav);
+  setText(served.children[0], text);
+  setAttribute(served, "title", title);
+  setAttribute(served, "data-level", level);
+  offers.forEach((cell, index) => {
+    const said = offerOf(uav.offers.find(({ node }) => node === names[index]));
+    setText(cell.children[0], said.text);
+    setAttribute(cell, "title", said.title);
+    toggleAttribute(cell, "data-serves", uav.served_by.includes(names[index]));
+  });
+}
+
+/** The newest first. */
+function showHandovers(handovers) {
+  const shown = handovers.slice(-HANDOVERS_KEPT).reverse();
+  setChildren($("fleet-handovers"), shown, () => (shown.length
+    ? shown.map(({ time, uav, before, after }) => make("li", {},
+      make("time", { datetime: time }, format.timeOfDay(time)),
+      make("span", {}, `${uav}: ${before ?? "nobody"} → ${after ?? "nobody"}`)))
+    : [make("li", { class: "muted" }, "none")]));
+}

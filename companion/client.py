@@ -114,7 +114,13 @@ class Client:
         """The answer of any path of the API that returns a JSON object."""
         address = quote(path) + ("?" + urlencode(query, doseq=True) if query else "")
         with self._open(address, "application/json") as answer:
-            found: Json = json.loads(_read(answer))
+            body = _read(answer)
+        try:
+            found = json.loads(body)
+        except ValueError as error:
+            raise ServiceError(None, f"{self._url}: the answer is not JSON") from error
+        if not isinstance(found, dict):
+            raise ServiceError(None, f"{self._url}: the answer is no JSON object")
         return found
 
     def stream(

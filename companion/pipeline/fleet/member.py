@@ -241,11 +241,13 @@ class Member:
         """
         witnesses = {self.name: own}
         hearers = dict[str, list[str]]()
+        heard_by = dict[str, frozenset[str]]()
         for node, known in self.neighbours.items():
             said = known.standing
             if not self.trust.believes(node) or known.offers is None or said is None:
                 continue
             heard = frozenset(u for u, offer in known.offers.items() if offer.heard_s is not None)
+            heard_by[node] = heard
             for uav in heard:
                 hearers.setdefault(uav, []).append(node)
             if said.place is not None and said.reach_m is not None:
@@ -255,7 +257,8 @@ class Member:
             for uav, nodes in hearers.items()
             if len(nodes) == 1 and uav not in own.heard and uav in positions
         ]
-        return self.trust.vehicles(now_ns, told, witnesses)
+        counts = {node: len(heard) for node, heard in heard_by.items()}
+        return self.trust.vehicles(now_ns, told, witnesses, counts)
 
     def says(self, now_ns: int, place: Place | None, reach_m: float | None) -> Standing:
         """What this node says of itself: where its array is, and how far it hears."""

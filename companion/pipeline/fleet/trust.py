@@ -6,7 +6,8 @@ A node is put aside that
 - has a clock that contradicts itself: round trips that no drift explains, again and again;
 - tells reports that contradict what is heard here, or what others tell;
 - tells of several vehicles that only it has ever heard, though they are said to be where others
-  hear everybody: ``PHANTOMS`` of them for ``UNHEARD_NS``. One such vehicle may be hidden.
+  hear everybody: ``PHANTOMS`` of them for ``UNHEARD_NS``, and most of what it hears. A few such
+  vehicles may be hidden: they are told, and stay unconfirmed.
 """
 
 import math
@@ -58,6 +59,7 @@ class Trust:
         self._until_ns: dict[str, int] = {}
         self._times: dict[tuple[str, str], deque[int]] = {}
         self._unheard: dict[str, tuple[str, int]] = {}
+        self._told_of: set[str] = set()
 
     def believes(self, node: str) -> bool:
         """Whether a node is believed."""
@@ -72,9 +74,16 @@ class Trust:
         return self._put_aside(now_ns, node, what)
 
     def vehicles(
-        self, now_ns: int, told: Iterable[Told], witnesses: Mapping[str, Witness]
+        self,
+        now_ns: int,
+        told: Iterable[Told],
+        witnesses: Mapping[str, Witness],
+        heard: Mapping[str, int],
     ) -> list[Notice]:
-        """Hold vehicles that only one other node tells of against who ought to hear them."""
+        """Hold vehicles that only one other node tells of against who ought to hear them.
+
+        ``heard`` is how many vehicles each node says that it has heard.
+        """
         before, self._unheard = self._unheard, {}
         for one in told:
             others = [w for name, w in witnesses.items() if name != one.node]
@@ -88,10 +97,15 @@ class Trust:
                 phantoms.setdefault(node, []).append(uav)
         said = []
         for node, uavs in phantoms.items():
-            if len(uavs) >= PHANTOMS:
-                names = ", ".join(sorted(uavs)[:6])
+            names = ", ".join(sorted(uavs)[:6])
+            if len(uavs) >= PHANTOMS and 2 * len(uavs) > heard.get(node, 0):
                 what = f"tells of vehicles where nobody else hears one: {names}"
                 said += self._put_aside(now_ns, node, what)
+            elif not self._told_of.issuperset(uavs):
+                text = f"tells of {names}, where nobody else hears one: hidden, or made up"
+                said.append(_notice(now_ns, node, text, Severity.WARNING))
+            self._told_of.update(uavs)
+        self._told_of &= self._unheard.keys()
         return said
 
     @property

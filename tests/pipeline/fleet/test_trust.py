@@ -1,15 +1,24 @@
 """Who is believed: contradictions put a node aside, a hidden vehicle does not."""
 
+from collections import Counter
+
 from companion.pipeline.fleet.trust import ASIDE_NS, TIMES, UNHEARD_NS, Told, Trust, Witness
 
 S = 1_000_000_000
 HERE = Witness((0.0, 0.0, 0.0), 1000.0, frozenset({"1:1"}))
 
 
-def look(trust: Trust, told: list[Told], witnesses: dict[str, Witness], seconds: int) -> list[str]:
+def look(
+    trust: Trust,
+    told: list[Told],
+    witnesses: dict[str, Witness],
+    seconds: int,
+    others: int = 0,
+) -> list[str]:
     said = []
     for second in range(seconds):
-        said += trust.vehicles(second * S, told, witnesses)
+        heard = Counter(one.node for one in told)
+        said += trust.vehicles(second * S, told, witnesses, heard + Counter({"b": others}))
     return [notice.text for notice in said]
 
 
@@ -42,8 +51,18 @@ def test_vehicles_that_nobody_else_can_hear_put_their_node_aside() -> None:
 def test_one_hidden_vehicle_is_unconfirmed_and_no_lie() -> None:
     trust = Trust()
     hidden = [Told("66:1", "b", (300.0, 0.0, 0.0))]
-    assert look(trust, hidden, {"a": HERE}, 60) == []
+    (said,) = look(trust, hidden, {"a": HERE}, 60)
+    assert "node b tells of 66:1, where nobody else hears one: hidden, or made up" in said
     assert trust.unconfirmed == {"66:1"}
+    assert trust.believes("b")
+
+
+def test_a_few_among_many_are_said_and_their_node_is_believed() -> None:
+    """A team behind a building is heard by the node beside it alone."""
+    trust = Trust()
+    hidden = [Told(f"6{n}:1", "b", (100.0 + n, 0.0, 0.0)) for n in range(4)]
+    (said,) = look(trust, hidden, {"a": HERE}, 60, others=6)
+    assert "60:1, 61:1, 62:1, 63:1" in said
     assert trust.believes("b")
 
 

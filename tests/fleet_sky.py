@@ -33,7 +33,7 @@ class FleetSky:
         self.names = [f"{number + 1}:1" for number in range(self.uavs)]
         self.heard_at = {name: set(self.ports) for name in self.names}
         self.begun_s = time.monotonic()
-        self._utc_s = time.time() - time.monotonic()
+        self.utc_s = time.time() - time.monotonic()
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -49,7 +49,7 @@ class FleetSky:
 
     def at(self, name: str, utc_s: float) -> tuple[float, float, float]:
         """Latitude, longitude and height of a vehicle."""
-        return self._state(int(name.split(":", maxsplit=1)[0]) - 1, utc_s - self._utc_s)[0]
+        return self._state(int(name.split(":", maxsplit=1)[0]) - 1, utc_s - self.utc_s)[0]
 
     def _state(
         self, number: int, t_s: float

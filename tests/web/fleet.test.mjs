@@ -153,6 +153,20 @@ test("a UAV that is taken over from another node is no alarm while it is good", 
   assert.equal(page.text("alarm-text"), "ALARM – link to 1:1: none");
 });
 
+test("a paused page has the fleet of its time, and goes on with the present one", async () => {
+  const answer = fleetAnswer();
+  const page = await openFleet(answer);
+  page.press(" ");
+  answer.uavs[0].served_by = ["south"];
+  page.service.uavs = [uav("1:1", ELSEWHERE), uav("2:1", ELSEWHERE)];
+  await page.time.advance(4 * BEAT_MS);
+  const of = () => page.rows().find(([id]) => id === "1:1")[1];
+  assert.deepEqual([of(), page.cells("verdict").join()], ["north", "good,by south"]);
+  page.press(" ");
+  await page.time.advance(2 * BEAT_MS);
+  assert.deepEqual([of(), page.cells("verdict").join()], ["south", "by south,by south"]);
+});
+
 test("in the plan each node has its mark and name, and a thin line to whom it serves", async () => {
   const view = await openPlan();
   const nodes = [{ node: "south", state: "there", north_m: -100, east_m: 0 }];

@@ -162,6 +162,7 @@ test("a paused page has the fleet of its time, and goes on with the present one"
   await page.time.advance(4 * BEAT_MS);
   const of = () => page.rows().find(([id]) => id === "1:1")[1];
   assert.deepEqual([of(), page.cells("verdict").join()], ["north", "good,by south"]);
+  assert.equal(page.element("fleet").hidden, false);
   page.press(" ");
   await page.time.advance(2 * BEAT_MS);
   assert.deepEqual([of(), page.cells("verdict").join()], ["south", "by south,by south"]);

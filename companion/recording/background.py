@@ -1,8 +1,8 @@
 """A recorder on a thread of its own, so that the event loop never waits for a disk.
 
 The queue is bounded; what does not fit is counted and reported. A disk that fails is tried again,
-less and less often. What had not reached it is kept as far as the queue goes, and the recording
-goes on in a new file, which says what is missing.
+less and less often, and one that is full as soon as it has room. What had not reached it is kept as
+far as the queue goes, and the recording goes on in a new file, which says what is missing.
 
 Over 300 lines: one thread: its queue, its failures, its parts.
 """
@@ -24,13 +24,18 @@ from companion.recording.writer import Writer
 from companion.values import ClockSet, Event, Output, Severity
 
 QUEUE_MAX: Final = 50_000
-"""Events waiting to be written at most: some seconds of the busiest stream."""
+"""Events waiting to be written at most: some seconds of the busiest stream.
+
+About 60 MB where twenty UAVs report ten times a second (1.3 kB for an event with its outputs)."""
 FLUSH_S: Final = 1.0
 """Time between two flushes to disk."""
 FLUSH_FIRST_S: Final = 0.1
 """The same where a file begins, and twice as long after each: a short life leaves something too."""
 RETRY_FIRST_S: Final = 1.0
-"""Time before the first new attempt after a disk error; it doubles from one to the next."""
+"""Time before the first new attempt after a disk error; it doubles from one to the next.
+
+Whether a full disk has room is asked without trying it, at the pace of the first attempt.
+"""
 RETRY_MAX_S: Final = 30.0
 """Longest time between two attempts."""
 STOP_MAX_S: Final = 30.0
@@ -300,10 +305,10 @@ class BackgroundRecorder:
         """Try again until it works; False if the service ended before that."""
         while True:
             stopped = self._stopping.wait(self._retry_s)
-            self._retry_s = min(2 * self._retry_s, RETRY_MAX_S)
             try:
+                self._require_room()  # asked again as soon: it costs the disk nothing
+                self._retry_s = min(2 * self._retry_s, RETRY_MAX_S)
                 self._open_next()
-                self._require_room()
                 return True
             except OSError as error:
                 self._fail(error)
@@ -312,7 +317,10 @@ class BackgroundRecorder:
                 return False
 
     def _require_room(self) -> None:
-        found = os.statvfs(self._writer.path.parent)
+        try:
+            found = os.statvfs(self._writer.path.parent)
+        except FileNotFoundError:
+            return  # the folder is made anew
         if found.f_bavail * found.f_frsize < ROOM_BYTES:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

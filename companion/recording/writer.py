@@ -30,6 +30,35 @@ VERSIONS: Final = "versions"
 SUMMARY: Final = "summary"
 
 
+class _Topics:
+    """The channels of a file by their topics; each is described with its first message.
+
+    Not part of the writer, which would then be part of its own encoder: such a circle keeps a
+    finished file's megabytes until a full garbage collection, and those are rare in the service.
+    """
+
+    def __init__(self, mcap: McapFile) -> None:
+        self.messages = 0
+        self._mcap = mcap
+        self._schema_ids: dict[str, int] = {}
+        self._channel_ids: dict[str, int] = {}
+
+    def add(self, topic: str, schema: schemas.Schema, t_ns: int, data: bytes) -> None:
+        """Write a message; ``Encoder`` calls it."""
+        channel_id = self._channel_ids.get(topic) or self._channel(topic, schema)
+        stamp_ns = t_ns if t_ns > 0 else 0
+        self._mcap.message(channel_id, stamp_ns, stamp_ns, self.messages & 0xFFFFFFFF, data)
+        self.messages += 1
+
+    def _channel(self, topic: str, schema: schemas.Schema) -> int:
+        schema_id = self._schema_ids.get(schema.name)
+        if schema_id is None:
+            schema_id = self._mcap.schema(schema.name, "protobuf", schema.descriptor_set)
+            self._schema_ids[schema.name] = schema_id
+        channel_id = self._mcap.channel(topic, "protobuf", schema_id)
+        return self._channel_ids.setdefault(topic, channel_id)
+
+
 class Writer:
     """One recording, open from the start until ``close`` or ``abandon``.
 
@@ -57,8 +86,6 @@ class Writer:
         scene: Scene | None = None,
         part: Part | None = None,
     ) -> None:
-        self.messages = 0
-        """Messages recorded so far."""
         self.flushed = 0
         """Messages that are on the disk."""
         self.size_bytes = 0
@@ -66,11 +93,10 @@ class Writer:
         self._replace = where.suffix == ".mcap" and not where.is_dir()
         self._final = where if self._replace else _reserve(where, started_ns)
         self._finished = False
-        self._encoder = Encoder(self._add, weights_hz, scene)
-        self._schema_ids: dict[str, int] = {}
-        self._channel_ids: dict[str, int] = {}
         self._file = open_alone(_beside(self._final))
         self._mcap = McapFile(self._file)
+        self._topics = _Topics(self._mcap)
+        self._encoder = Encoder(self._topics.add, weights_hz, scene)
         try:
             self._write_head(settings_toml, versions, max(0, started_ns), part)
         except OSError:
@@ -86,6 +112,11 @@ class Writer:
             self._mcap.metadata(PART, part.metadata())
         self.flush()
         sync_folder(self._final.parent)
+
+    @property
+    def messages(self) -> int:
+        """Messages recorded so far."""
+        return self._topics.messages
 
     @property
     def path(self) -> Path:
@@ -173,20 +204,6 @@ class Writer:
             return False
         held = os.fstat(self._file.fileno() if descriptor is None else descriptor)
         return os.path.samestat(named, held)
-
-    def _add(self, topic: str, schema: schemas.Schema, t_ns: int, data: bytes) -> None:
-        channel_id = self._channel_ids.get(topic) or self._channel(topic, schema)
-        stamp_ns = t_ns if t_ns > 0 else 0
-        self._mcap.message(channel_id, stamp_ns, stamp_ns, self.messages & 0xFFFFFFFF, data)
-        self.messages += 1
-
-    def _channel(self, topic: str, schema: schemas.Schema) -> int:
-        schema_id = self._schema_ids.get(schema.name)
-        if schema_id is None:
-            schema_id = self._mcap.schema(schema.name, "protobuf", schema.descriptor_set)
-            self._schema_ids[schema.name] = schema_id
-        channel_id = self._mcap.channel(topic, "protobuf", schema_id)
-        return self._channel_ids.setdefault(topic, channel_id)
 
     def __enter__(self) -> Self:
         return self

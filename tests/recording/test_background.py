@@ -153,6 +153,32 @@ def test_a_full_disk_keeps_no_file_of_nothing(small_disk: Path) -> None:
     assert [path.name for path in small_disk.iterdir()] == [BALLAST]
 
 
+def test_a_full_disk_is_looked_at_again_as_soon_however_long_it_is_full(
+    small_disk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Waiting twice as long each time, it kept in memory twice what the outage made it keep."""
+    monkeypatch.setattr(background, "RETRY_FIRST_S", 0.01)
+    made, waits_s = recorder(small_disk), list[float]()
+    wait = made._stopping.wait
+
+    def noted(seconds: float) -> bool:
+        waits_s.append(seconds)
+        return wait(seconds)
+
+    monkeypatch.setattr(made._stopping, "wait", noted)
+    made.start()
+    events = hand_over(made, ticks(1, 100))
+    wait_until(lambda: on_disk(made) == 99)
+    fill(small_disk)
+    events += hand_over(made, ticks(100, 200))
+    wait_until(lambda: len(waits_s) > 8)
+    assert max(waits_s) == background.RETRY_FIRST_S
+    (small_disk / BALLAST).unlink()
+    wait_until(lambda: made.failure is None)
+    made.stop({})
+    assert list(log_events(parts_of(small_disk), Settings())) == events
+
+
 def test_what_fits_into_little_room_is_kept_of_what_waits(
     small_disk: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,7 +1,9 @@
 """What is written can be read back, in order, by this program and by any reader of MCAP."""
 
+import gc
 import os
 import struct
+import weakref
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -52,6 +54,28 @@ def test_the_events_come_back_as_they_were(tmp_path: Path, record: Record) -> No
     path = writer.close({})
     assert log_kind(path) == "mcap"
     assert list(read_log(path)) == driven
+
+
+@pytest.mark.parametrize(
+    "end",
+    [lambda one: one.close({}), Writer.salvage, Writer.abandon],
+    ids=["close", "salvage", "abandon"],
+)
+def test_a_file_that_is_done_with_leaves_no_memory_behind(
+    tmp_path: Path, record: Record, end: Callable[[Writer], object]
+) -> None:
+    """A megabyte and a half of each stayed: full garbage collections are rare in the service."""
+    gc.disable()
+    try:
+        writer = open_writer(tmp_path)
+        record(writer, 10)
+        writer.flush()
+        end(writer)
+        left = weakref.ref(writer)
+        del writer
+        assert left() is None
+    finally:
+        gc.enable()
 
 
 def test_the_file_has_its_name_settings_and_metadata(tmp_path: Path, record: Record) -> None:

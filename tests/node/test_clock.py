@@ -76,6 +76,8 @@ def test_a_pause_between_two_clocks_is_no_step() -> None:
 
 SETTINGS = Settings().override(center={"source": "5:1"}, links={"urls": ["udpin:127.0.0.1:0"]})
 NTP_NS = 1_700_000_000 * S
+FRAMES = 350
+"""Heard of a log: the first second of four UAVs and the carrier."""
 
 
 def flown(log: Path, machine: Machine, recordings: Path, said: list[str]) -> Service:
@@ -84,7 +86,7 @@ def flown(log: Path, machine: Machine, recordings: Path, said: list[str]) -> Ser
     node = Service(settings, said.append, clock=machine.clock())
     assert node._recorder is not None
     node._recorder.start()
-    events = [event for event in read_log(log) if isinstance(event, Frame)]
+    events = [event for event in read_log(log) if isinstance(event, Frame)][:FRAMES]
     begins_ns = events[0].t_ns - node.now_ns()
     due_ns = node.now_ns()
     for number, frame in enumerate(events):
@@ -133,15 +135,13 @@ def test_times_follow_the_clock_that_was_set_live_and_in_a_replay(
     with (tables / "updates.csv").open() as file:
         assert {row["t_utc"][:14] for row in csv.DictReader(file)} == {"2023-11-14T22:"}
     pipeline, update = look([log], SETTINGS, shown["time"])
-    assert (
-        pipeline.utc_ns(update.t_ns) // 1_000_000
-        == node.pipeline.utc_ns(node.now_ns()) // 1_000_000
-    )
+    apart_ns = pipeline.utc_ns(update.t_ns) - node.pipeline.utc_ns(node.now_ns())
+    assert abs(apart_ns) < 2_000_000  # what is shown has milliseconds
 
 
 def test_a_clock_that_is_set_changes_no_estimate(short_log: Path) -> None:
     """The fold's own axis goes on as it does under a clock that is left alone."""
-    events = list(with_ticks(read_log(short_log), 10.0))
+    events = list(with_ticks(read_log(short_log), 10.0))[:FRAMES]
     middle = len(events) // 2
     alone, followed = Pipeline(SETTINGS), Pipeline(SETTINGS)
     for number, event in enumerate(events):

@@ -32,7 +32,7 @@ from companion.values import (
 
 NODES_MAX: Final = 256
 """Other nodes followed; one more is not heard."""
-WAYS_KEPT: Final = 2000
+WAYS_KEPT: Final = 500
 HANDOVERS_KEPT: Final = 500
 OFFERS_KEPT_NS: Final = 10_000_000_000
 """How long a node's offers stand while it says nothing new of them."""

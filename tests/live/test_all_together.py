@@ -32,8 +32,10 @@ SETTINGS = "[recording]\nrotate_s = 60.0\n"
 STREAM = "/v1/stream?topic=uavs&topic=beams&topic=status&rate_hz=10"  # as the page has it
 STALLED = 40
 MEMORY = "process_resident_memory_bytes"
+CYCLE_S = 60.0
+"""In which every trouble comes once, and memory comes and goes by some 10 MB with what waits."""
 GROWS_MB = 12.0
-"""Most that memory may grow after the first quarter."""
+"""Most that memory may grow after the first quarter: from the cycle there to the last one."""
 
 
 def vehicles(port: int, count: int, frames_hz: int, first: int) -> "subprocess.Popen[bytes]":
@@ -155,23 +157,29 @@ class Troubles:
 
 
 class Seen(NamedTuple):
-    """What was measured while it went: s, MB, s."""
+    """What was measured while it went; memory with the time since it began."""
 
     healthy_s: list[float]
-    memory_mb: list[float]
+    memory: list[tuple[float, float]]  # s, MB
     ages_s: list[float]
+
+    def usual_mb(self, begin_s: float, long_s: float) -> float:
+        """The median of memory in a window of time."""
+        return float(np.median([mb for at_s, mb in self.memory if 0 <= at_s - begin_s < long_s]))
 
 
 def tell(table: Any, seconds: float, seen: Seen) -> None:
     """Put what was measured into the table, and hold it against what is asked."""
-    first = seen.memory_mb[len(seen.memory_mb) // 4 :][:20]
-    grown_mb = float(np.median(seen.memory_mb[-20:]) - np.median(first))
+    window_s = min(CYCLE_S, seconds / 4)
+    first_mb = seen.usual_mb(seconds / 4, window_s)
+    grown_mb = seen.usual_mb(seconds - window_s, window_s) - first_mb
     health_ms = float(np.percentile(seen.healthy_s, 99)) * 1e3
     age_s = float(np.percentile(seen.ages_s, 99))
     name = f"{seconds:.0f} s of all faults: "
-    tenth = max(1, len(seen.memory_mb) // 10)
-    print("MB by the tenth:", *(f"{mb:.0f}" for mb in seen.memory_mb[::tenth]))
-    table.add(name + "memory at the end", seen.memory_mb[-1], "MB", "flat")
+    tenth_s = seconds / 10
+    tenths_mb = (seen.usual_mb(number * tenth_s, tenth_s) for number in range(10))
+    print("MB by the tenth:", *(f"{mb:.1f}" for mb in tenths_mb))
+    table.add(name + "memory at the end", seen.memory[-1][1], "MB", "flat")
     table.add(name + "grown since a quarter", grown_mb, "MB", f"< {GROWS_MB:g} MB")
     table.add(name + "/healthz, p99", health_ms, "ms", "-")
     table.add(name + "age of beams on the page, p99", age_s, "s", "< 1 s")
@@ -201,8 +209,8 @@ def test_whatever_goes_wrong_at_once_it_goes_on_and_all_is_recorded(
     )
     node = start_node("run", *links, *rest, "--record", str(small_disk))
     flight = vehicles(node.udp_port, UAVS, FRAMES_HZ, 1)
-    troubles = Troubles(node, small_disk, kept, min(60.0, seconds / 2))
-    page, healthy_s, memory_mb = Page(node), list[float](), list[float]()
+    troubles = Troubles(node, small_disk, kept, min(CYCLE_S, seconds / 2))
+    page, healthy_s, memory = Page(node), list[float](), list[tuple[float, float]]()
     try:
         node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) >= UAVS // 2)
         page.start()
@@ -213,7 +221,7 @@ def test_whatever_goes_wrong_at_once_it_goes_on_and_all_is_recorded(
                 asked_s = time.monotonic()
                 assert node.get("/healthz")[0] == 200
                 healthy_s.append(time.monotonic() - asked_s)
-                memory_mb.append(resident_mb(node))
+                memory.append((passed_s, resident_mb(node)))
                 time.sleep(0.2)  # between two questions
         troubles.over()
         node.wait_until("/v1/status", lambda answer: answer["recording"]["state"] == "recording")
@@ -231,7 +239,7 @@ def test_whatever_goes_wrong_at_once_it_goes_on_and_all_is_recorded(
     parts = sorted(kept.iterdir(), key=lambda path: getattr(read_story(path).part, "number", 0))
     settings = Settings.from_recording(read_settings(parts[0]) or "", parts[0].name)
     summary = replay(parts, settings)
-    tell(table, seconds, Seen(healthy_s, memory_mb, page.ages_s))
+    tell(table, seconds, Seen(healthy_s, memory, page.ages_s))
     name = f"{seconds:.0f} s of all faults: "
     for what, value in (
         ("events not recorded", status["recording"]["dropped"]),

@@ -37,7 +37,7 @@ def flown() -> tuple[Shot, Any, str]:
     equipment = assembly.equipment(EIGHT, pipeline.array)
     wanted = Wanted(("3:1",), False, Takes.REGISTERS)
     shot = shot_of(pipeline, equipment, update, wanted)
-    text = weight_formats.encode("adar1000", update.beams, pipeline.array, equipment, 0).decode()
+    text = weight_formats.encode("adar1000", update.beams, pipeline, equipment, 0).decode()
     read = parse(Device.ADAR1000, text, Calibration.ideal(range(8)))
     return shot, read, text
 

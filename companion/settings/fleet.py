@@ -31,7 +31,7 @@ class FleetSettings(Section):
                    tcp/192.0.2.1:7447; on this machine alone unless said otherwise
     connect        Zenoh endpoints of other nodes, or of a router
     mode           "peer" speaks with every other node directly, "client" through one router
-    most           UAVs that this node serves at most; None: half of its elements
+    most           UAVs that this node serves at most; None: as many as it has elements
     lease_s        time for which a node's word holds: after it others serve its UAVs
     attempt_s      longest time of an attempt to connect: 3 round trips over TCP, 5 with TLS; longer
                    ones make a fleet whole again later

@@ -112,7 +112,7 @@ def test_the_metrics_have_what_one_is_woken_for(north: StandIn) -> None:
         'companion_fleet_nodes{state="there"} 1.0',
         'companion_fleet_nodes{state="aside"} 0.0',
         "companion_fleet_serves 1.0",
-        "companion_fleet_most 8.0",
+        "companion_fleet_most 16.0",
         "companion_fleet_elsewhere 1.0",
         f"companion_fleet_unserved {alone}.0",
         "companion_fleet_handovers_total 3.0",

@@ -82,7 +82,7 @@ class Member:
         self.hearing = Hearing()
         self.sharing = Sharing(name)
         self.trust = Trust()
-        self.most = settings.most or max(elements // 2, 1)
+        self.most = settings.most or elements
         self.duties = Duties(name, self.most, round(settings.lease_s * 1e9), settings.hysteresis_db)
         self.place: Place | None = None
         self.reach_m: float | None = None

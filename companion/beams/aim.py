@@ -108,13 +108,16 @@ def aim(
 def without(beam_set: BeamSet, uavs: Collection[str]) -> BeamSet:
     """The beams of all others: the UAVs named keep the nulls that those have on them, and no beam.
 
-    What of the power was theirs goes to the others of their turn.
+    What of the power was theirs goes to the others of their turn, and a turn that was theirs alone
+    is none any more.
     """
     kept = [i for i, beam in enumerate(beam_set.beams) if beam.uav not in uavs]
     weights = beam_set.weights[:, kept]
-    beams = tuple(beam_set.beams[i] for i in kept)
+    turns = np.unique([beam_set.beams[i].group for i in kept], return_inverse=True)[1]
+    beams = tuple(
+        replace(beam_set.beams[i], group=turn) for i, turn in zip(kept, turns.tolist(), strict=True)
+    )
     if kept:
-        turns = np.unique([beam.group for beam in beams], return_inverse=True)[1]
         normalise(weights, beam_set.normalisation, turns)
     left_out = tuple(one for one in beam_set.left_out if one.uav not in uavs)
     return replace(beam_set, beams=beams, weights=weights, left_out=left_out)

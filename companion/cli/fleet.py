@@ -138,7 +138,7 @@ def replay(logs: Sequence[Path], as_json: bool) -> None:
     found = replaying.replay(logs, of_log(progress, None))
     progress.clear()
     click.echo(json.dumps(found) if as_json else _replayed(found))
-    other = [node["log"] for node in found["nodes"] if node["same"] is False]
+    other = [node["logs"][0] for node in found["nodes"] if node["same"] is False]
     if other:
         raise UserError(f"{other[0]}: the replay does not come to the digest of the run")
 

@@ -185,11 +185,19 @@ def log_events(logs: Sequence[Path], settings: Settings, latency_s: float = 0.0)
     """
     if len(logs) == 1 and log_kind(logs[0]) == TICKED:
         return read_log(logs[0])
-    ordered = _in_order(_stories(logs))
+    ordered = in_order(logs)
     if ordered is not None:
         return read_parts(ordered)
     merged = (event for event in read_flight(logs, latency_s) if not isinstance(event, Tick))
     return with_ticks(merged, settings.beams.update_hz)
+
+
+def in_order(logs: Sequence[Path]) -> list[Path] | None:
+    """The parts of one run, in their order; None where the logs are not that.
+
+    Raises ``LogError`` where one cannot be read, or is given twice.
+    """
+    return _in_order(_stories(logs))
 
 
 def missing(logs: Sequence[Path]) -> list[str]:

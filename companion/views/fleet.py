@@ -8,7 +8,8 @@ import numpy as np
 
 from companion.pipeline import blame
 from companion.pipeline.fleet.assignment import worth_db
-from companion.pipeline.fleet.member import Member, Neighbour
+from companion.pipeline.fleet.member import Member
+from companion.pipeline.fleet.neighbours import Neighbour
 from companion.pipeline.fold import Pipeline
 from companion.values import Blame, Offer, Standing
 from companion.views.words import rfc3339

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support import examples
 
-from companion.beams.aim import aim
+from companion.beams.aim import aim, directions, without
+from companion.beams.array import steering
 from companion.beams.array.coverage import Coverage, Sector
 from companion.beams.array.elements import Element, Pattern
 from companion.beams.array.geometry import Array, listed, uniform_linear
@@ -22,6 +23,7 @@ from companion.values import (
     FloatArray,
     Limits,
     Method,
+    Normalisation,
     Policy,
     Track,
     TrackState,
@@ -523,3 +525,40 @@ def test_behind_the_field_of_view_there_is_no_beam_and_no_null() -> None:
         "aside": "84.2 degrees off boresight, outside the field of view of 120",
         "behind": "143.1 degrees off boresight, outside the field of view of 120",
     }
+
+
+@pytest.mark.parametrize("normalisation", ["total", "antenna"])
+def test_who_is_spared_has_a_null_on_him_and_none_of_the_power(normalisation: str) -> None:
+    tracks = [track(uav, place) for uav, place in PLACES.items()]
+    precoder = Precoder(widen=Widen.NO, normalisation=Normalisation(normalisation))
+    full = aim(1, 2, tracks, carrier(), ARRAY, precoder)
+    spared = without(full, {"2:1"})
+    assert spared.uavs == ("1:1", "3:1")
+    towards = steering.steering_matrix(ARRAY, directions(full))
+    responses = np.abs(towards.T @ spared.weights)
+    assert responses[1].max() < 1e-9
+    power = np.abs(spared.weights) ** 2
+    used = power.sum() if normalisation == "total" else power.sum(axis=1).max() * ARRAY.size
+    assert used == pytest.approx(1.0)
+    np.testing.assert_allclose(  # the shares of those who stay are as they were
+        np.linalg.norm(spared.weights, axis=0)[0] / np.linalg.norm(spared.weights, axis=0)[1],
+        np.linalg.norm(full.weights, axis=0)[0] / np.linalg.norm(full.weights, axis=0)[2],
+    )
+    assert full.uavs == ("1:1", "2:1", "3:1")  # and what was made stays as it was
+
+
+def test_a_turn_that_was_of_the_spared_alone_is_none() -> None:
+    twins = [track("1:1", (100, 0, 0)), track("2:1", (101, 0, 0)), track("3:1", (102, 0, 0))]
+    precoder = Precoder(policy=Policy.GROUP, widen=Widen.NO, normalisation=Normalisation.TOTAL)
+    full = aim(1, 2, twins, carrier(), ARRAY, precoder)
+    assert [beam.group for beam in full.beams] == [0, 1, 2]
+    spared = without(full, {"2:1"})
+    assert [beam.group for beam in spared.beams] == [0, 1]
+    assert spared.groups == 2
+    np.testing.assert_allclose(np.linalg.norm(spared.weights, axis=0), 1.0)
+
+
+def test_sparing_all_leaves_nothing() -> None:
+    full = aim(1, 2, [track("1:1", (100, 0, 0))], carrier(), ARRAY, Precoder())
+    spared = without(full, {"1:1"})
+    assert (spared.uavs, spared.groups, spared.weights.shape) == ((), 0, (16, 0))

@@ -215,10 +215,7 @@ def test_a_node_that_is_killed_is_followed(fleet: Fleet) -> None:
     rest = [name for name in NAMES if name != victim]
     fleet.nodes[victim].process.send_signal(signal.SIGKILL)
     fleet.nodes[victim].process.wait(HANG_S)
-    killed_s = time.monotonic()
     fleet.until(lambda: all(fleet.served_by(*rest).values()))
-    took_s = time.monotonic() - killed_s
-    assert took_s < 10.0  # 2 s on a machine that keeps up; the figures are measured elsewhere
     fleet.until(lambda: all(len(one) == 1 for one in fleet.served_by(*rest).values()))
 
 

@@ -70,7 +70,7 @@ class SenderClock:
         self._gnss = Evidence(drift_max)
         self._gnss_plausible = 0
         self._latency_s = 0.0
-        self._doubt_ns = 0  # the greatest of the line's stamps
+        self._doubt_ns = 0  # the greatest of all stamps
         self._known: tuple[ClockKind, int, int, int] | None = None  # as of the newest stamp
 
     def observe(self, arrival_ns: int, boot_ms: int, doubt_ns: int = 0) -> Stamp | None:
@@ -81,13 +81,13 @@ class SenderClock:
         """
         placed = self._line.observe(arrival_ns, boot_ms)
         self.change = self._known = None
+        # A stamp that is not placed may begin a line that later ones confirm, and be its floor.
+        self._doubt_ns = max(self._doubt_ns, doubt_ns)
         if placed is None:
             return None
         if placed.new_line:
             self._timesync.clear()
             self.forget_gnss()
-            self._doubt_ns = 0
-        self._doubt_ns = max(self._doubt_ns, doubt_ns)
         self._note_change()
         latency_s = max(0.0, (arrival_ns - self.node_ns(placed.x_ns)) * 1e-9)
         if placed.x_ns == self._line.newest_ns:

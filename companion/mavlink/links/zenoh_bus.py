@@ -144,12 +144,12 @@ class Bus:
         self._sent += 1
         return True
 
-    def is_wanted(self, key: str) -> bool:
-        """Whether somebody listens to what ``put`` publishes under ``key``, as data."""
+    def is_wanted(self, key: str, priority: Priority = "data") -> bool:
+        """Whether somebody listens to what ``put`` publishes under ``key``, with this priority."""
         import zenoh
 
         try:
-            status: Any = self._publisher(key, "data", False, True).matching_status
+            status: Any = self._publisher(key, priority, False, True).matching_status
             return bool(status.matching)  # its annotation says that it is a bool, and it is not
         except zenoh.ZError:
             return False

@@ -4,7 +4,6 @@ What is said, how often and under which keys is described in docs/fleet.md.
 """
 
 import asyncio
-import struct
 import time
 from collections.abc import Callable
 from typing import Any, Final
@@ -23,6 +22,7 @@ from companion.values import Event, Frame, Notice, RoundTrip, Severity, UserErro
 from companion.views.fleet import FleetStatus
 
 PREFIX: Final = "companion"
+PRIORITY: Final = "data_high"
 STANDING_S: Final = 0.2
 """Time between two words of this node on what it does."""
 ASKED_S: Final = 0.5
@@ -31,8 +31,6 @@ LOOK_S: Final = 0.3
 """Time between two looks at what to offer; its multiples are not those of updates."""
 OFFERED_S: Final = 1.0
 """Time between two tellings of offers, and of tracks."""
-_CLOCK: Final = struct.Struct("<qq")
-"""Answer to a question for the clock: when the node started, and its time now; ns."""
 
 
 class _Rate:
@@ -140,7 +138,7 @@ class FleetNode:
         bus.alive(f"{base}/{self.name}/alive")
 
     def _time(self, key: str, payload: bytes) -> bytes:
-        return _CLOCK.pack(self._started_ns, self._now_ns())
+        return messages.CLOCK.pack(self._started_ns, self._now_ns())
 
     # --- what this node hears itself, and decides -------------------------------------------
 
@@ -171,18 +169,22 @@ class FleetNode:
         said = self.member.sharing.due(self._now_ns())
         if said is not None:
             self._put("heard", messages.shared(said), express=True, reliable=False)
-        if self.member.sharing.next_ns is not None:
+        if self.member.sharing.has_more:
             self._flush_soon()
 
     # --- what it says -----------------------------------------------------------------------
+
+    def _key(self, what: str) -> str:
+        return f"{PREFIX}/{self.settings.site}/{self.name}/{what}"
 
     def _put(
         self, what: str, payload: bytes, *, express: bool = False, reliable: bool = True
     ) -> None:
         if self._bus is not None:
             self._sent.bytes += len(payload)
-            key = f"{PREFIX}/{self.settings.site}/{self.name}/{what}"
-            self._bus.put(key, payload, express=express, priority="data_high", reliable=reliable)
+            self._bus.put(
+                self._key(what), payload, express=express, priority=PRIORITY, reliable=reliable
+            )
 
     def _stand(self, now_ns: int) -> None:
         said = self.member.says(now_ns, self._around.place(), self._around.reach_m(now_ns))
@@ -194,7 +196,11 @@ class FleetNode:
         self.member.offer(offers)
         self._put("offers", messages.offers(offers))
         update = self._pipeline.last_update
-        if update is not None:
+        if (
+            update is not None
+            and self._bus is not None
+            and self._bus.is_wanted(self._key("tracks"), PRIORITY)
+        ):
             said = schemas.TracksMessage(
                 track=[codec.track(one, update.t_ns) for one in update.tracks]
             )
@@ -214,10 +220,10 @@ class FleetNode:
         """What takes the answer to a question that is sent now."""
 
         def take(answer: bytes, arrived_ns: int) -> None:
-            if len(answer) != _CLOCK.size:
+            if len(answer) != messages.CLOCK.size:
                 self.damaged += 1
                 return
-            started_ns, remote_ns = _CLOCK.unpack(answer)
+            started_ns, remote_ns = messages.CLOCK.unpack(answer)
             received_ns = self._now_ns() - (time.monotonic_ns() - arrived_ns)
             self._tell(self.member.read_clock(node, started_ns, sent_ns, received_ns, remote_ns))
 
@@ -259,7 +265,7 @@ class FleetNode:
         if node == self.name:
             self._tell_of_twin()
             return
-        self._tell(self.member.stands(self._now_ns(), said))
+        self.member.stands(self._now_ns(), said)
 
     def _offered(self, node: str, payload: bytes) -> None:
         self.member.offered(self._now_ns(), node, messages.to_offers(payload))
@@ -272,8 +278,9 @@ class FleetNode:
             self._tell(self.member.left(self._now_ns(), node))
         elif node not in self.member.neighbours:
             text = f"node {node} is there"
-            self.member.came(node)
-            self._notify(Notice(self._now_ns(), Severity.INFO, f"node {node}", text))
+            now_ns = self._now_ns()
+            self.member.came(now_ns, node)
+            self._notify(Notice(now_ns, Severity.INFO, f"node {node}", text))
 
     def _tell_of_twin(self) -> None:
         if not self._has_twin:

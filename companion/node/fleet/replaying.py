@@ -4,7 +4,7 @@ Each recording holds all that its node used, what others told it included, so th
 by itself. What is seen together is who served whom, on the nodes' own clocks.
 """
 
-import tomllib
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +12,8 @@ from typing import Any, Final
 
 from companion.node import replay as replaying
 from companion.recording.reader import LogError, digest_of, read_settings
+from companion.settings.model import sections
+from companion.settings.section import ConfigError
 from companion.values import Duty, Frame
 
 TOLD_EVERY: Final = 20_000
@@ -22,10 +24,10 @@ SAMPLE_NS: Final = 100_000_000
 
 @dataclass(slots=True)
 class NodeRun:
-    """One node's recording: its name, its digest now and as recorded, and its duties in order."""
+    """One node's run: its parts, its digest now and as recorded, and its duties in order."""
 
     node: str
-    log: Path
+    logs: list[Path]
     digest: str = ""
     recorded: str | None = None
     frames: int = 0
@@ -36,28 +38,28 @@ class NodeRun:
 
     def serves(self, t_ns: int) -> tuple[str, ...]:
         """Whom the node serves at a time."""
-        past = [duty for duty in self.duties if duty.t_ns <= t_ns]
-        return past[-1].serves if past else ()
+        past = bisect_right(self.duties, t_ns, key=lambda duty: duty.t_ns)
+        return self.duties[past - 1].serves if past else ()
 
 
 def replay(
     logs: Sequence[Path], progress: Callable[[int, float, float], None] | None = None
 ) -> dict[str, Any]:
-    """Replay each recording, and sum up, as ``companion replay --fleet --json`` prints it.
+    """Replay each node's recording, and sum up, as ``companion replay --fleet --json`` prints it.
 
-    ``progress`` is as for ``companion.node.replay.replay``. Raises ``LogError`` for a log that is
-    no node's recording, or where two are of one node.
+    Several recordings of a node are the parts of one run. ``progress`` is as for
+    ``companion.node.replay.replay``. Raises ``LogError`` for a log that is no node's recording, or
+    where two of one node are not of one run.
     """
-    names = [_name(log) for log in logs]
-    twice = {name for name in names if names.count(name) > 1}
-    if twice:
-        raise LogError(f"{logs[0]}: two recordings are of node {min(twice)}: one after the other")
-    runs = [_run(name, log, progress) for name, log in zip(names, logs, strict=True)]
+    by_node: dict[str, list[Path]] = {}
+    for log in logs:
+        by_node.setdefault(_name(log), []).append(log)
+    runs = [_run(name, _one_run(name, of), progress) for name, of in by_node.items()]
     return {
         "nodes": [
             {
                 "node": run.node,
-                "log": str(run.log),
+                "logs": [str(log) for log in run.logs],
                 "frames": run.frames,
                 "told_by_others": run.told,
                 "digest": run.digest,
@@ -72,21 +74,30 @@ def replay(
 
 
 def _name(log: Path) -> str:
-    settings = read_settings(log)
     try:
-        name = tomllib.loads(settings or "").get("fleet", {}).get("node")
-    except tomllib.TOMLDecodeError:
+        name = sections(read_settings(log) or "", str(log)).get("fleet", {}).get("node")
+    except (AttributeError, ConfigError):  # "fleet" may be anything in what others wrote
         name = None
     if not isinstance(name, str):
         raise LogError(f"{log}: not a recording of a fleet's node: it has no [fleet] node")
     return name
 
 
-def _run(name: str, log: Path, progress: Callable[[int, float, float], None] | None) -> NodeRun:
-    settings = replaying.settings_for([log], None, None)
-    found = NodeRun(name, log, recorded=digest_of(log))
+def _one_run(name: str, logs: list[Path]) -> list[Path]:
+    """The recordings of one node in their order. Raises ``LogError`` where they are of two runs."""
+    ordered = logs if len(logs) == 1 else replaying.in_order(logs)
+    if ordered is None:
+        raise LogError(f"{logs[0]}: two recordings are of node {name}: one after the other")
+    return ordered
+
+
+def _run(
+    name: str, logs: list[Path], progress: Callable[[int, float, float], None] | None
+) -> NodeRun:
+    settings = replaying.settings_for(logs, None, None)
+    found = NodeRun(name, logs, recorded=digest_of(logs[-1]))
     run = replaying.Run(settings, None)
-    for event in replaying.log_events([log], settings):
+    for event in replaying.log_events(logs, settings):
         run.step(event)
         if isinstance(event, Duty):
             found.duties.append(event)
@@ -107,7 +118,7 @@ def _together(runs: Sequence[NodeRun]) -> dict[str, Any]:
     """
     begins_ns = max(run.first_ns for run in runs)
     ends_ns = min(run.last_ns for run in runs)
-    seen: dict[str, int] = {}
+    seen: set[str] = set()
     once = twice = none = handovers = 0
     before: dict[str, frozenset[str]] = {}
     for t_ns in range(begins_ns, ends_ns, SAMPLE_NS):
@@ -115,8 +126,7 @@ def _together(runs: Sequence[NodeRun]) -> dict[str, Any]:
         for run in runs:
             for uav in run.serves(t_ns):
                 by.setdefault(uav, set()).add(run.node)
-        for uav in by:
-            seen.setdefault(uav, t_ns)
+        seen |= by.keys()
         for uav in seen:
             nodes = frozenset(by.get(uav, ()))
             once, twice, none = (

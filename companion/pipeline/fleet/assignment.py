@@ -34,6 +34,12 @@ def worth_db(offer: Offer) -> float | None:
     return offer.sinr_db - UNSURE_DB
 
 
+def worths_db(offers: Mapping[str, Offer]) -> dict[str, float]:
+    """What each offer is worth, of those that are worth anything."""
+    found = ((uav, worth_db(offer)) for uav, offer in offers.items())
+    return {uav: worth for uav, worth in found if worth is not None}
+
+
 def assign(
     offers: Mapping[str, Mapping[str, float]],
     holders: Mapping[str, str],

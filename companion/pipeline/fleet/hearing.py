@@ -93,6 +93,7 @@ class Hearing:
             return key
         self._heard.note(frame.t_ns, key)
         self._twins.refuses(HERE, HERE, frame)
+        self._twins.told.clear()  # ``contradicted`` says it, of the nodes
         ears = self._ears.get(frame.source)
         if ears is None:
             if len(self._ears) < VEHICLES_MAX:
@@ -139,7 +140,9 @@ class Hearing:
     def _report(self, now_ns: int, node: str, frame: Frame, key: bytes) -> list[Frame]:
         if key in self._heard or not self._told.note(now_ns, key):
             return []
-        if self._twins.refuses(node, node, frame):
+        is_refused = self._twins.refuses(node, node, frame)
+        self._twins.told.clear()
+        if is_refused:
             self.contradicted.append(node)
             return []
         ears = self._ears.get(frame.source)

@@ -6,15 +6,14 @@ live node and the study of many nodes in virtual time use the same class.
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from typing import Final
 
 from companion.mavlink.trust.dedupe import content
 from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
-from companion.pipeline.fleet.assignment import worth_db
+from companion.pipeline.fleet.assignment import worths_db
 from companion.pipeline.fleet.duties import Duties, Handover
 from companion.pipeline.fleet.hearing import SHARED, Hearing
-from companion.pipeline.fleet.neighbours import TOLD_APART_NS, NeighbourClock, here
+from companion.pipeline.fleet.neighbours import TOLD_APART_NS, Neighbour, NeighbourClock, here
 from companion.pipeline.fleet.sharing import Sharing
 from companion.pipeline.fleet.trust import Told, Trust, Witness
 from companion.settings.fleet import FleetSettings
@@ -32,7 +31,6 @@ from companion.values import (
 
 NODES_MAX: Final = 256
 """Other nodes followed; one more is not heard."""
-WAYS_KEPT: Final = 500
 HANDOVERS_KEPT: Final = 500
 OFFERS_KEPT_NS: Final = 10_000_000_000
 """How long a node's offers stand while it says nothing new of them."""
@@ -40,29 +38,6 @@ FORGET_NS: Final = 600_000_000_000
 
 Place = tuple[float, float, float]
 ToLocal = Callable[[Place], Vector]
-
-
-@dataclass(slots=True)
-class Neighbour:
-    """Another node, as it is known here.
-
-    clock       its clock
-    standing    what it said last of itself; None before it did
-    offers      its offers by UAV
-    frames      frames that it told, ``used`` those that the pipeline had
-    ways_ns     how long the newest of them took from being heard there to being here, at most
-    """
-
-    clock: NeighbourClock
-    started_ns: int | None = None
-    standing: Standing | None = None
-    heard_ns: int = 0
-    offered_ns: int = 0
-    offers: dict[str, Offer] | None = None
-    frames: int = 0
-    used: int = 0
-    ways_ns: deque[int] = field(default_factory=lambda: deque(maxlen=WAYS_KEPT))
-    apart_told: bool = False
 
 
 class Member:
@@ -107,26 +82,29 @@ class Member:
 
     # --- what other nodes say ---------------------------------------------------------------
 
-    def came(self, node: str) -> list[Notice]:
+    def came(self, now_ns: int, node: str) -> None:
         """Another node is there."""
-        self._neighbour(node)
-        return []
+        self._neighbour(now_ns, node)
 
     def left(self, now_ns: int, node: str) -> list[Notice]:
         """Another node is gone: its process ended, or its connection did."""
         self.duties.gone(now_ns, node)
-        if self.neighbours.pop(node, None) is None:
+        if node not in self.neighbours:
             return []
-        if not self.neighbours:
-            self.sharing.alone()
+        self._drop(node)
         text = f"node {node} is gone"
         return [Notice(now_ns, Severity.WARNING, f"node {node}", text)]
+
+    def _drop(self, node: str) -> None:
+        del self.neighbours[node]
+        if not self.neighbours:
+            self.sharing.alone()
 
     def read_clock(
         self, node: str, started_ns: int, sent_ns: int, received_ns: int, remote_ns: int
     ) -> list[Notice]:
         """Take in a reading of another node's clock, between two times of this one's."""
-        known = self._neighbour(node)
+        known = self._neighbour(received_ns, node)
         if known is None:
             return []
         if known.started_ns != started_ns:  # another life has another timeline
@@ -150,11 +128,11 @@ class Member:
         self, now_ns: int, node: str, said: Shared
     ) -> tuple[list[Frame | RoundTrip], list[Notice]]:
         """Take in what another node heard. Returns what the pipeline is to have, and notices."""
-        known = self._neighbour(node)
+        known = self._neighbour(now_ns, node)
         if known is None or not self.trust.believes(node):
             return [], []
         ahead = known.clock.ahead(said.told_ns)
-        if ahead is None:
+        if ahead is None or not known.clock.is_settled:
             return [], []
         way_ns = max(now_ns - said.told_ns - ahead.low_ns, 0)
         events: list[Frame | RoundTrip] = []
@@ -186,18 +164,16 @@ class Member:
         self.hearing.contradicted.clear()
         return notices
 
-    def stands(self, now_ns: int, said: Standing) -> list[Notice]:
+    def stands(self, now_ns: int, said: Standing) -> None:
         """Take in what another node says of itself."""
-        known = self._neighbour(said.node)
-        if known is None:
-            return []
-        known.standing, known.heard_ns = said, now_ns
-        self.duties.hear(now_ns, said)
-        return []
+        known = self._neighbour(now_ns, said.node)
+        if known is not None:
+            known.standing = said
+            self.duties.hear(now_ns, said)
 
     def offered(self, now_ns: int, node: str, offers: tuple[Offer, ...]) -> None:
         """Take in another node's offers, all of them."""
-        known = self._neighbour(node)
+        known = self._neighbour(now_ns, node)
         if known is not None:
             known.offers = {offer.uav: offer for offer in offers}
             known.offered_ns = now_ns
@@ -212,11 +188,11 @@ class Member:
         """Decide whom this node serves: its new duty, None where it is as before; and notices."""
         notices = self.trust.again(now_ns)
         trusted = frozenset(node for node in self.neighbours if self.trust.believes(node))
-        offers = {self.name: _worths(self.offers)}
+        offers = {self.name: worths_db(self.offers)}
         for node in trusted:
             known = self.neighbours[node]
             if known.offers is not None and now_ns - known.offered_ns < OFFERS_KEPT_NS:
-                offers[node] = _worths(known.offers)
+                offers[node] = worths_db(known.offers)
         changes = self.duties.decide(now_ns, offers, trusted)
         self.handovers += changes
         self.handed_over += len(changes)
@@ -226,11 +202,24 @@ class Member:
         duty = tuple(sorted(self.duties.serves)), spares
         if now_ns - self._looked_ns > FORGET_NS // 10:
             self._looked_ns = now_ns
-            self.hearing.forget(now_ns, FORGET_NS)
+            self._forget(now_ns)
         if duty == self._duty:
             return None, notices
         self._duty = duty
         return Duty(now_ns, *duty), notices
+
+    def _forget(self, now_ns: int) -> None:
+        """Forget vehicles and nodes that were silent for long.
+
+        A word that was on its way when its node went makes it known again, with no sign of life to
+        end.
+        """
+        self.hearing.forget(now_ns, FORGET_NS)
+        self.sharing.forget(now_ns, FORGET_NS)
+        self.trust.forget(now_ns)
+        before_ns = now_ns - FORGET_NS
+        for node in [n for n, known in self.neighbours.items() if known.heard_ns < before_ns]:
+            self._drop(node)
 
     def look_for_phantoms(
         self, now_ns: int, positions: Mapping[str, Vector], own: Witness, local: ToLocal
@@ -274,15 +263,14 @@ class Member:
             tuple(self.duties.handing.items()),
         )
 
-    def _neighbour(self, node: str) -> Neighbour | None:
+    def _neighbour(self, now_ns: int, node: str) -> Neighbour | None:
+        """The node of which there is word now; None for this one, and where there are too many."""
         if node == self.name:
             return None
         known = self.neighbours.get(node)
-        if known is None and len(self.neighbours) < NODES_MAX:
+        if known is None:
+            if len(self.neighbours) >= NODES_MAX:
+                return None
             known = self.neighbours.setdefault(node, Neighbour(NeighbourClock()))
+        known.heard_ns = now_ns
         return known
-
-
-def _worths(offers: Mapping[str, Offer]) -> dict[str, float]:
-    found = ((uav, worth_db(offer)) for uav, offer in offers.items())
-    return {uav: worth for uav, worth in found if worth is not None}

@@ -1,4 +1,4 @@
-"""Clocks of other nodes, on this node's timeline.
+"""Other nodes, and their clocks on this node's timeline.
 
 Each node's timeline is its own. A question sent at s and answered at r, with the other clock's
 reading x in between, proves that
@@ -11,14 +11,18 @@ their drift.
 """
 
 import math
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, field
 from typing import Final
 
 from companion.mavlink.clock.evidence import DriftProven, Evidence, Interval
-from companion.values import RoundTrip
+from companion.values import Offer, RoundTrip, Standing
 
 DRIFT_MAX: Final = 200e-6
 """Greatest drift between two nodes' clocks, a ratio: two ordinary crystals, disciplined or not."""
+ANSWERS: Final = 3
+"""Answers from which on what a node hears is used: the first, slow one would leave its doubt."""
+WAYS_KEPT: Final = 500
 TOLD_APART_NS: Final = 100_000_000
 """Difference of two nodes' clocks from which on it is told: with NTP there is none."""
 
@@ -42,11 +46,18 @@ class NeighbourClock:
     def __init__(self) -> None:
         self._evidence = Evidence(DRIFT_MAX)
         self._newest_ns: int | None = None
+        self._answers = 0
 
     def answered(self, sent_ns: int, received_ns: int, remote_ns: int) -> DriftProven | None:
         """Take in a reading of the other clock; returns what it contradicts, None where nothing."""
         self._newest_ns = remote_ns
+        self._answers += 1
         return self._evidence.add(Interval(remote_ns, sent_ns - remote_ns, received_ns - remote_ns))
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether frames can be placed by it; a sender's clock keeps the doubt of the worst."""
+        return self._answers >= ANSWERS
 
     def ahead(self, remote_ns: int) -> Ahead | None:
         """What is known at a time of the other node; None before the first answer."""
@@ -56,6 +67,30 @@ class NeighbourClock:
     def newest(self) -> Ahead | None:
         """What was known at the newest answer; None before the first."""
         return None if self._newest_ns is None else self.ahead(self._newest_ns)
+
+
+@dataclass(slots=True)
+class Neighbour:
+    """Another node, as it is known here.
+
+    clock       its clock
+    standing    what it said last of itself; None before it did
+    offers      its offers by UAV
+    frames      frames that it told, ``used`` those that the pipeline had
+    heard_ns    when there was word of it last
+    ways_ns     how long the newest of them took from being heard there to being here, at most
+    """
+
+    clock: NeighbourClock
+    started_ns: int | None = None
+    standing: Standing | None = None
+    heard_ns: int = 0
+    offered_ns: int = 0
+    offers: dict[str, Offer] | None = None
+    frames: int = 0
+    used: int = 0
+    ways_ns: deque[int] = field(default_factory=lambda: deque(maxlen=WAYS_KEPT))
+    apart_told: bool = False
 
 
 def here(trip: RoundTrip, clock: NeighbourClock) -> RoundTrip | None:

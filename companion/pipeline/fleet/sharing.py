@@ -9,7 +9,7 @@ after two reports.
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 
 from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
 from companion.pipeline.fleet.hearing import VEHICLES_MAX, Recent
@@ -24,12 +24,20 @@ FADES: Final = 0.999
 SPEAKS_AFTER: Final = 2
 """Reports in a row that nobody else told, after which this node speaks for the vehicle."""
 HELD_MAX: Final = 20_000
+AT_ONCE: Final = 500
+"""Most frames, and most round trips, that are told at once; the others come with the next word."""
+
+
+_T = TypeVar("_T")
 
 
 @dataclass(slots=True)
 class _Voice:
-    """Whether this node speaks for a vehicle, and how many reports in a row it told late."""
+    """A vehicle heard here: when last, whether this node speaks for it, and how many reports in a
+    row it told late.
+    """
 
+    heard_ns: int
     mine: bool = False
     late: int = 0
 
@@ -50,8 +58,8 @@ class Sharing:
         self._held: deque[_Held] = deque()
         self._by_others = Recent()
         self._by_me = Recent()
-        self._frames: list[SharedFrame] = []
-        self._trips: list[RoundTrip] = []
+        self._frames: deque[SharedFrame] = deque(maxlen=HELD_MAX)
+        self._trips: deque[RoundTrip] = deque(maxlen=HELD_MAX)
 
     def heard(self, frame: Frame, key: bytes) -> None:
         """Take in a frame heard here, with its content."""
@@ -59,7 +67,8 @@ class Sharing:
         if voice is None:
             if len(self._voices) >= VEHICLES_MAX:
                 return
-            voice = self._voices.setdefault(frame.source, _Voice())
+            voice = self._voices.setdefault(frame.source, _Voice(frame.t_ns))
+        voice.heard_ns = frame.t_ns
         if voice.mine:
             self._tell(frame.t_ns, key, frame)
         elif key in self._by_others:
@@ -88,30 +97,40 @@ class Sharing:
         """What is to be told now; None where it is nothing."""
         while self._held and self._held[0].due_ns <= now_ns:
             _, key, frame = self._held.popleft()
-            voice = self._voices[frame.source]
+            voice = self._voices.get(frame.source)
+            if voice is None:
+                continue
             if key in self._by_others:
                 voice.late = 0
                 continue
             voice.late += 1
             voice.mine = voice.mine or voice.late >= SPEAKS_AFTER
             self._tell(now_ns, key, frame)
-        if not self._frames and not self._trips:
-            return None
-        shared = Shared(now_ns, tuple(self._frames), tuple(self._trips))
-        self._frames, self._trips = [], []
-        return shared
+        frames, trips = _first(self._frames), _first(self._trips)
+        return Shared(now_ns, frames, trips) if frames or trips else None
 
     @property
-    def next_ns(self) -> int | None:
-        """When something held falls due; None where nothing is held."""
-        return self._held[0].due_ns if self._held else None
+    def has_more(self) -> bool:
+        """Whether there is something to be told later, or to be held back until then."""
+        return bool(self._held or self._frames or self._trips)
+
+    def forget(self, now_ns: int, after_ns: int) -> None:
+        """Forget vehicles that were not heard here for so long."""
+        self._voices = {k: v for k, v in self._voices.items() if now_ns - v.heard_ns < after_ns}
 
     def alone(self) -> None:
         """Nobody else is there: whoever comes will find everybody without a speaker."""
         self._voices.clear()
         self._held.clear()
+        self._frames.clear()
+        self._trips.clear()
         self._hold_ns = HOLD_NS[0]
 
     def _tell(self, now_ns: int, key: bytes, frame: Frame) -> None:
         self._by_me.note(now_ns, key)
         self._frames.append(SharedFrame(frame.t_ns, frame.raw))
+
+
+def _first(waiting: deque[_T]) -> tuple[_T, ...]:
+    """Take the first ``AT_ONCE``."""
+    return tuple(waiting.popleft() for _ in range(min(AT_ONCE, len(waiting))))

@@ -113,6 +113,11 @@ class Trust:
         """Vehicles of which only one node tells, where others ought to hear them."""
         return frozenset(self._unheard)
 
+    def forget(self, now_ns: int) -> None:
+        """Forget contradictions that count no more."""
+        before_ns = now_ns - WITHIN_NS
+        self._times = {what: times for what, times in self._times.items() if times[-1] > before_ns}
+
     def again(self, now_ns: int) -> list[Notice]:
         """Try again those whose time is over."""
         over = [node for node, until_ns in self._until_ns.items() if now_ns >= until_ns]

@@ -92,7 +92,7 @@ class World:
         for name in self._names:
             for other in self._names:
                 if other != name:
-                    self.members[name].came(other)
+                    self.members[name].came(self._local_ns(name), other)
 
     # --- time -------------------------------------------------------------------------------
 
@@ -172,7 +172,7 @@ class World:
         said = sharing.due(self._local_ns(name))
         if said is not None:
             self._tell(name, "heard", messages.shared(said))
-        if sharing.next_ns is not None:
+        if sharing.has_more:
             self._flush_soon(name)
 
     def _flush_soon(self, name: str) -> None:

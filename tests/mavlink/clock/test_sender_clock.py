@@ -268,6 +268,20 @@ def test_that_the_first_frames_were_slow_is_soon_ruled_out() -> None:
     assert doubts[49] < 0.1
 
 
+def test_a_line_keeps_the_doubt_of_the_stamps_that_began_it() -> None:
+    """A new boot is believed after some stamps: those before, told by another node, are its floor
+    too, and may have arrived earlier than they are placed.
+    """
+    clock = fed([(EPOCH_NS + n * 100 * MS, 500_000 + n * 100) for n in range(100)])
+    again_ns = EPOCH_NS + 20 * S
+    for n in range(40):  # three that came at once, and were told with 300 ms; others took 310
+        late_ms, doubt_ms = (300, 400) if n < 3 else (310, 0)
+        clock.observe(again_ns + (n * 100 + late_ms) * MS, 1_000 + n * 100, doubt_ms * MS)
+    offset_ns = again_ns - 1_000 * MS
+    found = known(clock)
+    assert found.offset_ns - found.after_s * S <= offset_ns <= found.offset_ns + found.before_s * S
+
+
 # --- TIMESYNC -----------------------------------------------------------------------------------
 
 

@@ -292,6 +292,7 @@ def test_whether_somebody_listens_and_who_is_near_is_known(run: Run) -> None:
             await joined(leaves, stays)
             await near.until(1)
             assert stays.is_wanted("site/a") and not stays.is_wanted("site/b")
+            assert stays.is_wanted("site/a", "data_high")
             await asyncio.to_thread(leaves.close)
             await near.until(2)
             assert [is_joined for _, is_joined in near] == [True, False]

@@ -9,6 +9,7 @@ from fleet_sky import FleetSky
 from companion.mavlink.wire.framing import Splitter
 from companion.node.fleet import replaying
 from companion.pipeline.fold import Pipeline
+from companion.recording.parts import Part
 from companion.recording.reader import LogError, read_log
 from companion.recording.writer import Writer
 from companion.settings.model import Settings
@@ -35,9 +36,13 @@ def events(shift_ns: int, duties: list[tuple[float, tuple[str, ...]]]) -> list[E
     return sorted(found, key=lambda event: event.t_ns)
 
 
+def fleet_settings(node: str | None) -> Settings:
+    return Settings().override(center={"source": "47.3977,8.5456,480"}, fleet={"node": node})
+
+
 def record(path: Path, node: str | None, made: list[Event]) -> Path:
     """A node's recording, with the digest to which it came."""
-    settings = Settings().override(center={"source": "47.3977,8.5456,480"}, fleet={"node": node})
+    settings = fleet_settings(node)
     pipeline = Pipeline(settings)
     with Writer(path, settings.to_toml(), {}, None, START_NS) as writer:
         for event in made:
@@ -83,3 +88,33 @@ def test_what_is_no_fleet_is_said(recorded: list[Path], tmp_path: Path) -> None:
         replaying.replay([recorded[0], alone])
     with pytest.raises(LogError, match="two recordings are of node a"):
         replaying.replay([recorded[0], recorded[0]])
+
+
+def test_the_parts_of_one_run_are_one_recording_in_any_order(
+    recorded: list[Path], tmp_path: Path
+) -> None:
+    made, settings = events(0, [(0.5, ("1:1", "2:1")), (3.05, ("1:1",))]), fleet_settings("a")
+    pipeline, part = Pipeline(settings), Part.first()
+    paths = [tmp_path / "one.mcap", tmp_path / "two.mcap"]
+    for path, some in zip(paths, (made[:90], made[90:]), strict=True):
+        with Writer(path, settings.to_toml(), {}, None, START_NS, part=part) as writer:
+            for event in some:
+                pipeline.step(event)
+                writer.event(event)
+            writer.close({"digest": pipeline.digest.hexdigest()})
+        part = part.after(path.name)
+    found = replaying.replay([paths[1], recorded[1], paths[0]])
+    whole = replaying.replay(recorded)
+    assert [node["same"] for node in found["nodes"]] == [True, True]
+    assert found["nodes"][0]["logs"] == [str(path) for path in paths]
+    assert found["served"] == whole["served"]
+
+
+@pytest.mark.parametrize("text", ["fleet = 1", "fleet = [[[[" + "[" * 5000, "[fleet]\nnode = 3"])
+def test_settings_of_others_may_be_anything(
+    text: str, recorded: list[Path], tmp_path: Path
+) -> None:
+    with Writer(tmp_path / "x.mcap", text, {}, None, START_NS) as writer:
+        writer.close({})
+    with pytest.raises(LogError, match=r"no \[fleet\] node"):
+        replaying.replay([recorded[0], tmp_path / "x.mcap"])

@@ -7,10 +7,12 @@ from pymavlink.dialects.v20 import common
 
 from companion.mavlink.trust.dedupe import content
 from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
-from companion.pipeline.fleet.sharing import HOLD_NS, Sharing
+from companion.pipeline.fleet.hearing import VEHICLES_MAX
+from companion.pipeline.fleet.sharing import AT_ONCE, HOLD_NS, Sharing
 from companion.values import Frame, RoundTrip, Source
 
 MS = 1_000_000
+S = 1000 * MS
 UAV = Source(1, 1)
 
 
@@ -102,3 +104,54 @@ def test_round_trips_are_told_by_the_speaker() -> None:
     said = nodes.sharing["a"].due(nodes.now_ns)
     assert said is not None
     assert said.trips == (trip,)
+
+
+def spoken_for() -> Sharing:
+    """A node that speaks for a vehicle."""
+    nodes = Nodes(("a",))
+    nodes.fly(5, ("a",))
+    return nodes.sharing["a"]
+
+
+def test_a_burst_is_told_in_several_words_and_all_of_it() -> None:
+    sharing, now_ns = spoken_for(), 60_000 * MS
+    for number in range(1200):
+        frame = report(now_ns, 60_000 + number)
+        sharing.heard(frame, content(frame.raw))
+    counts, boots = [], []
+    while sharing.has_more:
+        said = sharing.due(now_ns)
+        assert said is not None
+        counts.append(len(said.frames))
+        boots += [struct.unpack_from("<I", one.raw, 10)[0] for one in said.frames]
+    assert boots == list(range(60_000, 61_200))
+    assert max(counts) <= AT_ONCE
+    assert len(counts) == 3
+
+
+def test_vehicles_of_yesterday_make_room_for_those_of_today() -> None:
+    sharing = Sharing("a")
+    for number in range(VEHICLES_MAX):
+        frame = report(0, 1, Source(1 + number % 255, number // 255))
+        sharing.heard(frame, content(frame.raw))
+    while sharing.has_more:
+        sharing.due(S)
+    late = Source(200, 201)
+    for number in range(2):
+        frame = report(3600 * S + number * S, 1000 * number, late)
+        sharing.heard(frame, content(frame.raw))
+    assert sharing.due(3610 * S) is None  # no room
+    sharing.forget(3620 * S, 600 * S)
+    frame = report(3620 * S, 9000, late)
+    sharing.heard(frame, content(frame.raw))
+    said = sharing.due(3630 * S)
+    assert said is not None
+    assert [one.raw for one in said.frames] == [frame.raw]
+
+
+def test_what_is_held_of_a_forgotten_vehicle_is_not_told() -> None:
+    sharing, frame = Sharing("a"), report(0, 1)
+    sharing.heard(frame, content(frame.raw))
+    sharing.forget(601 * S, 600 * S)
+    assert sharing.due(602 * S) is None
+    assert not sharing.has_more

@@ -1,0 +1,78 @@
+"""One node of a fleet by itself: what it keeps of others, and what it forgets."""
+
+import struct
+
+from pymavlink.dialects.v20 import common
+
+from companion.pipeline.fleet.member import FORGET_NS, NODES_MAX, Member
+from companion.settings.fleet import FleetSettings
+from companion.values import Shared, SharedFrame, Standing
+
+MS = 1_000_000
+S = 1000 * MS
+START_NS = 1_800_000_000 * S
+
+
+def member(**settings: object) -> Member:
+    return Member("a", FleetSettings.model_validate({"node": "a", **settings}), 16, START_NS)
+
+
+def standing(node: str, serves: tuple[str, ...] = ()) -> Standing:
+    each = tuple((uav, 20.0) for uav in serves)
+    return Standing(node, START_NS, START_NS, (47.0, 8.0, 0.0), 500.0, 16, each)
+
+
+def word(now_ns: int, number: int) -> Shared:
+    """What a node on the same clock heard 2 ms ago."""
+    mav = common.MAVLink(None, srcSystem=1, srcComponent=1)
+    message = common.MAVLink_global_position_int_message(
+        1000 + number, 473977000, 85456000, 0, 0, 0, 0, 0, 0
+    )
+    return Shared(now_ns, (SharedFrame(now_ns - 2 * MS, bytes(message.pack(mav))),))
+
+
+def test_a_word_that_comes_after_its_node_went_is_forgotten_in_the_end() -> None:
+    node = member()
+    node.came(START_NS, "b")
+    assert [notice.text for notice in node.left(START_NS + S, "b")] == ["node b is gone"]
+    node.stands(START_NS + 2 * S, standing("b"))
+    assert list(node.neighbours) == ["b"]
+    node.decide(START_NS + FORGET_NS)
+    assert list(node.neighbours) == ["b"]
+    node.decide(START_NS + 2 * FORGET_NS)
+    assert not node.neighbours
+
+
+def test_invented_nodes_take_no_room_for_ever() -> None:
+    node = member()
+    for number in range(NODES_MAX + 10):
+        node.stands(START_NS, standing(f"n{number}"))
+    node.stands(START_NS, standing("b"))
+    assert len(node.neighbours) == NODES_MAX
+    assert "b" not in node.neighbours
+    node.decide(START_NS + 2 * FORGET_NS)
+    node.stands(START_NS + 2 * FORGET_NS, standing("b"))
+    assert list(node.neighbours) == ["b"]
+
+
+def test_the_first_answers_of_a_clock_are_not_enough() -> None:
+    """The doubt with which a frame was placed stays with its sender's clock."""
+    node, now_ns = member(), START_NS
+    for number, wide_ms in enumerate((900, 4, 4)):
+        now_ns += 500 * MS
+        events, _ = node.shared(now_ns, "b", word(now_ns, number))
+        assert events == []
+        node.read_clock("b", START_NS, now_ns - wide_ms * MS, now_ns, now_ns - wide_ms * MS // 2)
+    (frame,), _ = node.shared(now_ns + MS, "b", word(now_ns + MS, 3))
+    (boot_ms,) = struct.unpack_from("<I", frame.raw, 10)
+    assert boot_ms == 1003
+    assert frame.doubt_ns < 6 * MS
+
+
+def test_who_is_served_elsewhere_is_spared_where_that_is_asked_for() -> None:
+    for nulls, spares in ((True, ("2:1",)), (False, ())):
+        node = member(nulls=nulls)
+        node.stands(START_NS, standing("b", ("2:1",)))
+        duty, _ = node.decide(START_NS + MS)
+        assert duty is not None
+        assert duty.spares == spares

@@ -1,0 +1,49 @@
+"""UAVs that another node serves and this one spares: nulls on them, and no beam."""
+
+import numpy as np
+from fleet_sky import FleetSky
+
+from companion.beams.aim import aim, directions
+from companion.beams.array import steering
+from companion.mavlink.wire.framing import Splitter
+from companion.pipeline.fold import Pipeline
+from companion.settings.model import Settings
+from companion.values import Duty, Frame, Tick
+
+S = 1_000_000_000
+START_NS = 1_800_000_000 * S
+
+
+def test_beams_have_nulls_on_the_spared_as_long_as_they_are() -> None:
+    sky = FleetSky([], uavs=2)
+    pipeline = Pipeline(
+        Settings().override(center={"source": "47.3977,8.5456,480"}, beams={"widen": "no"})
+    )
+    pipeline.step(Duty(START_NS, ("1:1",), ("2:1",)))
+    for step in range(30):
+        now_ns = START_NS + step * S // 10
+        for number in range(2):
+            frame = Splitter("udp").feed(now_ns, sky.report(number, sky.begun_s + step / 10))[0]
+            assert isinstance(frame, Frame)
+            pipeline.step(frame)
+        pipeline.step(Tick(now_ns + 1))
+    towards_db = {}
+    for spares in (("2:1",), ()):
+        pipeline.step(Duty(now_ns, ("1:1",), spares))
+        update = pipeline.look(now_ns)
+        assert update.beams.uavs == ("1:1",)
+        assert "2:1" not in {one.uav for one in update.beams.left_out}
+        track = pipeline.tracks(now_ns, update.beams.valid_at_ns, ["2:1"])
+        seen = aim(
+            now_ns,
+            update.beams.valid_at_ns,
+            track,
+            update.carrier,
+            pipeline.array,
+            pipeline.precoder,
+        )
+        there = steering.steering_matrix(pipeline.array, directions(seen))
+        weights = update.beams.weights
+        gain = np.abs(there.T @ weights).item() ** 2 / np.linalg.norm(weights) ** 2
+        towards_db[spares] = 10 * np.log10(gain + 1e-30)
+    assert towards_db[("2:1",)] < -100 < -60 < towards_db[()]

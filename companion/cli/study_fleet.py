@@ -37,6 +37,10 @@ def _steps(span: tuple[int, int], steps: int) -> list[int]:
     help="Virtual time for which each size is watched.",
 )  # fmt: skip
 @click.option(
+    "--spacing", type=click.FloatRange(10, 1e5), default=1500.0, show_default=True,
+    help="Metres between neighbouring nodes on a square grid; each hears 2500 m far.",
+)  # fmt: skip
+@click.option(
     "--delay", type=click.FloatRange(0, 5), default=0.02, show_default=True,
     help="Seconds from one node to another.",
 )  # fmt: skip
@@ -52,6 +56,7 @@ def fleet(
     uavs: tuple[int, int],
     steps: int,
     seconds: float,
+    spacing: float,
     delay: float,
     loss: float,
     seed: int,
@@ -70,12 +75,14 @@ def fleet(
 
     progress = Progress()
     sizes = tuple(zip(_steps(nodes, steps), _steps(uavs, steps), strict=True))
-    asked = study.Asked(sizes, seconds, delay, loss, seed=seed)
+    asked = study.Asked(sizes, seconds, delay, loss, spacing_m=spacing, seed=seed)
     out.mkdir(parents=True, exist_ok=True)
     found = list(study.run(asked, time.process_time, progress.show))
     spans = f"--nodes {nodes[0]}..{nodes[1]} --uavs {uavs[0]}..{uavs[1]} --steps {steps}"
-    command = f"companion study fleet {spans} --seconds {seconds:g} --delay {delay:g}"
-    answer = study.answer(asked, found, f"{command} --loss {loss:g} --seed {seed}")
+    command = f"companion study fleet {spans} --seconds {seconds:g} --spacing {spacing:g}"
+    answer = study.answer(
+        asked, found, f"{command} --delay {delay:g} --loss {loss:g} --seed {seed}"
+    )
     (out / "fleet.json").write_text(json.dumps(answer, indent=1), encoding="utf-8")
     for name, content in report.files(asked, found, answer, progress.show).items():
         (out / name).write_bytes(content)

@@ -333,6 +333,7 @@ class FleetNode(BaseModel):
     node: str
     is_self: bool
     state: Literal["here", "there", "silent", "aside"]
+    near: bool
     reason: str | None
     place: FleetPlace | None
     reach_m: float | None

@@ -150,7 +150,7 @@ def test_a_clock_that_is_wrong_is_said_and_allowed_for(fleet: Fleet) -> None:
     node = found(answer)
     assert abs(node["clock_offset_s"] - AHEAD_S) <= node["clock_doubt_s"] + 0.001
     fleet.until(lambda: "node c's clock is 3.0" in fleet.nodes["a"].errors())
-    assert node["state"] == "there"
+    fleet.until(lambda: found(fleet.nodes["a"].json("/v1/fleet"))["state"] == "there")
 
 
 def test_who_is_silent_here_and_heard_there_keeps_a_small_bound(fleet: Fleet) -> None:

@@ -183,8 +183,11 @@ class Bus:
 
     # --- hearing and answering ---------------------------------------------------------------
 
-    def subscribe(self, key_expr: str, take: Callable[[str, bytes], None]) -> None:
-        """Have ``take`` called with the key and the payload of every sample from others."""
+    def subscribe(self, key_expr: str, take: Callable[[str, bytes], None]) -> Callable[[], None]:
+        """Have ``take`` called with the key and the payload of every sample from others.
+
+        Returns what ends that: samples that are on their way to the loop are still handed over.
+        """
         import zenoh
 
         def heard(sample: "zenoh.Sample") -> None:
@@ -192,13 +195,20 @@ class Bus:
                 key, payload = str(sample.key_expr), sample.payload.to_bytes()
                 self._to_loop.post(lambda: take(key, payload))
 
-        self._declared.append(
-            self._opened().declare_subscriber(
-                key_expr,
-                zenoh.handlers.Callback(heard, indirect=False),
-                allowed_origin=zenoh.Locality.REMOTE,
-            )
+        subscriber = self._opened().declare_subscriber(
+            key_expr,
+            zenoh.handlers.Callback(heard, indirect=False),
+            allowed_origin=zenoh.Locality.REMOTE,
         )
+        self._declared.append(subscriber)
+
+        def end() -> None:
+            if subscriber in self._declared:
+                self._declared.remove(subscriber)
+            with contextlib.suppress(zenoh.ZError):  # the session has ended
+                subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+        return end
 
     def serve(self, key: str, answer: Callable[[str, bytes], bytes | None]) -> None:
         """Have questions about ``key`` answered, at once, on Zenoh's own thread.

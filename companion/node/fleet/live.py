@@ -11,7 +11,9 @@ from typing import Any, Final
 from companion.mavlink.links.zenoh_bus import Bus, open_peer
 from companion.node.fleet import messages
 from companion.node.fleet.config import bus_config
+from companion.node.fleet.listening import Listening
 from companion.node.fleet.messages import FleetMessageError
+from companion.node.fleet.traffic import Rate
 from companion.pipeline.fleet.member import Member
 from companion.pipeline.fleet.offers import Offers
 from companion.pipeline.fleet.surroundings import Surroundings
@@ -31,22 +33,6 @@ LOOK_S: Final = 0.3
 """Time between two looks at what to offer; its multiples are not those of updates."""
 OFFERED_S: Final = 1.0
 """Time between two tellings of offers, and of tracks."""
-
-
-class _Rate:
-    """Bits per second, by the bytes between two looks."""
-
-    def __init__(self) -> None:
-        self.bytes = 0
-        self.bps = 0.0
-        self._before: tuple[int, int] | None = None
-
-    def look(self, now_ns: int) -> None:
-        """Work out the rate since the last look."""
-        if self._before is not None and now_ns > self._before[0]:
-            t_ns, had = self._before
-            self.bps = 8e9 * (self.bytes - had) / (now_ns - t_ns)
-        self._before = now_ns, self.bytes
 
 
 class FleetNode:
@@ -73,8 +59,8 @@ class FleetNode:
         self.name = settings.node
         self.settings = settings
         self.damaged = 0
-        self._sent = _Rate()
-        self._heard = _Rate()
+        self._sent = Rate()
+        self._heard = Rate()
         self._pipeline = pipeline
         self._step = step
         self._notify = notify
@@ -88,6 +74,7 @@ class FleetNode:
         self._bus: Bus | None = None  # once all is declared
         self._flushing: asyncio.TimerHandle | None = None
         self._has_twin = False
+        self._listening: Listening | None = None
 
     # --- while it runs ----------------------------------------------------------------------
 
@@ -117,7 +104,7 @@ class FleetNode:
         except UserError as error:
             self._notify(Notice(self._now_ns(), Severity.ERROR, "fleet", f"no fleet: {error}"))
         finally:
-            self._bus = None
+            self._bus = self._listening = None
             if self._flushing is not None:
                 self._flushing.cancel()
             await asyncio.to_thread(bus.close)
@@ -131,9 +118,9 @@ class FleetNode:
         base = f"{PREFIX}/{self.settings.site}"
         bus.serve(f"{base}/{self.name}/time", self._time)
         bus.serve(f"{base}/{self.name}/schema", lambda key, payload: schemas.SHARED.descriptor_set)
-        bus.subscribe(f"{base}/*/heard", self._taking(self._shared))
         bus.subscribe(f"{base}/*/standing", self._taking(self._stands))
-        bus.subscribe(f"{base}/*/offers", self._taking(self._offered))
+        heard, offered = self._taking(self._shared), self._taking(self._offered)
+        self._listening = Listening(bus, base, heard, offered)
         bus.watch(f"{base}/*/alive", self._seen)
         bus.alive(f"{base}/{self.name}/alive")
 
@@ -189,6 +176,8 @@ class FleetNode:
     def _stand(self, now_ns: int) -> None:
         said = self.member.says(now_ns, self._around.place(), self._around.reach_m(now_ns))
         self._put("standing", messages.standing(said))
+        if self._listening is not None:
+            self._listening.to(self.member.near)
 
     def _offer(self, now_ns: int) -> None:
         """Tell this node's offers and the tracks of those it serves, and look for phantoms."""
@@ -212,7 +201,7 @@ class FleetNode:
     def _ask(self, now_ns: int) -> None:
         if self._bus is None:
             return
-        for node in self.member.neighbours:
+        for node in self.member.near:
             key = f"{PREFIX}/{self.settings.site}/{node}/time"
             self._bus.ask(key, b"", ASKED_S, self._reading(node, self._now_ns()))
 
@@ -283,10 +272,11 @@ class FleetNode:
             self._notify(Notice(now_ns, Severity.INFO, f"node {node}", text))
 
     def _tell_of_twin(self) -> None:
-        if not self._has_twin:
-            self._has_twin = True
-            text = f"another node says that it is {self.name} too: give each a name of its own"
-            self._notify(Notice(self._now_ns(), Severity.ERROR, "fleet", text))
+        if self._has_twin:
+            return
+        self._has_twin = True
+        text = f"another node says that it is {self.name} too: give each a name of its own"
+        self._notify(Notice(self._now_ns(), Severity.ERROR, "fleet", text))
 
     def _tell(self, notices: list[Notice]) -> None:
         for notice in notices:

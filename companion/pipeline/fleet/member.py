@@ -13,6 +13,7 @@ from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
 from companion.pipeline.fleet.assignment import worths_db
 from companion.pipeline.fleet.duties import Duties, Handover
 from companion.pipeline.fleet.hearing import SHARED, Hearing
+from companion.pipeline.fleet.nearness import Place, near
 from companion.pipeline.fleet.neighbours import TOLD_APART_NS, Neighbour, NeighbourClock, here
 from companion.pipeline.fleet.sharing import Sharing
 from companion.pipeline.fleet.trust import Told, Trust, Witness
@@ -36,7 +37,6 @@ OFFERS_KEPT_NS: Final = 10_000_000_000
 """How long a node's offers stand while it says nothing new of them."""
 FORGET_NS: Final = 600_000_000_000
 
-Place = tuple[float, float, float]
 ToLocal = Callable[[Place], Vector]
 
 
@@ -45,7 +45,8 @@ class Member:
 
     ``neighbours`` are the other nodes by name, ``offers`` this node's own, ``handovers`` the newest
     changes of who serves whom that this node took part in, of ``handed_over`` in all; ``place`` and
-    ``reach_m`` are what it said last of where its array is and how far it hears.
+    ``reach_m`` are what it said last of where its array is and how far it hears. ``near`` are the
+    others whose reports and offers are to be listened to (``nearness.py``).
     """
 
     def __init__(self, name: str, settings: FleetSettings, elements: int, started_ns: int) -> None:
@@ -61,6 +62,7 @@ class Member:
         self.duties = Duties(name, self.most, round(settings.lease_s * 1e9), settings.hysteresis_db)
         self.place: Place | None = None
         self.reach_m: float | None = None
+        self.near: frozenset[str] = frozenset()
         self._nulls = settings.nulls
         self._started_ns = started_ns
         self._duty: tuple[tuple[str, ...], tuple[str, ...]] | None = None
@@ -250,8 +252,15 @@ class Member:
         return self.trust.vehicles(now_ns, told, witnesses, counts)
 
     def says(self, now_ns: int, place: Place | None, reach_m: float | None) -> Standing:
-        """What this node says of itself: where its array is, and how far it hears."""
+        """What this node says of itself: where its array is, and how far it hears.
+
+        By that and by what others said, ``near`` is found anew.
+        """
         self.place, self.reach_m = place, reach_m
+        others = {node: known.standing for node, known in self.neighbours.items()}
+        self.near = near(place, reach_m, others, self.near)
+        for node in others.keys() - self.near:  # they are out of date from now on
+            self.neighbours[node].offers = None
         return Standing(
             self.name,
             self._started_ns,

@@ -3,7 +3,8 @@
 import math
 from typing import Final
 
-from companion.pipeline.fleet.member import Member, Place
+from companion.pipeline.fleet.member import Member
+from companion.pipeline.fleet.nearness import Place
 from companion.pipeline.fleet.trust import Witness
 from companion.pipeline.fold import Pipeline
 from companion.values import Notice, Vector

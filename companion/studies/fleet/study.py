@@ -53,12 +53,16 @@ class Grown:
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What is to be studied: sizes as (nodes, UAVs), over how much virtual time, on which links."""
+    """What is to be studied: sizes as (nodes, UAVs), over how much virtual time, on which links.
+
+    ``spacing_m`` is between neighbouring nodes.
+    """
 
     sizes: tuple[tuple[int, int], ...]
     seconds: float = 10.0
     delay_s: float = 0.02
     loss: float = 0.02
+    spacing_m: float = 1500.0
     sampled: int = 50
     seed: int = 1
 
@@ -71,7 +75,13 @@ def run(
         progress(f"{nodes} nodes, {uavs} UAVs")
         sampled = min(asked.sampled, uavs)
         sky = Sky(
-            nodes, uavs, sampled=sampled, delay_s=asked.delay_s, loss=asked.loss, seed=asked.seed
+            nodes,
+            uavs,
+            asked.spacing_m,
+            sampled=sampled,
+            delay_s=asked.delay_s,
+            loss=asked.loss,
+            seed=asked.seed,
         )
         yield _grown(World(sky, FleetSettings(node="any"), cpu_s), asked.seconds)
 

@@ -29,6 +29,7 @@ FLUSH_NS: Final = 5_000_000
 STANDING_TICKS: Final = 2
 OFFER_TICKS: Final = 10
 ASK_TICKS: Final = 5
+DEGREE_M: Final = 111_195.0
 ENTRY_S: Final = 2.0
 """Time from a UAV's coming within reach until it counts as served or not."""
 STAGGER_NS: Final = 7_919_000
@@ -156,11 +157,11 @@ class World:
             self.counted.handovers += one.after == name and one.before is not None
         member.handovers.clear()
         if turn % STANDING_TICKS == 0:
-            lat_deg, lon_deg = (self._flight.places_m[number] * 1e-5).tolist()
+            lat_deg, lon_deg = (self._flight.places_m[number] / DEGREE_M).tolist()
             said = member.says(now_ns, (lat_deg, lon_deg, 0.0), self.sky.reach_m)
             self._tell(name, "standing", messages.standing(said))
         if turn % ASK_TICKS == 0:
-            for other in member.neighbours:
+            for other in sorted(member.near):
                 self._ask(name, other)
 
     def _flush(self, name: str) -> None:
@@ -185,7 +186,11 @@ class World:
         self.counted.sent[what] += len(payload)
         self.counted.samples[what] += 1
         for other in self._names:
-            if other != name and other not in self.dead and self._arrives(name, other):
+            if other == name or other in self.dead:
+                continue
+            if what != "standing" and name not in self.members[other].near:
+                continue
+            if self._arrives(name, other):
                 self.counted.received[what] += len(payload) + HEADER_BYTES
                 self._at(self._arrival_ns(), partial(self._take, other, name, what, payload))
 

@@ -302,6 +302,30 @@ def test_whether_somebody_listens_and_who_is_near_is_known(run: Run) -> None:
     run(test())
 
 
+def test_who_listens_no_more_hears_nothing_and_nothing_is_sent_to_him(run: Run) -> None:
+    async def test() -> None:
+        async with pair() as (speaks, listens):
+            some, others, near = Heard(), Heard(), Heard()
+            end = listens.subscribe("site/a", some.take)
+            listens.subscribe("site/b", others.take)
+            speaks.neighbours(near.take)
+            await joined(listens, speaks)
+            await near.until(1)
+            speaks.put("site/a", b"1")
+            await some.until(1)
+            end()
+            while speaks.is_wanted("site/a"):
+                await asyncio.sleep(0.01)
+            speaks.put("site/a", b"2")
+            speaks.put("site/b", b"3")
+            await others.until(1)
+            assert [payload for _, payload in some] == [b"1"]
+            await asyncio.to_thread(listens.close)
+            end()  # once more, after the session: nothing
+
+    run(test())
+
+
 def test_a_client_waits_for_its_router_until_it_is_closed(run: Run) -> None:
     async def test() -> None:
         nobody = f"tcp/127.0.0.1:{free_port()}"

@@ -6,7 +6,7 @@ from pymavlink.dialects.v20 import common
 
 from companion.pipeline.fleet.member import FORGET_NS, NODES_MAX, Member
 from companion.settings.fleet import FleetSettings
-from companion.values import Shared, SharedFrame, Standing
+from companion.values import Offer, Shared, SharedFrame, Standing
 
 MS = 1_000_000
 S = 1000 * MS
@@ -76,3 +76,15 @@ def test_who_is_served_elsewhere_is_spared_where_that_is_asked_for() -> None:
         duty, _ = node.decide(START_NS + MS)
         assert duty is not None
         assert duty.spares == spares
+
+
+def test_who_is_far_away_is_not_near_and_its_offers_are_not_kept() -> None:
+    node = member()
+    for name, place in (("b", (47.0, 8.0, 0.0)), ("c", (48.0, 8.0, 0.0))):
+        node.stands(START_NS, Standing(name, START_NS, START_NS, place, 900.0, 16, ()))
+        node.offered(START_NS, name, (Offer("1:1", 10.0, 10.0, 10.0, 0.1),))
+    assert node.near == frozenset()
+    node.says(START_NS, (47.0, 8.01, 0.0), 900.0)
+    assert node.near == {"b"}
+    assert node.neighbours["b"].offers is not None
+    assert node.neighbours["c"].offers is None

@@ -89,3 +89,20 @@ def test_reports_are_told_about_once(sampled: int) -> None:
     bits = 8 * world.counted.sent["heard"] / 5
     frames = sampled * world.sky.report_hz
     assert bits <= 1.15 * frames * 8 * (40 + 8)
+
+
+def test_what_a_node_is_told_does_not_grow_with_a_fleet_that_spreads() -> None:
+    """Four times as many nodes on four times the area: each has the like around it."""
+    told = []
+    for nodes in (4, 16):
+        sky = Sky(nodes, 2 * nodes, 5000.0, sampled=2 * nodes, report_hz=1.0)
+        world = World(sky, SETTINGS)
+        world.run(5)
+        world.counted = Counted()
+        world.run(2)
+        once, _, none = shares(world.counted)
+        assert once >= 0.99
+        assert none == 0
+        received = world.counted.received
+        told.append((received["heard"] + received["offers"]) / nodes)
+    assert told[1] < 2 * told[0]  # two are near each of four, up to four each of sixteen

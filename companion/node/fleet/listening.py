@@ -1,0 +1,31 @@
+"""Listening to reports and offers of those nodes that are near, and of no others.        [shell]"""
+
+from collections.abc import Callable
+
+from companion.mavlink.links.zenoh_bus import Bus
+
+Take = Callable[[str, bytes], None]
+
+
+class Listening:
+    """What is subscribed to, by node. ``base`` is the site's key.
+
+    ``heard`` and ``offered`` are called with the key and the payload of what is said.
+    """
+
+    def __init__(self, bus: Bus, base: str, heard: Take, offered: Take) -> None:
+        self._bus = bus
+        self._base = base
+        self._takes = {"heard": heard, "offers": offered}
+        self._ends: dict[str, list[Callable[[], None]]] = {}
+
+    def to(self, nodes: frozenset[str]) -> None:
+        """Listen to these nodes from now on."""
+        for node in nodes - self._ends.keys():
+            self._ends[node] = [
+                self._bus.subscribe(f"{self._base}/{node}/{what}", take)
+                for what, take in self._takes.items()
+            ]
+        for node in self._ends.keys() - nodes:
+            for end in self._ends.pop(node):
+                end()

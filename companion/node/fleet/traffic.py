@@ -1,0 +1,17 @@
+"""How much a node tells the others, and is told."""
+
+
+class Rate:
+    """Bits per second, by the bytes between two looks."""
+
+    def __init__(self) -> None:
+        self.bytes = 0
+        self.bps = 0.0
+        self._before: tuple[int, int] | None = None
+
+    def look(self, now_ns: int) -> None:
+        """Work out the rate since the last look."""
+        if self._before is not None and now_ns > self._before[0]:
+            t_ns, had = self._before
+            self.bps = 8e9 * (self.bytes - had) / (now_ns - t_ns)
+        self._before = now_ns, self.bytes

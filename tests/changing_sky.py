@@ -13,7 +13,7 @@ from companion.values import Event, Frame, Source, Tick
 S = 1_000_000_000
 CARRIER = Source(5, 1)
 HERE = (47.3977, 8.5456, 500.0)
-STEP_S = 2.0
+STEP_S = 3.0
 """Between two reports of a vehicle, and two ticks."""
 VEHICLES, STAYS_S = 6, 900.0
 AIRCRAFT, CROSSES_S = 6, 240.0
@@ -50,7 +50,7 @@ def day(hours: float, seed: int = 1, begins_ns: int = 1_790_000_000 * S) -> Iter
     for number in range(round(hours * 3600 / STEP_S)):
         now_s = number * STEP_S
         t_ns = begins_ns + round(now_s * S)
-        if number % 5400 == 5399:
+        if number % 3600 == 3599:
             carrier.booted_s = now_s  # every three hours it restarts
         for group in (flying, crossing):
             for at, one in enumerate(group):

@@ -35,20 +35,22 @@ def beams(
     """What an array would have done over a flight: gains, guarantees, what must be swept.
 
     The beams as the settings make them, and beside them the same not widened. Where the log has
-    the simulator's truth (SIM_STATE) every guarantee is put to the test. Writes DIR/beams.json,
+    the simulator's truth every guarantee is put to the test. Writes DIR/beams.json,
     DIR/beams.html and the figures as PNG and SVG. A recording of our own is studied with the
-    settings that it holds.
+    settings that it holds. Logs that vehicles wrote themselves (.bin, .ulg, CSV) are one flight.
 
     Example: companion study beams flight.tlog --center 5:1 --links clean,radio --out report
     """
     from companion.node.replay import settings_for
+    from companion.recording.reader import flights
     from companion.studies.beams import report
     from companion.studies.beams.flight import BeamStudy, study
 
     progress = Progress()
-    settings = tuple(settings_for([log], config, center) for log in logs)
+    flown = tuple(flights(logs))
+    settings = tuple(settings_for(each, config, center) for each in flown)
     over = tuple(name for name in links.split(",") if name)
-    setting = BeamStudy(logs, settings, hz, center, str(config) if config else None, over)
+    setting = BeamStudy(flown, settings, hz, center, str(config) if config else None, over)
     out.mkdir(parents=True, exist_ok=True)
     if any(each.center.source is None for each in settings):
         click.echo("no --center: the array stands where the first report was made", err=True)

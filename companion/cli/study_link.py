@@ -17,7 +17,7 @@ def _range(_context: click.Context, _option: click.Parameter, text: str) -> list
 
 
 @click.command()
-@click.argument("log", metavar="[LOG]", required=False, type=click.Path(path_type=Path))
+@click.argument("logs", metavar="[LOG...]", nargs=-1, type=click.Path(path_type=Path))
 @CONFIG
 @CENTER
 @click.option(
@@ -64,7 +64,7 @@ def _range(_context: click.Context, _option: click.Parameter, text: str) -> list
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
 @JSON
 def link(
-    log: Path | None,
+    logs: tuple[Path, ...],
     config: Path | None,
     center: str | None,
     snr_db: list[float],
@@ -81,8 +81,8 @@ def link(
 ) -> None:
     """Error rates and throughput of 16-QAM OFDM by perfect, predicted and held positions.
 
-    Four UAVs on the paper's circles, reporting each --interval seconds; or those of a LOG that
-    holds the simulator's truth (SIM_STATE), through the whole pipeline. Writes DIR/link.json,
+    Four UAVs on the paper's circles, reporting each --interval seconds; or those of LOGs of
+    one flight that hold the simulator's truth, through the whole pipeline. Writes DIR/link.json,
     DIR/link.html and the figures as PNG and SVG.
 
     Example: companion study link --out report
@@ -95,14 +95,14 @@ def link(
     from companion.studies.link.level import LinkStudy, study
     from companion.studies.link.scenario import Reports
 
-    if log is None and center is not None:
+    if not logs and center is not None:
         raise click.UsageError("--center is for a LOG: the paper's circles are about the array")
     progress = Progress()
     setting = LinkStudy(
-        log=log,
+        logs=logs,
         center=center,
         config=str(config) if config else None,
-        settings=load(config) if log is None else settings_for([log], config, center),
+        settings=settings_for(logs, config, center) if logs else load(config),
         snr_db=(snr_db[0], snr_db[1], snr_db[2]),
         instants=instants,
         blocks=blocks,

@@ -14,7 +14,7 @@ Over 300 lines: one study: its settings, its looks, its answer.
 import math
 import platform
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -37,6 +37,7 @@ from companion.studies.beams.worth import Row, Sample, Worth, summed_up
 from companion.studies.prediction.radio_link import LINKS
 from companion.studies.truth import array_truth
 from companion.studies.truth.array_truth import ArrayTruth
+from companion.studies.truth.vehicles import named
 from companion.values import BeamSet, Carrier, FloatArray, Track, Update, UserError, Widen
 
 TOLD_EVERY: Final = 20
@@ -47,8 +48,8 @@ TOLD_EVERY: Final = 20
 class BeamStudy:
     """What is asked of the study.
 
-        logs      the logs
-        settings  those of each log
+        flights   the logs, by flight
+        settings  those of each flight
         hz        looks per second of log
         center    as on the command line
         config    as on the command line
@@ -57,7 +58,7 @@ class BeamStudy:
     Raises ``UserError`` for a rate out of range.
     """
 
-    logs: tuple[Path, ...]
+    flights: tuple[tuple[Path, ...], ...]
     settings: tuple[Settings, ...]
     hz: float = 5.0
     center: str | None = None
@@ -74,7 +75,12 @@ class BeamStudy:
     @property
     def command(self) -> str:
         """The command line that asks for this study."""
-        words = ["companion", "study", "beams", *map(str, self.logs)]
+        words = [
+            "companion",
+            "study",
+            "beams",
+            *(str(log) for logs in self.flights for log in logs),
+        ]
         words += ["--center", self.center] if self.center else []
         words += ["--config", self.config] if self.config else []
         words += ["--links", ",".join(self.links)] if self.links else []
@@ -83,7 +89,7 @@ class BeamStudy:
 
 @dataclass(frozen=True, slots=True)
 class Watched:
-    """One log: every UAV at every look, in order of time, with the array and the kind of truth."""
+    """One flight: every UAV at every look, in order of time; the array and the kind of truth."""
 
     log: str
     center: str
@@ -261,14 +267,14 @@ def _db(power: float) -> float | None:
 # --- the study ----------------------------------------------------------------------------------
 
 
-def updates(log: Path, pipeline: Pipeline, hz: float) -> Iterator[tuple[float, Update]]:
-    """Seconds into the log, ``hz`` per second, each with the update of the last tick by then.
+def updates(logs: Sequence[Path], pipeline: Pipeline, hz: float) -> Iterator[tuple[float, Update]]:
+    """Seconds into a flight, ``hz`` per second, each with the update of the last tick by then.
 
-    Each update comes once. Steps the pipeline through the whole log.
+    Each update comes once. Steps the pipeline through the whole flight.
     """
     period_ns = round(1e9 / hz)
     begins_ns, due_ns, seen = None, 0, None
-    for event in log_events([log], pipeline.settings):
+    for event in log_events(logs, pipeline.settings):
         if begins_ns is None:
             begins_ns, due_ns = event.t_ns, event.t_ns + period_ns
         while due_ns < event.t_ns:  # all that happened by then has been taken in
@@ -281,32 +287,32 @@ def updates(log: Path, pipeline: Pipeline, hz: float) -> Iterator[tuple[float, U
 
 
 def watch(
-    log: Path,
+    logs: Sequence[Path],
     settings: Settings,
     hz: float,
     progress: Callable[[str], None] = lambda _text: None,
 ) -> Watched:
-    """Study one log.
+    """Study the logs of one flight.
 
     Raises ``UserError``, ``LogError`` or ``ConfigError`` where there is nothing to see.
     """
     pipeline = Pipeline(settings)
     seen, truth, sought = sight(pipeline), None, False
     samples: list[Sample] = []
-    looks = 0
-    for t_s, update in updates(log, pipeline, hz):
+    looks, name = 0, named(logs)
+    for t_s, update in updates(logs, pipeline, hz):
         if not sought and any(not track.uav.startswith("icao:") for track in update.tracks):
-            truth, sought = array_truth.load(log, pipeline), True
+            truth, sought = array_truth.load(logs, pipeline), True
         if update.tracks:
             samples += look(seen, update, truth, t_s)
             looks += 1
         if looks % TOLD_EVERY == 0:
-            progress(f"{log.name}: {t_s:.0f} s of log")
+            progress(f"{name}: {t_s:.0f} s of log")
     if not any(sample.as_set or sample.sharp for sample in samples):
-        raise UserError(f"{log}: no UAV gets a beam in it, as far as its carrier is known")
+        raise UserError(f"{name}: no UAV gets a beam in it, as far as its carrier is known")
     array = pipeline.array
     return Watched(
-        log.name,
+        name,
         str(pipeline.center.place),
         f"{array.size} elements ({array.kind}) at {settings.array.frequency_hz * 1e-9:g} GHz",
         None if seen.codebook is None else seen.codebook.size,
@@ -326,8 +332,8 @@ def study(
     study.
     """
     found = [
-        watch(log, settings, setting.hz, progress)
-        for log, settings in zip(setting.logs, setting.settings, strict=True)
+        watch(logs, settings, setting.hz, progress)
+        for logs, settings in zip(setting.flights, setting.settings, strict=True)
     ]
     rows: list[Row] = [
         {"log": watched.log, "uav": uav, **summed_up(samples), "truth": watched.truth}
@@ -336,9 +342,9 @@ def study(
     ]
     modes_found = [
         row
-        for log, settings in zip(setting.logs, setting.settings, strict=True)
+        for logs, settings in zip(setting.flights, setting.settings, strict=True)
         for link in modes.links(setting.links)
-        for row in modes.compare(log, settings, link, progress)
+        for row in modes.compare(logs, settings, link, progress)
     ]
     return {
         "rows": rows,

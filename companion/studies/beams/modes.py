@@ -24,7 +24,7 @@ from companion.node.replay import log_events
 from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
 from companion.pipeline.ticks import with_ticks
-from companion.recording.reader import read_log
+from companion.recording.reader import read_flight
 from companion.settings.model import Settings
 from companion.studies.prediction.baselines import Observed, Predictor
 from companion.studies.prediction.delivery import deliver
@@ -97,11 +97,11 @@ def _share(marks: Any) -> float | None:
 
 
 def events(
-    log: Path, link: RadioLink, settings: Settings, seed: int = 1
+    logs: Sequence[Path], link: RadioLink, settings: Settings, seed: int = 1
 ) -> tuple[Iterator[Event], dict[str, list[Observed]], LocalFrame]:
     """What a node hears over a link, with ticks; each UAV's reports, and the frame they are in."""
     center = settings.center.source or "home"
-    flown = vehicles.load(log, center)
+    flown = vehicles.load(logs, center)
     streams = {
         flight.uav: deliver(flight, link, seed, lambda: assembly.clock(settings))
         for flight in flown.flights
@@ -109,10 +109,10 @@ def events(
     observed = {uav: list(one.observed) for uav, one in streams.items()}
     local = LocalFrame(*flown.origin)
     if link.as_logged:
-        return log_events([log], settings), observed, local
+        return log_events(logs, settings), observed, local
     others = (
         event
-        for event in read_log(log)
+        for event in read_flight(logs)
         if not isinstance(event, Tick)
         and not (isinstance(event, Frame) and str(event.source) in streams)
     )
@@ -151,26 +151,26 @@ class _Rival:
 
 
 def compare(
-    log: Path,
+    logs: Sequence[Path],
     settings: Settings,
     link: RadioLink,
     progress: Callable[[str], None] = lambda _text: None,
 ) -> list[Row]:
     """A row for each way of making beams, over one link."""
     pipeline = Pipeline(settings)
-    heard, observed, local = events(log, link, settings)
+    heard, observed, local = events(logs, link, settings)
     ways = [_Way(str(widen), widen) for widen in Widen]
     rivals = {name: _Rival(name, observed, settings) for name in RIVALS}
     theirs = {name: _Way(f"{name}, sharp", Widen.NO) for name in RIVALS}
     truth: ArrayTruth | None = None
-    sought, ticks = False, 0
+    flight, sought, ticks = vehicles.named(logs), False, 0
     for event in heard:
         pipeline.step(event)
         update = pipeline.last_update
         if not isinstance(event, Tick) or update is None or not update.tracks:
             continue
         if not sought and any(not track.uav.startswith("icao:") for track in update.tracks):
-            truth, sought = array_truth.load(log, pipeline), True
+            truth, sought = array_truth.load(logs, pipeline), True
         if update.carrier is None:
             continue
         ticks += 1
@@ -182,8 +182,8 @@ def compare(
                 tracks = rival.tracks(update, local, pipeline)
                 _make(pipeline, update, tracks, theirs[name], truth, looks)
         if looks and ticks % (25 * LOOK_EVERY) == 0:
-            progress(f"{log.name}, {link.name}: {ticks} ticks")
-    head = {"log": log.name, "link": link.name, "truth": None if truth is None else truth.kind}
+            progress(f"{flight}, {link.name}: {ticks} ticks")
+    head = {"log": flight, "link": link.name, "truth": None if truth is None else truth.kind}
     return [head | way.row() for way in (*ways, *theirs.values())]
 
 

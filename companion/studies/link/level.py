@@ -33,7 +33,7 @@ from companion.studies.link import blocks, channel, modulation, ofdm
 from companion.studies.link.blocks import BLOCK_BITS, CODED_BITS, Counted, Estimation
 from companion.studies.link.channel import SAMPLE_RATE_HZ, Scattering
 from companion.studies.link.rows import Row, crossing_db, row
-from companion.studies.link.scenario import Positions, Reports, Scenario, circles, from_log
+from companion.studies.link.scenario import Positions, Reports, Scenario, circles, from_logs
 from companion.studies.prediction.pointing import angles_deg
 from companion.values import ComplexArray, UserError
 
@@ -65,7 +65,7 @@ def snrs(first_db: float, last_db: float, step_db: float) -> tuple[float, ...]:
 class LinkStudy:
     """What is asked of the study.
 
-        log         a log with the simulator's truth; None: the paper's circles
+        logs        of one flight with the simulator's truth; none: the paper's circles
         center      as on the command line
         config      as on the command line
         settings    those of the array and the tracking
@@ -80,7 +80,7 @@ class LinkStudy:
     Raises ``UserError`` for values out of range.
     """
 
-    log: Path | None = None
+    logs: tuple[Path, ...] = ()
     center: str | None = None
     config: str | None = None
     settings: Settings = field(default_factory=Settings)
@@ -106,13 +106,13 @@ class LinkStudy:
     @property
     def command(self) -> str:
         """The command line that asks for this study."""
-        words = ["companion", "study", "link", *([str(self.log)] if self.log else [])]
+        words = ["companion", "study", "link", *map(str, self.logs)]
         words += ["--center", self.center] if self.center else []
         words += ["--config", self.config] if self.config else []
         words += ["--snr", ":".join(f"{part:g}" for part in self.snr_db)]
         words += ["--instants", str(self.instants), "--blocks", str(self.blocks)]
         words += ["--estimation", self.estimation.value]
-        if self.log is None:
+        if not self.logs:
             words += ["--interval", f"{self.reports.interval_s:g}"]
             words += ["--latency", f"{self.reports.latency_s:g}"]
         words += ["--rician-k", f"{self.scattering.rician_k_db:g}"]
@@ -182,10 +182,10 @@ def study(
     Raises ``UserError``, ``LogError`` or ``ConfigError`` where there is nothing to study.
     """
     rng = np.random.default_rng([setting.seed, 0])
-    if setting.log is None:
+    if not setting.logs:
         scenario = circles(setting.settings, setting.reports, setting.instants, rng)
     else:
-        scenario = from_log(setting.log, setting.settings, setting.instants, rng, progress)
+        scenario = from_logs(setting.logs, setting.settings, setting.instants, rng, progress)
     counts = simulate(setting, scenario, progress)
     rows: list[Row] = [
         row(kind, snr_db, coded, counted, SYMBOL_S)

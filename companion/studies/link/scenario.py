@@ -6,7 +6,7 @@ circles, or a log that holds the simulator's truth, which goes through the pipel
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
@@ -25,6 +25,7 @@ from companion.studies.beams.flight import updates
 from companion.studies.link.track_predictor import TrackPredictor
 from companion.studies.prediction.baselines import Hold, Observed, Predictor
 from companion.studies.truth import array_truth
+from companion.studies.truth.vehicles import named
 from companion.values import FloatArray, Method, Update, UserError
 
 RADII_M: Final = (100.0, 150.0, 200.0, 250.0)
@@ -227,35 +228,36 @@ def _unit(vectors: FloatArray) -> FloatArray:
 # --- a log --------------------------------------------------------------------------------------
 
 
-def from_log(
-    log: Path,
+def from_logs(
+    logs: Sequence[Path],
     settings: Settings,
     instants: int,
     rng: np.random.Generator,
     progress: Callable[[str], None],
 ) -> Scenario:
-    """Instants of a log, drawn from ``LOOKS_HZ`` looks a second at the running pipeline.
+    """Instants of a flight, drawn from ``LOOKS_HZ`` looks a second at the running pipeline.
 
-    Raises ``UserError``, ``LogError`` or ``ConfigError`` for a log without the simulator's truth.
+    Raises ``UserError``, ``LogError`` or ``ConfigError`` for logs without the simulator's truth.
     """
     pipeline, truth, looks = Pipeline(settings), None, list[Instant]()
-    for t_s, update in updates(log, pipeline, LOOKS_HZ):
+    name = named(logs)
+    for t_s, update in updates(logs, pipeline, LOOKS_HZ):
         if truth is None and any(not track.uav.startswith("icao:") for track in update.tracks):
-            truth = array_truth.load(log, pipeline)
+            truth = array_truth.load(logs, pipeline)
             if truth is None:
-                raise UserError(f"{log}: it holds no SIM_STATE of its UAVs, so no truth")
+                raise UserError(f"{name}: there is no simulator's truth of its UAVs in it")
         if truth is not None and (seen := _seen(t_s, update, pipeline, truth)) is not None:
             looks.append(seen)
-        progress(f"{log.name}: {t_s:.0f} s of log")
+        progress(f"{name}: {t_s:.0f} s of log")
     array = pipeline.array
     resolved = [
         seen for seen in looks if _resolved(settings, array, seen.towards[Positions.PERFECT])
     ]
     if not resolved:
-        raise UserError(f"{log}: at no time is there a UAV to serve whose true place is known")
+        raise UserError(f"{name}: at no time is there a UAV to serve whose true place is known")
     chosen = np.sort(rng.choice(len(resolved), min(instants, len(resolved)), replace=False))
     return Scenario(
-        f"{log.name}: array on {pipeline.center.place}",
+        f"{name}: array on {pipeline.center.place}",
         array,
         tuple(resolved[i] for i in chosen),
         1 - len(resolved) / len(looks),

@@ -82,14 +82,14 @@ class ArrayTruth:
         return replace(predicted, position_ned_m=position, body_from_local=local_from_body.T)
 
 
-def load(log: Path, pipeline: Pipeline) -> ArrayTruth | None:
-    """The truth in a log, for the array of a pipeline; None if it holds none.
+def load(logs: Sequence[Path], pipeline: Pipeline) -> ArrayTruth | None:
+    """The truth in the logs of a flight, for the array of a pipeline; None if they hold none.
 
     The pipeline must have had a report of a vehicle, so that its local frame exists.
     """
     local = pipeline.local
     assert local is not None
-    flown = vehicles.load(log, str(FixedCenter(*local.origin)))
+    flown = vehicles.load(logs, str(FixedCenter(*local.origin)))
     flights = {flight.uav: flight for flight in flown.flights if flight.truth.kind == SIMULATED}
     if not isinstance(pipeline.center.place, VehicleCenter):
         return ArrayTruth(SIMULATED, local, flights, None) if flights else None

@@ -119,6 +119,11 @@ class Flown:
         return np.broadcast_to(self.carrier, (len(t_ns), 3))
 
 
+def named(logs: Sequence[Path]) -> str:
+    """The name of a flight: those of its logs."""
+    return " + ".join(log.name for log in logs)
+
+
 def load(logs: Path | Sequence[Path], center_text: str | None) -> Flown:
     """Read a log, or the logs of a flight.
 

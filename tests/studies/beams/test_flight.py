@@ -66,14 +66,14 @@ def short(cut: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def watched(cut: Path) -> Watched:
-    return watch(cut, on_carrier(), 1.0)
+    return watch([cut], on_carrier(), 1.0)
 
 
 @pytest.fixture(scope="module")
 def looked(cut: Path) -> tuple[Pipeline, Update]:
     """A pipeline in mid-flight, and its update."""
     pipeline = Pipeline(on_carrier())
-    for t_s, update in updates(cut, pipeline, 1.0):
+    for t_s, update in updates([cut], pipeline, 1.0):
         if t_s >= 14.0:
             return pipeline, update
     raise AssertionError
@@ -151,7 +151,7 @@ def test_looks_are_at_the_last_tick(short: Path, hz: float) -> None:
     due = [begins_ns + k * period_ns for k in range(1, 1 + (ends_ns - begins_ns) // period_ns)]
     last = [max((t for t in ticks if t <= at), default=None) for at in due if at < ends_ns]
     expected = [t_ns for t_ns in dict.fromkeys(last) if t_ns is not None]
-    seen = list(updates(short, Pipeline(settings), hz))
+    seen = list(updates([short], Pipeline(settings), hz))
     assert [update.t_ns for _, update in seen] == expected
     late_s = [t_s - (update.t_ns - begins_ns) * 1e-9 for t_s, update in seen]
     assert -1e-9 <= min(late_s) <= max(late_s) < 1 / settings.beams.update_hz
@@ -161,7 +161,7 @@ def test_looks_are_at_the_last_tick(short: Path, hz: float) -> None:
 def test_sharp_beams_are_those_of_a_pipeline_that_does_not_widen(
     cut: Path, watched: Watched
 ) -> None:
-    sharp = watch(cut, on_carrier(beams={"widen": False}), 1.0)
+    sharp = watch([cut], on_carrier(beams={"widen": False}), 1.0)
     assert (watched.widen, sharp.widen) == (True, False)
     assert len(watched.samples) == len(sharp.samples) > 80
     for ours, theirs in zip(watched.samples, sharp.samples, strict=True):
@@ -210,7 +210,7 @@ def around(towards: np.ndarray, bound_rad: float, rng: np.random.Generator) -> n
 @pytest.mark.full
 def test_a_look_by_brute_force(cut: Path, looked: tuple[Pipeline, Update]) -> None:
     pipeline, update = looked
-    truth = array_truth.load(cut, pipeline)
+    truth = array_truth.load([cut], pipeline)
     assert truth is not None
     assert update.carrier is not None
     seen = sight(pipeline)
@@ -254,7 +254,7 @@ def _best(pipeline: Pipeline, seen: Sight, towards: np.ndarray) -> int:
 def test_a_codebook_that_is_missed_is_said(looked: tuple[Pipeline, Update], cut: Path) -> None:
     """A truth far off: outside the bound, and its best beam is not swept."""
     pipeline, update = looked
-    truth = array_truth.load(cut, pipeline)
+    truth = array_truth.load([cut], pipeline)
     assert truth is not None
     swapped = replace(truth, flights={"1:1": truth.flights["2:1"], "2:1": truth.flights["1:1"]})
     samples = {sample.uav: sample for sample in look(sight(pipeline), update, swapped, 0.0)}
@@ -325,7 +325,7 @@ def test_true_directions_by_another_way(cut: Path, looked: tuple[Pipeline, Updat
     """By pymavlink, pymap3d, and the angles instead of the quaternion. The predicted attitude is
     off by a degree: it would not pass."""
     pipeline, update = looked
-    truth = array_truth.load(cut, pipeline)
+    truth = array_truth.load([cut], pipeline)
     assert truth is not None
     assert update.carrier is not None
     at_s = update.beams.valid_at_ns * 1e-9
@@ -360,7 +360,7 @@ def test_past_the_end_of_the_truth_nothing_is_known(
     cut: Path, looked: tuple[Pipeline, Update]
 ) -> None:
     pipeline, update = looked
-    truth = array_truth.load(cut, pipeline)
+    truth = array_truth.load([cut], pipeline)
     assert truth is not None
     assert update.carrier is not None
     later = replace(update.carrier, valid_at_ns=update.carrier.valid_at_ns + 60 * S)
@@ -377,12 +377,12 @@ def test_past_the_end_of_the_truth_nothing_is_known(
 
 def test_the_truth_of_the_carrier_alone_is_none(short: Path, tmp_path: Path) -> None:
     log = without(short, tmp_path / "own.tlog", lambda f: f.msgid == 108 and f.source.sysid < 5)
-    assert watch(log, on_carrier(), 0.5).truth is None
+    assert watch([log], on_carrier(), 0.5).truth is None
 
 
 def test_a_carrier_without_truth_is_as_predicted(cut: Path, tmp_path: Path) -> None:
     log = without(cut, tmp_path / "some.tlog", lambda f: f.msgid == 108 and f.source.sysid == 5)
-    found = watch(log, on_carrier(), 0.5)
+    found = watch([log], on_carrier(), 0.5)
     row = summed_up(found.samples)
     assert found.truth == "SIM_STATE, carrier as predicted"
     assert row["n_true"] == row["n"] > 0
@@ -404,7 +404,7 @@ def test_a_log_without_truth(short: Path, tmp_path: Path) -> None:
 
 def test_a_station(cut: Path) -> None:
     """What stands has no attitude to be wrong about."""
-    found = watch(cut, Settings().override(center={"source": "47.3977419,8.5455938,500"}), 0.5)
+    found = watch([cut], Settings().override(center={"source": "47.3977419,8.5455938,500"}), 0.5)
     row = summed_up(found.samples)
     assert found.truth == "SIM_STATE"
     assert set(found.by_uav) == UAVS | {"5:1"}
@@ -420,7 +420,7 @@ def test_a_station(cut: Path) -> None:
 def test_a_sweep_of_a_tenth_of_a_panel_s_beams_holds_the_best(cut: Path) -> None:
     """The 64 beams of 8 × 8 elements, once a track has its bound."""
     panel = on_carrier(array={"kind": "ura"}, codebook={"kind": "dft"})
-    samples = watch(cut, panel, 5.0).samples
+    samples = watch([cut], panel, 5.0).samples
     assert not any(sample.missed for sample in samples)
     assert sum(sample.missed is False for sample in samples) > 440
     shares = [s.sweep_share for s in samples if s.t_s > 3 and s.sweep_share is not None]
@@ -429,10 +429,10 @@ def test_a_sweep_of_a_tenth_of_a_panel_s_beams_holds_the_best(cut: Path) -> None
 
 
 def test_the_codebook_of_the_settings_and_none(short: Path) -> None:
-    fine = watch(short, on_carrier(codebook={"kind": "dft", "oversampling": 2}), 0.5)
+    fine = watch([short], on_carrier(codebook={"kind": "dft", "oversampling": 2}), 0.5)
     assert fine.codebook_beams == 128
     assert summed_up(fine.samples)["codebook_misses"] == 0
-    circle = watch(short, on_carrier(array={"kind": "uca", "elements": 8}), 0.5)
+    circle = watch([short], on_carrier(array={"kind": "uca", "elements": 8}), 0.5)
     row = summed_up(circle.samples)
     assert circle.codebook_beams is None
     assert charts(circle).keys() == {"gain", "gain_had"}
@@ -604,7 +604,7 @@ def test_where_a_bound_does_not_hold_no_more_is_lost(short: Path) -> None:
     bold = {"follow_accuracy": False, "position_noise_m": 0.05, "velocity_noise_mps": 0.05}
     held = {"attitude_bound_deg": 0.1, "turn_acceleration_max_degps2": 0.0}
     settings = on_carrier(observer=bold).override(center=held)
-    row = summed_up(watch(short, settings, 2.0).samples)
+    row = summed_up(watch([short], settings, 2.0).samples)
     assert 0 < row["bound_violations"] < row["n"]
     assert row["violations"] > 0
     assert row["codebook_misses"] > 0

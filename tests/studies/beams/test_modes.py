@@ -55,7 +55,7 @@ def test_each_width_gives_what_it_is_for(rows: dict[str, modes.Row]) -> None:
 
 def test_the_likely_row_is_of_the_pipeline_s_own_beams(rows: dict[str, modes.Row]) -> None:
     pipeline = Pipeline(SETTINGS)
-    heard, _, _ = modes.events(CUT, CLEAN, SETTINGS)
+    heard, _, _ = modes.events([CUT], CLEAN, SETTINGS)
     ticks, gains_db, sure_db = 0, [], []
     for event in heard:
         pipeline.step(event)
@@ -79,11 +79,11 @@ def test_the_likely_row_is_of_the_pipeline_s_own_beams(rows: dict[str, modes.Row
 
 
 def test_over_a_radio_the_carrier_is_heard_as_it_was() -> None:
-    heard, observed, _ = modes.events(CUT, RADIO, SETTINGS)
+    heard, observed, _ = modes.events([CUT], RADIO, SETTINGS)
     events = list(heard)
     times = [event.t_ns for event in events]
     assert times == sorted(times)
-    clean, logged, _ = modes.events(CUT, CLEAN, SETTINGS)
+    clean, logged, _ = modes.events([CUT], CLEAN, SETTINGS)
     sources = [str(e.source) for e in events if not isinstance(e, Tick)]
     before = [str(e.source) for e in clean if not isinstance(e, Tick)]
     assert sources.count("5:1") == before.count("5:1")
@@ -101,3 +101,20 @@ def test_the_command_compares_over_the_links_that_are_named(
     assert "links are some of clean, radio, hostile, noisy" in str(wrong.output) + str(
         wrong.exception
     )
+
+
+def test_logs_of_the_vehicles_themselves_are_one_flight(tmp_path: Path) -> None:
+    """The carrier is one file, the UAV another, and both have the simulator's truth."""
+    folder = ROOT / "tests" / "data"
+    logs = [str(folder / f"sitl_planes_cut_{number}.bin") for number in (1, 5)]
+    words = ["study", "beams", *logs, "--center", logs[1], "--hz", "1", "--out", str(tmp_path)]
+    done = CliRunner().invoke(main, [*words, "--links", "clean", "--json"])
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)
+    assert told["command"].split()[3:5] == logs
+    (log,) = told["logs"]
+    assert log["log"] == "sitl_planes_cut_1.bin + sitl_planes_cut_5.bin"
+    assert (log["center"], log["truth"]) == ("5:1", "SIM_STATE")
+    assert [row["uav"] for row in told["rows"]] == ["1:1"]
+    assert {row["log"] for row in told["modes"]} == {log["log"]}
+    assert all(row["truth"] == "SIM_STATE" for row in told["modes"])

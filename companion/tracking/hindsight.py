@@ -13,7 +13,7 @@ from bisect import insort
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Final
 
 from companion.values import Fix, Vector
@@ -80,25 +80,31 @@ class _Made:
     accelerations: tuple[Vector | None, ...]
     aside: Vector  # of the smoothed position from the reported one
 
-    def off_m(self, ways: Sequence[int], there: Vector, ahead_s: float) -> list[float]:
-        """How far predictions by some ways are from a position reported later.
+    def off_m(self, way: int, there: Vector, ahead_s: float) -> float:
+        """How far the prediction by a way is from a position reported later.
 
         The numbers of ways are those of ``WAYS``, and then once more over smoothed positions.
         """
+        (reported_m,), (smoothed_m,) = self.offs_m((way % len(WAYS),), there, ahead_s)
+        return reported_m if way < len(WAYS) else smoothed_m
+
+    def offs_m(
+        self, ways: Sequence[int], there: Vector, ahead_s: float
+    ) -> tuple[list[float], list[float]]:
+        """The same of several of ``WAYS``: over reported positions, and over smoothed ones."""
         (n, e, d), (vn, ve, vd), (tn, te, td) = self.position, self.velocity, there
         n, e, d = n + vn * ahead_s - tn, e + ve * ahead_s - te, d + vd * ahead_s - td
-        found = []
+        aside_n, aside_e, aside_d = self.aside
+        reported, smoothed = [], []
         for way in ways:
-            which = way % len(WAYS)
-            given, north, east, down = self.accelerations[which], n, e, d
+            given, north, east, down = self.accelerations[way], n, e, d
             if given is not None:
-                (by_n, by_e, by_d), _ = fed(WAYS[which], given, self.velocity, ahead_s)
+                (by_n, by_e, by_d), _ = fed(WAYS[way], given, self.velocity, ahead_s)
                 north, east, down = north + by_n, east + by_e, down + by_d
-            if way != which:
-                (by_n, by_e, by_d) = self.aside
-                north, east, down = north + by_n, east + by_e, down + by_d
-            found.append(math.sqrt(north * north + east * east + down * down))
-        return found
+            reported.append(math.sqrt(north * north + east * east + down * down))
+            north, east, down = north + aside_n, east + aside_e, down + aside_d
+            smoothed.append(math.sqrt(north * north + east * east + down * down))
+        return reported, smoothed
 
 
 @dataclass(slots=True)
@@ -183,7 +189,7 @@ class Hindsight:
             if made is not None and made.sender_ns > errors.judged_ns:
                 errors.judged_ns = made.sender_ns
                 age_s = (fix.sender_ns - made.sender_ns) * 1e-9
-                errors.add(made.off_m((self._way,), there, age_s)[0], age_s)
+                errors.add(made.off_m(self._way, there, age_s), age_s)
         if fix.velocity_ned_mps is not None:
             velocity, aside = fix.velocity_ned_mps, self._aside
             self._made.append(_Made(fix.sender_ns, there, velocity, accelerations, aside))
@@ -207,7 +213,7 @@ class Hindsight:
         for one in (made, self._older(sender_ns, JUDGED_S[1])):
             if one is not None:
                 ahead_s = (sender_ns - one.sender_ns) * 1e-9
-                off_m = one.off_m(range(len(self._costs)), there, ahead_s)
+                off_m = chain(*one.offs_m(range(len(WAYS)), there, ahead_s))
                 self._costs = [c + m * m for c, m in zip(self._costs, off_m, strict=True)]
         self._judged += 1
         if self._judged < JUDGED:

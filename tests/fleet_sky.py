@@ -21,13 +21,17 @@ STEP_S = 0.005
 
 @dataclass
 class FleetSky:
-    """``uavs`` vehicles that report at ``hz``; each is heard at the ports in ``heard_at``."""
+    """``uavs`` vehicles that report at ``hz``; each is heard at the ports in ``heard_at``.
+
+    ``hosts`` has those of ports that are not on this machine.
+    """
 
     ports: list[int]
     uavs: int = 6
     hz: float = 10.0
     sent: int = 0
     heard_at: dict[str, set[int]] = field(default_factory=dict)
+    hosts: dict[int, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.names = [f"{number + 1}:1" for number in range(self.uavs)]
@@ -107,7 +111,7 @@ class FleetSky:
 
     def _send(self, number: int, raw: bytes) -> None:
         for port in self.heard_at[self.names[number]]:
-            self._socket.sendto(raw, ("127.0.0.1", port))
+            self._socket.sendto(raw, (self.hosts.get(port, "127.0.0.1"), port))
 
 
 def off_m(place: tuple[float, float, float], other: tuple[float, float, float]) -> float:

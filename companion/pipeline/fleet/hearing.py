@@ -130,6 +130,10 @@ class Hearing:
         t_ns = min(most_ns, max(now_ns, least_ns))
         return Frame(t_ns, f"fleet:{node}", source, msgid, raw, t_ns - least_ns)
 
+    def was_told(self, key: bytes) -> bool:
+        """Whether a report of this content was told by another node of late."""
+        return key in self._told
+
     def told(self, now_ns: int, node: str, frame: Frame, key: bytes) -> list[Frame]:
         """What the pipeline is to have, now that another node told a frame; mostly nothing."""
         if frame.msgid == GLOBAL_POSITION_INT:
@@ -138,7 +142,8 @@ class Hearing:
         return [frame] if ears is None or ears.is_silent(now_ns) else []
 
     def _report(self, now_ns: int, node: str, frame: Frame, key: bytes) -> list[Frame]:
-        if key in self._heard or not self._told.note(now_ns, key):
+        is_new = self._told.note(now_ns, key)
+        if key in self._heard or not is_new:
             return []
         is_refused = self._twins.refuses(node, node, frame)
         self._twins.told.clear()

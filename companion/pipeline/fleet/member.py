@@ -143,9 +143,10 @@ class Member:
             known.frames += 1
             if frame is None:
                 continue
-            known.ways_ns.append(now_ns - frame.t_ns + frame.doubt_ns)
             key = content(frame.raw)
             if frame.msgid == GLOBAL_POSITION_INT:
+                if not self.hearing.was_told(key):  # the second time it is late, and no matter
+                    known.ways_ns.append(now_ns - frame.t_ns + frame.doubt_ns)
                 self.sharing.told(now_ns, node, frame.source, key, way_ns)
             events += self.hearing.told(now_ns, node, frame, key)
         for trip in said.trips:

@@ -78,7 +78,8 @@ class Neighbour:
     offers      its offers by UAV
     frames      frames that it told, ``used`` those that the pipeline had
     heard_ns    when there was word of it last
-    ways_ns     how long the newest of them took from being heard there to being here, at most
+    ways_ns     how long the newest reports took from being heard there to being here, at most: of
+                those that no other had told before
     """
 
     clock: NeighbourClock

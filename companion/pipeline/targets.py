@@ -29,7 +29,7 @@ class Targets:
         self._all = settings.beams.targets == "all"
         self._dropped_s = settings.tracks.dropped_s
         self._identities = Identities()
-        self._states: Mapping[str, TrackState] = {}
+        self._states: dict[str, TrackState] = {}
         self.duty: Duty | None = None
 
     def wants(self, uav: str) -> bool:
@@ -75,15 +75,17 @@ class Targets:
         self._identities.observe(relayed, better)
 
     def forget(self, uav: str) -> None:
-        """Forget what a relayed aircraft was compared with."""
+        """Forget a UAV that is dropped: its state, and what it was compared with if relayed."""
         self._identities.forget(uav)
+        self._states.pop(uav, None)
 
     # --- what is said of them ---------------------------------------------------------------
 
     def changes(self, now_ns: int, states: Mapping[str, TrackState]) -> list[Notice]:
         """One notice for each target, or the carrier, whose state changed since the last call."""
         changed = [uav for uav, state in states.items() if self._states.get(uav) is not state]
-        self._states = states
+        elsewhere = {} if self.duty is None else self._states  # whom another node served meanwhile
+        self._states = {**elsewhere, **states}
         notices = []
         for uav in changed:
             bad = states[uav] in (TrackState.STALE, TrackState.LOST)

@@ -1,4 +1,4 @@
-"""UAVs that another node serves and this one spares: nulls on them, and no beam."""
+"""UAVs that another node serves: nulls on them where they are spared, and nothing said of them."""
 
 import numpy as np
 from fleet_sky import FleetSky
@@ -8,25 +8,42 @@ from companion.beams.array import steering
 from companion.mavlink.wire.framing import Splitter
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
-from companion.values import Duty, Frame, Tick
+from companion.values import Duty, Frame, Notice, Tick
 
 S = 1_000_000_000
 START_NS = 1_800_000_000 * S
 
 
-def test_beams_have_nulls_on_the_spared_as_long_as_they_are() -> None:
-    sky = FleetSky([], uavs=2)
-    pipeline = Pipeline(
-        Settings().override(center={"source": "47.3977,8.5456,480"}, beams={"widen": "no"})
-    )
-    pipeline.step(Duty(START_NS, ("1:1",), ("2:1",)))
-    for step in range(30):
-        now_ns = START_NS + step * S // 10
+def flown(pipeline: Pipeline, seconds: float, begins_ns: int = START_NS) -> list[str]:
+    """What is said while two vehicles fly."""
+    sky, said = FleetSky([], uavs=2), []
+    for step in range(round(10 * seconds)):
+        now_ns = begins_ns + step * S // 10
         for number in range(2):
             frame = Splitter("udp").feed(now_ns, sky.report(number, sky.begun_s + step / 10))[0]
             assert isinstance(frame, Frame)
             pipeline.step(frame)
-        pipeline.step(Tick(now_ns + 1))
+        said += pipeline.step(Tick(now_ns + 1))
+    return [one.text for one in said if isinstance(one, Notice)]
+
+
+def test_who_comes_back_from_another_node_is_not_live_anew() -> None:
+    pipeline = Pipeline(Settings().override(center={"source": "47.3977,8.5456,480"}))
+    pipeline.step(Duty(START_NS, ("1:1", "2:1")))
+    said = flown(pipeline, 1.0)
+    for serves in (("1:1",), ("1:1", "2:1")):
+        pipeline.step(Duty(START_NS + S, serves))
+        said += flown(pipeline, 1.0, START_NS + 2 * S)
+    assert said.count("2:1 is live") == 1
+
+
+def test_beams_have_nulls_on_the_spared_as_long_as_they_are() -> None:
+    pipeline = Pipeline(
+        Settings().override(center={"source": "47.3977,8.5456,480"}, beams={"widen": "no"})
+    )
+    pipeline.step(Duty(START_NS, ("1:1",), ("2:1",)))
+    flown(pipeline, 3.0)
+    now_ns = START_NS + 3 * S
     towards_db = {}
     for spares in (("2:1",), ()):
         pipeline.step(Duty(now_ns, ("1:1",), spares))

@@ -17,6 +17,7 @@ const LATE_MS = 1150;
 const MISSED_MS = 2150;
 /** Without any answer at all for so long, the service is lost. */
 export const LOST_MS = 3000;
+const NO_TOKEN = "the service asks for a token";
 const BAD_ANSWERS = ["lost", "frozen", "waiting"];
 
 const isListOf = (list, key) =>
@@ -130,7 +131,7 @@ export class Feed {
         signal: abort.signal, cache: "no-store", headers: { Accept: "application/json" },
       });
       if (!response.ok && !this.statuses?.includes(response.status)) {
-        throw new Error(response.status === 401 ? "the service asks for a token"
+        throw new Error(response.status === 401 ? NO_TOKEN
           : `the service answered ${response.status}`);
       }
       const data = await response.json();
@@ -236,6 +237,7 @@ export function connection(feeds, now = performance.now()) {
   }
   const lost = having("lost");
   const frozen = having("frozen");
+  if (lost.length && lost.every((feed) => feed.problem === NO_TOKEN)) return { state: "token" };
   const names = (list) => list.map((feed) => feed.what).join(", ");
   if (lost.length) return { state: "partial", what: names(lost), problem: lost[0].problem };
   if (frozen.length) return { state: "frozen", what: names(frozen) };

@@ -18,7 +18,10 @@ export class LastKnown {
     for (const beam of beams) this.beams.set(beam.uav, { beam, at });
     if (answer?.array) this.array = answer.array;
     if (uav !== null && pattern?.patterns.some((one) => one.uav === uav)) {
-      this.picture = { uav, pattern, weights, patternBeams, at };
+      // Weights are asked for less often: those of the same beam stay until there are others.
+      const before = this.picture?.uav === uav ? this.picture.weights : null;
+      const has = weights?.uavs?.includes(uav);
+      this.picture = { uav, pattern, weights: has ? weights : before, patternBeams, at };
     }
   }
 

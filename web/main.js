@@ -156,7 +156,9 @@ function showAll(link, now) {
   const carrier = carrierOf(found.status);
   const view = { ...found, carrier, uavs: found.uavs.map((uav) => placedBy(uav, carrier)) };
   if (selected !== null && !view.uavs.some((uav) => uav.id === selected)) selected = null;
-  showConnection(link, feeds.uavs.data?.valid_at);
+  const { status } = feeds;
+  showConnection(link, feeds.uavs.data?.valid_at,
+    status.isTrusted(now) ? status.data.health?.behind : null);
   showReadiness(feeds.readyz.data);
   showRecordings(feeds.recordings.data);
   alarm.watch(feeds.uavs.data?.uavs ?? [], link.state === "lost" && !link.never, now);
@@ -231,6 +233,7 @@ function planMessage(view, link, now) {
   }
   if (link.never) return "NOT LIVE – no connection";
   if (link.state === "lost") return "NOT LIVE – connection lost";
+  if (link.state === "token") return "NOT LIVE – token asked for";
   if (feeds.uavs.health(now) === "frozen") return "NOT LIVE – estimates stopped";
   if (feeds.uavs.health(now) === "lost") return "NOT LIVE – no answer about UAVs";
   const { unfit, ageS } = view.carrier ?? {};
@@ -260,7 +263,7 @@ function showPlan(view, link, now) {
 
 /** The tab's title and the picture's name tell the state to whoever does not see the page. */
 function nameThePage({ uavs, beams, status }, link) {
-  const trouble = { lost: "CONNECTION LOST", partial: "CONNECTION FAILING", frozen: "STOPPED" };
+  const trouble = { lost: "CONNECTION LOST", partial: "CONNECTION FAILING", token: "TOKEN", frozen: "STOPPED" };
   const state = trouble[link.state] ?? (timebar.isLive ? "" : "PAUSED");
   setText($("node-name"), status?.node ?? "");
   const title = [state || headlineOf(uavs).text, status?.node, "companion"].filter(Boolean)

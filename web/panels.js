@@ -21,11 +21,12 @@ const CHIPS = {
   late: ["warn", "service answers late"],
   partial: ["bad", "service fails in part"],
   frozen: ["bad", "estimates stopped"],
+  token: ["warn", "asks for a token"],
   lost: ["bad", "connection to the service lost"],
   never: ["bad", "service not reached"],
 };
 
-function bannerText(link, lastStamp) {
+function bannerText(link, lastStamp, behind) {
   const since = link.silentS === undefined ? "" : format.duration(link.silentS);
   switch (link.state) {
     case "lost":
@@ -35,7 +36,7 @@ function bannerText(link, lastStamp) {
         : ["CONNECTION LOST", `Nothing received for ${since} (${link.problem}). What is shown is `
           + `from ${lastStamp} and is no longer true. Still trying.`];
     case "partial":
-      return ["CONNECTION FAILING", `No answer about ${link.what} (${link.problem}): struck values `
+      return ["CONNECTION FAILING", `No answer about ${link.what} (${behind ?? link.problem}): struck values `
         + "are no longer true. Still trying."];
     case "frozen":
       return ["ESTIMATES STOPPED", `The service answers, but its time stands still at ${lastStamp} `
@@ -57,9 +58,10 @@ export function showFault(error) {
     + "Struck values are no longer true; reload the page.");
 }
 
-export function showConnection(link, lastStamp) {
+/** `behind`: that this machine does not keep up, in words, where that is so: then it is the cause. */
+export function showConnection(link, lastStamp, behind = null) {
   setChip($("connection"), ...CHIPS[link.never ? "never" : link.state]);
-  const text = bannerText(link, format.clock(lastStamp));
+  const text = bannerText(link, format.clock(lastStamp), behind);
   if (text) showBanner(...text);
   else $("banner").hidden = true;
 }
@@ -218,12 +220,12 @@ export function showBeams(answer) {
     return;
   }
   const { beams, array } = answer;
-  const regularised = answer.regularised || answer.method === "rzf";
+  const regularised = beams.length > 0 && (answer.regularised || answer.method === "rzf");
   setText($("beams-line"), [
     METHODS[answer.method] ?? answer.method ?? format.UNKNOWN,
-    `${beams.length} beam${beams.length === 1 ? "" : "s"}`,
-    `condition number ${conditionNumber(answer.condition_number)}`,
-  ].join(" · "));
+    `${beams.length || "no"} beam${beams.length === 1 ? "" : "s"}`,
+    beams.length ? `condition number ${conditionNumber(answer.condition_number)}` : "",
+  ].filter(Boolean).join(" · "));
   setText($("beams-array"), array ? [
     `${format.count(array.elements)} elements (${array.kind?.toUpperCase() ?? format.UNKNOWN})`,
     format.hertz(array.frequency_hz),

@@ -244,8 +244,11 @@ export class PlanView {
     context.ellipse(
       ...this.at(uav.north_m, uav.east_m), acrossPx, alongPx, 0, 0, 2 * Math.PI,
     );
-    context.fillStyle = withAlpha(this.colourOf(uav), 0.1);
-    context.fill();
+    // One as large as the picture says it by its rim: several would cover all else.
+    if (Math.max(alongPx, acrossPx) < this.outerPx) {
+      context.fillStyle = withAlpha(this.colourOf(uav), 0.1);
+      context.fill();
+    }
     context.strokeStyle = this.colourOf(uav);
     context.globalAlpha = 0.8;
     context.lineWidth = 1;
@@ -284,17 +287,21 @@ export class PlanView {
     const { context } = this;
     const size = this.width < 500 ? 16 : isQuiet ? 17 : 22;
     const x = this.width / 2;
-    const y = isQuiet ? this.height - size : this.height / 2 + this.outerPx * 0.42;
-    const widthPx = this.measure(text, size, 700) + 36;
+    const y = this.height / 2 + this.outerPx * 0.42;
+    const fits = this.measure(text, size, 700) + 36 <= this.width;
+    const lines = fits ? [text] : text.split(/(?<=:) /); // the cause, and how old that is
+    const widthPx = Math.max(...lines.map((line) => this.measure(line, size, 700))) + 36;
+    const heightPx = size * (0.8 + 1.2 * lines.length);
+    const top = isQuiet ? this.height - heightPx : y - heightPx / 2;
     context.fillStyle = isQuiet ? this.colour.plan
       : isPast ? this.colour.past : this.colour.bad;
-    context.fillRect(x - widthPx / 2, y - size, widthPx, size * 2);
+    context.fillRect(x - widthPx / 2, top, widthPx, heightPx);
     context.font = `700 ${size}px ${this.font}`;
     context.textAlign = "center";
     context.textBaseline = "middle";
     context.fillStyle = isQuiet ? this.colour.warn
       : isPast ? this.colour["on-past"] : this.colour.plan;
-    context.fillText(text, x, y);
+    lines.forEach((line, i) => context.fillText(line, x, top + size * (1 + 1.2 * i)));
   }
 
   nearest(event) {

@@ -38,7 +38,9 @@ class Evidence:
 def of_left_out(out: LeftOut, track: Track, unfit: str | None) -> Blame:
     """Why a UAV has no beam. ``unfit`` is what keeps everybody from having one."""
     if unfit is not None:
-        return Blame(Cause.CARRIER, unfit, "see what carries the array")
+        return Blame(
+            Cause.CARRIER, unfit, "see what carries the array: is it powered, heard, with a fix?"
+        )
     match out.cause:
         case Cause.CROWDED:
             remedy = 'fly them apart, or set [beams] policy = "group"'

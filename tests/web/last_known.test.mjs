@@ -8,7 +8,7 @@ import { load } from "./browser.mjs";
 import { LAT, LON, stampAt, statusAnswer, uav, weak } from "./service.mjs";
 import { BEAT_MS, openPage } from "./whole_page.mjs";
 
-const { carrierOf, placedBy } = await load("last_known.js");
+const { LastKnown, carrierOf, placedBy } = await load("last_known.js");
 const CAUSE = "the attitude of the carrier 5:1 is too old";
 const lastPose = (fields = {}) => ({
   at: stampAt(0), lat_deg: LAT, lon_deg: LON, alt_m: 450, heading_deg: 90, ...fields,
@@ -58,7 +58,8 @@ test("without the carrier the picture stays, with its age, and the cause is in t
   await page.time.advance(10_000);
   const plan = await page.drawn();
   plan.text("1:1".replace("1", "✕ 1"));
-  assert.ok(plan.texts.some((text) => text.startsWith(`${CAUSE}: carrier and beams as `)), plan.texts.join());
+  plan.text(`${CAUSE}:`);
+  assert.ok(plan.texts.some((text) => text.startsWith("carrier and beams as ")), plan.texts.join());
   assert.deepEqual(page.cells("range"), [range, range]);
   assert.deepEqual(page.cells("gain"), ["17.5 dB", "17.5 dB"]);
   const cell = page.document.querySelector("td[data-key=gain]");
@@ -67,6 +68,20 @@ test("without the carrier the picture stays, with its age, and the cause is in t
   assert.match(page.text("troubles"), new RegExp(CAUSE));
   assert.match(page.text("center"), new RegExp(CAUSE));
   assert.match(page.document.querySelector(".focus-uav").textContent, /^1:1, as \d+.s ago$/);
+});
+
+test("weights of a beam stay with it while there are none, and are no other beam's", () => {
+  const last = new LastKnown();
+  const [pattern, weights] = [{ patterns: [{ uav: "1:1" }, { uav: "2:1" }] }, { uavs: ["1:1"] }];
+  const note = (uav, found) => last.note({ uavs: [], beams: [], pattern, ...found }, uav, 0);
+  note("1:1", { weights });
+  assert.equal(last.picture.weights, weights);
+  for (const none of [null, { uavs: [] }]) {
+    note("1:1", { weights: none });
+    assert.equal(last.picture.weights, weights);
+  }
+  note("2:1", { weights });
+  assert.equal(last.picture.weights, null);
 });
 
 test("where this machine is behind, that is the cause, and no old attitude", async () => {

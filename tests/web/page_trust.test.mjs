@@ -122,6 +122,28 @@ test("where beams alone are not answered, UAVs stay live", async () => {
   assert.equal(page.document.title, "CONNECTION FAILING · companion");
 });
 
+test("a token that is asked for is no connection that fails, and nothing looks live meanwhile", async () => {
+  const page = await openPage();
+  const { answer } = page.service;
+  page.service.answer = (path) => (path.startsWith("/v1/") ? { status: 401, body: "{}" }
+    : answer.call(page.service, path));
+  await page.time.advance(20 * BEAT_MS);
+  assert.equal(page.text("connection"), "asks for a token");
+  assert.ok(page.element("banner").hidden);
+  assert.ok(page.marked("lost").includes("uavs"));
+  assert.match(page.document.title, /^TOKEN/);
+  (await page.drawn()).text("NOT LIVE – token asked for");
+});
+
+test("what keeps the service from answering is said in its words where it is known", async () => {
+  const page = await openPage();
+  const cause = "this machine is behind: frames wait 2.0 s for it";
+  page.service.status.health.behind = cause;
+  page.service.answers["/v1/beams"] = { status: 503, body: "{}" };
+  await page.time.advance(8 * BEAT_MS);
+  assert.ok(page.text("banner-detail").startsWith(`No answer about beams (${cause})`));
+});
+
 test("where UAVs alone are not answered, the plan is not live", async () => {
   const page = await openPage();
   page.service.answers["/v1/uavs"] = { status: 500, body: "{}" };

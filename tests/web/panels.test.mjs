@@ -51,8 +51,14 @@ test("a bad connection cannot be overlooked, and it is said since when and why",
     assert.match(text("banner-detail"), detail);
     assert.notEqual(text("banner"), null);
   }
-  panels.showConnection({ state: "live" }, stampAt(8));
-  assert.equal(text("banner"), null);
+  const late = { state: "partial", what: "beams", problem: "no answer within 2 s" };
+  panels.showConnection(late, stampAt(7), "this machine is behind: frames wait 2.0 s for it");
+  assert.match(text("banner-detail"), /about beams \(this machine is behind: frames wait 2\.0 s/);
+  for (const state of ["live", "token"]) { // the dialog says the latter
+    panels.showConnection({ state }, stampAt(8));
+    assert.equal(text("banner"), null);
+  }
+  assert.deepEqual([text("connection"), level("connection")], ["asks for a token", "warn"]);
 });
 
 test("a fault of the page itself is said", () => {
@@ -206,7 +212,7 @@ test("the beams in a line: method, number, condition; the array and the lead in 
   assert.match(text("beams-array"), /\(URA\).* · lead –$/);
   panels.showBeams(beamsAnswer([], { condition_number: null, array: null }));
   assert.deepEqual([text("beams-line"), text("beams-array")],
-    ["Zero forcing · 0 beams · condition number –", "–"]);
+    ["Zero forcing · no beams", "–"]);
 });
 
 test("what is not known is said to be so, and nothing of before stays", () => {
@@ -224,8 +230,12 @@ test("what is not known is said to be so, and nothing of before stays", () => {
 
 test("that nulls are held back is said", () => {
   const { text } = openPanels();
-  panels.showBeams(beamsAnswer([]));
-  assert.equal(text("beams-warning"), null);
-  panels.showBeams(beamsAnswer([], { regularised: true }));
+  for (const beams of [[], [beam("1:1")]]) {
+    panels.showBeams(beamsAnswer(beams));
+    assert.equal(text("beams-warning"), null);
+  }
+  panels.showBeams(beamsAnswer([beam("1:1")], { regularised: true }));
   assert.match(text("beams-warning"), /^Nulls are not exact/);
+  panels.showBeams(beamsAnswer([], { regularised: true })); // where there are none, of none
+  assert.equal(text("beams-warning"), null);
 });

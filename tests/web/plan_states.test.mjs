@@ -93,6 +93,28 @@ test("what must not be overlooked stands across the picture, the past in its col
   assert.equal(plate(said).fillStyle, view.browser.colour("plan"));
 });
 
+test("a message that is wider than the picture takes two lines, after its colon", async () => {
+  const view = await openPlan();
+  const cause = "the attitude of the carrier 5:1 is too old:";
+  const picture = view.show({ message: `${cause} carrier and beams as 19 s ago`, uavs: [] });
+  const [above, below] = [picture.text(cause), picture.text("carrier and beams as 19 s ago")];
+  const found = picture.of("rect").at(-1);
+  assert.ok(found.y < above.y && above.y < below.y && below.y < found.y + found.height);
+  assert.ok(found.x >= 0 && found.y + found.height <= view.plan.height);
+});
+
+test("a bound as large as the picture is a rim: several would cover all else", async () => {
+  const view = await openPlan();
+  const drawn = (boundM) => {
+    const picture = view.show({
+      uavs: [uav("1:1", { bound_cylinder_ned_m: [boundM, boundM, 2] })],
+    });
+    return ["fill", "stroke"].map((kind) =>
+      picture.of(kind, ({ path }) => path.length === 1 && path[0].op === "ellipse").length);
+  };
+  assert.deepEqual([drawn(20), drawn(400)], [[1, 1], [0, 1]]);
+});
+
 test("the colours are those of the theme", async () => {
   const view = await openPlan();
   view.browser.document.documentElement.dataset.theme = "light";

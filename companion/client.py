@@ -71,7 +71,7 @@ class Client:
     """
 
     def __init__(self, url: str, token: str | None = None, timeout_s: float = 10.0) -> None:
-        if urlsplit(url).scheme not in ("http", "https"):
+        if not _is_address(url):
             raise UserError(f"{url!r} is not http://HOST:PORT")
         self._url = url.rstrip("/")
         self._token = token
@@ -188,6 +188,15 @@ class Client:
         except (OSError, HTTPException) as error:
             raise ServiceError(None, f"{self._url}: {_reason(error)}") from error
         return found
+
+
+def _is_address(url: str) -> bool:
+    try:
+        found = urlsplit(url)
+        port = found.port
+    except ValueError:  # such as a port beyond 65535
+        return False
+    return found.scheme in ("http", "https") and bool(found.hostname) and port != 0
 
 
 def _read(answer: HTTPResponse) -> bytes:

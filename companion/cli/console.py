@@ -3,6 +3,7 @@
 import shutil
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
@@ -57,6 +58,22 @@ JSON_LINES = click.option(
     "--json", "as_json", is_flag=True, help="One JSON object a second on stdout: how it goes."
 )
 JSON = click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
+
+
+def make_folder(out: Path) -> None:
+    """Make the folder that a command writes to, at once: a long one must not fail at its end.
+
+    Where nothing was written by the command's end, it goes again.
+    """
+    made = [each for each in (out, *out.parents) if not each.exists()]
+    out.mkdir(parents=True, exist_ok=True)
+
+    def tidy() -> None:
+        for each in made:
+            with suppress(OSError):  # it is not empty
+                each.rmdir()
+
+    click.get_current_context().call_on_close(tidy)
 
 
 class InterruptedByUser(Exception):  # noqa: N818 - it is no error

@@ -81,10 +81,10 @@ def drive(
     from companion.pipeline import assembly
     from companion.settings.files import load
 
+    settings = load(config)
     stored: list[IntArray] = []
 
     def codebook() -> "list[IntArray]":
-        settings = load(config)
         array = assembly.array(settings)
         stored.extend(stored_registers(array, assembly.equipment(settings, array)))
         return stored

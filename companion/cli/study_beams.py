@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import CENTER, CONFIG, JSON, Progress
+from companion.cli.console import CENTER, CONFIG, JSON, Progress, make_folder
 
 
 @click.command()
@@ -51,7 +51,7 @@ def beams(
     settings = tuple(settings_for(each, config, center) for each in flown)
     over = tuple(name for name in links.split(",") if name)
     setting = BeamStudy(flown, settings, hz, center, str(config) if config else None, over)
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     if any(each.center.source is None for each in settings):
         click.echo("no --center: the array stands where the first report was made", err=True)
     answer, found = study(setting, progress.show)

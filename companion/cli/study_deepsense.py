@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import JSON, Progress
+from companion.cli.console import JSON, Progress, make_folder
 
 
 @click.command()
@@ -28,7 +28,7 @@ def deepsense(where: Path, seed: int, out: Path, as_json: bool) -> None:
 
     progress = Progress()
     samples = measured_beams.read(where)
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     answer = study.study(samples, seed, progress.show)
     (out / "deepsense.json").write_text(json.dumps(answer, indent=1), encoding="utf-8")
     for name, content in report.files(answer, progress.show).items():

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import JSON, Progress
+from companion.cli.console import JSON, Progress, make_folder
 
 
 def _span(_context: click.Context, _option: click.Parameter, text: str) -> tuple[int, int]:
@@ -76,7 +76,7 @@ def fleet(
     progress = Progress()
     sizes = tuple(zip(_steps(nodes, steps), _steps(uavs, steps), strict=True))
     asked = study.Asked(sizes, seconds, delay, loss, spacing_m=spacing, seed=seed)
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     found = list(study.run(asked, time.process_time, progress.show))
     spans = f"--nodes {nodes[0]}..{nodes[1]} --uavs {uavs[0]}..{uavs[1]} --steps {steps}"
     command = f"companion study fleet {spans} --seconds {seconds:g} --spacing {spacing:g}"

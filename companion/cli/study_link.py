@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import CENTER, CONFIG, JSON, Progress
+from companion.cli.console import CENTER, CONFIG, JSON, Progress, make_folder
 
 
 def _range(_context: click.Context, _option: click.Parameter, text: str) -> list[float]:
@@ -111,7 +111,7 @@ def link(
         scattering=Scattering(rician_k, delay_spread * 1e-9),
         seed=seed,
     )
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     answer = study(setting, progress.show)
     (out / "link.json").write_text(json.dumps(answer, indent=1), encoding="utf-8")
     for name, content in report.files(answer, progress.show).items():

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import JSON, Progress
+from companion.cli.console import JSON, Progress, make_folder
 
 
 @click.command()
@@ -22,7 +22,7 @@ def paper(seed: int, out: Path, as_json: bool) -> None:
     from companion.studies.paper import claims, experiments, page
 
     progress = Progress()
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     answer, material = experiments.study(seed, progress.show)
     answer["claims"] = claims.judge(answer)
     (out / "paper.json").write_text(json.dumps(answer, indent=1), encoding="utf-8")
@@ -45,7 +45,7 @@ def dt(out: Path, as_json: bool) -> None:
     from companion.studies.interval import maps
 
     progress = Progress()
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     answer, found = maps.study(progress.show)
     (out / "dt.json").write_text(json.dumps(answer), encoding="utf-8")
     for name, content in maps.files(answer, found, progress.show).items():

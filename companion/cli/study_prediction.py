@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import CENTER, CONFIG, JSON, Progress
+from companion.cli.console import CENTER, CONFIG, JSON, Progress, make_folder
 from companion.cli.design import numbers
 
 
@@ -108,7 +108,7 @@ def prediction(
         logs, center, tuple(leads_s), tuple(word.strip() for word in links.split(",")), radio,
         seed, load(config), name, learned, snr_db, jobs, cluster,
     )  # fmt: skip
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     if center is None:
         click.echo("no --center: the array stands where the first report was made", err=True)
     answer, found = study(setting, progress.show)

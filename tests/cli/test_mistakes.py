@@ -11,6 +11,7 @@ from companion.cli.main import main
 from companion.recording.foreign import kinds
 from companion.values import Reason
 from companion.views.words import REASONS
+from sitl_replay.cli import main as sitl
 
 FILES = {
     "flight.bin": b"\xa3\x95\x80\x80YFMT",
@@ -125,6 +126,60 @@ SAYS: list[tuple[str, int, str]] = [
     ("recover nothere.active", 1, "nothere.active"),
     ("study", 2, ""),
     ("rply good.tlog", 2, "Did you mean 'replay'? See companion --help"),
+    ("drive", 2, "Missing argument 'TARGET'. See companion drive --help"),
+    ("drive rotcld:127.0.0.1:4533", 1, "did you mean rotctld:HOST:PORT?"),
+    ("drive rotctld:127.0.0.1", 1, "'rotctld:127.0.0.1' is not rotctld:HOST:PORT"),
+    ("drive rotctld:127.0.0.1:99999", 1, "is not rotctld:HOST:PORT"),
+    ("drive gimbal:127.0.0.1:14550", 1, "is not gimbal:HOST:PORT:SYSID:COMPID"),
+    ("drive adar1000:x", 1, "is not adar1000:BUS.DEVICE"),
+    ("drive none:pointing --service nowhere", 1, "'nowhere' is not http://HOST:PORT"),
+    ("drive none:pointing --service https://", 1, "is not http://HOST:PORT"),
+    ("drive none:pointing --config nothere.toml", 1, "nothere.toml: No such file"),
+    ("drive none:pointing --config misspelt.toml", 1, "did you mean beams.update_hz?"),
+    ("drive none:pointing --rate 0", 2, "0.0 is not in the range 0.1<=x<=1000"),
+    ("drive none:pointing --aim center", 2, "'center' is not one of 'first', 'centre'"),
+    ("drive none:pointing --on-stale stop", 2, "'stop' is not one of 'hold', 'boresight'"),
+    ("fleet wach", 2, "Did you mean 'watch'? See companion fleet --help"),
+    ("fleet watch nowhere", 1, "'nowhere' is not http://HOST:PORT"),
+    ("fleet watch http://127.0.0.1:99999", 1, "is not http://HOST:PORT"),
+    ("fleet watch http://127.0.0.1:1", 1, "http://127.0.0.1:1: "),
+    ("fleet watch --seconds 0", 2, "0.0 is not in the range x>0"),
+    ("replay --fleet", 2, "Missing argument 'LOG...'. See companion replay --help"),
+    ("replay good.tlog --fleet", 1, "not a recording of a fleet's node"),
+    ("replay good.tlog --fleet --serve", 2, "--fleet takes recordings as they are"),
+    ("replay good.tlog --fleet --out x.mcap", 2, "--fleet takes recordings as they are"),
+    ("replay nothere.mcap half.mcap --fleet", 1, "nothere.mcap: no such file"),
+    ("study fleet", 2, "Missing option '--out'"),
+    ("study fleet --nodes three --out report", 2, "is not FROM..TO, such as 3..100"),
+    ("study fleet --nodes 3..2 --out report", 2, "the smaller first"),
+    ("study fleet --steps 0 --out report", 2, "0 is not in the range 1<=x<=20"),
+    ("study fleet --out good.tlog", 1, "good.tlog: File exists"),
+    ("study beams good.tlog --center 5:1 --out a/report", 1, "no UAV gets a beam in it"),
+    ("study link good.tlog --out report --snr loud", 2, "is not FROM:TO:STEP in dB"),
+    ("study nosuch", 2, "No such command 'nosuch'. See companion study --help"),
+    ("export beams", 1, 'there are no stored beams: [codebook] kind = "dft"'),
+    ("export beams --format oai --out x", 2, "'oai' is not 'oai-dbt'"),
+    ("calibrate table.csv --out c.csv", 1, "is not the header"),
+    ("calibrate nothere.csv --out c.csv", 2, "'nothere.csv' does not exist"),
+    ("design --dt often", 2, "is not a list of numbers such as 0.1,0.5"),
+    ("check --config nothere.toml", 1, "nothere.toml: No such file"),
+    ("run --center 5:1 --link zenoh:", 1, "a key without wildcards such as mavlink_raw"),
+    ("sitl-replay fly", 2, "Choose from: paper, "),
+    ("sitl-replay fly papr --to udpout:127.0.0.1:1", 2, "'papr' is not one of 'paper'"),
+    ("sitl-replay fly paper", 2, "Missing option '--to'. See sitl-replay fly --help"),
+    ("sitl-replay fly paper --to udp:127.0.0.1:1", 2, "did you mean udpin:127.0.0.1:1"),
+    ("sitl-replay fly paper --to udpout:127.0.0.1:1 --uavs 0", 2, "in the range 1<=x<=1000"),
+    ("sitl-replay fly paper --to udpout:127.0.0.1:1 --fault los=1", 2, "'los' is none of drift"),
+    ("sitl-replay fly paper --to udpout:127.0.0.1:1 --fault loss=2", 2, "allowed: 0 to 1, as in"),
+    (
+        "sitl-replay fly paper --to udpout:127.0.0.1:1 --record gone/x.tlog",
+        1,
+        "gone/x.tlog: No such file or directory",
+    ),
+    ("sitl-replay fly paper --to tcp:127.0.0.1:1", 1, "tcp:127.0.0.1:1: "),
+    ("sitl-replay play noise.tlog --to udpout:127.0.0.1:1", 1, "no MAVLink frame in it"),
+    ("sitl-replay play good.tlog --to udpout:127.0.0.1:1 --speed fast", 2, "or 'max'"),
+    ("sitl-replay ply good.tlog", 2, "Did you mean one of: 'fly', 'play'?"),
 ]
 
 
@@ -146,12 +201,15 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize(("given", "status", "says"), SAYS)
 def test_a_mistake_is_one_line(folder: Path, given: str, status: int, says: str) -> None:
     before = sorted(folder.rglob("*"))
-    done = CliRunner().invoke(main, given.split(), prog_name="companion")
+    words = given.split()
+    program, words = (sitl, words[1:]) if words[0] == "sitl-replay" else (main, words)
+    name = "companion" if program is main else "sitl-replay"
+    done = CliRunner().invoke(program, words, prog_name=name)
     assert done.exit_code == status, done.output
     if says:
         *before_it, line = done.stderr.splitlines()
         assert says in line
-        assert line.startswith("companion: ")
+        assert line.startswith(f"{name}: ")
         assert len(before_it) <= 1  # what was taken for granted, such as no --center
     assert sorted(folder.rglob("*")) == before
 

@@ -15,6 +15,7 @@
 IPv6 hosts stand in brackets.
 """
 
+import difflib
 import re
 from collections.abc import Callable, Sequence
 from typing import Final
@@ -22,10 +23,15 @@ from typing import Final
 from companion.node.drive.loop import Device, Safe, Shot, Takes
 from companion.values import IntArray, Source, UserError
 
-FORMS: Final = (
-    "rotctld:HOST:PORT, gimbal:HOST:PORT:SYSID:COMPID, gimbal-roi:..., phaser:URI, "
-    "phaser-memory:URI, adar1000:BUS.DEVICE[,...], none:pointing, none:adar1000, none:stored"
-)
+FORMS: Final = {
+    "rotctld": "rotctld:HOST:PORT",
+    "gimbal": "gimbal:HOST:PORT:SYSID:COMPID",
+    "gimbal-roi": "gimbal-roi:HOST:PORT:SYSID:COMPID",
+    "phaser": "phaser:URI, such as phaser:ip:phaser.local",
+    "phaser-memory": "phaser-memory:URI",
+    "adar1000": "adar1000:BUS.DEVICE[,...]",
+    "none": "none:pointing, none:adar1000 or none:stored",
+}
 _GIMBAL: Final = re.compile(r"(.+):(\d{1,5}):(\d{1,3}):(\d{1,3})")
 
 
@@ -68,7 +74,11 @@ def device(
             return Chips([(bus, number) for bus, number in places])
         case "none" if where in tuple(Takes):
             return DryRun(Takes(where), say)
-    raise UserError(f"{target!r} is none of {FORMS}")
+    if kind in FORMS:
+        raise UserError(f"{target!r} is not {FORMS[kind]}")
+    near = difflib.get_close_matches(kind, FORMS, 1)
+    meant = f"; did you mean {FORMS[near[0]]}?" if near else ""
+    raise UserError(f"{target!r} is none of {', '.join(FORMS.values())}{meant}")
 
 
 class DryRun:

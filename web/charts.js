@@ -10,6 +10,7 @@ const SPANS_S = [30, 60, 180]; // the shortest that holds what there is
 const GAP_MS = 2500; // no line through a hole in what was received
 const MOST_LINES = 7; // as many hues as can be told apart
 const REDRAW_MS = 2000; // of minutes: a second is not a pixel
+const LASTING_MS = 10_000;
 /** Besides its hue every line has its own dash: no UAV is told by colour alone. */
 const DASHES = [[], [7, 3], [2, 3], [10, 3, 2, 3], [4, 2], [14, 4], [2, 6]];
 const HUES = DASHES.map((_, i) => `line${i}`);
@@ -91,7 +92,7 @@ export class Charts {
 
   /** `pastAt`: the moment that the page shows, null while it is live. */
   show(history, uavs, { selected, pastAt, now }) {
-    const ids = chosenFew(uavs, selected);
+    const ids = this.lasting(chosenFew(uavs, selected), uavs, selected, now);
     const changed = this.ids === null || ids.join() !== this.ids.join()
       || selected !== this.selected;
     const due = pastAt !== this.pastAt || now - this.drawnAt > REDRAW_MS;
@@ -107,13 +108,24 @@ export class Charts {
     CHARTS.forEach(({ of }, i) => this.plots[i].plot.setData(columns(moments, ids, of, now)));
   }
 
+  /** The lines stay for a while though others have become the worst: to change them is much work. */
+  lasting(wanted, uavs, selected, now) {
+    const present = new Set(uavs.map(({ id }) => id));
+    const stay = this.ids?.length === wanted.length && this.ids.every((id) => present.has(id))
+      && selected === this.selected && now - this.builtAt < LASTING_MS;
+    return stay ? this.ids : wanted;
+  }
+
   build(ids, total) {
-    this.ids = ids;
+    Object.assign(this, { ids, builtAt: this.now });
+    // Their sizes all at once: to ask after each change would lay the page out each time.
+    const sizes = CHARTS.map(({ id }) => $(`chart-${id}`))
+      .map(({ clientWidth, clientHeight }) => [clientWidth, clientHeight]);
     this.plots.forEach(({ plot }) => plot.destroy());
-    this.plots = CHARTS.map(({ id }) => {
+    this.plots = CHARTS.map(({ id }, i) => {
       const box = $(`chart-${id}`);
       const empty = [[], ...ids.map(() => [])];
-      return { box, plot: new globalThis.uPlot(this.options(box), empty, box) };
+      return { box, plot: new globalThis.uPlot(this.options(sizes[i]), empty, box) };
     });
     this.plots.forEach(({ plot }) => {
       plot.over.addEventListener("click", () => {
@@ -123,13 +135,13 @@ export class Charts {
     showKey(ids, total);
   }
 
-  options(box) {
+  options([width, height]) {
     const axis = {
       stroke: this.colour.muted, font: this.font, ticks: { show: false },
       grid: { stroke: this.colour.grid, width: 1 },
     };
     return {
-      width: Math.max(60, box.clientWidth), height: Math.max(60, box.clientHeight),
+      width: Math.max(60, width), height: Math.max(60, height),
       padding: [8, 16, 0, 0], legend: { show: false },
       cursor: { y: false, points: { show: false }, drag: { x: false, y: false } },
       scales: { x: { time: false, range: () => [-this.spanS, 0] } },

@@ -28,7 +28,7 @@ import { setUpUnits } from "./units.js";
 
 const LOOK_MS = 250; // how often the connection is looked at, answers or not
 const AGES_MS = 900; // without an answer for so long, ages are counted on all the same
-const GATHER_MS = 60; // answers of one beat come together: they are shown together
+const GATHER_MS = 120; // answers of one beat come together: they are shown together
 const SAME_BEAT_MS = 400;
 const STATE_ORDER = ["live", "coasting", "stale", "lost"];
 const COLLATOR = new Intl.Collator("en", { numeric: true });
@@ -269,7 +269,7 @@ function nameThePage({ uavs, beams, status }, link) {
   const title = [state || headlineOf(uavs).text, status?.node, "companion"].filter(Boolean)
     .join(" · ");
   if (document.title !== title) document.title = title;
-  const name = `Plan view: ${uavs.length} UAVs, ${beams.length} beams`
+  const name = `${plan.space ? "View in space" : "Plan view"}: ${uavs.length} UAVs, ${beams.length} beams`
     + (state ? `, not live: ${state.toLowerCase()}` : "");
   if ($("plan").getAttribute("aria-label") !== name) $("plan").setAttribute("aria-label", name);
 }
@@ -309,6 +309,7 @@ function chooseNext(step) {
 function markPlan() {
   $("zoom-fit").setAttribute("aria-pressed", String(plan.isFitted));
   $("follow").setAttribute("aria-pressed", String(plan.followed !== null));
+  $("space").setAttribute("aria-pressed", String(plan.space !== null));
   $("follow").disabled = selected === null && plan.followed === null;
 }
 
@@ -320,6 +321,20 @@ function control(action) {
 const zoomIn = () => control(() => plan.zoom(1));
 const zoomOut = () => control(() => plan.zoom(-1));
 const fitAll = () => control(() => plan.fitAll());
+const TURN_PX = 40; // of the view in space, by a key
+const turn = (dx, dy) => control(() => plan.turn(dx * TURN_PX, dy * TURN_PX));
+
+/** From above, or in space; what draws the latter is loaded when it is first asked for. */
+async function toggleSpace() {
+  if (plan.space) {
+    plan.lookFrom(null);
+  } else {
+    const { Space } = await import("./space.js");
+    plan.lookFrom(new Space());
+  }
+  refresh();
+}
+
 const follow = () => control(() => plan.follow(plan.followed === null ? selected : null));
 const showHelp = () => $("help").showModal();
 
@@ -327,6 +342,7 @@ $("zoom-in").addEventListener("click", zoomIn);
 $("zoom-out").addEventListener("click", zoomOut);
 $("zoom-fit").addEventListener("click", fitAll);
 $("follow").addEventListener("click", follow);
+$("space").addEventListener("click", toggleSpace);
 $("help-open").addEventListener("click", showHelp);
 $("settings-open").addEventListener("click", showSettings);
 
@@ -367,6 +383,8 @@ setUpKeys({
   "Escape": () => (drawer.isOpen ? drawer.close() : selected !== null && choose(selected)),
   "Enter": () => selected !== null && drawer.open(selected),
   "f": follow,
+  "v": toggleSpace,
+  "[": () => turn(1, 0), "]": () => turn(-1, 0), ",": () => turn(0, -1), ".": () => turn(0, 1),
   "t": toggleTheme,
   "?": showHelp,
   "+": zoomIn, "=": zoomIn, "-": zoomOut, "0": fitAll,

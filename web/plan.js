@@ -35,6 +35,7 @@ export class PlanView {
     this.pan = [0, 0]; // where the carrier is, pixels off the middle
     this.ground = null; // a map beneath, which is moved along
     this.followed = null; // the UAV that is kept in the middle
+    this.space = null; // the onlooker, where all is drawn in space instead
     setUpGestures(canvas, {
       pan: (dx, dy) => this.drag(dx, dy),
       zoom: (steps) => this.zoom(steps),
@@ -90,10 +91,28 @@ export class PlanView {
   }
 
   drag(dx, dy) {
+    if (this.space) {
+      this.turn(dx, dy);
+      return;
+    }
     this.followed = null;
     this.pan = [this.pan[0] + dx, this.pan[1] + dy];
     this.redraw();
     this.onMove();
+  }
+
+  /** Draw in space, as an onlooker sees it; null: from above. */
+  lookFrom(space) {
+    this.space = space;
+    this.pan = [0, 0];
+    this.redraw();
+    this.onMove();
+  }
+
+  /** Go round the scene as by a drag of so many pixels; nothing where it is seen from above. */
+  turn(dx, dy) {
+    this.space?.turn(dx, dy);
+    this.redraw();
   }
 
   /** Keep a UAV in the middle; null: the carrier. */
@@ -145,8 +164,13 @@ export class PlanView {
     context.globalAlpha = 1;
     context.setLineDash([]);
     context.fillStyle = this.colour.plan;
-    if (this.ground) context.clearRect(0, 0, width, height);
+    if (this.ground && !this.space) context.clearRect(0, 0, width, height);
     else context.fillRect(0, 0, width, height);
+    if (this.space) {
+      this.space.draw(this);
+      this.drawMessage();
+      return;
+    }
     this.ground?.follow(this);
     drawRings(this);
     drawCompass(this);

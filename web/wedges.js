@@ -37,8 +37,10 @@ function drawBeam(view, beam, array, uav) {
   const reachPx = Math.max(targetPx + 60, view.outerPx);
   const fade = context.createRadialGradient(...view.centre, 0, ...view.centre, reachPx);
   const stop = Math.min(0.98, targetPx / reachPx);
-  fade.addColorStop(0, withAlpha(colour, 0.7));
-  fade.addColorStop(stop, withAlpha(colour, 0.45));
+  // Many wide ones lie over one another: together they are to look no stronger than one.
+  const strength = Math.max(0.1, Math.min(1, 360 / (widthDeg * view.scene.beams.length)));
+  fade.addColorStop(0, withAlpha(colour, 0.7 * strength));
+  fade.addColorStop(stop, withAlpha(colour, 0.45 * strength));
   fade.addColorStop(1, withAlpha(colour, 0));
   const chosen = view.scene.selected === beam.uav;
   context.globalAlpha = view.scene.selected === null || chosen ? 1 : 0.55;

@@ -23,8 +23,8 @@ function openCharts() {
     plots: () => Object.fromEntries(Plot.made.filter((plot) => !plot.isDestroyed)
       .map((plot) => [plot.box.id.replace("chart-", ""), plot])),
     add: (at, uavs, beams = []) => history.add({ at, uavs, beams }),
-    show({ now = 10_000, selected = null, pastAt = null } = {}) {
-      charts.show(history, history.newest?.uavs ?? [], { selected, pastAt, now });
+    show({ now = 10_000, selected = null, pastAt = null, uavs } = {}) {
+      charts.show(history, uavs ?? history.newest?.uavs ?? [], { selected, pastAt, now });
     },
   };
 }
@@ -101,6 +101,22 @@ test("seven lines at most, the chosen one always, and it is said of how many", (
   assert.deepEqual(key, ["0:1", "1:1", "2:1", "3:1", "4:1", "5:1", "8:1", "of 9 UAVs"]);
   show({ selected: "2:1" });
   assert.equal(plots().innovation.data.at(-1)[0], 6);
+});
+
+test("lines stay for ten seconds though others become the worst, and go with their UAV", () => {
+  const { browser, add, show } = openCharts();
+  const key = () => browser.element("series-key").children.map(({ textContent }) => textContent);
+  const ids = (...order) => order.map((n) => uav(`${n}:1`));
+  const few = ["1:1", "2:1", "3:1", "4:1", "5:1", "6:1", "7:1"];
+  add(9000, ids(1, 2, 3, 4, 5, 6, 7, 8));
+  show();
+  assert.deepEqual(key().slice(0, 7), few);
+  show({ uavs: ids(8, 7, 6, 5, 4, 3, 2, 1), now: 15_000 });
+  assert.deepEqual(key().slice(0, 7), few);
+  show({ uavs: ids(8, 7, 6, 5, 4, 3, 2), now: 16_000 });
+  assert.deepEqual(key(), ["2:1", "3:1", "4:1", "5:1", "6:1", "7:1", "8:1"]);
+  show({ uavs: ids(1, 2, 3, 4, 5, 6, 7, 8), now: 27_000 });
+  assert.deepEqual(key().slice(0, 7), few);
 });
 
 test("a line is told by its hue and its dash, as in the key, the chosen one by its width", () => {

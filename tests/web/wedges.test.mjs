@@ -113,3 +113,18 @@ test("every colour that gets an opacity is written #rrggbb in both themes", () =
     }
   }
 });
+
+test("many wide beams together are no stronger than one", async () => {
+  const view = await openPlan();
+  const opacity = (number, width) => {
+    const ids = Array.from({ length: number }, (_, i) => `${i + 1}:1`);
+    const picture = view.show({
+      uavs: ids.map((id) => uav(id)), array: array(),
+      beams: ids.map((id) => beam(id, { widened: true, pointing_bound_deg: width / 2 })),
+    });
+    return parseInt(wedges(picture)[0].fillStyle.stops[1][1].slice(7), 16);
+  };
+  assert.equal(opacity(1, 120), opacity(4, 20));
+  assert.ok(opacity(20, 120) < opacity(1, 120) / 5);
+  assert.ok(opacity(100, 120) > 0);
+});

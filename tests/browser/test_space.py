@@ -1,0 +1,39 @@
+"""The scene in space: asked for by a button or a key, turned by both, and as accessible."""
+
+from typing import Any
+
+import pytest
+from support import HANG_MS, Node
+
+from .test_accessibility import SIZES, violations
+from .test_layout import CUT, OVERLAPS
+from .test_page import UAVS, wait_for_uavs
+
+pytestmark = [pytest.mark.browser, pytest.mark.full]
+
+PICTURE = "document.getElementById('plan').toDataURL()"
+LOADED = "performance.getEntriesByType('resource').some(one => one.name.endsWith('space.js'))"
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_it_is_seen_from_all_sides(demo: Node, open_page: Any, size: str) -> None:
+    page = open_page(demo.url, SIZES[size])
+    wait_for_uavs(page)
+    assert not page.evaluate(LOADED)
+    page.locator("#pause").click()  # what moves from now on is moved by a key
+    button = page.get_by_role("button", name="3-D")
+    button.click()
+    page.locator("#space[aria-pressed=true]").wait_for(timeout=HANG_MS)
+    assert page.evaluate(LOADED)
+    assert page.locator("#plan").get_attribute("aria-label").startswith("View in space: ")
+    for key in ("]", "."):
+        before = page.evaluate(PICTURE)
+        page.keyboard.press(key)
+        while page.evaluate(PICTURE) == before:
+            page.wait_for_timeout(50)  # until the next frame; a test that hangs is ended
+    assert page.evaluate(OVERLAPS) == []
+    assert page.evaluate(CUT) == []
+    assert violations(page) == []
+    page.keyboard.press("v")
+    page.locator("#space[aria-pressed=false]").wait_for(timeout=HANG_MS)
+    assert page.locator("tbody .pick").count() == len(UAVS)

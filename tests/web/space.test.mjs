@@ -1,0 +1,111 @@
+// The scene in space: to scale in every direction, on the plan's canvas, loaded when it is asked for.
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+import { load, readPage } from "./browser.mjs";
+import { near } from "./near.mjs";
+import { CENTRE, openPlan } from "./plan_picture.mjs";
+import { array, beam, otherNode, uav } from "./service.mjs";
+
+const { Space, hull } = await load("space.js");
+
+async function openSpace(fields = {}) {
+  const view = await openPlan();
+  const space = Object.assign(new Space(), fields);
+  view.plan.lookFrom(space);
+  return { ...view, space };
+}
+
+const HIGH = uav("1:1", { north_m: 30, east_m: 40, down_m: -50 });
+const points = ({ path }) => path.filter(({ op }) => op === "move" || op === "line");
+
+test("from above it is the plan; from the side heights are to scale", () => {
+  const space = Object.assign(new Space(), { bearingDeg: 0, aboveDeg: 90 });
+  const [right, down] = space.offset([30, 40, -50], 2);
+  near(right, 80);
+  near(down, -60);
+  space.aboveDeg = 0;
+  near(space.offset([30, 40, -50], 2)[1], -100);
+  space.bearingDeg = 90; // who looks east has the south on the right
+  near(space.offset([-30, 0, 0], 1)[0], 30);
+});
+
+test("a drag goes round it, never below the ground, and on the plan it pans", async () => {
+  const { plan, space } = await openSpace();
+  const before = space.bearingDeg;
+  plan.drag(50, 10_000);
+  assert.notEqual(space.bearingDeg, before);
+  assert.equal(space.aboveDeg, 90);
+  plan.drag(0, -10_000);
+  assert.ok(space.aboveDeg > 0);
+  assert.deepEqual(plan.pan, [0, 0]);
+  plan.lookFrom(null);
+  plan.drag(5, 6);
+  assert.deepEqual(plan.pan, [5, 6]);
+});
+
+test("a UAV stands over its foot, can be chosen, and has its name", async () => {
+  const view = await openSpace({ bearingDeg: 0, aboveDeg: 30 });
+  const picture = view.show({ uavs: [HIGH] });
+  const { pxPerM } = view.plan;
+  const [hit] = view.plan.hits;
+  near(hit.x, CENTRE.x + 40 * pxPerM);
+  near(hit.y, CENTRE.y - (30 * 0.5 + 50 * Math.cos(Math.PI / 6)) * pxPerM);
+  const stem = picture.of("stroke", (one) => one.dash.join() === "2,3").map(points)[0];
+  near(stem[0].x, stem[1].x);
+  near(stem[1].y - stem[0].y, 50 * Math.cos(Math.PI / 6) * pxPerM);
+  picture.text("1:1");
+  assert.equal(view.plan.nearest({ offsetX: hit.x + 3, offsetY: hit.y }), "1:1");
+});
+
+test("a beam is a cone of the likely angle, of the bound where there is none", async () => {
+  const view = await openSpace({ bearingDeg: 0, aboveDeg: 90 });
+  const flat = uav("1:1", { north_m: 100, east_m: 0, down_m: 0, bound_cylinder_ned_m: null });
+  const halfWidthM = (fields) => {
+    const picture = view.show({ uavs: [flat], beams: [beam("1:1", fields)], array: array() });
+    const rim = picture.of("stroke", (one) => one.strokeStyle === view.browser.colour("beam")
+      && one.path.length > 10).map(points)[0];
+    return (Math.max(...rim.map(({ x }) => x)) - CENTRE.x) / view.plan.pxPerM;
+  };
+  near(halfWidthM({ pointing_p95_deg: 5, pointing_bound_deg: 20 }), 100 * Math.tan(Math.PI / 36));
+  near(halfWidthM({ pointing_p95_deg: null, pointing_bound_deg: 20 }), 100 * Math.tan(Math.PI / 9));
+});
+
+test("what is not true any more is grey, and what is not known does no harm", async () => {
+  const view = await openSpace();
+  const picture = view.show({ uavs: [HIGH], beams: [beam("1:1", { oldS: 3 })], array: array(),
+    uavsLive: false, message: "NOT LIVE – connection lost" });
+  for (const name of ["live", "beam"]) {
+    assert.ok(!picture.drawn.some(({ strokeStyle }) => strokeStyle === view.browser.colour(name)));
+  }
+  picture.text("NOT LIVE – connection lost");
+  view.show({
+    uavs: [uav("2:1", { down_m: null, bound_cylinder_ned_m: null, velocity_ned_mps: null }),
+      uav("3:1", { north_m: null })],
+    beams: [beam("9:1", { bearing_deg: null }),
+      beam("8:1", { range_m: null, elevation_deg: null, pointing_bound_deg: null })],
+    nodes: [{ ...otherNode("south"), north_m: 10, east_m: 10 }], selected: "2:1",
+  });
+  assert.deepEqual(view.plan.hits.map(({ uav: { id } }) => id), ["2:1"]);
+});
+
+test("who is followed is in the middle", async () => {
+  const view = await openSpace();
+  view.plan.follow("1:1");
+  view.show({ uavs: [HIGH] });
+  near(view.plan.hits[0].x, CENTRE.x);
+  near(view.plan.hits[0].y, CENTRE.y);
+});
+
+test("the hull of points holds them all, and has no other corners", () => {
+  const corners = [[0, 0], [4, 0], [4, 3], [0, 3]];
+  assert.deepEqual(new Set(hull([[2, 1], ...corners, [1, 2], [2, 0]]).map(String)),
+    new Set(corners.map(String)));
+});
+
+test("it is loaded when it is asked for, and is light", () => {
+  assert.doesNotMatch(readPage("main.js"), /^import .*space\.js/m);
+  assert.match(readPage("main.js"), /await import\("\.\/space\.js"\)/);
+  assert.ok(readPage("space.js").length < 20_000);
+});

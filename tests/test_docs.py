@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from support import HANG_S, ROOT
 
-from companion.values import Reason
+from companion.values import Cause, Reason
 
 DOCS = ROOT / "docs"
 PAGES = sorted([*DOCS.rglob("*.md"), *ROOT.glob("*.md")])
@@ -61,12 +61,46 @@ def test_every_threat_has_a_test_that_is_there() -> None:
         assert f"def {name}(" in (ROOT / file).read_text(encoding="utf-8"), one
 
 
+READ_BACK = {"companion/views/tables/said.py", "companion/recording/entries.py"}
+"""What makes notices of those that others made."""
+
+
+def rows(heading: str) -> list[list[str]]:
+    """The cells of the first table under a heading of the page on troubleshooting."""
+    text = (DOCS / "troubleshooting.md").read_text(encoding="utf-8").split(f"## {heading}\n")[1]
+    table = [line for line in text.split("\n## ")[0].splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table[2:]]
+
+
 def test_reasons_of_refusals_are_those_that_there_are() -> None:
+    named = [word for row in rows("Reports are refused") for word in row[0].split(", ")]
+    assert sorted(named) == sorted(f"`{reason}`" for reason in Reason)
+
+
+def test_every_cause_of_a_weak_link_is_told() -> None:
+    told = [cause for row in rows("A link is weak, or none") for cause in row[0].split(", ")]
+    assert sorted(told) == sorted(f"`{cause}`" for cause in Cause)
+
+
+def test_every_source_of_events_is_told_in_its_own_words() -> None:
     text = (DOCS / "troubleshooting.md").read_text(encoding="utf-8")
-    table = text.split("| reason | what it is |")[1].split("\n\n")[0]
-    named = {word for row in table.splitlines() for word in re.findall(r"`([a-z-]+)`", row[:40])}
-    assert named
-    assert named <= {str(reason) for reason in Reason}
+    said = {one for row in rows("What the events say") for one in re.findall(r'"(.+?)"', row[0])}
+    said |= set(re.findall(r'"([^"]+)"', text.split("## A fleet\n")[1].split("\n## ")[0]))
+    sources = {
+        path: path.read_text(encoding="utf-8") for path in (ROOT / "companion").rglob("*.py")
+    }
+    for phrase in said:
+        words = phrase.split(" … ")[-1]
+        assert any(words in source for source in sources.values()), phrase
+    makes = {
+        path for path, source in sources.items() if re.search(r"(?<!class )\bNotice\(", source)
+    }
+    untold = {
+        path.relative_to(ROOT).as_posix()
+        for path in makes
+        if not any(phrase.split(" … ")[-1] in sources[path] for phrase in said)
+    }
+    assert untold == READ_BACK
 
 
 def test_there_are_at_most_twelve_rooms_and_nothing_loose() -> None:

@@ -81,7 +81,7 @@ endif
 
 .venv/.runtime: requirements.lock pyproject.toml
 	@$(find_python); \
-	echo "making .venv with $$($$python -V) (once; about a minute)"; \
+	echo "making .venv with $$($$python -V) (once; one to four minutes)"; \
 	"$$python" -m venv --clear .venv
 	@$(PIP) -r requirements.lock
 	@$(PIP:--require-hashes=) --no-deps --no-build-isolation --editable .

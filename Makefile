@@ -12,6 +12,10 @@ UV = uv
 OPENBLAS_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS
 
+# Where this is set, each worker and each of some hundred processes that tests start compiles all
+# that it imports anew: together as long as the tests themselves.
+unexport PYTHONDONTWRITEBYTECODE
+
 # Tests of pure rooms on two workers; those that start services share one, one after the other.
 WORKERS = -n 2 --dist loadgroup
 

@@ -2,6 +2,7 @@
 
 import faulthandler
 import fcntl
+import gc
 import hashlib
 import os
 import subprocess
@@ -46,6 +47,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.xdist_group("studies"))
         else:  # what a file's tests share is made once
             item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[object]:
+    """What is there before the first test stays to the end: the garbage collector looks at what
+    the tests make alone. Over everything that is imported and collected, one look takes longer
+    than most tests."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 # --- the last resort against a test that hangs ---------------------------------------------------

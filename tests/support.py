@@ -42,6 +42,11 @@ def examples(most: int) -> int:
     return most if os.environ.get("HYPOTHESIS_PROFILE") == "full" else min(most, max(10, most // 4))
 
 
+def rounds(few: int, most: int) -> int:
+    """How often a seeded test draws anew: ``most`` in `make test-all`, else ``few``."""
+    return most if os.environ.get("HYPOTHESIS_PROFILE") == "full" else few
+
+
 def shared_log(name: str) -> Path:
     """A recording that is not part of the product; the test is skipped where it is missing."""
     path = SHARED / name

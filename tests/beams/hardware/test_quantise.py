@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support import examples
+from support import examples, rounds
 
 from companion.beams.hardware.quantise import (
     EMPHASIS,
@@ -208,7 +208,7 @@ def test_it_comes_near_the_best_of_all_settings() -> None:
     every = np.array([(0, *rest) for rest in itertools.product(range(4), repeat=5)])
     every_sent = kind.values(np.stack([every, np.zeros_like(every)], axis=-1))
     excess = []
-    for _ in range(20):
+    for _ in range(rounds(10, 20)):
         towards = line(list(rng.uniform(-1, 1, 2)), 6)
         weights = drawn(rng, 6)
         best = min(cost(sent, weights, towards) for sent in every_sent)
@@ -223,7 +223,7 @@ def test_a_matched_beam_loses_what_the_theory_says(bits: int, table_db: float) -
     """64 elements, MATH: golden values; and not more than sinc of a step."""
     rng = np.random.default_rng(bits)
     losses = []
-    for sine in rng.uniform(-1, 1, 60):
+    for sine in rng.uniform(-1, 1, rounds(15, 60)):
         own = line([sine])
         sent = quantise(own[:, 0].conj(), Resolution(2**bits), own).weights
         losses.append(loss_db(own[:, 0], own[:, 0].conj(), sent))
@@ -237,7 +237,7 @@ def test_six_bits_lose_almost_nothing() -> None:
     theory_db = -20 * np.log10(np.sinc(1 / 64))
     assert theory_db == pytest.approx(0.0035, abs=1e-4)
     losses = []
-    for sine in rng.uniform(-1, 1, 60):
+    for sine in rng.uniform(-1, 1, rounds(15, 60)):
         own = line([sine])
         sent = quantise(own[:, 0].conj(), Resolution(64), own).weights
         losses.append(loss_db(own[:, 0], own[:, 0].conj(), sent))
@@ -257,7 +257,7 @@ def test_nulls_are_deeper_than_by_rounding(kind: SettableStates, deeper_db: floa
     """Zero forcing of two users; the response at the other over that at the own, mean of dB."""
     rng = np.random.default_rng(5)
     plain, searched, lost = [], [], []
-    for _ in range(25):
+    for _ in range(rounds(8, 25)):
         sine = rng.uniform(-0.8, 0.6)
         towards = line([sine, sine + rng.uniform(0.05, 0.3)])
         weights = np.linalg.pinv(towards.T)[:, 0]

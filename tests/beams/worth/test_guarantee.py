@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from support import rounds
 
 from companion.beams.array import steering
 from companion.beams.array.elements import Element, Pattern
@@ -82,7 +83,7 @@ def searched(
     """The least gain (``sign`` 1) or the largest (-1) that many draws and, from the best few of
     them, ever closer ones attain."""
     rng = np.random.default_rng(4)
-    tried = within(direction, bound_rad, rng, 2000)
+    tried = within(direction, bound_rad, rng, rounds(600, 2000))
     for scale in 0.2 * 0.4 ** np.arange(6):
         values = sign * gains(array, tried, weights[:, np.newaxis])[:, 0]
         starts = tried[np.argsort(values)[:6]]
@@ -95,7 +96,7 @@ def searched(
 
 @pytest.mark.parametrize(("name", "kind"), CASES)
 def test_no_direction_within_the_bound_has_less_or_leaks_more(name: str, kind: str) -> None:
-    """10 000 directions for each array and each kind of weights, over all bounds."""
+    """Thousands of directions for each array and each kind of weights, over all bounds."""
     array, rng = ARRAYS[name], np.random.default_rng(CASES.index((name, kind)))
     weights = weights_for(array, np.random.default_rng(1))[kind]
     bounds = np.repeat(np.radians(BOUNDS_DEG), 3)
@@ -103,7 +104,7 @@ def test_no_direction_within_the_bound_has_less_or_leaks_more(name: str, kind: s
     least = guaranteed_gains_db(array, aims, bounds.tolist(), columns)
     most = leakage_bounds(array, aims, bounds.tolist(), weights)
     for i, direction in enumerate(aims):
-        true = gains(array, within(direction, bounds[i], rng, 480), weights)
+        true = gains(array, within(direction, bounds[i], rng, rounds(120, 480)), weights)
         assert (true.max(axis=0) <= most[i] * (1 + 1e-12) + 1e-20).all()
         bound_db = least[i]
         if bound_db is not None:
@@ -257,7 +258,7 @@ def test_a_larger_bound_promises_no_more(name: str) -> None:
     array = ARRAYS[name]
     weights = weights_for(array, np.random.default_rng(1))["matched"]
     before_db, before = [math.inf] * 3, np.zeros((3, 3))
-    for bound_rad in np.concatenate([[0.0], np.logspace(-6, math.log10(math.pi), 12)]):
+    for bound_rad in np.concatenate([[0.0], np.logspace(-6, math.log10(math.pi), rounds(7, 12))]):
         least = guaranteed_gains_db(array, AHEAD, [bound_rad] * 3, weights)
         most = leakage_bounds(array, AHEAD, [bound_rad] * 3, weights)
         after_db = [-math.inf if found is None else found for found in least]

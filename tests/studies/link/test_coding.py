@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from commpy.channelcoding import Trellis, conv_encode, viterbi_decode  # the oracle
 from scipy.stats import norm
+from support import rounds
 
 from companion.studies.link.coding import GENERATORS, TOGETHER, decode, encode
 from companion.studies.link.modulation import modulate, soft_bits
@@ -142,7 +143,7 @@ def test_the_error_rate_is_that_of_theory() -> None:
         eb_n0 = 10 ** (eb_n0_db / 10)
         return float(weights @ norm.sf(np.sqrt(2 * np.arange(27) * eb_n0 / 3)))
 
-    at_db, bits = 2.5, drawn(12_000, 306, 9)
+    at_db, bits = 2.5, drawn(rounds(4_000, 12_000), 306, 9)
     words = 1.0 - 2.0 * encode(bits)
     sigma = math.sqrt(3 / (2 * 10 ** (at_db / 10)))
     heard = words + sigma * np.random.default_rng(10).standard_normal(words.shape)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support import rounds
 
 from companion.studies.paper import published
 from companion.tracking.design import closed_form
@@ -41,7 +42,7 @@ def test_peaks_are_exact(gain: float) -> None:
     peak_e = float(closed_form.peak_gain(B, D, gain))
     peak_bd, peak_b0 = published.unknown_input_peak(B, D, gain)
     reached = np.zeros(3)
-    for trial in range(2000):
+    for trial in range(rounds(400, 2000)):
         w = rng.choice([-1.0, 1.0], 40) if trial % 2 else rng.uniform(-1, 1, 40)
         reached = np.maximum(reached, [np.abs(e).max() for e in errors(gain, B, D, w)])
     for last in (-1.0, 1.0):
@@ -81,7 +82,7 @@ def test_irregular_intervals_keep_the_guarantee() -> None:
     """|e| <= gamma sup|w| with gamma over the intervals that occurred, whatever their order."""
     rng = np.random.default_rng(3)
     alpha, d, worst = 0.95, -0.5, 0.0  # where gamma is close to the exact peak
-    for _ in range(2000):
+    for _ in range(rounds(500, 2000)):
         dts = rng.uniform(0.05, 1.2, 30)
         gamma = np.sqrt(closed_form.mu_stars(dts, d, alpha).max())
         x = estimate = np.zeros(1)

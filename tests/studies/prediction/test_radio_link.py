@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support import rounds
 
 from companion.studies.prediction.delivery import Delivery, deliver
 from companion.studies.prediction.radio_link import CLEAN, RADIO, RadioLink
@@ -32,12 +33,13 @@ def test_a_clean_link_is_the_log(straight_flight: MakeFlight) -> None:
 
 
 def test_latency_loss_and_rate_are_as_asked(straight_flight: MakeFlight) -> None:
-    flight = straight_flight(60_000)
+    reports = rounds(20_000, 60_000)
+    flight = straight_flight(reports)
     delivery = deliver(flight, RADIO, 1)
     added_s = latencies_s(flight, delivery)
     assert np.median(added_s) == pytest.approx(0.6, rel=0.05)
     assert np.percentile(added_s, 95) == pytest.approx(2.2, rel=0.08)
-    assert len(delivery.observed) == pytest.approx(6000 * 1.2 * 0.9, rel=0.01)
+    assert len(delivery.observed) == pytest.approx(reports / 10 * 1.2 * 0.9, rel=0.01)
     assert delivery.rate_hz == 1.2
     assert delivery.latency_s == 0.6
     arrivals = [each.arrival_ns for each in delivery.observed]

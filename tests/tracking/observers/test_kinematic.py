@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from support import examples
+from support import examples, rounds
 
 from companion.settings.files import kinematic_design
 from companion.settings.model import Settings
@@ -123,7 +123,7 @@ def sequences(count: int) -> Iterator[tuple[np.random.Generator, str]]:
 def test_no_adversary_leaves_the_bounds(fix: MakeFix, name: str, told: float) -> None:
     """Irregular reports, some without a velocity; asked before, at and after each of them."""
     observer = observing(name)
-    for rng, kind in sequences(240):
+    for rng, kind in sequences(rounds(60, 240)):
         times = np.cumsum(10 ** rng.uniform(7.3, rng.uniform(8.5, 10.3), size=9)).astype(int)
         flight = flown(rng, kind, 0, int(times[-1]) + 5 * S)
         state = None

@@ -155,7 +155,7 @@ def final_tracks(events: list[Event], at_ns: int) -> dict[str, Track]:
     return {track.uav: track for track in tracks if not track.uav.startswith("icao:")}
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(n, marks=pytest.mark.full) for n in (2, 3))])
 def test_shuffled_within_the_window_the_end_is_the_same(cut_log: Path, seed: int) -> None:
     """What is made on the sender's own timeline is equal. The node's clock has then seen other
     arrivals, and hindsight other predictions: that moves a prediction by no more than the clock

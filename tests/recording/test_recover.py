@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
-from support import HANG_S, line_of, read_metadata, started
+from support import HANG_S, line_of, read_metadata, rounds, started
 
 from companion.recording.reader import LogError, read_log, read_settings
 from companion.recording.recover import Recovered, recover, recover_leftovers
@@ -48,7 +48,17 @@ def test_cut_anywhere_no_more_than_one_flush_is_lost(
     whole, driven, flushed = recording
     data = whole.read_bytes()
     rng = random.Random(11)
-    cuts = [0, 1, 7, 8, 9, 16, 17, *(rng.randrange(len(data)) for _ in range(120)), len(data) - 1]
+    cuts = [
+        0,
+        1,
+        7,
+        8,
+        9,
+        16,
+        17,
+        *(rng.randrange(len(data)) for _ in range(rounds(40, 120))),
+        len(data) - 1,
+    ]
     for number, cut in enumerate(cuts):
         torn = tmp_path / f"{number}.mcap.active"
         torn.write_bytes(data[:cut])

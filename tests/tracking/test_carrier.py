@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from support import examples
+from support import rounds
 
 from companion.tracking import carrier
 from companion.tracking.geodesy import LocalFrame
@@ -134,7 +134,7 @@ def _at(make: Callable[..., Fix], lat_deg: float, lon_deg: float) -> Fix:
     return replace(made, report=replace(made.report, lat_deg=lat_deg, lon_deg=lon_deg))
 
 
-@settings(max_examples=examples(300))
+@settings(max_examples=rounds(30, 300))
 @given(
     st.tuples(*[st.floats(-3.0, 3.0)] * 3),
     st.tuples(*[st.floats(-1.0, 1.0)] * 3),
@@ -157,7 +157,7 @@ def test_no_turn_leaves_the_bound_of_the_attitude(
     push = push * most / max(1e-9, float(np.linalg.norm(push)))
     bounds = carrier.AttitudeBounds(off_rad, most)
     true_s = age_s + late * doubt_s
-    steps = 200
+    steps = 100
     truth = Rotation.from_rotvec([off_rad, 0, 0])
     for n in range(steps):
         at_s = (n + 0.5) / steps * true_s

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support import rounds
 
 from companion.beams.array.elements import Element, Pattern
 from companion.beams.array.geometry import Array, listed, uniform_circular
@@ -86,7 +87,7 @@ def test_no_array_that_the_bounds_allow_has_less_or_leaks_more(name: str, fault:
         for bound in np.radians([0.01, 1.0, 4.0]):
             least = guaranteed_gains_db(array, AHEAD, [bound, bound], weights)
             most = leakage_bounds(array, AHEAD, [bound, bound], weights)
-            for _ in range(100):
+            for _ in range(rounds(25, 100)):
                 for i, direction in enumerate(AHEAD):
                     true = drawn(array, weights, within(direction, bound, rng, 30), rng)
                     assert (true.max(axis=0) <= most[i] * (1 + 1e-9)).all()

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from link_support import frame
+from support import rounds
 
 from companion.mavlink.links import peers as peers_module
 from companion.mavlink.links.peers import PEERS_MAX, RESTART_RUN, SENDERS_MAX, Peer, Peers
@@ -90,7 +91,7 @@ def test_frames_in_reverse_are_no_restart() -> None:
 def test_a_restart_is_at_most_one_wrong_gap(lost: float) -> None:
     """From any place to any other; also over a link that loses frames, whose own holes count."""
     chance = random.Random(1)
-    for last in range(0, 256, 5):
+    for last in range(0, 256, rounds(25, 5)):
         for first in range(256):
             heard = Heard().hear([last])
             arrived = [first + n for n in range(40) if n == 0 or chance.random() >= lost]

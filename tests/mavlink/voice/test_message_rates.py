@@ -336,7 +336,7 @@ def test_in_progress_is_waited_for_but_not_for_ever() -> None:
 
 def test_one_that_refuses_both_is_asked_ever_less_often_and_told_of_once() -> None:
     world = World(Autopilot(results=(dialect.MAV_RESULT_DENIED,), streams=False))
-    world.run(3600)
+    world.run(1500)
     gaps = world.gaps_s()
     backoffs = [min(5.0 * 2 ** (n // 2), 300.0) for n in range(len(gaps))]
     assert all(gap >= backoff for gap, backoff in zip(gaps, backoffs, strict=True))
@@ -365,7 +365,7 @@ def test_refused_is_seen_and_left_again() -> None:
 
 def test_one_that_agrees_and_does_nothing_is_not_flooded() -> None:
     world = World(Autopilot(obeys=False))
-    world.run(3600)
+    world.run(1800)
     assert len(world.requests) < 20
     assert max(world.gaps_s()) >= 300.0
     assert world.rate().state in (RateState.ACCEPTED, RateState.ASKED)
@@ -513,7 +513,7 @@ def test_order_that_is_broken_off_is_no_long_order() -> None:
     """A rate that goes up and down by itself is not asked for any more often."""
     uav = Autopilot(results=(None,), streams=False)
     world = World(uav)
-    for _ in range(30):
+    for _ in range(12):
         uav.hz[POSITION] = 5.0
         world.run(100)
         uav.hz[POSITION] = 1.0
@@ -556,7 +556,7 @@ def test_a_restart_is_named() -> None:
 
 def test_a_ground_station_that_keeps_changing_it_is_told_of_once_and_not_fought() -> None:
     world = World(Autopilot())
-    for _ in range(360):
+    for _ in range(150):
         world.run(10)
         world.say(set_interval(1.0))
     assert len(world.requests) < 20

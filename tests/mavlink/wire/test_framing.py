@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
-from support import LONGEST_FRAME, examples
+from support import LONGEST_FRAME, examples, rounds
 
 from companion.mavlink.wire import encode
 from companion.mavlink.wire.crc_extra import CRC_EXTRA
@@ -263,7 +263,7 @@ def test_every_frame_outside_the_damage_is_found(scan: Scan, kind: str) -> None:
     made = traffic(30)
     ends = [sum(map(len, made[: n + 1])) for n in range(len(made))]
     whole = b"".join(made)
-    for _ in range(250):
+    for _ in range(rounds(80, 250)):
         data = bytearray(whole)
         start = rng.randrange(len(whole))
         stop = min(len(whole), start + rng.randrange(1, 120))

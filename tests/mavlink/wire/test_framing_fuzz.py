@@ -26,7 +26,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
-from support import LONGEST_FRAME, examples
+from support import LONGEST_FRAME, examples, rounds
 
 from companion.mavlink.wire.framing import Splitter
 from companion.recording.reader import LogError, read_log
@@ -190,7 +190,7 @@ FLOODS: dict[str, Callable[[random.Random, int], bytes]] = {
 )
 def test_ten_million_bytes_are_accounted_for(kind: str, size: int) -> None:
     rng = random.Random(f"flood {kind}")
-    data = FLOODS[kind](rng, size)
+    data = FLOODS[kind](rng, size // rounds(4, 1))
     frames, lost = split(reads(rng, data))
     check_accounts(data, frames, lost)
     assert bool(frames) or kind != "headers"
@@ -374,7 +374,7 @@ def test_what_the_oracle_calls_untouched_is_what_pymavlink_finds(
 
 def test_frames_outside_the_damage_are_found(cut_log: bytes) -> None:
     rng = random.Random("cut log")
-    for _ in range(10):
+    for _ in range(rounds(4, 10)):
         batter(rng, cut(rng, cut_log, 20_000), cut_log, rounds=20)
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from support import HANG_S, ROOT
+from support import HANG_S, ROOT, rounds
 from ulog_support import flight
 
 from companion.recording.reader import LogError, read_log
@@ -78,18 +78,19 @@ def test_damaged_files(kind: str, tmp_path: Path) -> None:
     path.write_bytes(whole)
     sound, _ = read(path)
     used = 0
-    for seed in range(120):
+    tried = rounds(40, 120)
+    for seed in range(tried):
         path.write_bytes(damaged(whole, seed))
         begin = time.monotonic()
         frames, _ = read(path)
         assert time.monotonic() - begin < SLOWEST_S, seed
         assert frames <= 4 * sound, seed
         used += frames > 0
-    assert used > 30  # most damage leaves something to be used
+    assert used > tried / 4  # most damage leaves something to be used
 
 
 def many_heads() -> bytes:
-    return CUT[:18_000] + b"\xa3\x95\x80" * 200_000
+    return CUT[:18_000] + b"\xa3\x95\x80" * rounds(50_000, 200_000)
 
 
 def many_topics() -> bytes:

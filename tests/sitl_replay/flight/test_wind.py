@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy import integrate, signal
 from scipy.spatial.transform import Rotation
+from support import rounds
 
 from companion.values import FloatArray
 from sitl_replay.flight.flights import COPTER_HOLD, PLANE_HOLD
@@ -42,17 +43,18 @@ def filter_power(axis: int, omega_radps: FloatArray) -> FloatArray:
 
 @pytest.mark.parametrize("axis", range(3))
 def test_power_of_each_octave_is_that_of_the_forming_filter(axis: int) -> None:
-    # Sampled in time, as anyone would measure it; 60 winds, each of a quarter of an hour or so.
+    # Sampled in time, as anyone would measure it; dozens of winds, each of a quarter of an hour.
     rng = Random(5)
     step_s, steps = 0.05, 2**14
     times_s = step_s * np.arange(steps)
     power = 0.0
-    for _ in range(60):
+    winds = rounds(40, 60)
+    for _ in range(winds):
         wind = gusts(TURBULENCE, rng)
         angles = np.outer(times_s, wind.omega_radps[axis]) + wind.phase_rad[axis]
         series = np.sin(angles) @ wind.amplitude[axis]
         f_hz, one = signal.periodogram(series, 1 / step_s, window="hann", detrend=False)
-        power += one / math.tau / 60
+        power += one / math.tau / winds
     omega_radps = math.tau * f_hz
     highest_radps = 100.0 * TURBULENCE.airspeed_mps / TURBULENCE.length_m[axis]
     octaves = [low for low in 2.0 ** np.arange(-4, 4) if 2 * low <= highest_radps]

@@ -38,7 +38,7 @@ class Written:
             self._samples.append((row[0], sample))
 
 
-def flight(seconds: int = 4, rate_hz: int = 10) -> Written:
+def flight(seconds: int = 4, rate_hz: int = 10, fix_type: int = 3) -> Written:
     """North at 12 m/s and climbing, with truth 3 m to the east of it."""
     made = Written()
     made.parameter("MAV_SYS_ID", 7)
@@ -68,7 +68,20 @@ def flight(seconds: int = 4, rate_hz: int = 10) -> Written:
         "uint8_t satellites_used;",
         "QQiii5fBB",
         [
-            (t, utc_us + t, round(n * 1e7), 80_000_000, 501_000, 1.5, 2.5, 0.4, 12.0, 0.0, 3, 11)
+            (
+                t,
+                utc_us + t,
+                round(n * 1e7),
+                80_000_000,
+                501_000,
+                1.5,
+                2.5,
+                0.4,
+                12.0,
+                0.0,
+                fix_type,
+                11,
+            )
             for t, n in zip(times, north_deg, strict=True)
         ],
     )

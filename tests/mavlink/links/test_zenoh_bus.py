@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import json
 import socket
 import sys
 import time
@@ -16,7 +17,7 @@ from support import free_port, run_async
 
 from companion.mavlink.links import to_loop, zenoh_bus
 from companion.mavlink.links.zenoh_bus import Bus
-from companion.mavlink.links.zenoh_config import QUEUED, BusConfig, BusTls
+from companion.mavlink.links.zenoh_config import QUEUED, BusConfig, BusTls, sections
 from companion.values import UserError
 
 pytest.importorskip("zenoh")
@@ -409,3 +410,12 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
 
     with pytest.raises(UserError, match=r"needs the package zenoh: pip install '.*\[fleet\]'"):
         run_async(test())
+
+
+@pytest.mark.parametrize("mutual", [True, False])
+def test_who_connects_shows_a_certificate_unless_told_otherwise(mutual: bool) -> None:
+    tls = BusTls(Path("ca.pem"), Path("me.pem"), Path("me.key"), mutual=mutual)
+    section = json.loads(sections(BusConfig(tls=tls))["transport/link/tls"])
+    assert section["enable_mtls"] is mutual
+    assert section["listen_certificate"] == section["connect_certificate"] == "me.pem"
+    assert BusTls(Path("ca.pem")).mutual

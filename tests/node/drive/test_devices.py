@@ -424,3 +424,10 @@ def test_a_device_that_fails_is_opened_again_and_rests_again() -> None:
 def test_a_target_that_is_none_is_refused(target: str) -> None:
     with pytest.raises(UserError, match=r"is (none of|not) [a-z0-9-]+:"):
         targets.device(target, print, list)
+
+
+def test_who_is_not_in_the_device_s_table_has_nothing_applied() -> None:
+    beam = dict.fromkeys(("bearing_deg", "above_horizon_deg", "lat_deg", "lon_deg", "alt_m"), 0.0)
+    told = {"unfit": None, "beams": [beam | {"uav": "1:1"}], "codebook_beams": None}
+    shot = chosen(told, "the head of a table\n", Wanted((), True, Takes.REGISTERS), 0)
+    assert shot.unfit == "1:1 has no beam in the device's table"

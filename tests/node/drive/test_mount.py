@@ -260,3 +260,11 @@ def test_a_mount_that_stands_still_shows_no_lag() -> None:
         lag.told(n * 100_000_000, 1.0)
         lag.seen(n * 100_000_000, 1.0)
     assert lag.lag_s == 0.0
+
+
+def test_a_mount_that_goes_its_own_way_has_no_lag() -> None:
+    lag, rng = MountLag(), np.random.default_rng(3)
+    for n in range(200):
+        lag.told(n * 50_000_000, math.sin(0.5 * n * 0.05))
+        lag.seen(n * 50_000_000, float(rng.uniform(-1, 1)))
+    assert lag.lag_s == 0.0

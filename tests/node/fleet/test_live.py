@@ -1,24 +1,35 @@
-"""What a node of a fleet refuses to begin with, in one line."""
+"""What a node of a fleet refuses to begin with, in one line, and what it takes of others."""
 
+import asyncio
 import socket
+import time
+from collections.abc import Callable
+from typing import Any
 
 import pytest
+from support import run_async
 
+from companion.node.fleet import live, messages
 from companion.node.fleet.config import bus_config
 from companion.node.fleet.live import FleetNode
 from companion.pipeline.fold import Pipeline
 from companion.settings.fleet import FleetSettings
 from companion.settings.model import Settings
 from companion.settings.section import ConfigError
-from companion.values import UserError
+from companion.values import Notice, Standing, UserError
 
 pytest.importorskip("zenoh")
+S = 1_000_000_000
 
 
-def node(**settings: object) -> FleetNode:
+def node(
+    notify: Callable[[Notice], Any] = lambda notice: None,
+    now: Callable[[], int] = lambda: 0,
+    **settings: object,
+) -> FleetNode:
     pipeline = Pipeline(Settings().override(center={"source": "47,8,400"}))
     given = FleetSettings.model_validate({"node": "north", **settings})
-    return FleetNode(given, pipeline, lambda event: None, lambda notice: None, lambda: 0)
+    return FleetNode(given, pipeline, lambda event: None, notify, now)
 
 
 @pytest.mark.parametrize(
@@ -58,3 +69,102 @@ def test_a_node_listens_on_this_machine_alone_unless_told_otherwise() -> None:
     config = bus_config(FleetSettings(node="north"))
     assert config.listen == ("tcp/127.0.0.1:0",)
     assert not config.scouting
+
+
+class Wire:
+    """What a node says and asks, in place of a bus; ``takes`` has who takes what of others."""
+
+    def __init__(self, *_: object) -> None:
+        self.takes: dict[str, Callable[..., None]] = {}
+        self.asked: list[Callable[[bytes, int], None]] = []
+        self.is_asked = asyncio.Event()
+
+    def open(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    async def run(self) -> None:
+        await asyncio.Event().wait()
+
+    def subscribe(self, key: str, take: Callable[..., None]) -> None:
+        self.takes[key.rsplit("/", 1)[-1]] = take
+
+    def watch(self, key: str, take: Callable[[str, bool], None]) -> None:
+        take(key.replace("*", "south"), True)
+
+    def ask(self, key: str, payload: bytes, timeout_s: float, take: Callable[..., None]) -> None:
+        assert key.endswith("/south/time")
+        self.asked.append(take)
+        self.is_asked.set()
+
+    def serve(self, *_: object) -> None:
+        pass
+
+    def alive(self, key: str) -> None:
+        pass
+
+    def put(self, *_: object, **__: object) -> bool:
+        return True
+
+    def is_wanted(self, *_: object) -> bool:
+        return False
+
+
+@pytest.fixture
+def wire(monkeypatch: pytest.MonkeyPatch) -> Wire:
+    made = Wire()
+    monkeypatch.setattr(live, "Bus", lambda *_: made)
+    return made
+
+
+def test_an_answer_came_when_zenoh_had_it(wire: Wire) -> None:
+    """However long the loop was busy then."""
+    now_ns = [1000 * S]
+
+    async def test() -> None:
+        member = node(mode="client", connect=["tcp/127.0.0.1:1"], now=lambda: now_ns[0])
+        task = asyncio.create_task(member.run())
+        await wire.is_asked.wait()
+        now_ns[0] = 1090 * S
+        remote_ns = 1005 * S
+        wire.asked[0](messages.CLOCK.pack(1, remote_ns), time.monotonic_ns() - 20 * S)
+        ahead = member.member.neighbours["south"].clock.newest()
+        assert ahead is not None
+        assert ahead.low_ns == 1000 * S - remote_ns
+        assert ahead.high_ns <= 1070 * S - remote_ns
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    run_async(test())
+
+
+def test_another_of_its_name_is_said_once_and_not_heard(wire: Wire) -> None:
+    notices: list[Notice] = []
+
+    async def test() -> None:
+        member = node(mode="client", connect=["tcp/127.0.0.1:1"], notify=notices.append)
+        task = asyncio.create_task(member.run())
+        await wire.is_asked.wait()
+        said = messages.standing(Standing("north", 0, 0, None, None, 4, (("1:1", 9.0),)))
+        for _ in range(2):
+            wire.takes["standing"]("companion/site/north/standing", said)
+        assert list(member.member.neighbours) == ["south"]
+        assert [one.text for one in notices if "too" in one.text] == [
+            "another node says that it is north too: give each a name of its own"
+        ]
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    run_async(test())
+
+
+def test_rates_are_in_bits() -> None:
+    rate = live._Rate()
+    rate.look(0)
+    rate.bytes += 250
+    rate.look(2 * S)
+    assert rate.bps == 1000.0

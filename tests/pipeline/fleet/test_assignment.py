@@ -114,3 +114,15 @@ def test_what_is_only_likely_is_worth_less(
     sure: float | None, likely: float | None, sinr: float | None, worth: float | None
 ) -> None:
     assert worth_db(Offer("1:1", sure, likely, sinr, 0.1)) == worth
+
+
+def test_who_has_no_other_choice_comes_first() -> None:
+    offers = {"a": {"1:1": 30.0, "2:1": 20.0}, "b": {"1:1": 29.0, "3:1": 5.0}}
+    assert assign(offers, {}, {"a": 1, "b": 1}, 0.0) == {"2:1": "a", "3:1": "b"}
+
+
+def test_who_moves_away_leaves_a_place() -> None:
+    offers = {"a": {"1:1": 10.0, "2:1": 20.0, "3:1": 30.0}, "b": {"1:1": 20.0, "3:1": 10.0}}
+    held = {"1:1": "a", "2:1": "a", "3:1": "b"}
+    moved = {"1:1": "b", "2:1": "a", "3:1": "a"}
+    assert assign(offers, held, {"a": 2, "b": 5}, 3.0) == moved

@@ -108,3 +108,14 @@ def test_damaged_frames_are_none() -> None:
     attitude = common.MAVLink_attitude_message(1, 0, 0, 0, 0, 0, 0)
     packed = attitude.pack(common.MAVLink(None, srcSystem=1, srcComponent=1))
     assert hearing.placed(12 * S, "b", clock(), SharedFrame(9 * S, bytes(packed))) is None
+
+
+def test_what_was_missed_between_reports_that_were_heard_is_no_news() -> None:
+    hearing = Hearing()
+    for number in range(20):
+        hear(hearing, 11 * S + number * 100 * MS, 1000 + 100 * number)
+        missed_ns = 11 * S + number * 100 * MS + 50 * MS
+        assert tell(hearing, missed_ns + 5 * MS, raw(1050 + 100 * number), missed_ns) == []
+    at_ns = 14 * S
+    taken = tell(hearing, at_ns + 5 * MS, raw(4000), at_ns)
+    assert [one.raw for one in taken] == [raw(2950), raw(4000)]

@@ -5,6 +5,7 @@ import struct
 from pymavlink.dialects.v20 import common
 
 from companion.pipeline.fleet.member import FORGET_NS, NODES_MAX, Member
+from companion.pipeline.fleet.trust import TIMES
 from companion.settings.fleet import FleetSettings
 from companion.values import Offer, Shared, SharedFrame, Standing
 
@@ -88,3 +89,62 @@ def test_who_is_far_away_is_not_near_and_its_offers_are_not_kept() -> None:
     assert node.near == {"b"}
     assert node.neighbours["b"].offers is not None
     assert node.neighbours["c"].offers is None
+
+
+def answered(
+    node: Member, now_ns: int, ahead_s: float, started_ns: int, times: int = 3
+) -> list[str]:
+    """Answers of a node whose clock is so much behind, 4 ms apart; what was said of them."""
+    notices = []
+    for number in range(times):
+        sent_ns = now_ns + number * 500 * MS
+        remote_ns = sent_ns + 2 * MS - round(ahead_s * S)
+        notices += node.read_clock("b", started_ns, sent_ns, sent_ns + 4 * MS, remote_ns)
+    return [notice.text for notice in notices]
+
+
+def test_another_life_of_a_node_has_another_clock() -> None:
+    node = member()
+    assert answered(node, START_NS, 0.0, 1) == []
+    (text,) = answered(node, START_NS + 10 * S, 100.0, 2)
+    assert text.startswith("node b's clock is 99.998 s behind this one's")
+    now_ns = START_NS + 12 * S
+    said = word(now_ns - 100 * S, 1)
+    (frame,), _ = node.shared(now_ns + MS, "b", said)
+    assert frame.doubt_ns < 6 * MS
+    assert node.trust.believes("b")
+
+
+def test_a_clock_that_is_ahead_is_said_to_be() -> None:
+    (text,) = answered(member(), START_NS, -5.0, 1)
+    assert text.startswith("node b's clock is 4.998 s ahead of this one's")
+
+
+def test_nothing_is_taken_of_a_node_that_is_not_believed() -> None:
+    node = member()
+    answered(node, START_NS, 0.0, START_NS)
+    now_ns = START_NS + 2 * S
+    assert len(node.shared(now_ns, "b", word(now_ns, 1))[0]) == 1
+    for _ in range(TIMES):
+        node.trust.against(now_ns, "b", "tells what cannot be")
+    assert node.shared(now_ns, "b", word(now_ns, 2)) == ([], [])
+
+
+def test_offers_stand_for_some_time() -> None:
+    node, now_ns = member(), START_NS
+    node.offer({"1:1": Offer("1:1", 10.0, 10.0, 10.0, 0.1)})
+
+    def run(seconds: int) -> None:
+        nonlocal now_ns
+        for _ in range(10 * seconds):
+            now_ns += 100 * MS
+            node.stands(now_ns, standing("b"))
+            node.decide(now_ns)
+
+    run(3)
+    assert list(node.duties.serves) == ["1:1"]
+    node.offered(now_ns, "b", (Offer("1:1", 25.0, 25.0, 25.0, 0.1),))
+    run(4)
+    assert node.duties.handing == {"1:1": "b"}
+    run(8)
+    assert not node.duties.handing

@@ -142,3 +142,8 @@ def test_a_lone_message_among_garbage_is_none() -> None:
     walked = ulog.walk(as_bytes(torn), ("vehicle_global_position",))
     assert len(walked.topics[0].at) == 40
     assert walked.lost >= 99 + len(false)  # one byte ends the cut sample
+
+
+def test_a_receiver_without_a_fix_does_not_know_the_time() -> None:
+    assert px4.read(as_bytes(flight().data)).clock is not None
+    assert px4.read(as_bytes(flight(fix_type=2).data)).clock is None

@@ -59,3 +59,11 @@ def test_a_span_that_is_none_is_said(span: str, tmp_path: Path) -> None:
     ran = CliRunner().invoke(main, ["study", "fleet", "--nodes", span, "--out", str(tmp_path)])
     assert ran.exit_code == 2
     assert "Traceback" not in ran.output
+
+
+def test_a_sample_of_the_reports_counts_for_all() -> None:
+    all_of_them, half = (
+        next(study.run(study.Asked(((2, 8),), seconds=1.0, loss=0.0, sampled=n), lambda: 0.0))
+        for n in (8, 4)
+    )
+    assert half.told_kbps["heard"] == pytest.approx(all_of_them.told_kbps["heard"], rel=0.3)

@@ -1,5 +1,7 @@
 """Fleets in virtual time, with links that delay and lose, partitions and deaths."""
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -7,7 +9,7 @@ from support import examples
 
 from companion.settings.fleet import FleetSettings
 from companion.studies.fleet.sky import Sky
-from companion.studies.fleet.world import Counted, World
+from companion.studies.fleet.world import HEADER_BYTES, Counted, World
 
 SETTINGS = FleetSettings(node="any")
 
@@ -106,3 +108,38 @@ def test_what_a_node_is_told_does_not_grow_with_a_fleet_that_spreads() -> None:
         received = world.counted.received
         told.append((received["heard"] + received["offers"]) / nodes)
     assert told[1] < 2 * told[0]  # two are near each of four, up to four each of sixteen
+
+
+def test_what_is_told_arrives_with_its_heads() -> None:
+    world = World(Sky(3, 10, 400.0, loss=0.0, sampled=5), SETTINGS)
+    world.run(3)
+    world.counted = Counted()
+    world.sky = replace(world.sky, delay_s=0.0)
+    world.run(1)
+    for what, samples in world.counted.samples.items():
+        sent = world.counted.sent[what] + samples * HEADER_BYTES
+        assert world.counted.received[what] == 2 * sent
+
+
+def test_parted_nothing_arrives_and_dead_nothing_is_heard() -> None:
+    world = settled(Sky(3, 10, 400.0, sampled=5))
+    world.parted = lambda one, other: True
+    world.run(1)
+    assert world.counted.sent
+    assert not world.counted.received
+    world.parted = lambda one, other: False
+    world.kill("n000")
+    member = world.members["n000"]
+    world.run(0.1)
+    before = {name: one.heard_ns for name, one in member.neighbours.items()}
+    world.run(1)
+    assert {name: one.heard_ns for name, one in member.neighbours.items()} == before
+
+
+def test_a_clock_is_known_to_the_way_there_and_back() -> None:
+    world = settled(Sky(2, 0, delay_s=0.05))
+    for member in world.members.values():
+        for known in member.neighbours.values():
+            ahead = known.clock.newest()
+            assert ahead is not None
+            assert ahead.doubt_ns > 99_000_000

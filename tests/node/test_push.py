@@ -1,0 +1,46 @@
+"""Weights pushed over UDP to somebody who does not listen yet."""
+
+import asyncio
+import socket
+
+from support import ROOT, free_port, run_async
+
+from companion.node import moment
+from companion.node.push import WELL, Push
+from companion.pipeline import assembly
+from companion.settings.model import Settings
+from companion.settings.outlets import RecordSettings
+from companion.values import Notice
+
+
+def test_who_does_not_listen_is_said_once_and_that_it_does_after_a_while() -> None:
+    settings = Settings().override(center={"source": "5:1"})
+    log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
+    pipeline, update = moment.look([log], settings, "3")
+    equipment, notices = assembly.equipment(settings, pipeline.array), list[Notice]()
+    to = ("127.0.0.1", free_port(socket.SOCK_DGRAM))
+    way = RecordSettings(udp=(f"{to[0]}:{to[1]}",))
+    push = Push(way, pipeline, equipment, notices.append, lambda: 0)
+
+    async def test() -> None:
+        task = asyncio.create_task(push.run())
+
+        async def pushed(number: int) -> None:
+            for n in range(number):
+                push.newest(update, n)
+                await asyncio.sleep(0)
+                await asyncio.sleep(0)
+
+        await pushed(WELL)  # every second one is told that the one before was refused
+        assert [one.text.partition(":")[2] for one in notices] == [
+            f"{to[1]} are refused: Connection refused"
+        ]
+        with socket.socket(type=socket.SOCK_DGRAM) as listener:
+            listener.bind(to)
+            await pushed(WELL + 1)
+        assert [one.text for one in notices[1:]] == [f"records to {to[0]}:{to[1]} go out"]
+        task.cancel()
+
+    push.open()
+    run_async(test())
+    push.close()

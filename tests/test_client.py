@@ -1,32 +1,51 @@
 """``companion.client`` against a live node, and against what is no node at all."""
 
+import contextlib
 import itertools
 import json
 import socket
 import threading
+from collections.abc import Iterator
 from contextlib import closing
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from support import HANG_S, Node
+from support import HANG_S, Node, end
 
 from companion.client import Client, ServiceError
 from companion.values import UserError
 from companion.views.records import HEADER
 
 RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
+TOKEN = "s3cret/ü"
 
 
-@pytest.fixture
-def flying(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start_node: Any) -> Node:
-    """The demo, once its four beams are up."""
-    monkeypatch.chdir(tmp_path)  # it records to ./recordings
-    node: Node = start_node("demo", "--port", "0", "--seconds", "60")
+def demo(folder: Path) -> Node:
+    """The demo, once its four beams are up; it records to a folder of its own."""
+    with contextlib.chdir(folder):
+        node = Node("demo", "--port", "0", "--seconds", "36000")
     node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
     return node
+
+
+@pytest.fixture(scope="module")
+def flying(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Node]:
+    """One for all tests that do not end it."""
+    node = demo(tmp_path_factory.mktemp("demo"))
+    yield node
+    end(node.process)
+
+
+@pytest.fixture(scope="module")
+def guarded() -> Iterator[Node]:
+    """One that asks for a token."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("COMPANION_TOKEN", TOKEN)
+        node = Node(*RUN)
+    yield node
+    end(node.process)
 
 
 def test_it_shows_what_the_service_says(flying: Node) -> None:
@@ -61,8 +80,9 @@ def test_a_stream_goes_on_until_it_is_closed(flying: Node) -> None:
 
 
 @pytest.mark.full
-def test_that_the_service_ends_is_said(flying: Node) -> None:
+def test_that_the_service_ends_is_said(tmp_path: Path) -> None:
     """A reader is told so, and one that never reads does not keep the service from ending."""
+    flying = demo(tmp_path)
     host, _, port = flying.url.removeprefix("http://").partition(":")
     with socket.socket() as deaf:
         deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -84,8 +104,8 @@ def test_that_the_service_ends_is_said(flying: Node) -> None:
     assert raised.value.status == 1012
 
 
-def test_refusals_have_a_status_and_a_title(start_node: Any) -> None:
-    client = Client(start_node(*RUN).url)
+def test_refusals_have_a_status_and_a_title(guarded: Node) -> None:
+    client = Client(guarded.url, TOKEN)
     with pytest.raises(ServiceError, match=r"422: query\.lead_ms: ") as raised:
         client.beams(lead_ms=-1)
     assert raised.value.status == 422
@@ -99,19 +119,16 @@ def test_refusals_have_a_status_and_a_title(start_node: Any) -> None:
     assert empty.matrix.shape == (64, 0)
 
 
-def test_a_token_is_sent(start_node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COMPANION_TOKEN", "s3cret/ü")
-    node = start_node(*RUN)
-    for wrong in (Client(node.url), Client(node.url, "wrong")):
+def test_a_token_is_sent(guarded: Node) -> None:
+    for wrong in (Client(guarded.url), Client(guarded.url, "wrong")):
         with pytest.raises(ServiceError, match="401: a bearer token is needed"):
             wrong.status()
         with pytest.raises(ServiceError, match="4401: a bearer token is needed"):
             next(wrong.stream())
 
 
-def test_the_right_token_opens(start_node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COMPANION_TOKEN", "s3cret")
-    client = Client(start_node(*RUN).url, "s3cret")
+def test_the_right_token_opens(guarded: Node) -> None:
+    client = Client(guarded.url, TOKEN)
     assert client.status()["version"]
     with closing(client.stream(topics=["status"])) as stream:
         assert next(stream)["topic"] == "status"

@@ -77,7 +77,9 @@ def many(node: Node, page: Any, number: int) -> None:
         page.route(f"**{path}", functools.partial(fulfil, path, key, name))
 
 
-@pytest.mark.parametrize("number", [1, 4, 20, 100])
+@pytest.mark.parametrize(
+    "number", [*(pytest.param(n, marks=pytest.mark.full) for n in (1, 20)), 4, 100]
+)
 @pytest.mark.parametrize("size", SIZES)
 def test_nothing_overlaps_and_nothing_is_cut(
     demo: Node, open_page: Any, size: str, number: int

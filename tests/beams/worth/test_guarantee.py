@@ -59,6 +59,8 @@ CASES = [
     for name, array in ARRAYS.items()
     for kind in weights_for(array, np.random.default_rng(1))
 ]
+QUICK = {"circle": "zero forcing", "cloud of patterns": "two bits", "line of patterns": "random"}
+"""Of arrays with which a case takes most of a second, the kind of weights in `make test`."""
 
 
 def within(
@@ -94,7 +96,13 @@ def searched(
     return float(sign * values.min())
 
 
-@pytest.mark.parametrize(("name", "kind"), CASES)
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        pytest.param(*one, marks=pytest.mark.full if QUICK.get(one[0], one[1]) != one[1] else ())
+        for one in CASES
+    ],
+)
 def test_no_direction_within_the_bound_has_less_or_leaks_more(name: str, kind: str) -> None:
     """Thousands of directions for each array and each kind of weights, over all bounds."""
     array, rng = ARRAYS[name], np.random.default_rng(CASES.index((name, kind)))

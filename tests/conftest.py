@@ -79,6 +79,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
+    gc.unfreeze()  # else what is there goes in any order, and extensions complain
     os.close(config.stash[STDERR])
 
 

@@ -254,11 +254,10 @@ def demo() -> Iterator[Node]:
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(short_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the replay of the short flight recorded."""
     made = tmp_path_factory.mktemp("readme") / "recording.mcap"
-    log = str(ROOT / "tests" / "data" / "sitl_4circle_cut.tlog")
-    run(["companion", "replay", log, "--out", str(made)], made.parent)
+    run(["companion", "replay", str(short_log), "--out", str(made)], made.parent)
     return made
 
 
@@ -266,19 +265,19 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_command_does_what_it_should(
     command: str,
     tmp_path: Path,
-    cut_log: Path,
+    short_log: Path,
     aeroplane: Path,
     carrier: Path,
     request: pytest.FixtureRequest,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    shutil.copy(cut_log, tmp_path / "flight.tlog")
+    shutil.copy(short_log, tmp_path / "flight.tlog")
     shutil.copy(aeroplane, tmp_path / "uav.bin")
     shutil.copy(carrier, tmp_path / "carrier.bin")
     if "recording.mcap" in command:
         shutil.copy(request.getfixturevalue("recording"), tmp_path)
     monkeypatch.chdir(tmp_path)  # `recordings` and the like are made here
-    words = ["12" if word == "120" else word for word in words_of(command)]  # it is 25 s long
+    words = ["3" if word == "120" else word for word in words_of(command)]  # it is 5 s long
     way = runner_of(command)
     RUNNERS[way](words, tmp_path, request.getfixturevalue(WITH.get(way, "start_node")))
 

@@ -8,6 +8,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+import pytest
 from support import BIN, HANG_S, line_of, started
 
 DEMO = [BIN / "companion", "demo", "--port", "0"]
@@ -30,6 +31,7 @@ def test_json_is_an_object_a_second_with_the_events_since_the_last(tmp_path: Pat
     assert len(said) == len({(e["at"], e["text"]) for each in found for e in each["events"]})
 
 
+@pytest.mark.full
 def test_into_a_pipe_there_are_plain_lines(tmp_path: Path) -> None:
     done = subprocess.run(
         [*DEMO, "--seconds", "3"],

@@ -28,8 +28,10 @@ main()
 
 @pytest.mark.parametrize(
     ("kind", "error"),
-    [("Frame", "ValueError('wrong shapes')"), ("Tick", "KeyError('1:1')")],
-    ids=["in a link's callback", "in the timer's task"],
+    [
+        pytest.param("Frame", "ValueError('wrong shapes')", id="in a link's callback"),
+        pytest.param("Tick", "KeyError('1:1')", id="in the timer's task", marks=pytest.mark.full),
+    ],
 )
 def test_a_defect_of_the_fold_ends_the_service_and_is_shown_whole(
     tmp_path: Path, kind: str, error: str

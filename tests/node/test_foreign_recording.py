@@ -74,6 +74,7 @@ def test_a_replay_writes_and_opens_nothing_that_a_recording_names(
     assert [file.suffix for file in (here / "recordings").iterdir()] == [".mcap"]
 
 
+@pytest.mark.full
 def test_a_file_is_not_replaced_because_a_recording_says_so(cut_log: Path, tmp_path: Path) -> None:
     mine = tmp_path / "mine.mcap"
     mine.write_bytes(b"years of work")

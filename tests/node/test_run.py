@@ -240,6 +240,7 @@ def test_errors_are_problem_json(start_node: Any, path: str, accept: str, expect
     assert json.loads(body)["title"]
 
 
+@pytest.mark.full
 def test_the_page_is_served(start_node: Any) -> None:
     node = start_node(*RUN)
     status, body = node.get("/", "text/html")
@@ -248,6 +249,7 @@ def test_the_page_is_served(start_node: Any) -> None:
     assert node.json("/openapi.json")["info"]["title"] == "companion"
 
 
+@pytest.mark.full
 def test_a_token_is_asked_for(start_node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COMPANION_TOKEN", "s3cret")
     node = start_node(*RUN)

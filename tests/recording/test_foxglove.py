@@ -127,6 +127,7 @@ main(["run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center
 """
 
 
+@pytest.mark.full
 def test_without_the_extra_it_is_one_line() -> None:
     done = subprocess.run(
         [sys.executable, "-c", _WITHOUT],

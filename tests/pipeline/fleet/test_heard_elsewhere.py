@@ -117,7 +117,7 @@ def flown(links: Links) -> tuple[list[tuple[float, float, float]], Pipeline]:
         st.integers(0, 999),
     )
 )
-@settings(max_examples=rounds(6, 60))
+@settings(max_examples=rounds(4, 60))
 def test_the_bound_holds_behind_the_building(links: Links) -> None:
     seen, pipeline = flown(links)
     broken = [(t, error, bound) for t, error, bound in seen if error > bound + 0.02]

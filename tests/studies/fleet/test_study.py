@@ -14,7 +14,7 @@ from companion.studies.fleet import study
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     out = tmp_path_factory.mktemp("fleet")
-    sizes = ["--nodes", "2..4", "--uavs", "10..40", "--steps", "2", "--seconds", "3"]
+    sizes = ["--nodes", "2..4", "--uavs", "8..16", "--steps", "2", "--seconds", "2"]
     ran = CliRunner().invoke(main, ["study", "fleet", *sizes, "--out", str(out), "--json"])
     assert ran.exit_code == 0, ran.output
     return out, json.loads(ran.stdout)
@@ -24,7 +24,7 @@ def test_every_uav_has_one_node_and_a_death_is_followed(
     found: tuple[Path, dict[str, Any]],
 ) -> None:
     _, answer = found
-    assert [(one["nodes"], one["uavs"]) for one in answer["sizes"]] == [(2, 10), (4, 40)]
+    assert [(one["nodes"], one["uavs"]) for one in answer["sizes"]] == [(2, 8), (4, 16)]
     for one in answer["sizes"]:
         assert one["served"] >= 0.99
         assert one["none"] == one["parted_none"] == 0
@@ -39,7 +39,7 @@ def test_the_page_and_its_figures_are_there(found: tuple[Path, dict[str, Any]]) 
     out, answer = found
     page = (out / "fleet.html").read_text(encoding="utf-8")
     assert answer["command"] in page
-    assert "<td>40</td>" in page
+    assert "<td>16</td>" in page
     for name in ("traffic", "time"):
         assert (out / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     kept = json.loads((out / "fleet.json").read_text(encoding="utf-8"))
@@ -48,7 +48,7 @@ def test_the_page_and_its_figures_are_there(found: tuple[Path, dict[str, Any]]) 
 
 def test_the_same_again_is_the_same(found: tuple[Path, dict[str, Any]]) -> None:
     _, answer = found
-    asked = study.Asked(((2, 10),), seconds=3.0)
+    asked = study.Asked(((2, 8),), seconds=2.0)
     (again,) = study.answer(asked, list(study.run(asked, lambda: 0.0)), "")["sizes"]
     before = answer["sizes"][0] | {"cpu_share": 0.0}
     assert again == before

@@ -472,7 +472,7 @@ def test_a_mistake_is_one_line(
     cut_log: Path, tmp_path: Path, arguments: list[str], says: str
 ) -> None:
     center = [] if "--center" in arguments else ["--center", "5:1"]
-    done = run(cut_log, *center, *arguments, "--out", tmp_path)
+    done = run(cut_log, *center, "--jobs", "1", *arguments, "--out", tmp_path)
     assert done.exit_code not in (0, None)
     assert done.stdout == ""
     (line,) = done.stderr.splitlines()

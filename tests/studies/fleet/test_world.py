@@ -128,6 +128,7 @@ def test_parted_nothing_arrives_and_dead_nothing_is_heard() -> None:
     assert world.counted.sent
     assert not world.counted.received
     world.parted = lambda one, other: False
+    world.run(1)
     world.kill("n000")
     member = world.members["n000"]  # some of what it is told is on its way
     before = {name: one.heard_ns for name, one in member.neighbours.items()}

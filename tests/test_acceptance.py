@@ -191,7 +191,13 @@ def test_one_reboot_and_tracking_goes_on() -> None:
     assert since > 2000
 
 
-@pytest.mark.parametrize("name", ["real_devmangrani_flight54.tlog", "real_eagle_c2_gui.tlog"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("real_devmangrani_flight54.tlog", marks=pytest.mark.full),
+        "real_eagle_c2_gui.tlog",
+    ],
+)
 def test_real_flights_are_not_gated(name: str) -> None:
     """Real vehicles stay within the default bounds on what a vehicle can do."""
     pipeline = Pipeline(Settings())

@@ -38,6 +38,7 @@ def test_every_file_and_folder_that_the_architecture_names_is_there() -> None:
             assert (ROOT / "companion" / name).is_dir() or (ROOT / name).exists(), name
 
 
+@pytest.mark.full
 def test_the_picture_of_the_rooms_is_up_to_date() -> None:
     drawing = [sys.executable, DOCS / "draw_architecture.py", "--check"]
     done = subprocess.run(drawing, capture_output=True, text=True, check=False, timeout=HANG_S)

@@ -73,18 +73,19 @@ def _record(opcode: int, body: bytes) -> bytes:
     return struct.pack("<BQ", opcode, len(body)) + body
 
 
-def test_a_second_service_on_the_same_ports_is_refused_in_a_line(start_node: Any) -> None:
+@pytest.mark.parametrize("way", ["link", pytest.param("listen", marks=pytest.mark.full)])
+def test_a_second_service_on_the_same_ports_is_refused_in_a_line(start_node: Any, way: str) -> None:
     node = start_node(*RUN)
-    http = node.url.removeprefix("http://")
-    other = f"udpin:127.0.0.1:{node.udp_port}"
-    for arguments, named in (
-        (("--link", other, "--listen", "127.0.0.1:0"), other),
-        (("--link", "udpin:127.0.0.1:0", "--listen", http), http),
-    ):
-        done = subprocess.run(
-            [BIN / "companion", "run", *arguments, "--center", "home"],
-            capture_output=True, text=True, check=False, timeout=HANG_S,
-        )  # fmt: skip
-        assert done.returncode == 1
-        assert done.stderr == f"companion: {named}: Address already in use\n"
+    taken = {
+        "link": f"udpin:127.0.0.1:{node.udp_port}",
+        "listen": node.url.removeprefix("http://"),
+    }[way]
+    free = {"link": "udpin:127.0.0.1:0", "listen": "127.0.0.1:0"} | {way: taken}
+    done = subprocess.run(
+        [BIN / "companion", "run", "--link", free["link"], "--listen", free["listen"],
+         "--center", "home"],
+        capture_output=True, text=True, check=False, timeout=HANG_S,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr == f"companion: {taken}: Address already in use\n"
     assert node.get("/healthz")[0] == 200

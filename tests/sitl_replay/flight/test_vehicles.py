@@ -272,7 +272,17 @@ def test_frames_are_those_that_pymavlink_packs(sent: list[Transmission]) -> None
         assert garbled or message.pack(packer) == raw
 
 
-@pytest.mark.parametrize("name", scenario.BUILDERS)
+LIKE_OTHERS = ("racetrack", "mirror", "crossing")
+"""Scenarios that send what others send as well."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(one, marks=pytest.mark.full if one in LIKE_OTHERS else ())
+        for one in scenario.BUILDERS
+    ],
+)
 def test_the_service_reads_where_each_vehicle_is(name: str) -> None:
     # Over some time, so that stops, turns and meetings are among it; a frame in 40 will do.
     flight = scenario.BUILDERS[name](6, seed=4)

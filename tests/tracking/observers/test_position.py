@@ -117,7 +117,7 @@ def test_positions_and_velocities_never_leave_the_bound(
     """Speed, acceleration and both noises bounded; a report may come without its velocity."""
     observer = observing(alpha, 0.0, velocity_lead_s)
     worst = 0.0
-    for adversary in adversaries(rounds(120, 400)):
+    for adversary in adversaries(rounds(60, 400)):
         rng = adversary.rng
         position, velocity = np.zeros(3), adversary(SPEED_MPS)
         t_ns, state, due_ns = 17 * S, None, 0

@@ -12,6 +12,7 @@ from support import run_async
 from companion.node.fleet import live, messages
 from companion.node.fleet.config import bus_config
 from companion.node.fleet.live import FleetNode
+from companion.node.fleet.traffic import Rate
 from companion.pipeline.fold import Pipeline
 from companion.settings.fleet import FleetSettings
 from companion.settings.model import Settings
@@ -163,7 +164,7 @@ def test_another_of_its_name_is_said_once_and_not_heard(wire: Wire) -> None:
 
 
 def test_rates_are_in_bits() -> None:
-    rate = live._Rate()
+    rate = Rate()
     rate.look(0)
     rate.bytes += 250
     rate.look(2 * S)

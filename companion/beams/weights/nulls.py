@@ -9,7 +9,8 @@ directions, and in the sense of least squares at the points around them. Each s_
 allowed by
 
 * the price: with c_p the correlation of a_p with the user's own a and q_p that with g, taking off
-  this one alone costs the gain 1 + s^2 q^2 / (1 - c^2), of which each may cost at most ``PRICE``;
+  this one alone costs the gain 1 + s^2 q^2 / (1 - c^2), of which each may cost at most ``PRICE``,
+  and towards c = 1 nothing (``APART``);
 * the floor: within a user's own cone no less may be left than the least gain that he is to have,
   and outside so much less of it as the null is further from the cone.
 
@@ -28,6 +29,10 @@ from companion.values import BoolArray, ComplexArray, FloatArray, IntArray
 
 PRICE: Final = 0.6
 """Gain, over the gain that is left, that one null may cost: 2 dB."""
+APART: Final = 0.02
+"""How unlike the user's own direction, as 1 - c^2, one is from which on a null is worth its price:
+some .08 natural widths. Nearer it would be none, and turn round where the two pass one another.
+"""
 FLOOR_PRICE_DB: Final = 2.5
 """Most that all nulls of a beam may take off its least gain, where it is looked at.
 
@@ -145,6 +150,7 @@ def _shares(spread: Spread, kept: FloatArray, power: FloatArray) -> FloatArray:
     alike = np.abs(spread.gram[:, :: spread.each]) ** 2 / np.outer(lengths, centres)
     cost = reached**2 / np.outer(lengths, power) / np.maximum(1.0 - alike, 1e-12)
     priced = np.sqrt(PRICE / np.maximum(cost, PRICE))
+    priced *= np.minimum((1.0 - alike) / APART, 1.0)
     near = np.clip(1.0 - spread.outside / NULL_WIDTHS, 0.0, 1.0) ** 2
     left = np.sqrt(kept * power) * near
     floored = 1.0 - np.minimum(left / np.maximum(reached, 1e-300), 1.0)

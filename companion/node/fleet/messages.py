@@ -10,12 +10,11 @@ from typing import Final
 
 from google.protobuf.message import DecodeError
 
-from companion.pipeline.fleet.sharing import AT_ONCE
 from companion.recording import codec, schemas
 from companion.values import Offer, Shared, SharedFrame, Standing
 
-FRAMES_MAX: Final = 4 * AT_ONCE
-"""Most frames, or round trips, of one message: more than any node of this make tells at once."""
+FRAMES_MAX: Final = 4096
+"""Most frames, or round trips, of one message."""
 CLOCK: Final = struct.Struct("<qq")
 """Answer to a question for the clock: when the node started, and its time now; ns."""
 OFFERS_MAX: Final = 10_000

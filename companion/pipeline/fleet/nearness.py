@@ -1,9 +1,9 @@
 """Which other nodes matter to this one: those that can hear or serve what it can.
 
 Far from one another, two arrays have no UAV in common, and what one hears is nothing to the other.
-So a node listens to the reports and the offers of those alone whose reach meets its own, and what
-it is told does not grow with the fleet. What nodes say of themselves they all hear: from that it
-follows who is near, and that a UAV has one node wherever it is.
+So a node listens to the reports and the offers of those alone that are near, or whose reach meets
+its own, and what it is told of UAVs does not grow with the fleet. What nodes say of themselves they
+all hear: from that it follows who is near, and that a UAV has one node wherever it is.
 """
 
 from collections.abc import Mapping
@@ -17,8 +17,8 @@ COMES: Final = 1.1
 """Share of both reaches within which a node is near: more than 1, as reach is what was heard."""
 GOES: Final = 1.3
 """Share of both beyond which one that was near is so no more."""
-SLACK_M: Final = 200.0
-"""Distance that is near whatever is heard."""
+ALWAYS_M: Final = 10_000.0
+"""Distance that is near whatever is heard: the farthest vehicle of a moment is no array's limit."""
 
 
 def near(
@@ -45,7 +45,7 @@ def near(
         reaches_m = [reach for reach in (reach_m, said.reach_m) if reach is not None]
         both_m = 2.0 * sum(reaches_m) / len(reaches_m) if reaches_m else 0.0
         north, east, _ = frame.localise(*said.place, None)[0]
-        limit_m = (GOES if node in before else COMES) * both_m + SLACK_M
+        limit_m = (GOES if node in before else COMES) * max(both_m, ALWAYS_M)
         if north * north + east * east <= limit_m * limit_m:
             found.add(node)
     return frozenset(found)

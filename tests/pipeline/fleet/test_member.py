@@ -44,6 +44,16 @@ def test_a_word_that_comes_after_its_node_went_is_forgotten_in_the_end() -> None
     assert not node.neighbours
 
 
+def test_an_answer_of_who_went_makes_nobody_known_and_is_no_word() -> None:
+    """Zenoh's threads answer for the clock though the node's own loop stands still."""
+    node = member()
+    node.read_clock("b", START_NS, START_NS, START_NS + MS, START_NS)
+    assert not node.neighbours
+    node.came(START_NS, "b")
+    node.read_clock("b", START_NS, START_NS + S, START_NS + S + MS, START_NS + S)
+    assert node.neighbours["b"].heard_ns == START_NS
+
+
 def test_invented_nodes_take_no_room_for_ever() -> None:
     node = member()
     for number in range(NODES_MAX + 10):
@@ -59,6 +69,7 @@ def test_invented_nodes_take_no_room_for_ever() -> None:
 def test_the_first_answers_of_a_clock_are_not_enough() -> None:
     """The doubt with which a frame was placed stays with its sender's clock."""
     node, now_ns = member(), START_NS
+    node.came(now_ns, "b")
     for number, wide_ms in enumerate((900, 4, 4)):
         now_ns += 500 * MS
         events, _ = node.shared(now_ns, "b", word(now_ns, number))
@@ -96,6 +107,7 @@ def answered(
 ) -> list[str]:
     """Answers of a node whose clock is so much behind, 4 ms apart; what was said of them."""
     notices = []
+    node.came(now_ns, "b")
     for number in range(times):
         sent_ns = now_ns + number * 500 * MS
         remote_ns = sent_ns + 2 * MS - round(ahead_s * S)

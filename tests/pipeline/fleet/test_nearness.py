@@ -5,7 +5,7 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.pipeline.fleet.nearness import COMES, GOES, SLACK_M, near
+from companion.pipeline.fleet.nearness import ALWAYS_M, COMES, GOES, near
 from companion.values import Standing
 
 HERE = (47.0, 8.0, 400.0)
@@ -18,28 +18,34 @@ def standing(east_m: float, reach_m: float | None) -> Standing:
     return Standing("b", 1, 1, (HERE[0], lon, 500.0), reach_m, 16, ())
 
 
-@given(st.floats(0, 20_000), st.floats(1, 5_000), st.floats(1, 5_000))
+@given(st.floats(0, 60_000), st.floats(1, 20_000), st.floats(1, 20_000))
 def test_whose_reach_can_meet_this_one_s_is_near(
     apart_m: float, own_m: float, its_m: float
 ) -> None:
     found = near(HERE, own_m, {"b": standing(apart_m, its_m)}, NOBODY)
-    if apart_m <= own_m + its_m:
+    if apart_m <= max(own_m + its_m, ALWAYS_M):
         assert found == {"b"}
-    elif apart_m > 1.02 * (COMES * (own_m + its_m) + SLACK_M):
+    elif apart_m > 1.02 * COMES * max(own_m + its_m, ALWAYS_M):
         assert found == NOBODY
 
 
 def test_who_was_near_stays_so_a_little_farther() -> None:
-    others = {"b": standing(0.5 * (COMES + GOES) * 4000, 2000.0)}
-    assert near(HERE, 2000.0, others, NOBODY) == NOBODY
-    assert near(HERE, 2000.0, others, frozenset(others)) == {"b"}
+    others = {"b": standing(0.5 * (COMES + GOES) * 16_000, 8000.0)}
+    assert near(HERE, 8000.0, others, NOBODY) == NOBODY
+    assert near(HERE, 8000.0, others, frozenset(others)) == {"b"}
 
 
 def test_who_hears_nobody_has_the_reach_of_the_other() -> None:
-    for own_m, its_m in ((None, 2000.0), (2000.0, None)):
-        assert near(HERE, own_m, {"b": standing(3900, its_m)}, NOBODY) == {"b"}
-        assert near(HERE, own_m, {"b": standing(6000, its_m)}, NOBODY) == NOBODY
-    assert near(HERE, None, {"b": standing(1000, None)}, NOBODY) == NOBODY
+    for own_m, its_m in ((None, 8000.0), (8000.0, None)):
+        assert near(HERE, own_m, {"b": standing(15_900, its_m)}, NOBODY) == {"b"}
+        assert near(HERE, own_m, {"b": standing(24_000, its_m)}, NOBODY) == NOBODY
+    assert near(HERE, None, {"b": standing(40_000, None)}, NOBODY) == NOBODY
+
+
+def test_neighbours_on_a_site_are_near_though_they_hear_little() -> None:
+    """One UAV circles a mast at 100 m; behind a building another mast is all that hears it."""
+    for own_m, its_m in ((100.0, None), (None, 400.0), (100.0, 200.0), (None, None)):
+        assert near(HERE, own_m, {"b": standing(1500, its_m)}, NOBODY) == {"b"}
 
 
 def test_of_whom_nothing_is_known_may_be_near() -> None:

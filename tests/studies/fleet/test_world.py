@@ -97,7 +97,7 @@ def test_what_a_node_is_told_does_not_grow_with_a_fleet_that_spreads() -> None:
     """Four times as many nodes on four times the area: each has the like around it."""
     told = []
     for nodes in (4, 16):
-        sky = Sky(nodes, 2 * nodes, 5000.0, sampled=2 * nodes, report_hz=1.0)
+        sky = Sky(nodes, 2 * nodes, 9000.0, sampled=2 * nodes, report_hz=1.0)
         world = World(sky, SETTINGS)
         world.run(5)
         world.counted = Counted()

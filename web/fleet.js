@@ -8,7 +8,7 @@ import { placedBy } from "./last_known.js";
 
 const HANDOVERS_KEPT = 30;
 /** How bad it is that a node is so. */
-export const NODE_LEVELS = { here: "good", there: "good", silent: "warn", aside: "bad" };
+export const NODE_LEVELS = { here: "good", there: "good", silent: "warn", aside: "bad", gone: "bad" };
 
 /** What is kept of an answer for looking back: of the handovers the newest. */
 export const slimFleet = (answer) => answer
@@ -41,7 +41,7 @@ const NODE_FACTS = [
 
 function nodeItem(one) {
   const most = format.known(one.most) ? ` of ${one.most}` : "";
-  const silent = one.state === "silent" && format.known(one.heard_s)
+  const silent = ["silent", "gone"].includes(one.state) && format.known(one.heard_s)
     ? ` ${format.duration(one.heard_s)}` : "";
   const head = make("p", { class: "link-head", "data-level": NODE_LEVELS[one.state] ?? "warn" },
     make("span", {}, one.node), make("b", {}, one.is_self ? "this node" : one.state + silent));
@@ -126,7 +126,7 @@ export class FleetView {
   }
 
   showUavs({ nodes, uavs }, selected) {
-    const names = nodes.filter(({ state }) => state !== "aside").map(({ node }) => node);
+    const names = nodes.filter(({ state }) => !["aside", "gone"].includes(state)).map(({ node }) => node);
     this.makeColumns(names);
     const present = new Set(uavs.map(({ uav }) => uav));
     for (const [id, { line }] of this.rows) {

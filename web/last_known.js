@@ -9,6 +9,13 @@ export class LastKnown {
   constructor() {
     this.beams = new Map(); // by UAV: {beam, at}
     this.picture = null; // {uav, pattern, weights, patternBeams, at} of the beam that was looked at
+    this.first = null; // where a UAV was first seen
+  }
+
+  /** The place that UAVs are seen from: the carrier's; where a UAV was first, while none is known. */
+  middle(carrier, uavs) {
+    this.first ??= uavs.find(({ lat_deg: lat }) => known(lat)) ?? null;
+    return !carrier || carrier.unseen ? this.first : carrier;
   }
 
   /** Take in what is true at `at`. */
@@ -41,8 +48,8 @@ export class LastKnown {
 }
 
 /**
- * Where the carrier is, or was: `{lat_deg, lon_deg, heading_deg, ageS, unfit}`; null if unknown.
- * `ageS` is null while that is true; `unfit` says what is wrong with it.
+ * Where the carrier is, or was: `{lat_deg, lon_deg, heading_deg, ageS, unfit}`; null without news.
+ * `ageS` is null while that is true; `unfit` says what is wrong with it; `unseen`: it never was known.
  */
 export function carrierOf(status) {
   const center = status?.center;
@@ -50,7 +57,7 @@ export function carrierOf(status) {
   // Where this machine does not keep up, that is why its news of the carrier is old.
   const unfit = status.health?.behind ?? center.unfit;
   const last = known(center.lat_deg) ? center : center.last_known;
-  if (!last) return { unfit };
+  if (!last) return { unfit, unseen: true };
   const ageS = last === center ? null : (Date.parse(status.time) - Date.parse(last.at)) / 1000;
   return { ...last, ageS, unfit };
 }

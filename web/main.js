@@ -154,7 +154,8 @@ function refresh() {
 function showAll(link, now) {
   const found = timebar.shown ?? liveView(now);
   const carrier = carrierOf(found.status);
-  const view = { ...found, carrier, uavs: found.uavs.map((uav) => placedBy(uav, carrier)) };
+  const middle = last.middle(carrier, found.uavs);
+  const view = { ...found, carrier, uavs: found.uavs.map((uav) => placedBy(uav, middle)) };
   if (selected !== null && !view.uavs.some((uav) => uav.id === selected)) selected = null;
   const { status } = feeds;
   showConnection(link, feeds.uavs.data?.valid_at,

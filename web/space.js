@@ -103,6 +103,7 @@ export class Space {
   drawCarrier(view) {
     const { context } = view;
     const { carrier, uavsLive } = view.scene;
+    if (carrier?.unseen) return;
     const [x, y] = this.at([0, 0, 0]);
     context.beginPath();
     context.arc(x, y, 5, 0, 2 * Math.PI);

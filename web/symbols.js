@@ -9,6 +9,7 @@ const LEADER_S = 2; // the line ahead of a UAV: where it is in so many seconds
 export function drawCarrier(view) {
   const { context } = view;
   const { carrier } = view.scene;
+  if (carrier?.unseen) return; // a UAV's first place is in the middle
   const headingDeg = carrier?.heading_deg;
   context.save();
   context.translate(...view.centre);

@@ -81,6 +81,9 @@ def _text(answer: dict[str, Any]) -> str:
     lines = [f"{answer['valid_at']}  fleet {answer['site']}, seen from {answer['node']}"]
     width = max(len(node["node"]) for node in answer["nodes"])
     for node in answer["nodes"]:
+        if node["state"] == "gone":
+            lines.append(f"  {node['node']:{width}} gone, {node['heard_s']:.0f} s ago")
+            continue
         served = [uav["uav"] for uav in answer["uavs"] if node["node"] in uav["served_by"]]
         names = ", ".join(served[:8]) + (" ..." if len(served) > 8 else "")
         way = "" if node["way_p99_ms"] is None else f"  way p99 {node['way_p99_ms']:.0f} ms"

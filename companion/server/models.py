@@ -328,11 +328,11 @@ class FleetPlace(BaseModel):
 
 
 class FleetNode(BaseModel):
-    """A node of the fleet: this one, then the others by name."""
+    """A node of the fleet: this one, then the others by name, and then those that are gone."""
 
     node: str
     is_self: bool
-    state: Literal["here", "there", "silent", "aside"]
+    state: Literal["here", "there", "silent", "aside", "gone"]
     near: bool
     reason: str | None
     place: FleetPlace | None

@@ -16,8 +16,10 @@ from companion.views.words import rfc3339
 
 Json = dict[str, Any]
 
-STATES: Final = ("here", "there", "silent", "aside")
-"""What a node is: this one; another, whose word holds; one that says nothing; one not believed."""
+STATES: Final = ("here", "there", "silent", "aside", "gone")
+"""What a node is: this one; another, whose word holds; one that says nothing; one not believed; one
+that left.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,26 +117,48 @@ def fleet(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Json:
 
 
 def nodes(member: Member, now_ns: int) -> list[Json]:
-    """This node, then the others by name."""
-    own = {
+    """This node, then the others by name, and then those that are gone."""
+    own = _NOTHING | {
         "node": member.name,
         "is_self": True,
         "state": "here",
         "near": True,
-        "reason": None,
         "place": _place(member.place),
         "reach_m": member.reach_m,
         "serves": len(member.duties.serves),
         "most": member.most,
-        "heard_s": None,
-        "clock_offset_s": None,
-        "clock_doubt_s": None,
-        "frames": None,
-        "used": None,
-        "way_p50_ms": None,
-        "way_p99_ms": None,
     }
-    return [own, *(_node(name, member, now_ns) for name in sorted(member.neighbours))]
+    others = [_node(name, member, now_ns) for name in sorted(member.neighbours)]
+    gone = [
+        _NOTHING
+        | {
+            "node": name,
+            "state": "gone",
+            "place": _place(place),
+            "heard_s": (now_ns - at_ns) * 1e-9,
+        }
+        for name, (at_ns, place) in sorted(member.gone.items())
+    ]
+    return [own, *others, *gone]
+
+
+_NOTHING: Final[Json] = {
+    "is_self": False,
+    "near": False,
+    "reason": None,
+    "place": None,
+    "reach_m": None,
+    "serves": 0,
+    "most": None,
+    "heard_s": None,
+    "clock_offset_s": None,
+    "clock_doubt_s": None,
+    "frames": None,
+    "used": None,
+    "way_p50_ms": None,
+    "way_p99_ms": None,
+}
+"""What is said of a node of which nothing is known."""
 
 
 def _node(name: str, member: Member, now_ns: int) -> Json:

@@ -21,6 +21,7 @@ OTHER = NODE | {"node": "harbour-south", "state": "there", "clock_offset_s": -0.
                 "clock_doubt_s": 0.0008, "way_p99_ms": 41.6}  # fmt: skip
 LIAR = NODE | {"node": "liar", "state": "aside", "most": None, "clock_offset_s": 3.0,
                "clock_doubt_s": 0.002, "reason": "has a clock that contradicts itself"}  # fmt: skip
+WENT = NODE | {"node": "west", "is_self": False, "state": "gone", "heard_s": 61.3}
 
 
 def uav(name: str, *by: str, to: str | None = None, unconfirmed: bool = False) -> dict[str, Any]:
@@ -29,7 +30,7 @@ def uav(name: str, *by: str, to: str | None = None, unconfirmed: bool = False) -
 
 FLEET = {
     "valid_at": "2026-11-23T02:00:00.000Z", "node": "north", "site": "harbour",
-    "nodes": [NODE, OTHER, LIAR], "sent_bps": 14_200.0, "heard_bps": 54_000.0, "damaged": 0,
+    "nodes": [NODE, OTHER, LIAR, WENT], "sent_bps": 14_200.0, "heard_bps": 54_000.0, "damaged": 0,
     "uavs": [
         uav("1:1", "north"), uav("2:1", "harbour-south", to="north"), uav("3:1"),
         uav("4:1", "north", "harbour-south", to="harbour-south", unconfirmed=True),
@@ -81,7 +82,7 @@ def watch(*arguments: str) -> Result:
 def test_a_look_says_who_serves_whom_and_what_needs_a_look(service: Service) -> None:
     done = watch(service.url, "--seconds", "0.001")
     assert done.exit_code == 0, done.stderr
-    lines = done.stdout.splitlines()[:8]
+    lines = done.stdout.splitlines()[:9]
     assert lines[0] == "2026-11-23T02:00:00.000Z  fleet harbour, seen from north"
     assert "  north         here    serves   2 of at most 8: 1:1, 4:1" in lines
     assert (
@@ -91,6 +92,7 @@ def test_a_look_says_who_serves_whom_and_what_needs_a_look(service: Service) -> 
     assert lines[3].endswith("of at most -: -  clock +3.000 ± 0.001 s")
     assert lines[4:] == [
         "    not believed: it has a clock that contradicts itself",
+        "  west          gone, 61 s ago",
         "  2:1 is to be taken over by north",
         "  3:1 is served by nobody",
         "  4:1 is served by north and harbour-south",

@@ -57,6 +57,22 @@ def test_who_serves_a_uav_is_said_of_it(north: StandIn) -> None:
     assert (found["2:1"].verdict, found["2:1"].health) == (None, None)
 
 
+def test_a_node_that_left_stays_in_the_list(north: StandIn) -> None:
+    assert north.fleet is not None
+    north.fleet.member.left(north.now_ns(), "south")
+    answer = models.Fleet.model_validate(client(north).get("/v1/fleet").json())
+    assert [(one.node, one.state, one.serves) for one in answer.nodes] == [
+        ("north", "here", 1),
+        ("south", "gone", 0),
+    ]
+    south = answer.nodes[1]
+    assert south.place is not None
+    assert south.place.lat_deg == 47.0
+    assert south.heard_s is not None
+    assert 0.0 <= south.heard_s < 10.0
+    assert 'companion_fleet_nodes{state="gone"} 1' in client(north).get("/metrics").text
+
+
 def test_who_is_served_by_nobody_has_no_link_and_why(north: StandIn) -> None:
     assert north.fleet is not None
     alone = next(uav for uav, one in uavs(north).items() if one.served_by == [])

@@ -44,6 +44,7 @@ test("the nodes stand with their state, their clock and their way; an unknown is
     otherNode("west", { state: "silent", heard_s: 4.2, clock_offset_s: null, way_p99_ms: null }),
     otherNode("liar", { state: "aside", reason: "has a clock that contradicts itself",
       clock_offset_s: 3 }),
+    otherNode("east", { state: "gone", heard_s: 61, clock_offset_s: null, way_p99_ms: null }),
   ] }));
   const items = page.element("fleet-nodes").children.map((item) => ({
     level: item.children[0].dataset.level,
@@ -53,10 +54,11 @@ test("the nodes stand with their state, their clock and their way; an unknown is
   }));
   assert.deepEqual(items.map(({ level, head }) => `${level}: ${head}`), [
     "good: north this node", "good: south there", "warn: west silent 4 s", "bad: liar aside",
+    "bad: east gone 1 min 01 s",
   ]);
   assert.deepEqual(items.map(({ facts }) => facts), ["1 of 8",
     "1 of 8 | +1.5 ± 0.4 ms | 12 ms | 7", "1 of 8 | – | – | 7",
-    "1 of 8 | +3.000 ± 0.000 s | 12 ms | 7"]);
+    "1 of 8 | +3.000 ± 0.000 s | 12 ms | 7", "1 of 8 | – | – | 7"]);
   assert.match(items[3].item.textContent, /not believed: it has a clock that contradicts itself$/);
   assert.match(plain(page.text("fleet-traffic")), /^tells 14\.0 kbit\/s · hears 900 bit\/s$/);
 });

@@ -5,6 +5,7 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 
 import { load } from "./browser.mjs";
+import { circles } from "./plan_picture.mjs";
 import { LAT, LON, stampAt, statusAnswer, uav, weak } from "./service.mjs";
 import { BEAT_MS, openPage } from "./whole_page.mjs";
 
@@ -37,7 +38,7 @@ test("the carrier is where it is, or where it was last, and why no better", () =
   const { lat_deg: lat, heading_deg: heading, ageS, unfit } = carrierOf(status);
   assert.deepEqual([lat, heading, ageS, unfit], [LAT, 90, 12, CAUSE]);
   assert.deepEqual(carrierOf({ ...status, center: { ...center, last_known: null } }),
-    { unfit: CAUSE });
+    { unfit: CAUSE, unseen: true });
   assert.equal(carrierOf(null), null);
   const late = { ...status, health: { behind: "this machine is behind" } };
   assert.equal(carrierOf(late).unfit, "this machine is behind");
@@ -92,4 +93,22 @@ test("where this machine is behind, that is the cause, and no old attitude", asy
   assert.ok(plan.texts.some((text) => text.startsWith("this machine is behind")), "on the plan");
   assert.ok(!plan.texts.some((text) => text.startsWith(CAUSE)), "no other cause");
   assert.doesNotMatch(page.text("center"), new RegExp(CAUSE));
+});
+
+test("before the carrier was ever known, UAVs are drawn about where one was first", async () => {
+  const page = await openPage();
+  loseCarrier(page.service);
+  const { center } = page.service.status;
+  page.service.status = { ...page.service.status, center: { ...center, last_known: null } };
+  await page.time.advance(3 * BEAT_MS);
+  const plan = await page.drawn();
+  plan.text("✕ 1:1");
+  plan.text("✕ 2:1");
+  assert.equal(circles(plan, 6).length, 2, "both UAVs");
+  assert.equal(circles(plan, 9).length, 0, "no carrier");
+  const last = new LastKnown();
+  const uavs = [uav("1:1", { lat_deg: null }), uav("2:1")];
+  assert.equal(last.middle({ unseen: true }, uavs), uavs[1]);
+  assert.equal(last.middle({ unseen: true }, []), uavs[1], "it stays where it was");
+  assert.equal(last.middle(center, uavs), center);
 });

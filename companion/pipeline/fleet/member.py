@@ -36,6 +36,8 @@ HANDOVERS_KEPT: Final = 500
 OFFERS_KEPT_NS: Final = 10_000_000_000
 """How long a node's offers stand while it says nothing new of them."""
 FORGET_NS: Final = 600_000_000_000
+GONE_MAX: Final = 64
+"""Nodes that went, and are remembered."""
 
 ToLocal = Callable[[Place], Vector]
 
@@ -46,12 +48,14 @@ class Member:
     ``neighbours`` are the other nodes by name, ``offers`` this node's own, ``handovers`` the newest
     changes of who serves whom that this node took part in, of ``handed_over`` in all; ``place`` and
     ``reach_m`` are what it said last of where its array is and how far it hears. ``near`` are the
-    others whose reports and offers are to be listened to (``nearness.py``).
+    others whose reports and offers are to be listened to (``nearness.py``). ``gone`` are those that
+    went, in their order, until they are back or forgotten: when, and where they were.
     """
 
     def __init__(self, name: str, settings: FleetSettings, elements: int, started_ns: int) -> None:
         self.name = name
         self.neighbours: dict[str, Neighbour] = {}
+        self.gone: dict[str, tuple[int, Place | None]] = {}
         self.offers: dict[str, Offer] = {}
         self.handovers: deque[Handover] = deque(maxlen=HANDOVERS_KEPT)
         self.handed_over = 0
@@ -91,9 +95,13 @@ class Member:
     def left(self, now_ns: int, node: str) -> list[Notice]:
         """Another node is gone: its process ended, or its connection did."""
         self.duties.gone(now_ns, node)
-        if node not in self.neighbours:
+        known = self.neighbours.get(node)
+        if known is None:
             return []
         self._drop(node)
+        while len(self.gone) >= GONE_MAX:
+            del self.gone[next(iter(self.gone))]
+        self.gone[node] = now_ns, known.standing and known.standing.place
         text = f"node {node} is gone"
         return [Notice(now_ns, Severity.WARNING, f"node {node}", text)]
 
@@ -223,6 +231,8 @@ class Member:
         before_ns = now_ns - FORGET_NS
         for node in [n for n, known in self.neighbours.items() if known.heard_ns < before_ns]:
             self._drop(node)
+        for node in [n for n, (at_ns, _) in self.gone.items() if at_ns < before_ns]:
+            del self.gone[node]
 
     def look_for_phantoms(
         self, now_ns: int, positions: Mapping[str, Vector], own: Witness, local: ToLocal
@@ -282,5 +292,6 @@ class Member:
             if len(self.neighbours) >= NODES_MAX:
                 return None
             known = self.neighbours.setdefault(node, Neighbour(NeighbourClock()))
+            self.gone.pop(node, None)
         known.heard_ns = now_ns
         return known

@@ -4,7 +4,7 @@ import struct
 
 from pymavlink.dialects.v20 import common
 
-from companion.pipeline.fleet.member import FORGET_NS, NODES_MAX, Member
+from companion.pipeline.fleet.member import FORGET_NS, GONE_MAX, NODES_MAX, Member
 from companion.pipeline.fleet.trust import TIMES
 from companion.settings.fleet import FleetSettings
 from companion.values import Offer, Shared, SharedFrame, Standing
@@ -36,12 +36,24 @@ def test_a_word_that_comes_after_its_node_went_is_forgotten_in_the_end() -> None
     node = member()
     node.came(START_NS, "b")
     assert [notice.text for notice in node.left(START_NS + S, "b")] == ["node b is gone"]
+    assert node.gone == {"b": (START_NS + S, None)}
     node.stands(START_NS + 2 * S, standing("b"))
     assert list(node.neighbours) == ["b"]
+    assert not node.gone
     node.decide(START_NS + FORGET_NS)
     assert list(node.neighbours) == ["b"]
     node.decide(START_NS + 2 * FORGET_NS)
     assert not node.neighbours
+
+
+def test_who_went_is_remembered_for_a_while_and_in_bounded_number() -> None:
+    node = member()
+    for number in range(GONE_MAX + 6):
+        node.came(START_NS, str(number))
+        node.left(START_NS + number, str(number))
+    assert list(node.gone) == [str(number) for number in range(6, GONE_MAX + 6)]
+    node.decide(START_NS + FORGET_NS + 8)
+    assert list(node.gone)[0] == "8"
 
 
 def test_an_answer_of_who_went_makes_nobody_known_and_is_no_word() -> None:

@@ -268,18 +268,19 @@ def make_likely(
     floors: Array,
     wider: Array | None,
     most: int,
+    along: bool = True,
 ) -> Array:
     """The table (C, R, J) of greatest means over a floor (C,), power ratios, by its even half.
 
-    A column of one ratio is made after the other, from several beginnings: the column before, and
-    that of the loss before, ``wider`` (C, R, J). Then all are made together.
+    A column of one ratio is made after the other, from several beginnings: the column before where
+    ``along``, and that of another loss, ``wider`` (C, R, J). Then all are made together.
     """
     inner = np.linalg.pinv(aperture.even)
     columns: list[Array] = []
     grows = np.clip(cones / 0.9, 0.05, 1.0)
     for column, ratio in enumerate(ratios):
         terms = _likely_terms(aperture, cones, ratios[column : column + 1], floors)
-        begins = columns[-1:]
+        begins = columns[-1:] if along else []
         if wider is None:
             edges = (0.25, 0.33, 0.4)
             begins += [np.outer(grows, inner @ _core(aperture, ratio, edge)) for edge in edges]
@@ -421,12 +422,16 @@ def main() -> None:
             least_db(aperture, interpolated(widths, sure, cone), cone, aperture.size)
             for cone in np.minimum(cones, 0.9 * aperture.reaches)
         ]
+        kinds = aperture, cones, ratios
+        floors = [10 ** ((np.array(least) - loss_db) / 10) for loss_db in losses_db]
         likely: list[Array] = []
-        for loss_db in losses_db:
-            floors = 10 ** ((np.array(least) - loss_db) / 10)
-            wider = likely[-1] if likely else None
-            likely.append(make_likely(aperture, cones, ratios, floors, wider, most))
-            print(name, "likely", loss_db, flush=True)
+        for floor in floors:
+            likely.append(make_likely(*kinds, floor, likely[-1] if likely else None, most))
+            print(name, "likely", len(likely), flush=True)
+        if name == "line":
+            # What is between two losses is the mean of their phases, which must be of one kind: the
+            # first, which began from nothing, is made once more from the second. (A square's are.)
+            likely[0] = make_likely(*kinds, floors[0], likely[1], most, along=False)
         # 5e-4 of the phase, which is at most some 30 rad, is all that half precision costs.
         made |= {
             f"{name}_widths": widths, f"{name}_sure": sure.astype(np.float32),

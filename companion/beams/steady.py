@@ -12,17 +12,26 @@ from typing import Final
 import numpy as np
 
 from companion.beams.weights.grouping import Turns
-from companion.values import BeamSet, Cause, FloatArray, Method
+from companion.values import Beam, BeamSet, Cause, FloatArray, Method
 
 PACE: Final = 3.0
 """Most by which the angles of a shape grow or shrink in a second, as a factor."""
 FOLLOWED_S: Final = 60.0
 """Longest time that is followed: a process may be stopped for days, whose powers are no number."""
-PACE_WIDTHS: Final = 3.0
-"""Most by which they shrink in a second, in natural widths, and half of what they grow.
+GROWN_WIDTHS: Final = 3.5
+"""Most by which they grow in a second, in natural widths.
 
 The phases at the ends of the aperture go with the width itself.
 """
+SHRUNK_WIDTHS: Final = 3.0
+"""Most by which they shrink in a second, in natural widths."""
+HELD_WIDTHS: Final = 1.0
+"""The same for a bound that was as wide as its shape within the last ``HELD_NS``.
+
+Over a slow radio a bound grows from report to report and falls with each: a shape that followed
+would change to and fro, and what is wider than it must be still holds.
+"""
+HELD_NS: Final = 3_000_000_000
 LEAST_WIDTHS: Final = 0.25
 """Angle in natural widths that shapes nothing: where growth by factors begins."""
 MOST_WIDTHS: Final = 16.0
@@ -37,6 +46,7 @@ class Steady:
 
     valid_at_ns  for when they were made
     shaped       the likely angle and the bound of each UAV's shape, radians
+    filled_ns    when last the bound of each UAV was no less than that of its shape
     turns        the turn of each UAV; those left out are missing
     known        the UAVs that could have a beam
     turned_ns    since when these UAVs have had these turns
@@ -45,6 +55,7 @@ class Steady:
 
     valid_at_ns: int
     shaped: Mapping[str, tuple[float, float]]
+    filled_ns: Mapping[str, int]
     turns: Mapping[str, int]
     known: frozenset[str]
     turned_ns: int
@@ -59,11 +70,20 @@ def after(before: Steady | None, made: BeamSet) -> Steady:
     return Steady(
         made.valid_at_ns,
         {beam.uav: (beam.shaped_likely_rad, beam.shaped_bound_rad) for beam in made.beams},
+        {beam.uav: _filled_ns(before, beam, made.valid_at_ns) for beam in made.beams},
         turns,
         frozenset(turns) | {out.uav for out in made.left_out if out.cause is Cause.CROWDED},
         before.turned_ns if before is not None and same else made.valid_at_ns,
         inexact_ns if made.exact else made.valid_at_ns,
     )
+
+
+def _filled_ns(before: Steady | None, beam: Beam, valid_at_ns: int) -> int:
+    """When last the bound of a UAV was no less than that of its shape; at first, now."""
+    bound_rad = 0.0 if beam.pointing_bound_rad is None else beam.pointing_bound_rad
+    if before is None or bound_rad >= beam.shaped_bound_rad:
+        return valid_at_ns
+    return before.filled_ns.get(beam.uav, valid_at_ns)
 
 
 def followed_rad(
@@ -87,8 +107,11 @@ def followed_rad(
     passed_s = min(abs(valid_at_ns - before.valid_at_ns) * 1e-9, FOLLOWED_S)
     last = np.array([before.shaped.get(uav, (np.nan, np.nan)) for uav in uavs])
     last = np.maximum(last, LEAST_WIDTHS * natural_rad)
-    further = np.minimum(last * (PACE**passed_s - 1), 2 * PACE_WIDTHS * natural_rad * passed_s)
-    nearer = np.minimum(last * (1 - PACE**-passed_s), PACE_WIDTHS * natural_rad * passed_s)
+    widths_rad = natural_rad * passed_s
+    further = np.minimum(last * (PACE**passed_s - 1), GROWN_WIDTHS * widths_rad)
+    nearer = np.minimum(last * (1 - PACE**-passed_s), SHRUNK_WIDTHS * widths_rad)
+    held = [abs(valid_at_ns - before.filled_ns.get(uav, valid_at_ns)) < HELD_NS for uav in uavs]
+    nearer[held, 1] = np.minimum(nearer[held, 1], HELD_WIDTHS * widths_rad)
     followed: FloatArray = np.where(
         np.isnan(last), wanted_rad, np.clip(wanted_rad, last - nearer, last + further)
     )

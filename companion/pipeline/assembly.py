@@ -44,7 +44,7 @@ from companion.values import (
     UserError,
 )
 
-FLOOR_SPARE_DB: Final = 2.7
+FLOOR_SPARE_DB: Final = 2.9
 """How much more than the link needs the floor of a likely beam is, unless it is given."""
 WORST_COUPLING: Final = 1e6
 """Condition number of a coupling matrix above which it tells nothing apart."""

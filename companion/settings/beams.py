@@ -120,7 +120,7 @@ class BeamSettings(Section):
                            gain within it; "no", sharp. Earlier settings' true is "guarantee", their
                            false "no"
         floor_db           that floor, over an isotropic element, where it leaves 3 dB to the best;
-                           it is given up as it is further out of reach. Unset: 2.7 more than the
+                           it is given up as it is further out of reach. Unset: 2.9 more than the
                            link needs ([link] needed_db), of which nulls may take most
         power              how beams share the power: "equal", "max-min" (the least SINR is the
                            greatest), "weighted-sum" (of rates); unset: as the normalisation makes

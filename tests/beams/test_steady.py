@@ -72,9 +72,9 @@ def test_in_the_end_the_shape_is_the_one_that_is_wanted() -> None:
 
 
 def test_once_a_uav_is_known_well_its_beam_soon_promises() -> None:
-    """After it was known nowhere near, and after it was not known at all: within six seconds."""
+    """After it was known nowhere near, and after it was not known at all: within eight seconds."""
     for before_m in (99.0, 1000.0):
-        made = flown([before_m] * 20 + [4.0] * 60, Precoder())
+        made = flown([before_m] * 20 + [4.0] * 80, Precoder())
         wanted = math.asin(0.04)
         assert made[10].beams[0].shaped_bound_rad != pytest.approx(wanted)
         assert made[-1].beams[0].shaped_bound_rad == pytest.approx(wanted)
@@ -108,7 +108,7 @@ def test_turns_do_not_change_to_and_fro(policy: Policy) -> None:
 @pytest.mark.parametrize("stopped_s", [100.0, 1000.0, 86_400.0, 2.0**31])
 def test_beams_go_on_after_any_pause(stopped_s: float) -> None:
     """A process that was stopped (SIGSTOP) or a machine that was suspended ticks on much later."""
-    before = Steady(0, {"1:1": (0.01, 0.2)}, {"1:1": 0}, frozenset({"1:1"}), 0, None)
+    before = Steady(0, {"1:1": (0.01, 0.2)}, {}, {"1:1": 0}, frozenset({"1:1"}), 0, None)
     wanted = np.array([[0.05, 0.3]])
     at_ns = round(stopped_s * 1e9)
     for then_ns in (at_ns, -at_ns):

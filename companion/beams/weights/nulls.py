@@ -27,11 +27,11 @@ import numpy as np
 from companion.beams.weights.widening import Spread
 from companion.values import BoolArray, ComplexArray, FloatArray, IntArray
 
-PRICE: Final = 0.6
-"""Gain, over the gain that is left, that one null may cost: 2 dB."""
-APART: Final = 0.02
+PRICE: Final = 0.2
+"""Gain, over the gain that is left, that one null may cost: 0.8 dB."""
+APART: Final = 0.3
 """How unlike the user's own direction, as 1 - c^2, one is from which on a null is worth its price:
-some .08 natural widths. Nearer it would be none, and turn round where the two pass one another.
+some .33 natural widths. Nearer it would be none, and turn round where the two pass one another.
 """
 FLOOR_PRICE_DB: Final = 2.5
 """Most that all nulls of a beam may take off its least gain, where it is looked at.
@@ -40,7 +40,7 @@ Between these places it may be half a decibel more, and rarely more than that.
 """
 ABOVE: Final = 1.15
 """Least gain that is kept if it was there, over what is worth keeping: places are samples."""
-GIVEN_UP: Final = 8.0
+GIVEN_UP: Final = 6.0
 """Power of the share of ``ABOVE`` that a lesser least gain is, to which it may fall."""
 NOTHING: Final = 1e-9
 """Least gain that is no gain."""

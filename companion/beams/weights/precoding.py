@@ -71,7 +71,7 @@ class Precoder:
     normalisation: Normalisation = Normalisation.UNIT_RESPONSE
     priority: tuple[str, ...] = ()
     widen: Widen = Widen.LIKELY
-    floor_db: float = 2.7
+    floor_db: float = 2.9
     power: Power | None = None
     rate_weights: Mapping[str, float] = field(default_factory=dict)
     budget: LinkBudget = field(default_factory=lambda: LinkBudget(20.0, 50e6, 7.0))

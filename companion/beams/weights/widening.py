@@ -39,7 +39,7 @@ class Uncertain:
 
     likely_rad: FloatArray
     bounds_rad: FloatArray
-    floor_db: float = 2.7
+    floor_db: float = 2.9
     worth_db: float = 0.0
 
 

@@ -83,6 +83,27 @@ def test_a_floor_that_is_out_of_reach_is_not_paid_for() -> None:
     assert middles[2] > 16.0
 
 
+@pytest.mark.parametrize(
+    ("array", "widest"),
+    [
+        (uniform_linear(64, 30e9, 0.5, np.eye(3)), 20.0),
+        (uniform_rectangular(16, 16, 30e9, 0.5, np.eye(3)), 4.0),
+    ],
+    ids=["line", "square"],
+)
+@pytest.mark.parametrize("likely", [0.05, 0.22, 0.5, 1.0])
+def test_a_bound_that_grows_changes_the_gain_little_by_little(
+    array: Array, widest: float, likely: float
+) -> None:
+    """Between the entries of a table as well: phases of two kinds have no mean."""
+    across = shapes.aperture(array)
+    widths = np.exp(np.arange(np.log(max(0.3, likely)), np.log(widest), 0.02))
+    one = np.ones((1, len(across.axes)))
+    phases = [shapes.phases_rad(across, w * one, likely * one, 2.7, 0.0)[0] for w in widths]
+    gains = np.abs(np.exp(1j * np.array(phases)).mean(axis=1)) ** 2
+    assert np.abs(np.diff(10 * np.log10(gains))).max() < 0.6
+
+
 def test_no_width_is_no_shape() -> None:
     across = shapes.aperture(line(64))
     nothing = shapes.phases_rad(across, np.zeros((2, 1)), np.zeros((2, 1)))

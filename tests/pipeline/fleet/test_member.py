@@ -53,7 +53,7 @@ def test_who_went_is_remembered_for_a_while_and_in_bounded_number() -> None:
         node.left(START_NS + number, str(number))
     assert list(node.gone) == [str(number) for number in range(6, GONE_MAX + 6)]
     node.decide(START_NS + FORGET_NS + 8)
-    assert list(node.gone)[0] == "8"
+    assert next(iter(node.gone)) == "8"
 
 
 def test_an_answer_of_who_went_makes_nobody_known_and_is_no_word() -> None:

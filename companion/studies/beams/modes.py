@@ -278,7 +278,7 @@ def cells(row: Row) -> list[str]:
 
 def text(rows: Sequence[Row]) -> str:
     """The table as text."""
-    widths = (9, 29, 9, 10, 10, 12, 10, 8, 9, 9, 8)
+    widths = (9, 31, 9, 10, 10, 12, 10, 8, 9, 9, 8)
     lines = [[words for words, _ in COLUMNS], *map(cells, rows)]
     return "\n".join(
         "  " + "".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()

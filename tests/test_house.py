@@ -541,6 +541,14 @@ def lock_faults(text: str) -> list[str]:
     return faults
 
 
+def test_every_fault_of_the_mutation_table_can_still_be_put_in() -> None:
+    for fault in tomllib.loads((ROOT / "tests" / "mutations.toml").read_text())["mutation"]:
+        times = (ROOT / fault["file"]).read_text().count(fault["old"])
+        assert times == 1, f"{fault['what']}: its text is in {fault['file']} {times} times"
+        for tests in fault["tests"]:
+            assert (ROOT / tests).exists(), f"{fault['what']}: no {tests}"
+
+
 def test_no_committed_file_names_a_registry() -> None:
     paths = committed()
     assert {"LICENSE", "pyproject.toml", *LOCKS} <= set(paths)

@@ -80,6 +80,14 @@ def test_once_a_uav_is_known_well_its_beam_soon_promises() -> None:
         assert made[-1].beams[0].shaped_bound_rad == pytest.approx(wanted)
 
 
+def test_a_bound_that_rises_and_falls_with_reports_hardly_moves_its_shape() -> None:
+    """Twelve ticks from report to report; a width is 1/32 rad."""
+    made = flown([6.0 + 14.0 * (tick % 12) / 12 for tick in range(96)], Precoder())
+    shaped = np.array([each.beams[0].shaped_bound_rad for each in made[24:]])
+    assert np.diff(shaped).min() > -1.1 * 0.1 / 32
+    assert shaped.min() > 0.75 * math.asin(0.2 - 0.14 / 12)
+
+
 def test_zero_forcing_is_named_only_once_it_lasts() -> None:
     """Through a place in which two cannot be told apart, and out of it again and again."""
     near, far = 0.05, 60.0

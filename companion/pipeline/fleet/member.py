@@ -101,7 +101,7 @@ class Member:
         self._drop(node)
         while len(self.gone) >= GONE_MAX:
             del self.gone[next(iter(self.gone))]
-        self.gone[node] = now_ns, known.standing and known.standing.place
+        self.gone[node] = now_ns, None if known.standing is None else known.standing.place
         text = f"node {node} is gone"
         return [Notice(now_ns, Severity.WARNING, f"node {node}", text)]
 

@@ -108,8 +108,28 @@ def cones(
     rows, columns = array.grid
     finer = FINER if min(array.grid) == 1 else FINER_IN_PLANE
     asked = tuple(fft.next_fast_len(finer * n) if n > 1 else 1 for n in (rows, columns))
-    near = _on_grid(array, across, (held, likely), asked)
+    on = _on_line if min(array.grid) == 1 else _on_grid
+    near = on(array, across, (held, likely), asked)
     return Cones((array.grid, (asked[0], asked[1])), nothing, near[0], near[1])
+
+
+def _on_line(
+    array: Array, across: Aperture, seen: Sequence[Seen], asked: tuple[int, ...]
+) -> BoolArray:
+    """Which places of the Fourier transform are in K times N intervals, (K, N, P).
+
+    Half a place more at both ends, so that the nearest place is always in it.
+    """
+    bins = max(asked)
+    places = bins * across.lengths_m / (array.wavelength_m * array.size)
+    middles = np.concatenate([one.middles for one in seen]) * places
+    halves = np.concatenate([one.halves for one in seen]) * places + 0.5
+    lowest = (middles - halves) % bins
+    highest = lowest + 2.0 * halves
+    place = np.arange(bins)
+    inside: BoolArray = (place >= lowest) & (place <= highest)
+    inside |= place <= highest - bins  # round the end, as a Fourier transform goes
+    return inside.reshape(len(seen), -1, bins)
 
 
 def _on_grid(
@@ -121,8 +141,7 @@ def _on_grid(
     middles = np.concatenate([one.middles for one in seen]) * wide
     halves = np.concatenate([one.halves for one in seen]) * wide
     off = np.zeros((len(middles), 1))
-    # The axes are y and z, or the one of them on which there is more than one element; the places
-    # are those of z by those of y.
+    # The axes are y and z; the places are those of z by those of y.
     for d, axis in reversed(list(enumerate(across.axes))):
         place = 1 if axis[1] else 0
         count, bins = array.grid[place], asked[place]

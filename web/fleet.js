@@ -8,16 +8,18 @@ import { placedBy } from "./last_known.js";
 
 const HANDOVERS_KEPT = 30;
 /** How bad it is that a node is so. */
-export const NODE_LEVELS = { here: "good", there: "good", silent: "warn", aside: "bad", gone: "bad" };
+export const NODE_LEVELS = {
+  here: "good", there: "good", silent: "warn", aside: "bad", gone: "bad",
+};
 
 /** What is kept of an answer for looking back: of the handovers the newest. */
 export const slimFleet = (answer) => answer
   && { ...answer, handovers: answer.handovers.slice(-HANDOVERS_KEPT) };
 
-/** The other nodes whose place is known, seen from the carrier: for the plan view. */
-export function nodesAround(answer, carrier) {
+/** The other nodes whose place is known, seen from the middle of the plan view. */
+export function nodesAround(answer, middle) {
   return (answer?.nodes ?? []).filter((one) => !one.is_self && one.place)
-    .map(({ node, state, place }) => placedBy({ node, state, ...place }, carrier))
+    .map(({ node, state, place }) => placedBy({ node, state, ...place }, middle))
     .filter(({ north_m: north, east_m: east }) => format.known(north) && format.known(east));
 }
 
@@ -41,10 +43,10 @@ const NODE_FACTS = [
 
 function nodeItem(one) {
   const most = format.known(one.most) ? ` of ${one.most}` : "";
-  const silent = ["silent", "gone"].includes(one.state) && format.known(one.heard_s)
+  const since = ["silent", "gone"].includes(one.state) && format.known(one.heard_s)
     ? ` ${format.duration(one.heard_s)}` : "";
   const head = make("p", { class: "link-head", "data-level": NODE_LEVELS[one.state] ?? "warn" },
-    make("span", {}, one.node), make("b", {}, one.is_self ? "this node" : one.state + silent));
+    make("span", {}, one.node), make("b", {}, one.is_self ? "this node" : one.state + since));
   const facts = [["Serves", () => `${one.serves}${most}`, "UAVs that it serves, and at most"],
     ...(one.is_self ? [] : NODE_FACTS)].map(([label, show, title]) => make(
     "div", { title }, make("dt", {}, label), make("dd", {}, show(one)),
@@ -126,7 +128,8 @@ export class FleetView {
   }
 
   showUavs({ nodes, uavs }, selected) {
-    const names = nodes.filter(({ state }) => !["aside", "gone"].includes(state)).map(({ node }) => node);
+    const offering = nodes.filter(({ state }) => !["aside", "gone"].includes(state));
+    const names = offering.map(({ node }) => node);
     this.makeColumns(names);
     const present = new Set(uavs.map(({ uav }) => uav));
     for (const [id, { line }] of this.rows) {

@@ -15,7 +15,7 @@ export class LastKnown {
   /** The place that UAVs are seen from: the carrier's; where a UAV was first, while none is known. */
   middle(carrier, uavs) {
     this.first ??= uavs.find(({ lat_deg: lat }) => known(lat)) ?? null;
-    return !carrier || carrier.unseen ? this.first : carrier;
+    return carrier?.unseen ? this.first : carrier;
   }
 
   /** Take in what is true at `at`. */
@@ -49,7 +49,8 @@ export class LastKnown {
 
 /**
  * Where the carrier is, or was: `{lat_deg, lon_deg, heading_deg, ageS, unfit}`; null without news.
- * `ageS` is null while that is true; `unfit` says what is wrong with it; `unseen`: it never was known.
+ * `ageS` is null while that is true; `unfit` says what is wrong with it; `unseen`: it never was
+ * known.
  */
 export function carrierOf(status) {
   const center = status?.center;

@@ -155,7 +155,8 @@ function showAll(link, now) {
   const found = timebar.shown ?? liveView(now);
   const carrier = carrierOf(found.status);
   const middle = last.middle(carrier, found.uavs);
-  const view = { ...found, carrier, uavs: found.uavs.map((uav) => placedBy(uav, middle)) };
+  const uavs = found.uavs.map((uav) => placedBy(uav, middle));
+  const view = { ...found, carrier, middle, uavs };
   if (selected !== null && !view.uavs.some((uav) => uav.id === selected)) selected = null;
   const { status } = feeds;
   showConnection(link, feeds.uavs.data?.valid_at,
@@ -251,7 +252,7 @@ function showPlan(view, link, now) {
     beams: view.beams,
     array: view.answer?.array ?? last.array ?? null,
     carrier: view.carrier,
-    nodes: nodesAround(view.fleet, view.carrier),
+    nodes: nodesAround(view.fleet, view.middle),
     uavsLive: believed(feeds.uavs, link, now),
     beamsLive: believed(feeds.beams, link, now),
     message,

@@ -111,4 +111,5 @@ test("before the carrier was ever known, UAVs are drawn about where one was firs
   assert.equal(last.middle({ unseen: true }, uavs), uavs[1]);
   assert.equal(last.middle({ unseen: true }, []), uavs[1], "it stays where it was");
   assert.equal(last.middle(center, uavs), center);
+  assert.equal(last.middle(null, uavs), null, "without news of the carrier nothing is moved");
 });

@@ -7,12 +7,12 @@ asked in a few directions. What is sampled here steers how much nulls may cost; 
 proven in ``worth.guarantee``.
 """
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy import fft
 
 from companion.beams.array.elements import Pattern
 from companion.beams.array.geometry import Array
@@ -85,10 +85,10 @@ class Cones:
             return found
         placed, asked = self.grid
         if placed[0] == 1:
-            line: ComplexArray = fft.ifft(weights.T, asked[1], axis=1, norm="forward")
+            line: ComplexArray = np.fft.ifft(weights.T, asked[1], axis=1, norm="forward")
             return line
         stood = weights.T.reshape(-1, *placed)
-        plane: ComplexArray = fft.ifft2(stood, asked, norm="forward").reshape(len(stood), -1)
+        plane: ComplexArray = np.fft.ifft2(stood, asked, norm="forward").reshape(len(stood), -1)
         return plane
 
     def of(self, users: IntArray) -> "Cones":
@@ -107,10 +107,27 @@ def cones(
     nothing: ComplexArray = np.empty((0, 0, 0), dtype=complex)
     rows, columns = array.grid
     finer = FINER if min(array.grid) == 1 else FINER_IN_PLANE
-    asked = tuple(fft.next_fast_len(finer * n) if n > 1 else 1 for n in (rows, columns))
+    asked = tuple(_fast_length(finer * n) if n > 1 else 1 for n in (rows, columns))
     on = _on_line if min(array.grid) == 1 else _on_grid
     near = on(array, across, (held, likely), asked)
     return Cones((array.grid, (asked[0], asked[1])), nothing, near[0], near[1])
+
+
+@functools.cache
+def _fast_length(least: int) -> int:
+    """The first length from ``least`` on that a Fourier transform is fast for: 2, 3 and 5 make it.
+
+    ``scipy.fft`` would know one, and takes 7 MB and a twentieth of the start for it.
+    """
+    length = least
+    while True:
+        rest = length
+        for prime in (2, 3, 5):
+            while rest % prime == 0:
+                rest //= prime
+        if rest == 1:
+            return length
+        length += 1
 
 
 def _on_line(

@@ -9,7 +9,7 @@ square; in apertures from the middle, their phases serve any number. See docs/ma
 import functools
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib import resources
 from typing import Final, NamedTuple
 
@@ -57,26 +57,22 @@ class Shapes(NamedTuple):
 
 
 @functools.cache
-def _tables() -> Mapping[str, Shapes]:
-    """The tables of a line and of a square."""
+def _table(name: str) -> Shapes:
+    """The tables of a ``line`` or of a ``square``."""
+    count, axes = (64, 1) if name == "line" else (16, 2)
+    even = _even(count) if axes == 1 else np.kron(_even(count), _even(count))
     file = resources.files(__package__) / TABLES
     with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as held:
-        return {
-            name: Shapes(
-                (np.arange(count) - (count - 1) / 2) / count,
-                np.log(held[f"{name}_widths"]),
-                held[f"{name}_sure"].astype(float),
-                held[f"{name}_least_db"],
-                np.log(held[f"{name}_losses_db"]),
-                np.log(held[f"{name}_cones"]),
-                -np.log(held[f"{name}_ratios"]),
-                held[f"{name}_likely"].astype(float).reshape(-1, count**axes // 2**axes) @ even.T,
-            )
-            for name, count, axes, even in (
-                ("line", 64, 1, _even(64)),
-                ("square", 16, 2, np.kron(_even(16), _even(16))),
-            )
-        }
+        return Shapes(
+            (np.arange(count) - (count - 1) / 2) / count,
+            np.log(held[f"{name}_widths"]),
+            held[f"{name}_sure"].astype(float),
+            held[f"{name}_least_db"],
+            np.log(held[f"{name}_losses_db"]),
+            np.log(held[f"{name}_cones"]),
+            -np.log(held[f"{name}_ratios"]),
+            held[f"{name}_likely"].astype(float).reshape(-1, count**axes // 2**axes) @ even.T,
+        )
 
 
 def _even(count: int) -> FloatArray:
@@ -120,7 +116,7 @@ def aperture(array: Array) -> Aperture:
     longer = counts / np.sqrt(np.maximum(counts**2 - 1.0, 1e-9))
     lengths_m = np.sqrt(12 * np.maximum(variances, 0.0)) * np.where(counts > 1, longer, 0.0)
     placed = array.centred_m @ axes.T / np.maximum(lengths_m, 1e-300)
-    shapes = _tables()["line" if len(axes) == 1 else "square"]
+    shapes = _table("line" if len(axes) == 1 else "square")
     knots = np.zeros((len(shapes.places), array.size if len(axes) == 1 else 0))
     if len(axes) == 1:
         before, share = _between(shapes.places, placed[:, 0])

@@ -110,15 +110,17 @@ def _short_of_gain(beam: Beam, needed_db: float) -> Blame:
 
 def _far_off(beam: Beam, track: Track, carrier: Carrier, evidence: Evidence) -> Blame:
     """Why the position may be far off, as seen from the array."""
-    speed_mps = math.hypot(*track.velocity_ned_mps) if track.velocity_ned_mps is not None else None
-    fastest_mps = track.limits.speed_mps if speed_mps is None else speed_mps
     aged_s = max(track.age_s, track.dt_s or 0.0)
+    grown_m = _grown_m(track, aged_s)
+    doubted_m = _grown_m(track, aged_s + track.clock_bound_s) - grown_m
+    if track.velocity_ned_mps is not None:
+        doubted_m += math.hypot(*track.velocity_ned_mps) * track.clock_bound_s
     parts = {
-        Cause.RATE: track.limits.acceleration_mps2 * aged_s**2 / 2,
-        Cause.CLOCK: fastest_mps * track.clock_bound_s,
+        Cause.RATE: grown_m,
+        Cause.CLOCK: doubted_m,
         Cause.CARRIER: carrier.bound_m,
+        Cause.POSITION: track.bound_m - grown_m - doubted_m,
     }
-    parts[Cause.POSITION] = track.bound_m - parts[Cause.RATE] - parts[Cause.CLOCK]
     match max(parts, key=lambda cause: parts[cause]):
         case Cause.RATE:
             return _aged(track)
@@ -134,6 +136,14 @@ def _far_off(beam: Beam, track: Track, carrier: Carrier, evidence: Evidence) -> 
                 f"{reason} {track.bound_m:.0f} m",
                 "fly farther from the array, or give it a better GNSS receiver",
             )
+
+
+def _grown_m(track: Track, seconds: float) -> float:
+    """How far a UAV can come in so long from where its last report lets it be expected."""
+    way_m = track.limits.speed_mps * seconds
+    if track.velocity_ned_mps is None:
+        return way_m
+    return min(track.limits.acceleration_mps2 * seconds**2 / 2, way_m)
 
 
 def _silence(track: Track, evidence: Evidence) -> Blame | None:
@@ -169,9 +179,10 @@ def _aged(track: Track) -> Blame:
 
 
 def _clock(track: Track, evidence: Evidence) -> Blame:
-    known = f"{track.clock_bound_s * 1e3:.0f} ms"
+    doubt_s = track.clock_bound_s
+    known = f"{doubt_s * 1e3:.0f} ms" if doubt_s < 1.0 else f"{doubt_s:.1f} s"
     if evidence.clock_assumed:
-        remedy = "allow TIMESYNC ([presence] enabled)"
+        remedy = "allow TIMESYNC ([presence] enabled), over a link both ways"
         return Blame(Cause.CLOCK, f"clock only assumed, to {known}", remedy)
     return Blame(
         Cause.CLOCK, f"its clock is only known to {known}", "use a MAVLink link of steadier delay"

@@ -47,6 +47,21 @@ def test_the_largest_part_of_a_track_s_bound_is_to_blame(
     assert blamed(replace(TRACK, **changed))[:2] == (cause, reason)  # type: ignore[arg-type]
 
 
+def test_a_clock_in_doubt_is_to_blame_for_the_turns_that_are_possible_meanwhile() -> None:
+    """4.8 s at 4 m/s^2 make 46 m by themselves, and more with the report's own age."""
+    doubted = replace(
+        TRACK, velocity_ned_mps=np.array([11.5, 0.0, 0.0]), limits=Limits(60.0, 4.0), age_s=2.8,
+        dt_s=3.5, clock_bound_s=4.8, bound_m=173.0,
+    )  # fmt: skip
+    assert blamed(doubted)[:2] == (Cause.CLOCK, "its clock is only known to 4.8 s")
+
+
+def test_without_a_velocity_an_old_report_says_little() -> None:
+    mute = replace(TRACK, velocity_ned_mps=None, dt_s=0.9, age_s=0.9, bound_m=58.0)
+    assert blamed(mute)[0] is Cause.RATE
+    assert blamed(replace(mute, bound_m=200.0))[0] is Cause.POSITION
+
+
 def test_slow_reports_are_not_silence() -> None:
     """At 2 s between reports, one that is 4 s old is one that is missing, not a lost link."""
     assert blamed(replace(TRACK, age_s=4.0, dt_s=2.0, bound_m=60.0))[0] is Cause.RATE

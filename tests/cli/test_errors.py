@@ -59,7 +59,6 @@ def test_a_defect_is_not_taken_for_a_mistake_of_the_user(what: str) -> None:
     assert done.stderr == ""
 
 
-@pytest.mark.full
 def test_every_error_that_is_raised_for_users_is_a_user_error() -> None:
     """Whatever class of ours ends in Error and can leave a command is one, or says here why not."""
     inside = {
@@ -68,6 +67,13 @@ def test_every_error_that_is_raised_for_users_is_a_user_error() -> None:
         "ServiceError",  # of the client: what the service answered
         "InterruptedByUser",  # Ctrl-C
         "HungUpError",  # a connection that ended in good order: a link tries again, or is done
+        "TooLongError",  # the parser refuses the request with a 400
+        "DamagedChunkError",  # the chunk is passed over and counted
+        "NoTableError",  # becomes the UserError of a file that is no log
+        "UnknownFlagsError",  # the same
+        "DeviceError",  # becomes "safe" and a try again, said once
+        "SourceLostError",  # the same
+        "FleetMessageError",  # becomes a counted sample that was refused
     }
     run = (
         "import pkgutil, importlib, companion\n"

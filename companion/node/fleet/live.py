@@ -1,6 +1,8 @@
 """The live node in a fleet: Zenoh on one side, a ``Member`` and the pipeline on the other.  [shell]
 
 What is said, how often and under which keys is described in docs/fleet.md.
+
+Over 300 lines: all that is said and heard meets here, the pipeline on one side, keys on the other.
 """
 
 import asyncio
@@ -10,6 +12,7 @@ from typing import Any, Final
 
 from companion.mavlink.links.zenoh_bus import Bus, open_peer
 from companion.node.fleet import messages
+from companion.node.fleet.answering import Unanswered
 from companion.node.fleet.config import bus_config
 from companion.node.fleet.listening import Listening
 from companion.node.fleet.messages import FleetMessageError
@@ -29,6 +32,14 @@ STANDING_S: Final = 0.2
 """Time between two words of this node on what it does."""
 ASKED_S: Final = 0.5
 """Time between two questions for another node's clock."""
+ANSWERED_S: Final = 3.0
+"""Longest time that an answer may take."""
+PATIENCE_S: Final = 6.0
+"""Least time without answers of a node that is there, after which all is connected anew."""
+RETRY_S: Final = 2.0
+"""Time after which a session that could not be opened again is tried once more."""
+PATIENCE_LEASES: Final = 4.0
+"""The least such time in leases."""
 LOOK_S: Final = 0.3
 """Time between two looks at what to offer; its multiples are not those of updates."""
 OFFERED_S: Final = 1.0
@@ -75,6 +86,8 @@ class FleetNode:
         self._flushing: asyncio.TimerHandle | None = None
         self._has_twin = False
         self._listening: Listening | None = None
+        patience_s = max(PATIENCE_S, PATIENCE_LEASES * settings.lease_s)
+        self._unanswered = Unanswered(round(patience_s * 1e9))
 
     # --- while it runs ----------------------------------------------------------------------
 
@@ -89,6 +102,19 @@ class FleetNode:
 
     async def run(self) -> None:
         """Take part until cancelled; a client that cannot says so, and serves alone."""
+        has_taken_part = False
+        while True:
+            try:
+                await self._take_part()
+                has_taken_part = True
+            except UserError as error:
+                self._notify(Notice(self._now_ns(), Severity.ERROR, "fleet", f"no fleet: {error}"))
+                if not has_taken_part:
+                    return
+                await asyncio.sleep(RETRY_S)  # what was this node's own until now is free again
+
+    async def _take_part(self) -> None:
+        """Take part over one session, until it has to be another (``answering.py``)."""
         bus = Bus(self._config, asyncio.get_running_loop(), self._session)
         try:
             if self._session is None:
@@ -96,18 +122,35 @@ class FleetNode:
             self._bus = bus
             self._declare(bus)
             async with asyncio.TaskGroup() as group:
-                group.create_task(bus.run(), name="zenoh")
-                group.create_task(self._repeat(STANDING_S, self._stand), name="standing")
-                group.create_task(self._repeat(ASKED_S, self._ask), name="clocks")
-                group.create_task(self._repeat(OFFERED_S, self._offer), name="offers")
-                group.create_task(self._repeat(LOOK_S, self._offers.look), name="looks")
-        except UserError as error:
-            self._notify(Notice(self._now_ns(), Severity.ERROR, "fleet", f"no fleet: {error}"))
+                tasks = [
+                    group.create_task(bus.run(), name="zenoh"),
+                    group.create_task(self._repeat(STANDING_S, self._stand), name="standing"),
+                    group.create_task(self._repeat(ASKED_S, self._ask), name="clocks"),
+                    group.create_task(self._repeat(OFFERED_S, self._offer), name="offers"),
+                    group.create_task(self._repeat(LOOK_S, self._offers.look), name="looks"),
+                ]
+                while not self._is_half_heard(self._now_ns()):
+                    await asyncio.sleep(1.0)
+                for task in tasks:
+                    task.cancel()
         finally:
-            self._bus = self._listening = None
+            self._bus = self._listening = self._session = None
+            self._unanswered.alive.clear()
             if self._flushing is not None:
                 self._flushing.cancel()
+                self._flushing = None
             await asyncio.to_thread(bus.close)
+
+    def _is_half_heard(self, now_ns: int) -> bool:
+        """Whether a node is there, and does not answer; tells who is not there any more."""
+        heard_ns = {node: known.heard_ns for node, known in self.member.neighbours.items()}
+        for node in self._unanswered.gone(now_ns, heard_ns):
+            self._tell(self.member.left(now_ns, node))
+        mute = self._unanswered.mute(now_ns, heard_ns)
+        if mute:
+            text = f"no answer from {', '.join(mute)}, all nodes are connected anew"
+            self._notify(Notice(now_ns, Severity.WARNING, "fleet", text))
+        return bool(mute)
 
     async def _repeat(self, period_s: float, what: Callable[[int], None]) -> None:
         while True:
@@ -203,12 +246,14 @@ class FleetNode:
             return
         for node in self.member.near:
             key = f"{PREFIX}/{self.settings.site}/{node}/time"
-            self._bus.ask(key, b"", ASKED_S, self._reading(node, self._now_ns()))
+            self._unanswered.asked(now_ns, node)
+            self._bus.ask(key, b"", ANSWERED_S, self._reading(node, self._now_ns()))
 
     def _reading(self, node: str, sent_ns: int) -> Callable[[bytes, int], None]:
         """What takes the answer to a question that is sent now."""
 
         def take(answer: bytes, arrived_ns: int) -> None:
+            self._unanswered.answered(node)
             if len(answer) != messages.CLOCK.size:
                 self.damaged += 1
                 return
@@ -264,8 +309,11 @@ class FleetNode:
         if node is None or node == self.name:
             return
         if not is_alive:
+            self._unanswered.alive.discard(node)
             self._tell(self.member.left(self._now_ns(), node))
-        elif node not in self.member.neighbours:
+            return
+        self._unanswered.alive.add(node)
+        if node not in self.member.neighbours:
             text = f"node {node} is there"
             now_ns = self._now_ns()
             self.member.came(now_ns, node)

@@ -7,8 +7,10 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from support import run_async
+from support import HANG_S, free_port, run_async
 
+from companion.mavlink.links.zenoh_bus import open_peer
+from companion.mavlink.links.zenoh_config import BusConfig
 from companion.node.fleet import live, messages
 from companion.node.fleet.config import bus_config
 from companion.node.fleet.live import FleetNode
@@ -161,6 +163,45 @@ def test_another_of_its_name_is_said_once_and_not_heard(wire: Wire) -> None:
             await task
 
     run_async(test())
+
+
+def test_who_is_there_and_does_not_answer_makes_it_connect_anew() -> None:
+    """A real neighbour that shows signs of life, and to whom no question comes."""
+    import zenoh
+
+    notices: list[str] = []
+    lives: list[bool] = []
+
+    async def test() -> None:
+        loop, again = asyncio.get_running_loop(), asyncio.Event()
+
+        def seen(sample: zenoh.Sample) -> None:
+            lives.append(sample.kind == zenoh.SampleKind.PUT)
+            if lives == [True, False, True]:
+                loop.call_soon_threadsafe(again.set)
+
+        member = node(
+            notify=lambda notice: notices.append(notice.text),
+            now=time.monotonic_ns,
+            connect=[f"tcp/127.0.0.1:{port}"],
+        )
+        member.open()
+        kept = [
+            south.liveliness().declare_token("companion/site/south/alive"),
+            south.liveliness().declare_subscriber("companion/site/north/alive", seen, history=True),
+        ]
+        task = asyncio.create_task(member.run())
+        await asyncio.wait_for(again.wait(), HANG_S)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        assert len(kept) == 2
+
+    port = free_port()
+    config = BusConfig(listen=(f"tcp/127.0.0.1:{port}",))
+    with open_peer(config) as south:
+        run_async(test())
+    assert "no answer from south, all nodes are connected anew" in notices
 
 
 def test_rates_are_in_bits() -> None:

@@ -1,0 +1,57 @@
+"""Nodes that are there and do not answer."""
+
+from companion.node.fleet.answering import HELD_UP_NS, MOST_NS, Unanswered
+
+S = 1_000_000_000
+PATIENCE_NS = 6 * S
+
+
+def looks(kept: Unanswered, begin_s: int, end_s: int, heard_ns: dict[str, int]) -> list[int]:
+    """The seconds at which a node is mute, where ``south`` is asked and looked at in each."""
+    found = []
+    for second in range(begin_s, end_s):
+        kept.asked(second * S, "south")
+        if kept.mute(second * S, heard_ns):
+            found.append(second)
+    return found
+
+
+def test_who_is_there_and_never_answers_is_mute_ever_more_rarely() -> None:
+    kept = Unanswered(PATIENCE_NS)
+    kept.alive.add("south")
+    found = looks(kept, 0, 400, {})
+    waits = [after - before for before, after in zip(found, found[1:], strict=False)]
+    assert found[0] == 6
+    assert waits[:4] == [13, 25, 49, 61]  # the next question begins each, a second later
+    assert set(waits[4:]) == {MOST_NS // S + 1}
+
+
+def test_who_answers_is_not_mute_and_has_all_the_patience_again() -> None:
+    kept = Unanswered(PATIENCE_NS)
+    kept.alive.add("south")
+    assert looks(kept, 0, 8, {}) == [6]
+    kept.answered("south")
+    assert looks(kept, 8, 16, {}) == [14]
+
+
+def test_who_is_heard_but_shows_no_sign_of_life_is_there_as_well() -> None:
+    kept = Unanswered(PATIENCE_NS)
+    assert looks(kept, 0, 20, {"south": 19 * S}) == [6, 19]
+
+
+def test_who_is_not_there_is_gone_and_not_mute() -> None:
+    kept = Unanswered(PATIENCE_NS)
+    assert looks(kept, 0, 20, {"south": -10 * S}) == []
+    assert kept.gone(0, {"south": -PATIENCE_NS, "west": -PATIENCE_NS - 1}) == ["west"]
+    kept.alive.add("west")
+    assert kept.gone(0, {"west": -PATIENCE_NS - 1}) == []
+
+
+def test_answers_that_wait_for_this_process_are_waited_for() -> None:
+    kept = Unanswered(PATIENCE_NS)
+    kept.alive.add("south")
+    assert looks(kept, 0, 3, {}) == []
+    stopped_ns = 2 * S + 10 * HELD_UP_NS
+    assert kept.mute(stopped_ns, {}) == []
+    kept.asked(stopped_ns, "south")
+    assert kept.mute(stopped_ns + S, {}) == []

@@ -39,7 +39,7 @@ class Unanswered:
         self._patiences_ns.pop(node, None)
 
     def gone(self, now_ns: int, heard_ns: Mapping[str, int]) -> list[str]:
-        """Those nodes that have shown nothing for long; ``heard_ns`` is when each was heard last."""
+        """Nodes that have shown nothing for long; ``heard_ns`` is when each was heard last."""
         before_ns = now_ns - self._patience_ns
         return [n for n, at_ns in heard_ns.items() if n not in self.alive and at_ns < before_ns]
 

@@ -1,5 +1,7 @@
 """Nodes that are there and do not answer."""
 
+from itertools import pairwise
+
 from companion.node.fleet.answering import HELD_UP_NS, MOST_NS, Unanswered
 
 S = 1_000_000_000
@@ -20,7 +22,7 @@ def test_who_is_there_and_never_answers_is_mute_ever_more_rarely() -> None:
     kept = Unanswered(PATIENCE_NS)
     kept.alive.add("south")
     found = looks(kept, 0, 400, {})
-    waits = [after - before for before, after in zip(found, found[1:], strict=False)]
+    waits = [after - before for before, after in pairwise(found)]
     assert found[0] == 6
     assert waits[:4] == [13, 25, 49, 61]  # the next question begins each, a second later
     assert set(waits[4:]) == {MOST_NS // S + 1}

@@ -10,7 +10,11 @@ from collections.abc import Mapping
 from typing import Final
 
 MOST_NS: Final = 60_000_000_000
-"""Longest patience: a node that never answers anybody must not cost the others theirs."""
+"""Time between two sessions that is enough: a node that never answers, or names that somebody makes
+up, must not cost the others theirs.
+"""
+CALM_NS: Final = 600_000_000_000
+"""Time after a new session after which the next one may come as soon as the first."""
 HELD_UP_NS: Final = 3_000_000_000
 """Time without a look after which this process was held up, and answers may wait for it."""
 
@@ -18,15 +22,16 @@ HELD_UP_NS: Final = 3_000_000_000
 class Unanswered:
     """Since when questions to other nodes have had no answer.
 
-    A node may be silent for ``patience_ns``, and for twice as long after each time that this did
-    not help. ``alive`` are the nodes that show signs of life.
+    A node may be silent for ``patience_ns``. From one new session to the next it is twice that at
+    least, and twice as long each time. ``alive`` are the nodes that show signs of life.
     """
 
     def __init__(self, patience_ns: int) -> None:
         self.alive: set[str] = set()
         self._patience_ns = patience_ns
         self._since: dict[str, int] = {}
-        self._patiences_ns: dict[str, int] = {}
+        self._gap_ns = patience_ns
+        self._found_ns: int | None = None
         self._looked_ns: int | None = None
 
     def asked(self, now_ns: int, node: str) -> None:
@@ -36,7 +41,6 @@ class Unanswered:
     def answered(self, node: str) -> None:
         """A node answered."""
         self._since.pop(node, None)
-        self._patiences_ns.pop(node, None)
 
     def gone(self, now_ns: int, heard_ns: Mapping[str, int]) -> list[str]:
         """Nodes that have shown nothing for long; ``heard_ns`` is when each was heard last."""
@@ -54,10 +58,19 @@ class Unanswered:
         lately_ns = now_ns - self._patience_ns // 2
         there = self.alive | {node for node, at_ns in heard_ns.items() if at_ns > lately_ns}
         self._since = {node: since for node, since in self._since.items() if node in there}
-        patience_ns = {node: self._patiences_ns.get(node, self._patience_ns) for node in there}
-        found = [n for n, since_ns in self._since.items() if now_ns - since_ns >= patience_ns[n]]
-        for node in found:
-            self._patiences_ns[node] = min(2 * patience_ns[node], MOST_NS)
-        if found:
-            self._since.clear()
+        before_ns = now_ns - self._patience_ns
+        found = [node for node, since_ns in self._since.items() if since_ns <= before_ns]
+        if not found or not self._may_find(now_ns):
+            return []
+        self._since.clear()
         return found
+
+    def _may_find(self, now_ns: int) -> bool:
+        passed_ns = CALM_NS if self._found_ns is None else now_ns - self._found_ns
+        if passed_ns >= CALM_NS:
+            self._gap_ns = self._patience_ns
+        if passed_ns < self._gap_ns:
+            return False
+        self._found_ns = now_ns
+        self._gap_ns = min(2 * self._gap_ns, MOST_NS)
+        return True

@@ -24,21 +24,42 @@ def test_who_is_there_and_never_answers_is_mute_ever_more_rarely() -> None:
     found = looks(kept, 0, 400, {})
     waits = [after - before for before, after in pairwise(found)]
     assert found[0] == 6
-    assert waits[:4] == [13, 25, 49, 61]  # the next question begins each, a second later
-    assert set(waits[4:]) == {MOST_NS // S + 1}
+    assert waits[:3] == [12, 24, 48]
+    assert set(waits[3:]) == {MOST_NS // S}
 
 
-def test_who_answers_is_not_mute_and_has_all_the_patience_again() -> None:
+def test_who_answers_is_not_mute() -> None:
     kept = Unanswered(PATIENCE_NS)
     kept.alive.add("south")
-    assert looks(kept, 0, 8, {}) == [6]
+    assert looks(kept, 0, 6, {}) == []
     kept.answered("south")
-    assert looks(kept, 8, 16, {}) == [14]
+    assert looks(kept, 6, 14, {}) == [12]
+
+
+def test_after_a_long_calm_the_next_comes_as_soon_as_the_first() -> None:
+    kept = Unanswered(PATIENCE_NS)
+    kept.alive.add("south")
+    assert looks(kept, 0, 7, {}) == [6]
+    kept.alive.clear()
+    assert looks(kept, 7, 620, {}) == []
+    kept.alive.add("south")
+    assert looks(kept, 620, 640, {}) == [626, 638]
+
+
+def test_names_that_somebody_makes_up_cost_one_session_a_minute() -> None:
+    kept = Unanswered(PATIENCE_NS)
+    found = 0
+    for second in range(600):
+        name = f"made-up-{second // 10}"
+        kept.alive = {name}
+        kept.asked(second * S, name)
+        found += bool(kept.mute(second * S, {}))
+    assert found <= 13
 
 
 def test_who_is_heard_but_shows_no_sign_of_life_is_there_as_well() -> None:
     kept = Unanswered(PATIENCE_NS)
-    assert looks(kept, 0, 20, {"south": 19 * S}) == [6, 19]
+    assert looks(kept, 0, 20, {"south": 19 * S}) == [6, 18]
 
 
 def test_who_is_not_there_is_gone_and_not_mute() -> None:

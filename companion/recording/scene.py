@@ -11,6 +11,7 @@ a UAV that is lost.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -22,7 +23,7 @@ from companion.beams.array.geometry import Array
 from companion.recording import schemas
 from companion.recording.codec import FRAME_ID, timestamp
 from companion.tracking.geodesy import LocalFrame, ned_from_ecef
-from companion.values import Beam, Carrier, FloatArray, Track, TrackState, Update
+from companion.values import Carrier, FloatArray, Track, TrackState, Update
 
 MAP: Final = "map"
 CARRIER: Final = "carrier"
@@ -82,69 +83,66 @@ class Scene:
 
     def picture(self, update: Update) -> Any:
         """``foxglove.SceneUpdate``: an entity for each UAV (place and bound) and for each beam."""
-        states = {track.uav: track.state for track in update.tracks}
         entities = [self._uav(track, update.t_ns) for track in update.tracks]
         if update.carrier is not None and update.beams.beams:
-            towards = directions(update.beams)
-            for beam, direction in zip(update.beams.beams, towards, strict=True):
-                entities.append(
-                    self._beam(beam, direction, update.carrier, states[beam.uav], update.t_ns)
-                )
+            entities += self._beams(update, update.carrier)
         return schemas.SceneUpdateMessage(entities=entities)
 
     def _uav(self, track: Track, t_ns: int) -> Any:
         """A name, a point, and the upright cylinder that holds the UAV, where it is finite."""
-        place = ENU_FROM_NED @ track.position_ned_m
+        north_m, east_m, down_m = track.position_ned_m.tolist()
+        pose = {"position": {"x": east_m, "y": north_m, "z": -down_m}, "orientation": {"w": 1.0}}
         colour = COLOURS[track.state]
         entity = self._entity(f"uav {track.uav}", t_ns)
         entity.texts.add(
-            pose=_pose(place), billboard=True, font_size=14, scale_invariant=True,
+            pose=pose, billboard=True, font_size=14, scale_invariant=True,
             color=_colour(colour, 1.0), text=f"{track.uav} {track.state}",
         )  # fmt: skip
-        entity.spheres.add(pose=_pose(place), size=_vector([2.0] * 3), color=_colour(colour, 1.0))
+        entity.spheres.add(pose=pose, size=_vector([2.0] * 3), color=_colour(colour, 1.0))
         if math.isfinite(track.bound_m):
             width_m, height_m = 2 * track.horizontal_bound_m, 2 * track.vertical_bound_m
             entity.cylinders.add(
-                pose=_pose(place), size=_vector([width_m, width_m, height_m]),
+                pose=pose, size=_vector([width_m, width_m, height_m]),
                 bottom_scale=1, top_scale=1, color=_colour(colour, 0.25),
             )  # fmt: skip
         return entity
 
-    def _beam(
-        self, beam: Beam, direction: FloatArray, carrier: Carrier, state: TrackState, t_ns: int
-    ) -> Any:
-        """A cone from the array to the range of its UAV, as wide as the beam at half power."""
+    def _beams(self, update: Update, carrier: Carrier) -> Iterator[Any]:
+        """Cones from the array to the range of each UAV, as wide as its beam at half power."""
+        towards = directions(update.beams)
         map_from_array = ENU_FROM_NED @ carrier.body_from_local.T @ self.array.array_from_body.T
         begin = ENU_FROM_NED @ line_of_sight.place_ned_m(carrier, self.array)
-        along, right, down = (map_from_array @ axis for axis in _axes(direction))
-        widths = [2 * beam.range_m * math.tan(angle / 2) for angle in self.widths_rad(direction)]
-        colour = COLOURS[state]
-        entity = self._entity(f"beam {beam.uav}", t_ns)
-        entity.cylinders.add(
-            pose=_pose(begin + along * beam.range_m / 2, np.array([right, down, along]).T),
-            size=_vector([*widths, beam.range_m]),
-            bottom_scale=0, top_scale=1, color=_colour(colour, 0.2),
-        )  # fmt: skip
-        line = entity.lines.add(thickness=2, scale_invariant=True, color=_colour(colour, 0.8))
-        for point in (begin, begin + along * beam.range_m):
-            line.points.add(x=point[0], y=point[1], z=point[2])
-        return entity
+        ranges_m = np.array([beam.range_m for beam in update.beams.beams])
+        turned = map_from_array @ _across(towards)
+        ends = begin + turned[:, :, 2] * ranges_m[:, np.newaxis]
+        sizes = np.c_[2 * ranges_m[:, np.newaxis] * np.tan(self.widths_rad(towards) / 2), ranges_m]
+        middles = (begin + ends) / 2
+        states = {track.uav: track.state for track in update.tracks}
+        start = _vector(begin)
+        for i, beam in enumerate(update.beams.beams):
+            colour = COLOURS[states[beam.uav]]
+            entity = self._entity(f"beam {beam.uav}", update.t_ns)
+            entity.cylinders.add(
+                pose={"position": _vector(middles[i]), "orientation": _quaternion(turned[i])},
+                size=_vector(sizes[i]), bottom_scale=0, top_scale=1, color=_colour(colour, 0.2),
+            )  # fmt: skip
+            line = entity.lines.add(thickness=2, scale_invariant=True, color=_colour(colour, 0.8))
+            line.points.add(**start)
+            line.points.add(**_vector(ends[i]))
+            yield entity
 
-    def widths_rad(self, direction: FloatArray) -> tuple[float, float]:
-        """Approximate full widths at half power across a unit direction (3,) of the array frame.
+    def widths_rad(self, towards: FloatArray) -> FloatArray:
+        """Approximate full widths (N, 2) at half power across unit directions (N, 3).
 
-        Horizontally and vertically in that frame: the widths of a uniform aperture of the extent
-        seen from there, at most ``WIDEST_RAD``. They are for drawing; ``patterns`` has the exact
-        ones.
+        Of the array frame, and horizontally and vertically in it: the widths of a uniform aperture
+        of the extent seen from there, at most ``WIDEST_RAD``. They are for drawing; ``patterns``
+        has the exact ones.
         """
         array = self.array
-        least_m = array.wavelength_m / 2
-        _, right, down = _axes(direction)
-        extents = (np.ptp(array.elements_m @ axis) + least_m for axis in (right, down))
-        right_rad, down_rad = (
-            min(WIDEST_RAD, HALF_POWER * array.wavelength_m / float(extent)) for extent in extents
-        )
-        return right_rad, down_rad
+        seen_m = array.elements_m @ _across(towards)[:, :, :2]
+        extents_m = np.ptp(seen_m, axis=1) + array.wavelength_m / 2
+        widths: FloatArray = np.minimum(WIDEST_RAD, HALF_POWER * array.wavelength_m / extents_m)
+        return widths
 
     def _entity(self, name: str, t_ns: int) -> Any:
         lifetime_ns = int(LIFETIMES * 1e9 / self.rate_hz)
@@ -156,12 +154,17 @@ class Scene:
         )
 
 
-def _axes(direction: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A direction of the array frame, and right and down across it: an orthonormal triple."""
-    right = np.array([-direction[1], direction[0], 0.0])
-    length = float(np.linalg.norm(right))
-    right = right / length if length > 1e-9 else np.array([0.0, 1.0, 0.0])  # straight up or down
-    return direction, right, np.cross(direction, right)
+def _across(towards: FloatArray) -> FloatArray:
+    """What leads to the array frame (N, 3, 3): right of and down across directions, and these."""
+    x, y, z = towards.T
+    lengths = np.hypot(x, y)
+    upright = lengths <= 1e-9  # straight up or down
+    lengths = np.where(upright, 1.0, lengths)
+    right_x, right_y = np.where(upright, 0.0, -y / lengths), np.where(upright, 1.0, x / lengths)
+    right = [right_x, right_y, np.zeros_like(x)]
+    down = [-z * right_y, z * right_x, x * right_y - y * right_x]
+    found: FloatArray = np.array([right, down, [x, y, z]]).transpose(2, 1, 0)
+    return found
 
 
 def _map_from_carrier(carrier: Carrier) -> FloatArray:
@@ -179,13 +182,9 @@ def _transform(at: Any, parent: str, child: str, place: FloatArray, turned: Floa
     )
 
 
-def _pose(place: FloatArray, turned: FloatArray | None = None) -> dict[str, Any]:
-    rotation = {"w": 1.0} if turned is None else _quaternion(turned)
-    return {"position": _vector(place), "orientation": rotation}
-
-
 def _vector(xyz: Any) -> dict[str, float]:
-    return dict(zip("xyz", map(float, xyz), strict=True))
+    x, y, z = xyz
+    return {"x": float(x), "y": float(y), "z": float(z)}
 
 
 def _quaternion(turned: FloatArray) -> dict[str, float]:
@@ -194,9 +193,9 @@ def _quaternion(turned: FloatArray) -> dict[str, float]:
     Found by its largest part (Shepperd 1978): the others are divided by it, so it must not be
     small.
     """
-    trace = float(np.trace(turned))
-    squares = [*(1 + 2 * float(turned[i, i]) - trace for i in range(3)), 1 + trace]
     m = turned.tolist()
+    trace = m[0][0] + m[1][1] + m[2][2]
+    squares = [*(1 + 2 * m[i][i] - trace for i in range(3)), 1 + trace]
     largest = max(range(4), key=squares.__getitem__)
     minus = (m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1])
     if largest == 3:
@@ -209,4 +208,5 @@ def _quaternion(turned: FloatArray) -> dict[str, float]:
 
 
 def _colour(rgb: tuple[float, float, float], alpha: float) -> dict[str, float]:
-    return dict(zip("rgba", (*rgb, alpha), strict=True))
+    red, green, blue = rgb
+    return {"r": red, "g": green, "b": blue, "a": alpha}

@@ -122,11 +122,12 @@ def test_cones_are_about_as_wide_as_the_beams(azimuth_deg: float) -> None:
     azimuth, elevation = math.radians(azimuth_deg), 0.2
     direction = unit_directions(np.array([azimuth]), np.array([elevation]))[0]
     exact = half_power_beamwidths_rad(array, direction)
-    across, upright = Scene(array, 2.0).widths_rad(direction)
+    ((across, upright),) = Scene(array, 2.0).widths_rad(direction[np.newaxis])
     assert across == pytest.approx(exact[0] * math.cos(elevation), rel=0.25)
     assert upright == pytest.approx(exact[1], rel=0.25)
-    line = Scene(uniform_linear(8, 3e9, 0.5, np.eye(3)), 2.0).widths_rad(direction)
-    assert line[0] < line[1] / 2 <= WIDEST_RAD / 2
+    scene = Scene(uniform_linear(8, 3e9, 0.5, np.eye(3)), 2.0)
+    ((across, upright),) = scene.widths_rad(direction[np.newaxis])
+    assert across < upright / 2 <= WIDEST_RAD / 2
 
 
 def test_the_bound_is_the_cylinder_that_is_guaranteed_and_goes_by_itself() -> None:

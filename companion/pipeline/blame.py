@@ -20,6 +20,9 @@ SILENT_S: Final = 1.0
 """Age of the newest report from which on a UAV is silent, if that is several intervals too."""
 SILENT_INTERVALS: Final = 3.0
 
+TIMESYNC: Final = "allow TIMESYNC ([presence] enabled), over a link both ways"
+STEADIER: Final = "use a MAVLink link of steadier delay"
+
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
@@ -28,11 +31,17 @@ class Evidence:
     clock_assumed       the constant part of its latency is only assumed
     refused             why its newest reports were not used; None where they were
     attitude_bound_rad  what the carrier's attitudes may be off when they are made
+    attitude_age_s      how old the newest of them is
+    carrier_doubt_s     how far the carrier's clock may be off
+    carrier_assumed     the constant part of its latency is only assumed
     """
 
     clock_assumed: bool
     refused: Reason | None
     attitude_bound_rad: float = 0.0
+    attitude_age_s: float = 0.0
+    carrier_doubt_s: float = 0.0
+    carrier_assumed: bool = False
 
 
 def of_left_out(out: LeftOut, track: Track, unfit: str | None) -> Blame:
@@ -81,16 +90,22 @@ def of_beam(
         return _short_of_gain(beam, needed_db)
     seen_rad = math.asin(min(1.0, (track.bound_m + carrier.bound_m) / max(beam.range_m, 1e-9)))
     if carrier.attitude_bound_rad > seen_rad:
-        known = f"{math.degrees(carrier.attitude_bound_rad):.0f}°"
-        aged_rad = carrier.attitude_bound_rad - evidence.attitude_bound_rad
-        return Blame(
-            Cause.CARRIER,
-            f"the carrier's attitude is only known to {known}",
-            "ask the carrier for ATTITUDE at 10 Hz or more ([presence] attitude_hz)"
-            if aged_rad > evidence.attitude_bound_rad / 2
-            else "give it a better compass, and say so ([center] attitude_bound_deg)",
-        )
+        return _turned(carrier, evidence)
     return _far_off(beam, track, carrier, evidence)
+
+
+def _turned(carrier: Carrier, evidence: Evidence) -> Blame:
+    """Why the carrier's attitude may be far off: by itself, by its age, or by its clock."""
+    if carrier.attitude_bound_rad < 1.5 * evidence.attitude_bound_rad:
+        remedy = "give it a better compass, and say so ([center] attitude_bound_deg)"
+    elif evidence.carrier_doubt_s <= evidence.attitude_age_s:
+        remedy = "ask the carrier for ATTITUDE at 10 Hz or more ([presence] attitude_hz)"
+    elif evidence.carrier_assumed:
+        remedy = f"have its clock known: {TIMESYNC}"
+    else:
+        remedy = f"have its clock known: {STEADIER}"
+    known = f"{math.degrees(carrier.attitude_bound_rad):.0f}°"
+    return Blame(Cause.CARRIER, f"the carrier's attitude is only known to {known}", remedy)
 
 
 def _short_of_gain(beam: Beam, needed_db: float) -> Blame:
@@ -182,8 +197,5 @@ def _clock(track: Track, evidence: Evidence) -> Blame:
     doubt_s = track.clock_bound_s
     known = f"{doubt_s * 1e3:.0f} ms" if doubt_s < 1.0 else f"{doubt_s:.1f} s"
     if evidence.clock_assumed:
-        remedy = "allow TIMESYNC ([presence] enabled), over a link both ways"
-        return Blame(Cause.CLOCK, f"clock only assumed, to {known}", remedy)
-    return Blame(
-        Cause.CLOCK, f"its clock is only known to {known}", "use a MAVLink link of steadier delay"
-    )
+        return Blame(Cause.CLOCK, f"clock only assumed, to {known}", TIMESYNC)
+    return Blame(Cause.CLOCK, f"its clock is only known to {known}", STEADIER)

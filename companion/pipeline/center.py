@@ -169,6 +169,10 @@ class Center:
         """The bound on reported attitudes of the carrier."""
         return carrier.reported_bound_rad(self._estimator, self._least_bound_rad)
 
+    def attitude_age_s(self, now: SenderTime) -> float | None:
+        """How old the newest attitude of the carrier is; None where there is none."""
+        return None if self._attitude is None else (now.sender_ns - self._attitude[0]) * 1e-9
+
     def trust(self, status: EstimatorStatus) -> Refuted | None:
         """Take in what the carrier's estimator says of its attitude. Returns it if it is news."""
         self._estimator = status

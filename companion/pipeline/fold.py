@@ -16,6 +16,7 @@ Over 300 lines: every event comes in here, and every look goes out.
 import math
 from collections import Counter
 from collections.abc import Iterable
+from functools import partial
 from typing import Final
 
 from companion.beams import steady
@@ -218,13 +219,25 @@ class Pipeline:
             state = self.tracker.state(self.center.vehicle, now)
             states |= {} if state is None else {self.center.vehicle: state}
         said = self.targets.changes(now_ns, states)
-        judged = self.health.judge(self.last_update, self._evidence)
+        judged = self.health.judge(self.last_update, partial(self._evidence, now_ns))
         return [*dropped, *said, *judged, self.last_update]
 
-    def _evidence(self, uav: str) -> Evidence:
-        clock = self.clock_estimate(uav)
-        assumed = clock is not None and clock.guarantee is Guarantee.ASSUMED
-        return Evidence(assumed, self.refusals.unheard(uav), self.center.attitude_bound_rad)
+    def _evidence(self, now_ns: int, uav: str) -> Evidence:
+        vehicle = self.center.vehicle
+        now = None if vehicle is None else self.senders.time(vehicle, now_ns)
+        age_s = None if now is None else self.center.attitude_age_s(now)
+        return Evidence(
+            self._is_assumed(uav),
+            self.refusals.unheard(uav),
+            self.center.attitude_bound_rad,
+            0.0 if age_s is None else age_s,
+            0.0 if now is None else now.bound_s,
+            vehicle is not None and self._is_assumed(vehicle),
+        )
+
+    def _is_assumed(self, sender: str) -> bool:
+        clock = self.clock_estimate(sender)
+        return clock is not None and clock.guarantee is Guarantee.ASSUMED
 
     def _drop_silent(self, now_ns: int) -> list[Notice]:
         """Drop tracks that have been silent for long, so that they take no more memory or time."""

@@ -19,12 +19,10 @@ OF_REPORTS: Final = frozenset(
         Reason.UNPLACED_STAMP,
         Reason.NO_FIX,
         Reason.OUT_OF_ORDER,
+        Reason.SHARED_ID,
     }
 )
-"""Reasons for which a report that is about its sender itself is not used.
-
-A shared id is told by itself.
-"""
+"""Reasons for which a report that is about its sender itself is not used."""
 RECENT: Final = 8
 """Recent rejections kept per sender."""
 SENDERS_MAX: Final = 4096
@@ -80,6 +78,8 @@ class Refusals:
         lasted_ns = refused.t_ns - run.since_ns
         if run.told or run.reports < 2 or lasted_ns < UNHEARD_NS:
             return None
+        if refused.reason is Reason.SHARED_ID:
+            return None  # that is told by itself
         run.told = True
         if refused.t_ns - self._told_ns.get(uav, refused.t_ns - AGAIN_NS) < AGAIN_NS:
             return None

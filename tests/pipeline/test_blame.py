@@ -82,6 +82,14 @@ def test_the_carrier_is_to_blame_for_its_attitude_and_its_position() -> None:
     compass = blamed(carrier=replace(CARRIER, attitude_bound_rad=0.2), evidence=as_given)
     assert compass[:2] == turned[:2]
     assert "compass" in compass[2]
+    doubted = replace(FINE, attitude_age_s=0.1, carrier_doubt_s=0.15)
+    for assumed, word in ((True, "TIMESYNC"), (False, "steadier")):
+        clock = blamed(
+            carrier=replace(CARRIER, attitude_bound_rad=0.2),
+            evidence=replace(doubted, carrier_assumed=assumed),
+        )
+        assert clock[:2] == turned[:2]
+        assert word in clock[2]
     placed = blamed(carrier=replace(CARRIER, bound_m=8.0))
     assert placed[:2] == (Cause.CARRIER, "the carrier's own position is only known to 8 m")
 

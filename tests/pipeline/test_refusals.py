@@ -73,3 +73,10 @@ def test_what_is_no_report_about_its_sender_is_told_of_nobody() -> None:
     for reason in (Reason.DUPLICATE, Reason.BAD_CRC, Reason.NOT_ALLOWED, Reason.UNSIGNED):
         assert told_at(refusals, [refused(t, reason=reason) for t in range(9)]) == []
     assert told_at(refusals, [refused(t, "icao:4CA7B3") for t in range(9)]) == []
+
+
+def test_reports_under_a_shared_id_are_why_a_uav_is_silent_and_are_told_elsewhere() -> None:
+    refusals = Refusals()
+    shared = [refused(t / 4, reason=Reason.SHARED_ID) for t in range(20)]
+    assert told_at(refusals, shared) == []
+    assert refusals.unheard("3:1") is Reason.SHARED_ID

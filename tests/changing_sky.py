@@ -1,14 +1,21 @@
 """A day of a changing sky, in virtual time: vehicles and aircraft come, restart and go."""
 
+import gc
 import math
 import random
+import re
 import struct
 from collections.abc import Iterator
+from pathlib import Path
 
 from companion.mavlink.wire.decode import ATTITUDE, GLOBAL_POSITION_INT, HEARTBEAT
 from companion.mavlink.wire.encode import Outgoing, pack
 from companion.mavlink.wire.transponder import ADSB_VEHICLE
+from companion.pipeline.fold import Pipeline
+from companion.settings.model import Settings
 from companion.values import Event, Frame, Source, Tick
+from companion.views.last_messages import LastMessages
+from companion.views.series import Series
 
 S = 1_000_000_000
 CARRIER = Source(5, 1)
@@ -85,3 +92,31 @@ def _aircraft(t_ns: int, one: _Flight, now_s: float) -> Frame:
     _, lat, lon, alt, _, _ = one.report(now_s, 80.0)
     fields = (one.icao, lat, lon, alt, 0, 8000, 0, 1 | 2, 0, 1, b"SOAK", 3, 0)
     return _said(t_ns, one.source, ADSB_VEHICLE, struct.pack("<IiiiHHhHHB9sBB", *fields))
+
+
+def resident_mb() -> float:
+    """What this process has in memory."""
+    gc.collect()
+    found = re.search(r"VmRSS:\s+(\d+)", Path("/proc/self/status").read_text())
+    assert found is not None
+    return int(found[1]) / 1000
+
+
+def flown(hours: int) -> tuple[list[float], int]:
+    """Memory at the end of each hour, MB, of all that a service keeps of its links.
+
+    And how many senders' clocks are kept at the end.
+    """
+    settings = Settings().override(center={"source": "5:1"})
+    pipeline, series, messages = Pipeline(settings), Series(), LastMessages()
+    begins_ns, found = 1_790_000_000 * S, list[float]()
+    for event in day(hours, begins_ns=begins_ns):
+        if isinstance(event, Frame):
+            messages.add(event)
+        pipeline.step(event)
+        if isinstance(event, Tick):
+            series.add(pipeline)
+            if (event.t_ns - begins_ns) // (3600 * S) > len(found):
+                found.append(resident_mb())
+    found.append(resident_mb())
+    return found, len(pipeline.senders._clocks)

@@ -171,7 +171,8 @@ class Health:
         if fresh.since_ns - since_ns >= wait_ns:
             del self._unsettled[uav]
             return fresh
-        return replace(fresh, level=held.level, blame=held.blame, since_ns=held.since_ns)
+        why = None if held.level is Level.GOOD else fresh.blame or held.blame
+        return replace(fresh, level=held.level, blame=why, since_ns=held.since_ns)
 
     def _told(self, update: Update) -> list[Notice]:
         """What changed: for all at once where the carrier is the cause, which all share."""

@@ -113,6 +113,24 @@ def test_worse_is_told_after_a_second_and_better_after_three() -> None:
     assert watch.health.verdicts["1:1"].since_ns == 8 * S
 
 
+def test_a_level_that_is_held_says_why_it_is_so_now() -> None:
+    watch = Watch()
+    assert watch.see(0, [replace(track("1:1", *WILD), age_s=2.0)]) == "none"
+    assert watch.see(1, [replace(track("1:1", *USUAL), age_s=3.0)]) == "none"
+    why = watch.health.verdicts["1:1"].blame
+    assert why is not None
+    assert why.reason == "no report for 3.0 s"
+    assert watch.see(2, [track("1:1", *SURE)]) == "none"
+    assert watch.health.verdicts["1:1"].blame == why  # what is good has no other reason
+
+
+def test_what_is_held_for_good_has_no_reason() -> None:
+    watch = Watch()
+    assert watch.see(0, [track("1:1", *SURE)]) == "good"
+    assert watch.see(1, [track("1:1", *USUAL)]) == "good"
+    assert watch.health.verdicts["1:1"].blame is None
+
+
 def test_what_comes_and_goes_is_not_told() -> None:
     watch = Watch()
     for t_s in range(20):

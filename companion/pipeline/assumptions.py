@@ -55,7 +55,8 @@ class Assumptions:
             if change.proven:
                 text = f"the clock of {sender} changed by {step} more than clocks.drift_max_ppm"
             else:
-                text = f"all of {sender} comes {step} later: its clock stood still, or its link"
+                why = "its clock stood still, or its link got slower; both are allowed for"
+                text = f"all of {sender} comes {step} later than before: {why}"
             out.append(Notice(t_ns, Severity.WARNING, sender, text))
         return out
 

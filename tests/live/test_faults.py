@@ -356,7 +356,7 @@ def test_of_two_with_one_id_a_track_follows_one(flights: dict[str, Outcome]) -> 
 def test_two_with_one_id_are_told(flights: dict[str, Outcome]) -> None:
     done = flights["shared-id"]
     assert done.uavs["1:1"]["rejected"]["shared-id"] > 0
-    assert [one["severity"] for one in done.events if "share" in one["text"]] == ["warning"]
+    assert [one["severity"] for one in done.events if "share the id" in one["text"]] == ["warning"]
 
 
 def test_adsb_traffic_is_tracked_apart_and_one_of_it_is_known(flights: dict[str, Outcome]) -> None:

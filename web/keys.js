@@ -1,7 +1,7 @@
 // The keyboard, for a page that is worked with gloves on.
 
 /** Native controls keep their own keys while the keyboard is on them. */
-function isTaken(event) {
+function isTaken(event, clicked) {
   const element = event.target;
   if (event.ctrlKey || event.altKey || event.metaKey || event.isComposing) return true;
   if (document.querySelector("dialog[open]")) return true;
@@ -11,13 +11,19 @@ function isTaken(event) {
   }
   // Space presses a button that was reached by the keyboard, not one that was clicked before.
   const pressable = element.closest("button, a, summary");
-  return event.key === " " && pressable !== null && pressable.matches(":focus-visible");
+  return event.key === " " && pressable !== null && pressable !== clicked
+    && pressable.matches(":focus-visible");
 }
 
 /** `actions`: what each key does; `selectNth(n)`: 1 is the first row of the table. */
 export function setUpKeys(actions, selectNth) {
+  let clicked = null; // the control that was pressed last, until the keyboard goes elsewhere
+  document.addEventListener("pointerdown", ({ target }) => {
+    clicked = target.closest("button, a, summary");
+  });
   document.addEventListener("keydown", (event) => {
-    if (isTaken(event)) return;
+    if (event.key === "Tab") clicked = null;
+    if (isTaken(event, clicked)) return;
     const digit = /^[1-9]$/.test(event.key) ? Number(event.key) : null;
     const key = event.shiftKey && event.key.startsWith("Arrow") ? `Shift+${event.key}` : event.key;
     const action = digit === null ? actions[key] ?? actions[key.toLowerCase()]

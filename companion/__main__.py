@@ -1,25 +1,14 @@
 """Entry point of the console command ``companion``, and of ``python -m companion``."""
 
-import os
-import signal
+from companion.cli.interrupts import interrupts_end
 
 
 def main() -> None:
-    """Load the command and run it; Ctrl-C ends it with one line, even while it is still loading.
+    """Load the command and run it; Ctrl-C ends it with one line, even while it is still loading."""
+    with interrupts_end("companion"):
+        from companion.cli.main import main as command
 
-    An exception raised by the signal would surface in the middle of some package's import, and come
-    out as whatever that package makes of it. While nothing is open yet, the process simply ends.
-    """
-    signal.signal(signal.SIGINT, _end)
-    from companion.cli.main import main as command
-
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    command(prog_name="companion")
-
-
-def _end(_number: int, _frame: object) -> None:
-    os.write(2, b"companion: interrupted\n")
-    os._exit(130)
+        command(prog_name="companion")
 
 
 if __name__ == "__main__":

@@ -183,7 +183,7 @@ def strangers(path: str, text: str) -> list[str]:
     if not path.startswith("sitl_replay/"):
         return []
     allowed = re.compile(
-        r"companion\.(values|mavlink|tracking\.geodesy|recording\.reader|cli\.console|__version__)(\.|$)"
+        r"companion\.(values|mavlink|tracking\.geodesy|recording\.reader|cli\.(console|interrupts)|__version__)(\.|$)"
     )
     return [
         f"{path}:{line}: imports {name}"

@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 
 import click
 
+from companion.cli.interrupts import interrupts_raised
 from companion.values import UserError
 
 CONFIG = click.option("--config", type=click.Path(path_type=Path), help="Settings: a TOML file.")
@@ -123,7 +124,8 @@ class OneLineErrors(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; an interrupt is caught before Click, which would print an empty line."""
         try:
-            return super().invoke(ctx)
+            with interrupts_raised():
+                return super().invoke(ctx)
         except KeyboardInterrupt:
             raise InterruptedByUser from None
 

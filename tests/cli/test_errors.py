@@ -37,6 +37,12 @@ def fail(what: str) -> None:
             _first, _second = (1, 2, 3)  # type: ignore[misc]
         case "interrupted":
             raise KeyboardInterrupt
+        case "interrupted in an import":
+            import interrupted_import
+
+            assert interrupted_import.ended  # type: ignore[attr-defined]
+            while True:
+                time.sleep(HANG_S)
 
 
 @pytest.mark.parametrize(
@@ -50,6 +56,23 @@ def fail(what: str) -> None:
 def test_one_line(what: str, status: int, said: str) -> None:
     done = CliRunner().invoke(prog, ["fail", what])
     assert (done.exit_code, done.stderr) == (status, said)
+
+
+@pytest.mark.parametrize("made_of_it", ["pass", "raise RuntimeError('no class')", "raise"])
+def test_an_interrupt_in_an_import_waits_for_its_end(
+    made_of_it: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever a package would make of it: nothing, another error, or half a package."""
+    (tmp_path / "interrupted_import.py").write_text(
+        "import signal\n"
+        "try:\n    signal.raise_signal(signal.SIGINT)\n"
+        f"except BaseException:\n    {made_of_it}\n"
+        "else:\n    ended = True\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "interrupted_import", raising=False)
+    done = CliRunner().invoke(prog, ["fail", "interrupted in an import"])
+    assert (done.exit_code, done.stderr) == (130, "prog: interrupted\n")
 
 
 @pytest.mark.parametrize("what", ["value", "unpacking"])
@@ -95,19 +118,33 @@ def test_every_error_that_is_raised_for_users_is_a_user_error() -> None:
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_an_interrupt_while_the_command_loads_is_one_line(seed: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("package", "asked", "ended"),
+    [
+        ("companion", ["replay", "/dev/zero.tlog"], "companion: /dev/zero.tlog: no such file"),
+        (
+            "sitl_replay",
+            ["play", "/dev/zero.tlog"],
+            "sitl-replay: Invalid value for 'LOG...': File '/dev/zero.tlog' does not exist."
+            " See sitl-replay play --help",
+        ),
+    ],
+)
+def test_an_interrupt_while_the_command_loads_is_one_line(
+    package: str, asked: list[str], ended: str, seed: int, tmp_path: Path
+) -> None:
     """From the moment on that it listens for it; before that the interpreter itself is starting,
     and on a busy machine that can take longer than any wait."""
     began = tmp_path / "began"
     code = (
-        "import signal, sys\nfrom companion.__main__ import main\n"
+        f"import signal, sys\nfrom {package}.__main__ import main\n"
         "listen = signal.signal\n"
         "def told(*what):\n"
         "    signal.signal = listen\n"
         "    listen(*what)\n"
         f"    open({str(began)!r}, 'w').close()\n"
         "signal.signal = told\n"
-        "sys.argv = ['companion', 'replay', '/dev/zero.tlog']\nmain()\n"
+        f"sys.argv = {[package, *asked]}\nmain()\n"
     )
     command = [sys.executable, "-c", code]
     with started(command, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
@@ -119,7 +156,7 @@ def test_an_interrupt_while_the_command_loads_is_one_line(seed: int, tmp_path: P
         _, said = process.communicate(timeout=HANG_S)
     lines = said.splitlines()
     assert len(lines) == 1, said
-    assert lines[0] in ("companion: interrupted", "companion: /dev/zero.tlog: no such file")
+    assert lines[0] in (f"{package.replace('_', '-')}: interrupted", ended)
 
 
 def test_both_doors_are_the_same_command() -> None:

@@ -1,0 +1,15 @@
+"""Entry point of the console command ``sitl-replay``, and of ``python -m sitl_replay``."""
+
+from companion.cli.interrupts import interrupts_end
+
+
+def main() -> None:
+    """Load the command and run it; Ctrl-C ends it with one line, even while it is still loading."""
+    with interrupts_end("sitl-replay"):
+        from sitl_replay.cli import main as command
+
+        command(prog_name="sitl-replay")
+
+
+if __name__ == "__main__":
+    main()

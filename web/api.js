@@ -68,8 +68,7 @@ const FEEDS = {
     stamp: (data) => data.valid_at, accepts: (data) => isListOf(data?.nodes, "node"),
   },
   recordings: {
-    path: ({ hasRecordings }) => hasRecordings && "/v1/recordings",
-    beats: 20, offset: 3, what: "recordings",
+    path: "/v1/recordings", beats: 20, offset: 3, what: "recordings",
     accepts: (data) => isListOf(data?.recordings, "name"),
   },
 };
@@ -193,27 +192,16 @@ function describe(error) {
  */
 export function startPolling(context, onAnswer) {
   const feeds = {};
-  const known = { hasRecordings: false };
   for (const [name, settings] of Object.entries(FEEDS)) {
-    const everything = () => ({ ...known, ...context() });
-    feeds[name] = new Feed(name, settings, everything, () => onAnswer(name));
+    feeds[name] = new Feed(name, settings, context, () => onAnswer(name));
   }
   const wakeAll = () => Object.values(feeds).forEach((feed) => feed.wake());
-  setUpToken(() => {
-    wakeAll();
-    findRecordings(known);
-  });
+  setUpToken(wakeAll);
   window.addEventListener("online", wakeAll);
   document.addEventListener("visibilitychange", () => document.hidden || wakeAll());
   // Once the caller has the feeds: what its context says depends on them.
   queueMicrotask(() => Object.values(feeds).forEach((feed) => feed.run()));
-  findRecordings(known);
   return feeds;
-}
-
-/** Whether the service offers its recordings: asked once, for asking in vain is an error. */
-async function findRecordings(known) {
-  known.hasRecordings = "/v1/recordings" in ((await askOnce("/openapi.json"))?.paths ?? {});
 }
 
 /** What need not be known: the answer, or null where there is none. */

@@ -40,7 +40,9 @@ export function drawRingLabels(view) {
   return boxes;
 }
 
+/** Returns the boxes that the bearings take, likewise. */
 export function drawCompass(view) {
+  const boxes = [];
   const { context } = view;
   context.strokeStyle = view.colour.grid;
   context.lineWidth = 1;
@@ -57,7 +59,9 @@ export function drawCompass(view) {
       colour: cardinal === "N" ? "text" : "gridtext", size: cardinal ? 14 : 10.5,
       weight: cardinal ? 700 : 400, align: "center",
     });
+    boxes.push([x - 11, y - 8, x + 11, y + 8]);
   }
+  return boxes;
 }
 
 function ringLabel(m) {

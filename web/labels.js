@@ -7,11 +7,12 @@ const CROWD = 8; // with more UAVs than this, a label without room is left away
 
 /**
  * Labels go where they cover nothing; in a crowd the second line goes, then the label. The chosen
- * UAV has its own first, then the worst links. The names of other nodes are always there.
+ * UAV has its own first, then the worst links. The names of other nodes are always there. What is
+ * `written` already, boxes of rings and bearings, stays legible.
  */
-export function drawLabels(view, ringLabels, nodes = []) {
+export function drawLabels(view, written, nodes = []) {
   const [x, y] = view.centre;
-  const taken = [...ringLabels, [x - 12, y - 12, x + 12, y + 12]];
+  const taken = [...written, [x - 12, y - 12, x + 12, y + 12]];
   taken.push(...view.hits.map((hit) => [hit.x - 9, hit.y - 9, hit.x + 9, hit.y + 9]));
   taken.push(...nodes.map(({ x, y }) => [x - 7, y - 7, x + 7, y + 7]));
   for (const node of nodes) {

@@ -173,7 +173,7 @@ export class PlanView {
     }
     this.ground?.follow(this);
     drawRings(this);
-    drawCompass(this);
+    const bearings = drawCompass(this);
     const uavs = this.scene.uavs.filter(placed);
     drawBeams(this, uavs);
     drawServing(this, uavs);
@@ -183,7 +183,7 @@ export class PlanView {
     const nodes = drawNodes(this);
     drawCarrier(this);
     this.hits = uavs.map((uav) => drawUav(this, uav));
-    drawLabels(this, drawRingLabels(this), nodes);
+    drawLabels(this, [...bearings, ...drawRingLabels(this)], nodes);
     this.drawMessage();
   }
 

@@ -8,6 +8,7 @@ from fastapi import Path as PathParameter
 from fastapi.responses import FileResponse, Response
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
+from starlette.concurrency import run_in_threadpool
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import companion
@@ -50,6 +51,7 @@ def create_app(node: Node, token: str | None = None, area: Path | None = None) -
         description=DESCRIPTION,
         docs_url=None,  # FastAPI's own pages load from elsewhere
         redoc_url=None,
+        openapi_url=None,  # its own route would make the document on the event loop
     )
     app.router.redirect_slashes = False
     responses.install(app)
@@ -60,6 +62,10 @@ def create_app(node: Node, token: str | None = None, area: Path | None = None) -
     beam_routes.add(app, node, turns)
     file_routes.add(app, node)
     area_map.add(app, area)
+
+    @app.get("/openapi.json", include_in_schema=False)
+    async def openapi() -> Response:
+        return answer(await run_in_threadpool(app.openapi))
 
     @app.get("/docs", include_in_schema=False)
     async def docs() -> Response:

@@ -63,6 +63,22 @@ test("names of UAVs close together cover neither each other nor a symbol", async
   });
 });
 
+test("a name leaves the bearings round the picture legible", async () => {
+  const view = await openPlan();
+  view.show({ uavs: [uav("1:1", { north_m: 0, east_m: 140 })] }); // the scale stays
+  const bearings = ["N", "E", "S", "W", "030", "060", "120", "240", "300"];
+  for (let deg = 0; deg < 360; deg += 3) {
+    const [north_m, east_m] = [Math.cos, Math.sin].map((part) => 140 * part(deg * Math.PI / 180));
+    const picture = view.show({ uavs: [uav("1:1", { north_m, east_m })] });
+    const [name] = boxesOf(picture, ["1:1"]);
+    for (const bearing of bearings) {
+      const { x, y } = picture.text(bearing);
+      const box = { left: x - 8, right: x + 8, top: y - 5, bottom: y + 5 };
+      assert.ok(!overlap(name, box), `at ${deg} the name covers ${bearing}`);
+    }
+  }
+});
+
 test("a name stays in the picture", async () => {
   const view = await openPlan();
   view.show({ uavs: [uav("1:1", { north_m: 0, east_m: 140 })] });

@@ -60,8 +60,7 @@ for (const mode of ["silent", "gone"]) {
 }
 
 test("every feed that can be marked has its rules in the style sheet, late and lost", async () => {
-  const offered = { "/openapi.json": { paths: { "/v1/recordings": {} } } };
-  const page = await openPage({ answers: offered });
+  const page = await openPage();
   page.service.mode = "gone";
   await page.time.advance(4000);
   const feeds = page.marked("lost");

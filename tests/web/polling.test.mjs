@@ -28,14 +28,14 @@ const timesOf = (service, place) =>
 
 test("everything is asked for at once, then each at its rate, five a second in all", async () => {
   const { time, service, answered } = await startPage();
-  assert.deepEqual(answered.sort(), ["beams", "events", "links", "pattern", "readyz", "status",
-    "uavs", "weights"]);
+  assert.deepEqual(answered.sort(), ["beams", "events", "links", "pattern", "readyz",
+    "recordings", "status", "uavs", "weights"]);
   await time.advance(60 * BEAT_MS); // until everything is in its beat
   const since = time.now;
   await time.advance(60 * BEAT_MS);
   const counts = ["/v1/uavs", "/v1/beams", "/v1/pattern", "/v1/beams/weights", "/v1/status",
-    "/readyz", "/v1/links", "/v1/events"].map((place) => service.count(place, since + 1));
-  assert.deepEqual(counts, [60, 60, 60, 15, 15, 20, 10, 10]);
+    "/readyz", "/v1/links", "/v1/events", "/v1/recordings"].map((place) => service.count(place, since + 1));
+  assert.deepEqual(counts, [60, 60, 60, 15, 15, 20, 10, 10, 3]);
   const all = counts.reduce((sum, one) => sum + one);
   assert.ok(all / (60 * BEAT_MS / 1000) <= 5);
 });
@@ -172,17 +172,4 @@ test("the pattern is asked for the UAV that is looked at, whatever is in its nam
   await time.advance(BEAT_MS);
   const { path } = service.asked.find((one) => one.path.startsWith("/v1/pattern"));
   assert.equal(path, "/v1/pattern?points=361&uav=icao%3A4CA7B3");
-});
-
-test("recordings are asked for only where the service offers them", async () => {
-  const without = await startPage();
-  await without.time.advance(60_000);
-  assert.equal(without.service.count("/v1/recordings"), 0);
-  const offered = { "/openapi.json": { paths: { "/v1/recordings": {} } } };
-  const having = await startPage({ answers: offered });
-  await having.time.advance(BEAT_MS);
-  assert.deepEqual(having.feeds.recordings.data, { recordings: [] });
-  const unsaid = await startPage({ answers: { "/openapi.json": { body: "<html>" } } });
-  await unsaid.time.advance(BEAT_MS);
-  assert.equal(unsaid.service.count("/v1/recordings"), 0);
 });

@@ -146,7 +146,6 @@ export class Service {
       case "/v1/events":
         return { events: [{ at: stampAt(0), severity: "info", text: "1:1 is live" }] };
       case "/v1/recordings": return { recordings: [] };
-      case "/openapi.json": return { paths: {} };
       default: return { status: 404, body: "{}" };
     }
   }

@@ -11,7 +11,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from support import HANG_S
+from support import HANG_S, ROOT
 
 HERE = Path(__file__).parent
 OLDEST = (20, 6)
@@ -30,6 +30,19 @@ def node() -> str:
     if version < OLDEST:
         pytest.skip(f"node {said.strip()} is too old for the page's modules: 20.6 or later")
     return found
+
+
+def test_every_module_is_asked_for_at_once() -> None:
+    """Else the browser learns of each only once it has read who imports it, in several turns."""
+    needed, asked = set[str](), ["main.js"]
+    while asked:
+        if (module := asked.pop()) not in needed:
+            needed.add(module)
+            text = (ROOT / "web" / module).read_text("utf-8")
+            asked += re.findall(r'^(?:import|export)\b[^;]*?"\./(\w+\.js)"', text, re.MULTILINE)
+    page = (ROOT / "web" / "index.html").read_text("utf-8")
+    told = re.findall(r'<link rel="modulepreload" href="(\w+\.js)">', page)
+    assert sorted(told) == sorted(needed - {"main.js"})
 
 
 @pytest.mark.timeout(600)  # for one that hangs

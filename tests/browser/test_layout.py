@@ -117,6 +117,27 @@ def test_what_is_acted_on_is_seen_on_a_tablet_without_scrolling(demo: Node, open
     assert page.evaluate(COLUMNS_IN_SIGHT) == wanted
 
 
+def test_every_column_is_seen_at_a_desk_whatever_the_states(demo: Node, open_page: Any) -> None:
+    """Signs and bold letters of what is old take more room than what is well."""
+
+    def fulfil(route: Any) -> None:
+        answer = crowd(demo.json("/v1/uavs"), "uavs", "id", 4)
+        for one in answer["uavs"]:
+            one |= {"state": "coasting", "verdict": "weak", "age_s": 3.29, "range_m": 1999.0}
+            one |= {"bound_m": 111.1, "error_p95_m": 111.1, "latency_ms": 888.0}
+        route.fulfill(json=answer)
+
+    page = open_page("about:blank", SIZES["desktop"], loses_service=True)
+    page.route("**/v1/uavs", fulfil)
+    page.goto(demo.url)
+    page.locator("tr[data-state=coasting]").nth(3).wait_for(state="attached", timeout=HANG_MS)
+    columns = page.evaluate(
+        "[...document.querySelectorAll('thead th')].filter(one => one.checkVisibility())"
+        ".map(({ dataset }) => dataset.key)"
+    )
+    assert page.evaluate(COLUMNS_IN_SIGHT) == columns
+
+
 def test_what_overlaps_and_what_is_cut_is_found(demo: Node, open_page: Any) -> None:
     page = open_page(demo.url, SIZES["desktop"])
     page.locator("#events time").first.wait_for(timeout=HANG_MS)

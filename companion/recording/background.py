@@ -7,10 +7,8 @@ far as the queue goes, and the recording goes on in a new file, which says what 
 Over 300 lines: one thread: its queue, its failures, its parts.
 """
 
-import contextlib
 import errno
 import os
-import queue
 import threading
 import time
 from collections import deque
@@ -27,6 +25,10 @@ QUEUE_MAX: Final = 50_000
 """Events waiting to be written at most: some seconds of the busiest stream.
 
 About 60 MB where twenty UAVs report ten times a second (1.3 kB for an event with its outputs)."""
+GATHER_S: Final = 0.02
+"""How long events are left to gather: to wake the thread for each costs as much as to write it."""
+AT_ONCE: Final = 500
+"""Events between two looks at whether a flush is due."""
 FLUSH_S: Final = 1.0
 """Time between two flushes to disk."""
 FLUSH_FIRST_S: Final = 0.1
@@ -105,8 +107,7 @@ class BackgroundRecorder:
         self._writer = open_part(self._part)
         self._begun_s = time.monotonic()
         self._finished_messages = 0  # messages in the parts before this one
-        # Bounded by ``put``; a queue that bounds itself costs ten times as much for each event.
-        self._queue: queue.SimpleQueue[_Item | None] = queue.SimpleQueue()
+        self._queue: deque[_Item] = deque()  # bounded by ``put``; nobody waits at it
         self._queue_max = queue_max
         self._missed = 0
         self._overrun = False
@@ -134,12 +135,12 @@ class BackgroundRecorder:
         Once the queue is full, nothing is accepted until half of it is written: one long hole can
         be reported, a thousand short ones would be a recording of holes.
         """
-        if self._overrun and self._queue.qsize() <= self._queue_max // 2:
+        if self._overrun and len(self._queue) <= self._queue_max // 2:
             self._overrun = False
             self._tell(Severity.INFO, f"recording again: {self._missed} events are missing")
         if not self._overrun:
-            if self._queue.qsize() < self._queue_max:
-                self._queue.put(_Item(event, outputs, self._missed))
+            if len(self._queue) < self._queue_max:
+                self._queue.append(_Item(event, outputs, self._missed))
                 self._missed = 0
                 return
             self._overrun = True
@@ -156,7 +157,6 @@ class BackgroundRecorder:
         """
         self._metadata = metadata
         self._stopping.set()
-        self._queue.put(None)  # it only wakes an idle thread
         self._thread.join(STOP_MAX_S)
         if self._thread.is_alive():
             self._tell(Severity.ERROR, f"{self._writer.path} is not finished: no answer from disk")
@@ -186,7 +186,7 @@ class BackgroundRecorder:
     @property
     def queued(self) -> int:
         """Events that wait to be written."""
-        return self._queue.qsize()
+        return len(self._queue)
 
     # --- the side of the thread -------------------------------------------------------------
 
@@ -226,12 +226,9 @@ class BackgroundRecorder:
     def _write_until_stopped(self) -> None:
         every_s = FLUSH_FIRST_S
         flush_due_s = time.monotonic() + every_s
-        while not (self._stopping.is_set() and self._queue.empty()):
-            try:
-                item = self._queue.get(timeout=max(0.0, flush_due_s - time.monotonic()))
-            except queue.Empty:
-                item = None
-            if item is not None:
+        while self._queue or not self._stopping.wait(GATHER_S) or self._queue:
+            for _ in range(min(AT_ONCE, len(self._queue))):
+                item = self._queue.popleft()
                 self._unsafe.append(item)
                 self._write(item)
             if time.monotonic() >= flush_due_s or len(self._unsafe) >= self._queue_max:
@@ -326,9 +323,8 @@ class BackgroundRecorder:
 
     def _give_up(self) -> None:
         self.dropped += len(self._unsafe)
-        with contextlib.suppress(queue.Empty):
-            while True:
-                self.dropped += self._queue.get_nowait() is not None
+        self.dropped += len(self._queue)
+        self._queue.clear()
 
     def _tell(self, severity: Severity, text: str) -> None:
         self._news.append((severity, text))

@@ -69,7 +69,7 @@ def on_disk(made: BackgroundRecorder) -> int:
 
 def waiting(made: BackgroundRecorder) -> int:
     """Items in the queue."""
-    return made._queue.qsize()
+    return made.queued
 
 
 def wait_for_part(made: BackgroundRecorder, number: int) -> None:
@@ -158,6 +158,7 @@ def test_a_full_disk_is_looked_at_again_as_soon_however_long_it_is_full(
 ) -> None:
     """Waiting twice as long each time, it kept in memory twice what the outage made it keep."""
     monkeypatch.setattr(background, "RETRY_FIRST_S", 0.01)
+    monkeypatch.setattr(background, "GATHER_S", 0.005)  # so that each longer wait is a retry's
     made, waits_s = recorder(small_disk), list[float]()
     wait = made._stopping.wait
 
@@ -171,7 +172,7 @@ def test_a_full_disk_is_looked_at_again_as_soon_however_long_it_is_full(
     wait_until(lambda: on_disk(made) == 99)
     fill(small_disk)
     events += hand_over(made, ticks(100, 200))
-    wait_until(lambda: len(waits_s) > 8)
+    wait_until(lambda: waits_s.count(background.RETRY_FIRST_S) > 8)
     assert max(waits_s) == background.RETRY_FIRST_S
     (small_disk / BALLAST).unlink()
     wait_until(lambda: made.failure is None)

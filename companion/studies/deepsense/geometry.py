@@ -1,13 +1,15 @@
-"""Where the array stands, of few parameters: bearings and distances of positions from it.
+"""Where the array stands, of few parameters: which beam is expected at a position.
 
 Positions are normalised, so that the two axes have scales of their own; the array's place, the way
-that it looks and the height are not known. Fitted are the array's place (2), the ratio of the
-scales, the way that it looks, the beam in the middle and beams by sine of the bearing; and how many
-samples the measured beam lags behind the reported position. The beams of a line of elements are
-even in the sine of the bearing.
+that it looks and how far above it is flown are not known. Fitted are the array's place (2), the
+ratio of the scales, the way that it looks, the height, the beam in the middle and beams by sine;
+and how many samples the measured beam lags behind the reported position.
+
+The beams of a line of elements are even in the sine of the angle from its middle, which counts the
+height: far above the array all is in the middle, however it bears.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -18,10 +20,11 @@ from companion.values import BoolArray, FloatArray, IntArray
 LAGS: Final = tuple(step * 0.5 for step in range(9))
 """Lags that are tried, samples."""
 _STARTS: Final = ((0.5, -0.3), (0.5, 1.3), (-0.3, 0.5), (1.3, 0.5))
-_WIDEST_RAD: Final = 1.5
+_HEIGHT: Final = 0.3
+_HIGHEST: Final = 3.0
 _SLOPE: Final = 0.4
 _WIDEST_SLOPE: Final = 1.0
-"""Beams by sine of the bearing, in codebooks: where the search begins, and at most."""
+"""Beams by sine, in codebooks: where the search begins, and at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +34,8 @@ class Geometry:
     stretch  log of the scale of the first axis to that of the second
     yaw      the way that the array looks, rad
     middle   the beam that looks there
-    slope    beams by sine of the bearing from there
+    slope    beams by sine of the angle from there
+    height   of the flight above the array, in the scale of the second axis; one for all samples
     lag      samples by which the beam is older than the position beside it
     """
 
@@ -41,24 +45,20 @@ class Geometry:
     yaw: float
     middle: float
     slope: float
+    height: float
     lag: float
 
-    def seen(self, place: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Bearings from where the array looks, rad, and distances (N,) of positions (N, 2).
-
-        The positions are in order of time.
-        """
-        there = delayed(place, self.lag) - np.array([self.x, self.y])
-        east = there[:, 0] * np.exp(self.stretch)
-        turned = np.arctan2(there[:, 1], east) - self.yaw
-        return (turned + np.pi) % (2 * np.pi) - np.pi, np.hypot(east, there[:, 1])
-
     def beams(self, place: FloatArray) -> FloatArray:
-        """The beams that are expected at positions (N, 2), with fractions."""
-        bearing, _ = self.seen(place)
-        expected: FloatArray = self.middle + self.slope * np.sin(
-            np.clip(bearing, -_WIDEST_RAD, _WIDEST_RAD)
-        )
+        """The beams that are expected at positions (N, 2) in order of time, with fractions."""
+        return self._at(delayed(place, self.lag))
+
+    def _at(self, place: FloatArray) -> FloatArray:
+        """The same at positions that have their lag already."""
+        east = (place[:, 0] - self.x) * np.exp(self.stretch)
+        north = place[:, 1] - self.y
+        across = north * np.cos(self.yaw) - east * np.sin(self.yaw)
+        away = np.sqrt(east**2 + north**2 + self.height**2)
+        expected: FloatArray = self.middle + self.slope * across / np.maximum(away, 1e-9)
         return expected
 
 
@@ -73,42 +73,54 @@ def delayed(place: FloatArray, lag: float) -> FloatArray:
 
 
 def fit(
-    place: FloatArray, beam: IntArray, learned: BoolArray, beams: int, *, lags: bool
+    place: FloatArray, beam: IntArray, learned: BoolArray, beams: int, *, simple: bool = False
 ) -> Geometry:
-    """The geometry by the samples that may be learned from; without ``lags`` the lag is 0."""
+    """The geometry by the samples that may be learned from; a simple one has no height or lag."""
+    height = 0.0 if simple else _HEIGHT
     begin = [
-        Geometry(x, y, 0.0, float(np.arctan2(0.5 - y, 0.5 - x)), beams / 2, slope, 0.0)
+        Geometry(x, y, 0.0, float(np.arctan2(0.5 - y, 0.5 - x)), beams / 2, slope, height, 0.0)
         for x, y in _STARTS
         for slope in (_SLOPE * beams, -_SLOPE * beams)
     ]
-    widest = _WIDEST_SLOPE * beams
     cost, best = min(
-        (_fitted(one, place, beam, learned, widest) for one in begin), key=lambda found: found[0]
+        (_fitted(one, place, beam, learned, beams) for one in begin), key=lambda found: found[0]
     )
-    for lag in LAGS[1:] if lags else ():
-        begun = Geometry(best.x, best.y, best.stretch, best.yaw, best.middle, best.slope, lag)
-        again, found = _fitted(begun, place, beam, learned, widest)
+    for lag in () if simple else LAGS[1:]:
+        again, found = _fitted(replace(best, lag=lag), place, beam, learned, beams)
         if again < cost:
             cost, best = again, found
     return best
 
 
+def refit(
+    begin: Geometry, place: FloatArray, beam: IntArray, learned: BoolArray, beams: int
+) -> Geometry:
+    """The same by fewer samples, its lag being known."""
+    _, found = _fitted(begin, place, beam, learned, beams)
+    return found
+
+
 def _fitted(
-    begin: Geometry, place: FloatArray, beam: IntArray, learned: BoolArray, widest: float
+    begin: Geometry, place: FloatArray, beam: IntArray, learned: BoolArray, beams: int
 ) -> tuple[float, Geometry]:
-    """The least cost, with few far-off beams counting little, and where it is."""
+    """The least cost, with few far-off beams counting little, and where it is.
+
+    Where the height is 0 to begin with it stays so.
+    """
     there = delayed(place, begin.lag)[learned]
+    first = [begin.x, begin.y, begin.stretch, begin.yaw, begin.middle, begin.slope, begin.height]
+    low = [-4.0, -4.0, -2.0, -10.0, -np.inf, -_WIDEST_SLOPE * beams, 0.0]
+    high = [4.0, 4.0, 2.0, 10.0, np.inf, _WIDEST_SLOPE * beams, _HIGHEST]
+    free = len(first) if begin.height > 0 else len(first) - 1
+
+    def made(values: FloatArray) -> Geometry:
+        x, y, stretch, yaw, middle, slope, *height = (float(value) for value in values)
+        return Geometry(x, y, stretch, yaw, middle, slope, sum(height), begin.lag)
 
     def off(values: FloatArray) -> FloatArray:
-        x, y, stretch, yaw, middle, slope = (float(value) for value in values)
-        found: FloatArray = (
-            Geometry(x, y, stretch, yaw, middle, slope, 0.0).beams(there) - beam[learned]
-        )
+        found: FloatArray = made(values)._at(there) - beam[learned]
         return found
 
-    first = [begin.x, begin.y, begin.stretch, begin.yaw, begin.middle, begin.slope]
-    low = [-4.0, -4.0, -2.0, -10.0, -np.inf, -widest]
-    high = [4.0, 4.0, 2.0, 10.0, np.inf, widest]
-    found = least_squares(off, np.clip(first, low, high), loss="soft_l1", bounds=(low, high))
-    x, y, stretch, yaw, middle, slope = (float(value) for value in found.x)
-    return float(found.cost), Geometry(x, y, stretch, yaw, middle, slope, begin.lag)
+    bounds = (low[:free], high[:free])
+    found = least_squares(off, np.clip(first[:free], *bounds), loss="soft_l1", bounds=bounds)
+    return float(found.cost), made(found.x)

@@ -1,9 +1,9 @@
 """Predictors of the best beam from a position: each learns from some samples and ranks all beams.
 
 ``nearest`` and ``geometry`` are what others do, to compare with. ``kernel`` is the product's
-way: the density of beams over bearing and distance from the fitted place of the array, by a
-Gaussian kernel (Nadaraya 1964, Watson 1964), with beams about as far aside where there are few
-samples. All make their choices by what is learned from alone.
+way: the density of beams over the beam that a geometry with a height expects, by a Gaussian kernel
+(Nadaraya 1964, Watson 1964), and by the distance from that beam where there are few samples. All
+make their choices by what is learned from alone.
 """
 
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from functools import partial
 from typing import Final
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from companion.studies.deepsense import geometry
@@ -23,13 +23,13 @@ Fitted = Callable[[BoolArray], FloatArray]
 """Probabilities (N, beams) by samples that are learned from, all choices being made."""
 Predictor = Callable[[Samples, BoolArray], Fitted]
 NEIGHBOURS: Final = 20
-BANDWIDTHS: Final = tuple((a, b) for a in (0.015, 0.03) for b in (0.1, 0.2))
-"""Bearing, rad, and distance, of normalised coordinates: the kernel's widths that are tried."""
+KERNELS: Final = tuple((width, weight) for width in (0.25, 0.5) for weight in (5.0, 15.0))
+"""Widths of the kernel, in beams, and weights of the prior, in samples, that are tried."""
 _INNER: Final = (16, 4)
-_CELL: Final = (0.005, 0.025)
-_BEARINGS: Final = round(2 * np.pi / _CELL[0])
-_PRIOR: Final = 0.05
-_SPREAD_BEAMS: Final = 1.5
+_CELL: Final = 0.05
+_FAR: Final = 1.3
+"""Beams within which the prior falls to 1/e."""
+_REFLECTED: Final = 0.01
 
 
 def nearest(samples: Samples, _: BoolArray) -> Fitted:
@@ -49,40 +49,55 @@ def _votes(samples: Samples, learned: BoolArray) -> FloatArray:
 
 def plain(samples: Samples, learned: BoolArray) -> Fitted:
     """Beams by their distance from the one that the sine of the bearing says."""
-    at = geometry.fit(samples.place, samples.beam, learned, samples.beams, lags=False)
-    off = np.abs(np.arange(samples.beams) - at.beams(samples.place)[:, None])
-    likely: FloatArray = np.exp(-off)
+    at = geometry.fit(samples.place, samples.beam, learned, samples.beams, simple=True)
+    likely = _beside(samples, at.beams(samples.place), 1.0)
     likely /= likely.sum(axis=1, keepdims=True)
     return lambda _: likely
 
 
 def kernel(samples: Samples, learned: BoolArray) -> Fitted:
-    """The density of beams over bearing and distance, its widths chosen within what is learned."""
-    at, widths = chosen(samples, learned)
-    return lambda mask: density(samples, mask, at, widths)
+    """The density of beams over the expected one, its kernel chosen within what is learned."""
+    at, (width, weight) = chosen(samples, learned)
+    return lambda mask: averaged(samples, mask, _doubted(samples, mask, at), width, weight)
 
 
 def chosen(samples: Samples, learned: BoolArray) -> tuple[Geometry, tuple[float, float]]:
-    """The geometry, and the kernel's widths that do best in blocks within what is learned."""
-    at = geometry.fit(samples.place, samples.beam, learned, samples.beams, lags=True)
-    parts = inner(learned, *_INNER)
-    widths = max(BANDWIDTHS, key=lambda one: _worth(samples, learned, parts, at, one))
-    return at, widths
+    """The geometry, and the kernel that does best in blocks within what is learned."""
+    counted = learned & samples.apart()
+    at = geometry.fit(samples.place, samples.beam, counted, samples.beams)
+    worth = dict.fromkeys(KERNELS, 0.0)
+    for part in inner(learned, *_INNER):
+        mask = learned & ~part
+        geometries = _doubted(samples, mask, at)
+        for width, weight in KERNELS:
+            likely = averaged(samples, mask, geometries, width, weight)
+            worth[width, weight] += float(np.log(own(likely, samples.beam)[part]).sum())
+    return at, max(KERNELS, key=lambda one: worth[one])
 
 
-def _worth(
-    samples: Samples,
-    learned: BoolArray,
-    parts: list[BoolArray],
-    at: Geometry,
-    widths: tuple[float, float],
-) -> float:
-    """Top-1, 3 and 5 hits in blocks that are left out in turn."""
-    hits = 0.0
-    for part in parts:
-        rank = rank_of(density(samples, learned & ~part, at, widths), samples.beam)[part]
-        hits += float(sum((rank < top).sum() for top in (1, 3, 5)))
-    return hits
+def _doubted(samples: Samples, learned: BoolArray, at: Geometry) -> list[Geometry]:
+    """Geometries that leave out each a part of what is learned: how far they differ is doubt."""
+    counted = learned & samples.apart()
+    return [
+        geometry.refit(at, samples.place, samples.beam, counted & ~part, samples.beams)
+        for part in inner(counted, *_INNER)
+    ]
+
+
+def averaged(
+    samples: Samples, learned: BoolArray, geometries: list[Geometry], width: float, weight: float
+) -> FloatArray:
+    """Probabilities (N, beams), the mean over geometries."""
+    found: FloatArray = np.mean(
+        [density(samples, learned, at, width, weight) for at in geometries], axis=0
+    )
+    return found
+
+
+def own(likely: FloatArray, beam: IntArray) -> FloatArray:
+    """The probability of each beam (N,) among those of all (N, beams)."""
+    found: FloatArray = likely[np.arange(len(beam)), beam % likely.shape[1]]
+    return found
 
 
 def rank_of(likely: FloatArray, beam: IntArray) -> IntArray:
@@ -90,32 +105,39 @@ def rank_of(likely: FloatArray, beam: IntArray) -> IntArray:
 
     Of equal ones it is the last: a predictor that cannot tell has not told.
     """
-    own = likely[np.arange(len(beam)), beam % likely.shape[1]]
-    found: IntArray = (likely >= own[:, None]).sum(axis=1) - 1
+    found: IntArray = (likely >= own(likely, beam)[:, None]).sum(axis=1) - 1
     return found
 
 
 def density(
-    samples: Samples, learned: BoolArray, at: Geometry, widths: tuple[float, float]
+    samples: Samples, learned: BoolArray, at: Geometry, width: float, weight: float
 ) -> FloatArray:
-    """Probabilities (N, beams) by the learned samples around each, counted in small cells."""
-    bearing, distance = at.seen(samples.place)
-    farthest = min(6.0, float(distance.max()) + _CELL[1])
-    row = np.clip((bearing + np.pi) / _CELL[0], 0, _BEARINGS - 1).astype(np.int64)
-    column = np.clip(distance / _CELL[1], 0, farthest / _CELL[1]).astype(np.int64)
-    counts = np.zeros((_BEARINGS, int(column.max()) + 1, samples.beams))
+    """Probabilities (N, beams) by the learned samples of about the same expected beam.
+
+    They are counted in small cells; one that is just there counts 1, and the prior ``weight``.
+    """
+    counted = learned & samples.apart()
+    expected = at.beams(samples.place)
+    cell = np.clip(np.round(expected / _CELL), 0, samples.beams / _CELL).astype(np.int64)
     beam = samples.beam % samples.beams
-    np.add.at(counts, (row[learned], column[learned], beam[learned]), 1.0)
-    sigma = (widths[0] / _CELL[0], widths[1] / _CELL[1], 0.0)
-    smooth = gaussian_filter(counts, sigma, mode=("wrap", "constant", "constant"), truncate=5.0)
-    found = smooth[row, column]
-    wide = gaussian_filter(counts.sum(axis=1), (4 * sigma[0], 0.0), mode="wrap", truncate=5.0)[row]
-    # Where nothing is near, beams around those of about this bearing; popular ones first.
-    spread = gaussian_filter(wide, (0.0, _SPREAD_BEAMS), mode="constant", truncate=4.0)
+    counts = np.zeros((round(samples.beams / _CELL) + 1, samples.beams))
+    np.add.at(counts, (cell[counted], beam[counted]), 1.0)
+    sigma = width / _CELL
+    near = gaussian_filter1d(counts, sigma, axis=0, mode="constant", truncate=5.0)
+    near *= np.sqrt(2 * np.pi) * sigma
+    # Where nothing is near, the beams beside the expected one; popular ones first.
     popular = np.bincount(beam[learned], minlength=samples.beams) + 1.0
-    prior = (spread + 1e-9) * np.sqrt(popular)
+    prior = _beside(samples, expected, _FAR) * np.sqrt(popular)
     prior /= prior.sum(axis=1, keepdims=True)
-    peak = 1.0 / (2 * np.pi * sigma[0] * sigma[1])  # of one sample's kernel
-    mixed: FloatArray = found + _PRIOR * peak * prior + 1e-4 * peak / samples.beams
+    # A reflection makes any beam the best one, whatever the position is.
+    prior = (1 - _REFLECTED) * prior + _REFLECTED / samples.beams
+    mixed: FloatArray = near[cell] + weight * prior
     mixed /= mixed.sum(axis=1, keepdims=True)
     return mixed
+
+
+def _beside(samples: Samples, expected: FloatArray, scale: float) -> FloatArray:
+    """Falls with the distance (N, beams) of beams from the expected one, in ``scale`` beams."""
+    off = np.abs(np.arange(samples.beams) - expected[:, None])
+    found: FloatArray = np.exp(-off / scale)
+    return found

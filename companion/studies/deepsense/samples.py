@@ -1,10 +1,14 @@
 """Samples of measured beams, and how they are split honestly into what is learned and tested."""
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from companion.values import BoolArray, FloatArray, IntArray
+
+_STAYED: Final = 0.1
+"""What a sample counts that is where the one before was, to one that is a mean step farther."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,6 +31,16 @@ class Samples:
     def neighbours_alike(self) -> float:
         """Share of samples that have the beam of the one before: what a random split leaks."""
         return float(np.mean(self.beam[1:] == self.beam[:-1]))
+
+    def apart(self) -> BoolArray:
+        """Samples (N,) about a mean step from the one before of them, along the way flown.
+
+        A UAV that hovers is measured again and again where it is: that says little more than once.
+        """
+        step = np.hypot(*np.diff(self.place, axis=0, prepend=self.place[:1]).T)
+        way = np.cumsum(step / max(float(step.mean()), 1e-12) + _STAYED)
+        begun: BoolArray = np.diff(np.floor(way), prepend=-1.0) > 0
+        return begun
 
 
 def blocks(count: int, number: int, folds: int) -> list[BoolArray]:

@@ -1,13 +1,15 @@
 # The service in a container, for amd64 and arm64: as an unprivileged user, on a root file system
 # that may be read only, with nothing in it but what it runs. docs/deployment.md
 ARG BASE=python:3.11-slim-bookworm
+# The same Python with more beside it, of which `strip` is used.
+ARG BUILD=python:3.11-bookworm
 
-FROM ${BASE} AS build
+FROM ${BUILD} AS build
 ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1
 RUN python -m venv /opt/venv
 WORKDIR /src
-# The packages first: they change seldom, so this layer is made seldom. Wheels alone: there is no
-# compiler here, and a package without a wheel for this machine is to fail at once.
+# The packages first: they change seldom, so this layer is made seldom. Wheels alone: a package
+# without a wheel for this machine is to fail at once.
 COPY requirements.lock ./
 RUN /opt/venv/bin/pip install --require-hashes --only-binary :all: -r requirements.lock
 COPY . ./
@@ -16,11 +18,15 @@ RUN /opt/venv/bin/pip install --no-deps --no-build-isolation . \
     && /opt/venv/bin/pip uninstall --yes editables hatchling pathspec pluggy trove-classifiers \
     && /opt/venv/bin/pip check
 # What packages ask for and nothing here uses: solvers beside Clarabel, what generates MAVLink; then
-# their own tests, and dialects that nobody speaks here. It is half of all.
+# their own tests, dialects that nobody speaks here, and symbols for debuggers. It is over half of
+# all. Not of packages that bring libraries: what was patched to find these need not load once
+# stripped.
 RUN /opt/venv/bin/pip uninstall --yes highspy lxml scs setuptools sparsediffpy pip \
     && find /opt/venv/lib -type d -name tests -prune -exec rm -r {} + \
     && find /opt/venv/lib -path '*/pymavlink/dialects/v*' -type f \
-        ! -path '*/v20/*__init__*' ! -path '*/v20/*all.*' ! -path '*/v20/*ardupilotmega.*' -delete
+        ! -path '*/v20/*__init__*' ! -path '*/v20/*all.*' ! -path '*/v20/*ardupilotmega.*' -delete \
+    && find /opt/venv/lib -name '*.so' ! -path '*.libs/*' ! -path '*/numpy/*' ! -path '*/scipy/*' \
+        ! -path '*/PIL/*' -exec strip --strip-unneeded {} +
 
 FROM ${BASE}
 COPY --from=build /opt/venv /opt/venv

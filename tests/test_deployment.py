@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -223,6 +224,68 @@ def test_what_the_image_leaves_out_is_not_missed(tmp_path: Path) -> None:
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
     assert list((tmp_path / "report").glob("*.png")) or list((tmp_path / "report").glob("*.html"))
+
+
+PACKAGES_MB = 330
+"""Most that the packages may take: beside a base of some 125 MB the image has less than 450."""
+
+
+@pytest.mark.full
+def test_what_the_image_keeps_is_small_and_works(tmp_path: Path) -> None:
+    """The packages of the lock, as they are here, made smaller as the image has them."""
+    if shutil.which("strip") is None:
+        pytest.skip("no strip: install binutils")
+    packages = tmp_path / "venv" / "lib"
+    (line,) = re.findall(r"pip uninstall --yes (highspy .*) pip ", DOCKERFILE)
+    builds = ["editables", "hatchling", "pathspec", "pluggy", "trove-classifiers"]
+    gone = {*line.split(), *builds}
+    lock = (ROOT / "requirements.lock").read_text(encoding="utf-8")
+    for name in set(re.findall(r"^([\w.-]+)==", lock, re.MULTILINE)) - gone:
+        for part in {file.parts[0] for file in metadata.files(name) or ()} - {"..", "__pycache__"}:
+            found = Path(str(metadata.distribution(name).locate_file(part)))
+            if found.is_dir():
+                shutil.copytree(found, packages / part, dirs_exist_ok=True)
+            else:
+                packages.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(found, packages)
+    before = taken_mb(packages)
+    steps = re.findall(r"&& (find /opt/venv.*?)(?= \\\n    &&|\n\n)", DOCKERFILE, re.DOTALL)
+    assert len(steps) == 3
+    for step in steps:
+        command = step.replace("/opt/venv/lib", str(packages))
+        subprocess.run(["sh", "-ec", command], check=True, timeout=HANG_S)
+    assert taken_mb(packages) < min(PACKAGES_MB, before - 100)
+    loads = (
+        "import importlib, pathlib, sys\n"
+        "root = pathlib.Path(sys.argv[1])\n"
+        "import numpy, scipy, cvxpy, matplotlib.pyplot, PIL.Image\n"
+        "assert all(root in pathlib.Path(one.__file__).parents for one in (numpy, cvxpy, PIL))\n"
+        "known = [one for one in root.rglob('*.so') if '.libs' not in str(one)]\n"
+        "for one in known:\n"
+        "    name = '.'.join(one.relative_to(root).with_name(one.name.split('.')[0]).parts)\n"
+        "    if name != 'scipy.linalg._matfuncs_sqrtm_triu':  # imports itself\n"
+        "        importlib.import_module(name)\n"
+        "print(len(known))\n"
+    )
+    python = Path(sys.executable).resolve()  # without the packages of its environment
+    environment = {**os.environ, "PYTHONPATH": f"{packages}{os.pathsep}{ROOT}"}
+    log = str(ROOT / "tests" / "data" / "sitl_4circle_cut.tlog")
+    for words in (
+        ["-c", loads, str(packages)],
+        ["-m", "companion", "design", "--method", "lmi", "--dt", "0.2"],
+        ["-m", "companion", "study", "dt", "--out", "report"],
+        ["-m", "companion", "replay", log, "--center", "5:1"],
+    ):
+        done = subprocess.run(
+            [python, *words], cwd=tmp_path, env=environment, capture_output=True, text=True,
+            timeout=HANG_S, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+
+
+def taken_mb(folder: Path) -> float:
+    """What the files in a folder take."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 2**20
 
 
 def test_services_are_tested_one_at_a_time(request: pytest.FixtureRequest) -> None:

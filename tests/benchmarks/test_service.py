@@ -19,7 +19,7 @@ pytestmark = pytest.mark.benchmark
 RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
 CLIENTS = 4
 ASKED_S = 2.0
-PEER = "import numpy, scipy.linalg, fastapi, uvicorn, google.protobuf.message, zstandard"
+PEER = "import numpy, fastapi, uvicorn, google.protobuf.message, zstandard"
 
 
 async def _ask(node: Node, path: str, accept: str, until_s: float) -> int:

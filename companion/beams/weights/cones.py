@@ -117,7 +117,7 @@ def cones(
 def _fast_length(least: int) -> int:
     """The first length from ``least`` on that a Fourier transform is fast for: 2, 3 and 5 make it.
 
-    ``scipy.fft`` would know one, and takes 7 MB and a twentieth of the start for it.
+    ``scipy.fft`` would know one, and brings all that ``lapack`` does without.
     """
     length = least
     while True:

@@ -15,9 +15,8 @@ from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.linalg.blas import zgemm, zherk
-from scipy.linalg.lapack import zposv
 
+from companion.beams.weights.lapack import zgemm, zherk, zposv
 from companion.values import ComplexArray, FloatArray
 
 MOST_LOSS: Final = 1e12

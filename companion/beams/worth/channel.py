@@ -88,7 +88,7 @@ def draw(
     uav_array: Array,
     directions_at_node: FloatArray,
     directions_at_uav: FloatArray,
-    rng: np.random.Generator,
+    rng: "np.random.Generator",
 ) -> ComplexArray:
     """Draw H for N UAVs, independent of one another: shape (N, N_U, M).
 
@@ -125,7 +125,9 @@ def draw(
     return channels
 
 
-def _ray_directions(settings: SalehValenzuela, users: int, rng: np.random.Generator) -> FloatArray:
+def _ray_directions(
+    settings: SalehValenzuela, users: int, rng: "np.random.Generator"
+) -> FloatArray:
     """Unit directions (N * rays, 3), user by user and cluster by cluster.
 
     The axes across a cluster are turned at random about it, so that no direction of space is
@@ -212,7 +214,7 @@ class Blockages:
 
 
 def draw_blockages(
-    rng: np.random.Generator,
+    rng: "np.random.Generator",
     duration_s: float,
     rate_hz: float,
     mean_s: float,

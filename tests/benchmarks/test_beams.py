@@ -5,10 +5,10 @@ import time
 import numpy as np
 import pytest
 from figures import Figures
-from scipy.optimize import linprog
+from scipy.optimize import linprog, minimize
 
 from companion.beams.aim import aim
-from companion.beams.array.geometry import uniform_linear
+from companion.beams.array.geometry import uniform_linear, uniform_rectangular
 from companion.beams.weights import shapes
 from companion.beams.weights.precoding import Precoder, Radio, precode
 from companion.values import (
@@ -53,6 +53,49 @@ def test_shapes_of_lines_against_free_amplitudes(elements: int) -> None:
         least = 10 * np.log10((np.abs(field.sum(axis=1)) ** 2).min() / elements)
         # Optima over the number of elements do not depend on it, but near the end of a short line.
         best = most_db(width, min(elements, 64)) + 10 * np.log10(elements / min(elements, 64))
+        print(f"  w = {width:5}: {least:6.2f}, {least - best:+.2f}")
+        assert least > best - 4.5
+
+
+def climbed(phases: FloatArray, response: ComplexArray) -> FloatArray:
+    """Phases from which no small change makes the least gain greater: softer minima at first."""
+
+    def cost(at: FloatArray, sharpness: float) -> tuple[float, FloatArray]:
+        radiated = np.exp(1j * at)
+        field = response @ radiated
+        gain = np.maximum(np.abs(field) ** 2 / len(at), 1e-12)
+        steep = -sharpness * np.log(gain)
+        parts = np.exp(steep - steep.max())
+        share = -parts / parts.sum() / gain
+        slope = 2 / len(at) * np.real(1j * radiated * ((share * field.conj()) @ response))
+        return float(steep.max() + np.log(parts.sum())) / sharpness, slope
+
+    for sharpness in (1.0, 3.0, 8.0, 20.0, 60.0, 150.0):
+        limits = {"maxiter": 400}
+        phases = minimize(cost, phases, sharpness, "L-BFGS-B", jac=True, options=limits).x
+    return phases
+
+
+@pytest.mark.parametrize("elements", [8, 16])
+def test_shapes_of_planes_against_a_search(elements: int) -> None:
+    across = shapes.aperture(uniform_rectangular(elements, elements, 30e9, 0.5, np.eye(3)))
+    rng = np.random.default_rng(1)
+    print(f"\n{elements} x {elements}: least gain, less that of a search from there, dB")
+    for width in (0.25, 0.5, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0):
+        if width > 0.375 * elements:
+            continue
+        side = np.linspace(-width, width, 41)
+        inner = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+        turns = np.linspace(0, 2 * np.pi, 120)
+        rim = width * np.stack([np.cos(turns), np.sin(turns)], axis=1)
+        places = np.concatenate([inner[np.hypot(*inner.T) < width], rim])
+        response = np.exp(2j * np.pi * places @ across.placed.T)
+        (ours,) = shapes.phases_rad(across, np.array([[width, width]]), None)
+        begins = [ours, *(ours + rng.normal(0, 0.3, len(ours)) for _ in range(3))]
+        made = [climbed(begin, response) for begin in begins]
+        found = [np.abs(response @ np.exp(1j * each)).min() for each in made]
+        least = 20 * np.log10(np.abs(response @ np.exp(1j * ours)).min() / elements)
+        best = 20 * np.log10(max(found) / elements)
         print(f"  w = {width:5}: {least:6.2f}, {least - best:+.2f}")
         assert least > best - 4.5
 

@@ -3,7 +3,8 @@
 One amplifier feeds each element, so all radiate alike and their phases alone shape the beam. Widths
 are in natural beams: an angle e across an aperture D is w = e D / wavelength. The tables were
 searched for offline (``docs/make_beam_shapes.py``) for 64 elements on a line and 16 x 16 in a
-square; in apertures from the middle, their phases serve any number. See docs/math.md 5.5.
+square; in apertures from the middle, their phases serve any number. A square of 16 x 16 places has
+no more to say of wide beams: there a plane has the sum of two lines. See docs/math.md 5.5.
 """
 
 import functools
@@ -27,6 +28,8 @@ GIVEN_UP: Final = 2.0
 """Loss in dB that is accepted for each dB by which a floor is too low to be worth something."""
 SPARE_DB: Final = 2.5
 """How far above what is worth something a floor has to be: nulls and places between take some."""
+FAR: Final = (3.8, 4.8)
+"""Widths of a plane's beams, in natural widths, from which and up to which lines take over."""
 LEAST_SHARE: Final = 1 / 16
 """Least ratio of the widths on the two axes of a plane that its shapes follow."""
 
@@ -147,23 +150,45 @@ def phases_rad(
     cones = np.minimum(cones, across.most)
     width = cones.max(axis=1)
     shapes = across.shapes
-    if likely is None:
-        psi = _sure(shapes, width)
-    else:
-        best_db = np.interp(np.log(np.maximum(width, 1e-9)), shapes.widths, shapes.least_db)
-        best_db += 10 * math.log10(len(across.placed))
-        least_db = math.exp(shapes.losses[0])
-        lacking_db = np.maximum(worth_db + SPARE_DB + least_db - best_db, 0.0)
-        loss_db = np.maximum(best_db - floor_db, least_db) + GIVEN_UP * lacking_db
-        psi = _likely(shapes, width, np.minimum(likely, cones).max(axis=1), loss_db)
+    most = None if likely is None else np.minimum(likely, cones)
     if len(across.axes) == 1:
-        found = psi @ across.knots
-    else:
-        shares = cones / np.maximum(width, 1e-300)[:, np.newaxis]
-        shares = np.sqrt(np.maximum(shares, LEAST_SHARE))
-        found = _on_square(shapes, psi, across.placed * shares[:, np.newaxis])
-    phases: FloatArray = 2 * np.pi * width[:, np.newaxis] * found
-    return phases
+        (psi,) = _psi(shapes, cones, most, len(across.placed), floor_db, worth_db)
+        return np.asarray(2 * np.pi * cones * (psi @ across.knots))
+    usual = None if most is None else most.max(axis=1, keepdims=True)
+    (psi,) = _psi(shapes, width[:, np.newaxis], usual, len(across.placed), floor_db, worth_db)
+    shares = cones / np.maximum(width, 1e-300)[:, np.newaxis]
+    shares = np.sqrt(np.maximum(shares, LEAST_SHARE))
+    found = width[:, np.newaxis] * _on_square(shapes, psi, across.placed * shares[:, np.newaxis])
+    far = np.interp(np.log(np.maximum(width, 1e-9)), np.log(FAR), (0.0, 1.0))[:, np.newaxis]
+    if far.any():
+        line = _table("line")
+        # What a product of lines pays for a floor, it pays on both axes: more than it is worth.
+        each = _psi(line, cones, most, len(across.placed), -math.inf, worth_db)
+        sides = [_on_line(line, one, across.placed[:, d]) for d, one in enumerate(each)]
+        lines = sum(cones[:, d, np.newaxis] * side for d, side in enumerate(sides))
+        found = (1 - far) * found + far * lines
+    return np.asarray(2 * np.pi * found)
+
+
+def _psi(
+    shapes: Shapes,
+    cones: FloatArray,
+    likely: FloatArray | None,
+    elements: int,
+    floor_db: float,
+    worth_db: float,
+) -> list[FloatArray]:
+    """Phases psi (N, K) of the table for each column of widths (N, D): their sum is one shape."""
+    columns = range(cones.shape[1])
+    if likely is None:
+        return [_sure(shapes, cones[:, d]) for d in columns]
+    best_db = np.interp(np.log(np.maximum(cones, 1e-9)), shapes.widths, shapes.least_db).sum(axis=1)
+    best_db += 10 * math.log10(elements)
+    least_db = len(columns) * math.exp(shapes.losses[0])
+    lacking_db = np.maximum(worth_db + SPARE_DB + least_db - best_db, 0.0)
+    loss_db = np.maximum(best_db - floor_db, least_db) + GIVEN_UP * lacking_db
+    loss_db /= len(columns)
+    return [_likely(shapes, cones[:, d], likely[:, d], loss_db) for d in columns]
 
 
 def _between(knots: FloatArray, at: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -207,6 +232,13 @@ def _likely(
     parts = np.stack([1 - share, share])
     shares = parts[CORNERS[:, 0], 0] * parts[CORNERS[:, 1], 1] * parts[CORNERS[:, 2], 2]
     return np.asarray((shares.T[:, np.newaxis] @ shapes.likely[corners])[:, 0])
+
+
+def _on_line(shapes: Shapes, psi: FloatArray, placed: FloatArray) -> FloatArray:
+    """Phases psi (N, n) of a line at places (M,), linear."""
+    before, share = _between(shapes.places, placed)
+    found: FloatArray = (1 - share) * psi[:, before] + share * psi[:, before + 1]
+    return found
 
 
 def _on_square(shapes: Shapes, psi: FloatArray, placed: FloatArray) -> FloatArray:

@@ -40,7 +40,7 @@ class Shapes(NamedTuple):
     places    (n,), where the phases are, in apertures from the middle; on each axis of a square
     widths    (W,), ascending
     sure      (W, K), the greatest least gain within the width
-    least_db  (W,), that gain over the number of elements
+    least_db  (W,), that gain over the number of elements, at the least: losses count from there
     losses    (L,), by how many dB the floor over the cone is below the greatest least gain
     cones     (C,), ascending
     ratios    (R,), the cone's width over the likely one, ascending from 1

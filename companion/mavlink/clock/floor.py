@@ -15,7 +15,9 @@ no cliff at the end of a window.
 A clock that stands still for a moment and a link that is slower from now on look alike: every y is
 higher. Which of them it was cannot be told, so both are kept: ``sure`` holds if the clock ran on,
 ``line`` begins again where all frames have lain above it for long, far beyond what their spread
-explains (``lateness.py``). Before that, the least of the last few frames is taken for possible: the
+explains (``lateness.py``). Likewise where frames come steadily later for a whole window: a clock
+that is slow, or a queue that fills. The line follows it, and a level floor is kept beside it until
+no queue can be that long. Before that, the least of the last few frames is taken for possible: the
 offset is below it whatever the clock did before them.
 """
 
@@ -57,6 +59,27 @@ class Heights(NamedTuple):
     least: int
 
 
+class _Level:
+    """The floor under stamps that lie along a slope, if the clock ran within its drift after all.
+
+    sure        height above the offset then, at the newest stamp, above the level base
+    touched_ns  sender time of the stamp that it comes from
+    """
+
+    __slots__ = ("sure", "touched_ns")
+
+    def __init__(self, sure: float, touched_ns: int) -> None:
+        self.sure = sure
+        self.touched_ns = touched_ns
+
+    def add(self, x_ns: int, height: float, ahead_ns: int, drift_max: float) -> None:
+        """Take in a stamp that is so much ahead of the newest."""
+        self.sure += drift_max * max(0, ahead_ns)
+        as_of_now = height + drift_max * max(0, -ahead_ns)
+        if as_of_now <= self.sure:
+            self.sure, self.touched_ns = as_of_now, x_ns
+
+
 class Floor:
     """The floor of one line of stamps. ``add`` takes placed stamps in order of arrival.
 
@@ -85,6 +108,7 @@ class Floor:
         self._first_arrival_ns = self._newest_arrival_ns = 0
         self._base = (0, 0)  # x, y: heights below are above base y + drift * (x - base x)
         self._sure = self._line = 0.0  # heights at newest_ns
+        self._level: _Level | None = None  # the floor, if what looks like a drift is a queue
         self._touched_ns = 0  # x of the stamp that ``sure`` comes from
         self._since_ns = 0  # x from which the line is what it is
         self._risen = -np.inf  # height of the last few frames, where they are suspiciously late
@@ -109,6 +133,8 @@ class Floor:
         self.count += 1
         height = self._height(x_ns, y_ns)
         ahead_ns = x_ns - self.newest_ns
+        if self._level is not None:
+            self._level.add(x_ns, y_ns - self._base[1], ahead_ns, self._drift_max)
         if ahead_ns > 0:
             self.newest_ns = x_ns
             self._sure += self._drift_max * ahead_ns
@@ -129,10 +155,11 @@ class Floor:
             if late_spell is not None:
                 self._all_late(late_spell)
         if self._line - self._sure > WORST_LATENCY_NS:
-            self._sure, self._touched_ns = (
-                self._line,
-                x_ns,
-            )  # no frame is as late as that: the clock did change
+            # No frame is as late as that: the clock did change.
+            self._sure, self._touched_ns = self._line, x_ns
+        level = self._level
+        if level is not None and self._tilted(self._line) - level.sure > WORST_LATENCY_NS:
+            self._level = None  # no queue is as long as that: the clock does drift
         if self.count < 4 * RECENT or self.count - self._looked >= 64 or gap < -RESOLUTION_NS:
             self._measure()
 
@@ -180,6 +207,7 @@ class Floor:
     def _drifts(self) -> None:
         """Lay the floor anew along the drift, on the least heights of the window."""
         newest_ns, level = self.newest_ns, self._sure
+        self._level = _Level(0.0, self._touched_ns)
         self._base = (newest_ns, self._base[1] + round(level))
         points = self._visible.tilt(self.drift, newest_ns, level)
         self._sure = self._line = min(
@@ -206,12 +234,23 @@ class Floor:
             least = min([h + drift_max * (newest_ns - at_ns) for at_ns, h in self._recent])
             recent = max(recent, least)
         aged = 2.0 * drift_max * (newest_ns - self._touched_ns)
+        highest, least = max(sure, line, recent) + moved, sure - aged + moved
+        sure += moved
+        if self._level is not None:
+            level = self._level.sure
+            aged = 2.0 * drift_max * (newest_ns - self._level.touched_ns)
+            sure, highest = min(sure, level), max(highest, level)
+            least = min(least, level - aged)
         return Heights(
-            base_ns + round(sure + slack + moved),
-            base_ns + round(max(sure, line, recent) + slack + moved),
+            base_ns + round(sure + slack),
+            base_ns + round(highest + slack),
             base_ns + round(line + moved),
-            base_ns + round(sure - aged - slack + moved),
+            base_ns + round(least - slack),
         )
+
+    def _tilted(self, height: float) -> float:
+        """A height at the newest stamp above the level base."""
+        return height + self.drift * (self.newest_ns - self._base[0])
 
     @property
     def median_ns(self) -> float:
@@ -239,10 +278,21 @@ class Floor:
         """By how much the drift that has shown itself moves the floor from its newest stamp, ns."""
         return round(self.drift * (x_ns - self.newest_ns))
 
+    def may_drift_ns(self, x_ns: int) -> tuple[int, int]:
+        """The least and the greatest that the offset may have drifted since the newest stamp, ns.
+
+        Beside what ``drift_max`` explains. While a queue may be what looks like a drift, none.
+        """
+        drifted_ns = self.drifted_ns(x_ns)
+        if self._level is None:
+            return drifted_ns, drifted_ns
+        return min(0, drifted_ns), max(0, drifted_ns)
+
     def begin_again(self, height_ns: int, x_ns: int) -> None:
         """Begin again at a height that was measured at a sender time: the clock did change."""
         measured = self._height(x_ns, height_ns)
         self._sure = self._line = measured + self._drift_max * abs(self.newest_ns - x_ns)
+        self._level = None
         self._since_ns = self._touched_ns = x_ns
         self._risen = -np.inf
         self._lateness.clear()

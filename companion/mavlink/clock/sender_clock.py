@@ -242,12 +242,12 @@ class SenderClock:
         kind, low_ns, high_ns, likely_ns = self._now()
         newest_ns = self._line.newest_ns
         slack_ns = math.ceil(self._drift_at(newest_ns) * abs(x_ns - newest_ns))
-        drifted_ns = self._line.floor.drifted_ns(x_ns)
+        least_ns, most_ns = self._line.floor.may_drift_ns(x_ns)
         return (
             kind,
-            low_ns - slack_ns + drifted_ns,
-            high_ns + slack_ns + drifted_ns,
-            likely_ns + drifted_ns,
+            low_ns - slack_ns + least_ns,
+            high_ns + slack_ns + most_ns,
+            likely_ns + self._line.floor.drifted_ns(x_ns),
         )
 
     def _drift_at(self, x_ns: int) -> float:

@@ -48,6 +48,9 @@ CLOCKS_MAX: Final = 4096
 """Clocks kept. Beyond it those of senders without a track are forgotten, the oldest first."""
 WAITS_NS: Final = 10_000_000_000
 """Time for which a track waits for its receiver to vouch for it."""
+STATED_LATE_US: Final = 30_000_000
+"""Greatest time by which what a receiver states may come after something newer; a longer step back
+is another boot's. As long as reports are remembered (``dedupe``)."""
 CLOCK_KEPT_NS: Final = 3_600_000_000_000
 """How long the clock of a sender without a track is kept: each takes some 50 kB."""
 FIX_3D: Final = 3
@@ -131,6 +134,7 @@ class Senders:
         self._shared: set[str] = set()
         self._known: dict[str, assembly.Assumed] = {}  # by UAV
         self._receivers: dict[Source, GnssStatus] = {}
+        self._stated_us: dict[str, int] = {}  # the receiver's time of it, by SYSID:COMPID
         self._apart_m2: dict[Source, float] = {}  # receiver's height less the autopilot's, squared
         self._utc_offset_ns = 0  # UTC less the node's timeline
         self._waits: dict[str, int] = {}  # since when a UAV's receiver does not vouch for it
@@ -171,7 +175,10 @@ class Senders:
     def _beside(self, frame: Frame, message: GnssStatus | SystemTime | Presence) -> Heard:
         """Take in what is said beside positions: of a receiver, a clock, a vehicle."""
         match message:
+            case GnssStatus() if self._is_outdated(message):
+                pass
             case GnssStatus():
+                self._stated_us[str(message.source)] = message.time_us
                 self._noise[message.source] = noise.reported(message, self._noise_settings)
                 self._receivers[message.source] = message
             case SystemTime():
@@ -185,6 +192,11 @@ class Senders:
                 self.presence[message.source] = message
                 self._known.pop(str(message.source), None)
         return NOTHING
+
+    def _is_outdated(self, status: GnssStatus) -> bool:
+        """Whether a receiver has said something newer, as where a second link lags behind."""
+        newest_us = self._stated_us.get(str(status.source), 0)
+        return 0 < status.time_us < newest_us <= status.time_us + STATED_LATE_US
 
     def notice(self, frame: Frame) -> ClockChange | None:
         """Take in the stamp of a frame that is not decoded otherwise, for its sender's clock.
@@ -323,7 +335,10 @@ class Senders:
         """Place a stamp on the sender's timeline; also returns the sender's name if it rebooted."""
         stamp = self._clock(name).observe(arrival_ns, boot_ms, doubt_ns)
         self._stamped_ns[name] = arrival_ns
-        return stamp, name if stamp is not None and stamp.rebooted else None
+        if stamp is None or not stamp.rebooted:
+            return stamp, None
+        self._stated_us.pop(name, None)
+        return stamp, name
 
     def _clock(self, name: str) -> SenderClock:
         if name not in self._clocks:
@@ -393,6 +408,7 @@ class Senders:
                 self._known.pop(name, None)
                 if heard is self._receivers:
                     self._noise.pop(source, None)
+                    self._stated_us.pop(name, None)
                     self._apart_m2.pop(source, None)
         self._shared = {uav for uav in self._shared if uav in wanted or uav in self._clocks}
 

@@ -206,7 +206,7 @@ class GnssStatus:
     """Fix type, height and stated accuracies of a GNSS receiver (GPS_RAW_INT).
 
     ``fix_type`` is MAVLink's GPS_FIX_TYPE, ``alt_m`` above mean sea level; accuracies are in metres
-    and m/s, None if not sent.
+    and m/s, None if not sent. ``time_us`` counts since boot or 1970, 0 if it is not known.
     """
 
     t_ns: int
@@ -217,6 +217,7 @@ class GnssStatus:
     h_acc_m: float | None
     v_acc_m: float | None
     vel_acc_mps: float | None
+    time_us: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -535,6 +535,20 @@ def test_the_autopilot_s_own_accuracy_is_followed_if_asked(
     assert noise_of(pipeline, "1:1") == (6.0, 6.0, 0.7)
 
 
+def test_what_a_receiver_said_before_does_not_take_the_place_of_what_it_says_now() -> None:
+    """A second link that lags brings it again; a time long before is another boot's."""
+    pipeline = Pipeline(settings("home"))
+    run(pipeline, [position(49.9, "1:1"), accuracy(50.0, "1:1", 0.5, 0.5, 0.1)])
+    run(pipeline, [accuracy(51.0, "1:1", 5.0, 5.0, 0.2), position(51.1, "1:1")])
+    assert noise_of(pipeline, "1:1") == pytest.approx((15.0, 15.0, 0.6))
+    late = accuracy(50.0, "1:1", 0.5, 0.5, 0.1)
+    run(pipeline, [late._replace(t_ns=START_NS + 51_200 * S // 1000), position(51.3, "1:1")])
+    assert noise_of(pipeline, "1:1") == pytest.approx((15.0, 15.0, 0.6))
+    anew = accuracy(2.0, "1:1", 1.0, 1.0, 0.1)
+    run(pipeline, [anew._replace(t_ns=START_NS + 52 * S), position(52.1, "1:1")])
+    assert noise_of(pipeline, "1:1") == pytest.approx((3.0, 3.0, 0.3))
+
+
 def test_a_relayed_report_is_as_good_as_transponders_are() -> None:
     """100 m, and the way flown in the second to which its time is known."""
     pipeline = Pipeline(settings("home", observer={"speed_max_mps": 90.0}))

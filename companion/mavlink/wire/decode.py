@@ -220,6 +220,7 @@ def _gps_raw_int(frame: Frame) -> GnssStatus:
         h_acc_m=_stated(h_acc),
         v_acc_m=_stated(v_acc),
         vel_acc_mps=_stated(vel_acc),
+        time_us=fields[0],
     )
 
 

@@ -153,7 +153,13 @@ def expected(m: dialect.MAVLink_message, t_ns: int, link: str) -> Message | None
         case "GPS_RAW_INT":
             accuracies = [value / 1000 or None for value in (m.h_acc, m.v_acc, m.vel_acc)]
             return GnssStatus(
-                t_ns, source, m.fix_type, m.satellites_visible, m.alt * 1e-3, *accuracies
+                t_ns,
+                source,
+                m.fix_type,
+                m.satellites_visible,
+                m.alt * 1e-3,
+                *accuracies,
+                m.time_usec,
             )
         case "GLOBAL_POSITION_INT":
             return Report(

@@ -49,10 +49,14 @@ class Assumptions:
         out: list[Refuted | Notice] = [
             Refuted(t_ns, sender, "clocks.drift_max_ppm", drift_max_ppm, drift, drift)
         ]
-        if t_ns - self._told_ns.get(sender, -SILENT_NS) >= SILENT_NS:
+        if change.leapt or t_ns - self._told_ns.get(sender, -SILENT_NS) >= SILENT_NS:
             self._told_ns[sender] = t_ns
             step = f"{change.step_s * 1e3:.0f} ms"
-            if change.proven:
+            if change.leapt:
+                way = "later" if change.step_s > 0 else "earlier"
+                why = "that is taken for a leap of its clock, as no link is known to be so slow"
+                text = f"all of {sender} comes {abs(change.step_s):.1f} s {way} than before: {why}"
+            elif change.proven:
                 text = f"the clock of {sender} changed by {step} more than clocks.drift_max_ppm"
             else:
                 why = "its clock stood still, or its link got slower; both are allowed for"

@@ -299,7 +299,7 @@ class Senders:
         stamp, restarted = self._stamp(carrier, attitude.t_ns, attitude.boot_ms)
         said = _restart_notice(attitude.t_ns, carrier, attitude.boot_ms) if restarted else ()
         placed = None if stamp is None else PlacedAttitude(attitude, stamp.sender_ns)
-        return Heard(placed, said, restarted)
+        return Heard(placed, said, restarted, self._clock(carrier).change)
 
     def _shared_id(self, uav: str, t_ns: int) -> tuple[Notice | Rejection, ...]:
         """Reject a report under an id with two boot clocks; the notice is given once."""

@@ -227,3 +227,18 @@ def test_home_moves_where_its_first_height_was_wrong() -> None:
     now_ns = START_NS + 12 * S
     (track,) = into.tracks(now_ns, now_ns)
     assert abs(track.position_ned_m[2]) < 1.0
+
+
+def test_a_line_that_leaps_beyond_what_frames_are_late_is_told() -> None:
+    """A link that held all frames back for a quarter of a minute looks like that: both are said."""
+    there = pipeline()
+    said = run(there, (position(0.1 * n, "7:1", (n, 0, 0), (10, 0, 0)) for n in range(300)))
+    said += run(
+        there,
+        (position(30 + 0.1 * n, "7:1", (300 + n, 0, 0), (10, 0, 0), 15.0) for n in range(60)),
+    )
+    told = [one for one in said if isinstance(one, Refuted)]
+    assert [one.setting for one in told] == ["clocks.drift_max_ppm"]
+    assert told[0].t_ns < START_NS + 48 * S
+    texts = [one.text for one in said if isinstance(one, Notice)]
+    assert any("comes 15.0 s later than before: that is taken for a leap" in text for text in texts)

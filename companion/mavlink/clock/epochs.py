@@ -51,11 +51,13 @@ class Placed(NamedTuple):
     x_ns      the sender's time since boot, unwrapped
     new_line  True for the first stamp on a new line
     rebooted  True if the new line was begun by a reboot
+    leapt_ns  by how much a new line is higher than the one before, else; 0 otherwise
     """
 
     x_ns: int
     new_line: bool = False
     rebooted: bool = False
+    leapt_ns: int = 0
 
 
 @dataclass(slots=True)
@@ -228,14 +230,16 @@ class BootLine:
         stamps = list(self._run.stamps)
         self._run.stamps.clear()
         self._rival.stamps.clear()
-        self._previous = (self.floor, stamps[0][0])
+        before = self.floor
+        self._previous = (before, stamps[0][0])
         self.floor = Floor(*self._shape)
         x_ns = stamps[0][1] * _NS_PER_MS if rebooted else self.newest_ns
         for arrival_ns, boot_ms in stamps:
             x_ns = _unwrap(boot_ms, x_ns)
             self.floor.add(x_ns, arrival_ns - x_ns)
         self.newest_ns = x_ns
-        return Placed(x_ns, new_line=True, rebooted=rebooted)
+        leapt_ns = 0 if rebooted else self.floor.at(x_ns) - before.at(x_ns)
+        return Placed(x_ns, True, rebooted, leapt_ns)
 
 
 def _unwrap(boot_ms: int, newest_ns: int) -> int:

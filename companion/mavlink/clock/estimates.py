@@ -108,8 +108,10 @@ class ClockChange:
                late by that much, by the clock or by the link
     step_s     by how much, seconds
     drift_ppm  drift that this amounts to; inf where it is too quick for a drift
+    leapt      whether it is more than any frame is taken to be late: the clock's, by assumption
     """
 
     proven: bool
     step_s: float
     drift_ppm: float
+    leapt: bool = False

@@ -88,7 +88,7 @@ class SenderClock:
         if placed.new_line:
             self._timesync.clear()
             self.forget_gnss()
-        self._note_change()
+        self._note_change(placed.leapt_ns)
         latency_s = max(0.0, (arrival_ns - self.node_ns(placed.x_ns)) * 1e-9)
         if placed.x_ns == self._line.newest_ns:
             self._latency_s = latency_s
@@ -100,10 +100,10 @@ class SenderClock:
         if self._line.notice(arrival_ns, boot_ms):
             self._note_change()
 
-    def _note_change(self) -> None:
-        rose_ns = self._line.floor.rose_ns
+    def _note_change(self, leapt_ns: int = 0) -> None:
+        rose_ns = leapt_ns or self._line.floor.rose_ns
         if rose_ns:
-            self.change = ClockChange(False, rose_ns * 1e-9, math.inf)
+            self.change = ClockChange(False, rose_ns * 1e-9, math.inf, leapt=leapt_ns != 0)
 
     def is_shared(self, arrival_ns: int) -> bool:
         """Whether two clocks go on side by side, which means that two senders share this id."""

@@ -185,7 +185,7 @@ class BootLine:
             self._run.stamps.clear()
         elif (
             x_ns < self.newest_ns
-            and boot_ms * _NS_PER_MS < self._late_max_ns
+            and x_ns < self._late_max_ns  # of the boot, not of a wrap
             and self._run.add(arrival_ns, boot_ms, _NS)
             and self._run.lasts(5, _NS)
         ):

@@ -187,6 +187,15 @@ def test_the_wrap_is_neither_a_reboot_nor_a_leap() -> None:
     assert all(s is not None and s.latency_s == 0.0 for s in stamps)
 
 
+def test_a_link_that_lags_by_seconds_is_no_reboot_after_the_wrap() -> None:
+    """The stamps are those of the first seconds of a boot, but the boot was 49.7 days ago."""
+    fast = [(at, boot % WRAP_MS) for at, boot in run(0, WRAP_MS - 10_000, 75)]
+    slow = [(at, boot % WRAP_MS) for at, boot in run(4_001, WRAP_MS - 9_999, 100)]
+    stamps = observe_all(sorted([*fast, *slow]))
+    assert not reboots(stamps)
+    assert None not in stamps
+
+
 def test_a_late_frame_from_before_the_wrap() -> None:
     stamps = observe_all([(0, WRAP_MS - 1_000), (1_500, 500), (1_600, WRAP_MS - 700), (1_700, 700)])
     assert not reboots(stamps)

@@ -35,6 +35,8 @@ VELOCITY_SHARE = 0.5
 
 Over equal intervals the error then has the eigenvalues 0 and 1 - share.
 """
+SHOWN_S = 0.1
+"""Interval below which positions show less of a velocity, as their noise would be one of km/s."""
 
 
 def deadbeat(interval_s: float) -> Gain:
@@ -170,7 +172,7 @@ class KinematicObserver:
             return self.model.gain(t)
         if state.interval_s is None:
             return 1.0, 0.0, 0.0, 0.0
-        rate = VELOCITY_SHARE / state.interval_s
+        rate = VELOCITY_SHARE / max(state.interval_s, SHOWN_S)
         return 1.0 + rate * t, 0.0, rate, 0.0
 
     def after(self, state: KinematicState, predicted: Prediction, fix: Fix) -> KinematicState:

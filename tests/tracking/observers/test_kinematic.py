@@ -299,6 +299,15 @@ def test_without_reported_velocity_it_is_learned_from_positions(fix: MakeFix) ->
     assert np.array(missing[2:]) / missing[1:-1] == pytest.approx(0.5)
 
 
+def test_two_positions_at_nearly_the_same_time_show_no_great_velocity(fix: MakeFix) -> None:
+    """Two receivers that differ by 3 m, 1 ms apart: that is not 1500 m/s."""
+    observer, state = observing(), None
+    for at_ns, north in ((0, 0.0), (S, 10.0), (S + S // 1000, 13.0)):
+        state = advance(state, fix(at_ns, [north, 0.0, 0.0]), observer)
+    found = observer.predict(state, 2 * S)
+    assert float(np.linalg.norm(found.velocity_ned_mps)) < 30.0
+
+
 @pytest.mark.parametrize("gap_s", [20.0, 60.0])
 def test_over_a_long_gap_the_greatest_speed_says_more(fix: MakeFix, gap_s: float) -> None:
     """Its own way and that of the prediction, however much it might have gained speed."""

@@ -150,11 +150,11 @@ def phases_rad(
     cones = np.minimum(cones, across.most)
     width = cones.max(axis=1)
     shapes = across.shapes
-    most = None if likely is None else np.minimum(likely, cones)
+    within = None if likely is None else np.minimum(likely, cones)
     if len(across.axes) == 1:
-        (psi,) = _psi(shapes, cones, most, len(across.placed), floor_db, worth_db)
+        (psi,) = _psi(shapes, cones, within, len(across.placed), floor_db, worth_db)
         return np.asarray(2 * np.pi * cones * (psi @ across.knots))
-    usual = None if most is None else most.max(axis=1, keepdims=True)
+    usual = None if within is None else within.max(axis=1, keepdims=True)
     (psi,) = _psi(shapes, width[:, np.newaxis], usual, len(across.placed), floor_db, worth_db)
     shares = cones / np.maximum(width, 1e-300)[:, np.newaxis]
     shares = np.sqrt(np.maximum(shares, LEAST_SHARE))
@@ -163,7 +163,7 @@ def phases_rad(
     if far.any():
         line = _table("line")
         # What a product of lines pays for a floor, it pays on both axes: more than it is worth.
-        each = _psi(line, cones, most, len(across.placed), -math.inf, worth_db)
+        each = _psi(line, cones, within, len(across.placed), -math.inf, worth_db)
         sides = [_on_line(line, one, across.placed[:, d]) for d, one in enumerate(each)]
         lines = sum(cones[:, d, np.newaxis] * side for d, side in enumerate(sides))
         found = (1 - far) * found + far * lines

@@ -56,9 +56,10 @@ function nodeItem(one) {
   return item;
 }
 
-function trafficOf({ sent_bps: sent, heard_bps: heard, damaged }) {
+function trafficOf({ sent_bps: sent, heard_bps: heard, damaged, untold }) {
   const parts = [`tells ${format.bitsPerSecond(sent)}`, `hears ${format.bitsPerSecond(heard)}`];
   if (damaged) parts.push(`▲ ${format.count(damaged)} damaged`);
+  if (untold) parts.push(`▲ ${format.count(untold)} untold`);
   return parts.join(" · ");
 }
 

@@ -46,6 +46,11 @@ def fleet_metrics(node: Node) -> Iterator[Metric]:
     yield CounterMetricFamily(
         "companion_fleet_damaged", "Samples of other nodes that were none", value=status.damaged
     )
+    yield CounterMetricFamily(
+        "companion_fleet_untold",
+        "Frames that nobody was told of, for want of room",
+        value=member.sharing.untold,
+    )
     ways = GaugeMetricFamily(
         "companion_fleet_way_p99_seconds",
         "How long frames of another node are on their way, 99 of 100 at most",

@@ -389,6 +389,7 @@ class Fleet(BaseModel):
     sent_bps: float | None
     heard_bps: float | None
     damaged: int
+    untold: int
 
 
 class Replay(BaseModel):

@@ -93,6 +93,7 @@ def fleet(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Json:
             "sent_bps": None,
             "heard_bps": None,
             "damaged": 0,
+            "untold": 0,
         }
     member = status.member
     return {
@@ -113,6 +114,7 @@ def fleet(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Json:
         "sent_bps": status.sent_bps,
         "heard_bps": status.heard_bps,
         "damaged": status.damaged,
+        "untold": member.sharing.untold,
     }
 
 

@@ -2,13 +2,14 @@
 
 An array sees a direction by its cosines on the axes of its aperture. Those of a cone about a
 direction are an interval on each axis: a line sees no more of it, and of a plane's the ellipse in
-these intervals is taken. Elements on a grid answer everywhere by one Fourier transform; others are
-asked in a few directions. What is sampled here steers how much nulls may cost; what is promised is
-proven in ``worth.guarantee``.
+these intervals is taken. Elements on a grid are asked at places that lie alike about each predicted
+direction: turned to look there, what all weights radiate to them is one product of matrices on each
+axis. Others are asked in a few directions. What is sampled here steers how much nulls may cost;
+what is promised is proven in ``worth.guarantee``.
 """
 
 import functools
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -21,7 +22,7 @@ from companion.beams.weights.shapes import Aperture
 from companion.values import BoolArray, ComplexArray, FloatArray, IntArray
 
 FINER: Final = 6
-"""Samples in each natural width of a line."""
+"""Places in each natural width of a line."""
 FINER_IN_PLANE: Final = 4
 """The same on each axis of a plane."""
 RINGS: Final = 4
@@ -30,10 +31,10 @@ RINGS: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """Cones by the cosines to the axes of an aperture, (N, D) each.
+    """Cones of K sizes about N directions, by the cosines to the axes of an aperture.
 
-    seen             of the predicted direction
-    lowest, highest  the ends of the interval
+    seen             (N, D), of the predicted direction
+    lowest, highest  (K, N, D), the ends of the interval
     """
 
     seen: FloatArray
@@ -55,9 +56,9 @@ class Seen:
 
 
 def seen_within(across: Aperture, directions: FloatArray, angles_rad: FloatArray) -> Seen:
-    """The cones within angles (N,) of unit directions (N, 3)."""
-    cosines = np.clip(directions @ across.axes.T, -1.0, 1.0)
-    angle, wide = np.arccos(cosines), angles_rad[:, np.newaxis]
+    """The cones within angles (K, N) of unit directions (N, 3)."""
+    cosines = np.minimum(np.maximum(directions @ across.axes.T, -1.0), 1.0)
+    angle, wide = np.arccos(cosines), angles_rad[:, :, np.newaxis]
     lowest = np.cos(np.minimum(angle + wide, np.pi))
     highest = np.cos(np.maximum(angle - wide, 0.0))
     return Seen(cosines, np.minimum(lowest, cosines), np.maximum(highest, cosines))
@@ -67,118 +68,94 @@ def seen_within(across: Aperture, directions: FloatArray, angles_rad: FloatArray
 class Cones:
     """Where N beams are looked at, at P places each.
 
-    grid     rows and columns of elements, and of the Fourier transform; None: ``vectors`` are asked
+    turns    (M, N), phase factors that turn all beams to one direction, on a grid
+    waves    what elements on each axis (n, P_d) radiate to places about it; empty elsewhere
     vectors  (N, P, M), steering vectors of the places; empty on a grid
-    held     (N, P), whether a place is within the cone over which the least gain counts
-    likely   (N, P), whether it is within that of the likely angle
+    inside   (2, N, P), whether a place is within the cone over which the least gain counts, and
+             within that of the likely angle
     """
 
-    grid: tuple[tuple[int, int], tuple[int, int]] | None
+    turns: ComplexArray
+    waves: tuple[ComplexArray, ...]
     vectors: ComplexArray
-    held: BoolArray
-    likely: BoolArray
+    inside: BoolArray
 
     def fields(self, weights: ComplexArray) -> ComplexArray:
         """What each column (M, N) radiates to its user's places, (N, P)."""
-        if self.grid is None:
+        if not self.waves:
             found: ComplexArray = np.einsum("npm,mn->np", self.vectors, weights)
             return found
-        placed, asked = self.grid
-        if placed[0] == 1:
-            line: ComplexArray = np.fft.ifft(weights.T, asked[1], axis=1, norm="forward")
+        turned = (weights * self.turns).T
+        if len(self.waves) == 1:
+            line: ComplexArray = turned @ self.waves[0]
             return line
-        stood = weights.T.reshape(-1, *placed)
-        plane: ComplexArray = np.fft.ifft2(stood, asked, norm="forward").reshape(len(stood), -1)
+        along, down = self.waves
+        stood = turned.reshape(-1, len(down), len(along))
+        plane: ComplexArray = (down.T @ (stood @ along)).reshape(len(stood), -1)
         return plane
 
     def of(self, users: IntArray) -> "Cones":
         """The cones of some of the users."""
-        vectors = self.vectors if self.grid is not None else self.vectors[users]
-        return Cones(self.grid, vectors, self.held[users], self.likely[users])
+        vectors = self.vectors if self.waves else self.vectors[users]
+        return Cones(self.turns[:, users], self.waves, vectors, self.inside[:, users])
 
 
 def cones(
-    array: Array, across: Aperture, directions: FloatArray, held: Seen, likely: Seen
+    array: Array, across: Aperture, directions: FloatArray, seen: Seen, centres: ComplexArray
 ) -> Cones:
-    """Where the beams towards unit directions (N, 3) are looked at."""
+    """Where the beams towards unit directions (N, 3) are looked at.
+
+    ``seen`` has the cones of the bound and of the likely angle; ``centres`` (M, N) are the steering
+    vectors of the directions.
+    """
     apart = array.element_from_array is not None and array.element.pattern is not Pattern.ISOTROPIC
     if array.grid is None or apart or array.coupling is not None:
-        return _asked(array, across, directions, held, likely)
-    nothing: ComplexArray = np.empty((0, 0, 0), dtype=complex)
-    rows, columns = array.grid
-    finer = FINER if min(array.grid) == 1 else FINER_IN_PLANE
-    asked = tuple(_fast_length(finer * n) if n > 1 else 1 for n in (rows, columns))
-    on = _on_line if min(array.grid) == 1 else _on_grid
-    near = on(array, across, (held, likely), asked)
-    return Cones((array.grid, (asked[0], asked[1])), nothing, near[0], near[1])
-
-
-@functools.cache
-def _fast_length(least: int) -> int:
-    """The first length from ``least`` on that a Fourier transform is fast for: 2, 3 and 5 make it.
-
-    ``scipy.fft`` would know one, and brings all that ``lapack`` does without.
-    """
-    length = least
-    while True:
-        rest = length
-        for prime in (2, 3, 5):
-            while rest % prime == 0:
-                rest //= prime
-        if rest == 1:
-            return length
-        length += 1
-
-
-def _on_line(
-    array: Array, across: Aperture, seen: Sequence[Seen], asked: tuple[int, ...]
-) -> BoolArray:
-    """Which places of the Fourier transform are in K times N intervals, (K, N, P).
-
-    Half a place more at both ends, so that the nearest place is always in it.
-    """
-    bins = max(asked)
-    places = bins * across.lengths_m / (array.wavelength_m * array.size)
-    middles = np.concatenate([one.middles for one in seen]) * places
-    halves = np.concatenate([one.halves for one in seen]) * places + 0.5
-    lowest = (middles - halves) % bins
-    highest = lowest + 2.0 * halves
-    place = np.arange(bins)
-    inside: BoolArray = (place >= lowest) & (place <= highest)
-    inside |= place <= highest - bins  # round the end, as a Fourier transform goes
-    return inside.reshape(len(seen), -1, bins)
-
-
-def _on_grid(
-    array: Array, across: Aperture, seen: Sequence[Seen], asked: tuple[int, ...]
-) -> BoolArray:
-    """Which places of the Fourier transform are in K times N cones, (K, N, P)."""
-    assert array.grid is not None
+        return _asked(array, across, directions, seen)
     wide = across.lengths_m / array.wavelength_m
-    middles = np.concatenate([one.middles for one in seen]) * wide
-    halves = np.concatenate([one.halves for one in seen]) * wide
-    off = np.zeros((len(middles), 1))
-    # The axes are y and z; the places are those of z by those of y.
-    for d, axis in reversed(list(enumerate(across.axes))):
-        place = 1 if axis[1] else 0
-        count, bins = array.grid[place], asked[place]
-        apart = np.arange(bins) * (count / bins) - middles[:, d, np.newaxis]
-        apart -= count * np.rint(apart / count)
-        apart /= (halves[:, d] + 0.5 * count / bins)[:, np.newaxis]
-        apart *= apart
-        off = (off[:, :, np.newaxis] + apart[:, np.newaxis]).reshape(len(apart), -1)
-    inside: BoolArray = off <= np.maximum(off.min(axis=1, keepdims=True), 1.0)
-    return inside.reshape(len(seen), -1, inside.shape[1])
+    furthest = (seen.furthest * wide).max(axis=(0, 1))
+    middles, halves = (seen.middles - seen.seen) * wide, seen.halves * wide
+    finer = FINER if len(across.axes) == 1 else FINER_IN_PLANE
+    waves, off = [], np.zeros((*middles.shape[:2], 1))
+    for d, axis in enumerate(across.axes):
+        count = array.grid[1 if axis[1] else 0]
+        most = finer * count // 2
+        reach = min(math.ceil(furthest[d] * finer), most)
+        waves.append(_waves(count, finer, reach))
+        beside = np.arange(-reach, reach + 1) / finer - middles[:, :, d, np.newaxis]
+        if reach == most:  # round the end, as the field goes
+            beside -= count * np.rint(beside / count)
+        # Half a place more, so that the nearest place is always in it.
+        beside /= (halves[:, :, d] + 0.5 / finer)[:, :, np.newaxis]
+        beside *= beside
+        # The axes are y and z; the places are those of z by those of y.
+        off = (beside[:, :, :, np.newaxis] + off[:, :, np.newaxis]).reshape(*off.shape[:2], -1)
+    inside = off <= np.maximum(off.min(axis=2, keepdims=True), 1.0)
+    turns = centres / np.maximum(np.abs(centres).max(axis=0), 1e-300)
+    nothing: ComplexArray = np.empty((0, 0, 0), dtype=complex)
+    return Cones(turns, tuple(waves), nothing, inside)
 
 
-def _asked(
-    array: Array, across: Aperture, directions: FloatArray, held: Seen, likely: Seen
-) -> Cones:
+def _waves(count: int, finer: int, reach: int) -> ComplexArray:
+    """What elements radiate, (count, 2 reach + 1), to places ``finer`` to a natural width."""
+    longest = 1 << max(reach - 1, 0).bit_length()
+    return _all_waves(count, finer, longest)[:, longest - reach : longest + reach + 1]
+
+
+@functools.lru_cache(maxsize=16)
+def _all_waves(count: int, finer: int, reach: int) -> ComplexArray:
+    placed = (np.arange(count) - (count - 1) / 2) / count
+    places = np.arange(-reach, reach + 1) / finer
+    waves: ComplexArray = np.exp(2j * np.pi * np.outer(placed, places))
+    return waves
+
+
+def _asked(array: Array, across: Aperture, directions: FloatArray, seen: Seen) -> Cones:
     """Steering vectors of directions in rings about each predicted one, out to either cone."""
     users = len(directions)
-    wide = np.arccos(np.clip(held.seen - held.halves, -1, 1)) - np.arccos(held.seen)
+    held, likely = seen.halves
+    wide = np.arccos(np.clip(seen.seen - held, -1, 1)) - np.arccos(seen.seen)
     reach = np.abs(wide).max(axis=1)
-    inner = np.arcsin(np.clip(likely.halves.max(axis=1), 0.0, 1.0))
+    inner = np.arcsin(np.clip(likely.max(axis=1), 0.0, 1.0))
     ring = np.repeat(np.arange(1, RINGS + 1), 6 * np.arange(1, RINGS + 1))
     turn = np.concatenate([np.arange(6 * n) * (np.pi / (3 * n)) for n in range(1, RINGS + 1)])
     share = np.concatenate([[0.0], ring / RINGS, ring / RINGS])
@@ -194,14 +171,19 @@ def _asked(
     towards = np.cos(angles)[:, :, np.newaxis] * directions[:, np.newaxis]
     towards = towards + np.sin(angles)[:, :, np.newaxis] * aside
     vectors = steering_matrix(array, towards.reshape(-1, 3)).T.reshape(users, len(share), -1)
-    inside = np.ones((users, len(share)), dtype=bool)
-    return Cones(None, vectors, inside, inside & from_likely)
+    inside = np.ones((2, users, len(share)), dtype=bool)
+    inside[1] = from_likely
+    nothing: ComplexArray = np.empty((0, users), dtype=complex)
+    return Cones(nothing, (), vectors, inside)
 
 
-def outside(across: Aperture, held: Seen, around: FloatArray, wavelength_m: float) -> FloatArray:
-    """How far directions (P, 3) are outside of cones (N,), in natural widths, (P, N); 0 within."""
+def outside(across: Aperture, seen: Seen, around: FloatArray, wavelength_m: float) -> FloatArray:
+    """How far directions (P, 3) are outside of the first of K cones, in natural widths, (P, N).
+
+    0 within.
+    """
     cosines = (around @ across.axes.T)[:, np.newaxis]
-    beyond = np.maximum(np.maximum(held.lowest - cosines, cosines - held.highest), 0.0)
+    beyond = np.maximum(np.maximum(seen.lowest[0] - cosines, cosines - seen.highest[0]), 0.0)
     beyond *= across.lengths_m / wavelength_m
     found: FloatArray = np.sqrt(np.einsum("pnd,pnd->pn", beyond, beyond))
     return found

@@ -25,7 +25,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from companion.beams.weights.widening import Spread
-from companion.values import BoolArray, ComplexArray, FloatArray, IntArray
+from companion.values import BoolArray, ComplexArray, FloatArray
 
 PRICE: Final = 0.2
 """Gain, over the gain that is left, that one null may cost: 0.8 dB."""
@@ -69,14 +69,10 @@ def nulled(spread: Spread, noise: FloatArray | None = None, exact: bool = False)
     users, each = spread.beams.shape[1], spread.each
     if users == 1:
         return Nulled(spread.beams.copy(), np.ones(1, dtype=bool))
-    places = _places(spread)
-    fields = spread.cones.fields(spread.beams)[places.rows, places.columns]
+    fields, inside = spread.cones.fields(spread.beams), spread.cones.inside
     power = _power(spread.beams)
-    gains = _squared(fields) / power[places.rows]
-    kept, inner = (
-        _kept(places.least(gains, inside), spread.worth) for inside in (places.held, places.likely)
-    )
-    shares = _shares(spread, kept, power)
+    kept = _kept(_least(_squared(fields) / power[:, np.newaxis], inside), spread.worth)
+    shares = _shares(spread, kept[0], power)
     if exact:
         shares[::each] = 1.0
     own = np.arange(users)
@@ -88,37 +84,15 @@ def nulled(spread: Spread, noise: FloatArray | None = None, exact: bool = False)
     whole = np.asarray(dark.all(axis=0))
     if exact:
         return Nulled(spread.beams - taken, whole)
-    least = np.where(places.held, kept[places.rows], 0.0)
-    least = np.where(places.likely, np.maximum(least, inner[places.rows]), least)
-    back = _back(spread, taken, places, (fields, power), least)
+    least = np.where(inside, kept[:, :, np.newaxis], 0.0).max(axis=0)
+    back = _back(spread, taken, (fields, power), least)
     return Nulled(spread.beams - back * taken, whole & (back >= 1.0))
 
 
-class _Places(NamedTuple):
-    """The P places that are looked at, user by user: rows and columns of what ``Cones`` answers.
-
-    starts  (N,), where each user's begin
-    held    whether a place is within the cone over which the least gain counts
-    likely  whether it is within that of the likely angle
-    """
-
-    rows: IntArray
-    columns: IntArray
-    starts: IntArray
-    held: BoolArray
-    likely: BoolArray
-
-    def least(self, values: FloatArray, inside: BoolArray) -> FloatArray:
-        """The least (N,) of what each user's places have, of those inside."""
-        least: FloatArray = np.minimum.reduceat(np.where(inside, values, np.inf), self.starts)
-        return least
-
-
-def _places(spread: Spread) -> _Places:
-    held, likely = spread.cones.held, spread.cones.likely
-    rows, columns = np.nonzero(held | likely)
-    starts = np.searchsorted(rows, np.arange(len(held)))
-    return _Places(rows, columns, starts, held[rows, columns], likely[rows, columns])
+def _least(values: FloatArray, inside: BoolArray) -> FloatArray:
+    """The least of what each user's places have (N, P), of those inside (..., N, P): (..., N)."""
+    least: FloatArray = np.where(inside, values, np.inf).min(axis=-1)
+    return least
 
 
 def _squared(values: ComplexArray) -> FloatArray:
@@ -181,13 +155,9 @@ def _taken(spread: Spread, wanted: ComplexArray, noise: FloatArray | None) -> Co
 
 
 def _back(
-    spread: Spread,
-    taken: ComplexArray,
-    places: _Places,
-    known: tuple[ComplexArray, FloatArray],
-    least: FloatArray,
+    spread: Spread, taken: ComplexArray, known: tuple[ComplexArray, FloatArray], least: FloatArray
 ) -> FloatArray:
-    """The share (N,) of the nulls up to which every place has its least gain (P,).
+    """The share (N,) of the nulls up to which every place has its least gain (N, P); 0: any.
 
     With the share t of what is taken, the gain at a place is a ratio of two quadratics in t,
 
@@ -196,15 +166,15 @@ def _back(
     and where it is the least gain, a t^2 - 2 b t + c = 0. ``known`` is what the beams radiate to
     the places, and their squared lengths.
     """
-    rows, beams, (fields, power) = places.rows, spread.beams, known
-    less = spread.cones.fields(taken)[rows, places.columns]
+    beams, (fields, power) = spread.beams, known
+    less = spread.cones.fields(taken)
     crossed = (beams.real * taken.real + beams.imag * taken.imag).sum(axis=0)
-    a = _squared(less) - least * _power(taken)[rows]
-    b = fields.real * less.real + fields.imag * less.imag - least * crossed[rows]
-    c = np.maximum(_squared(fields) - least * power[rows], 0.0)
+    a = _squared(less) - least * _power(taken)[:, np.newaxis]
+    b = fields.real * less.real + fields.imag * less.imag - least * crossed[:, np.newaxis]
+    c = np.maximum(_squared(fields) - least * power[:, np.newaxis], 0.0)
     # Without nulls there is enough, c >= 0. The first root above 0, in the form that never cancels.
     inside = np.sqrt(np.maximum(b * b - a * c, 0.0))
-    short = (b * b > a * c) & ((b > 0) | (a < 0))
+    short = (b * b > a * c) & ((b > 0) | (a < 0)) & (least > 0)
     first = np.where(b > 0, c, inside - b) / np.where(short, np.where(b > 0, b + inside, -a), 1.0)
-    back: FloatArray = np.minimum(places.least(first, short), 1.0)
+    back: FloatArray = np.minimum(_least(first, short), 1.0)
     return back

@@ -99,38 +99,35 @@ def spread(array: Array, directions: FloatArray, known: Uncertain, widen: Widen)
     if widen is Widen.NO:
         return None
     across = shapes.aperture(array)
-    likely_rad = np.minimum(known.likely_rad, WIDEST_RAD)
-    held = cones.seen_within(across, directions, np.minimum(known.bounds_rad, WIDEST_RAD))
-    likely = cones.seen_within(across, directions, likely_rad)
-    around = _around(array, across, directions, likely_rad)
+    angles_rad = np.minimum(np.array([known.bounds_rad, known.likely_rad]), WIDEST_RAD)
+    seen = cones.seen_within(across, directions, angles_rad)
+    around = _around(array, across, directions, angles_rad[1])
     each = around.shape[1]
     around = around.reshape(-1, 3)
     points = steering_matrix(array, around)
     if widen is Widen.LIKELY:
-        cone, usual = (
-            seen.furthest * across.lengths_m / array.wavelength_m for seen in (held, likely)
-        )
+        cone, usual = seen.furthest * (across.lengths_m / array.wavelength_m)
         phases = shapes.phases_rad(across, cone, usual, known.floor_db, known.worth_db)
     else:
-        phases = _for_the_bound_rad(array, across, held)
-    turned = np.exp(1j * phases.T)
-    beams = points[:, ::each].conj() * turned
+        phases = _for_the_bound_rad(array, across, seen)
+    turned, centres = np.exp(1j * phases.T), points[:, ::each]
+    beams = centres.conj() * turned
     return Spread(
         beams,
         np.abs(turned.mean(axis=0)) ** 2 < BROADENED,
         points,
         points.T @ points.conj(),
         points.T @ beams,
-        cones.outside(across, held, around, array.wavelength_m),
-        cones.cones(array, across, directions, held, likely),
+        cones.outside(across, seen, around, array.wavelength_m),
+        cones.cones(array, across, directions, seen, centres),
         10 ** (known.worth_db / 10),
     )
 
 
-def _for_the_bound_rad(array: Array, across: shapes.Aperture, held: Seen) -> FloatArray:
+def _for_the_bound_rad(array: Array, across: shapes.Aperture, seen: Seen) -> FloatArray:
     """Phases (N, M) for the bound alone: each beam looks at the middle of what is seen of it."""
-    shaped = shapes.phases_rad(across, held.halves * across.lengths_m / array.wavelength_m, None)
-    aside = (held.middles - held.seen) @ (array.centred_m @ across.axes.T).T
+    shaped = shapes.phases_rad(across, seen.halves[0] * across.lengths_m / array.wavelength_m, None)
+    aside = (seen.middles[0] - seen.seen) @ (array.centred_m @ across.axes.T).T
     found: FloatArray = shaped - array.wavenumber_radpm * aside
     return found
 

@@ -24,6 +24,7 @@ FADES: Final = 0.999
 SPEAKS_AFTER: Final = 2
 """Reports in a row that nobody else told, after which this node speaks for the vehicle."""
 HELD_MAX: Final = 20_000
+"""Frames held back, frames to be told and round trips to be told, of each at most."""
 AT_ONCE: Final = 500
 """Most frames, and most round trips, that are told at once; the others come with the next word."""
 
@@ -49,23 +50,28 @@ class _Held(NamedTuple):
 
 
 class Sharing:
-    """Decides what is told. ``name`` is this node's."""
+    """Decides what is told. ``name`` is this node's.
+
+    ``untold`` counts frames and round trips that nobody was told of, for want of room.
+    """
 
     def __init__(self, name: str) -> None:
+        self.untold = 0
         self._name = name
         self._voices: dict[Source, _Voice] = {}
         self._hold_ns: float = HOLD_NS[0]
         self._held: deque[_Held] = deque()
         self._by_others = Recent()
         self._by_me = Recent()
-        self._frames: deque[SharedFrame] = deque(maxlen=HELD_MAX)
-        self._trips: deque[RoundTrip] = deque(maxlen=HELD_MAX)
+        self._frames: deque[SharedFrame] = deque()
+        self._trips: deque[RoundTrip] = deque()
 
     def heard(self, frame: Frame, key: bytes) -> None:
         """Take in a frame heard here, with its content."""
         voice = self._voices.get(frame.source)
         if voice is None:
             if len(self._voices) >= VEHICLES_MAX:
+                self.untold += 1
                 return
             voice = self._voices.setdefault(frame.source, _Voice(frame.t_ns))
         voice.heard_ns = frame.t_ns
@@ -73,14 +79,14 @@ class Sharing:
             self._tell(frame.t_ns, key, frame)
         elif key in self._by_others:
             voice.late = 0
-        elif frame.msgid == GLOBAL_POSITION_INT and len(self._held) < HELD_MAX:
-            self._held.append(_Held(frame.t_ns + round(self._hold_ns), key, frame))
+        elif frame.msgid == GLOBAL_POSITION_INT:
+            self._wait(self._held, _Held(frame.t_ns + round(self._hold_ns), key, frame))
 
     def answered(self, trip: RoundTrip) -> None:
         """Take in a round trip with a vehicle for which this node speaks."""
         voice = self._voices.get(trip.source)
         if voice is not None and voice.mine:
-            self._trips.append(trip)
+            self._wait(self._trips, trip)
 
     def told(self, now_ns: int, node: str, source: Source, key: bytes, way_ns: int) -> None:
         """Take in that another node told a report, and for how long that was on its way at most."""
@@ -128,7 +134,14 @@ class Sharing:
 
     def _tell(self, now_ns: int, key: bytes, frame: Frame) -> None:
         self._by_me.note(now_ns, key)
-        self._frames.append(SharedFrame(frame.t_ns, frame.raw))
+        self._wait(self._frames, SharedFrame(frame.t_ns, frame.raw))
+
+    def _wait(self, waiting: deque[_T], one: _T) -> None:
+        """Let one more wait; where there is no room the oldest is given up."""
+        if len(waiting) >= HELD_MAX:
+            waiting.popleft()
+            self.untold += 1
+        waiting.append(one)
 
 
 def _first(waiting: deque[_T]) -> tuple[_T, ...]:

@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import common
 from companion.mavlink.trust.dedupe import content
 from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
 from companion.pipeline.fleet.hearing import VEHICLES_MAX
-from companion.pipeline.fleet.sharing import AT_ONCE, HOLD_NS, Sharing
+from companion.pipeline.fleet.sharing import AT_ONCE, HELD_MAX, HOLD_NS, Sharing
 from companion.values import Frame, RoundTrip, Source
 
 MS = 1_000_000
@@ -129,6 +129,22 @@ def test_a_burst_is_told_in_several_words_and_all_of_it() -> None:
     assert len(counts) == 3
 
 
+def test_what_waits_too_long_is_given_up_oldest_first_and_counted() -> None:
+    sharing = Sharing("a")
+    for number in range(HELD_MAX + 3):
+        frame = report(number, number)
+        sharing.heard(frame, content(frame.raw))
+    assert sharing.untold == 3
+    said = sharing.due(10 * S)
+    assert said is not None
+    assert struct.unpack_from("<I", said.frames[0].raw, 10)[0] == 3
+    told = len(said.frames)
+    while (said := sharing.due(10 * S)) is not None:
+        told += len(said.frames)
+    assert told == HELD_MAX
+    assert sharing.untold == 3
+
+
 def test_vehicles_of_yesterday_make_room_for_those_of_today() -> None:
     sharing = Sharing("a")
     for number in range(VEHICLES_MAX):
@@ -141,6 +157,7 @@ def test_vehicles_of_yesterday_make_room_for_those_of_today() -> None:
         frame = report(3600 * S + number * S, 1000 * number, late)
         sharing.heard(frame, content(frame.raw))
     assert sharing.due(3610 * S) is None  # no room
+    assert sharing.untold == 2
     sharing.forget(3620 * S, 600 * S)
     frame = report(3620 * S, 9000, late)
     sharing.heard(frame, content(frame.raw))

@@ -1,0 +1,92 @@
+"""Where beams are looked at: against steering vectors of directions worked out one by one."""
+
+import math
+
+import numpy as np
+import pytest
+
+from companion.beams.array.elements import Element, Pattern
+from companion.beams.array.geometry import Array, uniform_linear, uniform_rectangular
+from companion.beams.array.steering import steering_matrix
+from companion.beams.weights import shapes
+from companion.beams.weights.cones import FINER, FINER_IN_PLANE, Cones, cones, seen_within
+from companion.values import FloatArray
+
+EYE = np.eye(3)
+GRIDS = {
+    "line": uniform_linear(16, 30e9, 0.5, EYE),
+    "odd line": uniform_linear(15, 30e9, 0.4, EYE),
+    "square": uniform_rectangular(6, 6, 30e9, 0.5, EYE),
+    "oblong": uniform_rectangular(3, 8, 30e9, 0.5, EYE),
+    "patches": uniform_linear(16, 30e9, 0.5, EYE, element=Element(Pattern.COSINE)),
+}
+DIRECTIONS = np.array([[0.8, 0.6, 0.0], [0.6, -0.48, 0.64], [1.0, 0.0, 0.0]])
+
+
+def looked_at(array: Array, angles_deg: list[list[float]]) -> Cones:
+    across = shapes.aperture(array)
+    seen = seen_within(across, DIRECTIONS, np.radians(angles_deg))
+    return cones(array, across, DIRECTIONS, seen, steering_matrix(array, DIRECTIONS))
+
+
+def offsets(array: Array, found: Cones) -> list[FloatArray]:
+    """The places of each axis, as cosines beside the predicted direction's."""
+    finer = FINER if len(found.waves) == 1 else FINER_IN_PLANE
+    across = shapes.aperture(array)
+    reaches = [wave.shape[1] // 2 for wave in found.waves]
+    return [
+        np.arange(-reach, reach + 1) / finer * array.wavelength_m / across.lengths_m[d]
+        for d, reach in enumerate(reaches)
+    ]
+
+
+@pytest.mark.parametrize("array", GRIDS.values(), ids=GRIDS.keys())
+@pytest.mark.parametrize("wide_deg", [0.0, 3.0, 20.0, 90.0])
+def test_fields_are_what_elements_radiate_there(array: Array, wide_deg: float) -> None:
+    found = looked_at(array, [[wide_deg, wide_deg / 2, 1.0], [0.5, 0.5, 0.0]])
+    rng = np.random.default_rng(1)
+    weights = rng.normal(size=(array.size, 3)) + 1j * rng.normal(size=(array.size, 3))
+    fields = found.fields(weights)
+    across = shapes.aperture(array)
+    beside = np.meshgrid(*reversed(offsets(array, found)), indexing="ij")
+    aside = np.stack([one.ravel() for one in reversed(beside)], axis=1)
+    for user, direction in enumerate(DIRECTIONS):
+        cosines = across.axes @ direction + aside
+        phases = array.wavenumber_radpm * (array.centred_m @ across.axes.T) @ cosines.T
+        expected = np.abs(weights[:, user] @ np.exp(1j * phases))
+        assert np.abs(fields[user]) == pytest.approx(expected, abs=1e-8)
+
+
+@pytest.mark.parametrize("array", GRIDS.values(), ids=GRIDS.keys())
+@pytest.mark.parametrize("wide_deg", [0.0, 3.0, 20.0, 90.0])
+def test_places_are_all_over_the_cone_and_hardly_beyond(array: Array, wide_deg: float) -> None:
+    angles_deg = [[wide_deg, wide_deg / 2, 1.0], [0.5, 0.5, 0.0]]
+    found = looked_at(array, angles_deg)
+    beside = offsets(array, found)
+    step = [one[1] - one[0] if len(one) > 1 else 2.0 for one in beside]
+    axes = shapes.aperture(array).axes
+    grid = np.meshgrid(*reversed(beside), indexing="ij")
+    places = np.stack([one.ravel() for one in reversed(grid)], axis=1)
+    period = [array.wavelength_m / spacing for spacing in spacings(array)]
+    rng = np.random.default_rng(2)
+    for size, angles in enumerate(np.radians(angles_deg)):
+        for user, direction in enumerate(DIRECTIONS):
+            inside = places[found.inside[size, user]]
+            off = angles[user] * np.sqrt(rng.uniform(0, 1, 300))[:, np.newaxis]
+            aside = np.cross(direction, rng.normal(size=(300, 3)))
+            aside /= np.linalg.norm(aside, axis=1)[:, np.newaxis]
+            crowd = (np.cos(off) * direction + np.sin(off) * aside - direction) @ axes.T
+            apart = crowd[:, np.newaxis] - inside
+            apart -= period * np.rint(apart / period)
+            nearest = (np.abs(apart) / step).max(axis=2).min(axis=1)
+            # Of a plane's cone the ellipse in its intervals is taken, which may be a little less.
+            assert nearest.max() < (0.5 + 1e-9 if len(axes) == 1 else 1.6 + 0.05 * wide_deg)
+            reach = 2 * math.sin(angles[user] / 2) + np.array(step)
+            apart = inside - period * np.rint(inside / period)
+            assert (np.abs(apart) <= reach + 1e-9).all()
+
+
+def spacings(array: Array) -> list[float]:
+    across = shapes.aperture(array)
+    counts = [max(array.grid or ())] if len(across.axes) == 1 else list(array.grid or ())[::-1]
+    return [float(length / count) for length, count in zip(across.lengths_m, counts, strict=True)]

@@ -25,6 +25,8 @@ FINER: Final = 6
 """Places in each natural width of a line."""
 FINER_IN_PLANE: Final = 4
 """The same on each axis of a plane."""
+EDGE: Final = 0.25
+"""By how many places a place may be beyond a cone and count."""
 RINGS: Final = 4
 """Rings of directions in which other arrays are asked."""
 
@@ -124,8 +126,8 @@ def cones(
         beside = np.arange(-reach, reach + 1) / finer - middles[:, :, d, np.newaxis]
         if reach == most:  # round the end, as the field goes
             beside -= count * np.rint(beside / count)
-        # Half a place more, so that the nearest place is always in it.
-        beside /= (halves[:, :, d] + 0.5 / finer)[:, :, np.newaxis]
+        # A little more, as edges lie between places.
+        beside /= (halves[:, :, d] + EDGE / finer)[:, :, np.newaxis]
         beside *= beside
         # The axes are y and z; the places are those of z by those of y.
         off = (beside[:, :, :, np.newaxis] + off[:, :, np.newaxis]).reshape(*off.shape[:2], -1)

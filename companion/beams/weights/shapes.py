@@ -154,19 +154,21 @@ def phases_rad(
     if len(across.axes) == 1:
         (psi,) = _psi(shapes, cones, within, len(across.placed), floor_db, worth_db)
         return np.asarray(2 * np.pi * cones * (psi @ across.knots))
-    usual = None if within is None else within.max(axis=1, keepdims=True)
-    (psi,) = _psi(shapes, width[:, np.newaxis], usual, len(across.placed), floor_db, worth_db)
-    shares = cones / np.maximum(width, 1e-300)[:, np.newaxis]
-    shares = np.sqrt(np.maximum(shares, LEAST_SHARE))
-    found = width[:, np.newaxis] * _on_square(shapes, psi, across.placed * shares[:, np.newaxis])
     far = np.interp(np.log(np.maximum(width, 1e-9)), np.log(FAR), (0.0, 1.0))[:, np.newaxis]
+    found = np.zeros((len(cones), len(across.placed)))
+    if (far < 1).any():
+        usual = None if within is None else within.max(axis=1, keepdims=True)
+        (psi,) = _psi(shapes, width[:, np.newaxis], usual, len(across.placed), floor_db, worth_db)
+        shares = cones / np.maximum(width, 1e-300)[:, np.newaxis]
+        shares = np.sqrt(np.maximum(shares, LEAST_SHARE))
+        square = _on_square(shapes, psi, across.placed * shares[:, np.newaxis])
+        found += (1 - far) * width[:, np.newaxis] * square
     if far.any():
         line = _table("line")
         # What a product of lines pays for a floor, it pays on both axes: more than it is worth.
         each = _psi(line, cones, within, len(across.placed), -math.inf, worth_db)
         sides = [_on_line(line, one, across.placed[:, d]) for d, one in enumerate(each)]
-        lines = sum(cones[:, d, np.newaxis] * side for d, side in enumerate(sides))
-        found = (1 - far) * found + far * lines
+        found += far * sum(cones[:, d, np.newaxis] * side for d, side in enumerate(sides))
     return np.asarray(2 * np.pi * found)
 
 

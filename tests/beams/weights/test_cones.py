@@ -9,7 +9,7 @@ from companion.beams.array.elements import Element, Pattern
 from companion.beams.array.geometry import Array, uniform_linear, uniform_rectangular
 from companion.beams.array.steering import steering_matrix
 from companion.beams.weights import shapes
-from companion.beams.weights.cones import FINER, FINER_IN_PLANE, Cones, cones, seen_within
+from companion.beams.weights.cones import EDGE, FINER, FINER_IN_PLANE, Cones, cones, seen_within
 from companion.values import FloatArray
 
 EYE = np.eye(3)
@@ -80,7 +80,7 @@ def test_places_are_all_over_the_cone_and_hardly_beyond(array: Array, wide_deg: 
             apart -= period * np.rint(apart / period)
             nearest = (np.abs(apart) / step).max(axis=2).min(axis=1)
             # Of a plane's cone the ellipse in its intervals is taken, which may be a little less.
-            assert nearest.max() < (0.5 + 1e-9 if len(axes) == 1 else 1.6 + 0.05 * wide_deg)
+            assert nearest.max() < (1 - EDGE + 1e-9 if len(axes) == 1 else 1.6 + 0.05 * wide_deg)
             reach = 2 * math.sin(angles[user] / 2) + np.array(step)
             apart = inside - period * np.rint(inside / period)
             assert (np.abs(apart) <= reach + 1e-9).all()

@@ -221,7 +221,10 @@ def _out_of_reach(
     if coverage != EVERYWHERE:
         reasons = refusals(coverage, directions, directions @ array.array_from_body)
     if array.element.pattern is not Pattern.ISOTROPIC:
-        dark = steering.amplitudes(array, directions).max(axis=0) < DARK
+        amplitudes = steering.amplitudes(array, directions)
+        if array.live is not None:  # those that face there may be those that are dead
+            amplitudes = amplitudes * array.live[:, np.newaxis]
+        dark = amplitudes.max(axis=0) < DARK
         reasons = [
             why or ("its elements radiate nothing there" if none else None)
             for why, none in zip(reasons, dark.tolist(), strict=True)

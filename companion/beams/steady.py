@@ -106,9 +106,9 @@ def followed_rad(
         return wanted_rad
     passed_s = min(abs(valid_at_ns - before.valid_at_ns) * 1e-9, FOLLOWED_S)
     last = np.array([before.shaped.get(uav, (np.nan, np.nan)) for uav in uavs])
-    last = np.maximum(last, LEAST_WIDTHS * natural_rad)
+    begin = np.maximum(last, LEAST_WIDTHS * natural_rad)
     widths_rad = natural_rad * passed_s
-    further = np.minimum(last * (PACE**passed_s - 1), GROWN_WIDTHS * widths_rad)
+    further = begin - last + np.minimum(begin * (PACE**passed_s - 1), GROWN_WIDTHS * widths_rad)
     nearer = np.minimum(last * (1 - PACE**-passed_s), SHRUNK_WIDTHS * widths_rad)
     held = [abs(valid_at_ns - before.filled_ns.get(uav, valid_at_ns)) < HELD_NS for uav in uavs]
     nearer[held, 1] = np.minimum(nearer[held, 1], HELD_WIDTHS * widths_rad)

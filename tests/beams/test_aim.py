@@ -14,7 +14,7 @@ from companion.beams.aim import aim, directions, without
 from companion.beams.array import steering
 from companion.beams.array.coverage import Coverage, Sector
 from companion.beams.array.elements import Element, Pattern
-from companion.beams.array.geometry import Array, listed, uniform_linear
+from companion.beams.array.geometry import Array, listed, uniform_circular, uniform_linear
 from companion.beams.weights.precoding import Precoder
 from companion.values import (
     Beam,
@@ -300,6 +300,17 @@ def test_behind_an_element_that_radiates_forward_there_is_no_beam() -> None:
     assert found.method is Method.ZERO_FORCING
     (out,) = found.left_out
     assert (out.uav, out.reason) == ("behind", "its elements radiate nothing there")
+
+
+def test_where_all_elements_that_face_a_uav_are_dead_there_is_no_beam() -> None:
+    ring = uniform_circular(8, 5e9, 0.5, EYE, Element(Pattern.COSINE))
+    array = replace(ring, live=np.isin(np.arange(8), (3, 4, 5)))
+    tracks = [track("ahead", (100, 0, 0)), track("behind", (-100, 20, 0))]
+    for widen in Widen:
+        found = aim(7, 9, tracks, carrier(), array, Precoder(widen=widen))
+        assert found.uavs == ("behind",)
+        (out,) = found.left_out
+        assert (out.uav, out.reason) == ("ahead", "its elements radiate nothing there")
 
 
 @pytest.mark.parametrize("policy", Policy)

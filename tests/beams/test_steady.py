@@ -71,6 +71,17 @@ def test_in_the_end_the_shape_is_the_one_that_is_wanted() -> None:
     assert made[1].beams[0].pointing_bound_rad == pytest.approx(math.asin(0.3))
 
 
+@pytest.mark.parametrize("widen", [Widen.LIKELY, Widen.GUARANTEE])
+def test_a_uav_that_is_known_exactly_keeps_its_narrow_shape(widen: Widen) -> None:
+    """Narrower than what shapes anything: a width is 1/32 rad."""
+    made = flown([0.3] * 5 + [0.5] * 20 + [0.3] * 20, Precoder(widen=widen))
+    for tick, bound_m in ((4, 0.3), (24, 0.5), (44, 0.3)):
+        wanted = math.asin(bound_m / 100)
+        assert made[tick].beams[0].shaped_bound_rad == pytest.approx(wanted)
+    gains = [each.beams[0].gain_db for each in made]
+    assert np.abs(np.diff(gains)).max() < 0.1
+
+
 def test_once_a_uav_is_known_well_its_beam_soon_promises() -> None:
     """After it was known nowhere near, and after it was not known at all: within eight seconds."""
     for before_m in (99.0, 1000.0):

@@ -26,6 +26,8 @@ DUAL_ROUNDS: Final = 24
 """Most rounds in which beams are made anew."""
 ENOUGH: Final = 1e-4
 """Relative change of powers at which a search ends."""
+ROUNDING: Final = 1e-13
+"""Least loading, over the greatest power: what rounding leaves of vectors that are alike."""
 LEAST_SHARE: Final = 1e-4
 """Least share of the equal power that a user keeps, so that each beam is one."""
 
@@ -83,10 +85,8 @@ def dual_of_max_min(gram: ComplexArray, snr: FloatArray) -> FloatArray:
 
 def _alone(gram: ComplexArray, snr: FloatArray, share: FloatArray) -> FloatArray:
     """SINR (N,) of each user for a power of 1 while the others keep their shares."""
-    loaded = gram.copy()
-    loaded.flat[:: len(loaded) + 1] += 1.0 / (snr * share)
     # x [(K + X)^-1]_ii is the mean square error, 1 / (1 + SINR).
-    error = np.linalg.inv(loaded).diagonal().real / (snr * share)
+    error = _inverse(gram, 1.0 / (snr * share)).diagonal().real / (snr * share)
     found: FloatArray = np.maximum(1.0 / np.maximum(error, 1e-15) - 1.0, 1e-15) / share
     return found
 
@@ -109,22 +109,29 @@ def dual_of_weighted_sum(gram: ComplexArray, snr: FloatArray, worths: FloatArray
         weight = worths / np.maximum(1.0 - (receiver * own).real, 1e-12)
         pull = weight * np.abs(receiver) ** 2
         found = np.maximum(pull / pull.sum(), LEAST_SHARE / len(snr))
-        loaded = channel.T.copy()
-        loaded.flat[:: len(loaded) + 1] += 1.0 / found
-        made = np.linalg.inv(loaded) * (weight * receiver.conj() / np.maximum(pull, 1e-300))
-        made /= np.sqrt(_power(channel, made))
+        scale = weight * receiver.conj() / np.maximum(pull, 1e-300)
+        made = _inverse(channel.T, 1.0 / found) * scale
+        power = _power(channel, made)
         done = np.abs(found - share).max() <= ENOUGH * found.max()
         share = found
-        if done:
+        if done or not power > 0.0:  # rounding alone tells them apart: no beams to go on from
             break
+        made /= np.sqrt(power)
     return share
+
+
+def _inverse(gram: ComplexArray, loading: FloatArray) -> ComplexArray:
+    """(K + X)^-1 for a loading X (N,)."""
+    loaded = gram.copy()
+    least = ROUNDING * float(gram.diagonal().real.max())
+    loaded.flat[:: len(loaded) + 1] += np.maximum(loading, least)
+    found: ComplexArray = np.linalg.inv(loaded)
+    return found
 
 
 def _beams(channel: ComplexArray, share: FloatArray) -> ComplexArray:
     """Coefficients Z (N, N) of beams H* Z of the least mean square error, of equal powers."""
-    loaded = channel.T.copy()
-    loaded.flat[:: len(loaded) + 1] += 1.0 / share
-    made = np.linalg.inv(loaded)
+    made = _inverse(channel.T, 1.0 / share)
     lengths = np.einsum("in,ij,jn->n", made.conj(), channel.T, made).real
     found: ComplexArray = made / np.sqrt(np.maximum(lengths, 1e-300) * len(share))
     return found

@@ -113,3 +113,19 @@ def test_mmse_has_a_greater_sum_of_rates_than_zero_forcing(users: int, snr_db: f
 def test_without_a_radio_there_is_no_mmse() -> None:
     with pytest.raises(ValueError, match="radio"):
         precode(steering(1, 8, 2), Precoder(Method.MMSE))
+
+
+@pytest.mark.parametrize("power", Power)
+@pytest.mark.parametrize("snr_db", [0.0, 60.0, 120.0, 200.0])
+def test_channels_that_are_alike_are_shared_at_any_power(power: Power, snr_db: float) -> None:
+    """Two in one direction and two behind one another's mirror, and more than elements."""
+    rng = np.random.default_rng(3)
+    for users in (4, 12):
+        sines = rng.uniform(-0.9, 0.9, users)
+        sines[1] = sines[0]
+        a = np.exp(1j * np.pi * np.outer(np.arange(8), sines))
+        snr = 10 ** (snr_db / 10) * 10 ** rng.uniform(-3, 3, users)
+        how = Precoder(Method.MMSE, normalisation=Normalisation.TOTAL, widen=Widen.NO, power=power)
+        weights = precode(a, how, None, None, Radio(snr, np.ones(users))).weights
+        assert np.isfinite(weights).all()
+        assert (np.abs(weights) ** 2).sum() == pytest.approx(1.0)

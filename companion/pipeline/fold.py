@@ -15,7 +15,7 @@ Over 300 lines: every event comes in here, and every look goes out.
 
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Final
 
@@ -253,6 +253,13 @@ class Pipeline:
 
     def look(self, now_ns: int, lead_s: float = 0.0) -> Update:
         """Targets and beams at the actuation delay plus ``lead_s`` from now. Changes nothing."""
+        return self.sighted(now_ns, lead_s)()
+
+    def sighted(self, now_ns: int, lead_s: float = 0.0) -> Callable[[], Update]:
+        """What ``look`` makes of all as it is now: predictions, made at once, and then the beams.
+
+        Those are made when it is called, at any later time, on any thread.
+        """
         delay_s = self.settings.beams.actuation_delay_s + lead_s
         valid_at_ns = now_ns + round(delay_s * 1e9)
         tracks = self._tracks(self.targets.among(self.tracker.uavs), now_ns, valid_at_ns)
@@ -260,10 +267,14 @@ class Pipeline:
         known, unfit = (None, found) if isinstance(found, str) else (found, None)
         parts = (self.array, self.precoder, self.coverage, self._steady)
         spared = self._spared(now_ns, valid_at_ns, known)
-        beams = aim(now_ns, valid_at_ns, [*tracks, *spared], known, *parts)
-        if spared:
-            beams = without(beams, {track.uav for track in spared})
-        return Update(now_ns, known, unfit, tuple(tracks), beams)
+
+        def made() -> Update:
+            beams = aim(now_ns, valid_at_ns, [*tracks, *spared], known, *parts)
+            if spared:
+                beams = without(beams, {track.uav for track in spared})
+            return Update(now_ns, known, unfit, tuple(tracks), beams)
+
+        return made
 
     def _spared(self, now_ns: int, valid_at_ns: int, carrier: Carrier | None) -> list[Track]:
         """UAVs of other nodes that the beams spare: the nearest, as many as cost little.

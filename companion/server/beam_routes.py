@@ -76,14 +76,14 @@ def add(app: FastAPI, node: Node, turns: Turns) -> None:
         uav: Only = None,
         lead_ms: LeadMs = 0.0,
     ) -> Response:
-        served = moments.look(lead_ms).beams.uavs
-        if uav is not None and uav not in served:
-            raise HTTPException(404, f"there is no beam on {uav!r}")
-        shown = 1 if uav is not None else len(served)
-        if shown * points > MOST_ANGLES:
-            raise HTTPException(422, f"{shown} beams at {points} angles: say uav, or fewer points")
-
         def make(update: Update) -> bytes:
+            served = update.beams.uavs
+            if uav is not None and uav not in served:
+                raise HTTPException(404, f"there is no beam on {uav!r}")
+            shown = 1 if uav is not None else len(served)
+            if shown * points > MOST_ANGLES:
+                wanted = f"{shown} beams at {points} angles"
+                raise HTTPException(422, f"{wanted}: say uav, or fewer points")
             return encode(beam_state.pattern(pipeline, update, cut, points, uav, lead_ms))
 
         return as_json(await moments.made(lead_ms, (cut, points, uav), make))

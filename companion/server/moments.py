@@ -1,10 +1,12 @@
 """Answers about beams, made once for all who ask for the same moment.
 
 Moments are ``EVERY_NS`` apart. Who asks between two of them is answered for the next one: beams are
-never for a time that has passed, and at most that much later than asked for.
+never for a time that has passed, and at most that much later than asked for. On the event loop UAVs
+are predicted, as all is known there; the rest is done off it, in turn.
 """
 
 import asyncio
+import threading
 from collections.abc import Callable, Hashable
 from typing import Any, Final, TypeVar
 
@@ -25,37 +27,52 @@ class Moments:
         self._node = node
         self._turns = turns
         self._moment = 0
-        self._updates: dict[float, Update] = {}
+        self._looks: dict[float, Callable[[], Update]] = {}
         self._answers: dict[tuple[float, Hashable], asyncio.Task[Any]] = {}
 
-    def look(self, lead_ms: float) -> Update:
-        """The beams that are applied ``lead_ms`` from the moment."""
+    async def made(self, lead_ms: float, what: Hashable, make: Callable[[Update], T]) -> T:
+        """``make`` of the beams that are applied ``lead_ms`` from the moment, on another thread.
+
+        Unless it was made before: ``what`` names it among all that is made of the same beams.
+        Raises what ``make`` raises, and ``HTTPException`` 503 where too many ask for different
+        things.
+        """
         now_ns = self._node.now_ns()
         moment = -(-now_ns // EVERY_NS)
         if moment != self._moment:
             self._moment = moment
-            self._updates.clear()
+            self._looks.clear()
             self._answers.clear()
-        found = self._updates.get(lead_ms)
-        if found is None:
-            lead_s = (moment * EVERY_NS - now_ns) * 1e-9 + lead_ms * 1e-3
-            found = self._updates[lead_ms] = self._node.pipeline.look(now_ns, lead_s)
-        return found
-
-    async def made(self, lead_ms: float, what: Hashable, make: Callable[[Update], T]) -> T:
-        """``make`` of these beams, on another thread unless it was made before.
-
-        ``what`` names it among all that is made of the same beams. Raises what ``make`` raises, and
-        ``HTTPException`` 503 where too many ask for different things.
-        """
-        update = self.look(lead_ms)
         task = self._answers.get((lead_ms, what))
         if task is None:
-            task = asyncio.create_task(self._turns.run(lambda: make(update)))
+            self._turns.refuse_if_full()  # before anything is predicted
+            look = self._look(now_ns, moment * EVERY_NS - now_ns, lead_ms)
+            task = asyncio.create_task(self._turns.run(lambda: make(look())))
             task.add_done_callback(_seen)
             self._answers[lead_ms, what] = task
         found: T = await asyncio.shield(task)  # one who leaves does not take it from the others
         return found
+
+    def _look(self, now_ns: int, until_ns: int, lead_ms: float) -> Callable[[], Update]:
+        """What makes the beams that are applied ``lead_ms`` from the moment, once for all."""
+        found = self._looks.get(lead_ms)
+        if found is None:
+            lead_s = until_ns * 1e-9 + lead_ms * 1e-3
+            found = self._looks[lead_ms] = _once(self._node.pipeline.sighted(now_ns, lead_s))
+        return found
+
+
+def _once(make: Callable[[], T]) -> Callable[[], T]:
+    """What ``make`` makes, for whichever thread asks first; the others wait and have it too."""
+    lock, made = threading.Lock(), list[T]()
+
+    def found() -> T:
+        with lock:
+            if not made:
+                made.append(make())
+            return made[0]
+
+    return found
 
 
 def _seen(task: asyncio.Task[Any]) -> None:

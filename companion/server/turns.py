@@ -22,10 +22,14 @@ class Turns:
         self._free = asyncio.Semaphore(at_once)
         self._room = at_once + waiting
 
-    async def run(self, work: Callable[[], T]) -> T:
-        """Do the work on another thread, in turn. Raises ``HTTPException`` 503."""
+    def refuse_if_full(self) -> None:
+        """Raise ``HTTPException`` 503 where there is no room to wait."""
         if self._room == 0:
             raise HTTPException(503, "too many ask at once", {"retry-after": "1"})
+
+    async def run(self, work: Callable[[], T]) -> T:
+        """Do the work on another thread, in turn. Raises ``HTTPException`` 503."""
+        self.refuse_if_full()
         self._room -= 1
         try:
             async with self._free:

@@ -260,9 +260,9 @@ def test_a_pattern_of_everything_is_not_drawn(
     with TestClient(create_app(node), "http://localhost") as client:
         assert client.get("/v1/pattern?points=3601").status_code == 200
         monkeypatch.setattr("companion.server.beam_routes.MOST_ANGLES", 14_000)
-        told = client.get("/v1/pattern?points=3601")
+        told = client.get("/v1/pattern?points=3600")
         assert told.status_code == 422
-        assert told.json()["title"] == "4 beams at 3601 angles: say uav, or fewer points"
+        assert told.json()["title"] == "4 beams at 3600 angles: say uav, or fewer points"
         assert client.get("/v1/pattern?points=3601&uav=1:1").status_code == 200
 
 

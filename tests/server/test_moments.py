@@ -2,9 +2,11 @@
 
 import asyncio
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import pytest
+from starlette.exceptions import HTTPException
 
 from companion.server.moments import EVERY_NS, Moments
 from companion.server.turns import Turns
@@ -16,14 +18,19 @@ pytestmark = pytest.mark.anyio
 @pytest.fixture
 def moments(shared_node: Any, monkeypatch: pytest.MonkeyPatch) -> Moments:
     shared_node.looks = []
-    look = shared_node.pipeline.look
+    sighted = shared_node.pipeline.sighted
 
-    def counted(now_ns: int, lead_s: float = 0.0) -> Update:
-        shared_node.looks.append(lead_s)
-        found: Update = look(now_ns, lead_s)
-        return found
+    def counted(now_ns: int, lead_s: float = 0.0) -> Callable[[], Update]:
+        made = sighted(now_ns, lead_s)
 
-    monkeypatch.setattr(shared_node.pipeline, "look", counted)
+        def counted_too() -> Update:
+            shared_node.looks.append(threading.current_thread())
+            found: Update = made()
+            return found
+
+        return counted_too
+
+    monkeypatch.setattr(shared_node.pipeline, "sighted", counted)
     return Moments(shared_node, Turns())
 
 
@@ -48,12 +55,28 @@ async def test_many_who_ask_at_once_share_one_answer(moments: Moments, shared_no
 async def test_the_next_moment_is_made_anew(
     moments: Moments, shared_node: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = moments.look(0.0)
-    assert moments.look(0.0) is first
+    first = await moments.made(0.0, "beams", lambda update: update)
+    assert await moments.made(0.0, "others", lambda update: update) is first
     later_ns = shared_node.now_ns() + EVERY_NS
     monkeypatch.setattr(shared_node, "now_ns", lambda: later_ns)
-    second = moments.look(0.0)
+    second = await moments.made(0.0, "beams", lambda update: update)
     assert second.beams.valid_at_ns - first.beams.valid_at_ns == EVERY_NS
+
+
+async def test_beams_are_made_off_the_event_loop(moments: Moments, shared_node: Any) -> None:
+    """For any number of leads: what they cost is paid in turns."""
+    await asyncio.gather(*(moments.made(lead, "npy", lambda update: update) for lead in range(20)))
+    assert len(shared_node.looks) == 20
+    assert threading.current_thread() not in shared_node.looks
+
+
+async def test_who_finds_no_room_costs_no_prediction(
+    shared_node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shared_node.pipeline, "sighted", lambda *_: pytest.fail("predicted"))
+    with pytest.raises(HTTPException) as refused:
+        await Moments(shared_node, Turns(0, 0)).made(0.0, "npy", lambda update: update)
+    assert refused.value.status_code == 503
 
 
 async def test_one_who_leaves_does_not_take_the_answer_from_the_others(moments: Moments) -> None:

@@ -44,8 +44,11 @@ class Evidence:
     carrier_assumed: bool = False
 
 
-def of_left_out(out: LeftOut, track: Track, unfit: str | None) -> Blame:
-    """Why a UAV has no beam. ``unfit`` is what keeps everybody from having one."""
+def of_left_out(out: LeftOut, track: Track | None, unfit: str | None) -> Blame:
+    """Why a UAV has no beam. ``unfit`` is what keeps everybody from having one.
+
+    ``track`` is None where there are too many for all to be looked at.
+    """
     if unfit is not None:
         return Blame(
             Cause.CARRIER, unfit, "see what carries the array: is it powered, heard, with a fix?"
@@ -53,8 +56,10 @@ def of_left_out(out: LeftOut, track: Track, unfit: str | None) -> Blame:
     match out.cause:
         case Cause.CROWDED:
             remedy = 'fly them apart, or set [beams] policy = "group"'
-        case Cause.SILENT:
+        case Cause.SILENT if track is not None:
             return _silent(track)
+        case Cause.MACHINE:
+            remedy = "name it in [beams] priority, or raise [beams] most"
         case _:
             remedy = "turn the array or its carrier, or fly elsewhere"
     return Blame(out.cause, out.reason, remedy)

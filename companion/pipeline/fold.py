@@ -16,6 +16,7 @@ Over 300 lines: every event comes in here, and every look goes out.
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import partial
 from typing import Final
 
@@ -38,6 +39,7 @@ from companion.settings.model import Settings
 from companion.tracking.geodesy import LocalFrame
 from companion.values import (
     Carrier,
+    Cause,
     ClockSet,
     Duty,
     Estimate,
@@ -45,6 +47,7 @@ from companion.values import (
     Event,
     FloatArray,
     Frame,
+    LeftOut,
     Notice,
     Output,
     Reason,
@@ -262,7 +265,8 @@ class Pipeline:
         """
         delay_s = self.settings.beams.actuation_delay_s + lead_s
         valid_at_ns = now_ns + round(delay_s * 1e9)
-        tracks = self._tracks(self.targets.among(self.tracker.uavs), now_ns, valid_at_ns)
+        seated, others = self._seated(now_ns)
+        tracks = self._tracks(seated, now_ns, valid_at_ns)
         found = self.carrier(now_ns, valid_at_ns)
         known, unfit = (None, found) if isinstance(found, str) else (found, None)
         parts = (self.array, self.precoder, self.coverage, self._steady)
@@ -272,9 +276,27 @@ class Pipeline:
             beams = aim(now_ns, valid_at_ns, [*tracks, *spared], known, *parts)
             if spared:
                 beams = without(beams, {track.uav for track in spared})
+            if others:
+                beams = replace(beams, left_out=(*beams.left_out, *others))
             return Update(now_ns, known, unfit, tuple(tracks), beams)
 
         return made
+
+    def _seated(self, now_ns: int) -> tuple[list[str], list[LeftOut]]:
+        """The targets that are looked at, and those for whom there is no room.
+
+        Those of priority come first, then those that are heard, then who was here first.
+        """
+        wanted, most = self.targets.among(self.tracker.uavs), self.settings.beams.most
+        if len(wanted) <= most:
+            return wanted, []
+        first = frozenset(self.settings.beams.priority)
+        silent = frozenset(self.tracker.silent(now_ns, self.settings.tracks.lost_s))
+        ranked = sorted(wanted, key=lambda uav: (uav not in first, uav in silent))
+        why = f"{most} others have beams, which is the most"
+        seated = frozenset(ranked[:most])
+        left = [LeftOut(uav, Cause.MACHINE, why) for uav in ranked[most:]]
+        return [uav for uav in wanted if uav in seated], left
 
     def _spared(self, now_ns: int, valid_at_ns: int, carrier: Carrier | None) -> list[Track]:
         """UAVs of other nodes that the beams spare: the nearest, as many as cost little.

@@ -94,7 +94,8 @@ class Health:
         chosen, self._waiting = self._waiting[:many], self._waiting[many:]
         fresh |= self._of_beams(update, tracks, frozenset(chosen), evidence)
         held = self.verdicts | {uav: self._settled(verdict) for uav, verdict in fresh.items()}
-        self.verdicts = {uav: held[uav] for uav in tracks if uav in held}
+        names = dict.fromkeys((*tracks, *(out.uav for out in update.beams.left_out)))
+        self.verdicts = {uav: held[uav] for uav in names if uav in held}
         self._unsettled = {uav: kept for uav, kept in self._unsettled.items() if uav in tracks}
         return [] if self._waiting else self._told(update)
 
@@ -211,7 +212,7 @@ def _of_left_out(update: Update, tracks: dict[str, Track]) -> dict[str, Verdict]
         out.uav: Verdict(
             out.uav,
             Level.NONE,
-            blame.of_left_out(out, tracks[out.uav], update.unfit),
+            blame.of_left_out(out, tracks.get(out.uav), update.unfit),
             update.t_ns,
         )
         for out in update.beams.left_out

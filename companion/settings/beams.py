@@ -107,6 +107,8 @@ class BeamSettings(Section):
                            request over HTTP is answered with weights made for its own time
         actuation_delay_s  time from making weights to applying them
         targets            which tracks get beams
+        most               UAVs that have beams at a time, those of ``priority`` first and then who
+                           was here first; others would cost all of them their rate and memory
         method             zero forcing ("zf"), regularised ("rzf"), least mean square error by the
                            link budget ("mmse") or maximum ratio ("mrt")
         regularisation     loading of the regularised method, times the number of elements
@@ -134,6 +136,7 @@ class BeamSettings(Section):
     update_hz: Annotated[float, Field(gt=0, le=1000)] = 10.0
     actuation_delay_s: Annotated[float, Field(ge=0, le=10)] = 0.01
     targets: Literal["telemetry", "all"] = "telemetry"
+    most: Annotated[int, Field(ge=1, le=4096)] = 256
     method: Method = Method.ZERO_FORCING
     policy: Policy = Policy.REGULARISE
     loss_limit_db: Annotated[float, Field(gt=0, le=60)] = 3.0

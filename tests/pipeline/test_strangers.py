@@ -6,10 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import common
 
 from companion.mavlink.trust import admission
 from companion.mavlink.trust.admission import Admission
 from companion.pipeline.center import Center
+from companion.pipeline.fold import Pipeline
 from companion.pipeline.senders import CLOCKS_MAX, PlacedAttitude, Senders
 from companion.settings.model import Settings
 from companion.tracking.observers.position import PositionModel, PositionObserver
@@ -17,8 +19,10 @@ from companion.tracking.tracker import ESTABLISHED, Tracker, TrackerSettings
 from companion.values import (
     AltitudeDatum,
     Attitude,
+    Cause,
     Estimate,
     Fix,
+    Frame,
     GnssStatus,
     Limits,
     Presence,
@@ -27,6 +31,8 @@ from companion.values import (
     Report,
     ReportNoise,
     Source,
+    Tick,
+    Update,
 )
 
 S = 1_000_000_000
@@ -184,3 +190,43 @@ def test_attitudes_that_are_resent_at_once_turn_nothing_back(
     fresh = [attitude(t, t, yaw_rad(t)) for t in range(0, 3000, 100)]
     burst = [attitude(3000 + t // 1000, t, yaw_rad(t)) for t in range(0, 2900, 50)]
     assert set(turning([*fresh, *burst])[-len(burst) :]) == {29.0}
+
+
+# --- seats among the beams ------------------------------------------------------------------------
+
+
+def report(sysid: int, t_s: float) -> Frame:
+    """A UAV that hovers in its own direction from the array."""
+    mav = common.MAVLink(None, srcSystem=sysid, srcComponent=1)
+    angle, t_ms = sysid / 10, round(t_s * 1000)
+    lat, lon = 47.0 + 0.002 * math.cos(angle), 8.0 + 0.003 * math.sin(angle)
+    message = common.MAVLink_global_position_int_message(
+        t_ms, round(lat * 1e7), round(lon * 1e7), 500_000, 0, 0, 0, 0, 0
+    )
+    return Frame(round(t_s * S) + 3 * MS, "udp", Source(sysid, 1), 33, message.pack(mav))
+
+
+def test_beams_are_for_the_first_and_for_those_of_priority() -> None:
+    """However many come; who is lost gives up the seat, and everybody else is told why."""
+    given = {"center": {"source": "47,8,480,0"}, "beams": {"most": 3, "priority": ["90:1"]}}
+    pipeline = Pipeline(Settings().override(**given))
+
+    def flies(from_s: float, to_s: float, sysids: list[int]) -> Update:
+        for tenth in range(round(10 * from_s), round(10 * to_s)):
+            for sysid in sysids:
+                pipeline.step(report(sysid, tenth / 10))
+            pipeline.step(Tick(tenth * 100 * MS + 50 * MS))
+        assert pipeline.last_update is not None
+        return pipeline.last_update
+
+    assert flies(1, 3, [1, 2, 3]).beams.uavs == ("1:1", "2:1", "3:1")
+    update = flies(3, 5, [*range(1, 41), 90])
+    assert update.beams.uavs == ("1:1", "2:1", "90:1")
+    assert {out.uav for out in update.beams.left_out} == {f"{n}:1" for n in range(3, 41)}
+    assert {out.reason for out in update.beams.left_out} == {
+        "3 others have beams, which is the most"
+    }
+    assert {out.cause for out in update.beams.left_out} == {Cause.MACHINE}
+    assert pipeline.health.verdicts["7:1"].blame is not None
+    update = flies(5, 70, [*range(2, 41), 90])  # 1:1 has gone
+    assert update.beams.uavs == ("2:1", "3:1", "90:1")

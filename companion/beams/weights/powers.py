@@ -125,8 +125,7 @@ def _inverse(gram: ComplexArray, loading: FloatArray) -> ComplexArray:
     loaded = gram.copy()
     least = ROUNDING * float(gram.diagonal().real.max())
     loaded.flat[:: len(loaded) + 1] += np.maximum(loading, least)
-    found: ComplexArray = np.linalg.inv(loaded)
-    return found
+    return np.asarray(np.linalg.inv(loaded), dtype=complex)
 
 
 def _beams(channel: ComplexArray, share: FloatArray) -> ComplexArray:

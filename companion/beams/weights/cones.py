@@ -1,11 +1,11 @@
 """Cones of directions as an array sees them, and the least gain of beams over them, sampled.
 
 An array sees a direction by its cosines on the axes of its aperture. Those of a cone about a
-direction are an interval on each axis: a line sees no more of it, and of a plane's the ellipse in
-these intervals is taken. Elements on a grid are asked at places that lie alike about each predicted
-direction: turned to look there, what all weights radiate to them is one product of matrices on each
-axis. Others are asked in a few directions. What is sampled here steers how much nulls may cost;
-what is promised is proven in ``worth.guarantee``.
+direction are an interval on each axis: a line sees no more of it, and a plane an ellipse. Elements
+on a grid are asked at places that lie alike about each predicted direction: turned to look there,
+what all weights radiate to them is one product of matrices on each axis. Others are asked in a few
+directions. What is sampled here steers how much nulls may cost; what is promised is proven in
+``worth.guarantee``.
 """
 
 import functools
@@ -19,14 +19,16 @@ from companion.beams.array.elements import Pattern
 from companion.beams.array.geometry import Array
 from companion.beams.array.steering import steering_matrix
 from companion.beams.weights.shapes import Aperture
-from companion.values import BoolArray, ComplexArray, FloatArray, IntArray
+from companion.values import ComplexArray, FloatArray, IntArray
 
 FINER: Final = 6
 """Places in each natural width of a line."""
-FINER_IN_PLANE: Final = 4
+FINER_IN_PLANE: Final = 8
 """The same on each axis of a plane."""
 EDGE: Final = 0.25
-"""By how many places a place may be beyond a cone and count."""
+"""By how many places a place may be beyond a cone and count half."""
+MOST_INCLINED: Final = 0.95
+"""Inclination beyond which ellipses are no narrower: cones there reach behind the plane."""
 RINGS: Final = 4
 """Rings of directions in which other arrays are asked."""
 
@@ -52,6 +54,18 @@ class Seen:
         return (self.highest - self.lowest) / 2
 
     @property
+    def inclined(self) -> FloatArray:
+        """How inclined the ellipses are as which a plane sees cones, (N,), -1 to 1.
+
+        A cone about u is seen as an ellipse like 1 - u u^T, u cut to the two axes: this is that
+        matrix's coefficient of correlation. 0: parallel to the axes.
+        """
+        y, z = self.seen.T
+        level = np.sqrt(np.maximum((1.0 - y * y) * (1.0 - z * z), 1e-12))
+        inclined: FloatArray = np.clip(-y * z / level, -MOST_INCLINED, MOST_INCLINED)
+        return inclined
+
+    @property
     def furthest(self) -> FloatArray:
         """To the further end, from the predicted direction."""
         return np.maximum(self.highest - self.seen, self.seen - self.lowest)
@@ -73,14 +87,14 @@ class Cones:
     turns    (M, N), phase factors that turn all beams to one direction, on a grid
     waves    what elements on each axis (n, P_d) radiate to places about it; empty elsewhere
     vectors  (N, P, M), steering vectors of the places; empty on a grid
-    inside   (2, N, P), whether a place is within the cone over which the least gain counts, and
-             within that of the likely angle
+    counts   (2, N, P), how much of a least gain is asked at a place: 1 within the cone over which
+             it counts, and within that of the likely angle; about the edge it falls to 0
     """
 
     turns: ComplexArray
     waves: tuple[ComplexArray, ...]
     vectors: ComplexArray
-    inside: BoolArray
+    counts: FloatArray
 
     def fields(self, weights: ComplexArray) -> ComplexArray:
         """What each column (M, N) radiates to its user's places, (N, P)."""
@@ -99,7 +113,7 @@ class Cones:
     def of(self, users: IntArray) -> "Cones":
         """The cones of some of the users."""
         vectors = self.vectors if self.waves else self.vectors[users]
-        return Cones(self.turns[:, users], self.waves, vectors, self.inside[:, users])
+        return Cones(self.turns[:, users], self.waves, vectors, self.counts[:, users])
 
 
 def cones(
@@ -113,28 +127,48 @@ def cones(
     apart = array.element_from_array is not None and array.element.pattern is not Pattern.ISOTROPIC
     if array.grid is None or apart or array.coupling is not None:
         return _asked(array, across, directions, seen)
-    wide = across.lengths_m / array.wavelength_m
+    waves, counts = _about(across, seen, array.grid, array.wavelength_m)
+    turns = centres / np.maximum(np.abs(centres).max(axis=0), 1e-300)
+    nothing: ComplexArray = np.empty((0, 0, 0), dtype=complex)
+    return Cones(turns, tuple(waves), nothing, counts)
+
+
+def _about(
+    across: Aperture, seen: Seen, grid: tuple[int, int], wavelength_m: float
+) -> tuple[list[ComplexArray], FloatArray]:
+    """The places about each predicted direction: their waves on each axis, and how they count."""
+    wide = across.lengths_m / wavelength_m
     furthest = (seen.furthest * wide).max(axis=(0, 1))
     middles, halves = (seen.middles - seen.seen) * wide, seen.halves * wide
     finer = FINER if len(across.axes) == 1 else FINER_IN_PLANE
-    waves, off = [], np.zeros((*middles.shape[:2], 1))
+    waves, sides = list[ComplexArray](), list[FloatArray]()
     for d, axis in enumerate(across.axes):
-        count = array.grid[1 if axis[1] else 0]
+        count = grid[1 if axis[1] else 0]
         most = finer * count // 2
         reach = min(math.ceil(furthest[d] * finer), most)
         waves.append(_waves(count, finer, reach))
-        beside = np.arange(-reach, reach + 1) / finer - middles[:, :, d, np.newaxis]
+        aside = np.arange(-reach, reach + 1) / finer - middles[:, :, d, np.newaxis]
         if reach == most:  # round the end, as the field goes
-            beside -= count * np.rint(beside / count)
-        # A little more, as edges lie between places.
-        beside /= (halves[:, :, d] + EDGE / finer)[:, :, np.newaxis]
-        beside *= beside
-        # The axes are y and z; the places are those of z by those of y.
-        off = (beside[:, :, :, np.newaxis] + off[:, :, np.newaxis]).reshape(*off.shape[:2], -1)
-    inside = off <= np.maximum(off.min(axis=2, keepdims=True), 1.0)
-    turns = centres / np.maximum(np.abs(centres).max(axis=0), 1e-300)
-    nothing: ComplexArray = np.empty((0, 0, 0), dtype=complex)
-    return Cones(turns, tuple(waves), nothing, inside)
+            aside -= count * np.rint(aside / count)
+        aside /= (halves[:, :, d] + EDGE / finer)[:, :, np.newaxis]
+        sides.append(aside)
+    off = np.abs(sides[0]) if len(sides) == 1 else _off_ellipses(sides[0], sides[1], seen.inclined)
+    # Over one place about the edge: no place comes or goes at once.
+    steps = np.maximum(halves.min(axis=2) * finer + EDGE, 0.5)[:, :, np.newaxis]
+    counts = np.minimum(np.maximum(0.5 + steps * (1.0 - off), 0.0), 1.0)
+    counts /= np.maximum(counts.max(axis=2, keepdims=True), 1e-9)
+    return waves, counts
+
+
+def _off_ellipses(along: FloatArray, down: FloatArray, inclined: FloatArray) -> FloatArray:
+    """How far places are off ellipses: 1 on the rim, (K, N, P_1 P_0).
+
+    By the places on the first axis (K, N, P_0) and on the second (K, N, P_1), in half intervals.
+    """
+    y, z = along[:, :, np.newaxis], down[:, :, :, np.newaxis]
+    mixed = inclined[:, np.newaxis, np.newaxis]
+    off = (y * y + z * z - 2.0 * mixed * y * z) / (1.0 - mixed * mixed)
+    return np.asarray(np.sqrt(np.maximum(off, 0.0)).reshape(*off.shape[:2], -1))
 
 
 def _waves(count: int, finer: int, reach: int) -> ComplexArray:
@@ -173,10 +207,10 @@ def _asked(array: Array, across: Aperture, directions: FloatArray, seen: Seen) -
     towards = np.cos(angles)[:, :, np.newaxis] * directions[:, np.newaxis]
     towards = towards + np.sin(angles)[:, :, np.newaxis] * aside
     vectors = steering_matrix(array, towards.reshape(-1, 3)).T.reshape(users, len(share), -1)
-    inside = np.ones((2, users, len(share)), dtype=bool)
-    inside[1] = from_likely
+    counts = np.ones((2, users, len(share)))
+    counts[1] = from_likely
     nothing: ComplexArray = np.empty((0, users), dtype=complex)
-    return Cones(nothing, (), vectors, inside)
+    return Cones(nothing, (), vectors, counts)
 
 
 def outside(across: Aperture, seen: Seen, around: FloatArray, wavelength_m: float) -> FloatArray:

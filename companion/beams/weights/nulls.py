@@ -42,6 +42,8 @@ ABOVE: Final = 1.15
 """Least gain that is kept if it was there, over what is worth keeping: places are samples."""
 GIVEN_UP: Final = 6.0
 """Power of the share of ``ABOVE`` that a lesser least gain is, to which it may fall."""
+SHALLOW: Final = 0.05
+"""Share of what there is to spare by which a dip may reach below what is kept: some .15 dB."""
 NOTHING: Final = 1e-9
 """Least gain that is no gain."""
 NULL_WIDTHS: Final = 1.0
@@ -69,9 +71,11 @@ def nulled(spread: Spread, noise: FloatArray | None = None, exact: bool = False)
     users, each = spread.beams.shape[1], spread.each
     if users == 1:
         return Nulled(spread.beams.copy(), np.ones(1, dtype=bool))
-    fields, inside = spread.cones.fields(spread.beams), spread.cones.inside
+    fields, counts = spread.cones.fields(spread.beams), spread.cones.counts
     power = _power(spread.beams)
-    kept = _kept(_least(_squared(fields) / power[:, np.newaxis], inside), spread.worth)
+    gains = _squared(fields) / power[:, np.newaxis]
+    asked = np.where(counts > 0, gains / np.maximum(counts, NOTHING), np.inf)
+    kept = _kept(asked.min(axis=2), spread.worth)
     shares = _shares(spread, kept[0], power)
     if exact:
         shares[::each] = 1.0
@@ -84,15 +88,9 @@ def nulled(spread: Spread, noise: FloatArray | None = None, exact: bool = False)
     whole = np.asarray(dark.all(axis=0))
     if exact:
         return Nulled(spread.beams - taken, whole)
-    least = np.where(inside, kept[:, :, np.newaxis], 0.0).max(axis=0)
+    least = (counts * kept[:, :, np.newaxis]).max(axis=0)
     back = _back(spread, taken, (fields, power), least)
     return Nulled(spread.beams - back * taken, whole & (back >= 1.0))
-
-
-def _least(values: FloatArray, inside: BoolArray) -> FloatArray:
-    """The least of what each user's places have (N, P), of those inside (..., N, P): (..., N)."""
-    least: FloatArray = np.where(inside, values, np.inf).min(axis=-1)
-    return least
 
 
 def _squared(values: ComplexArray) -> FloatArray:
@@ -173,8 +171,12 @@ def _back(
     b = fields.real * less.real + fields.imag * less.imag - least * crossed[:, np.newaxis]
     c = np.maximum(_squared(fields) - least * power[:, np.newaxis], 0.0)
     # Without nulls there is enough, c >= 0. The first root above 0, in the form that never cancels.
-    inside = np.sqrt(np.maximum(b * b - a * c, 0.0))
-    short = (b * b > a * c) & ((b > 0) | (a < 0)) & (least > 0)
+    depth = b * b - a * c
+    inside = np.sqrt(np.maximum(depth, 0.0))
+    short = (depth > 0) & ((b > 0) | (a < 0)) & (least > 0)
     first = np.where(b > 0, c, inside - b) / np.where(short, np.where(b > 0, b + inside, -a), 1.0)
-    back: FloatArray = np.minimum(_least(first, short), 1.0)
+    # A dip that hardly reaches below is none: it would come and go at once with the directions.
+    reached = np.minimum(depth / np.maximum(SHALLOW * b * b, 1e-300), 1.0)
+    first = 1.0 - (1.0 - np.minimum(first, 1.0)) * reached
+    back: FloatArray = np.where(short, first, 1.0).min(axis=1)
     return back

@@ -112,7 +112,7 @@ class BeamSettings(Section):
         method             zero forcing ("zf"), regularised ("rzf"), least mean square error by the
                            link budget ("mmse") or maximum ratio ("mrt")
         regularisation     loading of the regularised method, times the number of elements
-        loss_limit_db      most that zero forcing may cost any UAV against a beam for it alone
+        loss_limit_db      most that zero forcing may cost any UAV against a sharp beam for it alone
         condition_limit    largest condition number of the steering matrix
         policy             what is done beyond either limit: load as little as will do, serve groups
                            in turns, or drop the UAVs of lowest priority

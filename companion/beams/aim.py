@@ -33,6 +33,7 @@ from companion.values import (
     LeftOut,
     Track,
     TrackState,
+    Widen,
 )
 
 AIMABLE: Final = (TrackState.LIVE, TrackState.COASTING)
@@ -158,7 +159,9 @@ def _beams(
     ]
     wanted = [(0.0, 0.0) if b is None else (u, b) for u, b in zip(usual, bounds, strict=True)]
     natural_rad = array.wavelength_m / max(float(shapes.aperture(array).lengths_m.max()), 1e-9)
-    shaped = steady.followed_rad(before, valid_at_ns, uavs, np.array(wanted), natural_rad)
+    sure_plane = precoder.widen is Widen.GUARANTEE and array.axis is None
+    pace = steady.SURE_PLANE if sure_plane else 1.0
+    shaped = steady.followed_rad(before, valid_at_ns, uavs, np.array(wanted), natural_rad, pace)
     spread = widening.spread(
         array,
         directions,

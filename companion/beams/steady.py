@@ -32,6 +32,11 @@ Over a slow radio a bound grows from report to report and falls with each: a sha
 would change to and fro, and what is wider than it must be still holds.
 """
 HELD_NS: Final = 3_000_000_000
+SURE_PLANE: Final = 1 / 3
+"""Share of the pace for a plane's beams that are shaped for the bound alone.
+
+Of all shapes the greatest least gains of planes change the most from one width to the next.
+"""
 LEAST_WIDTHS: Final = 0.25
 """Angle in natural widths that shapes nothing: where growth by factors begins."""
 MOST_WIDTHS: Final = 16.0
@@ -92,6 +97,7 @@ def followed_rad(
     uavs: list[str],
     wanted_rad: FloatArray,
     natural_rad: float,
+    pace: float = 1.0,
 ) -> FloatArray:
     """Angles (N, 2) for which beams are shaped, at the most so far from the last ones.
 
@@ -100,11 +106,12 @@ def followed_rad(
     uavs         names of the N UAVs
     wanted_rad   (N, 2), their likely angles and their bounds
     natural_rad  the natural width of the array
+    pace         share of the usual pace at which they follow
     """
     wanted_rad = np.minimum(wanted_rad, MOST_WIDTHS * natural_rad)
     if before is None:
         return wanted_rad
-    passed_s = min(abs(valid_at_ns - before.valid_at_ns) * 1e-9, FOLLOWED_S)
+    passed_s = pace * min(abs(valid_at_ns - before.valid_at_ns) * 1e-9, FOLLOWED_S)
     last = np.array([before.shaped.get(uav, (np.nan, np.nan)) for uav in uavs])
     begin = np.maximum(last, LEAST_WIDTHS * natural_rad)
     widths_rad = natural_rad * passed_s

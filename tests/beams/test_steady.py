@@ -8,7 +8,7 @@ import pytest
 
 from companion.beams import steady
 from companion.beams.aim import aim
-from companion.beams.array.geometry import uniform_linear
+from companion.beams.array.geometry import Array, uniform_linear, uniform_rectangular
 from companion.beams.steady import Steady
 from companion.beams.weights.precoding import Precoder
 from companion.values import (
@@ -25,6 +25,7 @@ from companion.values import (
 STILL = np.zeros(3)
 AT = Carrier(0, STILL, STILL, np.eye(3), STILL, 0.0, 0.0, None)
 ARRAY = uniform_linear(64, 30e9, 0.5, np.eye(3))
+PLANE = uniform_rectangular(16, 16, 30e9, 0.5, np.eye(3))
 TICK_NS = 100_000_000
 
 
@@ -36,7 +37,10 @@ def track(uav: str, aside_m: float, bound_m: float) -> Track:
 
 
 def flown(
-    bounds_m: list[float], how: Precoder, apart_m: list[float] | None = None
+    bounds_m: list[float],
+    how: Precoder,
+    apart_m: list[float] | None = None,
+    array: Array = ARRAY,
 ) -> list[BeamSet]:
     """A UAV whose bound changes from tick to tick, and one beside it."""
     state: Steady | None = None
@@ -45,15 +49,18 @@ def flown(
         at_ns = tick * TICK_NS
         aside_m = 60.0 if apart_m is None else apart_m[tick]
         tracks = [track("a", 0.0, bound_m), track("b", aside_m, 0.1)]
-        found.append(aim(at_ns, at_ns, tracks, AT, ARRAY, how, before=state))
+        found.append(aim(at_ns, at_ns, tracks, AT, array, how, before=state))
         state = steady.after(state, found[-1])
     return found
 
 
 @pytest.mark.parametrize("widen", [Widen.LIKELY, Widen.GUARANTEE])
 @pytest.mark.parametrize("bounds_m", [[2.0] + [30.0] * 40, [30.0] + [2.0] * 60, [90.0, 300.0] * 9])
-def test_no_shape_jumps_when_a_report_comes(widen: Widen, bounds_m: list[float]) -> None:
-    made = flown(bounds_m, Precoder(widen=widen))
+@pytest.mark.parametrize("array", [ARRAY, PLANE], ids=["line", "plane"])
+def test_no_shape_jumps_when_a_report_comes(
+    array: Array, widen: Widen, bounds_m: list[float]
+) -> None:
+    made = flown(bounds_m, Precoder(widen=widen), array=array)
     gains = [each.beams[0].gain_db for each in made]
     assert np.abs(np.diff(gains)).max() < 1.5
     for one, other in itertools.pairwise(made):

@@ -33,6 +33,8 @@ from numpy.typing import ArrayLike
 from companion.values import FloatArray, UserError
 
 FORMAT: Final = "kinematic-design-1"
+LARGEST: Final = 1 << 20
+"""Most characters of a design: that of the program has 4500."""
 FINER: Final = 5
 """Intervals that ``verify`` checks for each step of the design's grid."""
 
@@ -98,6 +100,8 @@ class KinematicDesign:
     @classmethod
     def from_json(cls, text: str) -> Self:
         """Read and verify a design. Raises ``DesignError``, which says what is wrong with it."""
+        if len(text) > LARGEST:
+            raise DesignError("not a kinematic design: too large")
         try:
             given: dict[str, Any] = json.loads(text)
             if given.pop("format", None) != FORMAT:
@@ -113,7 +117,9 @@ class KinematicDesign:
             design = cls(**given)
         except DesignError:
             raise
-        except (KeyError, TypeError, AttributeError, ValueError) as error:
+        except RecursionError as error:
+            raise DesignError("not a kinematic design: nested too deeply") from error
+        except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
             raise DesignError(f"not a kinematic design: {error}") from error
         verify(design)
         return design

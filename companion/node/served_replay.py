@@ -30,7 +30,7 @@ from companion.server import area_map
 from companion.server.access import bind
 from companion.settings.model import Settings
 from companion.settings.origins import Origins
-from companion.values import Event, Frame, Notice, Rejection, Tick
+from companion.values import Event, Frame, Notice, Rejection, Tick, printable
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
 from companion.views.series import Series
@@ -84,7 +84,7 @@ def serve(
 
 
 def _say(text: str) -> None:
-    click.echo(text, err=True)
+    click.echo(printable(text), err=True)
 
 
 class ServedReplay:

@@ -2,12 +2,15 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Final
 
 from pydantic import AfterValidator, Field
 
 from companion.settings.section import Section
 from companion.values import Source, UserError
+
+HEIGHT_MAX_M: Final = 1e5
+"""Most that a station may be above or below the sea."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +70,8 @@ def parse_center(text: str) -> CenterPlace:
         raise UserError(f"{text!r} is not LAT,LON,ALT[,HEADING], such as 47.4,8.55,500,90")
     if not (abs(numbers[0]) <= 90 and abs(numbers[1]) <= 180):
         raise UserError(f"{text!r}: latitude is within 90 degrees and longitude within 180")
+    if abs(numbers[2]) > HEIGHT_MAX_M or any(abs(heading) > 360 for heading in numbers[3:]):
+        raise UserError(f"{text!r}: altitude is within 100 km and heading within 360 degrees")
     return FixedCenter(*numbers)
 
 

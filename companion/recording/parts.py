@@ -78,14 +78,21 @@ class Hole(NamedTuple):
         """Read a hole. Raises ``ValueError`` where the metadata describe none."""
         try:
             why = "".join(printable(found["why"][:WHY_MAX]).split("\n"))
-            hole = cls(int(found["t_ns"]), int(found["events"]), why)
+            hole = cls(_whole(found["t_ns"]), _whole(found["events"]), why)
         except KeyError as error:
             raise ValueError(f"a hole without {error}") from None
-        if not 0 <= hole.t_ns < _LATEST_NS:
+        if hole.t_ns >= _LATEST_NS:
             raise ValueError("a hole beyond all time")
-        if not 0 <= hole.events <= EVENTS_MAX:
+        if hole.events > EVENTS_MAX:
             raise ValueError("a hole of more events than there are")
         return hole
+
+
+def _whole(text: str) -> int:
+    """A number of a hole. Raises ``ValueError`` where it is none, or of more digits than any."""
+    if not text.isdecimal() or len(text) > len(str(EVENTS_MAX)):
+        raise ValueError("a hole whose numbers are none")
+    return int(text)
 
 
 class Story(NamedTuple):

@@ -23,7 +23,7 @@ class Source(NamedTuple):
         """Read ``SYSID:COMPID``. Raises ``UserError`` unless both are numbers from 0 to 255."""
         sysid, colon, compid = text.partition(":")
         if not (colon and sysid.isdecimal() and compid.isdecimal()):
-            raise UserError(f"{text!r} is not SYSID:COMPID, such as 5:1")
+            raise UserError(f"{shown(text)} is not SYSID:COMPID, such as 5:1")
         if max(len(sysid), len(compid)) > DIGITS_MAX or int(sysid) > 255 or int(compid) > 255:
             raise UserError(f"{shown(text)}: system and component ids are at most 255")
         return cls(int(sysid), int(compid))

@@ -48,6 +48,7 @@ def test_no_list_is_no_fault(tmp_path: Path) -> None:
         '[{"unix": 1}]',
         '{"a": 1}',
     ],
+    ids=range(6),
 )
 def test_what_is_no_list_of_events(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.tlog.events.json").write_text(text)

@@ -120,6 +120,7 @@ ONE = "order = [0, 1]\n[[table]]\nfrequency_hz = 1e9\nphase_deg = [0, 1]\ngain_d
         (f"{CALIBRATION_HEADER}\n0,0,1e300,0\n", 1e9, "phase_deg '1e300' is not within 1000000"),
         ("chanel,element\n", 1e9, "neither calibration as CSV nor as TOML"),
     ],
+    ids=lambda value: str(value)[-40:],
 )  # fmt: skip
 def test_what_is_wrong_is_said(text: str, at_hz: float, said: str) -> None:
     with pytest.raises(UserError) as error:

@@ -137,6 +137,7 @@ def test_a_unit_without_a_range_is_set_by_phases_alone() -> None:
         (UNIT.replace("[0.0, 10.0]", "[0.0, -1.0]"), "the least and the greatest"),
         (UNIT.replace("[0.0, 10.0]", "[50.0, 60.0]"), "no gain in common"),
     ],
+    ids=lambda value: str(value)[-40:],
 )
 def test_a_file_that_is_none_says_what_is_wrong(text: str, said: str) -> None:
     with pytest.raises(UserError) as error:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import CENTER, CONFIG, INSECURE, JSON, LINKS, LISTEN, Progress
+from companion.cli.console import CENTER, CONFIG, INSECURE, JSON, LINKS, LISTEN, Progress, say
 from companion.values import UserError
 
 
@@ -61,7 +61,7 @@ def check(
         progress.clear()
         if not as_json:
             does = f"\n{'':6}do: {finding.remedy}" if finding.remedy else ""
-            click.echo(f"{finding.grade:5} {finding.subject}: {finding.text}{does}")
+            say(f"{finding.grade:5} {finding.subject}: {finding.text}{does}")
     progress.clear()
     if as_json:
         click.echo(json.dumps({"findings": [asdict(finding) for finding in found]}))

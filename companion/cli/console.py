@@ -11,7 +11,7 @@ from typing import Any, NoReturn
 import click
 
 from companion.cli.interrupts import interrupts_raised
-from companion.values import UserError
+from companion.values import UserError, printable
 
 CONFIG = click.option("--config", type=click.Path(path_type=Path), help="Settings: a TOML file.")
 CENTER = click.option(
@@ -47,12 +47,17 @@ LATENCY = click.option(
 )
 
 
+def say(text: str, err: bool = False) -> None:
+    """Print lines in which there may be text of a file or of the network."""
+    click.echo(printable(text), err=err)
+
+
 def tell_vehicles(logs: Sequence[Path]) -> None:
     """Say on stderr whose own logs are among these, and how well their time is known."""
     from companion.recording.reader import vehicles
 
     for one in vehicles(logs):
-        click.echo(one.told(), err=True)
+        say(one.told(), err=True)
 
 
 JSON_LINES = click.option(
@@ -130,7 +135,7 @@ class OneLineErrors(click.Group):
             raise InterruptedByUser from None
 
     def _end(self, said: str, status: int) -> NoReturn:
-        click.echo(f"{self.name}: {' '.join(said.split())}", err=True)
+        say(f"{self.name}: {' '.join(said.split())}", err=True)
         sys.exit(status)
 
 
@@ -144,7 +149,7 @@ class Progress:
         """Replace the line."""
         if self._on:
             width = shutil.get_terminal_size().columns - 1  # what wraps could not be overwritten
-            click.echo(f"\r\033[K{text[:width]}", nl=False, err=True)
+            click.echo(f"\r\033[K{printable(text)[:width]}", nl=False, err=True)
 
     def clear(self) -> None:
         """Remove the line."""

@@ -15,6 +15,7 @@ from companion.cli.console import (
     InterruptedByUser,
     Progress,
     of_log,
+    say,
     tell_vehicles,
 )
 from companion.cli.export_beams import beams
@@ -92,9 +93,9 @@ def export(
     except KeyboardInterrupt:
         raise InterruptedByUser("interrupted; nothing was exported") from None
     progress.clear()
-    click.echo(json.dumps(summary) if as_json else _text(summary))
+    say(json.dumps(summary) if as_json else _text(summary))
     if summary["unaimed"]:
-        click.echo(f"nothing was aimed at: {summary['unaimed']}", err=True)
+        say(f"nothing was aimed at: {summary['unaimed']}", err=True)
 
 
 def _text(summary: dict[str, Any]) -> str:

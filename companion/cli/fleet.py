@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from companion.cli.console import JSON_LINES, Progress, of_log
+from companion.cli.console import JSON_LINES, Progress, of_log, say
 from companion.values import UserError
 
 if TYPE_CHECKING:
@@ -49,11 +49,11 @@ def watch(url: str, seconds: float | None, as_json: bool) -> None:
     while True:
         try:
             answer = _asked(node.fleet(), url)
-            click.echo(json.dumps(answer) if as_json else _text(answer))
+            say(json.dumps(answer) if as_json else _text(answer))
         except ServiceError as error:
             if answer is None:
                 raise UserError(_refused(url, error)) from error
-            click.echo(f"no answer: {_refused(url, error)}", err=True)
+            say(f"no answer: {_refused(url, error)}", err=True)
         left_s = math.inf if ends_s is None else ends_s - time.monotonic()
         if left_s <= 0:
             return
@@ -140,7 +140,7 @@ def replay(logs: Sequence[Path], as_json: bool) -> None:
     progress = Progress()
     found = replaying.replay(logs, of_log(progress, None))
     progress.clear()
-    click.echo(json.dumps(found) if as_json else _replayed(found))
+    say(json.dumps(found) if as_json else _replayed(found))
     other = [node["logs"][0] for node in found["nodes"] if node["same"] is False]
     if other:
         raise UserError(f"{other[0]}: the replay does not come to the digest of the run")

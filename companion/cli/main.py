@@ -30,6 +30,7 @@ from companion.cli.console import (
     OneLineErrors,
     Progress,
     of_log,
+    say,
     tell_vehicles,
 )
 from companion.cli.design import design
@@ -244,7 +245,7 @@ def _left_behind(begun: "list[Writer]") -> str:
 
 
 def _show_replay(as_json: bool, summary: dict[str, Any]) -> None:
-    click.echo(json.dumps(summary) if as_json else replay_text.text(summary))
+    say(json.dumps(summary) if as_json else replay_text.text(summary))
 
 
 def _speed(text: str) -> float | None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import CENTER, CONFIG, JSON, Progress, make_folder
+from companion.cli.console import CENTER, CONFIG, JSON, Progress, make_folder, say
 from companion.cli.design import numbers
 
 
@@ -121,5 +121,5 @@ def prediction(
     click.echo(f"{len(logs)} logs over {len(setting.over)} links in {took_s:.0f} s", err=True)
     broken = violations.said(answer["rows"])
     if broken is not None:
-        click.echo(f"companion: {broken}", err=True)
+        say(f"companion: {broken}", err=True)
         click.get_current_context().exit(3)

@@ -4,7 +4,7 @@ import json
 
 import click
 
-from companion.cli.console import Progress
+from companion.cli.console import Progress, say
 from companion.node.service import Service
 from companion.views import glance
 
@@ -18,12 +18,12 @@ class Lines:
     def say(self, text: str) -> None:
         """Print a line above the one that is alive."""
         self._progress.clear()
-        click.echo(text, err=True)
+        say(text, err=True)
 
     def serves(self, text: str) -> None:
         """Print a line on stdout."""
         self._progress.clear()
-        click.echo(text)
+        say(text)
 
     def show(self, service: Service) -> None:
         """Renew the line that is alive."""
@@ -38,11 +38,11 @@ class JsonLines:
 
     def say(self, text: str) -> None:
         """Print a line on stderr."""
-        click.echo(text, err=True)
+        say(text, err=True)
 
     def serves(self, text: str) -> None:
         """Print a line on stderr."""
-        click.echo(text, err=True)
+        say(text, err=True)
 
     def show(self, service: Service) -> None:
         """Print the object."""

@@ -21,6 +21,7 @@ import click
 from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.peers import Peers
 from companion.mavlink.links.status import LinkStatus
+from companion.mavlink.trust.dedupe import LINKS_MAX
 from companion.mavlink.voice.rate_watch import MessageRate
 from companion.node.replay import FLUSH_EVERY_S, Run, log_events, missing, told
 from companion.node.serving import NOTICES_KEPT, Server, Throughput, address, pause, run_until_told
@@ -30,7 +31,7 @@ from companion.server import area_map
 from companion.server.access import bind
 from companion.settings.model import Settings
 from companion.settings.origins import Origins
-from companion.values import Event, Frame, Notice, Rejection, Tick
+from companion.values import Event, Frame, Notice, Rejection, Tick, printable
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
 from companion.views.series import Series
@@ -84,7 +85,7 @@ def serve(
 
 
 def _say(text: str) -> None:
-    click.echo(text, err=True)
+    click.echo(printable(text), err=True)
 
 
 class ServedReplay:
@@ -193,9 +194,10 @@ class ServedReplay:
             case Frame():
                 self.last_messages.add(event)
                 link = self._links.get(event.link)
-                if link is None:
+                if link is None and len(self._links) < LINKS_MAX:
                     link = self._links.setdefault(event.link, _ReplayedLink(event.link))
-                link.take(event)
+                if link is not None:
+                    link.take(event)
             case Rejection() if event.source in self._links:
                 self._links[event.source].take(event)
         for output in outputs:

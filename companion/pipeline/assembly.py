@@ -46,6 +46,8 @@ from companion.values import (
 
 FLOOR_SPARE_DB: Final = 2.9
 """How much more than the link needs the floor of a likely beam is, unless it is given."""
+COUPLING_MAX: Final = 1e6
+"""Most that an element may carry of what another is fed, and one over the least that all do."""
 WORST_COUPLING: Final = 1e6
 """Condition number of a coupling matrix above which it tells nothing apart."""
 
@@ -68,6 +70,9 @@ def array(settings: Settings) -> geometry.Array:
         if coupling.shape != (size, size) or not np.isfinite(coupling).all():
             shape = f"{coupling.shape} for {size} elements"
             raise ConfigError(f"array.coupling: finite numbers, a row and a column each: {shape}")
+        most = max(np.abs(coupling.real).max(), np.abs(coupling.imag).max())
+        if not 1 / COUPLING_MAX <= most <= COUPLING_MAX:
+            raise ConfigError(f"array.coupling: {most:.3g} at most is no share of what is fed")
         if np.linalg.cond(coupling) > WORST_COUPLING:
             raise ConfigError("array.coupling: elements that it makes alike are none of their own")
     return replace(

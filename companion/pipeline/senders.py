@@ -9,6 +9,7 @@ Over 300 lines: every kind of message comes through here.
 import math
 from collections.abc import Container
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Final
 
 from companion.mavlink.clock.estimates import ClockChange, ClockEstimate, Stamp
@@ -46,6 +47,8 @@ from companion.values import (
 
 CLOCKS_MAX: Final = 4096
 """Clocks kept. Beyond it those of senders without a track are forgotten, the oldest first."""
+CLOCKS_AT_ONCE: Final = 256
+"""Clocks that are forgotten at once where too many come between two ticks."""
 WAITS_NS: Final = 10_000_000_000
 """Time for which a track waits for its receiver to vouch for it."""
 STATED_LATE_US: Final = 30_000_000
@@ -116,18 +119,23 @@ class Senders:
     """All senders of frames, by MAVLink source.
 
     ``carrier`` is admitted whatever the lists say, and is the only one whose attitude is used.
+    ``tracked`` are those who have a track at any time: their clocks are kept.
     """
 
-    def __init__(self, settings: Settings, carrier: str | None) -> None:
+    def __init__(
+        self, settings: Settings, carrier: str | None, tracked: Container[str] = ()
+    ) -> None:
         self.presence: dict[Source, Presence] = {}
         self.aircraft = Aircraft()
         self.remote_ids = RemoteIds()
         self._settings = settings
         self._carrier = carrier
+        self._tracked = tracked
         self._carrier_source = None if carrier is None else Source.parse(carrier)
         self._noise_settings = assembly.noise(settings)
         self._noise: dict[Source, ReportNoise] = {}
         self._clocks: dict[str, SenderClock] = {}  # by SYSID:COMPID
+        self._clocks_most = CLOCKS_MAX
         self._stamped_ns: dict[str, int] = {}  # when each of them was last told its time
         self._dedupe = Dedupe()
         self._admission = Admission(settings.tracks.allow, settings.tracks.deny)
@@ -341,9 +349,23 @@ class Senders:
         return stamp, name
 
     def _clock(self, name: str) -> SenderClock:
-        if name not in self._clocks:
-            self._clocks[name] = assembly.clock(self._settings)
-        return self._clocks[name]
+        clock = self._clocks.get(name)
+        if clock is None:
+            if len(self._clocks) >= self._clocks_most:
+                self._make_room()
+            clock = self._clocks[name] = assembly.clock(self._settings)
+        return clock
+
+    def _make_room(self) -> None:
+        """Forget the oldest clocks between two ticks: senders without end may come before one.
+
+        Those who are tracked keep theirs. There may be more of them than ``CLOCKS_MAX``, so that it
+        is looked through again only when as many have come as are forgotten at once.
+        """
+        unwanted = (name for name in self._clocks if not self._is_kept(name, self._tracked))
+        for name in list(islice(unwanted, CLOCKS_AT_ONCE)):
+            self._forget_clock(name)
+        self._clocks_most = max(CLOCKS_MAX, len(self._clocks) + CLOCKS_AT_ONCE)
 
     def time(self, uav: str, node_ns: int) -> SenderTime:
         """A node time on a UAV's own timeline; a relayed aircraft's timeline is the node's."""
@@ -391,10 +413,16 @@ class Senders:
         silent_ns = now_ns - CLOCK_KEPT_NS
         names = [name for name in self._clocks if self._stamped_ns.get(name, now_ns) < silent_ns]
         for name in (*names, *list(self._clocks)[: max(0, len(self._clocks) - CLOCKS_MAX)]):
-            if name not in wanted and name != self._carrier:
-                self._clocks.pop(name, None)
-                self._stamped_ns.pop(name, None)
+            if not self._is_kept(name, wanted):
+                self._forget_clock(name)
         self._forget_beside(wanted, silent_ns)
+
+    def _is_kept(self, name: str, wanted: Container[str]) -> bool:
+        return name in wanted or name == self._carrier
+
+    def _forget_clock(self, name: str) -> None:
+        self._clocks.pop(name, None)
+        self._stamped_ns.pop(name, None)
 
     def _forget_beside(self, wanted: Container[str], silent_ns: int) -> None:
         """Forget what senders without a track have said beside positions, as their clocks are."""
@@ -402,7 +430,7 @@ class Senders:
             gone = [source for source, said in heard.items() if said.t_ns < silent_ns]
             for source in (*gone, *list(heard)[: max(0, len(heard) - CLOCKS_MAX)]):
                 name = str(source)
-                if name in wanted or name == self._carrier:
+                if self._is_kept(name, wanted):
                     continue
                 heard.pop(source, None)
                 self._known.pop(name, None)

@@ -7,6 +7,7 @@ import numpy as np
 
 from companion.recording import schemas
 from companion.values import (
+    DUTY_MAX,
     BeamSet,
     ClockSet,
     Duty,
@@ -219,8 +220,10 @@ def to_round_trip(data: bytes) -> RoundTrip:
 
 
 def to_duty(data: bytes) -> Duty:
-    """Read a duty. Raises ``DecodeError`` for bytes that are no such message."""
+    """Read a duty. Raises ``DecodeError``, or ``ValueError`` where it names too many."""
     message = schemas.DutyMessage.FromString(data)
+    if max(len(message.serves), len(message.spares)) > DUTY_MAX:
+        raise ValueError("a duty of too many UAVs")
     return Duty(message.t_ns, tuple(message.serves), tuple(message.spares))
 
 

@@ -13,6 +13,7 @@ that memory and time are bounded by the size of the file, whoever made it.
 import contextlib
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
@@ -43,6 +44,13 @@ _LARGEST_MESSAGE: Final = 1 << 24
 _LARGEST_SUMMARY: Final = 1 << 26  # two weeks of a chunk a second
 _DESCRIPTIONS: Final = 1 << 25
 """Most bytes of all schemas and channels together."""
+_LARGEST_PAIRS: Final = 1 << 16
+"""Most bytes of a channel, or of a record of metadata: names and values, many of which are
+objects of far more bytes; those of this program have hundreds."""
+_PAIR: Final = 256
+"""Bytes that a name and its value take in memory, beside their own."""
+_MOST: Final = 10_000
+"""Most attachments, and most records of metadata, that are read of a file."""
 _PACKED: Final = 50
 """Most bytes of contents for each byte of a file, beside one largest chunk: as much as ten times
 what is found in recordings, where a bomb has thousands."""
@@ -91,16 +99,21 @@ class Walk:
         """True if the file's end is there, so that it was closed in order."""
         self.lost_bytes = 0
         """Bytes that belong to no readable record."""
-        self._path = path
+        self.path = path
         self._topics = topics
         self._described_bytes = 0
+        self._channel_bodies: dict[bytes, bytes] = {}  # by the bytes of its id, as it was read
+        self._counts: Counter[int] = Counter()  # attachments and metadata, by opcode
         self._room = 0  # bytes that chunks may yet unpack to
 
     def __iter__(self) -> Iterator[Content]:
         self._read_descriptions()
-        with self._path.open("rb") as file:
+        with self.path.open("rb") as file:
             for opcode, length in self._records(file):
                 if not self._is_wanted(opcode):
+                    continue
+                if self._is_beyond(opcode):
+                    self.lost_bytes += _HEADER.size + length
                     continue
                 try:
                     yield from self._contents(opcode, file, length)
@@ -111,12 +124,12 @@ class Walk:
     def _read_descriptions(self) -> None:
         """Read schemas and channels from the summary, if there is one and its checksum holds."""
         with contextlib.suppress(*_DAMAGE):  # another program's: the data has them as well
-            for opcode, body in _split(_summary(self._path)):
+            for opcode, body in _split(_summary(self.path)):
                 self._describe(opcode, body)
 
     def _records(self, file: IO[bytes]) -> Iterator[tuple[int, int]]:
         """(opcode, length) of the records up to the file's end, the file standing at the body."""
-        size = self._path.stat().st_size
+        size = self.path.stat().st_size
         self._room = LARGEST + _PACKED * size
         at = len(file.read(len(MAGIC)))
         while len(header := file.read(_HEADER.size)) == _HEADER.size:
@@ -138,8 +151,15 @@ class Walk:
             return self._topics != frozenset()
         return opcode in _READ
 
+    def _is_beyond(self, opcode: int) -> bool:
+        """Whether this is an attachment or a record of metadata more than any file has."""
+        if opcode not in (Opcode.ATTACHMENT, Opcode.METADATA):
+            return False
+        self._counts[opcode] += 1
+        return self._counts[opcode] > _MOST
+
     def _contents(self, opcode: int, file: IO[bytes], length: int) -> Iterator[Content]:
-        if length > LARGEST:
+        if length > (_LARGEST_PAIRS if opcode == Opcode.METADATA else LARGEST):
             raise ValueError("no record is that large")
         body = file.read(length)
         if opcode == Opcode.CHUNK:
@@ -172,7 +192,7 @@ class Walk:
             yield Damage(orphaned)
 
     def _describe(self, opcode: int, body: bytes) -> None:
-        """Remember a schema or a channel."""
+        """Remember a schema or a channel. Raises ``ValueError`` where they are too large."""
         if opcode == Opcode.SCHEMA:
             schema = Schema.read(ReadDataStream(BytesIO(body)))
             if schema != self.schemas.get(schema.id):
@@ -180,15 +200,21 @@ class Walk:
                 self.schemas[schema.id] = schema
                 self._described.add(schema.id)
         elif opcode == Opcode.CHANNEL:
+            if body == self._channel_bodies.get(body[:2]):
+                return
+            if len(body) > _LARGEST_PAIRS:
+                raise ValueError("no channel is that large")
+            self._take(len(body))
             channel = Channel.read(ReadDataStream(BytesIO(body)))
-            if channel != self.channels.get(channel.id):
-                self._take(len(body))
-                self.channels[channel.id] = channel
+            self._take(_PAIR * len(channel.metadata))
+            self.channels[channel.id] = channel
+            self._channel_bodies[body[:2]] = body
 
     def _take(self, size: int) -> None:
-        if self._described_bytes + size > _DESCRIPTIONS:
-            raise ValueError("no file describes so much")
+        """Count what is described; once it is too much, nothing further is read."""
         self._described_bytes += size
+        if self._described_bytes > _DESCRIPTIONS:
+            raise ValueError("no file describes so much")
 
 
 def _split(data: bytes) -> Iterator[tuple[int, bytes]]:

@@ -44,7 +44,7 @@ def declared_faults(log: Path) -> tuple[DeclaredFault, ...]:
             (round(float(each["unix"]) * 1e9), int(each["sysid"]), str(each["event"]))
             for each in json.loads(text)
         ]
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise LogError(f"{path}: not a list of events with unix, sysid and event") from error
     return tuple(_faults(sorted(events)))
 

@@ -15,13 +15,16 @@ from uuid import uuid4
 from mcap.records import Metadata
 
 from companion.recording.container import MAGIC, Walk
-from companion.values import UserError
+from companion.values import UserError, printable
 
 PART: Final = "part"
 HOLE: Final = "hole"
 HOLES_MAX: Final = 1000
 """Holes of a file that are told one by one; what further ones lack is counted with the last."""
 WHY_MAX: Final = 200
+EVENTS_MAX: Final = (1 << 63) - 1
+NUMBER_DIGITS: Final = 9
+"""Most digits of a part's number."""
 _LATEST_NS: Final = 1 << 62
 
 
@@ -54,7 +57,7 @@ class Part(NamedTuple):
     def from_metadata(cls, found: Mapping[str, str]) -> "Part | None":
         """Read a part; None where the metadata describe none."""
         number = found.get("number", "")
-        if not number.isdecimal() or "run" not in found:
+        if not number.isdecimal() or len(number) > NUMBER_DIGITS or "run" not in found:
             return None
         return cls(found["run"], int(number), found.get("continues", ""))
 
@@ -74,12 +77,22 @@ class Hole(NamedTuple):
     def from_metadata(cls, found: Mapping[str, str]) -> "Hole":
         """Read a hole. Raises ``ValueError`` where the metadata describe none."""
         try:
-            hole = cls(int(found["t_ns"]), int(found["events"]), found["why"][:WHY_MAX])
+            why = "".join(printable(found["why"][:WHY_MAX]).split("\n"))
+            hole = cls(_whole(found["t_ns"]), _whole(found["events"]), why)
         except KeyError as error:
             raise ValueError(f"a hole without {error}") from None
-        if not 0 <= hole.t_ns < _LATEST_NS:
+        if hole.t_ns >= _LATEST_NS:
             raise ValueError("a hole beyond all time")
+        if hole.events > EVENTS_MAX:
+            raise ValueError("a hole of more events than there are")
         return hole
+
+
+def _whole(text: str) -> int:
+    """A number of a hole. Raises ``ValueError`` where it is none, or of more digits than any."""
+    if not text.isdecimal() or len(text) > len(str(EVENTS_MAX)):
+        raise ValueError("a hole whose numbers are none")
+    return int(text)
 
 
 class Story(NamedTuple):
@@ -105,7 +118,8 @@ def read_story(path: Path) -> Story:
         elif isinstance(record, Metadata) and record.name == HOLE:
             hole = Hole.from_metadata(record.metadata)
             if len(holes) == HOLES_MAX:
-                hole = hole._replace(events=holes.pop().events + hole.events)
+                events = min(holes.pop().events + hole.events, EVENTS_MAX)
+                hole = hole._replace(events=events)
             holes.append(hole)
     return Story(part, tuple(holes))
 

@@ -34,6 +34,8 @@ _MAPPED_BYTES: Final = 1 << 26
 """Size from which on a log is left to the system's pages rather than read into memory."""
 _LATEST_NS: Final = 1 << 62
 """Latest time of an event, the year 2116: what is worked out from times stays in 63 bits."""
+LARGEST_EVENT: Final = 1 << 21
+"""Most bytes of an event: a duty of all the names that it may have has no more."""
 _DOUBT_MAX_NS: Final = 3_600_000_000_000
 """Greatest doubt of a frame's arrival: what is worked out from it stays in 63 bits."""
 _EVENT_TOPICS: Final = frozenset(
@@ -169,7 +171,10 @@ def digest_of(path: Path) -> str | None:
 
 
 def utc_offset_ns(paths: Sequence[Path]) -> int:
-    """UTC less the timeline of recordings, by the last word in them; 0 where there is none."""
+    """UTC less the timeline of recordings, by the last word in them; 0 where there is none.
+
+    Raises ``LogError`` where that word is none.
+    """
     offset_ns = 0
     for path in paths:
         walk = Walk(path, frozenset())
@@ -178,8 +183,15 @@ def utc_offset_ns(paths: Sequence[Path]) -> int:
         if log_kind(path) == "mcap" and (not topics or schemas.CLOCK_TOPIC in topics):
             for content in Walk(path, frozenset((schemas.CLOCK_TOPIC,))):
                 if isinstance(content, Message):
-                    offset_ns = codec.to_clock_set(content.data).utc_offset_ns
+                    offset_ns = _offset_ns(path, content.data)
     return offset_ns
+
+
+def _offset_ns(path: Path, data: bytes) -> int:
+    try:
+        return codec.to_clock_set(data).utc_offset_ns
+    except (DecodeError, ValueError) as error:
+        raise LogError(f"{path}: not a recording of this program: {error}") from None
 
 
 def _open(path: Path) -> tuple[LogKind, bytes]:
@@ -266,6 +278,8 @@ def _recorded(path: Path) -> Iterator[Event]:
 
 
 def _event(topic: str, data: bytes, sources: dict[tuple[int, int], Source]) -> Event | None:
+    if len(data) > LARGEST_EVENT:
+        raise ValueError("an event that is longer than any")
     if topic == schemas.FRAMES_TOPIC:
         frame = codec.to_frame(data, sources)
         if not is_shaped(frame.raw) or max(frame.source) > 255 or frame.doubt_ns > _DOUBT_MAX_NS:
@@ -274,7 +288,10 @@ def _event(topic: str, data: bytes, sources: dict[tuple[int, int], Source]) -> E
     if topic == schemas.TICKS_TOPIC:
         return Tick(schemas.TickMessage.FromString(data).t_ns)
     if topic == schemas.ROUND_TRIPS_TOPIC:
-        return codec.to_round_trip(data)
+        trip = codec.to_round_trip(data)
+        if max(trip.source) > 255:
+            raise ValueError("a round trip with nobody")
+        return trip
     if topic == schemas.DUTIES_TOPIC:
         return codec.to_duty(data)
     if topic == schemas.CLOCK_TOPIC:

@@ -20,8 +20,8 @@ from companion.recording.reader import LogError
 from companion.recording.writer import ACTIVE, free_name, opened, sync_folder
 
 _PARTIAL: Final = ".recovering"
-
-
+CHANNELS_MAX: Final = 65_535
+"""Most channels with messages: those of a file are numbered from 1, in two bytes."""
 DAMAGED: Final = ".damaged"
 
 
@@ -191,6 +191,8 @@ class _Copy:
 
     def _register(self, message: Message) -> int:
         channel = message.channel
+        if len(self._channels) == CHANNELS_MAX:
+            raise UnreadableError(f"{self._walk.path}: more channels than a recording has")
         schema_id = self._schemas.get(channel.schema_id)
         if schema_id is None:
             schema_id = 0  # of other programs: a channel without one

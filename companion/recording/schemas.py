@@ -237,6 +237,10 @@ _RAW_HEADS: Final = (b"", *(bytes((_RAW,)) + _varint(size) for size in range(1, 
 """Tag and length of a frame's bytes, by their number; nothing where there are none."""
 
 
+HEADS_MAX: Final = 10_000
+"""Heads of frames that are kept packed."""
+
+
 class FrameEncoder:
     """Encodes ``companion.Frame`` messages; keeps the packed head of each (link, source, id) seen.
 
@@ -252,7 +256,9 @@ class FrameEncoder:
         key = (frame.link, frame.source, frame.msgid)
         head = self._heads.get(key)
         if head is None:
-            head = self._heads.setdefault(key, self._head(frame))
+            if len(self._heads) >= HEADS_MAX:  # a cache only: ids and links may be made up
+                self._heads.clear()
+            head = self._heads[key] = self._head(frame)
         t_ns, raw = frame.t_ns, frame.raw
         size = len(raw)
         length = _RAW_HEADS[size] if size <= RAW_MAX else bytes((_RAW,)) + _varint(size)

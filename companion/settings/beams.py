@@ -2,22 +2,16 @@
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import (
-    AfterValidator,
-    BeforeValidator,
-    Field,
-    FiniteFloat,
-    PositiveFloat,
-    model_validator,
-)
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from companion.settings.section import Section
 from companion.values import Method, Normalisation, Policy, Power, UserError, Widen
 
 Metres = Annotated[float, Field(ge=-1e4, le=1e4)]
+Degrees = Annotated[float, Field(ge=-360, le=360)]
 Position = tuple[Metres, Metres, Metres]
-Interval = tuple[FiniteFloat, FiniteFloat]
-HiddenSector = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+Interval = tuple[Degrees, Degrees]
+HiddenSector = tuple[Degrees, Degrees, Degrees, Degrees]
 
 
 def _rising(interval: Interval) -> Interval:
@@ -78,9 +72,9 @@ class ArraySettings(Section):
     spacing_m: Annotated[float, Field(gt=0, le=1e4)] | None = None
     element: Literal["isotropic", "cosine", "3gpp"] = "isotropic"
     element_exponent: Annotated[float, Field(ge=0, le=100)] = 1.0
-    mount_roll_deg: float = 0.0
-    mount_pitch_deg: float = 0.0
-    mount_yaw_deg: float = 0.0
+    mount_roll_deg: Degrees = 0.0
+    mount_pitch_deg: Degrees = 0.0
+    mount_yaw_deg: Degrees = 0.0
     lever_arm_m: Position = (0.0, 0.0, 0.0)
     field_of_view_deg: Annotated[float, Field(gt=0, le=360)] | None = None
     azimuth_limits_deg: Annotated[Interval, AfterValidator(_rising)] | None = None
@@ -133,7 +127,7 @@ class BeamSettings(Section):
     its error grows with the square of the condition number.
     """
 
-    update_hz: Annotated[float, Field(gt=0, le=1000)] = 10.0
+    update_hz: Annotated[float, Field(ge=1e-3, le=1000)] = 10.0
     actuation_delay_s: Annotated[float, Field(ge=0, le=10)] = 0.01
     targets: Literal["telemetry", "all"] = "telemetry"
     most: Annotated[int, Field(ge=1, le=4096)] = 256
@@ -218,7 +212,7 @@ class RadioSettings(Section):
     """
 
     tx_power_dbm: Annotated[float, Field(ge=-100, le=100)] = 20.0
-    bandwidth_hz: PositiveFloat = 50e6
+    bandwidth_hz: Annotated[float, Field(ge=1, le=1e12)] = 50e6
     noise_figure_db: Annotated[float, Field(ge=0, le=60)] = 7.0
     uav_antennas: Annotated[int, Field(ge=1, le=256)] = 4
 

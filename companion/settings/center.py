@@ -2,12 +2,15 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Final
 
 from pydantic import AfterValidator, Field
 
 from companion.settings.section import Section
-from companion.values import Source, UserError
+from companion.values import Source, UserError, shown
+
+HEIGHT_MAX_M: Final = 1e5
+"""Most that a station may be above or below the sea."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,15 +61,17 @@ def parse_center(text: str) -> CenterPlace:
     if ":" in text:
         return VehicleCenter(Source.parse(text))
     if "," not in text:
-        raise UserError(f"{text!r} is not SYSID:COMPID, LAT,LON,ALT[,HEADING] or home")
+        raise UserError(f"{shown(text)} is not SYSID:COMPID, LAT,LON,ALT[,HEADING] or home")
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
         numbers = []
     if len(numbers) not in (3, 4) or not all(map(math.isfinite, numbers[2:])):
-        raise UserError(f"{text!r} is not LAT,LON,ALT[,HEADING], such as 47.4,8.55,500,90")
+        raise UserError(f"{shown(text)} is not LAT,LON,ALT[,HEADING], such as 47.4,8.55,500,90")
     if not (abs(numbers[0]) <= 90 and abs(numbers[1]) <= 180):
-        raise UserError(f"{text!r}: latitude is within 90 degrees and longitude within 180")
+        raise UserError(f"{shown(text)}: latitude is within 90 degrees and longitude within 180")
+    if abs(numbers[2]) > HEIGHT_MAX_M or any(abs(heading) > 360 for heading in numbers[3:]):
+        raise UserError(f"{shown(text)}: altitude is within 100 km and heading within 360 degrees")
     return FixedCenter(*numbers)
 
 

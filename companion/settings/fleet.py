@@ -3,7 +3,7 @@
 import re
 from typing import Annotated, Final, Literal
 
-from pydantic import AfterValidator, Field, PositiveFloat
+from pydantic import AfterValidator, Field
 
 from companion.settings.section import Section
 from companion.values import UserError
@@ -53,7 +53,7 @@ class FleetSettings(Section):
     attempt_s: Annotated[float, Field(ge=0.1, le=60)] = 1.0
     hysteresis_db: Annotated[float, Field(ge=0, le=60)] = 3.0
     nulls: bool = False
-    share_hz: Annotated[PositiveFloat, Field(le=1000)] = 200.0
+    share_hz: Annotated[float, Field(ge=0.1, le=1000)] = 200.0
     ca: str | None = None
     certificate: str | None = None
     key: str | None = None

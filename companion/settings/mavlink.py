@@ -6,7 +6,6 @@ from typing import Annotated, Final, Literal, Self
 from pydantic import (
     AfterValidator,
     Field,
-    PositiveFloat,
     ValidationInfo,
     field_validator,
     model_validator,
@@ -101,6 +100,7 @@ def _uav_pattern(text: str) -> str:
     return text
 
 
+Age = Annotated[float, Field(gt=0, le=1e7)]
 UavPattern = Annotated[str, AfterValidator(_uav_pattern)]
 
 
@@ -154,12 +154,12 @@ class TrackSettings(Section):
 
     allow: tuple[UavPattern, ...] = ()
     deny: tuple[UavPattern, ...] = ()
-    coasting_s: PositiveFloat = 2.0
-    stale_s: PositiveFloat = 15.0
-    lost_s: PositiveFloat = 60.0
-    dropped_s: PositiveFloat = 600.0
+    coasting_s: Age = 2.0
+    stale_s: Age = 15.0
+    lost_s: Age = 60.0
+    dropped_s: Age = 600.0
     most: Annotated[int, Field(ge=1, le=100_000)] = 2000
-    window_s: PositiveFloat = 5.0
+    window_s: Annotated[float, Field(gt=0, le=3600)] = 5.0
     reacquire_reports: Annotated[int, Field(ge=2, le=60)] = 3
     reacquire_s: Annotated[float, Field(ge=0, le=60)] = 1.0
 

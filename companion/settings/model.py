@@ -5,8 +5,6 @@ is allowed.
 """
 
 import difflib
-import re
-import tomllib
 from typing import Any, Final, Self
 
 import tomli_w
@@ -38,21 +36,11 @@ from companion.settings.outlets import (
 )
 from companion.settings.section import ConfigError, Section
 from companion.settings.tracking import ClockSettings, ObserverSettings
+from companion.values import UserError, read_toml, shown
 
 NEAR: Final = 0.7
 """Likeness (difflib's ratio) from which on a setting may have been meant by another name."""
 
-LARGEST: Final = 1 << 20
-"""Most characters of settings without their strings: 4096 elements that face apart take 3/4."""
-_STRINGS: Final = re.compile(
-    r""""{3}[^"\\]*(?:(?:\\.|"(?!""))[^"\\]*)*"{3,5}|"""  # of several lines
-    r"""'{3}(?s:.*?)'{3,5}|"""
-    r""""[^"\\\n]*(?:\\.[^"\\\n]*)*"|'[^'\n]*'|#[^\n]*""",
-    re.DOTALL,
-)
-"""What TOML takes for a string or a comment, wherever it begins."""
-_DEEP: Final = re.compile(r"(?:\.[^.=,\n]*){16}")
-"""More parts in a key than any setting has."""
 MODELLED: Final = frozenset(
     (
         "center", "clocks", "observer", "tracks", "array", "beams", "codebook", "hardware", "radio",
@@ -148,16 +136,11 @@ class Settings(Section):
 
 
 def sections(text: str, where: str) -> dict[str, Any]:
-    """The sections of settings in TOML, unchecked. Raises ``ConfigError`` for what is not TOML."""
-    bare = _STRINGS.sub('""', text)  # a key of many parts costs its reader the square of them
-    if len(bare) > LARGEST or _DEEP.search(bare):
-        raise ConfigError(f"{where}: not settings: too large, or nested too deeply")
+    """The sections of settings in TOML, unchecked. Raises ``ConfigError`` as ``read_toml``."""
     try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{where}: not TOML: {error}") from error
-    except RecursionError as error:
-        raise ConfigError(f"{where}: not settings: too large, or nested too deeply") from error
+        return read_toml(text)
+    except UserError as error:
+        raise ConfigError(f"{where}: {error}") from error
 
 
 def _meant(place: tuple[int | str, ...]) -> str:
@@ -193,6 +176,4 @@ def _first(error: ValidationError) -> str:
         return f"{key} is not a setting{_meant(place)}"
     said = [wrong["msg"] for wrong in errors if wrong["loc"][:2] == place]
     allowed = dict.fromkeys(text.removeprefix("Value error, ") for text in said)
-    given = repr(errors[0]["input"])
-    given = given if len(given) <= 200 else f"{given[:200]}…"
-    return f"{key} = {given}: {', or '.join(allowed)}"
+    return f"{key} = {shown(errors[0]['input'])}: {', or '.join(allowed)}"

@@ -4,7 +4,7 @@ import ipaddress
 import re
 from typing import Annotated, Final, Literal
 
-from pydantic import AfterValidator, Field, PositiveFloat
+from pydantic import AfterValidator, Field
 
 from companion.settings.section import Section
 from companion.values import UserError
@@ -57,7 +57,7 @@ class RecordingSettings(Section):
     """
 
     directory: str | None = None
-    weights_hz: Literal["all"] | PositiveFloat = 10.0
+    weights_hz: Literal["all"] | Annotated[float, Field(ge=1e-3, le=1e6)] = 10.0
     scene_hz: Annotated[float, Field(gt=0, le=100)] = 2.0
     rotate_mb: Annotated[float, Field(ge=0.1, le=1e6)] | None = None
     rotate_s: Annotated[float, Field(ge=1, le=1e7)] = 3600.0

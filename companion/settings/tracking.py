@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, FiniteFloat, PositiveFloat, model_validator
+from pydantic import Field, FiniteFloat, model_validator
 
 from companion.settings.section import Section
 from companion.values import UserError
@@ -48,8 +48,8 @@ class LimitSettings(Section):
                            stamp, seconds; negative: it is where the aircraft will be
     """
 
-    speed_max_mps: PositiveFloat | None = None
-    acceleration_max_mps2: PositiveFloat | None = None
+    speed_max_mps: Annotated[float, Field(gt=0, le=1e5)] | None = None
+    acceleration_max_mps2: Annotated[float, Field(gt=0, le=1e5)] | None = None
     lag_s: Lag | None = None
 
     @model_validator(mode="after")
@@ -100,9 +100,9 @@ class ObserverSettings(LimitSettings):
     design_json: str | None = None
     types: dict[AirframeName, LimitSettings] = Field(default_factory=dict)
     uav: dict[str, LimitSettings] = Field(default_factory=dict)
-    position_noise_m: PositiveFloat = 3.0
-    velocity_noise_mps: PositiveFloat = 0.5
+    position_noise_m: Annotated[float, Field(gt=0, le=1e5)] = 3.0
+    velocity_noise_mps: Annotated[float, Field(gt=0, le=1e4)] = 0.5
     follow_accuracy: bool = True
-    accuracy_factor: PositiveFloat = 3.0
+    accuracy_factor: Annotated[float, Field(gt=0, le=1000)] = 3.0
     geoid_m: Annotated[float, Field(ge=-120, le=100)] | None = None
     geoid_error_m: Annotated[float, Field(ge=0, le=120)] = 5.0

@@ -371,7 +371,7 @@ class Tracker:
     def _limits(self, fix: Fix) -> Limits:
         return fix.limits or self._settings.limits
 
-    def __contains__(self, uav: str) -> bool:
+    def __contains__(self, uav: object) -> bool:
         """Whether there is a track of this UAV."""
         return uav in self._tracked
 

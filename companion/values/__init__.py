@@ -24,8 +24,8 @@ from companion.values.aimed import (
     Widen,
 )
 from companion.values.clock import ClockSet, UtcNs
-from companion.values.errors import UserError
-from companion.values.events import Duty, Event, RoundTrip, Tick
+from companion.values.errors import UserError, printable, shown
+from companion.values.events import DUTY_MAX, Duty, Event, RoundTrip, Tick
 from companion.values.fleet import Offer, Shared, SharedFrame, Standing
 from companion.values.health import Blame, Cause, Level, Verdict
 from companion.values.names import Source, reports_itself, standing
@@ -58,6 +58,7 @@ from companion.values.received import (
     SystemTime,
 )
 from companion.values.rejections import Reason, Rejection
+from companion.values.toml import read_toml
 from companion.values.tracked import (
     Carrier,
     Estimate,
@@ -72,6 +73,7 @@ from companion.values.tracked import (
 )
 
 __all__ = [
+    "DUTY_MAX",
     "Accuracy",
     "AdsbVehicle",
     "AltitudeDatum",
@@ -129,7 +131,10 @@ __all__ = [
     "Vector",
     "Verdict",
     "Widen",
+    "printable",
+    "read_toml",
     "reports_itself",
+    "shown",
     "standing",
     "vector",
 ]

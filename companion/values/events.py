@@ -1,6 +1,7 @@
 """Everything that drives the pipeline: frames, and what the node itself adds to them."""
 
 from dataclasses import dataclass
+from typing import Final
 
 from companion.values.clock import ClockSet
 from companion.values.names import Source
@@ -29,6 +30,10 @@ class RoundTrip:
     source: Source
     sent_ns: int
     remote_ns: int
+
+
+DUTY_MAX: Final = 10_000
+"""Most UAVs that a duty serves, and most that it spares."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,8 +2,10 @@
 
 from typing import Final, NamedTuple, Self
 
-from companion.values.errors import UserError
+from companion.values.errors import UserError, shown
 
+DIGITS_MAX: Final = 18
+"""Most digits of an id: Python reads thousands, and then raises another error."""
 _STANDING: Final = {"rid": 1, "icao": 2, "cot": 3}
 
 
@@ -21,9 +23,9 @@ class Source(NamedTuple):
         """Read ``SYSID:COMPID``. Raises ``UserError`` unless both are numbers from 0 to 255."""
         sysid, colon, compid = text.partition(":")
         if not (colon and sysid.isdecimal() and compid.isdecimal()):
-            raise UserError(f"{text!r} is not SYSID:COMPID, such as 5:1")
-        if int(sysid) > 255 or int(compid) > 255:
-            raise UserError(f"{text!r}: system and component ids are at most 255")
+            raise UserError(f"{shown(text)} is not SYSID:COMPID, such as 5:1")
+        if max(len(sysid), len(compid)) > DIGITS_MAX or int(sysid) > 255 or int(compid) > 255:
+            raise UserError(f"{shown(text)}: system and component ids are at most 255")
         return cls(int(sysid), int(compid))
 
 

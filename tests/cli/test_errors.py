@@ -13,7 +13,9 @@ import pytest
 from click.testing import CliRunner
 from support import BIN, HANG_S, ROOT, started
 
+from companion.cli import console, voice
 from companion.cli.console import OneLineErrors
+from companion.node import served_replay
 from companion.values import UserError
 
 
@@ -29,6 +31,8 @@ def fail(what: str) -> None:
     match what:
         case "user":
             raise UserError("the file holds\n  no log")
+        case "escapes":
+            raise UserError("\x1b[2J\x1b]0;pwned\x07 is not a setting\x9b")
         case "file":
             Path("/nowhere/x").read_text()
         case "value":
@@ -49,6 +53,7 @@ def fail(what: str) -> None:
     ("what", "status", "said"),
     [
         ("user", 1, "prog: the file holds no log\n"),
+        ("escapes", 1, "prog: [2J]0;pwned is not a setting\n"),
         ("file", 1, "prog: /nowhere/x: No such file or directory\n"),
         ("interrupted", 130, "prog: interrupted\n"),
     ],
@@ -56,6 +61,14 @@ def fail(what: str) -> None:
 def test_one_line(what: str, status: int, said: str) -> None:
     done = CliRunner().invoke(prog, ["fail", what])
     assert (done.exit_code, done.stderr) == (status, said)
+
+
+def test_nothing_that_a_terminal_obeys_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    """Lines are kept, and what is written in whatever letters."""
+    for say in (console.say, voice.Lines().say, voice.JsonLines().say, served_replay._say):
+        say("ü 王\n\x1b[2J\x1b]0;pwned\x07\r\b\x9b")  # as a hole's reason, or a name
+    said = capsys.readouterr()
+    assert said.out + said.err == 4 * "ü 王\n[2J]0;pwned\n"
 
 
 @pytest.mark.parametrize("made_of_it", ["pass", "raise RuntimeError('no class')", "raise"])

@@ -97,6 +97,8 @@ def test_dead_elements_are_some_of_those_there_are(tmp_path: Path, keys: str, sa
         (np.eye(3), "3, 3. for 16 elements"),
         (np.ones((16, 16)), "alike"),
         (np.full((16, 16), np.nan), "finite"),
+        (np.eye(16) * 1e150, "no share of what is fed"),
+        (np.eye(16) * 1e-300, "no share of what is fed"),
         (np.ones(16), "not a matrix"),
     ],
 )

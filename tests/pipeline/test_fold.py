@@ -914,15 +914,16 @@ def test_no_more_are_tracked_than_the_settings_allow() -> None:
 def test_clocks_of_those_without_a_track_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """Invented senders do not fill the memory; who has a track, and the carrier, keep theirs."""
     monkeypatch.setattr("companion.pipeline.senders.CLOCKS_MAX", 10)
+    monkeypatch.setattr("companion.pipeline.senders.CLOCKS_AT_ONCE", 2)
     pipeline = Pipeline(settings(tracks={"most": 2}))
     pipeline.step(attitude(0, "5:1"))  # the carrier has no position, and so no track
     for sysid in range(11, 61):
         pipeline.step(position(0, f"{sysid}:1", (10.0 * sysid, 0.0, 0.0)))
-    known = [f"{sysid}:1" for sysid in range(1, 61) if pipeline.clock_estimate(f"{sysid}:1")]
-    assert len(known) == 51
-    run(pipeline, [tick(n / 100) for n in range(100)])
-    known = [f"{sysid}:1" for sysid in range(1, 61) if pipeline.clock_estimate(f"{sysid}:1")]
-    assert known == ["5:1", "11:1", "12:1", *(f"{sysid}:1" for sysid in range(51, 61))]
+    kept = ["5:1", "11:1", "12:1", *(f"{sysid}:1" for sysid in range(55, 61))]
+    for _ in range(2):  # before any tick, and after some
+        known = [f"{sysid}:1" for sysid in range(1, 61) if pipeline.clock_estimate(f"{sysid}:1")]
+        assert known == kept
+        run(pipeline, [tick(n / 100) for n in range(100)])
 
 
 def test_pauses_without_end_are_not_ticked_through() -> None:

@@ -12,7 +12,7 @@ from companion.mavlink.trust import admission
 from companion.mavlink.trust.admission import Admission
 from companion.pipeline.center import Center
 from companion.pipeline.fold import Pipeline
-from companion.pipeline.senders import CLOCKS_MAX, PlacedAttitude, Senders
+from companion.pipeline.senders import CLOCKS_AT_ONCE, CLOCKS_MAX, PlacedAttitude, Senders
 from companion.settings.model import Settings
 from companion.tracking.observers.position import PositionModel, PositionObserver
 from companion.tracking.tracker import ESTABLISHED, Tracker, TrackerSettings
@@ -30,6 +30,7 @@ from companion.values import (
     Rejection,
     Report,
     ReportNoise,
+    RoundTrip,
     Source,
     Tick,
     Update,
@@ -106,6 +107,34 @@ def test_ids_without_end_do_not_fill_the_lists() -> None:
         assert lists.admits(f"icao:{number:06X}") is (f"{number:06X}"[0] == "4")
         assert len(lists._known) <= admission.KNOWN_MAX
     assert [lists.admits(uav) for uav in ("1:1", "1:7", "2:1")] == [True, False, False]
+
+
+def test_clocks_are_forgotten_between_ticks_and_those_of_tracks_are_kept() -> None:
+    tracked = {str(Source(number, 1)) for number in range(0, 200, 10)}
+    senders = Senders(Settings(), "255:1", tracked)
+    for number in range(CLOCKS_MAX + 2 * CLOCKS_AT_ONCE):
+        source = Source(255 - number % 256, 1 + number // 256)
+        senders.round_trip(RoundTrip(2 * S, source, S, 1))
+        assert len(senders._clocks) <= CLOCKS_MAX
+    assert tracked | {"255:1"} <= senders._clocks.keys()
+    assert str(source) in senders._clocks
+
+
+def test_more_tracks_than_clocks_leave_all_of_them_their_own() -> None:
+    class Everyone:
+        asked = 0
+
+        def __contains__(self, name: object) -> bool:
+            self.asked += 1
+            return True
+
+    everyone = Everyone()
+    senders = Senders(Settings(), None, everyone)
+    many = CLOCKS_MAX + 3 * CLOCKS_AT_ONCE
+    for number in range(many):
+        senders.round_trip(RoundTrip(2 * S, Source(number % 256, number // 256), S, 1))
+    assert len(senders._clocks) == many
+    assert everyone.asked < 4 * many  # they are not looked through for each that comes
 
 
 def test_what_is_said_beside_positions_is_forgotten() -> None:

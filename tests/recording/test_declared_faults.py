@@ -38,7 +38,18 @@ def test_no_list_is_no_fault(tmp_path: Path) -> None:
     assert declared_faults(tmp_path / "a.tlog") == ()
 
 
-@pytest.mark.parametrize("text", ["nonsense", "[1]", '[{"unix": 1}]', '{"a": 1}'])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "nonsense",
+        "[1]",
+        "[" * 100_000,
+        '[{"unix": 1e999, "sysid": 1}]',
+        '[{"unix": 1}]',
+        '{"a": 1}',
+    ],
+    ids=range(6),
+)
 def test_what_is_no_list_of_events(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.tlog.events.json").write_text(text)
     with pytest.raises(LogError, match="not a list of events"):

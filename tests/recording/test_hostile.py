@@ -11,13 +11,14 @@ from pathlib import Path
 
 import pytest
 import zstandard
+from mcap.records import Attachment, Metadata
 from support import HANG_S
 
 from companion.recording import schemas
 from companion.recording.container import LARGEST, MAGIC, Damage, Message, Walk
 from companion.recording.mcap_file import McapFile
-from companion.recording.parts import HOLE, HOLES_MAX, read_story
-from companion.recording.reader import LogError, read_log, read_settings
+from companion.recording.parts import EVENTS_MAX, HOLE, HOLES_MAX, Hole, Part, read_story
+from companion.recording.reader import LogError, read_log, read_settings, utc_offset_ns
 from companion.recording.recover import Recovered, recover, recover_leftovers
 from companion.recording.writer import Writer
 from companion.values import Event, Frame, Source, Tick
@@ -198,6 +199,10 @@ def bombs(folder: Path) -> list[Path]:
         "descriptions": MAGIC + b"".join(_packed(_schema(number)) for number in range(1, 60)),
         "holes": MAGIC + record(METADATA, _hole()) * 300_000,
         "channels": MAGIC + described() + b"".join(_channel(number) for number in range(1, 65_000)),
+        "channel-pairs": MAGIC + _packed(_channel(1, _pairs(2_300_000))),
+        "metadata-pairs": MAGIC + _metadata(_pairs(1_000_000)),
+        "metadata": MAGIC + _metadata(b"") * 1_000_000,
+        "attachments": MAGIC + record(ATTACHMENT, _attachment()) * 400_000,
     }  # fmt: skip
     paths = []
     for name, data in made.items():
@@ -222,11 +227,22 @@ def _schema(number: int) -> bytes:
     return record(3, body)
 
 
-def _channel(number: int) -> bytes:
-    topic = b"/mavlink/%d" % number
-    return record(4, struct.pack("<HH", number, 0) + text(topic) + text(b"") * 2) + record(
-        5, struct.pack("<HIQQ", number, 0, 1, 1)
-    )
+def _channel(number: int, pairs: bytes = b"") -> bytes:
+    head = struct.pack("<HH", number, 0) + text(b"/mavlink/%d" % number) + text(b"")
+    return record(4, head + text(pairs)) + record(5, struct.pack("<HIQQ", number, 0, 1, 1))
+
+
+def _pairs(count: int) -> bytes:
+    return b"".join(text(b"%06x" % number) + text(b"") for number in range(count))
+
+
+def _metadata(pairs: bytes) -> bytes:
+    return record(METADATA, text(b"part") + text(pairs))
+
+
+def _attachment() -> bytes:
+    body = bytes(16) + text(b"a") + text(b"b") + bytes(8)
+    return body + struct.pack("<I", zlib.crc32(body))
 
 
 def _hole() -> bytes:
@@ -236,6 +252,7 @@ def _hole() -> bytes:
 
 QUICK = frozenset(("frame", "both", "claim", "unsized", "sparse-attachment", "sparse-chunk"))
 SLOW = frozenset(("many", "tiny", "descriptions", "holes", "channels", "sparse"))
+PAIRS = frozenset(("channel-pairs", "metadata-pairs", "metadata", "attachments"))
 _READ_ALL = r"""
 import re, sys
 from pathlib import Path
@@ -253,7 +270,9 @@ for path in map(Path, sys.argv[1:]):
 """
 
 
-@pytest.mark.parametrize("names", [QUICK, pytest.param(SLOW, marks=pytest.mark.full)])
+@pytest.mark.parametrize(
+    "names", [QUICK, *(pytest.param(names, marks=pytest.mark.full) for names in (SLOW, PAIRS))]
+)
 def test_no_file_takes_more_memory_than_there_is(tmp_path: Path, names: frozenset[str]) -> None:
     """Nor for ever: each is read, told and recovered within ``HANG_S``."""
     wanted = [path for path in bombs(tmp_path) if path.stem in names]
@@ -261,8 +280,49 @@ def test_no_file_takes_more_memory_than_there_is(tmp_path: Path, names: frozense
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=HANG_S)
     assert done.returncode == 0, done.stderr
     peaks_mb = {name: int(peak) for name, peak in map(str.split, done.stdout.splitlines())}
-    assert len(peaks_mb) == len(names) == 6
+    assert len(peaks_mb) == len(names) == len(wanted)
     assert max(peaks_mb.values()) < MOST_MB, peaks_mb
+
+
+def test_pairs_without_end_are_damage(tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    kept = _metadata(_pairs(3))
+    for wide in (_metadata(_pairs(9000)), _packed(_channel(1, _pairs(9000)))):
+        path.write_bytes(MAGIC + wide + kept)
+        damage, found = Walk(path)
+        assert isinstance(damage, Damage)
+        assert isinstance(found, Metadata)
+        assert len(found.metadata) == 3
+
+
+def test_all_pairs_of_all_channels_are_bounded(tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    pairs = _pairs(4000)
+    path.write_bytes(MAGIC + b"".join(_packed(_channel(number, pairs)) for number in range(1, 60)))
+    walk = Walk(path)
+    found = [isinstance(content, Damage) for content in walk]
+    assert found == sorted(found)  # once it is too much, nothing further is read
+    assert 20 < len(walk.channels) < 40
+    assert sum(len(channel.metadata) for channel in walk.channels.values()) < 140_000
+
+
+@pytest.mark.parametrize("each", [_metadata(b""), record(ATTACHMENT, _attachment())])
+def test_more_of_a_kind_than_any_file_has_is_lost(tmp_path: Path, each: bytes) -> None:
+    torn = tmp_path / "x.mcap.active"
+    torn.write_bytes(MAGIC + each * 10_100 + described() + message(no_frame(FRAME)))
+    found = recover(torn)
+    assert found.lost_bytes == 100 * len(each)
+    assert found.messages == {schemas.FRAMES_TOPIC: 1}
+    assert sum(isinstance(one, Attachment | Metadata) for one in Walk(found.path)) == 10_000
+
+
+def test_more_channels_than_a_recording_has_are_put_aside(tmp_path: Path) -> None:
+    torn = tmp_path / "x.mcap.active"
+    torn.write_bytes(MAGIC + _packed(b"".join(_channel(number) for number in range(1 << 16))))
+    (told,) = recover_leftovers(tmp_path)
+    said = "more channels than a recording has; kept as x.mcap.damaged"
+    assert str(told) == f"{torn}: {said}"
+    assert [path.name for path in tmp_path.iterdir()] == ["x.mcap.damaged"]
 
 
 def test_messages_are_read_as_they_are_asked_for(tmp_path: Path) -> None:
@@ -297,6 +357,47 @@ def test_a_time_beyond_all_time_is_said(tmp_path: Path) -> None:
         list(read_log(path))
 
 
+@pytest.mark.parametrize(
+    ("topic", "data", "said"),
+    [
+        (
+            schemas.ROUND_TRIPS_TOPIC,
+            schemas.RoundTripMessage(t_ns=1, sysid=1, compid=2**32 - 1).SerializeToString(),
+            "a round trip with nobody",
+        ),
+        (
+            schemas.DUTIES_TOPIC,
+            schemas.DutyMessage(t_ns=1, serves=["1:1"] * 10_001).SerializeToString(),
+            "a duty of too many UAVs",
+        ),
+        (
+            schemas.DUTIES_TOPIC,
+            schemas.DutyMessage(t_ns=1, serves=["1"] * 1_000_000).SerializeToString(),
+            "an event that is longer than any",
+        ),
+        (schemas.FRAMES_TOPIC, no_frame(FRAME) * 200_000, "an event that is longer than any"),
+    ],
+    ids=["ids", "names", "names without end", "twice and again"],
+)
+def test_an_event_that_is_none_is_said(tmp_path: Path, topic: str, data: bytes, said: str) -> None:
+    path = tmp_path / "x.mcap"
+    frame = MAGIC + _packed(described() + message(no_frame(FRAME)))
+    path.write_bytes(frame + _packed(described(topic.encode()) + message(data)))
+    with pytest.raises(LogError, match=f"not a recording of this program: {said}"):
+        list(read_log(path))
+
+
+@pytest.mark.parametrize(
+    "data", [b"\xff\xff", schemas.ClockSetMessage(utc_offset_ns=2**63 - 1).SerializeToString()]
+)
+def test_a_clock_that_cannot_be_is_said_wherever_it_is_read(tmp_path: Path, data: bytes) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(MAGIC + _packed(described(schemas.CLOCK_TOPIC.encode()) + message(data)))
+    for read in (lambda: list(read_log(path)), lambda: utc_offset_ns([path])):
+        with pytest.raises(LogError, match="not a recording of this program"):
+            read()
+
+
 def test_settings_that_are_no_text_are_said(tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
     with path.open("wb") as file:
@@ -316,6 +417,26 @@ def test_holes_without_number_are_counted_together(tmp_path: Path) -> None:
     holes = read_story(path).holes
     assert len(holes) == HOLES_MAX
     assert holes[-1].events == 2 * 6
+
+
+def test_a_hole_says_nothing_that_a_terminal_obeys_and_no_number_beyond_all(tmp_path: Path) -> None:
+    hole = Hole.from_metadata({"t_ns": "5", "events": "1", "why": "\x1b[2J\x1b]0;x\x07\ndisk \x9b"})
+    assert hole.why == "[2J]0;xdisk "
+    for events in ("-1", "", "9" * 19, "9" * 4300, "9" * 5000):
+        with pytest.raises(
+            ValueError, match=r"a hole of more events|a hole whose numbers are none"
+        ):
+            Hole.from_metadata({"t_ns": "5", "events": events, "why": ""})
+    path, most = tmp_path / "x.mcap", str(EVENTS_MAX).encode()
+    pairs = {b"t_ns": b"5", b"events": most, b"why": b"x"}
+    body = text(b"".join(text(key) + text(value) for key, value in pairs.items()))
+    path.write_bytes(MAGIC + record(METADATA, text(HOLE.encode()) + body) * (HOLES_MAX + 5))
+    assert read_story(path).holes[-1].events == EVENTS_MAX
+
+
+@pytest.mark.parametrize("number", ["9" * 10, "9" * 5000])
+def test_a_part_beyond_all_numbers_is_none(number: str) -> None:
+    assert Part.from_metadata({"run": "r", "number": number}) is None
 
 
 def test_what_others_pack_with_lz4_is_read(tmp_path: Path) -> None:

@@ -54,6 +54,14 @@ def test_a_hand_packed_tick_is_the_generated_one(t_ns: int) -> None:
     assert schemas.encode_tick(t_ns) == schemas.TickMessage(t_ns=t_ns).SerializeToString()
 
 
+def test_frames_of_made_up_ids_fill_no_memory() -> None:
+    encoder = schemas.FrameEncoder()
+    for number in range(schemas.HEADS_MAX + 10):
+        frame = Frame(1, f"udp:{number}", Source(1, 1), 0, b"\xfe")
+        assert codec.to_frame(encoder.encode(frame), {}) == frame
+    assert len(encoder._heads) == 10
+
+
 @given(FRAMES)
 def test_a_frame_survives_the_round_trip(frame: Frame) -> None:
     assert codec.to_frame(schemas.FrameEncoder().encode(frame), {}) == frame

@@ -3,15 +3,21 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import Final, Self, TypeGuard
 
 import numpy as np
 
-from companion.values import ComplexArray, FloatArray, UserError
+from companion.values import ComplexArray, FloatArray, UserError, shown
 
 CALIBRATION_HEADER: Final = "channel,element,phase_deg,gain_db"
 BOUNDED_HEADER: Final = f"{CALIBRATION_HEADER},phase_error_deg,gain_error_db"
 """The header of a table that says how far its numbers may be off."""
+GAIN_MAX_DB: Final = 1000.0
+"""Most that a gain may be, either way: beyond it factors are no numbers any more."""
+DIGITS_MAX: Final = 18
+"""Most digits of a whole number: Python reads thousands, and then raises another error."""
+PHASE_MAX_DEG: Final = 1e6
+"""Most that a phase may be, either way, for it to be one still."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +58,8 @@ class Calibration:
             for element, value in enumerate(values):
                 if not math.isfinite(value):
                     raise UserError(f"{name} {value} of element {element} is not finite")
+                if name == "gain" and abs(value) > GAIN_MAX_DB:
+                    raise UserError(f"gain {value:.4g} dB of element {element}: at most 1000")
 
     @classmethod
     def ideal(cls, order: Sequence[int]) -> Self:
@@ -94,11 +102,12 @@ def parse_calibration(text: str) -> Calibration:
             raise UserError(f"line {number}: channel {channel} stands twice")
         if element in measured:
             raise UserError(f"line {number}: element {element} stands twice")
-        phase_deg = real(number, "phase_deg", found[2])
-        measured[element] = math.radians(phase_deg), real(number, "gain_db", found[3])
+        phase_deg = real(number, "phase_deg", found[2], PHASE_MAX_DEG)
+        measured[element] = math.radians(phase_deg), real(number, "gain_db", found[3], GAIN_MAX_DB)
         if bounded:
-            off_deg = real(number, "phase_error_deg", found[4])
-            measured[element] += math.radians(off_deg), real(number, "gain_error_db", found[5])
+            off_deg = real(number, "phase_error_deg", found[4], PHASE_MAX_DEG)
+            off_db = real(number, "gain_error_db", found[5], GAIN_MAX_DB)
+            measured[element] += math.radians(off_deg), off_db
         order[channel] = element
     for name, seen in (("channel", order), ("element", measured)):
         missing = set(range(len(order))) - set(seen)
@@ -132,17 +141,26 @@ def fields(text: str, header: str) -> Iterator[tuple[int, list[str]]]:
 def whole(number: int, name: str, field: str, least: int, most: int) -> int:
     """A whole number of a line. Raises ``UserError`` outside ``least`` to ``most``."""
     digits = field.removeprefix("-")
-    if not (digits.isascii() and digits.isdecimal()) or not least <= int(field) <= most:
-        raise UserError(f"line {number}: {name} {field!r} is not a whole number, {least} to {most}")
+    is_one = digits.isascii() and digits.isdecimal() and len(digits) <= DIGITS_MAX
+    if not is_one or not least <= int(field) <= most:
+        said = f"{shown(field)} is not a whole number, {least} to {most}"
+        raise UserError(f"line {number}: {name} {said}")
     return int(field)
 
 
-def real(number: int, name: str, field: str) -> float:
-    """A finite number of a line. Raises ``UserError`` for anything else."""
+def real(number: int, name: str, field: str, most: float = math.inf) -> float:
+    """A number of a line, within ``most`` either way. Raises ``UserError`` for anything else."""
     try:
         value = float(field)
     except ValueError:
         value = np.nan
     if not np.isfinite(value):
-        raise UserError(f"line {number}: {name} {field!r} is not a finite number")
+        raise UserError(f"line {number}: {name} {shown(field)} is not a finite number")
+    if abs(value) > most:
+        raise UserError(f"line {number}: {name} {shown(field)} is not within {most:.0f}")
     return value
+
+
+def is_number(given: object, most: float) -> TypeGuard[float]:
+    """Whether something that was read is a number, within ``most`` either way."""
+    return type(given) in (int, float) and -most <= given <= most  # type: ignore[operator]

@@ -16,7 +16,6 @@ Outside of the tables nothing is known.
 
 import itertools
 import math
-import tomllib
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -24,15 +23,21 @@ import numpy as np
 
 from companion.beams.hardware.calibration import (
     CALIBRATION_HEADER,
+    GAIN_MAX_DB,
+    PHASE_MAX_DEG,
     Calibration,
+    is_number,
     parse_calibration,
 )
-from companion.values import FloatArray, UserError
+from companion.values import FloatArray, UserError, read_toml, shown
 
 FARTHEST_DEG: Final = 90.0
 """Most that a channel's phase may differ from one frequency to the next, over channel 0's."""
 SAME: Final = 1e-9
 """Share of a frequency by which it may miss a table's and still be the same."""
+FREQUENCY_MAX_HZ: Final = 1e15
+LARGEST: Final = 1 << 22
+"""Most characters of tables: those of 4096 channels at 30 frequencies."""
 REQUIRED: Final = ("phase_deg", "gain_db")
 BOUNDS: Final = ("phase_error_deg", "gain_error_db")
 
@@ -59,8 +64,8 @@ def calibration_at(text: str, frequency_hz: float) -> Calibration:
 def _read(text: str) -> tuple[list[int], list[_Table]]:
     """Order and tables, by rising frequency."""
     try:
-        told = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        told = read_toml(text, LARGEST)
+    except UserError as error:
         header = f"a CSV file begins with {CALIBRATION_HEADER}"
         raise UserError(f"neither calibration as CSV nor as TOML: {error}; {header}") from error
     order, given = told.get("order"), told.get("table")
@@ -71,7 +76,9 @@ def _read(text: str) -> tuple[list[int], list[_Table]]:
     ):
         raise UserError("TOML of a calibration has an order and a [[table]] for each frequency")
     if not all(type(element) is int for element in order):
-        raise UserError(f"order {order} is not of whole numbers")
+        raise UserError(f"order {shown(order)} is not of whole numbers")
+    if sorted(order) != list(range(len(order))) or not order:
+        raise UserError(f"order {shown(order)} is not each of 0 to {max(len(order) - 1, 0)} once")
     tables = sorted((_table(one, len(order)) for one in given), key=lambda one: one.frequency_hz)
     for low, high in itertools.pairwise(tables):
         where = f"{low.frequency_hz:.9g} Hz and {high.frequency_hz:.9g} Hz"
@@ -90,14 +97,17 @@ def _table(given: Any, size: int) -> _Table:
     if set(given) != {"frequency_hz", *names}:
         raise UserError(f"a table has frequency_hz, {', '.join(names)}, not {', '.join(given)}")
     frequency = given["frequency_hz"]
-    if type(frequency) not in (int, float) or not 0 < frequency < math.inf:
-        raise UserError(f"frequency_hz = {frequency!r} is not above 0")
+    if not is_number(frequency, FREQUENCY_MAX_HZ) or frequency <= 0:
+        raise UserError(f"frequency_hz = {shown(frequency)} is not above 0, up to 1e15")
     columns = []
     for name in names:
         column = given[name]
-        numbers = isinstance(column, list) and all(type(one) in (int, float) for one in column)
-        if not numbers or len(column) != size or not np.isfinite(column).all():
-            raise UserError(f"{name} at {frequency:.9g} Hz is not {size} finite numbers")
+        most = GAIN_MAX_DB if name.startswith("gain") else PHASE_MAX_DEG
+        numbers = isinstance(column, list) and all(is_number(one, most) for one in column)
+        if not numbers or len(column) != size:
+            raise UserError(
+                f"{name} at {frequency:.9g} Hz is not {size} finite numbers within {most:.0f}"
+            )
         columns.append(np.array(column, dtype=float))
     return _Table(float(frequency), *columns, *([] if bounded else [None, None]))
 
@@ -148,8 +158,6 @@ def _calibration(order: list[int], table: _Table) -> Calibration:
             return ()
         return tuple(float(column[order.index(element)]) for element in range(len(order)))
 
-    if sorted(order) != list(range(len(order))):
-        raise UserError(f"order {order} is not each of 0 to {len(order) - 1} once")
     off_deg = by_element(table.phase_error_deg)
     return Calibration(
         tuple(math.radians(phase) for phase in by_element(table.phase_deg)),

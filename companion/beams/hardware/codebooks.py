@@ -40,6 +40,10 @@ SAMPLES_PER_BEAM: Final = 4
 """Samples while a direction crosses one beam."""
 
 
+WEIGHT_MAX: Final = 1e300
+"""Most that a weight of a list may be; the greatest of a beam is at least one over it."""
+
+
 class Kind(StrEnum):
     """Origin of a codebook."""
 
@@ -118,6 +122,9 @@ def listed(weights: ComplexArray, array: Array) -> Codebook:
     silent = np.flatnonzero(~weights.any(axis=0))
     if silent.size:
         raise UserError(f"column {silent[0]} of the weights is zero")
+    most = np.maximum(np.abs(weights.real), np.abs(weights.imag)).max(axis=0)
+    if most.max() > WEIGHT_MAX or most.min() < 1 / WEIGHT_MAX:
+        raise UserError(f"the greatest weight of each beam is within {WEIGHT_MAX:.0e}")
     return Codebook(Kind.LISTED, cone.unit_power(array, weights))
 
 

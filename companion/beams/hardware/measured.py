@@ -20,6 +20,8 @@ from companion.beams.array.geometry import Array
 from companion.beams.array.steering import steering_matrix, unit_directions
 from companion.beams.hardware.calibration import (
     BOUNDED_HEADER,
+    GAIN_MAX_DB,
+    PHASE_MAX_DEG,
     Calibration,
     channel_error,
     fields,
@@ -60,9 +62,11 @@ def parse_responses(text: str) -> Responses:
     """
     found: dict[tuple[float, float], dict[int, complex]] = {}
     for number, row in fields(text, MEASURED_HEADER):
-        towards = real(number, "azimuth_deg", row[0]), real(number, "elevation_deg", row[1])
+        azimuth_deg = real(number, "azimuth_deg", row[0], PHASE_MAX_DEG)
+        towards = azimuth_deg, real(number, "elevation_deg", row[1], PHASE_MAX_DEG)
         channel = whole(number, "channel", row[2], 0, 4095)
-        phase_deg, gain_db = real(number, "phase_deg", row[3]), real(number, "gain_db", row[4])
+        phase_deg = real(number, "phase_deg", row[3], PHASE_MAX_DEG)
+        gain_db = real(number, "gain_db", row[4], GAIN_MAX_DB)
         channels = found.setdefault(towards, {})
         if channel in channels:
             raise UserError(f"line {number}: channel {channel} stands twice at {towards}")

@@ -12,7 +12,7 @@ import pickle
 import struct
 from typing import Any, Final
 
-from companion.beams.hardware.calibration import Calibration
+from companion.beams.hardware.calibration import PHASE_MAX_DEG, Calibration, is_number
 from companion.values import UserError
 
 ELEMENTS: Final = 8
@@ -46,8 +46,10 @@ def numbers(what: str, data: bytes) -> list[float]:
     except Exception as error:  # a damaged pickle raises whatever it likes
         raise UserError(f"{what}: not a pickle of numbers: {error}") from error
     good = isinstance(found, list) and len(found) == ELEMENTS
-    if not good or not all(type(one) in (int, float) and math.isfinite(one) for one in found):
-        raise UserError(f"{what}: not a list of {ELEMENTS} finite numbers")
+    if not good or not all(is_number(one, PHASE_MAX_DEG) for one in found):
+        raise UserError(
+            f"{what}: not a list of {ELEMENTS} finite numbers within {PHASE_MAX_DEG:.0f}"
+        )
     return [float(one) for one in found]
 
 

@@ -14,10 +14,10 @@ each beam has its strongest element there.
 """
 
 import math
-import tomllib
 from dataclasses import dataclass
 from typing import Any, Final
 
+from companion.beams.hardware.calibration import is_number
 from companion.beams.hardware.devices import (
     TMYTEK_CHANNELS,
     TMYTEK_RANGE_DB,
@@ -25,10 +25,12 @@ from companion.beams.hardware.devices import (
     Mode,
 )
 from companion.beams.hardware.quantise import Resolution, stepped
-from companion.values import UserError
+from companion.values import UserError, read_toml, shown
 
 BOARD_CHANNELS: Final = 4
 BOARDS: Final = TMYTEK_CHANNELS // BOARD_CHANNELS
+UNIT_MAX_DB: Final = 200.0
+"""Most that a gain of a unit may be, either way: each step of its range takes memory."""
 KEYS: Final = {"mode", "common_db", "element_db"}
 
 
@@ -58,14 +60,11 @@ RELATIVE: Final = UnitGains(Mode.TX, 0.0, TMYTEK_RANGE_DB)
 
 def parse_unit_gains(text: str) -> UnitGains:
     """Read the file described above. Raises ``UserError`` that names the key."""
-    try:
-        told = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise UserError(f"not TOML: {error}") from error
+    told = read_toml(text)
     if set(told) != KEYS:
         raise UserError(f"the keys are {', '.join(sorted(KEYS))}, not {', '.join(sorted(told))}")
     if told["mode"] not in tuple(Mode):
-        raise UserError(f'mode = {told["mode"]!r} is not "TX" or "RX"')
+        raise UserError(f'mode = {shown(told["mode"])} is not "TX" or "RX"')
     common = [_numbers("common_db", pair, 2) for pair in _by_board("common_db", told["common_db"])]
     element = _numbers("element_db", _by_board("element_db", told["element_db"]), BOARDS)
     if any(low > high for low, high in common) or min(element) < 0:
@@ -85,10 +84,12 @@ def _by_board(key: str, given: Any) -> list[Any]:
 
 def _numbers(key: str, given: Any, count: int) -> list[float]:
     if isinstance(given, list) and len(given) == count:
-        values = [float(one) for one in given if type(one) in (int, float) and math.isfinite(one)]
+        values = [float(one) for one in given if is_number(one, UNIT_MAX_DB)]
         if len(values) == count:
             return values
-    raise UserError(f"{key}: {given!r} is not {count} finite numbers")
+    raise UserError(
+        f"{key}: {shown(given)} is not {count} finite numbers within {UNIT_MAX_DB:.0f} dB"
+    )
 
 
 def _floor(gain_db: float) -> float:

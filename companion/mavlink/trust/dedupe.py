@@ -13,6 +13,8 @@ from companion.values import Frame
 
 WINDOW_NS: Final = 30_000_000_000
 """How long a report is remembered: longer than any link has been seen to lag behind another."""
+LINKS_MAX: Final = 4096
+"""Links that are counted: a log may name one for each of its frames."""
 LATENCIES_KEPT: Final = 256
 """Newest latencies kept per link."""
 
@@ -52,9 +54,7 @@ class Dedupe:
         """Count a frame; True if the same content came before, within the window."""
         while self._order and self._order[0][1].t_ns < frame.t_ns - WINDOW_NS:
             self._forget(*self._order.popleft())
-        share = self.shares.get(frame.link)
-        if share is None:
-            share = self.shares.setdefault(frame.link, LinkShare())
+        share = self._share(frame.link)
         key = content(frame.raw)
         first = self._seen.get(key)
         if first is None:
@@ -71,7 +71,15 @@ class Dedupe:
         """Set the latency, in seconds, of the report that was last found to be new."""
         _, first = self._order[-1]
         first.latency_s = latency_s
-        self.shares[first.link].latencies_s.append(latency_s)
+        self._share(first.link).latencies_s.append(latency_s)
+
+    def _share(self, link: str) -> LinkShare:
+        share = self.shares.get(link)
+        if share is None:
+            share = LinkShare()
+            if len(self.shares) < LINKS_MAX:
+                self.shares[link] = share
+        return share
 
     def _forget(self, key: bytes, first: _First) -> None:
         if self._seen.get(key) is first:

@@ -19,6 +19,7 @@ from companion.pipeline.fleet.sharing import Sharing
 from companion.pipeline.fleet.trust import Told, Trust, Witness
 from companion.settings.fleet import FleetSettings
 from companion.values import (
+    DUTY_MAX,
     Duty,
     Frame,
     Notice,
@@ -210,7 +211,7 @@ class Member:
         standing = self.duties.others(now_ns)
         elsewhere = {uav for n, said in standing.items() if n in trusted for uav, _ in said.serves}
         spares = tuple(sorted(elsewhere - self.duties.serves.keys())) if self._nulls else ()
-        duty = tuple(sorted(self.duties.serves)), spares
+        duty = tuple(sorted(self.duties.serves)), spares[:DUTY_MAX]
         if now_ns - self._looked_ns > FORGET_NS // 10:
             self._looked_ns = now_ns
             self._forget(now_ns)

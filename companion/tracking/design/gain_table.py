@@ -33,6 +33,10 @@ from numpy.typing import ArrayLike
 from companion.values import FloatArray, UserError
 
 FORMAT: Final = "kinematic-design-1"
+LARGEST: Final = 1 << 20
+"""Most characters of a design: that of the program has 4500."""
+NUMBER_MAX: Final = 1e30
+"""Most that a number of a design may be; its intervals are no shorter than one over it."""
 FINER: Final = 5
 """Intervals that ``verify`` checks for each step of the design's grid."""
 
@@ -98,6 +102,8 @@ class KinematicDesign:
     @classmethod
     def from_json(cls, text: str) -> Self:
         """Read and verify a design. Raises ``DesignError``, which says what is wrong with it."""
+        if len(text) > LARGEST:
+            raise DesignError("not a kinematic design: too large")
         try:
             given: dict[str, Any] = json.loads(text)
             if given.pop("format", None) != FORMAT:
@@ -113,7 +119,9 @@ class KinematicDesign:
             design = cls(**given)
         except DesignError:
             raise
-        except (KeyError, TypeError, AttributeError, ValueError) as error:
+        except RecursionError as error:
+            raise DesignError("not a kinematic design: nested too deeply") from error
+        except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
             raise DesignError(f"not a kinematic design: {error}") from error
         verify(design)
         return design
@@ -218,6 +226,8 @@ def _check(design: KinematicDesign) -> None:
     numbers = np.concatenate([bounds, design.lyapunov, *design.corrections, *design.multipliers])
     if not (np.all(np.isfinite(numbers)) and np.all(bounds >= 0)):
         raise DesignError("the bounds of a design are finite and at least 0, its gains finite")
+    if grid[0] < 1 / NUMBER_MAX or max(grid[-1], np.abs(numbers).max()) > NUMBER_MAX:
+        raise DesignError(f"the numbers of a design are within {NUMBER_MAX:.0e}")
     p11, p12, p22 = design.lyapunov
     if not (p11 > 0 and p11 * p22 > p12 * p12):
         raise DesignError("the Lyapunov matrix of a design is not positive definite")

@@ -8,7 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.beams.hardware.calibration import Calibration, parse_calibration
+from companion.beams.hardware.calibration import (
+    CALIBRATION_HEADER,
+    Calibration,
+    parse_calibration,
+)
 from companion.beams.hardware.calibration_tables import calibration_at
 from companion.pipeline import assembly
 from companion.settings.files import load
@@ -30,6 +34,7 @@ gain_db = [0.0, 2.0, -1.0]
 phase_error_deg = [2.0, 2.0, 1.0]
 gain_error_db = [0.1, 0.2, 0.1]
 """
+EMPTY = "order = []\n[[table]]\nfrequency_hz = {}e9\nphase_deg = []\ngain_db = []\n"
 SEEDS = st.integers(0, 2**32 - 1)
 
 
@@ -103,13 +108,25 @@ ONE = "order = [0, 1]\n[[table]]\nfrequency_hz = 1e9\nphase_deg = [0, 1]\ngain_d
         ("order = [0]\ntable = []\n", 1e9, "there is no [[table]]"),
         ("order = [0]\ntable = [1]\n", 1e9, "[[table]] is not a table"),
         ("order = [0]\n", 1e9, "has an order and a [[table]]"),
+        (TWO.replace("30.0]", "9" * 400 + "]"), 10e9, "is not 3 finite numbers within 1000000"),
+        (TWO.replace("30.0]", "9" * 5000 + "]"), 10e9, "a number of thousands of digits"),
+        (TWO.replace("-1.0]", "1e5]"), 10e9, "gain_db at 1.05e+10 Hz is not 3 finite"),
+        (TWO.replace("10.5e9", "9" * 400), 10e9, "is not above 0, up to 1e15"),
+        (TWO.replace("[1, 0, 2]", "[1, 0, 0x" + "f" * 5000 + "]"), 10e9, "is not each of 0 to 2"),
+        (EMPTY.format(1) + EMPTY.format(2)[11:], 1.5e9, "order [] is not each of"),
+        ("a." * 20_000 + "a = 1", 1e9, "nested too deeply"),
+        (f"{CALIBRATION_HEADER}\n{'9' * 5000},0,0,0\n", 1e9, "is not a whole number"),
+        (f"{CALIBRATION_HEADER}\n0,0,0,-1e5\n", 1e9, "line 2: gain_db '-1e5' is not within 1000"),
+        (f"{CALIBRATION_HEADER}\n0,0,1e300,0\n", 1e9, "phase_deg '1e300' is not within 1000000"),
         ("chanel,element\n", 1e9, "neither calibration as CSV nor as TOML"),
     ],
+    ids=lambda value: str(value)[-40:],
 )  # fmt: skip
 def test_what_is_wrong_is_said(text: str, at_hz: float, said: str) -> None:
     with pytest.raises(UserError) as error:
         calibration_at(text, at_hz)
     assert said in str(error.value)
+    assert len(str(error.value)) < 600
 
 
 def test_the_frequency_is_that_of_the_array(tmp_path: Path) -> None:

@@ -90,6 +90,9 @@ def test_what_remains_is_bounded_and_said() -> None:
         (f"{MEASURED_HEADER}\n0,0,0,0,0\n0,0,0,0,0\n", "line 3: channel 0 stands twice"),
         (f"{MEASURED_HEADER}\n0,0,0,0,0\n0,0,2,0,0\n", "channel 1 of 2 has no response"),
         (f"{MEASURED_HEADER}\n0,0,0,nan,0\n", "not a finite number"),
+        (f"{MEASURED_HEADER}\n0,0,0,0,1e6\n", "line 2: gain_db '1e6' is not within 1000"),
+        (f"{MEASURED_HEADER}\n0,0,0,0,-1e6\n", "line 2: gain_db '-1e6' is not within 1000"),
+        (f"{MEASURED_HEADER}\n1e300,0,0,0,0\n", "azimuth_deg '1e300' is not within"),
     ],
 )
 def test_responses_that_are_none_are_refused(text: str, said: str) -> None:
@@ -154,6 +157,7 @@ class Evil:
         (pickle.dumps([float("nan")] * 8), "finite"),
         (pickle.dumps(["1"] * 8), "finite numbers"),
         (pickle.dumps([True] * 8), "finite numbers"),
+        (pickle.dumps([10**400] * 8), "finite numbers within"),
         (b"", "not a pickle"),
         (pickle.dumps([0.0] * 8)[:-3], "not a pickle"),
         (b"0" * 20_000, "more than a list"),

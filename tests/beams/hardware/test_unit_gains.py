@@ -128,10 +128,16 @@ def test_a_unit_without_a_range_is_set_by_phases_alone() -> None:
         (UNIT.replace("3.7", "nan"), "element_db"),
         (UNIT.replace("3.7", "true"), "element_db"),
         (UNIT.replace("3.7", "-1"), "element_db 0 or more"),
+        (UNIT.replace("-1.5", "9" * 400), "is not 2 finite numbers within 200 dB"),
+        (UNIT.replace("-1.5", "9" * 5000), "a number of thousands of digits"),
+        (UNIT.replace("-1.5", "0x" + "f" * 5000), "common_db: a number of thousands of digits"),
+        (UNIT.replace("-1.5", "-1e7"), "is not 2 finite numbers within 200 dB"),
+        ("x = " + "[" * 5000, "nested too deeply"),
         (UNIT.replace("[0.0, 10.0]", "[0.0]"), "common_db: [0.0] is not 2 finite numbers"),
         (UNIT.replace("[0.0, 10.0]", "[0.0, -1.0]"), "the least and the greatest"),
         (UNIT.replace("[0.0, 10.0]", "[50.0, 60.0]"), "no gain in common"),
     ],
+    ids=lambda value: str(value)[-40:],
 )
 def test_a_file_that_is_none_says_what_is_wrong(text: str, said: str) -> None:
     with pytest.raises(UserError) as error:

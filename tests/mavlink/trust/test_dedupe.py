@@ -5,7 +5,7 @@ import tracemalloc
 import pytest
 from pymavlink.dialects.v20 import all as dialect
 
-from companion.mavlink.trust.dedupe import WINDOW_NS, Dedupe
+from companion.mavlink.trust.dedupe import LINKS_MAX, WINDOW_NS, Dedupe
 from companion.values import Frame, Source
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -108,6 +108,16 @@ def test_memory_is_that_of_one_window() -> None:
         tracemalloc.stop()
     assert sizes[0] > per_window * 30  # it does remember the window
     assert sizes[1] < 1.2 * sizes[0]
+
+
+def test_links_without_end_are_not_all_counted() -> None:
+    dedupe = Dedupe()
+    for number in range(LINKS_MAX + 100):
+        assert not dedupe.is_repeat(sent(link=f"udp:{number}", boot_ms=number))
+        dedupe.took(0.1)
+    assert len(dedupe.shares) == LINKS_MAX
+    assert dedupe.is_repeat(sent(link="udp:0", boot_ms=LINKS_MAX + 50))
+    assert dedupe.shares["udp:0"].repeats == 1
 
 
 def test_which_link_was_first_and_how_late_each_is() -> None:

@@ -273,6 +273,10 @@ def test_a_design_is_the_same_after_a_trip_through_text(design: KinematicDesign)
         ({"surplus": 1}, "not a kinematic design"),
         ({"acceleration_mps2": "fast"}, "not a kinematic design"),
         ({"acceleration_mps2": -1.0}, "at least 0"),
+        ({"acceleration_mps2": 1e300}, "within 1e\\+30"),
+        ({"dt_s": [1e200 * dt for dt in WITH_VELOCITY.dt_s]}, "within 1e\\+30"),
+        ({"dt_s": [1e-200 * dt for dt in WITH_VELOCITY.dt_s]}, "within 1e\\+30"),
+        ({"acceleration_mps2": 10**400}, "not a kinematic design"),
         ({"acceleration_mps2": math.nan}, "finite"),
         ({"velocity_noise_mps": None}, "do not fit"),
         ({"lyapunov": [1.0, 2.0, 1.0]}, "positive definite"),
@@ -288,7 +292,14 @@ def test_a_bad_text_is_refused_in_one_line(change: dict[str, object], fault: str
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{", "3", '{"format": "kinematic-design-1"}'])
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "[]", "{", "3", '{"format": "kinematic-design-1"}'),
+        *("[" * 100_000, '{"a":' * 100_000, "9" * 6000, " " * (1 << 20) + "{}"),
+    ],
+    ids=range(9),
+)
 def test_what_is_no_design_is_refused(text: str) -> None:
     with pytest.raises(DesignError):
         KinematicDesign.from_json(text)

@@ -406,13 +406,13 @@ class Senders:
         self._waits.pop(uav, None)
 
     def forget_clocks(self, wanted: Container[str], now_ns: int) -> None:
-        """Keep ``CLOCKS_MAX`` clocks and those that are wanted, dropping the oldest others.
+        """Forget clocks that were long silent, but for those that are wanted, and what goes with them.
 
-        Those that were long silent go in any case: who comes and goes all day takes no memory.
+        Who comes and goes all day takes no memory.
         """
         silent_ns = now_ns - CLOCK_KEPT_NS
         names = [name for name in self._clocks if self._stamped_ns.get(name, now_ns) < silent_ns]
-        for name in (*names, *list(self._clocks)[: max(0, len(self._clocks) - CLOCKS_MAX)]):
+        for name in names:
             if not self._is_kept(name, wanted):
                 self._forget_clock(name)
         self._forget_beside(wanted, silent_ns)

@@ -406,7 +406,7 @@ class Senders:
         self._waits.pop(uav, None)
 
     def forget_clocks(self, wanted: Container[str], now_ns: int) -> None:
-        """Forget clocks that were long silent, but for those that are wanted, and what goes with them.
+        """Forget clocks that were long silent, but for those wanted, and what goes with them.
 
         Who comes and goes all day takes no memory.
         """

@@ -159,9 +159,9 @@ class Service:
 
     def _hear(self, event: Event) -> None:
         """Take in what came over this node's own links."""
-        self._step(event)
         if self.fleet is not None:
-            self.fleet.heard(event)
+            self.fleet.heard(event)  # first: others wait for it
+        self._step(event)
 
     def _step(self, event: Event) -> None:
         if isinstance(event, Frame):

@@ -168,6 +168,7 @@ def _node(name: str, member: Member, now_ns: int) -> Json:
     said, ahead = known.standing, known.clock.newest()
     reason = member.trust.aside.get(name)
     standing = member.duties.others(now_ns)
+    median_ms, p99_ms = _ways_ms(known, now_ns)
     state = "aside" if reason is not None else "there" if name in standing else "silent"
     return {
         "node": name,
@@ -184,13 +185,18 @@ def _node(name: str, member: Member, now_ns: int) -> Json:
         "clock_doubt_s": None if ahead is None else ahead.doubt_ns * 1e-9,
         "frames": known.frames,
         "used": known.used,
-        "way_p50_ms": _way_ms(known, 50),
-        "way_p99_ms": _way_ms(known, 99),
+        "way_p50_ms": median_ms,
+        "way_p99_ms": p99_ms,
     }
 
 
-def _way_ms(known: Neighbour, percentile: float) -> float | None:
-    return float(np.percentile(known.ways_ns, percentile)) * 1e-6 if known.ways_ns else None
+def _ways_ms(known: Neighbour, now_ns: int) -> tuple[float | None, float | None]:
+    """Median and 99th percentile of how long reports were on their way; None: none came."""
+    ways_ns = known.ways_ns(now_ns)
+    if not ways_ns:
+        return None, None
+    median_ns, p99_ns = np.percentile(ways_ns, (50, 99)).tolist()
+    return median_ns * 1e-6, p99_ns * 1e-6
 
 
 def _place(place: tuple[float, float, float] | None) -> Json | None:

@@ -119,7 +119,8 @@ def test_without_a_fleet_nobody_is_said_to_serve(shared_node: StandIn) -> None:
 def test_the_metrics_have_what_one_is_woken_for(north: StandIn) -> None:
     assert north.fleet is not None
     member = north.fleet.member
-    member.neighbours["south"].ways_ns.extend([10_000_000] * 100)
+    for _ in range(100):
+        member.neighbours["south"].came(north.now_ns(), 10_000_000)
     member.handed_over = 3
     alone = sum(one.served_by == [] for one in uavs(north).values())
     lines = client(north).get("/metrics").text.splitlines()

@@ -84,6 +84,8 @@ class FleetNode:
         self._session: Any = None  # of a peer, opened before there was a loop
         self._bus: Bus | None = None  # once all is declared
         self._flushing: asyncio.TimerHandle | None = None
+        self._told_ns = self._started_ns
+        self._told_every_ns = round(1e9 / settings.share_hz)
         self._has_twin = False
         self._listening: Listening | None = None
         patience_s = max(PATIENCE_S, PATIENCE_LEASES * settings.lease_s)
@@ -127,7 +129,7 @@ class FleetNode:
                     group.create_task(self._repeat(STANDING_S, self._stand), name="standing"),
                     group.create_task(self._repeat(ASKED_S, self._ask), name="clocks"),
                     group.create_task(self._repeat(OFFERED_S, self._offer), name="offers"),
-                    group.create_task(self._repeat(LOOK_S, self._offers.look), name="looks"),
+                    group.create_task(self._make_offers(), name="looks"),
                 ]
                 while not self._is_half_heard(self._now_ns()):
                     await asyncio.sleep(1.0)
@@ -157,6 +159,14 @@ class FleetNode:
             what(self._now_ns())
             await asyncio.sleep(period_s)
 
+    async def _make_offers(self) -> None:
+        """Look what to offer, some UAVs at a time; what takes long is done off the loop."""
+        while True:
+            make = self._offers.look(self._now_ns())
+            if make is not None:
+                self._offers.take(await asyncio.to_thread(make))
+            await asyncio.sleep(LOOK_S)
+
     def _declare(self, bus: Bus) -> None:
         base = f"{PREFIX}/{self.settings.site}"
         bus.serve(f"{base}/{self.name}/time", self._time)
@@ -173,14 +183,23 @@ class FleetNode:
     # --- what this node hears itself, and decides -------------------------------------------
 
     def heard(self, event: Event) -> None:
-        """Take in what came over this node's own links, after the pipeline had it."""
+        """Take in what came over this node's own links, before the pipeline has it.
+
+        What this node speaks for is told at once, unless something was told just now.
+        """
+        now_ns = self._now_ns()
         if isinstance(event, Frame):
+            self.member.hearing.behind_ns = max(now_ns - event.t_ns, 0)
             self.member.heard(event)
         elif isinstance(event, RoundTrip):
             self.member.answered(event)
         else:
             return
-        if self._flushing is None and self.member.neighbours and self._bus is not None:
+        if not self.member.neighbours or self._bus is None:
+            return
+        if now_ns - self._told_ns >= self._told_every_ns:
+            self._tell_of_heard(now_ns)
+        elif self._flushing is None:
             self._flush_soon()
 
     def ticked(self, now_ns: int) -> None:
@@ -188,6 +207,7 @@ class FleetNode:
         duty, notices = self.member.decide(now_ns)
         if duty is not None:
             self._step(duty)
+            self._stand(now_ns)  # at once: whom it took from another is served by two until then
         self._tell(notices)
 
     def _flush_soon(self) -> None:
@@ -196,10 +216,14 @@ class FleetNode:
 
     def _flush(self) -> None:
         self._flushing = None
-        said = self.member.sharing.due(self._now_ns())
+        self._tell_of_heard(self._now_ns())
+
+    def _tell_of_heard(self, now_ns: int) -> None:
+        said = self.member.sharing.due(now_ns)
         if said is not None:
+            self._told_ns = now_ns
             self._put("heard", messages.shared(said), express=True, reliable=False)
-        if self.member.sharing.has_more:
+        if self.member.sharing.has_more and self._flushing is None:
             self._flush_soon()
 
     # --- what it says -----------------------------------------------------------------------
@@ -299,7 +323,10 @@ class FleetNode:
         if node == self.name:
             self._tell_of_twin()
             return
-        self.member.stands(self._now_ns(), said)
+        now_ns = self._now_ns()
+        self.member.stands(now_ns, said)
+        if any(uav in self.member.duties.serves for uav, _ in said.serves):
+            self.ticked(now_ns)  # one of them is to let go
 
     def _offered(self, node: str, payload: bytes) -> None:
         self.member.offered(self._now_ns(), node, messages.to_offers(payload))

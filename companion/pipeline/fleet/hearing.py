@@ -66,6 +66,7 @@ class _Ears:
     missed: deque[Frame] = field(default_factory=lambda: deque(maxlen=MISSED))
 
     def is_silent(self, now_ns: int) -> bool:
+        """Whether nothing was heard of it for too long, all being read until ``now_ns``."""
         least_ns, most_ns = SILENT_NS
         wait_ns = min(max(SILENT_INTERVALS * self.interval_ns, least_ns), most_ns)
         return now_ns - self.heard_ns > wait_ns
@@ -76,11 +77,15 @@ class Hearing:
 
     ``contradicted`` and ``early`` hold names of nodes whose frames contradicted what is heard here
     or another node, or came before they can have been heard; whoever reads them empties them.
+    ``behind_ns`` is how old the newest frame of this node's own was when it was read: a vehicle is
+    not silent whose reports wait here. Else a node that is short of time would take in what the
+    others tell of everybody as well, and have less.
     """
 
     def __init__(self) -> None:
         self.contradicted: list[str] = []
         self.early: list[str] = []
+        self.behind_ns = 0
         self._heard = Recent()
         self._told = Recent()
         self._ears: dict[Source, _Ears] = {}
@@ -139,7 +144,7 @@ class Hearing:
         if frame.msgid == GLOBAL_POSITION_INT:
             return self._report(now_ns, node, frame, key)
         ears = self._ears.get(frame.source)
-        return [frame] if ears is None or ears.is_silent(now_ns) else []
+        return [frame] if ears is None or ears.is_silent(now_ns - self.behind_ns) else []
 
     def _report(self, now_ns: int, node: str, frame: Frame, key: bytes) -> list[Frame]:
         is_new = self._told.note(now_ns, key)
@@ -154,7 +159,7 @@ class Hearing:
         if ears is None:
             return [frame]
         ears.missed.append(frame)
-        if not ears.is_silent(now_ns):
+        if not ears.is_silent(now_ns - self.behind_ns):
             return []
         missed = [one for one in ears.missed if one.t_ns > ears.heard_ns]
         ears.missed.clear()

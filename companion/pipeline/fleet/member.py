@@ -155,11 +155,11 @@ class Member:
             key = content(frame.raw)
             if frame.msgid == GLOBAL_POSITION_INT:
                 if not self.hearing.was_told(key):  # the second time it is late, and no matter
-                    known.ways_ns.append(now_ns - frame.t_ns + frame.doubt_ns)
+                    known.came(now_ns, now_ns - frame.t_ns + frame.doubt_ns)
                 self.sharing.told(now_ns, node, frame.source, key, way_ns)
             events += self.hearing.told(now_ns, node, frame, key)
         for trip in said.trips:
-            silent_s = self.hearing.silent_s(str(trip.source), now_ns)
+            silent_s = self.hearing.silent_s(str(trip.source), now_ns - self.hearing.behind_ns)
             placed = here(trip, known.clock) if silent_s is None or silent_s > 1.0 else None
             if placed is not None:
                 events.append(placed)

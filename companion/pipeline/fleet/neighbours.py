@@ -22,7 +22,9 @@ DRIFT_MAX: Final = 200e-6
 """Greatest drift between two nodes' clocks, a ratio: two ordinary crystals, disciplined or not."""
 ANSWERS: Final = 3
 """Answers from which on what a node hears is used: the first, slow one would leave its doubt."""
-WAYS_KEPT: Final = 500
+WAYS_KEPT: Final = 4096
+WAYS_NS: Final = 60_000_000_000
+"""How long it counts how long a report was on its way."""
 TOLD_APART_NS: Final = 100_000_000
 """Difference of two nodes' clocks from which on it is told: with NTP there is none."""
 
@@ -78,8 +80,6 @@ class Neighbour:
     offers      its offers by UAV
     frames      frames that it told, ``used`` those that the pipeline had
     heard_ns    when there was word of it last
-    ways_ns     how long the newest reports took from being heard there to being here, at most: of
-                those that no other had told before
     """
 
     clock: NeighbourClock
@@ -90,8 +90,16 @@ class Neighbour:
     offers: dict[str, Offer] | None = None
     frames: int = 0
     used: int = 0
-    ways_ns: deque[int] = field(default_factory=lambda: deque(maxlen=WAYS_KEPT))
     apart_told: bool = False
+    _ways_ns: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=WAYS_KEPT))
+
+    def came(self, now_ns: int, way_ns: int) -> None:
+        """A report came that no other node had told before, so long after it was heard there."""
+        self._ways_ns.append((now_ns, way_ns))
+
+    def ways_ns(self, now_ns: int) -> list[int]:
+        """How long the reports of late were on their way, at most."""
+        return [way_ns for came_ns, way_ns in self._ways_ns if now_ns - came_ns < WAYS_NS]
 
 
 def here(trip: RoundTrip, clock: NeighbourClock) -> RoundTrip | None:

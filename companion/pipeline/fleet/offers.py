@@ -1,7 +1,7 @@
 """What this node offers each UAV: the gain that its array would have, if it served it alone.
 
-Made in turn, some at each call, so that no update is held up: every UAV has its turn about every
-two seconds, a new one at once.
+Made in turn, some at each call: every UAV has its turn about every two seconds, a new one at once.
+UAVs are predicted by whoever holds the pipeline; the beams are made on any thread.
 """
 
 import math
@@ -36,9 +36,11 @@ class Offers:
         self._waiting: list[str] = []
         self._last_ns: int | None = None
 
-    def look(self, now_ns: int) -> None:
-        """Make the offers whose turn it is. Call it some times a second, not at every update:
-        a call costs milliseconds, however few UAVs it is for.
+    def look(self, now_ns: int) -> Callable[[], dict[str, Offer]] | None:
+        """What makes the offers whose turn it is, on any thread; None: it is nobody's.
+
+        Give what it makes to ``take``. Call this some times a second, not at every update: it costs
+        milliseconds, however few UAVs it is for.
         """
         pipeline = self._pipeline
         wanted = [uav for uav in pipeline.tracker.uavs if pipeline.targets.wants(uav)]
@@ -50,31 +52,43 @@ class Offers:
         self._last_ns = now_ns
         many = max(LEAST, math.ceil(share * len(self.made)))
         chosen, self._waiting = self._waiting[:many], self._waiting[many:]
-        if chosen:
-            self._make(now_ns, chosen)
+        return self._made_of(now_ns, chosen) if chosen else None
 
-    def _make(self, now_ns: int, uavs: list[str]) -> None:
-        pipeline, array = self._pipeline, self._pipeline.array
+    def take(self, made: dict[str, Offer]) -> None:
+        """Take in offers that were made."""
+        self.made |= made
+
+    def _made_of(self, now_ns: int, uavs: list[str]) -> Callable[[], dict[str, Offer]]:
+        """What makes the offers for these, where they are predicted now."""
+        pipeline = self._pipeline
         at_ns = now_ns + round(pipeline.settings.beams.actuation_delay_s * 1e9)
         carrier = pipeline.carrier(now_ns, at_ns)
         known = None if isinstance(carrier, str) else carrier
         tracks = pipeline.tracks(now_ns, at_ns, uavs)
-        made = aim(now_ns, at_ns, tracks, known, array, self._alone, pipeline.coverage)
-        for uav in uavs:
-            self.made[uav] = Offer(uav, None, None, None, self._silent_s(uav, now_ns))
-        if not made.beams:
-            return
-        sure = self._least_db(made, [beam.pointing_bound_rad for beam in made.beams])
-        likely = self._least_db(made, [beam.pointing_p95_rad for beam in made.beams])
-        ranges_m = np.array([beam.range_m for beam in made.beams])
+        heard_s = {uav: self._silent_s(uav, now_ns) for uav in uavs}
+        parts = (pipeline.array, self._alone, pipeline.coverage)
+
+        def make() -> dict[str, Offer]:
+            return self._make(aim(now_ns, at_ns, tracks, known, *parts), heard_s)
+
+        return make
+
+    def _make(self, aimed: BeamSet, heard_s: dict[str, float | None]) -> dict[str, Offer]:
+        made = {uav: Offer(uav, None, None, None, since_s) for uav, since_s in heard_s.items()}
+        if not aimed.beams:
+            return made
+        sure = self._least_db(aimed, [beam.pointing_bound_rad for beam in aimed.beams])
+        likely = self._least_db(aimed, [beam.pointing_p95_rad for beam in aimed.beams])
+        ranges_m = np.array([beam.range_m for beam in aimed.beams])
         budget, antennas = self._alone.budget, self._alone.uav_antennas
+        array = self._pipeline.array
         snr_db = 10 * np.log10(link_budget.isotropic_snr(ranges_m, array, budget, antennas))
-        for i, beam in enumerate(made.beams):
-            heard_s = self.made[beam.uav].heard_s
+        for i, beam in enumerate(aimed.beams):
             gain_db = likely[i] if sure[i] is None else sure[i]
             sinr_db = None if gain_db is None else float(snr_db[i]) + gain_db
             told = _step(sure[i]), _step(likely[i]), _step(sinr_db)
-            self.made[beam.uav] = Offer(beam.uav, *told, heard_s)
+            made[beam.uav] = Offer(beam.uav, *told, heard_s[beam.uav])
+        return made
 
     def _least_db(self, made: BeamSet, angles_rad: list[float | None]) -> tuple[float | None, ...]:
         """The least gain of each beam within these angles of where its UAV is predicted."""

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from pymavlink.dialects.v20 import common
 from support import HANG_S, free_port, run_async
 
 from companion.mavlink.links.zenoh_bus import open_peer
@@ -19,10 +20,21 @@ from companion.pipeline.fold import Pipeline
 from companion.settings.fleet import FleetSettings
 from companion.settings.model import Settings
 from companion.settings.section import ConfigError
-from companion.values import Notice, Standing, UserError
+from companion.values import (
+    Duty,
+    Event,
+    Frame,
+    Notice,
+    Offer,
+    Shared,
+    Source,
+    Standing,
+    UserError,
+)
 
 pytest.importorskip("zenoh")
-S = 1_000_000_000
+MS = 1_000_000
+S = 1000 * MS
 
 
 def node(
@@ -81,6 +93,7 @@ class Wire:
         self.takes: dict[str, Callable[..., None]] = {}
         self.asked: list[Callable[[bytes, int], None]] = []
         self.is_asked = asyncio.Event()
+        self.said: list[tuple[str, bytes]] = []
 
     def open(self) -> None:
         pass
@@ -108,7 +121,8 @@ class Wire:
     def alive(self, key: str) -> None:
         pass
 
-    def put(self, *_: object, **__: object) -> bool:
+    def put(self, key: str, payload: bytes, **__: object) -> bool:
+        self.said.append((key.rsplit("/", 1)[-1], payload))
         return True
 
     def is_wanted(self, *_: object) -> bool:
@@ -158,6 +172,82 @@ def test_another_of_its_name_is_said_once_and_not_heard(wire: Wire) -> None:
         assert [one.text for one in notices if "too" in one.text] == [
             "another node says that it is north too: give each a name of its own"
         ]
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    run_async(test())
+
+
+def test_what_is_heard_is_told_at_once_but_not_too_often(wire: Wire) -> None:
+    """The second report is held back until its time; nobody waits for a tick or for the fold."""
+    now_ns = [1000 * S]
+
+    async def test() -> None:
+        member = node(
+            mode="client", connect=["tcp/127.0.0.1:1"], now=lambda: now_ns[0], share_hz=0.1
+        )
+        task = asyncio.create_task(member.run())
+        await wire.is_asked.wait()
+        for number in range(4):  # nobody else tells them: it speaks for the vehicle from then on
+            now_ns[0] += 100 * MS
+            member.heard(report(now_ns[0], number))
+        assert not told(wire)
+        now_ns[0] += 10 * S
+        member.heard(report(now_ns[0], 4))
+        assert len(told(wire)) == 1
+        now_ns[0] += 9 * S
+        member.heard(report(now_ns[0], 5))
+        assert len(told(wire)) == 1
+        now_ns[0] += S
+        member.heard(report(now_ns[0] - 70 * MS, 6))
+        assert [len(said.frames) for said in told(wire)] == [4, 3]
+        assert member.member.hearing.behind_ns == 70 * MS
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    run_async(test())
+
+
+def report(t_ns: int, number: int) -> Frame:
+    mav = common.MAVLink(None, srcSystem=1, srcComponent=1)
+    message = common.MAVLink_global_position_int_message(
+        5000 + 100 * number, 473977000, 85456000, 0, 0, 0, 0, 0, 0
+    )
+    raw = bytes(message.pack(mav))
+    return Frame(t_ns, "udp", Source(1, 1), message.get_msgId(), raw)
+
+
+def told(wire: Wire) -> list[Shared]:
+    """What was told of what was heard."""
+    return [messages.to_shared(payload) for what, payload in wire.said if what == "heard"]
+
+
+def test_a_change_of_duty_is_said_at_once_and_a_rival_is_answered(wire: Wire) -> None:
+    """A UAV is served by two for the way of a word, not until the next word is due."""
+    now_ns, steps = [1000 * S], list[Event]()
+
+    async def test() -> None:
+        member = node(mode="client", connect=["tcp/127.0.0.1:1"], now=lambda: now_ns[0])
+        member._step = steps.append
+        task = asyncio.create_task(member.run())
+        await wire.is_asked.wait()
+        member.member.offer({"1:1": Offer("1:1", 10.0, 10.0, 20.0, 0.1)})
+        member.ticked(now_ns[0])
+        now_ns[0] += 3 * S
+        wire.said.clear()
+        member.ticked(now_ns[0])
+        (duty,) = [one for one in steps if isinstance(one, Duty) and one.serves]
+        assert duty.serves == ("1:1",)
+        ((what, payload),) = wire.said
+        assert what == "standing"
+        assert messages.to_standing(payload, "north").serves[0][0] == "1:1"
+        rival = Standing("south", 0, now_ns[0], None, None, 4, (("1:1", 25.0),))
+        wire.takes["standing"]("companion/site/south/standing", messages.standing(rival))
+        last = steps[-1]
+        assert isinstance(last, Duty)
+        assert last.serves == ()  # without waiting for a tick
         task.cancel()
         with pytest.raises(asyncio.CancelledError):
             await task

@@ -72,6 +72,20 @@ def test_of_one_that_falls_silent_what_was_missed_is_taken_up() -> None:
     assert tell(hearing, 16 * S + 50 * MS, raw(6040), 16 * S + 40 * MS) == []
 
 
+def test_nobody_is_silent_whose_reports_wait_here() -> None:
+    """A node that is short of time would else take in everybody's reports twice."""
+    hearing = Hearing()
+    for number in range(20):
+        hear(hearing, 11 * S + number * 100 * MS, 1000 + 100 * number)
+    now_ns = 11 * S + 1900 * MS + 900 * MS
+    hearing.behind_ns = 850 * MS
+    assert tell(hearing, now_ns, raw(3700), now_ns - 5 * MS) == []
+    assert tell(hearing, now_ns, raw(0, msg="heartbeat"), now_ns - 5 * MS) == []
+    later_ns = now_ns + 300 * MS
+    assert tell(hearing, later_ns, raw(0, msg="heartbeat"), later_ns - 5 * MS)
+    assert len(tell(hearing, later_ns, raw(3900), later_ns - 5 * MS)) == 2
+
+
 def test_who_was_never_heard_here_is_taken_from_others_once() -> None:
     hearing = Hearing()
     assert len(tell(hearing, 12 * S, raw(1000), 12 * S - 5 * MS, "b")) == 1

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import examples
 
-from companion.pipeline.fleet.neighbours import DRIFT_MAX, NeighbourClock, here
+from companion.pipeline.fleet.neighbours import DRIFT_MAX, WAYS_NS, Neighbour, NeighbourClock, here
 from companion.values import RoundTrip, Source
 
 MS = 1_000_000
@@ -53,3 +53,13 @@ def test_a_round_trip_of_another_node_is_no_shorter_here() -> None:
     assert placed.t_ns >= 1500 * MS
     assert placed.t_ns - placed.sent_ns <= 100 * MS + 10 * MS + 4 * DRIFT_MAX * 500 * MS
     assert placed.remote_ns == 77
+
+
+def test_ways_of_long_ago_say_nothing_of_now() -> None:
+    """A node that speaks for nobody any more has no ways, however slow its last words were."""
+    node = Neighbour(NeighbourClock())
+    node.came(START_NS, 900 * MS)
+    node.came(START_NS + WAYS_NS // 2, 5 * MS)
+    assert node.ways_ns(START_NS + WAYS_NS // 2) == [900 * MS, 5 * MS]
+    assert node.ways_ns(START_NS + WAYS_NS) == [5 * MS]
+    assert node.ways_ns(START_NS + 2 * WAYS_NS) == []

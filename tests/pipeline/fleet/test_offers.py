@@ -41,7 +41,9 @@ def test_an_offer_is_worth_its_gain_over_the_range(flown: tuple[Pipeline, Member
     pipeline, member, now_ns = flown
     offers = Offers(pipeline, member.hearing.silent_s)
     for _ in range(4):
-        offers.look(now_ns)
+        make = offers.look(now_ns)
+        assert make is not None
+        offers.take(make())
     assert offers.made.keys() >= {"1:1", "2:1", "3:1", "4:1"}
     carrier = pipeline.carrier(now_ns, now_ns)
     assert not isinstance(carrier, str)

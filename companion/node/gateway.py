@@ -154,6 +154,11 @@ class Gateway:
             self._notify(Notice(self._now_ns(), Severity.WARNING, who, text))
         self._twins.told.clear()
 
+    @property
+    def has_voice(self) -> bool:
+        """Whether this service says anything of itself."""
+        return self._component is not None
+
     def speak(self, fit: bool, uavs: Iterable[Source]) -> None:
         """Send what is due. Call it some ten times a second.
 

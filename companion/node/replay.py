@@ -27,7 +27,7 @@ from companion.recording.writer import Writer
 from companion.settings.files import embedded, layered
 from companion.settings.model import Settings
 from companion.settings.origins import Origin, Origins, changed, of_options
-from companion.values import Estimate, Event, Output, Refuted, Tick, Update
+from companion.values import Estimate, Event, Output, Refuted, Tick, Tock, Update
 
 FLUSH_EVERY_S: Final = 1.0
 """Time between two flushes of the recording."""
@@ -188,7 +188,7 @@ def log_events(logs: Sequence[Path], settings: Settings, latency_s: float = 0.0)
     ordered = in_order(logs)
     if ordered is not None:
         return read_parts(ordered)
-    merged = (event for event in read_flight(logs, latency_s) if not isinstance(event, Tick))
+    merged = (event for event in read_flight(logs, latency_s) if not isinstance(event, Tick | Tock))
     return with_ticks(merged, settings.beams.update_hz)
 
 

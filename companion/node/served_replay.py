@@ -31,7 +31,7 @@ from companion.server import area_map
 from companion.server.access import bind
 from companion.settings.model import Settings
 from companion.settings.origins import Origins
-from companion.values import Event, Frame, Notice, Rejection, Tick, printable
+from companion.values import Event, Frame, Notice, Rejection, Update, printable
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
 from companion.views.series import Series
@@ -186,11 +186,6 @@ class ServedReplay:
         outputs = self._run.step(event)
         self._now_ns = max(self._now_ns, event.t_ns)  # a frame may be taken in after a later tick
         match event:
-            case Tick():
-                self._rates.count(event.t_ns, self.pipeline.frames, self.pipeline.updates)
-                self.series.add(self.pipeline)
-                self._ticked.set()  # wakes those who wait now;
-                self._ticked.clear()  # later ones wait for the next tick
             case Frame():
                 self.last_messages.add(event)
                 link = self._links.get(event.link)
@@ -204,6 +199,14 @@ class ServedReplay:
             if isinstance(output, Notice):
                 self._notices.append(output)
                 self._say(output.text)
+            elif isinstance(output, Update):
+                self._updated(event.t_ns)
+
+    def _updated(self, now_ns: int) -> None:
+        self._rates.count(now_ns, self.pipeline.frames, self.pipeline.updates)
+        self.series.add(self.pipeline)
+        self._ticked.set()  # wakes those who wait now;
+        self._ticked.clear()  # later ones wait for the next tick
 
     async def _measure(self) -> None:
         """Find the length of the log by reading it through, beside the replay."""

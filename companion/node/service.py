@@ -5,8 +5,10 @@ Over 300 lines: it holds the parts of the running service together.
 
 import asyncio
 import socket
+import time
 from collections import deque
 from collections.abc import Callable, Coroutine, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -37,7 +39,7 @@ from companion.server import area_map
 from companion.settings.files import embedded
 from companion.settings.model import Settings
 from companion.settings.origins import Origins
-from companion.values import ClockSet, Event, Frame, Notice, Output, Severity, Tick, UserError
+from companion.values import ClockSet, Event, Frame, Notice, Output, Severity, Tick, Tock, UserError
 from companion.views.fleet import FleetStatus
 from companion.views.health import behind
 from companion.views.last_messages import LastMessages
@@ -75,6 +77,7 @@ class Service:
         self._area = area_map.find(settings.page.map)
         self._ticked = asyncio.Event()
         self._is_behind = False
+        self._aimer = ThreadPoolExecutor(1, "beams")
         self._settings = settings
         self._say = say
         self._timeline = clock or NodeClock()
@@ -138,6 +141,7 @@ class Service:
             try:
                 self._push.close()
                 self._traffic.close()
+                self._aimer.shutdown()
             finally:  # a disk that takes no timestamps is no reason to lose the recording
                 await self._finish()
 
@@ -245,6 +249,9 @@ class Service:
     async def _tick(self) -> None:
         """Tick at the update rate; ticks missed while the loop was held up are left out.
 
+        Beams are made on a thread of their own: what is received meanwhile is taken in, and those
+        who ask are answered.
+
         Updates take at most half of the time: with more UAVs than can be served at that rate there
         are fewer updates, and no frame is lost to them.
         """
@@ -252,9 +259,9 @@ class Service:
         period_s = 1 / self._settings.beams.update_hz
         due_s = loop.time()
         while True:
-            began_s = loop.time()
             self._follow_wall_clock()
-            self._step(Tick(self._timeline.now_ns()))
+            spent_s = await self._update()
+            began_s = loop.time()
             if self.fleet is not None:
                 self.fleet.ticked(self.now_ns())
             if self.pipeline.last_update:
@@ -262,15 +269,33 @@ class Service:
             self._rates.count(self.now_ns(), self.pipeline.frames, self.pipeline.updates)
             if self._recorder:
                 self._tell_of_recorder(self._recorder)
-            self._traffic.speak(not self.unfit(), self.pipeline.reporters())
+            if self._traffic.has_voice:
+                self._traffic.speak(not self.unfit(), self.pipeline.reporters())
             self._tell_of_machine()
             self.series.add(self.pipeline)
             self._ticked.set()  # wakes those who wait now;
             self._ticked.clear()  # later ones wait for the next tick
             ended_s = loop.time()
-            due_s = max(due_s + period_s, ended_s + (ended_s - began_s))
+            due_s = max(due_s + period_s, ended_s + spent_s + (ended_s - began_s))
             await asyncio.sleep(due_s - loop.time())
             self.lateness.observe(loop.time() - due_s)
+
+    async def _update(self) -> float:
+        """Predict the UAVs, make the beams on a thread, and take them in; the first ones at once.
+
+        Who finds the service running is to find an update. Returns the seconds that this took from
+        others: on the loop, and of the processor.
+        """
+        loop, now_ns = asyncio.get_running_loop(), self._timeline.now_ns
+        began_s = loop.time()
+        self._step(Tick(now_ns(), in_two=self.pipeline.updates > 0))
+        spent_s = loop.time() - began_s
+        if self.pipeline.aiming is not None:
+            spent_s += await loop.run_in_executor(self._aimer, _took_s, self.pipeline.aiming.made)
+            began_s = loop.time()
+            self._step(Tock(now_ns()))
+            spent_s += loop.time() - began_s
+        return spent_s
 
     # --- what the server looks at -----------------------------------------------------------
 
@@ -401,6 +426,13 @@ class Service:
             self._scene(),
             part,
         )
+
+
+def _took_s(work: Callable[[], object]) -> float:
+    """Do work on this thread; the processor time that it took."""
+    began_s = time.thread_time()
+    work()
+    return time.thread_time() - began_s
 
 
 def require_center(settings: Settings) -> None:

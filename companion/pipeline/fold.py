@@ -8,7 +8,8 @@ digest, whoever feeds them. A report passes through these parts in the order of 
 3. ``tracker``: the track that it belongs to, and the estimate;
 
 and a relayed aircraft's report also goes to ``targets``, which returns nothing. A tick asks
-``tracker`` for the tracks that ``targets`` wants and ``center`` for the array, and aims the beams.
+``tracker`` for the tracks that ``targets`` wants and ``center`` for the array, and aims the beams;
+or it comes in two, with what is received meanwhile between it and its ``Tock``.
 
 Over 300 lines: every event comes in here, and every look goes out.
 """
@@ -17,8 +18,8 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from functools import partial
-from typing import Final
+from functools import cache, partial
+from typing import Final, NamedTuple
 
 from companion.beams import steady
 from companion.beams.aim import aim, without
@@ -31,7 +32,7 @@ from companion.pipeline.assumptions import Assumptions
 from companion.pipeline.blame import Evidence
 from companion.pipeline.center import Center
 from companion.pipeline.digest import Digest
-from companion.pipeline.health import Health, Site
+from companion.pipeline.health import Health, Site, Weighed
 from companion.pipeline.refusals import Refusals
 from companion.pipeline.senders import NOTHING, PlacedAttitude, PlacedReport, Senders
 from companion.pipeline.targets import Targets
@@ -55,6 +56,7 @@ from companion.values import (
     Severity,
     Source,
     Tick,
+    Tock,
     Track,
     Update,
     UtcNs,
@@ -71,10 +73,22 @@ NEAR_M: Final = 2000.0
 """Largest distance between two reports of one aircraft, whatever its speed and their latency."""
 
 
+class Aiming(NamedTuple):
+    """The beams of a tick in two, until its ``Tock``.
+
+    made   makes them and weighs their links, once, on whichever thread asks first
+    local  the local frame that they are in
+    """
+
+    made: Callable[[], tuple[Update, Weighed | None]]
+    local: LocalFrame | None
+
+
 class Pipeline:
     """State of the program.
 
     ``step`` takes events in the order of ``values.Event``; the other methods change nothing.
+    ``aiming`` has the beams that a tick in two left to be made; None: there are none to be.
 
     Raises ``UserError`` for settings that do not make sense together.
     """
@@ -87,6 +101,7 @@ class Pipeline:
         self.restarts: Counter[str] = Counter()
         self.last_update: Update | None = None
         self.last_carrier: Carrier | None = None
+        self.aiming: Aiming | None = None
         self._steady: Steady | None = None  # changes with ticks alone, so that looks change nothing
         self.refusals = Refusals()
         self.digest = Digest()
@@ -108,7 +123,9 @@ class Pipeline:
         if isinstance(event, Frame):  # first and without a match: nearly all events are frames
             outputs = self._frame(event)
         elif isinstance(event, Tick):
-            outputs = self._tick(event.t_ns)
+            outputs = self._tick(event)
+        elif isinstance(event, Tock):
+            outputs = self._tock(event.t_ns)
         elif isinstance(event, Rejection):
             outputs = [event]
         elif isinstance(event, Duty):
@@ -210,10 +227,23 @@ class Pipeline:
         self.senders.forget(uav)
         self.center.restarted(uav)
 
-    def _tick(self, now_ns: int) -> list[Output]:
+    def _tick(self, tick: Tick) -> list[Output]:
+        dropped = self._drop_silent(tick.t_ns) if (self.updates + 1) % DROP_EVERY == 0 else []
+        self.aiming = Aiming(cache(self._aimed_of(self.sighted(tick.t_ns))), self.local)
+        return [*dropped] if tick.in_two else [*dropped, *self._tock(tick.t_ns)]
+
+    def _tock(self, now_ns: int) -> list[Output]:
+        """What follows from the beams of the tick before.
+
+        They are made anew where the local frame has begun again since: its places are none of this.
+        """
+        aiming, self.aiming = self.aiming, None
+        if aiming is None:
+            return []
         self.updates += 1
-        dropped = self._drop_silent(now_ns) if self.updates % DROP_EVERY == 0 else []
-        self.last_update = self.look(now_ns)
+        is_old = aiming.local is not self.local
+        made = self._aimed_of(self.sighted(now_ns)) if is_old else aiming.made
+        self.last_update, weighed = made()
         self.last_carrier = self.last_update.carrier or self.last_carrier
         self._steady = steady.after(self._steady, self.last_update.beams)
         states = {track.uav: track.state for track in self.last_update.tracks}
@@ -222,8 +252,15 @@ class Pipeline:
             state = self.tracker.state(self.center.vehicle, now)
             states |= {} if state is None else {self.center.vehicle: state}
         said = self.targets.changes(now_ns, states)
-        judged = self.health.judge(self.last_update, partial(self._evidence, now_ns))
-        return [*dropped, *said, *judged, self.last_update]
+        judged = self.health.judge(self.last_update, weighed, partial(self._evidence, now_ns))
+        return [*said, *judged, self.last_update]
+
+    def _aimed_of(self, make: Callable[[], Update]) -> Callable[[], tuple[Update, Weighed | None]]:
+        def made() -> tuple[Update, Weighed | None]:
+            update = make()
+            return update, self.health.weigh(update)
+
+        return made
 
     def _evidence(self, now_ns: int, uav: str) -> Evidence:
         vehicle = self.center.vehicle

@@ -9,7 +9,7 @@ breadth, so that it does not flap.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from companion.pipeline import blame
 from companion.pipeline.blame import Evidence
 from companion.settings.beams import NeedSettings
 from companion.values import (
+    Beam,
     BeamSet,
     Cause,
     FloatArray,
@@ -59,6 +60,23 @@ class Site:
     uav_antennas: int
 
 
+class _Link(NamedTuple):
+    """A beam, the gain that its link needs, and what it surely and likely has; None: none."""
+
+    beam: Beam
+    needed_db: float
+    sure_db: float | None
+    likely_db: float | None
+
+
+class Weighed(NamedTuple):
+    """Links that are to be judged: whether a round begins, who still waits in it, and they."""
+
+    begins: bool
+    waiting: list[str]
+    links: list[_Link]
+
+
 class Health:
     """The verdicts. ``verdicts`` holds the present one of each target, by its name."""
 
@@ -73,58 +91,72 @@ class Health:
         self._unsettled: dict[str, tuple[bool, int]] = {}  # judged better or worse, since when
         self._unfit: str | None = None
 
-    def judge(self, update: Update, evidence: Callable[[str], Evidence]) -> list[Notice]:
-        """Judge the links whose turn it is, and tell what changed when all have had theirs.
+    def weigh(self, update: Update) -> Weighed | None:
+        """What the links whose turn it is have, and need; None: it is nobody's.
+
+        Changes nothing. It takes milliseconds, and may be made on any thread.
+        """
+        begun_ns, last_ns = self._begun_ns, self._last_ns
+        begins = begun_ns is None or not 0 <= update.t_ns - begun_ns < EVERY_NS
+        waiting = [beam.uav for beam in update.beams.beams] if begins else self._waiting
+        if not begins and not waiting:
+            return None
+        elapsed_ns = 0 if last_ns is None else update.t_ns - last_ns
+        share = len(update.beams.beams) * min(max(elapsed_ns / EVERY_NS, 0.0), 1.0)
+        many = max(AT_ONCE, math.ceil(share))
+        chosen = frozenset(waiting[:many])
+        which = [i for i, beam in enumerate(update.beams.beams) if beam.uav in chosen]
+        links = [] if update.carrier is None or not which else self._links(update.beams, which)
+        return Weighed(begins, waiting[many:], links)
+
+    def _links(self, beam_set: BeamSet, which: Sequence[int]) -> list[_Link]:
+        towards = directions(beam_set)
+        needed_db = _needed_db(self._need, self._site, beam_set, towards)
+        least_db = self._least_db(beam_set, towards, which)
+        return [
+            _Link(beam_set.beams[i], needed_db[i], sure_db, likely_db)
+            for i, sure_db, likely_db in zip(which, *least_db, strict=True)
+        ]
+
+    def judge(
+        self, update: Update, weighed: Weighed | None, evidence: Callable[[str], Evidence]
+    ) -> list[Notice]:
+        """Judge the links that were weighed, and tell what changed when all have had their turn.
 
         ``evidence`` says what is known of a UAV beside its track; it is asked of UAVs whose link is
         not good.
         """
-        elapsed_ns = 0 if self._last_ns is None else update.t_ns - self._last_ns
         self._last_ns = update.t_ns
+        if weighed is None:
+            return []
+        self._waiting = weighed.waiting
         tracks = {track.uav: track for track in update.tracks}
         fresh = dict[str, Verdict]()
-        if self._begun_ns is None or not 0 <= update.t_ns - self._begun_ns < EVERY_NS:
+        if weighed.begins:
             self._begun_ns = update.t_ns
-            self._waiting = [beam.uav for beam in update.beams.beams]
             fresh = _of_left_out(update, tracks)
-        elif not self._waiting:
-            return []
-        share = len(update.beams.beams) * min(max(elapsed_ns / EVERY_NS, 0.0), 1.0)
-        many = max(AT_ONCE, math.ceil(share))
-        chosen, self._waiting = self._waiting[:many], self._waiting[many:]
-        fresh |= self._of_beams(update, tracks, frozenset(chosen), evidence)
+        for link in weighed.links:
+            fresh[link.beam.uav] = self._of_link(update, link, tracks, evidence)
         held = self.verdicts | {uav: self._settled(verdict) for uav, verdict in fresh.items()}
         names = dict.fromkeys((*tracks, *(out.uav for out in update.beams.left_out)))
         self.verdicts = {uav: held[uav] for uav in names if uav in held}
         self._unsettled = {uav: kept for uav, kept in self._unsettled.items() if uav in tracks}
         return [] if self._waiting else self._told(update)
 
-    def _of_beams(
+    def _of_link(
         self,
         update: Update,
+        link: _Link,
         tracks: dict[str, Track],
-        chosen: frozenset[str],
         evidence: Callable[[str], Evidence],
-    ) -> dict[str, Verdict]:
-        beam_set, carrier = update.beams, update.carrier
-        which = [i for i, beam in enumerate(beam_set.beams) if beam.uav in chosen]
-        if carrier is None or not which:
-            return {}
-        towards = directions(beam_set)
-        needed_db = _needed_db(self._need, self._site, beam_set, towards)
-        least_db = self._least_db(beam_set, towards, which)
-        found = {}
-        for i, sure_db, likely_db in zip(which, *least_db, strict=True):
-            beam = beam_set.beams[i]
-            level = self._level(beam.uav, needed_db[i], sure_db, likely_db)
-            why = None
-            if level is not Level.GOOD:
-                known = tracks[beam.uav], carrier, needed_db[i], evidence(beam.uav)
-                why = blame.of_beam(beam, *known)
-            found[beam.uav] = Verdict(
-                beam.uav, level, why, update.t_ns, needed_db[i], sure_db, likely_db
-            )
-        return found
+    ) -> Verdict:
+        uav, carrier = link.beam.uav, update.carrier
+        level = self._level(uav, link.needed_db, link.sure_db, link.likely_db)
+        why = None
+        if level is not Level.GOOD and carrier is not None:
+            known = tracks[uav], carrier, link.needed_db, evidence(uav)
+            why = blame.of_beam(link.beam, *known)
+        return Verdict(uav, level, why, update.t_ns, link.needed_db, link.sure_db, link.likely_db)
 
     def _least_db(
         self, beam_set: BeamSet, towards: FloatArray, which: Sequence[int]

@@ -25,6 +25,7 @@ from companion.values import (
     Rejection,
     RoundTrip,
     Tick,
+    Tock,
     Track,
     Update,
 )
@@ -94,8 +95,11 @@ class Encoder:
             return
         match event:
             case Tick():
-                data = schemas.encode_tick(event.t_ns)
+                data = schemas.encode_tick(event.t_ns, in_two=event.in_two)
                 self._emit(schemas.TICKS_TOPIC, schemas.TICK, event.t_ns, data)
+            case Tock():
+                data = schemas.TockMessage(t_ns=event.t_ns).SerializeToString()
+                self._emit(schemas.TOCKS_TOPIC, schemas.TOCK, event.t_ns, data)
             case Rejection():
                 self._rejection(event, is_event=True)
             case RoundTrip():

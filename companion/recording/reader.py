@@ -4,6 +4,8 @@ Recordings of this program give back exactly the events that drove the live run,
 telemetry logs, raw MAVLink, captures and MCAP of others give the events that a live run would have
 had. What a vehicle wrote of itself becomes the frames that it would have sent: several such logs
 are one flight.
+
+Over 300 lines: whatever the kind, what comes out are the same events.
 """
 
 import heapq
@@ -24,7 +26,7 @@ from companion.recording.errors import LogError
 from companion.recording.foreign import capture, kinds, together
 from companion.recording.foreign.together import Vehicle
 from companion.recording.writer import SETTINGS, SUMMARY
-from companion.values import Event, Frame, Reason, Rejection, Source, Tick
+from companion.values import Event, Frame, Reason, Rejection, Source, Tick, Tock
 
 __all__ = ["LogError", "LogKind", "center_of", "flights", "log_kind", "read_flight", "read_log",
            "read_parts", "read_settings", "utc_offset_ns", "vehicles"]  # fmt: skip
@@ -42,6 +44,7 @@ _EVENT_TOPICS: Final = frozenset(
     (
         schemas.FRAMES_TOPIC,
         schemas.TICKS_TOPIC,
+        schemas.TOCKS_TOPIC,
         schemas.REJECTIONS_TOPIC,
         schemas.ROUND_TRIPS_TOPIC,
         schemas.DUTIES_TOPIC,
@@ -286,7 +289,10 @@ def _event(topic: str, data: bytes, sources: dict[tuple[int, int], Source]) -> E
             raise ValueError("a frame that is none")
         return frame
     if topic == schemas.TICKS_TOPIC:
-        return Tick(schemas.TickMessage.FromString(data).t_ns)
+        tick = schemas.TickMessage.FromString(data)
+        return Tick(tick.t_ns, tick.in_two)
+    if topic == schemas.TOCKS_TOPIC:
+        return Tock(schemas.TockMessage.FromString(data).t_ns)
     if topic == schemas.ROUND_TRIPS_TOPIC:
         trip = codec.to_round_trip(data)
         if max(trip.source) > 255:

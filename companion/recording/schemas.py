@@ -34,7 +34,8 @@ from companion.values import Frame
 _MESSAGES: Final[dict[str, list[str]]] = {
     "Frame": ["fixed64 t_ns", "string link", "uint32 sysid", "uint32 compid", "uint32 msgid",
               "bytes raw", "uint64 doubt_ns"],
-    "Tick": ["fixed64 t_ns"],
+    "Tick": ["fixed64 t_ns", "bool in_two"],
+    "Tock": ["fixed64 t_ns"],
     "Rejection": ["fixed64 t_ns", "string source", "string reason", "uint64 count",
                   "optional uint32 msgid", "string detail", "bool is_event"],
     "RoundTrip": ["fixed64 t_ns", "uint32 sysid", "uint32 compid", "fixed64 sent_ns",
@@ -80,6 +81,7 @@ _MESSAGES: Final[dict[str, list[str]]] = {
     Rejection  ``is_event``: made while framing, so that it drove the pipeline; others were made by
                the pipeline
     RoundTrip  a TIMESYNC request of the service and its answer
+    Tick       ``in_two``: the beams of it are made by the ``Tock`` that follows
     Frame      ``doubt_ns``: of a frame that another node heard, by how much ``t_ns`` may be late
     Shared, Standing, Offers   what the nodes of a fleet tell one another (docs/fleet.md); they are
                in no recording
@@ -137,6 +139,7 @@ def _message(name: str) -> Any:
 
 FrameMessage: Final = _message("Frame")
 TickMessage: Final = _message("Tick")
+TockMessage: Final = _message("Tock")
 RejectionMessage: Final = _message("Rejection")
 RoundTripMessage: Final = _message("RoundTrip")
 DutyMessage: Final = _message("Duty")
@@ -181,6 +184,7 @@ def _with_dependencies(message: Any) -> Schema:
 
 FRAME: Final = _with_dependencies(FrameMessage)
 TICK: Final = _with_dependencies(TickMessage)
+TOCK: Final = _with_dependencies(TockMessage)
 REJECTION: Final = _with_dependencies(RejectionMessage)
 ROUND_TRIP: Final = _with_dependencies(RoundTripMessage)
 DUTY: Final = _with_dependencies(DutyMessage)
@@ -196,6 +200,7 @@ POINT_CLOUD: Final = _with_dependencies(PointCloudMessage)
 
 FRAMES_TOPIC: Final = "/mavlink/frames"
 TICKS_TOPIC: Final = "/ticks"
+TOCKS_TOPIC: Final = "/tocks"
 REJECTIONS_TOPIC: Final = "/rejections"
 ROUND_TRIPS_TOPIC: Final = "/timesync"
 DUTIES_TOPIC: Final = "/fleet/duty"
@@ -210,6 +215,7 @@ SCENE_TOPIC: Final = "/scene"
 RAW_MAX: Final = 280
 """Most bytes of a frame: 10 of head, 255 of payload, 2 of checksum, 13 of signature."""
 _TIME = struct.Struct("<BQ")
+_IN_TWO = 0x10  # of a tick
 _T_NS, _LINK, _SYSID, _COMPID, _MSGID, _RAW, _DOUBT_NS = (
     0x09, 0x12, 0x18, 0x20, 0x28, 0x32, 0x38,
 )  # fmt: skip
@@ -228,9 +234,9 @@ def _number(tag: int, value: int) -> bytes:
     return bytes([tag]) + _varint(value) if value else b""
 
 
-def encode_tick(t_ns: int) -> bytes:
+def encode_tick(t_ns: int, *, in_two: bool = False) -> bytes:
     """``companion.Tick``; ``t_ns`` in [0, 2⁶⁴)."""
-    return _TIME.pack(_T_NS, t_ns) if t_ns else b""
+    return (_TIME.pack(_T_NS, t_ns) if t_ns else b"") + _number(_IN_TWO, in_two)
 
 
 _RAW_HEADS: Final = (b"", *(bytes((_RAW,)) + _varint(size) for size in range(1, RAW_MAX + 1)))

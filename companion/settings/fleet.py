@@ -53,7 +53,7 @@ class FleetSettings(Section):
     attempt_s: Annotated[float, Field(ge=0.1, le=60)] = 1.0
     hysteresis_db: Annotated[float, Field(ge=0, le=60)] = 3.0
     nulls: bool = False
-    share_hz: Annotated[float, Field(ge=0.1, le=1000)] = 200.0
+    share_hz: Annotated[float, Field(ge=0.1, le=1000)] = 500.0
     ca: str | None = None
     certificate: str | None = None
     key: str | None = None

@@ -25,7 +25,7 @@ from companion.values.aimed import (
 )
 from companion.values.clock import ClockSet, UtcNs
 from companion.values.errors import UserError, printable, shown
-from companion.values.events import DUTY_MAX, Duty, Event, RoundTrip, Tick
+from companion.values.events import DUTY_MAX, Duty, Event, RoundTrip, Tick, Tock
 from companion.values.fleet import Offer, Shared, SharedFrame, Standing
 from companion.values.health import Blame, Cause, Level, Verdict
 from companion.values.names import Source, reports_itself, standing
@@ -123,6 +123,7 @@ __all__ = [
     "Standing",
     "SystemTime",
     "Tick",
+    "Tock",
     "Track",
     "TrackState",
     "Update",

@@ -11,7 +11,20 @@ from companion.values.rejections import Rejection
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """The timer event at which beams are due."""
+    """The timer event at which beams are due.
+
+    t_ns    when
+    in_two  whether UAVs are predicted now alone, and the beams come with an event of their own,
+            ``Tock``: what is received while they are made is taken in between
+    """
+
+    t_ns: int
+    in_two: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Tock:
+    """The beams of the tick before, which came in two, are made; when."""
 
     t_ns: int
 
@@ -50,7 +63,7 @@ class Duty:
     spares: tuple[str, ...] = ()
 
 
-Event = Frame | Tick | Rejection | RoundTrip | ClockSet | Duty
+Event = Frame | Tick | Tock | Rejection | RoundTrip | ClockSet | Duty
 """Everything that drives the pipeline, in the order in which it was taken in.
 
 That is the order of time, but that a frame's time is its arrival: where the node was busy, a tick

@@ -1,5 +1,6 @@
 """Names: of senders of frames, and of UAVs."""
 
+from functools import lru_cache
 from typing import Final, NamedTuple, Self
 
 from companion.values.errors import UserError, shown
@@ -21,12 +22,18 @@ class Source(NamedTuple):
     @classmethod
     def parse(cls, text: str) -> Self:
         """Read ``SYSID:COMPID``. Raises ``UserError`` unless both are numbers from 0 to 255."""
-        sysid, colon, compid = text.partition(":")
-        if not (colon and sysid.isdecimal() and compid.isdecimal()):
-            raise UserError(f"{shown(text)} is not SYSID:COMPID, such as 5:1")
-        if max(len(sysid), len(compid)) > DIGITS_MAX or int(sysid) > 255 or int(compid) > 255:
-            raise UserError(f"{shown(text)}: system and component ids are at most 255")
-        return cls(int(sysid), int(compid))
+        return cls(*_ids(text))
+
+
+@lru_cache(maxsize=4096)
+def _ids(text: str) -> tuple[int, int]:
+    """System and component id. A node reads the same names at every update."""
+    sysid, colon, compid = text.partition(":")
+    if not (colon and sysid.isdecimal() and compid.isdecimal()):
+        raise UserError(f"{shown(text)} is not SYSID:COMPID, such as 5:1")
+    if max(len(sysid), len(compid)) > DIGITS_MAX or int(sysid) > 255 or int(compid) > 255:
+        raise UserError(f"{shown(text)}: system and component ids are at most 255")
+    return int(sysid), int(compid)
 
 
 def reports_itself(uav: str) -> bool:

@@ -7,6 +7,7 @@ import asyncio
 import json
 import socket
 import sys
+import threading
 import time
 import urllib.error
 import urllib.request
@@ -24,9 +25,10 @@ from companion.mavlink.links.urls import parse_link
 from companion.node.replay import replay
 from companion.node.service import Service
 from companion.node.serving import address
+from companion.pipeline.fold import Pipeline
 from companion.recording.reader import read_log
 from companion.settings.model import Settings
-from companion.values import Frame, Tick
+from companion.values import Frame, Tick, Tock, Update
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux stamps datagrams")
 
@@ -163,3 +165,55 @@ def test_a_machine_that_stays_behind_is_not_fit_and_says_why(tmp_path: Path) -> 
         assert "\ncompanion_ready 0.0" in await flight.ask("/metrics")
 
     fly(tmp_path, course)
+
+
+def test_what_comes_while_beams_are_made_is_taken_in_and_answered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However long it takes to make them; a replay takes all in the same order."""
+    held, sighted = threading.Event(), Pipeline.sighted
+    held.set()
+
+    def slow(pipeline: Pipeline, now_ns: int, lead_s: float = 0.0) -> Callable[[], Update]:
+        make = sighted(pipeline, now_ns, lead_s)
+
+        def made() -> Update:
+            if threading.current_thread().name.startswith("beams"):
+                assert held.wait(HANG_S)
+            return make()
+
+        return made
+
+    monkeypatch.setattr(Pipeline, "sighted", slow)
+
+    async def course(flight: Flight) -> None:
+        service = flight.service
+        flight.hold_up(0.01)
+        await flight.until_heard()
+        held.clear()
+        while service.pipeline.aiming is None:
+            await asyncio.sleep(0)
+        before = service.pipeline.updates
+        flight.hold_up(0.01)
+        while service.pipeline.frames < len(flight.sent_ns):
+            await asyncio.sleep(0)
+        assert (await flight.ask("/healthz"))["status"] == "ok"
+        assert (await flight.ask("/v1/uavs"))["uavs"][0]["id"] == "1:1"
+        assert service.pipeline.updates == before
+        held.set()
+        await service.ticked()
+        assert service.pipeline.updates > before
+
+    flight = fly(tmp_path, course)
+    (log,) = tmp_path.iterdir()
+    between = [0]
+    for event in read_log(log):
+        if isinstance(event, Tick):
+            between.append(0)
+        between[-1] += isinstance(event, Frame)
+        if isinstance(event, Tock):
+            between.append(0)
+    assert max(between) >= WAITING
+    monkeypatch.undo()
+    summary = replay([log], flight.service.pipeline.settings)
+    assert summary["digest"] == read_metadata(log)["summary"]["digest"]

@@ -45,9 +45,9 @@ class Watch:
         self.said: list[Notice] = []
 
     def see(self, t_s: float, tracks: list[Track], carrier: Carrier | None = CARRIER) -> str:
-        self.said += self.health.judge(
-            update(t_s, tracks, carrier), lambda _uav: Evidence(False, None)
-        )
+        news = update(t_s, tracks, carrier)
+        weighed = self.health.weigh(news)
+        self.said += self.health.judge(news, weighed, lambda _uav: Evidence(False, None))
         return " ".join(str(one.level) for one in self.health.verdicts.values())
 
 

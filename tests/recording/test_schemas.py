@@ -49,9 +49,10 @@ def test_a_hand_packed_frame_is_the_generated_one(frame: Frame) -> None:
     assert encoder.encode(frame) == generated.SerializeToString(deterministic=True)
 
 
-@given(TIMES)
-def test_a_hand_packed_tick_is_the_generated_one(t_ns: int) -> None:
-    assert schemas.encode_tick(t_ns) == schemas.TickMessage(t_ns=t_ns).SerializeToString()
+@given(TIMES, st.booleans())
+def test_a_hand_packed_tick_is_the_generated_one(t_ns: int, in_two: bool) -> None:
+    generated = schemas.TickMessage(t_ns=t_ns, in_two=in_two)
+    assert schemas.encode_tick(t_ns, in_two=in_two) == generated.SerializeToString()
 
 
 def test_frames_of_made_up_ids_fill_no_memory() -> None:

@@ -2,14 +2,15 @@
 
 import asyncio
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Final
 
 QUEUE_MAX: Final = 20_000
 """Calls that may wait for the loop; what comes beyond is dropped and counted."""
-AT_ONCE: Final = 256
-"""Calls made in one turn of the loop, so that other work comes between."""
+TURN_S: Final = 0.003
+"""Time after which other work of the loop has its turn."""
 
 
 class ToLoop:
@@ -63,17 +64,17 @@ class ToLoop:
         await asyncio.shield(self._fault)
 
     def _hand_over(self) -> None:
-        with self._lock:
-            batch = [self._waiting.popleft() for _ in range(min(AT_ONCE, len(self._waiting)))]
-            self._is_woken = bool(self._waiting)
-            if self._is_woken:
-                self._loop.call_soon(self._hand_over)
-        for call in batch:
-            if self._is_over:
-                return
+        until_s = time.monotonic() + TURN_S
+        while time.monotonic() < until_s:
+            with self._lock:
+                if not self._waiting:
+                    self._is_woken = False
+                    return
+                call = self._waiting.popleft()
             try:
                 call()
             except Exception as fault:
                 self.fail(fault)
                 return
             self.handed_over += 1
+        self._loop.call_soon(self._hand_over)

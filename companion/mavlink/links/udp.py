@@ -1,4 +1,7 @@
-"""UDP for a link: one socket that serves all senders, or one that is connected.          [shell]"""
+"""UDP for a link: one socket that serves all senders, or one that is connected.          [shell]
+
+Over 300 lines: both are read alike, and the system's doings with a socket belong together.
+"""
 
 import asyncio
 import contextlib
@@ -30,6 +33,8 @@ STALE_NS: Final = 2_000_000_000
 """Age at which a datagram is let go unread: a busy machine then sees what is new, not a backlog."""
 READ_AT_ONCE: Final = 32
 """Datagrams read at most before others have their turn, as in libuv."""
+TURN_S: Final = 0.003
+"""Time after which others have it, be it fewer."""
 DATAGRAM_BYTES: Final = 1 << 16
 """More than any datagram has."""
 
@@ -246,7 +251,10 @@ class _Datagrams:
     def _read(self) -> None:
         """Hand on the datagrams that wait, each with its age."""
         was_set = self._wall_clock.was_set()
+        until_s = time.monotonic() + TURN_S
         for _ in range(READ_AT_ONCE):
+            if time.monotonic() > until_s:
+                return
             try:
                 data, ancillary, _, address = self._socket.recvmsg(
                     DATAGRAM_BYTES, kernel_time.ANCILLARY_BYTES

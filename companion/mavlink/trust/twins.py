@@ -156,10 +156,11 @@ class Twins:
         for other in sender.paths.values():
             if other is path or (other.is_router and path.is_router):
                 continue
-            stretches = pairwise(other.reports)
-            if any(_is_off(said, *stretch) for stretch in stretches):
+            if any(_is_off(said, *stretch) for stretch in _around(other.reports, said.boot_ms)):
                 return True
-            if before is not None and any(_is_off(q, before, said) for q in other.reports):
+            if before is not None and any(
+                _is_off(q, before, said) for q in _within(other.reports, before, said)
+            ):
                 return True
         return False
 
@@ -176,15 +177,33 @@ class Twins:
         return sender.told
 
 
+def _around(reports: deque[_Said], boot_ms: int) -> Iterator[tuple[_Said, _Said]]:
+    """The stretches of a path in which a stamp lies, the newest first: one, or two that meet."""
+    for last, first in pairwise(reversed(reports)):
+        if boot_ms > last.boot_ms:
+            return
+        if first.boot_ms <= boot_ms:
+            yield first, last
+
+
+def _within(reports: deque[_Said], first: _Said, last: _Said) -> Iterator[_Said]:
+    """The reports of a path whose stamps lie between those of two others, the newest first."""
+    for one in reversed(reports):
+        if one.boot_ms < first.boot_ms:
+            return
+        if one.boot_ms <= last.boot_ms:
+            yield one
+
+
 def _said(frame: Frame) -> _Said:
     boot_ms, lat, lon, alt_mm, _, north, east, down = unpack(frame, _REPORT)
     return _Said(boot_ms, lat, lon, alt_mm * 1e-3, (north * 1e-2, east * 1e-2, down * 1e-2))
 
 
 def _is_off(said: _Said, first: _Said, last: _Said) -> bool:
-    """Whether a report between two others cannot be of the vehicle that made these."""
+    """Whether a report whose stamp is between two others cannot be of who made these."""
     stretch_ms = last.boot_ms - first.boot_ms
-    if not first.boot_ms <= said.boot_ms <= last.boot_ms or stretch_ms > STRETCH_MS:
+    if stretch_ms > STRETCH_MS:
         return False
     share, dt_s = (said.boot_ms - first.boot_ms) / stretch_ms, stretch_ms * 1e-3
     between = [one + share * (two - one) for one, two in _pairs(first, last)]

@@ -84,8 +84,6 @@ class FleetNode:
         self._session: Any = None  # of a peer, opened before there was a loop
         self._bus: Bus | None = None  # once all is declared
         self._flushing: asyncio.TimerHandle | None = None
-        self._told_ns = self._started_ns
-        self._told_every_ns = round(1e9 / settings.share_hz)
         self._has_twin = False
         self._listening: Listening | None = None
         patience_s = max(PATIENCE_S, PATIENCE_LEASES * settings.lease_s)
@@ -195,12 +193,8 @@ class FleetNode:
             self.member.answered(event)
         else:
             return
-        if not self.member.neighbours or self._bus is None:
-            return
-        if now_ns - self._told_ns >= self._told_every_ns:
+        if self.member.neighbours and self._bus is not None:
             self._tell_of_heard(now_ns)
-        elif self._flushing is None:
-            self._flush_soon()
 
     def ticked(self, now_ns: int) -> None:
         """Decide whom this node serves. Call it at every update, after the pipeline had it."""
@@ -210,21 +204,17 @@ class FleetNode:
             self._stand(now_ns)  # at once: whom it took from another is served by two until then
         self._tell(notices)
 
-    def _flush_soon(self) -> None:
-        loop = asyncio.get_running_loop()
-        self._flushing = loop.call_later(1 / self.settings.share_hz, self._flush)
+    def _tell_of_heard(self, now_ns: int) -> None:
+        said = self.member.sharing.due(now_ns)
+        if said is not None:
+            self._put("heard", messages.shared(said), express=True, reliable=False)
+        if self.member.sharing.has_more and self._flushing is None:
+            loop = asyncio.get_running_loop()
+            self._flushing = loop.call_later(1 / self.settings.share_hz, self._flush)
 
     def _flush(self) -> None:
         self._flushing = None
         self._tell_of_heard(self._now_ns())
-
-    def _tell_of_heard(self, now_ns: int) -> None:
-        said = self.member.sharing.due(now_ns)
-        if said is not None:
-            self._told_ns = now_ns
-            self._put("heard", messages.shared(said), express=True, reliable=False)
-        if self.member.sharing.has_more and self._flushing is None:
-            self._flush_soon()
 
     # --- what it says -----------------------------------------------------------------------
 

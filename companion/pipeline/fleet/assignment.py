@@ -6,10 +6,12 @@ by all that it serves, so a place at a node that has n already costs all of them
 
     10 (n + 1) log10(n + 1) - 10 n log10(n)   dB.
 
-From what is, UAVs without a node are placed first, those with the least choice before the others;
-where all that could serve one are full, the best of them gives one to another node. Then single
-UAVs move while a move gains more than ``hysteresis_db`` in all. No order of arrival, no chance and
-no leader is in it.
+From what is, UAVs without a node are given one; then UAVs move, one or several, each to the place
+that the next one leaves, while there is a ring of such moves that gains anything. Where there is
+none left the assignment is the best of all: a place more at a node costs more than the one before,
+so this is a flow of least cost, and such rings are all that can better one (Klein, "A primal method
+for minimal cost flows", 1967). To stay where it is is worth ``hysteresis_db`` to a UAV. No order of
+arrival, no chance and no leader is in it.
 """
 
 from collections.abc import Mapping
@@ -23,8 +25,12 @@ UNSURE_DB: Final = 10.0
 """How much less a gain that is only likely is worth than one that is guaranteed."""
 STEP_DB: Final = 0.1
 """Offers are told in whole steps, so that every node has the same numbers."""
-MOVES: Final = 256
-"""Most moves that one decision makes."""
+NOBODY_DB: Final = -1e6
+"""What it is worth to be served by nobody: so little that whoever can be served is."""
+MOVES: Final = 1000
+"""Most rings of moves that one decision makes."""
+ROUNDING_DB: Final = 1e-7
+"""What is less is no gain, but arithmetic."""
 
 
 def worth_db(offer: Offer) -> float | None:
@@ -59,79 +65,91 @@ def assign(
     uavs = sorted({uav for given in offers.values() for uav in given})
     if not nodes or not uavs:
         return {}
-    worth = np.array([[offers[node].get(uav, -np.inf) for node in nodes] for uav in uavs])
-    room = np.array([most[node] for node in nodes])
+    nobody = len(nodes)
+    given = [[offers[node].get(uav, -np.inf) for node in nodes] for uav in uavs]
+    worth = np.column_stack([np.array(given), np.full(len(uavs), NOBODY_DB)])
     rank = {node: number for number, node in enumerate(nodes)}
-    at = np.array([rank.get(holders.get(uav, ""), -1) for uav in uavs])
-    at[(at >= 0) & ~np.isfinite(worth[np.arange(len(uavs)), at])] = -1
-    others = np.array([(beside or {}).get(node, 0) for node in nodes])
-    load = others + np.bincount(at[at >= 0], minlength=len(nodes))
+    at = np.array([rank.get(holders.get(uav, ""), nobody) for uav in uavs])
+    each = np.arange(len(uavs))
+    at[~np.isfinite(worth[each, at])] = nobody
+    worth[each, at] += np.where(at == nobody, 0.0, hysteresis_db)
+    room = np.array([*(most[node] for node in nodes), len(uavs)])
+    others = np.array([*((beside or {}).get(node, 0) for node in nodes), 0])
+    load = others + np.bincount(at, minlength=nobody + 1)
     _place(worth, room, at, load)
-    _move(worth, room, at, load, hysteresis_db)
-    return {uav: nodes[at[i]] for i, uav in enumerate(uavs) if at[i] >= 0}
+    _improve(worth, room, at, load)
+    return {uav: nodes[at[i]] for i, uav in enumerate(uavs) if at[i] != nobody}
 
 
 def _price_db(load: IntArray) -> FloatArray:
-    """What one more costs all that a node serves, by how many it has."""
+    """What one more costs all that a node serves, by how many it has; with nobody it is nothing."""
     more = load + 1.0
     price: FloatArray = 10.0 * (more * np.log10(more) - load * np.log10(np.maximum(load, 1.0)))
+    price[-1] = 0.0
     return price
 
 
 def _place(worth: FloatArray, room: IntArray, at: IntArray, load: IntArray) -> None:
-    """Give every UAV without a node the best that has room; who has least to choose from first."""
-    free = np.flatnonzero(at < 0)
-    ordered = np.sort(worth[free], axis=1)
-    spare = np.full(len(free), np.inf)
-    if worth.shape[1] > 1:
-        best, second = ordered[:, -1], ordered[:, -2]
-        has_choice = np.isfinite(second)
-        spare[has_choice] = (best - second)[has_choice]
-    for i in free[np.argsort(-spare, kind="stable")]:
-        net = np.where(load < room, worth[i] - _price_db(load), -np.inf)
-        node = int(np.argmax(net if np.isfinite(net).any() else worth[i]))
-        if np.isfinite(net[node]) or _make_room(worth, room, at, load, i):
-            at[i] = node
-            load[node] += 1
+    """Give UAVs without a node the best that has room: where moves begin, and no more."""
+    nobody = len(room) - 1
+    for i in np.flatnonzero(at == nobody):
+        load[nobody] -= 1
+        at[i] = np.argmax(np.where(load < room, worth[i] - _price_db(load), -np.inf))
+        load[at[i]] += 1
 
 
-def _make_room(worth: FloatArray, room: IntArray, at: IntArray, load: IntArray, uav: int) -> bool:
-    """Move one of those at a UAV's best node elsewhere, the one that loses least by it.
-
-    The node is full, and so are all others that could serve the UAV. Returns whether there is one.
-    """
-    node = int(np.argmax(worth[uav]))
-    there = np.flatnonzero(at == node)
-    if not there.size or not np.isfinite(worth[uav, node]):
-        return False
-    elsewhere = np.where(load < room, worth[there] - _price_db(load), -np.inf)
-    elsewhere[:, node] = -np.inf
-    lost = worth[there, node] - elsewhere.max(axis=1)
-    least = int(np.argmin(lost))
-    if not np.isfinite(lost[least]):
-        return False
-    to = int(np.argmax(elsewhere[least]))
-    at[there[least]] = to
-    load[to] += 1
-    load[node] -= 1
-    return True
-
-
-def _move(
-    worth: FloatArray, room: IntArray, at: IntArray, load: IntArray, hysteresis_db: float
-) -> None:
-    """Move single UAVs, the best move first, while one gains more than the hysteresis."""
-    placed = np.flatnonzero(at >= 0)
-    for _ in range(MOVES if placed.size else 0):
-        price = _price_db(load)
-        given_back = _price_db(np.maximum(load - 1, 0))
-        here = at[placed]
-        net = worth[placed] - np.where(load < room, price, np.inf)
-        net[np.arange(placed.size), here] = -np.inf
-        gain = net.max(axis=1) - worth[placed, here] + given_back[here]
-        best = int(np.argmax(gain))
-        if not gain[best] > hysteresis_db:
+def _improve(worth: FloatArray, room: IntArray, at: IntArray, load: IntArray) -> None:
+    """Move UAVs, each to the place that the next one leaves, while that gains anything."""
+    for _ in range(MOVES):
+        gain, who = _gains_db(worth, at)
+        left = _price_db(np.maximum(load - 1, 0))
+        taken = np.where(load < room, _price_db(load), np.inf)
+        outside = len(load)
+        moves = _ring(np.block([[gain, -taken[:, None]], [left, -np.inf]]))
+        if not moves:
             return
-        load[here[best]] -= 1
-        at[placed[best]] = int(np.argmax(net[best]))
-        load[at[placed[best]]] += 1
+        for a, b in moves:
+            if b == outside:  # the last one takes a place at a
+                load[a] += 1
+            elif a == outside:  # the first one leaves a place at b
+                load[b] -= 1
+            else:
+                at[who[a, b]] = b
+
+
+def _gains_db(worth: FloatArray, at: IntArray) -> tuple[FloatArray, IntArray]:
+    """What it gains at most that one UAV moves from a node to another, (from, to), and which."""
+    count = worth.shape[1]
+    gain, who = np.full((count, count), -np.inf), np.zeros((count, count), dtype=int)
+    for a in range(count):
+        there = np.flatnonzero(at == a)
+        if there.size:
+            more = worth[there] - worth[there, a][:, None]
+            gain[a], who[a] = more.max(axis=0), there[more.argmax(axis=0)]
+            gain[a, a] = -np.inf
+    return gain, who
+
+
+def _ring(edges: FloatArray) -> list[tuple[int, int]]:
+    """A ring of edges whose sum is more than nothing; empty where there is none (Bellman, Ford).
+
+    ``edges`` are from row to column.
+    """
+    count = len(edges)
+    best, before = np.zeros(count), np.full(count, -1)
+    for _ in range(count):
+        ways = best[:, None] + edges
+        found = ways.max(axis=0)
+        better = found > best + ROUNDING_DB
+        if not better.any():
+            return []
+        before[better] = ways.argmax(axis=0)[better]
+        best[better] = found[better]
+    at = int(np.flatnonzero(better)[0])
+    for _ in range(count):
+        at = int(before[at])
+    ring, end = list[tuple[int, int]](), at
+    while not ring or at != end:
+        ring.append((int(before[at]), at))
+        at = int(before[at])
+    return ring

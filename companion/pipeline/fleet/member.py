@@ -61,7 +61,7 @@ class Member:
         self.handovers: deque[Handover] = deque(maxlen=HANDOVERS_KEPT)
         self.handed_over = 0
         self.hearing = Hearing()
-        self.sharing = Sharing(name)
+        self.sharing = Sharing(name, round(1e9 / settings.share_hz))
         self.trust = Trust()
         self.most = settings.most or elements
         self.duties = Duties(name, self.most, round(settings.lease_s * 1e9), settings.hysteresis_db)

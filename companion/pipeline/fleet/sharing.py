@@ -50,13 +50,16 @@ class _Held(NamedTuple):
 
 
 class Sharing:
-    """Decides what is told. ``name`` is this node's.
+    """Decides what is told. ``name`` is this node's; ``every_ns`` is the least time between two
+    words.
 
     ``untold`` counts frames and round trips that nobody was told of, for want of room.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, every_ns: int = 0) -> None:
         self.untold = 0
+        self._every_ns = every_ns
+        self._said_ns: int | None = None
         self._name = name
         self._voices: dict[Source, _Voice] = {}
         self._hold_ns: float = HOLD_NS[0]
@@ -100,7 +103,9 @@ class Sharing:
             self._hold_ns = max(FADES * self._hold_ns, HOLD_NS[0])
 
     def due(self, now_ns: int) -> Shared | None:
-        """What is to be told now; None where it is nothing."""
+        """What is to be told now; None where it is nothing, or where the last word was just now."""
+        if self._said_ns is not None and 0 <= now_ns - self._said_ns < self._every_ns:
+            return None
         while self._held and self._held[0].due_ns <= now_ns:
             _, key, frame = self._held.popleft()
             voice = self._voices.get(frame.source)
@@ -113,7 +118,10 @@ class Sharing:
             voice.mine = voice.mine or voice.late >= SPEAKS_AFTER
             self._tell(now_ns, key, frame)
         frames, trips = _first(self._frames), _first(self._trips)
-        return Shared(now_ns, frames, trips) if frames or trips else None
+        if not frames and not trips:
+            return None
+        self._said_ns = now_ns
+        return Shared(now_ns, frames, trips)
 
     @property
     def has_more(self) -> bool:

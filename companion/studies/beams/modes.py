@@ -34,7 +34,7 @@ from companion.studies.prediction.radio_link import LINKS, RadioLink
 from companion.studies.truth import array_truth, vehicles
 from companion.studies.truth.array_truth import ArrayTruth
 from companion.tracking.geodesy import LocalFrame
-from companion.values import BeamSet, Event, FloatArray, Frame, Tick, Track, Update, Widen
+from companion.values import BeamSet, Event, FloatArray, Frame, Tick, Tock, Track, Update, Widen
 
 RIVALS: Final = ("hold", "kalman-peng", "dead-reckoning-arrival")
 """Predictors whose beams are sharp and stand beside the product's."""
@@ -113,7 +113,7 @@ def events(
     others = (
         event
         for event in read_flight(logs)
-        if not isinstance(event, Tick)
+        if not isinstance(event, Tick | Tock)
         and not (isinstance(event, Frame) and str(event.source) in streams)
     )
     heard = heapq.merge(
@@ -165,9 +165,9 @@ def compare(
     truth: ArrayTruth | None = None
     flight, sought, ticks = vehicles.named(logs), False, 0
     for event in heard:
-        pipeline.step(event)
-        update = pipeline.last_update
-        if not isinstance(event, Tick) or update is None or not update.tracks:
+        outputs = pipeline.step(event)
+        update = next((one for one in outputs if isinstance(one, Update)), None)
+        if update is None or not update.tracks:
             continue
         if not sought and any(not track.uav.startswith("icao:") for track in update.tracks):
             truth, sought = array_truth.load(logs, pipeline), True

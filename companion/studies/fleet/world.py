@@ -25,7 +25,6 @@ from companion.values import FloatArray, Frame, Source
 SECOND_NS: Final = 1_000_000_000
 START_NS: Final = 1_800_000_000 * SECOND_NS
 TICK_NS: Final = 100_000_000
-FLUSH_NS: Final = 5_000_000
 STANDING_TICKS: Final = 2
 OFFER_TICKS: Final = 10
 ASK_TICKS: Final = 5
@@ -86,6 +85,7 @@ class World:
         }
         self._clock_ns = self._random.integers(-3, 3, sky.nodes) * SECOND_NS
         self._since: dict[str, int] = {}
+        self._flush_ns = round(SECOND_NS / settings.share_hz)
         self._flushing: set[str] = set()
         self._queue: list[tuple[int, int, Callable[[], None]]] = []
         self._order = count()
@@ -165,22 +165,20 @@ class World:
                 self._ask(name, other)
 
     def _flush(self, name: str) -> None:
-        """Tell what is due of what was heard, as the live node does 200 times a second."""
+        """Tell what is due of what was heard, as the live node does."""
         self._flushing.discard(name)
-        if name in self.dead:
-            return
+        if name not in self.dead:
+            self._tell_of_heard(name)
+
+    def _tell_of_heard(self, name: str) -> None:
         sharing = self.members[name].sharing
         said = sharing.due(self._local_ns(name))
         if said is not None:
             self._tell(name, "heard", messages.shared(said))
-        if sharing.has_more:
-            self._flush_soon(name)
-
-    def _flush_soon(self, name: str) -> None:
-        if name not in self._flushing:
+        if sharing.has_more and name not in self._flushing:
             self._flushing.add(name)
             flush = partial(self._timed, name, partial(self._flush, name), of_frames=True)
-            self._at(self.now_ns + FLUSH_NS, flush)
+            self._at(self.now_ns + self._flush_ns, flush)
 
     def _tell(self, name: str, what: str, payload: bytes) -> None:
         self.counted.sent[what] += len(payload)
@@ -247,8 +245,11 @@ class World:
     def _hear(self, name: str, raw: bytes, uav: str) -> None:
         if name not in self.dead:
             frame = Frame(self._local_ns(name), "udp", Source.parse(uav), REPORT, raw)
-            self._timed(name, partial(self.members[name].heard, frame), of_frames=True)
-            self._flush_soon(name)
+            self._timed(name, partial(self._heard, name, frame), of_frames=True)
+
+    def _heard(self, name: str, frame: Frame) -> None:
+        self.members[name].heard(frame)
+        self._tell_of_heard(name)
 
     # --- counting ---------------------------------------------------------------------------
 

@@ -2,10 +2,14 @@
 
 import math
 import random
+from collections import deque
 from collections.abc import Callable, Iterable
+from itertools import pairwise
 from typing import NamedTuple
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from companion.mavlink.trust import twins
 from companion.mavlink.trust.twins import KEPT_NS, Twins
@@ -201,3 +205,24 @@ def test_ids_and_addresses_without_end_take_no_memory(monkeypatch: pytest.Monkey
     later_ns = 200 + KEPT_NS
     judge.refuses(LINK, HOME, report(later_ns, 1, circle(0), 99))
     assert (99, 1) in judge._senders
+
+
+@given(
+    stamps=st.sets(st.integers(0, 40), max_size=20),
+    boot_ms=st.integers(-1, 41),
+    later_ms=st.integers(0, 20),
+)
+def test_what_is_held_against_what_is_found_from_the_newest_on(
+    stamps: set[int], boot_ms: int, later_ms: int
+) -> None:
+    """A report is near the end of a path: that all of it need not be looked at changes nothing."""
+
+    def said(stamp_ms: int) -> twins._Said:
+        return twins._Said(stamp_ms, 0, 0, 0.0, (0.0, 0.0, 0.0))
+
+    reports = deque(map(said, sorted(stamps)))
+    first, last = said(boot_ms), said(boot_ms + later_ms)
+    around = [one for one in pairwise(reports) if one[0].boot_ms <= boot_ms <= one[1].boot_ms]
+    within = [one for one in reports if first.boot_ms <= one.boot_ms <= last.boot_ms]
+    assert list(twins._around(reports, boot_ms)) == around[::-1]
+    assert list(twins._within(reports, first, last)) == within[::-1]

@@ -2,9 +2,10 @@
 
 import itertools
 import math
+from collections import Counter
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from support import examples
 
@@ -31,25 +32,58 @@ def total_db(found: dict[str, str], offers: dict[str, dict[str, float]]) -> floa
     return sum(offers[node][uav] for uav, node in found.items()) - shared
 
 
-def best_db(offers: dict[str, dict[str, float]]) -> float:
-    """The greatest total over all assignments that leave nobody out who can be served."""
+def best(offers: dict[str, dict[str, float]], room: dict[str, int]) -> tuple[int, float]:
+    """The most UAVs that can be served, and the greatest total of those assignments that do so."""
     uavs = sorted({uav for one in offers.values() for uav in one})
-    choices = [[node for node in offers if uav in offers[node]] for uav in uavs]
-    return max(
-        total_db(dict(zip(uavs, nodes, strict=True)), offers)
-        for nodes in itertools.product(*choices)
-    )
+    choices = [[None, *(node for node in offers if uav in offers[node])] for uav in uavs]
+    found = []
+    for nodes in itertools.product(*choices):
+        served = {uav: node for uav, node in zip(uavs, nodes, strict=True) if node is not None}
+        load = Counter(served.values())
+        if all(load[node] <= room[node] for node in room):
+            found.append((len(served), total_db(served, offers)))
+    return max(found)
 
 
-@given(OFFERS)
+@given(OFFERS, st.fixed_dictionaries({node: st.sampled_from((0, 1, 2, 10)) for node in NODES}))
 @settings(max_examples=examples(200))
-def test_nobody_is_left_out_and_little_is_lost(offers: dict[str, dict[str, float]]) -> None:
-    found = assign(offers, {}, ROOM, 0.0)
-    assert found.keys() == {uav for one in offers.values() for uav in one}
+@example(
+    {
+        "a": dict.fromkeys(("0:1", "1:1", "2:1"), 0.0),
+        "b": {"0:1": 0.0, "1:1": 0.0},
+        "c": {"0:1": 0.0},
+    },
+    ROOM,
+)  # two have to move on for one
+@example(
+    {
+        "a": {"0:1": 0.0, "1:1": 0.0, "2:1": 10.0, "3:1": 20.0},
+        "b": {"0:1": 0.0, "2:1": 5.0, "3:1": 0.0},
+        "c": {"0:1": 0.0, "1:1": 0.0, "3:1": 10.0},
+    },
+    ROOM,
+)  # three change places
+def test_it_is_the_best_of_all(offers: dict[str, dict[str, float]], room: dict[str, int]) -> None:
+    found = assign(offers, {}, room, 0.0)
     assert all(uav in offers[node] for uav, node in found.items())
-    if found:
-        # Single moves end where no single move helps: a swap of two may still.
-        assert best_db(offers) - total_db(found, offers) <= 4.0
+    count, greatest_db = best(offers, room)
+    assert len(found) == count
+    assert total_db(found, offers) == pytest.approx(greatest_db, abs=1e-6)
+
+
+@given(
+    OFFERS, st.dictionaries(st.sampled_from([f"{n}:1" for n in range(6)]), st.sampled_from(NODES))
+)
+@settings(max_examples=examples(200))
+@example(
+    {node: {f"{n}:1": 20.0 for n in range(6)} for node in NODES},
+    {f"{n}:1": "a" for n in range(6)},
+)
+def test_it_is_the_best_wherever_it_begins(
+    offers: dict[str, dict[str, float]], held: dict[str, str]
+) -> None:
+    found = assign(offers, held, ROOM, 0.0)
+    assert (len(found), pytest.approx(total_db(found, offers), abs=1e-6)) == best(offers, ROOM)
 
 
 @given(OFFERS, st.randoms(use_true_random=False))
@@ -116,9 +150,9 @@ def test_what_is_only_likely_is_worth_less(
     assert worth_db(Offer("1:1", sure, likely, sinr, 0.1)) == worth
 
 
-def test_who_has_no_other_choice_comes_first() -> None:
+def test_where_not_all_have_room_those_have_it_who_gain_most() -> None:
     offers = {"a": {"1:1": 30.0, "2:1": 20.0}, "b": {"1:1": 29.0, "3:1": 5.0}}
-    assert assign(offers, {}, {"a": 1, "b": 1}, 0.0) == {"2:1": "a", "3:1": "b"}
+    assert assign(offers, {}, {"a": 1, "b": 1}, 0.0) == {"2:1": "a", "1:1": "b"}
 
 
 def test_who_moves_away_leaves_a_place() -> None:

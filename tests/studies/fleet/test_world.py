@@ -20,8 +20,8 @@ def shares(counted: Counted) -> tuple[float, float, float]:
     return tuple(one / sum(found) for one in found)  # type: ignore[return-value]
 
 
-def settled(sky: Sky) -> World:
-    world = World(sky, SETTINGS)
+def settled(sky: Sky, told: FleetSettings = SETTINGS) -> World:
+    world = World(sky, told)
     world.run(8)
     world.counted = Counted()
     return world
@@ -86,7 +86,8 @@ def test_parted_nobody_is_unserved_and_it_heals(
 @pytest.mark.parametrize("sampled", [40])
 def test_reports_are_told_about_once(sampled: int) -> None:
     """All hear all; after the first moments each report is told by one of them."""
-    world = settled(Sky(3, sampled, 300.0, sampled=sampled))
+    several = SETTINGS.model_copy(update={"share_hz": 200.0})  # in a word, with its head
+    world = settled(Sky(3, sampled, 300.0, sampled=sampled), several)
     world.run(5)
     bits = 8 * world.counted.sent["heard"] / 5
     frames = sampled * world.sky.report_hz

@@ -1,0 +1,57 @@
+"""Calls of threads made on the loop: in order, and not all at once."""
+
+import asyncio
+import time
+
+from support import run_async
+
+from companion.mavlink.links import to_loop
+from companion.mavlink.links.to_loop import ToLoop
+
+CALLS = 20
+EACH_S = to_loop.TURN_S / 2
+
+
+def test_other_work_has_its_turn_among_many_calls() -> None:
+    """By time, since what a call takes is the caller's matter."""
+    made: list[int] = []
+    seen: list[int] = []
+
+    async def test() -> None:
+        calls = ToLoop(asyncio.get_running_loop())
+        over = asyncio.Event()
+        for number in range(CALLS):
+            calls.post(lambda number=number: (time.sleep(EACH_S), made.append(number)))
+        calls.post(over.set)
+
+        async def beside() -> None:
+            while not over.is_set():
+                seen.append(len(made))
+                await asyncio.sleep(0)
+
+        await asyncio.gather(beside(), over.wait())
+        assert calls.handed_over == CALLS + 1
+
+    run_async(test())
+    assert made == list(range(CALLS))
+    assert len(set(seen)) > CALLS / 5
+
+
+def test_what_is_posted_after_all_was_made_is_made_too() -> None:
+    made: list[str] = []
+
+    async def test() -> None:
+        loop = asyncio.get_running_loop()
+        calls = ToLoop(loop)
+        for text in ("one", "two"):
+            done = asyncio.Event()
+            calls.post(lambda text=text: made.append(text))
+            await asyncio.to_thread(calls.post, done.set)
+            await done.wait()
+        calls.post(calls.end)
+        calls.post(lambda: made.append("never"))
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+
+    run_async(test())
+    assert made == ["one", "two"]

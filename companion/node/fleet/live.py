@@ -84,6 +84,7 @@ class FleetNode:
         self._session: Any = None  # of a peer, opened before there was a loop
         self._bus: Bus | None = None  # once all is declared
         self._flushing: asyncio.TimerHandle | None = None
+        self._flush_ns = 0  # when that is due
         self._has_twin = False
         self._listening: Listening | None = None
         patience_s = max(PATIENCE_S, PATIENCE_LEASES * settings.lease_s)
@@ -187,7 +188,7 @@ class FleetNode:
         """
         now_ns = self._now_ns()
         if isinstance(event, Frame):
-            self.member.hearing.behind_ns = max(now_ns - event.t_ns, 0)
+            self.member.is_behind(now_ns - event.t_ns)
             self.member.heard(event)
         elif isinstance(event, RoundTrip):
             self.member.answered(event)
@@ -208,9 +209,16 @@ class FleetNode:
         said = self.member.sharing.due(now_ns)
         if said is not None:
             self._put("heard", messages.shared(said), express=True, reliable=False)
-        if self.member.sharing.has_more and self._flushing is None:
-            loop = asyncio.get_running_loop()
-            self._flushing = loop.call_later(1 / self.settings.share_hz, self._flush)
+        wait_ns = self.member.sharing.wait_ns(now_ns)
+        if wait_ns is None:
+            return
+        due_ns = now_ns + wait_ns
+        if self._flushing is not None:
+            if self._flush_ns <= due_ns:
+                return
+            self._flushing.cancel()
+        loop, self._flush_ns = asyncio.get_running_loop(), due_ns
+        self._flushing = loop.call_later(wait_ns * 1e-9, self._flush)
 
     def _flush(self) -> None:
         self._flushing = None

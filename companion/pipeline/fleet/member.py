@@ -82,6 +82,10 @@ class Member:
             if self.neighbours:
                 self.sharing.heard(frame, key)
 
+    def is_behind(self, late_ns: int) -> None:
+        """Take in how old the newest frame of this node's own was when it was read."""
+        self.hearing.behind_ns = self.sharing.behind_ns = max(late_ns, 0)
+
     def answered(self, trip: RoundTrip) -> None:
         """Take in a TIMESYNC round trip of this node's own."""
         if self.neighbours:

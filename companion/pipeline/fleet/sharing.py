@@ -54,12 +54,16 @@ class Sharing:
     words.
 
     ``untold`` counts frames and round trips that nobody was told of, for want of room.
+    ``behind_ns`` is how old the newest frame of this node's own was when it was read: what others
+    tell waits here as well, so that a report is held for longer. Else a node that is short of time
+    would tell everybody's reports too, and leave the others less.
     """
 
     def __init__(self, name: str, every_ns: int = 0) -> None:
         self.untold = 0
+        self.behind_ns = 0
         self._every_ns = every_ns
-        self._said_ns: int | None = None
+        self._said_ns = -every_ns
         self._name = name
         self._voices: dict[Source, _Voice] = {}
         self._hold_ns: float = HOLD_NS[0]
@@ -104,29 +108,39 @@ class Sharing:
 
     def due(self, now_ns: int) -> Shared | None:
         """What is to be told now; None where it is nothing, or where the last word was just now."""
-        if self._said_ns is not None and 0 <= now_ns - self._said_ns < self._every_ns:
+        self._let_go(now_ns)
+        if 0 <= now_ns - self._said_ns < self._every_ns:
             return None
-        while self._held and self._held[0].due_ns <= now_ns:
-            _, key, frame = self._held.popleft()
-            voice = self._voices.get(frame.source)
-            if voice is None:
-                continue
-            if key in self._by_others:
-                voice.late = 0
-                continue
-            voice.late += 1
-            voice.mine = voice.mine or voice.late >= SPEAKS_AFTER
-            self._tell(now_ns, key, frame)
         frames, trips = _first(self._frames), _first(self._trips)
         if not frames and not trips:
             return None
         self._said_ns = now_ns
         return Shared(now_ns, frames, trips)
 
-    @property
-    def has_more(self) -> bool:
-        """Whether there is something to be told later, or to be held back until then."""
-        return bool(self._held or self._frames or self._trips)
+    def _let_go(self, now_ns: int) -> None:
+        """Let go of what was held: what another told, and what it did not tell in time."""
+        while self._held:
+            due_ns, key, frame = self._held[0]
+            voice = self._voices.get(frame.source)
+            is_told = voice is None or key in self._by_others
+            if not is_told and now_ns - self.behind_ns < due_ns:
+                return
+            self._held.popleft()
+            if voice is None:
+                continue
+            if is_told:
+                voice.late = 0
+                continue
+            voice.late += 1
+            voice.mine = voice.mine or voice.late >= SPEAKS_AFTER
+            self._tell(now_ns, key, frame)
+
+    def wait_ns(self, now_ns: int) -> int | None:
+        """How long it is until something is to be told; None: there is nothing, and none is held."""
+        if self._frames or self._trips:
+            return max(self._said_ns + self._every_ns - now_ns, 0)
+        due_ns = self._held[0].due_ns + self.behind_ns if self._held else None
+        return None if due_ns is None else max(due_ns - now_ns, 0)
 
     def forget(self, now_ns: int, after_ns: int) -> None:
         """Forget vehicles that were not heard here for so long."""

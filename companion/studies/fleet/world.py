@@ -85,8 +85,7 @@ class World:
         }
         self._clock_ns = self._random.integers(-3, 3, sky.nodes) * SECOND_NS
         self._since: dict[str, int] = {}
-        self._flush_ns = round(SECOND_NS / settings.share_hz)
-        self._flushing: set[str] = set()
+        self._flushing: dict[str, int] = {}
         self._queue: list[tuple[int, int, Callable[[], None]]] = []
         self._order = count()
         self._tick = 0
@@ -166,8 +165,8 @@ class World:
 
     def _flush(self, name: str) -> None:
         """Tell what is due of what was heard, as the live node does."""
-        self._flushing.discard(name)
-        if name not in self.dead:
+        if self._flushing.get(name) == self.now_ns and name not in self.dead:  # else it is put off
+            del self._flushing[name]
             self._tell_of_heard(name)
 
     def _tell_of_heard(self, name: str) -> None:
@@ -175,10 +174,12 @@ class World:
         said = sharing.due(self._local_ns(name))
         if said is not None:
             self._tell(name, "heard", messages.shared(said))
-        if sharing.has_more and name not in self._flushing:
-            self._flushing.add(name)
-            flush = partial(self._timed, name, partial(self._flush, name), of_frames=True)
-            self._at(self.now_ns + self._flush_ns, flush)
+        wait_ns = sharing.wait_ns(self._local_ns(name))
+        if wait_ns is None or self.now_ns <= self._flushing.get(name, 0) <= self.now_ns + wait_ns:
+            return
+        self._flushing[name] = self.now_ns + wait_ns
+        flush = partial(self._timed, name, partial(self._flush, name), of_frames=True)
+        self._at(self.now_ns + wait_ns, flush)
 
     def _tell(self, name: str, what: str, payload: bytes) -> None:
         self.counted.sent[what] += len(payload)

@@ -119,7 +119,7 @@ def test_a_burst_is_told_in_several_words_and_all_of_it() -> None:
         frame = report(now_ns, 60_000 + number)
         sharing.heard(frame, content(frame.raw))
     counts, boots = [], []
-    while sharing.has_more:
+    while sharing.wait_ns(now_ns) is not None:
         said = sharing.due(now_ns)
         assert said is not None
         counts.append(len(said.frames))
@@ -150,7 +150,7 @@ def test_vehicles_of_yesterday_make_room_for_those_of_today() -> None:
     for number in range(VEHICLES_MAX):
         frame = report(0, 1, Source(1 + number % 255, number // 255))
         sharing.heard(frame, content(frame.raw))
-    while sharing.has_more:
+    while sharing.wait_ns(S) is not None:
         sharing.due(S)
     late = Source(200, 201)
     for number in range(2):
@@ -171,4 +171,39 @@ def test_what_is_held_of_a_forgotten_vehicle_is_not_told() -> None:
     sharing.heard(frame, content(frame.raw))
     sharing.forget(601 * S, 600 * S)
     assert sharing.due(602 * S) is None
-    assert not sharing.has_more
+    assert sharing.wait_ns(602 * S) is None
+
+
+def test_it_says_how_long_to_wait_and_nobody_looks_before() -> None:
+    """A node that does not speak holds everything for a moment: it is not woken for all of it."""
+    sharing = Sharing("b", every_ns=2 * MS)
+    assert sharing.wait_ns(S) is None
+    frames = [report(S + number * MS, number) for number in range(3)]
+    for frame in frames:
+        sharing.heard(frame, content(frame.raw))
+    assert sharing.wait_ns(S + 10 * MS) == 50 * MS
+    sharing.told(S + 11 * MS, "a", frames[0].source, content(frames[0].raw), MS)
+    assert sharing.due(S + 12 * MS) is None
+    assert sharing.wait_ns(S + 12 * MS) == 49 * MS  # the next one's
+    assert sharing.due(S + 60 * MS) is None
+    assert sharing.due(S + 61 * MS) is not None
+    assert sharing.due(S + 62 * MS) is None
+    assert sharing.wait_ns(S + 62 * MS) == 1 * MS
+    assert sharing.due(S + 63 * MS) is not None
+    assert sharing.wait_ns(S + 63 * MS) is None
+
+
+def test_what_others_tell_waits_too_where_this_node_is_behind() -> None:
+    """What it reads late is not late by the others' fault."""
+    sharing = Sharing("b")
+    sharing.behind_ns = 900 * MS
+    frames = [report(S + number * 100 * MS, number) for number in range(3)]
+    for frame in frames:
+        sharing.heard(frame, content(frame.raw))
+    now_ns = S + 900 * MS
+    assert sharing.due(now_ns) is None
+    assert sharing.wait_ns(now_ns) == 60 * MS
+    for frame in frames:
+        sharing.told(now_ns + MS, "a", frame.source, content(frame.raw), MS)
+    assert sharing.due(now_ns + 2 * MS) is None
+    assert sharing.wait_ns(now_ns + 2 * MS) is None

@@ -86,7 +86,7 @@ def test_parted_nobody_is_unserved_and_it_heals(
 @pytest.mark.parametrize("sampled", [40])
 def test_reports_are_told_about_once(sampled: int) -> None:
     """All hear all; after the first moments each report is told by one of them."""
-    several = SETTINGS.model_copy(update={"share_hz": 200.0})  # in a word, with its head
+    several = SETTINGS.model_copy(update={"share_hz": 100.0})  # in a word, with its head
     world = settled(Sky(3, sampled, 300.0, sampled=sampled), several)
     world.run(5)
     bits = 8 * world.counted.sent["heard"] / 5

@@ -136,11 +136,14 @@ class Sharing:
             self._tell(now_ns, key, frame)
 
     def wait_ns(self, now_ns: int) -> int | None:
-        """How long it is until something is to be told; None: there is nothing, and none is held."""
+        """How long it is until something is to be told; None: nothing is, and nothing is held."""
         if self._frames or self._trips:
-            return max(self._said_ns + self._every_ns - now_ns, 0)
-        due_ns = self._held[0].due_ns + self.behind_ns if self._held else None
-        return None if due_ns is None else max(due_ns - now_ns, 0)
+            due_ns = self._said_ns + self._every_ns
+        elif self._held:
+            due_ns = self._held[0].due_ns + self.behind_ns
+        else:
+            return None
+        return max(due_ns - now_ns, 0)
 
     def forget(self, now_ns: int, after_ns: int) -> None:
         """Forget vehicles that were not heard here for so long."""

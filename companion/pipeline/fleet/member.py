@@ -2,6 +2,8 @@
 
 Pure: time is an argument, what others say comes in by methods, what is to be said comes out. The
 live node and the study of many nodes in virtual time use the same class.
+
+Over 300 lines: whatever a node hears or says in a fleet meets here.
 """
 
 from collections import deque

@@ -18,6 +18,7 @@ from typing import Final, cast
 from companion.mavlink.links import kernel_time
 from companion.mavlink.links.endpoints import Address, Upcalls, bound, resolved, settle
 from companion.mavlink.links.status import LinkStatus
+from companion.mavlink.links.to_loop import TURN_S
 from companion.mavlink.links.urls import LinkUrl
 
 RECEIVE_BUFFER_BYTES: Final = 4 << 20
@@ -32,9 +33,7 @@ OVERFLOW_CHECK_DATAGRAMS: Final = 1024
 STALE_NS: Final = 2_000_000_000
 """Age at which a datagram is let go unread: a busy machine then sees what is new, not a backlog."""
 READ_AT_ONCE: Final = 32
-"""Datagrams read at most before others have their turn, as in libuv."""
-TURN_S: Final = 0.003
-"""Time after which others have it, be it fewer."""
+"""Datagrams read at most before others have their turn, as in libuv; fewer in ``TURN_S``."""
 DATAGRAM_BYTES: Final = 1 << 16
 """More than any datagram has."""
 

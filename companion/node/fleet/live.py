@@ -188,8 +188,7 @@ class FleetNode:
         """
         now_ns = self._now_ns()
         if isinstance(event, Frame):
-            self.member.is_behind(now_ns - event.t_ns)
-            self.member.heard(event)
+            self.member.heard(now_ns, event)
         elif isinstance(event, RoundTrip):
             self.member.answered(event)
         else:
@@ -323,7 +322,8 @@ class FleetNode:
             return
         now_ns = self._now_ns()
         self.member.stands(now_ns, said)
-        if any(uav in self.member.duties.serves for uav, _ in said.serves):
+        serves = self.member.duties.serves
+        if self.member.trust.believes(node) and any(uav in serves for uav, _ in said.serves):
             self.ticked(now_ns)  # one of them is to let go
 
     def _offered(self, node: str, payload: bytes) -> None:

@@ -77,16 +77,13 @@ class Member:
 
     # --- what this node hears itself --------------------------------------------------------
 
-    def heard(self, frame: Frame) -> None:
-        """Take in a frame that came over one of this node's own links."""
+    def heard(self, now_ns: int, frame: Frame) -> None:
+        """Take in a frame that came over one of this node's own links, as it is read."""
+        self.hearing.behind_ns = max(now_ns - frame.t_ns, 0)
         if frame.msgid in SHARED:
             key = self.hearing.heard(frame)
             if self.neighbours:
-                self.sharing.heard(frame, key)
-
-    def is_behind(self, late_ns: int) -> None:
-        """Take in how old the newest frame of this node's own was when it was read."""
-        self.hearing.behind_ns = self.sharing.behind_ns = max(late_ns, 0)
+                self.sharing.heard(now_ns, frame, key)
 
     def answered(self, trip: RoundTrip) -> None:
         """Take in a TIMESYNC round trip of this node's own."""

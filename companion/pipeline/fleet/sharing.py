@@ -54,14 +54,10 @@ class Sharing:
     words.
 
     ``untold`` counts frames and round trips that nobody was told of, for want of room.
-    ``behind_ns`` is how old the newest frame of this node's own was when it was read: what others
-    tell waits here as well, so that a report is held for longer. Else a node that is short of time
-    would tell everybody's reports too, and leave the others less.
     """
 
     def __init__(self, name: str, every_ns: int = 0) -> None:
         self.untold = 0
-        self.behind_ns = 0
         self._every_ns = every_ns
         self._said_ns = -every_ns
         self._name = name
@@ -73,8 +69,13 @@ class Sharing:
         self._frames: deque[SharedFrame] = deque()
         self._trips: deque[RoundTrip] = deque()
 
-    def heard(self, frame: Frame, key: bytes) -> None:
-        """Take in a frame heard here, with its content."""
+    def heard(self, now_ns: int, frame: Frame, key: bytes) -> None:
+        """Take in a frame heard here, with its content, as it is read.
+
+        It is held from now on and not from when it came: where frames wait to be read, what others
+        tell of them waits as well. Else a node that is short of time would tell everybody's
+        reports too, and leave the others less.
+        """
         voice = self._voices.get(frame.source)
         if voice is None:
             if len(self._voices) >= VEHICLES_MAX:
@@ -87,7 +88,7 @@ class Sharing:
         elif key in self._by_others:
             voice.late = 0
         elif frame.msgid == GLOBAL_POSITION_INT:
-            self._wait(self._held, _Held(frame.t_ns + round(self._hold_ns), key, frame))
+            self._wait(self._held, _Held(now_ns + round(self._hold_ns), key, frame))
 
     def answered(self, trip: RoundTrip) -> None:
         """Take in a round trip with a vehicle for which this node speaks."""
@@ -123,7 +124,7 @@ class Sharing:
             due_ns, key, frame = self._held[0]
             voice = self._voices.get(frame.source)
             is_told = voice is None or key in self._by_others
-            if not is_told and now_ns - self.behind_ns < due_ns:
+            if not is_told and now_ns < due_ns:
                 return
             self._held.popleft()
             if voice is None:
@@ -140,7 +141,7 @@ class Sharing:
         if self._frames or self._trips:
             due_ns = self._said_ns + self._every_ns
         elif self._held:
-            due_ns = self._held[0].due_ns + self.behind_ns
+            due_ns = self._held[0].due_ns
         else:
             return None
         return max(due_ns - now_ns, 0)

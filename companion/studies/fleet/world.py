@@ -249,7 +249,7 @@ class World:
             self._timed(name, partial(self._heard, name, frame), of_frames=True)
 
     def _heard(self, name: str, frame: Frame) -> None:
-        self.members[name].heard(frame)
+        self.members[name].heard(self._local_ns(name), frame)
         self._tell_of_heard(name)
 
     # --- counting ---------------------------------------------------------------------------

@@ -33,7 +33,7 @@ def flown() -> tuple[Pipeline, Member, int]:
             return pipeline, member, event.t_ns
         pipeline.step(event)
         if isinstance(event, Frame):
-            member.heard(event)
+            member.heard(event.t_ns, event)
     raise AssertionError
 
 

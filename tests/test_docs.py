@@ -47,7 +47,12 @@ def test_the_picture_of_the_rooms_is_up_to_date() -> None:
 
 @pytest.mark.parametrize(
     "drawn",
-    ["make_api.py", "make_notice.py", pytest.param("make_researcher.py", marks=pytest.mark.full)],
+    [
+        "make_api.py",
+        "make_export.py",
+        "make_notice.py",
+        pytest.param("make_researcher.py", marks=pytest.mark.full),
+    ],
 )
 def test_a_page_that_is_written_by_a_program_is_up_to_date(drawn: str) -> None:
     """The API's reference, what is redistributed, and the notebook, whose cells are run."""

@@ -1,14 +1,12 @@
 """What ``companion replay`` says at its end."""
 
-from typing import Any
+from typing import Any, Final
 
 from companion.values import Reason, reports_itself
 
 
 def text(summary: dict[str, Any]) -> str:
     """The summary of a replay as lines of text."""
-    from companion.views.words import REASONS
-
     lines = [
         f"{summary['frames']} frames, {summary['duration_s']:.0f} s of log in"
         f" {summary['wall_s']:.1f} s; center {summary['center']}"
@@ -28,11 +26,14 @@ def text(summary: dict[str, Any]) -> str:
         f"{beams['updates']} beam updates, {beams['regularised']} regularised,"
         f" condition number to {_number(beams['condition_number_max'])}"
     )
-    lines += [f"  not used: {n} {REASONS[Reason(why)]}" for why, n in summary["rejected"].items()]
+    lines += [f"  not used: {n} {_REASONS[why].meaning}" for why, n in summary["rejected"].items()]
     lines += [f"  missing: {line}" for line in summary["missing"]]
     if summary["recording"]:
         lines.append(f"recording {summary['recording']}")
     return "\n".join([*lines, f"digest {summary['digest']}"])
+
+
+_REASONS: Final = {str(reason): reason for reason in Reason}
 
 
 def _number(value: float | None) -> str:

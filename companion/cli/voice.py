@@ -49,5 +49,5 @@ class JsonLines:
         fresh = [notice for notice in service.events() if notice.t_ns > self._seen_ns]
         self._seen_ns = max([self._seen_ns, *(notice.t_ns for notice in fresh)])
         click.echo(
-            json.dumps(glance.glance(service) | {"events": glance.events(service.pipeline, fresh)})
+            json.dumps(glance.glance(service) | {"events": glance.as_events(service, fresh)})
         )

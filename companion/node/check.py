@@ -182,14 +182,15 @@ def _silent(url: str) -> str:
 
 def _uavs(service: Service) -> Iterator[Finding]:
     verdicts = service.pipeline.health.verdicts
-    shown = [uav for uav in state.uavs(service) if uav["target"]]
+    shown = [one for one in state.states(service, service.now_ns()) if one.target]
     if not shown:
         remedy = "wait for a position fix; see what /v1/uavs refuses"
         yield Finding("UAVs", Grade.FAULT, "none to aim at was heard", remedy)
-    for uav in shown:
-        name, dt_s = uav["id"], uav["dt_s"]
+    for one in shown:
+        track = one.track
+        name, dt_s = track.uav, track.dt_s
         pace = "one report" if dt_s is None else f"reports each {dt_s:.2f} s"
-        text = f"{uav['state']}, {pace}, bound {uav['bound_m']:.1f} m"
+        text = f"{track.state}, {pace}, bound {track.bound_m:.1f} m"
         yield _judged(name, text, verdicts.get(name))
 
 

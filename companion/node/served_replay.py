@@ -272,8 +272,13 @@ class ServedReplay:
 
     def replay(self) -> ReplayStatus:
         """Progress of the replay."""
-        state = "finished" if self._finished else "running"
-        return ReplayStatus(self.name, self._speed, self._run.at_s, self._of_s, state)
+        return ReplayStatus(
+            log=self.name,
+            speed=self._speed,
+            at_s=self._run.at_s,
+            of_s=self._of_s,
+            state="finished" if self._finished else "running",
+        )
 
 
 class _ReplayedLink:

@@ -336,16 +336,15 @@ class Service:
         recorder = self._recorder
         if recorder is None:
             return RecordingStatus("off", None, 0, 0, 0)
-        state = "degraded" if recorder.degraded else "recording"
         written_ns = recorder.written_ns
         return RecordingStatus(
-            state,
-            recorder.file,
-            recorder.bytes,
-            recorder.messages,
-            recorder.dropped,
-            recorder.queued,
-            None if written_ns is None else (self.now_ns() - written_ns) * 1e-9,
+            state="degraded" if recorder.degraded else "recording",
+            file=recorder.file,
+            bytes=recorder.bytes,
+            messages=recorder.messages,
+            dropped=recorder.dropped,
+            queued=recorder.queued,
+            lag_s=None if written_ns is None else (self.now_ns() - written_ns) * 1e-9,
         )
 
     def unfit(self) -> list[str]:

@@ -267,15 +267,17 @@ def observer(settings: Settings) -> PositionObserver | KinematicObserver:
     if given.model == "position":
         return PositionObserver(
             PositionModel(
-                limits.speed_mps,
-                limits.acceleration_mps2,
+                limits.speed_max_mps,
+                limits.acceleration_max_mps2,
                 None if given.alpha == "auto" else given.alpha,
                 given.feedthrough_s,
                 given.velocity_lead_s,
             )
         )
     gain = scheduled(kinematic_design(settings))
-    return KinematicObserver(KinematicModel(limits.speed_mps, limits.acceleration_mps2, gain))
+    return KinematicObserver(
+        KinematicModel(limits.speed_max_mps, limits.acceleration_max_mps2, gain)
+    )
 
 
 def clock(settings: Settings) -> SenderClock:
@@ -296,7 +298,7 @@ def tracker(settings: Settings) -> Tracker:
     """The tracks of all UAVs, with none yet."""
     given, kept, limits = settings.observer, settings.tracks, anyone(settings)
     leads = given.model == "position"
-    lead_m = abs(given.feedthrough_s) * limits.speed_mps if leads else 0.0
+    lead_m = abs(given.feedthrough_s) * limits.speed_max_mps if leads else 0.0
     feeds = given.model == "kinematic" and given.feed_forward
     return Tracker(
         observer(settings),

@@ -160,10 +160,10 @@ def _far_off(beam: Beam, track: Track, carrier: Carrier, evidence: Evidence) -> 
 
 def _grown_m(track: Track, seconds: float) -> float:
     """How far a UAV can come in so long from where its last report lets it be expected."""
-    way_m = track.limits.speed_mps * seconds
+    way_m = track.limits.speed_max_mps * seconds
     if track.velocity_ned_mps is None:
         return way_m
-    return min(track.limits.acceleration_mps2 * seconds**2 / 2, way_m)
+    return min(track.limits.acceleration_max_mps2 * seconds**2 / 2, way_m)
 
 
 def _silence(track: Track, evidence: Evidence) -> Blame | None:
@@ -193,7 +193,7 @@ def _aged(track: Track) -> Blame:
         )
     return Blame(
         Cause.AGILE,
-        f"it may accelerate by {track.limits.acceleration_mps2:.0f} m/s²",
+        f"it may accelerate by {track.limits.acceleration_max_mps2:.0f} m/s²",
         "ask for more reports, or tell what it can ([observer] acceleration_max_mps2)",
     )
 

@@ -113,7 +113,7 @@ class Center:
             errors = noise.relayed(
                 velocity,
                 report.alt_age_s,
-                placed.limits.speed_mps,
+                placed.limits.speed_max_mps,
                 report.accuracy,
                 report.alt_datum,
                 self._accuracy_factor,

@@ -200,7 +200,7 @@ class Health:
             since_ns = fresh.since_ns
         self._unsettled[uav] = (better, since_ns)
         # Without a beam there is nothing that could waver: it is said at once.
-        wait_ns = BETTER_NS if better else WORSE_NS if fresh.needed_db is not None else 0
+        wait_ns = BETTER_NS if better else WORSE_NS if fresh.needed_gain_db is not None else 0
         if fresh.since_ns - since_ns >= wait_ns:
             del self._unsettled[uav]
             return fresh
@@ -222,7 +222,7 @@ class Health:
                 continue
             cause = verdict.blame.cause if verdict.blame else None
             # That a UAV is stale or lost, and therefore without a beam, is told by itself.
-            if cause is not Cause.SILENT or verdict.needed_db is not None:
+            if cause is not Cause.SILENT or verdict.needed_gain_db is not None:
                 changed.setdefault((verdict.level, cause), []).append(verdict)
         return [_notice(update.t_ns, alike) for alike in changed.values()]
 
@@ -262,18 +262,8 @@ def _needed_db(
     beams = beam_set.beams
     if need.needed_sinr_db is None:
         return [need.needed_db] * len(beams)
-    groups = np.array([beam.group for beam in beams])
-    sent = link_budget.transmitted(
-        beam_set.weights, site.budget.tx_power_w, groups, beam_set.normalisation
-    )
-    sinr_db = link_budget.predicted_sinr_db(
-        site.array,
-        towards,
-        np.array([beam.range_m for beam in beams]),
-        sent,
-        groups,
-        site.budget,
-        site.uav_antennas,
+    sinr_db = link_budget.sinr_of_beams_db(
+        site.array, beam_set, towards, site.budget, site.uav_antennas
     )
     spare_db = sinr_db - need.needed_sinr_db
     return [beam.gain_db - spare for beam, spare in zip(beams, spare_db.tolist(), strict=True)]

@@ -98,18 +98,18 @@ class Encoder:
                 data = schemas.encode_tick(event.t_ns, in_two=event.in_two)
                 self._emit(schemas.TICKS_TOPIC, schemas.TICK, event.t_ns, data)
             case Tock():
-                data = schemas.TockMessage(t_ns=event.t_ns).SerializeToString()
+                data = schemas.encode("Tock", event)
                 self._emit(schemas.TOCKS_TOPIC, schemas.TOCK, event.t_ns, data)
             case Rejection():
                 self._rejection(event, is_event=True)
             case RoundTrip():
-                data = codec.round_trip(event).SerializeToString()
+                data = schemas.encode("RoundTrip", event)
                 self._emit(schemas.ROUND_TRIPS_TOPIC, schemas.ROUND_TRIP, event.t_ns, data)
             case Duty():
-                data = codec.duty(event).SerializeToString()
+                data = schemas.encode("Duty", event)
                 self._emit(schemas.DUTIES_TOPIC, schemas.DUTY, event.t_ns, data)
             case ClockSet():
-                data = codec.clock_set(event).SerializeToString()
+                data = schemas.encode("ClockSet", event)
                 self._emit(schemas.CLOCK_TOPIC, schemas.CLOCK_SET, event.t_ns, data)
 
     def output(self, output: Output, geodetic: Geodetic) -> None:
@@ -136,7 +136,7 @@ class Encoder:
                 self._emit(schemas.LOG_TOPIC, schemas.LOG, output.t_ns, data)
 
     def _rejection(self, rejection: Rejection, *, is_event: bool) -> None:
-        data = codec.rejection(rejection, is_event=is_event).SerializeToString()
+        data = schemas.encode("Rejection", schemas.RecordedRejection(rejection, is_event))
         self._emit(schemas.REJECTIONS_TOPIC, schemas.REJECTION, rejection.t_ns, data)
 
     def _tracks(self, t_ns: int, tracks: tuple[Track, ...], geodetic: Geodetic) -> None:
@@ -147,11 +147,11 @@ class Encoder:
             where = codec.predicted(track, float(lat_deg), float(lon_deg), float(alt_m))
             topic = f"/uav/{track.uav}/predicted"
             self._emit(topic, schemas.LOCATION_FIX, t_ns, where.SerializeToString())
-            data = codec.track(track, t_ns).SerializeToString()
+            data = schemas.encode("Track", schemas.RecordedTrack(track, t_ns))
             self._emit(schemas.TRACKS_TOPIC, schemas.TRACK, t_ns, data)
 
     def _beams(self, beams: BeamSet) -> None:
-        data = codec.weights(beams).SerializeToString()
+        data = schemas.encode("Weights", schemas.RecordedWeights(beams))
         self._emit(schemas.WEIGHTS_TOPIC, schemas.WEIGHTS, beams.t_ns, data)
 
     def _draw(self, scene: Scene, update: Update, geodetic: Geodetic) -> None:

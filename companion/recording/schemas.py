@@ -1,17 +1,23 @@
 """The messages of a recording: protobuf on every channel.
 
 Positions, log lines and the scene are Foxglove's own messages, which viewers draw as they are
-(docs/field-notes.md 4). The rest is described here and built at run time, so that no generated file
-has to be kept in step. A ``Schema`` carries the whole ``FileDescriptorSet``: a recording can be
+(docs/field-notes.md 4). The fields of the others are the described values of their classes
+(``companion.values.described``), with the number that stands there: a number that has been written
+once keeps its meaning. A ``Schema`` carries the whole ``FileDescriptorSet``: a recording can be
 read by anyone, years from now, with nothing but the file.
 
 ``FrameEncoder`` and ``encode_tick`` pack by hand the two messages that come by the thousand a
 second; the bytes are those of the generated classes (a test compares them).
 """
 
+import functools
 import struct
-from typing import Any, Final, NamedTuple
+import typing
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Annotated, Any, Final, NamedTuple, TypeVar
 
+import numpy as np
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 from foxglove_schemas_protobuf.Log_pb2 import Log
@@ -27,38 +33,90 @@ from google.protobuf.descriptor_pb2 import (
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
-from companion.values import Frame
+from companion.values import (
+    Beam,
+    BeamSet,
+    ClockSet,
+    Duty,
+    Frame,
+    LeftOut,
+    Offer,
+    Rejection,
+    RoundTrip,
+    Source,
+    Tick,
+    Tock,
+    Track,
+)
+from companion.values.described import Inline, Meaning, Member, members
 
-# A field is "[repeated|optional] type name"; its number is its place in the list, so fields are
-# only ever appended: a number that has been written once keeps its meaning.
-_MESSAGES: Final[dict[str, list[str]]] = {
-    "Frame": ["fixed64 t_ns", "string link", "uint32 sysid", "uint32 compid", "uint32 msgid",
-              "bytes raw", "uint64 doubt_ns"],
-    "Tick": ["fixed64 t_ns", "bool in_two"],
-    "Tock": ["fixed64 t_ns"],
-    "Rejection": ["fixed64 t_ns", "string source", "string reason", "uint64 count",
-                  "optional uint32 msgid", "string detail", "bool is_event"],
-    "RoundTrip": ["fixed64 t_ns", "uint32 sysid", "uint32 compid", "fixed64 sent_ns",
-                  "sfixed64 remote_ns"],
-    "Track": ["string uav", "string state", "fixed64 valid_at_ns", "double age_s",
-              "repeated double position_ned_m", "repeated double velocity_ned_mps",
-              "repeated double unknown_input_mps", "double bound_m", "optional double dt_s",
-              "optional double latency_s", "optional double gamma",
-              "optional double innovation_m", "uint32 reports", "fixed64 t_ns",
-              "repeated double acceleration_ned_mps2", "double horizontal_bound_m",
-              "double vertical_bound_m", "double clock_bound_s",
-              "repeated double set_center_ned_m", "double set_radius_m",
-              "double speed_max_mps", "double acceleration_max_mps2", "string limits_source",
-              "optional double error_p95_m"],
-    "Beam": ["string uav", "double azimuth_rad", "double elevation_rad", "double range_m",
-             "optional double pointing_bound_rad", "double gain_db",
-             "optional double azimuth_rate_radps", "optional double elevation_rate_radps",
-             "optional double range_rate_mps", "double loss_db", "uint32 group", "bool widened"],
-    "LeftOut": ["string uav", "string reason"],
-    "Weights": ["fixed64 t_ns", "fixed64 valid_at_ns", "repeated string uavs", "uint32 elements",
-                "bytes weights_complex64", "string method", "optional double condition_number",
-                "repeated Beam beam", "repeated LeftOut left_out", "string normalisation"],
-    "Duty": ["fixed64 t_ns", "repeated string serves", "repeated string spares"],
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedRejection:
+    """A rejection, and whether it drove the pipeline rather than coming out of it."""
+
+    rejection: Annotated[Rejection, Inline()]
+    is_event: Annotated[bool, Meaning("whether it was made while framing, before the pipeline", 7)]
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedTrack:
+    """A track, and when the update was computed to which it belongs."""
+
+    track: Annotated[Track, Inline()]
+    t_ns: Annotated[int, Meaning("when the update was computed", 14)]
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedWeights:
+    """Beams and weights in single precision: a replay computes them again in double."""
+
+    made: Annotated[BeamSet, Inline()]
+
+    @property
+    def uavs(self) -> Annotated[tuple[str, ...], Meaning("the UAV of each column", 3)]:
+        return self.made.uavs
+
+    @property
+    def elements(self) -> Annotated[int, Meaning("rows of the weights", 4)]:
+        return len(self.made.weights)
+
+    @property
+    def weights_complex64(
+        self,
+    ) -> Annotated[
+        bytes, Meaning("weights (elements, uavs), row-major, little-endian float32 pairs re, im", 5)
+    ]:
+        return self.made.weights.astype(np.dtype("<c8")).tobytes("C")
+
+    @property
+    def beam(self) -> Annotated[tuple[Beam, ...], Meaning("the beams, one per column", 8)]:
+        return self.made.beams
+
+    @property
+    def left_out(self) -> Annotated[tuple[LeftOut, ...], Meaning("UAVs without a beam", 9)]:
+        return self.made.left_out
+
+
+_CLASSES: Final[dict[str, type]] = {
+    "Frame": Frame,
+    "Tick": Tick,
+    "Tock": Tock,
+    "Rejection": RecordedRejection,
+    "RoundTrip": RoundTrip,
+    "Track": RecordedTrack,
+    "Beam": Beam,
+    "LeftOut": LeftOut,
+    "Weights": RecordedWeights,
+    "Duty": Duty,
+    "Offer": Offer,
+    "ClockSet": ClockSet,
+}
+"""The messages of recordings, and the classes whose described values are their fields."""
+
+_FLEET: Final[dict[str, list[str]]] = {
     "SharedFrame": ["uint64 after_ns", "bytes raw"],
     "Shared": ["fixed64 first_ns", "repeated SharedFrame frame", "repeated RoundTrip trip",
                "fixed64 told_ns"],
@@ -67,26 +125,13 @@ _MESSAGES: Final[dict[str, list[str]]] = {
     "Standing": ["string node", "fixed64 started_ns", "fixed64 t_ns", "repeated double place",
                  "optional double reach_m", "uint32 most", "repeated Served serves",
                  "repeated Handing handing"],
-    "Offer": ["string uav", "optional double sure_db", "optional double likely_db",
-              "optional double sinr_db", "optional double heard_s"],
     "Offers": ["repeated Offer offer"],
     "Tracks": ["repeated Track track"],
-    "ClockSet": ["fixed64 t_ns", "sfixed64 utc_offset_ns"],
 }  # fmt: skip
-"""Fields of this program's own messages.
+"""What the nodes of a fleet send one another (docs/fleet.md); they are in no recording.
 
-    Track      a vector is empty where it is unknown, else north, east, down
-    Weights    ``weights_complex64`` is (elements, len(uavs)), row-major, interleaved little-endian
-               float32 real and imaginary parts
-    Rejection  ``is_event``: made while framing, so that it drove the pipeline; others were made by
-               the pipeline
-    RoundTrip  a TIMESYNC request of the service and its answer
-    Tick       ``in_two``: the beams of it are made by the ``Tock`` that follows
-    Frame      ``doubt_ns``: of a frame that another node heard, by how much ``t_ns`` may be late
-    Shared, Standing, Offers   what the nodes of a fleet tell one another (docs/fleet.md); they are
-               in no recording
-    Duty       whom this node of a fleet serves from then on, and whom its beams spare
-    ClockSet   the wall clock was set: what is added from here on to any time to have it in UTC
+A field is "[repeated|optional] type name"; its number is its place in the list, so fields are only
+ever appended.
 """
 
 _TYPES: Final = {
@@ -99,6 +144,106 @@ _TYPES: Final = {
     "bytes": FieldDescriptorProto.TYPE_BYTES,
     "bool": FieldDescriptorProto.TYPE_BOOL,
 }
+
+
+class Field(NamedTuple):
+    """One field of a message: its declaration, and how it is read from a value."""
+
+    number: int
+    declared: str
+    get: Callable[[Any], Any]
+
+
+@functools.cache
+def fields(message: str) -> tuple[Field, ...]:
+    """The fields of a recorded message, by number.
+
+    The protobuf type follows from the value's: times are fixed64, other integers uint32, vectors
+    and tuples repeated, what may be None optional; a ``Source`` is two fields, sysid and compid.
+    """
+    found = (one for member in members(_CLASSES[message]) for one in _fields(member))
+    return tuple(sorted(found, key=lambda one: one.number))
+
+
+def _fields(member: Member) -> Iterator[Field]:
+    number, name, kind, get = member.meaning.number, member.name, member.type, member.get
+    if number is None:
+        return
+    if kind is Source:
+        for offset, part in enumerate(("sysid", "compid")):
+            yield Field(number + offset, f"uint32 {part}", _part(get, part))
+        return
+    if "ndarray" in str(kind):
+        yield Field(number, f"repeated double {name}", _listed(get))
+        return
+    if typing.get_origin(kind) is tuple:
+        inner = typing.get_args(kind)[0]
+        known = next((named for named, of in _CLASSES.items() if of is inner), None)
+        read = get if known is None else _messages(known, get)
+        yield Field(number, f"repeated {known or _scalar(inner, '')} {name}", read)
+        return
+    optional = "optional " if member.optional else ""
+    yield Field(number, f"{optional}{member.meaning.wire or _scalar(kind, name)} {name}", get)
+
+
+def _scalar(kind: Any, name: str) -> str:
+    if kind is int:
+        return "fixed64" if name.endswith("_ns") else "uint32"
+    return {float: "double", bool: "bool", bytes: "bytes"}.get(kind, "string")
+
+
+def _part(get: Callable[[Any], Any], part: str) -> Callable[[Any], Any]:
+    return lambda value: getattr(get(value), part)
+
+
+def _listed(get: Callable[[Any], Any]) -> Callable[[Any], list[float]]:
+    """A vector as a list, empty where it is unknown."""
+
+    def listed(value: Any) -> list[float]:
+        vector = get(value)
+        return [] if vector is None else vector.tolist()
+
+    return listed
+
+
+def _messages(name: str, get: Callable[[Any], Any]) -> Callable[[Any], list[dict[str, Any]]]:
+    return lambda value: [_values(name, one) for one in get(value)]
+
+
+def _values(message: str, value: Any) -> dict[str, Any]:
+    """The fields of a message by name."""
+    return {one.declared.rpartition(" ")[2]: one.get(value) for one in fields(message)}
+
+
+def message(name: str, value: Any) -> Any:
+    """A described value as a protobuf message of this name."""
+    return _message(name)(**_values(name, value))
+
+
+def encode(name: str, value: Any) -> bytes:
+    """A described value as the bytes of a protobuf message of this name."""
+    data: bytes = message(name, value).SerializeToString()
+    return data
+
+
+def value_of(kind: type[T], found: Any) -> T:
+    """A flat value of a class, read back from its message."""
+    values = {
+        member.name: Source(found.sysid, found.compid)
+        if member.type is Source
+        else None
+        if member.optional and not found.HasField(member.name)
+        else _native(getattr(found, member.name), member)
+        for member in members(kind)
+        if member.meaning.number is not None
+    }
+    return kind(**values)
+
+
+def _native(value: Any, member: Member) -> Any:
+    if typing.get_origin(member.type) is tuple:
+        return tuple(value)
+    return member.type(value) if isinstance(member.type, type) else value
 
 
 def _describe_field(into: DescriptorProto, number: int, declared: str) -> None:
@@ -122,10 +267,12 @@ def _describe() -> FileDescriptorProto:
     file = FileDescriptorProto(
         name="companion/recording.proto", package="companion", syntax="proto3"
     )
-    for message, fields in _MESSAGES.items():
-        described = file.message_type.add(name=message)
-        for number, declared in enumerate(fields, start=1):
-            _describe_field(described, number, declared)
+    declared = {name: [(one.number, one.declared) for one in fields(name)] for name in _CLASSES}
+    declared |= {name: list(enumerate(listed, start=1)) for name, listed in _FLEET.items()}
+    for name, numbered in declared.items():
+        described = file.message_type.add(name=name)
+        for number, text in numbered:
+            _describe_field(described, number, text)
     return file
 
 
@@ -133,6 +280,7 @@ _POOL: Final = DescriptorPool()  # of its own: names cannot clash with other pro
 _POOL.Add(_describe())
 
 
+@functools.cache
 def _message(name: str) -> Any:
     return GetMessageClass(_POOL.FindMessageTypeByName(f"companion.{name}"))
 

@@ -20,9 +20,10 @@ from companion.server.stream import Stream
 from companion.server.turns import Turns
 from companion.views import fleet as fleet_view
 from companion.views import glance, series, settings, state
-from companion.views.design import DesignView
+from companion.views.as_json import as_json
+from companion.views.design import Design, DesignView
+from companion.views.link_state import Links
 from companion.views.state import Node
-from companion.views.words import rfc3339
 
 CONTENT_POLICY: Final = b"default-src 'self'; frame-ancestors 'none'"
 DRAWN_POLICY: Final = CONTENT_POLICY + b"; style-src 'self' 'unsafe-inline'; img-src 'self' data:"
@@ -110,7 +111,7 @@ def _health_routes(app: FastAPI, node: Node, stream: Stream) -> None:
         "/readyz",
         summary="Fit to be used, or why not (503)",
         responses=answers(models.Readiness)
-        | {503: {"model": models.Readiness, "description": "Not fit to be used"}},
+        | {503: {"model": models.model(models.Readiness), "description": "Not fit to be used"}},
     )
     async def readyz() -> Response:
         reasons = node.unfit()
@@ -132,31 +133,30 @@ def _state_routes(app: FastAPI, node: Node, turns: Turns) -> None:
     @app.get(
         "/v1/status",
         summary="Version, uptime, links, center, recording, rates",
-        responses=answers(models.Status),
+        responses=answers(state.Status),
     )
     async def status() -> Response:
         return answer(state.status(node, companion.__version__))
 
-    @app.get("/v1/uavs", summary="Every UAV as it is now", responses=answers(models.Uavs))
+    @app.get("/v1/uavs", summary="Every UAV as it is now", responses=answers(state.Uavs))
     async def uavs() -> Response:
-        valid_at = rfc3339(node.pipeline.utc_ns(node.now_ns()))
-        return answer({"valid_at": valid_at, "uavs": state.uavs(node)})
+        return answer(state.uavs(node))
 
     @app.get(
         "/v1/uavs/{uav}",
         summary="One UAV as it is now",
-        responses=answers(models.UavState, 404, 422),
+        responses=answers(state.UavState, 404, 422),
     )
     async def one_uav(uav: UavId) -> Response:
-        found = state.uavs(node, only=uav)
+        found = state.states(node, node.now_ns(), only=uav)
         if not found:
             raise HTTPException(404, f"no UAV {uav!r} has been heard")
-        return answer(found[0])
+        return answer(as_json(found[0], node.pipeline.utc_ns))
 
     @app.get(
         "/v1/links",
         summary="Links, who is heard over each, and the rates asked for",
-        responses=answers(models.Links),
+        responses=answers(Links),
     )
     async def links() -> Response:
         return answer(state.links(node))
@@ -164,7 +164,7 @@ def _state_routes(app: FastAPI, node: Node, turns: Turns) -> None:
     @app.get(
         "/v1/fleet",
         summary="The nodes of the fleet, and who serves whom",
-        responses=answers(models.Fleet),
+        responses=answers(fleet_view.Fleet),
     )
     async def fleet() -> Response:
         return answer(fleet_view.fleet(node.pipeline, node.fleet_status(), node.now_ns()))
@@ -172,15 +172,15 @@ def _state_routes(app: FastAPI, node: Node, turns: Turns) -> None:
     @app.get(
         "/v1/events",
         summary="What was said to the operator last",
-        responses=answers(models.Events),
+        responses=answers(glance.Events),
     )
     async def events() -> Response:
-        return answer({"events": glance.events(node.pipeline, node.events())})
+        return answer(glance.events(node))
 
     @app.get(
         "/v1/history",
         summary="What the charts show, each second of the last five minutes",
-        responses=answers(models.History, 503),
+        responses=answers(series.History, 503),
     )
     async def history() -> Response:
         samples, now_ns = node.series.samples(), node.now_ns()
@@ -190,7 +190,7 @@ def _state_routes(app: FastAPI, node: Node, turns: Turns) -> None:
     @app.get(
         "/v1/settings",
         summary="The effective settings, and where each comes from",
-        responses=answers(models.EffectiveSettings),
+        responses=answers(settings.EffectiveSettings),
     )
     async def effective() -> Response:
         return answer(settings.show(node.pipeline.settings, node.origins))
@@ -198,7 +198,7 @@ def _state_routes(app: FastAPI, node: Node, turns: Turns) -> None:
     @app.get(
         "/v1/design",
         summary="The observer in use: gains at each UAV's interval, and their certificate",
-        responses=answers(models.Design),
+        responses=answers(Design),
     )
     async def design() -> Response:
         return answer(design_view.show(node.pipeline, node.now_ns()))

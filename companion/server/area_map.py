@@ -4,18 +4,26 @@ Format: PMTiles, version 3 (github.com/protomaps/PMTiles). It is named in the no
 never in a recording's: a replay must not serve files that whoever recorded has chosen.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 from fastapi import FastAPI, HTTPException
 from fastapi.responses import FileResponse, Response
 
-from companion.server import models
 from companion.server.responses import answer, answers, refusals
 from companion.values import UserError
+from companion.values.described import Meaning
 
 MAGIC: Final = b"PMTiles\x03"
 MEDIA_TYPE: Final = "application/vnd.pmtiles"
+
+
+@dataclass(frozen=True, slots=True)
+class AreaMap:
+    """The map under the plan view."""
+
+    name: Annotated[str | None, Meaning("name of its file; null without one")]
 
 
 def find(named: str | None) -> Path | None:
@@ -38,7 +46,7 @@ def add(app: FastAPI, file: Path | None) -> None:
     @app.get(
         "/v1/map",
         summary="The map under the plan view, where the settings name one",
-        responses=answers(models.AreaMap),
+        responses=answers(AreaMap),
     )
     async def area_map() -> Response:
         return answer({"name": None if file is None else file.name})

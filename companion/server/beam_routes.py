@@ -1,7 +1,7 @@
 """The routes ``/v1/beams``, ``/v1/beams/weights`` and ``/v1/pattern``, computed when asked for."""
 
 import re
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final
 
 from fastapi import FastAPI, HTTPException, Query, Request
 from fastapi.responses import Response
@@ -18,7 +18,7 @@ MOST_ANGLES: Final = 20_000
 """Beams times angles that one answer may hold: more than half a second's work."""
 LeadMs = Annotated[float, Query(ge=0, le=10_000, description="milliseconds ahead of now")]
 Cut = Annotated[
-    Literal["azimuth", "elevation"],
+    beam_state.Cut,
     Query(description="the angle that varies; the other is the beam's own"),
 ]
 Points = Annotated[int, Query(ge=2, le=3601, description="angles along the cut")]
@@ -35,7 +35,7 @@ def add(app: FastAPI, node: Node, turns: Turns) -> None:
     @app.get(
         "/v1/beams",
         summary="The beams, applied lead_ms from now",
-        responses=answers(models.Beams, 422, 503),
+        responses=answers(beam_state.Beams, 422, 503),
     )
     async def beams(lead_ms: LeadMs = 0.0) -> Response:
         def make(update: Update) -> bytes:
@@ -68,7 +68,7 @@ def add(app: FastAPI, node: Node, turns: Turns) -> None:
     @app.get(
         "/v1/pattern",
         summary="Array response in dB along a cut through each beam",
-        responses=answers(models.Pattern, 404, 422, 503),
+        responses=answers(beam_state.Pattern, 404, 422, 503),
     )
     async def pattern(
         cut: Cut = "azimuth",
@@ -92,7 +92,10 @@ def add(app: FastAPI, node: Node, turns: Turns) -> None:
 def _weight_answers() -> dict[int | str, dict[str, Any]]:
     kinds = dict.fromkeys(weight_formats.TYPES.values(), _BINARY)
     # The model is named for its schema to be in the document; the content says where it applies.
-    content = {"model": models.Weights, "content": kinds | {"application/json": _JSON}}
+    content = {
+        "model": models.model(beam_state.Weights),
+        "content": kinds | {"application/json": _JSON},
+    }
     return {200: content} | refusals(406, 409, 422, 503)
 
 

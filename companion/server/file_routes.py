@@ -6,7 +6,7 @@ from fastapi import FastAPI, Header, HTTPException, Path
 from fastapi.responses import Response, StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
-from companion.server import models, recordings
+from companion.server import recordings
 from companion.server.responses import answer, answers, refusals
 from companion.values import Source
 from companion.views import mavlink_messages
@@ -35,7 +35,7 @@ def _recordings(app: FastAPI, node: Node) -> None:
     @app.get(
         "/v1/recordings",
         summary="The recordings: name, bytes, state, when begun",
-        responses=answers(models.Recordings),
+        responses=answers(recordings.Recordings),
     )
     async def listing() -> Response:
         return answer({"recordings": await run_in_threadpool(recordings.listed, where, current())})
@@ -83,7 +83,7 @@ def _mavlink(app: FastAPI, node: Node) -> None:
     @app.get(
         "/v1/mavlink/vehicles",
         summary="The last messages of everybody, as mavlink2rest has them",
-        responses=answers(dict[str, models.MavlinkVehicle]),
+        responses=answers(dict[str, mavlink_messages.MavlinkVehicle]),
     )
     async def vehicles() -> Response:
         shown = mavlink_messages.vehicles
@@ -92,7 +92,7 @@ def _mavlink(app: FastAPI, node: Node) -> None:
     @app.get(
         "/v1/mavlink/vehicles/{sys}/components/{comp}/messages",
         summary="The last messages of one component",
-        responses=answers(dict[str, models.MavlinkMessage], 404, 422),
+        responses=answers(dict[str, mavlink_messages.MavlinkMessage], 404, 422),
     )
     async def messages(sys: SystemId, comp: ComponentId) -> Response:
         found = kept.by_sender().get(Source(sys, comp))
@@ -103,7 +103,7 @@ def _mavlink(app: FastAPI, node: Node) -> None:
     @app.get(
         "/v1/mavlink/vehicles/{sys}/components/{comp}/messages/{name}",
         summary="The last message of a kind, as mavlink2rest has it",
-        responses=answers(models.MavlinkMessage, 404, 422),
+        responses=answers(mavlink_messages.MavlinkMessage, 404, 422),
     )
     async def message(sys: SystemId, comp: ComponentId, name: MessageName) -> Response:
         dialect = await run_in_threadpool(mavlink_messages.dialect)

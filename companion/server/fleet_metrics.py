@@ -17,14 +17,14 @@ def fleet_metrics(node: Node) -> Iterator[Metric]:
         return
     member = status.member
     shown = fleet.nodes(member, now_ns)
-    states = Counter(one["state"] for one in shown)
+    states = Counter(one.state for one in shown)
     nodes = GaugeMetricFamily(
         "companion_fleet_nodes",
         "Nodes of the fleet by state, this one being here",
         labels=["state"],
     )
-    for state in fleet.STATES:
-        nodes.add_metric([state], states[state])
+    for state in fleet.NodeState:
+        nodes.add_metric([str(state)], states[state])
     yield nodes
     yield GaugeMetricFamily(
         "companion_fleet_serves", "UAVs that this node serves", value=len(member.duties.serves)
@@ -62,8 +62,8 @@ def fleet_metrics(node: Node) -> Iterator[Metric]:
         labels=["node"],
     )
     for one in shown:
-        if one["way_p99_ms"] is not None:
-            ways.add_metric([one["node"]], one["way_p99_ms"] * 1e-3)
-        if one["clock_doubt_s"] is not None:
-            doubts.add_metric([one["node"]], one["clock_doubt_s"])
+        if one.way_p99_ms is not None:
+            ways.add_metric([one.node], one.way_p99_ms * 1e-3)
+        if one.clock_doubt_s is not None:
+            doubts.add_metric([one.node], one.clock_doubt_s)
     yield from (ways, doubts)

@@ -159,9 +159,9 @@ class NodeCollector(Collector):
             for level in Level:
                 levels.add_metric([found.uav, str(level)], float(found.level is level))
             for name, gain_db in (
-                ("needed", found.needed_db),
-                ("guaranteed", found.guaranteed_db),
-                ("likely", found.likely_db),
+                ("needed", found.needed_gain_db),
+                ("guaranteed", found.guaranteed_gain_db),
+                ("likely", found.likely_gain_db),
             ):
                 if gain_db is not None:
                     gains[name].add_metric([found.uav], gain_db)

@@ -11,15 +11,14 @@ from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Annotated, BinaryIO, Final, Literal
 
 from starlette.concurrency import run_in_threadpool
 
 from companion.recording.writer import ACTIVE
 from companion.values import UtcNs
-from companion.views.words import rfc3339
-
-Json = dict[str, Any]
+from companion.values.described import Meaning
+from companion.views.as_json import Json, rfc3339
 
 MEDIA_TYPE: Final = "application/x-mcap"
 _NAME: Final = re.compile(r"[A-Za-z0-9][\w.-]*\.mcap(\.active)?", re.ASCII)
@@ -38,6 +37,26 @@ class Current:
 
     name: str | None
     bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """A file that can be had at ``/v1/recordings/{name}``."""
+
+    name: Annotated[str, Meaning("name of the file", example="companion-20261120T130000Z.mcap")]
+    bytes: Annotated[int | None, Meaning("size of the file")]
+    state: Annotated[
+        Literal["recording", "finished", "unfinished"],
+        Meaning("being written; finished; unfinished: cut short"),
+    ]
+    started: Annotated[str | None, Meaning("when it was begun")]
+
+
+@dataclass(frozen=True, slots=True)
+class Recordings:
+    """The recordings, by name."""
+
+    recordings: Annotated[list[Recording], Meaning("the recordings, by name")]
 
 
 def listed(where: str | None, current: Current) -> list[Json]:

@@ -4,8 +4,6 @@ No answer is validated on its way out: the models of ``models.py`` only describe
 compare the answers with them.
 """
 
-import tomllib
-from importlib import resources
 from typing import Any, Final
 
 import orjson
@@ -49,15 +47,16 @@ def problem(status: int, title: str, headers: dict[str, str] | None = None) -> J
     return JSONResponse(body, status_code=status, headers=headers, media_type=PROBLEM_TYPE)
 
 
-def answers(model: Any, *problems: int) -> dict[int | str, dict[str, Any]]:
-    """Responses of an operation, for the OpenAPI document: the model, or one of the problems."""
-    return {200: {"model": model}} | refusals(*problems)
+def answers(kind: Any, *problems: int) -> dict[int | str, dict[str, Any]]:
+    """Responses of an operation, for the OpenAPI document: the described class, or a problem."""
+    return {200: {"model": models.outward(kind)}} | refusals(*problems)
 
 
 def refusals(*problems: int) -> dict[int | str, dict[str, Any]]:
     """Problems that an operation answers with, for the OpenAPI document."""
     return {
-        status: {"model": models.Problem, "description": _MEANINGS[status]} for status in problems
+        status: {"model": models.model(models.Problem), "description": _MEANINGS[status]}
+        for status in problems
     }
 
 
@@ -87,10 +86,7 @@ async def _failed(_request: Request, _error: Exception) -> JSONResponse:
 
 
 def _document(app: FastAPI) -> dict[str, Any]:
-    """The OpenAPI document, with what each field means, and problems under their own media type.
-
-    FastAPI puts these under JSON's.
-    """
+    """The OpenAPI document, with problems under their own media type, not under JSON's."""
     if app.openapi_schema is None:
         made = get_openapi(
             title=app.title, version=app.version, description=app.description, routes=app.routes
@@ -102,19 +98,5 @@ def _document(app: FastAPI) -> dict[str, Any]:
                     schema = content.get("application/json", {}).get("schema", {})
                     if schema.get("$ref", "").endswith("/Problem"):
                         shown["content"] = {PROBLEM_TYPE: content["application/json"]}
-        _describe(made["components"]["schemas"])
         app.openapi_schema = made
     return app.openapi_schema
-
-
-def _describe(schemas: dict[str, Any]) -> None:
-    """Give each field of the document's schemas its meaning: ``vocabulary.toml`` has the words."""
-    words = tomllib.loads(
-        resources.files("companion.server").joinpath("vocabulary.toml").read_text("utf-8")
-    )
-    for model, schema in schemas.items():
-        closer = words.get(model, {})
-        for name, field in schema.get("properties", {}).items():
-            meaning = closer.get(name, words.get(name))
-            if isinstance(meaning, str):
-                field["description"] = meaning

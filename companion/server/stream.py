@@ -185,7 +185,7 @@ class Stream:
             self._snapshot = Snapshot(self._node.pipeline.updates)
         snapshot = self._snapshot
         if topic not in snapshot.bodies:
-            snapshot.bodies[topic] = asyncio.create_task(topics.BODIES[topic](self._node))
+            snapshot.bodies[topic] = asyncio.create_task(topics.body(topic, self._node))
         body = await asyncio.shield(snapshot.bodies[topic])  # others may wait for it too
         message = snapshot.messages.get((topic, uavs))
         if message is None:

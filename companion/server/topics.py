@@ -1,5 +1,6 @@
 """What ``/v1/stream`` sends: a body for each topic, and the part of it that a client asked for."""
 
+import inspect
 from collections.abc import Callable
 from dataclasses import replace
 from enum import StrEnum
@@ -12,10 +13,8 @@ from companion.server.responses import encode
 from companion.values import BeamSet
 from companion.views import beam_state, glance, guaranteed_gain, records, state
 from companion.views import fleet as fleet_view
+from companion.views.as_json import Json
 from companion.views.state import Node
-from companion.views.words import rfc3339
-
-Json = dict[str, Any]
 
 
 class Topic(StrEnum):
@@ -72,10 +71,6 @@ def _only(topic: Topic, body: Json, uavs: frozenset[str]) -> Json:
             return body
 
 
-async def _uavs(node: Node) -> Json:
-    return {"valid_at": rfc3339(node.pipeline.utc_ns(node.now_ns())), "uavs": state.uavs(node)}
-
-
 async def _beams(node: Node) -> Json:
     update = node.pipeline.last_update or node.pipeline.look(node.now_ns())
     age_s = (node.now_ns() - update.t_ns) * 1e-9
@@ -84,7 +79,7 @@ async def _beams(node: Node) -> Json:
     )
 
 
-async def _weights(node: Node) -> Json:
+def _weights(node: Node) -> Json:
     update = node.pipeline.last_update or node.pipeline.look(node.now_ns())
     return beam_state.weights(node.pipeline, update.beams, 0.0)
 
@@ -104,31 +99,25 @@ async def _records(node: Node) -> Json:
     }
 
 
-async def _status(node: Node) -> Json:
+def _status(node: Node) -> Json:
     shown = state.status(node, companion.__version__)
     return {"valid_at": shown["time"], **shown}
 
 
-async def _links(node: Node) -> Json:
-    return state.links(node)
-
-
-async def _fleet(node: Node) -> Json:
-    return fleet_view.fleet(node.pipeline, node.fleet_status(), node.now_ns())
-
-
-async def _events(node: Node) -> Json:
-    valid_at = rfc3339(node.pipeline.utc_ns(node.now_ns()))
-    return {"valid_at": valid_at, "events": glance.events(node.pipeline, node.events())}
-
-
 BODIES: Final[dict[Topic, Callable[[Node], Any]]] = {
-    Topic.UAVS: _uavs,
+    Topic.UAVS: state.uavs,
     Topic.BEAMS: _beams,
     Topic.WEIGHTS: _weights,
     Topic.RECORDS: _records,
     Topic.STATUS: _status,
-    Topic.LINKS: _links,
-    Topic.FLEET: _fleet,
-    Topic.EVENTS: _events,
+    Topic.LINKS: state.links,
+    Topic.FLEET: lambda node: fleet_view.fleet(node.pipeline, node.fleet_status(), node.now_ns()),
+    Topic.EVENTS: glance.events,
 }
+
+
+async def body(topic: Topic, node: Node) -> Json:
+    """The body of a topic, as the path of its name answers."""
+    made = BODIES[topic](node)
+    found: Json = await made if inspect.isawaitable(made) else made
+    return found

@@ -61,7 +61,7 @@ def _way_m(fix: Fix, within_s: float) -> float:
     velocity = fix.velocity_ned_mps
     if velocity is None:
         return 0.0
-    gained_mps = within_s * (0.0 if fix.limits is None else fix.limits.acceleration_mps2)
+    gained_mps = within_s * (0.0 if fix.limits is None else fix.limits.acceleration_max_mps2)
     north, east, down = velocity
     speed_mps = math.sqrt(north * north + east * east + down * down)
     return within_s * (speed_mps + fix.noise.velocity_mps + gained_mps)

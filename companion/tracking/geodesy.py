@@ -8,11 +8,12 @@ positions.
 """
 
 import math
-from typing import Final, NamedTuple
+from typing import Annotated, Final, NamedTuple
 
 import numpy as np
 
 from companion.values import FloatArray, Vector
+from companion.values.described import Meaning
 
 SEMI_MAJOR_M: Final = 6_378_137.0
 SEMI_MINOR_M: Final = SEMI_MAJOR_M * (1 - 1 / 298.257223563)
@@ -40,9 +41,9 @@ def ned_from_ecef(lat_deg: float, lon_deg: float) -> FloatArray:
 class Place(NamedTuple):
     """A point on Earth: WGS84 degrees, metres above the ellipsoid or mean sea level, as given."""
 
-    lat_deg: float
-    lon_deg: float
-    alt_m: float
+    lat_deg: Annotated[float, Meaning("latitude, WGS84", example=47.3977)]
+    lon_deg: Annotated[float, Meaning("longitude, WGS84", example=8.5456)]
+    alt_m: Annotated[float, Meaning("altitude above the datum of its reports", example=531.2)]
 
 
 class _Axes:

@@ -132,9 +132,9 @@ class Refutations:
 
     def limits(self, base: Limits, sender_ns: int) -> Limits:
         """The limits in force at a sender time."""
-        speed = self.speed.at(base.speed_mps, sender_ns)
-        acceleration = self.acceleration.at(base.acceleration_mps2, sender_ns)
-        if speed == base.speed_mps and acceleration == base.acceleration_mps2:
+        speed = self.speed.at(base.speed_max_mps, sender_ns)
+        acceleration = self.acceleration.at(base.acceleration_max_mps2, sender_ns)
+        if speed == base.speed_max_mps and acceleration == base.acceleration_max_mps2:
             return base
         return Limits(speed, acceleration, LimitSource.RAISED)
 
@@ -147,12 +147,12 @@ class Refutations:
         north, east, down = velocity
         noise_mps = fix.noise.velocity_mps
         speed = math.sqrt(north * north + east * east + down * down) - noise_mps
-        limit = self.speed.at(base.speed_mps, fix.sender_ns)
-        if limit < speed < MOST * base.speed_mps:
+        limit = self.speed.at(base.speed_max_mps, fix.sender_ns)
+        if limit < speed < MOST * base.speed_max_mps:
             found.append(self._raise(self.speed, fix, "observer.speed_max_mps", limit, speed))
         proven = self._proven(fix, north, east, down)
-        limit = self.acceleration.at(base.acceleration_mps2, fix.sender_ns)
-        if limit < proven < MOST * base.acceleration_mps2:
+        limit = self.acceleration.at(base.acceleration_max_mps2, fix.sender_ns)
+        if limit < proven < MOST * base.acceleration_max_mps2:
             name = "observer.acceleration_max_mps2"
             found.append(self._raise(self.acceleration, fix, name, limit, proven))
         if not self._times_ns or fix.sender_ns > self._times_ns[-1]:

@@ -52,7 +52,7 @@ def reach(fix: Fix, limits: Limits, predicted_ned_m: Vector, at: SenderTime) -> 
     bound = horizontal = vertical = 0.0
     radii = []
     for s in ends:
-        grown = abs(s) * noise.velocity_mps + limits.acceleration_mps2 * s * s / 2.0
+        grown = abs(s) * noise.velocity_mps + limits.acceleration_max_mps2 * s * s / 2.0
         n, e, d = north - v_north * s, east - v_east * s, down - v_down * s
         flat = n * n + e * e
         radii.append(noise.position_m + grown)
@@ -64,7 +64,7 @@ def reach(fix: Fix, limits: Limits, predicted_ned_m: Vector, at: SenderTime) -> 
         horizontal = aside if aside > horizontal else horizontal
         vertical = above if above > vertical else vertical
     # Over long gaps the greatest speed says more.
-    way = max(abs(ends[0]), abs(ends[1])) * limits.speed_mps
+    way = max(abs(ends[0]), abs(ends[1])) * limits.speed_max_mps
     flat = north * north + east * east
     bound = min(bound, math.sqrt(flat + down * down) + noise.position_m + way)
     horizontal = min(horizontal, math.sqrt(flat) + noise.horizontal_m + way)

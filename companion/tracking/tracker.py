@@ -127,7 +127,7 @@ class Tracker:
         found = known.look(fix)
         assert fix.limits is not None
         limits = known.limits(fix.limits, fix.sender_ns)
-        noise, strays = self._doubted(fix, limits.acceleration_mps2)
+        noise, strays = self._doubted(fix, limits.acceleration_max_mps2)
         if strays is not None:
             found.append(strays)
         if limits is fix.limits and noise is fix.noise:
@@ -273,7 +273,7 @@ class Tracker:
         if not self._settings.feed_forward:
             hindsight.add(fix, (None,) * len(WAYS))
             return
-        most_mps2 = self._limits(fix).acceleration_mps2
+        most_mps2 = self._limits(fix).acceleration_max_mps2
         slopes = [_cut(one, most_mps2) for one in tracked.history.accelerations(WINDOWS)]
         by_window = {window[0]: slope for window, slope in zip(WINDOWS, slopes, strict=True)}
         hindsight.add(fix, tuple(by_window.get(way.window_s) for way in WAYS))
@@ -407,9 +407,9 @@ def _fastest_mps(
 ) -> float:
     """Greatest speed within a time of the instant at which the UAV is predicted."""
     if velocity is None or bound_mps is None:
-        return limits.speed_mps
-    gained_mps = limits.acceleration_mps2 * within_s
-    return min(limits.speed_mps, math.hypot(*velocity) + bound_mps + gained_mps)
+        return limits.speed_max_mps
+    gained_mps = limits.acceleration_max_mps2 * within_s
+    return min(limits.speed_max_mps, math.hypot(*velocity) + bound_mps + gained_mps)
 
 
 def _rejected(fix: Fix, reason: Reason, detail: str) -> Rejection:

@@ -2,9 +2,13 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Annotated
 
+import numpy as np
+
+from companion.values.described import Meaning
 from companion.values.health import Cause
-from companion.values.numbers import ComplexArray
+from companion.values.numbers import ComplexArray, FloatArray, IntArray
 
 
 class Method(StrEnum):
@@ -82,37 +86,40 @@ class Widen(StrEnum):
 class Beam:
     """One UAV's beam: where it points, how well, and how that direction changes.
 
-    uav                 the UAV's name
-    azimuth_rad         array frame, positive to the right of boresight
-    elevation_rad       array frame, positive up
-    range_m             from the array to the predicted position
-    *_rate_*            time derivatives of the three; None where no velocity is known
-    pointing_bound_rad  largest angle between the predicted and the true direction; None:
-                        anywhere
-    gain_db             array gain towards the predicted direction for weights of unit power,
-                        element gain included
-    loss_db             what ``gain_db`` lacks against a beam for this UAV alone (maximum ratio)
-    group               number of the turn in which the UAV is served; 0 unless the policy
-                        groups
-    widened             True if the main lobe was broadened
-    pointing_p95_rad    angle between the predicted and the true direction that is usual at most
-    shaped_likely_rad   the likely angle and the bound for which the beam is shaped: they follow the
-    shaped_bound_rad    two above no faster than a beam may change its shape; 0: sharp
+    shaped_likely_rad, shaped_bound_rad  angles for which the main lobe is shaped: they follow
+        ``pointing_p95_rad`` and ``pointing_bound_rad`` no faster than a beam may change its shape;
+        0: not shaped
     """
 
-    uav: str
-    azimuth_rad: float
-    elevation_rad: float
-    range_m: float
-    azimuth_rate_radps: float | None
-    elevation_rate_radps: float | None
-    range_rate_mps: float | None
-    pointing_bound_rad: float | None
-    gain_db: float
-    loss_db: float
-    group: int = 0
-    widened: bool = False
-    pointing_p95_rad: float | None = None
+    uav: Annotated[str, Meaning("UAV that the beam points at", 1, example="3:1")]
+    azimuth_rad: Annotated[
+        float, Meaning("direction in the array's frame, right of boresight positive", 2)
+    ]
+    elevation_rad: Annotated[
+        float, Meaning("direction in the array's frame, above boresight positive", 3)
+    ]
+    range_m: Annotated[float, Meaning("distance from the array to the predicted position", 4)]
+    azimuth_rate_radps: Annotated[float | None, Meaning("rate of change of the azimuth", 7)]
+    elevation_rate_radps: Annotated[float | None, Meaning("rate of change of the elevation", 8)]
+    range_rate_mps: Annotated[float | None, Meaning("rate of change of the range", 9)]
+    pointing_bound_rad: Annotated[
+        float | None,
+        Meaning(
+            "largest angle between the predicted and the true direction; null: unlimited",
+            5,
+            label="Pointing bound",
+        ),
+    ]
+    gain_db: Annotated[
+        float, Meaning("array gain towards the predicted direction, over one element", 6)
+    ]
+    loss_db: Annotated[float, Meaning("gain lost against a beam for this UAV alone", 10)]
+    group: Annotated[int, Meaning("time slot in which the beam is applied, from 0", 11)] = 0
+    widened: Annotated[bool, Meaning("whether the main lobe is broadened", 12)] = False
+    pointing_p95_rad: Annotated[
+        float | None,
+        Meaning("estimated 95th percentile of the angle to the true direction, not a bound", 13),
+    ] = None
     shaped_likely_rad: float = 0.0
     shaped_bound_rad: float = 0.0
 
@@ -121,50 +128,63 @@ class Beam:
 class LeftOut:
     """A UAV that is tracked but has no beam, and the reason: as a cause and in words."""
 
-    uav: str
+    uav: Annotated[str, Meaning("UAV without a beam", 1)]
     cause: Cause
-    reason: str
+    reason: Annotated[str, Meaning("why it has no beam", 2)]
 
 
 @dataclass(frozen=True, slots=True)
 class BeamSet:
     """The beams and weights of one update.
 
-        t_ns              when the update was made, node time
-        valid_at_ns       when the beams are to be applied, node time
-        beams             N beams
-        weights           F, (M, N) complex: one row per element, columns in the order of ``beams``
-        method            how F was made
-        normalisation     how its columns are scaled
-        condition_number  of the steering matrix A in the 2-norm, columns scaled to equal length;
-                          the largest over the groups; None without beams
-        left_out          UAVs without a beam
-        exact             whether each UAV lies in a null of all other beams of its turn; ``method``
-                          says zero forcing only once that has been so for a while
+    weights   F, (M, N) complex: one row per element, columns in the order of ``beams``
+    left_out  UAVs without a beam
 
-    Zero forcing gives AᵀF = I within a group (no conjugate; diagonal under other normalisations):
-    each UAV lies in a null of the others' beams. See docs/math.md 7.
+    Zero forcing gives AᵀF = I within a time slot (no conjugate; diagonal under other
+    normalisations): each UAV lies in a null of the others' beams. See docs/math.md 7.
     """
 
-    t_ns: int
-    valid_at_ns: int
+    t_ns: Annotated[
+        int, Meaning("when the update was computed", 1, absent={"api": "`age_s` says it"})
+    ]
+    valid_at_ns: Annotated[int, Meaning("when the beams are applied", 2)]
     beams: tuple[Beam, ...]
     weights: ComplexArray
-    method: Method
-    normalisation: Normalisation
-    condition_number: float | None
+    method: Annotated[Method, Meaning("how the weights were computed", 6)]
+    normalisation: Annotated[Normalisation, Meaning("scale of the weights' columns", 10)]
+    condition_number: Annotated[
+        float | None,
+        Meaning(
+            "condition number of the steering matrix, columns scaled to equal length, the largest "
+            "over the time slots; null without beams",
+            7,
+        ),
+    ]
     left_out: tuple[LeftOut, ...]
-    exact: bool = False
+    exact: Annotated[
+        bool, Meaning("whether each UAV lies in a null of every other beam of its time slot", 11)
+    ] = False
 
     @property
     def uavs(self) -> tuple[str, ...]:
         return tuple(beam.uav for beam in self.beams)
 
     @property
-    def regularised(self) -> bool:
+    def slots(self) -> IntArray:
+        """(N,), the time slot of each beam."""
+        return np.array([beam.group for beam in self.beams], dtype=np.int64)
+
+    @property
+    def ranges_m(self) -> FloatArray:
+        """(N,), the predicted range of each beam's UAV."""
+        return np.array([beam.range_m for beam in self.beams], dtype=float)
+
+    @property
+    def regularised(
+        self,
+    ) -> Annotated[bool, Meaning("whether zero forcing was regularised", 12)]:
         return self.method is Method.REGULARISED
 
     @property
-    def groups(self) -> int:
-        """Number of turns in which all UAVs are served; 0 without beams."""
+    def groups(self) -> Annotated[int, Meaning("time slots that serve all UAVs once", 13)]:
         return max((beam.group for beam in self.beams), default=-1) + 1

@@ -1,9 +1,10 @@
 """Everything that drives the pipeline: frames, and what the node itself adds to them."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
 from companion.values.clock import ClockSet
+from companion.values.described import Meaning
 from companion.values.names import Source
 from companion.values.received import Frame
 from companion.values.rejections import Rejection
@@ -11,38 +12,41 @@ from companion.values.rejections import Rejection
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """The timer event at which beams are due.
+    """The timer event at which beams are due."""
 
-    t_ns    when
-    in_two  whether UAVs are predicted now alone, and the beams come with an event of their own,
-            ``Tock``: what is received while they are made is taken in between
-    """
-
-    t_ns: int
-    in_two: bool = False
+    t_ns: Annotated[int, Meaning("when beams are due", 1)]
+    in_two: Annotated[
+        bool,
+        Meaning(
+            "whether this tick only predicts the UAVs; the beams follow with a Tock, after the "
+            "frames received meanwhile",
+            2,
+        ),
+    ] = False
 
 
 @dataclass(frozen=True, slots=True)
 class Tock:
-    """The beams of the tick before, which came in two, are made; when."""
+    """The beams of the preceding split tick are computed."""
 
-    t_ns: int
+    t_ns: Annotated[int, Meaning("when they are computed", 1)]
 
 
 @dataclass(frozen=True, slots=True)
 class RoundTrip:
-    """A TIMESYNC request sent by this node, and its answer.
+    """A TIMESYNC request sent by this node, and its answer."""
 
-    t_ns       when the answer was received, node time
-    source     who answered
-    sent_ns    when the request was sent, node time
-    remote_ns  the sender's clock since boot, read at some time between ``sent_ns`` and ``t_ns``
-    """
-
-    t_ns: int
-    source: Source
-    sent_ns: int
-    remote_ns: int
+    t_ns: Annotated[int, Meaning("when the answer was received", 1)]
+    source: Annotated[Source, Meaning("component that answered", 2)]
+    sent_ns: Annotated[int, Meaning("when the request was sent", 4)]
+    remote_ns: Annotated[
+        int,
+        Meaning(
+            "clock since boot of the component, read between the request and the answer",
+            5,
+            wire="sfixed64",
+        ),
+    ]
 
 
 DUTY_MAX: Final = 10_000
@@ -51,16 +55,13 @@ DUTY_MAX: Final = 10_000
 
 @dataclass(frozen=True, slots=True)
 class Duty:
-    """The UAVs that this node serves from now on, and those that it spares; an event.
+    """The UAVs that this node of a fleet serves from now on, and those that it protects."""
 
-    t_ns    since when, node time
-    serves  UAVs that get a beam
-    spares  UAVs that another node serves, on which beams are to have nulls
-    """
-
-    t_ns: int
-    serves: tuple[str, ...]
-    spares: tuple[str, ...] = ()
+    t_ns: Annotated[int, Meaning("when the duty begins", 1)]
+    serves: Annotated[tuple[str, ...], Meaning("UAVs that get a beam", 2)]
+    spares: Annotated[
+        tuple[str, ...], Meaning("UAVs of other nodes, on which beams have nulls", 3)
+    ] = ()
 
 
 Event = Frame | Tick | Tock | Rejection | RoundTrip | ClockSet | Duty

@@ -1,8 +1,9 @@
 """Values of a fleet: what the nodes of a site tell one another, and what each is to do."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
+from companion.values.described import Meaning
 from companion.values.events import RoundTrip
 
 
@@ -29,21 +30,20 @@ class Shared:
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """What a node's array would have towards a UAV, if it served it alone.
+    """What a node's array would offer a UAV, if it served that UAV alone."""
 
-    uav        the UAV's name
-    sure_db    gain that is guaranteed wherever the UAV is; None: none
-    likely_db  gain towards where it usually is; None: none
-    sinr_db    signal over noise at that UAV with all of the power, of the gain that is guaranteed,
-               or else of the likely one; None: neither
-    heard_s    how long ago the node itself heard it; None: never
-    """
-
-    uav: str
-    sure_db: float | None
-    likely_db: float | None
-    sinr_db: float | None
-    heard_s: float | None
+    uav: Annotated[str, Meaning("UAV of the offer", 1)]
+    sure_db: Annotated[float | None, Meaning("gain guaranteed wherever the UAV is; null: none", 2)]
+    likely_db: Annotated[float | None, Meaning("gain where the UAV usually is; null: none", 3)]
+    sinr_db: Annotated[
+        float | None,
+        Meaning(
+            "SNR at the UAV with full power and the guaranteed gain, or else the likely gain", 4
+        ),
+    ]
+    heard_s: Annotated[
+        float | None, Meaning("time since that node itself received the UAV; null: never", 5)
+    ]
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Annotated
+
+from companion.values.described import Meaning
 
 
 class Level(StrEnum):
@@ -54,28 +57,29 @@ class Cause(StrEnum):
 class Blame:
     """What holds a link back: the cause, in words, and what to do about it."""
 
-    cause: Cause
-    reason: str
-    remedy: str
+    cause: Annotated[Cause, Meaning("what limits the link most; null where it is good")]
+    reason: Annotated[str, Meaning("the cause in words", example="reports 1.1 s apart")]
+    remedy: Annotated[str, Meaning("what to do", example="ask for 10 Hz ([presence] position_hz)")]
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """How good the link to a UAV is.
 
-    uav            the UAV's name
-    level          how good
-    blame          why it is not good; None where it is
-    since_ns       when it became so, node time
-    needed_db      array gain that the link needs; None where there is no beam to tell
-    guaranteed_db  least gain within the bound; None where nothing is sure
-    likely_db      least gain where the UAV usually is; None where even that is not sure
+    level  how good
+    blame  why it is not good; None where it is
     """
 
     uav: str
     level: Level
     blame: Blame | None
-    since_ns: int
-    needed_db: float | None = None
-    guaranteed_db: float | None = None
-    likely_db: float | None = None
+    since_ns: Annotated[int, Meaning("since when the link is so")]
+    needed_gain_db: Annotated[
+        float | None, Meaning("array gain that the link needs; null without a beam")
+    ] = None
+    guaranteed_gain_db: Annotated[
+        float | None, Meaning("least array gain wherever the UAV can be; null: none")
+    ] = None
+    likely_gain_db: Annotated[
+        float | None, Meaning("least array gain where the UAV usually is; null: none")
+    ] = None

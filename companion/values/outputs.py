@@ -2,8 +2,10 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Annotated
 
 from companion.values.aimed import BeamSet
+from companion.values.described import Meaning
 from companion.values.rejections import Rejection
 from companion.values.tracked import Carrier, Estimate, Refuted, Track
 
@@ -20,10 +22,10 @@ class Severity(StrEnum):
 class Notice:
     """A message to the operator, emitted once when the state it describes changes."""
 
-    t_ns: int
-    severity: Severity
-    subject: str
-    text: str
+    t_ns: Annotated[int, Meaning("when it was issued")]
+    severity: Annotated[Severity, Meaning("how important it is")]
+    subject: Annotated[str, Meaning("UAV, link or part of the service that it is about")]
+    text: Annotated[str, Meaning("the message", example="3:1 is coasting")]
 
 
 @dataclass(frozen=True, slots=True)

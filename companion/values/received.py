@@ -2,26 +2,30 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
+from companion.values.described import Meaning
 from companion.values.names import Source
 
 
 class Frame(NamedTuple):
     """One MAVLink frame whose checksum is right.
 
-    ``raw`` is the whole frame, from the magic byte to the checksum or signature; ``t_ns`` is when
-    it arrived, node time; of one that another node heard, the latest time at which that can have
-    been, which may be too late by ``doubt_ns``. It is a tuple because one is made for every frame
-    received, wanted or not.
+    It is a tuple because one is made for every frame received, wanted or not.
     """
 
-    t_ns: int
-    link: str
-    source: Source
-    msgid: int
-    raw: bytes
-    doubt_ns: int = 0
+    t_ns: Annotated[
+        int, Meaning("arrival; for a frame that another node received, its latest arrival", 1)
+    ]
+    link: Annotated[str, Meaning("link that it came over", 2)]
+    source: Annotated[Source, Meaning("sender: MAVLink system and component id", 3)]
+    msgid: Annotated[int, Meaning("MAVLink message id", 5)]
+    raw: Annotated[
+        bytes, Meaning("whole frame, from the magic byte to the checksum or signature", 6)
+    ]
+    doubt_ns: Annotated[
+        int, Meaning("by how much the arrival may be earlier than stated", 7, wire="uint64")
+    ] = 0
 
     @property
     def version(self) -> int:

@@ -2,47 +2,55 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Annotated, Self
+
+from companion.values.described import Meaning
 
 
 class Reason(StrEnum):
-    """Why something received was not used. The values are shown in recordings and by the API."""
+    """Why something received was not used. Each reason has a ``meaning`` for people."""
 
-    GARBAGE = "garbage"  # bytes between frames; counted in bytes
-    BAD_CRC = "bad-crc"  # framed like a known message, but the checksum is wrong
-    UNKNOWN_MESSAGE = "unknown-message"  # an id without a known checksum seed: cannot be trusted
-    BAD_STAMP = "bad-stamp"  # a log's own time stamp steps back or leaps; the step was clamped
-    MALFORMED = "malformed"  # a checked frame whose fields cannot be what they say
-    UNREACHABLE = "unreachable"  # farther from the track than it can have flown since
-    ALTITUDE_JUMP = "altitude-jump"  # the same in height alone: the datum has changed
-    FROZEN = "frozen"  # a fresh stamp on an old position, while the velocity says it moves
-    SHARED_ID = "shared-id"  # two vehicles send under one id: neither can be believed
-    ZERO_POSITION = "zero-position"  # within 5 km of 0 N 0 E: what is sent before a fix
-    NO_POSITION = "no-position"  # ADSB_VEHICLE whose flags do not vouch for its coordinates
-    NO_IDENTITY = "no-identity"  # a Remote ID position whose sender's id was not heard yet
-    NO_ALTITUDE = "no-altitude"  # a position in the plane only
-    UNPLACED_STAMP = "unplaced-stamp"  # off the sender's clock, and not enough others yet to agree
-    NOT_ALLOWED = "not-allowed"  # a sender that the lists of the settings keep out
-    TOO_MANY = "too-many"  # another sender, where as many are tracked as the settings allow
-    UNSIGNED = "unsigned"  # without a signature, over a link that requires them
-    BAD_SIGNATURE = "bad-signature"  # signed with another key, or altered
-    REPLAYED = "replayed"  # well signed, but not newer than what was heard before
-    SECRET = "secret"  # SETUP_SIGNING carries a key: it is not used, and not recorded
-    SOCKET_OVERFLOW = "socket-overflow"  # lost before it was read: a full buffer, or too old
-    DUPLICATE = "duplicate"  # the same report again, over this link or another
-    NO_FIX = "no-fix"  # the first position of all, whose sender's receiver does not vouch for it
-    OUT_OF_ORDER = "out-of-order"  # later than the window for late reports
+    meaning: str
+
+    def __new__(cls, value: str, meaning: str) -> Self:
+        made = str.__new__(cls, value)
+        made._value_ = value
+        made.meaning = meaning
+        return made
+
+    GARBAGE = "garbage", "bytes between frames"
+    BAD_CRC = "bad-crc", "frames with a wrong checksum"
+    UNKNOWN_MESSAGE = "unknown-message", "frames of unknown messages, which cannot be checked"
+    BAD_STAMP = "bad-stamp", "time stamps of a log that step back or jump; the step was clamped"
+    MALFORMED = "malformed", "messages with impossible field values"
+    UNREACHABLE = "unreachable", "reports farther from the track than the aircraft can have flown"
+    ALTITUDE_JUMP = "altitude-jump", "reports at an unreachable height: the datum has changed"
+    FROZEN = "frozen", "new time stamps on an old position, while the velocity says it moves"
+    SHARED_ID = "shared-id", "reports of two vehicles under one id"
+    ZERO_POSITION = "zero-position", "reports near 0° N 0° E, which are sent before a fix"
+    NO_POSITION = "no-position", "relayed aircraft without valid coordinates"
+    NO_IDENTITY = "no-identity", "Remote ID positions received before the id of their sender"
+    NO_ALTITUDE = "no-altitude", "relayed aircraft without an altitude"
+    UNPLACED_STAMP = "unplaced-stamp", "reports whose time stamp fits no clock of the sender yet"
+    NOT_ALLOWED = "not-allowed", "reports of senders that the allow and deny lists exclude"
+    TOO_MANY = "too-many", "reports of UAVs beyond the number that the settings allow"
+    UNSIGNED = "unsigned", "frames without the signature that their link requires"
+    BAD_SIGNATURE = "bad-signature", "frames signed with another key, or altered"
+    REPLAYED = "replayed", "signed frames no newer than an earlier one"
+    SECRET = "secret", "frames that carry a signing key: neither used nor recorded"
+    SOCKET_OVERFLOW = "socket-overflow", "frames lost before they were read: buffer full or too old"
+    DUPLICATE = "duplicate", "copies of a report received before"
+    NO_FIX = "no-fix", "first reports sent before the receiver had a fix"
+    OUT_OF_ORDER = "out-of-order", "reports older than the window for late reports"
 
 
 @dataclass(frozen=True, slots=True)
 class Rejection:
-    """Something received that was not used, and why.
+    """Something received that was not used, and why."""
 
-    ``count`` is in frames, or in bytes for ``GARBAGE``. ``detail`` is text for the operator.
-    """
-
-    t_ns: int
-    source: str
-    reason: Reason
-    count: int = 1
-    msgid: int | None = None
-    detail: str = ""
+    t_ns: Annotated[int, Meaning("when it was received", 1)]
+    source: Annotated[str, Meaning("UAV, sender, link or log that it came from", 2)]
+    reason: Annotated[Reason, Meaning("why it was not used", 3, example="unreachable")]
+    count: Annotated[int, Meaning("number of frames; for garbage, bytes", 4, wire="uint64")] = 1
+    msgid: Annotated[int | None, Meaning("MAVLink message id", 5)] = None
+    detail: Annotated[str, Meaning("the reason with its numbers", 6)] = ""

@@ -1,8 +1,11 @@
 """Values for where things are: fixes, estimates, tracks and the carrier of the array."""
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Annotated, Final
 
+from companion.values.described import Inline, Meaning
 from companion.values.numbers import FloatArray, Vector
 from companion.values.received import Report
 
@@ -11,26 +14,25 @@ from companion.values.received import Report
 class ReportNoise:
     """Bounds on the errors of one report.
 
-    horizontal_m  norm of the position error in the horizontal plane
-    vertical_m    height error
-    position_m    norm of the position error in space
-    velocity_mps  norm of the velocity error
-    time_s        by how much the report may be older or newer than the time it is put at: what is
-                  left of its lag
-    apart_m       by how much the receiver's own heights differ from those reported, of late: which
-                  of them is off is not known; 0 where they are not
+    apart_m  by how much the receiver's own altitudes differ from those reported of late, while it
+             is unknown which of them is wrong; 0 where they agree
     """
 
-    horizontal_m: float
-    vertical_m: float
-    position_m: float
-    velocity_mps: float
-    time_s: float = 0.0
+    horizontal_m: Annotated[float, Meaning("bound on the horizontal position error")]
+    vertical_m: Annotated[float, Meaning("bound on the altitude error")]
+    position_m: Annotated[float, Meaning("bound on the position error in space")]
+    velocity_mps: Annotated[float, Meaning("bound on the velocity error")]
+    time_s: Annotated[float, Meaning("bound on the error of the report's time stamp")] = 0.0
     apart_m: float = 0.0
 
 
 class LimitSource(StrEnum):
-    """Where a limit of an aircraft comes from."""
+    """Where the limits of an aircraft come from.
+
+    SETTINGS  ``[observer]`` in the settings
+    TYPE      the aircraft's type
+    RAISED    raised, because reports refuted the limits before
+    """
 
     SETTINGS = "settings"
     TYPE = "type"
@@ -39,36 +41,27 @@ class LimitSource(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What an aircraft is taken to be able to do, which the bounds rest on.
+    """Largest speed and acceleration of an aircraft, norms of 3-vectors: the bounds assume both."""
 
-    speed_mps          greatest speed, norm of a 3-vector
-    acceleration_mps2  greatest acceleration, norm of a 3-vector
-    source             the settings, the aircraft's type, or raised because reports refuted them
-    """
-
-    speed_mps: float
-    acceleration_mps2: float
-    source: LimitSource = LimitSource.SETTINGS
+    speed_max_mps: Annotated[float, Meaning("largest speed that the bounds assume", 21)]
+    acceleration_max_mps2: Annotated[
+        float, Meaning("largest acceleration that the bounds assume", 22)
+    ]
+    limits_source: Annotated[LimitSource, Meaning("where both limits come from", 23)] = (
+        LimitSource.SETTINGS
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class Refuted:
-    """An assumption that what was reported proves to be wrong; it was raised.
+    """An assumption that reports refuted, in the unit of its setting; it was raised."""
 
-    t_ns       when that was seen, node time
-    uav        whose assumption it is
-    setting    name of the setting that holds it
-    limit      what was assumed, in the setting's unit
-    proven     what was proven at least
-    raised_to  what is assumed from now on, fading back over minutes
-    """
-
-    t_ns: int
+    t_ns: Annotated[int, Meaning("when it was refuted")]
     uav: str
-    setting: str
-    limit: float
-    proven: float
-    raised_to: float
+    setting: Annotated[str, Meaning("setting whose assumption was refuted")]
+    limit: Annotated[float, Meaning("assumed value")]
+    proven: Annotated[float, Meaning("least value that the reports prove")]
+    raised_to: Annotated[float, Meaning("value assumed from then on, which fades over minutes")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,20 +99,19 @@ class Estimate:
 
     fix             the accepted report
     position_ned_m  local frame: the estimate before this report entered it
-    bound_m         bound on the norm of that estimate's error
-    innovation_m    distance from the estimate to the report; None for the first report of a
-                    track; of one that was begun again, how far it jumped
-    dt_s            interval since the report before; None for the first report of a track
-    reacquired      True if the track was begun again, from reports that disagreed with the
-                    track but agreed with one another
+
+    A track is restarted from reports that disagree with it but agree with one another.
+    ``innovation_m`` is None for the first report of a track; after a restart it is the jump.
     """
 
     fix: Fix
     position_ned_m: Vector
-    bound_m: float
-    innovation_m: float | None
-    dt_s: float | None
-    reacquired: bool = False
+    bound_m: Annotated[float, Meaning("bound on the error of the prediction for this report")]
+    innovation_m: Annotated[
+        float | None, Meaning("distance from the prediction to the reported position")
+    ]
+    dt_s: Annotated[float | None, Meaning("interval since the UAV's report before")]
+    reacquired: Annotated[bool, Meaning("whether this report restarted the track")] = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +136,13 @@ class SenderTime:
 
 
 class TrackState(StrEnum):
-    """How old the newest report of a UAV is; the age limits are settings (``[tracks]``)."""
+    """How old the newest report of a UAV is; the age limits are settings (``[tracks]``).
+
+    LIVE      reports arrive
+    COASTING  predicted without new reports
+    STALE     too old for a beam
+    LOST      about to be dropped
+    """
 
     LIVE = "live"
     COASTING = "coasting"
@@ -152,71 +150,88 @@ class TrackState(StrEnum):
     LOST = "lost"
 
 
+_LOCAL_FRAME: Final = "coordinates of the node's own frame; `lat_deg` … and `north_m` … say where"
+
+
 @dataclass(frozen=True, slots=True)
 class Track:
-    """What is known of one UAV at the instant ``valid_at_ns``.
-
-    Vectors are (3,), in the local frame.
-
-        age_s                  ``valid_at_ns`` less the time of the newest accepted report
-        unknown_input_mps      estimate of the unknown input (docs/math.md 3)
-        acceleration_ned_mps2  acceleration that was fed forward (docs/math.md 5.1)
-        bound_m                bound on the norm of the position error
-        horizontal_bound_m     its part in the plane: the error lies in an upright cylinder of this
-        vertical_bound_m       radius and of this half height
-        set_center_ned_m       centre of the least ball that holds every place that is possible,
-        set_radius_m           and its radius: for whoever plans with it, not to point at
-        limits                 what the aircraft is taken to be able to do
-        error_p95_m            error that 95 of 100 predictions at this age stayed below of late;
-                               None before enough reports have shown it
-        clock_bound_s          uncertainty of the sender's clock, whose effect is in all bounds
-        dt_s                   interval between the last two reports
-        latency_s              visible latency of the newest report
-        gamma                  certified gain over all intervals that occurred (docs/math.md 2.3);
-                               position model only
-        innovation_m           distance from the prediction to the last report
-        reports                number of accepted reports
+    """One UAV at the instant ``valid_at_ns``. Vectors are (3,), in the local frame.
 
     The bounds hold if the settings' bounds on speed, acceleration and noise do (docs/math.md 5.6).
     None stands for what is not known.
     """
 
-    uav: str
-    state: TrackState
-    valid_at_ns: int
-    age_s: float
-    position_ned_m: FloatArray
-    velocity_ned_mps: FloatArray | None
-    unknown_input_mps: FloatArray | None
-    acceleration_ned_mps2: FloatArray | None
-    bound_m: float
-    horizontal_bound_m: float
-    vertical_bound_m: float
-    set_center_ned_m: FloatArray
-    set_radius_m: float
-    limits: Limits
-    error_p95_m: float | None
-    clock_bound_s: float
-    dt_s: float | None
-    latency_s: float | None
-    gamma: float | None
-    innovation_m: float | None
-    reports: int
+    uav: Annotated[str, Meaning("id of the UAV", 1, label="UAV", example="3:1")]
+    state: Annotated[TrackState, Meaning("how old the newest report is", 2)]
+    valid_at_ns: Annotated[int, Meaning("the instant for which the values hold", 3)]
+    age_s: Annotated[float, Meaning("age of the newest accepted report", 4)]
+    position_ned_m: Annotated[
+        FloatArray, Meaning("position in the local frame", 5, absent={"api": _LOCAL_FRAME})
+    ]
+    velocity_ned_mps: Annotated[
+        FloatArray | None, Meaning("estimated velocity to the north, east and down", 6)
+    ]
+    unknown_input_mps: Annotated[
+        FloatArray | None, Meaning("estimate of the unknown input (docs/math.md 3)", 7)
+    ]
+    acceleration_ned_mps2: Annotated[
+        FloatArray | None, Meaning("acceleration that is fed forward (docs/math.md 5.1)", 15)
+    ]
+    bound_m: Annotated[
+        float, Meaning("guaranteed bound on the position error", 8, label="Bound", example=4.2)
+    ]
+    horizontal_bound_m: Annotated[
+        float, Meaning("radius of the cylinder that contains the position", 16)
+    ]
+    vertical_bound_m: Annotated[
+        float, Meaning("half height of the cylinder that contains the position", 17)
+    ]
+    set_center_ned_m: Annotated[
+        FloatArray, Meaning("centre of the smallest ball that contains every possible position", 19)
+    ]
+    set_radius_m: Annotated[float, Meaning("radius of that ball", 20)]
+    limits: Annotated[Limits, Inline()]
+    error_p95_m: Annotated[
+        float | None,
+        Meaning(
+            "95th percentile of recent prediction errors at this age: an estimate, not a bound",
+            24,
+            label="Usual error",
+        ),
+    ]
+    clock_bound_s: Annotated[
+        float, Meaning("uncertainty of the sender's clock; every bound includes its effect", 18)
+    ]
+    dt_s: Annotated[float | None, Meaning("interval between the last two reports", 9, label="ΔT")]
+    latency_s: Annotated[
+        float | None,
+        Meaning("age of the newest report at its arrival; negative: the autopilot predicts", 10),
+    ]
+    gamma: Annotated[
+        float | None,
+        Meaning("certified gain from the unknown input to the error, s; position model only", 11),
+    ]
+    innovation_m: Annotated[
+        float | None, Meaning("distance from the prediction to the newest report", 12)
+    ]
+    reports: Annotated[int, Meaning("accepted reports", 13)]
+
+    @property
+    def speed_mps(self) -> Annotated[float | None, Meaning("estimated speed", 25)]:
+        velocity = self.velocity_ned_mps
+        return None if velocity is None else math.hypot(*velocity)
 
 
 @dataclass(frozen=True, slots=True)
 class Carrier:
     """Position and attitude of the array's carrier at the instant ``valid_at_ns``.
 
-    position_ned_m      (3,), local frame
-    velocity_ned_mps    (3,), local frame; None if not known
-    body_from_local     (3, 3) rotation matrix
-    body_rates_radps    (3,), angular rates about the body axes
-    bound_m             bound on the norm of the position error
-    attitude_bound_rad  bound on the angle by which the attitude is off
-    age_s               age of the newest report; None for a fixed station
-    error_p95_m         error that positions usually stay below; None where that is not known
-    attitude_p95_rad    angle by which the attitude usually is off at most; None likewise
+    position_ned_m    (3,), local frame
+    velocity_ned_mps  (3,), local frame; None if not known
+    body_from_local   (3, 3) rotation matrix
+    body_rates_radps  (3,), angular rates about the body axes
+    error_p95_m       error that positions usually stay below; None where that is not known
+    attitude_p95_rad  angle by which the attitude usually is off at most; None likewise
     """
 
     valid_at_ns: int
@@ -224,8 +239,24 @@ class Carrier:
     velocity_ned_mps: FloatArray | None
     body_from_local: FloatArray
     body_rates_radps: FloatArray
-    bound_m: float
-    attitude_bound_rad: float
-    age_s: float | None
+    bound_m: Annotated[float, Meaning("guaranteed bound on the error of the carrier's position")]
+    attitude_bound_rad: Annotated[
+        float, Meaning("largest angle between the estimated and the true attitude")
+    ]
+    age_s: Annotated[
+        float | None, Meaning("age of the carrier's newest report; null for a fixed station")
+    ]
     error_p95_m: float | None = None
     attitude_p95_rad: float | None = None
+
+    @property
+    def roll_rad(self) -> Annotated[float, Meaning("roll, right side down positive")]:
+        return math.atan2(self.body_from_local[1, 2], self.body_from_local[2, 2])
+
+    @property
+    def pitch_rad(self) -> Annotated[float, Meaning("pitch, nose up positive")]:
+        return math.asin(min(max(-self.body_from_local[0, 2], -1.0), 1.0))
+
+    @property
+    def yaw_rad(self) -> Annotated[float, Meaning("yaw of the nose, from true north, clockwise")]:
+        return math.atan2(self.body_from_local[0, 1], self.body_from_local[0, 0])

@@ -5,7 +5,10 @@ therefore run on any thread.
 """
 
 import functools
-from typing import Any, Final
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Annotated, Final, Literal
 
 import numpy as np
 
@@ -16,11 +19,11 @@ from companion.beams.hardware import codebooks
 from companion.beams.worth import link_budget, patterns
 from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
-from companion.values import Beam, BeamSet, FloatArray, Update
+from companion.tracking.geodesy import Place
+from companion.values import Beam, BeamSet, FloatArray, LeftOut, Method, Policy, Update
+from companion.values.described import Inline, Meaning
 from companion.views import guaranteed_gain
-from companion.views.words import degrees, rfc3339
-
-Json = dict[str, Any]
+from companion.views.as_json import Json, as_json, degrees
 
 AHEAD_S: Final = 30.0
 """How far ahead the next beam of a codebook is looked for."""
@@ -32,41 +35,162 @@ MOST_RESPONSES: Final = 2**28
 """Samples times beams of a codebook times elements, for all UAVs of one answer."""
 FULL_SHARE: Final = 8
 """UAVs up to which each has all the work that a question may take."""
+Cut = Literal["azimuth", "elevation"]
+_LEAD: Final = "how long after the question the beams apply; up to 10 ms more, as valid_at says"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredBeam:
+    """The codebook's beam that serves a UAV, and the next one."""
+
+    best: Annotated[int, Meaning("number of the codebook's beam that serves this UAV now")]
+    gain_db: Annotated[float, Meaning("its gain towards the predicted direction")]
+    next: Annotated[int | None, Meaning("number of the beam that will serve this UAV next")]
+    next_in_s: Annotated[float | None, Meaning("time until the next beam")]
+    candidates: Annotated[
+        list[int], Meaning("numbers of the beams among which the right one surely is")
+    ]
+    ssb_candidates: Annotated[
+        list[int], Meaning("the candidates in the order of a sweep, the strongest first")
+    ]
+    sweep_share: Annotated[float, Meaning("share of the codebook that such a sweep takes, 0 to 1")]
+
+
+@dataclass(frozen=True, slots=True)
+class Pointing:
+    """Where a beam points over the ground."""
+
+    bearing_deg: Annotated[float, Meaning("direction from true north, clockwise")]
+    above_horizon_deg: Annotated[float, Meaning("angle of the direction above the horizon")]
+    place: Annotated[Place, Inline()]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BeamState:
+    """One beam. Azimuth and elevation are in the array's frame, the bearing is from north."""
+
+    beam: Annotated[Beam, Inline()]
+    pointing: Annotated[Pointing, Inline()]
+    guaranteed_gain_db: Annotated[
+        float | None, Meaning("least array gain wherever the UAV can be; null: none")
+    ]
+    power_dbm: Annotated[float, Meaning("power of this beam in its time slot")]
+    cost_db: Annotated[float, Meaning("`loss_db` plus the share of time of the other time slots")]
+    guaranteed_sinr_db: Annotated[
+        float | None, Meaning("least SINR wherever the UAVs can be; null: none, or too many beams")
+    ]
+    sinr_db: Annotated[float | None, Meaning("SINR at the predicted directions")]
+    codebook: Annotated[StoredBeam | None, Meaning("beam of the device's codebook for this UAV")]
+
+    @property
+    def eirp_dbm(self) -> Annotated[float, Meaning("power plus gain in the predicted direction")]:
+        return self.power_dbm + self.beam.gain_db
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ArrayState:
+    """The antenna array."""
+
+    kind: Annotated[str, Meaning("ula: line; ura: plane; uca: circle; list: listed elements")]
+    elements: Annotated[int, Meaning("number of elements")]
+    frequency_hz: Annotated[float, Meaning("carrier frequency")]
+    half_power_beamwidth_deg: Annotated[float | None, Meaning("width 3 dB below the peak")]
+    half_power_beamwidth_elevation_deg: Annotated[
+        float | None, Meaning("width 3 dB below the peak, in elevation")
+    ]
+    boresight_bearing_deg: Annotated[
+        float | None, Meaning("bearing of boresight from true north, clockwise")
+    ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Beams:
+    """The beams that are applied at ``valid_at``."""
+
+    made: Annotated[BeamSet, Inline()]
+    age_s: Annotated[float, Meaning("time since the beams were computed")]
+    lead_ms: Annotated[float, Meaning(_LEAD)]
+    beams: Annotated[list[BeamState], Meaning("the beams, in the order of the weights' columns")]
+    array: Annotated[ArrayState, Meaning("the antenna array")]
+    policy: Annotated[
+        Policy, Meaning("what is done where zero forcing would cost a UAV too much gain")
+    ]
+    codebook_beams: Annotated[int | None, Meaning("beams in the device's codebook")]
+    unfit: Annotated[str | None, Meaning("why there are no beams; null: there can be beams")]
+    left_out: Annotated[list[LeftOut], Meaning("UAVs without a beam, and why")]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Weights:
+    """The complex weights, M rows; columns in the order of ``uavs``."""
+
+    made: Annotated[BeamSet, Inline(omit=("groups", "regularised"))]
+    lead_ms: Annotated[float, Meaning(_LEAD)]
+    uavs: Annotated[list[str], Meaning("the UAV of each column")]
+    groups: Annotated[list[int], Meaning("the time slot of each column, from 0")]
+    re: Annotated[list[list[float]], Meaning("real parts, a row per element")]
+    im: Annotated[list[list[float]], Meaning("imaginary parts, a row per element")]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BeamPattern:
+    """The response of one beam along the cut."""
+
+    uav: Annotated[str, Meaning("UAV of the beam", example="3:1")]
+    at_deg: Annotated[float, Meaning("the other angle of the cut, which is constant")]
+    target_deg: Annotated[float, Meaning("the UAV's own angle along the cut")]
+    response_db: Annotated[list[float], Meaning("response at each angle, over one element")]
+    peak_azimuth_deg: Annotated[float, Meaning("azimuth of the peak")]
+    peak_elevation_deg: Annotated[float, Meaning("elevation of the peak")]
+    peak_db: Annotated[float, Meaning("response at the peak, over one element")]
+    half_power_beamwidth_deg: Annotated[float | None, Meaning("width 3 dB below the peak")]
+    side_lobe_db: Annotated[float | None, Meaning("largest side lobe below the peak")]
+    null_depths_db: Annotated[
+        dict[str, float], Meaning("response towards each other UAV, over one element")
+    ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pattern:
+    """The array's response in dB along a cut through each beam."""
+
+    valid_at_ns: Annotated[int, Meaning("when the beams are applied")]
+    lead_ms: Annotated[float, Meaning(_LEAD)]
+    cut: Annotated[Cut, Meaning("the angle that varies along the cut")]
+    method: Annotated[Method, Meaning("how the weights were computed")]
+    angles_deg: Annotated[list[float], Meaning("angles of the cut, in the order of response_db")]
+    patterns: Annotated[list[BeamPattern], Meaning("one cut per beam")]
 
 
 def beams(
     pipeline: Pipeline, equipment: Equipment, update: Update, age_s: float, lead_ms: float
 ) -> Json:
     """The answer of ``/v1/beams`` for one update."""
-    beam_set, array = update.beams, pipeline.array
-    boresight = None
+    beam_set, array, unfit = update.beams, pipeline.array, update.unfit
+    boresight_deg = None
     if update.carrier is not None:
         array_from_local = array.array_from_body @ update.carrier.body_from_local
-        boresight = float(np.degrees(np.arctan2(array_from_local[0, 1], array_from_local[0, 0])))
+        boresight_deg = math.degrees(math.atan2(array_from_local[0, 1], array_from_local[0, 0]))
     azimuth_width, elevation_width = _beamwidths_rad(array)
-    return {
-        "valid_at": rfc3339(pipeline.utc_ns(beam_set.valid_at_ns)),
-        "age_s": age_s,
-        "lead_ms": lead_ms,
-        "beams": _entries(pipeline, equipment, update),
-        "array": {
-            "kind": array.kind,
-            "elements": array.size,
-            "frequency_hz": pipeline.settings.array.frequency_hz,
-            "half_power_beamwidth_deg": degrees(azimuth_width),
-            "half_power_beamwidth_elevation_deg": degrees(elevation_width),
-            "boresight_bearing_deg": None if boresight is None else boresight % 360,
-        },
-        "method": str(beam_set.method),
-        "policy": str(pipeline.precoder.policy),
-        "normalisation": str(beam_set.normalisation),
-        "condition_number": beam_set.condition_number,
-        "regularised": beam_set.regularised,
-        "groups": beam_set.groups,
-        "codebook_beams": None if equipment.codebook is None else equipment.codebook.size,
-        "unfit": update.unfit,
-        "left_out": left_out(beam_set, update.unfit),
-    }
+    shown = Beams(
+        made=beam_set,
+        age_s=age_s,
+        lead_ms=lead_ms,
+        beams=list(_entries(pipeline, equipment, update)),
+        array=ArrayState(
+            kind=array.kind,
+            elements=array.size,
+            frequency_hz=pipeline.settings.array.frequency_hz,
+            half_power_beamwidth_deg=degrees(azimuth_width),
+            half_power_beamwidth_elevation_deg=degrees(elevation_width),
+            boresight_bearing_deg=None if boresight_deg is None else boresight_deg % 360,
+        ),
+        policy=pipeline.precoder.policy,
+        codebook_beams=None if equipment.codebook is None else equipment.codebook.size,
+        unfit=unfit,
+        left_out=[LeftOut(out.uav, out.cause, unfit or out.reason) for out in beam_set.left_out],
+    )
+    return as_json(shown, pipeline.utc_ns)
 
 
 @functools.lru_cache(maxsize=4)
@@ -78,13 +202,8 @@ def _beamwidths_rad(array: Array) -> tuple[float | None, float | None]:
     return patterns.half_power_beamwidths_rad(array, np.array([1.0, 0.0, 0.0]))
 
 
-def left_out(beam_set: BeamSet, unfit: str | None = None) -> list[Json]:
-    """UAVs that have no beam, with the reason; ``unfit`` is the one that all of them share."""
-    return [{"uav": out.uav, "reason": unfit or out.reason} for out in beam_set.left_out]
-
-
-def pointing(pipeline: Pipeline, update: Update) -> list[Json]:
-    """Where each beam points over the ground: bearing, angle above the horizon, and the place."""
+def pointing(pipeline: Pipeline, update: Update) -> list[Pointing]:
+    """Where each beam points over the ground; empty while the carrier's attitude is unknown."""
     carrier, beam_set = update.carrier, update.beams
     if carrier is None or not beam_set.beams:
         return []
@@ -93,66 +212,38 @@ def pointing(pipeline: Pipeline, update: Update) -> list[Json]:
     ned = directions(beam_set) @ pipeline.array.array_from_body @ carrier.body_from_local
     bearings = np.degrees(np.arctan2(ned[:, 1], ned[:, 0])) % 360
     above = np.degrees(np.arcsin(np.clip(-ned[:, 2], -1.0, 1.0)))
-    names = "uav", "bearing_deg", "above_horizon_deg", "lat_deg", "lon_deg", "alt_m"
-    columns = bearings.tolist(), above.tolist(), *(one.tolist() for one in places)
-    return [dict(zip(names, row, strict=True)) for row in zip(beam_set.uavs, *columns, strict=True)]
+    rows = zip(bearings.tolist(), above.tolist(), *(one.tolist() for one in places), strict=True)
+    return [Pointing(bearing, angle, Place(*place)) for bearing, angle, *place in rows]
 
 
-def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[Json]:
-    beam_set, carrier = update.beams, update.carrier
-    if carrier is None or not beam_set.beams:
-        return []
-    array, towards = pipeline.array, directions(beam_set)
-    ranges_m = np.array([beam.range_m for beam in beam_set.beams])
-    groups = np.array([beam.group for beam in beam_set.beams])
-    power_w = equipment.budget.tx_power_w
-    sent = link_budget.transmitted(beam_set.weights, power_w, groups, beam_set.normalisation)
-    powers_w = np.einsum("mn,mn->n", sent, sent.conj()).real
-    sinr_db = link_budget.predicted_sinr_db(
-        array,
-        towards,
-        ranges_m,
-        sent,
-        groups,
-        equipment.budget,
-        equipment.uav_antennas,
-    )
+def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> Iterator[BeamState]:
+    beam_set, towards, budget = update.beams, directions(update.beams), equipment.budget
     pointed = pointing(pipeline, update)
-    guaranteed, guaranteed_sinr = guaranteed_gain.of_beams(
-        pipeline, equipment, update, towards, powers_w
+    if not pointed:
+        return
+    sent = link_budget.sent_weights(beam_set, budget)
+    powers_w = np.einsum("mn,mn->n", sent, sent.conj()).real
+    sinr_db = link_budget.sinr_of_beams_db(
+        pipeline.array, beam_set, towards, budget, equipment.uav_antennas
     )
+    gains_db, sinrs_db = guaranteed_gain.of_beams(pipeline, equipment, update, towards, powers_w)
     powers_dbm = 10 * np.log10(np.maximum(powers_w, 1e-30)) + 30
-    turns_db = 10 * np.log10(beam_set.groups)
-    return [
-        {
-            "azimuth_deg": degrees(beam.azimuth_rad),
-            "elevation_deg": degrees(beam.elevation_rad),
-            "range_m": beam.range_m,
-            **pointed[i],
-            "azimuth_rate_dps": degrees(beam.azimuth_rate_radps),
-            "elevation_rate_dps": degrees(beam.elevation_rate_radps),
-            "range_rate_mps": beam.range_rate_mps,
-            "gain_db": beam.gain_db,
-            "guaranteed_gain_db": guaranteed[i],
-            "power_dbm": float(powers_dbm[i]),
-            "eirp_dbm": float(powers_dbm[i]) + beam.gain_db,
-            "loss_db": beam.loss_db,
-            "cost_db": beam.loss_db + turns_db,
-            "group": beam.group,
-            "widened": beam.widened,
-            "pointing_bound_deg": degrees(beam.pointing_bound_rad),
-            "pointing_p95_deg": degrees(beam.pointing_p95_rad),
-            "guaranteed_sinr_db": guaranteed_sinr[i],
-            "sinr_db": float(sinr_db[i]) if np.isfinite(sinr_db[i]) else None,
-            "codebook": _codebook_entry(pipeline, equipment, update, beam, towards[i]),
-        }
-        for i, beam in enumerate(beam_set.beams)
-    ]
+    for i, beam in enumerate(beam_set.beams):
+        yield BeamState(
+            beam=beam,
+            pointing=pointed[i],
+            guaranteed_gain_db=gains_db[i],
+            power_dbm=float(powers_dbm[i]),
+            cost_db=beam.loss_db + 10 * math.log10(beam_set.groups),
+            guaranteed_sinr_db=sinrs_db[i],
+            sinr_db=float(sinr_db[i]) if np.isfinite(sinr_db[i]) else None,
+            codebook=_stored(pipeline, equipment, update, beam, towards[i]),
+        )
 
 
-def _codebook_entry(
+def _stored(
     pipeline: Pipeline, equipment: Equipment, update: Update, beam: Beam, towards: FloatArray
-) -> Json | None:
+) -> StoredBeam | None:
     """Which stored beam serves a UAV, which is next and when, and which must be swept."""
     codebook, array = equipment.codebook, pipeline.array
     if codebook is None:
@@ -161,15 +252,15 @@ def _codebook_entry(
     share = min(1.0, FULL_SHARE / len(update.beams.beams))
     swept = codebooks.candidates(codebook, array, towards, beam.pointing_bound_rad, share)
     following = _next_best(pipeline, equipment, update, beam)
-    return {
-        "best": int(best),
-        "gain_db": float(10 * np.log10(np.maximum(gains[0], 1e-20))),
-        "next": None if following is None else following.next_index,
-        "next_in_s": None if following is None else following.after_s,
-        "candidates": swept.tolist(),
-        "ssb_candidates": codebooks.strongest_first(codebook, array, towards, swept).tolist(),
-        "sweep_share": len(swept) / codebook.size,
-    }
+    return StoredBeam(
+        best=int(best),
+        gain_db=float(10 * np.log10(np.maximum(gains[0], 1e-20))),
+        next=None if following is None else following.next_index,
+        next_in_s=None if following is None else following.after_s,
+        candidates=swept.tolist(),
+        ssb_candidates=codebooks.strongest_first(codebook, array, towards, swept).tolist(),
+        sweep_share=len(swept) / codebook.size,
+    )
 
 
 def _next_best(
@@ -201,25 +292,22 @@ def _next_best(
 
 def weights(pipeline: Pipeline, beam_set: BeamSet, lead_ms: float) -> Json:
     """The answer of ``/v1/beams/weights`` as JSON: M rows, columns in the order of ``uavs``."""
-    return {
-        "valid_at": rfc3339(pipeline.utc_ns(beam_set.valid_at_ns)),
-        "lead_ms": lead_ms,
-        "uavs": list(beam_set.uavs),
-        "groups": [beam.group for beam in beam_set.beams],
-        "method": str(beam_set.method),
-        "normalisation": str(beam_set.normalisation),
-        "condition_number": beam_set.condition_number,
-        "re": beam_set.weights.real.tolist(),
-        "im": beam_set.weights.imag.tolist(),
-    }
+    shown = Weights(
+        made=beam_set,
+        lead_ms=lead_ms,
+        uavs=list(beam_set.uavs),
+        groups=beam_set.slots.tolist(),
+        re=beam_set.weights.real.tolist(),
+        im=beam_set.weights.imag.tolist(),
+    )
+    return as_json(shown, pipeline.utc_ns)
 
 
 def pattern(
-    pipeline: Pipeline, update: Update, cut: str, points: int, only: str | None, lead_ms: float
+    pipeline: Pipeline, update: Update, cut: Cut, points: int, only: str | None, lead_ms: float
 ) -> Json:
     """The answer of ``/v1/pattern``: the response of each beam (or one) along a cut through it."""
     array, beam_set = pipeline.array, update.beams
-    towards = directions(beam_set)
     entries, angles = [], np.empty(0)
     for i, beam in enumerate(beam_set.beams):
         if only is not None and beam.uav != only:
@@ -229,41 +317,39 @@ def pattern(
             angles, response_db = patterns.azimuth_cut(array, column, beam.elevation_rad, points)
         else:
             angles, response_db = patterns.elevation_cut(array, column, beam.azimuth_rad, points)
-        entries.append(_pattern_entry(pipeline, beam_set, i, cut, response_db, towards))
-    return {
-        "valid_at": rfc3339(pipeline.utc_ns(beam_set.valid_at_ns)),
-        "lead_ms": lead_ms,
-        "cut": cut,
-        "method": str(beam_set.method),
-        "angles_deg": np.degrees(angles).tolist(),
-        "patterns": entries,
-    }
+        entries.append(_pattern(pipeline, beam_set, i, cut, response_db))
+    shown = Pattern(
+        valid_at_ns=beam_set.valid_at_ns,
+        lead_ms=lead_ms,
+        cut=cut,
+        method=beam_set.method,
+        angles_deg=np.degrees(angles).tolist(),
+        patterns=entries,
+    )
+    return as_json(shown, pipeline.utc_ns)
 
 
-def _pattern_entry(
-    pipeline: Pipeline,
-    beam_set: BeamSet,
-    i: int,
-    cut: str,
-    response_db: FloatArray,
-    towards: FloatArray,
-) -> Json:
-    beam, column = beam_set.beams[i], beam_set.weights[:, i]
+def _pattern(
+    pipeline: Pipeline, beam_set: BeamSet, i: int, cut: Cut, response_db: FloatArray
+) -> BeamPattern:
+    beam, column, towards = beam_set.beams[i], beam_set.weights[:, i], directions(beam_set)
     lobe = patterns.lobe(pipeline.array, column, towards[i])
     across = lobe.azimuth if cut == "azimuth" else lobe.elevation
     others = [j for j, other in enumerate(beam_set.beams) if j != i and other.group == beam.group]
     depths = patterns.null_depths_db(pipeline.array, column, lobe.peak_db, towards[others])
-    return {
-        "uav": beam.uav,
-        "at_deg": degrees(beam.elevation_rad if cut == "azimuth" else beam.azimuth_rad),
-        "target_deg": degrees(beam.azimuth_rad if cut == "azimuth" else beam.elevation_rad),
-        "response_db": response_db.tolist(),
-        "peak_azimuth_deg": degrees(lobe.peak_azimuth_rad),
-        "peak_elevation_deg": degrees(lobe.peak_elevation_rad),
-        "peak_db": lobe.peak_db,
-        "half_power_beamwidth_deg": degrees(across.half_power_width_rad),
-        "side_lobe_db": across.side_lobe_db,
-        "null_depths_db": {
+    azimuth_deg, elevation_deg = np.degrees([beam.azimuth_rad, beam.elevation_rad]).tolist()
+    is_azimuth = cut == "azimuth"
+    return BeamPattern(
+        uav=beam.uav,
+        at_deg=elevation_deg if is_azimuth else azimuth_deg,
+        target_deg=azimuth_deg if is_azimuth else elevation_deg,
+        response_db=response_db.tolist(),
+        peak_azimuth_deg=math.degrees(lobe.peak_azimuth_rad),
+        peak_elevation_deg=math.degrees(lobe.peak_elevation_rad),
+        peak_db=lobe.peak_db,
+        half_power_beamwidth_deg=degrees(across.half_power_width_rad),
+        side_lobe_db=across.side_lobe_db,
+        null_depths_db={
             beam_set.beams[j].uav: float(depth) for j, depth in zip(others, depths, strict=True)
         },
-    }
+    )

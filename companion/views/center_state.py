@@ -1,61 +1,81 @@
-"""What carries the array, as the API shows it: where it is and how it is turned."""
+"""What carries the array, as the API shows it: its position and attitude."""
 
-from typing import Any
-
-import numpy as np
+from dataclasses import dataclass
+from typing import Annotated
 
 from companion.pipeline.fold import Pipeline
 from companion.settings.center import FixedCenter
-from companion.values import Carrier, FloatArray
-from companion.views.words import rfc3339
+from companion.tracking.geodesy import Place
+from companion.values import Carrier
+from companion.values.described import Inline, Meaning
+from companion.views.as_json import degrees
 
-Json = dict[str, Any]
+
+@dataclass(frozen=True, slots=True)
+class Angles:
+    """Attitude of the carrier's body, in degrees."""
+
+    roll: Annotated[float, Meaning("roll, right side down positive, degrees")]
+    pitch: Annotated[float, Meaning("pitch, nose up positive, degrees")]
+    yaw: Annotated[float, Meaning("yaw of the nose, from true north, clockwise, degrees")]
 
 
-def center(pipeline: Pipeline, now_ns: int) -> Json:
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Position and attitude of the array's carrier at a time."""
+
+    place: Annotated[Place, Inline()]
+    carrier: Annotated[Carrier, Inline()]
+
+    @property
+    def heading_deg(self) -> Annotated[float, Meaning("bearing of the nose from true north")]:
+        return self.attitude_deg.yaw % 360
+
+    @property
+    def attitude_deg(
+        self,
+    ) -> Annotated[Angles, Meaning("attitude", deprecated="roll_deg, pitch_deg and yaw_deg")]:
+        angles = (self.carrier.roll_rad, self.carrier.pitch_rad, self.carrier.yaw_rad)
+        return Angles(*(degrees(angle) or 0.0 for angle in angles))
+
+
+@dataclass(frozen=True, slots=True)
+class LastPose:
+    """The last known position and attitude."""
+
+    t_ns: Annotated[int, Meaning("when the array was there")]
+    pose: Annotated[Pose, Inline()]
+
+
+@dataclass(frozen=True, slots=True)
+class Center:
+    """What carries the array; its values are null while its position is unknown."""
+
+    source: Annotated[
+        str, Meaning("the vehicle SYSID:COMPID, the coordinates, or home", example="5:1")
+    ]
+    fixed: Annotated[bool, Meaning("whether it is a fixed station")]
+    pose: Annotated[Pose | None, Inline()] = None
+    unfit: Annotated[str | None, Meaning("why its position is unknown; null where it is known")] = (
+        None
+    )
+    last_known: Annotated[
+        LastPose | None, Meaning("last known position, while the present one is unknown")
+    ] = None
+
+
+def center(pipeline: Pipeline, now_ns: int) -> Center:
     """Position and attitude of the carrier, as far as they are known."""
-    view: Json = {
-        "source": str(pipeline.center.place),
-        "fixed": isinstance(pipeline.center.place, FixedCenter),
-        "lat_deg": None,
-        "lon_deg": None,
-        "alt_m": None,
-        "heading_deg": None,
-        "attitude_deg": None,
-        "age_s": None,
-        "bound_m": None,
-        "unfit": None,
-        "last_known": None,
-    }
+    place = pipeline.center.place
+    source, fixed = str(place), isinstance(place, FixedCenter)
     found = pipeline.carrier(now_ns, now_ns)
-    if isinstance(found, str):
-        last = pipeline.last_carrier
-        if last is not None:
-            view["last_known"] = {
-                "at": rfc3339(pipeline.utc_ns(last.valid_at_ns)),
-                **_pose(pipeline, last),
-            }
-        return view | {"unfit": found}
-    return view | _pose(pipeline, found) | {"age_s": found.age_s, "bound_m": found.bound_m}
+    if not isinstance(found, str):
+        return Center(source, fixed, pose=_pose(pipeline, found))
+    last = pipeline.last_carrier
+    known = None if last is None else LastPose(last.valid_at_ns, _pose(pipeline, last))
+    return Center(source, fixed, unfit=found, last_known=known)
 
 
-def _pose(pipeline: Pipeline, carrier: Carrier) -> Json:
-    """Where the array is, and how it is turned."""
+def _pose(pipeline: Pipeline, carrier: Carrier) -> Pose:
     assert pipeline.local is not None
-    lat, lon, alt = pipeline.local.geodetic(carrier.position_ned_m[np.newaxis])
-    roll, pitch, yaw = euler_deg(carrier.body_from_local)
-    return {
-        "lat_deg": float(lat[0]),
-        "lon_deg": float(lon[0]),
-        "alt_m": float(alt[0]),
-        "heading_deg": yaw % 360,
-        "attitude_deg": {"roll": roll, "pitch": pitch, "yaw": yaw},
-    }
-
-
-def euler_deg(body_from_ned: FloatArray) -> tuple[float, float, float]:
-    """Roll, pitch and yaw in degrees of a rotation (3, 3), in MAVLink's yaw-pitch-roll order."""
-    roll = np.arctan2(body_from_ned[1, 2], body_from_ned[2, 2])
-    pitch = np.arcsin(np.clip(-body_from_ned[0, 2], -1.0, 1.0))
-    yaw = np.arctan2(body_from_ned[0, 1], body_from_ned[0, 0])
-    return float(np.degrees(roll)), float(np.degrees(pitch)), float(np.degrees(yaw))
+    return Pose(pipeline.local.place(*carrier.position_ned_m.tolist()), carrier)

@@ -1,6 +1,7 @@
 """The answer of ``/v1/design``: the observer in use, its gains, and its certificate."""
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
@@ -13,23 +14,82 @@ from companion.tracking.design import answers, gain_table
 from companion.tracking.design.gain_table import KinematicDesign
 from companion.tracking.observers.kinematic import VELOCITY_SHARE
 from companion.values import FloatArray, Limits, Track
-from companion.views.words import rfc3339
+from companion.values.described import Inline, Meaning
+from companion.views.as_json import Json, as_json
 
-Json = dict[str, Any]
-
-
-class _Bounds(NamedTuple):
-    """The bounds that one aircraft's observer relies on."""
-
-    speed_max_mps: float
-    acceleration_max_mps2: float
-    position_noise_m: float
-    velocity_noise_mps: float
+Matrix = list[list[float]]
+Model = Literal["kinematic", "position"]
 
 
-def _bounds(given: ObserverSettings, limits: Limits) -> _Bounds:
-    noise = (given.position_noise_m, given.velocity_noise_mps)
-    return _Bounds(limits.speed_mps, limits.acceleration_mps2, *noise)
+class Assumed(NamedTuple):
+    """Bounds that the observer assumes."""
+
+    limits: Annotated[Limits, Inline(omit=("limits_source",))]
+    position_noise_m: Annotated[float, Meaning("largest error of a reported position")]
+    velocity_noise_mps: Annotated[float, Meaning("largest error of a reported velocity")]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Certificate:
+    """Certificate of the table of gains: e'Pe <= scale^2 holds for every order of intervals.
+
+    ``scale`` is how much larger the assumed bounds are than those of the table.
+    """
+
+    P: Annotated[Matrix, Meaning("matrix of the quadratic form, (position, velocity) in one axis")]
+    dt_range_s: Annotated[tuple[float, float], Meaning("shortest and longest certified interval")]
+    margin: Annotated[float, Meaning("smallest eigenvalue of all matrix inequalities; at least 0")]
+    scale: Annotated[float, Meaning("assumed bounds over those of the table")]
+    bound_m: Annotated[float, Meaning("certified bound on the position error")]
+    provenance: Annotated[str, Meaning("how the gains were computed")]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UavDesign:
+    """The gains at a UAV's interval, with the keys of ``companion design --json``."""
+
+    uav: Annotated[str, Meaning("id of the UAV", example="3:1")]
+    dt_s: Annotated[float, Meaning("interval between reports")]
+    model: Annotated[Model, Meaning("the observer's model")]
+    alpha: Annotated[float | None, Meaning("decay of the quadratic form per report, in (0, 1)")]
+    feedthrough_s: Annotated[float, Meaning("time by which a report leads the position")]
+    L: Annotated[float | Matrix, Meaning("observer gain on the innovation: number or matrix rows")]
+    Q: Annotated[float | Matrix, Meaning("share of the last estimate: transition minus L C")]
+    mu: Annotated[float | None, Meaning("square of gamma, s² or m²")]
+    gamma: Annotated[
+        float | None,
+        Meaning("certified gain from unknown input to error, s; kinematic: certified error, m"),
+    ]
+    peak_gain: Annotated[
+        float | None,
+        Meaning("largest error in the long run: per m/s of unknown input, s; kinematic: m"),
+    ]
+    residual: Annotated[
+        float | None,
+        Meaning("smallest eigenvalue of the matrix inequalities; at least 0: they hold"),
+    ]
+    feasible: Annotated[bool, Meaning("whether the design has a solution")]
+    dt_limit_s: Annotated[float | None, Meaning("longest interval for which the gain is certified")]
+    method: Annotated[
+        Literal["lmi", "closed-form", "fixed-share"], Meaning("how the gain was computed")
+    ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Design:
+    """The observer in use."""
+
+    valid_at_ns: Annotated[int, Meaning("the instant for which the values hold")]
+    model: Annotated[Model, Meaning("the observer's model")]
+    assumed: Annotated[Assumed, Meaning("bounds that the observer assumes")]
+    certificate: Annotated[
+        Certificate | None, Meaning("certificate of the table of gains; null for the closed form")
+    ]
+    designs: Annotated[list[UavDesign], Meaning("the gains at each UAV's own interval")]
+
+
+def _bounds(given: ObserverSettings, limits: Limits) -> Assumed:
+    return Assumed(limits, given.position_noise_m, given.velocity_noise_mps)
 
 
 class DesignView:
@@ -50,18 +110,18 @@ class DesignView:
         interval. ``feasible``: the interval is in the certified range; beyond it the gains are
         those at its end.
         """
-        given = self._observer
-        return {
-            "valid_at": rfc3339(pipeline.utc_ns(now_ns)),
-            "model": given.model,
-            "assumed": self._anyone._asdict(),
-            "certificate": None if self._table is None else _certificate(self._table, self._anyone),
-            "designs": [
-                {"uav": track.uav, **self._row(pipeline, track, track.dt_s)}
+        shown = Design(
+            valid_at_ns=now_ns,
+            model=self._observer.model,
+            assumed=self._anyone,
+            certificate=None if self._table is None else _certificate(self._table, self._anyone),
+            designs=[
+                UavDesign(uav=track.uav, **self._row(pipeline, track, track.dt_s))
                 for track in pipeline.tracks(now_ns, now_ns)
                 if track.dt_s is not None and track.dt_s > 0
             ],
-        }
+        )
+        return as_json(shown, pipeline.utc_ns)
 
     def _row(self, pipeline: Pipeline, track: Track, dt_s: float) -> Json:
         given, newest = self._observer, pipeline.tracker.newest(track.uav)
@@ -76,13 +136,13 @@ class DesignView:
         return answers.row(dt_s, lead_s, alpha, None, "position", "closed-form")
 
 
-def _scale(table: KinematicDesign, given: _Bounds) -> float:
+def _scale(table: KinematicDesign, given: Assumed) -> float:
     """How many times larger the assumed bounds are than those of the table.
 
     The errors obey a linear equation, so the guarantee grows by the same factor (docs/math.md 4).
     """
     ratios = [
-        given.acceleration_max_mps2 / table.acceleration_mps2,
+        given.limits.acceleration_max_mps2 / table.acceleration_mps2,
         given.position_noise_m / table.position_noise_m,
     ]
     if table.velocity_noise_mps is not None:
@@ -90,20 +150,20 @@ def _scale(table: KinematicDesign, given: _Bounds) -> float:
     return max(ratios)
 
 
-def _certificate(table: KinematicDesign, given: _Bounds) -> Json:
-    """The certificate for every order of intervals within the range: e'Pe <= scale^2 stays true."""
+def _certificate(table: KinematicDesign, given: Assumed) -> Certificate:
+    """The certificate for every order of intervals within the range."""
     scale = _scale(table, given)
-    return {
-        "P": table.p.tolist(),
-        "dt_range_s": [table.dt_s[0], table.dt_s[-1]],
-        "margin": table.margin,
-        "scale": scale,
-        "bound_m": scale * gain_table.invariant_bound(table),
-        "provenance": table.provenance,
-    }
+    return Certificate(
+        P=table.p.tolist(),
+        dt_range_s=(table.dt_s[0], table.dt_s[-1]),
+        margin=table.margin,
+        scale=scale,
+        bound_m=scale * gain_table.invariant_bound(table),
+        provenance=table.provenance,
+    )
 
 
-def _kinematic(table: KinematicDesign, given: _Bounds, dt_s: float) -> Json:
+def _kinematic(table: KinematicDesign, given: Assumed, dt_s: float) -> Json:
     """Gains by the table.
 
     Mu, gamma and residual are those of its certificate, one for all intervals.
@@ -120,7 +180,7 @@ def _kinematic(table: KinematicDesign, given: _Bounds, dt_s: float) -> Json:
     }
 
 
-def _shared(given: _Bounds, dt_s: float) -> Json:
+def _shared(given: Assumed, dt_s: float) -> Json:
     """Gains for a UAV without a reported velocity: a fixed share of what two reports show.
 
     They have no certificate.
@@ -136,9 +196,9 @@ def _shared(given: _Bounds, dt_s: float) -> Json:
     }
 
 
-def _row(dt_s: float, gain: FloatArray, given: _Bounds, velocity_noise_mps: float | None) -> Json:
+def _row(dt_s: float, gain: FloatArray, given: Assumed, velocity_noise_mps: float | None) -> Json:
     motion = answers.KinematicLimits(
-        given.acceleration_max_mps2, given.position_noise_m, velocity_noise_mps
+        given.limits.acceleration_max_mps2, given.position_noise_m, velocity_noise_mps
     )
     return {
         "dt_s": dt_s,

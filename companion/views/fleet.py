@@ -1,25 +1,125 @@
 """The fleet as the API shows it: nodes, who serves whom, what each offers, handovers."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Final
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Annotated
 
 import numpy as np
 
 from companion.pipeline import blame
 from companion.pipeline.fleet.assignment import worth_db
+from companion.pipeline.fleet.duties import Handover
 from companion.pipeline.fleet.member import Member
 from companion.pipeline.fleet.neighbours import Neighbour
 from companion.pipeline.fold import Pipeline
+from companion.tracking.geodesy import Place
 from companion.values import Blame, Offer, Standing
-from companion.views.words import rfc3339
+from companion.values.described import Inline, Meaning
+from companion.views.as_json import Json, as_json
 
-Json = dict[str, Any]
 
-STATES: Final = ("here", "there", "silent", "aside", "gone")
-"""What a node is: this one; another, whose word holds; one that says nothing; one not believed; one
-that left.
-"""
+class NodeState(StrEnum):
+    """State of a node of the fleet.
+
+    HERE    the node that answers
+    THERE   its messages are current
+    SILENT  no message for a lease
+    ASIDE   excluded, because its messages contradict others
+    GONE    it left
+    """
+
+    HERE = "here"
+    THERE = "there"
+    SILENT = "silent"
+    ASIDE = "aside"
+    GONE = "gone"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FleetNode:
+    """A node of the fleet: this one, then the others by name, and then those that left."""
+
+    node: Annotated[str, Meaning("name of the node", example="north")]
+    is_self: Annotated[bool, Meaning("whether it is the node that answers")] = False
+    state: Annotated[
+        NodeState,
+        Meaning(
+            "here: it answers; there: current; silent: no message; aside: excluded; gone: left"
+        ),
+    ]
+    near: Annotated[
+        bool, Meaning("whether it can receive or serve what this node can; others are not asked")
+    ] = False
+    reason: Annotated[str | None, Meaning("why it is excluded")] = None
+    place: Annotated[Place | None, Meaning("position of its array")] = None
+    reach_m: Annotated[float | None, Meaning("distance of the farthest UAV that it receives")] = (
+        None
+    )
+    serves: Annotated[int, Meaning("UAVs that it serves")] = 0
+    most: Annotated[int | None, Meaning("largest number of UAVs that it serves")] = None
+    heard_s: Annotated[float | None, Meaning("time since its last message, or since it left")] = (
+        None
+    )
+    clock_offset_s: Annotated[
+        float | None, Meaning("its clock minus this node's, middle of the possible interval")
+    ] = None
+    clock_doubt_s: Annotated[float | None, Meaning("width of the possible interval")] = None
+    frames: Annotated[int | None, Meaning("frames of vehicles that it shared")] = None
+    used: Annotated[
+        int | None, Meaning("shared frames used here, of vehicles that this node does not receive")
+    ] = None
+    way_p50_ms: Annotated[
+        float | None, Meaning("median time from reception there to here over the last minute")
+    ] = None
+    way_p99_ms: Annotated[float | None, Meaning("99th percentile of that time")] = None
+
+
+@dataclass(frozen=True, slots=True)
+class FleetOffer:
+    """What a node's array would offer a UAV, if it served that UAV alone."""
+
+    node: Annotated[str, Meaning("node that offers")]
+    offer: Annotated[Offer, Inline(omit=("uav",))]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FleetUav:
+    """A UAV, the nodes that serve it, and what each node offers it."""
+
+    uav: Annotated[str, Meaning("id of the UAV", example="3:1")]
+    served_by: Annotated[
+        list[str], Meaning("nodes that serve it; two during a handover or in a split fleet")
+    ]
+    handing_to: Annotated[str | None, Meaning("node that is to take it over")]
+    unconfirmed: Annotated[
+        bool, Meaning("whether a single node reports it, where others ought to receive it")
+    ]
+    offers: Annotated[list[FleetOffer], Meaning("what each node offers it")]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fleet:
+    """The fleet as this node knows it; ``node`` is null without a fleet."""
+
+    valid_at_ns: Annotated[int, Meaning("the instant for which the values hold")]
+    node: Annotated[str | None, Meaning("this node")] = None
+    site: Annotated[str | None, Meaning("name of the fleet")] = None
+    nodes: Annotated[list[FleetNode], Meaning("this node, then the others by name")] = field(
+        default_factory=list
+    )
+    uavs: Annotated[list[FleetUav], Meaning("every UAV that a node serves or offers to serve")] = (
+        field(default_factory=list)
+    )
+    handovers: Annotated[list[Handover], Meaning("newest handovers of this node, oldest first")] = (
+        field(default_factory=list)
+    )
+    sent_bps: Annotated[float | None, Meaning("data that this node shares, last second")] = None
+    heard_bps: Annotated[float | None, Meaning("data that others share, last second")] = None
+    damaged: Annotated[int, Meaning("malformed fleet messages received")] = 0
+    untold: Annotated[
+        int, Meaning("frames and round trips not shared because the message was full")
+    ] = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,112 +182,73 @@ def served(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Serve
 
 def fleet(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Json:
     """The answer of ``/v1/fleet``; ``node`` is null where there is no fleet."""
-    if status is None:
-        return {
-            "valid_at": rfc3339(pipeline.utc_ns(now_ns)),
-            "node": None,
-            "site": None,
-            "nodes": [],
-            "uavs": [],
-            "handovers": [],
-            "sent_bps": None,
-            "heard_bps": None,
-            "damaged": 0,
-            "untold": 0,
-        }
-    member = status.member
-    return {
-        "valid_at": rfc3339(pipeline.utc_ns(now_ns)),
-        "node": member.name,
-        "site": status.site,
-        "nodes": nodes(member, now_ns),
-        "uavs": _uavs(member, now_ns),
-        "handovers": [
-            {
-                "time": rfc3339(pipeline.utc_ns(one.t_ns)),
-                "uav": one.uav,
-                "before": one.before,
-                "after": one.after,
-            }
-            for one in member.handovers
-        ],
-        "sent_bps": status.sent_bps,
-        "heard_bps": status.heard_bps,
-        "damaged": status.damaged,
-        "untold": member.sharing.untold,
-    }
+    shown = Fleet(valid_at_ns=now_ns)
+    if status is not None:
+        member = status.member
+        shown = Fleet(
+            valid_at_ns=now_ns,
+            node=member.name,
+            site=status.site,
+            nodes=nodes(member, now_ns),
+            uavs=_uavs(member, now_ns),
+            handovers=list(member.handovers),
+            sent_bps=status.sent_bps,
+            heard_bps=status.heard_bps,
+            damaged=status.damaged,
+            untold=member.sharing.untold,
+        )
+    return as_json(shown, pipeline.utc_ns)
 
 
-def nodes(member: Member, now_ns: int) -> list[Json]:
-    """This node, then the others by name, and then those that are gone."""
-    own = _NOTHING | {
-        "node": member.name,
-        "is_self": True,
-        "state": "here",
-        "near": True,
-        "place": _place(member.place),
-        "reach_m": member.reach_m,
-        "serves": len(member.duties.serves),
-        "most": member.most,
-    }
+def nodes(member: Member, now_ns: int) -> list[FleetNode]:
+    """This node, then the others by name, and then those that left."""
+    own = FleetNode(
+        node=member.name,
+        is_self=True,
+        state=NodeState.HERE,
+        near=True,
+        place=_place(member.place),
+        reach_m=member.reach_m,
+        serves=len(member.duties.serves),
+        most=member.most,
+    )
     others = [_node(name, member, now_ns) for name in sorted(member.neighbours)]
     gone = [
-        _NOTHING
-        | {
-            "node": name,
-            "state": "gone",
-            "place": _place(place),
-            "heard_s": (now_ns - at_ns) * 1e-9,
-        }
+        FleetNode(
+            node=name,
+            state=NodeState.GONE,
+            place=_place(place),
+            heard_s=(now_ns - at_ns) * 1e-9,
+        )
         for name, (at_ns, place) in sorted(member.gone.items())
     ]
     return [own, *others, *gone]
 
 
-_NOTHING: Final[Json] = {
-    "is_self": False,
-    "near": False,
-    "reason": None,
-    "place": None,
-    "reach_m": None,
-    "serves": 0,
-    "most": None,
-    "heard_s": None,
-    "clock_offset_s": None,
-    "clock_doubt_s": None,
-    "frames": None,
-    "used": None,
-    "way_p50_ms": None,
-    "way_p99_ms": None,
-}
-"""What is said of a node of which nothing is known."""
-
-
-def _node(name: str, member: Member, now_ns: int) -> Json:
+def _node(name: str, member: Member, now_ns: int) -> FleetNode:
     known: Neighbour = member.neighbours[name]
     said, ahead = known.standing, known.clock.newest()
     reason = member.trust.aside.get(name)
-    standing = member.duties.others(now_ns)
+    is_there = name in member.duties.others(now_ns)
     median_ms, p99_ms = _ways_ms(known, now_ns)
-    state = "aside" if reason is not None else "there" if name in standing else "silent"
-    return {
-        "node": name,
-        "is_self": False,
-        "state": state,
-        "near": name in member.near,
-        "reason": reason,
-        "place": None if said is None else _place(said.place),
-        "reach_m": None if said is None else said.reach_m,
-        "serves": 0 if said is None else len(said.serves),
-        "most": None if said is None else said.most,
-        "heard_s": None if said is None else (now_ns - known.heard_ns) * 1e-9,
-        "clock_offset_s": None if ahead is None else -(ahead.low_ns + ahead.high_ns) / 2e9,
-        "clock_doubt_s": None if ahead is None else ahead.doubt_ns * 1e-9,
-        "frames": known.frames,
-        "used": known.used,
-        "way_p50_ms": median_ms,
-        "way_p99_ms": p99_ms,
-    }
+    state = NodeState.THERE if is_there else NodeState.SILENT
+    return FleetNode(
+        node=name,
+        state=state if reason is None else NodeState.ASIDE,
+        near=name in member.near,
+        reason=reason,
+        place=None if said is None else _place(said.place),
+        reach_m=None if said is None else said.reach_m,
+        serves=0 if said is None else len(said.serves),
+        most=None if said is None else said.most,
+        heard_s=None if said is None else (now_ns - known.heard_ns) * 1e-9,
+        clock_offset_s=None if ahead is None else -(ahead.low_ns + ahead.high_ns) / 2e9,
+        clock_doubt_s=None if ahead is None else ahead.doubt_ns * 1e-9,
+        frames=known.frames,
+        used=known.used,
+        way_p50_ms=median_ms,
+        way_p99_ms=p99_ms,
+    )
 
 
 def _ways_ms(known: Neighbour, now_ns: int) -> tuple[float | None, float | None]:
@@ -199,8 +260,8 @@ def _ways_ms(known: Neighbour, now_ns: int) -> tuple[float | None, float | None]
     return median_ns * 1e-6, p99_ns * 1e-6
 
 
-def _place(place: tuple[float, float, float] | None) -> Json | None:
-    return None if place is None else dict(zip(("lat_deg", "lon_deg", "alt_m"), place, strict=True))
+def _place(place: tuple[float, float, float] | None) -> Place | None:
+    return None if place is None else Place(*place)
 
 
 def _offers(member: Member) -> dict[str, dict[str, Offer]]:
@@ -236,30 +297,20 @@ def _served_by(member: Member, now_ns: int) -> dict[str, list[str]]:
     return served_by
 
 
-def _uavs(member: Member, now_ns: int) -> list[Json]:
+def _uavs(member: Member, now_ns: int) -> list[FleetUav]:
     """Every UAV that some node offers to serve or serves, and by whom it is served."""
     offers, by = _offers(member), _served_by(member, now_ns)
     handing = dict(member.duties.handing)
     for said in _standing(member, now_ns).values():
         handing |= dict(said.handing)
-    unconfirmed = member.trust.unconfirmed
     return [
-        {
-            "uav": uav,
-            "served_by": by.get(uav, []),
-            "handing_to": handing.get(uav),
-            "unconfirmed": uav in unconfirmed,
-            "offers": [
-                {
-                    "node": name,
-                    "sure_db": offer.sure_db,
-                    "likely_db": offer.likely_db,
-                    "sinr_db": offer.sinr_db,
-                    "heard_s": offer.heard_s,
-                }
-                for name, offer in sorted(offers.get(uav, {}).items())
-            ],
-        }
+        FleetUav(
+            uav=uav,
+            served_by=by.get(uav, []),
+            handing_to=handing.get(uav),
+            unconfirmed=uav in member.trust.unconfirmed,
+            offers=[FleetOffer(name, one) for name, one in sorted(offers.get(uav, {}).items())],
+        )
         for uav in sorted({*offers, *by}, key=_natural)
     ]
 

@@ -2,15 +2,15 @@
 lines."""
 
 from collections.abc import Sequence
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Annotated, Final
 
 from companion.pipeline.fold import Pipeline
-from companion.values import Level, Notice, Verdict, reports_itself
-from companion.views import health, link_state
+from companion.values import Blame, Level, Notice, Verdict, reports_itself
+from companion.values.described import Meaning
+from companion.views import health
+from companion.views.as_json import Json, as_json, rfc3339
 from companion.views.state import Node, summary
-from companion.views.words import rfc3339
-
-Json = dict[str, Any]
 
 NAMED: Final = 2
 """Most UAVs that the line names."""
@@ -24,7 +24,7 @@ def glance(node: Node) -> Json:
     recording = node.recording()
     return {
         "at": rfc3339(pipeline.utc_ns(now_ns)),
-        **summary(node, now_ns),
+        **as_json(summary(node, now_ns), pipeline.utc_ns),
         "unfit": node.unfit(),
         "links": [
             {"url": link.url, "state": link.state, "frames": link.frames} for link in node.links()
@@ -32,7 +32,7 @@ def glance(node: Node) -> Json:
         "uavs": [
             {"id": track.uav, "state": str(track.state), "age_s": track.age_s}
             | {"bound_m": track.bound_m}
-            | health.verdict(verdicts.get(track.uav), machine, pipeline.utc_ns)
+            | _verdict(pipeline, verdicts.get(track.uav), machine)
             for track in (update.tracks if update else ())
             if reports_itself(track.uav)
         ],
@@ -52,7 +52,7 @@ def line(node: Node) -> str:
     if frames_hz is not None:
         parts[0] += f", {frames_hz:.0f} frames/s"
     machine = health.behind(node.arrival_lag.seen(now_ns))
-    parts.append(summary(node, now_ns)["headline"])
+    parts.append(summary(node, now_ns).headline)
     if machine is not None:
         parts.append(machine.reason)
     elif node.unfit():
@@ -65,9 +65,28 @@ def line(node: Node) -> str:
     return " · ".join(parts)
 
 
-def events(pipeline: Pipeline, notices: Sequence[Notice]) -> list[Json]:
+@dataclass(frozen=True, slots=True)
+class Events:
+    """The newest notices, the oldest first."""
+
+    valid_at_ns: Annotated[int, Meaning("the instant for which the values hold")]
+    events: Annotated[list[Notice], Meaning("the notices, the oldest first")]
+
+
+def events(node: Node) -> Json:
+    """The answer of ``/v1/events``."""
+    return as_json(Events(node.now_ns(), node.events()), node.pipeline.utc_ns)
+
+
+def as_events(node: Node, notices: Sequence[Notice]) -> list[Json]:
     """Notices as ``/v1/events`` has them."""
-    return [link_state.event(notice, pipeline.utc_ns(notice.t_ns)) for notice in notices]
+    return [as_json(notice, node.pipeline.utc_ns) for notice in notices]
+
+
+def _verdict(pipeline: Pipeline, found: Verdict | None, machine: Blame | None) -> Json:
+    level, why = health.verdict(found, machine)
+    shown = None if why is None else as_json(why, pipeline.utc_ns)
+    return {"verdict": None if level is None else str(level), "health": shown}
 
 
 def _worst_first(verdicts: list[Verdict]) -> list[Verdict]:

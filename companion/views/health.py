@@ -1,18 +1,40 @@
 """Verdicts on the links to UAVs as the API shows them.
 
-Where this machine is behind, that is the cause of whatever is not good: all that the pipeline sees
-then is that news is old.
+Where this machine is behind, that is the cause of every link that is not good: the pipeline then
+sees old reports only.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Annotated
 
 from companion.mavlink.links.lag import LagSeen
-from companion.values import Blame, Cause, Level, UtcNs, Verdict
-from companion.views.words import rfc3339
+from companion.values import Blame, Cause, Level, Verdict
+from companion.values.described import Inline, Meaning
 
-Json = dict[str, Any]
+
+@dataclass(frozen=True, slots=True)
+class LinkHealth:
+    """What is behind the verdict on the link to a UAV; gains are those of the array."""
+
+    blame: Annotated[Blame | None, Inline()]
+    verdict: Annotated[Verdict | None, Inline()]
+
+
+@dataclass(frozen=True, slots=True)
+class Headline:
+    """How many links to UAVs are good, weak, none; and the same in words."""
+
+    good: Annotated[int, Meaning("links with the guaranteed gain they need")]
+    weak: Annotated[int, Meaning("links that usually have the gain they need")]
+    none: Annotated[int, Meaning("links without the gain they need, or without a beam")]
+    headline: Annotated[
+        str, Meaning("how many links are good, in words", example="3 of 4 links good")
+    ]
+    behind: Annotated[
+        str | None, Meaning("that this machine does not keep up, in words; null where it does")
+    ]
 
 
 def behind(seen: LagSeen) -> Blame | None:
@@ -27,63 +49,36 @@ def behind(seen: LagSeen) -> Blame | None:
 
 
 def verdict(
-    found: Verdict | None,
-    machine: Blame | None,
-    utc_ns: Callable[[int], UtcNs],
-    unserved: Blame | None = None,
-) -> Json:
-    """The fields of one UAV: ``verdict``, and ``health`` with what is behind it.
+    found: Verdict | None, machine: Blame | None, unserved: Blame | None = None
+) -> tuple[Level | None, LinkHealth | None]:
+    """The verdict on one UAV's link, and what is behind it.
 
-    ``unserved`` is why no node of the fleet serves it, where none does: it has no link then.
+    ``unserved`` is why no node of the fleet serves the UAV, where none does: it has no link then.
     """
     if unserved is not None:
-        return {"verdict": str(Level.NONE), "health": _behind_none(machine or unserved)}
+        return Level.NONE, LinkHealth(machine or unserved, None)
     if found is None:
-        return {"verdict": None, "health": None}
+        return None, None
     why = None if found.level is Level.GOOD else machine or found.blame
-    return {
-        "verdict": str(found.level),
-        "health": {
-            "cause": None if why is None else str(why.cause),
-            "reason": None if why is None else why.reason,
-            "remedy": None if why is None else why.remedy,
-            "since": rfc3339(utc_ns(found.since_ns)),
-            "needed_gain_db": found.needed_db,
-            "guaranteed_gain_db": found.guaranteed_db,
-            "likely_gain_db": found.likely_db,
-        },
-    }
-
-
-def _behind_none(why: Blame) -> Json:
-    """``health`` of a UAV that nobody serves: since when is not kept, and there are no gains."""
-    return {
-        "cause": str(why.cause),
-        "reason": why.reason,
-        "remedy": why.remedy,
-        "since": None,
-        "needed_gain_db": None,
-        "guaranteed_gain_db": None,
-        "likely_gain_db": None,
-    }
+    return found.level, LinkHealth(why, found)
 
 
 def summary(
     verdicts: Iterable[Verdict], machine: Blame | None, *, unserved: int = 0, elsewhere: int = 0
-) -> Json:
+) -> Headline:
     """How many links there are of each level, the same in words, and whether all of it is late.
 
-    ``unserved`` UAVs no node of the fleet serves; ``elsewhere`` are with other nodes.
+    ``unserved`` UAVs have no node of the fleet; ``elsewhere`` counts those of other nodes.
     """
     counts = Counter(found.level for found in verdicts)
     counts[Level.NONE] += unserved
     good, total = counts[Level.GOOD], counts.total()
     parts = [f"{good} of {total} links good"] if total else []
     parts += [f"{elsewhere} with other nodes"] if elsewhere else []
-    return {
-        "good": good,
-        "weak": counts[Level.WEAK],
-        "none": counts[Level.NONE],
-        "headline": ", ".join(parts) or "no UAV to aim at",
-        "behind": None if machine is None else machine.reason,
-    }
+    return Headline(
+        good=good,
+        weak=counts[Level.WEAK],
+        none=counts[Level.NONE],
+        headline=", ".join(parts) or "no UAV to aim at",
+        behind=None if machine is None else machine.reason,
+    )

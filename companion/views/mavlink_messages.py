@@ -12,16 +12,64 @@ loop's.
 
 import functools
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Annotated, Any, Final
 
 import numpy as np
 
 from companion.values import Source, UtcNs
+from companion.values.described import Meaning
+from companion.views.as_json import Json, rfc3339
 from companion.views.last_messages import Kept
-from companion.views.words import rfc3339
 
-Json = dict[str, Any]
 _PLAIN: Final = {"char", "float", "double"}
+
+
+@dataclass(frozen=True, slots=True)
+class MessageTime:
+    """When a message came, how many, and how often."""
+
+    first_update: Annotated[str, Meaning("arrival of the first of its kind")]
+    last_update: Annotated[str, Meaning("arrival of the newest of its kind")]
+    counter: Annotated[int, Meaning("messages of this kind so far")]
+    frequency: Annotated[float | None, Meaning("mean rate, Hz; null after a single message")]
+
+
+@dataclass(frozen=True, slots=True)
+class MessageStatus:
+    """Status of a message, as in mavlink2rest."""
+
+    time: Annotated[MessageTime, Meaning("when it came, how many, how often")]
+
+
+@dataclass(frozen=True, slots=True)
+class MavlinkMessage:
+    """The last message of its kind: ``type`` is its name, beside its fields."""
+
+    message: Annotated[
+        dict[str, Any],
+        Meaning(
+            "the message: its name as `type`, beside its fields in MAVLink's units",
+            example={"type": "SYSTEM_TIME", "time_unix_usec": 0, "time_boot_ms": 81},
+        ),
+    ]
+    status: Annotated[MessageStatus, Meaning("when it came, how many, how often")]
+
+
+@dataclass(frozen=True, slots=True)
+class MavlinkComponent:
+    """One component: its last messages by name."""
+
+    id: Annotated[int, Meaning("component id")]
+    messages: Annotated[dict[str, MavlinkMessage], Meaning("last message of each kind, by name")]
+
+
+@dataclass(frozen=True, slots=True)
+class MavlinkVehicle:
+    """One system: its components by id."""
+
+    id: Annotated[int, Meaning("system id")]
+    components: Annotated[dict[str, MavlinkComponent], Meaning("its components, by id")]
 
 
 class Dialect:

@@ -4,24 +4,44 @@ The page keeps its own minutes; these are for a page that has just been opened.
 """
 
 from collections import deque
-from collections.abc import Callable
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Annotated, Final
 
 from companion.pipeline.fold import Pipeline
-from companion.values import UtcNs
-from companion.views.words import degrees, rfc3339
+from companion.values.described import Meaning, members
+from companion.views.as_json import Json, Utc, degrees, rfc3339
 
-Json = dict[str, Any]
 EVERY_NS: Final = 1_000_000_000
 """Least time between two samples."""
 SAMPLES: Final = 300
 """Samples kept: five minutes."""
-FIELDS: Final = ("pointing_bound_deg", "innovation_m", "latency_s", "guaranteed_gain_db")
-"""What is kept of each UAV."""
+Column = list[float | None]
 
 
+@dataclass(frozen=True, slots=True)
+class UavHistory:
+    """Samples of one UAV, as many as ``at``; null where a value was unknown."""
+
+    pointing_bound_deg: Annotated[
+        Column, Meaning("largest angle between the predicted and the true direction")
+    ]
+    innovation_m: Annotated[Column, Meaning("distance from the prediction to the newest report")]
+    latency_s: Annotated[Column, Meaning("age of the newest report at its arrival")]
+    guaranteed_gain_db: Annotated[Column, Meaning("least array gain wherever the UAV can be")]
+
+
+@dataclass(frozen=True, slots=True)
+class History:
+    """A sample each second, the oldest first."""
+
+    valid_at_ns: Annotated[int, Meaning("the instant for which the values hold")]
+    at: Annotated[list[str], Meaning("when each sample was taken")]
+    uavs: Annotated[dict[str, UavHistory], Meaning("the samples of each UAV")]
+
+
+FIELDS: Final = tuple(member.name for member in members(UavHistory))
 Sample = tuple[int, dict[str, tuple[float | None, ...]]]
-"""The time of an update, ns, and what is kept of each UAV."""
+"""The time of an update, ns, and the values of ``FIELDS`` for each UAV."""
 
 
 class Series:
@@ -44,7 +64,7 @@ class Series:
                 degrees(bounds.get(track.uav)),
                 track.innovation_m,
                 track.latency_s,
-                None if found is None else found.guaranteed_db,
+                None if found is None else found.guaranteed_gain_db,
             )
         self._samples.append((update.t_ns, sample))
 
@@ -53,7 +73,7 @@ class Series:
         return list(self._samples)
 
 
-def show(samples: list[Sample], now_ns: int, utc_ns: Callable[[int], UtcNs]) -> Json:
+def show(samples: list[Sample], now_ns: int, utc_ns: Utc) -> Json:
     """The answer of ``/v1/history``: columns. May run on any thread."""
     uavs = dict.fromkeys(uav for _, sample in samples for uav in sample)
     nothing = (None,) * len(FIELDS)

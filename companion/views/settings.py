@@ -1,14 +1,35 @@
 """The effective settings as the API shows them: each with its default, and where it comes from."""
 
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Annotated, Any, Final, Literal
 
 from companion.settings.model import Settings
 from companion.settings.origins import Origin, Origins
-
-Json = dict[str, Any]
+from companion.values.described import Meaning
+from companion.views.as_json import Json
 
 LONGEST: Final = 400
 """Most characters of a text that is shown whole; what files held may be millions."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One setting, and where it comes from."""
+
+    value: Annotated[Any, Meaning("the value in effect; the key's name has its unit")]
+    default: Annotated[Any, Meaning("the default value")]
+    source: Annotated[
+        Literal["default", "file", "recording", "option", "program"],
+        Meaning("what set it; the program sets some in its demo"),
+    ]
+    file: Annotated[str | None, Meaning("the file or recording that set it")]
+
+
+@dataclass(frozen=True, slots=True)
+class EffectiveSettings:
+    """The settings by section and key."""
+
+    sections: Annotated[dict[str, dict[str, Setting]], Meaning("settings by section and key")]
 
 
 def show(settings: Settings, origins: Origins) -> Json:

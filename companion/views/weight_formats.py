@@ -13,8 +13,8 @@ from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
 from companion.values import BeamSet
 from companion.views import beam_state
+from companion.views.as_json import rfc3339
 from companion.views.quantised import device_table
-from companion.views.words import rfc3339
 
 TYPES: Final = {
     "json": "application/json",
@@ -25,7 +25,7 @@ TYPES: Final = {
 """Names of the formats, and their media types.
 
 ``raw`` is interleaved little-endian complex64, row-major, and nothing else: what tells of it is in
-``headers``. ``npy`` is in C order.
+``headers``. ``npy`` holds the same numbers, in C order.
 """
 
 
@@ -57,7 +57,7 @@ def encode(
             return json.dumps(beam_state.weights(pipeline, beam_set, lead_ms)).encode()
         case "npy":
             file = io.BytesIO()
-            np.save(file, np.ascontiguousarray(beam_set.weights), allow_pickle=False)
+            np.save(file, beam_set.weights.astype("<c8", order="C"), allow_pickle=False)
             return file.getvalue()
         case "raw":
             return beam_set.weights.astype("<c8").tobytes("C")

@@ -72,7 +72,7 @@ def test_the_bound_is_little_more_than_the_exact_worst_case() -> None:
             age_s = (until_ns - newest.sender_ns) * 1e-9
             carried = np.array(newest.velocity_ned_mps) * age_s - predicted
             off = carried / np.linalg.norm(carried)
-            most_m = furthest_m(fixes, until_ns, off, track.limits.acceleration_mps2)
+            most_m = furthest_m(fixes, until_ns, off, track.limits.acceleration_max_mps2)
             exact_m = max(exact_m, most_m - float(off @ predicted))
         ratios.append(track.bound_m / exact_m)
         if len(ratios) == QUERIES:

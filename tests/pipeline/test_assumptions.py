@@ -86,8 +86,8 @@ def test_a_turn_that_the_type_cannot_do_is_told_once_and_the_bound_widens() -> N
     assert "observer.acceleration_max_mps2" in notices[0].text
     now_ns = START_NS + 10 * S
     (track,) = into.tracks(now_ns, now_ns + S)
-    assert track.limits.source == "raised"
-    assert track.limits.acceleration_mps2 > 7.0
+    assert track.limits.limits_source == "raised"
+    assert track.limits.acceleration_max_mps2 > 7.0
     assert into.assumptions.times("1:1") == len(refuted)
     assert not any(isinstance(one, Rejection) for one in out)
 
@@ -97,7 +97,7 @@ def test_what_an_aeroplane_can_do_is_no_news() -> None:
     out = run(into, [heartbeat(0, "1:1", 1), *turning("1:1", 10)])
     assert not any(isinstance(one, Refuted) for one in out)
     (track,) = into.tracks(START_NS + 10 * S, START_NS + 10 * S)
-    assert (track.limits.source, track.limits.acceleration_mps2) == ("type", 16.0)
+    assert (track.limits.limits_source, track.limits.acceleration_max_mps2) == ("type", 16.0)
 
 
 @pytest.mark.parametrize(("mav_type", "lag_s"), [(2, 0.0295), (1, -0.026)])

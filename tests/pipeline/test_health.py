@@ -62,9 +62,9 @@ def test_the_gain_that_is_sure_or_likely_makes_the_verdict(
     watch = Watch()
     assert watch.see(0, [track("1:1", *errors)]) == level
     verdict = watch.health.verdicts["1:1"]
-    assert verdict.needed_db == 10.0
+    assert verdict.needed_gain_db == 10.0
     assert (verdict.blame is None) == (level == "good")
-    sure, likely = verdict.guaranteed_db, verdict.likely_db
+    sure, likely = verdict.guaranteed_gain_db, verdict.likely_gain_db
     assert (sure is not None and sure >= 10) == (level == "good")
     assert (likely is not None and likely >= 10) == (level != "none")
 
@@ -158,7 +158,7 @@ def test_a_hair_s_breadth_changes_nothing() -> None:
     """Up to a decibel less than needed keeps the level, and does not reach it."""
     watch = Watch()
     watch.see(0, [track("1:1", *SURE)])
-    sure_db = watch.health.verdicts["1:1"].guaranteed_db
+    sure_db = watch.health.verdicts["1:1"].guaranteed_gain_db
     assert sure_db is not None
     for short_db, is_good in ((0.9, True), (1.1, False)):
         watch = Watch(needed_db=sure_db - 0.5)
@@ -175,7 +175,7 @@ def test_without_a_beam_there_is_no_link_at_once_and_the_state_is_told_elsewhere
     watch.see(0, [track("1:1", *SURE), track("2:1", *SURE)])
     assert watch.see(1, [track("1:1", *SURE, "stale"), track("2:1", *SURE)]) == "none good"
     assert watch.said == []
-    assert watch.health.verdicts["1:1"].guaranteed_db is None
+    assert watch.health.verdicts["1:1"].guaranteed_gain_db is None
 
 
 def test_one_cause_is_told_once() -> None:
@@ -206,7 +206,7 @@ def test_an_sinr_that_is_needed_is_turned_into_a_gain() -> None:
         watch = Watch(needed_sinr_db=5.0)
         near = track("1:1", *SURE)
         watch.see(0, [replace(near, position_ned_m=factor * near.position_ned_m)])
-        found.append(watch.health.verdicts["1:1"].needed_db)
+        found.append(watch.health.verdicts["1:1"].needed_gain_db)
     wavelength_m, noise_dbm = 299_792_458 / 30e9, 10 * math.log10(1.380649e-20 * 290 * 50e6) + 7
     path_db = 20 * math.log10(wavelength_m / (4 * math.pi * math.hypot(*PLACES["1:1"])))
     expected = 5.0 - (20.0 + path_db + 10 * math.log10(4) - noise_dbm)

@@ -70,9 +70,9 @@ def test_a_frame_survives_the_round_trip(frame: Frame) -> None:
 
 @given(REJECTIONS)
 def test_a_rejection_survives_the_round_trip(rejection: Rejection) -> None:
-    data = codec.rejection(rejection, is_event=True).SerializeToString()
+    data = schemas.encode("Rejection", schemas.RecordedRejection(rejection, True))
     assert codec.to_rejection(data) == rejection
-    output = codec.rejection(rejection, is_event=False).SerializeToString()
+    output = schemas.encode("Rejection", schemas.RecordedRejection(rejection, False))
     assert codec.to_rejection(output) is None
 
 

@@ -3,7 +3,6 @@
 import asyncio
 import io
 import json
-import tomllib
 from collections.abc import Iterator
 from datetime import datetime
 from typing import Any
@@ -13,34 +12,45 @@ import orjson
 import pytest
 from pydantic import TypeAdapter
 from starlette.testclient import TestClient
-from support import ROOT
 
-from companion.server import models, responses
+from companion.server import area_map, models, recordings, responses
 from companion.server.app import create_app
 from companion.server.beam_routes import accepted
 from companion.tracking.design import answers
+from companion.values.described import unit
+from companion.views import (
+    beam_state,
+    design,
+    fleet,
+    glance,
+    link_state,
+    mavlink_messages,
+    series,
+    settings,
+    state,
+)
 
 PATHS: dict[str, Any] = {
     "/healthz": models.Health,
     "/readyz": models.Readiness,
-    "/v1/status": models.Status,
-    "/v1/uavs": models.Uavs,
-    "/v1/uavs/1:1": models.UavState,
-    "/v1/links": models.Links,
-    "/v1/fleet": models.Fleet,
-    "/v1/history": models.History,
-    "/v1/settings": models.EffectiveSettings,
-    "/v1/events": models.Events,
-    "/v1/design": models.Design,
-    "/v1/beams?lead_ms=20": models.Beams,
-    "/v1/beams/weights": models.Weights,
-    "/v1/pattern?points=5": models.Pattern,
-    "/v1/pattern?points=5&cut=elevation": models.Pattern,
-    "/v1/map": models.AreaMap,
-    "/v1/recordings": models.Recordings,
-    "/v1/mavlink/vehicles": dict[str, models.MavlinkVehicle],
-    "/v1/mavlink/vehicles/1/components/1/messages": dict[str, models.MavlinkMessage],
-    "/v1/mavlink/vehicles/1/components/1/messages/HEARTBEAT": models.MavlinkMessage,
+    "/v1/status": state.Status,
+    "/v1/uavs": state.Uavs,
+    "/v1/uavs/1:1": state.UavState,
+    "/v1/links": link_state.Links,
+    "/v1/fleet": fleet.Fleet,
+    "/v1/history": series.History,
+    "/v1/settings": settings.EffectiveSettings,
+    "/v1/events": glance.Events,
+    "/v1/design": design.Design,
+    "/v1/beams?lead_ms=20": beam_state.Beams,
+    "/v1/beams/weights": beam_state.Weights,
+    "/v1/pattern?points=5": beam_state.Pattern,
+    "/v1/pattern?points=5&cut=elevation": beam_state.Pattern,
+    "/v1/map": area_map.AreaMap,
+    "/v1/recordings": recordings.Recordings,
+    "/v1/mavlink/vehicles": dict[str, mavlink_messages.MavlinkVehicle],
+    "/v1/mavlink/vehicles/1/components/1/messages": dict[str, mavlink_messages.MavlinkMessage],
+    "/v1/mavlink/vehicles/1/components/1/messages/HEARTBEAT": mavlink_messages.MavlinkMessage,
 }
 
 
@@ -52,9 +62,9 @@ def client(shared_node: Any) -> Iterator[TestClient]:
 
 def holds(model: Any, answer: Any) -> None:
     """The answer has the fields of the model, all of them, none besides, of its types."""
-    adapter = TypeAdapter(model)
+    adapter = TypeAdapter(models.outward(model))
     read = adapter.validate_json(orjson.dumps(answer), strict=True)
-    assert adapter.dump_python(read) == answer
+    assert adapter.dump_python(read, mode="json") == answer
 
 
 @pytest.mark.parametrize("path", PATHS)
@@ -86,7 +96,7 @@ def test_what_is_compared_is_not_empty(client: TestClient) -> None:
 def test_before_anything_was_heard_the_models_hold_too(make_node: Any) -> None:
     with TestClient(create_app(make_node(flown=False))) as client:
         for path in ("/v1/status", "/v1/uavs", "/v1/beams", "/v1/beams/weights", "/v1/design"):
-            holds(PATHS.get(path) or models.Beams, client.get(path).json())
+            holds(PATHS.get(path) or beam_state.Beams, client.get(path).json())
 
 
 def test_every_path_of_the_document_is_held_against_its_model(client: TestClient) -> None:
@@ -127,28 +137,18 @@ def test_the_document_shows_problems_as_problems(client: TestClient) -> None:
     assert "HTTPValidationError" not in document["components"]["schemas"]
 
 
-UNITS = {
-    "_m": " m", "_s": " s", "_deg": "degrees", "_db": "dB", "_dbm": "dBm", "_hz": "Hz",
-    "_mps": "m/s", "_mps2": "m/s²", "_dps": "degrees/s", "_ms": " ms", "_ppm": "million",
-}  # fmt: skip
-
-
 def test_the_document_says_what_every_field_and_parameter_means(client: TestClient) -> None:
-    """With the unit that its name ends in; and the words are those of fields that there are."""
+    """With the unit that its name ends in."""
     document = client.get("/openapi.json").json()
-    words = tomllib.loads((ROOT / "companion" / "server" / "vocabulary.toml").read_text())
-    used: set[tuple[str, str]] = set()
     lacking: list[str] = []
     for model, schema in document["components"]["schemas"].items():
         for name, field in schema.get("properties", {}).items():
-            said, unit = field.get("description", ""), UNITS.get("_" + name.rpartition("_")[2])
-            if not said or (unit is not None and unit not in said):
+            said, measure = field.get("description", ""), unit(name)
+            if not said or (
+                measure and not said.endswith(f", {measure}") and "deprecated" not in said
+            ):
                 lacking.append(f"{model}.{name}: {said!r}")
-            used.add((model, name) if name in words.get(model, {}) else ("", name))
-    told = {("", name) for name, said in words.items() if isinstance(said, str)}
-    told |= {(m, name) for m, own in words.items() if isinstance(own, dict) for name in own}
     assert lacking == []
-    assert told <= used, told - used
     for path, operations in document["paths"].items():
         for parameter in operations["get"].get("parameters", []):
             assert parameter.get("description"), (path, parameter["name"])
@@ -268,7 +268,7 @@ def test_the_position_model_shows_what_companion_design_prints(make_node: Any) -
     node = make_node(observer={"model": "position", "alpha": 0.5})
     with TestClient(create_app(node)) as client:
         shown = client.get("/v1/design").json()
-    holds(models.Design, shown)
+    holds(design.Design, shown)
     assert shown["certificate"] is None
     for row in shown["designs"]:
         lead_s = max(0.2, row["dt_s"])  # velocities are reported: velocity_lead_s, or the interval
@@ -317,7 +317,7 @@ def test_how_far_the_machine_is_behind(make_node: Any) -> None:
             node.arrival_lag.observe(began_ns + tenth * 100_000_000, 700_000_000 + tenth)
         node.tick(1.9)
         status = client.get("/v1/status").json()
-        holds(models.Status, status)
+        holds(state.Status, status)
         lag = {"newest_s": 0.700000019, "p95_s": 0.700000018, "max_s": 0.700000019, "behind": True}
         assert status["arrival_lag"] == pytest.approx(lag, abs=1e-10)
         assert status["health"]["behind"] == "this machine is behind: frames wait 0.7 s for it"
@@ -335,7 +335,7 @@ def test_a_carrier_that_is_lost_is_shown_where_it_was(make_node: Any) -> None:
             node.tick(10.0)
         status = client.get("/v1/status").json()
         beams = client.get("/v1/beams").json()
-    holds(models.Status, status)
+    holds(state.Status, status)
     assert before["center"]["last_known"] is None
     center = status["center"]
     assert center["lat_deg"] is None and center["unfit"]
@@ -352,7 +352,7 @@ def test_what_the_charts_show_was_kept(make_node: Any) -> None:
     with TestClient(create_app(node)) as client:
         history = client.get("/v1/history").json()
         uavs = client.get("/v1/uavs").json()["uavs"]
-    holds(models.History, history)
+    holds(series.History, history)
     times = [datetime.fromisoformat(at).timestamp() for at in history["at"]]
     assert len(times) >= 5 and min(np.diff(times)) >= 0.999
     assert set(history["uavs"]) == {uav["id"] for uav in uavs if uav["target"]}

@@ -55,12 +55,12 @@ def test_the_nearest_setting_wins() -> None:
         }
     )
     found = [assembly.assumed(given, uav, 1, 3) for uav in ("3:1", "4:1")]
-    assert [one.limits.acceleration_mps2 for one in found] == [30.0, 20.0]
+    assert [one.limits.acceleration_max_mps2 for one in found] == [30.0, 20.0]
     assert [one.lag_s for one in found] == [(0.0, 0.01), (-0.033, -0.019)]
-    assert assembly.assumed(given, "4:1", 2, 3).limits.acceleration_mps2 == 7.0
+    assert assembly.assumed(given, "4:1", 2, 3).limits.acceleration_max_mps2 == 7.0
     assert assembly.assumed(Settings(), "4:1", 2, 3).limits == COPTER
     relayed = assembly.assumed(Settings(), "icao:4CA7B3", None, None)
-    assert relayed.limits.speed_mps == 400.0
+    assert relayed.limits.speed_max_mps == 400.0
     assert relayed.lag_s == (0.0, 0.0)
 
 
@@ -103,18 +103,18 @@ def test_a_turn_beyond_the_limit_is_proven_raised_and_fades(fix: Callable[..., F
     assert all(4.0 < one.proven <= 8.0 for one in found)
     assert found[0].t_ns <= 2 * S  # within a second of its beginning
     raised = known.limits(COPTER, 3 * S)
-    assert raised.source is LimitSource.RAISED
-    assert 4.0 < raised.acceleration_mps2 <= RAISED * 8.0
+    assert raised.limits_source is LimitSource.RAISED
+    assert 4.0 < raised.acceleration_max_mps2 <= RAISED * 8.0
     later = known.limits(COPTER, round((3 + 3 * FADES_S) * S))
-    assert 4.0 < later.acceleration_mps2 < 4.7
-    assert later.speed_mps == 60.0
+    assert 4.0 < later.acceleration_max_mps2 < 4.7
+    assert later.speed_max_mps == 60.0
 
 
 def test_a_speed_beyond_the_limit_is_proven(fix: Callable[..., Fix]) -> None:
     known = Refutations()
     (found,) = known.look(told(fix, 0, [70, 0, 0]))
     assert (found.setting, found.limit, found.proven) == ("observer.speed_max_mps", 60.0, 69.7)
-    assert known.limits(COPTER, 0).speed_mps == RAISED * 69.7
+    assert known.limits(COPTER, 0).speed_max_mps == RAISED * 69.7
 
 
 def test_what_nothing_can_fly_is_no_proof(fix: Callable[..., Fix]) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from companion.beams.array.geometry import Array
 from companion.beams.array.steering import steering_matrix
 from companion.beams.worth.channel import free_space_gain
-from companion.values import ComplexArray, FloatArray, IntArray, Normalisation
+from companion.values import BeamSet, ComplexArray, FloatArray, IntArray, Normalisation
 
 BOLTZMANN_JPK: Final = 1.380649e-23
 
@@ -204,6 +204,25 @@ def predicted_sinr_db(
     with np.errstate(divide="ignore"):
         ratio_db: FloatArray = 10 * np.log10(ratio)
     return ratio_db
+
+
+def sent_weights(beam_set: BeamSet, budget: LinkBudget) -> ComplexArray:
+    """The weights (M, N) of an update as they are sent, in square roots of watts."""
+    slots, normalisation = beam_set.slots, beam_set.normalisation
+    return transmitted(beam_set.weights, budget.tx_power_w, slots, normalisation)
+
+
+def sinr_of_beams_db(
+    array: Array,
+    beam_set: BeamSet,
+    directions: FloatArray,
+    budget: LinkBudget,
+    uav_antennas: int = 1,
+) -> FloatArray:
+    """SINR (N,) that the UAVs of an update have in these unit directions (N, 3), dB."""
+    sent = sent_weights(beam_set, budget)
+    ranges_m, slots = beam_set.ranges_m, beam_set.slots
+    return predicted_sinr_db(array, directions, ranges_m, sent, slots, budget, uav_antennas)
 
 
 def least_sinr_db(

@@ -3,6 +3,9 @@
 import math
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Annotated
+
+from companion.values.described import Meaning
 
 
 class ClockKind(StrEnum):
@@ -70,33 +73,32 @@ class Stamp:
 class ClockEstimate:
     """A sender's clock against the node's.
 
-    kind              the evidence used: that which leaves the least uncertainty
-    guarantee         whether both sides of the interval were measured
-    offset_ns         node time less sender time, the most likely
-    before_s          how much greater the offset may be: a thing that is put at a sender time
-                      may have been that much earlier
-    after_s           how much less it may be
-    usual_s           by how much the estimate usually is off: no bound
-    drift_ppm         drift beyond the greatest taken for possible that has shown itself; 0
-                      without any
-    constant_delay_s  depth of the offset below the floor of the stamps, which is the latency of
-                      the fastest frame
-    latency_s         latency of the newest stamp
+    offset_ns  most likely difference, node time minus sender time
+    usual_s    usual error of the estimate: no bound
     """
 
-    kind: ClockKind
-    guarantee: Guarantee
+    kind: Annotated[ClockKind, Meaning("evidence that leaves the least uncertainty")]
+    guarantee: Annotated[
+        Guarantee, Meaning("measured: both ends of the interval are; assumed: one end is assumed")
+    ]
     offset_ns: int
-    before_s: float
-    after_s: float
+    before_s: Annotated[float, Meaning("how much earlier the sender's time may be than estimated")]
+    after_s: Annotated[float, Meaning("how much later the sender's time may be than estimated")]
     usual_s: float
-    drift_ppm: float
-    constant_delay_s: float
-    latency_s: float
+    drift_ppm: Annotated[
+        float | None, Meaning("observed drift beyond the largest assumed; 0 where none was seen")
+    ]
+    constant_delay_s: Annotated[
+        float | None, Meaning("latency of the fastest frame, which is taken off")
+    ]
+    latency_s: Annotated[float | None, Meaning("latency of the newest time stamp")]
 
     @property
-    def uncertainty_s(self) -> float:
-        """Bound on the error of ``offset_ns``, seconds."""
+    def offset_s(self) -> Annotated[float, Meaning("node time minus sender time")]:
+        return self.offset_ns * 1e-9
+
+    @property
+    def uncertainty_s(self) -> Annotated[float, Meaning("bound on the error of the offset")]:
         return max(self.before_s, self.after_s)
 
 

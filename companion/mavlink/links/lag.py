@@ -7,7 +7,9 @@ quiet time, and a datagram costs a comparison.
 from collections import deque
 from dataclasses import dataclass
 from math import ceil
-from typing import Final
+from typing import Annotated, Final
+
+from companion.values.described import Meaning
 
 SLOT_NS: Final = 100_000_000
 """Time of which the worst lag is kept."""
@@ -23,18 +25,17 @@ CLEARS_NS: Final = 2_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class LagSeen:
-    """The lags of the last ten seconds, in seconds; None where no datagram was stamped in them.
+    """How long frames waited for this machine in the last ten seconds; null without time stamps."""
 
-    newest_s  that of the newest datagram
-    p95_s     what the worst lags of 95 of 100 tenths of a second do not exceed
-    max_s     the worst
-    behind    whether it was above the limit for a second or more, until two seconds after that
-    """
-
-    newest_s: float | None
-    p95_s: float | None
-    max_s: float | None
-    behind: bool
+    newest_s: Annotated[float | None, Meaning("wait of the newest datagram")]
+    p95_s: Annotated[
+        float | None, Meaning("95th percentile of the longest waits of each tenth of a second")
+    ]
+    max_s: Annotated[float | None, Meaning("longest wait")]
+    behind: Annotated[
+        bool,
+        Meaning("whether waits exceeded half a second for a second, until two seconds after that"),
+    ]
 
 
 class ArrivalLag:

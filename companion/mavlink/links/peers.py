@@ -187,7 +187,7 @@ class Peers:
             counts = component.status
             counts.frames += 1
             counts.heard_ns = t_ns
-            counts.version = version
+            counts.mavlink = version
             if msgid in STAMPED:
                 sender.stamped_ns = t_ns
             peer.versions |= version

@@ -5,9 +5,10 @@ prove who it is changes no other number.
 """
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 from companion.values import Source
+from companion.values.described import Meaning
 
 LinkState = Literal["up", "connecting", "down"]
 Arrival = Literal["kernel", "read"]
@@ -15,66 +16,53 @@ Arrival = Literal["kernel", "read"]
 
 @dataclass(slots=True)
 class ComponentStatus:
-    """One component as heard over one link.
+    """One component as heard over one link; ``heard_ns`` is the time of its last frame."""
 
-    frames    frames heard
-    gaps      frames missing, as in ``LinkStatus``
-    heard_ns  time of the last frame
-    version   MAVLink version of the last frame
-    """
-
-    frames: int
-    gaps: int
+    frames: Annotated[int, Meaning("frames received")]
+    gaps: Annotated[int, Meaning("frames missing by sequence number, at least")]
     heard_ns: int
-    version: int
+    mavlink: Annotated[int, Meaning("MAVLink version of its last frame")]
 
 
 @dataclass(slots=True)
 class LinkStatus:
     """The state and the counts of one link.
 
-        state         "up" (a listening link: it listens), "connecting" (the peer or the device is
-                      away and is tried again and again) or "down" (not run)
-        frames        frames accepted
-        bytes         bytes received
-        peers         peers met; a connection that is made again counts anew
-        lost          rejections by reason; garbage in bytes
-        gaps          frames missing by sequence number, per peer and sender. A hole of n frames
-                      shows as n modulo 256, so this is a lower bound; a sender that starts again
-                      can add one wrong hole (see ``peers``)
-        late          frames that step back by less than half a round; each was counted in ``gaps``
-                      before, or is a copy
-        repeats       frames with the same number as the frame before
-        sent          frames that a peer was sent
-        send_dropped  frames that it did not take
-        arrival       what tells when a frame arrived: "kernel", the system's stamp on its datagram;
-                      or "read", the time at which it was read here
-        misstamped    datagrams whose stamp could not be true, as when the wall clock was set: they
-                      count as arrived when they were read
-        overflowed    datagrams that the system dropped because its receive buffer was full, or that
-                      had waited too long
-        heard_ns      time of the last frame
-        components    counts of each component
-
-    ``receive_buffer_bytes`` is the buffer that the system granted (Linux includes its own
-    bookkeeping and says twice what was asked for). It and ``overflowed`` are None for streams, and
-    where the system does not say.
+    A listening link is up while it listens; a link that connects is connecting until its peer or
+    device answers. A hole of n frames shows as n modulo 256 in ``gaps``; a sender that restarts can
+    add one wrong hole (see ``peers``). ``late`` frames were counted in ``gaps`` before, or are
+    copies. ``receive_buffer_bytes`` and ``overflowed`` are None for streams, and where the system
+    does not say. ``heard_ns`` is the time of the last frame.
     """
 
-    url: str
-    state: LinkState = "down"
-    frames: int = 0
-    bytes: int = 0
-    peers: int = 0
-    lost: dict[str, int] = field(default_factory=dict)
-    gaps: int = 0
-    late: int = 0
-    repeats: int = 0
-    sent: int = 0
-    send_dropped: int = 0
-    arrival: Arrival = "read"
-    misstamped: int = 0
-    receive_buffer_bytes: int | None = None
-    overflowed: int | None = None
+    url: Annotated[str, Meaning("address of the link", example="udpin:0.0.0.0:14550")]
+    state: Annotated[LinkState, Meaning("up, trying to connect, or down")] = "down"
+    frames: Annotated[int, Meaning("frames accepted")] = 0
+    bytes: Annotated[int, Meaning("bytes received")] = 0
+    peers: Annotated[int, Meaning("peers so far; a new connection counts anew")] = 0
+    lost: Annotated[
+        dict[str, int], Meaning("frames that could not be used, by reason; garbage in bytes")
+    ] = field(default_factory=dict)
+    gaps: Annotated[int, Meaning("frames missing by sequence number, at least")] = 0
+    late: Annotated[int, Meaning("frames with an earlier sequence number: late or copies")] = 0
+    repeats: Annotated[int, Meaning("frames with the sequence number of the frame before")] = 0
+    sent: Annotated[int, Meaning("frames sent")] = 0
+    send_dropped: Annotated[int, Meaning("frames that could not be sent")] = 0
+    arrival: Annotated[
+        Arrival, Meaning("what dates an arrival: the kernel's time stamp, or the reading")
+    ] = "read"
+    misstamped: Annotated[
+        int, Meaning("datagrams with an impossible time stamp, dated by their reading")
+    ] = 0
+    receive_buffer_bytes: Annotated[
+        int | None, Meaning("receive buffer that the system granted (Linux doubles the request)")
+    ] = None
+    overflowed: Annotated[
+        int | None, Meaning("datagrams dropped: receive buffer full, or too old to be of use")
+    ] = None
     heard_ns: int | None = None
     components: dict[Source, ComponentStatus] = field(default_factory=dict)
+
+    @property
+    def bad_crc(self) -> Annotated[int, Meaning("frames with a wrong checksum")]:
+        return self.lost.get("bad-crc", 0)

@@ -29,11 +29,12 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import pairwise
 from statistics import median_high
-from typing import Final, NamedTuple
+from typing import Annotated, Final, NamedTuple
 
 from companion.mavlink.wire.decode import ATTITUDE, GLOBAL_POSITION_INT
 from companion.mavlink.wire.encode import Outgoing, request_data_stream, set_message_interval
 from companion.values import Notice, Severity, Source
+from companion.values.described import Meaning
 
 _NS: Final = 1_000_000_000
 SLOW_BELOW: Final = 0.8
@@ -79,19 +80,17 @@ class RateState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class MessageRate:
-    """State of one message of one UAV.
+    """A message whose rate is requested of a UAV."""
 
-    ``changed_by`` is who lowered a rate that was in order: ``SYSID:COMPID``, a restart of the UAV,
-    or the statement that nobody was heard asking; None if nobody has.
-    """
-
-    uav: Source
-    msgid: int
-    wanted_hz: float
-    observed_hz: float | None
-    state: RateState
-    asked: int
-    changed_by: str | None
+    uav: Annotated[Source, Meaning("UAV that sends the message", example="3:1")]
+    message_id: Annotated[int, Meaning("MAVLink message id")]
+    wanted_hz: Annotated[float, Meaning("requested rate")]
+    observed_hz: Annotated[float | None, Meaning("observed rate, by the sender's clock")]
+    state: Annotated[RateState, Meaning("state of the request")]
+    asked: Annotated[int, Meaning("requests sent")]
+    changed_by: Annotated[
+        str | None, Meaning("what lowered the rate: another component, or a restart of the UAV")
+    ]
 
 
 class Request(NamedTuple):

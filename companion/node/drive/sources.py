@@ -21,6 +21,7 @@ from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
 from companion.values import IntArray, Update, UserError
 from companion.views import beam_state
+from companion.views.as_json import as_json
 from companion.views.quantised import device_table
 
 ADAR1000: Final = MEDIA_TYPES[Device.ADAR1000]
@@ -117,12 +118,16 @@ def shot_of(pipeline: Pipeline, equipment: Equipment, update: Update, wanted: Wa
         except UserError as error:
             return Shot(beams.valid_at_ns, str(error))
     pointed, codebook = beam_state.pointing(pipeline, update), equipment.codebook
-    if wanted.takes is Takes.STORED and codebook is not None and pointed:
+    shown: list[dict[str, Any]] = [
+        {"uav": uav} | as_json(one, pipeline.utc_ns)
+        for uav, one in zip(beams.uavs, pointed, strict=bool(pointed))
+    ]
+    if wanted.takes is Takes.STORED and codebook is not None and shown:
         best, _ = codebooks.best(codebook, pipeline.array, directions(beams))
-        for beam, index in zip(pointed, best.tolist(), strict=True):
+        for beam, index in zip(shown, best.tolist(), strict=True):
             beam["codebook"] = {"best": index}
     size = None if codebook is None else codebook.size
-    told = {"unfit": update.unfit, "beams": pointed, "codebook_beams": size}
+    told = {"unfit": update.unfit, "beams": shown, "codebook_beams": size}
     return chosen(told, text, wanted, beams.valid_at_ns)
 
 

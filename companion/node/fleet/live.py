@@ -21,7 +21,7 @@ from companion.pipeline.fleet.member import Member
 from companion.pipeline.fleet.offers import Offers
 from companion.pipeline.fleet.surroundings import Surroundings
 from companion.pipeline.fold import Pipeline
-from companion.recording import codec, schemas
+from companion.recording import schemas
 from companion.settings.fleet import FleetSettings, is_node_name
 from companion.values import Event, Frame, Notice, RoundTrip, Severity, UserError
 from companion.views.fleet import FleetStatus
@@ -255,7 +255,10 @@ class FleetNode:
             and self._bus.is_wanted(self._key("tracks"), PRIORITY)
         ):
             said = schemas.TracksMessage(
-                track=[codec.track(one, update.t_ns) for one in update.tracks]
+                track=[
+                    schemas.message("Track", schemas.RecordedTrack(one, update.t_ns))
+                    for one in update.tracks
+                ]
             )
             self._put("tracks", said.SerializeToString())
         self._tell(self._around.phantoms(now_ns))

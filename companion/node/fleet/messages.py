@@ -33,7 +33,7 @@ def shared(said: Shared) -> bytes:
     message.first_ns, message.told_ns = first_ns, said.told_ns
     for frame in said.frames:
         message.frame.add(after_ns=frame.heard_ns - first_ns, raw=frame.raw)
-    message.trip.extend(codec.round_trip(trip) for trip in said.trips)
+    message.trip.extend(schemas.message("RoundTrip", trip) for trip in said.trips)
     found: bytes = message.SerializeToString()
     return found
 
@@ -101,14 +101,7 @@ def to_standing(data: bytes, node: str) -> Standing:
 def offers(said: dict[str, Offer]) -> bytes:
     """A node's offers, all of them."""
     message = schemas.OffersMessage()
-    for one in said.values():
-        message.offer.add(
-            uav=one.uav,
-            sure_db=one.sure_db,
-            likely_db=one.likely_db,
-            sinr_db=one.sinr_db,
-            heard_s=one.heard_s,
-        )
+    message.offer.extend(schemas.message("Offer", one) for one in said.values())
     found: bytes = message.SerializeToString()
     return found
 

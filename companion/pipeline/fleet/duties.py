@@ -14,10 +14,11 @@ node that was not heard for so long, or whose liveliness went, holds nothing.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
 from companion.pipeline.fleet.assignment import assign
 from companion.values import Standing
+from companion.values.described import Meaning
 
 GRACE_NS: Final = 500_000_000
 """Time without a holder after which a UAV is claimed: longer than a word takes to come."""
@@ -29,12 +30,12 @@ SETTLED_NS: Final = 2_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Handover:
-    """A change of who serves a UAV: when, node time; from whom and to whom, None: nobody."""
+    """A change of the node that serves a UAV, in which this node took part."""
 
-    t_ns: int
-    uav: str
-    before: str | None
-    after: str | None
+    t_ns: Annotated[int, Meaning("when this node changed it")]
+    uav: Annotated[str, Meaning("UAV that changed its node", example="3:1")]
+    before: Annotated[str | None, Meaning("node that served it before; null: none")]
+    after: Annotated[str | None, Meaning("node that serves it from then on; null: none")]
 
 
 class Duties:

@@ -1,13 +1,16 @@
-"""What a column of an exported table is, and what of a value may stand in it."""
+"""The columns of an exported table, made from the described values of a row's class."""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any
+from typing import Any, Final
+
+from companion.values.described import Member, members, unit
 
 Value = str | int | float | bool | None
 """A value in a table; None: unknown, or not there."""
+_AXES: Final = ("north", "east", "down")
 
 
 class Kind(StrEnum):
@@ -29,44 +32,115 @@ class Kind(StrEnum):
     TRUTH = "truth"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Column:
-    """A column of a table.
-
-    name     unique in its table; ends in the unit where there is one
-    kind     what its values are
-    unit     as it is written in documents; empty: none
-    meaning  what it says
-    of       the value, of what a row is made of
-    """
+    """A column of a table; ``get`` takes its value from a row."""
 
     name: str
     kind: Kind
-    unit: str
     meaning: str
-    of: Callable[[Any], Any]
+    get: Callable[[Any], Any]
+
+    @property
+    def unit(self) -> str:
+        """The unit of its values; empty where they have none."""
+        return unit(self.name) if self.kind is not Kind.TIME else "UTC"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
-    """A table: its name, what a row is, and its columns in order."""
+    """A table: its name, what a row is, and its columns in order.
+
+    ``former_names`` are those that columns had in the version before: they are still written, after
+    the others.
+    """
 
     name: str
     row_is: str
-    columns: tuple[Column, ...]
+    row_class: type
+    former_names: Mapping[str, str] = field(default_factory=dict)
+    columns: tuple[Column, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        now = {column.name: column for column in _columns(self.row_class)}
+        former = [
+            Column(
+                name=old, kind=now[new].kind, meaning=f"deprecated: use `{new}`", get=now[new].get
+            )
+            for old, new in self.former_names.items()
+        ]
+        object.__setattr__(self, "columns", (*now.values(), *former))
 
     def row(self, item: Any, utc_offset_ns: int) -> list[Value]:
         """The values of one row, in the order of the columns.
 
-        ``utc_offset_ns`` is what a time of the node's timeline lacks to be UTC.
-        Raises ``TypeError`` where one that is always known is not: a defect of the program.
+        ``utc_offset_ns`` is UTC minus the node's timeline. Raises ``TypeError`` where a value is
+        None that may not be: a defect of the program.
         """
-        values = [_CLEAN[column.kind](column.of(item)) for column in self.columns]
+        values = [_CLEAN[column.kind](column.get(item)) for column in self.columns]
         if utc_offset_ns:
             for i, (column, value) in enumerate(zip(self.columns, values, strict=True)):
                 if column.kind is Kind.TIME and isinstance(value, int):
                     values[i] = value + utc_offset_ns
         return values
+
+
+def _columns(row_class: type) -> Iterator[Column]:
+    """The columns of a class: a time gives two, a vector three, an angle is in degrees."""
+    for member in members(row_class):
+        name, get, meaning = member.name, member.get, member.meaning.text
+        if "export" in member.meaning.absent:
+            continue
+        if name.endswith("_ns"):
+            if not member.optional:
+                yield Column(
+                    name=name, kind=Kind.INTEGER, meaning=f"{meaning}, since 1970", get=get
+                )
+            utc = name.removesuffix("_ns") + "_utc"
+            yield Column(name=utc, kind=Kind.TIME, meaning=meaning, get=get)
+        elif "ndarray" in str(member.type):
+            for axis, direction in enumerate(_AXES):
+                yield Column(
+                    name=_along(name, direction),
+                    kind=Kind.NUMBER,
+                    meaning=f"{meaning}: {direction}",
+                    get=_element(get, axis),
+                )
+        elif name.endswith(("_rad", "_radps")):
+            outside = name.replace("_radps", "_degps").replace("_rad", "_deg")
+            yield Column(name=outside, kind=Kind.NUMBER, meaning=meaning, get=_degrees(get))
+        else:
+            yield Column(name=name, kind=_kind(member), meaning=meaning, get=get)
+
+
+def _kind(member: Member) -> Kind:
+    if member.type is bool:
+        return Kind.TRUTH
+    if member.type is int and not member.optional:
+        return Kind.INTEGER
+    return Kind.NUMBER if member.type in (int, float) else Kind.TEXT
+
+
+def _along(name: str, direction: str) -> str:
+    """``velocity_ned_mps`` to the north: ``velocity_north_mps``."""
+    stem, _, ending = name.rpartition("_")
+    return f"{stem.removesuffix('_ned')}_{direction}_{ending}"
+
+
+def _element(get: Callable[[Any], Any], axis: int) -> Callable[[Any], float | None]:
+    def element(row: Any) -> float | None:
+        vector = get(row)
+        return None if vector is None else float(vector[axis])
+
+    return element
+
+
+def _degrees(get: Callable[[Any], Any]) -> Callable[[Any], float | None]:
+    def degrees(row: Any) -> float | None:
+        angle_rad = get(row)
+        return None if angle_rad is None else math.degrees(angle_rad)
+
+    return degrees
 
 
 def _text(value: object) -> str | None:

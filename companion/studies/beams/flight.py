@@ -140,19 +140,8 @@ class Sight:
         seen = np.array([truly.get(uav, np.full(3, np.nan)) for uav in beam_set.uavs])
         responses = np.einsum("mn,mn->n", steering_matrix(array, seen), beam_set.weights)
         power = np.einsum("mn,mn->n", beam_set.weights, beam_set.weights.conj()).real
-        groups = np.array([beam.group for beam in beam_set.beams])
-        sent = link_budget.transmitted(
-            beam_set.weights, self.equipment.budget.tx_power_w, groups, beam_set.normalisation
-        )
-        sinr_db = link_budget.predicted_sinr_db(
-            array,
-            towards,
-            np.array([beam.range_m for beam in beam_set.beams]),
-            sent,
-            groups,
-            self.equipment.budget,
-            self.equipment.uav_antennas,
-        )
+        budget, antennas = self.equipment.budget, self.equipment.uav_antennas
+        sinr_db = link_budget.sinr_of_beams_db(array, beam_set, towards, budget, antennas)
         efficiency = link_budget.spectral_efficiency(10 ** (sinr_db / 10), beam_set.groups)
         return {
             beam.uav: Worth(

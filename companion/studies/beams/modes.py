@@ -230,12 +230,7 @@ def _judge(pipeline: Pipeline, made: BeamSet, true: dict[str, FloatArray], way: 
     there = np.array([true.get(uav, np.full(3, np.nan)) for uav in made.uavs])
     known = ~np.isnan(there).any(axis=1)
     there = np.where(known[:, np.newaxis], there, towards)
-    groups = np.array([beam.group for beam in made.beams])
-    sent = link_budget.transmitted(made.weights, how.budget.tx_power_w, groups, made.normalisation)
-    ranges_m = np.array([beam.range_m for beam in made.beams])
-    sinr_db = link_budget.predicted_sinr_db(
-        array, there, ranges_m, sent, groups, how.budget, how.uav_antennas
-    )
+    sinr_db = link_budget.sinr_of_beams_db(array, made, there, how.budget, how.uav_antennas)
     rates = link_budget.spectral_efficiency(10 ** (sinr_db / 10), made.groups)
     towards_true = np.einsum("mn,mn->n", steering_matrix(array, there), made.weights)
     power = np.einsum("mn,mn->n", made.weights, made.weights.conj()).real

@@ -102,7 +102,7 @@ def known_tuning(settings: Settings) -> Tuning:
     ``MANOEUVRE_S``.
     """
     given = settings.observer
-    deviation_mps2 = assembly.anyone(settings).acceleration_mps2 / given.accuracy_factor
+    deviation_mps2 = assembly.anyone(settings).acceleration_max_mps2 / given.accuracy_factor
     return Tuning(
         deviation_mps2**2 * MANOEUVRE_S,
         given.position_noise_m / given.accuracy_factor,

@@ -13,7 +13,7 @@ of all three obey it, each with its own noise. Gains come from a design with one
 over a range of T (``gain_table.KinematicDesign``); the bound holds whatever they are.
 
 The same step predicts, with T the time since the report; backwards too, with |T| in the last terms.
-The greatest speed ``speed_mps`` limits the bound over long gaps. See docs/math.md 4.
+The greatest speed ``speed_max_mps`` limits the bound over long gaps. See docs/math.md 4.
 """
 
 import math
@@ -61,8 +61,8 @@ class KinematicModel:
     The bounds are those of reports that have no ``limits`` of their own.
     """
 
-    speed_mps: float
-    acceleration_mps2: float
+    speed_max_mps: float
+    acceleration_max_mps2: float
     gain: GainSchedule = deadbeat
 
 
@@ -103,7 +103,7 @@ class KinematicObserver:
 
         Without a reported velocity the estimate is at rest, with the greatest speed as its bound.
         """
-        velocity = fix.velocity_ned_mps
+        velocity, fastest_mps = fix.velocity_ned_mps, (fix.limits or self.model).speed_max_mps
         return KinematicState(
             fix,
             fix.position_ned_m,
@@ -111,7 +111,7 @@ class KinematicObserver:
             fix.noise.horizontal_m,
             fix.noise.vertical_m,
             fix.noise.position_m,
-            (fix.limits or self.model).speed_mps if velocity is None else fix.noise.velocity_mps,
+            fastest_mps if velocity is None else fix.noise.velocity_mps,
             None,
         )
 
@@ -141,7 +141,7 @@ class KinematicObserver:
         drift_m = (
             abs(t - l12) * state.velocity_mps
             + abs(l12) * noise.velocity_mps
-            + model.acceleration_mps2 * age * age / 2
+            + model.acceleration_max_mps2 * age * age / 2
         )
         horizontal_m = kept * state.horizontal_m + taken * noise.horizontal_m + drift_m
         vertical_m = kept * state.vertical_m + taken * noise.vertical_m + drift_m
@@ -150,21 +150,21 @@ class KinematicObserver:
             abs(l21) * (state.position_m + noise.position_m)
             + abs(1.0 - l22) * state.velocity_mps
             + abs(l22) * noise.velocity_mps
-            + model.acceleration_mps2 * age
+            + model.acceleration_max_mps2 * age
         )
         bound_m = min(bound_m, math.hypot(horizontal_m, vertical_m))
         found = Prediction(
             position, velocity, bound_m, horizontal_m, vertical_m, velocity_mps, None
         )
-        reach_m = age * model.speed_mps
+        reach_m = age * model.speed_max_mps
         if (
-            velocity_mps <= model.speed_mps
+            velocity_mps <= model.speed_max_mps
             and horizontal_m <= noise.horizontal_m + reach_m
             and vertical_m <= noise.vertical_m + reach_m
             and bound_m <= noise.position_m + reach_m
         ):
             return found  # the greatest speed says no more
-        return self._limited(fix, reach_m, found, model.speed_mps)
+        return self._limited(fix, reach_m, found, model.speed_max_mps)
 
     def _gain(self, state: KinematicState, t: float) -> Gain:
         """The scheduled gain; without a reported velocity, A(t) [1; share / interval before]."""

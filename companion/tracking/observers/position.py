@@ -41,8 +41,8 @@ class PositionModel:
         velocity_lead_s  least lead made from a reported velocity; a longer one smooths more
     """
 
-    speed_mps: float
-    acceleration_mps2: float
+    speed_max_mps: float
+    acceleration_max_mps2: float
     alpha: float | None = None
     feedthrough_s: float = 0.0
     velocity_lead_s: float = 0.2
@@ -65,7 +65,7 @@ class PositionObserver:
 
     def begin(self, fix: Fix) -> PositionState:
         """The state of a track with one report, which is the estimate."""
-        lead_m = abs(self.model.feedthrough_s) * (fix.limits or self.model).speed_mps
+        lead_m = abs(self.model.feedthrough_s) * (fix.limits or self.model).speed_max_mps
         return PositionState(fix, fix.position_ned_m, fix.noise.position_m + lead_m)
 
     def predict(self, state: PositionState, sender_ns: int) -> Prediction:
@@ -74,20 +74,20 @@ class PositionObserver:
         limits = fix.limits or model
         b = (sender_ns - fix.sender_ns) * 1e-9
         if b <= 0:
-            bound_m = state.bound_m - b * limits.speed_mps
+            bound_m = state.bound_m - b * limits.speed_max_mps
             return self._made(state, state.estimate_ned_m, bound_m, b, 0.0)
         d, noise_m, lead_s = model.feedthrough_s, fix.noise.position_m, 0.0
         # The mean velocity of the sender's lead is not quite that of the interval.
-        noise_m += abs(d) * limits.acceleration_mps2 * abs(b - d) / 2
+        noise_m += abs(d) * limits.acceleration_max_mps2 * abs(b - d) / 2
         if fix.velocity_ned_mps is not None:
             lead_s = max(model.velocity_lead_s, b)
             d += lead_s
-            noise_m += lead_s * (fix.noise.velocity_mps + limits.acceleration_mps2 * b / 2)
+            noise_m += lead_s * (fix.noise.velocity_mps + limits.acceleration_max_mps2 * b / 2)
         alpha = closed_form.best_alpha(b, d) if model.alpha is None else model.alpha
         gain = closed_form.gain(b, d, alpha)
         bound_m = (
             abs(1 - gain) * state.bound_m
-            + abs(gain * d - b) * limits.speed_mps
+            + abs(gain * d - b) * limits.speed_max_mps
             + abs(gain) * noise_m
         )
         estimate = _drawn(state, lead_s, gain)
@@ -109,7 +109,9 @@ class PositionObserver:
     ) -> Prediction:
         """A prediction with the reported velocity, whose bound grows with the acceleration."""
         fix = state.fix
-        changed_mps = fix.noise.velocity_mps + (fix.limits or self.model).acceleration_mps2 * abs(b)
+        changed_mps = fix.noise.velocity_mps + (
+            fix.limits or self.model
+        ).acceleration_max_mps2 * abs(b)
         velocity_bound_mps = None if fix.velocity_ned_mps is None else changed_mps
         return Prediction(
             estimate, fix.velocity_ned_mps, bound_m, bound_m, bound_m, velocity_bound_mps, mu_s2

@@ -1,18 +1,23 @@
 """The table of reports: every position that was received, used or not."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Annotated, Final
+
+import numpy as np
 
 from companion.mavlink.wire.cot_link import TUNNEL
 from companion.mavlink.wire.decode import GLOBAL_POSITION_INT, decode
 from companion.mavlink.wire.remote_id import LOCATION, MESSAGE_PACK
 from companion.mavlink.wire.transponder import ADSB_VEHICLE
-from companion.recording.tables.columns import Column, Kind, Table
+from companion.recording.tables.columns import Table
+from companion.tracking.geodesy import Place
 from companion.values import (
     AdsbVehicle,
     AltitudeDatum,
     Estimate,
+    FloatArray,
     Frame,
     Output,
     Rejection,
@@ -20,6 +25,7 @@ from companion.values import (
     Report,
     ReportNoise,
 )
+from companion.values.described import Inline, Meaning
 
 MESSAGES: Final = {
     GLOBAL_POSITION_INT: "GLOBAL_POSITION_INT",
@@ -31,37 +37,120 @@ MESSAGES: Final = {
 """Messages that are reports, or may be, by id."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Heard:
     """A report that was received: with its estimate where it was used, else why it was not.
 
-    ``said`` is None where the message could not be read.
+    ``said`` is None where the message could not be decoded.
     """
 
     frame: Frame
-    estimate: Estimate | None
+    estimate: Annotated[Estimate | None, Inline(omit=("reacquired",))]
     refused: Rejection | None
     said: Report | AdsbVehicle | None
 
     @property
-    def uav(self) -> str:
+    def arrival_ns(self) -> Annotated[int, Meaning("when it was received")]:
+        return self.frame.t_ns
+
+    @property
+    def uav(self) -> Annotated[str, Meaning("UAV whose position it is")]:
         if self.said is not None:
             return self.said.uav
         return self.refused.source if self.refused is not None else str(self.frame.source)
 
     @property
-    def position_deg(self) -> tuple[float, float] | None:
+    def message(self) -> Annotated[str, Meaning("name of the MAVLink message")]:
+        return MESSAGES[self.frame.msgid]
+
+    @property
+    def link(self) -> Annotated[str, Meaning("link or log that it came over")]:
+        return self.frame.link
+
+    @property
+    def sender(self) -> Annotated[str, Meaning("sender of the message: the UAV, or a relay")]:
+        return str(self.frame.source)
+
+    @property
+    def accepted(self) -> Annotated[bool, Meaning("whether it was used")]:
+        return self.estimate is not None
+
+    @property
+    def reason(self) -> Annotated[str | None, Meaning("why it was not used")]:
+        return None if self.refused is None else self.refused.reason
+
+    @property
+    def detail(self) -> Annotated[str | None, Meaning("the reason with its numbers")]:
+        return None if self.refused is None else self.refused.detail
+
+    @property
+    def true_ns(
+        self,
+    ) -> Annotated[int | None, Meaning("when the position was true, by the sender's clock")]:
+        return None if self.estimate is None else self.estimate.fix.t_ns
+
+    @property
+    def latency_s(self) -> Annotated[float | None, Meaning("time from then to the arrival")]:
+        return None if self.true_ns is None else (self.frame.t_ns - self.true_ns) * 1e-9
+
+    @property
+    def boot_s(self) -> Annotated[float | None, Meaning("the sender's clock since boot, as sent")]:
+        boot_ms = self._number("boot_ms")
+        return None if boot_ms is None else boot_ms / 1000
+
+    @property
+    def position(self) -> Annotated[Place | None, Inline(omit=("alt_m",))]:
         if isinstance(self.said, Report):
-            return self.said.lat_deg, self.said.lon_deg
-        return None if self.said is None else self.said.position_deg
+            return Place(self.said.lat_deg, self.said.lon_deg, self.said.alt_m)
+        known = None if self.said is None else self.said.position_deg
+        return None if known is None else Place(*known, 0.0)
 
     @property
-    def report(self) -> Report | None:
-        return self.said if isinstance(self.said, Report) else None
+    def alt_m(self) -> Annotated[float | None, Meaning("altitude above `alt_datum`")]:
+        return self._number("alt_m")
 
     @property
-    def noise(self) -> ReportNoise | None:
+    def alt_datum(
+        self,
+    ) -> Annotated[AltitudeDatum | None, Meaning("what `alt_m` is measured from")]:
+        return None if self.said is None else self.said.alt_datum
+
+    @property
+    def relative_alt_m(self) -> Annotated[float | None, Meaning("height above its home")]:
+        return self._number("relative_alt_m")
+
+    @property
+    def velocity_ned_mps(self) -> Annotated[FloatArray | None, Meaning("velocity as sent")]:
+        if self.said is None:
+            return None
+        down_mps = self.said.velocity_down_mps
+        level_mps = self.said.velocity_ne_mps or (math.nan, math.nan)
+        return np.array([*level_mps, math.nan if down_mps is None else down_mps])
+
+    @property
+    def heading_deg(
+        self,
+    ) -> Annotated[float | None, Meaning("heading from true north, as sent")]:
+        return self._number("heading_deg")
+
+    @property
+    def tslc_s(
+        self,
+    ) -> Annotated[float | None, Meaning("age of the position as a relay states it")]:
+        return self._number("tslc_s")
+
+    @property
+    def reacquired(self) -> Annotated[bool, Meaning("whether this report restarted the track")]:
+        return self.estimate is not None and self.estimate.reacquired
+
+    @property
+    def noise(self) -> Annotated[ReportNoise | None, Inline(prefix="noise_")]:
         return None if self.estimate is None else self.estimate.fix.noise
+
+    def _number(self, name: str) -> float | None:
+        """A number of the message; None where it has no such field."""
+        found: float | None = getattr(self.said, name, None)
+        return found
 
 
 def heard(frame: Frame, outputs: Sequence[Output]) -> Heard | None:
@@ -83,92 +172,6 @@ def heard(frame: Frame, outputs: Sequence[Output]) -> Heard | None:
     return Heard(frame, None, refused, said if isinstance(said, Report | AdsbVehicle) else None)
 
 
-def _of_said(heard: Heard, name: str) -> float | AltitudeDatum | None:
-    found: float | AltitudeDatum | None = getattr(heard.said, name, None)
-    return found
-
-
-def _degrees(heard: Heard, axis: int) -> float | None:
-    return None if heard.position_deg is None else heard.position_deg[axis]
-
-
-def _level_mps(heard: Heard, axis: int) -> float | None:
-    velocity = None if heard.said is None else heard.said.velocity_ne_mps
-    return None if velocity is None else velocity[axis]
-
-
-def _boot_s(heard: Heard) -> float | None:
-    boot_ms = None if heard.report is None else heard.report.boot_ms
-    return None if boot_ms is None else boot_ms / 1000
-
-
-def _true_ns(heard: Heard) -> int | None:
-    return None if heard.estimate is None else heard.estimate.fix.t_ns
-
-
-def _latency_s(heard: Heard) -> float | None:
-    true_ns = _true_ns(heard)
-    return None if true_ns is None else (heard.frame.t_ns - true_ns) * 1e-9
-
-
-def _of_noise(heard: Heard, name: str) -> float | None:
-    found: float | None = getattr(heard.noise, name, None)
-    return found
-
-
-def _of_estimate(heard: Heard, name: str) -> float | None:
-    found: float | None = getattr(heard.estimate, name, None)
-    return found
-
-
-_T, _N, _TIME, _INT, _TRUTH = Kind.TEXT, Kind.NUMBER, Kind.TIME, Kind.INTEGER, Kind.TRUTH
-
-# fmt: off
-REPORTS: Final = Table("reports", "a report received, over whatever message", (
-    Column("arrival_ns", _INT, "ns", "when it arrived, since 1970", lambda h: h.frame.t_ns),
-    Column("arrival_utc", _TIME, "UTC", "the same", lambda h: h.frame.t_ns),
-    Column("uav", _T, "", "whose position it is", lambda h: h.uav),
-    Column("message", _T, "", "the MAVLink message", lambda h: MESSAGES[h.frame.msgid]),
-    Column("link", _T, "", "the link, or the log, over which it came", lambda h: h.frame.link),
-    Column("sender", _T, "", "who sent the message: the UAV, or who relays it",
-           lambda h: h.frame.source),
-    Column("accepted", _TRUTH, "", "whether it was used", lambda h: h.estimate is not None),
-    Column("reason", _T, "", "why it was not used",
-           lambda h: None if h.refused is None else h.refused.reason),
-    Column("detail", _T, "", "more of that", lambda h: h.refused and h.refused.detail),
-    Column("true_utc", _TIME, "UTC", "when the position was true, by the sender's clock", _true_ns),
-    Column("latency_s", _N, "s", "from then to the arrival", _latency_s),
-    Column("boot_s", _N, "s", "the sender's clock since boot, as sent", _boot_s),
-    Column("tslc_s", _N, "s", "age of the position as a relay says",
-           lambda h: _of_said(h, "tslc_s")),
-    Column("lat_deg", _N, "deg", "latitude, WGS84", lambda h: _degrees(h, 0)),
-    Column("lon_deg", _N, "deg", "longitude, WGS84", lambda h: _degrees(h, 1)),
-    Column("alt_m", _N, "m", "height over `alt_datum`", lambda h: _of_said(h, "alt_m")),
-    Column("alt_datum", _T, "", "`msl`, `pressure` or `geometric`",
-           lambda h: _of_said(h, "alt_datum")),
-    Column("relative_alt_m", _N, "m", "height above its home",
-           lambda h: _of_said(h, "relative_alt_m")),
-    Column("velocity_north_mps", _N, "m/s", "velocity as sent", lambda h: _level_mps(h, 0)),
-    Column("velocity_east_mps", _N, "m/s", "velocity as sent", lambda h: _level_mps(h, 1)),
-    Column("velocity_down_mps", _N, "m/s", "velocity as sent",
-           lambda h: _of_said(h, "velocity_down_mps")),
-    Column("heading_deg", _N, "deg", "from true north, as sent",
-           lambda h: _of_said(h, "heading_deg")),
-    Column("noise_horizontal_m", _N, "m", "bound on the error of the position in the plane",
-           lambda h: _of_noise(h, "horizontal_m")),
-    Column("noise_vertical_m", _N, "m", "bound on the error of the height",
-           lambda h: _of_noise(h, "vertical_m")),
-    Column("noise_velocity_mps", _N, "m/s", "bound on the error of the velocity",
-           lambda h: _of_noise(h, "velocity_mps")),
-    Column("noise_time_s", _N, "s", "what the UAV's own lag leaves of error in `true_utc`",
-           lambda h: _of_noise(h, "time_s")),
-    Column("dt_s", _N, "s", "interval since the UAV's report before",
-           lambda h: _of_estimate(h, "dt_s")),
-    Column("innovation_m", _N, "m", "from where the UAV was expected to where it says it is",
-           lambda h: _of_estimate(h, "innovation_m")),
-    Column("bound_m", _N, "m", "bound on the error of that expectation",
-           lambda h: _of_estimate(h, "bound_m")),
-    Column("reacquired", _TRUTH, "", "whether the track was begun again with it",
-           lambda h: h.estimate is not None and h.estimate.reacquired),
-))
-# fmt: on
+REPORTS: Final = Table(
+    name="reports", row_is="a report received, over whatever message", row_class=Heard
+)

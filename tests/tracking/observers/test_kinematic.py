@@ -146,7 +146,7 @@ def test_a_greedy_adversary_reaches_the_bounds(
     fix: MakeFix, name: str, interval_s: float, along: tuple[float, float, float]
 ) -> None:
     """Noise that lags, as much as it may, of a UAV that gains speed for as long as it flies."""
-    observer, ahead = observing(name, speed_mps=1e6), np.array(along)
+    observer, ahead = observing(name, speed_max_mps=1e6), np.array(along)
     acceleration, state, step_ns = ACCELERATION_MPS2 * ahead, None, round(interval_s * S)
     size = NOISE.vertical_m if along[2] else NOISE.horizontal_m
     for number in range(60):
@@ -201,7 +201,7 @@ def test_no_plan_over_many_intervals_leaves_the_bounds(
     """Noise and acceleration along one axis, each step as the plan wants it: never outside, and
     in the best of the plans all but at the bound. The speed limit is out of reach."""
     rng, along, closest = np.random.default_rng(7), np.array(axis), 0.0
-    observer = observing(name, speed_mps=1e6)
+    observer = observing(name, speed_max_mps=1e6)
     for number in range(60):
         intervals, goals = planned(rng, observer, 40, 2.0 if number % 2 else 0.3)
         truth, error, t_s = np.zeros(2), np.zeros(2), 0.0
@@ -312,7 +312,7 @@ def test_two_positions_at_nearly_the_same_time_show_no_great_velocity(fix: MakeF
 def test_over_a_long_gap_the_greatest_speed_says_more(fix: MakeFix, gap_s: float) -> None:
     """Its own way and that of the prediction, however much it might have gained speed."""
     made = fix(0, [5, 5, 5], [20.0, 0, 0], noise=NOISE)
-    observer, free = observing(), observing(speed_mps=1e6)
+    observer, free = observing(), observing(speed_max_mps=1e6)
     limited = observer.predict(observer.begin(made), round(gap_s * S))
     unlimited = free.predict(free.begin(made), round(gap_s * S))
     assert limited.position_ned_m == unlimited.position_ned_m

@@ -89,7 +89,7 @@ def test_positions_alone_never_leave_the_bound(
     fix: MakeFix, feedthrough_s: float, alpha: float | None
 ) -> None:
     """Speed and noise bounded, nothing else; the sender's lead is by the same mean velocity."""
-    observer = observing(alpha, feedthrough_s, acceleration_mps2=STILL_MPS2)
+    observer = observing(alpha, feedthrough_s, acceleration_max_mps2=STILL_MPS2)
     worst = 0.0
     for adversary in adversaries(400):
         position, t_ns, state = np.zeros(3), 17 * S, None
@@ -193,7 +193,7 @@ def test_a_greedy_adversary_reaches_the_bound(
     fix: MakeFix, feedthrough_s: float, alpha: float | None
 ) -> None:
     """Knowing the gains to come, it takes noise and velocity as they hurt most: all of it."""
-    observer = observing(alpha, feedthrough_s, acceleration_mps2=STILL_MPS2)
+    observer = observing(alpha, feedthrough_s, acceleration_max_mps2=STILL_MPS2)
     along = np.array([0.6, 0.0, -0.8])
     reached = []
     for seed in range(100):

@@ -1,0 +1,185 @@
+"""What a value means where it leaves the program, declared once, beside the value.
+
+    age_s: Annotated[float, Meaning("age of the newest accepted report", 4)]
+
+Every way out derives from these declarations: the HTTP API and its OpenAPI document
+(``companion.server.models``), recordings (``companion.recording.schemas``), exported tables
+(``companion.recording.tables``), the reference pages of ``docs`` and the labels of the dashboard.
+
+A described class is a dataclass, a ``NamedTuple`` or a ``TypedDict``. A property is described in
+the annotation of what it returns. What has no ``Meaning`` stays inside the program.
+
+The name of a value ends in its unit. Each way out writes that unit in its own form, by rule:
+
+    inside, recording    API          export
+    azimuth_rad          azimuth_deg  azimuth_deg
+    azimuth_rate_radps   ..._degps    ..._degps
+    valid_at_ns          valid_at     valid_at_ns and valid_at_utc
+    velocity_ned_mps     as it is     velocity_north_mps, velocity_east_mps, velocity_down_mps
+"""
+
+import functools
+import operator
+import types
+import typing
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal, NamedTuple
+
+Way = Literal["api", "recording", "export"]
+"""A way out of the program."""
+NOWHERE: Final[Mapping[Way, str]] = types.MappingProxyType({})
+
+UNITS: Final = {
+    "m": "m", "s": "s", "ms": "ms", "ns": "ns", "deg": "deg", "rad": "rad", "db": "dB",
+    "dbm": "dBm", "hz": "Hz", "mps": "m/s", "mps2": "m/s²", "degps": "deg/s", "dps": "deg/s",
+    "radps": "rad/s", "ppm": "ppm", "bps": "bit/s", "bytes": "bytes", "utc": "UTC",
+}  # fmt: skip
+"""How the ending of a name writes its unit."""
+
+
+@dataclass(frozen=True, slots=True)
+class Meaning:
+    """What a value means, and how it leaves the program.
+
+    text        a phrase in plain English, without the unit, which the name has; it says what None
+                means where that is more than "unknown"
+    number      field number in the recording's protobuf message; None: not recorded
+    label       short name for tables and charts of the dashboard
+    example     for the OpenAPI document
+    wire        protobuf type, where the rule of ``companion.recording.schemas`` gives another
+    absent      ways out that lack it, each with the reason
+    deprecated  what to use instead: the value goes with the next version
+    """
+
+    text: str
+    number: int | None = None
+    label: str | None = None
+    example: Any = None
+    wire: str | None = None
+    absent: Mapping[Way, str] = field(default_factory=lambda: NOWHERE)
+    deprecated: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Inline:
+    """Marks a described value whose own members stand in place of it.
+
+    prefix  put before their names
+    omit    members that are left out
+    """
+
+    prefix: str = ""
+    omit: tuple[str, ...] = ()
+
+
+class Member(NamedTuple):
+    """One described value of a class.
+
+    name      as it is inside the program, an inlined one with its prefix
+    type      annotation without ``Annotated`` and without None
+    optional  whether it may be None
+    meaning   what it means
+    get       reads it from an instance
+    """
+
+    name: str
+    type: Any
+    optional: bool
+    meaning: Meaning
+    get: Callable[[Any], Any]
+
+
+def members(described: Any) -> tuple[Member, ...]:
+    """The described values of a class, in the order in which they are declared."""
+    found = _MEMBERS.get(described)
+    if found is None:
+        found = _MEMBERS[described] = tuple(_members(described))
+    return found
+
+
+_MEMBERS: Final[dict[Any, tuple[Member, ...]]] = {}
+
+
+def meaning(described: Any, name: str) -> Meaning:
+    """What one value of a class means. Raises ``KeyError`` where it is not described."""
+    return {member.name: member.meaning for member in members(described)}[name]
+
+
+def is_described(kind: Any) -> bool:
+    """True for a class whose values are described."""
+    return isinstance(kind, type) and not issubclass(kind, str | int) and bool(members(kind))
+
+
+def bare(annotation: Any) -> tuple[Any, bool]:
+    """An annotation without ``Annotated``, ``NewType`` and None, and whether it admits None."""
+    if typing.get_origin(annotation) is typing.Annotated:
+        return bare(typing.get_args(annotation)[0])
+    if isinstance(annotation, typing.NewType):
+        return bare(annotation.__supertype__)
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        kinds = [kind for kind in typing.get_args(annotation) if kind is not types.NoneType]
+        optional = len(kinds) < len(typing.get_args(annotation))
+        return functools.reduce(operator.or_, (bare(kind)[0] for kind in kinds)), optional
+    return annotation, False
+
+
+def unit(name: str) -> str:
+    """The unit in which a value of this name is written; empty where it has none."""
+    return UNITS.get(name.rpartition("_")[2], "") if "_" in name else ""
+
+
+def _members(described: type) -> Iterator[Member]:
+    for name, annotation in _annotations(described).items():
+        said = [one for one in _metadata(annotation) if isinstance(one, Meaning | Inline)]
+        if not said:
+            continue
+        kind, optional = bare(annotation)
+        get = _item(name) if typing.is_typeddict(described) else operator.attrgetter(name)
+        if isinstance(said[0], Meaning):
+            yield Member(name, kind, optional, said[0], get)
+            continue
+        for inner in members(kind):
+            if inner.name not in said[0].omit:
+                yield inner._replace(
+                    name=said[0].prefix + inner.name,
+                    optional=optional or inner.optional,
+                    get=_through(get, inner.get) if optional else _chain(get, inner.get),
+                )
+
+
+def _annotations(described: type) -> dict[str, Any]:
+    """Annotations of the fields and properties, those of base classes first."""
+    hints = typing.get_type_hints(described, include_extras=True)
+    found: dict[str, Any] = {}
+    for base in reversed(described.__mro__):
+        found |= {name: hints[name] for name in vars(base).get("__annotations__", ())}
+        for name, value in vars(base).items():
+            if isinstance(value, property) and value.fget is not None:
+                returned = typing.get_type_hints(value.fget, include_extras=True)
+                found[name] = returned.get("return")
+    return found
+
+
+def _metadata(annotation: Any) -> tuple[Any, ...]:
+    """What ``Annotated`` says, wherever it stands in an annotation."""
+    if typing.get_origin(annotation) is typing.Annotated:
+        inner, *said = typing.get_args(annotation)
+        return (*said, *_metadata(inner))
+    return ()
+
+
+def _item(name: str) -> Callable[[Any], Any]:
+    return lambda whole: whole[name]
+
+
+def _chain(outer: Callable[[Any], Any], inner: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    return lambda whole: inner(outer(whole))
+
+
+def _through(outer: Callable[[Any], Any], inner: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    def get(whole: Any) -> Any:
+        found = outer(whole)
+        return None if found is None else inner(found)
+
+    return get

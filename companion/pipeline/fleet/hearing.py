@@ -12,14 +12,13 @@ from typing import Final
 
 from companion.mavlink.trust.dedupe import content
 from companion.mavlink.trust.twins import Twins
-from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
+from companion.mavlink.wire.decode import GPS_RAW_INT, HEARTBEAT
 from companion.mavlink.wire.framing import MAGIC_V2, SHORTEST, examine
+from companion.mavlink.wire.positions import OWN
 from companion.pipeline.fleet.neighbours import NeighbourClock
 from companion.values import Frame, SharedFrame, Source
 
-HEARTBEAT: Final = 0
-GPS_RAW_INT: Final = 24
-SHARED: Final = frozenset((HEARTBEAT, GPS_RAW_INT, GLOBAL_POSITION_INT))
+SHARED: Final = OWN | {HEARTBEAT, GPS_RAW_INT}
 """Messages that nodes tell one another: where a vehicle is, how exact, and what it is."""
 KEPT_NS: Final = 10_000_000_000
 """How long it is remembered what was heard, and by whom."""
@@ -94,7 +93,7 @@ class Hearing:
     def heard(self, frame: Frame) -> bytes:
         """Take in a frame heard here, of a message in ``SHARED``. Returns its content."""
         key = content(frame.raw)
-        if frame.msgid != GLOBAL_POSITION_INT:
+        if frame.msgid not in OWN:
             return key
         self._heard.note(frame.t_ns, key)
         self._twins.refuses(HERE, HERE, frame)
@@ -141,7 +140,7 @@ class Hearing:
 
     def told(self, now_ns: int, node: str, frame: Frame, key: bytes) -> list[Frame]:
         """What the pipeline is to have, now that another node told a frame; mostly nothing."""
-        if frame.msgid == GLOBAL_POSITION_INT:
+        if frame.msgid in OWN:
             return self._report(now_ns, node, frame, key)
         ears = self._ears.get(frame.source)
         return [frame] if ears is None or ears.is_silent(now_ns - self.behind_ns) else []

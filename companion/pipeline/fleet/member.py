@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from companion.mavlink.trust.dedupe import content
-from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
+from companion.mavlink.wire.positions import OWN
 from companion.pipeline.fleet.assignment import worths_db
 from companion.pipeline.fleet.duties import Duties, Handover
 from companion.pipeline.fleet.hearing import SHARED, Hearing
@@ -156,7 +156,7 @@ class Member:
             if frame is None:
                 continue
             key = content(frame.raw)
-            if frame.msgid == GLOBAL_POSITION_INT:
+            if frame.msgid in OWN:
                 if not self.hearing.was_told(key):  # the second time it is late, and no matter
                     known.came(now_ns, now_ns - frame.t_ns + frame.doubt_ns)
                 self.sharing.told(now_ns, node, frame.source, key, way_ns)

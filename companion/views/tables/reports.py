@@ -4,10 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
-from companion.mavlink.wire.cot_link import TUNNEL
-from companion.mavlink.wire.decode import GLOBAL_POSITION_INT, decode
-from companion.mavlink.wire.remote_id import LOCATION, MESSAGE_PACK
-from companion.mavlink.wire.transponder import ADSB_VEHICLE
+from companion.mavlink.wire.decode import decode
+from companion.mavlink.wire.positions import POSITIONS
 from companion.recording.tables.columns import Column, Kind, Table
 from companion.values import (
     AdsbVehicle,
@@ -20,15 +18,6 @@ from companion.values import (
     Report,
     ReportNoise,
 )
-
-MESSAGES: Final = {
-    GLOBAL_POSITION_INT: "GLOBAL_POSITION_INT",
-    ADSB_VEHICLE: "ADSB_VEHICLE",
-    LOCATION: "OPEN_DRONE_ID_LOCATION",
-    MESSAGE_PACK: "OPEN_DRONE_ID_MESSAGE_PACK",
-    TUNNEL: "TUNNEL",
-}
-"""Messages that are reports, or may be, by id."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +55,7 @@ class Heard:
 
 def heard(frame: Frame, outputs: Sequence[Output]) -> Heard | None:
     """The report that a frame held, with what came of it; None where it held none."""
-    if frame.msgid not in MESSAGES:
+    if frame.msgid not in POSITIONS:
         return None
     for output in outputs:
         if isinstance(output, Estimate):
@@ -128,7 +117,7 @@ REPORTS: Final = Table("reports", "a report received, over whatever message", (
     Column("arrival_ns", _INT, "ns", "when it arrived, since 1970", lambda h: h.frame.t_ns),
     Column("arrival_utc", _TIME, "UTC", "the same", lambda h: h.frame.t_ns),
     Column("uav", _T, "", "whose position it is", lambda h: h.uav),
-    Column("message", _T, "", "the MAVLink message", lambda h: MESSAGES[h.frame.msgid]),
+    Column("message", _T, "", "the MAVLink message", lambda h: POSITIONS[h.frame.msgid].name),
     Column("link", _T, "", "the link, or the log, over which it came", lambda h: h.frame.link),
     Column("sender", _T, "", "who sent the message: the UAV, or who relays it",
            lambda h: h.frame.source),

@@ -60,7 +60,7 @@ from companion.values import (
     Track,
     Update,
     UtcNs,
-    reports_itself,
+    kind_of,
 )
 
 DROP_EVERY: Final = 100
@@ -200,7 +200,7 @@ class Pipeline:
         if isinstance(accepted, Rejection):
             return [*said, accepted]
         self.refusals.used(fix.uav)
-        if not reports_itself(fix.uav):
+        if not kind_of(fix.uav).reports_itself:
             near = self.targets.betters(fix.uav, self.tracker.near(fix.position_ned_m, NEAR_M))
             self.targets.compare(fix, self._tracks(near, fix.t_ns, fix.t_ns))
         if accepted.reacquired:
@@ -380,7 +380,7 @@ class Pipeline:
 
     def reporters(self) -> list[Source]:
         """Senders that report their own position, the carrier among them."""
-        return [Source.parse(uav) for uav in filter(reports_itself, self.tracker.uavs)]
+        return [Source.parse(uav) for uav in self.tracker.uavs if kind_of(uav).reports_itself]
 
     def clock_estimate(self, uav: str) -> ClockEstimate | None:
         """The state of a UAV's clock; None for a UAV that has none."""

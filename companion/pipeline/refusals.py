@@ -4,7 +4,7 @@ from collections import Counter, OrderedDict, deque
 from dataclasses import dataclass, field
 from typing import Final
 
-from companion.values import Notice, Reason, Rejection, Severity, reports_itself
+from companion.values import Notice, Reason, Rejection, Severity, kind_of
 
 UNHEARD_NS: Final = 1_000_000_000
 """Time for which no report of a sender is used before that is told."""
@@ -66,7 +66,7 @@ class Refusals:
         """
         self._count(refused)
         uav = refused.source
-        if refused.reason not in OF_REPORTS or not reports_itself(uav):
+        if refused.reason not in OF_REPORTS or not kind_of(uav).reports_itself:
             return None
         run = self._unheard.get(uav)
         if run is None:

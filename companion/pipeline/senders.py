@@ -42,7 +42,7 @@ from companion.values import (
     Severity,
     Source,
     SystemTime,
-    reports_itself,
+    kind_of,
 )
 
 CLOCKS_MAX: Final = 4096
@@ -239,7 +239,8 @@ class Senders:
         """
         assert report.boot_ms is not None
         uav, t_ns = report.uav, report.t_ns
-        if uav not in self._clocks and len(self._clocks) >= CLOCKS_MAX and not reports_itself(uav):
+        is_own = kind_of(uav).reports_itself
+        if uav not in self._clocks and len(self._clocks) >= CLOCKS_MAX and not is_own:
             return _refused(report, Reason.TOO_MANY)  # any number of names can be made up
         stamp, restarted = self._stamp(uav, t_ns, report.boot_ms, doubt_ns)
         said = _restart_notice(t_ns, uav, report.boot_ms) if restarted else ()
@@ -254,7 +255,7 @@ class Senders:
         lag_ns = round(assumed.lag_middle_s * 1e9)
         errors = replace(errors, time_s=assumed.lag_rest_s, apart_m=self._apart(report))
         true_ns = t_ns - round(stamp.latency_s * 1e9) - lag_ns
-        known = errors if reports_itself(uav) else None
+        known = errors if is_own else None
         placed = PlacedReport(report, stamp.sender_ns - lag_ns, true_ns, known, assumed.limits)
         return Heard(placed, said, restarted, self._clock(uav).change)
 
@@ -326,7 +327,7 @@ class Senders:
         waits ``always``.
         """
         receiver = self._receivers.get(report.source)
-        if receiver is None or not reports_itself(report.uav):
+        if receiver is None or not kind_of(report.uav).reports_itself:
             return True
         if receiver.fix_type >= FIX_3D and abs(receiver.alt_m - report.alt_m) < NEAR_HEIGHT_M:
             self._waits.pop(report.uav, None)
@@ -394,7 +395,7 @@ class Senders:
         if uav not in self._known:
             if len(self._known) >= CLOCKS_MAX:  # a cache only
                 self._known.clear()
-            heard = self.presence.get(Source.parse(uav)) if reports_itself(uav) else None
+            heard = self.presence.get(Source.parse(uav)) if kind_of(uav).reports_itself else None
             what = (None, None) if heard is None else (heard.mav_type, heard.autopilot)
             self._known[uav] = assembly.assumed(self._settings, uav, *what)
         return self._known[uav]

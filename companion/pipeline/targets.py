@@ -11,8 +11,7 @@ from companion.values import (
     Severity,
     Track,
     TrackState,
-    reports_itself,
-    standing,
+    kind_of,
 )
 
 
@@ -36,7 +35,7 @@ class Targets:
         """Whether a beam is wanted for this UAV."""
         if uav == self._carrier or self.same_as(uav) is not None:
             return False
-        return self._all or reports_itself(uav)
+        return self._all or kind_of(uav).reports_itself
 
     def among(self, uavs: Iterable[str]) -> list[str]:
         """The UAVs for which beams are wanted, in the order given."""
@@ -64,8 +63,8 @@ class Targets:
         Telemetry before Remote ID, ADS-B and Cursor on Target, in this order; who is known by
         another track himself is none of them.
         """
-        own = standing(uav)
-        return [one for one in others if standing(one) < own and self.same_as(one) is None]
+        own = kind_of(uav).rank
+        return [one for one in others if kind_of(one).rank < own and self.same_as(one) is None]
 
     def compare(self, relayed: Fix, better: list[Track]) -> None:
         """Compare a relayed aircraft with tracks near it that are better known, at its time.

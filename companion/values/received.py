@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
-from companion.values.names import Source
+from companion.values.names import Source, UavKind
 
 
 class Frame(NamedTuple):
@@ -142,7 +142,7 @@ class AdsbVehicle:
     @property
     def uav(self) -> str:
         """The aircraft's name here: ``icao:`` and six hexadecimal digits."""
-        return f"icao:{self.icao:06X}"
+        return UavKind.ADSB.uav(f"{self.icao:06X}")
 
 
 @dataclass(frozen=True, slots=True)

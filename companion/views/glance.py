@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from companion.pipeline.fold import Pipeline
-from companion.values import Level, Notice, Verdict, reports_itself
+from companion.values import Level, Notice, Verdict, kind_of
 from companion.views import health, link_state
 from companion.views.state import Node, summary
 from companion.views.words import rfc3339
@@ -34,7 +34,7 @@ def glance(node: Node) -> Json:
             | {"bound_m": track.bound_m}
             | health.verdict(verdicts.get(track.uav), machine, pipeline.utc_ns)
             for track in (update.tracks if update else ())
-            if reports_itself(track.uav)
+            if kind_of(track.uav).reports_itself
         ],
         **node.rates(),
         "recording": {

@@ -18,7 +18,7 @@ from companion.mavlink.wire.encode import (
 )
 from companion.pipeline.fold import Pipeline
 from companion.tracking.noise import GEOID_M
-from companion.values import AltitudeDatum, Source, Track, TrackState, reports_itself
+from companion.values import AltitudeDatum, Source, Track, TrackState, kind_of
 
 KNOWN: Final = (TrackState.LIVE, TrackState.COASTING)
 _REBOOT_MS: Final = 60_000
@@ -41,7 +41,7 @@ class Positions:
         found = [
             message
             for track in tracks
-            if reports_itself(track.uav)
+            if kind_of(track.uav).reports_itself
             and track.state in KNOWN
             and (message := self._one(pipeline, track)) is not None
         ]

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from companion.mavlink.wire import accuracy
-from companion.values import Accuracy, AltitudeDatum, Frame, RemoteId, Report
+from companion.values import Accuracy, AltitudeDatum, Frame, RemoteId, Report, UavKind
 
 BASIC_ID: Final = 12900
 LOCATION: Final = 12901
@@ -178,7 +178,7 @@ def _located(said: RemoteId, at: _Place) -> RemoteId:
     report = Report(
         t_ns=said.t_ns,
         link=said.link,
-        uav=f"rid:{said.heard_as}",
+        uav=UavKind.REMOTE_ID.uav(said.heard_as),
         source=said.source,
         lat_deg=at.lat_1e7 * 1e-7,
         lon_deg=at.lon_1e7 * 1e-7,

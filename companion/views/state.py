@@ -240,7 +240,7 @@ def uav(
             "source": str(track.limits.source),
             "speed_max_mps": track.limits.speed_mps,
             "acceleration_max_mps2": track.limits.acceleration_mps2,
-            "refuted": pipeline.assumptions.times(track.uav),
+            "refuted": pipeline.refuted(track.uav),
         },
         "clock_bound_s": track.clock_bound_s,
         "clock": clock(pipeline.clock_estimate(track.uav)),

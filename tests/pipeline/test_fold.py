@@ -623,7 +623,6 @@ def test_frames_that_nobody_reads_are_counted_and_no_more() -> None:
     beat = dialect.MAVLink_heartbeat_message(2, 3, 128, 0, 4, 3)
     assert pipeline.step(sent(0, "1:1", beat)) == []
     assert pipeline.frames == 2
-    assert pipeline.senders.presence[Source(1, 1)].armed
     assert pipeline.digest.hexdigest() == before
 
 
@@ -913,8 +912,9 @@ def test_no_more_are_tracked_than_the_settings_allow() -> None:
 
 def test_clocks_of_those_without_a_track_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """Invented senders do not fill the memory; who has a track, and the carrier, keep theirs."""
-    monkeypatch.setattr("companion.pipeline.senders.CLOCKS_MAX", 10)
-    monkeypatch.setattr("companion.pipeline.senders.CLOCKS_AT_ONCE", 2)
+    monkeypatch.setattr("companion.pipeline.records.RECORDS_MAX", 10)
+    monkeypatch.setattr("companion.pipeline.senders.RECORDS_MAX", 10)
+    monkeypatch.setattr("companion.pipeline.records.DROPPED_AT_ONCE", 2)
     pipeline = Pipeline(settings(tracks={"most": 2}))
     pipeline.step(attitude(0, "5:1"))  # the carrier has no position, and so no track
     for sysid in range(11, 61):

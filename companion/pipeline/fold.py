@@ -199,11 +199,11 @@ class Pipeline:
         if begins and not self.senders.vouch(report, self.center.seeks_home):
             return [Rejection(report.t_ns, report.uav, Reason.NO_FIX)]
         fix, begun = self.center.fix(placed)
-        fix, refuted = self.tracker.refuted(fix)
+        accepted, refuted = self.tracker.accept(fix)
         said: list[Output] = [*begun, *self._told(refuted)]
-        accepted = self.tracker.accept(fix)
         if isinstance(accepted, Rejection):
             return [*said, accepted]
+        fix = accepted.fix  # with what reports have shown of its bounds
         self.refusals.used(fix.uav)
         if not kind_of(fix.uav).reports_itself:
             near = self.targets.betters(fix.uav, self.tracker.near(fix.position_ned_m, NEAR_M))

@@ -146,5 +146,5 @@ def test_made_up_names_take_no_memory(fix: MakeFix) -> None:
     assert identities.same_as(AIRCRAFT) == "1:1"
     for number in range(RELAYED_MAX):
         identities.observe(replace(relayed(fix, 9, here), uav=f"cot:{number}"), [])
-    assert len(identities._counts) == RELAYED_MAX
+    assert len(identities._relayed) == RELAYED_MAX
     assert identities.same_as(AIRCRAFT) is None

@@ -196,7 +196,7 @@ class Pipeline:
     def _report(self, placed: PlacedReport) -> list[Output]:
         report = placed.report
         begins = self.center.seeks_home or report.uav not in self.tracker
-        if begins and not self.senders.vouch(report, self.center.seeks_home):
+        if begins and not self.senders.may_begin(report, self.center.seeks_home):
             return [Rejection(report.t_ns, report.uav, Reason.NO_FIX)]
         fix, begun = self.center.fix(placed)
         accepted, refuted = self.tracker.accept(fix)

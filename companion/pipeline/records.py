@@ -38,7 +38,7 @@ class Records(dict[str, _T]):
         return self.setdefault(uav, self._make())
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Unused:
     """A run of reports of which none was used: since when, and why the newest was not."""
 
@@ -48,7 +48,7 @@ class Unused:
     is_told: bool = False
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class UavRecord:
     """What is remembered of a UAV until it is restarted or its track is dropped.
 

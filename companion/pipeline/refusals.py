@@ -60,7 +60,7 @@ class Refusals:
             return None
         record = self._records[uav]
         if record.unused is None:
-            record.unused = Unused(refused.t_ns, refused.reason)
+            record.unused = Unused(since_ns=refused.t_ns, reason=refused.reason)
         run = record.unused
         run.reports += 1
         run.reason = refused.reason

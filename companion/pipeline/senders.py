@@ -1,7 +1,8 @@
-"""Senders of frames: who sent a message, and when it was true. Every frame comes here first.
+"""Senders of frames: which of them sent a message, and when it was true. Every frame comes here.
 
-Each sender has a clock, bounds on the noise of its reports, and a presence. A message leaves here
-with its time on the sender's and on the node's timeline, or as a rejection with its reason.
+There is a record of each sender's clock, and one of what each component says beside positions:
+heartbeat, GNSS status, and the bounds on noise that follow from it. A message leaves here with its
+time on the sender's and on the node's timeline, or as a rejection with its reason.
 
 Over 300 lines: every kind of message comes through here.
 """
@@ -127,7 +128,7 @@ class Sender:
     is_shared: bool = False
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Component:
     """What a MAVLink component says beside positions.
 
@@ -150,9 +151,10 @@ class Component:
 class Senders:
     """All senders of frames.
 
-    ``carrier`` is admitted whatever the lists say, and is the only one whose attitude is used.
-    ``records`` are those of the UAVs, ``tracked`` are those who have a track at any time: their
-    clocks are kept.
+        carrier  id of the vehicle that carries the array: it is admitted whatever the lists say,
+                 and only its attitude is used
+        records  those of the UAVs
+        tracked  ids of the present tracks, whose clocks are kept
 
     Clocks are kept by the id under which reports are tracked: aircraft of Remote ID and Cursor on
     Target have a clock, and no MAVLink source of their own.
@@ -346,7 +348,7 @@ class Senders:
         placed = None if stamp is None else PlacedAttitude(attitude, stamp.sender_ns)
         return Heard(placed, said, carrier if said else None, sender.clock.change)
 
-    def vouch(self, report: Report, always: bool) -> bool:
+    def may_begin(self, report: Report, always: bool) -> bool:
         """Take in a report that would begin a track. Returns whether one may begin with it.
 
         Its sender's receiver, if one was heard, has to have a 3-D fix near the report's height. For

@@ -105,7 +105,3 @@ class Refusals:
     def of(self, sender: str) -> OfSender:
         """The rejections of one sender; empty for one that is not known."""
         return self._senders.get(sender) or OfSender()
-
-    def senders(self) -> list[str]:
-        """Senders with rejections, the one with the newest last."""
-        return list(self._senders)

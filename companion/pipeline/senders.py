@@ -169,7 +169,6 @@ class Senders:
     ) -> None:
         self.aircraft = Aircraft()  # by ICAO address, over all relays
         self.remote_ids = RemoteIds()  # by radio address, for each receiver
-        self._settings = settings
         self._carrier = carrier
         self._carrier_source = None if carrier is None else Source.parse(carrier)
         self._records = records

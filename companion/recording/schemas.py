@@ -30,7 +30,9 @@ from google.protobuf.message_factory import GetMessageClass
 from companion.values import Frame
 
 # A field is "[repeated|optional] type name"; its number is its place in the list, so fields are
-# only ever appended: a number that has been written once keeps its meaning.
+# only ever appended: a number that has been written once keeps its meaning. A field that is gone
+# leaves RESERVED in its place.
+RESERVED: Final = "reserved"
 _MESSAGES: Final[dict[str, list[str]]] = {
     "Frame": ["fixed64 t_ns", "string link", "uint32 sysid", "uint32 compid", "uint32 msgid",
               "bytes raw", "uint64 doubt_ns"],
@@ -64,7 +66,7 @@ _MESSAGES: Final[dict[str, list[str]]] = {
                "fixed64 told_ns"],
     "Served": ["string uav", "double worth_db"],
     "Handing": ["string uav", "string to"],
-    "Standing": ["string node", "fixed64 started_ns", "fixed64 t_ns", "repeated double place",
+    "Standing": ["string node", RESERVED, RESERVED, "repeated double place",
                  "optional double reach_m", "uint32 most", "repeated Served serves",
                  "repeated Handing handing"],
     "Offer": ["string uav", "optional double sure_db", "optional double likely_db",
@@ -125,7 +127,10 @@ def _describe() -> FileDescriptorProto:
     for message, fields in _MESSAGES.items():
         described = file.message_type.add(name=message)
         for number, declared in enumerate(fields, start=1):
-            _describe_field(described, number, declared)
+            if declared == RESERVED:
+                described.reserved_range.add(start=number, end=number + 1)
+            else:
+                _describe_field(described, number, declared)
     return file
 
 

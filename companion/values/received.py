@@ -88,7 +88,6 @@ class Report:
     """
 
     t_ns: int
-    link: str
     uav: str
     source: Source
     lat_deg: float
@@ -112,7 +111,6 @@ class AdsbVehicle:
         t_ns               when it arrived, node time
         icao               24-bit ICAO address of the aircraft
         source             the relay, not the aircraft
-        emitter_type       MAVLink's ADSB_EMITTER_TYPE, which includes ground vehicles and obstacles
         position_deg       latitude, longitude
         alt_m, alt_datum   height and what it is measured from; both None or neither
         heading_deg        from true north, clockwise
@@ -125,11 +123,9 @@ class AdsbVehicle:
     """
 
     t_ns: int
-    link: str
     icao: int
     source: Source
     callsign: str | None
-    emitter_type: int
     position_deg: tuple[float, float] | None
     alt_m: float | None
     alt_datum: AltitudeDatum | None
@@ -160,7 +156,6 @@ class RemoteId:
     """
 
     t_ns: int
-    link: str
     source: Source
     heard_as: str
     uas_id: str | None = None
@@ -197,8 +192,6 @@ class Presence:
     source: Source
     mav_type: int
     autopilot: int
-    system_status: int
-    armed: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +205,6 @@ class GnssStatus:
     t_ns: int
     source: Source
     fix_type: int
-    satellites: int | None
     alt_m: float
     h_acc_m: float | None
     v_acc_m: float | None

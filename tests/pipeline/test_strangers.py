@@ -44,7 +44,7 @@ MS = 1_000_000
 def fix(uav: str, t_s: float) -> Fix:
     t_ns = round(t_s * S)
     report = Report(
-        t_ns, "udp", uav, Source(1, 1), 47.0, 8.0, 500.0, AltitudeDatum.MSL, None, None, None,
+        t_ns, uav, Source(1, 1), 47.0, 8.0, 500.0, AltitudeDatum.MSL, None, None, None,
         None, 1000, None,
     )  # fmt: skip
     place = (10.0 * t_s, 0.0, -50.0)

@@ -88,7 +88,7 @@ DEFAULT = ReportNoise(3.0, 3.0, 3.0, 0.5)
 
 
 def status(h: float | None, v: float | None, vel: float | None) -> GnssStatus:
-    return GnssStatus(0, Source(1, 1), 3, 12, 500.0, h, v, vel)
+    return GnssStatus(0, Source(1, 1), 3, 500.0, h, v, vel)
 
 
 @pytest.mark.parametrize(

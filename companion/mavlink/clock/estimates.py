@@ -76,7 +76,6 @@ class ClockEstimate:
     before_s          how much greater the offset may be: a thing that is put at a sender time
                       may have been that much earlier
     after_s           how much less it may be
-    usual_s           by how much the estimate usually is off: no bound
     drift_ppm         drift beyond the greatest taken for possible that has shown itself; 0
                       without any
     constant_delay_s  depth of the offset below the floor of the stamps, which is the latency of
@@ -89,7 +88,6 @@ class ClockEstimate:
     offset_ns: int
     before_s: float
     after_s: float
-    usual_s: float
     drift_ppm: float
     constant_delay_s: float
     latency_s: float

@@ -132,7 +132,6 @@ class Component:
     """The service as a MAVLink component. Times are node times and do not go back."""
 
     def __init__(self, settings: ComponentSpec) -> None:
-        self.settings = settings
         self._source = settings.source
         self._rates = MessageRates(
             settings.source, settings.carrier, settings.position_hz, settings.attitude_hz

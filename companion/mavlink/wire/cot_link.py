@@ -196,7 +196,6 @@ def report(frame: Frame) -> Report | None:
             down = -speed_mps * math.tan(math.radians(slope_deg))
     return Report(
         t_ns=frame.t_ns,
-        link=frame.link,
         uav=UavKind.COT.uav(name),
         source=frame.source,
         lat_deg=lat * 1e-7,

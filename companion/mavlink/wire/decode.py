@@ -96,7 +96,6 @@ def _own_position(frame: Frame) -> Report:
     velocity = said.velocity_ned_mps
     return Report(
         t_ns=frame.t_ns,
-        link=frame.link,
         uav=str(frame.source),
         source=frame.source,
         lat_deg=lat_deg,
@@ -126,7 +125,7 @@ def _adsb_vehicle(frame: Frame) -> AdsbVehicle:
     """
     fields = _ADSB_VEHICLE.unpack(frame.payload.ljust(_ADSB_VEHICLE.size, b"\0")[:38])
     icao, lat, lon, alt_mm, heading_cdeg, speed_cmps, climb_cmps, flags = fields[:8]
-    altitude_type, callsign, emitter_type, tslc_s = fields[9:]
+    altitude_type, callsign, _, tslc_s = fields[9:]
     if not 0 < icao <= _ICAO_MAX:
         raise _RefusedError(Reason.MALFORMED, f"ICAO address {icao:#x}")
     heading_deg = heading_cdeg * 1e-2 if flags & _HEADING and heading_cdeg <= 36_000 else None
@@ -137,11 +136,9 @@ def _adsb_vehicle(frame: Frame) -> AdsbVehicle:
     datum = _DATUM.get(altitude_type) if flags & _ALTITUDE else None
     return AdsbVehicle(
         t_ns=frame.t_ns,
-        link=frame.link,
         icao=icao,
         source=frame.source,
         callsign=_callsign(callsign) if flags & _CALLSIGN else None,
-        emitter_type=emitter_type,
         position_deg=_position(lat, lon) if flags & _COORDS else None,
         alt_m=alt_mm * 1e-3 if datum is not None else None,
         alt_datum=datum,
@@ -180,12 +177,11 @@ def _attitude(frame: Frame) -> Attitude:
 
 
 _HEARTBEAT = struct.Struct("<IBBBBB")
-_ARMED: Final = 128
 
 
 def _heartbeat(frame: Frame) -> Presence:
-    _, mav_type, autopilot, base_mode, status, _ = unpack(frame, _HEARTBEAT)
-    return Presence(frame.t_ns, frame.source, mav_type, autopilot, status, bool(base_mode & _ARMED))
+    _, mav_type, autopilot, *_ = unpack(frame, _HEARTBEAT)
+    return Presence(frame.t_ns, frame.source, mav_type, autopilot)
 
 
 _UNKNOWN: Final = 0xFFFF_FFFF
@@ -200,12 +196,11 @@ def _stated(thousandths: int) -> float | None:
 def _gps_raw_int(frame: Frame) -> GnssStatus:
     """Decode fix type and accuracies; the accuracies are extension fields, 0 where not sent."""
     fields = unpack(frame, _GPS_RAW_INT)
-    fix_type, satellites, h_acc, v_acc, vel_acc = fields[8], fields[9], *fields[11:14]
+    h_acc, v_acc, vel_acc = fields[11:14]
     return GnssStatus(
         t_ns=frame.t_ns,
         source=frame.source,
-        fix_type=fix_type,
-        satellites=None if satellites == 255 else satellites,
+        fix_type=fields[8],
         alt_m=fields[3] * 1e-3,
         h_acc_m=_stated(h_acc),
         v_acc_m=_stated(v_acc),

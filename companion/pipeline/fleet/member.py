@@ -71,7 +71,6 @@ class Member:
         self.reach_m: float | None = None
         self.near: frozenset[str] = frozenset()
         self._nulls = settings.nulls
-        self._started_ns = started_ns
         self._duty: tuple[tuple[str, ...], tuple[str, ...]] | None = None
         self._looked_ns = started_ns
 
@@ -277,14 +276,12 @@ class Member:
         for node in others.keys() - self.near:  # they are out of date from now on
             self.neighbours[node].offers = None
         return Standing(
-            self.name,
-            self._started_ns,
-            now_ns,
-            place,
-            reach_m,
-            self.most,
-            tuple(self.duties.serves.items()),
-            tuple(self.duties.handing.items()),
+            node=self.name,
+            place=place,
+            reach_m=reach_m,
+            most=self.most,
+            serves=tuple(self.duties.serves.items()),
+            handing=tuple(self.duties.handing.items()),
         )
 
     def _neighbour(self, now_ns: int, node: str) -> Neighbour | None:

@@ -1,6 +1,5 @@
 """What reports refute, told once: which assumption was wrong, and by which setting it is held."""
 
-from collections.abc import Iterable
 from typing import Final
 
 from companion.mavlink.clock.estimates import ClockChange
@@ -21,10 +20,10 @@ SILENT_NS: Final = 60_000_000_000
 """Time for which a change of a clock or link is not told again."""
 
 
-def told(records: UavRecords, refuted: Iterable[Refuted]) -> list[Refuted | Notice]:
+def told(records: UavRecords, *refuted: Refuted | None) -> list[Refuted | Notice]:
     """The refutations, each followed by a notice if it goes beyond what was reported before."""
     out: list[Refuted | Notice] = []
-    for one in refuted:
+    for one in filter(None, refuted):
         out.append(one)
         record = records[one.uav]
         record.refuted += 1

@@ -52,7 +52,6 @@ from companion.values import (
     Notice,
     Output,
     Reason,
-    Refuted,
     Rejection,
     Severity,
     Source,
@@ -176,10 +175,9 @@ class Pipeline:
         elif isinstance(heard.message, PlacedAttitude):
             turn_degps2 = self.senders.assumed(str(frame.source)).turn_degps2
             refuted = self.center.turn(heard.message, turn_degps2)
-            said += self._told([] if refuted is None else [refuted])
+            said += assumptions.told(self.records, refuted)
         elif isinstance(heard.message, EstimatorStatus):
-            refuted = self.center.trust(heard.message)
-            said += self._told([] if refuted is None else [refuted])
+            said += assumptions.told(self.records, self.center.trust(heard.message))
         return said
 
     def _changed(self, t_ns: int, sender: str, change: ClockChange) -> list[Output]:
@@ -190,9 +188,6 @@ class Pipeline:
         record = self.records[sender]
         return [*assumptions.clock_changed(record, t_ns, sender, change, drift_max_ppm)]
 
-    def _told(self, refuted: Iterable[Refuted]) -> list[Refuted | Notice]:
-        return assumptions.told(self.records, refuted)
-
     def _report(self, placed: PlacedReport) -> list[Output]:
         report = placed.report
         begins = self.center.seeks_home or report.uav not in self.tracker
@@ -200,14 +195,14 @@ class Pipeline:
             return [Rejection(report.t_ns, report.uav, Reason.NO_FIX)]
         fix, begun = self.center.fix(placed)
         accepted, refuted = self.tracker.accept(fix)
-        said: list[Output] = [*begun, *self._told(refuted)]
+        said: list[Output] = [*begun, *assumptions.told(self.records, *refuted)]
         if isinstance(accepted, Rejection):
             return [*said, accepted]
         fix = accepted.fix  # with what reports have shown of its bounds
         self.refusals.used(fix.uav)
         if not kind_of(fix.uav).reports_itself:
             near = self.targets.betters(fix.uav, self.tracker.near(fix.position_ned_m, NEAR_M))
-            self.targets.compare(fix, self._tracks(near, fix.t_ns, fix.t_ns))
+            self.targets.identities.observe(fix, self._tracks(near, fix.t_ns, fix.t_ns))
         if accepted.reacquired:
             said.append(assumptions.jumped(self.records[fix.uav], accepted))
             said += self._move_home(placed, accepted)

@@ -219,8 +219,10 @@ class Senders:
         match message:
             case GnssStatus():
                 component = self._heard(message)
-                if not _is_outdated(component.stated_us, message.time_us):
-                    component.stated_us = message.time_us
+                stated_us, newest_us = message.time_us, component.stated_us
+                # What is older comes over a second link that lags behind.
+                if not 0 < stated_us < newest_us <= stated_us + STATED_LATE_US:
+                    component.stated_us = stated_us
                     component.noise = noise.reported(message, self._noise_settings)
                     component.receiver = message
             case SystemTime():
@@ -440,11 +442,6 @@ class Senders:
 
 def _refused(message: Report | AdsbVehicle, reason: Reason) -> Heard:
     return Heard(said=(Rejection(message.t_ns, message.uav, reason),))
-
-
-def _is_outdated(newest_us: int, stated_us: int) -> bool:
-    """Whether a receiver has said something newer, as where a second link lags behind."""
-    return 0 < stated_us < newest_us <= stated_us + STATED_LATE_US
 
 
 def _shared_id(sender: Sender, uav: str, t_ns: int) -> tuple[Notice | Rejection, ...]:

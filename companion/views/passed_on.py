@@ -104,7 +104,7 @@ def events(pipeline: Pipeline, tracks: Iterable[Track], stale_s: float) -> list[
     return [
         _event(pipeline, track, stale_s)
         for track in tracks
-        if track.state in KNOWN and pipeline.targets.same_as(track.uav) is None
+        if track.state in KNOWN and pipeline.targets.identities.same_as(track.uav) is None
     ]
 
 

@@ -212,7 +212,7 @@ def uav(
         **health.verdict(judged, machine, pipeline.utc_ns, unserved),
         "target": is_target,
         "served_by": served.by.get(track.uav, []) if served and is_target else None,
-        "same_as": pipeline.targets.same_as(track.uav),
+        "same_as": pipeline.targets.identities.same_as(track.uav),
         "callsign": pipeline.senders.aircraft.callsign(track.uav),
         "relays": [str(relay) for relay in pipeline.senders.aircraft.relays(track.uav)],
         "altitude_datum": str(newest.report.alt_datum) if newest else None,

@@ -818,8 +818,8 @@ def test_own_telemetry_and_adsb_of_one_aircraft_get_one_beam() -> None:
         pipeline.step(adsb(n + 0.1, (here[0] + 8, 30.0, -130.0)))
         update = updated(pipeline, n + 0.2)
         assert set(update.beams.uavs) == ({"1:1", "icao:4CA7B3"} if n < 4 else {"1:1"})
-    assert pipeline.targets.same_as("icao:4CA7B3") == "1:1"
-    assert pipeline.targets.same_as("1:1") is None
+    assert pipeline.targets.identities.same_as("icao:4CA7B3") == "1:1"
+    assert pipeline.targets.identities.same_as("1:1") is None
     assert not pipeline.targets.wants("icao:4CA7B3")
 
 

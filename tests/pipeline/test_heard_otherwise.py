@@ -115,13 +115,17 @@ def test_one_aircraft_that_is_heard_three_ways_gets_one_beam() -> None:
         fold.step(transponder(n + 0.1))
         beams = set(updated(fold, n + 0.2).beams.uavs)
         assert beams == ({RID, "icao:4CA7B3"} if n < 4 else {RID})
-    assert fold.targets.same_as("icao:4CA7B3") == RID
+    assert fold.targets.identities.same_as("icao:4CA7B3") == RID
     for n in range(12, 24):
         fold.step(telemetry(n))
         fold.step(broadcast(n + 0.05))
         fold.step(transponder(n + 0.1))
     assert set(updated(fold, 24).beams.uavs) == {"1:1"}
-    assert fold.targets.same_as(RID) == fold.targets.same_as("icao:4CA7B3") == "1:1"
+    assert (
+        fold.targets.identities.same_as(RID)
+        == fold.targets.identities.same_as("icao:4CA7B3")
+        == "1:1"
+    )
 
 
 def test_an_event_of_an_aircraft_that_is_known_better_is_that_one() -> None:
@@ -130,7 +134,7 @@ def test_an_event_of_an_aircraft_that_is_known_better_is_that_one() -> None:
         fold.step(transponder(n))
         fold.step(event(n))
     assert set(updated(fold, 12).beams.uavs) == {"icao:4CA7B3"}
-    assert fold.targets.same_as("cot:HAWK") == "icao:4CA7B3"
+    assert fold.targets.identities.same_as("cot:HAWK") == "icao:4CA7B3"
 
 
 def test_an_events_errors_are_its_bounds_and_late_is_late() -> None:

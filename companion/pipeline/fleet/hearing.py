@@ -6,7 +6,7 @@ a vehicle that is heard here is held against what is heard (``mavlink/trust/twin
 missed here is taken up when the vehicle falls silent.
 """
 
-from collections import deque
+from collections import OrderedDict, deque
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -39,17 +39,15 @@ class Recent:
     """Contents of frames, each remembered for ``KEPT_NS`` after it was first noted."""
 
     def __init__(self) -> None:
-        self._seen: dict[bytes, int] = {}
-        self._order: deque[tuple[int, bytes]] = deque()
+        self._seen: OrderedDict[bytes, int] = OrderedDict()
 
     def note(self, now_ns: int, key: bytes) -> bool:
         """Note a content. Returns whether it is new."""
-        while self._order and self._order[0][0] < now_ns - KEPT_NS:
-            self._seen.pop(self._order.popleft()[1], None)
+        while self._seen and next(iter(self._seen.values())) < now_ns - KEPT_NS:
+            self._seen.popitem(last=False)
         if key in self._seen:
             return False
         self._seen[key] = now_ns
-        self._order.append((now_ns, key))
         return True
 
     def __contains__(self, key: bytes) -> bool:

@@ -549,6 +549,19 @@ def test_what_a_receiver_said_before_does_not_take_the_place_of_what_it_says_now
     assert noise_of(pipeline, "1:1") == pytest.approx((3.0, 3.0, 0.3))
 
 
+def test_after_a_reboot_a_receiver_is_believed_whose_time_is_a_little_before() -> None:
+    """Less than a second link may lag, so that only the reboot tells it from an old status."""
+    pipeline = Pipeline(settings("home"))
+    run(pipeline, [position(n / 5, "1:1") for n in range(100)])
+    run(pipeline, [accuracy(15.0, "1:1", 5.0, 5.0, 0.2)])
+    run(pipeline, [position(20.0 + n, "1:1", boot_s=1.0 + n) for n in range(4)])
+    anew = accuracy(3.0, "1:1", 1.0, 1.0, 0.1)
+    pipeline.step(anew._replace(t_ns=START_NS + 23_500 * S // 1000))
+    run(pipeline, [position(20.0 + n, "1:1", boot_s=1.0 + n) for n in range(4, 16)])
+    assert pipeline.restarts["1:1"] == 1
+    assert noise_of(pipeline, "1:1") == pytest.approx((3.0, 3.0, 0.3))
+
+
 def test_a_relayed_report_is_as_good_as_transponders_are() -> None:
     """100 m, and the way flown in the second to which its time is known."""
     pipeline = Pipeline(settings("home", observer={"speed_max_mps": 90.0}))
@@ -624,6 +637,23 @@ def test_frames_that_nobody_reads_are_counted_and_no_more() -> None:
     assert pipeline.step(sent(0, "1:1", beat)) == []
     assert pipeline.frames == 2
     assert pipeline.digest.hexdigest() == before
+
+
+def test_after_a_reboot_a_track_waits_for_its_receiver_anew() -> None:
+    """The receiver's height is always another, so that the first track began after ten seconds."""
+    pipeline = Pipeline(settings("47.4,8.55,500"))
+
+    def reasons(from_s: float, to_s: float, boot_s: float) -> list[Reason]:
+        found = []
+        for t_s in np.arange(from_s, to_s, 0.5):
+            events = [accuracy(t_s, "1:1", 1, 1, 1), position(t_s, "1:1", boot_s=boot_s + t_s)]
+            found += [one.reason for one in run(pipeline, events) if isinstance(one, Rejection)]
+        return found
+
+    assert reasons(0, 15, 100.0) == [Reason.NO_FIX] * 20
+    after = reasons(15, 30, -14.0)
+    assert pipeline.restarts["1:1"] == 1
+    assert after.count(Reason.NO_FIX) == 20
 
 
 def test_a_reboot_is_said_and_begins_a_fresh_track() -> None:

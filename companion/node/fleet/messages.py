@@ -1,7 +1,8 @@
 """What nodes tell one another, as protobuf described like a recording's messages.          [shell]
 
-Version 1 of the contract in docs/fleet.md: fields are only ever added. What comes from others is
-read with limits, and anything that is no such message is a ``FleetMessageError``.
+Version 1 of the contract in docs/fleet.md: fields are added, and the number of one that is gone is
+never used again. What comes from others is read with limits, and anything that is no such message
+is a ``FleetMessageError``.
 """
 
 import math

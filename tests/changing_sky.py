@@ -8,8 +8,9 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-from companion.mavlink.wire.decode import ATTITUDE, GLOBAL_POSITION_INT, HEARTBEAT
+from companion.mavlink.wire.decode import ATTITUDE, HEARTBEAT
 from companion.mavlink.wire.encode import Outgoing, pack
+from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
 from companion.mavlink.wire.transponder import ADSB_VEHICLE
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings

@@ -18,7 +18,8 @@ import pymap3d
 from mcap.reader import make_reader
 from support import BIN, HANG_S, Node, end
 
-from companion.mavlink.wire.decode import DECODED, GLOBAL_POSITION_INT, decode
+from companion.mavlink.wire.decode import DECODED, decode
+from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
 from companion.recording import schemas
 from companion.recording.reader import read_log
 from companion.values import Frame, SystemTime

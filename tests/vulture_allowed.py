@@ -19,9 +19,7 @@ one.rx_phase, one.rx_gain, one.rx_attenuator  # pyadi-iio writes them to the chi
 one.rx_beam_state, chip.beam_mem_enable  # the same
 one.shows, one.likeness, one.bears_on  # the same
 found.rejections  # the same
-presence.system_status, presence.armed  # what a heartbeat says, for who looks at `senders.presence`
 status.of_s  # written to the API by its fields
-clock.timesync_refused, clock.gnss_refused  # why evidence was not used, for who debugs a clock
 one_uav, streamed, healthz, readyz, listing, download, list_scenarios, prediction  # by decorators
 served.readable, served.readinto  # `io` calls them
 exception  # the name of an argument of `__exit__`

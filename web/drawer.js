@@ -44,7 +44,7 @@ export class Drawer {
   /** Its last messages, for battery and mode; a relayed aircraft sends none. */
   async ask(now) {
     const [system, component] = this.id.split(":");
-    if (system === "icao" || now - this.askedAt < ASK_MS) return;
+    if (!/^\d+$/.test(system) || now - this.askedAt < ASK_MS) return;
     this.askedAt = now;
     const { id } = this;
     const messages = await askOnce(

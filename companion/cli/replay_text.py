@@ -2,7 +2,7 @@
 
 from typing import Any, Final
 
-from companion.values import Reason, reports_itself
+from companion.values import Reason, kind_of
 
 
 def text(summary: dict[str, Any]) -> str:
@@ -11,7 +11,7 @@ def text(summary: dict[str, Any]) -> str:
         f"{summary['frames']} frames, {summary['duration_s']:.0f} s of log in"
         f" {summary['wall_s']:.1f} s; center {summary['center']}"
     ]
-    own = {uav: seen for uav, seen in summary["uavs"].items() if reports_itself(uav)}
+    own = {uav: seen for uav, seen in summary["uavs"].items() if kind_of(uav).reports_itself}
     relayed = [seen["reports"] for uav, seen in summary["uavs"].items() if uav not in own]
     for uav, seen in own.items():
         lines.append(

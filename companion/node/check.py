@@ -21,7 +21,7 @@ from companion.server.access import bind
 from companion.settings.files import embedded
 from companion.settings.model import Settings
 from companion.settings.outlets import DriveSettings, RecordSettings
-from companion.values import Level, Reason, UserError, Verdict, reports_itself
+from companion.values import Level, Reason, UserError, Verdict, kind_of
 from companion.views import state
 
 LOOKS: Final = 5
@@ -118,7 +118,7 @@ def _heard(service: Service, settings: Settings) -> Iterator[Finding]:
     pipeline = service.pipeline
     update = pipeline.last_update
     names = [track.uav for track in update.tracks] if update else []
-    own = [uav for uav in names if reports_itself(uav)]
+    own = [uav for uav in names if kind_of(uav).reports_itself]
     if settings.center.source is None:
         heard = f"; heard: {', '.join(own[:SOME])}" if own else ""
         remedy = f"say --center SYSID:COMPID or LAT,LON,ALT{heard}"

@@ -10,7 +10,7 @@ from dataclasses import replace
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.links.transport import Link
 from companion.mavlink.links.urls import parse_link
-from companion.mavlink.trust.admission import Admission
+from companion.mavlink.trust.admission import admission
 from companion.mavlink.wire.encode import pack
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
@@ -31,7 +31,7 @@ class Outlet:
         self._settings = settings.out
         self._pipeline = pipeline
         self._now_ns = now_ns
-        self._admission = Admission(settings.out.uavs, ())
+        self._admits = admission(settings.out.uavs, ())
         self._positions = passed_on.Positions(
             utm=settings.out.message == "UTM_GLOBAL_POSITION", every_s=1 / settings.out.rate_hz
         )
@@ -83,7 +83,7 @@ class Outlet:
     def _say(self) -> None:
         now_ns = self._now_ns()
         named = self._pipeline.tracks(now_ns, now_ns)
-        tracks = [track for track in named if self._admission.admits(track.uav)]
+        tracks = [track for track in named if self._admits(track.uav)]
         if self._frames:
             for message in self._positions.said(self._pipeline, tracks):
                 number = self._sequences.get(message.source, 0)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from companion.pipeline.fold import Pipeline
-from companion.values import Estimate, Event, Update, reports_itself
+from companion.values import Estimate, Event, Update, kind_of
 
 
 @dataclass(slots=True)
@@ -111,7 +111,7 @@ def _unaimed(pipeline: Pipeline, tally: Tally) -> str | None:
         first = update.beams.left_out[0]
         return f"{first.uav}: {first.reason}"
     others = [uav for uav in pipeline.tracker.uavs if uav != pipeline.center.vehicle]
-    if others and not any(map(reports_itself, others)):
+    if others and not any(kind_of(uav).reports_itself for uav in others):
         return 'only relayed aircraft were heard, and [beams] targets is not "all"'
     if others:
         return "every UAV had been silent for too long"

@@ -42,6 +42,7 @@ from companion.values import (
     LimitSource,
     ReportNoise,
     UserError,
+    kind_of,
 )
 
 FLOOR_SPARE_DB: Final = 2.9
@@ -237,8 +238,7 @@ def assumed(settings: Settings, uav: str, mav_type: int | None, autopilot: int |
     ``mav_type`` and ``autopilot`` are those of its heartbeat; None where none was heard.
     """
     given = settings.observer
-    manned = uav.startswith(("icao:", "cot:"))  # or may be
-    kind = Airframe.ADSB if manned else airframe(mav_type)
+    kind = Airframe.ADSB if kind_of(uav).may_be_manned else airframe(mav_type)
     known = LIMITS[kind]
     told = [given.uav.get(uav), given.types.get(kind.value), given]
     speed = next((one.speed_max_mps for one in told if one and one.speed_max_mps), None)

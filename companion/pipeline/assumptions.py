@@ -1,9 +1,9 @@
 """What reports refute, told once: which assumption was wrong, and by which setting it is held."""
 
-from collections.abc import Iterable
 from typing import Final
 
 from companion.mavlink.clock.estimates import ClockChange
+from companion.pipeline.records import UavRecord, UavRecords
 from companion.values import Estimate, Notice, Refuted, Severity
 
 AGAIN: Final = 1.25
@@ -20,71 +20,57 @@ SILENT_NS: Final = 60_000_000_000
 """Time for which a change of a clock or link is not told again."""
 
 
-class Assumptions:
-    """Counts refutations by UAV, and tells each once."""
+def told(records: UavRecords, *refuted: Refuted | None) -> list[Refuted | Notice]:
+    """The refutations, each followed by a notice if it goes beyond what was reported before."""
+    out: list[Refuted | Notice] = []
+    for one in filter(None, refuted):
+        out.append(one)
+        record = records[one.uav]
+        record.refuted += 1
+        if one.proven > AGAIN * record.proven.get(one.setting, 0.0):
+            record.proven[one.setting] = one.proven
+            out.append(Notice(one.t_ns, Severity.WARNING, one.uav, _said(one)))
+    return out
 
-    def __init__(self) -> None:
-        self._told: dict[tuple[str, str], float] = {}
-        self._told_ns: dict[str, int] = {}
-        self._times: dict[str, int] = {}
 
-    def told(self, refuted: Iterable[Refuted]) -> list[Refuted | Notice]:
-        """The refutations, each followed by a notice if there is news in it."""
-        out: list[Refuted | Notice] = []
-        for one in refuted:
-            out.append(one)
-            self._times[one.uav] = self._times.get(one.uav, 0) + 1
-            key = (one.uav, one.setting)
-            if one.proven > AGAIN * self._told.get(key, 0.0):
-                self._told[key] = one.proven
-                out.append(Notice(one.t_ns, Severity.WARNING, one.uav, _said(one)))
-        return out
+def clock_changed(
+    record: UavRecord, t_ns: int, sender: str, change: ClockChange, drift_max_ppm: float
+) -> list[Refuted | Notice]:
+    """A change of a sender's clock, or of its link, as a refutation and a notice."""
+    drift = change.drift_ppm
+    record.refuted += 1
+    out: list[Refuted | Notice] = [
+        Refuted(t_ns, sender, "clocks.drift_max_ppm", drift_max_ppm, drift, drift)
+    ]
+    told_ns = record.clock_told_ns
+    if change.leapt or told_ns is None or t_ns - told_ns >= SILENT_NS:
+        record.clock_told_ns = t_ns
+        out.append(Notice(t_ns, Severity.WARNING, sender, _clock_text(sender, change)))
+    return out
 
-    def clock(
-        self, t_ns: int, sender: str, change: ClockChange, drift_max_ppm: float
-    ) -> list[Refuted | Notice]:
-        """A change of a sender's clock, or of its link, as a refutation and a notice."""
-        drift = change.drift_ppm
-        self._times[sender] = self._times.get(sender, 0) + 1
-        out: list[Refuted | Notice] = [
-            Refuted(t_ns, sender, "clocks.drift_max_ppm", drift_max_ppm, drift, drift)
-        ]
-        if change.leapt or t_ns - self._told_ns.get(sender, -SILENT_NS) >= SILENT_NS:
-            self._told_ns[sender] = t_ns
-            step = f"{change.step_s * 1e3:.0f} ms"
-            if change.leapt:
-                way = "later" if change.step_s > 0 else "earlier"
-                why = "that is taken for a leap of its clock, as no link is known to be so slow"
-                text = f"all of {sender} comes {abs(change.step_s):.1f} s {way} than before: {why}"
-            elif change.proven:
-                text = f"the clock of {sender} changed by {step} more than clocks.drift_max_ppm"
-            else:
-                why = "its clock stood still, or its link got slower; both are allowed for"
-                text = f"all of {sender} comes {step} later than before: {why}"
-            out.append(Notice(t_ns, Severity.WARNING, sender, text))
-        return out
 
-    def jumped(self, begun: Estimate) -> list[Refuted]:
-        """A track that was begun again from reports that were refused, as a refutation.
+def _clock_text(sender: str, change: ClockChange) -> str:
+    step = f"{change.step_s * 1e3:.0f} ms"
+    if change.leapt:
+        way = "later" if change.step_s > 0 else "earlier"
+        why = "that is taken for a leap of its clock, as no link is known to be so slow"
+        return f"all of {sender} comes {abs(change.step_s):.1f} s {way} than before: {why}"
+    if change.proven:
+        return f"the clock of {sender} changed by {step} more than clocks.drift_max_ppm"
+    why = "its clock stood still, or its link got slower; both are allowed for"
+    return f"all of {sender} comes {step} later than before: {why}"
 
-        They agree among themselves, so what they were refused by is wrong.
-        """
-        fix, jump_m = begun.fix, begun.innovation_m or 0.0
-        self._times[fix.uav] = self._times.get(fix.uav, 0) + 1
-        limit_m = fix.noise.position_m
-        name = "observer.position_noise_m"
-        return [Refuted(fix.arrival_ns, fix.uav, name, limit_m, jump_m, limit_m)]
 
-    def times(self, uav: str) -> int:
-        """How often assumptions about a UAV were refuted."""
-        return self._times.get(uav, 0)
+def jumped(record: UavRecord, begun: Estimate) -> Refuted:
+    """A track that was begun again from reports that were refused, as a refutation.
 
-    def forget(self, uav: str) -> None:
-        """Forget what was told of a UAV that is gone."""
-        self._times.pop(uav, None)
-        self._told_ns.pop(uav, None)
-        for key in [key for key in self._told if key[0] == uav]:
-            del self._told[key]
+    They agree among themselves, so what they were refused by is wrong.
+    """
+    fix, jump_m = begun.fix, begun.innovation_m or 0.0
+    record.refuted += 1
+    limit_m = fix.noise.position_m
+    name = "observer.position_noise_m"
+    return Refuted(fix.arrival_ns, fix.uav, name, limit_m, jump_m, limit_m)
 
 
 def _said(one: Refuted) -> str:

@@ -27,12 +27,12 @@ from companion.beams.steady import Steady
 from companion.mavlink.clock.estimates import ClockChange, ClockEstimate, Guarantee
 from companion.mavlink.wire.decode import DECODED
 from companion.mavlink.wire.stamps import STAMPED
-from companion.pipeline import assembly
-from companion.pipeline.assumptions import Assumptions
+from companion.pipeline import assembly, assumptions
 from companion.pipeline.blame import Evidence
 from companion.pipeline.center import Center
 from companion.pipeline.digest import Digest
 from companion.pipeline.health import Health, Site, Weighed
+from companion.pipeline.records import Records, UavRecord
 from companion.pipeline.refusals import Refusals
 from companion.pipeline.senders import NOTHING, PlacedAttitude, PlacedReport, Senders
 from companion.pipeline.targets import Targets
@@ -60,7 +60,7 @@ from companion.values import (
     Track,
     Update,
     UtcNs,
-    reports_itself,
+    kind_of,
 )
 
 DROP_EVERY: Final = 100
@@ -103,16 +103,16 @@ class Pipeline:
         self.last_carrier: Carrier | None = None
         self.aiming: Aiming | None = None
         self._steady: Steady | None = None  # changes with ticks alone, so that looks change nothing
-        self.refusals = Refusals()
         self.digest = Digest()
         self.array = assembly.array(settings)
         self.coverage = assembly.coverage(settings)
         self.precoder = assembly.precoder(settings)
         self.center = Center(settings)
         self.tracker = assembly.tracker(settings)
-        self.senders = Senders(settings, self.center.vehicle, self.tracker)
+        self.records = Records(UavRecord, self.tracker.__contains__)
+        self.refusals = Refusals(self.records)
+        self.senders = Senders(settings, self.center.vehicle, self.records, self.tracker)
         self.targets = Targets(settings, self.center.vehicle)
-        self.assumptions = Assumptions()
         site = Site(self.array, self.coverage, *assembly.radio(settings))
         self.health = Health(settings.link, site)
 
@@ -175,10 +175,9 @@ class Pipeline:
         elif isinstance(heard.message, PlacedAttitude):
             turn_degps2 = self.senders.assumed(str(frame.source)).turn_degps2
             refuted = self.center.turn(heard.message, turn_degps2)
-            said += self.assumptions.told([] if refuted is None else [refuted])
+            said += assumptions.told(self.records, refuted)
         elif isinstance(heard.message, EstimatorStatus):
-            refuted = self.center.trust(heard.message)
-            said += self.assumptions.told([] if refuted is None else [refuted])
+            said += assumptions.told(self.records, self.center.trust(heard.message))
         return said
 
     def _changed(self, t_ns: int, sender: str, change: ClockChange) -> list[Output]:
@@ -186,25 +185,26 @@ class Pipeline:
         if sender not in self.tracker:
             return []
         drift_max_ppm = self.settings.clocks.drift_max_ppm
-        return [*self.assumptions.clock(t_ns, sender, change, drift_max_ppm)]
+        record = self.records[sender]
+        return [*assumptions.clock_changed(record, t_ns, sender, change, drift_max_ppm)]
 
     def _report(self, placed: PlacedReport) -> list[Output]:
         report = placed.report
         begins = self.center.seeks_home or report.uav not in self.tracker
-        if begins and not self.senders.vouch(report, self.center.seeks_home):
+        if begins and not self.senders.may_begin(report, self.center.seeks_home):
             return [Rejection(report.t_ns, report.uav, Reason.NO_FIX)]
         fix, begun = self.center.fix(placed)
-        fix, refuted = self.tracker.refuted(fix)
-        said: list[Output] = [*begun, *self.assumptions.told(refuted)]
-        accepted = self.tracker.accept(fix)
+        accepted, refuted = self.tracker.accept(fix)
+        said: list[Output] = [*begun, *assumptions.told(self.records, *refuted)]
         if isinstance(accepted, Rejection):
             return [*said, accepted]
+        fix = accepted.fix  # with what reports have shown of its bounds
         self.refusals.used(fix.uav)
-        if not reports_itself(fix.uav):
+        if not kind_of(fix.uav).reports_itself:
             near = self.targets.betters(fix.uav, self.tracker.near(fix.position_ned_m, NEAR_M))
-            self.targets.compare(fix, self._tracks(near, fix.t_ns, fix.t_ns))
+            self.targets.identities.observe(fix, self._tracks(near, fix.t_ns, fix.t_ns))
         if accepted.reacquired:
-            said += self.assumptions.jumped(accepted)
+            said.append(assumptions.jumped(self.records[fix.uav], accepted))
             said += self._move_home(placed, accepted)
             text = f"{fix.uav} is tracked anew: its reports agree, but not with its past"
             return [*said, Notice(fix.arrival_ns, Severity.WARNING, fix.uav, text), accepted]
@@ -221,10 +221,8 @@ class Pipeline:
 
     def _restart(self, uav: str) -> None:
         """Forget the past of a sender."""
+        self.records.pop(uav, None)
         self.tracker.forget(uav)
-        self.assumptions.forget(uav)
-        self.refusals.forget(uav)
-        self.senders.forget(uav)
         self.center.restarted(uav)
 
     def _tick(self, tick: Tick) -> list[Output]:
@@ -286,7 +284,7 @@ class Pipeline:
         for uav in silent:
             self._restart(uav)
             self.targets.forget(uav)
-        self.senders.forget_clocks(frozenset(self.tracker.uavs), now_ns)
+        self.senders.forget_silent(now_ns)
         return dropped
 
     # --- looking ----------------------------------------------------------------------------
@@ -380,7 +378,12 @@ class Pipeline:
 
     def reporters(self) -> list[Source]:
         """Senders that report their own position, the carrier among them."""
-        return [Source.parse(uav) for uav in filter(reports_itself, self.tracker.uavs)]
+        return [Source.parse(uav) for uav in self.tracker.uavs if kind_of(uav).reports_itself]
+
+    def refuted(self, uav: str) -> int:
+        """How often assumptions about a UAV were refuted."""
+        record = self.records.get(uav)
+        return 0 if record is None else record.refuted
 
     def clock_estimate(self, uav: str) -> ClockEstimate | None:
         """The state of a UAV's clock; None for a UAV that has none."""

@@ -4,7 +4,8 @@ from collections import Counter, OrderedDict, deque
 from dataclasses import dataclass, field
 from typing import Final
 
-from companion.values import Notice, Reason, Rejection, Severity, reports_itself
+from companion.pipeline.records import UavRecords, Unused
+from companion.values import Notice, Reason, Rejection, Severity, kind_of
 
 UNHEARD_NS: Final = 1_000_000_000
 """Time for which no report of a sender is used before that is told."""
@@ -40,24 +41,13 @@ class OfSender:
     recent: deque[Rejection] = field(default_factory=lambda: deque(maxlen=RECENT))
 
 
-@dataclass(slots=True)
-class _Unheard:
-    """A run of refused reports of one sender, without one between that was used."""
-
-    since_ns: int
-    reason: Reason
-    reports: int = 0
-    told: bool = False
-
-
 class Refusals:
     """Counts rejections. ``total`` includes those of senders that were forgotten."""
 
-    def __init__(self) -> None:
+    def __init__(self, records: UavRecords) -> None:
         self.total: Counter[Reason] = Counter()
+        self._records = records
         self._senders: OrderedDict[str, OfSender] = OrderedDict()
-        self._unheard: dict[str, _Unheard] = {}
-        self._told_ns: dict[str, int] = {}
 
     def add(self, refused: Rejection) -> Notice | None:
         """Count one rejection.
@@ -66,42 +56,39 @@ class Refusals:
         """
         self._count(refused)
         uav = refused.source
-        if refused.reason not in OF_REPORTS or not reports_itself(uav):
+        if refused.reason not in OF_REPORTS or not kind_of(uav).reports_itself:
             return None
-        run = self._unheard.get(uav)
-        if run is None:
-            run = self._unheard.setdefault(uav, _Unheard(refused.t_ns, refused.reason))
-            if len(self._unheard) > SENDERS_MAX:  # the oldest: made-up ids must not silence others
-                del self._unheard[next(iter(self._unheard))]
+        record = self._records[uav]
+        if record.unused is None:
+            record.unused = Unused(since_ns=refused.t_ns, reason=refused.reason)
+        run = record.unused
         run.reports += 1
         run.reason = refused.reason
         lasted_ns = refused.t_ns - run.since_ns
-        if run.told or run.reports < 2 or lasted_ns < UNHEARD_NS:
+        if run.is_told or run.reports < 2 or lasted_ns < UNHEARD_NS:
             return None
         if refused.reason is Reason.SHARED_ID:
             return None  # that is told by itself
-        run.told = True
-        if refused.t_ns - self._told_ns.get(uav, refused.t_ns - AGAIN_NS) < AGAIN_NS:
+        run.is_told = True
+        told_ns = record.unused_told_ns
+        if told_ns is not None and refused.t_ns - told_ns < AGAIN_NS:
             return None
-        self._told_ns[uav] = refused.t_ns
+        record.unused_told_ns = refused.t_ns
         why = f"{refused.reason}, {refused.detail}" if refused.detail else str(refused.reason)
         text = f"no report of {uav} was used for {lasted_ns * 1e-9:.1f} s: {why}"
         return Notice(refused.t_ns, Severity.WARNING, uav, text)
 
     def used(self, uav: str) -> None:
         """Note that a report was used."""
-        if self._unheard:
-            self._unheard.pop(uav, None)
+        record = self._records.get(uav)
+        if record is not None:
+            record.unused = None
 
     def unheard(self, uav: str) -> Reason | None:
         """Why the newest reports of a sender are not used; None where they are."""
-        run = self._unheard.get(uav)
+        record = self._records.get(uav)
+        run = None if record is None else record.unused
         return run.reason if run is not None and run.reports > 1 else None
-
-    def forget(self, uav: str) -> None:
-        """Forget when it was told that a UAV's reports are refused."""
-        self._unheard.pop(uav, None)
-        self._told_ns.pop(uav, None)
 
     def _count(self, refused: Rejection) -> None:
         self.total[refused.reason] += refused.count
@@ -118,7 +105,3 @@ class Refusals:
     def of(self, sender: str) -> OfSender:
         """The rejections of one sender; empty for one that is not known."""
         return self._senders.get(sender) or OfSender()
-
-    def senders(self) -> list[str]:
-        """Senders with rejections, the one with the newest last."""
-        return list(self._senders)

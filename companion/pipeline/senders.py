@@ -1,26 +1,30 @@
-"""Senders of frames: who sent a message, and when it was true. Every frame comes here first.
+"""Senders of frames: which of them sent a message, and when it was true. Every frame comes here.
 
-Each sender has a clock, bounds on the noise of its reports, and a presence. A message leaves here
-with its time on the sender's and on the node's timeline, or as a rejection with its reason.
+There is a record of each sender's clock, and one of what each component says beside positions:
+heartbeat, GNSS status, and the bounds on noise that follow from it. A message leaves here with its
+time on the sender's and on the node's timeline, or as a rejection with its reason.
 
 Over 300 lines: every kind of message comes through here.
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Container
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from itertools import islice
 from typing import Final
 
 from companion.mavlink.clock.estimates import ClockChange, ClockEstimate, Stamp
 from companion.mavlink.clock.sender_clock import SenderClock
-from companion.mavlink.trust.admission import Admission
+from companion.mavlink.trust.admission import admission
 from companion.mavlink.trust.adsb import Aircraft
 from companion.mavlink.trust.dedupe import Dedupe, LinkShare
 from companion.mavlink.trust.remote_id import RemoteIds
 from companion.mavlink.wire.decode import ATTITUDE, decode
 from companion.mavlink.wire.stamps import boot_ms
 from companion.pipeline import assembly
+from companion.pipeline.records import RECORDS_MAX, Records, UavRecords
 from companion.settings.model import Settings
 from companion.tracking import noise
 from companion.values import (
@@ -42,20 +46,16 @@ from companion.values import (
     Severity,
     Source,
     SystemTime,
-    reports_itself,
+    kind_of,
 )
 
-CLOCKS_MAX: Final = 4096
-"""Clocks kept. Beyond it those of senders without a track are forgotten, the oldest first."""
-CLOCKS_AT_ONCE: Final = 256
-"""Clocks that are forgotten at once where too many come between two ticks."""
 WAITS_NS: Final = 10_000_000_000
 """Time for which a track waits for its receiver to vouch for it."""
 STATED_LATE_US: Final = 30_000_000
 """Greatest time by which what a receiver states may come after something newer; a longer step back
 is another boot's. As long as reports are remembered (``dedupe``)."""
-CLOCK_KEPT_NS: Final = 3_600_000_000_000
-"""How long the clock of a sender without a track is kept: each takes some 50 kB."""
+KEPT_NS: Final = 3_600_000_000_000
+"""How long a silent sender without a track is kept: each clock takes some 50 kB."""
 FIX_3D: Final = 3
 """GPS_FIX_TYPE_3D_FIX; better fixes have greater numbers."""
 NEAR_HEIGHT_M: Final = 50.0
@@ -115,37 +115,71 @@ NOTHING: Final = Heard()
 """The outcome of a frame that asks for nothing further."""
 
 
-class Senders:
-    """All senders of frames, by MAVLink source.
+@dataclass(slots=True)
+class Sender:
+    """A sender whose stamps are placed: a vehicle, or an aircraft that broadcasts its own stamps.
 
-    ``carrier`` is admitted whatever the lists say, and is the only one whose attitude is used.
-    ``tracked`` are those who have a track at any time: their clocks are kept.
+    stamped_ns  when the clock was last given a stamp; None if never
+    is_shared   whether it was reported that two senders share this id
+    """
+
+    clock: SenderClock
+    stamped_ns: int | None = None
+    is_shared: bool = False
+
+
+@dataclass(slots=True, kw_only=True)
+class Component:
+    """What a MAVLink component says beside positions.
+
+    heard_ns   when it last said any of this
+    presence   its newest heartbeat
+    receiver   its newest GNSS status
+    stated_us  the receiver's own time of that status; 0 if unknown, or of the boot before
+    noise      bounds on the noise of its reports, by that status
+    apart_m2   mean square of the receiver's height less the autopilot's of late, m²
+    """
+
+    heard_ns: int = 0
+    presence: Presence | None = None
+    receiver: GnssStatus | None = None
+    stated_us: int = 0
+    noise: ReportNoise | None = None
+    apart_m2: float | None = None
+
+
+class Senders:
+    """All senders of frames.
+
+        carrier  id of the vehicle that carries the array: it is admitted whatever the lists say,
+                 and only its attitude is used
+        records  those of the UAVs
+        tracked  ids of the present tracks, whose clocks are kept
+
+    Clocks are kept by the id under which reports are tracked: aircraft of Remote ID and Cursor on
+    Target have a clock, and no MAVLink source of their own.
     """
 
     def __init__(
-        self, settings: Settings, carrier: str | None, tracked: Container[str] = ()
+        self,
+        settings: Settings,
+        carrier: str | None,
+        records: UavRecords,
+        tracked: Container[str] = (),
     ) -> None:
-        self.presence: dict[Source, Presence] = {}
-        self.aircraft = Aircraft()
-        self.remote_ids = RemoteIds()
-        self._settings = settings
+        self.aircraft = Aircraft()  # by ICAO address, over all relays
+        self.remote_ids = RemoteIds()  # by radio address, for each receiver
         self._carrier = carrier
-        self._tracked = tracked
         self._carrier_source = None if carrier is None else Source.parse(carrier)
+        self._records = records
+        self._tracked = tracked
+        self._senders = Records(lambda: Sender(assembly.clock(settings)), self._is_kept)
+        self._components: defaultdict[Source, Component] = defaultdict(Component)
         self._noise_settings = assembly.noise(settings)
-        self._noise: dict[Source, ReportNoise] = {}
-        self._clocks: dict[str, SenderClock] = {}  # by SYSID:COMPID
-        self._clocks_most = CLOCKS_MAX
-        self._stamped_ns: dict[str, int] = {}  # when each of them was last told its time
-        self._dedupe = Dedupe()
-        self._admission = Admission(settings.tracks.allow, settings.tracks.deny)
-        self._shared: set[str] = set()
-        self._known: dict[str, assembly.Assumed] = {}  # by UAV
-        self._receivers: dict[Source, GnssStatus] = {}
-        self._stated_us: dict[str, int] = {}  # the receiver's time of it, by SYSID:COMPID
-        self._apart_m2: dict[Source, float] = {}  # receiver's height less the autopilot's, squared
+        self._dedupe = Dedupe()  # by content, over all links
+        self._admits = admission(settings.tracks.allow, settings.tracks.deny)
+        self._assumed = lru_cache(RECORDS_MAX)(partial(assembly.assumed, settings))
         self._utc_offset_ns = 0  # UTC less the node's timeline
-        self._waits: dict[str, int] = {}  # since when a UAV's receiver does not vouch for it
 
     # --- what they say ----------------------------------------------------------------------
 
@@ -161,11 +195,11 @@ class Senders:
             case Report():
                 if self._dedupe.is_repeat(frame):
                     return _refused(message, Reason.DUPLICATE)
-                if message.uav != self._carrier and not self._admission.admits(message.uav):
+                if message.uav != self._carrier and not self._admits(message.uav):
                     return _refused(message, Reason.NOT_ALLOWED)
                 return self._telemetry(message, frame.doubt_ns)
             case AdsbVehicle():
-                if not self._admission.admits(message.uav):
+                if not self._admits(message.uav):
                     return _refused(message, Reason.NOT_ALLOWED)
                 return self._relayed(message)
             case RemoteId():
@@ -183,54 +217,55 @@ class Senders:
     def _beside(self, frame: Frame, message: GnssStatus | SystemTime | Presence) -> Heard:
         """Take in what is said beside positions: of a receiver, a clock, a vehicle."""
         match message:
-            case GnssStatus() if self._is_outdated(message):
-                pass
             case GnssStatus():
-                self._stated_us[str(message.source)] = message.time_us
-                self._noise[message.source] = noise.reported(message, self._noise_settings)
-                self._receivers[message.source] = message
+                component = self._heard(message)
+                stated_us, newest_us = message.time_us, component.stated_us
+                # What is older comes over a second link that lags behind.
+                if not 0 < stated_us < newest_us <= stated_us + STATED_LATE_US:
+                    component.stated_us = stated_us
+                    component.noise = noise.reported(message, self._noise_settings)
+                    component.receiver = message
             case SystemTime():
                 change = self.notice(frame)
                 if message.unix_us is not None:
-                    clock = self._clock(str(message.source))
+                    clock = self._senders[str(message.source)].clock
                     on_timeline_us = message.unix_us - self._utc_offset_ns // 1000
                     clock.system_time(message.t_ns, on_timeline_us, message.boot_ms)
                 return NOTHING if change is None else Heard(change=change)
             case Presence():
-                self.presence[message.source] = message
-                self._known.pop(str(message.source), None)
+                self._heard(message).presence = message
         return NOTHING
 
-    def _is_outdated(self, status: GnssStatus) -> bool:
-        """Whether a receiver has said something newer, as where a second link lags behind."""
-        newest_us = self._stated_us.get(str(status.source), 0)
-        return 0 < status.time_us < newest_us <= status.time_us + STATED_LATE_US
+    def _heard(self, message: GnssStatus | Presence) -> Component:
+        component = self._components[message.source]
+        component.heard_ns = message.t_ns
+        return component
 
     def notice(self, frame: Frame) -> ClockChange | None:
         """Take in the stamp of a frame that is not decoded otherwise, for its sender's clock.
 
         Returns what it showed of a change of that clock.
         """
-        clock = self._clocks.get(str(frame.source))
-        if clock is None:
+        sender = self._senders.get(str(frame.source))
+        if sender is None:
             return None
-        clock.notice(frame.t_ns, boot_ms(frame))
-        return clock.change
+        sender.clock.notice(frame.t_ns, boot_ms(frame))
+        return sender.clock.change
 
     def round_trip(self, event: RoundTrip) -> ClockChange | None:
         """Take in a TIMESYNC round trip, as evidence of its sender's clock.
 
         Returns what it showed of a change of that clock.
         """
-        clock = self._clock(str(event.source))
+        clock = self._senders[str(event.source)].clock
         clock.timesync(event.sent_ns, event.t_ns, event.remote_ns)
         return clock.change
 
     def utc_is(self, offset_ns: int) -> None:
         """Take in by how much UTC is beyond the node's timeline, from now on."""
         self._utc_offset_ns = offset_ns
-        for clock in self._clocks.values():
-            clock.forget_gnss()
+        for sender in self._senders.values():
+            sender.clock.forget_gnss()
 
     def _telemetry(self, report: Report, doubt_ns: int = 0) -> Heard:
         """Place a report by its stamp; its noise is a vehicle's own matter if it reports itself.
@@ -239,36 +274,41 @@ class Senders:
         """
         assert report.boot_ms is not None
         uav, t_ns = report.uav, report.t_ns
-        if uav not in self._clocks and len(self._clocks) >= CLOCKS_MAX and not reports_itself(uav):
+        is_own = kind_of(uav).reports_itself
+        if uav not in self._senders and len(self._senders) >= RECORDS_MAX and not is_own:
             return _refused(report, Reason.TOO_MANY)  # any number of names can be made up
-        stamp, restarted = self._stamp(uav, t_ns, report.boot_ms, doubt_ns)
-        said = _restart_notice(t_ns, uav, report.boot_ms) if restarted else ()
-        if self._clock(uav).is_shared(t_ns):
-            return Heard(None, (*said, *self._shared_id(uav, t_ns)), restarted)
-        self._shared.discard(uav)
+        sender = self._senders[uav]
+        stamp, said = self._stamp(sender, uav, t_ns, report.boot_ms, doubt_ns)
+        restarted = uav if said else None
+        if sender.clock.is_shared(t_ns):
+            return Heard(None, (*said, *_shared_id(sender, uav, t_ns)), restarted)
+        sender.is_shared = False
         if stamp is None:
             return Heard(None, (*said, Rejection(t_ns, uav, Reason.UNPLACED_STAMP)), restarted)
         self._dedupe.took(stamp.latency_s)
-        errors = self._noise.get(report.source, self._noise_settings.default)
         assumed = self.assumed(uav)
         lag_ns = round(assumed.lag_middle_s * 1e9)
-        errors = replace(errors, time_s=assumed.lag_rest_s, apart_m=self._apart(report))
+        errors = self._errors(report, assumed.lag_rest_s) if is_own else None
         true_ns = t_ns - round(stamp.latency_s * 1e9) - lag_ns
-        known = errors if reports_itself(uav) else None
-        placed = PlacedReport(report, stamp.sender_ns - lag_ns, true_ns, known, assumed.limits)
-        return Heard(placed, said, restarted, self._clock(uav).change)
+        placed = PlacedReport(report, stamp.sender_ns - lag_ns, true_ns, errors, assumed.limits)
+        return Heard(placed, said, restarted, sender.clock.change)
 
-    def _apart(self, report: Report) -> float:
-        """By how much a receiver's own heights differ from its autopilot's of late, in metres."""
-        receiver = self._receivers.get(report.source)
-        if receiver is None or receiver.fix_type < FIX_3D or report.alt_m is None:
-            return 0.0
-        before = self._apart_m2.get(report.source)
-        apart_m2 = (report.alt_m - receiver.alt_m) ** 2
-        if before is not None:
-            apart_m2 = before + APART_SHARE * (apart_m2 - before)
-        self._apart_m2[report.source] = apart_m2
-        return math.sqrt(apart_m2)
+    def _errors(self, report: Report, time_s: float) -> ReportNoise:
+        """Bounds on the errors of a report, with by how much two heights differ of late.
+
+        These are a receiver's own and its autopilot's; ``time_s`` is the greatest error of the
+        report's time.
+        """
+        component = self._components.get(report.source)
+        if component is None or component.noise is None or component.receiver is None:
+            return replace(self._noise_settings.default, time_s=time_s)
+        apart_m = 0.0
+        if component.receiver.fix_type >= FIX_3D:
+            apart_m2, before = (report.alt_m - component.receiver.alt_m) ** 2, component.apart_m2
+            if before is not None:
+                apart_m2 = before + APART_SHARE * (apart_m2 - before)
+            component.apart_m2, apart_m = apart_m2, math.sqrt(apart_m2)
+        return replace(component.noise, time_s=time_s, apart_m=apart_m)
 
     def _relayed(self, said: AdsbVehicle) -> Heard:
         """Place a report of an aircraft that a receiver relays.
@@ -294,7 +334,7 @@ class Senders:
             return NOTHING
         if isinstance(named, Rejection):
             return Heard(said=(named,))
-        if not self._admission.admits(named.uav):
+        if not self._admits(named.uav):
             return _refused(named, Reason.NOT_ALLOWED)
         if self._dedupe.is_repeat(frame):
             return _refused(named, Reason.DUPLICATE)
@@ -304,73 +344,49 @@ class Senders:
 
     def _attitude(self, attitude: Attitude) -> Heard:
         carrier = str(attitude.source)
-        stamp, restarted = self._stamp(carrier, attitude.t_ns, attitude.boot_ms)
-        said = _restart_notice(attitude.t_ns, carrier, attitude.boot_ms) if restarted else ()
+        sender = self._senders[carrier]
+        stamp, said = self._stamp(sender, carrier, attitude.t_ns, attitude.boot_ms)
         placed = None if stamp is None else PlacedAttitude(attitude, stamp.sender_ns)
-        return Heard(placed, said, restarted, self._clock(carrier).change)
+        return Heard(placed, said, carrier if said else None, sender.clock.change)
 
-    def _shared_id(self, uav: str, t_ns: int) -> tuple[Notice | Rejection, ...]:
-        """Reject a report under an id with two boot clocks; the notice is given once."""
-        refused = Rejection(t_ns, uav, Reason.SHARED_ID, detail="two boot clocks under this id")
-        if uav in self._shared:
-            return (refused,)
-        self._shared.add(uav)
-        text = f"two vehicles share the id {uav}: neither is believed"
-        return Notice(t_ns, Severity.WARNING, uav, text), refused
-
-    def vouch(self, report: Report, always: bool) -> bool:
+    def may_begin(self, report: Report, always: bool) -> bool:
         """Take in a report that would begin a track. Returns whether one may begin with it.
 
         Its sender's receiver, if one was heard, has to have a 3-D fix near the report's height. For
         that no more than ``WAITS_NS`` are waited, as heights may be of other data for good; home
         waits ``always``.
         """
-        receiver = self._receivers.get(report.source)
-        if receiver is None or not reports_itself(report.uav):
+        component = self._components.get(report.source)
+        receiver = None if component is None else component.receiver
+        if receiver is None or not kind_of(report.uav).reports_itself:
             return True
+        record = self._records[report.uav]
         if receiver.fix_type >= FIX_3D and abs(receiver.alt_m - report.alt_m) < NEAR_HEIGHT_M:
-            self._waits.pop(report.uav, None)
+            record.waits_ns = None
             return True
-        return not always and report.t_ns - self._waits.setdefault(report.uav, report.t_ns) >= (
-            WAITS_NS
-        )
+        if record.waits_ns is None:
+            record.waits_ns = report.t_ns
+        return not always and report.t_ns - record.waits_ns >= WAITS_NS
 
     # --- when they said it ------------------------------------------------------------------
 
     def _stamp(
-        self, name: str, arrival_ns: int, boot_ms: int, doubt_ns: int = 0
-    ) -> tuple[Stamp | None, str | None]:
-        """Place a stamp on the sender's timeline; also returns the sender's name if it rebooted."""
-        stamp = self._clock(name).observe(arrival_ns, boot_ms, doubt_ns)
-        self._stamped_ns[name] = arrival_ns
+        self, sender: Sender, name: str, arrival_ns: int, boot_ms: int, doubt_ns: int = 0
+    ) -> tuple[Stamp | None, tuple[Notice, ...]]:
+        """Place a stamp on the sender's timeline; a notice says where it shows a reboot."""
+        stamp = sender.clock.observe(arrival_ns, boot_ms, doubt_ns)
+        sender.stamped_ns = arrival_ns
         if stamp is None or not stamp.rebooted:
-            return stamp, None
-        self._stated_us.pop(name, None)
-        return stamp, name
-
-    def _clock(self, name: str) -> SenderClock:
-        clock = self._clocks.get(name)
-        if clock is None:
-            if len(self._clocks) >= self._clocks_most:
-                self._make_room()
-            clock = self._clocks[name] = assembly.clock(self._settings)
-        return clock
-
-    def _make_room(self) -> None:
-        """Forget the oldest clocks between two ticks: senders without end may come before one.
-
-        Those who are tracked keep theirs. There may be more of them than ``CLOCKS_MAX``, so that it
-        is looked through again only when as many have come as are forgotten at once.
-        """
-        unwanted = (name for name in self._clocks if not self._is_kept(name, self._tracked))
-        for name in list(islice(unwanted, CLOCKS_AT_ONCE)):
-            self._forget_clock(name)
-        self._clocks_most = max(CLOCKS_MAX, len(self._clocks) + CLOCKS_AT_ONCE)
+            return stamp, ()
+        if kind_of(name).reports_itself and (source := Source.parse(name)) in self._components:
+            self._components[source].stated_us = 0
+        text = f"{name} was restarted: its boot clock stepped back to {boot_ms / 1e3:.1f} s"
+        return stamp, (Notice(arrival_ns, Severity.WARNING, name, text),)
 
     def time(self, uav: str, node_ns: int) -> SenderTime:
         """A node time on a UAV's own timeline; a relayed aircraft's timeline is the node's."""
-        clock = self._clocks.get(uav)
-        known = clock.time(node_ns) if clock else None
+        sender = self._senders.get(uav)
+        known = sender.clock.time(node_ns) if sender else None
         if known is None:
             bound_s = noise.ADSB_TIME_BOUND_S
             return SenderTime(node_ns, node_ns, bound_s, bound_s)
@@ -386,59 +402,38 @@ class Senders:
 
     def clock_estimate(self, uav: str) -> ClockEstimate | None:
         """The state of a UAV's clock; None for a UAV that has none."""
-        clock = self._clocks.get(uav)
-        return clock.estimate() if clock else None
+        sender = self._senders.get(uav)
+        return sender.clock.estimate() if sender else None
 
     def assumed(self, uav: str) -> assembly.Assumed:
         """What is assumed of a UAV, by its newest heartbeat."""
-        if uav not in self._known:
-            if len(self._known) >= CLOCKS_MAX:  # a cache only
-                self._known.clear()
-            heard = self.presence.get(Source.parse(uav)) if reports_itself(uav) else None
-            what = (None, None) if heard is None else (heard.mav_type, heard.autopilot)
-            self._known[uav] = assembly.assumed(self._settings, uav, *what)
-        return self._known[uav]
+        vehicle = kind_of(uav).reports_itself
+        component = self._components.get(Source.parse(uav)) if vehicle else None
+        heard = None if component is None else component.presence
+        if heard is None:
+            return self._assumed(uav, None, None)
+        return self._assumed(uav, heard.mav_type, heard.autopilot)
 
     # --- memory -----------------------------------------------------------------------------
 
-    def forget(self, uav: str) -> None:
-        """Forget for how long a sender's receiver has not vouched for it: it begins anew."""
-        self._waits.pop(uav, None)
+    def forget_silent(self, now_ns: int) -> None:
+        """Drop what is known of senders without a track that were silent for long.
 
-    def forget_clocks(self, wanted: Container[str], now_ns: int) -> None:
-        """Forget clocks that were long silent, but for those wanted, and what goes with them.
-
-        Who comes and goes all day takes no memory.
+        Who comes and goes all day takes no memory. Of components the oldest are dropped, too,
+        beyond ``RECORDS_MAX``.
         """
-        silent_ns = now_ns - CLOCK_KEPT_NS
-        names = [name for name in self._clocks if self._stamped_ns.get(name, now_ns) < silent_ns]
-        for name in names:
-            if not self._is_kept(name, wanted):
-                self._forget_clock(name)
-        self._forget_beside(wanted, silent_ns)
+        silent_ns, senders, components = now_ns - KEPT_NS, self._senders, self._components
+        for name in [n for n, one in senders.items() if (one.stamped_ns or now_ns) < silent_ns]:
+            if not self._is_kept(name):
+                del senders[name]
+        gone = [source for source, one in components.items() if one.heard_ns < silent_ns]
+        too_many = max(0, len(components) - RECORDS_MAX)
+        for source in {*gone, *islice(components, too_many)}:
+            if not self._is_kept(str(source)):
+                del components[source]
 
-    def _is_kept(self, name: str, wanted: Container[str]) -> bool:
-        return name in wanted or name == self._carrier
-
-    def _forget_clock(self, name: str) -> None:
-        self._clocks.pop(name, None)
-        self._stamped_ns.pop(name, None)
-
-    def _forget_beside(self, wanted: Container[str], silent_ns: int) -> None:
-        """Forget what senders without a track have said beside positions, as their clocks are."""
-        for heard in (self._receivers, self.presence):
-            gone = [source for source, said in heard.items() if said.t_ns < silent_ns]
-            for source in (*gone, *list(heard)[: max(0, len(heard) - CLOCKS_MAX)]):
-                name = str(source)
-                if self._is_kept(name, wanted):
-                    continue
-                heard.pop(source, None)
-                self._known.pop(name, None)
-                if heard is self._receivers:
-                    self._noise.pop(source, None)
-                    self._stated_us.pop(name, None)
-                    self._apart_m2.pop(source, None)
-        self._shared = {uav for uav in self._shared if uav in wanted or uav in self._clocks}
+    def _is_kept(self, name: str) -> bool:
+        return name in self._tracked or name == self._carrier
 
     def link_share(self, link: str) -> LinkShare:
         """What a link has contributed to the reports so far."""
@@ -449,6 +444,11 @@ def _refused(message: Report | AdsbVehicle, reason: Reason) -> Heard:
     return Heard(said=(Rejection(message.t_ns, message.uav, reason),))
 
 
-def _restart_notice(t_ns: int, name: str, boot_ms: int) -> tuple[Notice]:
-    text = f"{name} was restarted: its boot clock stepped back to {boot_ms / 1e3:.1f} s"
-    return (Notice(t_ns, Severity.WARNING, name, text),)
+def _shared_id(sender: Sender, uav: str, t_ns: int) -> tuple[Notice | Rejection, ...]:
+    """Reject a report under an id with two boot clocks; the notice is given once."""
+    refused = Rejection(t_ns, uav, Reason.SHARED_ID, detail="two boot clocks under this id")
+    if sender.is_shared:
+        return (refused,)
+    sender.is_shared = True
+    text = f"two vehicles share the id {uav}: neither is believed"
+    return Notice(t_ns, Severity.WARNING, uav, text), refused

@@ -6,18 +6,18 @@ from companion.settings.model import Settings
 from companion.tracking.identity import Identities
 from companion.values import (
     Duty,
-    Fix,
     Notice,
     Severity,
-    Track,
     TrackState,
-    reports_itself,
-    standing,
+    kind_of,
 )
 
 
 class Targets:
     """Decides for which UAVs beams are wanted.
+
+    ``identities`` tells which relayed aircraft is which better known track: two beams on one
+    aircraft would make zero forcing all but singular.
 
     Wanted are UAVs that report themselves, relayed aircraft only if the settings say so, and never
     the carrier (``carrier`` is its id, None for a station). Of a fleet's node it is those that are
@@ -28,15 +28,15 @@ class Targets:
         self._carrier = carrier
         self._all = settings.beams.targets == "all"
         self._dropped_s = settings.tracks.dropped_s
-        self._identities = Identities()
+        self.identities = Identities()
         self._states: dict[str, TrackState] = {}
         self.duty: Duty | None = None
 
     def wants(self, uav: str) -> bool:
         """Whether a beam is wanted for this UAV."""
-        if uav == self._carrier or self.same_as(uav) is not None:
+        if uav == self._carrier or self.identities.same_as(uav) is not None:
             return False
-        return self._all or reports_itself(uav)
+        return self._all or kind_of(uav).reports_itself
 
     def among(self, uavs: Iterable[str]) -> list[str]:
         """The UAVs for which beams are wanted, in the order given."""
@@ -51,32 +51,19 @@ class Targets:
         spares = frozenset(self.duty.spares if self.duty else ())
         return [uav for uav in uavs if uav in spares and self.wants(uav)]
 
-    def same_as(self, uav: str) -> str | None:
-        """The better known track that is the same aircraft as this relayed one.
-
-        None if there is none.
-        """
-        return self._identities.same_as(uav)
-
     def betters(self, uav: str, others: Iterable[str]) -> list[str]:
         """Those of the others by which a relayed aircraft would rather be known.
 
         Telemetry before Remote ID, ADS-B and Cursor on Target, in this order; who is known by
         another track himself is none of them.
         """
-        own = standing(uav)
-        return [one for one in others if standing(one) < own and self.same_as(one) is None]
-
-    def compare(self, relayed: Fix, better: list[Track]) -> None:
-        """Compare a relayed aircraft with tracks near it that are better known, at its time.
-
-        Two beams on one aircraft would make zero forcing all but singular.
-        """
-        self._identities.observe(relayed, better)
+        own = kind_of(uav).rank
+        same_as = self.identities.same_as
+        return [one for one in others if kind_of(one).rank < own and same_as(one) is None]
 
     def forget(self, uav: str) -> None:
         """Forget a UAV that is dropped: its state, and what it was compared with if relayed."""
-        self._identities.forget(uav)
+        self.identities.forget(uav)
         self._states.pop(uav, None)
 
     # --- what is said of them ---------------------------------------------------------------

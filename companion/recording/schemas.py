@@ -116,13 +116,15 @@ _CLASSES: Final[dict[str, type]] = {
 }
 """The messages of recordings, and the classes whose described values are their fields."""
 
+RESERVED: Final = "reserved"
+"""Stands in place of a field that is gone."""
 _FLEET: Final[dict[str, list[str]]] = {
     "SharedFrame": ["uint64 after_ns", "bytes raw"],
     "Shared": ["fixed64 first_ns", "repeated SharedFrame frame", "repeated RoundTrip trip",
                "fixed64 told_ns"],
     "Served": ["string uav", "double worth_db"],
     "Handing": ["string uav", "string to"],
-    "Standing": ["string node", "fixed64 started_ns", "fixed64 t_ns", "repeated double place",
+    "Standing": ["string node", RESERVED, RESERVED, "repeated double place",
                  "optional double reach_m", "uint32 most", "repeated Served serves",
                  "repeated Handing handing"],
     "Offers": ["repeated Offer offer"],
@@ -272,7 +274,10 @@ def _describe() -> FileDescriptorProto:
     for name, numbered in declared.items():
         described = file.message_type.add(name=name)
         for number, text in numbered:
-            _describe_field(described, number, text)
+            if text == RESERVED:
+                described.reserved_range.add(start=number, end=number + 1)
+            else:
+                _describe_field(described, number, text)
     return file
 
 

@@ -18,6 +18,7 @@ from companion.server.metrics import NodeCollector
 from companion.server.responses import answer, answers
 from companion.server.stream import Stream
 from companion.server.turns import Turns
+from companion.values import UAV_FORMS
 from companion.views import fleet as fleet_view
 from companion.views import glance, series, settings, state
 from companion.views.as_json import as_json
@@ -28,7 +29,7 @@ from companion.views.state import Node
 CONTENT_POLICY: Final = b"default-src 'self'; frame-ancestors 'none'"
 DRAWN_POLICY: Final = CONTENT_POLICY + b"; style-src 'self' 'unsafe-inline'; img-src 'self' data:"
 """For ``/docs``: Swagger UI brings pictures in its style sheet, and styles with what it draws."""
-UavId = Annotated[str, PathParameter(description="SYSID:COMPID, icao:HEX, rid:ID or cot:UID")]
+UavId = Annotated[str, PathParameter(description=UAV_FORMS)]
 DESCRIPTION: Final = """Location-aware beamforming from MAVLink. Read only.
 
 Angles in degrees, distances in metres; null is not known, never 0. Estimates are worked out for

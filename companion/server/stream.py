@@ -28,7 +28,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from companion.server import topics
 from companion.server.access import SUBPROTOCOL
 from companion.server.topics import Topic
-from companion.values import UserError
+from companion.values import UAV_FORMS, UavKind, UserError
 from companion.views.state import Node
 
 Json = dict[str, Any]
@@ -40,9 +40,7 @@ BAD_ARGUMENTS: Final = 4422
 
 RATE_HZ: Final = 10.0
 LEAST_HZ, MOST_HZ = 0.1, 100.0
-_UAV: Final = re.compile(
-    r"\d{1,3}:\d{1,3}|icao:[0-9A-F]{6}|(rid|cot):[A-Za-z0-9._-]{1,64}", re.ASCII
-)
+_UAV: Final = re.compile("|".join(kind.pattern for kind in UavKind), re.ASCII)
 MOST_CLIENTS: Final = 256
 """Streams at a time: half of the connections, the others are left for questions."""
 SLOTS: Final = 32
@@ -71,7 +69,7 @@ def wanted(query: QueryParams) -> Wanted:
         raise UserError(f"{min(unknown)[:40]!r} is none of uav, topic, rate_hz")
     for uav in query.getlist("uav"):
         if not _UAV.fullmatch(uav):
-            raise UserError(f"uav: {uav[:40]!r} is not SYSID:COMPID, icao:HEX, rid:ID or cot:UID")
+            raise UserError(f"uav: {uav[:40]!r} is not {UAV_FORMS}")
     text = query.get("rate_hz", str(RATE_HZ))
     try:
         rate_hz = float(text)

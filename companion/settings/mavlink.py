@@ -13,7 +13,7 @@ from pydantic import (
 
 from companion.mavlink.links.urls import Scheme, parse_link
 from companion.settings.section import Section
-from companion.values import UserError
+from companion.values import UAV_FORMS, UserError
 
 
 def _link(text: str) -> str:
@@ -94,9 +94,7 @@ _OUT: Final[tuple[Scheme, ...]] = ("udpout", "tcp", "tcpin", "serial", "zenoh", 
 
 def _uav_pattern(text: str) -> str:
     if not _UAV_PATTERN.fullmatch(text):
-        raise UserError(
-            f"{text!r} is not SYSID:COMPID, icao:HEX, rid:ID or cot:UID; * stands for any"
-        )
+        raise UserError(f"{text!r} is not {UAV_FORMS}; * stands for any")
     return text
 
 

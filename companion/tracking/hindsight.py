@@ -42,7 +42,7 @@ WAYS: Final = (
     Way(1.0, 3, 3.0, turns=True), Way(2.5, 3, 3.0, turns=True), Way(5.0, 5, 3.0, turns=True),
 )  # fmt: skip
 """None; a quick turn, soon over or not; one that goes on; a slow one, noisy reports; circles."""
-WINDOWS: Final = ((1.0, 3), (2.5, 3), (5.0, 5))
+WINDOWS: Final = sorted({(way.window_s, way.fewest) for way in WAYS if way.window_s})
 """Windows of the ways and the velocities they need, each once, ascending."""
 TURNS_MPS: Final = 1.0
 """Speed in the plane below which there is no direction that could turn."""

@@ -21,48 +21,52 @@ SPEED_APART_MPS: Final = 15.0
 
 
 @dataclass(slots=True)
-class _Count:
-    uav: str
+class _Relayed:
+    """A relayed aircraft: the track near its newest reports, and the track that it is.
+
+    near      the nearest better known track; empty if none is near enough
+    in_a_row  newest reports for which that is so
+    same_as   the better known track that is the same aircraft; None if there is none
+    """
+
+    near: str
     in_a_row: int = 0
+    same_as: str | None = None
 
 
 class Identities:
     """Which relayed aircraft is which better known track."""
 
     def __init__(self) -> None:
-        self._counts: dict[str, _Count] = {}
-        self._same: dict[str, str] = {}
+        self._relayed: dict[str, _Relayed] = {}
 
     def same_as(self, uav: str) -> str | None:
         """The better known track that is the same aircraft as this relayed one.
 
         None if there is none.
         """
-        return self._same.get(uav)
+        known = self._relayed.get(uav)
+        return None if known is None else known.same_as
 
     def forget(self, uav: str) -> None:
         """Forget a relayed aircraft."""
-        self._counts.pop(uav, None)
-        self._same.pop(uav, None)
+        self._relayed.pop(uav, None)
 
     def observe(self, relayed: Fix, better: list[Track]) -> None:
         """Compare a relayed report with the better known tracks at its time."""
         near = [(_apart_m(relayed, track), track.uav) for track in better]
         nearest = min((pair for pair in near if pair[0] is not None), default=None)
         match = nearest[1] if nearest else ""
-        count = self._counts.get(relayed.uav)
-        if count is None or count.uav != match:
-            count = self._counts[relayed.uav] = _Count(match)
-            if len(self._counts) > RELAYED_MAX:
-                oldest = next(iter(self._counts))
-                del self._counts[oldest]
-                self._same.pop(oldest, None)
-        count.in_a_row += 1
-        if count.in_a_row >= REPORTS_TO_DECIDE:
-            if match:
-                self._same[relayed.uav] = match
-            else:
-                self._same.pop(relayed.uav, None)
+        known = self._relayed.get(relayed.uav)
+        if known is None:
+            known = self._relayed[relayed.uav] = _Relayed(match)
+            if len(self._relayed) > RELAYED_MAX:
+                del self._relayed[next(iter(self._relayed))]
+        elif known.near != match:
+            known.near, known.in_a_row = match, 0
+        known.in_a_row += 1
+        if known.in_a_row >= REPORTS_TO_DECIDE:
+            known.same_as = match or None
 
 
 def _apart_m(relayed: Fix, track: Track) -> float | None:

@@ -96,16 +96,14 @@ def lag_s(kind: Airframe, autopilot: int | None) -> tuple[float, float]:
 
 @dataclass(slots=True)
 class Raised:
-    """A limit that was raised: to how much, when on the sender's timeline, and how often."""
+    """A limit that was raised: to how much, and when on the sender's timeline."""
 
     to: float = 0.0
     at_ns: int = 0
-    times: int = 0
 
     def to_hold(self, proven: float, sender_ns: int) -> float:
         """Raise the limit to what holds what was proven, and more; returns it."""
         self.to, self.at_ns = RAISED * proven, sender_ns
-        self.times += 1
         return self.to
 
     def at(self, limit: float, sender_ns: int) -> float:
@@ -124,11 +122,6 @@ class Refutations:
         self.acceleration = Raised()
         self._times_ns: list[int] = []
         self._velocities: list[tuple[float, float, float, float, float]] = []
-
-    @property
-    def times(self) -> int:
-        """How often a limit was refuted."""
-        return self.speed.times + self.acceleration.times
 
     def limits(self, base: Limits, sender_ns: int) -> Limits:
         """The limits in force at a sender time."""

@@ -30,7 +30,6 @@ from companion.values import (
     Reason,
     Refuted,
     Rejection,
-    ReportNoise,
     SenderTime,
     Track,
     TrackState,
@@ -85,12 +84,23 @@ class TrackerSettings:
 
 
 @dataclass(slots=True)
+class _Past:
+    """What outlasts a track that is begun again; ``straying`` is None if noise is believed."""
+
+    refutations: Refutations
+    straying: Straying | None
+    pace: Pace
+
+
+@dataclass(slots=True, kw_only=True)
 class _Tracked:
+    """One track: its newest reports, and what they have shown."""
+
+    past: _Past
     history: History[Any]
     suspects: Suspects[Any]
     arrived: Fix
     newest: Estimate
-    pace: Pace
     reports: int = 1
     believable_ns: int = 0
     unknown_input: Vector | None = None
@@ -111,49 +121,45 @@ class Tracker:
         self._observer = observer
         self._settings = settings
         self._tracked: dict[str, _Tracked] = {}
-        self._refutations: dict[str, Refutations] = {}
-        self._straying: dict[str, Straying] = {}
-        self._established: set[str] = set()  # whose track is over, and had many reports
+        self._established: set[str] = set()  # whose record was dropped, and had many reports
 
     # --- reports in -------------------------------------------------------------------------
 
-    def refuted(self, fix: Fix) -> tuple[Fix, list[Refuted]]:
-        """What a report refutes of its aircraft and receiver; the report with the bounds raised."""
-        if fix.limits is None:
-            fix = replace(fix, limits=self._settings.limits)
-        known = self._refutations.get(fix.uav)
-        if known is None:
-            known = self._refutations.setdefault(fix.uav, Refutations())
-        found = known.look(fix)
-        assert fix.limits is not None
-        limits = known.limits(fix.limits, fix.sender_ns)
-        noise, strays = self._doubted(fix, limits.acceleration_max_mps2)
-        if strays is not None:
-            found.append(strays)
-        if limits is fix.limits and noise is fix.noise:
+    def accept(self, fix: Fix) -> tuple[Estimate | Rejection, list[Refuted]]:
+        """Add a report to its track, or begin a track; or return the reason why it is not used.
+
+        Also returns what the report refutes of its aircraft and receiver. The bounds of the report
+        that is judged are raised by that.
+        """
+        tracked = self._tracked.get(fix.uav)
+        past = self._new_past() if tracked is None else tracked.past
+        fix, refuted = self._held_to(past, fix)
+        full = tracked is None and len(self._tracked) >= self._settings.most
+        if full and not self._make_room(fix.uav):
+            why = f"{self._settings.most} tracks are kept"
+            return _rejected(fix, Reason.TOO_MANY, why), refuted
+        if tracked is None or self._is_lost(tracked, fix):
+            return self._begin(fix, past), refuted
+        return self._accepted(tracked, fix), refuted
+
+    def _new_past(self) -> _Past:
+        noise = self._settings.noise
+        return _Past(Refutations(), None if noise is None else Straying(noise), Pace())
+
+    def _held_to(self, past: _Past, fix: Fix) -> tuple[Fix, list[Refuted]]:
+        """A report with the bounds that reports have shown, and what it refutes of them."""
+        given = self._limits(fix)
+        found = past.refutations.look(fix if fix.limits else replace(fix, limits=given))
+        limits, noise = past.refutations.limits(given, fix.sender_ns), fix.noise
+        if past.straying is not None:
+            strays = past.straying.look(fix, limits.acceleration_max_mps2)
+            noise = past.straying.noise(noise)
+            found += [] if strays is None else [strays]
+        if limits is given and noise is fix.noise:
             return fix, found
         return replace(fix, limits=limits, noise=noise), found
 
-    def _doubted(self, fix: Fix, acceleration_mps2: float) -> tuple[ReportNoise, Refuted | None]:
-        """The bounds on a report's noise, by what was seen of its receiver, and what is news."""
-        if self._settings.noise is None:
-            return fix.noise, None
-        if fix.uav not in self._straying:
-            self._straying[fix.uav] = Straying(self._settings.noise)
-        known = self._straying[fix.uav]
-        found = known.look(fix, acceleration_mps2)
-        return known.noise(fix.noise), found
-
-    def accept(self, fix: Fix) -> Estimate | Rejection:
-        """Add a report to its track, or begin a track; or return the reason why it is not used."""
-        tracked = self._tracked.get(fix.uav)
-        full = tracked is None and len(self._tracked) >= self._settings.most
-        if full and not self._make_room(fix.uav):
-            self._refutations.pop(fix.uav, None)
-            self._straying.pop(fix.uav, None)
-            return _rejected(fix, Reason.TOO_MANY, f"{self._settings.most} tracks are kept")
-        if tracked is None or self._is_lost(tracked, fix):
-            return self._begin(fix)
+    def _accepted(self, tracked: _Tracked, fix: Fix) -> Estimate | Rejection:
         index = tracked.history.index(fix.sender_ns)
         if index is None:
             return _rejected(fix, Reason.OUT_OF_ORDER, "older than the window for late reports")
@@ -184,14 +190,17 @@ class Tracker:
                 return True
         return False
 
-    def _begin(self, fix: Fix, reports: int = 0) -> Estimate:
-        history: History[Any] = History(self._observer, fix, round(self._settings.window_s * 1e9))
-        suspects: Suspects[Any] = Suspects(self._observer, self._settings.gate)
+    def _begin(self, fix: Fix, past: _Past, reports: int = 0) -> Estimate:
         first = Estimate(fix, fix.position_ned_m, fix.noise.position_m, None, None)
-        before = self._tracked.get(fix.uav)
-        pace = Pace() if before is None else before.pace
-        pace.add(fix)
-        self._tracked[fix.uav] = _Tracked(history, suspects, fix, first, pace, reports + 1)
+        past.pace.add(fix)
+        self._tracked[fix.uav] = _Tracked(
+            past=past,
+            history=History(self._observer, fix, round(self._settings.window_s * 1e9)),
+            suspects=Suspects(self._observer, self._settings.gate),
+            arrived=fix,
+            newest=first,
+            reports=reports + 1,
+        )
         return first
 
     def _is_lost(self, tracked: _Tracked, fix: Fix) -> bool:
@@ -222,21 +231,19 @@ class Tracker:
         first, *rest = tracked.suspects.take()
         predicted = self._observer.predict(before.state, first.sender_ns)
         off_m = math.dist(first.position_ned_m, predicted.position_ned_m)
-        begun = self._begin(first, tracked.reports)
+        begun = self._begin(first, tracked.past, tracked.reports)
+        anew = self._tracked[fix.uav]
         for later in rest:
-            begun = self._use(self._tracked[fix.uav], len(self._history(fix.uav).entries), later)
-        self._tracked[fix.uav].arrived = fix
+            begun = self._use(anew, len(anew.history.entries), later)
+        anew.arrived = fix
         return replace(begun, innovation_m=off_m, reacquired=True)
-
-    def _history(self, uav: str) -> History[Any]:
-        return self._tracked[uav].history
 
     def _use(
         self, tracked: _Tracked, index: int, fix: Fix, predicted: Prediction | None = None
     ) -> Estimate:
         history = tracked.history
         history.insert(index, fix, predicted)
-        tracked.pace.add(fix)
+        tracked.past.pace.add(fix)
         tracked.reports += 1
         if history.newest.fix is fix:
             self._look_back(tracked, fix)
@@ -282,8 +289,6 @@ class Tracker:
     def forget(self, uav: str) -> None:
         """Forget a track, because its sender was restarted or is gone."""
         tracked = self._tracked.pop(uav, None)
-        self._refutations.pop(uav, None)
-        self._straying.pop(uav, None)
         room = len(self._established) < self._settings.most  # for whoever was here first
         if room and tracked is not None and tracked.reports >= ESTABLISHED:
             self._established.add(uav)
@@ -306,7 +311,7 @@ class Tracker:
         last = tracked.newest
         return Track(
             uav=uav,
-            state=self._settings.ages.state((now - newest.fix.sender_ns) * 1e-9, tracked.pace),
+            state=self._settings.ages.state((now - newest.fix.sender_ns) * 1e-9, tracked.past.pace),
             valid_at_ns=at.node_ns,
             age_s=(at.sender_ns - newest.fix.sender_ns) * 1e-9,
             position_ned_m=np.array(position),
@@ -363,7 +368,7 @@ class Tracker:
             return None
         if velocity is not None:
             newest = tracked.history.newest.fix
-            straying = self._straying.get(newest.uav)
+            straying = tracked.past.straying
             common_m = 0.0 if straying is None else straying.usual_m(newest.noise)
             seen_m = math.hypot(seen_m, common_m, math.hypot(*velocity) * at.usual_s)
         return min(seen_m, bound_m)
@@ -391,7 +396,7 @@ class Tracker:
         if tracked is None:
             return None
         age_s = (now.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
-        return self._settings.ages.state(age_s, tracked.pace)
+        return self._settings.ages.state(age_s, tracked.past.pace)
 
     def near(self, position_ned_m: Vector, within_m: float) -> list[str]:
         """UAVs whose newest accepted report lies within a distance of a local place."""

@@ -28,7 +28,7 @@ from companion.values.errors import UserError, printable, shown
 from companion.values.events import DUTY_MAX, Duty, Event, RoundTrip, Tick, Tock
 from companion.values.fleet import Offer, Shared, SharedFrame, Standing
 from companion.values.health import Blame, Cause, Level, Verdict
-from companion.values.names import Source, reports_itself, standing
+from companion.values.names import UAV_FORMS, Source, UavKind, kind_of
 from companion.values.numbers import (
     BoolArray,
     ComplexArray,
@@ -74,6 +74,7 @@ from companion.values.tracked import (
 
 __all__ = [
     "DUTY_MAX",
+    "UAV_FORMS",
     "Accuracy",
     "AdsbVehicle",
     "AltitudeDatum",
@@ -126,16 +127,16 @@ __all__ = [
     "Tock",
     "Track",
     "TrackState",
+    "UavKind",
     "Update",
     "UserError",
     "UtcNs",
     "Vector",
     "Verdict",
     "Widen",
+    "kind_of",
     "printable",
     "read_toml",
-    "reports_itself",
     "shown",
-    "standing",
     "vector",
 ]

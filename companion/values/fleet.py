@@ -51,8 +51,6 @@ class Standing:
     """What a node says of itself, some times a second.
 
     node       its name
-    started_ns when it started, on its own timeline: another start is another life
-    t_ns       when it says so, on its own timeline
     place      of its array: latitude and longitude in degrees, height above mean sea level in
                metres; None: not known
     reach_m    distance of the farthest UAV that it hears itself; None: none
@@ -62,8 +60,6 @@ class Standing:
     """
 
     node: str
-    started_ns: int
-    t_ns: int
     place: tuple[float, float, float] | None
     reach_m: float | None
     most: int

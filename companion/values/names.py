@@ -1,5 +1,6 @@
 """Names: of senders of frames, and of UAVs."""
 
+from enum import Enum
 from functools import lru_cache
 from typing import Final, NamedTuple, Self
 
@@ -7,7 +8,6 @@ from companion.values.errors import UserError, shown
 
 DIGITS_MAX: Final = 18
 """Most digits of an id: Python reads thousands, and then raises another error."""
-_STANDING: Final = {"rid": 1, "icao": 2, "cot": 3}
 
 
 class Source(NamedTuple):
@@ -36,19 +36,41 @@ def _ids(text: str) -> tuple[int, int]:
     return int(sysid), int(compid)
 
 
-def reports_itself(uav: str) -> bool:
-    """True if ``uav`` names a vehicle that sends its own position, False for a relayed aircraft.
+class UavKind(Enum):
+    """What a UAV's id names, in the order in which one aircraft is best known.
 
-    Relayed aircraft are named ``icao:HEX`` (ADS-B), ``rid:ID`` (Remote ID) or ``cot:UID`` (Cursor
-    on Target).
+    Its own telemetry comes first, then what it broadcasts of itself, then what others report.
+
+        prefix         what its ids begin with, before a colon; empty for SYSID:COMPID
+        pattern        regular expression of its ids
+        may_be_manned  whether an aircraft of this kind may carry people
+        rank           its place in this order, from 0
+
+    Only a vehicle reports itself: it has a MAVLink source, a link and a clock of its own.
     """
-    return standing(uav) == 0
+
+    VEHICLE = "", r"\d{1,3}:\d{1,3}", False
+    REMOTE_ID = "rid", r"rid:[A-Za-z0-9._-]{1,64}", False
+    ADSB = "icao", r"icao:[0-9A-F]{6}", True
+    COT = "cot", r"cot:[A-Za-z0-9._-]{1,64}", True
+
+    def __init__(self, prefix: str, pattern: str, may_be_manned: bool) -> None:
+        self.prefix = prefix
+        self.pattern = pattern
+        self.may_be_manned = may_be_manned
+        self.rank = len(type(self).__members__)
+        self.reports_itself = not prefix
+
+    def uav(self, name: str) -> str:
+        """The id of an aircraft of this kind that is relayed under a name."""
+        return f"{self.prefix}:{name}"
 
 
-def standing(uav: str) -> int:
-    """The place of a UAV's name among those that one aircraft may have, the best is 0.
+_KINDS: Final = {kind.prefix: kind for kind in UavKind}
+UAV_FORMS: Final = "SYSID:COMPID, icao:HEX, rid:ID or cot:UID"
+"""How the ids of all kinds are written."""
 
-    An aircraft is known by its own telemetry before all, then by what it broadcasts of itself, then
-    by what others say.
-    """
-    return _STANDING.get(uav.partition(":")[0], 0)
+
+def kind_of(uav: str) -> UavKind:
+    """The kind of thing that an id names."""
+    return _KINDS.get(uav.partition(":")[0], UavKind.VEHICLE)

@@ -5,7 +5,7 @@ from enum import StrEnum
 from typing import Annotated, NamedTuple
 
 from companion.values.described import Meaning
-from companion.values.names import Source
+from companion.values.names import Source, UavKind
 
 
 class Frame(NamedTuple):
@@ -92,7 +92,6 @@ class Report:
     """
 
     t_ns: int
-    link: str
     uav: str
     source: Source
     lat_deg: float
@@ -116,7 +115,6 @@ class AdsbVehicle:
         t_ns               when it arrived, node time
         icao               24-bit ICAO address of the aircraft
         source             the relay, not the aircraft
-        emitter_type       MAVLink's ADSB_EMITTER_TYPE, which includes ground vehicles and obstacles
         position_deg       latitude, longitude
         alt_m, alt_datum   height and what it is measured from; both None or neither
         heading_deg        from true north, clockwise
@@ -129,11 +127,9 @@ class AdsbVehicle:
     """
 
     t_ns: int
-    link: str
     icao: int
     source: Source
     callsign: str | None
-    emitter_type: int
     position_deg: tuple[float, float] | None
     alt_m: float | None
     alt_datum: AltitudeDatum | None
@@ -146,7 +142,7 @@ class AdsbVehicle:
     @property
     def uav(self) -> str:
         """The aircraft's name here: ``icao:`` and six hexadecimal digits."""
-        return f"icao:{self.icao:06X}"
+        return UavKind.ADSB.uav(f"{self.icao:06X}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +160,6 @@ class RemoteId:
     """
 
     t_ns: int
-    link: str
     source: Source
     heard_as: str
     uas_id: str | None = None
@@ -201,8 +196,6 @@ class Presence:
     source: Source
     mav_type: int
     autopilot: int
-    system_status: int
-    armed: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,7 +209,6 @@ class GnssStatus:
     t_ns: int
     source: Source
     fix_type: int
-    satellites: int | None
     alt_m: float
     h_acc_m: float | None
     v_acc_m: float | None

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Final
 
 from companion.pipeline.fold import Pipeline
-from companion.values import Blame, Level, Notice, Verdict, reports_itself
+from companion.values import Blame, Level, Notice, Verdict, kind_of
 from companion.values.described import Meaning
 from companion.views import health
 from companion.views.as_json import Json, as_json, rfc3339
@@ -34,7 +34,7 @@ def glance(node: Node) -> Json:
             | {"bound_m": track.bound_m}
             | _verdict(pipeline, verdicts.get(track.uav), machine)
             for track in (update.tracks if update else ())
-            if reports_itself(track.uav)
+            if kind_of(track.uav).reports_itself
         ],
         **node.rates(),
         "recording": {

@@ -18,7 +18,7 @@ from companion.mavlink.wire.encode import (
 )
 from companion.pipeline.fold import Pipeline
 from companion.tracking.noise import GEOID_M
-from companion.values import AltitudeDatum, Source, Track, TrackState, reports_itself
+from companion.values import AltitudeDatum, Source, Track, TrackState, kind_of
 
 KNOWN: Final = (TrackState.LIVE, TrackState.COASTING)
 _REBOOT_MS: Final = 60_000
@@ -41,7 +41,7 @@ class Positions:
         found = [
             message
             for track in tracks
-            if reports_itself(track.uav)
+            if kind_of(track.uav).reports_itself
             and track.state in KNOWN
             and (message := self._one(pipeline, track)) is not None
         ]
@@ -104,7 +104,7 @@ def events(pipeline: Pipeline, tracks: Iterable[Track], stale_s: float) -> list[
     return [
         _event(pipeline, track, stale_s)
         for track in tracks
-        if track.state in KNOWN and pipeline.targets.same_as(track.uav) is None
+        if track.state in KNOWN and pipeline.targets.identities.same_as(track.uav) is None
     ]
 
 

@@ -12,12 +12,12 @@ from typing import Final, NamedTuple
 
 from companion.mavlink.wire.decode import (
     ATTITUDE,
-    GLOBAL_POSITION_INT,
     GPS_RAW_INT,
     HEARTBEAT,
     SYSTEM_TIME,
 )
 from companion.mavlink.wire.encode import Outgoing
+from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
 from companion.mavlink.wire.transponder import ADSB_VEHICLE
 from companion.tracking.geodesy import LocalFrame
 from companion.values import AltitudeDatum

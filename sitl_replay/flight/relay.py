@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import IntFlag
 from typing import Final, NamedTuple
 
-from companion.values import AltitudeDatum
+from companion.values import AltitudeDatum, UavKind
 from sitl_replay.flight.motion import Motion
 
 SQUITTER_INTERVAL_S: Final = 1.0
@@ -76,7 +76,7 @@ class Aircraft:
     squawk: int = 7000
 
     def __str__(self) -> str:
-        return f"icao:{self.icao:06X}"
+        return UavKind.ADSB.uav(f"{self.icao:06X}")
 
 
 class Contact(NamedTuple):

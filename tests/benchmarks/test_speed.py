@@ -147,7 +147,7 @@ def _update_us(uavs: int) -> float:
     tracker = assembly.tracker(settings)
     noise = ReportNoise(1.0, 1.0, 1.4, 0.3)
     report = Report(
-        0, "bench", "", Source(1, 1), 47.0, 8.0, 500.0, AltitudeDatum.MSL, None, None, None, None,
+        0, "", Source(1, 1), 47.0, 8.0, 500.0, AltitudeDatum.MSL, None, None, None, None,
         0, None,
     )  # fmt: skip
     velocity = (5.0, 0.0, 0.0)

@@ -11,7 +11,7 @@ import pytest
 from faulty_flight import Case, Outcome, fly_all
 from support import LONGEST_FRAME, read_metadata
 
-from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
+from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
 from companion.recording import schemas
 from companion.values import Frame
 

@@ -251,4 +251,4 @@ def _offers() -> Any:
 
 
 def _standing(started_ns: int) -> Any:
-    return Standing("liar", started_ns, time.time_ns(), None, None, 10, ())
+    return Standing("liar", None, None, 10, ())

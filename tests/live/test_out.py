@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import all as dialect
 from support import BIN, HANG_S, end
 
 from companion.mavlink.wire.cot import from_xml
-from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
+from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
 from sitl_replay.flight import scenario
 from sitl_replay.flight.vehicles import schedule
 from sitl_replay.traffic.recorder import TlogWriter

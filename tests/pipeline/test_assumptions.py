@@ -88,7 +88,7 @@ def test_a_turn_that_the_type_cannot_do_is_told_once_and_the_bound_widens() -> N
     (track,) = into.tracks(now_ns, now_ns + S)
     assert track.limits.limits_source == "raised"
     assert track.limits.acceleration_max_mps2 > 7.0
-    assert into.assumptions.times("1:1") == len(refuted)
+    assert into.refuted("1:1") == len(refuted)
     assert not any(isinstance(one, Rejection) for one in out)
 
 

@@ -549,6 +549,19 @@ def test_what_a_receiver_said_before_does_not_take_the_place_of_what_it_says_now
     assert noise_of(pipeline, "1:1") == pytest.approx((3.0, 3.0, 0.3))
 
 
+def test_after_a_reboot_a_receiver_is_believed_whose_time_is_a_little_before() -> None:
+    """Less than a second link may lag, so that only the reboot tells it from an old status."""
+    pipeline = Pipeline(settings("home"))
+    run(pipeline, [position(n / 5, "1:1") for n in range(100)])
+    run(pipeline, [accuracy(15.0, "1:1", 5.0, 5.0, 0.2)])
+    run(pipeline, [position(20.0 + n, "1:1", boot_s=1.0 + n) for n in range(4)])
+    anew = accuracy(3.0, "1:1", 1.0, 1.0, 0.1)
+    pipeline.step(anew._replace(t_ns=START_NS + 23_500 * S // 1000))
+    run(pipeline, [position(20.0 + n, "1:1", boot_s=1.0 + n) for n in range(4, 16)])
+    assert pipeline.restarts["1:1"] == 1
+    assert noise_of(pipeline, "1:1") == pytest.approx((3.0, 3.0, 0.3))
+
+
 def test_a_relayed_report_is_as_good_as_transponders_are() -> None:
     """100 m, and the way flown in the second to which its time is known."""
     pipeline = Pipeline(settings("home", observer={"speed_max_mps": 90.0}))
@@ -623,8 +636,24 @@ def test_frames_that_nobody_reads_are_counted_and_no_more() -> None:
     beat = dialect.MAVLink_heartbeat_message(2, 3, 128, 0, 4, 3)
     assert pipeline.step(sent(0, "1:1", beat)) == []
     assert pipeline.frames == 2
-    assert pipeline.senders.presence[Source(1, 1)].armed
     assert pipeline.digest.hexdigest() == before
+
+
+def test_after_a_reboot_a_track_waits_for_its_receiver_anew() -> None:
+    """The receiver's height is always another, so that the first track began after ten seconds."""
+    pipeline = Pipeline(settings("47.4,8.55,500"))
+
+    def reasons(from_s: float, to_s: float, boot_s: float) -> list[Reason]:
+        found = []
+        for t_s in np.arange(from_s, to_s, 0.5):
+            events = [accuracy(t_s, "1:1", 1, 1, 1), position(t_s, "1:1", boot_s=boot_s + t_s)]
+            found += [one.reason for one in run(pipeline, events) if isinstance(one, Rejection)]
+        return found
+
+    assert reasons(0, 15, 100.0) == [Reason.NO_FIX] * 20
+    after = reasons(15, 30, -14.0)
+    assert pipeline.restarts["1:1"] == 1
+    assert after.count(Reason.NO_FIX) == 20
 
 
 def test_a_reboot_is_said_and_begins_a_fresh_track() -> None:
@@ -819,8 +848,8 @@ def test_own_telemetry_and_adsb_of_one_aircraft_get_one_beam() -> None:
         pipeline.step(adsb(n + 0.1, (here[0] + 8, 30.0, -130.0)))
         update = updated(pipeline, n + 0.2)
         assert set(update.beams.uavs) == ({"1:1", "icao:4CA7B3"} if n < 4 else {"1:1"})
-    assert pipeline.targets.same_as("icao:4CA7B3") == "1:1"
-    assert pipeline.targets.same_as("1:1") is None
+    assert pipeline.targets.identities.same_as("icao:4CA7B3") == "1:1"
+    assert pipeline.targets.identities.same_as("1:1") is None
     assert not pipeline.targets.wants("icao:4CA7B3")
 
 
@@ -839,11 +868,11 @@ def test_who_is_denied_is_not_tracked_and_that_is_counted() -> None:
     assert pipeline.tracker.newest("5:1") is not None  # the carrier always is
     refused = {
         uav: pipeline.refusals.of(uav).counts[Reason.NOT_ALLOWED]
-        for uav in pipeline.refusals.senders()
+        for uav in ("2:1", "3:7", "icao:4CA7B3", "5:1")
     }
     assert refused["2:1"] == refused["3:7"] == 20
     assert refused["icao:4CA7B3"] > 0
-    assert "5:1" not in refused
+    assert refused["5:1"] == 0
 
 
 def test_the_link_that_is_first_is_known_and_both_latencies_are() -> None:
@@ -913,8 +942,9 @@ def test_no_more_are_tracked_than_the_settings_allow() -> None:
 
 def test_clocks_of_those_without_a_track_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """Invented senders do not fill the memory; who has a track, and the carrier, keep theirs."""
-    monkeypatch.setattr("companion.pipeline.senders.CLOCKS_MAX", 10)
-    monkeypatch.setattr("companion.pipeline.senders.CLOCKS_AT_ONCE", 2)
+    monkeypatch.setattr("companion.pipeline.records.RECORDS_MAX", 10)
+    monkeypatch.setattr("companion.pipeline.senders.RECORDS_MAX", 10)
+    monkeypatch.setattr("companion.pipeline.records.DROPPED_AT_ONCE", 2)
     pipeline = Pipeline(settings(tracks={"most": 2}))
     pipeline.step(attitude(0, "5:1"))  # the carrier has no position, and so no track
     for sysid in range(11, 61):

@@ -11,14 +11,14 @@ from pymavlink.dialects.v20 import all as dialect
 from companion.mavlink.wire.cot_link import CotSplitter
 from companion.mavlink.wire.transponder import Said
 from companion.mavlink.wire.transponder import frame as transponder_frame
-from companion.pipeline import senders
+from companion.pipeline import records, senders
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
 from companion.values import Estimate, Frame, Reason, Rejection, Source, Tick, Update
 from companion.views.tables.reports import heard
 
 S = 1_000_000_000
-CLOCKS_MAX = 256
+RECORDS_MAX = 256
 TRACKS_MAX = 100
 START_NS = 1_760_000_000 * S
 PLACE = (47.4, 8.55, 500.0)
@@ -115,13 +115,17 @@ def test_one_aircraft_that_is_heard_three_ways_gets_one_beam() -> None:
         fold.step(transponder(n + 0.1))
         beams = set(updated(fold, n + 0.2).beams.uavs)
         assert beams == ({RID, "icao:4CA7B3"} if n < 4 else {RID})
-    assert fold.targets.same_as("icao:4CA7B3") == RID
+    assert fold.targets.identities.same_as("icao:4CA7B3") == RID
     for n in range(12, 24):
         fold.step(telemetry(n))
         fold.step(broadcast(n + 0.05))
         fold.step(transponder(n + 0.1))
     assert set(updated(fold, 24).beams.uavs) == {"1:1"}
-    assert fold.targets.same_as(RID) == fold.targets.same_as("icao:4CA7B3") == "1:1"
+    assert (
+        fold.targets.identities.same_as(RID)
+        == fold.targets.identities.same_as("icao:4CA7B3")
+        == "1:1"
+    )
 
 
 def test_an_event_of_an_aircraft_that_is_known_better_is_that_one() -> None:
@@ -130,7 +134,7 @@ def test_an_event_of_an_aircraft_that_is_known_better_is_that_one() -> None:
         fold.step(transponder(n))
         fold.step(event(n))
     assert set(updated(fold, 12).beams.uavs) == {"icao:4CA7B3"}
-    assert fold.targets.same_as("cot:HAWK") == "icao:4CA7B3"
+    assert fold.targets.identities.same_as("cot:HAWK") == "icao:4CA7B3"
 
 
 def test_an_events_errors_are_its_bounds_and_late_is_late() -> None:
@@ -234,17 +238,18 @@ def test_an_export_has_a_row_of_each_report_whatever_its_message() -> None:
 
 def test_made_up_names_take_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of events, whose names are anybody's: what is kept of them has an end."""
-    monkeypatch.setattr(senders, "CLOCKS_MAX", CLOCKS_MAX)
+    monkeypatch.setattr(records, "RECORDS_MAX", RECORDS_MAX)
+    monkeypatch.setattr(senders, "RECORDS_MAX", RECORDS_MAX)
     fold = pipeline(tracks={"most": TRACKS_MAX})
     template = event(0).raw
     at = template.index(b"HAWK")
     seen: Counter[str] = Counter()
-    for number in range(3 * CLOCKS_MAX):
+    for number in range(3 * RECORDS_MAX):
         raw = template[:at] + f"{number:04x}".encode() + template[at + 4 :]
         for said in fold.step(event(0)._replace(raw=raw)):
             seen[said.reason if isinstance(said, Rejection) else "used"] += 1
-    assert len(fold.senders._clocks) <= CLOCKS_MAX
-    assert len(fold.senders._known) <= CLOCKS_MAX
-    assert len(fold.tracker._straying) == len(fold.tracker._refutations)
-    assert len(fold.tracker._refutations) == len(fold.tracker.uavs) == seen["used"] == TRACKS_MAX
-    assert seen[Reason.TOO_MANY] == 3 * CLOCKS_MAX - TRACKS_MAX
+    assert len(fold.senders._senders) <= RECORDS_MAX
+    assert len(fold.records) <= RECORDS_MAX
+    assert fold.senders._assumed.cache_info().currsize <= RECORDS_MAX
+    assert len(fold.tracker.uavs) == seen["used"] == TRACKS_MAX
+    assert seen[Reason.TOO_MANY] == 3 * RECORDS_MAX - TRACKS_MAX

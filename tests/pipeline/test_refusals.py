@@ -1,11 +1,16 @@
 """What was refused is counted, by whom, and a flood of names is bounded."""
 
+from companion.pipeline.records import Records, UavRecord
 from companion.pipeline.refusals import RECENT, SENDERS_MAX, Refusals
 from companion.values import Reason, Rejection
 
 
+def made_refusals() -> Refusals:
+    return Refusals(Records(UavRecord, set[str]().__contains__))
+
+
 def test_counts_by_sender_and_reason() -> None:
-    refusals = Refusals()
+    refusals = made_refusals()
     for n in range(20):
         refusals.add(Rejection(n, "1:1", Reason.DUPLICATE))
     refusals.add(Rejection(20, "udp", Reason.GARBAGE, 7))
@@ -13,15 +18,14 @@ def test_counts_by_sender_and_reason() -> None:
     assert refusals.of("udp").counts == {Reason.GARBAGE: 7}
     assert [one.t_ns for one in refusals.of("1:1").recent] == list(range(20 - RECENT, 20))
     assert not refusals.of("2:1").counts
-    assert refusals.senders() == ["1:1", "udp"]
 
 
 def test_a_flood_of_senders_forgets_the_one_heard_of_longest_ago() -> None:
-    refusals = Refusals()
+    refusals = made_refusals()
     for n in range(2 * SENDERS_MAX):
         refusals.add(Rejection(n, f"icao:{n:06X}", Reason.NO_POSITION))
         refusals.add(Rejection(n, "1:1", Reason.DUPLICATE))
-    assert len(refusals.senders()) == SENDERS_MAX
+    assert len(refusals._senders) == SENDERS_MAX
     assert refusals.total == {
         Reason.NO_POSITION: 2 * SENDERS_MAX,
         Reason.DUPLICATE: 2 * SENDERS_MAX,
@@ -38,7 +42,7 @@ def told_at(refusals: Refusals, rejections: list[Rejection]) -> list[float]:
 
 
 def test_a_second_without_a_report_that_is_used_is_told_once() -> None:
-    refusals = Refusals()
+    refusals = made_refusals()
     assert told_at(refusals, [refused(t / 4) for t in range(20)]) == [1.0]
     said = refusals.add(refused(7, "4:1"))
     assert said is None
@@ -50,7 +54,7 @@ def test_a_second_without_a_report_that_is_used_is_told_once() -> None:
 
 
 def test_a_report_that_is_used_ends_the_run() -> None:
-    refusals = Refusals()
+    refusals = made_refusals()
     for t in range(40):
         assert refusals.add(refused(t / 4)) is None
         if t % 3 == 0:
@@ -58,7 +62,7 @@ def test_a_report_that_is_used_ends_the_run() -> None:
 
 
 def test_runs_that_follow_one_another_are_told_every_ten_seconds_at_most() -> None:
-    refusals = Refusals()
+    refusals = made_refusals()
     told = []
     for t in range(30):
         told += told_at(refusals, [refused(t), refused(t + 0.5, reason=Reason.FROZEN)])
@@ -69,14 +73,14 @@ def test_runs_that_follow_one_another_are_told_every_ten_seconds_at_most() -> No
 
 
 def test_what_is_no_report_about_its_sender_is_told_of_nobody() -> None:
-    refusals = Refusals()
+    refusals = made_refusals()
     for reason in (Reason.DUPLICATE, Reason.BAD_CRC, Reason.NOT_ALLOWED, Reason.UNSIGNED):
         assert told_at(refusals, [refused(t, reason=reason) for t in range(9)]) == []
     assert told_at(refusals, [refused(t, "icao:4CA7B3") for t in range(9)]) == []
 
 
 def test_reports_under_a_shared_id_are_why_a_uav_is_silent_and_are_told_elsewhere() -> None:
-    refusals = Refusals()
+    refusals = made_refusals()
     shared = [refused(t / 4, reason=Reason.SHARED_ID) for t in range(20)]
     assert told_at(refusals, shared) == []
     assert refusals.unheard("3:1") is Reason.SHARED_ID

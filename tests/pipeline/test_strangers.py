@@ -2,17 +2,17 @@
 
 import math
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Container
 
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common
 
-from companion.mavlink.trust import admission
-from companion.mavlink.trust.admission import Admission
+from companion.mavlink.trust.admission import KNOWN_MAX, admission
 from companion.pipeline.center import Center
 from companion.pipeline.fold import Pipeline
-from companion.pipeline.senders import CLOCKS_AT_ONCE, CLOCKS_MAX, PlacedAttitude, Senders
+from companion.pipeline.records import DROPPED_AT_ONCE, RECORDS_MAX, Records, UavRecord
+from companion.pipeline.senders import PlacedAttitude, Senders
 from companion.settings.model import Settings
 from companion.tracking.observers.position import PositionModel, PositionObserver
 from companion.tracking.tracker import ESTABLISHED, Tracker, TrackerSettings
@@ -23,9 +23,7 @@ from companion.values import (
     Estimate,
     Fix,
     Frame,
-    GnssStatus,
     Limits,
-    Presence,
     Reason,
     Rejection,
     Report,
@@ -46,7 +44,7 @@ MS = 1_000_000
 def fix(uav: str, t_s: float) -> Fix:
     t_ns = round(t_s * S)
     report = Report(
-        t_ns, "udp", uav, Source(1, 1), 47.0, 8.0, 500.0, AltitudeDatum.MSL, None, None, None,
+        t_ns, uav, Source(1, 1), 47.0, 8.0, 500.0, AltitudeDatum.MSL, None, None, None,
         None, 1000, None,
     )  # fmt: skip
     place = (10.0 * t_s, 0.0, -50.0)
@@ -62,7 +60,7 @@ def tracker() -> Tracker:
 
 def flown(tracker: Tracker, uav: str, reports: int, from_s: float) -> None:
     for number in range(reports):
-        assert isinstance(tracker.accept(fix(uav, from_s + number * 0.1)), Estimate)
+        assert isinstance(tracker.accept(fix(uav, from_s + number * 0.1))[0], Estimate)
 
 
 def test_who_was_here_before_is_not_shut_out_by_strangers(tracker: Tracker) -> None:
@@ -70,10 +68,10 @@ def test_who_was_here_before_is_not_shut_out_by_strangers(tracker: Tracker) -> N
     tracker.forget("1:1")  # behind a hill for ten minutes
     for number in range(10):
         flown(tracker, f"200:{number}", 3, 700.0)
-    refused = tracker.accept(fix("201:1", 701.0))
+    refused = tracker.accept(fix("201:1", 701.0))[0]
     assert isinstance(refused, Rejection)
     assert refused.reason is Reason.TOO_MANY
-    assert isinstance(tracker.accept(fix("1:1", 702.0)), Estimate)
+    assert isinstance(tracker.accept(fix("1:1", 702.0))[0], Estimate)
     assert tracker.uavs == [*(f"200:{number}" for number in range(9)), "1:1"]
 
 
@@ -82,16 +80,15 @@ def test_who_is_tracked_for_long_makes_no_room(tracker: Tracker) -> None:
     tracker.forget("1:1")
     for number in range(10):
         flown(tracker, f"2:{number}", ESTABLISHED, 700.0)
-    assert isinstance(tracker.accept(fix("1:1", 710.0)), Rejection)
+    assert isinstance(tracker.accept(fix("1:1", 710.0))[0], Rejection)
 
 
 def test_strangers_who_are_refused_leave_nothing_behind(tracker: Tracker) -> None:
     for number in range(10):
         flown(tracker, f"2:{number}", 1, 0.0)
     for number in range(1000):
-        stranger, _ = tracker.refuted(fix(f"icao:{number:06X}", 1.0))
-        assert isinstance(tracker.accept(stranger), Rejection)
-    assert len(tracker._refutations) <= 10
+        assert isinstance(tracker.accept(fix(f"icao:{number:06X}", 1.0))[0], Rejection)
+    assert len(tracker._tracked) == 10
 
 
 def test_only_as_many_are_remembered_as_are_tracked(tracker: Tracker) -> None:
@@ -102,22 +99,26 @@ def test_only_as_many_are_remembered_as_are_tracked(tracker: Tracker) -> None:
 
 
 def test_ids_without_end_do_not_fill_the_lists() -> None:
-    lists = Admission(("1:*", "icao:4*"), ("1:7",))
-    for number in range(3 * admission.KNOWN_MAX):
-        assert lists.admits(f"icao:{number:06X}") is (f"{number:06X}"[0] == "4")
-        assert len(lists._known) <= admission.KNOWN_MAX
-    assert [lists.admits(uav) for uav in ("1:1", "1:7", "2:1")] == [True, False, False]
+    admits = admission(("1:*", "icao:4*"), ("1:7",))
+    for number in range(3 * KNOWN_MAX):
+        assert admits(f"icao:{number:06X}") is (f"{number:06X}"[0] == "4")
+    assert admits.cache_info().currsize == KNOWN_MAX  # type: ignore[attr-defined]
+    assert [admits(uav) for uav in ("1:1", "1:7", "2:1")] == [True, False, False]
+
+
+def made_senders(carrier: str | None, tracked: Container[str]) -> Senders:
+    return Senders(Settings(), carrier, Records(UavRecord, tracked.__contains__), tracked)
 
 
 def test_clocks_are_forgotten_between_ticks_and_those_of_tracks_are_kept() -> None:
     tracked = {str(Source(number, 1)) for number in range(0, 200, 10)}
-    senders = Senders(Settings(), "255:1", tracked)
-    for number in range(CLOCKS_MAX + 2 * CLOCKS_AT_ONCE):
+    senders = made_senders("255:1", tracked)
+    for number in range(RECORDS_MAX + 2 * DROPPED_AT_ONCE):
         source = Source(255 - number % 256, 1 + number // 256)
         senders.round_trip(RoundTrip(2 * S, source, S, 1))
-        assert len(senders._clocks) <= CLOCKS_MAX
-    assert tracked | {"255:1"} <= senders._clocks.keys()
-    assert str(source) in senders._clocks
+        assert len(senders._senders) <= RECORDS_MAX
+    assert tracked | {"255:1"} <= senders._senders.keys()
+    assert str(source) in senders._senders
 
 
 def test_more_tracks_than_clocks_leave_all_of_them_their_own() -> None:
@@ -129,32 +130,43 @@ def test_more_tracks_than_clocks_leave_all_of_them_their_own() -> None:
             return True
 
     everyone = Everyone()
-    senders = Senders(Settings(), None, everyone)
-    many = CLOCKS_MAX + 3 * CLOCKS_AT_ONCE
+    senders = made_senders(None, everyone)
+    many = RECORDS_MAX + 3 * DROPPED_AT_ONCE
     for number in range(many):
         senders.round_trip(RoundTrip(2 * S, Source(number % 256, number // 256), S, 1))
-    assert len(senders._clocks) == many
+    assert len(senders._senders) == many
     assert everyone.asked < 4 * many  # they are not looked through for each that comes
 
 
 def test_what_is_said_beside_positions_is_forgotten() -> None:
-    senders = Senders(Settings(), "5:1")
+    senders = made_senders("5:1", {"1:1"})
+    mav = common.MAVLink(None)
 
-    def heard(second: int, number: int) -> None:
+    def heard(number: int) -> None:
         source = Source(1 + number % 250, 1 + number // 250)
-        beside = GnssStatus(second * S, source, 3, None, 0.0, None, None, None)
-        senders._receivers[source] = beside
-        senders._noise[source] = ReportNoise(1.0, 1.0, 1.0, 1.0)
-        senders._apart_m2[source] = 1.0
-        senders.presence[source] = Presence(second * S, source, 2, 3, 4, False)
+        mav.srcSystem, mav.srcComponent = source
+        gnss = common.MAVLink_gps_raw_int_message(S, 3, 0, 0, 0, 0, 0, 0, 0, 9)
+        for message in (gnss, common.MAVLink_heartbeat_message(2, 3, 128, 0, 4, 3)):
+            raw = message.pack(mav, force_mavlink1=True)
+            senders.hear(Frame(S, "udp", source, message.get_msgId(), raw))
 
-    for number in range(CLOCKS_MAX + 100):
-        heard(1, number)
-    tables = (senders._receivers, senders._noise, senders._apart_m2, senders.presence)
-    senders.forget_clocks(frozenset(["1:1"]), 2 * S)
-    assert [len(table) for table in tables] == [CLOCKS_MAX + 2] * 4
-    senders.forget_clocks(frozenset(["1:1"]), 4000 * S)
-    assert [set(map(str, table)) for table in tables] == [{"1:1", "5:1"}] * 4
+    for number in range(RECORDS_MAX + 100):
+        heard(number)
+    assert len(senders._components) == RECORDS_MAX + 100
+    senders.forget_silent(2 * S)
+    assert len(senders._components) == RECORDS_MAX + 2  # the oldest went, but for who is kept
+    assert {str(source) for source in list(senders._components)[:3]} == {"1:1", "5:1", "101:1"}
+    senders.forget_silent(4000 * S)
+    assert set(map(str, senders._components)) == {"1:1", "5:1"}
+
+
+def test_records_of_made_up_ids_have_an_end() -> None:
+    records = Records(UavRecord, {"0:1"}.__contains__)
+    for number in range(3 * RECORDS_MAX):
+        records[f"{number}:1"].refuted += 1
+        assert len(records) <= RECORDS_MAX
+    assert records["0:1"].refuted == 1
+    assert records.get(f"{RECORDS_MAX}:1") is None
 
 
 # --- attitudes of the carrier -------------------------------------------------------------------

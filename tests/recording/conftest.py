@@ -130,7 +130,7 @@ def update() -> Callable[[int], Update]:
 def estimate() -> Estimate:
     """An accepted report, true a tenth of a second before it came."""
     report = Report(
-        START_NS, "udp", "1:1", Source(1, 1), 47.5, 8.5, 321.5, AltitudeDatum.MSL, None,
+        START_NS, "1:1", Source(1, 1), 47.5, 8.5, 321.5, AltitudeDatum.MSL, None,
         None, None, None, 1000, None,
     )  # fmt: skip
     noise = ReportNoise(3.0, 3.0, 4.25, 0.5)

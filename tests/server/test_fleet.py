@@ -32,7 +32,7 @@ def north(flown: StandIn) -> Iterator[StandIn]:
     member = Member("north", FleetSettings(node="north"), 16, now_ns)
     member.duties.serves["1:1"] = 20.0
     place = (47.0, 8.0, 480.0)
-    member.stands(now_ns, Standing("south", now_ns, now_ns, place, 900.0, 1, (("2:1", 25.0),)))
+    member.stands(now_ns, Standing("south", place, 900.0, 1, (("2:1", 25.0),)))
     flown.fleet = FleetStatus(member, "harbour", 1e3, 2e3, 0)
     flown.pipeline.step(Duty(now_ns, ("1:1",)))
     flown.tick(0.0)

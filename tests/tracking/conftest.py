@@ -36,7 +36,7 @@ def fix() -> MakeFix:
         position = vector(np.array(position_ned_m, dtype=float))
         lat_deg, lon_deg = 47.0 + position[0] * 9e-6, 8.0 + position[1] * 13e-6
         report = Report(
-            t_ns + late_ns, "udp", uav, Source(1, 1), lat_deg, lon_deg, 500.0 - position[2],
+            t_ns + late_ns, uav, Source(1, 1), lat_deg, lon_deg, 500.0 - position[2],
             AltitudeDatum.MSL, None, None, None, None, 1000, None,
         )  # fmt: skip
         return Fix(uav, t_ns, t_ns, t_ns + late_ns, position, velocity, noise, report)

@@ -88,7 +88,7 @@ DEFAULT = ReportNoise(3.0, 3.0, 3.0, 0.5)
 
 
 def status(h: float | None, v: float | None, vel: float | None) -> GnssStatus:
-    return GnssStatus(0, Source(1, 1), 3, 12, 500.0, h, v, vel)
+    return GnssStatus(0, Source(1, 1), 3, 500.0, h, v, vel)
 
 
 @pytest.mark.parametrize(
@@ -146,5 +146,5 @@ def test_made_up_names_take_no_memory(fix: MakeFix) -> None:
     assert identities.same_as(AIRCRAFT) == "1:1"
     for number in range(RELAYED_MAX):
         identities.observe(replace(relayed(fix, 9, here), uav=f"cot:{number}"), [])
-    assert len(identities._counts) == RELAYED_MAX
+    assert len(identities._relayed) == RELAYED_MAX
     assert identities.same_as(AIRCRAFT) is None

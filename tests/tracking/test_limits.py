@@ -11,7 +11,15 @@ from support import examples
 
 from companion.pipeline import assembly
 from companion.settings.model import Settings
-from companion.tracking.limits import FADES_S, RAISED, Airframe, Refutations, airframe, lag_s
+from companion.tracking.limits import (
+    FADES_S,
+    RAISED,
+    Airframe,
+    Raised,
+    Refutations,
+    airframe,
+    lag_s,
+)
 from companion.values import Fix, Limits, LimitSource, ReportNoise
 
 S = 1_000_000_000
@@ -88,7 +96,7 @@ def test_what_keeps_within_its_limits_is_never_refuted(
             return
         stamped = math.floor(t_s * 1e3) / 1e3
         assert known.look(told(fix, stamped, velocity + wrong)) == []
-    assert known.times == 0
+    assert known.speed == known.acceleration == Raised()
 
 
 def test_a_turn_beyond_the_limit_is_proven_raised_and_fades(fix: Callable[..., Fix]) -> None:

@@ -63,7 +63,7 @@ def test_tracks_age(tracker: Tracker, fix: MakeFix, age_s: float, state: str) ->
 
 
 def test_a_first_report_is_its_own_estimate(tracker: Tracker, fix: MakeFix) -> None:
-    first = tracker.accept(fix(100 * S, [1, 2, 3], late_ns=S // 4))
+    first = tracker.accept(fix(100 * S, [1, 2, 3], late_ns=S // 4))[0]
     assert isinstance(first, Estimate)
     assert first.position_ned_m == (1, 2, 3)
     assert (first.innovation_m, first.dt_s) == (None, None)
@@ -81,7 +81,7 @@ def test_a_second_report_is_judged_by_the_prediction_made_for_it(
 ) -> None:
     first, second = fix(100 * S, [0, 0, 0], [10, 0, 0]), fix(101 * S, [13, 4, 0], [10, 0, 0])
     tracker.accept(first)
-    found = tracker.accept(second)
+    found = tracker.accept(second)[0]
     assert isinstance(found, Estimate)
     expected = OBSERVER.predict(OBSERVER.begin(first), 101 * S)
     assert found.position_ned_m == pytest.approx([10, 0, 0])
@@ -121,7 +121,7 @@ def test_a_report_that_is_too_old_or_came_twice_is_rejected_and_changes_nothing(
     newest = fix(101 * S, [1, 0, 0])
     tracker.accept(newest)
     before = tracker.track("1:1", 102 * S, same_time(102 * S))
-    late = tracker.accept(fix(101 * S - older_ns, [3, 0, 0], late_ns=3 * S))
+    late = tracker.accept(fix(101 * S - older_ns, [3, 0, 0], late_ns=3 * S))[0]
     assert isinstance(late, Rejection)
     assert (late.reason, late.source) == (reason, "1:1")
     assert late.t_ns == 104 * S - older_ns
@@ -138,10 +138,10 @@ def test_a_late_report_is_put_in_its_place(fix: MakeFix) -> None:
     made = [fix(n * S, [10 * n, n * n, 0], [10, 2 * n, 0], late_ns=S // 8) for n in range(100, 106)]
     one, other = Tracker(OBSERVER, SETTINGS), Tracker(OBSERVER, SETTINGS)
     for n in range(6):
-        assert isinstance(one.accept(made[n]), Estimate)
+        assert isinstance(one.accept(made[n])[0], Estimate)
     for n in (0, 1, 3, 2, 5):
-        assert isinstance(other.accept(made[n]), Estimate)
-    late = other.accept(made[4])
+        assert isinstance(other.accept(made[n])[0], Estimate)
+    late, _ = other.accept(made[4])
     assert isinstance(late, Estimate)
     assert late.fix is made[4]
     assert (late.dt_s, late.reacquired) == (1.0, False)
@@ -168,7 +168,7 @@ def test_a_restart_begins_anew(tracker: Tracker, fix: MakeFix) -> None:
     assert tracker.track("1:1", 0, same_time(0)) is None
     assert tracker.newest("1:1") is None
     assert tracker.state("1:1", same_time(0)) is None
-    found = tracker.accept(fix(50 * S, [7, 0, 0]))
+    found = tracker.accept(fix(50 * S, [7, 0, 0]))[0]
     assert isinstance(found, Estimate)
     assert found.dt_s is None
 
@@ -258,7 +258,7 @@ def test_one_bad_report_is_refused_and_nothing_is_gated_on_it(fix: MakeFix) -> N
     made = flight(
         fix, every(0.2, 0, 30), lambda t_s: (500, 0, 0) if abs(t_s - 10) < 0.05 else (0, 0, 0)
     )
-    outcomes = [tracker.accept(one) for one in made]
+    outcomes = [tracker.accept(one)[0] for one in made]
     assert reasons(outcomes) == {None: 149, Reason.UNREACHABLE: 1}
     refused = outcomes[50]
     assert isinstance(refused, Rejection)
@@ -273,7 +273,7 @@ def test_a_glitch_is_sat_out(fix: MakeFix) -> None:
         fix, every(0.2, 0, 40), lambda t_s: (25, 0, 0) if 9.9 < t_s < 10.7 else (0, 0, 0)
     ):
         t_s = one.sender_ns * 1e-9
-        outcome = tracker.accept(one)
+        outcome = tracker.accept(one)[0]
         glitch = 9.9 < t_s < 10.7
         assert isinstance(outcome, Rejection if glitch else Estimate)
         if isinstance(outcome, Estimate):
@@ -287,7 +287,7 @@ def test_a_jump_that_lasts_is_followed_once(fix: MakeFix) -> None:
     """Refused for as long as it takes to be believed; then the track begins anew from it."""
     tracker = tracking()
     jumped = flight(fix, every(0.2, 0, 40), lambda t_s: (25, 0, 0) if t_s > 9.9 else (0, 0, 0))
-    outcomes = [tracker.accept(one) for one in jumped]
+    outcomes = [tracker.accept(one)[0] for one in jumped]
     again = [n for n, one in enumerate(outcomes) if isinstance(one, Estimate) and one.reacquired]
     refused = [n for n, one in enumerate(outcomes) if isinstance(one, Rejection)]
     assert len(again) == 1
@@ -307,14 +307,14 @@ def test_a_jump_is_followed_at_any_rate(fix: MakeFix, rate_hz: int) -> None:
     tracker = tracking()
     times_s = every(1 / rate_hz, 0, 10)
     jumped = flight(fix, times_s, lambda t_s: (400, 0, 0) if t_s > 4.99 else (0, 0, 0))
-    outcomes = [tracker.accept(one) for one in jumped]
+    outcomes = [tracker.accept(one)[0] for one in jumped]
     assert sum(isinstance(one, Estimate) and one.reacquired for one in outcomes) == 1
 
 
 def test_a_change_of_the_height_s_datum_has_its_own_reason(fix: MakeFix) -> None:
     tracker = tracking()
     made = flight(fix, every(0.2, 0, 20), lambda t_s: (0, 0, -40) if t_s > 9.9 else (0, 0, 0))
-    found = reasons(tracker.accept(one) for one in made)
+    found = reasons(tracker.accept(one)[0] for one in made)
     assert set(found) == {None, Reason.ALTITUDE_JUMP}
     assert 4 <= found[Reason.ALTITUDE_JUMP] <= 6
     holds(seen(tracker, 20), circling(20)[0] - np.array([0, 0, 40.0]))
@@ -328,7 +328,7 @@ def test_positions_that_are_sent_again_are_not_used(fix: MakeFix) -> None:
         frozen = 50 <= number < 65
         place = made[49] if frozen else one
         told = replace(one, position_ned_m=place.position_ned_m, report=place.report)
-        outcomes.append(tracker.accept(told))
+        outcomes.append(tracker.accept(told)[0])
         holds(seen(tracker, number / 5 + 0.1), circling(number / 5 + 0.1)[0])
     assert reasons(outcomes) == {None: 85, Reason.FROZEN: 15}
     assert all(isinstance(one, Rejection) for one in outcomes[50:65])
@@ -337,10 +337,10 @@ def test_positions_that_are_sent_again_are_not_used(fix: MakeFix) -> None:
 def test_a_position_sent_again_just_after_a_jump_was_believed_is_not_used(fix: MakeFix) -> None:
     tracker = tracking()
     for one in flight(fix, every(0.2, 0, 20), lambda t_s: (400, 0, 0) if t_s > 9.9 else (0, 0, 0)):
-        outcome = tracker.accept(one)
+        outcome = tracker.accept(one)[0]
         if isinstance(outcome, Estimate) and outcome.reacquired:
             break
-    again = tracker.accept(replace(one, sender_ns=one.sender_ns + S // 5))
+    again = tracker.accept(replace(one, sender_ns=one.sender_ns + S // 5))[0]
     assert isinstance(again, Rejection)
     assert again.reason is Reason.FROZEN
 
@@ -355,7 +355,7 @@ def two_under_one_id(fix: MakeFix, end_s: float) -> list[Fix]:
 def test_two_vehicles_under_one_id_are_said(fix: MakeFix) -> None:
     """At first the second one's reports are refused, then, while both go on, everyone's."""
     tracker = tracking()
-    outcomes = [tracker.accept(one) for one in two_under_one_id(fix, 5.9)]
+    outcomes = [tracker.accept(one)[0] for one in two_under_one_id(fix, 5.9)]
     early = reasons(outcomes[:30])
     assert early == {None: 15, Reason.UNREACHABLE: 15}
     late = reasons(outcomes[34:])
@@ -366,7 +366,7 @@ def test_two_vehicles_under_one_id_are_said(fix: MakeFix) -> None:
 def test_of_two_vehicles_under_one_id_neither_becomes_the_track(fix: MakeFix) -> None:
     """As long as both go on, the track does not leap from the one to the other."""
     tracker = tracking()
-    outcomes = [tracker.accept(one) for one in two_under_one_id(fix, 20)]
+    outcomes = [tracker.accept(one)[0] for one in two_under_one_id(fix, 20)]
     assert not any(isinstance(one, Estimate) and one.reacquired for one in outcomes)
 
 
@@ -374,7 +374,7 @@ def test_a_hole_is_coasted_over(fix: MakeFix) -> None:
     """12 s without a report: the bound grows, and holds; the first report after it is taken."""
     tracker = tracking()
     for one in flight(fix, every(0.2, 0, 10)):
-        assert isinstance(tracker.accept(one), Estimate)
+        assert isinstance(tracker.accept(one)[0], Estimate)
     bounds = []
     for t_s in every(0.5, 10, 22):
         track = seen(tracker, t_s)
@@ -384,7 +384,7 @@ def test_a_hole_is_coasted_over(fix: MakeFix) -> None:
     assert bounds == sorted(bounds)
     assert bounds[-1] > 20 * bounds[0]
     after = flight(fix, every(0.2, 22, 25))
-    assert reasons(tracker.accept(one) for one in after) == {None: 15}
+    assert reasons(tracker.accept(one)[0] for one in after) == {None: 15}
     track = seen(tracker, 25)
     assert track.state is TrackState.LIVE
     holds(track, circling(25)[0])
@@ -396,7 +396,7 @@ def test_a_lost_track_begins_anew(fix: MakeFix, gap_s: float, anew: bool) -> Non
     """Wherever it comes back: there is nothing left to compare it with."""
     tracker = tracking()
     tracker.accept(fix(0, [0, 0, 0], [0, 0, 0]))
-    found = tracker.accept(fix(round(gap_s * S), [20_000, 0, 0], [0, 0, 0]))
+    found = tracker.accept(fix(round(gap_s * S), [20_000, 0, 0], [0, 0, 0]))[0]
     assert isinstance(found, Estimate if anew else Rejection)
     if isinstance(found, Estimate):
         assert (found.dt_s, found.reacquired) == (None, False)
@@ -410,7 +410,7 @@ def errors_m(fix: MakeFix, feed_mps2: float | None, ahead_s: float) -> float:
     """The mean error over a circle, ``ahead_s`` past the newest report."""
     tracker, off = tracking(feed_mps2), []
     for one in flight(fix, every(0.2, 0, 60)):
-        assert isinstance(tracker.accept(one), Estimate)
+        assert isinstance(tracker.accept(one)[0], Estimate)
         t_s = one.sender_ns * 1e-9 + ahead_s
         if one.sender_ns > 5 * S:
             off.append(holds(seen(tracker, t_s), circling(t_s)[0]))
@@ -445,11 +445,12 @@ def test_what_is_fed_forward_is_within_the_bound(fix: MakeFix) -> None:
 
 
 def test_no_more_is_fed_forward_than_is_possible(fix: MakeFix) -> None:
-    tracker = tracking(3.0)
+    """Velocities of such a noise prove nothing, and raise no limit."""
+    tracker, noise = tracking(3.0), replace(NOISE, velocity_mps=20.0)
     for n in range(31):  # 5 m/s^2
         t_s = n / 5
         place = [0, 1.5 * t_s * t_s, 2.0 * t_s * t_s]
-        tracker.accept(fix(n * S // 5, place, [0, 3.0 * t_s, 4.0 * t_s], noise=NOISE))
+        tracker.accept(fix(n * S // 5, place, [0, 3.0 * t_s, 4.0 * t_s], noise=noise))
     assert seen(tracker, 6).acceleration_ned_mps2 == pytest.approx([0, 1.8, 2.4])
 
 
@@ -466,7 +467,7 @@ def test_no_adversary_leaves_what_the_fleet_says(fix: MakeFix, doubt_s: float) -
             plane, fast = plane * 2 / math.hypot(*plane), fast * 0.4 / math.hypot(*fast)
             wrong = np.array([*plane, 2 * rng.choice([-1, 1])]) * (1 - 1e-9)
             made = fix(round(t_s * S), position + wrong, velocity + fast, noise=NOISE)
-            assert isinstance(tracker.accept(made), Estimate)
+            assert isinstance(tracker.accept(made)[0], Estimate)
             step_s = round(float(10 ** rng.uniform(-1.5, 0.5)), 9)
             push = (
                 rng.normal(0, 1, 3) if seed % 2 else rng.choice([-1, 1]) * np.array([0, 0.6, 0.8])
@@ -503,7 +504,7 @@ def test_doubt_of_the_clock_covers_an_acceleration_in_it(fix: MakeFix) -> None:
     tracker = tracking()
     tracker.accept(
         fix(0, [0, 0, 0], [0, 0, 0], noise=replace(NOISE, horizontal_m=1e-6, velocity_mps=1e-6))
-    )
+    )[0]
     for ahead_s in (0.0, 0.5, 2.0):
         true_s = ahead_s + 1.0
         holds(seen(tracker, ahead_s, doubt_s=1.0), np.array([5.0 * true_s**2 / 2, 0, 0]))

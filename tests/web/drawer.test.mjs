@@ -83,3 +83,13 @@ test("Escape closes the drawer, then chooses nothing; messages are asked for whi
   page.press("Escape");
   assert.deepEqual(page.chosen(), []);
 });
+
+test("a relayed aircraft sends no messages, whatever relays it: none are asked for", async () => {
+  for (const id of ["icao:4CA7B3", "rid:1581F5", "cot:HAWK"]) {
+    const page = await openPage({ ids: [id] });
+    await openDrawer(page, 0);
+    const [system, component] = id.split(":");
+    const path = `/v1/mavlink/vehicles/${system}/components/${component}/messages`;
+    assert.equal(page.service.count(path), 0);
+  }
+});

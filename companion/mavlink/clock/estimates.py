@@ -74,7 +74,6 @@ class ClockEstimate:
     """A sender's clock against the node's.
 
     offset_ns  most likely difference, node time minus sender time
-    usual_s    usual error of the estimate: no bound
     """
 
     kind: Annotated[ClockKind, Meaning("evidence that leaves the least uncertainty")]
@@ -84,7 +83,6 @@ class ClockEstimate:
     offset_ns: int
     before_s: Annotated[float, Meaning("how much earlier the sender's time may be than estimated")]
     after_s: Annotated[float, Meaning("how much later the sender's time may be than estimated")]
-    usual_s: float
     drift_ppm: Annotated[
         float | None, Meaning("observed drift beyond the largest assumed; 0 where none was seen")
     ]

@@ -52,19 +52,16 @@ class SenderClock:
 
     ``observe`` takes the stamps of its reports in order of arrival, ``notice`` those of its other
     messages. ``change`` is what the newest stamp or answer showed of a change of the clock, None
-    where it showed none. ``timesync_refused`` and ``gnss_refused`` say why the newest evidence of
-    that kind was not used; None where it was used, or where there was none.
+    where it showed none.
     """
 
     def __init__(self, settings: ClockAssumptions | None = None) -> None:
-        self.settings = settings or ClockAssumptions()
-        self.timesync_refused: str | None = None
-        self.gnss_refused: str | None = None
+        self._settings = settings or ClockAssumptions()
         self.change: ClockChange | None = None
-        self._constant_delay_ns = round(self.settings.constant_delay_s * _NS)
-        drift_max = self.settings.drift_max_ppm * 1e-6
+        self._constant_delay_ns = round(self._settings.constant_delay_s * _NS)
+        drift_max = self._settings.drift_max_ppm * 1e-6
         self._line = BootLine(
-            round(self.settings.window_s * _NS), drift_max, round(self.settings.late_max_s * _NS)
+            round(self._settings.window_s * _NS), drift_max, round(self._settings.late_max_s * _NS)
         )
         self._timesync = Evidence(drift_max)
         self._gnss = Evidence(drift_max)
@@ -111,38 +108,37 @@ class SenderClock:
 
     # --- evidence from both sides -----------------------------------------------------------
 
-    def timesync(self, sent_ns: int, received_ns: int, remote_ns: int) -> None:
+    def timesync(self, sent_ns: int, received_ns: int, remote_ns: int) -> str | None:
         """Take in one TIMESYNC round trip, of any length.
+
+        Returns None, or the reason why it is not used, as before the first stamp.
 
             sent_ns      when the request was sent, node time
             received_ns  when the answer was received, node time
             remote_ns    the sender's time since boot when it answered
-
-        It is refused until a stamp of the sender was observed.
         """
         self.change = self._known = None
         if not self._line.floor:
-            self.timesync_refused = "no stamp of this sender was seen so far"
-        elif received_ns < sent_ns:
-            self.timesync_refused = "it was received before it was sent"
-        else:
-            x_ns = remote_ns + round((self._line.newest_ns - remote_ns) / WRAP_NS) * WRAP_NS
-            interval = Interval(x_ns, sent_ns - x_ns, received_ns - x_ns)
-            self.timesync_refused = self._prove(self._timesync, interval)
+            return "no stamp of this sender was seen so far"
+        if received_ns < sent_ns:
+            return "it was received before it was sent"
+        x_ns = remote_ns + round((self._line.newest_ns - remote_ns) / WRAP_NS) * WRAP_NS
+        return self._prove(self._timesync, Interval(x_ns, sent_ns - x_ns, received_ns - x_ns))
 
-    def system_time(self, arrival_ns: int, unix_us: int, boot_ms: int) -> None:
+    def system_time(self, arrival_ns: int, unix_us: int, boot_ms: int) -> str | None:
         """Take in one SYSTEM_TIME: the sender's Unix time in microseconds beside its boot time.
 
         ``unix_us`` counts on the node's timeline: what that is off UTC is taken off before.
 
         It is used only if the settings trust it and the node keeps UTC, and only after five in a
         row have implied latencies between -20 ms and 5 s (each limit widened by the node's own
-        error).
+        error). Returns None, or the reason why it is not used.
         """
         self.change = self._known = None
-        self.gnss_refused = self._system_time(arrival_ns, unix_us, boot_ms)
-        if self.gnss_refused is not None:
+        refused = self._system_time(arrival_ns, unix_us, boot_ms)
+        if refused is not None:
             self.forget_gnss()
+        return refused
 
     def forget_gnss(self) -> None:
         """Forget what SYSTEM_TIME has shown, as when the node's own clock was set."""
@@ -152,9 +148,9 @@ class SenderClock:
 
     def _system_time(self, arrival_ns: int, unix_us: int, boot_ms: int) -> str | None:
         """Take in a SYSTEM_TIME. Returns None, or the reason for which it was not used."""
-        if not self.settings.trust_gnss:
+        if not self._settings.trust_gnss:
             return "the settings do not trust it"
-        if self.settings.node_utc_error_s is None:
+        if self._settings.node_utc_error_s is None:
             return "the node's own timeline is not known to be UTC"
         if unix_us == 0:
             return "the sender does not know the time"
@@ -162,11 +158,11 @@ class SenderClock:
         if not self._line.fits(arrival_ns, x_ns):
             return "its boot time is not on the line of the sender's stamps"
         latency_s = (arrival_ns - unix_us * 1000) * 1e-9
-        error_s = self.settings.node_utc_error_s
+        error_s = self._settings.node_utc_error_s
         if not _LATENCY_S[0] - error_s <= latency_s <= _LATENCY_S[1] + error_s:
             return f"it implies a latency of {latency_s:.6g} s"
         self._gnss_plausible += 1
-        error_ns = round((error_s + self.settings.gnss_error_s) * _NS) + _NS_PER_MS
+        error_ns = round((error_s + self._settings.gnss_error_s) * _NS) + _NS_PER_MS
         offset_ns = unix_us * 1000 - x_ns
         return self._prove(self._gnss, Interval(x_ns, offset_ns - error_ns, offset_ns + error_ns))
 
@@ -219,7 +215,6 @@ class SenderClock:
             offset_ns=likely_ns,
             before_s=(high_ns - likely_ns + _NS_PER_MS) * 1e-9,
             after_s=(likely_ns - low_ns + _NS_PER_MS) * 1e-9,
-            usual_s=self._usual_s(kind, low_ns, high_ns),
             drift_ppm=floor.drift * 1e6,
             constant_delay_s=(floor.at(x_ns) - likely_ns) * 1e-9,
             latency_s=self._latency_s,

@@ -22,7 +22,7 @@ from typing import Final, Protocol
 
 from companion.mavlink.links.endpoints import address_text
 from companion.mavlink.links.status import ComponentStatus, LinkStatus
-from companion.mavlink.wire.decode import ATTITUDE, GLOBAL_POSITION_INT
+from companion.mavlink.wire.decode import POSE
 from companion.mavlink.wire.framing import MAGIC_V2, Splitter
 from companion.values import Frame, Rejection, Source
 
@@ -36,8 +36,6 @@ When there are more, all are begun anew, which costs no more than the holes of t
 RESTART_RUN: Final = 3
 """Late frames in a row, each further on, that show a restart of the sender."""
 
-STAMPED: Final = frozenset((GLOBAL_POSITION_INT, ATTITUDE))
-"""Messages whose stamps are those of the clock that TIMESYNC is about."""
 STAMPS_KEPT_NS: Final = 30_000_000_000
 _HALF_ROUND: Final = 128
 
@@ -188,7 +186,7 @@ class Peers:
             counts.frames += 1
             counts.heard_ns = t_ns
             counts.mavlink = version
-            if msgid in STAMPED:
+            if msgid in POSE:  # their stamps are of the clock that TIMESYNC is about
                 sender.stamped_ns = t_ns
             peer.versions |= version
             peer.heard_ns = status.heard_ns = t_ns

@@ -29,7 +29,8 @@ from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.peers import Peer, Peers
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.links.urls import LinkError, LinkUrl
-from companion.mavlink.trust.twins import REFUSED, Twins
+from companion.mavlink.trust.twins import Twins
+from companion.mavlink.wire.decode import POSE
 from companion.mavlink.wire.encode import TIMESYNC, Outgoing, pack
 from companion.values import Frame, Notice, Reason, Rejection, Severity, Source
 
@@ -166,7 +167,7 @@ class Link:
 
     def _believed(self, peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
         """The item itself, or the refusal of what its sender's peers contradict each other in."""
-        if isinstance(item, Rejection) or item.msgid not in REFUSED:
+        if isinstance(item, Rejection) or item.msgid not in POSE:
             return item
         if not self._twins.refuses(str(self.url), peer.address or str(self.url), item):
             return item

@@ -124,7 +124,6 @@ class _Known:
             self.reported.popitem(last=False)
         return Report(
             t_ns=said.t_ns,
-            link=said.link,
             uav=said.uav,
             source=said.source,
             lat_deg=at_deg[0],

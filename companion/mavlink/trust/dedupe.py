@@ -5,7 +5,7 @@ since every link has its own. GLOBAL_POSITION_INT carries a boot time, so equal 
 report. ADSB_VEHICLE carries none: ``adsb`` decides what is new in it.
 """
 
-from collections import deque
+from collections import OrderedDict, deque
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -47,19 +47,17 @@ class Dedupe:
 
     def __init__(self) -> None:
         self.shares: dict[str, LinkShare] = {}
-        self._seen: dict[bytes, _First] = {}
-        self._order: deque[tuple[bytes, _First]] = deque()
+        self._seen: OrderedDict[bytes, _First] = OrderedDict()  # in order of arrival
 
     def is_repeat(self, frame: Frame) -> bool:
         """Count a frame; True if the same content came before, within the window."""
-        while self._order and self._order[0][1].t_ns < frame.t_ns - WINDOW_NS:
-            self._forget(*self._order.popleft())
+        while self._seen and next(iter(self._seen.values())).t_ns < frame.t_ns - WINDOW_NS:
+            self._seen.popitem(last=False)
         share = self._share(frame.link)
         key = content(frame.raw)
         first = self._seen.get(key)
         if first is None:
-            first = self._seen[key] = _First(frame.t_ns, frame.link)
-            self._order.append((key, first))
+            self._seen[key] = _First(frame.t_ns, frame.link)
             share.first += 1
             return False
         share.repeats += 1
@@ -69,7 +67,7 @@ class Dedupe:
 
     def took(self, latency_s: float) -> None:
         """Set the latency, in seconds, of the report that was last found to be new."""
-        _, first = self._order[-1]
+        first = next(reversed(self._seen.values()))
         first.latency_s = latency_s
         self._share(first.link).latencies_s.append(latency_s)
 
@@ -80,10 +78,6 @@ class Dedupe:
             if len(self.shares) < LINKS_MAX:
                 self.shares[link] = share
         return share
-
-    def _forget(self, key: bytes, first: _First) -> None:
-        if self._seen.get(key) is first:
-            del self._seen[key]
 
 
 def content(raw: bytes) -> bytes:

@@ -10,7 +10,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, replace
 from typing import Final
 
-from companion.values import AltitudeDatum, Reason, Rejection, RemoteId, Report, Source
+from companion.values import AltitudeDatum, Reason, Rejection, RemoteId, Report, Source, UavKind
 
 NAMED_NS: Final = 60_000_000_000
 """How long a name holds after its address was last heard."""
@@ -49,8 +49,8 @@ class RemoteIds:
         if said.report is None and not said.is_flat:
             return None
         if known.uas_id is None:
-            return _rejected(said, f"rid:{said.heard_as}", Reason.NO_IDENTITY)
-        uav = f"rid:{known.uas_id}"
+            return _rejected(said, UavKind.REMOTE_ID.uav(said.heard_as), Reason.NO_IDENTITY)
+        uav = UavKind.REMOTE_ID.uav(known.uas_id)
         if known.aircraft > 1:
             detail = f"it stands for {known.aircraft} aircraft"
             return _rejected(said, uav, Reason.SHARED_ID, detail)

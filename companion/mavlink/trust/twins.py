@@ -18,18 +18,15 @@ Peers that the settings name as routers are believed, whoever else contradicts t
 """
 
 import math
-import struct
 from collections import deque
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Final, NamedTuple
+from typing import Final
 
-from companion.mavlink.wire.decode import ATTITUDE, GLOBAL_POSITION_INT, unpack
+from companion.mavlink.wire.positions import OWN, OwnPosition, read
 from companion.values import Frame, Vector
 
-REFUSED: Final = frozenset((ATTITUDE, GLOBAL_POSITION_INT))
-"""Messages of which none is believed while two peers contradict each other."""
 CONTRADICTIONS: Final = 5
 SPACED_NS: Final = 500_000_000
 """Time within which contradictions count as one: a position that is reset makes a few."""
@@ -51,19 +48,8 @@ PEERS_MAX: Final = 4
 REPORTS_KEPT: Final = 32
 """Newest reports kept of a peer."""
 
-_REPORT = struct.Struct("<Iiiiihhh")
 _METRES: Final = 111_195.0 * 1e-7
 """Metres in 1e-7 degrees of latitude."""
-
-
-class _Said(NamedTuple):
-    """A report: boot ms; latitude and longitude, 1e-7 deg; height, m; velocity in NED, m/s."""
-
-    boot_ms: int
-    lat: int
-    lon: int
-    alt_m: float
-    velocity_mps: Vector
 
 
 @dataclass(slots=True)
@@ -72,7 +58,7 @@ class _Path:
 
     is_router: bool
     heard_ns: int
-    reports: deque[_Said] = field(default_factory=lambda: deque(maxlen=REPORTS_KEPT))
+    reports: deque[OwnPosition] = field(default_factory=lambda: deque(maxlen=REPORTS_KEPT))
 
 
 @dataclass(slots=True)
@@ -98,7 +84,7 @@ class Twins:
         self._senders: dict[tuple[int, int], _Sender] = {}
 
     def refuses(self, link: str, peer: str, frame: Frame) -> bool:
-        """Take in a frame of one of ``REFUSED``. Returns whether it is not to be believed.
+        """Take in a frame of ``decode.POSE``. Returns whether it is not to be believed.
 
         ``link`` is the link as it stands in the settings, ``peer`` the peer's HOST:PORT, or the
         link again where it has but one peer.
@@ -115,7 +101,7 @@ class Twins:
         path.heard_ns = frame.t_ns
         if len(sender.paths) == 1:
             return False
-        if frame.msgid == GLOBAL_POSITION_INT and self._contradicts(sender, path, _said(frame)):
+        if frame.msgid in OWN and self._contradicts(sender, path, read(frame)):
             when = sender.contradicted_ns
             if not when or frame.t_ns - when[-1] >= SPACED_NS:
                 when.append(frame.t_ns)
@@ -141,7 +127,7 @@ class Twins:
         known = {link, peer, peer.rpartition(":")[0].strip("[]")}
         return paths.setdefault(peer, _Path(not known.isdisjoint(self._routers), t_ns))
 
-    def _contradicts(self, sender: _Sender, path: _Path, said: _Said) -> bool:
+    def _contradicts(self, sender: _Sender, path: _Path, said: OwnPosition) -> bool:
         """Add a report to its path. Returns whether that shows two senders.
 
         It is held against the stretches of other peers, and their reports against the stretch that
@@ -177,7 +163,7 @@ class Twins:
         return sender.told
 
 
-def _around(reports: deque[_Said], boot_ms: int) -> Iterator[tuple[_Said, _Said]]:
+def _around(reports: deque[OwnPosition], boot_ms: int) -> Iterator[tuple[OwnPosition, OwnPosition]]:
     """The stretches of a path in which a stamp lies, the newest first: one, or two that meet."""
     for last, first in pairwise(reversed(reports)):
         if boot_ms > last.boot_ms:
@@ -186,7 +172,9 @@ def _around(reports: deque[_Said], boot_ms: int) -> Iterator[tuple[_Said, _Said]
             yield first, last
 
 
-def _within(reports: deque[_Said], first: _Said, last: _Said) -> Iterator[_Said]:
+def _within(
+    reports: deque[OwnPosition], first: OwnPosition, last: OwnPosition
+) -> Iterator[OwnPosition]:
     """The reports of a path whose stamps lie between those of two others, the newest first."""
     for one in reversed(reports):
         if one.boot_ms < first.boot_ms:
@@ -195,33 +183,30 @@ def _within(reports: deque[_Said], first: _Said, last: _Said) -> Iterator[_Said]
             yield one
 
 
-def _said(frame: Frame) -> _Said:
-    boot_ms, lat, lon, alt_mm, _, north, east, down = unpack(frame, _REPORT)
-    return _Said(boot_ms, lat, lon, alt_mm * 1e-3, (north * 1e-2, east * 1e-2, down * 1e-2))
-
-
-def _is_off(said: _Said, first: _Said, last: _Said) -> bool:
+def _is_off(said: OwnPosition, first: OwnPosition, last: OwnPosition) -> bool:
     """Whether a report whose stamp is between two others cannot be of who made these."""
     stretch_ms = last.boot_ms - first.boot_ms
     if stretch_ms > STRETCH_MS:
         return False
     share, dt_s = (said.boot_ms - first.boot_ms) / stretch_ms, stretch_ms * 1e-3
-    between = [one + share * (two - one) for one, two in _pairs(first, last)]
-    fastest_mps = max(math.hypot(*one.velocity_mps) for one in (said, first, last))
+    velocities = [v for v in (one.velocity_ned_mps for one in (said, first, last)) if v is not None]
+    fastest_mps = max((math.hypot(*velocity) for velocity in velocities), default=0.0)
     limit_m = SLACK_M + STALE_S * fastest_mps + ACCELERATION_MPS2 * dt_s**2 / 8
-    east = _METRES * math.cos(math.radians(said.lat * 1e-7))
-    scales = (_METRES, east, 1.0)
-    here = (said.lat, said.lon, said.alt_m)
-    off_m = math.hypot(*(s * (a - b) for s, a, b in zip(scales, here, between, strict=False)))
-    if off_m > limit_m:
+    scales = (_METRES, _METRES * math.cos(math.radians(said.lat_1e7 * 1e-7)), 1.0)
+    between = _between(_place(first), _place(last), share)
+    places = zip(scales, _place(said), between, strict=True)
+    if math.hypot(*(scale * (a - b) for scale, a, b in places)) > limit_m:
         return True
-    off_mps = math.dist(said.velocity_mps, between[3:])
+    if len(velocities) < 3:
+        return False
+    velocity, before, after = velocities
+    off_mps = math.dist(velocity, _between(before, after, share))
     return off_mps > SLACK_MPS + ACCELERATION_MPS2 * dt_s / 2
 
 
-def _pairs(first: _Said, last: _Said) -> Iterator[tuple[float, float]]:
-    """Positions and velocities of two reports, component by component."""
-    yield (first.lat, last.lat)
-    yield (first.lon, last.lon)
-    yield (first.alt_m, last.alt_m)
-    yield from zip(first.velocity_mps, last.velocity_mps, strict=True)
+def _place(said: OwnPosition) -> Vector:
+    return said.lat_1e7, said.lon_1e7, said.alt_m
+
+
+def _between(one: Vector, two: Vector, share: float) -> list[float]:
+    return [a + share * (b - a) for a, b in zip(one, two, strict=True)]

@@ -33,7 +33,8 @@ from typing import Final
 from companion.mavlink.clock.epochs import WRAP_NS
 from companion.mavlink.voice.message_rates import MessageRates
 from companion.mavlink.voice.rate_watch import STREAM, MessageRate, Request
-from companion.mavlink.wire.decode import ATTITUDE, GLOBAL_POSITION_INT, unpack
+from companion.mavlink.wire import positions, stamps
+from companion.mavlink.wire.decode import POSE
 from companion.mavlink.wire.encode import (
     COMMAND_LONG,
     HEARTBEAT,
@@ -44,6 +45,7 @@ from companion.mavlink.wire.encode import (
     heartbeat,
     timesync,
 )
+from companion.mavlink.wire.payload import unpack
 from companion.values import (
     Frame,
     Notice,
@@ -57,8 +59,7 @@ from companion.values import (
 
 _NS: Final = 1_000_000_000
 COMMAND_ACK: Final = 77
-_STAMPED: Final = frozenset({ATTITUDE, GLOBAL_POSITION_INT})
-HEARD: Final = _STAMPED | {HEARTBEAT, REQUEST_DATA_STREAM, COMMAND_LONG, COMMAND_ACK, TIMESYNC}
+HEARD: Final = POSE | {HEARTBEAT, REQUEST_DATA_STREAM, COMMAND_LONG, COMMAND_ACK, TIMESYNC}
 """Ids of the messages that ``Component.hear`` must be given."""
 
 HEARTBEAT_NS: Final = _NS
@@ -131,7 +132,6 @@ class Component:
     """The service as a MAVLink component. Times are node times and do not go back."""
 
     def __init__(self, settings: ComponentSpec) -> None:
-        self.settings = settings
         self._source = settings.source
         self._rates = MessageRates(
             settings.source, settings.carrier, settings.position_hz, settings.attitude_hz
@@ -155,8 +155,9 @@ class Component:
         said: list[RoundTrip | Rejection | Notice] = []
         if frame.source == self._source:
             self._own_name(frame, said)
-        elif frame.msgid in _STAMPED:
-            boot_ms = int.from_bytes(frame.payload[:4], "little")  # zeros cut off are zeros
+        elif frame.msgid in POSE:
+            is_own = frame.msgid in positions.OWN
+            boot_ms = positions.read(frame).boot_ms if is_own else stamps.boot_ms(frame)
             self._stamps[frame.source] = (frame.t_ns, boot_ms)
             self._rates.stamped(frame.t_ns, frame.source, frame.msgid, boot_ms)
         else:

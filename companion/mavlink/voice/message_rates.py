@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from companion.mavlink.voice.rate_watch import MessageRate, Observed, RateState, Request, Watch
-from companion.mavlink.wire.decode import ATTITUDE, GLOBAL_POSITION_INT
+from companion.mavlink.wire.decode import ATTITUDE
 from companion.mavlink.wire.encode import Outgoing
+from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
 from companion.values import Notice, Source
 
 _NS: Final = 1_000_000_000

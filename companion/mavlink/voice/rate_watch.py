@@ -31,8 +31,9 @@ from itertools import pairwise
 from statistics import median_high
 from typing import Annotated, Final, NamedTuple
 
-from companion.mavlink.wire.decode import ATTITUDE, GLOBAL_POSITION_INT
+from companion.mavlink.wire.decode import ATTITUDE
 from companion.mavlink.wire.encode import Outgoing, request_data_stream, set_message_interval
+from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
 from companion.values import Notice, Severity, Source
 from companion.values.described import Meaning
 

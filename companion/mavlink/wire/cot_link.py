@@ -25,6 +25,7 @@ from companion.values import (
     Rejection,
     Report,
     Source,
+    UavKind,
 )
 
 TUNNEL: Final = 385
@@ -94,7 +95,7 @@ class CotSplitter:
         if unfit:
             return [Rejection(t_ns, self.link, Reason.UNKNOWN_MESSAGE, detail=unfit)]
         if event.hae_m is None:
-            return [Rejection(t_ns, f"cot:{_name(event.uid)}", Reason.NO_ALTITUDE)]
+            return [Rejection(t_ns, UavKind.COT.uav(_name(event.uid)), Reason.NO_ALTITUDE)]
         frame = Frame(t_ns, self.link, SENDER, TUNNEL, pack(_outgoing(event), self._seq))
         self._seq = (self._seq + 1) & 0xFF
         return [frame]
@@ -195,8 +196,7 @@ def report(frame: Frame) -> Report | None:
             down = -speed_mps * math.tan(math.radians(slope_deg))
     return Report(
         t_ns=frame.t_ns,
-        link=frame.link,
-        uav=f"cot:{name}",
+        uav=UavKind.COT.uav(name),
         source=frame.source,
         lat_deg=lat * 1e-7,
         lon_deg=lon * 1e-7,

@@ -10,7 +10,8 @@ import struct
 from collections.abc import Callable
 from typing import Final
 
-from companion.mavlink.wire import accuracy, cot_link, remote_id
+from companion.mavlink.wire import accuracy, cot_link, positions, remote_id
+from companion.mavlink.wire.payload import unpack
 from companion.mavlink.wire.transponder import ADSB_VEHICLE, SENDER
 from companion.values import (
     AdsbVehicle,
@@ -32,8 +33,10 @@ HEARTBEAT: Final = 0
 SYSTEM_TIME: Final = 2
 GPS_RAW_INT: Final = 24
 ATTITUDE: Final = 30
-GLOBAL_POSITION_INT: Final = 33
 EKF_STATUS_REPORT: Final = 193
+
+POSE: Final = positions.OWN | {ATTITUDE}
+"""Messages in which vehicles report their own position or attitude, stamped by their boot clock."""
 
 NULL_ISLAND_RADIUS_M: Final = 5000.0
 """Distance from 0 N 0 E within which no position is believed.
@@ -73,18 +76,6 @@ def decode(frame: Frame) -> Message | Rejection | None:
         )
 
 
-def unpack(frame: Frame, layout: struct.Struct) -> tuple[int, ...]:
-    """Unpack the fields of a payload.
-
-    Fields cut off, or absent in its MAVLink version, are zeros.
-    """
-    raw = frame.raw
-    start = 10 if raw[0] == 0xFD else 6
-    if raw[1] >= layout.size:
-        return layout.unpack_from(raw, start)
-    return layout.unpack(frame.payload.ljust(layout.size, b"\0"))
-
-
 def _position(lat_1e7: int, lon_1e7: int) -> tuple[float, float]:
     """Latitude and longitude in degrees.
 
@@ -98,28 +89,26 @@ def _position(lat_1e7: int, lon_1e7: int) -> tuple[float, float]:
     return lat_deg, lon_deg
 
 
-_GLOBAL_POSITION_INT = struct.Struct("<IiiiihhhH")
-
-
-def _global_position_int(frame: Frame) -> Report:
-    """Decode position and velocity; ``vz`` is positive down, ``hdg`` 65535 is unknown."""
-    boot_ms, lat, lon, alt_mm, rel_mm, vx, vy, vz, hdg = unpack(frame, _GLOBAL_POSITION_INT)
-    lat_deg, lon_deg = _position(lat, lon)
+def _own_position(frame: Frame) -> Report:
+    """Decode a position that a vehicle sent of itself."""
+    said = positions.read(frame)
+    lat_deg, lon_deg = _position(said.lat_1e7, said.lon_1e7)
+    velocity = said.velocity_ned_mps
     return Report(
         t_ns=frame.t_ns,
-        link=frame.link,
         uav=str(frame.source),
         source=frame.source,
         lat_deg=lat_deg,
         lon_deg=lon_deg,
-        alt_m=alt_mm * 1e-3,
+        alt_m=said.alt_m,
         alt_datum=AltitudeDatum.MSL,
-        relative_alt_m=rel_mm * 1e-3,
-        velocity_ne_mps=(vx * 1e-2, vy * 1e-2),
-        velocity_down_mps=vz * 1e-2,
-        heading_deg=hdg * 1e-2 if hdg <= 36_000 else None,
-        boot_ms=boot_ms,
+        relative_alt_m=said.relative_alt_m,
+        velocity_ne_mps=None if velocity is None else velocity[:2],
+        velocity_down_mps=None if velocity is None else velocity[2],
+        heading_deg=said.heading_deg,
+        boot_ms=said.boot_ms,
         tslc_s=None,
+        accuracy=said.accuracy,
     )
 
 
@@ -136,7 +125,7 @@ def _adsb_vehicle(frame: Frame) -> AdsbVehicle:
     """
     fields = _ADSB_VEHICLE.unpack(frame.payload.ljust(_ADSB_VEHICLE.size, b"\0")[:38])
     icao, lat, lon, alt_mm, heading_cdeg, speed_cmps, climb_cmps, flags = fields[:8]
-    altitude_type, callsign, emitter_type, tslc_s = fields[9:]
+    altitude_type, callsign, _, tslc_s = fields[9:]
     if not 0 < icao <= _ICAO_MAX:
         raise _RefusedError(Reason.MALFORMED, f"ICAO address {icao:#x}")
     heading_deg = heading_cdeg * 1e-2 if flags & _HEADING and heading_cdeg <= 36_000 else None
@@ -147,11 +136,9 @@ def _adsb_vehicle(frame: Frame) -> AdsbVehicle:
     datum = _DATUM.get(altitude_type) if flags & _ALTITUDE else None
     return AdsbVehicle(
         t_ns=frame.t_ns,
-        link=frame.link,
         icao=icao,
         source=frame.source,
         callsign=_callsign(callsign) if flags & _CALLSIGN else None,
-        emitter_type=emitter_type,
         position_deg=_position(lat, lon) if flags & _COORDS else None,
         alt_m=alt_mm * 1e-3 if datum is not None else None,
         alt_datum=datum,
@@ -190,12 +177,11 @@ def _attitude(frame: Frame) -> Attitude:
 
 
 _HEARTBEAT = struct.Struct("<IBBBBB")
-_ARMED: Final = 128
 
 
 def _heartbeat(frame: Frame) -> Presence:
-    _, mav_type, autopilot, base_mode, status, _ = unpack(frame, _HEARTBEAT)
-    return Presence(frame.t_ns, frame.source, mav_type, autopilot, status, bool(base_mode & _ARMED))
+    _, mav_type, autopilot, *_ = unpack(frame, _HEARTBEAT)
+    return Presence(frame.t_ns, frame.source, mav_type, autopilot)
 
 
 _UNKNOWN: Final = 0xFFFF_FFFF
@@ -210,12 +196,11 @@ def _stated(thousandths: int) -> float | None:
 def _gps_raw_int(frame: Frame) -> GnssStatus:
     """Decode fix type and accuracies; the accuracies are extension fields, 0 where not sent."""
     fields = unpack(frame, _GPS_RAW_INT)
-    fix_type, satellites, h_acc, v_acc, vel_acc = fields[8], fields[9], *fields[11:14]
+    h_acc, v_acc, vel_acc = fields[11:14]
     return GnssStatus(
         t_ns=frame.t_ns,
         source=frame.source,
-        fix_type=fix_type,
-        satellites=None if satellites == 255 else satellites,
+        fix_type=fields[8],
         alt_m=fields[3] * 1e-3,
         h_acc_m=_stated(h_acc),
         v_acc_m=_stated(v_acc),
@@ -268,7 +253,7 @@ _DECODERS: Final[dict[int, Callable[[Frame], Message | None]]] = {
     SYSTEM_TIME: _system_time,
     GPS_RAW_INT: _gps_raw_int,
     ATTITUDE: _attitude,
-    GLOBAL_POSITION_INT: _global_position_int,
+    **dict.fromkeys(positions.OWN, _own_position),
     EKF_STATUS_REPORT: _ekf_status_report,
     ADSB_VEHICLE: _adsb_vehicle,
     cot_link.TUNNEL: _tunnel,

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from companion.mavlink.wire import accuracy
-from companion.values import Accuracy, AltitudeDatum, Frame, RemoteId, Report
+from companion.values import Accuracy, AltitudeDatum, Frame, RemoteId, Report, UavKind
 
 BASIC_ID: Final = 12900
 LOCATION: Final = 12901
@@ -50,7 +50,7 @@ def _payload(frame: Frame, layout: struct.Struct) -> bytes:
 
 
 def _begun(frame: Frame, heard_as: bytes) -> RemoteId:
-    return RemoteId(frame.t_ns, frame.link, frame.source, heard_as.rstrip(b"\0").hex())
+    return RemoteId(frame.t_ns, frame.source, heard_as.rstrip(b"\0").hex())
 
 
 def _basic_id(frame: Frame) -> RemoteId:
@@ -177,8 +177,7 @@ def _located(said: RemoteId, at: _Place) -> RemoteId:
         velocity = (at.speed_mps * math.cos(course), at.speed_mps * math.sin(course))
     report = Report(
         t_ns=said.t_ns,
-        link=said.link,
-        uav=f"rid:{said.heard_as}",
+        uav=UavKind.REMOTE_ID.uav(said.heard_as),
         source=said.source,
         lat_deg=at.lat_1e7 * 1e-7,
         lon_deg=at.lon_1e7 * 1e-7,

@@ -1,7 +1,8 @@
 """What nodes tell one another, as protobuf described like a recording's messages.          [shell]
 
-Version 1 of the contract in docs/fleet.md: fields are only ever added. What comes from others is
-read with limits, and anything that is no such message is a ``FleetMessageError``.
+Version 1 of the contract in docs/fleet.md: fields are added, and the number of one that is gone is
+never used again. What comes from others is read with limits, and anything that is no such message
+is a ``FleetMessageError``.
 """
 
 import math
@@ -58,8 +59,6 @@ def standing(said: Standing) -> bytes:
     """What a node says of itself."""
     message = schemas.StandingMessage(
         node=said.node,
-        started_ns=said.started_ns,
-        t_ns=said.t_ns,
         place=said.place or (),
         reach_m=said.reach_m,
         most=said.most,
@@ -87,14 +86,12 @@ def to_standing(data: bytes, node: str) -> Standing:
         raise FleetMessageError("a place that is none")
     reach_m = message.reach_m if message.HasField("reach_m") else None
     return Standing(
-        node,
-        _time(message.started_ns),
-        _time(message.t_ns),
-        (place[0], place[1], place[2]) if place else None,
-        None if reach_m is None else _number(reach_m),
-        min(message.most, OFFERS_MAX),
-        tuple((_name(one.uav), _number(one.worth_db)) for one in message.serves),
-        tuple((_name(one.uav), _name(one.to)) for one in message.handing),
+        node=node,
+        place=(place[0], place[1], place[2]) if place else None,
+        reach_m=None if reach_m is None else _number(reach_m),
+        most=min(message.most, OFFERS_MAX),
+        serves=tuple((_name(one.uav), _number(one.worth_db)) for one in message.serves),
+        handing=tuple((_name(one.uav), _name(one.to)) for one in message.handing),
     )
 
 

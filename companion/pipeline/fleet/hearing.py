@@ -6,20 +6,19 @@ a vehicle that is heard here is held against what is heard (``mavlink/trust/twin
 missed here is taken up when the vehicle falls silent.
 """
 
-from collections import deque
+from collections import OrderedDict, deque
 from dataclasses import dataclass, field
 from typing import Final
 
 from companion.mavlink.trust.dedupe import content
 from companion.mavlink.trust.twins import Twins
-from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
+from companion.mavlink.wire.decode import GPS_RAW_INT, HEARTBEAT
 from companion.mavlink.wire.framing import MAGIC_V2, SHORTEST, examine
+from companion.mavlink.wire.positions import OWN
 from companion.pipeline.fleet.neighbours import NeighbourClock
 from companion.values import Frame, SharedFrame, Source
 
-HEARTBEAT: Final = 0
-GPS_RAW_INT: Final = 24
-SHARED: Final = frozenset((HEARTBEAT, GPS_RAW_INT, GLOBAL_POSITION_INT))
+SHARED: Final = OWN | {HEARTBEAT, GPS_RAW_INT}
 """Messages that nodes tell one another: where a vehicle is, how exact, and what it is."""
 KEPT_NS: Final = 10_000_000_000
 """How long it is remembered what was heard, and by whom."""
@@ -40,17 +39,15 @@ class Recent:
     """Contents of frames, each remembered for ``KEPT_NS`` after it was first noted."""
 
     def __init__(self) -> None:
-        self._seen: dict[bytes, int] = {}
-        self._order: deque[tuple[int, bytes]] = deque()
+        self._seen: OrderedDict[bytes, int] = OrderedDict()
 
     def note(self, now_ns: int, key: bytes) -> bool:
         """Note a content. Returns whether it is new."""
-        while self._order and self._order[0][0] < now_ns - KEPT_NS:
-            self._seen.pop(self._order.popleft()[1], None)
+        while self._seen and next(iter(self._seen.values())) < now_ns - KEPT_NS:
+            self._seen.popitem(last=False)
         if key in self._seen:
             return False
         self._seen[key] = now_ns
-        self._order.append((now_ns, key))
         return True
 
     def __contains__(self, key: bytes) -> bool:
@@ -94,7 +91,7 @@ class Hearing:
     def heard(self, frame: Frame) -> bytes:
         """Take in a frame heard here, of a message in ``SHARED``. Returns its content."""
         key = content(frame.raw)
-        if frame.msgid != GLOBAL_POSITION_INT:
+        if frame.msgid not in OWN:
             return key
         self._heard.note(frame.t_ns, key)
         self._twins.refuses(HERE, HERE, frame)
@@ -141,7 +138,7 @@ class Hearing:
 
     def told(self, now_ns: int, node: str, frame: Frame, key: bytes) -> list[Frame]:
         """What the pipeline is to have, now that another node told a frame; mostly nothing."""
-        if frame.msgid == GLOBAL_POSITION_INT:
+        if frame.msgid in OWN:
             return self._report(now_ns, node, frame, key)
         ears = self._ears.get(frame.source)
         return [frame] if ears is None or ears.is_silent(now_ns - self.behind_ns) else []

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from companion.mavlink.trust.dedupe import content
-from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
+from companion.mavlink.wire.positions import OWN
 from companion.pipeline.fleet.assignment import worths_db
 from companion.pipeline.fleet.duties import Duties, Handover
 from companion.pipeline.fleet.hearing import SHARED, Hearing
@@ -71,7 +71,6 @@ class Member:
         self.reach_m: float | None = None
         self.near: frozenset[str] = frozenset()
         self._nulls = settings.nulls
-        self._started_ns = started_ns
         self._duty: tuple[tuple[str, ...], tuple[str, ...]] | None = None
         self._looked_ns = started_ns
 
@@ -156,7 +155,7 @@ class Member:
             if frame is None:
                 continue
             key = content(frame.raw)
-            if frame.msgid == GLOBAL_POSITION_INT:
+            if frame.msgid in OWN:
                 if not self.hearing.was_told(key):  # the second time it is late, and no matter
                     known.came(now_ns, now_ns - frame.t_ns + frame.doubt_ns)
                 self.sharing.told(now_ns, node, frame.source, key, way_ns)
@@ -277,14 +276,12 @@ class Member:
         for node in others.keys() - self.near:  # they are out of date from now on
             self.neighbours[node].offers = None
         return Standing(
-            self.name,
-            self._started_ns,
-            now_ns,
-            place,
-            reach_m,
-            self.most,
-            tuple(self.duties.serves.items()),
-            tuple(self.duties.handing.items()),
+            node=self.name,
+            place=place,
+            reach_m=reach_m,
+            most=self.most,
+            serves=tuple(self.duties.serves.items()),
+            handing=tuple(self.duties.handing.items()),
         )
 
     def _neighbour(self, now_ns: int, node: str) -> Neighbour | None:

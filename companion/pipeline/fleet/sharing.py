@@ -11,7 +11,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Final, NamedTuple, TypeVar
 
-from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
+from companion.mavlink.wire.positions import OWN
 from companion.pipeline.fleet.hearing import VEHICLES_MAX, Recent
 from companion.values import Frame, RoundTrip, Shared, SharedFrame, Source
 
@@ -87,7 +87,7 @@ class Sharing:
             self._tell(frame.t_ns, key, frame)
         elif key in self._by_others:
             voice.late = 0
-        elif frame.msgid == GLOBAL_POSITION_INT:
+        elif frame.msgid in OWN:
             self._wait(self._held, _Held(now_ns + round(self._hold_ns), key, frame))
 
     def answered(self, trip: RoundTrip) -> None:

@@ -7,7 +7,7 @@ from companion.pipeline.fleet.member import Member
 from companion.pipeline.fleet.nearness import Place
 from companion.pipeline.fleet.trust import Witness
 from companion.pipeline.fold import Pipeline
-from companion.values import Notice, Vector, reports_itself
+from companion.values import Notice, Vector, kind_of
 
 HEARD_S: Final = 5.0
 """How long ago a vehicle may have been heard that shows how far this node hears."""
@@ -59,6 +59,6 @@ class Surroundings:
     def _positions(self) -> dict[str, Vector]:
         """Where every vehicle that reports itself was last, in the local frame."""
         tracker = self._pipeline.tracker
-        names = filter(reports_itself, tracker.uavs)
+        names = [uav for uav in tracker.uavs if kind_of(uav).reports_itself]
         found = ((name, tracker.newest(name)) for name in names)
         return {uav: newest.position_ned_m for uav, newest in found if newest is not None}

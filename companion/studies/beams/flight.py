@@ -38,7 +38,7 @@ from companion.studies.prediction.radio_link import LINKS
 from companion.studies.truth import array_truth
 from companion.studies.truth.array_truth import ArrayTruth
 from companion.studies.truth.vehicles import named
-from companion.values import BeamSet, Carrier, FloatArray, Track, Update, UserError, Widen
+from companion.values import BeamSet, Carrier, FloatArray, Track, Update, UserError, Widen, kind_of
 
 TOLD_EVERY: Final = 20
 """Looks between two reports of progress."""
@@ -290,7 +290,7 @@ def watch(
     samples: list[Sample] = []
     looks, name = 0, named(logs)
     for t_s, update in updates(logs, pipeline, hz):
-        if not sought and any(not track.uav.startswith("icao:") for track in update.tracks):
+        if not sought and any(kind_of(track.uav).reports_itself for track in update.tracks):
             truth, sought = array_truth.load(logs, pipeline), True
         if update.tracks:
             samples += look(seen, update, truth, t_s)

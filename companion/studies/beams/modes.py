@@ -34,7 +34,18 @@ from companion.studies.prediction.radio_link import LINKS, RadioLink
 from companion.studies.truth import array_truth, vehicles
 from companion.studies.truth.array_truth import ArrayTruth
 from companion.tracking.geodesy import LocalFrame
-from companion.values import BeamSet, Event, FloatArray, Frame, Tick, Tock, Track, Update, Widen
+from companion.values import (
+    BeamSet,
+    Event,
+    FloatArray,
+    Frame,
+    Tick,
+    Tock,
+    Track,
+    Update,
+    Widen,
+    kind_of,
+)
 
 RIVALS: Final = ("hold", "kalman-peng", "dead-reckoning-arrival")
 """Predictors whose beams are sharp and stand beside the product's."""
@@ -169,7 +180,7 @@ def compare(
         update = next((one for one in outputs if isinstance(one, Update)), None)
         if update is None or not update.tracks:
             continue
-        if not sought and any(not track.uav.startswith("icao:") for track in update.tracks):
+        if not sought and any(kind_of(track.uav).reports_itself for track in update.tracks):
             truth, sought = array_truth.load(logs, pipeline), True
         if update.carrier is None:
             continue

@@ -8,7 +8,7 @@ import numpy as np
 from pymavlink.dialects.v20 import common
 
 from companion.pipeline.fleet.assignment import STEP_DB
-from companion.values import FloatArray, Offer
+from companion.values import FloatArray, Offer, Source
 
 SNR_AT_1_KM_DB: Final = 20.0
 GAIN_DB: Final = 18.0
@@ -79,7 +79,7 @@ class Flight:
 
     def report(self, uav: str, boot_ms: int) -> bytes:
         """A report of a UAV; its fields say nothing, its stamp makes it one of its own."""
-        sysid, compid = map(int, uav.split(":"))
+        sysid, compid = Source.parse(uav)
         mav = self._mavs.setdefault(uav, common.MAVLink(None, sysid, compid))
         message = common.MAVLink_global_position_int_message(
             boot_ms, 473977000, 85456000, 500000, 50000, 100, 100, 10, 9000

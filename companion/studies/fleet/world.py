@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from companion.mavlink.wire.decode import GLOBAL_POSITION_INT as REPORT
+from companion.mavlink.wire.positions import GLOBAL_POSITION_INT as REPORT
 from companion.node.fleet import messages
 from companion.pipeline.fleet.member import Member
 from companion.settings.fleet import FleetSettings

@@ -26,7 +26,7 @@ from companion.studies.link.track_predictor import TrackPredictor
 from companion.studies.prediction.baselines import Hold, Observed, Predictor
 from companion.studies.truth import array_truth
 from companion.studies.truth.vehicles import named
-from companion.values import FloatArray, Method, Update, UserError
+from companion.values import FloatArray, Method, Update, UserError, kind_of
 
 RADII_M: Final = (100.0, 150.0, 200.0, 250.0)
 RATE_RADPS: Final = 0.5
@@ -242,7 +242,7 @@ def from_logs(
     pipeline, truth, looks = Pipeline(settings), None, list[Instant]()
     name = named(logs)
     for t_s, update in updates(logs, pipeline, LOOKS_HZ):
-        if truth is None and any(not track.uav.startswith("icao:") for track in update.tracks):
+        if truth is None and any(kind_of(track.uav).reports_itself for track in update.tracks):
             truth = array_truth.load(logs, pipeline)
             if truth is None:
                 raise UserError(f"{name}: there is no simulator's truth of its UAVs in it")

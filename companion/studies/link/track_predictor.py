@@ -48,7 +48,7 @@ class TrackPredictor:
 
 _UAV: Final = "1:1"
 _REPORT: Final = Report(
-    0, "study", _UAV, Source(1, 1), 0.0, 0.0, 0.0, AltitudeDatum.MSL, None, None, None, None,
+    0, _UAV, Source(1, 1), 0.0, 0.0, 0.0, AltitudeDatum.MSL, None, None, None, None,
     None, None,
 )  # fmt: skip
 """Placeholder for the message of a fix, which tracking does not read."""

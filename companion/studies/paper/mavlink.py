@@ -14,9 +14,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
 from companion.mavlink.wire.encode import Outgoing, pack
 from companion.mavlink.wire.framing import Splitter
+from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
 from companion.studies.paper import published

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from companion.mavlink.clock.sender_clock import SenderClock
-from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
+from companion.mavlink.wire.positions import OWN
 from companion.mavlink.wire.stamps import STAMPED
 from companion.mavlink.wire.stamps import boot_ms as stamp_of
 from companion.studies.prediction import hostile_link, noisy_frames
@@ -124,7 +124,7 @@ def deliver(
 def _sends(flight: Flight) -> _Sends:
     # Further frames with a position are repeats, or positions before a fix.
     others = np.array(
-        [at for at, frame in enumerate(flight.frames) if frame.msgid != GLOBAL_POSITION_INT],
+        [at for at, frame in enumerate(flight.frames) if frame.msgid not in OWN],
         dtype=np.int64,
     )
     frames = [flight.frames[at] for at in others.tolist()]

@@ -13,7 +13,8 @@ from typing import Final
 import numpy as np
 
 from companion.mavlink.trust.dedupe import Dedupe
-from companion.mavlink.wire.decode import GLOBAL_POSITION_INT, GPS_RAW_INT, decode
+from companion.mavlink.wire.decode import GPS_RAW_INT, decode
+from companion.mavlink.wire.positions import OWN
 from companion.recording.reader import read_flight
 from companion.studies.truth import stamps
 from companion.studies.truth.hindsight import BootClock, boot_clock
@@ -90,7 +91,7 @@ class Stream:
         stamp_ms = stamps.boot_ms(frame)
         if stamp_ms is not None:
             self._stamped(frame.t_ns, stamp_ms * 1_000_000, order)
-        if frame.msgid in (GLOBAL_POSITION_INT, GPS_RAW_INT):
+        if frame.msgid in OWN or frame.msgid == GPS_RAW_INT:
             self._decoded(frame, dedupe)
         self.frames.append(frame)
 

@@ -7,10 +7,8 @@ from typing import Annotated, Final
 
 import numpy as np
 
-from companion.mavlink.wire.cot_link import TUNNEL
-from companion.mavlink.wire.decode import GLOBAL_POSITION_INT, decode
-from companion.mavlink.wire.remote_id import LOCATION, MESSAGE_PACK
-from companion.mavlink.wire.transponder import ADSB_VEHICLE
+from companion.mavlink.wire.decode import decode
+from companion.mavlink.wire.positions import POSITIONS
 from companion.recording.tables.columns import Table
 from companion.tracking.geodesy import Place
 from companion.values import (
@@ -26,15 +24,6 @@ from companion.values import (
     ReportNoise,
 )
 from companion.values.described import Inline, Meaning
-
-MESSAGES: Final = {
-    GLOBAL_POSITION_INT: "GLOBAL_POSITION_INT",
-    ADSB_VEHICLE: "ADSB_VEHICLE",
-    LOCATION: "OPEN_DRONE_ID_LOCATION",
-    MESSAGE_PACK: "OPEN_DRONE_ID_MESSAGE_PACK",
-    TUNNEL: "TUNNEL",
-}
-"""Messages that are reports, or may be, by id."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +50,7 @@ class Heard:
 
     @property
     def message(self) -> Annotated[str, Meaning("name of the MAVLink message")]:
-        return MESSAGES[self.frame.msgid]
+        return POSITIONS[self.frame.msgid].name
 
     @property
     def link(self) -> Annotated[str, Meaning("link or log that it came over")]:
@@ -155,7 +144,7 @@ class Heard:
 
 def heard(frame: Frame, outputs: Sequence[Output]) -> Heard | None:
     """The report that a frame held, with what came of it; None where it held none."""
-    if frame.msgid not in MESSAGES:
+    if frame.msgid not in POSITIONS:
         return None
     for output in outputs:
         if isinstance(output, Estimate):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from companion.mavlink.trust.admission import Admission
+from companion.mavlink.trust.admission import admission
 
 
 @pytest.mark.parametrize(
@@ -23,5 +23,5 @@ from companion.mavlink.trust.admission import Admission
     ],
 )
 def test_the_lists(allow: tuple[str, ...], deny: tuple[str, ...], uav: str, admitted: bool) -> None:
-    lists = Admission(allow, deny)
-    assert lists.admits(uav) is lists.admits(uav) is admitted
+    admits = admission(allow, deny)
+    assert admits(uav) is admits(uav) is admitted

@@ -86,7 +86,7 @@ def test_a_complete_message_is_a_report() -> None:
     message = said(3, alt=500, velocity=(90, 70), climb=-2, callsign="EIN123", tslc=4)
     found = report(Aircraft().merge(message))
     assert found == Report(
-        t_ns=message.t_ns, link="udp5", uav=UAV, source=Source(5, 1),
+        t_ns=message.t_ns, uav=UAV, source=Source(5, 1),
         lat_deg=pytest.approx(47.4), lon_deg=pytest.approx(8.55), alt_m=500.0,
         alt_datum=GEOMETRIC, relative_alt_m=None, velocity_ne_mps=pytest.approx((0, 70)),
         velocity_down_mps=pytest.approx(2.0), heading_deg=pytest.approx(90), boot_ms=None,
@@ -467,7 +467,6 @@ class Model:
                     "heading_deg": self.fitting(m, then_ns, "heading_deg"),
                     "uav": m.uav,
                     "t_ns": m.t_ns,
-                    "link": m.link,
                     "source": m.source,
                     "tslc_s": m.tslc_s,
                 }

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from companion.mavlink.trust import twins
 from companion.mavlink.trust.twins import KEPT_NS, Twins
-from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
 from companion.mavlink.wire.encode import Outgoing, pack
 from companion.mavlink.wire.framing import Splitter
+from companion.mavlink.wire.positions import GLOBAL_POSITION_INT, OwnPosition
 from companion.values import Frame, Source
 
 S = 1_000_000_000
@@ -217,8 +217,16 @@ def test_what_is_held_against_what_is_found_from_the_newest_on(
 ) -> None:
     """A report is near the end of a path: that all of it need not be looked at changes nothing."""
 
-    def said(stamp_ms: int) -> twins._Said:
-        return twins._Said(stamp_ms, 0, 0, 0.0, (0.0, 0.0, 0.0))
+    def said(stamp_ms: int) -> OwnPosition:
+        return OwnPosition(
+            boot_ms=stamp_ms,
+            lat_1e7=0,
+            lon_1e7=0,
+            alt_m=0.0,
+            relative_alt_m=None,
+            velocity_ned_mps=None,
+            heading_deg=None,
+        )
 
     reports = deque(map(said, sorted(stamps)))
     first, last = said(boot_ms), said(boot_ms + later_ms)

@@ -13,7 +13,7 @@ import pytest
 from pymavlink.dialects.v20 import all as dialect
 from support import HANG_S
 
-from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
+from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
 from companion.node.drive.lag import MountLag
 from companion.node.drive.loop import DeviceError, Drive, Safe, Shot, Takes
 from companion.node.drive.rotctld import Rotator

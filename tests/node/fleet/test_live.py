@@ -166,7 +166,7 @@ def test_another_of_its_name_is_said_once_and_not_heard(wire: Wire) -> None:
         member = node(mode="client", connect=["tcp/127.0.0.1:1"], notify=notices.append)
         task = asyncio.create_task(member.run())
         await wire.is_asked.wait()
-        said = messages.standing(Standing("north", 0, 0, None, None, 4, (("1:1", 9.0),)))
+        said = messages.standing(Standing("north", None, None, 4, (("1:1", 9.0),)))
         for _ in range(2):
             wire.takes["standing"]("companion/site/north/standing", said)
         assert list(member.member.neighbours) == ["south"]
@@ -239,7 +239,7 @@ def test_a_change_of_duty_is_said_at_once_and_a_rival_is_answered(wire: Wire) ->
         ((what, payload),) = wire.said
         assert what == "standing"
         assert messages.to_standing(payload, "north").serves[0][0] == "1:1"
-        rival = Standing("south", 0, now_ns[0], None, None, 4, (("1:1", 25.0),))
+        rival = Standing("south", None, None, 4, (("1:1", 25.0),))
         wire.takes["standing"]("companion/site/south/standing", messages.standing(rival))
         last = steps[-1]
         assert isinstance(last, Duty)

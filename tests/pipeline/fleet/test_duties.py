@@ -25,7 +25,7 @@ class Pair:
     def says(self, name: str) -> Standing:
         duties = self.nodes[name]
         serves, handing = tuple(duties.serves.items()), tuple(duties.handing.items())
-        return Standing(name, 0, self.now_ns, None, None, 50, serves, handing)
+        return Standing(name, None, None, 50, serves, handing)
 
     def step(self, talk: bool = True, alive: str = "ab") -> list[list[str]]:
         """One tick of 100 ms. Returns who serves what after each node's decision."""
@@ -135,7 +135,7 @@ def test_the_second_takes_what_the_first_does_not() -> None:
 
 
 def said(node: str, *serves: tuple[str, float]) -> Standing:
-    return Standing(node, 0, 0, None, None, 50, serves)
+    return Standing(node, None, None, 50, serves)
 
 
 class Alone:

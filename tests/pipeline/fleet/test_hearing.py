@@ -3,7 +3,7 @@
 from pymavlink.dialects.v20 import common
 
 from companion.mavlink.trust.dedupe import content
-from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
+from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
 from companion.pipeline.fleet.hearing import Hearing
 from companion.pipeline.fleet.neighbours import NeighbourClock
 from companion.values import Frame, SharedFrame, Source

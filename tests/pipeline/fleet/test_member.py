@@ -20,7 +20,7 @@ def member(**settings: object) -> Member:
 
 def standing(node: str, serves: tuple[str, ...] = ()) -> Standing:
     each = tuple((uav, 20.0) for uav in serves)
-    return Standing(node, START_NS, START_NS, (47.0, 8.0, 0.0), 500.0, 16, each)
+    return Standing(node, (47.0, 8.0, 0.0), 500.0, 16, each)
 
 
 def word(now_ns: int, number: int) -> Shared:
@@ -105,7 +105,7 @@ def test_who_is_served_elsewhere_is_spared_where_that_is_asked_for() -> None:
 def test_who_is_far_away_is_not_near_and_its_offers_are_not_kept() -> None:
     node = member()
     for name, place in (("b", (47.0, 8.0, 0.0)), ("c", (48.0, 8.0, 0.0))):
-        node.stands(START_NS, Standing(name, START_NS, START_NS, place, 900.0, 16, ()))
+        node.stands(START_NS, Standing(name, place, 900.0, 16, ()))
         node.offered(START_NS, name, (Offer("1:1", 10.0, 10.0, 10.0, 0.1),))
     assert node.near == frozenset()
     node.says(START_NS, (47.0, 8.01, 0.0), 900.0)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pymavlink.dialects.v20 import common
 
 from companion.mavlink.trust.dedupe import content
-from companion.mavlink.wire.decode import GLOBAL_POSITION_INT
+from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
 from companion.pipeline.fleet.hearing import VEHICLES_MAX
 from companion.pipeline.fleet.sharing import AT_ONCE, HELD_MAX, HOLD_NS, Sharing
 from companion.values import Frame, RoundTrip, Source

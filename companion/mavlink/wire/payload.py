@@ -1,0 +1,17 @@
+"""The fields of a payload."""
+
+import struct
+
+from companion.values import Frame
+
+
+def unpack(frame: Frame, layout: struct.Struct) -> tuple[int, ...]:
+    """Unpack the fields of a payload.
+
+    Fields cut off, or absent in its MAVLink version, are zeros.
+    """
+    raw = frame.raw
+    start = 10 if raw[0] == 0xFD else 6
+    if raw[1] >= layout.size:
+        return layout.unpack_from(raw, start)
+    return layout.unpack(frame.payload.ljust(layout.size, b"\0"))

@@ -1,0 +1,85 @@
+"""The messages that carry positions: one table, from which everything else derives.
+
+A message in which a vehicle reports its own position needs a function that reads it, and a row in
+``POSITIONS``. It is then decoded, compared between peers and nodes, shared within a fleet, timed
+and exported like the others.
+"""
+
+import struct
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+from companion.mavlink.wire.cot_link import TUNNEL
+from companion.mavlink.wire.payload import unpack
+from companion.mavlink.wire.remote_id import LOCATION, MESSAGE_PACK
+from companion.mavlink.wire.transponder import ADSB_VEHICLE
+from companion.values import Accuracy, Frame, Vector
+
+GLOBAL_POSITION_INT: Final = 33
+
+
+class OwnPosition(NamedTuple):
+    """A position that a vehicle sent of itself; None stands for what its message does not have.
+
+    boot_ms           milliseconds since the vehicle's boot when the position was true
+    lat_1e7, lon_1e7  WGS84, 1e-7 degrees
+    alt_m             height above mean sea level
+    relative_alt_m    height above home
+    velocity_ned_mps  north, east, down
+    heading_deg       from true north, clockwise
+    accuracy          accuracy that the message states
+    """
+
+    boot_ms: int
+    lat_1e7: int
+    lon_1e7: int
+    alt_m: float
+    relative_alt_m: float | None
+    velocity_ned_mps: Vector | None
+    heading_deg: float | None
+    accuracy: Accuracy | None = None
+
+
+class PositionMessage(NamedTuple):
+    """A message that carries a position: its MAVLink name, and how a vehicle's own is read.
+
+    ``read`` is None where the message relays another aircraft's position (see ``decode``).
+    """
+
+    name: str
+    read: Callable[[Frame], OwnPosition] | None = None
+
+
+_GLOBAL_POSITION_INT = struct.Struct("<IiiiihhhH")
+
+
+def _global_position_int(frame: Frame) -> OwnPosition:
+    """Read GLOBAL_POSITION_INT: ``vz`` is positive down, ``hdg`` 65535 is unknown."""
+    boot_ms, lat, lon, alt_mm, rel_mm, vx, vy, vz, hdg = unpack(frame, _GLOBAL_POSITION_INT)
+    return OwnPosition(
+        boot_ms=boot_ms,
+        lat_1e7=lat,
+        lon_1e7=lon,
+        alt_m=alt_mm * 1e-3,
+        relative_alt_m=rel_mm * 1e-3,
+        velocity_ned_mps=(vx * 1e-2, vy * 1e-2, vz * 1e-2),
+        heading_deg=hdg * 1e-2 if hdg <= 36_000 else None,
+    )
+
+
+POSITIONS: Final = {
+    GLOBAL_POSITION_INT: PositionMessage("GLOBAL_POSITION_INT", _global_position_int),
+    ADSB_VEHICLE: PositionMessage("ADSB_VEHICLE"),
+    LOCATION: PositionMessage("OPEN_DRONE_ID_LOCATION"),
+    MESSAGE_PACK: PositionMessage("OPEN_DRONE_ID_MESSAGE_PACK"),
+    TUNNEL: PositionMessage("TUNNEL"),
+}
+"""Messages that carry a position, or may, by id."""
+_READERS: Final = {msgid: one.read for msgid, one in POSITIONS.items() if one.read is not None}
+OWN: Final = frozenset(_READERS)
+"""Messages in which vehicles report their own positions."""
+
+
+def read(frame: Frame) -> OwnPosition:
+    """Read the position in a frame of a message in ``OWN``. Nothing is checked."""
+    return _READERS[frame.msgid](frame)

@@ -64,8 +64,17 @@ def run(
     manager = systemd.manager(os.environ)
     http = bind(settings.server.listen, token=token, insecure=insecure)
     with http:
-        service = Service(settings, voice.say, origins)
-        serve = partial(_serve, service, voice, http, token, traffic, manager, open_page)
+        service = Service(settings=settings, say=voice.say, origins=origins)
+        serve = partial(
+            _serve,
+            service,
+            voice,
+            http,
+            token=token,
+            traffic=traffic,
+            manager=manager,
+            open_page=open_page,
+        )
         run_until_told(serve, seconds)
 
 
@@ -80,6 +89,7 @@ async def _serve(
     service: Service,
     voice: Voice,
     http: socket.socket,
+    *,
     token: str | None,
     traffic: Callable[[str], Coroutine[Any, Any, None]] | None,
     manager: systemd.Manager | None,

@@ -29,7 +29,9 @@ def told(records: UavRecords, *refuted: Refuted | None) -> list[Refuted | Notice
         record.refuted += 1
         if one.proven > AGAIN * record.proven.get(one.setting, 0.0):
             record.proven[one.setting] = one.proven
-            out.append(Notice(one.t_ns, Severity.WARNING, one.uav, _said(one)))
+            out.append(
+                Notice(t_ns=one.t_ns, severity=Severity.WARNING, subject=one.uav, text=_said(one))
+            )
     return out
 
 
@@ -40,12 +42,26 @@ def clock_changed(
     drift = change.drift_ppm
     record.refuted += 1
     out: list[Refuted | Notice] = [
-        Refuted(t_ns, sender, "clocks.drift_max_ppm", drift_max_ppm, drift, drift)
+        Refuted(
+            t_ns=t_ns,
+            uav=sender,
+            setting="clocks.drift_max_ppm",
+            limit=drift_max_ppm,
+            proven=drift,
+            raised_to=drift,
+        )
     ]
     told_ns = record.clock_told_ns
     if change.leapt or told_ns is None or t_ns - told_ns >= SILENT_NS:
         record.clock_told_ns = t_ns
-        out.append(Notice(t_ns, Severity.WARNING, sender, _clock_text(sender, change)))
+        out.append(
+            Notice(
+                t_ns=t_ns,
+                severity=Severity.WARNING,
+                subject=sender,
+                text=_clock_text(sender, change),
+            )
+        )
     return out
 
 
@@ -70,7 +86,14 @@ def jumped(record: UavRecord, begun: Estimate) -> Refuted:
     record.refuted += 1
     limit_m = fix.noise.position_m
     name = "observer.position_noise_m"
-    return Refuted(fix.arrival_ns, fix.uav, name, limit_m, jump_m, limit_m)
+    return Refuted(
+        t_ns=fix.arrival_ns,
+        uav=fix.uav,
+        setting=name,
+        limit=limit_m,
+        proven=jump_m,
+        raised_to=limit_m,
+    )
 
 
 def _said(one: Refuted) -> str:

@@ -111,7 +111,12 @@ class Pipeline:
         self.tracker = assembly.tracker(settings)
         self.records = Records(UavRecord, self.tracker.__contains__)
         self.refusals = Refusals(self.records)
-        self.senders = Senders(settings, self.center.vehicle, self.records, self.tracker)
+        self.senders = Senders(
+            settings=settings,
+            carrier=self.center.vehicle,
+            records=self.records,
+            tracked=self.tracker,
+        )
         self.targets = Targets(settings, self.center.vehicle)
         site = Site(self.array, self.coverage, *assembly.radio(settings))
         self.health = Health(settings.link, site)
@@ -154,7 +159,7 @@ class Pipeline:
         text = (
             f"this machine's clock was set {way} by {abs(step_s):.3f} s: all times are said by it"
         )
-        return [Notice(event.t_ns, Severity.WARNING, "clock", text)]
+        return [Notice(t_ns=event.t_ns, severity=Severity.WARNING, subject="clock", text=text)]
 
     def _frame(self, frame: Frame) -> list[Output]:
         self.frames += 1
@@ -192,7 +197,7 @@ class Pipeline:
         report = placed.report
         begins = self.center.seeks_home or report.uav not in self.tracker
         if begins and not self.senders.may_begin(report, self.center.seeks_home):
-            return [Rejection(report.t_ns, report.uav, Reason.NO_FIX)]
+            return [Rejection(t_ns=report.t_ns, source=report.uav, reason=Reason.NO_FIX)]
         fix, begun = self.center.fix(placed)
         accepted, refuted = self.tracker.accept(fix)
         said: list[Output] = [*begun, *assumptions.told(self.records, *refuted)]
@@ -207,7 +212,11 @@ class Pipeline:
             said.append(assumptions.jumped(self.records[fix.uav], accepted))
             said += self._move_home(placed, accepted)
             text = f"{fix.uav} is tracked anew: its reports agree, but not with its past"
-            return [*said, Notice(fix.arrival_ns, Severity.WARNING, fix.uav, text), accepted]
+            return [
+                *said,
+                Notice(t_ns=fix.arrival_ns, severity=Severity.WARNING, subject=fix.uav, text=text),
+                accepted,
+            ]
         return [*said, accepted]
 
     def _move_home(self, placed: PlacedReport, anew: Estimate) -> list[Output]:
@@ -265,12 +274,12 @@ class Pipeline:
         now = None if vehicle is None else self.senders.time(vehicle, now_ns)
         age_s = None if now is None else self.center.attitude_age_s(now)
         return Evidence(
-            self._is_assumed(uav),
-            self.refusals.unheard(uav),
-            self.center.attitude_bound_rad,
-            0.0 if age_s is None else age_s,
-            0.0 if now is None else now.bound_s,
-            vehicle is not None and self._is_assumed(vehicle),
+            clock_assumed=self._is_assumed(uav),
+            refused=self.refusals.unheard(uav),
+            attitude_bound_rad=self.center.attitude_bound_rad,
+            attitude_age_s=0.0 if age_s is None else age_s,
+            carrier_doubt_s=0.0 if now is None else now.bound_s,
+            carrier_assumed=vehicle is not None and self._is_assumed(vehicle),
         )
 
     def _is_assumed(self, sender: str) -> bool:
@@ -313,7 +322,9 @@ class Pipeline:
                 beams = without(beams, {track.uav for track in spared})
             if others:
                 beams = replace(beams, left_out=(*beams.left_out, *others))
-            return Update(now_ns, known, unfit, tuple(tracks), beams)
+            return Update(
+                t_ns=now_ns, carrier=known, unfit=unfit, tracks=tuple(tracks), beams=beams
+            )
 
         return made
 

@@ -76,7 +76,7 @@ class Refusals:
         record.unused_told_ns = refused.t_ns
         why = f"{refused.reason}, {refused.detail}" if refused.detail else str(refused.reason)
         text = f"no report of {uav} was used for {lasted_ns * 1e-9:.1f} s: {why}"
-        return Notice(refused.t_ns, Severity.WARNING, uav, text)
+        return Notice(t_ns=refused.t_ns, severity=Severity.WARNING, subject=uav, text=text)
 
     def used(self, uav: str) -> None:
         """Note that a report was used."""

@@ -69,7 +69,7 @@ APART_SHARE: Final = 0.1
 """Share of the newest report in how far the two heights are apart of late."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PlacedReport:
     """A report with its time.
 
@@ -95,7 +95,7 @@ class PlacedAttitude:
     sender_ns: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Heard:
     """The outcome of one frame.
 
@@ -162,6 +162,7 @@ class Senders:
 
     def __init__(
         self,
+        *,
         settings: Settings,
         carrier: str | None,
         records: UavRecords,
@@ -208,7 +209,7 @@ class Senders:
                 return self._attitude(message)
             case EstimatorStatus():
                 carries = message.source == self._carrier_source
-                return Heard(message) if carries else NOTHING
+                return Heard(message=message) if carries else NOTHING
             case None:
                 return NOTHING
             case _:
@@ -281,17 +282,29 @@ class Senders:
         stamp, said = self._stamp(sender, uav, t_ns, report.boot_ms, doubt_ns)
         restarted = uav if said else None
         if sender.clock.is_shared(t_ns):
-            return Heard(None, (*said, *_shared_id(sender, uav, t_ns)), restarted)
+            return Heard(
+                message=None, said=(*said, *_shared_id(sender, uav, t_ns)), restarted=restarted
+            )
         sender.is_shared = False
         if stamp is None:
-            return Heard(None, (*said, Rejection(t_ns, uav, Reason.UNPLACED_STAMP)), restarted)
+            return Heard(
+                message=None,
+                said=(*said, Rejection(t_ns=t_ns, source=uav, reason=Reason.UNPLACED_STAMP)),
+                restarted=restarted,
+            )
         self._dedupe.took(stamp.latency_s)
         assumed = self.assumed(uav)
         lag_ns = round(assumed.lag_middle_s * 1e9)
         errors = self._errors(report, assumed.lag_rest_s) if is_own else None
         true_ns = t_ns - round(stamp.latency_s * 1e9) - lag_ns
-        placed = PlacedReport(report, stamp.sender_ns - lag_ns, true_ns, errors, assumed.limits)
-        return Heard(placed, said, restarted, sender.clock.change)
+        placed = PlacedReport(
+            report=report,
+            sender_ns=stamp.sender_ns - lag_ns,
+            t_ns=true_ns,
+            noise=errors,
+            limits=assumed.limits,
+        )
+        return Heard(message=placed, said=said, restarted=restarted, change=sender.clock.change)
 
     def _errors(self, report: Report, time_s: float) -> ReportNoise:
         """Bounds on the errors of a report, with by how much two heights differ of late.
@@ -321,11 +334,17 @@ class Senders:
             return Heard(said=(merged,))
         true_ns = merged.t_ns - round((merged.tslc_s or 0.0) * 1e9)
         limits = self.assumed(said.uav).limits
-        placed = PlacedReport(merged, true_ns, true_ns, None, limits)
+        placed = PlacedReport(
+            report=merged, sender_ns=true_ns, t_ns=true_ns, noise=None, limits=limits
+        )
         if datum in (None, merged.alt_datum):
-            return Heard(placed)
+            return Heard(message=placed)
         text = f"{said.uav} is tracked anew: its altitude is {merged.alt_datum} now, not {datum}"
-        return Heard(placed, (Notice(said.t_ns, Severity.INFO, said.uav, text),), said.uav)
+        return Heard(
+            message=placed,
+            said=(Notice(t_ns=said.t_ns, severity=Severity.INFO, subject=said.uav, text=text),),
+            restarted=said.uav,
+        )
 
     def _remote_id(self, frame: Frame, said: RemoteId) -> Heard:
         """Place a position that an aircraft broadcasts, by the stamp that it has."""
@@ -347,7 +366,12 @@ class Senders:
         sender = self._senders[carrier]
         stamp, said = self._stamp(sender, carrier, attitude.t_ns, attitude.boot_ms)
         placed = None if stamp is None else PlacedAttitude(attitude, stamp.sender_ns)
-        return Heard(placed, said, carrier if said else None, sender.clock.change)
+        return Heard(
+            message=placed,
+            said=said,
+            restarted=carrier if said else None,
+            change=sender.clock.change,
+        )
 
     def may_begin(self, report: Report, always: bool) -> bool:
         """Take in a report that would begin a track. Returns whether one may begin with it.
@@ -381,7 +405,7 @@ class Senders:
         if kind_of(name).reports_itself and (source := Source.parse(name)) in self._components:
             self._components[source].stated_us = 0
         text = f"{name} was restarted: its boot clock stepped back to {boot_ms / 1e3:.1f} s"
-        return stamp, (Notice(arrival_ns, Severity.WARNING, name, text),)
+        return stamp, (Notice(t_ns=arrival_ns, severity=Severity.WARNING, subject=name, text=text),)
 
     def time(self, uav: str, node_ns: int) -> SenderTime:
         """A node time on a UAV's own timeline; a relayed aircraft's timeline is the node's."""
@@ -389,15 +413,15 @@ class Senders:
         known = sender.clock.time(node_ns) if sender else None
         if known is None:
             bound_s = noise.ADSB_TIME_BOUND_S
-            return SenderTime(node_ns, node_ns, bound_s, bound_s)
+            return SenderTime(node_ns=node_ns, sender_ns=node_ns, before_s=bound_s, after_s=bound_s)
         offset_ns, before_s, after_s, usual_s = known
         rest_s = self.assumed(uav).lag_rest_s
         return SenderTime(
-            node_ns,
-            node_ns - offset_ns,
-            before_s + rest_s,
-            after_s + rest_s,
-            math.hypot(usual_s, rest_s),
+            node_ns=node_ns,
+            sender_ns=node_ns - offset_ns,
+            before_s=before_s + rest_s,
+            after_s=after_s + rest_s,
+            usual_s=math.hypot(usual_s, rest_s),
         )
 
     def clock_estimate(self, uav: str) -> ClockEstimate | None:
@@ -441,14 +465,16 @@ class Senders:
 
 
 def _refused(message: Report | AdsbVehicle, reason: Reason) -> Heard:
-    return Heard(said=(Rejection(message.t_ns, message.uav, reason),))
+    return Heard(said=(Rejection(t_ns=message.t_ns, source=message.uav, reason=reason),))
 
 
 def _shared_id(sender: Sender, uav: str, t_ns: int) -> tuple[Notice | Rejection, ...]:
     """Reject a report under an id with two boot clocks; the notice is given once."""
-    refused = Rejection(t_ns, uav, Reason.SHARED_ID, detail="two boot clocks under this id")
+    refused = Rejection(
+        t_ns=t_ns, source=uav, reason=Reason.SHARED_ID, detail="two boot clocks under this id"
+    )
     if sender.is_shared:
         return (refused,)
     sender.is_shared = True
     text = f"two vehicles share the id {uav}: neither is believed"
-    return Notice(t_ns, Severity.WARNING, uav, text), refused
+    return Notice(t_ns=t_ns, severity=Severity.WARNING, subject=uav, text=text), refused

@@ -104,7 +104,14 @@ def to_frame(data: bytes, sources: dict[tuple[int, int], Source]) -> Frame:
     if source is None:
         source = sources.setdefault(ids, Source(*ids))
     doubt_ns = message.doubt_ns
-    return Frame(message.t_ns, message.link, source, message.msgid, message.raw, doubt_ns)
+    return Frame(
+        t_ns=message.t_ns,
+        link=message.link,
+        source=source,
+        msgid=message.msgid,
+        raw=message.raw,
+        doubt_ns=doubt_ns,
+    )
 
 
 def to_round_trip(data: bytes) -> RoundTrip:

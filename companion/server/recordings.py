@@ -39,7 +39,7 @@ class Current:
     bytes: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Recording:
     """A file that can be had at ``/v1/recordings/{name}``."""
 

@@ -23,7 +23,7 @@ class VehicleCenter:
         return str(self.source)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FixedCenter:
     """The array stands level at a fixed place.
 

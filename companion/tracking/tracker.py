@@ -61,7 +61,7 @@ class Ages:
         return TrackState.COASTING if age_s > coasting_s else TrackState.LIVE
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TrackerSettings:
     """How tracks are kept.
 
@@ -191,7 +191,13 @@ class Tracker:
         return False
 
     def _begin(self, fix: Fix, past: _Past, reports: int = 0) -> Estimate:
-        first = Estimate(fix, fix.position_ned_m, fix.noise.position_m, None, None)
+        first = Estimate(
+            fix=fix,
+            position_ned_m=fix.position_ned_m,
+            bound_m=fix.noise.position_m,
+            innovation_m=None,
+            dt_s=None,
+        )
         past.pace.add(fix)
         self._tracked[fix.uav] = _Tracked(
             past=past,
@@ -259,13 +265,25 @@ class Tracker:
         predicted = entry.predicted
         if predicted is None:
             fix = entry.fix
-            return Estimate(fix, fix.position_ned_m, fix.noise.position_m, None, None)
+            return Estimate(
+                fix=fix,
+                position_ned_m=fix.position_ned_m,
+                bound_m=fix.noise.position_m,
+                innovation_m=None,
+                dt_s=None,
+            )
         if predicted.mu_s2 is not None:
             tracked.mu_max_s2 = max(predicted.mu_s2, tracked.mu_max_s2 or 0.0)
         before_ns = tracked.history.entries[at - 1].fix.sender_ns if at else None
         dt_s = None if before_ns is None else (entry.fix.sender_ns - before_ns) * 1e-9
         innovation_m = math.dist(entry.fix.position_ned_m, predicted.position_ned_m)
-        return Estimate(entry.fix, predicted.position_ned_m, predicted.bound_m, innovation_m, dt_s)
+        return Estimate(
+            fix=entry.fix,
+            position_ned_m=predicted.position_ned_m,
+            bound_m=predicted.bound_m,
+            innovation_m=innovation_m,
+            dt_s=dt_s,
+        )
 
     def _look_back(self, tracked: _Tracked, fix: Fix) -> None:
         """Judge earlier predictions by the newest report, and choose what is fed forward from it.
@@ -353,7 +371,17 @@ class Tracker:
         widened_m = at.bound_s * fastest_mps
         bound_m = found.bound_m + widened_m
         horizontal_m, vertical_m = found.horizontal_m + widened_m, found.vertical_m + widened_m
-        return position, velocity, Reach(bound_m, horizontal_m, vertical_m, position, bound_m)
+        return (
+            position,
+            velocity,
+            Reach(
+                bound_m=bound_m,
+                horizontal_m=horizontal_m,
+                vertical_m=vertical_m,
+                center_ned_m=position,
+                radius_m=bound_m,
+            ),
+        )
 
     def _usual_m(
         self, tracked: _Tracked, velocity: Vector | None, at: SenderTime, bound_m: float
@@ -418,7 +446,7 @@ def _fastest_mps(
 
 
 def _rejected(fix: Fix, reason: Reason, detail: str) -> Rejection:
-    return Rejection(fix.arrival_ns, fix.uav, reason, detail=detail)
+    return Rejection(t_ns=fix.arrival_ns, source=fix.uav, reason=reason, detail=detail)
 
 
 def _fed(

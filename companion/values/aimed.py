@@ -82,7 +82,7 @@ class Widen(StrEnum):
     NO = "no"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Beam:
     """One UAV's beam: where it points, how well, and how that direction changes.
 
@@ -133,7 +133,7 @@ class LeftOut:
     reason: Annotated[str, Meaning("why it has no beam", 2)]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class BeamSet:
     """The beams and weights of one update.
 

@@ -38,7 +38,7 @@ UNITS: Final = {
 """How the ending of a name writes its unit."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Meaning:
     """What a value means, and how it leaves the program.
 
@@ -137,7 +137,7 @@ def _members(described: type) -> Iterator[Member]:
         kind, optional = bare(annotation)
         get = _item(name) if typing.is_typeddict(described) else operator.attrgetter(name)
         if isinstance(said[0], Meaning):
-            yield Member(name, kind, optional, said[0], get)
+            yield Member(name=name, type=kind, optional=optional, meaning=said[0], get=get)
             continue
         for inner in members(kind):
             if inner.name not in said[0].omit:

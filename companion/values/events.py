@@ -32,7 +32,7 @@ class Tock:
     t_ns: Annotated[int, Meaning("when they are computed", 1)]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RoundTrip:
     """A TIMESYNC request sent by this node, and its answer."""
 

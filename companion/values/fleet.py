@@ -28,7 +28,7 @@ class Shared:
     trips: tuple[RoundTrip, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Offer:
     """What a node's array would offer a UAV, if it served that UAV alone."""
 
@@ -46,7 +46,7 @@ class Offer:
     ]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Standing:
     """What a node says of itself, some times a second.
 

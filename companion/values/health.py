@@ -62,7 +62,7 @@ class Blame:
     remedy: Annotated[str, Meaning("what to do", example="ask for 10 Hz ([presence] position_hz)")]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
     """How good the link to a UAV is.
 

@@ -18,7 +18,7 @@ class Severity(StrEnum):
     ERROR = "error"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Notice:
     """A message to the operator, emitted once when the state it describes changes."""
 
@@ -28,7 +28,7 @@ class Notice:
     text: Annotated[str, Meaning("the message", example="3:1 is coasting")]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Update:
     """Every tracked UAV at the time of use, and the beams towards them.
 

@@ -69,7 +69,7 @@ class Accuracy(NamedTuple):
     time_s: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Report:
     """A position that a UAV sent of itself, or that a receiver relayed of it.
 
@@ -108,7 +108,7 @@ class Report:
     accuracy: Accuracy | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AdsbVehicle:
     """An aircraft relayed by a receiver (ADSB_VEHICLE).
 
@@ -145,7 +145,7 @@ class AdsbVehicle:
         return UavKind.ADSB.uav(f"{self.icao:06X}")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RemoteId:
     """What a Remote ID receiver heard from one radio: an id, a position, or both.
 
@@ -169,7 +169,7 @@ class RemoteId:
     is_flat: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Attitude:
     """Body attitude and body rates (ATTITUDE).
 
@@ -188,7 +188,7 @@ class Attitude:
     yawspeed_radps: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Presence:
     """A HEARTBEAT: a component exists. It does not prove that there is a vehicle."""
 
@@ -198,7 +198,7 @@ class Presence:
     autopilot: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class GnssStatus:
     """Fix type, height and stated accuracies of a GNSS receiver (GPS_RAW_INT).
 
@@ -216,7 +216,7 @@ class GnssStatus:
     time_us: int = 0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SystemTime:
     """The sender's Unix clock, in microseconds, beside its clock since boot (SYSTEM_TIME)."""
 
@@ -226,7 +226,7 @@ class SystemTime:
     boot_ms: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class EstimatorStatus:
     """What an autopilot's estimator says of its attitude (EKF_STATUS_REPORT).
 

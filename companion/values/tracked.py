@@ -10,7 +10,7 @@ from companion.values.numbers import FloatArray, Vector
 from companion.values.received import Report
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ReportNoise:
     """Bounds on the errors of one report.
 
@@ -52,7 +52,7 @@ class Limits:
     )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Refuted:
     """An assumption that reports refuted, in the unit of its setting; it was raised."""
 
@@ -64,7 +64,7 @@ class Refuted:
     raised_to: Annotated[float, Meaning("value assumed from then on, which fades over minutes")]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Fix:
     """A report put on the node's timeline and into the local frame.
 
@@ -93,7 +93,7 @@ class Fix:
     limits: Limits | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
     """The observer's answer to an accepted report, at the time of that report.
 
@@ -114,7 +114,7 @@ class Estimate:
     reacquired: Annotated[bool, Meaning("whether this report restarted the track")] = False
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SenderTime:
     """A time of the node, ``node_ns``, converted to a sender's timeline.
 
@@ -153,7 +153,7 @@ class TrackState(StrEnum):
 _LOCAL_FRAME: Final = "coordinates of the node's own frame; `lat_deg` … and `north_m` … say where"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
     """One UAV at the instant ``valid_at_ns``. Vectors are (3,), in the local frame.
 
@@ -222,7 +222,7 @@ class Track:
         return None if velocity is None else math.hypot(*velocity)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Carrier:
     """Position and attitude of the array's carrier at the instant ``valid_at_ns``.
 

@@ -304,7 +304,7 @@ def weights(pipeline: Pipeline, beam_set: BeamSet, lead_ms: float) -> Json:
 
 
 def pattern(
-    pipeline: Pipeline, update: Update, cut: Cut, points: int, only: str | None, lead_ms: float
+    pipeline: Pipeline, update: Update, cut: Cut, *, points: int, only: str | None, lead_ms: float
 ) -> Json:
     """The answer of ``/v1/pattern``: the response of each beam (or one) along a cut through it."""
     array, beam_set = pipeline.array, update.beams

@@ -47,7 +47,7 @@ class LastPose:
     pose: Annotated[Pose, Inline()]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Center:
     """What carries the array; its values are null while its position is unknown."""
 
@@ -70,10 +70,10 @@ def center(pipeline: Pipeline, now_ns: int) -> Center:
     source, fixed = str(place), isinstance(place, FixedCenter)
     found = pipeline.carrier(now_ns, now_ns)
     if not isinstance(found, str):
-        return Center(source, fixed, pose=_pose(pipeline, found))
+        return Center(source=source, fixed=fixed, pose=_pose(pipeline, found))
     last = pipeline.last_carrier
     known = None if last is None else LastPose(last.valid_at_ns, _pose(pipeline, last))
-    return Center(source, fixed, unfit=found, last_known=known)
+    return Center(source=source, fixed=fixed, unfit=found, last_known=known)
 
 
 def _pose(pipeline: Pipeline, carrier: Carrier) -> Pose:

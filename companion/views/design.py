@@ -133,7 +133,14 @@ class DesignView:
         if has_velocity:
             lead_s += max(given.velocity_lead_s, dt_s)
         alpha = None if given.alpha == "auto" else given.alpha
-        return answers.row(dt_s, lead_s, alpha, None, "position", "closed-form")
+        return answers.row(
+            dt_s,
+            feedthrough_s=lead_s,
+            alpha=alpha,
+            mu_max=None,
+            model="position",
+            method="closed-form",
+        )
 
 
 def _scale(table: KinematicDesign, given: Assumed) -> float:

@@ -122,7 +122,7 @@ class Fleet:
     ] = 0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FleetStatus:
     """This node's place in a fleet.
 
@@ -140,7 +140,7 @@ class FleetStatus:
     damaged: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Served:
     """Who serves the UAVs for which beams are wanted.
 
@@ -177,7 +177,7 @@ def served(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Serve
         able = [full.get(node, False) for node, one in given.items() if worth_db(one) is not None]
         nobody[track.uav] = blame.of_unserved(track, reached=bool(able), full=all(able))
     elsewhere = sum(uav in by and member.name not in by[uav] for uav in wanted)
-    return Served(member.name, by, nobody, elsewhere)
+    return Served(node=member.name, by=by, nobody=nobody, elsewhere=elsewhere)
 
 
 def fleet(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Json:

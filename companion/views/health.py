@@ -22,7 +22,7 @@ class LinkHealth:
     verdict: Annotated[Verdict | None, Inline()]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Headline:
     """How many links to UAVs are good, weak, none; and the same in words."""
 

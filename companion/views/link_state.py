@@ -12,7 +12,7 @@ from companion.values import Source
 from companion.values.described import Inline, Meaning
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LinkReports:
     """Reports received over a link, and their age at arrival."""
 
@@ -62,7 +62,7 @@ class OutLink:
     ]  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Links:
     """Links, the components heard over each, and the requested message rates."""
 
@@ -78,7 +78,17 @@ def link(item: LinkStatus, share: LinkShare, now_ns: int) -> LinkState:
     total, latencies = share.first + share.repeats, list(share.latencies_s)
     p50, p95 = np.percentile(latencies, [50, 95]).tolist() if latencies else (None, None)
     first_share = share.first / total if total else None
-    return LinkState(item, age_s, LinkReports(total, share.first, first_share, p50, p95))
+    return LinkState(
+        item,
+        age_s,
+        LinkReports(
+            total=total,
+            first=share.first,
+            first_share=first_share,
+            latency_p50_s=p50,
+            latency_p95_s=p95,
+        ),
+    )
 
 
 def components(item: LinkStatus, now_ns: int) -> list[Component]:

@@ -25,7 +25,7 @@ from companion.views.last_messages import Kept
 _PLAIN: Final = {"char", "float", "double"}
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MessageTime:
     """When a message came, how many, and how often."""
 

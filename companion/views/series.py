@@ -18,7 +18,7 @@ SAMPLES: Final = 300
 Column = list[float | None]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class UavHistory:
     """Samples of one UAV, as many as ``at``; null where a value was unknown."""
 

@@ -12,7 +12,7 @@ LONGEST: Final = 400
 """Most characters of a text that is shown whole; what files held may be millions."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Setting:
     """One setting, and where it comes from."""
 

@@ -38,7 +38,7 @@ from companion.views.link_state import HeardLink, Links, LinkState, OutLink
 from companion.views.series import Series
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingStatus:
     """The recording that is being written."""
 
@@ -54,7 +54,7 @@ class RecordingStatus:
     lag_s: Annotated[float | None, Meaning("age of the newest written event")] = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ReplayStatus:
     """Progress of a replay."""
 
@@ -77,7 +77,7 @@ class Throughput:
     updates_hz: Annotated[float | None, Meaning("rate of beam updates")]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Status:
     """The service at a glance; ``replay`` is null where it is live."""
 
@@ -117,7 +117,7 @@ class Assumptions:
 
 
 _BOUND_AXES: Final = Meaning(
-    "half axes of the cylinder that contains the position, north, east, down",
+    text="half axes of the cylinder that contains the position, north, east, down",
     deprecated="horizontal_bound_m and vertical_bound_m",
 )
 
@@ -219,7 +219,10 @@ def links(node: Node) -> Json:
         for item in node.links()
     ]
     out = [OutLink(item) for item in node.out_links()]
-    return as_json(Links(now_ns, heard, out, node.message_rates()), node.pipeline.utc_ns)
+    return as_json(
+        Links(valid_at_ns=now_ns, links=heard, out=out, message_rates=node.message_rates()),
+        node.pipeline.utc_ns,
+    )
 
 
 def status(node: Node, version: str) -> Json:
@@ -279,7 +282,7 @@ def states(node: Node, now_ns: int, only: str | None = None) -> list[UavState]:
     machine = health.behind(node.arrival_lag.seen(now_ns))
     served = fleet_view.served(pipeline, node.fleet_status(), now_ns)
     return [
-        _state(pipeline, track, carrier, Place(*place), machine, served)
+        _state(pipeline, track, carrier, place=Place(*place), machine=machine, served=served)
         for track, place in zip(tracks, places, strict=True)
     ]
 
@@ -288,6 +291,7 @@ def _state(
     pipeline: Pipeline,
     track: Track,
     carrier: Carrier | None,
+    *,
     place: Place,
     machine: Blame | None,
     served: Served | None,

@@ -54,7 +54,7 @@ class Pose(NamedTuple):
     yawspeed_radps: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Circle:
     """The paper's flight (docs/math.md 8.2): a clockwise circle about the carrier, with gusts.
 
@@ -91,7 +91,7 @@ class Hover:
         return Motion(self.position_ned_m, (0.0, 0.0, 0.0))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Sway:
     """A level attitude with a slow sway, about a heading that is constant or turns steadily.
 

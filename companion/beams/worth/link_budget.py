@@ -23,7 +23,7 @@ from companion.values import BeamSet, ComplexArray, FloatArray, IntArray, Normal
 BOLTZMANN_JPK: Final = 1.380649e-23
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LinkBudget:
     """Power of the transmitter and noise of a receiver.
 
@@ -178,6 +178,7 @@ def transmitted(
 def predicted_sinr_db(
     array: Array,
     directions: FloatArray,
+    *,
     ranges_m: FloatArray,
     sent: ComplexArray,
     groups: IntArray | None,
@@ -222,11 +223,20 @@ def sinr_of_beams_db(
     """SINR (N,) that the UAVs of an update have in these unit directions (N, 3), dB."""
     sent = sent_weights(beam_set, budget)
     ranges_m, slots = beam_set.ranges_m, beam_set.slots
-    return predicted_sinr_db(array, directions, ranges_m, sent, slots, budget, uav_antennas)
+    return predicted_sinr_db(
+        array,
+        directions,
+        ranges_m=ranges_m,
+        sent=sent,
+        groups=slots,
+        budget=budget,
+        uav_antennas=uav_antennas,
+    )
 
 
 def least_sinr_db(
     least_gains: FloatArray,
+    *,
     leaks: FloatArray,
     users: IntArray,
     farthest_m: FloatArray,

@@ -14,7 +14,7 @@ LinkState = Literal["up", "connecting", "down"]
 Arrival = Literal["kernel", "read"]
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class ComponentStatus:
     """One component as heard over one link; ``heard_ns`` is the time of its last frame."""
 
@@ -24,7 +24,7 @@ class ComponentStatus:
     mavlink: Annotated[int, Meaning("MAVLink version of its last frame")]
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class LinkStatus:
     """The state and the counts of one link.
 

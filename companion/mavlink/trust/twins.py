@@ -61,7 +61,7 @@ class _Path:
     reports: deque[OwnPosition] = field(default_factory=lambda: deque(maxlen=REPORTS_KEPT))
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Sender:
     """A sender by its peers, and when they contradicted each other; ``told`` while it is known."""
 
@@ -114,7 +114,7 @@ class Twins:
             self._senders = {k: v for k, v in self._senders.items() if v.heard_ns >= before_ns}
             if len(self._senders) >= SENDERS_MAX:
                 return None
-        return self._senders.setdefault(frame.source, _Sender(frame.t_ns))
+        return self._senders.setdefault(frame.source, _Sender(heard_ns=frame.t_ns))
 
     def _meet(self, sender: _Sender, link: str, peer: str, t_ns: int) -> _Path:
         """Begin to follow a peer of a sender; those that are silent are forgotten."""

@@ -79,7 +79,7 @@ class RateState(StrEnum):
     REFUSED = "refused"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MessageRate:
     """A message whose rate is requested of a UAV."""
 
@@ -142,7 +142,7 @@ class Observed:
         return median_high(b - a for a, b in pairwise(self.stamps_ms)) * 1_000_000
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Watch:
     """The state machine for one message of one UAV."""
 
@@ -295,4 +295,4 @@ class Watch:
         if what in self._told:
             return []
         self._told.add(what)
-        return [Notice(now_ns, Severity.WARNING, str(self.uav), text)]
+        return [Notice(t_ns=now_ns, severity=Severity.WARNING, subject=str(self.uav), text=text)]

@@ -72,7 +72,11 @@ def decode(frame: Frame) -> Message | Rejection | None:
         return decoder(frame)
     except _RefusedError as why:
         return Rejection(
-            frame.t_ns, str(frame.source), why.reason, msgid=frame.msgid, detail=why.detail
+            t_ns=frame.t_ns,
+            source=str(frame.source),
+            reason=why.reason,
+            msgid=frame.msgid,
+            detail=why.detail,
         )
 
 
@@ -181,7 +185,7 @@ _HEARTBEAT = struct.Struct("<IBBBBB")
 
 def _heartbeat(frame: Frame) -> Presence:
     _, mav_type, autopilot, *_ = unpack(frame, _HEARTBEAT)
-    return Presence(frame.t_ns, frame.source, mav_type, autopilot)
+    return Presence(t_ns=frame.t_ns, source=frame.source, mav_type=mav_type, autopilot=autopilot)
 
 
 _UNKNOWN: Final = 0xFFFF_FFFF
@@ -218,7 +222,9 @@ def _system_time(frame: Frame) -> SystemTime:
     Nothing is checked.
     """
     unix_us, boot_ms = unpack(frame, _SYSTEM_TIME)
-    return SystemTime(frame.t_ns, frame.source, unix_us or None, boot_ms)
+    return SystemTime(
+        t_ns=frame.t_ns, source=frame.source, unix_us=unix_us or None, boot_ms=boot_ms
+    )
 
 
 _EKF_STATUS_REPORT = struct.Struct("<fffffH")
@@ -231,7 +237,9 @@ def _ekf_status_report(frame: Frame) -> EstimatorStatus:
     if not math.isfinite(compass_ratio) or compass_ratio < 0.0:
         raise _RefusedError(Reason.MALFORMED, "a compass ratio that is none")
     knows = bool(flags & _KNOWS_ATTITUDE) and not flags & _UNINITIALIZED
-    return EstimatorStatus(frame.t_ns, frame.source, knows, compass_ratio)
+    return EstimatorStatus(
+        t_ns=frame.t_ns, source=frame.source, knows_attitude=knows, compass_ratio=compass_ratio
+    )
 
 
 def _remote_id(frame: Frame) -> RemoteId | None:

@@ -28,7 +28,7 @@ SETTLED_NS: Final = 2_000_000_000
 """Time for which a UAV must belong elsewhere before it is handed over."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Handover:
     """A change of the node that serves a UAV, in which this node took part."""
 
@@ -50,7 +50,7 @@ class Duties:
     those of them that another is to take.
     """
 
-    def __init__(self, name: str, most: int, lease_ns: int, hysteresis_db: float) -> None:
+    def __init__(self, *, name: str, most: int, lease_ns: int, hysteresis_db: float) -> None:
         self.serves: dict[str, float] = {}
         self.handing: dict[str, str] = {}
         self._name = name

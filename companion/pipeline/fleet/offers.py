@@ -74,7 +74,10 @@ class Offers:
         return make
 
     def _make(self, aimed: BeamSet, heard_s: dict[str, float | None]) -> dict[str, Offer]:
-        made = {uav: Offer(uav, None, None, None, since_s) for uav, since_s in heard_s.items()}
+        made = {
+            uav: Offer(uav=uav, sure_db=None, likely_db=None, sinr_db=None, heard_s=since_s)
+            for uav, since_s in heard_s.items()
+        }
         if not aimed.beams:
             return made
         sure = self._least_db(aimed, [beam.pointing_bound_rad for beam in aimed.beams])

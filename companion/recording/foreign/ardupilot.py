@@ -54,18 +54,18 @@ def read(data: Bytes) -> Onboard:
     fixes, clock = fixes_of(tables["GPS"], tables["GPA"], lost)
     notes: list[str] = []
     return Onboard(
-        sysid,
-        1,
-        mav_type,
-        _ARDUPILOT,
-        _positions(tables, fixes, lost, notes),
-        _attitudes(tables["ATT"], tables["RATE"], lost),
-        fixes,
-        _truth(tables["SIM"], tables["SIM2"], lost),
-        _armed(tables["ARM"]),
-        clock,
-        lost,
-        tuple(notes),
+        sysid=sysid,
+        compid=1,
+        mav_type=mav_type,
+        autopilot=_ARDUPILOT,
+        positions=_positions(tables, fixes, lost, notes),
+        attitudes=_attitudes(tables["ATT"], tables["RATE"], lost),
+        fixes=fixes,
+        truth=_truth(tables["SIM"], tables["SIM2"], lost),
+        armed=_armed(tables["ARM"]),
+        clock=clock,
+        lost=lost,
+        notes=tuple(notes),
     )
 
 
@@ -161,7 +161,15 @@ def _received(fixes: Fixes, tables: dict[str, Table], notes: list[str]) -> Posit
     way = moved(boot_us, lat_1e7, lon_1e7, alt_m)
     velocity = _filled(np.full_like(way, np.nan), boot_us, fixes, way, notes)
     heading = _headings(boot_us, tables["ATT"])
-    return Positions(boot_us, lat_1e7, lon_1e7, alt_m, alt_m - alt_m[0], velocity, heading)
+    return Positions(
+        boot_us=boot_us,
+        lat_1e7=lat_1e7,
+        lon_1e7=lon_1e7,
+        alt_m=alt_m,
+        height_m=alt_m - alt_m[0],
+        velocity_ned_mps=velocity,
+        heading_deg=heading,
+    )
 
 
 def _velocities(boot_us: IntArray, tables: dict[str, Table]) -> FloatArray:

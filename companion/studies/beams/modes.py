@@ -59,7 +59,7 @@ JUMP_DB: Final = 1.0
 Row = dict[str, Any]
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Way:
     """One way of making beams, with what has been seen of it."""
 
@@ -170,9 +170,9 @@ def compare(
     """A row for each way of making beams, over one link."""
     pipeline = Pipeline(settings)
     heard, observed, local = events(logs, link, settings)
-    ways = [_Way(str(widen), widen) for widen in Widen]
+    ways = [_Way(name=str(widen), widen=widen) for widen in Widen]
     rivals = {name: _Rival(name, observed, settings) for name in RIVALS}
-    theirs = {name: _Way(f"{name}, sharp", Widen.NO) for name in RIVALS}
+    theirs = {name: _Way(name=f"{name}, sharp", widen=Widen.NO) for name in RIVALS}
     truth: ArrayTruth | None = None
     flight, sought, ticks = vehicles.named(logs), False, 0
     for event in heard:
@@ -187,11 +187,11 @@ def compare(
         ticks += 1
         looks = ticks % LOOK_EVERY == 0
         for way in ways:
-            _make(pipeline, update, update.tracks, way, truth, looks)
+            _make(pipeline, update, update.tracks, way=way, truth=truth, looks=looks)
         for name, rival in rivals.items():
             if looks:
                 tracks = rival.tracks(update, local, pipeline)
-                _make(pipeline, update, tracks, theirs[name], truth, looks)
+                _make(pipeline, update, tracks, way=theirs[name], truth=truth, looks=looks)
         if looks and ticks % (25 * LOOK_EVERY) == 0:
             progress(f"{flight}, {link.name}: {ticks} ticks")
     head = {"log": flight, "link": link.name, "truth": None if truth is None else truth.kind}
@@ -202,6 +202,7 @@ def _make(
     pipeline: Pipeline,
     update: Update,
     tracks: tuple[Track, ...],
+    *,
     way: _Way,
     truth: ArrayTruth | None,
     looks: bool,

@@ -26,7 +26,7 @@ from companion.values import (
 from companion.values.described import Inline, Meaning
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Heard:
     """A report that was received: with its estimate where it was used, else why it was not.
 
@@ -148,7 +148,7 @@ def heard(frame: Frame, outputs: Sequence[Output]) -> Heard | None:
         return None
     for output in outputs:
         if isinstance(output, Estimate):
-            return Heard(frame, output, None, output.fix.report)
+            return Heard(frame=frame, estimate=output, refused=None, said=output.fix.report)
     refused = next((one for one in outputs if isinstance(one, Rejection)), None)
     said = decode(frame)
     if isinstance(
@@ -158,7 +158,12 @@ def heard(frame: Frame, outputs: Sequence[Output]) -> Heard | None:
         said = replace(report, uav=named) if report is not None and named is not None else report
     if refused is None and said is None:  # a message that may be a report, and was none
         return None
-    return Heard(frame, None, refused, said if isinstance(said, Report | AdsbVehicle) else None)
+    return Heard(
+        frame=frame,
+        estimate=None,
+        refused=refused,
+        said=said if isinstance(said, Report | AdsbVehicle) else None,
+    )
 
 
 REPORTS: Final = Table(

@@ -53,7 +53,7 @@ class UpdateRow(_OfUpdate):
         return self.update.carrier
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TrackRow(_OfUpdate):
     """A track at an update, and its place."""
 
@@ -81,7 +81,10 @@ def rows(update: Update, local: LocalFrame | None) -> Iterator[tuple[str, Any]]:
     for track in update.tracks:
         assert local is not None  # it begins with the first report
         there = local.place(*track.position_ned_m.tolist())
-        yield TRACKS.name, TrackRow(update, track, there, left_out.get(track.uav))
+        yield (
+            TRACKS.name,
+            TrackRow(update=update, track=track, place=there, left_out=left_out.get(track.uav)),
+        )
     for beam in update.beams.beams:
         yield BEAMS.name, BeamRow(update, beam)
 

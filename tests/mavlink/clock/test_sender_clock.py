@@ -312,6 +312,7 @@ def exchange(
     clock: SenderClock,
     rng: random.Random,
     drift: float,
+    *,
     true_ns: int,
     there_s: float,
     back_s: float,
@@ -335,7 +336,10 @@ def test_timesync_stays_within_its_uncertainty(drift: float, there_s: float, bac
             stamp = clock.observe(arrival_ns, boot_ms)
             assert stamp is not None
             if arrival_ns - EPOCH_NS > next_ns + 10 * S:
-                assert exchange(clock, rng, drift, next_ns, there_s, back_s) is None
+                assert (
+                    exchange(clock, rng, drift, true_ns=next_ns, there_s=there_s, back_s=back_s)
+                    is None
+                )
                 next_ns += 10 * S
             estimate = known(clock)
             if estimate.kind is ClockKind.TIMESYNC and stamp.latency_s == estimate.latency_s:

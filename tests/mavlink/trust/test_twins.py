@@ -36,9 +36,11 @@ def circle(t_s: float) -> Place:
     """20 m/s, 60 m wide: 13 m/s² to its middle, more than most can."""
     angle, speed = t_s / 3, 20.0
     return Place(
-        60 * math.cos(angle), 60 * math.sin(angle), -speed * math.sin(angle),
-        speed * math.cos(angle),
-    )  # fmt: skip
+        north_m=60 * math.cos(angle),
+        east_m=60 * math.sin(angle),
+        north_mps=-speed * math.sin(angle),
+        east_mps=speed * math.cos(angle),
+    )
 
 
 def report(t_ns: int, boot_s: float, place: Place, sysid: int = 1) -> Frame:
@@ -71,6 +73,7 @@ def refused(judge: Twins, *streams: Stream) -> dict[str, list[float]]:
 def heard(
     peer: str,
     hz: float,
+    *,
     lasts_s: float = 60.0,
     delay_s: Callable[[], float] = lambda: 0.05,
     begins_s: float = 0.0,
@@ -110,8 +113,10 @@ def test_a_second_port_has_stamps_of_its_own(hz: float) -> None:
 def test_a_radio_that_starts_again_has_another_address() -> None:
     judge = Twins()
     found = refused(
-        judge, heard(HOME, 10, 20), heard(OTHER, 10, 60, begins_s=20.1),
-    )  # fmt: skip
+        judge,
+        heard(HOME, 10, lasts_s=20),
+        heard(OTHER, 10, lasts_s=60, begins_s=20.1),
+    )
     assert found == {HOME: [], OTHER: []}
 
 
@@ -183,8 +188,8 @@ def test_who_agree_again_are_believed_again_and_a_second_time_is_told() -> None:
         return 10 < t_s < 20 or 60 < t_s < 70
 
     judge = Twins()
-    visits = (one for one in heard(OTHER, 4, 110, told=beside(20)) if two_visits(one[0]))
-    found = refused(judge, heard(HOME, 4, 120), visits)
+    visits = (one for one in heard(OTHER, 4, lasts_s=110, told=beside(20)) if two_visits(one[0]))
+    found = refused(judge, heard(HOME, 4, lasts_s=120), visits)
     assert not [t_s for t_s in found[HOME] if 51 < t_s < 60 or t_s > 101]
     assert len(judge.told) == 2
 

@@ -39,7 +39,7 @@ def as_frame(raw: bytes) -> Frame:
     v2 = raw[0] == 0xFD
     source = Source(raw[5], raw[6]) if v2 else Source(raw[3], raw[4])
     msgid = int.from_bytes(raw[7:10], "little") if v2 else raw[5]
-    return Frame(T_NS, "udpin:x", source, msgid, raw)
+    return Frame(t_ns=T_NS, link="udpin:x", source=source, msgid=msgid, raw=raw)
 
 
 def sent(message: dialect.MAVLink_message) -> Frame:
@@ -79,6 +79,7 @@ def position(lat: int = HERE[0], lon: int = HERE[1], hdg: int = 0, **other: int)
 
 def adsb(
     flags: int = 0xFFFF,
+    *,
     lat: int = HERE[0],
     lon: int = HERE[1],
     altitude_type: int = 0,
@@ -140,15 +141,19 @@ def expected(m: dialect.MAVLink_message, t_ns: int, link: str) -> Message | None
     source = Source(m.get_srcSystem(), m.get_srcComponent())
     match m.get_type():
         case "HEARTBEAT":
-            return Presence(t_ns, source, m.type, m.autopilot)
+            return Presence(t_ns=t_ns, source=source, mav_type=m.type, autopilot=m.autopilot)
         case "SYSTEM_TIME":
-            return SystemTime(t_ns, source, m.time_unix_usec or None, m.time_boot_ms)
+            return SystemTime(
+                t_ns=t_ns, source=source, unix_us=m.time_unix_usec or None, boot_ms=m.time_boot_ms
+            )
         case "ATTITUDE":
             rates = (m.rollspeed, m.pitchspeed, m.yawspeed)
             return Attitude(t_ns, source, m.time_boot_ms, m.roll, m.pitch, m.yaw, *rates)
         case "EKF_STATUS_REPORT":
             knows = m.flags & dialect.EKF_ATTITUDE != 0
-            return EstimatorStatus(t_ns, source, knows, m.compass_variance)
+            return EstimatorStatus(
+                t_ns=t_ns, source=source, knows_attitude=knows, compass_ratio=m.compass_variance
+            )
         case "GPS_RAW_INT":
             accuracies = [value / 1000 or None for value in (m.h_acc, m.v_acc, m.vel_acc)]
             return GnssStatus(
@@ -161,19 +166,36 @@ def expected(m: dialect.MAVLink_message, t_ns: int, link: str) -> Message | None
             )
         case "GLOBAL_POSITION_INT":
             return Report(
-                t_ns, str(source), source, m.lat / 1e7, m.lon / 1e7, m.alt / 1000,
-                AltitudeDatum.MSL, m.relative_alt / 1000, (m.vx / 100, m.vy / 100), m.vz / 100,
-                m.hdg / 100, m.time_boot_ms, None,
-            )  # fmt: skip
+                t_ns=t_ns,
+                uav=str(source),
+                source=source,
+                lat_deg=m.lat / 1e7,
+                lon_deg=m.lon / 1e7,
+                alt_m=m.alt / 1000,
+                alt_datum=AltitudeDatum.MSL,
+                relative_alt_m=m.relative_alt / 1000,
+                velocity_ne_mps=(m.vx / 100, m.vy / 100),
+                velocity_down_mps=m.vz / 100,
+                heading_deg=m.hdg / 100,
+                boot_ms=m.time_boot_ms,
+                tslc_s=None,
+            )
         case "ADSB_VEHICLE":
             course, speed = math.radians(m.heading / 100), m.hor_velocity / 100
             datums = (AltitudeDatum.PRESSURE, AltitudeDatum.GEOMETRIC)
             return AdsbVehicle(
-                t_ns, m.ICAO_address, source, m.callsign,
-                (m.lat / 1e7, m.lon / 1e7), m.altitude / 1000, datums[m.altitude_type],
-                m.heading / 100, (speed * math.cos(course), speed * math.sin(course)),
-                -m.ver_velocity / 100, m.tslc,
-            )  # fmt: skip
+                t_ns=t_ns,
+                icao=m.ICAO_address,
+                source=source,
+                callsign=m.callsign,
+                position_deg=(m.lat / 1e7, m.lon / 1e7),
+                alt_m=m.altitude / 1000,
+                alt_datum=datums[m.altitude_type],
+                heading_deg=m.heading / 100,
+                velocity_ne_mps=(speed * math.cos(course), speed * math.sin(course)),
+                velocity_down_mps=-m.ver_velocity / 100,
+                tslc_s=m.tslc,
+            )
     return None
 
 
@@ -334,6 +356,7 @@ def test_the_flags_are_those_of_the_dialect() -> None:
     tslc=st.integers(0, 255),
 )
 def test_an_adsb_field_is_none_exactly_when_nobody_vouches_for_it(
+    *,
     flags: int,
     altitude_type: int,
     altitude: int,
@@ -434,14 +457,32 @@ def test_trailing_zeros_that_mavlink_2_cuts_are_zeros(hdg: int, v: list[int], al
 def test_a_payload_of_one_byte() -> None:
     frame = sent(dialect.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0))
     assert len(frame.payload) == 1
-    assert decode(frame) == Attitude(T_NS, Source(7, 3), 0, 0, 0, 0, 0, 0, 0)
+    assert decode(frame) == Attitude(
+        t_ns=T_NS,
+        source=Source(7, 3),
+        boot_ms=0,
+        roll_rad=0,
+        pitch_rad=0,
+        yaw_rad=0,
+        rollspeed_radps=0,
+        pitchspeed_radps=0,
+        yawspeed_radps=0,
+    )
     frame = sent(dialect.MAVLink_heartbeat_message(0, 0, 0, 0, 0, 0))
-    assert decode(frame) == Presence(T_NS, Source(7, 3), 0, 0)
+    assert decode(frame) == Presence(t_ns=T_NS, source=Source(7, 3), mav_type=0, autopilot=0)
     assert rejected(sent(dialect.MAVLink_adsb_vehicle_message(
         0, 0, 0, 0, 0, 0, 0, 0, b"", 0, 0, 0, 0
     ))) is Reason.MALFORMED  # fmt: skip
     frame = sent(dialect.MAVLink_gps_raw_int_message(0, 0, 0, 0, 0, 0, 0, 0, 0, 0))
-    assert decode(frame) == GnssStatus(T_NS, Source(7, 3), 0, 0.0, None, None, None)
+    assert decode(frame) == GnssStatus(
+        t_ns=T_NS,
+        source=Source(7, 3),
+        fix_type=0,
+        alt_m=0.0,
+        h_acc_m=None,
+        v_acc_m=None,
+        vel_acc_mps=None,
+    )
 
 
 def test_an_adsb_payload_cut_within_its_flags() -> None:
@@ -452,7 +493,17 @@ def test_an_adsb_payload_cut_within_its_flags() -> None:
     assert len(frame.payload) == 23
     place = pytest.approx((HERE[0] / 1e7, HERE[1] / 1e7), abs=1e-12)
     assert traffic(frame) == AdsbVehicle(
-        T_NS, 1, Source(7, 3), None, place, None, None, None, None, None, 0
+        t_ns=T_NS,
+        icao=1,
+        source=Source(7, 3),
+        callsign=None,
+        position_deg=place,
+        alt_m=None,
+        alt_datum=None,
+        heading_deg=None,
+        velocity_ne_mps=None,
+        velocity_down_mps=None,
+        tslc_s=0,
     )
 
 
@@ -509,9 +560,9 @@ def test_an_accuracy_of_0_or_all_ones_is_unknown(field: str, unknown: int) -> No
 
 def test_a_unix_clock_of_0_is_none() -> None:
     found = decode(sent(dialect.MAVLink_system_time_message(0, 4321)))
-    assert found == SystemTime(T_NS, Source(7, 3), None, 4321)
+    assert found == SystemTime(t_ns=T_NS, source=Source(7, 3), unix_us=None, boot_ms=4321)
     found = decode(sent(dialect.MAVLink_system_time_message(2**63 + 1, 2**32 - 1)))
-    assert found == SystemTime(T_NS, Source(7, 3), 2**63 + 1, 2**32 - 1)
+    assert found == SystemTime(t_ns=T_NS, source=Source(7, 3), unix_us=2**63 + 1, boot_ms=2**32 - 1)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
@@ -541,7 +592,7 @@ def test_the_fields_of_an_attitude_keep_their_order() -> None:
 
 def test_a_heartbeat_says_what_it_is_of() -> None:
     found = decode(sent(dialect.MAVLink_heartbeat_message(2, 3, 128, 99, 4, 3)))
-    assert found == Presence(T_NS, Source(7, 3), 2, 3)
+    assert found == Presence(t_ns=T_NS, source=Source(7, 3), mav_type=2, autopilot=3)
 
 
 def test_other_messages_are_nobodys() -> None:

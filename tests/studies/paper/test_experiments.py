@@ -232,14 +232,17 @@ def test_the_blockages_are_the_same_for_every_scheme(answer: dict[str, Any]) -> 
 
 def test_the_same_seed_gives_the_same_rates(flight: Flight) -> None:
     short = Flight(
-        flight.scenario, flight.position_m[:12], flight.input_mps[:11], flight.report_m[:11]
+        scenario=flight.scenario,
+        position_m=flight.position_m[:12],
+        input_mps=flight.input_mps[:11],
+        report_m=flight.report_m[:11],
     )
     rates = np.array([0.0, 60.0])
 
     def rates_of(seed: int) -> dict[str, list[float]]:
         rng = np.random.default_rng(seed)
         aimed = {"right": short.position_m}
-        found = link.under_blockage(short, aimed, rates, 1, rng, lambda _: None)
+        found = link.under_blockage(short, aimed, rates, draws=1, rng=rng, progress=lambda _: None)
         return {name: means.tolist() for name, means in found.schemes.items()}
 
     assert rates_of(5) == rates_of(5) != rates_of(6)

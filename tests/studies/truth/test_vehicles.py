@@ -43,7 +43,12 @@ def test_nothing_is_known_outside_and_in_gaps() -> None:
     known = [False, True, False, False, True, False]
     assert list(~np.isnan(position[:, 0])) == known
     assert list(~np.isnan(velocity[:, 2])) == known
-    lone = Trajectory("reports", np.array([5]), np.zeros((1, 3)), np.zeros((1, 3)))
+    lone = Trajectory(
+        kind="reports",
+        t_ns=np.array([5]),
+        position_ned_m=np.zeros((1, 3)),
+        velocity_ned_mps=np.zeros((1, 3)),
+    )
     assert np.isnan(lone.at(np.array([5]))[0]).all()
 
 
@@ -175,7 +180,9 @@ def test_flying_is_fast_and_up(straight_flight: Callable[..., Flight]) -> None:
     assert not low.flying(t_ns).any()
     assert not high.flying(high.truth.t_ns[-1:] + S).any()
     zero = high.position_ned_m * 0
-    still = Trajectory("reports", high.truth.t_ns, zero, zero)
+    still = Trajectory(
+        kind="reports", t_ns=high.truth.t_ns, position_ned_m=zero, velocity_ned_mps=zero
+    )
     assert not replace(high, truth=still).flying(t_ns).any()
 
 

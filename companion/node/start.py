@@ -65,7 +65,16 @@ def run(
     http = bind(settings.server.listen, token=token, insecure=insecure)
     with http:
         service = Service(settings, voice.say, origins)
-        serve = partial(_serve, service, voice, http, token, traffic, manager, open_page)
+        serve = partial(
+            _serve,
+            service=service,
+            voice=voice,
+            http=http,
+            token=token,
+            traffic=traffic,
+            manager=manager,
+            open_page=open_page,
+        )
         run_until_told(serve, seconds)
 
 
@@ -77,6 +86,8 @@ async def _keep_shown(service: Service, voice: Voice) -> None:
 
 
 async def _serve(
+    until: asyncio.Event,
+    *,
     service: Service,
     voice: Voice,
     http: socket.socket,
@@ -84,7 +95,6 @@ async def _serve(
     traffic: Callable[[str], Coroutine[Any, Any, None]] | None,
     manager: systemd.Manager | None,
     open_page: bool,
-    until: asyncio.Event,
 ) -> None:
     others = [_keep_shown(service, voice)]
     others += [traffic(service.links()[0].url)] if traffic else []

@@ -3,6 +3,7 @@
 Over 300 lines: a function for each section of the settings, and nothing else.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -122,7 +123,15 @@ def coverage(settings: Settings) -> Coverage:
             None if view is None else np.radians(view),
             radians(given.azimuth_limits_deg),
             radians(given.elevation_limits_deg),
-            tuple(Sector(*np.radians(sector).tolist()) for sector in given.hidden_deg),
+            tuple(
+                Sector(
+                    math.radians(azimuth_from),
+                    math.radians(azimuth_to),
+                    math.radians(elevation_from),
+                    math.radians(elevation_to),
+                )
+                for azimuth_from, azimuth_to, elevation_from, elevation_to in given.hidden_deg
+            ),
         )
     except UserError as error:
         raise ConfigError(f"array: {error}") from error
@@ -171,7 +180,8 @@ def equipment(settings: Settings, antenna: geometry.Array) -> Equipment:
     except UserError as error:
         raise ConfigError(f"hardware.unit: {error}") from error
     channels = calibration(settings, antenna.size)
-    return Equipment(codebook, channels, *radio(settings), device, gains)
+    budget, antennas = radio(settings)
+    return Equipment(codebook, channels, budget, antennas, device, gains)
 
 
 def precoder(settings: Settings) -> Precoder:

@@ -180,9 +180,14 @@ class Center:
             return None
         self._doubted_rad = self.attitude_bound_rad
         least_deg, doubted_deg = map(math.degrees, (self._least_bound_rad, self._doubted_rad))
-        name = "center.attitude_bound_deg"
-        uav = str(status.source)
-        return Refuted(status.t_ns, uav, name, least_deg, doubted_deg, doubted_deg)
+        return Refuted(
+            status.t_ns,
+            str(status.source),
+            "center.attitude_bound_deg",
+            least_deg,
+            doubted_deg,
+            doubted_deg,
+        )
 
     def _goes_on_before(self, placed: PlacedAttitude) -> bool:
         """Whether attitudes go on at their pace before the newest, which none has followed.
@@ -215,7 +220,8 @@ class Center:
         self._begin(home)
         place = f"{home.lat_deg:.6f}, {home.lon_deg:.6f}, {home.alt_m:.1f} m"
         if self.vehicle is not None:
-            return Notice(report.t_ns, Severity.INFO, "origin", f"local frame begins at {place}")
+            text = f"local frame begins at {place}"
+            return Notice(report.t_ns, Severity.INFO, "origin", text)
         self.place, self._home_from = home, (report.uav, report.t_ns)
         text = f"home is where {report.uav} first reported: {place}; level, facing north"
         return Notice(report.t_ns, Severity.INFO, "home", text)
@@ -281,5 +287,6 @@ class Center:
         turn_degps2 = self._turns.limit_degps2(turn_degps2, at.sender_ns)
         bounds = carrier.AttitudeBounds(self.attitude_bound_rad, math.radians(turn_degps2))
         since_ns = at.sender_ns - made_ns
-        doubt = (at.bound_s, bounds, self._contradicted)
-        return carrier.moving(self.local, track, newest, attitude, since_ns, *doubt)
+        return carrier.moving(
+            self.local, track, newest, attitude, since_ns, at.bound_s, bounds, self._contradicted
+        )

@@ -113,7 +113,8 @@ class Pipeline:
         self.senders = Senders(settings, self.center.vehicle, self.tracker)
         self.targets = Targets(settings, self.center.vehicle)
         self.assumptions = Assumptions()
-        site = Site(self.array, self.coverage, *assembly.radio(settings))
+        budget, antennas = assembly.radio(settings)
+        site = Site(self.array, self.coverage, budget, antennas)
         self.health = Health(settings.link, site)
 
     # --- the fold ---------------------------------------------------------------------------
@@ -306,11 +307,20 @@ class Pipeline:
         tracks = self._tracks(seated, now_ns, valid_at_ns)
         found = self.carrier(now_ns, valid_at_ns)
         known, unfit = (None, found) if isinstance(found, str) else (found, None)
-        parts = (self.array, self.precoder, self.coverage, self._steady)
+        before = self._steady
         spared = self._spared(now_ns, valid_at_ns, known)
 
         def made() -> Update:
-            beams = aim(now_ns, valid_at_ns, [*tracks, *spared], known, *parts)
+            beams = aim(
+                now_ns,
+                valid_at_ns,
+                [*tracks, *spared],
+                known,
+                self.array,
+                self.precoder,
+                self.coverage,
+                before,
+            )
             if spared:
                 beams = without(beams, {track.uav for track in spared})
             if others:

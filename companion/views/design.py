@@ -28,8 +28,12 @@ class _Bounds(NamedTuple):
 
 
 def _bounds(given: ObserverSettings, limits: Limits) -> _Bounds:
-    noise = (given.position_noise_m, given.velocity_noise_mps)
-    return _Bounds(limits.speed_mps, limits.acceleration_mps2, *noise)
+    return _Bounds(
+        limits.speed_mps,
+        limits.acceleration_mps2,
+        given.position_noise_m,
+        given.velocity_noise_mps,
+    )
 
 
 class DesignView:

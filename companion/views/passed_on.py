@@ -86,10 +86,12 @@ class Positions:
         """Its height is above the ellipsoid: it is said where the geoid's height is known."""
         known = pipeline.settings.observer.geoid_m is not None
         undulation_m, off_m = _geoid(pipeline) if known else (0.0, 0.0)
+        lat_deg, lon_deg, alt_m = place
         said = UtmPosition(
             pipeline.utc_ns(track.valid_at_ns),
-            *place[:2],
-            place[2] + undulation_m if known else None,
+            lat_deg,
+            lon_deg,
+            alt_m + undulation_m if known else None,
             relative_alt_m,
             velocity_ned_mps,
             track.horizontal_bound_m,

@@ -135,7 +135,17 @@ def _uas_data(mac: bytes, uas: bytes) -> Iterator[tuple[int, bytes]]:
         yield (
             LOCATION,
             _location(
-                *(mac, lat, lon, baro, geo, height, more[5], course, speed, climb, _code(status)),
+                mac,
+                lat,
+                lon,
+                baro,
+                geo,
+                height,
+                more[5],
+                course,
+                speed,
+                climb,
+                _code(status),
                 (horizontal, vertical, barometer, at_speed, at_time),
             ),
         )

@@ -359,5 +359,6 @@ class FleetNode:
 
     def status(self) -> FleetStatus:
         """This node's place in the fleet."""
-        rates = self._sent.bps, self._heard.bps
-        return FleetStatus(self.member, self.settings.site, *rates, self.damaged)
+        return FleetStatus(
+            self.member, self.settings.site, self._sent.bps, self._heard.bps, self.damaged
+        )

@@ -236,8 +236,10 @@ def look(seen: Sight, update: Update, truth: ArrayTruth | None, t_s: float) -> l
         true = truly.get(track.uav)
         best, share, missed = seen.swept(towards, bound_rad, true)
         off_rad = None if true is None else _angle_rad(towards, true)
-        own = (worth.get(track.uav) for worth in worths)
-        samples.append(Sample(t_s, track.uav, bound_rad, off_rad, best, share, missed, *own))
+        set_worth, sharp_worth = (worth.get(track.uav) for worth in worths)
+        samples.append(
+            Sample(t_s, track.uav, bound_rad, off_rad, best, share, missed, set_worth, sharp_worth)
+        )
     return samples
 
 

@@ -197,9 +197,16 @@ def _make(
 ) -> None:
     """Make beams one way, and note what they are worth."""
     assert update.carrier is not None
-    how = replace(pipeline.precoder, widen=way.widen)
-    parts = (update.carrier, pipeline.array, how, pipeline.coverage, way.state)
-    made = aim(update.t_ns, update.beams.valid_at_ns, tracks, *parts)
+    made = aim(
+        update.t_ns,
+        update.beams.valid_at_ns,
+        tracks,
+        update.carrier,
+        pipeline.array,
+        replace(pipeline.precoder, widen=way.widen),
+        pipeline.coverage,
+        way.state,
+    )
     way.state = steady.after(way.state, made)
     steering = steering_matrix(pipeline.array, directions(made))
     shapes = made.weights * steering

@@ -75,7 +75,7 @@ def test_noise_by_hand() -> None:
 )
 def test_a_budget_that_is_none_is_refused(values: tuple[float, ...], name: str) -> None:
     with pytest.raises(ValueError, match=name):
-        LinkBudget(*values)
+        LinkBudget(values[0], values[1], values[2], values[3])
 
 
 # --- power --------------------------------------------------------------------------------------

@@ -145,20 +145,33 @@ def expected(m: dialect.MAVLink_message, t_ns: int, link: str) -> Message | None
         case "SYSTEM_TIME":
             return SystemTime(t_ns, source, m.time_unix_usec or None, m.time_boot_ms)
         case "ATTITUDE":
-            rates = (m.rollspeed, m.pitchspeed, m.yawspeed)
-            return Attitude(t_ns, source, m.time_boot_ms, m.roll, m.pitch, m.yaw, *rates)
+            return Attitude(
+                t_ns,
+                source,
+                m.time_boot_ms,
+                m.roll,
+                m.pitch,
+                m.yaw,
+                m.rollspeed,
+                m.pitchspeed,
+                m.yawspeed,
+            )
         case "EKF_STATUS_REPORT":
             knows = m.flags & dialect.EKF_ATTITUDE != 0
             return EstimatorStatus(t_ns, source, knows, m.compass_variance)
         case "GPS_RAW_INT":
-            accuracies = [value / 1000 or None for value in (m.h_acc, m.v_acc, m.vel_acc)]
+            h_acc, v_acc, vel_acc = (
+                value / 1000 or None for value in (m.h_acc, m.v_acc, m.vel_acc)
+            )
             return GnssStatus(
                 t_ns,
                 source,
                 m.fix_type,
                 m.satellites_visible,
                 m.alt * 1e-3,
-                *accuracies,
+                h_acc,
+                v_acc,
+                vel_acc,
                 m.time_usec,
             )
         case "GLOBAL_POSITION_INT":
@@ -547,7 +560,9 @@ def test_an_attitude_that_nothing_can_measure_is_malformed(field: int) -> None:
 
 def test_the_fields_of_an_attitude_keep_their_order() -> None:
     angles = [struct.unpack("<f", struct.pack("<f", 0.1 * n))[0] for n in range(1, 7)]
-    assert decode(attitude(angles)) == Attitude(T_NS, Source(7, 3), 77, *angles)
+    assert decode(attitude(angles)) == Attitude(
+        T_NS, Source(7, 3), 77, angles[0], angles[1], angles[2], angles[3], angles[4], angles[5]
+    )
 
 
 @pytest.mark.parametrize(("base_mode", "armed"), [(128, True), (127, False), (209, True)])

@@ -173,9 +173,9 @@ def test_the_least_mu_of_a_gain_is_certified_and_less_is_not(
     mu = scenario.gain_mu(dt_s, feedthrough_s, alpha, gain)
     if not 1e-3 < mu < 1e3:
         return
-    arguments = (dt_s, feedthrough_s, alpha, gain)
-    assert closed_form.lmi_margin(*arguments, mu, 1 / mu) >= -1e-9
-    assert closed_form.lmi_margin(*arguments, 0.99 * mu, 1 / (0.99 * mu)) < 0
+    assert closed_form.lmi_margin(dt_s, feedthrough_s, alpha, gain, mu, 1 / mu) >= -1e-9
+    less = 0.99 * mu
+    assert closed_form.lmi_margin(dt_s, feedthrough_s, alpha, gain, less, 1 / less) < 0
     assert mu >= closed_form.mu_star(dt_s, feedthrough_s, alpha) * (1 - 1e-9)
 
 

@@ -44,7 +44,7 @@ class ServiceError(Exception):
         self.title = title
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Weights:
     """The weights of one answer.
 
@@ -102,7 +102,9 @@ class Client:
         uavs = tuple(name for name in headers["x-uavs"].split(",") if name)
         matrix = np.load(io.BytesIO(body), allow_pickle=False)
         groups = tuple(int(turn) for turn in headers["x-groups"].split(",") if turn)
-        return Weights(uavs, matrix, int(headers["x-valid-at-ns"]), groups)
+        return Weights(
+            uavs=uavs, matrix=matrix, valid_at_ns=int(headers["x-valid-at-ns"]), groups=groups
+        )
 
     def table(self, media_type: str, lead_ms: float = 0.0) -> str:
         """The weights applied in ``lead_ms`` milliseconds as the text that a device reads."""

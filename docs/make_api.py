@@ -30,7 +30,9 @@ def document() -> Json:
     settings = Settings().override(
         center={"source": "0,0,0"}, links={"urls": ["udpin:127.0.0.1:0"]}
     )
-    with TestClient(create_app(Service(settings, print)), "http://localhost") as client:
+    with TestClient(
+        create_app(Service(settings=settings, say=print)), "http://localhost"
+    ) as client:
         found: Json = client.get("/openapi.json").json()
     return found
 

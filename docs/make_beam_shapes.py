@@ -140,7 +140,7 @@ Aperture = Line | Square
 # --- the search ---------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Term:
     """One place in a table that is judged, and how.
 
@@ -263,13 +263,22 @@ def _sure_terms(aperture: Aperture, widths: Array, free: Array) -> list[Term]:
             part = (np.log(width) - logs[at]) / (logs[at + 1] - logs[at])
             share = ((at, 1 - part), (at + 1, part))
             seen = response(aperture.points(width, half=is_even), places)
-            terms.append(Term(share, 2 * np.pi * width, phases @ free, seen, len(places)))
+            terms.append(
+                Term(
+                    share=share,
+                    width=2 * np.pi * width,
+                    phases=phases @ free,
+                    response=seen,
+                    size=len(places),
+                )
+            )
     return terms
 
 
 def make_likely(
     aperture: Aperture,
     cones: Array,
+    *,
     ratios: Array,
     floors: Array,
     wider: Array | None,
@@ -325,7 +334,17 @@ def _likely_terms(aperture: Aperture, cones: Array, ratios: Array, floors: Array
             points, shares = _weighed(aperture, cone, likely)
             seen = response(points, places)
             under = np.full(len(points), floor)
-            terms.append(Term(corners, 2 * np.pi * cone, phases, seen, len(places), shares, under))
+            terms.append(
+                Term(
+                    share=corners,
+                    width=2 * np.pi * cone,
+                    phases=phases,
+                    response=seen,
+                    size=len(places),
+                    mean=shares,
+                    floor=under,
+                )
+            )
     return terms
 
 
@@ -375,7 +394,7 @@ def most_with_phases_db(aperture: Aperture, width: float, elements: int, tries: 
         bend = rng.uniform(0.0, 1.3, places.shape[1]) * (1 if number % 2 else rng.choice([-1, 1]))
         begin = 2 * np.pi * width * (places**2 @ bend)
         begin += rng.standard_normal(len(places)) * (0.3 if number % 3 else 0.02)
-        term = Term(((0, 1.0),), 1.0, own, seen, len(places))
+        term = Term(share=((0, 1.0),), width=1.0, phases=own, response=seen, size=len(places))
         rounds = ((2, 100), (8, 150), (30, 200), (100, 300))
         found = searched([term], begin[np.newaxis], rounds)
         field = fine @ np.exp(1j * found[0])
@@ -432,13 +451,21 @@ def main() -> None:
         likely: list[Array] = []
         for floor in floors:
             wider = likely[-1] if likely else None
-            likely.append(make_likely(aperture, cones, ratios, floor, wider, most))
+            likely.append(
+                make_likely(aperture, cones, ratios=ratios, floors=floor, wider=wider, most=most)
+            )
             print(name, "likely", len(likely), flush=True)
         if name == "line":
             # What is between two losses is the mean of their phases, which must be of one kind: the
             # first, which began from nothing, is made once more from the second. (A square's are.)
             likely[0] = make_likely(
-                aperture, cones, ratios, floors[0], likely[1], most, along=False
+                aperture,
+                cones,
+                ratios=ratios,
+                floors=floors[0],
+                wider=likely[1],
+                most=most,
+                along=False,
             )
         # 5e-4 of the phase, which is at most some 30 rad, is all that half precision costs.
         made |= {

@@ -149,6 +149,7 @@ def main() -> None:
     help="Also write the frames to this tlog (replaced if it exists).",
 )
 def fly(
+    *,
     name: str,
     links: tuple[LinkUrl, ...],
     uavs: int,
@@ -193,6 +194,7 @@ def fly(
 )
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the faults.")
 def play(
+    *,
     logs: tuple[Path, ...],
     links: tuple[LinkUrl, ...],
     speed: float | None,

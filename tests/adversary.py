@@ -68,7 +68,7 @@ def settings() -> Settings:
     )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Worst:
     """What a flight came to.
 
@@ -216,7 +216,13 @@ class Flight:
         sender = dialect.MAVLink(None, self._source.sysid, self._source.compid)
         sender.seq = count % 256
         raw, msgid = bytes(message.pack(sender)), message.get_msgId()
-        return Frame(START_NS + round(arrival_s * S), "udp", self._source, msgid, raw)
+        return Frame(
+            t_ns=START_NS + round(arrival_s * S),
+            link="udp",
+            source=self._source,
+            msgid=msgid,
+            raw=raw,
+        )
 
     def _velocity(self, t_s: float) -> FloatArray:
         at = min(int(t_s / STEP_S), len(self.times_s) - 2)
@@ -235,7 +241,12 @@ class Flight:
             drifted_s = float(np.interp(at_s, self.times_s, self.drifted_s))
             remote_ns = round((BOOT_S + at_s + drifted_s) * S)
             back_ns = START_NS + round((at_s + back_s) * S)
-            trip = RoundTrip(back_ns, self._source, START_NS + round(t_s * S), remote_ns)
+            trip = RoundTrip(
+                t_ns=back_ns,
+                source=self._source,
+                sent_ns=START_NS + round(t_s * S),
+                remote_ns=remote_ns,
+            )
             yield at_s + back_s, trip
             t_s += 0.2 + 5 * g[19]
 
@@ -276,4 +287,11 @@ def worst(flight: Flight) -> Worst:
                 refuted.append(str(said))
             if isinstance(said, Notice) and "limit" in said.text:
                 refuted.append(said.text)
-    return Worst(ratio, outside, at, queries, tuple(refused), tuple(refuted))
+    return Worst(
+        ratio=ratio,
+        outside=outside,
+        at=at,
+        queries=queries,
+        refused=tuple(refused),
+        refuted=tuple(refuted),
+    )

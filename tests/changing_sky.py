@@ -79,7 +79,13 @@ def day(hours: float, seed: int = 1, begins_ns: int = 1_790_000_000 * S) -> Iter
 
 
 def _said(t_ns: int, source: Source, msgid: int, payload: bytes) -> Frame:
-    return Frame(t_ns, "udp", source, msgid, pack(Outgoing(source, msgid, payload), 0))
+    return Frame(
+        t_ns=t_ns,
+        link="udp",
+        source=source,
+        msgid=msgid,
+        raw=pack(Outgoing(source, msgid, payload), 0),
+    )
 
 
 def _position(t_ns: int, one: _Flight, now_s: float, velocity: float) -> Frame:

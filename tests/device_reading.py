@@ -49,7 +49,9 @@ def parse(device: Device, text: str, calibration: Calibration) -> DeviceTable:
     weights = np.empty(codes.shape[:2], dtype=complex).T
     weights[list(order)] = SETTINGS[device].values(codes).T
     weights *= calibration.factors[:, np.newaxis]
-    return DeviceTable(device, uavs, codes, order, weights, None)
+    return DeviceTable(
+        device=device, uavs=uavs, codes=codes, order=order, weights=weights, loss_db=None
+    )
 
 
 def _beams(rows: dict[tuple[int, int], tuple[int, int]], first: int, channels: int) -> IntArray:

@@ -40,7 +40,7 @@ reacquire_s = 3.0
 Json = dict[str, Any]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Case:
     """A flight with faults, and the service that hears it over so many links.
 
@@ -74,7 +74,7 @@ class Moment:
         return {beam["uav"] for beam in self.beams["beams"]}
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Outcome:
     """One flight: what was sent, what the service said meanwhile, in the end, and in its record.
 

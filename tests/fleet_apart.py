@@ -107,7 +107,7 @@ class Relay(threading.Thread):
         return self._delay_s
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Seen:
     """What was seen, of UAVs that all nodes hear; ``whole``: before the fleet was parted.
 
@@ -240,7 +240,7 @@ def healed_s(nodes: Nodes, sky: FleetSky) -> float:
 
 
 def fly(
-    companion: str, folder: Path, uavs: int, delay_s: float, loss: float, parted_s: float
+    companion: str, folder: Path, uavs: int, *, delay_s: float, loss: float, parted_s: float
 ) -> Seen:
     nodes, seen = Nodes(companion, folder), Seen()
     relay = Relay(nodes.devices, delay_s, loss)
@@ -249,7 +249,7 @@ def fly(
         nodes.until(nodes.answer, STARTED_S)
         ports = [15550 + number for number in range(len(NAMES))]
         hosts = {port: address(name) for port, name in zip(ports, NAMES, strict=True)}
-        with FleetSky(ports, uavs, hosts=hosts) as sky:
+        with FleetSky(ports=ports, uavs=uavs, hosts=hosts) as sky:
             nodes.until(
                 lambda: (
                     all(len(nodes.ask(name, "fleet")["uavs"]) == uavs for name in NAMES)
@@ -278,4 +278,17 @@ def fly(
 if __name__ == "__main__":
     companion, folder, *numbers = sys.argv[1:]
     uavs, delay_s, loss, parted_s = map(float, numbers)
-    print(json.dumps(asdict(fly(companion, Path(folder), int(uavs), delay_s, loss, parted_s))))
+    print(
+        json.dumps(
+            asdict(
+                fly(
+                    companion,
+                    Path(folder),
+                    int(uavs),
+                    delay_s=delay_s,
+                    loss=loss,
+                    parted_s=parted_s,
+                )
+            )
+        )
+    )

@@ -19,7 +19,7 @@ DEG_M = 111_195.0
 STEP_S = 0.005
 
 
-@dataclass
+@dataclass(kw_only=True)
 class FleetSky:
     """``uavs`` vehicles that report at ``hz``; each is heard at the ports in ``heard_at``.
 
@@ -123,6 +123,6 @@ def off_m(place: tuple[float, float, float], other: tuple[float, float, float]) 
 
 if __name__ == "__main__":
     seconds, hz, uavs, *ports = sys.argv[1:]
-    with FleetSky([int(port) for port in ports], int(uavs), float(hz)) as sky:
+    with FleetSky(ports=[int(port) for port in ports], uavs=int(uavs), hz=float(hz)) as sky:
         time.sleep(float(seconds))
     print(sky.sent)

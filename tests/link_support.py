@@ -115,7 +115,11 @@ async def running(
     """A link that is open and runs, and is cancelled at the end. Its time is 1, 2, 3 …"""
     inbox, clock = Inbox(), count(1)
     link = Link(
-        parse_link(url), inbox.receive, now_ns or (lambda: next(clock)), inbox.notify, guard
+        url=parse_link(url),
+        receive=inbox.receive,
+        now_ns=now_ns or (lambda: next(clock)),
+        notify=inbox.notify,
+        guard=guard,
     )
     link.open()
     task = asyncio.create_task(link.run())

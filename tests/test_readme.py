@@ -263,6 +263,7 @@ def recording(short_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 @pytest.mark.parametrize("command", [marked(command) for command in sorted(set(COMMANDS) - FULL)])
 def test_the_command_does_what_it_should(
+    *,
     command: str,
     tmp_path: Path,
     short_log: Path,

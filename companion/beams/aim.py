@@ -54,6 +54,7 @@ DARK: Final = 1e-3
 
 def aim(
     now_ns: int,
+    *,
     valid_at_ns: int,
     tracks: Sequence[Track],
     carrier: Carrier | None,
@@ -88,21 +89,23 @@ def aim(
         inside = [i for i, why in enumerate(hidden) if why is None]
         if inside:
             aimed = _Aimed([seen[i] for i in inside], ranges_m[inside], directions[inside])
-            beams, made, dropped = _beams(aimed, carrier, array, precoder, before, valid_at_ns)
+            beams, made, dropped = _beams(
+                aimed, carrier, array, precoder=precoder, before=before, valid_at_ns=valid_at_ns
+            )
             refused |= {uav: (Cause.CROWDED, why) for uav, why in dropped.items()}
     if made is None:
         made = precode(np.empty((array.size, 0), dtype=complex), precoder)
     left_out = tuple(LeftOut(uav, *why) for uav, why in refused.items() if why is not None)
     return BeamSet(
-        now_ns,
-        valid_at_ns,
-        beams,
-        made.weights,
-        steady.named(before, valid_at_ns, made.method, made.exact),
-        made.normalisation,
-        made.condition_number,
-        left_out,
-        made.exact,
+        t_ns=now_ns,
+        valid_at_ns=valid_at_ns,
+        beams=beams,
+        weights=made.weights,
+        method=steady.named(before, valid_at_ns, made.method, made.exact),
+        normalisation=made.normalisation,
+        condition_number=made.condition_number,
+        left_out=left_out,
+        exact=made.exact,
     )
 
 
@@ -143,6 +146,7 @@ def _beams(
     aimed: _Aimed,
     carrier: Carrier,
     array: Array,
+    *,
     precoder: Precoder,
     before: Steady | None,
     valid_at_ns: int,
@@ -161,11 +165,18 @@ def _beams(
     natural_rad = array.wavelength_m / max(float(shapes.aperture(array).lengths_m.max()), 1e-9)
     sure_plane = precoder.widen is Widen.GUARANTEE and array.axis is None
     pace = steady.SURE_PLANE if sure_plane else 1.0
-    shaped = steady.followed_rad(before, valid_at_ns, uavs, np.array(wanted), natural_rad, pace)
+    shaped = steady.followed_rad(
+        before, valid_at_ns, uavs, wanted_rad=np.array(wanted), natural_rad=natural_rad, pace=pace
+    )
     spread = widening.spread(
         array,
         directions,
-        Uncertain(shaped[:, 0], shaped[:, 1], precoder.floor_db, precoder.worth_db),
+        Uncertain(
+            likely_rad=shaped[:, 0],
+            bounds_rad=shaped[:, 1],
+            floor_db=precoder.floor_db,
+            worth_db=precoder.worth_db,
+        ),
         precoder.widen,
     )
     matrix = steering.steering_matrix(array, directions) if spread is None else spread.centres
@@ -174,12 +185,12 @@ def _beams(
         matrix,
         precoder,
         spread,
-        _priorities(tracks, precoder.priority),
-        Radio(
+        priorities=_priorities(tracks, precoder.priority),
+        radio=Radio(
             link_budget.isotropic_snr(ranges_m, array, precoder.budget, precoder.uav_antennas),
             worths,
         ),
-        steady.turns(before, valid_at_ns, uavs),
+        before=steady.turns(before, valid_at_ns, uavs),
     )
     azimuths, elevations = steering.angles_rad(directions)
     served = matrix[:, made.served]

@@ -45,7 +45,7 @@ KEPT_NS: Final = 500_000_000
 """Time for which a method and turns are kept."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Steady:
     """What the beams of the last tick were.
 
@@ -73,13 +73,13 @@ def after(before: Steady | None, made: BeamSet) -> Steady:
     same = before is not None and before.turns == turns
     inexact_ns = None if before is None else before.inexact_ns
     return Steady(
-        made.valid_at_ns,
-        {beam.uav: (beam.shaped_likely_rad, beam.shaped_bound_rad) for beam in made.beams},
-        {beam.uav: _filled_ns(before, beam, made.valid_at_ns) for beam in made.beams},
-        turns,
-        frozenset(turns) | {out.uav for out in made.left_out if out.cause is Cause.CROWDED},
-        before.turned_ns if before is not None and same else made.valid_at_ns,
-        inexact_ns if made.exact else made.valid_at_ns,
+        valid_at_ns=made.valid_at_ns,
+        shaped={beam.uav: (beam.shaped_likely_rad, beam.shaped_bound_rad) for beam in made.beams},
+        filled_ns={beam.uav: _filled_ns(before, beam, made.valid_at_ns) for beam in made.beams},
+        turns=turns,
+        known=frozenset(turns) | {out.uav for out in made.left_out if out.cause is Cause.CROWDED},
+        turned_ns=before.turned_ns if before is not None and same else made.valid_at_ns,
+        inexact_ns=inexact_ns if made.exact else made.valid_at_ns,
     )
 
 
@@ -95,6 +95,7 @@ def followed_rad(
     before: Steady | None,
     valid_at_ns: int,
     uavs: list[str],
+    *,
     wanted_rad: FloatArray,
     natural_rad: float,
     pace: float = 1.0,

@@ -27,6 +27,7 @@ from companion.values import UserError
 )
 @JSON
 def check(
+    *,
     config: Path | None,
     links: tuple[str, ...],
     center: str | None,

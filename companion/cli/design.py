@@ -91,6 +91,7 @@ def _alpha(text: str) -> float | None:
 )
 @JSON
 def design(
+    *,
     dt: list[float],
     model: str,
     alpha: str,
@@ -117,7 +118,17 @@ def design(
         if out is not None:
             raise click.UsageError("--out writes tables of the kinematic model only")
         way = method or "closed-form"
-        rows = [answers.row(s, feedthrough, _alpha(alpha), mu_max, model, way) for s in dt]
+        rows = [
+            answers.row(
+                s,
+                feedthrough_s=feedthrough,
+                alpha=_alpha(alpha),
+                mu_max=mu_max,
+                model=model,
+                method=way,
+            )
+            for s in dt
+        ]
     else:
         if method == "closed-form" or feedthrough:
             raise click.UsageError("the kinematic model: no closed form, no feedthrough")

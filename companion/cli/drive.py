@@ -54,6 +54,7 @@ if TYPE_CHECKING:
 @click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after so long.")
 @click.option("--json", "as_json", is_flag=True, help="How it goes, one JSON object a second.")
 def drive(
+    *,
     target: str,
     service: str,
     config: Path | None,
@@ -94,14 +95,21 @@ def drive(
         device = targets.device(f"none:{device.takes}", click.echo, codebook)
     client = Client(service, os.environ.get("COMPANION_TOKEN"))
     driven = Drive(
-        OverHttp(
-            client, Wanted(uavs, not uavs, device.takes, len(stored) or None, aim == "centre")
+        source=OverHttp(
+            client,
+            Wanted(
+                uavs=uavs,
+                anybody=not uavs,
+                takes=device.takes,
+                stored_beams=len(stored) or None,
+                centre=aim == "centre",
+            ),
         ),
-        device,
-        update_hz,
-        Safe(on_stale),
-        time.time_ns,
-        lambda text: click.echo(text, err=True),
+        device=device,
+        update_hz=update_hz,
+        safe=Safe(on_stale),
+        now_ns=time.time_ns,
+        say=lambda text: click.echo(text, err=True),
     )
 
     def show(told: "Told") -> None:

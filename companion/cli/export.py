@@ -59,6 +59,7 @@ class _OrBeams(click.Command):
 @LATENCY
 @JSON
 def export(
+    *,
     logs: tuple[Path, ...],
     form: str,
     out: Path,
@@ -89,7 +90,9 @@ def export(
         if form == "rerun":
             summary = exporting.export_space(logs, settings, out, show, latency_s)
         else:
-            summary = exporting.export(logs, settings, out, form, show, latency_s)
+            summary = exporting.export(
+                logs, settings, out, form=form, progress=show, latency_s=latency_s
+            )
     except KeyboardInterrupt:
         raise InterruptedByUser("interrupted; nothing was exported") from None
     progress.clear()

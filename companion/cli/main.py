@@ -73,6 +73,7 @@ def main() -> None:
 @click.option("--silent", is_flag=True, help="Send nothing over links, whatever the settings say.")
 @JSON_LINES
 def run(
+    *,
     config: Path | None,
     links: tuple[str, ...],
     center: str | None,
@@ -160,6 +161,7 @@ def demo(seconds: float | None, port: int, open_page: bool, as_json: bool) -> No
 @INSECURE
 @JSON
 def replay(
+    *,
     logs: tuple[Path, ...],
     config: Path | None,
     center: str | None,
@@ -218,7 +220,15 @@ def replay(
 
         own = load(config).override(server={"listen": listen})
         served_replay.serve(
-            served_replay.Asked(logs, settings, pace, recorder, latency_s, origins, own.page.map),
+            served_replay.Asked(
+                logs=logs,
+                settings=settings,
+                speed=pace,
+                record=recorder,
+                latency_s=latency_s,
+                origins=origins,
+                area_map=own.page.map,
+            ),
             own.server.listen,
             partial(_show_replay, as_json),
             token=os.environ.get("COMPANION_TOKEN"),
@@ -227,7 +237,9 @@ def replay(
         return
     show = of_log(progress, replaying.length_s(logs))
     try:
-        summary = replaying.replay(logs, settings, recorder, pace, show, latency_s)
+        summary = replaying.replay(
+            logs, settings, recorder, speed=pace, progress=show, latency_s=latency_s
+        )
     except KeyboardInterrupt:
         raise InterruptedByUser(_left_behind(begun)) from None
     progress.clear()

@@ -24,6 +24,7 @@ from companion.cli.console import CENTER, CONFIG, JSON, Progress, make_folder
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
 @JSON
 def beams(
+    *,
     logs: tuple[Path, ...],
     config: Path | None,
     center: str | None,
@@ -50,7 +51,14 @@ def beams(
     flown = tuple(flights(logs))
     settings = tuple(settings_for(each, config, center) for each in flown)
     over = tuple(name for name in links.split(",") if name)
-    setting = BeamStudy(flown, settings, hz, center, str(config) if config else None, over)
+    setting = BeamStudy(
+        flights=flown,
+        settings=settings,
+        hz=hz,
+        center=center,
+        config=str(config) if config else None,
+        links=over,
+    )
     make_folder(out)
     if any(each.center.source is None for each in settings):
         click.echo("no --center: the array stands where the first report was made", err=True)

@@ -52,6 +52,7 @@ def _steps(span: tuple[int, int], steps: int) -> list[int]:
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
 @JSON
 def fleet(
+    *,
     nodes: tuple[int, int],
     uavs: tuple[int, int],
     steps: int,
@@ -75,7 +76,9 @@ def fleet(
 
     progress = Progress()
     sizes = tuple(zip(_steps(nodes, steps), _steps(uavs, steps), strict=True))
-    asked = study.Asked(sizes, seconds, delay, loss, spacing_m=spacing, seed=seed)
+    asked = study.Asked(
+        sizes=sizes, seconds=seconds, delay_s=delay, loss=loss, spacing_m=spacing, seed=seed
+    )
     make_folder(out)
     found = list(study.run(asked, time.process_time, progress.show))
     spans = f"--nodes {nodes[0]}..{nodes[1]} --uavs {uavs[0]}..{uavs[1]} --steps {steps}"

@@ -64,6 +64,7 @@ def _range(_context: click.Context, _option: click.Parameter, text: str) -> list
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
 @JSON
 def link(
+    *,
     logs: tuple[Path, ...],
     config: Path | None,
     center: str | None,

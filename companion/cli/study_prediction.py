@@ -65,6 +65,7 @@ from companion.cli.design import numbers
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
 @JSON
 def prediction(
+    *,
     logs: tuple[Path, ...],
     config: Path | None,
     center: str | None,
@@ -102,12 +103,28 @@ def prediction(
     if len(latency_s) != 2:
         raise click.BadParameter("a latency is MEDIAN,P95 in seconds, such as 0.6,2.2")
     progress = Progress()
-    radio = RadioLink("radio", rate_hz, (latency_s[0], latency_s[1]), loss, known_delay)
+    radio = RadioLink(
+        name="radio",
+        rate_hz=rate_hz,
+        latency_s=(latency_s[0], latency_s[1]),
+        loss=loss,
+        known_delay=known_delay,
+    )
     name = str(config) if config else None
     setting = PredictionStudy(
-        logs, center, tuple(leads_s), tuple(word.strip() for word in links.split(",")), radio,
-        seed, load(config), name, learned, snr_db, jobs, cluster,
-    )  # fmt: skip
+        logs=logs,
+        center=center,
+        leads_s=tuple(leads_s),
+        links=tuple(word.strip() for word in links.split(",")),
+        radio=radio,
+        seed=seed,
+        settings=load(config),
+        config=name,
+        learned=learned,
+        snr_db=snr_db,
+        jobs=jobs,
+        cluster=cluster,
+    )
     make_folder(out)
     if center is None:
         click.echo("no --center: the array stands where the first report was made", err=True)

@@ -42,6 +42,7 @@ FORMATS = ("json", "npy", "raw", "adar1000", "tmytek", "sivers")
 @CENTER
 @LATENCY
 def weights(
+    *,
     logs: tuple[Path, ...],
     at: str,
     form: str,
@@ -78,9 +79,9 @@ def weights(
         logs,
         settings,
         at,
-        lead_ms * 1e-3,
-        lambda done_s: progress.show(f"{done_s:.0f} s"),
-        latency_s,
+        lead_s=lead_ms * 1e-3,
+        progress=lambda done_s: progress.show(f"{done_s:.0f} s"),
+        latency_s=latency_s,
     )
     progress.clear()
     if update.unfit is not None:

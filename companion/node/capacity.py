@@ -100,5 +100,14 @@ def _sky(number: int, update_hz: float) -> Iterator[Event]:
             place = frame.place(north * far_m, east * far_m, -60.0)
             velocity = (8.0 * north, 8.0 * east, 0.0)
             source = Source(1 + uav, 1)
-            said = global_position_int(source, round(t_s * 1e3) + 5000, place, 60.0, velocity, None)
-            yield Frame(t_ns, "sky", source, said.msgid, pack(said, step % 256))
+            said = global_position_int(
+                source,
+                round(t_s * 1e3) + 5000,
+                place,
+                relative_alt_m=60.0,
+                velocity_ned_mps=velocity,
+                heading_deg=None,
+            )
+            yield Frame(
+                t_ns=t_ns, link="sky", source=source, msgid=said.msgid, raw=pack(said, step % 256)
+            )

@@ -62,7 +62,9 @@ def check(
     yield _capacity(settings)
     urls = [url for url in settings.links.urls if url not in faulty]
     if not settings.links.urls:
-        yield Finding("links", Grade.FAULT, "none", "say --link udpin:0.0.0.0:14550")
+        yield Finding(
+            subject="links", grade=Grade.FAULT, text="none", remedy="say --link udpin:0.0.0.0:14550"
+        )
     if urls and seconds > 0:
         show(f"listening for {seconds:g} s")
         service = _listen(_to_listen(settings, urls), seconds)
@@ -74,7 +76,12 @@ def _capacity(settings: Settings) -> Finding:
         share = machine.processor_share()
         found = capacity.measure(embedded(settings), processor=share)
     except UserError as error:
-        return Finding("settings", Grade.FAULT, str(error), "mend them, or the file they name")
+        return Finding(
+            subject="settings",
+            grade=Grade.FAULT,
+            text=str(error),
+            remedy="mend them, or the file they name",
+        )
     most = f"more than {capacity.MOST}" if found.uavs is None else f"some {found.uavs}"
     text = (
         f"carries {most} UAVs at {capacity.RATE_HZ} reports a second each"
@@ -84,8 +91,10 @@ def _capacity(settings: Settings) -> Finding:
     if share < 1:
         text += f"; this process is allowed {share * 100:.0f} % of a processor"
     if found.uavs is not None and found.uavs < capacity.FEW:
-        return Finding("capacity", Grade.DOUBT, text, "lower [beams] update_hz")
-    return Finding("capacity", Grade.OK, text)
+        return Finding(
+            subject="capacity", grade=Grade.DOUBT, text=text, remedy="lower [beams] update_hz"
+        )
+    return Finding(subject="capacity", grade=Grade.OK, text=text)
 
 
 def _to_listen(settings: Settings, urls: list[str]) -> Settings:
@@ -108,7 +117,7 @@ def _to_listen(settings: Settings, urls: list[str]) -> Settings:
 def _listen(settings: Settings, seconds: float) -> Service:
     """A service that ran so long, with nobody to see it but this process."""
     with bind("127.0.0.1:0", token=None, insecure=False) as http:
-        service = Service(settings, lambda _: None)
+        service = Service(settings=settings, say=lambda _: None)
         run_until_told(lambda until: service.run(http, None, until), seconds)
     return service
 
@@ -122,15 +131,20 @@ def _heard(service: Service, settings: Settings) -> Iterator[Finding]:
     if settings.center.source is None:
         heard = f"; heard: {', '.join(own[:SOME])}" if own else ""
         remedy = f"say --center SYSID:COMPID or LAT,LON,ALT{heard}"
-        yield Finding("carrier", Grade.FAULT, "nobody said what carries the array", remedy)
+        yield Finding(
+            subject="carrier",
+            grade=Grade.FAULT,
+            text="nobody said what carries the array",
+            remedy=remedy,
+        )
         return
     subject = f"carrier {settings.center.source}"
     if update is None or update.unfit is not None:
         unfit = "no beam update was made" if update is None else str(update.unfit)
         remedy = f"is it one of {', '.join(own[:SOME])}?" if own else "nobody else is heard either"
-        yield Finding(subject, Grade.FAULT, unfit, remedy)
+        yield Finding(subject=subject, grade=Grade.FAULT, text=unfit, remedy=remedy)
     else:
-        yield Finding(subject, Grade.OK, "its place and attitude are known")
+        yield Finding(subject=subject, grade=Grade.OK, text="its place and attitude are known")
     yield from _uavs(service)
     yield from _speed(service, settings.beams.update_hz)
 
@@ -146,25 +160,42 @@ def _links(service: Service) -> Iterator[Finding]:
         elif link.frames == 0 and link.bytes > 0:
             remedy = "another baud rate? signed with another key? not MAVLink at all?"
             yield Finding(
-                subject, Grade.FAULT, f"{link.bytes} bytes, and no MAVLink in them", remedy
+                subject=subject,
+                grade=Grade.FAULT,
+                text=f"{link.bytes} bytes, and no MAVLink in them",
+                remedy=remedy,
             )
         elif link.frames == 0:
-            yield Finding(subject, Grade.FAULT, "heard nothing", _silent(link.url))
+            yield Finding(
+                subject=subject, grade=Grade.FAULT, text="heard nothing", remedy=_silent(link.url)
+            )
         elif bad > NOISY * link.frames:
             yield Finding(
-                subject, Grade.DOUBT, f"{said}; {bad} with a wrong checksum", "is the line noisy?"
+                subject=subject,
+                grade=Grade.DOUBT,
+                text=f"{said}; {bad} with a wrong checksum",
+                remedy="is the line noisy?",
             )
         else:
-            yield Finding(subject, Grade.OK, said)
+            yield Finding(subject=subject, grade=Grade.OK, text=said)
 
 
 def _not_understood(subject: str, scheme: str, link: LinkStatus) -> Finding:
     """A receiver of another kind that sent bytes, and no position of anybody."""
     refused = ", ".join(f"{count} {reason}" for reason, count in link.lost.items())
     if not refused:
-        return Finding(subject, Grade.DOUBT, f"{link.bytes} bytes, and no aircraft in them yet")
+        return Finding(
+            subject=subject,
+            grade=Grade.DOUBT,
+            text=f"{link.bytes} bytes, and no aircraft in them yet",
+        )
     said = f"{link.bytes} bytes, and nothing of use in them ({refused})"
-    return Finding(subject, Grade.FAULT, said, f"is this the port that says {SAYS[scheme]}?")
+    return Finding(
+        subject=subject,
+        grade=Grade.FAULT,
+        text=said,
+        remedy=f"is this the port that says {SAYS[scheme]}?",
+    )
 
 
 def _silent(url: str) -> str:
@@ -185,7 +216,9 @@ def _uavs(service: Service) -> Iterator[Finding]:
     shown = [uav for uav in state.uavs(service) if uav["target"]]
     if not shown:
         remedy = "wait for a position fix; see what /v1/uavs refuses"
-        yield Finding("UAVs", Grade.FAULT, "none to aim at was heard", remedy)
+        yield Finding(
+            subject="UAVs", grade=Grade.FAULT, text="none to aim at was heard", remedy=remedy
+        )
     for uav in shown:
         name, dt_s = uav["id"], uav["dt_s"]
         pace = "one report" if dt_s is None else f"reports each {dt_s:.2f} s"
@@ -194,7 +227,7 @@ def _uavs(service: Service) -> Iterator[Finding]:
 
 
 def _judged(name: str, text: str, verdict: Verdict | None) -> Finding:
-    found = Finding(f"UAV {name}", Grade.OK, text)
+    found = Finding(subject=f"UAV {name}", grade=Grade.OK, text=text)
     if verdict is None:
         return replace(found, grade=Grade.DOUBT, text=f"not judged: {text}")
     text = f"{verdict.level}: {text}"
@@ -209,9 +242,11 @@ def _speed(service: Service, update_hz: float) -> Iterator[Finding]:
     share = took_s * update_hz
     text = f"beams take {took_s * 1e3:.1f} ms, {share:.0%} of the time between updates"
     if share > BUSY:
-        yield Finding("this machine", Grade.DOUBT, text, "lower [beams] update_hz")
+        yield Finding(
+            subject="this machine", grade=Grade.DOUBT, text=text, remedy="lower [beams] update_hz"
+        )
     else:
-        yield Finding("this machine", Grade.OK, text)
+        yield Finding(subject="this machine", grade=Grade.OK, text=text)
 
 
 def _look_s(pipeline: Pipeline, now_ns: int) -> float:

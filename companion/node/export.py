@@ -26,6 +26,7 @@ def export(
     logs: Sequence[Path],
     settings: Settings,
     where: Path,
+    *,
     form: str,
     progress: Callable[[int, float, float], None],
     latency_s: float = 0.0,

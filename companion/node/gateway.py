@@ -42,6 +42,7 @@ class Gateway:
 
     def __init__(
         self,
+        *,
         settings: Settings,
         step: Callable[[Event], None],
         notify: Callable[[Notice], None],
@@ -78,7 +79,9 @@ class Gateway:
             self.links.append(link)
             if link.url.scheme == "udpout" and self._component is None:
                 text = f"{url} is silent, for [presence] is off: nobody there learns of it"
-                self._notify(Notice(self._now_ns(), Severity.WARNING, url, text))
+                self._notify(
+                    Notice(t_ns=self._now_ns(), severity=Severity.WARNING, subject=url, text=text)
+                )
 
     def _link(self, number: int, url: str) -> Link:
         parsed, signing, guard = parse_link(url), self._settings.signing, None
@@ -88,11 +91,19 @@ class Gateway:
             key, now_ns = load_key(path), self._now_ns()
             warning = key_warning(path)
             if warning:
-                self._notify(Notice(now_ns, Severity.WARNING, url, warning))
+                self._notify(
+                    Notice(t_ns=now_ns, severity=Severity.WARNING, subject=url, text=warning)
+                )
             unsigned = url in signing.allow_unsigned
             guard = self._timestamps.guard(url, key, number % 256, now_ns, allow_unsigned=unsigned)
         return Link(
-            parsed, self._received, self._now_ns, self._notify, guard, self.lag, self._twins
+            url=parsed,
+            receive=self._received,
+            now_ns=self._now_ns,
+            notify=self._notify,
+            guard=guard,
+            lag=self.lag,
+            twins=self._twins,
         )
 
     async def run(self) -> None:
@@ -125,7 +136,14 @@ class Gateway:
                 await asyncio.to_thread(timestamps.write, timestamps.snapshot(self._now_ns()))
             except LinkError as error:
                 if not failing:
-                    self._notify(Notice(self._now_ns(), Severity.ERROR, "signing", str(error)))
+                    self._notify(
+                        Notice(
+                            t_ns=self._now_ns(),
+                            severity=Severity.ERROR,
+                            subject="signing",
+                            text=str(error),
+                        )
+                    )
                 failing = True
             else:
                 failing = False
@@ -134,7 +152,9 @@ class Gateway:
         for item in items:
             if isinstance(item, Frame) and item.msgid == SETUP_SIGNING:
                 who = str(item.source)
-                self._step(Rejection(item.t_ns, who, Reason.SECRET, msgid=SETUP_SIGNING))
+                self._step(
+                    Rejection(t_ns=item.t_ns, source=who, reason=Reason.SECRET, msgid=SETUP_SIGNING)
+                )
                 continue
             self._step(item)
             if self._component and isinstance(item, Frame) and item.msgid in self._hear:
@@ -151,7 +171,9 @@ class Gateway:
                 f"{who} is heard from {' and '.join(peers)}, which contradict each other: not"
                 " believed; [links] routers names whom to believe"
             )
-            self._notify(Notice(self._now_ns(), Severity.WARNING, who, text))
+            self._notify(
+                Notice(t_ns=self._now_ns(), severity=Severity.WARNING, subject=who, text=text)
+            )
         self._twins.told.clear()
 
     @property
@@ -204,7 +226,10 @@ def component(settings: Settings) -> Component | None:
     try:
         return Component(
             ComponentSpec(
-                Source(sysid, given.component_id), carrier, given.position_hz, given.attitude_hz
+                source=Source(sysid, given.component_id),
+                carrier=carrier,
+                position_hz=given.position_hz,
+                attitude_hz=given.attitude_hz,
             )
         )
     except UserError as error:

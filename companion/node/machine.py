@@ -37,7 +37,7 @@ class Grade(StrEnum):
     FAULT = "fault"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
     """One thing that was looked at: what it is, how it was found, and what to do about it."""
 
@@ -66,8 +66,8 @@ def _served(listen: str, *, token: str | None, insecure: bool) -> Finding:
     except UserError as error:
         busy = os.strerror(errno.EADDRINUSE) in str(error)
         remedy = "stop the other program, or --listen 127.0.0.1:8081" if busy else ""
-        return Finding(subject, Grade.FAULT, str(error), remedy)
-    return Finding(subject, Grade.OK, "the page and the API can be served here")
+        return Finding(subject=subject, grade=Grade.FAULT, text=str(error), remedy=remedy)
+    return Finding(subject=subject, grade=Grade.OK, text="the page and the API can be served here")
 
 
 def _link(url: LinkUrl) -> Finding:
@@ -77,7 +77,7 @@ def _link(url: LinkUrl) -> Finding:
     if url.scheme == "zenoh":
         return _zenoh(subject, url)
     if not url.listens:
-        return Finding(subject, Grade.OK, "calls from here")
+        return Finding(subject=subject, grade=Grade.OK, text="calls from here")
     kind = socket.SOCK_STREAM if url.scheme == "tcpin" else socket.SOCK_DGRAM
     try:
         bound(url, kind).close()
@@ -85,28 +85,34 @@ def _link(url: LinkUrl) -> Finding:
         remedy = "another program has it: stop that, or choose another port"
         if error.errno != errno.EADDRINUSE:
             remedy = "name an address of this machine, such as 0.0.0.0"
-        return Finding(subject, Grade.FAULT, reason(error), remedy)
-    return Finding(subject, Grade.OK, "can be listened on")
+        return Finding(subject=subject, grade=Grade.FAULT, text=reason(error), remedy=remedy)
+    return Finding(subject=subject, grade=Grade.OK, text="can be listened on")
 
 
 def _zenoh(subject: str, url: LinkUrl) -> Finding:
     try:
         zenoh_bus.check(zenoh_link.configuration(url))
     except UserError as error:
-        return Finding(subject, Grade.FAULT, str(error))
-    return Finding(subject, Grade.OK, "Zenoh is here, and can read its endpoints")
+        return Finding(subject=subject, grade=Grade.FAULT, text=str(error))
+    return Finding(
+        subject=subject, grade=Grade.OK, text="Zenoh is here, and can read its endpoints"
+    )
 
 
 def _device(subject: str, device: Path) -> Finding:
     if not device.exists():
         there = sorted(str(path) for path in Path("/dev").glob("tty[AUT][CMSH][MABS]*"))
         remedy = f"is it plugged in? there is {', '.join(there)}" if there else "is it plugged in?"
-        return Finding(subject, Grade.FAULT, "there is no such device", remedy)
+        return Finding(
+            subject=subject, grade=Grade.FAULT, text="there is no such device", remedy=remedy
+        )
     if not os.access(device, os.R_OK | os.W_OK):
         group = grp.getgrgid(device.stat().st_gid).gr_name
         remedy = f"sudo usermod -a -G {group} $USER, then log in again"
-        return Finding(subject, Grade.FAULT, "may not be opened by this user", remedy)
-    return Finding(subject, Grade.OK, "is there, and may be opened")
+        return Finding(
+            subject=subject, grade=Grade.FAULT, text="may not be opened by this user", remedy=remedy
+        )
+    return Finding(subject=subject, grade=Grade.OK, text="is there, and may be opened")
 
 
 def _buffers() -> Iterator[Finding]:
@@ -117,9 +123,9 @@ def _buffers() -> Iterator[Finding]:
     text = f"the system grants UDP links {granted / 1e3:.0f} kB"
     if granted < BUFFER_BYTES:
         remedy = f"for thousands of frames a second: sysctl -w net.core.rmem_max={4 * BUFFER_BYTES}"
-        yield Finding("receive buffer", Grade.DOUBT, text, remedy)
+        yield Finding(subject="receive buffer", grade=Grade.DOUBT, text=text, remedy=remedy)
     else:
-        yield Finding("receive buffer", Grade.OK, text)
+        yield Finding(subject="receive buffer", grade=Grade.OK, text=text)
 
 
 def _disk(folder: Path) -> Finding:
@@ -131,11 +137,21 @@ def _disk(folder: Path) -> Finding:
         with tempfile.TemporaryFile(dir=where):
             free = shutil.disk_usage(where).free
     except OSError as error:
-        return Finding(subject, Grade.FAULT, reason(error), "choose a folder that can be written")
+        return Finding(
+            subject=subject,
+            grade=Grade.FAULT,
+            text=reason(error),
+            remedy="choose a folder that can be written",
+        )
     text = f"{free / 1e9:.1f} GB free"
     if free < SCARCE_BYTES:
-        return Finding(subject, Grade.DOUBT, text, "make room: a full disk ends a recording")
-    return Finding(subject, Grade.OK, text)
+        return Finding(
+            subject=subject,
+            grade=Grade.DOUBT,
+            text=text,
+            remedy="make room: a full disk ends a recording",
+        )
+    return Finding(subject=subject, grade=Grade.OK, text=text)
 
 
 def processor_share(root: Path = Path("/")) -> float:
@@ -181,6 +197,11 @@ def _clock() -> Iterator[Finding]:
         return  # not Linux
     if state == UNSYNCHRONISED:
         text = "nothing keeps this machine's clock right: times in recordings are as it has them"
-        yield Finding("wall clock", Grade.DOUBT, text, "run chrony or systemd-timesyncd")
+        yield Finding(
+            subject="wall clock",
+            grade=Grade.DOUBT,
+            text=text,
+            remedy="run chrony or systemd-timesyncd",
+        )
     elif state >= 0:
-        yield Finding("wall clock", Grade.OK, "is kept right")
+        yield Finding(subject="wall clock", grade=Grade.OK, text="is kept right")

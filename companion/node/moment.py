@@ -27,6 +27,7 @@ def look(
     logs: Sequence[Path],
     settings: Settings,
     at: str,
+    *,
     lead_s: float = 0.0,
     progress: Callable[[float], None] | None = None,
     latency_s: float = 0.0,

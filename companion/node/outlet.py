@@ -23,6 +23,7 @@ class Outlet:
 
     def __init__(
         self,
+        *,
         settings: Settings,
         pipeline: Pipeline,
         notify: Callable[[Notice], None],
@@ -44,7 +45,7 @@ class Outlet:
             says_cot = url.scheme == "cot"
             if says_cot:
                 url = replace(url, scheme="udpout" if url.way == "udp" else "tcp", way="")
-            link = Link(url, lambda _: None, now_ns, notify)
+            link = Link(url=url, receive=lambda _: None, now_ns=now_ns, notify=notify)
             if says_cot:
                 self._events.append(link)
                 self._named.append(text)

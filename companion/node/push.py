@@ -31,6 +31,7 @@ class Push:
 
     def __init__(
         self,
+        *,
         settings: RecordSettings,
         pipeline: Pipeline,
         equipment: Equipment,
@@ -106,7 +107,7 @@ class Push:
                     self._tell(Severity.INFO, f"records to {text} go out")
 
     def _tell(self, severity: Severity, text: str) -> None:
-        self._notify(Notice(self._now_ns(), severity, "records", text))
+        self._notify(Notice(t_ns=self._now_ns(), severity=severity, subject="records", text=text))
 
     def close(self) -> None:
         """Close all ways."""

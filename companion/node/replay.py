@@ -74,7 +74,14 @@ def writer_for(logs: Sequence[Path], settings: Settings, out: Path | None) -> Wr
     weights_hz = None if kept.weights_hz == "all" else kept.weights_hz
     scene = Scene(assembly.array(settings), kept.scene_hz)
     versions = {"companion": companion.__version__}
-    return Writer(where, embedded(settings).to_toml(), versions, weights_hz, first_ns, scene)
+    return Writer(
+        where=where,
+        settings_toml=embedded(settings).to_toml(),
+        versions=versions,
+        weights_hz=weights_hz,
+        started_ns=first_ns,
+        scene=scene,
+    )
 
 
 class Run:
@@ -134,6 +141,7 @@ def replay(
     logs: Sequence[Path],
     settings: Settings,
     record: Callable[[], Writer] | None = None,
+    *,
     speed: float | None = None,
     progress: Callable[[int, float, float], None] | None = None,
     latency_s: float = 0.0,

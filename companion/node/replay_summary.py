@@ -10,7 +10,7 @@ from companion.pipeline.fold import Pipeline
 from companion.values import Estimate, Event, Update, reports_itself
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Tally:
     """Figures of a replay, gathered as it goes."""
 

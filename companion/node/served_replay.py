@@ -45,7 +45,7 @@ MEASURED_AT_ONCE: Final = 20_000
 """Events read at once while measuring the log; measuring can be stopped only in between."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Asked:
     """What is to be replayed, and how.
 
@@ -139,7 +139,7 @@ class ServedReplay:
         turns out to be unusable, ``OSError`` where the recording cannot be written.
         """
         answering = asyncio.Event()
-        server = Server(self, token, answering, self._area)
+        server = Server(node=self, token=token, answering=answering, area=self._area)
         failed: Exception | None = None
         try:
             async with asyncio.TaskGroup() as group:
@@ -242,8 +242,14 @@ class ServedReplay:
         """State of the replay's recording."""
         writer = self._run.writer
         if writer is None:
-            return RecordingStatus("off", None, 0, 0, 0)
-        return RecordingStatus("recording", writer.path.name, writer.size_bytes, writer.messages, 0)
+            return RecordingStatus(state="off", file=None, bytes=0, messages=0, dropped=0)
+        return RecordingStatus(
+            state="recording",
+            file=writer.path.name,
+            bytes=writer.size_bytes,
+            messages=writer.messages,
+            dropped=0,
+        )
 
     def rates(self) -> dict[str, float | None]:
         """Frames and updates per second of the log."""
@@ -275,14 +281,16 @@ class ServedReplay:
     def replay(self) -> ReplayStatus:
         """Progress of the replay."""
         state = "finished" if self._finished else "running"
-        return ReplayStatus(self.name, self._speed, self._run.at_s, self._of_s, state)
+        return ReplayStatus(
+            log=self.name, speed=self._speed, at_s=self._run.at_s, of_s=self._of_s, state=state
+        )
 
 
 class _ReplayedLink:
     """Counts of one link, from its frames in the log, which does not tell its peers apart."""
 
     def __init__(self, url: str) -> None:
-        self.status = LinkStatus(url)
+        self.status = LinkStatus(url=url)
         self._peers = Peers(self.status, lambda _peer: None)
         self._peer = self._peers.at(url)
 

@@ -60,6 +60,7 @@ class Service:
 
     def __init__(
         self,
+        *,
         settings: Settings,
         say: Callable[[str], None],
         origins: Origins | None = None,
@@ -86,15 +87,28 @@ class Service:
         self._defects: asyncio.Queue[Exception] = asyncio.Queue()
         self._recorder: BackgroundRecorder | None = None
         self._live = self._open_live()
-        self._traffic = Gateway(settings, self._hear, self._notify, self._timeline.now_ns)
+        self._traffic = Gateway(
+            settings=settings, step=self._hear, notify=self._notify, now_ns=self._timeline.now_ns
+        )
         self.arrival_lag = self._traffic.lag
-        self._outlet = Outlet(settings, self.pipeline, self._notify, self._timeline.now_ns)
+        self._outlet = Outlet(
+            settings=settings,
+            pipeline=self.pipeline,
+            notify=self._notify,
+            now_ns=self._timeline.now_ns,
+        )
         now_ns = self._timeline.now_ns
         target = settings.drive.target
         stored = partial(stored_registers, self.pipeline.array, self.equipment)
         self._device = None if target is None else targets.device(target, self._say, stored)
         self.fleet = self._fleet_node(settings)
-        self._push = Push(settings.records, self.pipeline, self.equipment, self._notify, now_ns)
+        self._push = Push(
+            settings=settings.records,
+            pipeline=self.pipeline,
+            equipment=self.equipment,
+            notify=self._notify,
+            now_ns=now_ns,
+        )
         self._traffic.open()
         self._outlet.open()
         self._push.open()
@@ -114,7 +128,7 @@ class Service:
         ``others`` are further coroutines to run beside, as for the demo; they are cancelled at the
         end.
         """
-        server = Server(self, token, self.answering, self._area)
+        server = Server(node=self, token=token, answering=self.answering, area=self._area)
         if self._recorder:
             self._recorder.start()
         if self._live:
@@ -157,7 +171,13 @@ class Service:
         if settings.fleet.node is None:
             return None
         now_ns = self._timeline.now_ns
-        return FleetNode(settings.fleet, self.pipeline, self._step, self._notify, now_ns)
+        return FleetNode(
+            settings=settings.fleet,
+            pipeline=self.pipeline,
+            step=self._step,
+            notify=self._notify,
+            now_ns=now_ns,
+        )
 
     # --- what drives the pipeline -----------------------------------------------------------
 
@@ -194,19 +214,36 @@ class Service:
         uavs = kept.drive.uavs or kept.beams.priority
 
         def say(text: str) -> None:
-            notice = Notice(self.now_ns(), Severity.INFO, "drive", text)
+            notice = Notice(t_ns=self.now_ns(), severity=Severity.INFO, subject="drive", text=text)
             loop.call_soon_threadsafe(self._notify, notice)
 
         try:
             centre = kept.drive.aim == "centre"
-            wanted = Wanted(uavs, not kept.drive.uavs, self._device.takes, centre=centre)
-            source = OfThisProcess(loop, self.pipeline, self.equipment, self.now_ns, wanted)
+            wanted = Wanted(
+                uavs=uavs, anybody=not kept.drive.uavs, takes=self._device.takes, centre=centre
+            )
+            source = OfThisProcess(
+                loop=loop,
+                pipeline=self.pipeline,
+                equipment=self.equipment,
+                now_ns=self.now_ns,
+                wanted=wanted,
+            )
             safe = Safe(kept.drive.on_stale)
-            drive = Drive(source, self._device, kept.beams.update_hz, safe, self.now_ns, say)
+            drive = Drive(
+                source=source,
+                device=self._device,
+                update_hz=kept.beams.update_hz,
+                safe=safe,
+                now_ns=self.now_ns,
+                say=say,
+            )
             await beside(drive)
         except UserError as error:
             text = f"the device is driven no more: {error}"
-            self._notify(Notice(self.now_ns(), Severity.ERROR, "drive", text))
+            self._notify(
+                Notice(t_ns=self.now_ns(), severity=Severity.ERROR, subject="drive", text=text)
+            )
 
     async def _end_on_defect(self) -> None:
         """Wait for a defect of the fold and raise it, which ends the service.
@@ -228,7 +265,9 @@ class Service:
 
     def _tell_of_recorder(self, recorder: BackgroundRecorder) -> None:
         for severity, text in recorder.news():
-            self._notify(Notice(self.now_ns(), severity, "recording", text))
+            self._notify(
+                Notice(t_ns=self.now_ns(), severity=severity, subject="recording", text=text)
+            )
 
     def _tell_of_machine(self) -> None:
         """Tell once that this machine does not keep up, and once that it does again."""
@@ -240,7 +279,7 @@ class Service:
             text, severity = "this machine keeps up again", Severity.INFO
         else:
             text, severity = f"{machine.reason}; {machine.remedy}", Severity.WARNING
-        self._notify(Notice(self.now_ns(), severity, "machine", text))
+        self._notify(Notice(t_ns=self.now_ns(), severity=severity, subject="machine", text=text))
 
     def _show(self, notice: Notice) -> None:
         self.notices.append(notice)
@@ -335,17 +374,17 @@ class Service:
         """State of the recording."""
         recorder = self._recorder
         if recorder is None:
-            return RecordingStatus("off", None, 0, 0, 0)
+            return RecordingStatus(state="off", file=None, bytes=0, messages=0, dropped=0)
         state = "degraded" if recorder.degraded else "recording"
         written_ns = recorder.written_ns
         return RecordingStatus(
-            state,
-            recorder.file,
-            recorder.bytes,
-            recorder.messages,
-            recorder.dropped,
-            recorder.queued,
-            None if written_ns is None else (self.now_ns() - written_ns) * 1e-9,
+            state=state,
+            file=recorder.file,
+            bytes=recorder.bytes,
+            messages=recorder.messages,
+            dropped=recorder.dropped,
+            queued=recorder.queued,
+            lag_s=None if written_ns is None else (self.now_ns() - written_ns) * 1e-9,
         )
 
     def unfit(self) -> list[str]:
@@ -395,7 +434,9 @@ class Service:
             return None
         size_bytes = None if kept.rotate_mb is None else kept.rotate_mb * 1e6
         rotation = Rotation(size_bytes, kept.rotate_s)
-        return BackgroundRecorder(self._open_part, self.pipeline.geodetic, rotation)
+        return BackgroundRecorder(
+            open_part=self._open_part, geodetic=self.pipeline.geodetic, rotation=rotation
+        )
 
     def _open_live(self) -> LiveChannels | None:
         """The live channels, on this machine alone, since their protocol has no token.
@@ -405,7 +446,9 @@ class Service:
         port = self._settings.server.foxglove
         if port is None:
             return None
-        live = LiveChannels("127.0.0.1", port, self.pipeline.geodetic, self._scene())
+        live = LiveChannels(
+            host="127.0.0.1", port=port, geodetic=self.pipeline.geodetic, scene=self._scene()
+        )
         self._say(f"live channels for Foxglove and Lichtblick on ws://127.0.0.1:{live.port}")
         return live
 
@@ -418,13 +461,15 @@ class Service:
         if part.number > 1 and where.suffix == ".mcap" and not where.is_dir():
             where = where.parent  # a file was asked for: later parts go into its folder
         return Writer(
-            where,
-            self._settings.to_toml(),
-            {"companion": companion.__version__},
-            None if kept.weights_hz == "all" else kept.weights_hz,
-            self.pipeline.utc_ns(self._started_ns if part.number == 1 else self.now_ns()),
-            self._scene(),
-            part,
+            where=where,
+            settings_toml=self._settings.to_toml(),
+            versions={"companion": companion.__version__},
+            weights_hz=None if kept.weights_hz == "all" else kept.weights_hz,
+            started_ns=self.pipeline.utc_ns(
+                self._started_ns if part.number == 1 else self.now_ns()
+            ),
+            scene=self._scene(),
+            part=part,
         )
 
 

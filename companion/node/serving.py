@@ -39,7 +39,7 @@ class Server(uvicorn.Server):
     """
 
     def __init__(
-        self, node: Node, token: str | None, answering: asyncio.Event, area: Path | None = None
+        self, *, node: Node, token: str | None, answering: asyncio.Event, area: Path | None = None
     ) -> None:
         app = create_app(node, token, area)
         super().__init__(

@@ -64,7 +64,7 @@ def run(
     manager = systemd.manager(os.environ)
     http = bind(settings.server.listen, token=token, insecure=insecure)
     with http:
-        service = Service(settings, voice.say, origins)
+        service = Service(settings=settings, say=voice.say, origins=origins)
         serve = partial(
             _serve,
             service=service,

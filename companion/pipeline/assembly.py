@@ -120,15 +120,15 @@ def coverage(settings: Settings) -> Coverage:
     view = given.field_of_view_deg
     try:
         return Coverage(
-            None if view is None else np.radians(view),
-            radians(given.azimuth_limits_deg),
-            radians(given.elevation_limits_deg),
-            tuple(
+            field_of_view_rad=None if view is None else np.radians(view),
+            azimuth_limits_rad=radians(given.azimuth_limits_deg),
+            elevation_limits_rad=radians(given.elevation_limits_deg),
+            hidden=tuple(
                 Sector(
-                    math.radians(azimuth_from),
-                    math.radians(azimuth_to),
-                    math.radians(elevation_from),
-                    math.radians(elevation_to),
+                    azimuth_from_rad=math.radians(azimuth_from),
+                    azimuth_to_rad=math.radians(azimuth_to),
+                    elevation_from_rad=math.radians(elevation_from),
+                    elevation_to_rad=math.radians(elevation_to),
                 )
                 for azimuth_from, azimuth_to, elevation_from, elevation_to in given.hidden_deg
             ),
@@ -137,7 +137,7 @@ def coverage(settings: Settings) -> Coverage:
         raise ConfigError(f"array: {error}") from error
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Equipment:
     """What is needed, beside the pipeline, to answer questions about beams.
 
@@ -181,7 +181,14 @@ def equipment(settings: Settings, antenna: geometry.Array) -> Equipment:
         raise ConfigError(f"hardware.unit: {error}") from error
     channels = calibration(settings, antenna.size)
     budget, antennas = radio(settings)
-    return Equipment(codebook, channels, budget, antennas, device, gains)
+    return Equipment(
+        codebook=codebook,
+        calibration=channels,
+        budget=budget,
+        uav_antennas=antennas,
+        device=device,
+        unit_gains=gains,
+    )
 
 
 def precoder(settings: Settings) -> Precoder:
@@ -190,27 +197,31 @@ def precoder(settings: Settings) -> Precoder:
     budget, antennas = radio(settings)
     worth_db = 0.0 if settings.link.needed_sinr_db is not None else settings.link.needed_db
     return Precoder(
-        given.method,
-        given.policy,
-        given.loss_limit_db,
-        given.condition_limit,
-        given.regularisation,
-        given.normalisation,
-        given.priority,
-        given.widen,
-        worth_db + FLOOR_SPARE_DB if given.floor_db is None else given.floor_db,
-        given.power,
-        given.rate_weights,
-        budget,
-        antennas,
-        worth_db,
+        method=given.method,
+        policy=given.policy,
+        loss_limit_db=given.loss_limit_db,
+        condition_limit=given.condition_limit,
+        regularisation=given.regularisation,
+        normalisation=given.normalisation,
+        priority=given.priority,
+        widen=given.widen,
+        floor_db=worth_db + FLOOR_SPARE_DB if given.floor_db is None else given.floor_db,
+        power=given.power,
+        rate_weights=given.rate_weights,
+        budget=budget,
+        uav_antennas=antennas,
+        worth_db=worth_db,
     )
 
 
 def radio(settings: Settings) -> tuple[LinkBudget, int]:
     """The link budget, and the antennas that each UAV combines."""
     given = settings.radio
-    budget = LinkBudget(given.tx_power_dbm, given.bandwidth_hz, given.noise_figure_db)
+    budget = LinkBudget(
+        tx_power_dbm=given.tx_power_dbm,
+        bandwidth_hz=given.bandwidth_hz,
+        noise_figure_db=given.noise_figure_db,
+    )
     return budget, given.uav_antennas
 
 
@@ -218,7 +229,12 @@ def noise(settings: Settings) -> NoiseSettings:
     """Bounds on the errors of reports."""
     given = settings.observer
     most_m = given.position_noise_m
-    default = ReportNoise(most_m, most_m, most_m, given.velocity_noise_mps)
+    default = ReportNoise(
+        horizontal_m=most_m,
+        vertical_m=most_m,
+        position_m=most_m,
+        velocity_mps=given.velocity_noise_mps,
+    )
     return NoiseSettings(default, given.accuracy_factor if given.follow_accuracy else None)
 
 
@@ -277,11 +293,11 @@ def observer(settings: Settings) -> PositionObserver | KinematicObserver:
     if given.model == "position":
         return PositionObserver(
             PositionModel(
-                limits.speed_mps,
-                limits.acceleration_mps2,
-                None if given.alpha == "auto" else given.alpha,
-                given.feedthrough_s,
-                given.velocity_lead_s,
+                speed_mps=limits.speed_mps,
+                acceleration_mps2=limits.acceleration_mps2,
+                alpha=None if given.alpha == "auto" else given.alpha,
+                feedthrough_s=given.feedthrough_s,
+                velocity_lead_s=given.velocity_lead_s,
             )
         )
     gain = scheduled(kinematic_design(settings))
@@ -311,17 +327,17 @@ def tracker(settings: Settings) -> Tracker:
     return Tracker(
         observer(settings),
         TrackerSettings(
-            limits,
-            Ages(kept.coasting_s, kept.stale_s, kept.lost_s),
-            GateSettings(
-                kept.reacquire_reports,
-                kept.reacquire_s,
+            limits=limits,
+            ages=Ages(kept.coasting_s, kept.stale_s, kept.lost_s),
+            gate=GateSettings(
+                reacquire_reports=kept.reacquire_reports,
+                reacquire_s=kept.reacquire_s,
                 lead_m=lead_m,
                 drift_max=settings.clocks.drift_max_ppm * 1e-6,
             ),
-            kept.window_s,
-            feeds,
-            kept.most,
-            noise(settings),
+            window_s=kept.window_s,
+            feed_forward=feeds,
+            most=kept.most,
+            noise=noise(settings),
         ),
     )

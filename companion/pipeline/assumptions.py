@@ -37,7 +37,11 @@ class Assumptions:
             key = (one.uav, one.setting)
             if one.proven > AGAIN * self._told.get(key, 0.0):
                 self._told[key] = one.proven
-                out.append(Notice(one.t_ns, Severity.WARNING, one.uav, _said(one)))
+                out.append(
+                    Notice(
+                        t_ns=one.t_ns, severity=Severity.WARNING, subject=one.uav, text=_said(one)
+                    )
+                )
         return out
 
     def clock(
@@ -47,7 +51,14 @@ class Assumptions:
         drift = change.drift_ppm
         self._times[sender] = self._times.get(sender, 0) + 1
         out: list[Refuted | Notice] = [
-            Refuted(t_ns, sender, "clocks.drift_max_ppm", drift_max_ppm, drift, drift)
+            Refuted(
+                t_ns=t_ns,
+                uav=sender,
+                setting="clocks.drift_max_ppm",
+                limit=drift_max_ppm,
+                proven=drift,
+                raised_to=drift,
+            )
         ]
         if change.leapt or t_ns - self._told_ns.get(sender, -SILENT_NS) >= SILENT_NS:
             self._told_ns[sender] = t_ns
@@ -61,7 +72,7 @@ class Assumptions:
             else:
                 why = "its clock stood still, or its link got slower; both are allowed for"
                 text = f"all of {sender} comes {step} later than before: {why}"
-            out.append(Notice(t_ns, Severity.WARNING, sender, text))
+            out.append(Notice(t_ns=t_ns, severity=Severity.WARNING, subject=sender, text=text))
         return out
 
     def jumped(self, begun: Estimate) -> list[Refuted]:
@@ -73,7 +84,16 @@ class Assumptions:
         self._times[fix.uav] = self._times.get(fix.uav, 0) + 1
         limit_m = fix.noise.position_m
         name = "observer.position_noise_m"
-        return [Refuted(fix.arrival_ns, fix.uav, name, limit_m, jump_m, limit_m)]
+        return [
+            Refuted(
+                t_ns=fix.arrival_ns,
+                uav=fix.uav,
+                setting=name,
+                limit=limit_m,
+                proven=jump_m,
+                raised_to=limit_m,
+            )
+        ]
 
     def times(self, uav: str) -> int:
         """How often assumptions about a UAV were refuted."""

@@ -24,7 +24,7 @@ TIMESYNC: Final = "allow TIMESYNC ([presence] enabled), over a link both ways"
 STEADIER: Final = "use a MAVLink link of steadier delay"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
     """What is known of a UAV beside its track.
 

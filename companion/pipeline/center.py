@@ -113,22 +113,22 @@ class Center:
             errors = noise.relayed(
                 velocity,
                 report.alt_age_s,
-                placed.limits.speed_mps,
-                report.accuracy,
-                report.alt_datum,
-                self._accuracy_factor,
-                self._geoid_error_m,
+                speed_max_mps=placed.limits.speed_mps,
+                accuracy=report.accuracy,
+                datum=report.alt_datum,
+                factor=self._accuracy_factor,
+                geoid_error_m=self._geoid_error_m,
             )
         made = Fix(
-            report.uav,
-            placed.sender_ns,
-            placed.t_ns,
-            report.t_ns,
-            position,
-            velocity,
-            errors,
-            report,
-            placed.limits,
+            uav=report.uav,
+            sender_ns=placed.sender_ns,
+            t_ns=placed.t_ns,
+            arrival_ns=report.t_ns,
+            position_ned_m=position,
+            velocity_ned_mps=velocity,
+            noise=errors,
+            report=report,
+            limits=placed.limits,
         )
         return made, said
 
@@ -181,12 +181,12 @@ class Center:
         self._doubted_rad = self.attitude_bound_rad
         least_deg, doubted_deg = map(math.degrees, (self._least_bound_rad, self._doubted_rad))
         return Refuted(
-            status.t_ns,
-            str(status.source),
-            "center.attitude_bound_deg",
-            least_deg,
-            doubted_deg,
-            doubted_deg,
+            t_ns=status.t_ns,
+            uav=str(status.source),
+            setting="center.attitude_bound_deg",
+            limit=least_deg,
+            proven=doubted_deg,
+            raised_to=doubted_deg,
         )
 
     def _goes_on_before(self, placed: PlacedAttitude) -> bool:
@@ -216,15 +216,15 @@ class Center:
 
     def _first(self, report: Report) -> Notice:
         """Make the first position of all the origin of the local frame, and of ``home``."""
-        home = FixedCenter(report.lat_deg, report.lon_deg, report.alt_m)
+        home = FixedCenter(lat_deg=report.lat_deg, lon_deg=report.lon_deg, alt_m=report.alt_m)
         self._begin(home)
         place = f"{home.lat_deg:.6f}, {home.lon_deg:.6f}, {home.alt_m:.1f} m"
         if self.vehicle is not None:
             text = f"local frame begins at {place}"
-            return Notice(report.t_ns, Severity.INFO, "origin", text)
+            return Notice(t_ns=report.t_ns, severity=Severity.INFO, subject="origin", text=text)
         self.place, self._home_from = home, (report.uav, report.t_ns)
         text = f"home is where {report.uav} first reported: {place}; level, facing north"
-        return Notice(report.t_ns, Severity.INFO, "home", text)
+        return Notice(t_ns=report.t_ns, severity=Severity.INFO, subject="home", text=text)
 
     def moved(self, placed: PlacedReport, anew: Estimate) -> Notice | None:
         """Move ``home`` if the UAV that it began with was tracked anew soon, far above or below.
@@ -240,7 +240,7 @@ class Center:
             return None
         said = self._first(placed.report)
         text = f"home moves, for the first height was wrong: {said.text}"
-        return Notice(said.t_ns, Severity.WARNING, "home", text)
+        return Notice(t_ns=said.t_ns, severity=Severity.WARNING, subject="home", text=text)
 
     def _begin(self, at: FixedCenter) -> None:
         self.local = LocalFrame(at.lat_deg, at.lon_deg, at.alt_m)
@@ -288,5 +288,12 @@ class Center:
         bounds = carrier.AttitudeBounds(self.attitude_bound_rad, math.radians(turn_degps2))
         since_ns = at.sender_ns - made_ns
         return carrier.moving(
-            self.local, track, newest, attitude, since_ns, at.bound_s, bounds, self._contradicted
+            self.local,
+            track,
+            newest,
+            attitude=attitude,
+            since_ns=since_ns,
+            doubt_s=at.bound_s,
+            bounds=bounds,
+            contradicted=self._contradicted,
         )

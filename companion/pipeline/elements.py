@@ -25,27 +25,42 @@ def placed(settings: Settings) -> geometry.Array:
         match given.kind:
             case "ula":
                 return geometry.uniform_linear(
-                    given.elements, given.frequency_hz, spacing, mount, element, lever_arm_m
+                    given.elements,
+                    given.frequency_hz,
+                    spacing_wavelengths=spacing,
+                    array_from_body=mount,
+                    element=element,
+                    lever_arm_m=lever_arm_m,
                 )
             case "ura":
                 return geometry.uniform_rectangular(
                     given.rows,
-                    given.columns,
-                    given.frequency_hz,
-                    spacing,
-                    mount,
-                    element,
-                    lever_arm_m,
+                    columns=given.columns,
+                    frequency_hz=given.frequency_hz,
+                    spacing_wavelengths=spacing,
+                    array_from_body=mount,
+                    element=element,
+                    lever_arm_m=lever_arm_m,
                 )
             case "uca":
                 return geometry.uniform_circular(
-                    given.elements, given.frequency_hz, spacing, mount, element, lever_arm_m
+                    given.elements,
+                    given.frequency_hz,
+                    spacing_wavelengths=spacing,
+                    array_from_body=mount,
+                    element=element,
+                    lever_arm_m=lever_arm_m,
                 )
             case "list":
                 placed = _rows(given.positions_m or ())
                 outward = placed[:, 3:6] if placed.shape[1] == 6 else None
                 return geometry.listed(
-                    placed[:, :3], given.frequency_hz, mount, element, lever_arm_m, outward
+                    placed[:, :3],
+                    given.frequency_hz,
+                    array_from_body=mount,
+                    element=element,
+                    lever_arm_m=lever_arm_m,
+                    outward=outward,
                 )
     except UserError as error:
         raise ConfigError(f"array: {error}") from error

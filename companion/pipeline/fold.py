@@ -114,7 +114,7 @@ class Pipeline:
         self.targets = Targets(settings, self.center.vehicle)
         self.assumptions = Assumptions()
         budget, antennas = assembly.radio(settings)
-        site = Site(self.array, self.coverage, budget, antennas)
+        site = Site(array=self.array, coverage=self.coverage, budget=budget, uav_antennas=antennas)
         self.health = Health(settings.link, site)
 
     # --- the fold ---------------------------------------------------------------------------
@@ -155,7 +155,7 @@ class Pipeline:
         text = (
             f"this machine's clock was set {way} by {abs(step_s):.3f} s: all times are said by it"
         )
-        return [Notice(event.t_ns, Severity.WARNING, "clock", text)]
+        return [Notice(t_ns=event.t_ns, severity=Severity.WARNING, subject="clock", text=text)]
 
     def _frame(self, frame: Frame) -> list[Output]:
         self.frames += 1
@@ -193,7 +193,7 @@ class Pipeline:
         report = placed.report
         begins = self.center.seeks_home or report.uav not in self.tracker
         if begins and not self.senders.vouch(report, self.center.seeks_home):
-            return [Rejection(report.t_ns, report.uav, Reason.NO_FIX)]
+            return [Rejection(t_ns=report.t_ns, source=report.uav, reason=Reason.NO_FIX)]
         fix, begun = self.center.fix(placed)
         fix, refuted = self.tracker.refuted(fix)
         said: list[Output] = [*begun, *self.assumptions.told(refuted)]
@@ -208,7 +208,11 @@ class Pipeline:
             said += self.assumptions.jumped(accepted)
             said += self._move_home(placed, accepted)
             text = f"{fix.uav} is tracked anew: its reports agree, but not with its past"
-            return [*said, Notice(fix.arrival_ns, Severity.WARNING, fix.uav, text), accepted]
+            return [
+                *said,
+                Notice(t_ns=fix.arrival_ns, severity=Severity.WARNING, subject=fix.uav, text=text),
+                accepted,
+            ]
         return [*said, accepted]
 
     def _move_home(self, placed: PlacedReport, anew: Estimate) -> list[Output]:
@@ -268,12 +272,12 @@ class Pipeline:
         now = None if vehicle is None else self.senders.time(vehicle, now_ns)
         age_s = None if now is None else self.center.attitude_age_s(now)
         return Evidence(
-            self._is_assumed(uav),
-            self.refusals.unheard(uav),
-            self.center.attitude_bound_rad,
-            0.0 if age_s is None else age_s,
-            0.0 if now is None else now.bound_s,
-            vehicle is not None and self._is_assumed(vehicle),
+            clock_assumed=self._is_assumed(uav),
+            refused=self.refusals.unheard(uav),
+            attitude_bound_rad=self.center.attitude_bound_rad,
+            attitude_age_s=0.0 if age_s is None else age_s,
+            carrier_doubt_s=0.0 if now is None else now.bound_s,
+            carrier_assumed=vehicle is not None and self._is_assumed(vehicle),
         )
 
     def _is_assumed(self, sender: str) -> bool:
@@ -313,19 +317,21 @@ class Pipeline:
         def made() -> Update:
             beams = aim(
                 now_ns,
-                valid_at_ns,
-                [*tracks, *spared],
-                known,
-                self.array,
-                self.precoder,
-                self.coverage,
-                before,
+                valid_at_ns=valid_at_ns,
+                tracks=[*tracks, *spared],
+                carrier=known,
+                array=self.array,
+                precoder=self.precoder,
+                coverage=self.coverage,
+                before=before,
             )
             if spared:
                 beams = without(beams, {track.uav for track in spared})
             if others:
                 beams = replace(beams, left_out=(*beams.left_out, *others))
-            return Update(now_ns, known, unfit, tuple(tracks), beams)
+            return Update(
+                t_ns=now_ns, carrier=known, unfit=unfit, tracks=tuple(tracks), beams=beams
+            )
 
         return made
 

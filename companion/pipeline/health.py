@@ -50,7 +50,7 @@ RANK: Final = {Level.NONE: 0, Level.WEAK: 1, Level.GOOD: 2}
 """Levels from the worst to the best."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Site:
     """What stands behind every beam: the array, its reach, its radio."""
 
@@ -114,7 +114,9 @@ class Health:
         needed_db = _needed_db(self._need, self._site, beam_set, towards)
         least_db = self._least_db(beam_set, towards, which)
         return [
-            _Link(beam_set.beams[i], needed_db[i], sure_db, likely_db)
+            _Link(
+                beam=beam_set.beams[i], needed_db=needed_db[i], sure_db=sure_db, likely_db=likely_db
+            )
             for i, sure_db, likely_db in zip(which, *least_db, strict=True)
         ]
 
@@ -156,7 +158,15 @@ class Health:
         if level is not Level.GOOD and carrier is not None:
             known = tracks[uav], carrier, link.needed_db, evidence(uav)
             why = blame.of_beam(link.beam, *known)
-        return Verdict(uav, level, why, update.t_ns, link.needed_db, link.sure_db, link.likely_db)
+        return Verdict(
+            uav=uav,
+            level=level,
+            blame=why,
+            since_ns=update.t_ns,
+            needed_db=link.needed_db,
+            guaranteed_db=link.sure_db,
+            likely_db=link.likely_db,
+        )
 
     def _least_db(
         self, beam_set: BeamSet, towards: FloatArray, which: Sequence[int]
@@ -214,7 +224,11 @@ class Health:
         if update.unfit is not None:
             text = f"no links: {update.unfit}"
             news = before and was is None
-            return [Notice(update.t_ns, Severity.WARNING, "beams", text)] if news else []
+            return (
+                [Notice(t_ns=update.t_ns, severity=Severity.WARNING, subject="beams", text=text)]
+                if news
+                else []
+            )
         changed = dict[tuple[Level, Cause | None], list[Verdict]]()
         for uav, verdict in self.verdicts.items():
             held = before.get(uav)
@@ -234,18 +248,18 @@ def _notice(t_ns: int, alike: Sequence[Verdict]) -> Notice:
     one, links = alike[0], "links" if len(alike) > 1 else "link"
     text = f"{links} to {names}{rest}: {one.level}"
     if one.blame is None:
-        return Notice(t_ns, Severity.INFO, one.uav, text)
+        return Notice(t_ns=t_ns, severity=Severity.INFO, subject=one.uav, text=text)
     text += f" – {one.blame.reason}; {one.blame.remedy}"
-    return Notice(t_ns, Severity.WARNING, one.uav, text)
+    return Notice(t_ns=t_ns, severity=Severity.WARNING, subject=one.uav, text=text)
 
 
 def _of_left_out(update: Update, tracks: dict[str, Track]) -> dict[str, Verdict]:
     return {
         out.uav: Verdict(
-            out.uav,
-            Level.NONE,
-            blame.of_left_out(out, tracks.get(out.uav), update.unfit),
-            update.t_ns,
+            uav=out.uav,
+            level=Level.NONE,
+            blame=blame.of_left_out(out, tracks.get(out.uav), update.unfit),
+            since_ns=update.t_ns,
         )
         for out in update.beams.left_out
     }
@@ -269,11 +283,11 @@ def _needed_db(
     sinr_db = link_budget.predicted_sinr_db(
         site.array,
         towards,
-        np.array([beam.range_m for beam in beams]),
-        sent,
-        groups,
-        site.budget,
-        site.uav_antennas,
+        ranges_m=np.array([beam.range_m for beam in beams]),
+        sent=sent,
+        groups=groups,
+        budget=site.budget,
+        uav_antennas=site.uav_antennas,
     )
     spare_db = sinr_db - need.needed_sinr_db
     return [beam.gain_db - spare for beam, spare in zip(beams, spare_db.tolist(), strict=True)]

@@ -40,7 +40,7 @@ class OfSender:
     recent: deque[Rejection] = field(default_factory=lambda: deque(maxlen=RECENT))
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Unheard:
     """A run of refused reports of one sender, without one between that was used."""
 
@@ -70,7 +70,9 @@ class Refusals:
             return None
         run = self._unheard.get(uav)
         if run is None:
-            run = self._unheard.setdefault(uav, _Unheard(refused.t_ns, refused.reason))
+            run = self._unheard.setdefault(
+                uav, _Unheard(since_ns=refused.t_ns, reason=refused.reason)
+            )
             if len(self._unheard) > SENDERS_MAX:  # the oldest: made-up ids must not silence others
                 del self._unheard[next(iter(self._unheard))]
         run.reports += 1
@@ -86,7 +88,7 @@ class Refusals:
         self._told_ns[uav] = refused.t_ns
         why = f"{refused.reason}, {refused.detail}" if refused.detail else str(refused.reason)
         text = f"no report of {uav} was used for {lasted_ns * 1e-9:.1f} s: {why}"
-        return Notice(refused.t_ns, Severity.WARNING, uav, text)
+        return Notice(t_ns=refused.t_ns, severity=Severity.WARNING, subject=uav, text=text)
 
     def used(self, uav: str) -> None:
         """Note that a report was used."""

@@ -69,7 +69,7 @@ APART_SHARE: Final = 0.1
 """Share of the newest report in how far the two heights are apart of late."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PlacedReport:
     """A report with its time.
 
@@ -95,7 +95,7 @@ class PlacedAttitude:
     sender_ns: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Heard:
     """The outcome of one frame.
 
@@ -174,7 +174,7 @@ class Senders:
                 return self._attitude(message)
             case EstimatorStatus():
                 carries = message.source == self._carrier_source
-                return Heard(message) if carries else NOTHING
+                return Heard(message=message) if carries else NOTHING
             case None:
                 return NOTHING
             case _:
@@ -244,10 +244,16 @@ class Senders:
         stamp, restarted = self._stamp(uav, t_ns, report.boot_ms, doubt_ns)
         said = _restart_notice(t_ns, uav, report.boot_ms) if restarted else ()
         if self._clock(uav).is_shared(t_ns):
-            return Heard(None, (*said, *self._shared_id(uav, t_ns)), restarted)
+            return Heard(
+                message=None, said=(*said, *self._shared_id(uav, t_ns)), restarted=restarted
+            )
         self._shared.discard(uav)
         if stamp is None:
-            return Heard(None, (*said, Rejection(t_ns, uav, Reason.UNPLACED_STAMP)), restarted)
+            return Heard(
+                message=None,
+                said=(*said, Rejection(t_ns=t_ns, source=uav, reason=Reason.UNPLACED_STAMP)),
+                restarted=restarted,
+            )
         self._dedupe.took(stamp.latency_s)
         errors = self._noise.get(report.source, self._noise_settings.default)
         assumed = self.assumed(uav)
@@ -255,8 +261,14 @@ class Senders:
         errors = replace(errors, time_s=assumed.lag_rest_s, apart_m=self._apart(report))
         true_ns = t_ns - round(stamp.latency_s * 1e9) - lag_ns
         known = errors if reports_itself(uav) else None
-        placed = PlacedReport(report, stamp.sender_ns - lag_ns, true_ns, known, assumed.limits)
-        return Heard(placed, said, restarted, self._clock(uav).change)
+        placed = PlacedReport(
+            report=report,
+            sender_ns=stamp.sender_ns - lag_ns,
+            t_ns=true_ns,
+            noise=known,
+            limits=assumed.limits,
+        )
+        return Heard(message=placed, said=said, restarted=restarted, change=self._clock(uav).change)
 
     def _apart(self, report: Report) -> float:
         """By how much a receiver's own heights differ from its autopilot's of late, in metres."""
@@ -281,11 +293,17 @@ class Senders:
             return Heard(said=(merged,))
         true_ns = merged.t_ns - round((merged.tslc_s or 0.0) * 1e9)
         limits = self.assumed(said.uav).limits
-        placed = PlacedReport(merged, true_ns, true_ns, None, limits)
+        placed = PlacedReport(
+            report=merged, sender_ns=true_ns, t_ns=true_ns, noise=None, limits=limits
+        )
         if datum in (None, merged.alt_datum):
-            return Heard(placed)
+            return Heard(message=placed)
         text = f"{said.uav} is tracked anew: its altitude is {merged.alt_datum} now, not {datum}"
-        return Heard(placed, (Notice(said.t_ns, Severity.INFO, said.uav, text),), said.uav)
+        return Heard(
+            message=placed,
+            said=(Notice(t_ns=said.t_ns, severity=Severity.INFO, subject=said.uav, text=text),),
+            restarted=said.uav,
+        )
 
     def _remote_id(self, frame: Frame, said: RemoteId) -> Heard:
         """Place a position that an aircraft broadcasts, by the stamp that it has."""
@@ -307,16 +325,20 @@ class Senders:
         stamp, restarted = self._stamp(carrier, attitude.t_ns, attitude.boot_ms)
         said = _restart_notice(attitude.t_ns, carrier, attitude.boot_ms) if restarted else ()
         placed = None if stamp is None else PlacedAttitude(attitude, stamp.sender_ns)
-        return Heard(placed, said, restarted, self._clock(carrier).change)
+        return Heard(
+            message=placed, said=said, restarted=restarted, change=self._clock(carrier).change
+        )
 
     def _shared_id(self, uav: str, t_ns: int) -> tuple[Notice | Rejection, ...]:
         """Reject a report under an id with two boot clocks; the notice is given once."""
-        refused = Rejection(t_ns, uav, Reason.SHARED_ID, detail="two boot clocks under this id")
+        refused = Rejection(
+            t_ns=t_ns, source=uav, reason=Reason.SHARED_ID, detail="two boot clocks under this id"
+        )
         if uav in self._shared:
             return (refused,)
         self._shared.add(uav)
         text = f"two vehicles share the id {uav}: neither is believed"
-        return Notice(t_ns, Severity.WARNING, uav, text), refused
+        return Notice(t_ns=t_ns, severity=Severity.WARNING, subject=uav, text=text), refused
 
     def vouch(self, report: Report, always: bool) -> bool:
         """Take in a report that would begin a track. Returns whether one may begin with it.
@@ -373,15 +395,15 @@ class Senders:
         known = clock.time(node_ns) if clock else None
         if known is None:
             bound_s = noise.ADSB_TIME_BOUND_S
-            return SenderTime(node_ns, node_ns, bound_s, bound_s)
+            return SenderTime(node_ns=node_ns, sender_ns=node_ns, before_s=bound_s, after_s=bound_s)
         offset_ns, before_s, after_s, usual_s = known
         rest_s = self.assumed(uav).lag_rest_s
         return SenderTime(
-            node_ns,
-            node_ns - offset_ns,
-            before_s + rest_s,
-            after_s + rest_s,
-            math.hypot(usual_s, rest_s),
+            node_ns=node_ns,
+            sender_ns=node_ns - offset_ns,
+            before_s=before_s + rest_s,
+            after_s=after_s + rest_s,
+            usual_s=math.hypot(usual_s, rest_s),
         )
 
     def clock_estimate(self, uav: str) -> ClockEstimate | None:
@@ -446,9 +468,9 @@ class Senders:
 
 
 def _refused(message: Report | AdsbVehicle, reason: Reason) -> Heard:
-    return Heard(said=(Rejection(message.t_ns, message.uav, reason),))
+    return Heard(said=(Rejection(t_ns=message.t_ns, source=message.uav, reason=reason),))
 
 
 def _restart_notice(t_ns: int, name: str, boot_ms: int) -> tuple[Notice]:
     text = f"{name} was restarted: its boot clock stepped back to {boot_ms / 1e3:.1f} s"
-    return (Notice(t_ns, Severity.WARNING, name, text),)
+    return (Notice(t_ns=t_ns, severity=Severity.WARNING, subject=name, text=text),)

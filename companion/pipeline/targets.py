@@ -90,7 +90,9 @@ class Targets:
         for uav in changed:
             bad = states[uav] in (TrackState.STALE, TrackState.LOST)
             severity = Severity.WARNING if bad else Severity.INFO
-            notices.append(Notice(now_ns, severity, uav, f"{uav} is {states[uav]}"))
+            notices.append(
+                Notice(t_ns=now_ns, severity=severity, subject=uav, text=f"{uav} is {states[uav]}")
+            )
         return notices
 
     def dropped(self, now_ns: int, silent: Iterable[str]) -> list[Notice]:
@@ -100,10 +102,10 @@ class Targets:
         """
         return [
             Notice(
-                now_ns,
-                Severity.INFO,
-                uav,
-                f"{uav} is dropped: nothing of it for {self._dropped_s:.0f} s",
+                t_ns=now_ns,
+                severity=Severity.INFO,
+                subject=uav,
+                text=f"{uav} is dropped: nothing of it for {self._dropped_s:.0f} s",
             )
             for uav in self.among(silent)
         ]

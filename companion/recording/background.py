@@ -90,6 +90,7 @@ class BackgroundRecorder:
 
     def __init__(
         self,
+        *,
         open_part: Callable[[Part], Writer],
         geodetic: Geodetic,
         rotation: Rotation = NEVER,

@@ -209,14 +209,23 @@ def to_frame(data: bytes, sources: dict[tuple[int, int], Source]) -> Frame:
     if source is None:
         source = sources.setdefault(ids, Source(*ids))
     doubt_ns = message.doubt_ns
-    return Frame(message.t_ns, message.link, source, message.msgid, message.raw, doubt_ns)
+    return Frame(
+        t_ns=message.t_ns,
+        link=message.link,
+        source=source,
+        msgid=message.msgid,
+        raw=message.raw,
+        doubt_ns=doubt_ns,
+    )
 
 
 def to_round_trip(data: bytes) -> RoundTrip:
     """Read a round trip. Raises ``DecodeError`` for bytes that are no such message."""
     message = schemas.RoundTripMessage.FromString(data)
     source = Source(message.sysid, message.compid)
-    return RoundTrip(message.t_ns, source, message.sent_ns, message.remote_ns)
+    return RoundTrip(
+        t_ns=message.t_ns, source=source, sent_ns=message.sent_ns, remote_ns=message.remote_ns
+    )
 
 
 def to_duty(data: bytes) -> Duty:
@@ -241,10 +250,10 @@ def to_rejection(data: bytes) -> Rejection | None:
     if not message.is_event:
         return None
     return Rejection(
-        message.t_ns,
-        message.source,
-        Reason(message.reason),
-        message.count,
-        message.msgid if message.HasField("msgid") else None,
-        message.detail,
+        t_ns=message.t_ns,
+        source=message.source,
+        reason=Reason(message.reason),
+        count=message.count,
+        msgid=message.msgid if message.HasField("msgid") else None,
+        detail=message.detail,
     )

@@ -186,7 +186,13 @@ class Walk:
             if channel is None or channel.schema_id not in self._described:
                 orphaned += _HEADER.size + len(body)
             elif topics is None or channel.topic in topics:
-                yield Message(channel, sequence, log_ns, publish_ns, body[_MESSAGE.size :])
+                yield Message(
+                    channel=channel,
+                    sequence=sequence,
+                    log_time_ns=log_ns,
+                    publish_time_ns=publish_ns,
+                    data=body[_MESSAGE.size :],
+                )
         if orphaned:  # the chunk that described their channel was damaged
             self.lost_bytes += orphaned
             yield Damage(orphaned)

@@ -19,7 +19,7 @@ _LASTS: Final = re.compile(r"(\d+(?:\.\d+)?)s$")
 _END_NS: Final = 2**62
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DeclaredFault:
     """A fault of one vehicle, by its system id, between two times of the log."""
 
@@ -60,7 +60,7 @@ def _faults(events: list[tuple[int, int, str]]) -> list[DeclaredFault]:
             if lasts is None and other == sysid and _ends(name, said):
                 ends_ns = later_ns
                 break
-        found.append(DeclaredFault(sysid, name, at_ns, ends_ns))
+        found.append(DeclaredFault(sysid=sysid, name=name, from_ns=at_ns, to_ns=ends_ns))
     return found
 
 

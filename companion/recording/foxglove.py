@@ -48,6 +48,7 @@ class LiveChannels:
 
     def __init__(
         self,
+        *,
         host: str,
         port: int,
         geodetic: Geodetic,

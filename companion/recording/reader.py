@@ -269,7 +269,11 @@ def _recorded(path: Path) -> Iterator[Event]:
                 raise ValueError("an event that is beyond all time")
             if damaged:
                 yield Rejection(
-                    t_ns, path.name, Reason.GARBAGE, damaged, detail="recording damaged"
+                    t_ns=t_ns,
+                    source=path.name,
+                    reason=Reason.GARBAGE,
+                    count=damaged,
+                    detail="recording damaged",
                 )
                 damaged = 0
             t_ns = event.t_ns

@@ -33,7 +33,7 @@ class BeingRecordedError(LogError):
     """The recording is not a leftover: a process has it open."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Recovered:
     """The result of recovering a recording.
 
@@ -152,7 +152,13 @@ class _Tally:
         self._last_ns = max(self._last_ns or 0, message.log_time_ns)
 
     def result(self, path: Path, lost_bytes: int, *, changed: bool) -> Recovered:
-        return Recovered(path, dict(self._messages), self._last_ns, lost_bytes, changed)
+        return Recovered(
+            path=path,
+            messages=dict(self._messages),
+            last_ns=self._last_ns,
+            lost_bytes=lost_bytes,
+            changed=changed,
+        )
 
 
 class _Copy:

@@ -98,21 +98,26 @@ def read_tlog(data: bytes, link: str) -> Iterator[Event]:
         for stamp_ns, frame, lost in group:
             off_ns = None if stamp_ns is None else timeline.place(stamp_ns)
             for reason, count in lost.items():
-                yield Rejection(timeline.t_ns, link, reason, count)
+                yield Rejection(t_ns=timeline.t_ns, source=link, reason=reason, count=count)
             if frame is None:
                 return
             if off_ns is not None:
                 yield _bad_stamp(timeline.t_ns, link, off_ns)
             elif stamp_ns is None:
-                yield Rejection(timeline.t_ns, link, Reason.BAD_STAMP, detail="no stamp")
+                yield Rejection(
+                    t_ns=timeline.t_ns, source=link, reason=Reason.BAD_STAMP, detail="no stamp"
+                )
             source, msgid, raw = frame
-            yield Frame(timeline.t_ns, link, source, msgid, raw)
+            yield Frame(t_ns=timeline.t_ns, link=link, source=source, msgid=msgid, raw=raw)
 
 
 def _bad_stamp(t_ns: int, link: str, off_ns: int) -> Rejection:
     way = "back" if off_ns < 0 else "ahead"
     return Rejection(
-        t_ns, link, Reason.BAD_STAMP, detail=f"{abs(off_ns) / 1e9:.6g} s {way}, clamped"
+        t_ns=t_ns,
+        source=link,
+        reason=Reason.BAD_STAMP,
+        detail=f"{abs(off_ns) / 1e9:.6g} s {way}, clamped",
     )
 
 
@@ -189,7 +194,14 @@ def _at(event: Event, t_ns: int) -> Event:
     if isinstance(event, Frame):
         return event._replace(t_ns=t_ns)
     if isinstance(event, Rejection):
-        return Rejection(t_ns, event.source, event.reason, event.count, event.msgid, event.detail)
+        return Rejection(
+            t_ns=t_ns,
+            source=event.source,
+            reason=event.reason,
+            count=event.count,
+            msgid=event.msgid,
+            detail=event.detail,
+        )
     return event
 
 

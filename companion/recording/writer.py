@@ -78,6 +78,7 @@ class Writer:
 
     def __init__(
         self,
+        *,
         where: Path,
         settings_toml: str,
         versions: Mapping[str, str],

@@ -84,7 +84,9 @@ def add(app: FastAPI, node: Node, turns: Turns) -> None:
             if shown * points > MOST_ANGLES:
                 wanted = f"{shown} beams at {points} angles"
                 raise HTTPException(422, f"{wanted}: say uav, or fewer points")
-            return encode(beam_state.pattern(pipeline, update, cut, points, uav, lead_ms))
+            return encode(
+                beam_state.pattern(pipeline, update, cut, points=points, only=uav, lead_ms=lead_ms)
+            )
 
         return as_json(await moments.made(lead_ms, (cut, points, uav), make))
 

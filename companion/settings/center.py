@@ -23,7 +23,7 @@ class VehicleCenter:
         return str(self.source)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FixedCenter:
     """The array stands level at a fixed place.
 
@@ -73,7 +73,12 @@ def parse_center(text: str) -> CenterPlace:
     if abs(numbers[2]) > HEIGHT_MAX_M or any(abs(heading) > 360 for heading in numbers[3:]):
         raise UserError(f"{shown(text)}: altitude is within 100 km and heading within 360 degrees")
     lat_deg, lon_deg, alt_m, *heading_deg = numbers
-    return FixedCenter(lat_deg, lon_deg, alt_m, heading_deg[0] if heading_deg else 0.0)
+    return FixedCenter(
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        alt_m=alt_m,
+        heading_deg=heading_deg[0] if heading_deg else 0.0,
+    )
 
 
 def _center_text(text: str) -> str:

@@ -80,9 +80,17 @@ def fixed(
     body_from_local = body_from_ned(0.0, 0.0, heading_rad) @ local.local_from_ned(*place[:2]).T
     still = np.zeros(3)
     return Carrier(
-        valid_at_ns, local.position_ned_m(*place), still, body_from_local, still, 0.0, 0.0, None,
-        0.0, 0.0,
-    )  # fmt: skip
+        valid_at_ns=valid_at_ns,
+        position_ned_m=local.position_ned_m(*place),
+        velocity_ned_mps=still,
+        body_from_local=body_from_local,
+        body_rates_radps=still,
+        bound_m=0.0,
+        attitude_bound_rad=0.0,
+        age_s=None,
+        error_p95_m=0.0,
+        attitude_p95_rad=0.0,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,12 +221,12 @@ class Turns:
             return None
         to = self._raised.to_hold(proven, sender_ns)
         return Refuted(
-            attitude.t_ns,
-            str(attitude.source),
-            "center.turn_acceleration_max_degps2",
-            limit,
-            proven,
-            to,
+            t_ns=attitude.t_ns,
+            uav=str(attitude.source),
+            setting="center.turn_acceleration_max_degps2",
+            limit=limit,
+            proven=proven,
+            raised_to=to,
         )
 
 
@@ -226,6 +234,7 @@ def moving(
     local: LocalFrame,
     track: Track,
     newest: Fix,
+    *,
     attitude: Attitude,
     since_ns: int,
     doubt_s: float,
@@ -250,14 +259,14 @@ def moving(
     then = body_from_ned(attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad)
     local_from_ned = local.local_from_ned(newest.report.lat_deg, newest.report.lon_deg)
     return Carrier(
-        track.valid_at_ns,
-        track.position_ned_m,
-        track.velocity_ned_mps,
-        later_body_from_body(rates, age_s) @ then @ local_from_ned.T,
-        rates,
-        track.bound_m,
-        bound_rad,
-        track.age_s,
-        track.error_p95_m,
-        USUAL_ATTITUDE * bounds.attitude_rad,
+        valid_at_ns=track.valid_at_ns,
+        position_ned_m=track.position_ned_m,
+        velocity_ned_mps=track.velocity_ned_mps,
+        body_from_local=later_body_from_body(rates, age_s) @ then @ local_from_ned.T,
+        body_rates_radps=rates,
+        bound_m=track.bound_m,
+        attitude_bound_rad=bound_rad,
+        age_s=track.age_s,
+        error_p95_m=track.error_p95_m,
+        attitude_p95_rad=USUAL_ATTITUDE * bounds.attitude_rad,
     )

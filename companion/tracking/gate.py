@@ -26,7 +26,7 @@ SHARED_S: Final = 3.0
 """Seconds for which they must do so."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class GateSettings:
     """When refused reports become the track.
 

@@ -19,7 +19,7 @@ from typing import Final
 from companion.values import Fix, Vector
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Way:
     """A way of feeding acceleration forward.
 
@@ -36,11 +36,17 @@ class Way:
     turns: bool = False
 
 
-PLAIN: Final = Way(0.0, 0, 1.0)
+PLAIN: Final = Way(window_s=0.0, fewest=0, fades_s=1.0)
 WAYS: Final = (
-    PLAIN, Way(1.0, 3, 3.0), Way(1.0, 3, 10.0), Way(2.5, 3, 10.0), Way(5.0, 5, 3.0),
-    Way(1.0, 3, 3.0, turns=True), Way(2.5, 3, 3.0, turns=True), Way(5.0, 5, 3.0, turns=True),
-)  # fmt: skip
+    PLAIN,
+    Way(window_s=1.0, fewest=3, fades_s=3.0),
+    Way(window_s=1.0, fewest=3, fades_s=10.0),
+    Way(window_s=2.5, fewest=3, fades_s=10.0),
+    Way(window_s=5.0, fewest=5, fades_s=3.0),
+    Way(window_s=1.0, fewest=3, fades_s=3.0, turns=True),
+    Way(window_s=2.5, fewest=3, fades_s=3.0, turns=True),
+    Way(window_s=5.0, fewest=5, fades_s=3.0, turns=True),
+)
 """None; a quick turn, soon over or not; one that goes on; a slow one, noisy reports; circles."""
 WINDOWS: Final = ((1.0, 3), (2.5, 3), (5.0, 5))
 """Windows of the ways and the velocities they need, each once, ascending."""
@@ -70,7 +76,7 @@ SPACING_S: Final = 0.3
 _KEPT: Final = 64
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Made:
     """What was known at a report: from it predictions by every way can be made again."""
 
@@ -107,7 +113,7 @@ class _Made:
         return reported, smoothed
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Errors:
     """The newest errors of predictions of about one age."""
 
@@ -192,7 +198,15 @@ class Hindsight:
                 errors.add(made.off_m(self._way, there, age_s), age_s)
         if fix.velocity_ned_mps is not None:
             velocity, aside = fix.velocity_ned_mps, self._aside
-            self._made.append(_Made(fix.sender_ns, there, velocity, accelerations, aside))
+            self._made.append(
+                _Made(
+                    sender_ns=fix.sender_ns,
+                    position=there,
+                    velocity=velocity,
+                    accelerations=accelerations,
+                    aside=aside,
+                )
+            )
 
     def _older(self, sender_ns: int, least_s: float) -> _Made | None:
         """The newest of what is remembered that is at least so old, and not twice as old."""

@@ -38,7 +38,7 @@ class Airframe(StrEnum):
     ADSB = "adsb"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AirframeLimits:
     """What is assumed of a kind of aircraft.
 
@@ -59,13 +59,27 @@ class AirframeLimits:
 ANY_LAG_S: Final = (0.0, 0.06)
 """Lag of an autopilot of which nothing is known."""
 LIMITS: Final = {
-    Airframe.COPTER: AirframeLimits(60.0, 4.0, ANY_LAG_S, 180.0),
-    Airframe.AEROPLANE: AirframeLimits(80.0, 16.0, ANY_LAG_S, 720.0),
-    Airframe.VTOL: AirframeLimits(80.0, 16.0, ANY_LAG_S, 720.0),
-    Airframe.HELICOPTER: AirframeLimits(80.0, 8.0, ANY_LAG_S, 180.0),
-    Airframe.ROVER: AirframeLimits(40.0, 5.0, ANY_LAG_S, 90.0),
-    Airframe.UNKNOWN: AirframeLimits(80.0, 16.0, ANY_LAG_S, 270.0),
-    Airframe.ADSB: AirframeLimits(400.0, 16.0, (0.0, 0.0), 720.0),
+    Airframe.COPTER: AirframeLimits(
+        speed_mps=60.0, acceleration_mps2=4.0, lag_s=ANY_LAG_S, turn_degps2=180.0
+    ),
+    Airframe.AEROPLANE: AirframeLimits(
+        speed_mps=80.0, acceleration_mps2=16.0, lag_s=ANY_LAG_S, turn_degps2=720.0
+    ),
+    Airframe.VTOL: AirframeLimits(
+        speed_mps=80.0, acceleration_mps2=16.0, lag_s=ANY_LAG_S, turn_degps2=720.0
+    ),
+    Airframe.HELICOPTER: AirframeLimits(
+        speed_mps=80.0, acceleration_mps2=8.0, lag_s=ANY_LAG_S, turn_degps2=180.0
+    ),
+    Airframe.ROVER: AirframeLimits(
+        speed_mps=40.0, acceleration_mps2=5.0, lag_s=ANY_LAG_S, turn_degps2=90.0
+    ),
+    Airframe.UNKNOWN: AirframeLimits(
+        speed_mps=80.0, acceleration_mps2=16.0, lag_s=ANY_LAG_S, turn_degps2=270.0
+    ),
+    Airframe.ADSB: AirframeLimits(
+        speed_mps=400.0, acceleration_mps2=16.0, lag_s=(0.0, 0.0), turn_degps2=720.0
+    ),
 }
 """From real and simulated logs: docs/field-notes.md 1."""
 ARDUPILOT_LAG_S: Final = {Airframe.COPTER: (0.019, 0.040), Airframe.AEROPLANE: (-0.033, -0.019)}
@@ -182,4 +196,11 @@ class Refutations:
         self, raised: Raised, fix: Fix, setting: str, limit: float, proven: float
     ) -> Refuted:
         to = raised.to_hold(proven, fix.sender_ns)
-        return Refuted(fix.arrival_ns, fix.uav, setting, limit, proven, to)
+        return Refuted(
+            t_ns=fix.arrival_ns,
+            uav=fix.uav,
+            setting=setting,
+            limit=limit,
+            proven=proven,
+            raised_to=to,
+        )

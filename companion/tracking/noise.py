@@ -56,10 +56,10 @@ def reported(status: GnssStatus, settings: NoiseSettings) -> ReportNoise:
     horizontal_m = _bound(status.h_acc_m, factor, default.horizontal_m, least_m)
     vertical_m = _bound(status.v_acc_m, factor, default.vertical_m, least_m)
     return ReportNoise(
-        horizontal_m,
-        vertical_m,
-        math.hypot(horizontal_m, vertical_m),
-        _bound(status.vel_acc_mps, factor, default.velocity_mps),
+        horizontal_m=horizontal_m,
+        vertical_m=vertical_m,
+        position_m=math.hypot(horizontal_m, vertical_m),
+        velocity_mps=_bound(status.vel_acc_mps, factor, default.velocity_mps),
     )
 
 
@@ -70,6 +70,7 @@ def _bound(accuracy: float | None, factor: float, default: float, least: float =
 def relayed(
     velocity_ned_mps: Vector | None,
     alt_age_s: float,
+    *,
     speed_max_mps: float,
     accuracy: Accuracy | None = None,
     datum: AltitudeDatum | None = None,
@@ -97,4 +98,9 @@ def relayed(
         height_m = geoid_m + _bound(known.vertical_m, factor or 0.0, ADSB_NOISE_M)
     vertical_m = height_m + way_m + alt_age_s * speed_max_mps
     velocity_mps = _bound(known.velocity_mps, factor or 0.0, ADSB_VELOCITY_NOISE_MPS)
-    return ReportNoise(horizontal_m, vertical_m, math.hypot(horizontal_m, vertical_m), velocity_mps)
+    return ReportNoise(
+        horizontal_m=horizontal_m,
+        vertical_m=vertical_m,
+        position_m=math.hypot(horizontal_m, vertical_m),
+        velocity_mps=velocity_mps,
+    )

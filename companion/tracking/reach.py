@@ -72,7 +72,13 @@ def reach(fix: Fix, limits: Limits, predicted_ned_m: Vector, at: SenderTime) -> 
     center, radius = _ball(fix, ends, radii)
     if noise.position_m + way < radius:
         center, radius = fix.position_ned_m, noise.position_m + way
-    return Reach(min(bound, math.hypot(horizontal, vertical)), horizontal, vertical, center, radius)
+    return Reach(
+        bound_m=min(bound, math.hypot(horizontal, vertical)),
+        horizontal_m=horizontal,
+        vertical_m=vertical,
+        center_ned_m=center,
+        radius_m=radius,
+    )
 
 
 def _ball(fix: Fix, ends: tuple[float, float], radii: list[float]) -> tuple[Vector, float]:

@@ -78,7 +78,14 @@ class Straying:
         self._strayed_m = strayed_m
         to_m = self.noise(fix.noise).horizontal_m
         name = "observer.follow_accuracy"
-        return Refuted(fix.arrival_ns, fix.uav, name, stated_m, strayed_m, to_m)
+        return Refuted(
+            t_ns=fix.arrival_ns,
+            uav=fix.uav,
+            setting=name,
+            limit=stated_m,
+            proven=strayed_m,
+            raised_to=to_m,
+        )
 
     def _begin(self, fix: Fix) -> None:
         self._seen.clear()

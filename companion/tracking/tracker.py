@@ -62,7 +62,7 @@ class Ages:
         return TrackState.COASTING if age_s > coasting_s else TrackState.LIVE
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TrackerSettings:
     """How tracks are kept.
 
@@ -84,7 +84,7 @@ class TrackerSettings:
     noise: NoiseSettings | None = None
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Tracked:
     history: History[Any]
     suspects: Suspects[Any]
@@ -187,11 +187,24 @@ class Tracker:
     def _begin(self, fix: Fix, reports: int = 0) -> Estimate:
         history: History[Any] = History(self._observer, fix, round(self._settings.window_s * 1e9))
         suspects: Suspects[Any] = Suspects(self._observer, self._settings.gate)
-        first = Estimate(fix, fix.position_ned_m, fix.noise.position_m, None, None)
+        first = Estimate(
+            fix=fix,
+            position_ned_m=fix.position_ned_m,
+            bound_m=fix.noise.position_m,
+            innovation_m=None,
+            dt_s=None,
+        )
         before = self._tracked.get(fix.uav)
         pace = Pace() if before is None else before.pace
         pace.add(fix)
-        self._tracked[fix.uav] = _Tracked(history, suspects, fix, first, pace, reports + 1)
+        self._tracked[fix.uav] = _Tracked(
+            history=history,
+            suspects=suspects,
+            arrived=fix,
+            newest=first,
+            pace=pace,
+            reports=reports + 1,
+        )
         return first
 
     def _is_lost(self, tracked: _Tracked, fix: Fix) -> bool:
@@ -252,13 +265,25 @@ class Tracker:
         predicted = entry.predicted
         if predicted is None:
             fix = entry.fix
-            return Estimate(fix, fix.position_ned_m, fix.noise.position_m, None, None)
+            return Estimate(
+                fix=fix,
+                position_ned_m=fix.position_ned_m,
+                bound_m=fix.noise.position_m,
+                innovation_m=None,
+                dt_s=None,
+            )
         if predicted.mu_s2 is not None:
             tracked.mu_max_s2 = max(predicted.mu_s2, tracked.mu_max_s2 or 0.0)
         before_ns = tracked.history.entries[at - 1].fix.sender_ns if at else None
         dt_s = None if before_ns is None else (entry.fix.sender_ns - before_ns) * 1e-9
         innovation_m = math.dist(entry.fix.position_ned_m, predicted.position_ned_m)
-        return Estimate(entry.fix, predicted.position_ned_m, predicted.bound_m, innovation_m, dt_s)
+        return Estimate(
+            fix=entry.fix,
+            position_ned_m=predicted.position_ned_m,
+            bound_m=predicted.bound_m,
+            innovation_m=innovation_m,
+            dt_s=dt_s,
+        )
 
     def _look_back(self, tracked: _Tracked, fix: Fix) -> None:
         """Judge earlier predictions by the newest report, and choose what is fed forward from it.
@@ -348,7 +373,17 @@ class Tracker:
         widened_m = at.bound_s * fastest_mps
         bound_m = found.bound_m + widened_m
         horizontal_m, vertical_m = found.horizontal_m + widened_m, found.vertical_m + widened_m
-        return position, velocity, Reach(bound_m, horizontal_m, vertical_m, position, bound_m)
+        return (
+            position,
+            velocity,
+            Reach(
+                bound_m=bound_m,
+                horizontal_m=horizontal_m,
+                vertical_m=vertical_m,
+                center_ned_m=position,
+                radius_m=bound_m,
+            ),
+        )
 
     def _usual_m(
         self, tracked: _Tracked, velocity: Vector | None, at: SenderTime, bound_m: float
@@ -413,7 +448,7 @@ def _fastest_mps(
 
 
 def _rejected(fix: Fix, reason: Reason, detail: str) -> Rejection:
-    return Rejection(fix.arrival_ns, fix.uav, reason, detail=detail)
+    return Rejection(t_ns=fix.arrival_ns, source=fix.uav, reason=reason, detail=detail)
 
 
 def _fed(

@@ -78,7 +78,7 @@ class Widen(StrEnum):
     NO = "no"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Beam:
     """One UAV's beam: where it points, how well, and how that direction changes.
 
@@ -126,7 +126,7 @@ class LeftOut:
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class BeamSet:
     """The beams and weights of one update.
 

@@ -29,7 +29,7 @@ class Tock:
     t_ns: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RoundTrip:
     """A TIMESYNC request sent by this node, and its answer.
 

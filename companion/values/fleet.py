@@ -27,7 +27,7 @@ class Shared:
     trips: tuple[RoundTrip, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Offer:
     """What a node's array would have towards a UAV, if it served it alone.
 
@@ -46,7 +46,7 @@ class Offer:
     heard_s: float | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Standing:
     """What a node says of itself, some times a second.
 

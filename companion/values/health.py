@@ -59,7 +59,7 @@ class Blame:
     remedy: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
     """How good the link to a UAV is.
 

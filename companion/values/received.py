@@ -65,7 +65,7 @@ class Accuracy(NamedTuple):
     time_s: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Report:
     """A position that a UAV sent of itself, or that a receiver relayed of it.
 
@@ -105,7 +105,7 @@ class Report:
     accuracy: Accuracy | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AdsbVehicle:
     """An aircraft relayed by a receiver (ADSB_VEHICLE).
 
@@ -145,7 +145,7 @@ class AdsbVehicle:
         return f"icao:{self.icao:06X}"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RemoteId:
     """What a Remote ID receiver heard from one radio: an id, a position, or both.
 
@@ -170,7 +170,7 @@ class RemoteId:
     is_flat: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Attitude:
     """Body attitude and body rates (ATTITUDE).
 
@@ -189,7 +189,7 @@ class Attitude:
     yawspeed_radps: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Presence:
     """A HEARTBEAT: a component exists. It does not prove that there is a vehicle."""
 
@@ -201,7 +201,7 @@ class Presence:
     armed: bool
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class GnssStatus:
     """Fix type, height and stated accuracies of a GNSS receiver (GPS_RAW_INT).
 
@@ -220,7 +220,7 @@ class GnssStatus:
     time_us: int = 0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SystemTime:
     """The sender's Unix clock, in microseconds, beside its clock since boot (SYSTEM_TIME)."""
 
@@ -230,7 +230,7 @@ class SystemTime:
     boot_ms: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class EstimatorStatus:
     """What an autopilot's estimator says of its attitude (EKF_STATUS_REPORT).
 

@@ -33,7 +33,7 @@ class Reason(StrEnum):
     OUT_OF_ORDER = "out-of-order"  # later than the window for late reports
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Rejection:
     """Something received that was not used, and why.
 

@@ -7,7 +7,7 @@ from companion.values.numbers import FloatArray, Vector
 from companion.values.received import Report
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ReportNoise:
     """Bounds on the errors of one report.
 
@@ -51,7 +51,7 @@ class Limits:
     source: LimitSource = LimitSource.SETTINGS
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Refuted:
     """An assumption that what was reported proves to be wrong; it was raised.
 
@@ -71,7 +71,7 @@ class Refuted:
     raised_to: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Fix:
     """A report put on the node's timeline and into the local frame.
 
@@ -100,7 +100,7 @@ class Fix:
     limits: Limits | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
     """The observer's answer to an accepted report, at the time of that report.
 
@@ -122,7 +122,7 @@ class Estimate:
     reacquired: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SenderTime:
     """A time of the node, ``node_ns``, converted to a sender's timeline.
 
@@ -152,7 +152,7 @@ class TrackState(StrEnum):
     LOST = "lost"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
     """What is known of one UAV at the instant ``valid_at_ns``.
 
@@ -204,7 +204,7 @@ class Track:
     reports: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Carrier:
     """Position and attitude of the array's carrier at the instant ``valid_at_ns``.
 

@@ -111,11 +111,11 @@ def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[J
     sinr_db = link_budget.predicted_sinr_db(
         array,
         towards,
-        ranges_m,
-        sent,
-        groups,
-        equipment.budget,
-        equipment.uav_antennas,
+        ranges_m=ranges_m,
+        sent=sent,
+        groups=groups,
+        budget=equipment.budget,
+        uav_antennas=equipment.uav_antennas,
     )
     pointed = pointing(pipeline, update)
     guaranteed, guaranteed_sinr = guaranteed_gain.of_beams(
@@ -215,7 +215,7 @@ def weights(pipeline: Pipeline, beam_set: BeamSet, lead_ms: float) -> Json:
 
 
 def pattern(
-    pipeline: Pipeline, update: Update, cut: str, points: int, only: str | None, lead_ms: float
+    pipeline: Pipeline, update: Update, cut: str, *, points: int, only: str | None, lead_ms: float
 ) -> Json:
     """The answer of ``/v1/pattern``: the response of each beam (or one) along a cut through it."""
     array, beam_set = pipeline.array, update.beams
@@ -229,7 +229,9 @@ def pattern(
             angles, response_db = patterns.azimuth_cut(array, column, beam.elevation_rad, points)
         else:
             angles, response_db = patterns.elevation_cut(array, column, beam.azimuth_rad, points)
-        entries.append(_pattern_entry(pipeline, beam_set, i, cut, response_db, towards))
+        entries.append(
+            _pattern_entry(pipeline, beam_set, i, cut=cut, response_db=response_db, towards=towards)
+        )
     return {
         "valid_at": rfc3339(pipeline.utc_ns(beam_set.valid_at_ns)),
         "lead_ms": lead_ms,
@@ -244,6 +246,7 @@ def _pattern_entry(
     pipeline: Pipeline,
     beam_set: BeamSet,
     i: int,
+    *,
     cut: str,
     response_db: FloatArray,
     towards: FloatArray,

@@ -29,10 +29,10 @@ class _Bounds(NamedTuple):
 
 def _bounds(given: ObserverSettings, limits: Limits) -> _Bounds:
     return _Bounds(
-        limits.speed_mps,
-        limits.acceleration_mps2,
-        given.position_noise_m,
-        given.velocity_noise_mps,
+        speed_max_mps=limits.speed_mps,
+        acceleration_max_mps2=limits.acceleration_mps2,
+        position_noise_m=given.position_noise_m,
+        velocity_noise_mps=given.velocity_noise_mps,
     )
 
 
@@ -77,7 +77,14 @@ class DesignView:
         if has_velocity:
             lead_s += max(given.velocity_lead_s, dt_s)
         alpha = None if given.alpha == "auto" else given.alpha
-        return answers.row(dt_s, lead_s, alpha, None, "position", "closed-form")
+        return answers.row(
+            dt_s,
+            feedthrough_s=lead_s,
+            alpha=alpha,
+            mu_max=None,
+            model="position",
+            method="closed-form",
+        )
 
 
 def _scale(table: KinematicDesign, given: _Bounds) -> float:

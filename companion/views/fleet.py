@@ -22,7 +22,7 @@ that left.
 """
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FleetStatus:
     """This node's place in a fleet.
 
@@ -40,7 +40,7 @@ class FleetStatus:
     damaged: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Served:
     """Who serves the UAVs for which beams are wanted.
 
@@ -77,7 +77,7 @@ def served(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Serve
         able = [full.get(node, False) for node, one in given.items() if worth_db(one) is not None]
         nobody[track.uav] = blame.of_unserved(track, reached=bool(able), full=all(able))
     elsewhere = sum(uav in by and member.name not in by[uav] for uav in wanted)
-    return Served(member.name, by, nobody, elsewhere)
+    return Served(node=member.name, by=by, nobody=nobody, elsewhere=elsewhere)
 
 
 def fleet(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Json:

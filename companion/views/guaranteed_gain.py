@@ -52,14 +52,14 @@ def of_beams(
     leaks = guarantee.leakage_bounds(array, towards[known], [bounds[i] for i in known], weights)
     sinr_db = link_budget.least_sinr_db(
         10 ** (np.array([gains_db[i] for i in known], dtype=float) / 10),
-        leaks,
-        np.array(known),
-        ranges_m[known],
-        np.array([beam.group for beam in beam_set.beams]),
-        powers_w,
-        equipment.budget,
-        array.wavelength_m,
-        equipment.uav_antennas,
+        leaks=leaks,
+        users=np.array(known),
+        farthest_m=ranges_m[known],
+        groups=np.array([beam.group for beam in beam_set.beams]),
+        powers_w=powers_w,
+        budget=equipment.budget,
+        wavelength_m=array.wavelength_m,
+        uav_antennas=equipment.uav_antennas,
     )
     for i, value in zip(known, sinr_db.tolist(), strict=True):
         unknown[i] = value

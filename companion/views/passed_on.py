@@ -70,9 +70,9 @@ class Positions:
             Source.parse(track.uav),
             boot_ms & 0xFFFF_FFFF,
             place,
-            relative_alt_m or 0.0,
-            velocity,
-            report.heading_deg,
+            relative_alt_m=relative_alt_m or 0.0,
+            velocity_ned_mps=velocity,
+            heading_deg=report.heading_deg,
         )
 
     def _as_utm(
@@ -88,15 +88,15 @@ class Positions:
         undulation_m, off_m = _geoid(pipeline) if known else (0.0, 0.0)
         lat_deg, lon_deg, alt_m = place
         said = UtmPosition(
-            pipeline.utc_ns(track.valid_at_ns),
-            lat_deg,
-            lon_deg,
-            alt_m + undulation_m if known else None,
-            relative_alt_m,
-            velocity_ned_mps,
-            track.horizontal_bound_m,
-            track.vertical_bound_m + off_m,
-            self._every_s,
+            utc_ns=pipeline.utc_ns(track.valid_at_ns),
+            lat_deg=lat_deg,
+            lon_deg=lon_deg,
+            hae_m=alt_m + undulation_m if known else None,
+            relative_alt_m=relative_alt_m,
+            velocity_ned_mps=velocity_ned_mps,
+            horizontal_m=track.horizontal_bound_m,
+            vertical_m=track.vertical_bound_m + off_m,
+            every_s=self._every_s,
         )
         return utm_global_position(Source.parse(track.uav), said)
 
@@ -124,13 +124,13 @@ def _event(pipeline: Pipeline, track: Track, stale_s: float) -> bytes:
         course_deg = math.degrees(math.atan2(velocity[1], velocity[0])) % 360
         speed_mps = math.hypot(velocity[0], velocity[1])
     where = cot_text.Place(
-        lat_deg,
-        lon_deg,
-        alt_m + undulation_m if known else None,
-        track.horizontal_bound_m,
-        track.vertical_bound_m + geoid_m if known else None,
-        course_deg,
-        speed_mps,
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        hae_m=alt_m + undulation_m if known else None,
+        ce_m=track.horizontal_bound_m,
+        le_m=track.vertical_bound_m + geoid_m if known else None,
+        course_deg=course_deg,
+        speed_mps=speed_mps,
     )
     at_ns = pipeline.utc_ns(track.valid_at_ns)
     stale_ns = at_ns + round(stale_s * 1e9)

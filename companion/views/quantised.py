@@ -30,11 +30,11 @@ def device_table(
         others = [j for j, one in enumerate(beam_set.beams) if j != i and one.group == beam.group]
         wanted.append(
             tables.WantedBeam(
-                beam.uav,
-                beam_set.weights[:, i],
-                beam.azimuth_rad,
-                beam.elevation_rad,
-                steering[:, [i, *others]],
+                uav=beam.uav,
+                weights=beam_set.weights[:, i],
+                azimuth_rad=beam.azimuth_rad,
+                elevation_rad=beam.elevation_rad,
+                steering=steering[:, [i, *others]],
             )
         )
     calibration = equipment.calibration or Calibration.ideal(range(array.size))

@@ -25,7 +25,7 @@ from companion.views.words import rfc3339
 Json = dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingStatus:
     """The recording as the API shows it.
 
@@ -47,7 +47,7 @@ class RecordingStatus:
     lag_s: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ReplayStatus:
     """Progress of a replay.
 
@@ -178,7 +178,9 @@ def uavs(node: Node, only: str | None = None) -> list[Json]:
     machine = health.behind(node.arrival_lag.seen(now_ns))
     served = fleet_view.served(pipeline, node.fleet_status(), now_ns)
     return [
-        uav(pipeline, track, carrier, tuple(map(float, place)), machine, served)
+        uav(
+            pipeline, track, carrier, place=tuple(map(float, place)), machine=machine, served=served
+        )
         for track, place in zip(tracks, geodetic, strict=True)
     ]
 
@@ -187,6 +189,7 @@ def uav(
     pipeline: Pipeline,
     track: Track,
     carrier: Carrier | None,
+    *,
     place: tuple[float, ...],
     machine: Blame | None,
     served: Served | None,

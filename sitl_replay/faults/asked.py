@@ -68,79 +68,102 @@ class Kind(NamedTuple):
         return f"{self.name}={':'.join(letters)}{''.join(optional)}"
 
 
-_SHARE: Final = Bound("P", 0.0, 1.0)
-_FROM: Final = Bound("T", 0.0, 1e6)
+_SHARE: Final = Bound(letter="P", low=0.0, high=1.0)
+_FROM: Final = Bound(letter="T", low=0.0, high=1e6)
 
 KINDS: Final = {
     kind.name: kind
     for kind in (
         Kind(
-            "drift",
-            (Bound("PPM", -500_000.0, 500_000.0),),
-            "boot clocks run fast by PPM millionths, or slow if negative: time_boot_ms",
-            "drift=-24000",
+            name="drift",
+            bounds=(Bound(letter="PPM", low=-500_000.0, high=500_000.0),),
+            meaning="boot clocks run fast by PPM millionths, or slow if negative: time_boot_ms",
+            example="drift=-24000",
         ),
         Kind(
-            "reboot",
-            (_FROM,),
-            "at T s boot clocks (time_boot_ms) and sequence numbers start again at 0",
-            "reboot=20",
+            name="reboot",
+            bounds=(_FROM,),
+            meaning="at T s boot clocks (time_boot_ms) and sequence numbers start again at 0",
+            example="reboot=20",
             is_event=True,
         ),
         Kind(
-            "frozen",
-            (_FROM, Bound("S", 0.0, 1e6)),
-            "from T s on, for S s, GLOBAL_POSITION_INT repeats the position before",
-            "frozen@3:1=20:5",
+            name="frozen",
+            bounds=(_FROM, Bound(letter="S", low=0.0, high=1e6)),
+            meaning="from T s on, for S s, GLOBAL_POSITION_INT repeats the position before",
+            example="frozen@3:1=20:5",
             is_event=True,
         ),
         Kind(
-            "glitch",
-            (_FROM, Bound("M", 0.0, 100_000.0), Bound("N", 1.0, 1e6, default=1.0, whole=True)),
-            "from T s on, N reports (1) of GLOBAL_POSITION_INT are M metres beside the place",
-            "glitch=30:25:4",
+            name="glitch",
+            bounds=(
+                _FROM,
+                Bound(letter="M", low=0.0, high=100_000.0),
+                Bound(letter="N", low=1.0, high=1e6, default=1.0, whole=True),
+            ),
+            meaning="from T s on, N reports (1) of GLOBAL_POSITION_INT are M metres beside the"
+            " place",
+            example="glitch=30:25:4",
             is_event=True,
         ),
-        Kind("loss", (_SHARE,), "a frame is lost with probability P", "loss=0.1"),
         Kind(
-            "duplication",
-            (_SHARE,),
-            "with probability P it comes again, 0 to 0.2 s later",
-            "duplication=0.5",
+            name="loss",
+            bounds=(_SHARE,),
+            meaning="a frame is lost with probability P",
+            example="loss=0.1",
         ),
-        Kind("delay", (Bound("S", 0.0, 600.0),), "every frame is late by S s", "delay=0.3"),
         Kind(
-            "jitter",
-            (Bound("S", 0.0, 60.0),),
-            "and by a random time, exponential with mean S s; a sender's frames keep"
+            name="duplication",
+            bounds=(_SHARE,),
+            meaning="with probability P it comes again, 0 to 0.2 s later",
+            example="duplication=0.5",
+        ),
+        Kind(
+            name="delay",
+            bounds=(Bound(letter="S", low=0.0, high=600.0),),
+            meaning="every frame is late by S s",
+            example="delay=0.3",
+        ),
+        Kind(
+            name="jitter",
+            bounds=(Bound(letter="S", low=0.0, high=60.0),),
+            meaning="and by a random time, exponential with mean S s; a sender's frames keep"
             " their order, so those behind a later one wait",
-            "jitter=0.05",
+            example="jitter=0.05",
         ),
         Kind(
-            "burst",
-            (Bound("P", 0.0, 0.95), Bound("S", 0.001, 600.0)),
-            "the link is shut for S s at a time, on average a share P of all time; what"
+            name="burst",
+            bounds=(
+                Bound(letter="P", low=0.0, high=0.95),
+                Bound(letter="S", low=0.001, high=600.0),
+            ),
+            meaning="the link is shut for S s at a time, on average a share P of all time; what"
             " would come meanwhile comes at once when it opens",
-            "burst=0.3:2",
+            example="burst=0.3:2",
         ),
         Kind(
-            "reordering",
-            (_SHARE,),
-            "with probability P a frame is overtaken by those 0 to 0.2 s behind",
-            "reordering=0.1",
+            name="reordering",
+            bounds=(_SHARE,),
+            meaning="with probability P a frame is overtaken by those 0 to 0.2 s behind",
+            example="reordering=0.1",
         ),
         Kind(
-            "bit-errors",
-            (Bound("P", 0.0, 0.5),),
-            "every bit is inverted with probability P",
-            "bit-errors=1e-5",
+            name="bit-errors",
+            bounds=(Bound(letter="P", low=0.0, high=0.5),),
+            meaning="every bit is inverted with probability P",
+            example="bit-errors=1e-5",
         ),
-        Kind("truncation", (_SHARE,), "with probability P a frame is cut short", "truncation=0.01"),
         Kind(
-            "garbage",
-            (_SHARE,),
-            "with probability P, 1 to 64 random bytes come before a frame",
-            "garbage=0.01",
+            name="truncation",
+            bounds=(_SHARE,),
+            meaning="with probability P a frame is cut short",
+            example="truncation=0.01",
+        ),
+        Kind(
+            name="garbage",
+            bounds=(_SHARE,),
+            meaning="with probability P, 1 to 64 random bytes come before a frame",
+            example="garbage=0.01",
         ),
     )
 }
@@ -149,7 +172,7 @@ KINDS: Final = {
 _ORDER: Final = {name: place for place, name in enumerate(KINDS)}
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Fault:
     """One fault: its name, its numbers, and whose frames it concerns (None: everybody's)."""
 
@@ -186,7 +209,7 @@ class Fault:
         except FaultError as error:
             raise FaultError(f"{text!r}: {error}, as in {kind.example}") from None
         defaults = [b.default for b in kind.bounds[len(given) :] if b.default is not None]
-        return cls(name, (*given, *defaults), sysid, compid)
+        return cls(name=name, values=(*given, *defaults), sysid=sysid, compid=compid)
 
     def concerns(self, sender: Sender) -> bool:
         """Whether the fault concerns the frames of this system and component."""

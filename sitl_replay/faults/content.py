@@ -173,7 +173,7 @@ class Glitch:
     same for all of them; the altitudes are as they are.
     """
 
-    def __init__(self, at_s: float, metres: float, reports: int, seed: str) -> None:
+    def __init__(self, *, at_s: float, metres: float, reports: int, seed: str) -> None:
         self._at_s = at_s
         self._metres = metres
         self._reports = reports

@@ -75,7 +75,7 @@ class Network:
     """
 
     def __init__(
-        self, faults: Sequence[Fault], links: int, seed: int, touched: Counter[str]
+        self, *, faults: Sequence[Fault], links: int, seed: int, touched: Counter[str]
     ) -> None:
         chosen = [fault for fault in in_order(faults) if fault.name not in CONTENT]
         self._links = [_Link(chosen, f"{seed} {link}", touched) for link in range(links)]
@@ -92,7 +92,10 @@ class Network:
                     self._touched[OVERFLOW] += 1
                     continue
                 self._count += 1
-                heapq.heappush(self._held, Delivery(released_s, self._count, number, arriving))
+                heapq.heappush(
+                    self._held,
+                    Delivery(t_s=released_s, place=self._count, link=number, raw=arriving),
+                )
 
     def due(self, until_s: float = math.inf) -> Iterator[Delivery]:
         """Take out what arrives up to and at ``until_s``, in order of time."""
@@ -158,7 +161,9 @@ def _content(fault: Fault, seed: int) -> ContentFault:
         case "frozen", (at_s, lasts_s):
             return Frozen(at_s, lasts_s)
         case "glitch", (at_s, metres, reports):
-            return Glitch(at_s, metres, int(reports), f"{seed} {fault} {at_s}")
+            return Glitch(
+                at_s=at_s, metres=metres, reports=int(reports), seed=f"{seed} {fault} {at_s}"
+            )
     raise FaultError(f"{fault} with {len(fault.values)} numbers is none of a sender's")
 
 

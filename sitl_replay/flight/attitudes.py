@@ -36,7 +36,14 @@ class Leaning:
         roll_rate = (upright * right_rate - right * upright_rate) / (upright**2 + right**2)
         pitch_rate = (below * ahead_rate - ahead * down_rate) / upright**2
         p, q, r = body_rates(roll, pitch, (roll_rate, pitch_rate, yaw_rate))
-        return Pose(roll, pitch, math.remainder(yaw, math.tau), p, q, r)
+        return Pose(
+            roll_rad=roll,
+            pitch_rad=pitch,
+            yaw_rad=math.remainder(yaw, math.tau),
+            rollspeed_radps=p,
+            pitchspeed_radps=q,
+            yawspeed_radps=r,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,4 +75,11 @@ class Banked:
         roll_rate = sideways_rate * GRAVITY_MPS2 / (GRAVITY_MPS2**2 + sideways**2)
         yaw = math.atan2(east, north)
         p, q, r = body_rates(roll, self.pitch_rad, (roll_rate, 0.0, sideways / airspeed))
-        return Pose(roll, self.pitch_rad, yaw, p, q, r)
+        return Pose(
+            roll_rad=roll,
+            pitch_rad=self.pitch_rad,
+            yaw_rad=yaw,
+            rollspeed_radps=p,
+            pitchspeed_radps=q,
+            yawspeed_radps=r,
+        )

@@ -37,7 +37,7 @@ class Airframe(Enum):
         return self.value[1]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Vehicle:
     """One vehicle: who it is, how it moves, and how often it sends what.
 
@@ -74,7 +74,7 @@ class Vehicle:
         return f"{self.source}/{self.twin}" if self.twin else str(self.source)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
     """A carrier at ``origin`` and the UAVs about it.
 
@@ -132,7 +132,14 @@ def uptime_ms(index: int) -> int:
 
 def around_carrier(name: str, description: str, uavs: tuple[Vehicle, ...]) -> Scenario:
     """A scenario at the usual place with the usual carrier."""
-    return Scenario(name, description, ORIGIN, HOME_ALT_M, CARRIER, uavs)
+    return Scenario(
+        name=name,
+        description=description,
+        origin=ORIGIN,
+        home_alt_m=HOME_ALT_M,
+        carrier=CARRIER,
+        uavs=uavs,
+    )
 
 
 def checked(uavs: int, fewest: int = 1) -> int:

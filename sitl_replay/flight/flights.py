@@ -75,7 +75,15 @@ def calm(index: int, path: Path) -> Vehicle:
 def circling(index: int, centre_m: float = 250.0) -> Vehicle:
     """A copter in still air on a circle of 40 m, away from those of other numbers."""
     north_m, east_m = on_spiral(index, centre_m)
-    return calm(index, Orbit((north_m, east_m, -60.0), 40.0, 0.2, float(index)))
+    return calm(
+        index,
+        Orbit(
+            centre_ned_m=(north_m, east_m, -60.0),
+            radius_m=40.0,
+            rate_radps=0.2,
+            phase_rad=float(index),
+        ),
+    )
 
 
 def touring(index: int, seed: int) -> Vehicle:
@@ -131,7 +139,15 @@ def paired(index: int, *, mirrored: bool) -> Vehicle:
     elevation_rad = math.radians(4.0 + 3.0 * (pair % 4))
     height_m = range_m * math.tan(elevation_rad)
     return calm(
-        index, Swing(range_m, height_m, azimuth_rad, amplitude_rad, SWING_RADPS, 1.7 * pair + 0.8)
+        index,
+        Swing(
+            range_m=range_m,
+            height_m=height_m,
+            azimuth_rad=azimuth_rad,
+            amplitude_rad=amplitude_rad,
+            omega_radps=SWING_RADPS,
+            phase_rad=1.7 * pair + 0.8,
+        ),
     )
 
 
@@ -148,7 +164,10 @@ def swarming(index: int, seed: int) -> Vehicle:
     radius_m = rng.uniform(60.0, 90.0)
     rate_radps = rng.choice((-1.0, 1.0)) * rng.uniform(8.0, 13.0) / radius_m
     path = Orbit(
-        (north_m, east_m, -LAYER_M * (layer + 1)), radius_m, rate_radps, rng.uniform(0.0, math.tau)
+        centre_ned_m=(north_m, east_m, -LAYER_M * (layer + 1)),
+        radius_m=radius_m,
+        rate_radps=rate_radps,
+        phase_rad=rng.uniform(0.0, math.tau),
     )
     return Vehicle(
         source=uav_source(index),
@@ -175,7 +194,7 @@ def aircraft(uav_trajectory: Callable[[float], Motion]) -> tuple[Aircraft, ...]:
         # Each place gives an axis and an offset that no other aircraft has.
         return Flight(
             Racetrack(
-                centre_ned_m,
+                centre_ned_m=centre_ned_m,
                 axis_rad=north_m,
                 straight_m=4.0 * radius_m,
                 speed_mps=speed_mps,
@@ -188,23 +207,52 @@ def aircraft(uav_trajectory: Callable[[float], Motion]) -> tuple[Aircraft, ...]:
     pressure, geometric = AltitudeDatum.PRESSURE, AltitudeDatum.GEOMETRIC
     still = Valid.HEADING | Valid.VELOCITY | Valid.VERTICAL_VELOCITY
     return (
-        Aircraft(0xF00001, "TEST01", 3, holding(9e3, 4e3, 2400.0, 120.0), pressure),
-        Aircraft(0xF00002, "TEST02", 3, holding(-7e3, 8e3, 1800.0, 95.0), geometric),
         Aircraft(
-            0xF00003, "TEST03", 1, holding(3e3, -5e3, 700.0, 50.0), pressure, ~still & EVERYTHING
+            icao=0xF00001,
+            callsign="TEST01",
+            emitter_type=3,
+            trajectory=holding(9e3, 4e3, 2400.0, 120.0),
+            datum=pressure,
         ),
         Aircraft(
-            0xF00004, "TEST04", 7, holding(-2e3, -3e3, 400.0, 40.0), pressure, EVERYTHING, 0.33
+            icao=0xF00002,
+            callsign="TEST02",
+            emitter_type=3,
+            trajectory=holding(-7e3, 8e3, 1800.0, 95.0),
+            datum=geometric,
         ),
         Aircraft(
-            0xF00005,
-            "TEST05",
-            9,
-            holding(5e3, 1e3, 900.0, 28.0),
-            geometric,
-            ~Valid.ALTITUDE & EVERYTHING,
+            icao=0xF00003,
+            callsign="TEST03",
+            emitter_type=1,
+            trajectory=holding(3e3, -5e3, 700.0, 50.0),
+            datum=pressure,
+            says=~still & EVERYTHING,
         ),
-        Aircraft(0xF00006, "TEST06", 14, uav_trajectory, geometric),
+        Aircraft(
+            icao=0xF00004,
+            callsign="TEST04",
+            emitter_type=7,
+            trajectory=holding(-2e3, -3e3, 400.0, 40.0),
+            datum=pressure,
+            says=EVERYTHING,
+            placeless_share=0.33,
+        ),
+        Aircraft(
+            icao=0xF00005,
+            callsign="TEST05",
+            emitter_type=9,
+            trajectory=holding(5e3, 1e3, 900.0, 28.0),
+            datum=geometric,
+            says=~Valid.ALTITUDE & EVERYTHING,
+        ),
+        Aircraft(
+            icao=0xF00006,
+            callsign="TEST06",
+            emitter_type=14,
+            trajectory=uav_trajectory,
+            datum=geometric,
+        ),
     )
 
 

@@ -54,7 +54,7 @@ class Pose(NamedTuple):
     yawspeed_radps: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Circle:
     """The paper's flight (docs/math.md 8.2): a clockwise circle about the carrier, with gusts.
 
@@ -91,7 +91,7 @@ class Hover:
         return Motion(self.position_ned_m, (0.0, 0.0, 0.0))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Sway:
     """A level attitude with a slow sway, about a heading that is constant or turns steadily.
 
@@ -111,7 +111,14 @@ class Sway:
         yaw += self.heading_rad + self.turn_rate_radps * t_s
         yaw_rate += self.turn_rate_radps
         p, q, r = body_rates(roll, pitch, (roll_rate, pitch_rate, yaw_rate))
-        return Pose(roll, pitch, math.remainder(yaw, math.tau), p, q, r)
+        return Pose(
+            roll_rad=roll,
+            pitch_rad=pitch,
+            yaw_rad=math.remainder(yaw, math.tau),
+            rollspeed_radps=p,
+            pitchspeed_radps=q,
+            yawspeed_radps=r,
+        )
 
     def _swing(self, t_s: float, amplitude_rad: float, frequency_hz: float) -> tuple[float, float]:
         """Angle and its derivative."""

@@ -44,14 +44,14 @@ class Ramp(NamedTuple):
         """The step at ``x``, which is 0 to 1."""
         cubed = x * x * x
         return cls(
-            cubed * x * (2.5 - 3.0 * x + x * x),
-            cubed * (10.0 - 15.0 * x + 6.0 * x * x),
-            30.0 * (x * (1.0 - x)) ** 2,
-            60.0 * x * (1.0 - x) * (1.0 - 2.0 * x),
+            integral=cubed * x * (2.5 - 3.0 * x + x * x),
+            value=cubed * (10.0 - 15.0 * x + 6.0 * x * x),
+            slope=30.0 * (x * (1.0 - x)) ** 2,
+            curvature=60.0 * x * (1.0 - x) * (1.0 - 2.0 * x),
         )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Leg:
     """A straight line from stop to stop, then a stand in which the nose turns to the next one.
 
@@ -82,12 +82,16 @@ class Leg:
         north, east, down = self.direction
         start = self.start_ned_m
         return Kinematics(
-            (start[0] + north * along, start[1] + east * along, start[2] + down * along),
-            (north * speed, east * speed, down * speed),
-            (north * acceleration, east * acceleration, down * acceleration),
-            (north * jerk, east * jerk, down * jerk),
-            self.heading_rad + self.turn_rad * turned.value,
-            self.turn_rad * turned.slope / self.stand_s,
+            position_ned_m=(
+                start[0] + north * along,
+                start[1] + east * along,
+                start[2] + down * along,
+            ),
+            velocity_ned_mps=(north * speed, east * speed, down * speed),
+            acceleration_ned_mps2=(north * acceleration, east * acceleration, down * acceleration),
+            jerk_ned_mps3=(north * jerk, east * jerk, down * jerk),
+            heading_rad=self.heading_rad + self.turn_rad * turned.value,
+            heading_rate_radps=self.turn_rad * turned.slope / self.stand_s,
         )
 
     def _progress(self, t_s: float) -> tuple[float, float, float, float]:
@@ -149,14 +153,14 @@ class Tour:
             next_rad = headings_rad[(index + 1) % len(hops)]
             legs.append(
                 Leg(
-                    start,
-                    (north / length_m, east / length_m, down / length_m),
-                    length_m,
-                    speed_mps,
-                    STEEPEST_RAMP * speed_mps / limits.acceleration_mps2,
-                    headings_rad[index],
-                    math.remainder(next_rad - headings_rad[index], math.tau),
-                    stand_s,
+                    start_ned_m=start,
+                    direction=(north / length_m, east / length_m, down / length_m),
+                    length_m=length_m,
+                    speed_mps=speed_mps,
+                    ramp_s=STEEPEST_RAMP * speed_mps / limits.acceleration_mps2,
+                    heading_rad=headings_rad[index],
+                    turn_rad=math.remainder(next_rad - headings_rad[index], math.tau),
+                    stand_s=stand_s,
                 )
             )
         return cls(tuple(legs), tuple(accumulate(leg.duration_s for leg in legs)), offset_s)
@@ -169,7 +173,7 @@ class Tour:
         return leg.at(into_s - (self.ends_s[index] - leg.duration_s))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Racetrack:
     """A stadium at one height and one ground speed: two straights, two half turns clockwise.
 
@@ -261,7 +265,7 @@ class Racetrack:
         return self.speed_mps * t_s * along, self.speed_mps * t_s * across
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Orbit:
     """A circle about a point at one height, the nose along the course.
 
@@ -289,7 +293,7 @@ class Orbit:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Swing:
     """A swing on an arc about the carrier: azimuth + amplitude sin(ωt + φ), radians from north.
 
@@ -321,12 +325,12 @@ class Swing:
             )
 
         return Kinematics(
-            (range_m * cosine, range_m * sine, -self.height_m),
-            turned(0.0, rate),
-            turned(-(rate**2), growth),
-            turned(-3.0 * rate * growth, third - rate**3),
-            self.azimuth_rad,
-            0.0,
+            position_ned_m=(range_m * cosine, range_m * sine, -self.height_m),
+            velocity_ned_mps=turned(0.0, rate),
+            acceleration_ned_mps2=turned(-(rate**2), growth),
+            jerk_ned_mps3=turned(-3.0 * rate * growth, third - rate**3),
+            heading_rad=self.azimuth_rad,
+            heading_rate_radps=0.0,
         )
 
 
@@ -336,10 +340,10 @@ def _steered(
     """Level flight at one speed along ``course``; ``growth`` is the derivative of its rate."""
     cosine, sine = speed * math.cos(course), speed * math.sin(course)
     return Kinematics(
-        position,
-        (cosine, sine, 0.0),
-        (-rate * sine, rate * cosine, 0.0),
-        (-growth * sine - rate**2 * cosine, growth * cosine - rate**2 * sine, 0.0),
-        course,
-        rate,
+        position_ned_m=position,
+        velocity_ned_mps=(cosine, sine, 0.0),
+        acceleration_ned_mps2=(-rate * sine, rate * cosine, 0.0),
+        jerk_ned_mps3=(-growth * sine - rate**2 * cosine, growth * cosine - rate**2 * sine, 0.0),
+        heading_rad=course,
+        heading_rate_radps=rate,
     )

@@ -49,7 +49,7 @@ class Valid(IntFlag):
 EVERYTHING: Final = Valid(0b1011_1111)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Aircraft:
     """An aircraft: how it flies (NED from the carrier) and what its transponder says of that.
 
@@ -105,7 +105,12 @@ def squitters(aircraft: Aircraft, seed: int) -> Iterator[Contact]:
         bare = aircraft.says & (Valid.ALTITUDE | Valid.SQUAWK)
         jittered_s = t_s + rng.uniform(0.0, SQUITTER_JITTER_S)
         garbage = rng.randbytes(GARBAGE_OCTETS)
-        yield Contact(aircraft, jittered_s, bare if placeless else aircraft.says, garbage)
+        yield Contact(
+            aircraft=aircraft,
+            t_s=jittered_s,
+            valid=bare if placeless else aircraft.says,
+            garbage=garbage,
+        )
         t_s += SQUITTER_INTERVAL_S
 
 

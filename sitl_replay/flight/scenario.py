@@ -185,8 +185,12 @@ def shared_id(uavs: int = 4) -> Scenario:
 
     The others, from 2:1 on, are honest. Needs two UAVs.
     """
-    west = calm(0, Orbit((200.0, -300.0, -30.0), 30.0, 0.2, 0.0))
-    east = calm(0, Orbit((200.0, 300.0, -40.0), 30.0, 0.2, 2.0))
+    west = calm(
+        0, Orbit(centre_ned_m=(200.0, -300.0, -30.0), radius_m=30.0, rate_radps=0.2, phase_rad=0.0)
+    )
+    east = calm(
+        0, Orbit(centre_ned_m=(200.0, 300.0, -40.0), radius_m=30.0, rate_radps=0.2, phase_rad=2.0)
+    )
     honest = (circling(index) for index in range(1, checked(uavs, fewest=2) - 1))
     return around_carrier(
         "shared-id",
@@ -221,9 +225,19 @@ def _on_paper(index: int, gust: float) -> Vehicle:
     radius_m = 100.0 + 50.0 * index
     rate_radps = min(PAPER_RATE_RADPS, PAPER_TOP_SPEED_MPS / radius_m)
     phase_rad = index * math.pi / 2
-    circle = Circle(radius_m, rate_radps, phase_rad, HEIGHTS_M[index % len(HEIGHTS_M)], gust)
+    circle = Circle(
+        radius_m=radius_m,
+        rate_radps=rate_radps,
+        phase_rad=phase_rad,
+        height_m=HEIGHTS_M[index % len(HEIGHTS_M)],
+        gust=gust,
+    )
     # The nose follows the nominal velocity, whose course is −(ωt+φ).
-    return uav(index, circle, Sway(-phase_rad, -rate_radps, phase_rad=float(index + 1)))
+    return uav(
+        index,
+        circle,
+        Sway(heading_rad=-phase_rad, turn_rate_radps=-rate_radps, phase_rad=float(index + 1)),
+    )
 
 
 def _hovering(index: int, azimuth_rad: float) -> Vehicle:
@@ -233,4 +247,6 @@ def _hovering(index: int, azimuth_rad: float) -> Vehicle:
         range_m * math.sin(azimuth_rad),
         -HEIGHTS_M[index % len(HEIGHTS_M)],
     )
-    return uav(index, Hover(position_ned_m), Sway(azimuth_rad, phase_rad=float(index + 1)))
+    return uav(
+        index, Hover(position_ned_m), Sway(heading_rad=azimuth_rad, phase_rad=float(index + 1))
+    )

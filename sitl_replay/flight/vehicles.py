@@ -68,9 +68,9 @@ def schedule(
         _, sample_s, build = due[number]
         since_start_ms = math.floor(sample_s * 1000)
         sample = Sample(
-            local,
-            scenario.home_alt_m,
-            vehicle,
+            local=local,
+            home_alt_m=scenario.home_alt_m,
+            vehicle=vehicle,
             t_s=since_start_ms / 1000,
             boot_ms=vehicle.uptime_ms + since_start_ms,
             unix_us=epoch_ns // 1000 + since_start_ms * 1000,

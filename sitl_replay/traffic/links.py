@@ -59,8 +59,14 @@ class TrafficLink:
         self._receive = receive
         self._up = asyncio.Event()
         self._heard: dict[Hashable, None] = {}  # the one heard last comes last
-        upcalls = Upcalls(self._up.set, self._take, lambda *_: None, self._hang_up, lambda _: None)
-        self._endpoint = transport.endpoint(url, LinkStatus(str(url)), upcalls)
+        upcalls = Upcalls(
+            up=self._up.set,
+            take=self._take,
+            stale=lambda *_: None,
+            hang_up=self._hang_up,
+            overflow=lambda _: None,
+        )
+        self._endpoint = transport.endpoint(url, LinkStatus(url=str(url)), upcalls)
 
     async def open(self) -> None:
         """Claim the address, connect or open. Raises ``LinkError`` where that is not possible."""
@@ -69,7 +75,7 @@ class TrafficLink:
         except OSError as error:
             raise LinkError(f"{self.url}: {reason(error)}") from error
         if port is not None:
-            self.url = LinkUrl(self.url.scheme, self.url.host, port)
+            self.url = LinkUrl(scheme=self.url.scheme, host=self.url.host, port=port)
         self.serving = asyncio.create_task(self._serve())
         up = asyncio.create_task(self._up.wait())
         try:

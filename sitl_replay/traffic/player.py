@@ -29,7 +29,7 @@ MAX_STEP_NS = 5_000_000_000
 BATCH = 32
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Tally:
     """What has been sent so far; kept up to date while it runs.
 
@@ -97,7 +97,7 @@ async def fly(
     """
     tally = Tally() if tally is None else tally
     senders = Senders(faults, seed, tally.faults)
-    network = Network(faults, len(links), seed, tally.faults)
+    network = Network(faults=faults, links=len(links), seed=seed, touched=tally.faults)
     urls = [parse_link(link, MAVLINK) for link in links]
     with TlogWriter(record) if record else contextlib.nullcontext() as writer:
         async with _opened(urls, tally) as endpoints:
@@ -110,7 +110,9 @@ async def fly(
                     if writer is not None:  # asked for the next one: this one is sent
                         writer.write(epoch_ns + round(t_s * 1e9), raw)
 
-            await _Sending(endpoints, network, 1.0, tally).send_all(due())
+            await _Sending(endpoints=endpoints, network=network, speed=1.0, tally=tally).send_all(
+                due()
+            )
     return tally
 
 
@@ -139,12 +141,14 @@ async def play(
     """
     tally = Tally() if tally is None else tally
     senders = Senders(faults, seed, tally.faults)
-    network = Network(faults, len(links), seed, tally.faults)
+    network = Network(faults=faults, links=len(links), seed=seed, touched=tally.faults)
     urls = [parse_link(link, MAVLINK) for link in links]
     async with _opened(urls, tally) as endpoints:
         timed = on_timeline(frames, tally)
         sent = ((t_s, senders.altered(t_s, raw)) for t_s, raw in timed)
-        await _Sending(endpoints, network, speed, tally).send_all(sent)
+        await _Sending(endpoints=endpoints, network=network, speed=speed, tally=tally).send_all(
+            sent
+        )
     return tally
 
 
@@ -188,7 +192,7 @@ class _Sending:
     """One run over open links, timed against one start instant so that no drift adds up."""
 
     def __init__(
-        self, endpoints: list[TrafficLink], network: Network, speed: float | None, tally: Tally
+        self, *, endpoints: list[TrafficLink], network: Network, speed: float | None, tally: Tally
     ) -> None:
         self._endpoints = endpoints
         self._there = list(endpoints)

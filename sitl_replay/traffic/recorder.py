@@ -55,7 +55,7 @@ class TlogWriter:
         self._file.close()
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Heard:
     """Counts of a recording so far: whole frames, their bytes, and what was not usable."""
 

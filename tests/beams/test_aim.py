@@ -32,7 +32,7 @@ from companion.values import (
 
 EYE = np.eye(3)
 STILL = np.zeros(3)
-ARRAY = uniform_linear(16, 30e9, 0.5, EYE)
+ARRAY = uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
 PLACES = {"1:1": (100.0, 20.0, -10.0), "2:1": (80.0, -60.0, 5.0), "3:1": (30.0, 90.0, 0.0)}
 
 
@@ -44,28 +44,63 @@ def track(
     velocity: FloatArray | None = None,
 ) -> Track:
     return Track(
-        uav, TrackState(state), 9, 0.1, np.array(position, dtype=float), velocity, None, None,
-        bound_m, bound_m, bound_m, np.zeros(3), bound_m, Limits(60.0, 5.0), None, 0.0, None, None,
-        None, None, 1,
-    )  # fmt: skip
+        uav=uav,
+        state=TrackState(state),
+        valid_at_ns=9,
+        age_s=0.1,
+        position_ned_m=np.array(position, dtype=float),
+        velocity_ned_mps=velocity,
+        unknown_input_mps=None,
+        acceleration_ned_mps2=None,
+        bound_m=bound_m,
+        horizontal_bound_m=bound_m,
+        vertical_bound_m=bound_m,
+        set_center_ned_m=np.zeros(3),
+        set_radius_m=bound_m,
+        limits=Limits(60.0, 5.0),
+        error_p95_m=None,
+        clock_bound_s=0.0,
+        dt_s=None,
+        latency_s=None,
+        gamma=None,
+        innovation_m=None,
+        reports=1,
+    )
 
 
 def carrier(
     position: tuple[float, ...] | FloatArray = (0, 0, 0),
     turn: FloatArray = EYE,
     bound_m: float = 0.0,
+    *,
     velocity: FloatArray | None = None,
     rates: FloatArray = STILL,
     attitude_bound_rad: float = 0.0,
 ) -> Carrier:
     place = np.array(position, dtype=float)
-    return Carrier(9, place, velocity, turn, rates, bound_m, attitude_bound_rad, None)
+    return Carrier(
+        valid_at_ns=9,
+        position_ned_m=place,
+        velocity_ned_mps=velocity,
+        body_from_local=turn,
+        body_rates_radps=rates,
+        bound_m=bound_m,
+        attitude_bound_rad=attitude_bound_rad,
+        age_s=None,
+    )
 
 
 def pointed(
     tracks: list[Track], at: Carrier | None, array: Array = ARRAY, limit: float = 100.0
 ) -> BeamSet:
-    return aim(7, 9, tracks, at, array, Precoder(condition_limit=limit))
+    return aim(
+        7,
+        valid_at_ns=9,
+        tracks=tracks,
+        carrier=at,
+        array=array,
+        precoder=Precoder(condition_limit=limit),
+    )
 
 
 def test_beams_point_where_the_tracks_are() -> None:
@@ -116,11 +151,25 @@ def test_a_true_direction_lies_within_the_pointing_bound() -> None:
 
 def test_a_wrong_attitude_swings_an_array_that_stands_off() -> None:
     """Ten metres off the point that is reported, a UAV two metres away, two degrees."""
-    array = uniform_linear(8, 30e9, 0.5, EYE, lever_arm_m=np.array([10.0, 0.0, 0.0]))
+    array = uniform_linear(
+        8,
+        30e9,
+        spacing_wavelengths=0.5,
+        array_from_body=EYE,
+        lever_arm_m=np.array([10.0, 0.0, 0.0]),
+    )
     turned = math.radians(2.0)
     place = np.array([10.0, 0.0, 0.0]) + 2.0 * np.array([math.cos(0.5), math.sin(0.5), 0.0])
     at = carrier(bound_m=0.0, attitude_bound_rad=turned)
-    beams = aim(9, 9, [track("a", tuple(place), bound_m=0.0)], at, array, Precoder(), Coverage())
+    beams = aim(
+        9,
+        valid_at_ns=9,
+        tracks=[track("a", tuple(place), bound_m=0.0)],
+        carrier=at,
+        array=array,
+        precoder=Precoder(),
+        coverage=Coverage(),
+    )
     (beam,) = beams.beams
     assert beam.pointing_bound_rad is not None
     worst = 0.0
@@ -216,7 +265,7 @@ def test_turning_the_carrier_is_turning_the_world_the_other_way(seed: int) -> No
     turn, mount, pose = (m.as_matrix() for m in Rotation.random(3, rng=rng))
     shift = rng.uniform(-500, 500, 3)
     place = rng.uniform(-50, 50, 3)
-    array = uniform_linear(16, 30e9, 0.5, mount)
+    array = uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=mount)
     tracks = [track(uav, np.array(p)) for uav, p in PLACES.items()]
     plain = pointed(tracks, carrier(tuple(place), pose), array)
     # The world, carrier included, turned and moved.
@@ -224,17 +273,17 @@ def test_turning_the_carrier_is_turning_the_world_the_other_way(seed: int) -> No
     turned = carrier(tuple(turn @ place + shift), pose @ turn.T)
     assert_same_beams(plain, pointed(moved, turned, array))
     # The mount turned one way and the carrier the other.
-    other = uniform_linear(16, 30e9, 0.5, mount @ turn)
+    other = uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=mount @ turn)
     assert_same_beams(plain, pointed(tracks, carrier(tuple(place), turn.T @ pose), other))
     # The mount alone, or the carrier alone: the same, for they follow one another.
-    straight = uniform_linear(16, 30e9, 0.5, EYE)
+    straight = uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
     assert_same_beams(plain, pointed(tracks, carrier(tuple(place), mount @ pose), straight))
 
 
 def test_a_mount_that_looks_right_sees_the_right_ahead() -> None:
     """Array yawed by 90 degrees: body's right is its boresight."""
     right = Rotation.from_euler("ZYX", [math.pi / 2, 0, 0]).as_matrix().T
-    array = uniform_linear(16, 30e9, 0.5, right)
+    array = uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=right)
     (beam,) = pointed([track("a", (0, 100, 0))], carrier(), array).beams
     assert beam.azimuth_rad == pytest.approx(0.0, abs=1e-12)
 
@@ -249,7 +298,9 @@ def test_the_lever_arm_turns_with_the_carrier(seed: int) -> None:
     rng = np.random.default_rng(seed)
     pose = Rotation.random(rng=rng).as_matrix()
     lever = rng.uniform(-3, 3, 3)
-    array = uniform_linear(16, 30e9, 0.5, EYE, lever_arm_m=lever)
+    array = uniform_linear(
+        16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, lever_arm_m=lever
+    )
     place = rng.uniform(-50, 50, 3)
     tracks = [track(uav, np.array(p)) for uav, p in PLACES.items()]
     found = pointed(tracks, carrier(place, pose), array)
@@ -260,7 +311,13 @@ def test_the_lever_arm_turns_with_the_carrier(seed: int) -> None:
 def test_the_lever_arm_is_in_the_body_frame() -> None:
     """Two metres below the belly of a carrier that lies on its right side: two metres to its west,
     when it looks north."""
-    array = uniform_linear(16, 30e9, 0.5, EYE, lever_arm_m=np.array([0.0, 0.0, 2.0]))
+    array = uniform_linear(
+        16,
+        30e9,
+        spacing_wavelengths=0.5,
+        array_from_body=EYE,
+        lever_arm_m=np.array([0.0, 0.0, 2.0]),
+    )
     on_its_right = Rotation.from_euler("x", math.pi / 2).as_matrix().T
     (beam,) = pointed([track("a", (0, 100, 0))], carrier(turn=on_its_right), array).beams
     assert beam.range_m == pytest.approx(102.0)
@@ -277,7 +334,9 @@ def test_turning_array_and_carrier_is_turning_the_world_for_every_array(seed: in
     elements = rng.uniform(-0.02, 0.02, (12, 3))
     outward, lever = rng.standard_normal((12, 3)), rng.uniform(-2, 2, 3)
     element = Element(Pattern.TR38901)
-    array = listed(elements, 30e9, mount, element, lever, outward)
+    array = listed(
+        elements, 30e9, array_from_body=mount, element=element, lever_arm_m=lever, outward=outward
+    )
     place, shift = rng.uniform(-50, 50, 3), rng.uniform(-500, 500, 3)
     tracks = [track(uav, np.array(p)) for uav, p in PLACES.items()]
     plain = pointed(tracks, carrier(place, pose), array)
@@ -285,7 +344,14 @@ def test_turning_array_and_carrier_is_turning_the_world_for_every_array(seed: in
     world = carrier(turn @ place + shift, pose @ turn.T)
     assert_same_beams(plain, pointed(moved, world, array))
     # The body's axes named otherwise: the mount and the lever arm turn with them.
-    other = listed(elements, 30e9, mount @ turn, element, turn.T @ lever, outward)
+    other = listed(
+        elements,
+        30e9,
+        array_from_body=mount @ turn,
+        element=element,
+        lever_arm_m=turn.T @ lever,
+        outward=outward,
+    )
     assert_same_beams(plain, pointed(tracks, carrier(place, turn.T @ pose), other))
 
 
@@ -293,7 +359,9 @@ def test_turning_array_and_carrier_is_turning_the_world_for_every_array(seed: in
 
 
 def test_behind_an_element_that_radiates_forward_there_is_no_beam() -> None:
-    array = uniform_linear(16, 30e9, 0.5, EYE, Element(Pattern.COSINE))
+    array = uniform_linear(
+        16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=Element(Pattern.COSINE)
+    )
     tracks = [track("ahead", (80, 60, 0)), track("behind", (-80, 60, 0))]
     found = pointed(tracks, carrier(), array)
     assert found.uavs == ("ahead",)
@@ -303,11 +371,20 @@ def test_behind_an_element_that_radiates_forward_there_is_no_beam() -> None:
 
 
 def test_where_all_elements_that_face_a_uav_are_dead_there_is_no_beam() -> None:
-    ring = uniform_circular(8, 5e9, 0.5, EYE, Element(Pattern.COSINE))
+    ring = uniform_circular(
+        8, 5e9, spacing_wavelengths=0.5, array_from_body=EYE, element=Element(Pattern.COSINE)
+    )
     array = replace(ring, live=np.isin(np.arange(8), (3, 4, 5)))
     tracks = [track("ahead", (100, 0, 0)), track("behind", (-100, 20, 0))]
     for widen in Widen:
-        found = aim(7, 9, tracks, carrier(), array, Precoder(widen=widen))
+        found = aim(
+            7,
+            valid_at_ns=9,
+            tracks=tracks,
+            carrier=carrier(),
+            array=array,
+            precoder=Precoder(widen=widen),
+        )
         assert found.uavs == ("behind",)
         (out,) = found.left_out
         assert (out.uav, out.reason) == ("ahead", "its elements radiate nothing there")
@@ -316,7 +393,14 @@ def test_where_all_elements_that_face_a_uav_are_dead_there_is_no_beam() -> None:
 @pytest.mark.parametrize("policy", Policy)
 def test_two_uavs_at_one_point_are_defined_under_every_policy(policy: Policy) -> None:
     tracks = [track("a", (80, 60, 0)), track("b", (80, 60, 0)), track("c", (80, -60, 0))]
-    found = aim(7, 9, tracks, carrier(), ARRAY, Precoder(policy=policy, priority=("b",)))
+    found = aim(
+        7,
+        valid_at_ns=9,
+        tracks=tracks,
+        carrier=carrier(),
+        array=ARRAY,
+        precoder=Precoder(policy=policy, priority=("b",)),
+    )
     assert np.all(np.isfinite(found.weights))
     match policy:
         case Policy.REGULARISE:
@@ -368,7 +452,14 @@ def test_a_beam_says_that_it_was_widened() -> None:
     sure, vague = pointed(tracks, carrier(turn=Rotation.from_euler("z", 0.7).as_matrix())).beams
     assert (sure.widened, vague.widened) == (False, True)
     turned = carrier(turn=Rotation.from_euler("z", 0.7).as_matrix())
-    sharp = aim(7, 9, tracks, turned, ARRAY, Precoder(widen=Widen.NO))
+    sharp = aim(
+        7,
+        valid_at_ns=9,
+        tracks=tracks,
+        carrier=turned,
+        array=ARRAY,
+        precoder=Precoder(widen=Widen.NO),
+    )
     assert [beam.widened for beam in sharp.beams] == [False, False]
 
 
@@ -401,12 +492,16 @@ def test_what_is_said_of_a_beam_is_of_its_own_uav_when_others_are_dropped() -> N
         track("kept", (80, 60, 0), bound_m=0.2),
         track("vague", (80, -20, 0), bound_m=30.0),
     ]
-    array = uniform_linear(16, 30e9, 0.5, EYE, Element(Pattern.COSINE))
+    array = uniform_linear(
+        16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=Element(Pattern.COSINE)
+    )
     how = Precoder(policy=Policy.DROP, priority=("kept", "vague"))
-    found = aim(7, 9, tracks, carrier(), array, how)
+    found = aim(7, valid_at_ns=9, tracks=tracks, carrier=carrier(), array=array, precoder=how)
     assert found.uavs == ("kept", "vague")
     for beam, one in zip(found.beams, tracks[1:], strict=True):
-        (alone,) = aim(7, 9, [one], carrier(), array, Precoder()).beams
+        (alone,) = aim(
+            7, valid_at_ns=9, tracks=[one], carrier=carrier(), array=array, precoder=Precoder()
+        ).beams
         assert beam.pointing_bound_rad == alone.pointing_bound_rad
         assert beam.widened is alone.widened
         assert beam.gain_db - alone.gain_db == pytest.approx(0.0, abs=3.0)
@@ -421,9 +516,16 @@ def test_what_is_not_covered_is_left_out_in_the_frames_that_its_limits_are_in() 
     """Array yawed to the right on a carrier that heads east: steering limits turn with the array,
     what the airframe hides with the carrier."""
     right = Rotation.from_euler("z", math.pi / 2).as_matrix().T
-    array = uniform_linear(16, 30e9, 0.5, right, Element(Pattern.COSINE))
+    array = uniform_linear(
+        16, 30e9, spacing_wavelengths=0.5, array_from_body=right, element=Element(Pattern.COSINE)
+    )
     east = carrier(turn=right)
-    hidden = Sector(math.radians(80), math.radians(100), -math.pi / 2, math.pi / 2)
+    hidden = Sector(
+        azimuth_from_rad=math.radians(80),
+        azimuth_to_rad=math.radians(100),
+        elevation_from_rad=-math.pi / 2,
+        elevation_to_rad=math.pi / 2,
+    )
     tracks = [
         track("ahead", (-100, 0, 0)),  # south: right of the nose, the array's boresight
         track("aside", (-60, 80, 0)),
@@ -431,13 +533,29 @@ def test_what_is_not_covered_is_left_out_in_the_frames_that_its_limits_are_in() 
     ]
     reasons = {
         out.uav: out.reason
-        for out in aim(7, 9, tracks, east, array, Precoder(), Coverage(hidden=(hidden,))).left_out
+        for out in aim(
+            7,
+            valid_at_ns=9,
+            tracks=tracks,
+            carrier=east,
+            array=array,
+            precoder=Precoder(),
+            coverage=Coverage(hidden=(hidden,)),
+        ).left_out
     }
     assert reasons.keys() == {"ahead", "behind"}
     assert reasons["ahead"].startswith("hidden by the airframe")
     assert reasons["behind"] == "its elements radiate nothing there"
     limits = Coverage(azimuth_limits_rad=(-0.5, 0.5))
-    found = aim(7, 9, tracks, east, array, Precoder(), limits)
+    found = aim(
+        7,
+        valid_at_ns=9,
+        tracks=tracks,
+        carrier=east,
+        array=array,
+        precoder=Precoder(),
+        coverage=limits,
+    )
     assert found.uavs == ("ahead",)
     assert [out.uav for out in found.left_out] == ["aside", "behind"]
     assert all("outside the steering limits" in out.reason for out in found.left_out)
@@ -458,12 +576,14 @@ def test_rates_are_those_of_positions_and_of_the_turning_carrier(seed: int) -> N
     """Central differences of what is aimed at a moment earlier and later."""
     rng = np.random.default_rng(seed)
     pose, mount = (m.as_matrix() for m in Rotation.random(2, rng=rng))
-    array = uniform_linear(16, 30e9, 0.5, mount)
+    array = uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=mount)
     place, here = rng.uniform(-300, 300, 3), rng.uniform(-50, 50, 3)
     velocity, own, rates = rng.normal(0, 30, 3), rng.normal(0, 30, 3), rng.normal(0, 1.0, 3)
 
     def at(t_s: float) -> Beam | None:
-        there = carrier(here + own * t_s, integrated(rates, t_s) @ pose, 0.0, own, rates)
+        there = carrier(
+            here + own * t_s, integrated(rates, t_s) @ pose, 0.0, velocity=own, rates=rates
+        )
         tracks = [track("a", place + velocity * t_s, velocity=velocity)]
         return next(iter(pointed(tracks, there, array).beams), None)
 
@@ -495,7 +615,13 @@ def test_a_turning_carrier_alone_moves_the_beam_the_other_way() -> None:
 
 def test_an_array_on_a_boom_swings_with_the_turning_carrier() -> None:
     """10 m ahead of the centre at 0.3 rad/s to the right: 3 m/s sideways, towards what is right."""
-    array = uniform_linear(16, 30e9, 0.5, EYE, lever_arm_m=np.array([10.0, 0.0, 0.0]))
+    array = uniform_linear(
+        16,
+        30e9,
+        spacing_wavelengths=0.5,
+        array_from_body=EYE,
+        lever_arm_m=np.array([10.0, 0.0, 0.0]),
+    )
     at = carrier(velocity=STILL, rates=np.array([0.0, 0.0, 0.3]))
     (beam,) = pointed([track("a", (10, 50, 0), velocity=STILL)], at, array).beams
     assert beam.range_rate_mps == pytest.approx(-3.0)
@@ -528,8 +654,24 @@ def test_behind_the_field_of_view_there_is_no_beam_and_no_null() -> None:
     view = Coverage(field_of_view_rad=math.radians(120))
     ahead = track("ahead", (80, 60, 0))
     tracks = [ahead, track("aside", (10, 99, 0)), track("behind", (-80, 60, 0))]
-    found = aim(7, 9, tracks, carrier(), ARRAY, Precoder(), view)
-    alone = aim(7, 9, [ahead], carrier(), ARRAY, Precoder(), view)
+    found = aim(
+        7,
+        valid_at_ns=9,
+        tracks=tracks,
+        carrier=carrier(),
+        array=ARRAY,
+        precoder=Precoder(),
+        coverage=view,
+    )
+    alone = aim(
+        7,
+        valid_at_ns=9,
+        tracks=[ahead],
+        carrier=carrier(),
+        array=ARRAY,
+        precoder=Precoder(),
+        coverage=view,
+    )
     assert found.uavs == ("ahead",)
     assert np.array_equal(found.weights, alone.weights)
     assert {out.uav: out.reason for out in found.left_out} == {
@@ -542,7 +684,7 @@ def test_behind_the_field_of_view_there_is_no_beam_and_no_null() -> None:
 def test_who_is_spared_has_a_null_on_him_and_none_of_the_power(normalisation: str) -> None:
     tracks = [track(uav, place) for uav, place in PLACES.items()]
     precoder = Precoder(widen=Widen.NO, normalisation=Normalisation(normalisation))
-    full = aim(1, 2, tracks, carrier(), ARRAY, precoder)
+    full = aim(1, valid_at_ns=2, tracks=tracks, carrier=carrier(), array=ARRAY, precoder=precoder)
     spared = without(full, {"2:1"})
     assert spared.uavs == ("1:1", "3:1")
     towards = steering.steering_matrix(ARRAY, directions(full))
@@ -561,7 +703,7 @@ def test_who_is_spared_has_a_null_on_him_and_none_of_the_power(normalisation: st
 def test_a_turn_that_was_of_the_spared_alone_is_none() -> None:
     twins = [track("1:1", (100, 0, 0)), track("2:1", (101, 0, 0)), track("3:1", (102, 0, 0))]
     precoder = Precoder(policy=Policy.GROUP, widen=Widen.NO, normalisation=Normalisation.TOTAL)
-    full = aim(1, 2, twins, carrier(), ARRAY, precoder)
+    full = aim(1, valid_at_ns=2, tracks=twins, carrier=carrier(), array=ARRAY, precoder=precoder)
     assert [beam.group for beam in full.beams] == [0, 1, 2]
     spared = without(full, {"2:1"})
     assert [beam.group for beam in spared.beams] == [0, 1]
@@ -570,6 +712,13 @@ def test_a_turn_that_was_of_the_spared_alone_is_none() -> None:
 
 
 def test_sparing_all_leaves_nothing() -> None:
-    full = aim(1, 2, [track("1:1", (100, 0, 0))], carrier(), ARRAY, Precoder())
+    full = aim(
+        1,
+        valid_at_ns=2,
+        tracks=[track("1:1", (100, 0, 0))],
+        carrier=carrier(),
+        array=ARRAY,
+        precoder=Precoder(),
+    )
     spared = without(full, {"1:1"})
     assert (spared.uavs, spared.groups, spared.weights.shape) == ((), 0, (16, 0))

@@ -18,12 +18,25 @@ from companion.beams.weights.precoding import Precoder
 from companion.values import Carrier, ComplexArray, FloatArray, Limits, Track, TrackState, Widen
 
 STILL, EYE = np.zeros(3), np.eye(3)
-AT = Carrier(0, STILL, STILL, EYE, STILL, 0.0, 0.0, None)
+AT = Carrier(
+    valid_at_ns=0,
+    position_ned_m=STILL,
+    velocity_ned_mps=STILL,
+    body_from_local=EYE,
+    body_rates_radps=STILL,
+    bound_m=0.0,
+    attitude_bound_rad=0.0,
+    age_s=None,
+)
 ARRAYS = {
-    "line": uniform_linear(64, 30e9, 0.5, EYE),
-    "square": uniform_rectangular(8, 8, 30e9, 0.5, EYE),
-    "oblong": uniform_rectangular(8, 4, 30e9, 0.5, EYE),
-    "circle": uniform_circular(16, 30e9, 0.5, EYE),
+    "line": uniform_linear(64, 30e9, spacing_wavelengths=0.5, array_from_body=EYE),
+    "square": uniform_rectangular(
+        8, columns=8, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
+    ),
+    "oblong": uniform_rectangular(
+        8, columns=4, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
+    ),
+    "circle": uniform_circular(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE),
 }
 STEPS, HALVINGS = 24, 18
 """Steps of a sweep, and how often the one of the largest change is halved: to .06 microdegrees."""
@@ -46,16 +59,37 @@ class Scene:
         angles[0] += share * self._way
         places = 100.0 * steering.unit_directions(*angles.T)
         tracks = [track(*one) for one in zip(places, self._bounds_m.tolist(), strict=True)]
-        weights = aim(0, 0, tracks, AT, self._array, self._how).weights
+        weights = aim(
+            0, valid_at_ns=0, tracks=tracks, carrier=AT, array=self._array, precoder=self._how
+        ).weights
         unit: ComplexArray = weights / np.linalg.norm(weights, axis=0)
         return unit
 
 
 def track(place: FloatArray, bound_m: float) -> Track:
     return Track(
-        str(bound_m), TrackState.LIVE, 0, 0.1, place, None, None, None, bound_m, bound_m, bound_m,
-        STILL, bound_m, Limits(60.0, 5.0), bound_m / 4, 0.0, None, None, None, None, 1,
-    )  # fmt: skip
+        uav=str(bound_m),
+        state=TrackState.LIVE,
+        valid_at_ns=0,
+        age_s=0.1,
+        position_ned_m=place,
+        velocity_ned_mps=None,
+        unknown_input_mps=None,
+        acceleration_ned_mps2=None,
+        bound_m=bound_m,
+        horizontal_bound_m=bound_m,
+        vertical_bound_m=bound_m,
+        set_center_ned_m=STILL,
+        set_radius_m=bound_m,
+        limits=Limits(60.0, 5.0),
+        error_p95_m=bound_m / 4,
+        clock_bound_s=0.0,
+        dt_s=None,
+        latency_s=None,
+        gamma=None,
+        innovation_m=None,
+        reports=1,
+    )
 
 
 def least_alike(one: ComplexArray, other: ComplexArray) -> float:

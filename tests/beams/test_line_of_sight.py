@@ -15,9 +15,28 @@ from companion.values import Carrier, FloatArray, Limits, Track, TrackState
 def flying(rng: np.random.Generator, acceleration: FloatArray | None) -> Track:
     place, velocity = rng.uniform(-300, 300, 3), rng.normal(0, 20, 3)
     return Track(
-        "a", TrackState.LIVE, 9, 0.1, place, velocity, None, acceleration,
-        2.0, 2.0, 2.0, place, 2.0, Limits(60.0, 5.0), None, 0.0, None, None, None, None, 1,
-    )  # fmt: skip
+        uav="a",
+        state=TrackState.LIVE,
+        valid_at_ns=9,
+        age_s=0.1,
+        position_ned_m=place,
+        velocity_ned_mps=velocity,
+        unknown_input_mps=None,
+        acceleration_ned_mps2=acceleration,
+        bound_m=2.0,
+        horizontal_bound_m=2.0,
+        vertical_bound_m=2.0,
+        set_center_ned_m=place,
+        set_radius_m=2.0,
+        limits=Limits(60.0, 5.0),
+        error_p95_m=None,
+        clock_bound_s=0.0,
+        dt_s=None,
+        latency_s=None,
+        gamma=None,
+        innovation_m=None,
+        reports=1,
+    )
 
 
 @settings(max_examples=examples(50))
@@ -27,9 +46,20 @@ def test_directions_ahead_are_those_of_positions_ahead(seed: int, accelerates: b
     rng = np.random.default_rng(seed)
     pose, mount = (m.as_matrix() for m in Rotation.random(2, rng=rng))
     lever, rates = rng.uniform(-3, 3, 3), rng.normal(0, 1, 3)
-    array = uniform_linear(4, 30e9, 0.5, mount, lever_arm_m=lever)
+    array = uniform_linear(
+        4, 30e9, spacing_wavelengths=0.5, array_from_body=mount, lever_arm_m=lever
+    )
     here, own = rng.uniform(-50, 50, 3), rng.normal(0, 20, 3)
-    at = Carrier(9, here, own, pose, rates, 0.0, 0.0, None)
+    at = Carrier(
+        valid_at_ns=9,
+        position_ned_m=here,
+        velocity_ned_mps=own,
+        body_from_local=pose,
+        body_rates_radps=rates,
+        bound_m=0.0,
+        attitude_bound_rad=0.0,
+        age_s=None,
+    )
     track = flying(rng, rng.normal(0, 5, 3) if accelerates else None)
     times_s = np.array([0.0, 0.1, 1.0, 7.0])
     found = line_of_sight.directions_ahead(track, at, array, times_s)
@@ -47,13 +77,41 @@ def test_directions_ahead_are_those_of_positions_ahead(seed: int, accelerates: b
 
 def test_through_the_array_itself_directions_stay_unit_vectors() -> None:
     """A UAV that flies through it is at no direction for one instant."""
-    array = uniform_linear(4, 30e9, 0.5, np.eye(3))
-    at = Carrier(9, np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3), 0.0, 0.0, None)
+    array = uniform_linear(4, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
+    at = Carrier(
+        valid_at_ns=9,
+        position_ned_m=np.zeros(3),
+        velocity_ned_mps=np.zeros(3),
+        body_from_local=np.eye(3),
+        body_rates_radps=np.zeros(3),
+        bound_m=0.0,
+        attitude_bound_rad=0.0,
+        age_s=None,
+    )
     place, velocity = np.array([0.0, 30.0, 0.0]), np.array([0.0, -10.0, 0.0])
     track = Track(
-        "a", TrackState.LIVE, 9, 0.1, place, velocity, None, None,
-        2.0, 2.0, 2.0, place, 2.0, Limits(60.0, 5.0), None, 0.0, None, None, None, None, 1,
-    )  # fmt: skip
+        uav="a",
+        state=TrackState.LIVE,
+        valid_at_ns=9,
+        age_s=0.1,
+        position_ned_m=place,
+        velocity_ned_mps=velocity,
+        unknown_input_mps=None,
+        acceleration_ned_mps2=None,
+        bound_m=2.0,
+        horizontal_bound_m=2.0,
+        vertical_bound_m=2.0,
+        set_center_ned_m=place,
+        set_radius_m=2.0,
+        limits=Limits(60.0, 5.0),
+        error_p95_m=None,
+        clock_bound_s=0.0,
+        dt_s=None,
+        latency_s=None,
+        gamma=None,
+        innovation_m=None,
+        reports=1,
+    )
     found = line_of_sight.directions_ahead(track, at, array, np.array([2.0, 3.0, 4.0]))
     assert found is not None
     assert found == pytest.approx(np.array([[0, 1, 0], [1, 0, 0], [0, -1, 0]]))
@@ -61,6 +119,15 @@ def test_through_the_array_itself_directions_stay_unit_vectors() -> None:
 
 def test_without_a_velocity_nothing_is_known_ahead() -> None:
     rng = np.random.default_rng(1)
-    array = uniform_linear(4, 30e9, 0.5, np.eye(3))
-    unknown = Carrier(9, np.zeros(3), None, np.eye(3), np.zeros(3), 0.0, 0.0, None)
+    array = uniform_linear(4, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
+    unknown = Carrier(
+        valid_at_ns=9,
+        position_ned_m=np.zeros(3),
+        velocity_ned_mps=None,
+        body_from_local=np.eye(3),
+        body_rates_radps=np.zeros(3),
+        bound_m=0.0,
+        attitude_bound_rad=0.0,
+        age_s=None,
+    )
     assert line_of_sight.directions_ahead(flying(rng, None), unknown, array, np.zeros(1)) is None

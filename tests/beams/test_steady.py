@@ -23,17 +23,47 @@ from companion.values import (
 )
 
 STILL = np.zeros(3)
-AT = Carrier(0, STILL, STILL, np.eye(3), STILL, 0.0, 0.0, None)
-ARRAY = uniform_linear(64, 30e9, 0.5, np.eye(3))
-PLANE = uniform_rectangular(16, 16, 30e9, 0.5, np.eye(3))
+AT = Carrier(
+    valid_at_ns=0,
+    position_ned_m=STILL,
+    velocity_ned_mps=STILL,
+    body_from_local=np.eye(3),
+    body_rates_radps=STILL,
+    bound_m=0.0,
+    attitude_bound_rad=0.0,
+    age_s=None,
+)
+ARRAY = uniform_linear(64, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
+PLANE = uniform_rectangular(
+    16, columns=16, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3)
+)
 TICK_NS = 100_000_000
 
 
 def track(uav: str, aside_m: float, bound_m: float) -> Track:
     return Track(
-        uav, TrackState.LIVE, 0, 0.1, np.array([100.0, aside_m, 0.0]), None, None, None, bound_m,
-        bound_m, bound_m, STILL, bound_m, Limits(60.0, 5.0), None, 0.0, None, None, None, None, 1,
-    )  # fmt: skip
+        uav=uav,
+        state=TrackState.LIVE,
+        valid_at_ns=0,
+        age_s=0.1,
+        position_ned_m=np.array([100.0, aside_m, 0.0]),
+        velocity_ned_mps=None,
+        unknown_input_mps=None,
+        acceleration_ned_mps2=None,
+        bound_m=bound_m,
+        horizontal_bound_m=bound_m,
+        vertical_bound_m=bound_m,
+        set_center_ned_m=STILL,
+        set_radius_m=bound_m,
+        limits=Limits(60.0, 5.0),
+        error_p95_m=None,
+        clock_bound_s=0.0,
+        dt_s=None,
+        latency_s=None,
+        gamma=None,
+        innovation_m=None,
+        reports=1,
+    )
 
 
 def flown(
@@ -49,7 +79,17 @@ def flown(
         at_ns = tick * TICK_NS
         aside_m = 60.0 if apart_m is None else apart_m[tick]
         tracks = [track("a", 0.0, bound_m), track("b", aside_m, 0.1)]
-        found.append(aim(at_ns, at_ns, tracks, AT, array, how, before=state))
+        found.append(
+            aim(
+                at_ns,
+                valid_at_ns=at_ns,
+                tracks=tracks,
+                carrier=AT,
+                array=array,
+                precoder=how,
+                before=state,
+            )
+        )
         state = steady.after(state, found[-1])
     return found
 
@@ -134,8 +174,19 @@ def test_turns_do_not_change_to_and_fro(policy: Policy) -> None:
 @pytest.mark.parametrize("stopped_s", [100.0, 1000.0, 86_400.0, 2.0**31])
 def test_beams_go_on_after_any_pause(stopped_s: float) -> None:
     """A process that was stopped (SIGSTOP) or a machine that was suspended ticks on much later."""
-    before = Steady(0, {"1:1": (0.01, 0.2)}, {}, {"1:1": 0}, frozenset({"1:1"}), 0, None)
+    before = Steady(
+        valid_at_ns=0,
+        shaped={"1:1": (0.01, 0.2)},
+        filled_ns={},
+        turns={"1:1": 0},
+        known=frozenset({"1:1"}),
+        turned_ns=0,
+        inexact_ns=None,
+    )
     wanted = np.array([[0.05, 0.3]])
     at_ns = round(stopped_s * 1e9)
     for then_ns in (at_ns, -at_ns):
-        assert np.array_equal(steady.followed_rad(before, then_ns, ["1:1"], wanted, 0.1), wanted)
+        assert np.array_equal(
+            steady.followed_rad(before, then_ns, ["1:1"], wanted_rad=wanted, natural_rad=0.1),
+            wanted,
+        )

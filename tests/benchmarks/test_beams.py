@@ -27,7 +27,16 @@ from companion.values import (
 
 pytestmark = pytest.mark.benchmark
 STILL = np.zeros(3)
-AT = Carrier(0, STILL, STILL, np.eye(3), STILL, 0.0, 0.05, None)
+AT = Carrier(
+    valid_at_ns=0,
+    position_ned_m=STILL,
+    velocity_ned_mps=STILL,
+    body_from_local=np.eye(3),
+    body_rates_radps=STILL,
+    bound_m=0.0,
+    attitude_bound_rad=0.05,
+    age_s=None,
+)
 
 
 def most_db(width: float, elements: int) -> float:
@@ -42,7 +51,9 @@ def most_db(width: float, elements: int) -> float:
 
 @pytest.mark.parametrize("elements", [16, 64, 256])
 def test_shapes_of_lines_against_free_amplitudes(elements: int) -> None:
-    across = shapes.aperture(uniform_linear(elements, 30e9, 0.5, np.eye(3)))
+    across = shapes.aperture(
+        uniform_linear(elements, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
+    )
     print(f"\nline of {elements}: least gain, less that of the best amplitudes, dB")
     for width in (0.25, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0):
         if width > 0.375 * elements:
@@ -78,7 +89,15 @@ def climbed(phases: FloatArray, response: ComplexArray) -> FloatArray:
 
 @pytest.mark.parametrize("elements", [8, 16])
 def test_shapes_of_planes_against_a_search(elements: int) -> None:
-    across = shapes.aperture(uniform_rectangular(elements, elements, 30e9, 0.5, np.eye(3)))
+    across = shapes.aperture(
+        uniform_rectangular(
+            elements,
+            columns=elements,
+            frequency_hz=30e9,
+            spacing_wavelengths=0.5,
+            array_from_body=np.eye(3),
+        )
+    )
     rng = np.random.default_rng(1)
     print(f"\n{elements} x {elements}: least gain, less that of a search from there, dB")
     for width in (0.25, 0.5, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0):
@@ -149,8 +168,10 @@ def test_mmse_against_its_references(elements: int, users: int) -> None:
         radio = Radio(snr, np.ones(users))
 
         def made(method: Method, power: Power, radio: Radio = radio) -> FloatArray:
-            how = Precoder(method, normalisation=Normalisation.TOTAL, widen=Widen.NO, power=power)
-            return sinr(a, precode(a, how, None, None, radio).weights, radio.snr)
+            how = Precoder(
+                method=method, normalisation=Normalisation.TOTAL, widen=Widen.NO, power=power
+            )
+            return sinr(a, precode(a, how, None, priorities=None, radio=radio).weights, radio.snr)
 
         fair = made(Method.MMSE, Power.MAX_MIN).min() / fixed_point(a, snr)
         best = wmmse(a, snr)
@@ -174,18 +195,42 @@ def flying(users: int, apart_rad: float) -> list[Track]:
         angle = (n - (users - 1) / 2) * apart_rad
         place = 100.0 * np.array([np.cos(angle), np.sin(angle), 0.0])
         found.append(
-            Track(str(n), TrackState.LIVE, 0, 0.1, place, STILL, None, None, 5.0, 5.0, 5.0, STILL,
-                  5.0, Limits(60.0, 5.0), 0.5, 0.0, None, None, None, None, 1)
-        )  # fmt: skip
+            Track(
+                uav=str(n),
+                state=TrackState.LIVE,
+                valid_at_ns=0,
+                age_s=0.1,
+                position_ned_m=place,
+                velocity_ned_mps=STILL,
+                unknown_input_mps=None,
+                acceleration_ned_mps2=None,
+                bound_m=5.0,
+                horizontal_bound_m=5.0,
+                vertical_bound_m=5.0,
+                set_center_ned_m=STILL,
+                set_radius_m=5.0,
+                limits=Limits(60.0, 5.0),
+                error_p95_m=0.5,
+                clock_bound_s=0.0,
+                dt_s=None,
+                latency_s=None,
+                gamma=None,
+                innovation_m=None,
+                reports=1,
+            )
+        )
     return found
 
 
 def took_s(how: Precoder, elements: int, users: int, apart_rad: float, rounds: int) -> float:
-    array, tracks = uniform_linear(elements, 30e9, 0.5, np.eye(3)), flying(users, apart_rad)
+    array, tracks = (
+        uniform_linear(elements, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3)),
+        flying(users, apart_rad),
+    )
     best = np.inf
     for _ in range(rounds):
         begin = time.perf_counter()
-        aim(0, 0, tracks, AT, array, how)
+        aim(0, valid_at_ns=0, tracks=tracks, carrier=AT, array=array, precoder=how)
         best = min(best, time.perf_counter() - begin)
     return best
 

@@ -103,7 +103,9 @@ def test_splitting_against_pymavlink(figures: Figures) -> None:
 
 def users_of_a_line(elements: int, users: int) -> ComplexArray:
     """The steering matrix of a half-wave line for users in directions that are all different."""
-    array = geometry.uniform_linear(elements, 30e9, 0.5, np.eye(3))
+    array = geometry.uniform_linear(
+        elements, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3)
+    )
     sines = np.linspace(-0.9, 0.9, users)
     directions = np.c_[np.sqrt(1 - sines**2), sines, np.zeros(users)]
     return steering.steering_matrix(array, directions)
@@ -145,11 +147,23 @@ def test_a_kinematic_update_with_prediction_and_bound(uavs: int, figures: Figure
 def _update_us(uavs: int) -> float:
     settings = Settings()
     tracker = assembly.tracker(settings)
-    noise = ReportNoise(1.0, 1.0, 1.4, 0.3)
+    noise = ReportNoise(horizontal_m=1.0, vertical_m=1.0, position_m=1.4, velocity_mps=0.3)
     report = Report(
-        0, "bench", "", Source(1, 1), 47.0, 8.0, 500.0, AltitudeDatum.MSL, None, None, None, None,
-        0, None,
-    )  # fmt: skip
+        t_ns=0,
+        link="bench",
+        uav="",
+        source=Source(1, 1),
+        lat_deg=47.0,
+        lon_deg=8.0,
+        alt_m=500.0,
+        alt_datum=AltitudeDatum.MSL,
+        relative_alt_m=None,
+        velocity_ne_mps=None,
+        velocity_down_mps=None,
+        heading_deg=None,
+        boot_ms=0,
+        tslc_s=None,
+    )
     velocity = (5.0, 0.0, 0.0)
     rounds = 4000 // uavs
 
@@ -162,9 +176,24 @@ def _update_us(uavs: int) -> float:
             position = (5.0 * (t_ns * 1e-9), 0.0, 0.0)
             for uav in range(uavs):
                 name = str(uav)
-                tracker.accept(Fix(name, t_ns, t_ns, t_ns, position, velocity, noise, report))
+                tracker.accept(
+                    Fix(
+                        uav=name,
+                        sender_ns=t_ns,
+                        t_ns=t_ns,
+                        arrival_ns=t_ns,
+                        position_ned_m=position,
+                        velocity_ned_mps=velocity,
+                        noise=noise,
+                        report=report,
+                    )
+                )
                 later_ns = t_ns + 50_000_000
-                tracker.track(name, t_ns, SenderTime(later_ns, later_ns, 0.01, 0.01))
+                tracker.track(
+                    name,
+                    t_ns,
+                    SenderTime(node_ns=later_ns, sender_ns=later_ns, before_s=0.01, after_s=0.01),
+                )
         begin_ns += rounds * 100_000_000
 
     (seconds,) = interleaved(fly)

@@ -374,7 +374,7 @@ def left(where: Path) -> dict[str, bytes]:
     ],
 )
 def test_an_export_cut_short_leaves_what_was_there(
-    form: str, failure: BaseException, status: int, says: str, short_log: Path,
+    *, form: str, failure: BaseException, status: int, says: str, short_log: Path,
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     where, steps, before = tmp_path / "out", 0, dict[str, bytes]()

@@ -49,7 +49,9 @@ def test_no_device_within_its_calibration_s_bounds_has_less(cut_log: Path, tmp_p
     live = np.ones(16)
     live[list(DEAD)] = 0.0
     assert not np.array(answer["re"])[list(DEAD)].any()
-    array = uniform_rectangular(4, 4, 30e9, 0.5, np.eye(3))
+    array = uniform_rectangular(
+        4, columns=4, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3)
+    )
     known = 0
     for i, beam in enumerate(answer["beams"]):
         if beam["guaranteed_gain_db"] is None:

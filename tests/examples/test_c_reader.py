@@ -62,7 +62,16 @@ def beam_set(rng: np.random.Generator, elements: int, beams: int) -> BeamSet:
     weights = rng.normal(size=(elements, beams)) + 1j * rng.normal(size=(elements, beams))
     t_ns = int(rng.integers(0, 2**62))
     kind = list(Normalisation)[rng.integers(0, 4)]
-    return BeamSet(t_ns, t_ns + 7, made, weights, Method.MATCHED, kind, 1.0, ())
+    return BeamSet(
+        t_ns=t_ns,
+        valid_at_ns=t_ns + 7,
+        beams=made,
+        weights=weights,
+        method=Method.MATCHED,
+        normalisation=kind,
+        condition_number=1.0,
+        left_out=(),
+    )
 
 
 def printed(printer: Path, parts: list[bytes]) -> list[list[str]]:

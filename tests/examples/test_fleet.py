@@ -64,9 +64,9 @@ class Node:
             listen=(endpoint,) if listens else (),
             connect=() if listens else (endpoint,),
             tls=BusTls(
-                folder / "ca.pem",
-                certificate if certificate.exists() else None,
-                certificate.with_suffix(".key") if certificate.exists() else None,
+                ca=folder / "ca.pem",
+                certificate=certificate if certificate.exists() else None,
+                private_key=certificate.with_suffix(".key") if certificate.exists() else None,
             ),
             access_control=acl,
             retry_s=0.05,

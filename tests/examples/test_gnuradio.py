@@ -31,9 +31,31 @@ def python() -> str:
 
 def record(number: int, uavs: list[str], weights: ComplexArray) -> bytes:
     beams = tuple(
-        Beam(uav, 0.0, 0.0, 1.0, None, None, None, None, 0.0, 0.0, group=0) for uav in uavs
+        Beam(
+            uav=uav,
+            azimuth_rad=0.0,
+            elevation_rad=0.0,
+            range_m=1.0,
+            azimuth_rate_radps=None,
+            elevation_rate_radps=None,
+            range_rate_mps=None,
+            pointing_bound_rad=None,
+            gain_db=0.0,
+            loss_db=0.0,
+            group=0,
+        )
+        for uav in uavs
     )
-    made = BeamSet(0, 0, beams, weights, Method.MATCHED, Normalisation.STREAM, 1.0, ())
+    made = BeamSet(
+        t_ns=0,
+        valid_at_ns=0,
+        beams=beams,
+        weights=weights,
+        method=Method.MATCHED,
+        normalisation=Normalisation.STREAM,
+        condition_number=1.0,
+        left_out=(),
+    )
     return next(records.encode(made, number))
 
 

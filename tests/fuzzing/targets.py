@@ -81,12 +81,12 @@ def _events(data: bytes) -> Iterator[Any]:
         elif kind >= 245 and len(payload) >= 16:
             sent_ms, there_ns = struct.unpack_from("<qq", payload)
             sent_ns = t_ns - abs(sent_ms) % 10_000 * 1_000_000
-            yield RoundTrip(t_ns, source, sent_ns, there_ns)
+            yield RoundTrip(t_ns=t_ns, source=source, sent_ns=sent_ns, remote_ns=there_ns)
         else:
             msgid = HEARD[kind % len(HEARD)]
             head = bytes([0xFD, len(payload), 0, 0, 0, source.sysid, source.compid])
             raw = head + msgid.to_bytes(3, "little") + payload + b"\0\0"
-            yield Frame(t_ns, "fuzz", source, msgid, raw)
+            yield Frame(t_ns=t_ns, link="fuzz", source=source, msgid=msgid, raw=raw)
 
 
 def _now(data: bytes) -> int:

@@ -23,7 +23,7 @@ SCHEDULER_S = 0.1
 
 CASES = {
     "senders": Case(
-        (
+        faults=(
             "drift@1:1=-24000",
             "drift@6:1=24000",
             "reboot@2:1=4",
@@ -32,15 +32,15 @@ CASES = {
         ),
         uavs=6,
     ),
-    "loss": Case(("loss@1:1=0.3", "loss@3:1=0.3")),
-    "duplication": Case(("duplication@1:1=0.2", "duplication@3:1=0.2")),
-    "delay": Case(("delay@1:1=0.3", "delay@2:1=0.3"), clocks=GNSS),
-    "jitter": Case(("jitter=0.1",), links=2),
-    "burst": Case(("burst=0.4:1",)),
-    "reordering": Case(("reordering=0.1",)),
-    "bit-errors": Case(("bit-errors@1:1=5e-4", "bit-errors@2:1=5e-4")),
-    "truncation": Case(("truncation@1:1=0.2", "truncation@2:1=0.2")),
-    "garbage": Case(("garbage=0.2",)),
+    "loss": Case(faults=("loss@1:1=0.3", "loss@3:1=0.3")),
+    "duplication": Case(faults=("duplication@1:1=0.2", "duplication@3:1=0.2")),
+    "delay": Case(faults=("delay@1:1=0.3", "delay@2:1=0.3"), clocks=GNSS),
+    "jitter": Case(faults=("jitter=0.1",), links=2),
+    "burst": Case(faults=("burst=0.4:1",)),
+    "reordering": Case(faults=("reordering=0.1",)),
+    "bit-errors": Case(faults=("bit-errors@1:1=5e-4", "bit-errors@2:1=5e-4")),
+    "truncation": Case(faults=("truncation@1:1=0.2", "truncation@2:1=0.2")),
+    "garbage": Case(faults=("garbage=0.2",)),
     "shared-id": Case(scenario="shared-id"),
     "adsb": Case(scenario="adsb", seconds=12.0),
 }

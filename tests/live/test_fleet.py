@@ -26,7 +26,7 @@ NAMES = ("a", "b", "c")
 UAVS = 6
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Fleet:
     """The nodes, what they hear, and every answer that was held against the truth."""
 
@@ -114,8 +114,8 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
             nodes[name] = Node(
                 *run, "--listen", "127.0.0.1:0", code=WRONG_CLOCK if name == "c" else None
             )
-        with FleetSky([node.udp_port for node in nodes.values()], UAVS) as sky:
-            made = Fleet(nodes, sky, ports)
+        with FleetSky(ports=[node.udp_port for node in nodes.values()], uavs=UAVS) as sky:
+            made = Fleet(nodes=nodes, sky=sky, ports=ports)
             watcher = threading.Thread(target=made.watch)
             watcher.start()
             try:
@@ -247,8 +247,19 @@ def _phantom(sysid: int, told: dict[str, int]) -> bytes:
 
 
 def _offers() -> Any:
-    return {f"{n}:1": Offer(f"{n}:1", 17.0, 17.0, 90.0, 0.1) for n in range(66, 70)}
+    return {
+        f"{n}:1": Offer(uav=f"{n}:1", sure_db=17.0, likely_db=17.0, sinr_db=90.0, heard_s=0.1)
+        for n in range(66, 70)
+    }
 
 
 def _standing(started_ns: int) -> Any:
-    return Standing("liar", started_ns, time.time_ns(), None, None, 10, ())
+    return Standing(
+        node="liar",
+        started_ns=started_ns,
+        t_ns=time.time_ns(),
+        place=None,
+        reach_m=None,
+        most=10,
+        serves=(),
+    )

@@ -95,7 +95,7 @@ def fly(folder: Path, course: Callable[[Flight], Coroutine[Any, Any, None]]) -> 
 
     async def run() -> Flight:
         with socket.create_server(("127.0.0.1", 0)) as http:
-            service, until = Service(settings, lambda _: None), asyncio.Event()
+            service, until = Service(settings=settings, say=lambda _: None), asyncio.Event()
             flight = Flight(service, address(http))
 
             async def beside() -> None:

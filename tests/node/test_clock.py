@@ -83,7 +83,7 @@ FRAMES = 350
 def flown(log: Path, machine: Machine, recordings: Path, said: list[str]) -> Service:
     """A service that heard a log, and whose clock was set in the middle of it."""
     settings = SETTINGS.override(recording={"directory": str(recordings)})
-    node = Service(settings, said.append, clock=machine.clock())
+    node = Service(settings=settings, say=said.append, clock=machine.clock())
     assert node._recorder is not None
     node._recorder.start()
     events = [event for event in read_log(log) if isinstance(event, Frame)][:FRAMES]
@@ -124,14 +124,14 @@ def test_times_follow_the_clock_that_was_set_live_and_in_a_replay(
 
     (log,) = (tmp_path / "recordings").iterdir()
     assert sum(isinstance(event, ClockSet) for event in read_log(log)) == 1
-    again = ServedReplay(Asked([log], SETTINGS, None, None), said.append)
+    again = ServedReplay(Asked(logs=[log], settings=SETTINGS, speed=None, record=None), said.append)
     run_async(again._replay(asyncio.Event()))
     assert again.pipeline.digest.hexdigest() == node.pipeline.digest.hexdigest()
     assert state.uavs(again)[0]["fix"] == uavs[0]["fix"]
     assert said.count(told[0]) == 2
 
     tables = tmp_path / "tables"
-    export([log], SETTINGS, tables, "csv", lambda *_: None)
+    export([log], SETTINGS, tables, form="csv", progress=lambda *_: None)
     with (tables / "updates.csv").open() as file:
         assert {row["t_utc"][:14] for row in csv.DictReader(file)} == {"2023-11-14T22:"}
     pipeline, update = look([log], SETTINGS, shown["time"])

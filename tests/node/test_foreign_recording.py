@@ -43,7 +43,9 @@ SHORT = "companion: nothing was aimed at: the log is shorter than one update\n"
 def foreign(cut_log: Path, path: Path, sections: dict[str, Any]) -> Path:
     """A recording of a real flight, with settings of somebody else's making."""
     text = tomli_w.dumps({"center": {"source": "5:1"}, **sections}).replace("{}", str(path.parent))
-    with Writer(path, text, {}, None, 0) as writer:
+    with Writer(
+        where=path, settings_toml=text, versions={}, weights_hz=None, started_ns=0
+    ) as writer:
         for event in read_log(cut_log):
             if isinstance(event, Frame):
                 writer.event(event)

@@ -29,7 +29,9 @@ def test_a_signing_key_goes_no_further_and_that_is_counted() -> None:
 
     async def test() -> None:
         settings = Settings().override(links={"urls": ["udpin:127.0.0.1:0"]})
-        gateway = Gateway(settings, stepped.append, lambda _: None, lambda: 5)
+        gateway = Gateway(
+            settings=settings, step=stepped.append, notify=lambda _: None, now_ns=lambda: 5
+        )
         gateway.open()
         serving = asyncio.create_task(gateway.run())
         with socket.socket(type=socket.SOCK_DGRAM) as sender:
@@ -44,7 +46,7 @@ def test_a_signing_key_goes_no_further_and_that_is_counted() -> None:
     before, refused, after = stepped
     assert isinstance(before, Frame) and isinstance(after, Frame)
     assert [before.raw, after.raw] == [sent[0], sent[2]]
-    assert refused == Rejection(before.t_ns, "255:190", Reason.SECRET, msgid=256)
+    assert refused == Rejection(t_ns=before.t_ns, source="255:190", reason=Reason.SECRET, msgid=256)
     assert repr(SECRET)[2:-1] not in repr(stepped)
 
 
@@ -65,7 +67,12 @@ def test_a_uav_is_asked_over_the_link_on_which_it_was_heard_last() -> None:
             links={"urls": ["udpin:127.0.0.1:0", "udpin:localhost:0"]},
             presence={"enabled": True, "position_hz": 10.0},
         )
-        gateway = Gateway(settings, stepped.append, lambda _: None, lambda: now_s[0] * 10**9)
+        gateway = Gateway(
+            settings=settings,
+            step=stepped.append,
+            notify=lambda _: None,
+            now_ns=lambda: now_s[0] * 10**9,
+        )
         gateway.open()
         serving = asyncio.create_task(gateway.run())
         loop = asyncio.get_running_loop()
@@ -124,7 +131,12 @@ def test_two_peers_that_contradict_each_other_are_said_once_and_not_believed(
     now_ms = 100_000
     urls = ["udpin:127.0.0.1:0", "tcpin:127.0.0.1:0"]
     settings = Settings().override(links={"urls": urls, "routers": routers})
-    gateway = Gateway(settings, stepped.append, said.append, lambda: now_ms * 1_000_000)
+    gateway = Gateway(
+        settings=settings,
+        step=stepped.append,
+        notify=said.append,
+        now_ns=lambda: now_ms * 1_000_000,
+    )
     gateway.open()
     try:
         for number in range(100):

@@ -22,7 +22,10 @@ def test_each_vehicle_counts_its_messages() -> None:
     async def test(heard: socket.socket) -> None:
         out = {"urls": [f"udpout:127.0.0.1:{heard.getsockname()[1]}"], "rate_hz": 50.0}
         outlet = Outlet(
-            settings.override(out=out), pipeline, lambda notice: None, lambda: next(now_ns)
+            settings=settings.override(out=out),
+            pipeline=pipeline,
+            notify=lambda notice: None,
+            now_ns=lambda: next(now_ns),
         )
         outlet.open()
         task, mav = asyncio.create_task(outlet.run()), common.MAVLink(None)

@@ -20,7 +20,13 @@ def test_who_does_not_listen_is_said_once_and_that_it_does_after_a_while() -> No
     equipment, notices = assembly.equipment(settings, pipeline.array), list[Notice]()
     to = ("127.0.0.1", free_port(socket.SOCK_DGRAM))
     way = RecordSettings(udp=(f"{to[0]}:{to[1]}",))
-    push = Push(way, pipeline, equipment, notices.append, lambda: 0)
+    push = Push(
+        settings=way,
+        pipeline=pipeline,
+        equipment=equipment,
+        notify=notices.append,
+        now_ns=lambda: 0,
+    )
 
     async def test() -> None:
         task = asyncio.create_task(push.run())

@@ -147,7 +147,9 @@ def test_on_plain_asyncio_as_fast_as_it_goes(cut_log: Path, unserved: dict[str, 
 
     async def serve() -> ServedReplay:
         settings = Settings().override(center={"source": "5:1"})
-        node = ServedReplay(Asked([cut_log], settings, None, None), said.append)
+        node = ServedReplay(
+            Asked(logs=[cut_log], settings=settings, speed=None, record=None), said.append
+        )
         until = asyncio.Event()
 
         def show(summary: dict[str, Any]) -> None:
@@ -169,14 +171,27 @@ def test_on_plain_asyncio_as_fast_as_it_goes(cut_log: Path, unserved: dict[str, 
 def test_now_does_not_go_back_for_a_frame_that_waited(tmp_path: Path) -> None:
     """It is taken in after a tick of a later time, with the time at which it arrived."""
     settings, begun_ns = Settings().override(center={"source": "5:1"}), 1_760_000_000 * 10**9
-    late = Frame(begun_ns + 500_000_000, "udp", Source(1, 1), 33, frame(1))
-    with Writer(tmp_path / "log.mcap", settings.to_toml(), {}, None, begun_ns) as writer:
+    late = Frame(
+        t_ns=begun_ns + 500_000_000, link="udp", source=Source(1, 1), msgid=33, raw=frame(1)
+    )
+    with Writer(
+        where=tmp_path / "log.mcap",
+        settings_toml=settings.to_toml(),
+        versions={},
+        weights_hz=None,
+        started_ns=begun_ns,
+    ) as writer:
         for event in (Tick(begun_ns), Tick(begun_ns + 10**9), late):
             writer.event(event)
         log = writer.close({})
 
     async def served() -> tuple[int, float]:
-        node, until = ServedReplay(Asked([log], settings, None, None), lambda _: None), Event()
+        node, until = (
+            ServedReplay(
+                Asked(logs=[log], settings=settings, speed=None, record=None), lambda _: None
+            ),
+            Event(),
+        )
         with socket.create_server(("127.0.0.1", 0)) as http:
             await node.run(http, None, lambda _: until.set(), until)
         return node.now_ns(), node.replay().at_s

@@ -120,7 +120,7 @@ def test_late_beams_are_no_sign_of_life(tmp_path: Path) -> None:
     said: list[str] = []
 
     async def told() -> None:
-        service = Service(settings, said.append)
+        service = Service(settings=settings, say=said.append)
         service.answering.set()
         until = asyncio.Event()
         manager = systemd.Manager(str(tmp_path / "notify"), watchdog_s=0.2)

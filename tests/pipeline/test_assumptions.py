@@ -19,8 +19,13 @@ M_PER_DEG = 111_195.0
 
 def sent(t_s: float, source: str, message: Any) -> Frame:
     sender = dialect.MAVLink(None, *map(int, source.split(":")))
-    return Frame(START_NS + round(t_s * S), "udp", Source.parse(source), message.get_msgId(),
-                 message.pack(sender))  # fmt: skip
+    return Frame(
+        t_ns=START_NS + round(t_s * S),
+        link="udp",
+        source=Source.parse(source),
+        msgid=message.get_msgId(),
+        raw=message.pack(sender),
+    )
 
 
 def position(
@@ -161,7 +166,12 @@ def test_a_round_trip_that_contradicts_is_told_as_proven() -> None:
     for t_s, late_s in ((9.0, 0.0), (9.5, 0.4)):
         remote_ns = round((100 + t_s - late_s) * S)
         sent_ns = START_NS + round((t_s - 0.01) * S)
-        trip = RoundTrip(START_NS + round((t_s + 0.01) * S), Source(1, 1), sent_ns, remote_ns)
+        trip = RoundTrip(
+            t_ns=START_NS + round((t_s + 0.01) * S),
+            source=Source(1, 1),
+            sent_ns=sent_ns,
+            remote_ns=remote_ns,
+        )
         out += into.step(trip)
     assert into.clock_estimate("1:1") is not None
     changed = [one for one in out if isinstance(one, Notice) and "clock of 1:1" in one.text]

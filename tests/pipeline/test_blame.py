@@ -17,8 +17,29 @@ TRACK = Track(
     set_center_ned_m=np.zeros(3), set_radius_m=3.0, limits=Limits(60.0, 5.0), error_p95_m=None,
     clock_bound_s=0.0, dt_s=0.1, latency_s=0.01, gamma=None, innovation_m=None, reports=9,
 )  # fmt: skip
-CARRIER = Carrier(9, np.zeros(3), None, np.eye(3), np.zeros(3), 0.5, 0.01, 0.1)
-BEAM = Beam("3:1", 0.0, 0.0, 100.0, None, None, None, 0.04, 16.0, 0.5, widened=True)
+CARRIER = Carrier(
+    valid_at_ns=9,
+    position_ned_m=np.zeros(3),
+    velocity_ned_mps=None,
+    body_from_local=np.eye(3),
+    body_rates_radps=np.zeros(3),
+    bound_m=0.5,
+    attitude_bound_rad=0.01,
+    age_s=0.1,
+)
+BEAM = Beam(
+    uav="3:1",
+    azimuth_rad=0.0,
+    elevation_rad=0.0,
+    range_m=100.0,
+    azimuth_rate_radps=None,
+    elevation_rate_radps=None,
+    range_rate_mps=None,
+    pointing_bound_rad=0.04,
+    gain_db=16.0,
+    loss_db=0.5,
+    widened=True,
+)
 
 
 def blamed(

@@ -44,7 +44,7 @@ PLACE = (47.4, 8.55, 500.0)
 
 def frame(t_ns: int, raw: bytes, link: str = "udp") -> Frame:
     msgid = raw[7] | raw[8] << 8 | raw[9] << 16
-    return Frame(t_ns, link, Source(raw[5], raw[6]), msgid, raw)
+    return Frame(t_ns=t_ns, link=link, source=Source(raw[5], raw[6]), msgid=msgid, raw=raw)
 
 
 def sent(t_s: float, source: str, message: Any, seq: int = 0, link: str = "udp") -> Frame:
@@ -447,7 +447,7 @@ def test_the_same_report_over_two_links_counts_once() -> None:
     pipeline.step(position(0, "1:1", seq=1))
     again = position(0.0, "1:1", seq=77, link="tcp")._replace(t_ns=START_NS + S // 2)
     (refused,) = pipeline.step(again)
-    assert refused == Rejection(again.t_ns, "1:1", Reason.DUPLICATE)
+    assert refused == Rejection(t_ns=again.t_ns, source="1:1", reason=Reason.DUPLICATE)
     assert pipeline.refusals.total == {Reason.DUPLICATE: 1}
     assert list(pipeline.refusals.of("1:1").recent) == [refused]
     assert pipeline.frames == 2
@@ -607,10 +607,10 @@ def test_a_position_at_0_0_is_counted_and_makes_no_track() -> None:
 
 def test_rejections_pass_through_and_are_counted() -> None:
     pipeline = Pipeline(settings())
-    garbage = Rejection(START_NS, "udp", Reason.GARBAGE, 17)
+    garbage = Rejection(t_ns=START_NS, source="udp", reason=Reason.GARBAGE, count=17)
     assert pipeline.step(garbage) == [garbage]
     pipeline.step(garbage)
-    pipeline.step(Rejection(START_NS, "tcp", Reason.BAD_CRC, 2))
+    pipeline.step(Rejection(t_ns=START_NS, source="tcp", reason=Reason.BAD_CRC, count=2))
     assert pipeline.refusals.total == {Reason.GARBAGE: 34, Reason.BAD_CRC: 2}
     assert pipeline.refusals.of("udp").counts == {Reason.GARBAGE: 34}
     assert pipeline.frames == 0
@@ -807,7 +807,7 @@ def test_a_period_is_rounded_once_not_at_every_tick() -> None:
 
 def test_no_events_no_ticks() -> None:
     assert list(with_ticks([], 20.0)) == []
-    garbage = Rejection(START_NS, "udp", Reason.GARBAGE)
+    garbage = Rejection(t_ns=START_NS, source="udp", reason=Reason.GARBAGE)
     assert list(with_ticks([garbage, garbage], 1000.0)) == [garbage, garbage]
 
 
@@ -874,7 +874,17 @@ def test_a_round_trip_tells_what_one_way_cannot() -> None:
         remote_ns = (
             sent_ns + S // 100 - START_NS + 100 * S
         )  # halfway; the boot clock began at 100 s
-        assert pipeline.step(RoundTrip(sent_ns + S // 50, Source(1, 1), sent_ns, remote_ns)) == []
+        assert (
+            pipeline.step(
+                RoundTrip(
+                    t_ns=sent_ns + S // 50,
+                    source=Source(1, 1),
+                    sent_ns=sent_ns,
+                    remote_ns=remote_ns,
+                )
+            )
+            == []
+        )
     estimate = pipeline.clock_estimate("1:1")
     assert estimate is not None
     assert estimate.kind is ClockKind.TIMESYNC
@@ -929,14 +939,18 @@ def test_clocks_of_those_without_a_track_are_bounded(monkeypatch: pytest.MonkeyP
 def test_pauses_without_end_are_not_ticked_through() -> None:
     """A thousand of an hour each: 36 million ticks, were they all made."""
     hour_ns = 3_590 * S
-    garbage = [Rejection(n * hour_ns, "log", Reason.GARBAGE) for n in range(1_000)]
+    garbage = [
+        Rejection(t_ns=n * hour_ns, source="log", reason=Reason.GARBAGE) for n in range(1_000)
+    ]
     ticks = sum(isinstance(event, Tick) for event in with_ticks(garbage, 10.0))
     assert 4 * 35_000 < ticks < 4 * 36_100 + 1_000
 
 
 def test_pauses_of_a_flight_are_ticked_through_however_many() -> None:
     """Each is less than a minute, and all together are a day."""
-    garbage = [Rejection(n * 50 * S, "log", Reason.GARBAGE) for n in range(1_728)]
+    garbage = [
+        Rejection(t_ns=n * 50 * S, source="log", reason=Reason.GARBAGE) for n in range(1_728)
+    ]
     ticks = sum(isinstance(event, Tick) for event in with_ticks(garbage, 1.0))
     assert ticks == 1_727 * 50
 

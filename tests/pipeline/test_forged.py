@@ -69,7 +69,9 @@ def flight(seconds: float) -> Iterator[Frame | Tick]:
             beside = (HEARTBEAT, GPS_RAW_INT, EKF) if n % 10 == 0 else ()
             for msgid in (*beside, ATTITUDE, GLOBAL_POSITION_INT):
                 raw = frame(ids, n % 256, msgid, said(ids, msgid, t_s))
-                yield Frame(at_ns + LATE_NS, "udp", Source(*ids), msgid, raw)
+                yield Frame(
+                    t_ns=at_ns + LATE_NS, link="udp", source=Source(*ids), msgid=msgid, raw=raw
+                )
         yield Tick(at_ns + LATE_NS + 20_000_000)
 
 
@@ -124,7 +126,13 @@ def forged(
     """An honest frame after so many events but for some of its bytes."""
     payload = bytearray(said(ids, msgid, at // 5 / 10))
     struct.pack_into(form, payload, offset, *values)
-    return at, Frame(0, "udp", Source(*ids), msgid, frame(ids, 77, msgid, bytes(payload)))
+    return at, Frame(
+        t_ns=0,
+        link="udp",
+        source=Source(*ids),
+        msgid=msgid,
+        raw=frame(ids, 77, msgid, bytes(payload)),
+    )
 
 
 def test_an_honest_flight_is_within_its_bounds() -> None:

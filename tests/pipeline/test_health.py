@@ -17,24 +17,59 @@ from companion.settings.beams import NeedSettings
 from companion.values import Carrier, Limits, Notice, Severity, Track, TrackState, Update
 
 S = 1_000_000_000
-ARRAY = uniform_linear(16, 30e9, 0.5, np.eye(3))
-SITE = Site(ARRAY, EVERYWHERE, LinkBudget(20.0, 50e6, 7.0), 4)
-CARRIER = Carrier(9, np.zeros(3), None, np.eye(3), np.zeros(3), 0.0, 0.0, None)
+ARRAY = uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
+SITE = Site(
+    array=ARRAY,
+    coverage=EVERYWHERE,
+    budget=LinkBudget(tx_power_dbm=20.0, bandwidth_hz=50e6, noise_figure_db=7.0),
+    uav_antennas=4,
+)
+CARRIER = Carrier(
+    valid_at_ns=9,
+    position_ned_m=np.zeros(3),
+    velocity_ned_mps=None,
+    body_from_local=np.eye(3),
+    body_rates_radps=np.zeros(3),
+    bound_m=0.0,
+    attitude_bound_rad=0.0,
+    age_s=None,
+)
 PLACES = {"1:1": (100.0, 20.0, -10.0), "2:1": (80.0, -60.0, 5.0), "3:1": (30.0, 90.0, 0.0)}
 
 
 def track(uav: str, bound_m: float, usual_m: float, state: str = "live") -> Track:
     return Track(
-        uav, TrackState(state), 9, 0.1, np.array(PLACES[uav]), None, None, None, bound_m, bound_m,
-        bound_m, np.zeros(3), bound_m, Limits(60.0, 5.0), usual_m, 0.0, 0.1, 0.0, None, None, 9,
-    )  # fmt: skip
+        uav=uav,
+        state=TrackState(state),
+        valid_at_ns=9,
+        age_s=0.1,
+        position_ned_m=np.array(PLACES[uav]),
+        velocity_ned_mps=None,
+        unknown_input_mps=None,
+        acceleration_ned_mps2=None,
+        bound_m=bound_m,
+        horizontal_bound_m=bound_m,
+        vertical_bound_m=bound_m,
+        set_center_ned_m=np.zeros(3),
+        set_radius_m=bound_m,
+        limits=Limits(60.0, 5.0),
+        error_p95_m=usual_m,
+        clock_bound_s=0.0,
+        dt_s=0.1,
+        latency_s=0.0,
+        gamma=None,
+        innovation_m=None,
+        reports=9,
+    )
 
 
 def update(t_s: float, tracks: list[Track], carrier: Carrier | None = CARRIER) -> Update:
     t_ns = round(t_s * S)
-    beams = aim(t_ns, t_ns, tracks, carrier, ARRAY, Precoder())
+    beams = aim(
+        t_ns, valid_at_ns=t_ns, tracks=tracks, carrier=carrier, array=ARRAY, precoder=Precoder()
+    )
     unfit = None if carrier else "the carrier is not known"
-    return Update(t_ns, carrier, unfit, tuple(tracks), beams)
+    return Update(t_ns=t_ns, carrier=carrier, unfit=unfit, tracks=tuple(tracks), beams=beams)
 
 
 class Watch:
@@ -47,7 +82,9 @@ class Watch:
     def see(self, t_s: float, tracks: list[Track], carrier: Carrier | None = CARRIER) -> str:
         news = update(t_s, tracks, carrier)
         weighed = self.health.weigh(news)
-        self.said += self.health.judge(news, weighed, lambda _uav: Evidence(False, None))
+        self.said += self.health.judge(
+            news, weighed, lambda _uav: Evidence(clock_assumed=False, refused=None)
+        )
         return " ".join(str(one.level) for one in self.health.verdicts.values())
 
 

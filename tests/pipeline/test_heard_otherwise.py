@@ -42,7 +42,13 @@ def there(t_s: float, aside_m: float = 0.0) -> tuple[float, float, float]:
 def framed(t_s: float, source: Source, message: Any) -> Frame:
     mav = dialect.MAVLink(None, srcSystem=source.sysid, srcComponent=source.compid)
     raw = bytes(message.pack(mav))
-    return Frame(START_NS + round(t_s * S), "udp", source, message.get_msgId(), raw)
+    return Frame(
+        t_ns=START_NS + round(t_s * S),
+        link="udp",
+        source=source,
+        msgid=message.get_msgId(),
+        raw=raw,
+    )
 
 
 def telemetry(t_s: float) -> Frame:
@@ -75,9 +81,16 @@ def naming(t_s: float, receiver: int = 9) -> Frame:
 def transponder(t_s: float, **codes: int) -> Frame:
     lat, lon, alt = there(t_s, 8.0)
     said = Said(
-        0x4CA7B3, lat, lon, alt / 0.3048, geometric=True, speed_kt=5 * 3600 / 1852, track_deg=0.0,
-        climb_fpm=0.0, **codes,
-    )  # fmt: skip
+        icao=0x4CA7B3,
+        lat_deg=lat,
+        lon_deg=lon,
+        altitude_ft=alt / 0.3048,
+        geometric=True,
+        speed_kt=5 * 3600 / 1852,
+        track_deg=0.0,
+        climb_fpm=0.0,
+        **codes,
+    )
     frame = transponder_frame(START_NS + round(t_s * S), "readsb", said, 0)
     assert frame is not None
     return frame
@@ -221,7 +234,15 @@ def test_an_export_has_a_row_of_each_report_whatever_its_message() -> None:
     frames = [broadcast(0), naming(0), broadcast(1), transponder(1), event(1), telemetry(1)]
     mav = dialect.MAVLink(None, srcSystem=9, srcComponent=25)
     other = dialect.MAVLink_tunnel_message(0, 0, 1, 3, [7] * 128)
-    frames.append(Frame(START_NS + S, "udp", Source(9, 25), 385, bytes(other.pack(mav))))
+    frames.append(
+        Frame(
+            t_ns=START_NS + S,
+            link="udp",
+            source=Source(9, 25),
+            msgid=385,
+            raw=bytes(other.pack(mav)),
+        )
+    )
     for frame in frames:
         found += [heard(frame, fold.step(frame))]
     rows = [(one.uav, one.estimate is not None) for one in found if one is not None]

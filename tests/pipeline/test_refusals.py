@@ -7,8 +7,8 @@ from companion.values import Reason, Rejection
 def test_counts_by_sender_and_reason() -> None:
     refusals = Refusals()
     for n in range(20):
-        refusals.add(Rejection(n, "1:1", Reason.DUPLICATE))
-    refusals.add(Rejection(20, "udp", Reason.GARBAGE, 7))
+        refusals.add(Rejection(t_ns=n, source="1:1", reason=Reason.DUPLICATE))
+    refusals.add(Rejection(t_ns=20, source="udp", reason=Reason.GARBAGE, count=7))
     assert refusals.total == {Reason.DUPLICATE: 20, Reason.GARBAGE: 7}
     assert refusals.of("udp").counts == {Reason.GARBAGE: 7}
     assert [one.t_ns for one in refusals.of("1:1").recent] == list(range(20 - RECENT, 20))
@@ -19,8 +19,8 @@ def test_counts_by_sender_and_reason() -> None:
 def test_a_flood_of_senders_forgets_the_one_heard_of_longest_ago() -> None:
     refusals = Refusals()
     for n in range(2 * SENDERS_MAX):
-        refusals.add(Rejection(n, f"icao:{n:06X}", Reason.NO_POSITION))
-        refusals.add(Rejection(n, "1:1", Reason.DUPLICATE))
+        refusals.add(Rejection(t_ns=n, source=f"icao:{n:06X}", reason=Reason.NO_POSITION))
+        refusals.add(Rejection(t_ns=n, source="1:1", reason=Reason.DUPLICATE))
     assert len(refusals.senders()) == SENDERS_MAX
     assert refusals.total == {
         Reason.NO_POSITION: 2 * SENDERS_MAX,
@@ -30,7 +30,12 @@ def test_a_flood_of_senders_forgets_the_one_heard_of_longest_ago() -> None:
 
 
 def refused(t_s: float, uav: str = "3:1", reason: Reason = Reason.UNREACHABLE) -> Rejection:
-    return Rejection(round(t_s * 1e9), uav, reason, detail="45.0 m off, at most 4.0 m possible")
+    return Rejection(
+        t_ns=round(t_s * 1e9),
+        source=uav,
+        reason=reason,
+        detail="45.0 m off, at most 4.0 m possible",
+    )
 
 
 def told_at(refusals: Refusals, rejections: list[Rejection]) -> list[float]:

@@ -46,18 +46,39 @@ MS = 1_000_000
 def fix(uav: str, t_s: float) -> Fix:
     t_ns = round(t_s * S)
     report = Report(
-        t_ns, "udp", uav, Source(1, 1), 47.0, 8.0, 500.0, AltitudeDatum.MSL, None, None, None,
-        None, 1000, None,
-    )  # fmt: skip
+        t_ns=t_ns,
+        link="udp",
+        uav=uav,
+        source=Source(1, 1),
+        lat_deg=47.0,
+        lon_deg=8.0,
+        alt_m=500.0,
+        alt_datum=AltitudeDatum.MSL,
+        relative_alt_m=None,
+        velocity_ne_mps=None,
+        velocity_down_mps=None,
+        heading_deg=None,
+        boot_ms=1000,
+        tslc_s=None,
+    )
     place = (10.0 * t_s, 0.0, -50.0)
-    noise = ReportNoise(1.2, 0.9, 1.5, 0.4)
-    return Fix(uav, t_ns, t_ns, t_ns, place, None, noise, report)
+    noise = ReportNoise(horizontal_m=1.2, vertical_m=0.9, position_m=1.5, velocity_mps=0.4)
+    return Fix(
+        uav=uav,
+        sender_ns=t_ns,
+        t_ns=t_ns,
+        arrival_ns=t_ns,
+        position_ned_m=place,
+        velocity_ned_mps=None,
+        noise=noise,
+        report=report,
+    )
 
 
 @pytest.fixture
 def tracker() -> Tracker:
-    observer = PositionObserver(PositionModel(30.0, 8.0, alpha=0.5))
-    return Tracker(observer, TrackerSettings(Limits(30.0, 8.0), most=10))
+    observer = PositionObserver(PositionModel(speed_mps=30.0, acceleration_mps2=8.0, alpha=0.5))
+    return Tracker(observer, TrackerSettings(limits=Limits(30.0, 8.0), most=10))
 
 
 def flown(tracker: Tracker, uav: str, reports: int, from_s: float) -> None:
@@ -114,7 +135,7 @@ def test_clocks_are_forgotten_between_ticks_and_those_of_tracks_are_kept() -> No
     senders = Senders(Settings(), "255:1", tracked)
     for number in range(CLOCKS_MAX + 2 * CLOCKS_AT_ONCE):
         source = Source(255 - number % 256, 1 + number // 256)
-        senders.round_trip(RoundTrip(2 * S, source, S, 1))
+        senders.round_trip(RoundTrip(t_ns=2 * S, source=source, sent_ns=S, remote_ns=1))
         assert len(senders._clocks) <= CLOCKS_MAX
     assert tracked | {"255:1"} <= senders._clocks.keys()
     assert str(source) in senders._clocks
@@ -132,7 +153,11 @@ def test_more_tracks_than_clocks_leave_all_of_them_their_own() -> None:
     senders = Senders(Settings(), None, everyone)
     many = CLOCKS_MAX + 3 * CLOCKS_AT_ONCE
     for number in range(many):
-        senders.round_trip(RoundTrip(2 * S, Source(number % 256, number // 256), S, 1))
+        senders.round_trip(
+            RoundTrip(
+                t_ns=2 * S, source=Source(number % 256, number // 256), sent_ns=S, remote_ns=1
+            )
+        )
     assert len(senders._clocks) == many
     assert everyone.asked < 4 * many  # they are not looked through for each that comes
 
@@ -142,11 +167,24 @@ def test_what_is_said_beside_positions_is_forgotten() -> None:
 
     def heard(second: int, number: int) -> None:
         source = Source(1 + number % 250, 1 + number // 250)
-        beside = GnssStatus(second * S, source, 3, None, 0.0, None, None, None)
+        beside = GnssStatus(
+            t_ns=second * S,
+            source=source,
+            fix_type=3,
+            satellites=None,
+            alt_m=0.0,
+            h_acc_m=None,
+            v_acc_m=None,
+            vel_acc_mps=None,
+        )
         senders._receivers[source] = beside
-        senders._noise[source] = ReportNoise(1.0, 1.0, 1.0, 1.0)
+        senders._noise[source] = ReportNoise(
+            horizontal_m=1.0, vertical_m=1.0, position_m=1.0, velocity_mps=1.0
+        )
         senders._apart_m2[source] = 1.0
-        senders.presence[source] = Presence(second * S, source, 2, 3, 4, False)
+        senders.presence[source] = Presence(
+            t_ns=second * S, source=source, mav_type=2, autopilot=3, system_status=4, armed=False
+        )
 
     for number in range(CLOCKS_MAX + 100):
         heard(1, number)
@@ -162,8 +200,16 @@ def test_what_is_said_beside_positions_is_forgotten() -> None:
 
 def attitude(arrival_ms: int, stamp_ms: int, yaw_rad: float) -> PlacedAttitude:
     said = Attitude(
-        arrival_ms * MS, Source(5, 1), stamp_ms, 0.0, 0.0, yaw_rad, 0.0, 0.0, 0.0
-    )  # fmt: skip
+        t_ns=arrival_ms * MS,
+        source=Source(5, 1),
+        boot_ms=stamp_ms,
+        roll_rad=0.0,
+        pitch_rad=0.0,
+        yaw_rad=yaw_rad,
+        rollspeed_radps=0.0,
+        pitchspeed_radps=0.0,
+        yawspeed_radps=0.0,
+    )
     return PlacedAttitude(said, stamp_ms * MS)
 
 
@@ -232,7 +278,13 @@ def report(sysid: int, t_s: float) -> Frame:
     message = common.MAVLink_global_position_int_message(
         t_ms, round(lat * 1e7), round(lon * 1e7), 500_000, 0, 0, 0, 0, 0
     )
-    return Frame(round(t_s * S) + 3 * MS, "udp", Source(sysid, 1), 33, message.pack(mav))
+    return Frame(
+        t_ns=round(t_s * S) + 3 * MS,
+        link="udp",
+        source=Source(sysid, 1),
+        msgid=33,
+        raw=message.pack(mav),
+    )
 
 
 def test_beams_are_for_the_first_and_for_those_of_priority() -> None:

@@ -144,7 +144,13 @@ def test_a_tock_alone_is_none_and_of_two_ticks_the_last_counts(flown: list[Event
 def test_a_recording_replays_to_the_same(tmp_path: Path, flown: list[Event]) -> None:
     events = list(in_two(flown))
     pipeline = Pipeline(SETTINGS)
-    writer = Writer(tmp_path, SETTINGS.to_toml(), {}, None, events[0].t_ns)
+    writer = Writer(
+        where=tmp_path,
+        settings_toml=SETTINGS.to_toml(),
+        versions={},
+        weights_hz=None,
+        started_ns=events[0].t_ns,
+    )
     for event in events:
         writer.event(event)
         for output in pipeline.step(event):

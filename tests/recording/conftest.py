@@ -86,14 +86,25 @@ def events(wire: Callable[..., list[bytes]]) -> Callable[[int], list[Event]]:
             t_ns = START_NS + 10_000_000 * number - (5_000_000 if number % 5 == 0 else 0)
             link = f"udpin:127.0.0.1:{14550 + number % 2}"
             msgid = raw[7] | raw[8] << 8 | raw[9] << 16
-            made.append(Frame(t_ns, link, Source(raw[5], raw[6]), msgid, raw))
+            made.append(
+                Frame(t_ns=t_ns, link=link, source=Source(raw[5], raw[6]), msgid=msgid, raw=raw)
+            )
             if number % 10 == 0:
                 made.append(Tick(t_ns))
             if number % 17 == 0:
-                made.append(Rejection(t_ns, link, Reason.GARBAGE, 3 + number))
+                made.append(
+                    Rejection(t_ns=t_ns, source=link, reason=Reason.GARBAGE, count=3 + number)
+                )
             if number % 23 == 0:
                 remote_ns = (-1) ** number * 1_000_000 * number
-                made.append(RoundTrip(t_ns, Source(1, 1), t_ns - 40_000_000, remote_ns))
+                made.append(
+                    RoundTrip(
+                        t_ns=t_ns,
+                        source=Source(1, 1),
+                        sent_ns=t_ns - 40_000_000,
+                        remote_ns=remote_ns,
+                    )
+                )
         return made
 
     return make
@@ -101,10 +112,28 @@ def events(wire: Callable[..., list[bytes]]) -> Callable[[int], list[Event]]:
 
 def _track(uav: str, t_ns: int) -> Track:
     return Track(
-        uav, TrackState.LIVE, t_ns + 5, 0.25, np.array([10.0, 20.0, -30.0]), None,
-        np.array([0.1, 0.2, 0.3]), None, 3.0, 2.0, 2.5, np.zeros(3), 3.0,
-        Limits(60.0, 5.0), None, 0.0, 0.1, None, 0.4, 0.0, 7,
-    )  # fmt: skip
+        uav=uav,
+        state=TrackState.LIVE,
+        valid_at_ns=t_ns + 5,
+        age_s=0.25,
+        position_ned_m=np.array([10.0, 20.0, -30.0]),
+        velocity_ned_mps=None,
+        unknown_input_mps=np.array([0.1, 0.2, 0.3]),
+        acceleration_ned_mps2=None,
+        bound_m=3.0,
+        horizontal_bound_m=2.0,
+        vertical_bound_m=2.5,
+        set_center_ned_m=np.zeros(3),
+        set_radius_m=3.0,
+        limits=Limits(60.0, 5.0),
+        error_p95_m=None,
+        clock_bound_s=0.0,
+        dt_s=0.1,
+        latency_s=None,
+        gamma=0.4,
+        innovation_m=0.0,
+        reports=7,
+    )
 
 
 @pytest.fixture(scope="session")
@@ -114,14 +143,51 @@ def update() -> Callable[[int], Update]:
 
     def make(t_ns: int) -> Update:
         beams = (
-            Beam("1:1", 0.1, -0.2, 100.0, None, None, None, None, 18.0, 0.1),
-            Beam("icao:4CA7B3", 0.3, 0.0, 50.0, 0.01, -0.02, 3.0, 0.02, 17.5, 0.6, 1, True),
+            Beam(
+                uav="1:1",
+                azimuth_rad=0.1,
+                elevation_rad=-0.2,
+                range_m=100.0,
+                azimuth_rate_radps=None,
+                elevation_rate_radps=None,
+                range_rate_mps=None,
+                pointing_bound_rad=None,
+                gain_db=18.0,
+                loss_db=0.1,
+            ),
+            Beam(
+                uav="icao:4CA7B3",
+                azimuth_rad=0.3,
+                elevation_rad=0.0,
+                range_m=50.0,
+                azimuth_rate_radps=0.01,
+                elevation_rate_radps=-0.02,
+                range_rate_mps=3.0,
+                pointing_bound_rad=0.02,
+                gain_db=17.5,
+                loss_db=0.6,
+                group=1,
+                widened=True,
+            ),
         )
         left_out = (LeftOut("9:1", Cause.COVERAGE, "behind the array"),)
         chosen = BeamSet(
-            t_ns, t_ns + 5, beams, weights, Method.ZERO_FORCING, Normalisation.STREAM, 1.5, left_out
+            t_ns=t_ns,
+            valid_at_ns=t_ns + 5,
+            beams=beams,
+            weights=weights,
+            method=Method.ZERO_FORCING,
+            normalisation=Normalisation.STREAM,
+            condition_number=1.5,
+            left_out=left_out,
         )
-        return Update(t_ns, None, None, (_track("1:1", t_ns), _track("icao:4CA7B3", t_ns)), chosen)
+        return Update(
+            t_ns=t_ns,
+            carrier=None,
+            unfit=None,
+            tracks=(_track("1:1", t_ns), _track("icao:4CA7B3", t_ns)),
+            beams=chosen,
+        )
 
     return make
 
@@ -130,14 +196,35 @@ def update() -> Callable[[int], Update]:
 def estimate() -> Estimate:
     """An accepted report, true a tenth of a second before it came."""
     report = Report(
-        START_NS, "udp", "1:1", Source(1, 1), 47.5, 8.5, 321.5, AltitudeDatum.MSL, None,
-        None, None, None, 1000, None,
-    )  # fmt: skip
-    noise = ReportNoise(3.0, 3.0, 4.25, 0.5)
-    fix = Fix(
-        "1:1", 100_000_000, START_NS - 100_000_000, START_NS, (0.0, 0.0, 0.0), None, noise, report
+        t_ns=START_NS,
+        link="udp",
+        uav="1:1",
+        source=Source(1, 1),
+        lat_deg=47.5,
+        lon_deg=8.5,
+        alt_m=321.5,
+        alt_datum=AltitudeDatum.MSL,
+        relative_alt_m=None,
+        velocity_ne_mps=None,
+        velocity_down_mps=None,
+        heading_deg=None,
+        boot_ms=1000,
+        tslc_s=None,
     )
-    return Estimate(fix, (0.0, 0.0, 0.0), 1.0, None, None)
+    noise = ReportNoise(horizontal_m=3.0, vertical_m=3.0, position_m=4.25, velocity_mps=0.5)
+    fix = Fix(
+        uav="1:1",
+        sender_ns=100_000_000,
+        t_ns=START_NS - 100_000_000,
+        arrival_ns=START_NS,
+        position_ned_m=(0.0, 0.0, 0.0),
+        velocity_ned_mps=None,
+        noise=noise,
+        report=report,
+    )
+    return Estimate(
+        fix=fix, position_ned_m=(0.0, 0.0, 0.0), bound_m=1.0, innovation_m=None, dt_s=None
+    )
 
 
 @pytest.fixture
@@ -163,10 +250,14 @@ def record(
             writer.event(event)
             if number % 3 == 0:
                 writer.output(estimate, geodetic)
-                writer.output(Rejection(event.t_ns, "1:1", Reason.DUPLICATE), geodetic)
+                writer.output(
+                    Rejection(t_ns=event.t_ns, source="1:1", reason=Reason.DUPLICATE), geodetic
+                )
             if isinstance(event, Tick):
                 writer.output(update(event.t_ns), geodetic)
-                notice = Notice(event.t_ns, Severity.WARNING, "1:1", "1:1 is stale")
+                notice = Notice(
+                    t_ns=event.t_ns, severity=Severity.WARNING, subject="1:1", text="1:1 is stale"
+                )
                 writer.output(notice, geodetic)
             if isinstance(event, Rejection):
                 writer.output(event, geodetic)  # as the pipeline hands it through

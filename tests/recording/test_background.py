@@ -49,9 +49,18 @@ def recorder(folder: Path, rotation: Rotation | None = None, **more: int) -> Bac
     """A recorder on fresh files."""
 
     def open_part(part: Part) -> Writer:
-        return Writer(folder, "", {}, None, START_NS, part=part)
+        return Writer(
+            where=folder,
+            settings_toml="",
+            versions={},
+            weights_hz=None,
+            started_ns=START_NS,
+            part=part,
+        )
 
-    return BackgroundRecorder(open_part, nowhere, rotation or Rotation(), **more)
+    return BackgroundRecorder(
+        open_part=open_part, geodetic=nowhere, rotation=rotation or Rotation(), **more
+    )
 
 
 def wait_until(good: Callable[[], bool], seconds: float = HANG_S) -> None:
@@ -106,7 +115,10 @@ def test_who_lives_for_a_moment_leaves_what_it_heard(tmp_path: Path) -> None:
 def test_what_is_put_is_in_the_file_in_order(tmp_path: Path) -> None:
     made = recorder(tmp_path)
     made.start()
-    events = [Frame(n, "link", Source(1, 1), 0, RAW) if n % 3 else Tick(n) for n in range(1, 500)]
+    events = [
+        Frame(t_ns=n, link="link", source=Source(1, 1), msgid=0, raw=RAW) if n % 3 else Tick(n)
+        for n in range(1, 500)
+    ]
     hand_over(made, events)
     made.stop({"digest": "abc"})
     (path,) = tmp_path.glob("*.mcap")
@@ -149,7 +161,9 @@ def test_a_full_disk_keeps_no_file_of_nothing(small_disk: Path) -> None:
     """One was left by each new attempt, to be recovered as a recording without a frame."""
     fill(small_disk)
     with pytest.raises(OSError, match="No space left"):
-        Writer(small_disk, "", {}, None, START_NS)
+        Writer(
+            where=small_disk, settings_toml="", versions={}, weights_hz=None, started_ns=START_NS
+        )
     assert [path.name for path in small_disk.iterdir()] == [BALLAST]
 
 
@@ -314,9 +328,16 @@ def test_a_slow_disk_drops_counts_and_tells(
         return nowhere(positions)
 
     def open_part(part: Part) -> Writer:
-        return Writer(tmp_path, "", {}, None, START_NS, part=part)
+        return Writer(
+            where=tmp_path,
+            settings_toml="",
+            versions={},
+            weights_hz=None,
+            started_ns=START_NS,
+            part=part,
+        )
 
-    made = BackgroundRecorder(open_part, slow, queue_max=1000)
+    made = BackgroundRecorder(open_part=open_part, geodetic=slow, queue_max=1000)
     made.start()
     made.put(Tick(START_NS), [update(START_NS)])
     wait_until(lambda: waiting(made) == 0)
@@ -342,7 +363,11 @@ def test_a_slow_disk_drops_counts_and_tells(
 
 
 def said(t_ns: int) -> list[Output]:
-    return [Notice(t_ns, Severity.INFO, "1:1", "something that came of no event")]
+    return [
+        Notice(
+            t_ns=t_ns, severity=Severity.INFO, subject="1:1", text="something that came of no event"
+        )
+    ]
 
 
 def test_a_hole_in_the_queue_counts_events_alone(tmp_path: Path) -> None:
@@ -382,9 +407,16 @@ def test_a_hole_in_a_broken_file_counts_events_alone(
 
     def open_part(part: Part) -> Writer:
         kind, folder = (Writer, sound) if broken.exists() else (_Broken, broken)
-        return kind(folder, "", {}, None, START_NS, part=part)
+        return kind(
+            where=folder,
+            settings_toml="",
+            versions={},
+            weights_hz=None,
+            started_ns=START_NS,
+            part=part,
+        )
 
-    made = BackgroundRecorder(open_part, nowhere, queue_max=5)
+    made = BackgroundRecorder(open_part=open_part, geodetic=nowhere, queue_max=5)
     hand_over(made, ticks(1, 3))
     for n in range(3):
         made.put(None, said(START_NS + n))

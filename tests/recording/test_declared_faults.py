@@ -27,10 +27,10 @@ def test_what_begins_and_what_ends(tmp_path: Path) -> None:
         (180.0, 4, "link_drop12s"), (200.0, 1, "storm"),
     )  # fmt: skip
     assert declared_faults(log) == (
-        DeclaredFault(3, "gps_off", 100 * S, round(108.5 * S)),
-        DeclaredFault(2, "glitch25m", 120 * S, 125 * S),
-        DeclaredFault(4, "link_drop12s", 180 * S, 192 * S),
-        DeclaredFault(1, "storm", 200 * S, 2**62),
+        DeclaredFault(sysid=3, name="gps_off", from_ns=100 * S, to_ns=round(108.5 * S)),
+        DeclaredFault(sysid=2, name="glitch25m", from_ns=120 * S, to_ns=125 * S),
+        DeclaredFault(sysid=4, name="link_drop12s", from_ns=180 * S, to_ns=192 * S),
+        DeclaredFault(sysid=1, name="storm", from_ns=200 * S, to_ns=2**62),
     )
 
 

@@ -29,7 +29,13 @@ def tlog(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def recording(tmp_path: Path, record: Callable[..., list[Event]]) -> Path:
-    writer = Writer(tmp_path / "whole", "[a]\n", {"companion": "1"}, None, 0)
+    writer = Writer(
+        where=tmp_path / "whole",
+        settings_toml="[a]\n",
+        versions={"companion": "1"},
+        weights_hz=None,
+        started_ns=0,
+    )
     record(writer, 400, 25, [])
     return writer.close({"digest": "d"})
 

@@ -75,7 +75,12 @@ def test_a_viewer_is_sent_what_a_recording_holds(
     geodetic: Geodetic, update: Callable[[int], Update], estimate: Estimate
 ) -> None:
     live = LiveChannels(
-        "127.0.0.1", 0, geodetic, Scene(uniform_linear(4, 1e9, 0.5, np.eye(3)), 2.0)
+        host="127.0.0.1",
+        port=0,
+        geodetic=geodetic,
+        scene=Scene(
+            uniform_linear(4, 1e9, spacing_wavelengths=0.5, array_from_body=np.eye(3)), 2.0
+        ),
     )
     live.start()
     now = iter(range(START_NS, START_NS + 10**12, 10**9))
@@ -100,9 +105,9 @@ def test_a_viewer_is_sent_what_a_recording_holds(
 
 
 def test_a_port_that_is_taken_is_said(geodetic: Geodetic) -> None:
-    live = LiveChannels("127.0.0.1", 0, geodetic, None)
+    live = LiveChannels(host="127.0.0.1", port=0, geodetic=geodetic, scene=None)
     with pytest.raises(LiveError, match=rf"cannot listen on 127\.0\.0\.1:{live.port}"):
-        LiveChannels("127.0.0.1", live.port, geodetic, None)
+        LiveChannels(host="127.0.0.1", port=live.port, geodetic=geodetic, scene=None)
     live.stop()
 
 

@@ -142,7 +142,13 @@ def test_some_random_damage_raises_nothing_else(
 
 
 def _damaged_at_random(tmp_path: Path, events: Callable[[int], list[Event]], seeds: range) -> None:
-    with Writer(tmp_path / "whole.mcap", "[a]\n", {"v": "1"}, None, 0) as writer:
+    with Writer(
+        where=tmp_path / "whole.mcap",
+        settings_toml="[a]\n",
+        versions={"v": "1"},
+        weights_hz=None,
+        started_ns=0,
+    ) as writer:
         for number, event in enumerate(events(60)):
             writer.event(event)
             if number % 20 == 0:
@@ -459,8 +465,10 @@ def test_a_recovered_file_of_others_keeps_what_has_no_schema(tmp_path: Path) -> 
 
 
 def test_what_is_whole_is_read_as_ever(tmp_path: Path) -> None:
-    driven = [Tick(5), Frame(6, "udp", Source(1, 1), 0, FRAME)]
-    with Writer(tmp_path / "x.mcap", "", {}, None, 0) as writer:
+    driven = [Tick(5), Frame(t_ns=6, link="udp", source=Source(1, 1), msgid=0, raw=FRAME)]
+    with Writer(
+        where=tmp_path / "x.mcap", settings_toml="", versions={}, weights_hz=None, started_ns=0
+    ) as writer:
         for event in driven:
             writer.event(event)
         writer.close({})

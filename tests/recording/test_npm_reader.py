@@ -73,7 +73,14 @@ def test_the_npm_reader_finds_every_message(
     tmp_path: Path, packages: Path, record: Callable[..., list[Event]]
 ) -> None:
     part = Part("abc", 2, "one.mcap")
-    writer = Writer(tmp_path, '[a]\nb = "é"\n', {"companion": "1"}, None, 0, part=part)
+    writer = Writer(
+        where=tmp_path,
+        settings_toml='[a]\nb = "é"\n',
+        versions={"companion": "1"},
+        weights_hz=None,
+        started_ns=0,
+        part=part,
+    )
     record(writer, 300, 100)
     writer.hole(Hole(7, 5, "why"))
     record(writer, 10)

@@ -24,7 +24,14 @@ START_NS = 1_700_000_000_000_000_000
 
 
 def write(path: Path, part: Part | None, events: list[Event], hole: Hole | None = None) -> Path:
-    writer = Writer(path, Settings().to_toml(), {}, None, START_NS, part=part)
+    writer = Writer(
+        where=path,
+        settings_toml=Settings().to_toml(),
+        versions={},
+        weights_hz=None,
+        started_ns=START_NS,
+        part=part,
+    )
     if hole is not None:
         writer.hole(hole)
     for event in events:
@@ -135,7 +142,15 @@ def test_a_recording_holds_the_gains_of_its_observer(tmp_path: Path, short_log: 
     settings = load(config)
     path = tmp_path / "a.mcap"
     digest = replay(
-        [short_log], settings, lambda: Writer(path, settings.to_toml(), {}, None, START_NS)
+        [short_log],
+        settings,
+        lambda: Writer(
+            where=path,
+            settings_toml=settings.to_toml(),
+            versions={},
+            weights_hz=None,
+            started_ns=START_NS,
+        ),
     )["digest"]
     design.write_text("another")
     held = settings_for([path], None, None)

@@ -25,7 +25,13 @@ FLUSH_EVERY = 25
 def recording(tmp_path: Path, record: Record) -> tuple[Path, list[Event], list[tuple[int, int]]]:
     """A finished recording, its events, and (size, events so far) at each flush."""
     flushed: list[tuple[int, int]] = []
-    writer = Writer(tmp_path / "whole", "[a]\n", {"companion": "1"}, None, 0)
+    writer = Writer(
+        where=tmp_path / "whole",
+        settings_toml="[a]\n",
+        versions={"companion": "1"},
+        weights_hz=None,
+        started_ns=0,
+    )
     flushed.append((writer.size_bytes, 0))
     driven = record(writer, 400, FLUSH_EVERY, flushed)
     return writer.close({"digest": "d"}), driven, flushed
@@ -203,7 +209,9 @@ def test_damage_at_the_beginning_costs_no_more(
 
 
 def test_the_latest_time_need_not_be_the_last(tmp_path: Path) -> None:
-    with Writer(tmp_path / "x.mcap", "", {}, None, 0) as writer:
+    with Writer(
+        where=tmp_path / "x.mcap", settings_toml="", versions={}, weights_hz=None, started_ns=0
+    ) as writer:
         for t_ns in (5, 9, 7):
             writer.event(Tick(t_ns))
         writer.flush()
@@ -239,7 +247,7 @@ def test_leftovers_are_recovered_and_what_cannot_be_is_told(
     (folder / "b.mcap.active").write_bytes(b"something else")
     (folder / "c.mcap").write_bytes(data)
     (folder / "d.mcap.active").touch()
-    live = Writer(folder, "", {}, None, 0)
+    live = Writer(where=folder, settings_toml="", versions={}, weights_hz=None, started_ns=0)
     results = recover_leftovers(folder)
     assert [type(result) for result in results] == [Recovered, LogError, Recovered]
     assert live.path.exists()

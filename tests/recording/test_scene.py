@@ -34,29 +34,77 @@ TURNS = st.tuples(ANGLES, st.floats(-1.5, 1.5), ANGLES)
 
 
 def array_on(turn: tuple[float, float, float], lever_arm_m: FloatArray) -> Array:
-    return uniform_linear(8, 3e9, 0.5, body_from_ned(*turn), lever_arm_m=lever_arm_m)
+    return uniform_linear(
+        8,
+        3e9,
+        spacing_wavelengths=0.5,
+        array_from_body=body_from_ned(*turn),
+        lever_arm_m=lever_arm_m,
+    )
 
 
 def update_of(array: Array, turn: tuple[float, float, float], place_ned_m: FloatArray) -> Update:
     """One track, live, and a beam on it, as the array at that place and attitude sees it."""
     carrier = Carrier(
-        NOW_NS, np.array([10.0, -20.0, -30.0]), None, body_from_ned(*turn), np.zeros(3), 1.0,
-        0.01, 0.1,
-    )  # fmt: skip
+        valid_at_ns=NOW_NS,
+        position_ned_m=np.array([10.0, -20.0, -30.0]),
+        velocity_ned_mps=None,
+        body_from_local=body_from_ned(*turn),
+        body_rates_radps=np.zeros(3),
+        bound_m=1.0,
+        attitude_bound_rad=0.01,
+        age_s=0.1,
+    )
     begin = carrier.position_ned_m + carrier.body_from_local.T @ array.lever_arm_m
     seen = array.array_from_body @ carrier.body_from_local @ (place_ned_m - begin)
     range_m = float(np.linalg.norm(seen))
     azimuth, elevation = math.atan2(seen[1], seen[0]), math.asin(-seen[2] / range_m)
-    beam = Beam("1:1", azimuth, elevation, range_m, None, None, None, 0.1, 9.0, 0.0)
+    beam = Beam(
+        uav="1:1",
+        azimuth_rad=azimuth,
+        elevation_rad=elevation,
+        range_m=range_m,
+        azimuth_rate_radps=None,
+        elevation_rate_radps=None,
+        range_rate_mps=None,
+        pointing_bound_rad=0.1,
+        gain_db=9.0,
+        loss_db=0.0,
+    )
     track = Track(
-        "1:1", TrackState.LIVE, NOW_NS, 0.1, place_ned_m, None, None, None, 5.0, 4.0, 3.0,
-        place_ned_m, 5.0, Limits(60.0, 5.0), None, 0.0, 0.1, 0.05, 1.0, 0.5, 9,
-    )  # fmt: skip
+        uav="1:1",
+        state=TrackState.LIVE,
+        valid_at_ns=NOW_NS,
+        age_s=0.1,
+        position_ned_m=place_ned_m,
+        velocity_ned_mps=None,
+        unknown_input_mps=None,
+        acceleration_ned_mps2=None,
+        bound_m=5.0,
+        horizontal_bound_m=4.0,
+        vertical_bound_m=3.0,
+        set_center_ned_m=place_ned_m,
+        set_radius_m=5.0,
+        limits=Limits(60.0, 5.0),
+        error_p95_m=None,
+        clock_bound_s=0.0,
+        dt_s=0.1,
+        latency_s=0.05,
+        gamma=1.0,
+        innovation_m=0.5,
+        reports=9,
+    )
     beams = BeamSet(
-        NOW_NS, NOW_NS, (beam,), np.ones((8, 1), complex), Method.ZERO_FORCING,
-        Normalisation.STREAM, 1.0, (),
-    )  # fmt: skip
-    return Update(NOW_NS, carrier, None, (track,), beams)
+        t_ns=NOW_NS,
+        valid_at_ns=NOW_NS,
+        beams=(beam,),
+        weights=np.ones((8, 1), complex),
+        method=Method.ZERO_FORCING,
+        normalisation=Normalisation.STREAM,
+        condition_number=1.0,
+        left_out=(),
+    )
+    return Update(t_ns=NOW_NS, carrier=carrier, unfit=None, tracks=(track,), beams=beams)
 
 
 def xyz(vector: object) -> FloatArray:
@@ -118,14 +166,16 @@ def test_a_level_carrier_that_faces_north_has_x_north_and_z_up() -> None:
 
 @pytest.mark.parametrize("azimuth_deg", [0.0, 30.0, -50.0])
 def test_cones_are_about_as_wide_as_the_beams(azimuth_deg: float) -> None:
-    array = uniform_rectangular(16, 32, 3e9, 0.5, np.eye(3))
+    array = uniform_rectangular(
+        16, columns=32, frequency_hz=3e9, spacing_wavelengths=0.5, array_from_body=np.eye(3)
+    )
     azimuth, elevation = math.radians(azimuth_deg), 0.2
     direction = unit_directions(np.array([azimuth]), np.array([elevation]))[0]
     exact = half_power_beamwidths_rad(array, direction)
     ((across, upright),) = Scene(array, 2.0).widths_rad(direction[np.newaxis])
     assert across == pytest.approx(exact[0] * math.cos(elevation), rel=0.25)
     assert upright == pytest.approx(exact[1], rel=0.25)
-    scene = Scene(uniform_linear(8, 3e9, 0.5, np.eye(3)), 2.0)
+    scene = Scene(uniform_linear(8, 3e9, spacing_wavelengths=0.5, array_from_body=np.eye(3)), 2.0)
     ((across, upright),) = scene.widths_rad(direction[np.newaxis])
     assert across < upright / 2 <= WIDEST_RAD / 2
 

@@ -12,28 +12,28 @@ TIMES = st.integers(0, 2**63 - 1)
 BYTE = st.integers(0, 255)
 FRAMES = st.builds(
     Frame,
-    TIMES,
-    st.text(max_size=200),
-    st.builds(Source, BYTE, BYTE),
-    st.integers(0, 2**24 - 1),
-    st.binary(max_size=300),
-    st.just(0) | st.integers(0, 2**63 - 1),
+    t_ns=TIMES,
+    link=st.text(max_size=200),
+    source=st.builds(Source, BYTE, BYTE),
+    msgid=st.integers(0, 2**24 - 1),
+    raw=st.binary(max_size=300),
+    doubt_ns=st.just(0) | st.integers(0, 2**63 - 1),
 )
 REJECTIONS = st.builds(
     Rejection,
-    TIMES,
-    st.text(),
-    st.sampled_from(Reason),
-    st.integers(0, 2**40),
-    st.none() | st.integers(0, 2**24 - 1),
-    st.text(),
+    t_ns=TIMES,
+    source=st.text(),
+    reason=st.sampled_from(Reason),
+    count=st.integers(0, 2**40),
+    msgid=st.none() | st.integers(0, 2**24 - 1),
+    detail=st.text(),
 )
 
 
 @given(FRAMES)
-@example(Frame(1, "x" * 200, Source(0, 255), 2**24 - 1, b"\xfd" * 200))
-@example(Frame(0, "", Source(0, 0), 0, b"\xfd" * 127))
-@example(Frame(0, "", Source(0, 0), 0, b"\xfd" * 128))
+@example(Frame(t_ns=1, link="x" * 200, source=Source(0, 255), msgid=2**24 - 1, raw=b"\xfd" * 200))
+@example(Frame(t_ns=0, link="", source=Source(0, 0), msgid=0, raw=b"\xfd" * 127))
+@example(Frame(t_ns=0, link="", source=Source(0, 0), msgid=0, raw=b"\xfd" * 128))
 def test_a_hand_packed_frame_is_the_generated_one(frame: Frame) -> None:
     generated = schemas.FrameMessage(
         t_ns=frame.t_ns,
@@ -58,7 +58,7 @@ def test_a_hand_packed_tick_is_the_generated_one(t_ns: int, in_two: bool) -> Non
 def test_frames_of_made_up_ids_fill_no_memory() -> None:
     encoder = schemas.FrameEncoder()
     for number in range(schemas.HEADS_MAX + 10):
-        frame = Frame(1, f"udp:{number}", Source(1, 1), 0, b"\xfe")
+        frame = Frame(t_ns=1, link=f"udp:{number}", source=Source(1, 1), msgid=0, raw=b"\xfe")
         assert codec.to_frame(encoder.encode(frame), {}) == frame
     assert len(encoder._heads) == 10
 

@@ -28,7 +28,13 @@ Record = Callable[..., list[Event]]
 
 
 def open_writer(where: Path, weights_hz: float | None = None) -> Writer:
-    return Writer(where, "[beams]\nlead_s = 0.1\n", {"companion": "1"}, weights_hz, START_NS)
+    return Writer(
+        where=where,
+        settings_toml="[beams]\nlead_s = 0.1\n",
+        versions={"companion": "1"},
+        weights_hz=weights_hz,
+        started_ns=START_NS,
+    )
 
 
 def decode_all(path: Path) -> list[tuple[str, Any, Any]]:
@@ -233,6 +239,7 @@ def test_weights_are_row_major_complex64(
     ],
 )
 def test_weights_are_thinned_by_the_updates_own_time(
+    *,
     tmp_path: Path,
     update: Callable[[int], Update],
     geodetic: Any,
@@ -273,9 +280,15 @@ def test_a_chunk_is_closed_before_it_grows_large(tmp_path: Path) -> None:
     writer = open_writer(tmp_path)
     noise = np.random.default_rng(1)
     frames = [
-        Frame(number, "udp", Source(1, 1), 0, b"\xfd\xff\1" + noise.bytes(277))
+        Frame(
+            t_ns=number,
+            link="udp",
+            source=Source(1, 1),
+            msgid=0,
+            raw=b"\xfd\xff\1" + noise.bytes(277),
+        )
         for number in range(12_000)
-    ]  # fmt: skip
+    ]
     for frame in frames:
         writer.event(frame)
     path = writer.close({})
@@ -315,7 +328,9 @@ def test_what_is_salvaged_ends_at_the_last_flush(tmp_path: Path) -> None:
     writer.event(Tick(5))
     writer.flush()
     for number in range(12_000):
-        writer.event(Frame(number, "udp", Source(1, 1), 0, noise.bytes(280)))
+        writer.event(
+            Frame(t_ns=number, link="udp", source=Source(1, 1), msgid=0, raw=noise.bytes(280))
+        )
     assert writer.path.stat().st_size > 2 << 20
     assert writer.salvage()
     assert list(read_log(writer.path)) == [Tick(5)]
@@ -330,7 +345,9 @@ def test_who_flies_where_is_not_for_all_to_read(tmp_path: Path, umask: int) -> N
     before = os.umask(umask)
     try:
         folder = tmp_path / "recordings"
-        with Writer(folder, "", {}, None, 0) as writer:
+        with Writer(
+            where=folder, settings_toml="", versions={}, weights_hz=None, started_ns=0
+        ) as writer:
             opened = writer.path.stat().st_mode & 0o777
             kept = writer.close({})
         (folder / "torn.mcap.active").write_bytes(kept.read_bytes()[:-20])

@@ -41,7 +41,7 @@ class StandIn:
         self.series = Series()
         self.arrival_lag = ArrivalLag()
         self.notices: list[Notice] = []
-        self.current = RecordingStatus("off", None, 0, 0, 0)
+        self.current = RecordingStatus(state="off", file=None, bytes=0, messages=0, dropped=0)
         self.replayed: ReplayStatus | None = None
         self.fleet: FleetStatus | None = None
         self._ticked = asyncio.Event()
@@ -71,7 +71,9 @@ class StandIn:
 
     def say(self, text: str) -> None:
         """A notice to the operator."""
-        self.notices.append(Notice(self._now_ns, Severity.INFO, "test", text))
+        self.notices.append(
+            Notice(t_ns=self._now_ns, severity=Severity.INFO, subject="test", text=text)
+        )
 
     async def ticked(self) -> None:
         """Return after the next tick."""
@@ -87,15 +89,25 @@ class StandIn:
 
     def links(self) -> list[LinkStatus]:
         """One link that hears one vehicle, and one that hears nobody."""
-        heard = {Source(1, 1): ComponentStatus(7, 1, self._now_ns, 2)}
+        heard = {Source(1, 1): ComponentStatus(frames=7, gaps=1, heard_ns=self._now_ns, version=2)}
         lost = {"garbage": 12}
-        one = LinkStatus("udpin:127.0.0.1:14550", "up", 7, 210, 1, lost, heard_ns=self._now_ns)
+        one = LinkStatus(
+            url="udpin:127.0.0.1:14550",
+            state="up",
+            frames=7,
+            bytes=210,
+            peers=1,
+            lost=lost,
+            heard_ns=self._now_ns,
+        )
         one.components = heard
-        return [one, LinkStatus("serial:/dev/ttyS0:57600", "connecting")]
+        return [one, LinkStatus(url="serial:/dev/ttyS0:57600", state="connecting")]
 
     def out_links(self) -> list[LinkStatus]:
         """One that has said something."""
-        return [LinkStatus("cot:udp:127.0.0.1:6969", "up", peers=1, sent=12, send_dropped=3)]
+        return [
+            LinkStatus(url="cot:udp:127.0.0.1:6969", state="up", peers=1, sent=12, send_dropped=3)
+        ]
 
     def recording(self) -> RecordingStatus:
         """As the test says."""
@@ -111,7 +123,17 @@ class StandIn:
 
     def message_rates(self) -> list[MessageRate]:
         """One that is asked for."""
-        return [MessageRate(Source(1, 1), 33, 10.0, None, RateState.ASKED, 1, None)]
+        return [
+            MessageRate(
+                uav=Source(1, 1),
+                msgid=33,
+                wanted_hz=10.0,
+                observed_hz=None,
+                state=RateState.ASKED,
+                asked=1,
+                changed_by=None,
+            )
+        ]
 
     def events(self) -> list[Notice]:
         """What was said."""

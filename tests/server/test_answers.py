@@ -272,7 +272,14 @@ def test_the_position_model_shows_what_companion_design_prints(make_node: Any) -
     assert shown["certificate"] is None
     for row in shown["designs"]:
         lead_s = max(0.2, row["dt_s"])  # velocities are reported: velocity_lead_s, or the interval
-        expected = answers.row(row["dt_s"], lead_s, 0.5, None, "position", "closed-form")
+        expected = answers.row(
+            row["dt_s"],
+            feedthrough_s=lead_s,
+            alpha=0.5,
+            mu_max=None,
+            model="position",
+            method="closed-form",
+        )
         assert row == {"uav": row["uav"], **json.loads(json.dumps(expected))}
 
 

@@ -90,6 +90,7 @@ QUERIES = ["lead_ms", "points", "cut", "uav", "rate_hz", "x"]
     span=st.text("bytes=0123456789-, ", max_size=20),
 )
 def test_nothing_that_anybody_asks_is_a_mistake_of_ours(
+    *,
     shared_node: Any,
     method: str,
     path: str,

@@ -16,7 +16,7 @@ from .conftest import StandIn, settings
 
 
 def offer(uav: str, sinr_db: float | None = 30.0) -> Offer:
-    return Offer(uav, sinr_db, sinr_db, sinr_db, 0.1)
+    return Offer(uav=uav, sure_db=sinr_db, likely_db=sinr_db, sinr_db=sinr_db, heard_s=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -29,11 +29,24 @@ def flown() -> StandIn:
 def north(flown: StandIn) -> Iterator[StandIn]:
     """It serves 1:1 in a fleet; another, south, serves 2:1, and nobody serves the rest."""
     now_ns = flown.now_ns()
-    member = Member("north", FleetSettings(node="north"), 16, now_ns)
+    member = Member(
+        name="north", settings=FleetSettings(node="north"), elements=16, started_ns=now_ns
+    )
     member.duties.serves["1:1"] = 20.0
     place = (47.0, 8.0, 480.0)
-    member.stands(now_ns, Standing("south", now_ns, now_ns, place, 900.0, 1, (("2:1", 25.0),)))
-    flown.fleet = FleetStatus(member, "harbour", 1e3, 2e3, 0)
+    member.stands(
+        now_ns,
+        Standing(
+            node="south",
+            started_ns=now_ns,
+            t_ns=now_ns,
+            place=place,
+            reach_m=900.0,
+            most=1,
+            serves=(("2:1", 25.0),),
+        ),
+    )
+    flown.fleet = FleetStatus(member=member, site="harbour", sent_bps=1e3, heard_bps=2e3, damaged=0)
     flown.pipeline.step(Duty(now_ns, ("1:1",)))
     flown.tick(0.0)
     yield flown

@@ -37,7 +37,7 @@ async def served(node: Any, token: str | None = None) -> AsyncIterator[int]:
     """The service's own server around a node: gives its port."""
     answering = asyncio.Event()
     with bind("127.0.0.1:0", token=token, insecure=False) as listening:
-        server = Server(node, token, answering)
+        server = Server(node=node, token=token, answering=answering)
         task = asyncio.create_task(server.serve(sockets=[listening]))
         await asyncio.wait_for(answering.wait(), HANG_S)
         try:

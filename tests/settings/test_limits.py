@@ -123,7 +123,13 @@ def flight() -> list[Event]:
 def flown(settings: Settings, flight: list[Event], path: Path) -> int:
     """Fly and record; the number of updates with beams."""
     run, beams = Run(settings, None), 0
-    run.writer = Writer(path, settings.to_toml(), {}, None, flight[0].t_ns)
+    run.writer = Writer(
+        where=path,
+        settings_toml=settings.to_toml(),
+        versions={},
+        weights_hz=None,
+        started_ns=flight[0].t_ns,
+    )
     for event in flight:
         run.step(event)
         update = run.pipeline.last_update

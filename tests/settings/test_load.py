@@ -271,6 +271,7 @@ SCALAR = st.characters(exclude_categories=["Cs"])
     attitude_bound_deg=st.floats(0, 180),
 )
 def test_settings_survive_being_written(
+    *,
     directory: str | None,
     urls: list[str],
     keys: dict[str, str],
@@ -493,7 +494,10 @@ def test_the_precoder_is_the_one_that_is_described() -> None:
     assert assembly.precoder(Settings()) == Precoder()
     radio = {"tx_power_dbm": 30.0, "bandwidth_hz": 1e6, "noise_figure_db": 3.0, "uav_antennas": 1}
     told = assembly.precoder(Settings().override(radio=radio))
-    assert (told.budget, told.uav_antennas) == (LinkBudget(30.0, 1e6, 3.0), 1)
+    assert (told.budget, told.uav_antennas) == (
+        LinkBudget(tx_power_dbm=30.0, bandwidth_hz=1e6, noise_figure_db=3.0),
+        1,
+    )
 
 
 @pytest.mark.parametrize(
@@ -538,9 +542,15 @@ def test_the_array_is_the_one_that_is_described() -> None:
         ("home", HomeCenter()),
         ("5:1", VehicleCenter(Source(5, 1))),
         ("255:0", VehicleCenter(Source(255, 0))),
-        ("47.4,8.55,500", FixedCenter(47.4, 8.55, 500.0, 0.0)),
-        ("-90,180,-3.5,-90", FixedCenter(-90.0, 180.0, -3.5, -90.0)),
-        (" 47.4, 8.55, 500, 90", FixedCenter(47.4, 8.55, 500.0, 90.0)),
+        ("47.4,8.55,500", FixedCenter(lat_deg=47.4, lon_deg=8.55, alt_m=500.0, heading_deg=0.0)),
+        (
+            "-90,180,-3.5,-90",
+            FixedCenter(lat_deg=-90.0, lon_deg=180.0, alt_m=-3.5, heading_deg=-90.0),
+        ),
+        (
+            " 47.4, 8.55, 500, 90",
+            FixedCenter(lat_deg=47.4, lon_deg=8.55, alt_m=500.0, heading_deg=90.0),
+        ),
     ],
 )
 def test_centers(text: str, center: object) -> None:

@@ -315,10 +315,14 @@ def written_as(kind: str, folder: Path, stamps_s: list[float]) -> tuple[Path, li
         path = folder / "a.raw"
         path.write_bytes(b"".join(frames))
         return path, frames
-    writer = Writer(folder / "a.mcap", "", {}, None, 0)
+    writer = Writer(
+        where=folder / "a.mcap", settings_toml="", versions={}, weights_hz=None, started_ns=0
+    )
     for t_s, raw in zip(stamps_s, frames, strict=True):
         t_ns = 10**18 + round(t_s * 1e9)
-        writer.event(Frame(t_ns, "udpin:127.0.0.1:1", Source(3, 1), 30, raw))
+        writer.event(
+            Frame(t_ns=t_ns, link="udpin:127.0.0.1:1", source=Source(3, 1), msgid=30, raw=raw)
+        )
         writer.event(Tick(t_ns))
     return writer.close({}), frames
 
@@ -349,7 +353,7 @@ def test_faults_are_summed_up(receiver: socket.socket, tmp_path: Path) -> None:
     assert list(summary["faults"]) == ["loss", "duplication@1:1", "jitter@77"]
     lost, doubled = summary["faults"]["loss"], summary["faults"]["duplication@1:1"]
     assert summary["faults"]["jitter@77"] == 0
-    network = Network([Fault.parse("loss=0.5")], 1, 7, Counter())
+    network = Network(faults=[Fault.parse("loss=0.5")], links=1, seed=7, touched=Counter())
     for raw in frames:
         network.take(0.0, raw)
     assert lost == len(frames) - len(kept := [one.raw for one in network.due()])

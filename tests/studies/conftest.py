@@ -30,7 +30,7 @@ def frames(uav: str, arrival_ns: np.ndarray, flight: tuple[np.ndarray, ...]) -> 
         fields += [round(each * 1e2) for each in (to_ned @ moves).tolist()]
         payload = struct.pack("<IiiiihhhH", *fields, 65535)
         raw = pack(Outgoing(source, 33, payload), seq % 256)
-        found.append(Frame(came_ns, "test", source, 33, raw))
+        found.append(Frame(t_ns=came_ns, link="test", source=source, msgid=33, raw=raw))
     return tuple(found)
 
 
@@ -43,11 +43,21 @@ def straight_flight() -> MakeFlight:
         made_ns = EPOCH_NS + boot_ms * 1_000_000
         velocity = np.tile([12.0, -3.0, 0.5], (n, 1))
         position = np.array([200.0, 50.0, -height_m]) + velocity * (boot_ms[:, None] * 1e-3)
-        truth = Trajectory("SIM_STATE", made_ns, position, velocity)
+        truth = Trajectory(
+            kind="SIM_STATE", t_ns=made_ns, position_ned_m=position, velocity_ned_mps=velocity
+        )
         return Flight(
-            uav, made_ns + 5_000_000, boot_ms, position, velocity, np.full(n, height_m),
-            (None,) * n, truth, made_ns,
-            frames(uav, made_ns + 5_000_000, (boot_ms, position, velocity)), np.arange(n),
-        )  # fmt: skip
+            uav=uav,
+            arrival_ns=made_ns + 5_000_000,
+            boot_ms=boot_ms,
+            position_ned_m=position,
+            velocity_ned_mps=velocity,
+            height_m=np.full(n, height_m),
+            gnss=(None,) * n,
+            truth=truth,
+            made_ns=made_ns,
+            frames=frames(uav, made_ns + 5_000_000, (boot_ms, position, velocity)),
+            report_at=np.arange(n),
+        )
 
     return make

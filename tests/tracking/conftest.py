@@ -10,7 +10,9 @@ from numpy.typing import ArrayLike
 from companion.values import AltitudeDatum, Fix, Report, ReportNoise, Source, vector
 
 MakeFix = Callable[..., Fix]
-NOISE = ReportNoise(1.2, 0.9, math.hypot(1.2, 0.9), 0.4)
+NOISE = ReportNoise(
+    horizontal_m=1.2, vertical_m=0.9, position_m=math.hypot(1.2, 0.9), velocity_mps=0.4
+)
 """1.5 m in space."""
 
 
@@ -36,9 +38,30 @@ def fix() -> MakeFix:
         position = vector(np.array(position_ned_m, dtype=float))
         lat_deg, lon_deg = 47.0 + position[0] * 9e-6, 8.0 + position[1] * 13e-6
         report = Report(
-            t_ns + late_ns, "udp", uav, Source(1, 1), lat_deg, lon_deg, 500.0 - position[2],
-            AltitudeDatum.MSL, None, None, None, None, 1000, None,
-        )  # fmt: skip
-        return Fix(uav, t_ns, t_ns, t_ns + late_ns, position, velocity, noise, report)
+            t_ns=t_ns + late_ns,
+            link="udp",
+            uav=uav,
+            source=Source(1, 1),
+            lat_deg=lat_deg,
+            lon_deg=lon_deg,
+            alt_m=500.0 - position[2],
+            alt_datum=AltitudeDatum.MSL,
+            relative_alt_m=None,
+            velocity_ne_mps=None,
+            velocity_down_mps=None,
+            heading_deg=None,
+            boot_ms=1000,
+            tslc_s=None,
+        )
+        return Fix(
+            uav=uav,
+            sender_ns=t_ns,
+            t_ns=t_ns,
+            arrival_ns=t_ns + late_ns,
+            position_ned_m=position,
+            velocity_ned_mps=velocity,
+            noise=noise,
+            report=report,
+        )
 
     return make

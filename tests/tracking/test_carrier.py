@@ -107,13 +107,50 @@ def test_a_vehicle_s_attitude_is_carried_on_to_the_time_of_use(fix: Callable[...
     local = LocalFrame(47.4, 8.5, 500.0)
     far = (49.0, 12.0)
     track = Track(
-        "5:1", TrackState.LIVE, 12 * S, 0.5, np.array([1.0, 2, 3]), np.array([4.0, 5, 6]), None,
-        None, 4.5, 3.6, 2.7, np.zeros(3), 4.5, Limits(60.0, 5.0), None, 0.0, None, None, None, None,
-        1,
-    )  # fmt: skip
-    attitude = Attitude(0, Source(5, 1), 0, 0.2, -0.1, 1.0, 0.3, -0.2, 0.5)
+        uav="5:1",
+        state=TrackState.LIVE,
+        valid_at_ns=12 * S,
+        age_s=0.5,
+        position_ned_m=np.array([1.0, 2, 3]),
+        velocity_ned_mps=np.array([4.0, 5, 6]),
+        unknown_input_mps=None,
+        acceleration_ned_mps2=None,
+        bound_m=4.5,
+        horizontal_bound_m=3.6,
+        vertical_bound_m=2.7,
+        set_center_ned_m=np.zeros(3),
+        set_radius_m=4.5,
+        limits=Limits(60.0, 5.0),
+        error_p95_m=None,
+        clock_bound_s=0.0,
+        dt_s=None,
+        latency_s=None,
+        gamma=None,
+        innovation_m=None,
+        reports=1,
+    )
+    attitude = Attitude(
+        t_ns=0,
+        source=Source(5, 1),
+        boot_ms=0,
+        roll_rad=0.2,
+        pitch_rad=-0.1,
+        yaw_rad=1.0,
+        rollspeed_radps=0.3,
+        pitchspeed_radps=-0.2,
+        yawspeed_radps=0.5,
+    )
     newest = _at(fix, *far)
-    found = carrier.moving(local, track, newest, attitude, S + S // 4, 0.0, HELD, None)
+    found = carrier.moving(
+        local,
+        track,
+        newest,
+        attitude=attitude,
+        since_ns=S + S // 4,
+        doubt_s=0.0,
+        bounds=HELD,
+        contradicted=None,
+    )
     rates = np.array([0.3, -0.2, 0.5])
     then = oracle(0.2, -0.1, 1.0) @ local.local_from_ned(*far).T
     assert found.body_from_local == pytest.approx(integrated(rates, 1.25) @ then, abs=1e-9)
@@ -125,7 +162,16 @@ def test_a_vehicle_s_attitude_is_carried_on_to_the_time_of_use(fix: Callable[...
     assert found.velocity_ned_mps.tolist() == [4, 5, 6]
     assert found.body_rates_radps.tolist() == [0.3, -0.2, 0.5]
     silent = replace(track, velocity_ned_mps=None)
-    unknown = carrier.moving(local, silent, newest, attitude, S + S // 4, 0.0, HELD, None)
+    unknown = carrier.moving(
+        local,
+        silent,
+        newest,
+        attitude=attitude,
+        since_ns=S + S // 4,
+        doubt_s=0.0,
+        bounds=HELD,
+        contradicted=None,
+    )
     assert unknown.velocity_ned_mps is None
 
 
@@ -136,14 +182,15 @@ def _at(make: Callable[..., Fix], lat_deg: float, lon_deg: float) -> Fix:
 
 @settings(max_examples=rounds(30, 300))
 @given(
-    st.tuples(*[st.floats(-3.0, 3.0)] * 3),
-    st.tuples(*[st.floats(-1.0, 1.0)] * 3),
-    st.floats(-0.3, 2.0),
-    st.floats(0.0, 0.4),
-    st.floats(-1.0, 1.0),
-    st.floats(0.0, 0.1),
+    rates=st.tuples(*[st.floats(-3.0, 3.0)] * 3),
+    way=st.tuples(*[st.floats(-1.0, 1.0)] * 3),
+    age_s=st.floats(-0.3, 2.0),
+    doubt_s=st.floats(0.0, 0.4),
+    late=st.floats(-1.0, 1.0),
+    off_rad=st.floats(0.0, 0.1),
 )
 def test_no_turn_leaves_the_bound_of_the_attitude(
+    *,
     rates: tuple[float, float, float],
     way: tuple[float, float, float],
     age_s: float,
@@ -176,7 +223,17 @@ def test_an_attitude_that_was_lost_says_nothing_soon() -> None:
 
 def turning(rate_degps: float) -> Attitude:
     rate = math.radians(rate_degps)
-    return Attitude(0, Source(5, 1), 0, 0.0, 0.0, 0.0, rate, 0.0, 0.0)
+    return Attitude(
+        t_ns=0,
+        source=Source(5, 1),
+        boot_ms=0,
+        roll_rad=0.0,
+        pitch_rad=0.0,
+        yaw_rad=0.0,
+        rollspeed_radps=rate,
+        pitchspeed_radps=0.0,
+        yawspeed_radps=0.0,
+    )
 
 
 def test_rates_prove_an_angular_acceleration_and_raise_the_limit() -> None:

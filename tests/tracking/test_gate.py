@@ -15,8 +15,18 @@ from companion.values import Fix, Reason, ReportNoise
 MakeFix = Callable[..., Fix]
 S = 1_000_000_000
 OBSERVER = KinematicObserver(KinematicModel(30.0, 5.0))
-PREDICTED = Prediction(np.array([100.0, 0, -50]), None, 99.0, 10.0, 4.0, None, None)
-NOISE = ReportNoise(3.0, 2.0, math.hypot(3.0, 2.0), 0.5)
+PREDICTED = Prediction(
+    position_ned_m=np.array([100.0, 0, -50]),
+    velocity_ned_mps=None,
+    bound_m=99.0,
+    horizontal_m=10.0,
+    vertical_m=4.0,
+    velocity_bound_mps=None,
+    mu_s2=None,
+)
+NOISE = ReportNoise(
+    horizontal_m=3.0, vertical_m=2.0, position_m=math.hypot(3.0, 2.0), velocity_mps=0.5
+)
 
 
 @pytest.mark.parametrize(

@@ -43,9 +43,22 @@ def test_north_east_and_down_point_where_they_should(lat_deg: float, lon_deg: fl
     assert ned_from_ecef(lat_deg, lon_deg) == pytest.approx(axes(lat_deg, lon_deg), abs=1e-6)
 
 
-@given(LATITUDES, LONGITUDES, HEIGHTS, st.floats(-1, 1), st.floats(-1, 1), HEIGHTS)
+@given(
+    lat_deg=LATITUDES,
+    lon_deg=LONGITUDES,
+    alt_m=HEIGHTS,
+    north_deg=st.floats(-1, 1),
+    east_deg=st.floats(-1, 1),
+    high_m=HEIGHTS,
+)
 def test_places_to_local_points(
-    lat_deg: float, lon_deg: float, alt_m: float, north_deg: float, east_deg: float, high_m: float
+    *,
+    lat_deg: float,
+    lon_deg: float,
+    alt_m: float,
+    north_deg: float,
+    east_deg: float,
+    high_m: float,
 ) -> None:
     local = LocalFrame(lat_deg, lon_deg, alt_m)
     lat2_deg = min(89.5, max(-89.5, lat_deg + north_deg))
@@ -115,11 +128,15 @@ METRES = st.floats(-60_000.0, 60_000.0)
 
 
 @given(
-    st.floats(-80.0, 80.0), st.floats(-180.0, 180.0), st.floats(-400.0, 9000.0),
-    METRES, METRES, st.floats(-12_000.0, 1_000.0),
-)  # fmt: skip
+    lat_deg=st.floats(-80.0, 80.0),
+    lon_deg=st.floats(-180.0, 180.0),
+    alt_m=st.floats(-400.0, 9000.0),
+    north_m=METRES,
+    east_m=METRES,
+    down_m=st.floats(-12_000.0, 1_000.0),
+)
 def test_places_are_those_of_pymap3d(
-    lat_deg: float, lon_deg: float, alt_m: float, north_m: float, east_m: float, down_m: float
+    *, lat_deg: float, lon_deg: float, alt_m: float, north_m: float, east_m: float, down_m: float
 ) -> None:
     origin = Place(lat_deg, lon_deg, alt_m)
     place = LocalFrame(*origin).place(north_m, east_m, down_m)

@@ -32,6 +32,7 @@ def flown(
     fix: Callable[..., Fix],
     place: Place,
     interval_s: float,
+    *,
     seconds: float,
     noise_mps: float = 0.0,
     noise_m: float = 0.0,
@@ -58,28 +59,31 @@ def flown(
 
 def test_in_straight_flight_with_noise_nothing_is_fed(fix: Callable[..., Fix]) -> None:
     straight: Place = lambda t_s: ([10 * t_s, 0, 0], [10, 0, 0])  # noqa: E731
-    assert flown(fix, straight, 0.9, 120, noise_mps=0.5, noise_m=1.0).way is PLAIN
+    assert flown(fix, straight, 0.9, seconds=120, noise_mps=0.5, noise_m=1.0).way is PLAIN
 
 
 def test_in_a_quick_turn_a_short_window_is_taken(fix: Callable[..., Fix]) -> None:
     """An aeroplane's: over five seconds the acceleration turns by a radian."""
-    way = flown(fix, circling(110.0, 22.0), 0.1, 60, noise_mps=0.05, noise_m=0.05).way
+    way = flown(fix, circling(110.0, 22.0), 0.1, seconds=60, noise_mps=0.05, noise_m=0.05).way
     assert 0 < way.window_s <= 2.5
 
 
 def test_in_a_slow_noisy_turn_something_is_fed(fix: Callable[..., Fix]) -> None:
-    assert flown(fix, circling(60.0, 5.0), 0.1, 60, noise_mps=0.05, noise_m=0.02).way is not PLAIN
+    assert (
+        flown(fix, circling(60.0, 5.0), 0.1, seconds=60, noise_mps=0.05, noise_m=0.02).way
+        is not PLAIN
+    )
 
 
 def test_before_there_is_any_judgement_nothing_is_fed(fix: Callable[..., Fix]) -> None:
-    assert flown(fix, circling(110.0, 22.0), 0.1, 1.0).way is PLAIN
+    assert flown(fix, circling(110.0, 22.0), 0.1, seconds=1.0).way is PLAIN
     assert Hindsight().usual_m(1.0) is None
 
 
 def test_the_usual_error_covers_what_comes(fix: Callable[..., Fix]) -> None:
     """Over noisy reports, at the ages that were judged: 19 of 20, and not much more."""
     place = circling(60.0, 8.0)
-    hindsight = flown(fix, place, 0.2, 120, noise_mps=0.2, noise_m=0.5)
+    hindsight = flown(fix, place, 0.2, seconds=120, noise_mps=0.2, noise_m=0.5)
     rng, covered, count = np.random.default_rng(2), 0, 2000
     usual_m = hindsight.usual_m(1.0)
     assert usual_m is not None
@@ -107,7 +111,7 @@ def test_in_a_turn_the_velocity_turns(
     speed_mps: float, heading: float, across_mps2: float, along_mps2: float, ahead_s: float
 ) -> None:
     """Against small steps; and no further from straight flight than what is across could go."""
-    way = Way(1.0, 3, 3.0, turns=True)
+    way = Way(window_s=1.0, fewest=3, fades_s=3.0, turns=True)
     direction = np.array([math.cos(heading), math.sin(heading)])
     aside = np.array([-direction[1], direction[0]])
     given = along_mps2 * direction + across_mps2 * aside
@@ -127,7 +131,10 @@ def test_in_a_turn_the_velocity_turns(
 
 
 def test_who_stands_has_no_direction_to_turn() -> None:
-    turning, straight = Way(1.0, 3, 3.0, turns=True), Way(1.0, 3, 3.0)
+    turning, straight = (
+        Way(window_s=1.0, fewest=3, fades_s=3.0, turns=True),
+        Way(window_s=1.0, fewest=3, fades_s=3.0),
+    )
     stands = (0.5, -0.5, 1.0)
     for ahead_s in (0.1, 2.0):
         found = (fed(way, (1.0, 2.0, -1.0), stands, ahead_s) for way in (turning, straight))
@@ -135,7 +142,7 @@ def test_who_stands_has_no_direction_to_turn() -> None:
 
 
 def test_in_a_steady_circle_the_turn_is_fed(fix: Callable[..., Fix]) -> None:
-    assert flown(fix, circling(60.0, 12.0), 0.8, 60, noise_mps=0.05, noise_m=0.05).way.turns
+    assert flown(fix, circling(60.0, 12.0), 0.8, seconds=60, noise_mps=0.05, noise_m=0.05).way.turns
 
 
 def test_positions_of_a_poor_receiver_are_smoothed(fix: Callable[..., Fix]) -> None:
@@ -156,7 +163,7 @@ def test_positions_of_a_poor_receiver_are_smoothed(fix: Callable[..., Fix]) -> N
             )  # fmt: skip
         reported, taken = (np.array(off)[100:, which] for which in (0, 1))
         assert np.sqrt((taken**2).mean()) < 0.65 * np.sqrt((reported**2).mean())
-    assert math.hypot(*flown(fix, circling(60.0, 8.0), 0.8, 60).aside) < 0.05
+    assert math.hypot(*flown(fix, circling(60.0, 8.0), 0.8, seconds=60).aside) < 0.05
 
 
 def test_over_a_gap_nothing_is_smoothed(fix: Callable[..., Fix]) -> None:

@@ -20,14 +20,39 @@ VELOCITY = (20.0, 0.0, 0.0)
 def track(uav: str, position: ArrayLike, velocity: ArrayLike | None = VELOCITY) -> Track:
     speeds = None if velocity is None else np.array(velocity, dtype=float)
     return Track(
-        uav, TrackState.LIVE, 0, 0.0, np.array(position, dtype=float), speeds, None, None,
-        5.0, 5.0, 5.0, np.zeros(3), 5.0, Limits(60.0, 5.0), None, 0.0, None, None, None, None, 1,
-    )  # fmt: skip
+        uav=uav,
+        state=TrackState.LIVE,
+        valid_at_ns=0,
+        age_s=0.0,
+        position_ned_m=np.array(position, dtype=float),
+        velocity_ned_mps=speeds,
+        unknown_input_mps=None,
+        acceleration_ned_mps2=None,
+        bound_m=5.0,
+        horizontal_bound_m=5.0,
+        vertical_bound_m=5.0,
+        set_center_ned_m=np.zeros(3),
+        set_radius_m=5.0,
+        limits=Limits(60.0, 5.0),
+        error_p95_m=None,
+        clock_bound_s=0.0,
+        dt_s=None,
+        latency_s=None,
+        gamma=None,
+        innovation_m=None,
+        reports=1,
+    )
 
 
 def relayed(fix: MakeFix, n: int, position: ArrayLike, velocity: ArrayLike = VELOCITY) -> Fix:
     speeds = np.array(velocity, dtype=float)
-    return fix(n * S, position, velocity, uav=AIRCRAFT, noise=noise.relayed(speeds, 0.0, 60.0))
+    return fix(
+        n * S,
+        position,
+        velocity,
+        uav=AIRCRAFT,
+        noise=noise.relayed(speeds, 0.0, speed_max_mps=60.0),
+    )
 
 
 def after(fix: MakeFix, offsets: list[float], *others: Track) -> str | None:
@@ -84,11 +109,20 @@ def test_it_is_itself_again_when_they_part(fix: MakeFix) -> None:
 
 # --- bounds on a report's errors ------------------------------------------------------------------
 
-DEFAULT = ReportNoise(3.0, 3.0, 3.0, 0.5)
+DEFAULT = ReportNoise(horizontal_m=3.0, vertical_m=3.0, position_m=3.0, velocity_mps=0.5)
 
 
 def status(h: float | None, v: float | None, vel: float | None) -> GnssStatus:
-    return GnssStatus(0, Source(1, 1), 3, 12, 500.0, h, v, vel)
+    return GnssStatus(
+        t_ns=0,
+        source=Source(1, 1),
+        fix_type=3,
+        satellites=12,
+        alt_m=500.0,
+        h_acc_m=h,
+        v_acc_m=v,
+        vel_acc_mps=vel,
+    )
 
 
 @pytest.mark.parametrize(

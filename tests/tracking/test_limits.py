@@ -17,7 +17,7 @@ from companion.values import Fix, Limits, LimitSource, ReportNoise
 
 S = 1_000_000_000
 COPTER = Limits(60.0, 4.0, LimitSource.TYPE)
-NOISE = ReportNoise(1.0, 1.0, 1.4, 0.3)
+NOISE = ReportNoise(horizontal_m=1.0, vertical_m=1.0, position_m=1.4, velocity_mps=0.3)
 
 
 def told(fix: Callable[..., Fix], t_s: float, velocity: object, limits: Limits = COPTER) -> Fix:

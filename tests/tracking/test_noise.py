@@ -34,7 +34,10 @@ def test_a_time_in_whole_seconds_is_worth_the_way_flown_in_one(
 def test_an_altitude_of_another_time_is_worth_what_can_be_climbed_between(age_s: float) -> None:
     """In height, and in space; where it is on the map has nothing to do with it."""
     velocity = np.array([30.0, 40.0, 0.0])
-    fresh, old = relayed(velocity, 0.0, 90.0), relayed(velocity, age_s, 90.0)
+    fresh, old = (
+        relayed(velocity, 0.0, speed_max_mps=90.0),
+        relayed(velocity, age_s, speed_max_mps=90.0),
+    )
     assert old.horizontal_m == fresh.horizontal_m
     assert old.vertical_m == pytest.approx(fresh.vertical_m + 90.0 * age_s)
     assert old.position_m == pytest.approx(math.hypot(old.horizontal_m, old.vertical_m))
@@ -43,34 +46,84 @@ def test_an_altitude_of_another_time_is_worth_what_can_be_climbed_between(age_s:
 def test_a_stated_accuracy_takes_the_place_of_what_is_taken_for_granted() -> None:
     """Field by field, with the factor of the settings; the geoid is no matter of accuracy."""
     still = np.zeros(3)
-    told = Accuracy(6.0, 20.0, 0.5)
-    found = relayed(still, 0.0, 90.0, told, AltitudeDatum.GEOMETRIC, 3.0)
+    told = Accuracy(horizontal_m=6.0, vertical_m=20.0, velocity_mps=0.5)
+    found = relayed(
+        still, 0.0, speed_max_mps=90.0, accuracy=told, datum=AltitudeDatum.GEOMETRIC, factor=3.0
+    )
     assert found.horizontal_m == pytest.approx(18.0)
     assert found.vertical_m == pytest.approx(60.0 + GEOID_M)
     assert found.velocity_mps == pytest.approx(1.5)
-    by_pressure = relayed(still, 0.0, 90.0, told, AltitudeDatum.PRESSURE, 3.0)
+    by_pressure = relayed(
+        still, 0.0, speed_max_mps=90.0, accuracy=told, datum=AltitudeDatum.PRESSURE, factor=3.0
+    )
     assert by_pressure.vertical_m == ADSB_NOISE_M
-    partly = relayed(still, 0.0, 90.0, Accuracy(velocity_mps=0.5), AltitudeDatum.GEOMETRIC, 3.0)
+    partly = relayed(
+        still,
+        0.0,
+        speed_max_mps=90.0,
+        accuracy=Accuracy(velocity_mps=0.5),
+        datum=AltitudeDatum.GEOMETRIC,
+        factor=3.0,
+    )
     assert (partly.horizontal_m, partly.vertical_m) == (ADSB_NOISE_M, ADSB_NOISE_M + GEOID_M)
-    exact = relayed(still, 0.0, 90.0, Accuracy(0.0, 0.0, 0.0), AltitudeDatum.GEOMETRIC, 3.0)
+    exact = relayed(
+        still,
+        0.0,
+        speed_max_mps=90.0,
+        accuracy=Accuracy(horizontal_m=0.0, vertical_m=0.0, velocity_mps=0.0),
+        datum=AltitudeDatum.GEOMETRIC,
+        factor=3.0,
+    )
     assert (exact.horizontal_m, exact.velocity_mps) == (QUANTISATION, QUANTISATION)
 
 
 def test_settings_that_do_not_follow_accuracies_ignore_them() -> None:
-    told = Accuracy(6.0, 20.0, 0.5, 0.1)
-    found = relayed(np.ones(3), 0.0, 90.0, told, AltitudeDatum.GEOMETRIC, None)
-    assert found == relayed(np.ones(3), 0.0, 90.0, None, AltitudeDatum.GEOMETRIC)
+    told = Accuracy(horizontal_m=6.0, vertical_m=20.0, velocity_mps=0.5, time_s=0.1)
+    found = relayed(
+        np.ones(3),
+        0.0,
+        speed_max_mps=90.0,
+        accuracy=told,
+        datum=AltitudeDatum.GEOMETRIC,
+        factor=None,
+    )
+    assert found == relayed(
+        np.ones(3), 0.0, speed_max_mps=90.0, accuracy=None, datum=AltitudeDatum.GEOMETRIC
+    )
 
 
 def test_a_height_that_was_brought_to_the_sea_has_what_that_may_be_off() -> None:
-    still, told = np.zeros(3), Accuracy(6.0, 20.0, 0.5)
-    found = relayed(still, 0.0, 90.0, told, AltitudeDatum.MSL, 3.0, geoid_error_m=4.0)
+    still, told = np.zeros(3), Accuracy(horizontal_m=6.0, vertical_m=20.0, velocity_mps=0.5)
+    found = relayed(
+        still,
+        0.0,
+        speed_max_mps=90.0,
+        accuracy=told,
+        datum=AltitudeDatum.MSL,
+        factor=3.0,
+        geoid_error_m=4.0,
+    )
     assert found.vertical_m == pytest.approx(60.0 + 4.0)
-    unstated = relayed(still, 0.0, 90.0, None, AltitudeDatum.MSL, 3.0, geoid_error_m=4.0)
+    unstated = relayed(
+        still,
+        0.0,
+        speed_max_mps=90.0,
+        accuracy=None,
+        datum=AltitudeDatum.MSL,
+        factor=3.0,
+        geoid_error_m=4.0,
+    )
     assert unstated.vertical_m == ADSB_NOISE_M + 4.0
 
 
 def test_a_time_that_is_better_known_is_worth_less_way() -> None:
     velocity = np.array([30.0, 40.0, 0.0])
-    found = relayed(velocity, 0.0, 90.0, Accuracy(2.0, time_s=0.1), None, 3.0)
+    found = relayed(
+        velocity,
+        0.0,
+        speed_max_mps=90.0,
+        accuracy=Accuracy(horizontal_m=2.0, time_s=0.1),
+        datum=None,
+        factor=3.0,
+    )
     assert found.horizontal_m == pytest.approx(6.0 + 5.0)

@@ -14,7 +14,7 @@ from companion.tracking.reach import reach
 from companion.values import Fix, FloatArray, Limits, ReportNoise, SenderTime
 
 S = 1_000_000_000
-NOISE = ReportNoise(1.2, 0.9, 1.5, 0.4)
+NOISE = ReportNoise(horizontal_m=1.2, vertical_m=0.9, position_m=1.5, velocity_mps=0.4)
 LIMITS = Limits(60.0, 5.0)
 VECTOR = st.tuples(*[st.floats(-1, 1)] * 3)
 
@@ -26,10 +26,20 @@ def unit(vector: tuple[float, ...]) -> FloatArray:
 
 @settings(max_examples=examples(500))
 @given(
-    VECTOR, st.floats(0, 25), st.floats(0, 3), st.floats(0, 1), st.floats(0, 1), st.floats(0, 1),
-    VECTOR, VECTOR, VECTOR, VECTOR, st.floats(0, 4),
-)  # fmt: skip
+    way=VECTOR,
+    speed=st.floats(0, 25),
+    age_s=st.floats(0, 3),
+    before_s=st.floats(0, 1),
+    after_s=st.floats(0, 1),
+    when=st.floats(0, 1),
+    wrong=VECTOR,
+    fast=VECTOR,
+    push=VECTOR,
+    aside=VECTOR,
+    off_m=st.floats(0, 4),
+)
 def test_no_motion_leaves_what_is_possible(
+    *,
     fix: Callable[..., Fix],
     way: tuple[float, ...],
     speed: float,
@@ -52,7 +62,12 @@ def test_no_motion_leaves_what_is_possible(
     error[2] = max(-0.9, min(0.9, error[2]))
     truth = error + (velocity + 0.4 * unit(fast)) * at_s + 5.0 * unit(push) * at_s**2 / 2
     predicted = velocity * age_s + off_m * unit(aside)
-    found = reach(made, LIMITS, predicted, SenderTime(0, round(age_s * S), before_s, after_s))
+    found = reach(
+        made,
+        LIMITS,
+        predicted,
+        SenderTime(node_ns=0, sender_ns=round(age_s * S), before_s=before_s, after_s=after_s),
+    )
     off = predicted - truth
     assert float(np.linalg.norm(off)) <= found.bound_m + 1e-6
     assert math.hypot(off[0], off[1]) <= found.horizontal_m + 1e-6
@@ -68,7 +83,7 @@ def test_the_bound_and_the_ball_are_the_least(
     noise = replace(NOISE, horizontal_m=1.5, vertical_m=1.5)
     velocity = np.array([8.0, 3.0, 0.0])
     made = fix(0, [0, 0, 0], velocity, noise=noise)
-    at = SenderTime(0, round(age_s * S), before_s, after_s)
+    at = SenderTime(node_ns=0, sender_ns=round(age_s * S), before_s=before_s, after_s=after_s)
     predicted = velocity * age_s + np.array([0.0, 0.4, 0.0])
     found = reach(made, LIMITS, predicted, at)
     times = np.linspace(age_s - before_s, age_s + after_s, 201)
@@ -83,6 +98,11 @@ def test_the_bound_and_the_ball_are_the_least(
 
 def test_over_a_long_gap_the_greatest_speed_says_more(fix: Callable[..., Fix]) -> None:
     made = fix(0, [0, 0, 0], [10, 0, 0], noise=NOISE)
-    found = reach(made, LIMITS, np.zeros(3), SenderTime(0, 60 * S, 0.0, 0.0))
+    found = reach(
+        made,
+        LIMITS,
+        np.zeros(3),
+        SenderTime(node_ns=0, sender_ns=60 * S, before_s=0.0, after_s=0.0),
+    )
     assert found.radius_m == pytest.approx(1.5 + 60 * 60)
     assert found.center_ned_m == (0, 0, 0)

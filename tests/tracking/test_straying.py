@@ -12,9 +12,9 @@ from companion.values import Fix, FloatArray, Refuted, ReportNoise
 
 S = 1_000_000_000
 ACCELERATION_MPS2 = 5.0
-DEFAULT = ReportNoise(3.0, 3.0, 3.0, 0.5)
+DEFAULT = ReportNoise(horizontal_m=3.0, vertical_m=3.0, position_m=3.0, velocity_mps=0.5)
 SETTINGS = NoiseSettings(DEFAULT, 3.0)
-STATED = ReportNoise(0.9, 0.9, 1.27, 0.5)
+STATED = ReportNoise(horizontal_m=0.9, vertical_m=0.9, position_m=1.27, velocity_mps=0.5)
 MakeFix = Callable[..., Fix]
 Wander = Callable[[float], tuple[float, float]]
 
@@ -73,12 +73,14 @@ def test_one_that_wanders_is_found_while_the_bound_still_holds(fix: MakeFix, siz
 
 
 def test_a_poor_receiver_that_says_so_may_wander(fix: MakeFix) -> None:
-    honest = ReportNoise(2.7, 2.7, 3.8, 0.5)
+    honest = ReportNoise(horizontal_m=2.7, vertical_m=2.7, position_m=3.8, velocity_mps=0.5)
     assert told(Straying(SETTINGS), flown(fix, wave(0.6, 15), honest)) == []
 
 
 def test_what_is_left_of_the_lag_is_no_fault_of_the_receiver(fix: MakeFix) -> None:
-    late = ReportNoise(0.9, 0.9, 1.27, 0.5, time_s=0.06)
+    late = ReportNoise(
+        horizontal_m=0.9, vertical_m=0.9, position_m=1.27, velocity_mps=0.5, time_s=0.06
+    )
 
     def lag(t_s: float) -> tuple[float, float]:
         turn, off_m = 0.1 * t_s, 6 * 0.06 * (1 if t_s % 4 < 2 else -1)
@@ -122,5 +124,7 @@ def test_who_does_not_rest_on_statements_is_not_judged(fix: MakeFix) -> None:
 def test_heights_that_differ_count_as_usual_within_the_bound() -> None:
     straying = Straying(SETTINGS)
     for apart_m, usual_m in ((0.3, 0.3), (50.0, 0.9)):
-        noise = ReportNoise(0.9, 0.9, 1.27, 0.5, apart_m=apart_m)
+        noise = ReportNoise(
+            horizontal_m=0.9, vertical_m=0.9, position_m=1.27, velocity_mps=0.5, apart_m=apart_m
+        )
         assert straying.usual_m(noise) == pytest.approx(usual_m)

@@ -28,14 +28,14 @@ from companion.values import (
 
 MakeFix = Callable[..., Fix]
 S = 1_000_000_000
-OBSERVER = PositionObserver(PositionModel(30.0, 8.0, alpha=0.5))
+OBSERVER = PositionObserver(PositionModel(speed_mps=30.0, acceleration_mps2=8.0, alpha=0.5))
 AGES = Ages(2.0, 15.0, 60.0)
-SETTINGS = TrackerSettings(Limits(30.0, 8.0), AGES)
+SETTINGS = TrackerSettings(limits=Limits(30.0, 8.0), ages=AGES)
 
 
 def same_time(node_ns: int, bound_s: float = 0.0) -> SenderTime:
     """A time of a sender whose timeline is the node's, as is known to within ``bound_s``."""
-    return SenderTime(node_ns, node_ns, bound_s, bound_s)
+    return SenderTime(node_ns=node_ns, sender_ns=node_ns, before_s=bound_s, after_s=bound_s)
 
 
 @pytest.fixture
@@ -193,13 +193,17 @@ def test_tracks_do_not_touch_one_another(fix: MakeFix) -> None:
 # --- what cannot be true ------------------------------------------------------------------------
 
 KINEMATIC = KinematicObserver(KinematicModel(30.0, 5.0))
-NOISE = ReportNoise(2.0, 2.0, math.hypot(2.0, 2.0), 0.4)
+NOISE = ReportNoise(
+    horizontal_m=2.0, vertical_m=2.0, position_m=math.hypot(2.0, 2.0), velocity_mps=0.4
+)
 CRUISE_MPS = 12.0
 
 
 def tracking(feed_mps2: float | None = None, ages: Ages = AGES, **gate: float) -> Tracker:
     limits = Limits(30.0, feed_mps2 or 5.0)
-    given = TrackerSettings(limits, ages, GateSettings(**gate), feed_forward=feed_mps2 is not None)
+    given = TrackerSettings(
+        limits=limits, ages=ages, gate=GateSettings(**gate), feed_forward=feed_mps2 is not None
+    )
     return Tracker(KINEMATIC, given)
 
 

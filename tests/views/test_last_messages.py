@@ -26,7 +26,9 @@ def packed(message: Any) -> bytes:
 def kept(message: Any) -> LastMessages:
     store = LastMessages()
     raw = packed(message)
-    store.add(Frame(1_000_000_000, "link", SENDER, message.get_msgId(), raw))
+    store.add(
+        Frame(t_ns=1_000_000_000, link="link", source=SENDER, msgid=message.get_msgId(), raw=raw)
+    )
     return store
 
 
@@ -89,7 +91,7 @@ def test_every_message_decodes_as_pymavlink_decodes_it(data: st.DataObject) -> N
     size = kind.unpacker.size
     payload = data.draw(st.binary(min_size=1, max_size=size))
     header = bytes([0xFD, len(payload), 0, 0, 0, 7, 42]) + msgid.to_bytes(3, "little")
-    frame = Frame(0, "link", SENDER, msgid, header + payload + b"\0\0")
+    frame = Frame(t_ns=0, link="link", source=SENDER, msgid=msgid, raw=header + payload + b"\0\0")
     store = LastMessages()
     store.add(frame)
     one = store.find(SENDER, msgid)
@@ -121,7 +123,7 @@ def test_every_message_decodes_as_pymavlink_decodes_it(data: st.DataObject) -> N
 
 
 def frame(t_ns: int, source: Source, msgid: int = 0) -> Frame:
-    return Frame(t_ns, "link", source, msgid, b"")
+    return Frame(t_ns=t_ns, link="link", source=source, msgid=msgid, raw=b"")
 
 
 def test_the_newest_is_kept_and_all_are_counted() -> None:

@@ -38,7 +38,13 @@ def there(t_s: float) -> tuple[float, float, float]:
 def framed(t_s: float, source: Source, message: Any) -> Frame:
     mav = dialect.MAVLink(None, srcSystem=source.sysid, srcComponent=source.compid)
     raw = bytes(message.pack(mav))
-    return Frame(START_NS + round(t_s * S), "udp", source, message.get_msgId(), raw)
+    return Frame(
+        t_ns=START_NS + round(t_s * S),
+        link="udp",
+        source=source,
+        msgid=message.get_msgId(),
+        raw=raw,
+    )
 
 
 def telemetry(t_s: float, late_s: float = 0.0, boot_s: float = 100.0) -> Frame:

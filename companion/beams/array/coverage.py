@@ -19,7 +19,7 @@ BoolArray = NDArray[np.bool_]
 QUARTER: Final = math.pi / 2
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Sector:
     """A range of azimuths to the right and of elevations upwards, radians.
 
@@ -110,7 +110,7 @@ class Sector:
         return f"{_degrees(self.elevation_from_rad)} to {_degrees(self.elevation_to_rad)}"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Coverage:
     """Where the array may point. A limit that is not given (None, nothing hidden) does not limit.
 

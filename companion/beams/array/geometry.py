@@ -21,7 +21,7 @@ LINE_WAVELENGTHS: Final = 1e-6
 """Root mean square distance from a line below which all elements count as on it."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Array:
     """Element positions at a wavelength, and the mounting of the array.
 
@@ -94,6 +94,7 @@ class Array:
 def uniform_linear(
     elements: int,
     frequency_hz: float,
+    *,
     spacing_wavelengths: float,
     array_from_body: FloatArray,
     element: Element = ISOTROPIC,
@@ -104,12 +105,19 @@ def uniform_linear(
     Raises ``UserError`` for numbers that make no array, as do the functions below.
     """
     return uniform_rectangular(
-        1, elements, frequency_hz, spacing_wavelengths, array_from_body, element, lever_arm_m
+        1,
+        columns=elements,
+        frequency_hz=frequency_hz,
+        spacing_wavelengths=spacing_wavelengths,
+        array_from_body=array_from_body,
+        element=element,
+        lever_arm_m=lever_arm_m,
     )
 
 
 def uniform_rectangular(
     rows: int,
+    *,
     columns: int,
     frequency_hz: float,
     spacing_wavelengths: float,
@@ -128,13 +136,21 @@ def uniform_rectangular(
     kind = "ula" if rows == 1 else "ura"
     lever = np.zeros(3) if lever_arm_m is None else lever_arm_m
     return Array(
-        kind, elements_m, wavelength_m, array_from_body, lever, element, None, (rows, columns)
+        kind=kind,
+        elements_m=elements_m,
+        wavelength_m=wavelength_m,
+        array_from_body=array_from_body,
+        lever_arm_m=lever,
+        element=element,
+        element_from_array=None,
+        grid=(rows, columns),
     )
 
 
 def uniform_circular(
     elements: int,
     frequency_hz: float,
+    *,
     spacing_wavelengths: float,
     array_from_body: FloatArray,
     element: Element = ISOTROPIC,
@@ -150,12 +166,21 @@ def uniform_circular(
     radius_m = spacing_wavelengths * wavelength_m / (2 * np.sin(np.pi / elements))
     outward = np.stack([np.cos(angle), np.sin(angle), np.zeros(elements)], axis=1)
     placed = outward * (radius_m if elements > 1 else 0.0)
-    return listed(placed, frequency_hz, array_from_body, element, lever_arm_m, outward, kind="uca")
+    return listed(
+        placed,
+        frequency_hz,
+        array_from_body=array_from_body,
+        element=element,
+        lever_arm_m=lever_arm_m,
+        outward=outward,
+        kind="uca",
+    )
 
 
 def listed(
     elements_m: FloatArray,
     frequency_hz: float,
+    *,
     array_from_body: FloatArray,
     element: Element = ISOTROPIC,
     lever_arm_m: FloatArray | None = None,
@@ -176,7 +201,15 @@ def listed(
     if outward is not None and element.pattern is not Pattern.ISOTROPIC:
         turned = _facing(outward, len(elements_m))
     lever = np.zeros(3) if lever_arm_m is None else lever_arm_m
-    return Array(kind, elements_m, wavelength_m, array_from_body, lever, element, turned)
+    return Array(
+        kind=kind,
+        elements_m=elements_m,
+        wavelength_m=wavelength_m,
+        array_from_body=array_from_body,
+        lever_arm_m=lever,
+        element=element,
+        element_from_array=turned,
+    )
 
 
 def _wavelength_m(elements: int, frequency_hz: float, spacing: float) -> float:

@@ -20,7 +20,7 @@ PHASE_MAX_DEG: Final = 1e6
 """Most that a phase may be, either way, for it to be one still."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Calibration:
     """A measured calibration of an array of M elements.
 
@@ -64,7 +64,7 @@ class Calibration:
     @classmethod
     def ideal(cls, order: Sequence[int]) -> Self:
         """A calibration of channels that add nothing, in this order."""
-        return cls((0.0,) * len(order), (0.0,) * len(order), tuple(order))
+        return cls(phase_rad=(0.0,) * len(order), gain_db=(0.0,) * len(order), order=tuple(order))
 
     @property
     def factors(self) -> ComplexArray:
@@ -115,11 +115,11 @@ def parse_calibration(text: str) -> Calibration:
             raise UserError(f"{name} {min(missing)} of {len(order)} has no line")
     elements = range(len(order))
     return Calibration(
-        tuple(measured[m][0] for m in elements),
-        tuple(measured[m][1] for m in elements),
-        tuple(order[c] for c in elements),
-        tuple(measured[m][2] for m in elements) if bounded else (),
-        tuple(measured[m][3] for m in elements) if bounded else (),
+        phase_rad=tuple(measured[m][0] for m in elements),
+        gain_db=tuple(measured[m][1] for m in elements),
+        order=tuple(order[c] for c in elements),
+        phase_error_rad=tuple(measured[m][2] for m in elements) if bounded else (),
+        gain_error_db=tuple(measured[m][3] for m in elements) if bounded else (),
     )
 
 

@@ -42,7 +42,7 @@ REQUIRED: Final = ("phase_deg", "gain_db")
 BOUNDS: Final = ("phase_error_deg", "gain_error_db")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Table:
     """One table: columns (M,) by channel, bounds None where they are not said."""
 
@@ -148,11 +148,11 @@ def _between(low: _Table, high: _Table, frequency_hz: float) -> _Table:
     if low.gain_error_db is not None and high.gain_error_db is not None:
         gain_error = np.maximum(low.gain_error_db, high.gain_error_db)
     return _Table(
-        frequency_hz,
-        low.phase_deg + share * (turned_deg[0] + apart_deg),
-        low.gain_db + share * (high.gain_db - low.gain_db),
-        phase_error,
-        gain_error,
+        frequency_hz=frequency_hz,
+        phase_deg=low.phase_deg + share * (turned_deg[0] + apart_deg),
+        gain_db=low.gain_db + share * (high.gain_db - low.gain_db),
+        phase_error_deg=phase_error,
+        gain_error_db=gain_error,
     )
 
 
@@ -166,9 +166,9 @@ def _calibration(order: list[int], table: _Table) -> Calibration:
 
     off_deg = by_element(table.phase_error_deg)
     return Calibration(
-        tuple(math.radians(phase) for phase in by_element(table.phase_deg)),
-        by_element(table.gain_db),
-        tuple(order),
-        tuple(math.radians(phase) for phase in off_deg),
-        by_element(table.gain_error_db),
+        phase_rad=tuple(math.radians(phase) for phase in by_element(table.phase_deg)),
+        gain_db=by_element(table.gain_db),
+        order=tuple(order),
+        phase_error_rad=tuple(math.radians(phase) for phase in off_deg),
+        gain_error_db=by_element(table.gain_error_db),
     )

@@ -30,7 +30,7 @@ MEDIA_TYPES: Final = {
 """Media types for HTTP. They are this product's own names; the makers have registered none."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
     """What a device can hold and do.
 
@@ -141,8 +141,18 @@ SETTINGS: Final[dict[Device, SettableStates]] = {
 """Settings of one channel of each device."""
 
 LIMITS: Final = {
-    Device.ADAR1000: Limits(None, 121, None, 31.0),
-    Device.TMYTEK: Limits(TMYTEK_CHANNELS, 64, math.radians(45), TMYTEK_RANGE_DB),
-    Device.SIVERS: Limits(SIVERS_ANTENNAS, SIVERS_ROWS, None, 20 * math.log10(SIVERS_OFFSET)),
+    Device.ADAR1000: Limits(elements=None, beams=121, off_boresight_rad=None, gain_range_db=31.0),
+    Device.TMYTEK: Limits(
+        elements=TMYTEK_CHANNELS,
+        beams=64,
+        off_boresight_rad=math.radians(45),
+        gain_range_db=TMYTEK_RANGE_DB,
+    ),
+    Device.SIVERS: Limits(
+        elements=SIVERS_ANTENNAS,
+        beams=SIVERS_ROWS,
+        off_boresight_rad=None,
+        gain_range_db=20 * math.log10(SIVERS_OFFSET),
+    ),
 }
 """Limits of each device. An ADAR1000 array has as many chips as it needs."""

@@ -41,7 +41,7 @@ class Responses:
     responses: ComplexArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Found:
     """A calibration with bounds, and what it leaves.
 
@@ -110,18 +110,18 @@ def fitted(measured: Responses, array: Array, order: Sequence[int]) -> Found:
     gain_off[places] = np.abs(20 * np.log10(np.abs(off))).max(axis=0)
     gains = 20 * np.log10(np.abs(factors))
     calibration = Calibration(
-        tuple(np.angle(factors / factors[0]).tolist()),
-        tuple((gains - gains.mean()).tolist()),
-        tuple(places),
-        tuple(phase_off.tolist()),
-        tuple(gain_off.tolist()),
+        phase_rad=tuple(np.angle(factors / factors[0]).tolist()),
+        gain_db=tuple((gains - gains.mean()).tolist()),
+        order=tuple(places),
+        phase_error_rad=tuple(phase_off.tolist()),
+        gain_error_db=tuple(gain_off.tolist()),
     )
     share = 1 - float(channel_error(phase_off, gain_off).mean())
     return Found(
-        calibration,
-        float(np.degrees(phase_off.max())),
-        float(gain_off.max()),
-        -20 * float(np.log10(share)) if share > 0 else np.inf,
+        calibration=calibration,
+        phase_deg=float(np.degrees(phase_off.max())),
+        gain_db=float(gain_off.max()),
+        cost_db=-20 * float(np.log10(share)) if share > 0 else np.inf,
     )
 
 

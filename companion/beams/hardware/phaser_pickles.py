@@ -29,9 +29,9 @@ def calibration(phases: bytes, gains: bytes) -> Calibration:
     if not all(factor > 0 for factor in factors):
         raise UserError("gain calibration: a factor is not above 0")
     return Calibration(
-        tuple(math.radians(-phase) for phase in added_deg),
-        tuple(-20 * math.log10(factor) for factor in factors),
-        ORDER,
+        phase_rad=tuple(math.radians(-phase) for phase in added_deg),
+        gain_db=tuple(-20 * math.log10(factor) for factor in factors),
+        order=ORDER,
     )
 
 

@@ -210,7 +210,9 @@ def quantise(
     wanted = _wanted(weights, factors)
     strongest = int(np.argmax(np.abs(wanted)))
     starts = _best_rotations(wanted, settings, metric, weights, factors)
-    codes = _descend(starts, settings, metric, weights, factors, strongest)
+    codes = _descend(
+        starts, settings, metric, weights=weights, factors=factors, strongest=strongest
+    )
     radiated = factors * settings.values(codes)
     score = _score(radiated, metric, weights)
     best = int(np.argmax(score))
@@ -276,6 +278,7 @@ def _descend(
     starts: IntArray,
     settings: SettableStates,
     metric: ComplexArray,
+    *,
     weights: ComplexArray,
     factors: ComplexArray,
     strongest: int,

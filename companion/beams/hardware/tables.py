@@ -18,7 +18,7 @@ from companion.beams.weights.precoding import gain_db
 from companion.values import ComplexArray, IntArray, UserError
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class WantedBeam:
     """A beam to be written for a device.
 
@@ -35,7 +35,7 @@ class WantedBeam:
     steering: ComplexArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class DeviceTable:
     """The settings of a device.
 
@@ -82,7 +82,15 @@ def fit(
     )
     weights = np.stack([one.weights for one in found], axis=1)
     uavs = tuple(device_text.check_name(beam.uav) for beam in beams)
-    return DeviceTable(device, uavs, codes, calibration.order, weights, losses, gains)
+    return DeviceTable(
+        device=device,
+        uavs=uavs,
+        codes=codes,
+        order=calibration.order,
+        weights=weights,
+        loss_db=losses,
+        gains=gains,
+    )
 
 
 def encode(table: DeviceTable, frequency_hz: float | None = None) -> str:

@@ -80,7 +80,7 @@ def seen_within(across: Aperture, directions: FloatArray, angles_rad: FloatArray
     return Seen(cosines, np.minimum(lowest, cosines), np.maximum(highest, cosines))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Cones:
     """Where N beams are looked at, at P places each.
 
@@ -113,7 +113,12 @@ class Cones:
     def of(self, users: IntArray) -> "Cones":
         """The cones of some of the users."""
         vectors = self.vectors if self.waves else self.vectors[users]
-        return Cones(self.turns[:, users], self.waves, vectors, self.counts[:, users])
+        return Cones(
+            turns=self.turns[:, users],
+            waves=self.waves,
+            vectors=vectors,
+            counts=self.counts[:, users],
+        )
 
 
 def cones(
@@ -130,7 +135,7 @@ def cones(
     waves, counts = _about(across, seen, array.grid, array.wavelength_m)
     turns = centres / np.maximum(np.abs(centres).max(axis=0), 1e-300)
     nothing: ComplexArray = np.empty((0, 0, 0), dtype=complex)
-    return Cones(turns, tuple(waves), nothing, counts)
+    return Cones(turns=turns, waves=tuple(waves), vectors=nothing, counts=counts)
 
 
 def _about(
@@ -210,7 +215,7 @@ def _asked(array: Array, across: Aperture, directions: FloatArray, seen: Seen) -
     counts = np.ones((2, users, len(share)))
     counts[1] = from_likely
     nothing: ComplexArray = np.empty((0, users), dtype=complex)
-    return Cones(nothing, (), vectors, counts)
+    return Cones(turns=nothing, waves=(), vectors=vectors, counts=counts)
 
 
 def outside(across: Aperture, seen: Seen, around: FloatArray, wavelength_m: float) -> FloatArray:

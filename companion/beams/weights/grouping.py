@@ -62,7 +62,7 @@ def _lost_db(gram: ComplexArray, elements: int, limits: Limits) -> float:
 class _Group:
     """A group that grows: the inverse of its Gram matrix, bordered with each user it takes in."""
 
-    def __init__(self, gram: ComplexArray, first: int, elements: int, limits: Limits) -> None:
+    def __init__(self, *, gram: ComplexArray, first: int, elements: int, limits: Limits) -> None:
         self.members = [first]
         self._gram, self._elements, self._limits = gram, elements, limits
         self._inverse: ComplexArray = np.array([[1.0 / gram[first, first]]])
@@ -121,7 +121,7 @@ def semi_orthogonal(steering: ComplexArray, order: Sequence[int], limits: Limits
     for begin in order:
         if not left[begin]:
             continue
-        group = _Group(gram, begin, len(steering), limits)
+        group = _Group(gram=gram, first=begin, elements=len(steering), limits=limits)
         left[begin] = False
         factors: ComplexArray = np.empty((min(len(gram), len(steering)), len(gram)), dtype=complex)
         count = 0
@@ -148,7 +148,7 @@ def semi_orthogonal(steering: ComplexArray, order: Sequence[int], limits: Limits
 def without_the_lowest(steering: ComplexArray, order: Sequence[int], limits: Limits) -> IntArray:
     """The users kept: by descending priority, each that fits with those kept before."""
     unit: ComplexArray = steering / np.linalg.norm(steering, axis=0)
-    kept = _Group(unit.conj().T @ unit, order[0], len(steering), limits)
+    kept = _Group(gram=unit.conj().T @ unit, first=order[0], elements=len(steering), limits=limits)
     for user in order[1:]:
         kept.take(user)
     return np.sort(np.array(kept.members))

@@ -43,7 +43,7 @@ from companion.values import (
 )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Precoder:
     """How weights are made.
 
@@ -74,12 +74,16 @@ class Precoder:
     floor_db: float = 2.9
     power: Power | None = None
     rate_weights: Mapping[str, float] = field(default_factory=dict)
-    budget: LinkBudget = field(default_factory=lambda: LinkBudget(20.0, 50e6, 7.0))
+    budget: LinkBudget = field(
+        default_factory=lambda: LinkBudget(
+            tx_power_dbm=20.0, bandwidth_hz=50e6, noise_figure_db=7.0
+        )
+    )
     uav_antennas: int = 4
     worth_db: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Precoding:
     """Weights for the K users that are served, and what they cost.
 
@@ -125,6 +129,7 @@ def precode(
     steering: ComplexArray,
     settings: Precoder,
     spread: Spread | None = None,
+    *,
     priorities: Sequence[int] | None = None,
     radio: Radio | None = None,
     before: Turns | None = None,
@@ -150,7 +155,13 @@ def precode(
     if users == 0:
         nothing: ComplexArray = np.empty((size, 0), dtype=complex)
         return Precoding(
-            nothing, settings.method, settings.normalisation, None, everyone, everyone, {}
+            weights=nothing,
+            method=settings.method,
+            normalisation=settings.normalisation,
+            condition_number=None,
+            served=everyone,
+            groups=everyone,
+            dropped={},
         )
     groups, dropped = _turns(steering, settings, priorities, before)
     made = [_columns(steering, settings, spread, radio, group) for group in groups]
@@ -165,9 +176,15 @@ def precode(
     condition = max(one.condition_number for one in made)
     normalise(weights, settings.normalisation, turns[served])
     return Precoding(
-        weights, method, settings.normalisation, condition, served, turns[served], dropped,
-        method is Method.ZERO_FORCING,
-    )  # fmt: skip
+        weights=weights,
+        method=method,
+        normalisation=settings.normalisation,
+        condition_number=condition,
+        served=served,
+        groups=turns[served],
+        dropped=dropped,
+        exact=method is Method.ZERO_FORCING,
+    )
 
 
 _METHODS: Final = (Method.ZERO_FORCING, Method.REGULARISED, Method.MMSE, Method.MATCHED)

@@ -67,14 +67,15 @@ def _table(name: str) -> Shapes:
     file = resources.files(__package__) / TABLES
     with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as held:
         return Shapes(
-            (np.arange(count) - (count - 1) / 2) / count,
-            np.log(held[f"{name}_widths"]),
-            held[f"{name}_sure"].astype(float),
-            held[f"{name}_least_db"],
-            np.log(held[f"{name}_losses_db"]),
-            np.log(held[f"{name}_cones"]),
-            -np.log(held[f"{name}_ratios"]),
-            held[f"{name}_likely"].astype(float).reshape(-1, count**axes // 2**axes) @ even.T,
+            places=(np.arange(count) - (count - 1) / 2) / count,
+            widths=np.log(held[f"{name}_widths"]),
+            sure=held[f"{name}_sure"].astype(float),
+            least_db=held[f"{name}_least_db"],
+            losses=np.log(held[f"{name}_losses_db"]),
+            cones=np.log(held[f"{name}_cones"]),
+            ratios=-np.log(held[f"{name}_ratios"]),
+            likely=held[f"{name}_likely"].astype(float).reshape(-1, count**axes // 2**axes)
+            @ even.T,
         )
 
 
@@ -125,7 +126,14 @@ def aperture(array: Array) -> Aperture:
         before, share = _between(shapes.places, placed[:, 0])
         knots[before, np.arange(array.size)] = 1 - share
         knots[before + 1, np.arange(array.size)] = share
-    return Aperture(shapes, axes, lengths_m, MOST * counts, placed, knots)
+    return Aperture(
+        shapes=shapes,
+        axes=axes,
+        lengths_m=lengths_m,
+        most=MOST * counts,
+        placed=placed,
+        knots=knots,
+    )
 
 
 def phases_rad(
@@ -152,13 +160,22 @@ def phases_rad(
     shapes = across.shapes
     within = None if likely is None else np.minimum(likely, cones)
     if len(across.axes) == 1:
-        (psi,) = _psi(shapes, cones, within, len(across.placed), floor_db, worth_db)
+        (psi,) = _psi(
+            shapes, cones, within, elements=len(across.placed), floor_db=floor_db, worth_db=worth_db
+        )
         return np.asarray(2 * np.pi * cones * (psi @ across.knots))
     far = np.interp(np.log(np.maximum(width, 1e-9)), np.log(FAR), (0.0, 1.0))[:, np.newaxis]
     found = np.zeros((len(cones), len(across.placed)))
     if (far < 1).any():
         usual = None if within is None else within.max(axis=1, keepdims=True)
-        (psi,) = _psi(shapes, width[:, np.newaxis], usual, len(across.placed), floor_db, worth_db)
+        (psi,) = _psi(
+            shapes,
+            width[:, np.newaxis],
+            usual,
+            elements=len(across.placed),
+            floor_db=floor_db,
+            worth_db=worth_db,
+        )
         shares = cones / np.maximum(width, 1e-300)[:, np.newaxis]
         shares = np.sqrt(np.maximum(shares, LEAST_SHARE))
         square = _on_square(shapes, psi, across.placed * shares[:, np.newaxis])
@@ -166,7 +183,9 @@ def phases_rad(
     if far.any():
         line = _table("line")
         # What a product of lines pays for a floor, it pays on both axes: more than it is worth.
-        each = _psi(line, cones, within, len(across.placed), -math.inf, worth_db)
+        each = _psi(
+            line, cones, within, elements=len(across.placed), floor_db=-math.inf, worth_db=worth_db
+        )
         sides = [_on_line(line, one, across.placed[:, d]) for d, one in enumerate(each)]
         found += far * sum(cones[:, d, np.newaxis] * side for d, side in enumerate(sides))
     return np.asarray(2 * np.pi * found)
@@ -176,6 +195,7 @@ def _psi(
     shapes: Shapes,
     cones: FloatArray,
     likely: FloatArray | None,
+    *,
     elements: int,
     floor_db: float,
     worth_db: float,

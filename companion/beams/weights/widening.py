@@ -27,7 +27,7 @@ BROADENED: Final = 0.9
 """Share of the sharp beam's gain at its middle below which a beam counts as broadened."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Uncertain:
     """How far N directions are off.
 
@@ -43,7 +43,7 @@ class Uncertain:
     worth_db: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Spread:
     """How to widen the beams and nulls of N users.
 
@@ -83,14 +83,14 @@ class Spread:
             return self
         rows = (users[:, np.newaxis] * self.each + np.arange(self.each)).ravel()
         return Spread(
-            self.beams[:, users],
-            self.broadened[users],
-            self.points[:, rows],
-            self.gram[np.ix_(rows, rows)],
-            self.reached[np.ix_(rows, users)],
-            self.outside[np.ix_(rows, users)],
-            self.cones.of(users),
-            self.worth,
+            beams=self.beams[:, users],
+            broadened=self.broadened[users],
+            points=self.points[:, rows],
+            gram=self.gram[np.ix_(rows, rows)],
+            reached=self.reached[np.ix_(rows, users)],
+            outside=self.outside[np.ix_(rows, users)],
+            cones=self.cones.of(users),
+            worth=self.worth,
         )
 
 
@@ -113,14 +113,14 @@ def spread(array: Array, directions: FloatArray, known: Uncertain, widen: Widen)
     turned, centres = np.exp(1j * phases.T), points[:, ::each]
     beams = centres.conj() * turned
     return Spread(
-        beams,
-        np.abs(turned.mean(axis=0)) ** 2 < BROADENED,
-        points,
-        points.T @ points.conj(),
-        points.T @ beams,
-        cones.outside(across, seen, around, array.wavelength_m),
-        cones.cones(array, across, directions, seen, centres),
-        10 ** (known.worth_db / 10),
+        beams=beams,
+        broadened=np.abs(turned.mean(axis=0)) ** 2 < BROADENED,
+        points=points,
+        gram=points.T @ points.conj(),
+        reached=points.T @ beams,
+        outside=cones.outside(across, seen, around, array.wavelength_m),
+        cones=cones.cones(array, across, directions, seen, centres),
+        worth=10 ** (known.worth_db / 10),
     )
 
 

@@ -39,7 +39,7 @@ def free_space_gain(ranges_m: float | FloatArray, wavelength_m: float) -> FloatA
     return gain
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SalehValenzuela:
     """Parameters of the scattered channel.
 
@@ -85,6 +85,7 @@ class SalehValenzuela:
 def draw(
     settings: SalehValenzuela,
     array: Array,
+    *,
     uav_array: Array,
     directions_at_node: FloatArray,
     directions_at_uav: FloatArray,

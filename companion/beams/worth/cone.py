@@ -45,7 +45,7 @@ ROUNDING_RAD: Final = 1e-12
 """Angle added wherever a pattern is bounded within an angle, for rounding."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Cones:
     """N cones of directions, and what bounds the responses of one array over them.
 
@@ -81,7 +81,7 @@ class Boxes:
         return Boxes(self.cone[chosen], self.low[chosen], self.high[chosen])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Cells:
     """C cells in space, each in the union of its K caps.
 
@@ -167,9 +167,18 @@ def cones_around(
     poles = np.broadcast_to(along, directions.shape) if line else directions
     frames, tilts = _frames(poles, directions)
     return Cones(
-        array, frames, tilts, np.minimum(bounds_rad, np.pi), positions, columns, centres,
-        wavenumber**2 * moments, ceilings, unsure * ceilings, line,
-    )  # fmt: skip
+        array=array,
+        frames=frames,
+        tilts_rad=tilts,
+        bounds_rad=np.minimum(bounds_rad, np.pi),
+        positions_m=positions,
+        columns=columns,
+        centres_m=centres,
+        curvatures=wavenumber**2 * moments,
+        ceilings=ceilings,
+        rounding=unsure * ceilings,
+        line=line,
+    )
 
 
 def _frames(poles: FloatArray, towards: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -268,9 +277,14 @@ def _strips(cones: Cones, boxes: Boxes, caps: int) -> Cells:
     cosines = np.einsum("ckj,coj->ck", around, predicted)
     in_cone = cosines >= np.cos(cones.bounds_rad)[boxes.cone, np.newaxis] - 1e-12
     return Cells(
-        boxes.cone, around[:, caps // 2], frames[:, :1, cones.columns], reach[:, np.newaxis],
-        around, caps_rad, in_cone,
-    )  # fmt: skip
+        cone=boxes.cone,
+        middles=around[:, caps // 2],
+        axes=frames[:, :1, cones.columns],
+        reach=reach[:, np.newaxis],
+        caps=around,
+        caps_rad=caps_rad,
+        in_cone=in_cone,
+    )
 
 
 def _turn_rad(cones: Cones, boxes: Boxes) -> FloatArray:
@@ -310,10 +324,14 @@ def _patches(cones: Cones, boxes: Boxes) -> Cells:
     outward += highest * np.abs(np.cos(angle)) * 2 * np.sin(width / 2) ** 2
     sideways = highest * np.sin(np.minimum(width, right))
     return Cells(
-        boxes.cone, axes[:, 0], axes[:, :, cones.columns],
-        np.stack([inward[:, 0], outward, sideways], axis=1),
-        axes[:, :1], _angle_rad(inward), np.ones(inward.shape, dtype=bool),
-    )  # fmt: skip
+        cone=boxes.cone,
+        middles=axes[:, 0],
+        axes=axes[:, :, cones.columns],
+        reach=np.stack([inward[:, 0], outward, sideways], axis=1),
+        caps=axes[:, :1],
+        caps_rad=_angle_rad(inward),
+        in_cone=np.ones(inward.shape, dtype=bool),
+    )
 
 
 def _polar(frames: FloatArray, angle: FloatArray, turn: FloatArray) -> FloatArray:

@@ -23,7 +23,7 @@ from companion.values import ComplexArray, FloatArray, IntArray, Normalisation
 BOLTZMANN_JPK: Final = 1.380649e-23
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LinkBudget:
     """Power of the transmitter and noise of a receiver.
 
@@ -178,6 +178,7 @@ def transmitted(
 def predicted_sinr_db(
     array: Array,
     directions: FloatArray,
+    *,
     ranges_m: FloatArray,
     sent: ComplexArray,
     groups: IntArray | None,
@@ -208,6 +209,7 @@ def predicted_sinr_db(
 
 def least_sinr_db(
     least_gains: FloatArray,
+    *,
     leaks: FloatArray,
     users: IntArray,
     farthest_m: FloatArray,

@@ -125,7 +125,7 @@ class CutLobe:
     side_lobe_db: float | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Lobe:
     """The lobe that holds a direction: its peak (array frame, gain in dB), and its two cuts."""
 
@@ -145,11 +145,11 @@ def lobe(array: Array, weights: ComplexArray, direction: FloatArray) -> Lobe:
     peak = _summit(array, unit, direction)
     azimuth, elevation = (float(angle[0]) for angle in steering.angles_rad(peak[np.newaxis]))
     return Lobe(
-        azimuth,
-        elevation,
-        float(_db(_gains(array, unit, peak))),
-        _cut_lobe(_Cut(array, unit, _Circle.parallel(elevation)), azimuth),
-        _cut_lobe(_Cut(array, unit, _Circle.meridian(azimuth)), elevation),
+        peak_azimuth_rad=azimuth,
+        peak_elevation_rad=elevation,
+        peak_db=float(_db(_gains(array, unit, peak))),
+        azimuth=_cut_lobe(_Cut(array, unit, _Circle.parallel(elevation)), azimuth),
+        elevation=_cut_lobe(_Cut(array, unit, _Circle.meridian(azimuth)), elevation),
     )
 
 

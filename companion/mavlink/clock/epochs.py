@@ -60,7 +60,7 @@ class Placed(NamedTuple):
     leapt_ns: int = 0
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Run:
     """Stamps off the line, (arrival ns, boot ms), that lie on a line of their own."""
 
@@ -174,7 +174,7 @@ class BootLine:
     def _accept(self, arrival_ns: int, x_ns: int) -> Placed:
         self.floor.add(x_ns, arrival_ns - x_ns)
         self.newest_ns = max(self.newest_ns, x_ns)
-        return Placed(x_ns)
+        return Placed(x_ns=x_ns)
 
     def _near(self, arrival_ns: int, boot_ms: int, x_ns: int) -> Placed | None:
         """Place a stamp on the line: in order, late, or in the first seconds of a second boot."""
@@ -210,7 +210,7 @@ class BootLine:
         if self._run.add(arrival_ns, boot_ms, _NS) and self._run.lasts(5, 2 * _NS):
             return self._begin_again(rebooted=False)
         self.newest_ns = x_ns
-        return Placed(x_ns)
+        return Placed(x_ns=x_ns)
 
     def _is_straggler(self, arrival_ns: int, boot_ms: int, late_ns: int) -> bool:
         """Whether a stamp fits the previous line and not the present one."""
@@ -239,7 +239,7 @@ class BootLine:
             self.floor.add(x_ns, arrival_ns - x_ns)
         self.newest_ns = x_ns
         leapt_ns = 0 if rebooted else self.floor.at(x_ns) - before.at(x_ns)
-        return Placed(x_ns, True, rebooted, leapt_ns)
+        return Placed(x_ns=x_ns, new_line=True, rebooted=rebooted, leapt_ns=leapt_ns)
 
 
 def _unwrap(boot_ms: int, newest_ns: int) -> int:

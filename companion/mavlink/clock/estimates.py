@@ -20,7 +20,7 @@ class Guarantee(StrEnum):
     ASSUMED = "assumed"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ClockAssumptions:
     """What is assumed of a sender's clock and its link.
 
@@ -66,7 +66,7 @@ class Stamp:
     rebooted: bool
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ClockEstimate:
     """A sender's clock against the node's.
 
@@ -100,7 +100,7 @@ class ClockEstimate:
         return max(self.before_s, self.after_s)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ClockChange:
     """A change of a sender's clock, or of its link, beyond what was taken for possible.
 

@@ -242,10 +242,10 @@ class Floor:
             sure, highest = min(sure, level), max(highest, level)
             least = min(least, level - aged)
         return Heights(
-            base_ns + round(sure + slack),
-            base_ns + round(highest + slack),
-            base_ns + round(line + moved),
-            base_ns + round(least - slack),
+            sure=base_ns + round(sure + slack),
+            highest=base_ns + round(highest + slack),
+            line=base_ns + round(line + moved),
+            least=base_ns + round(least - slack),
         )
 
     def _tilted(self, height: float) -> float:

@@ -114,7 +114,12 @@ class Lateness:
             as_before = abs(height - self._before) < LEAST_CHANGE_NS
             followed = as_before or lasted_ns >= min(FOLLOWED * least, FOLLOWED_NS)
             if found is None or followed:
-                found = Late(height, block.first_ns, self.height == -math.inf, followed)
+                found = Late(
+                    height=height,
+                    since_ns=block.first_ns,
+                    is_news=self.height == -math.inf,
+                    followed=followed,
+                )
             if followed:
                 break
         self.height = self.height if found is None else found.height

@@ -105,7 +105,9 @@ class SenderClock:
     def _note_change(self, leapt_ns: int = 0) -> None:
         rose_ns = leapt_ns or self._line.floor.rose_ns
         if rose_ns:
-            self.change = ClockChange(False, rose_ns * 1e-9, math.inf, leapt=leapt_ns != 0)
+            self.change = ClockChange(
+                proven=False, step_s=rose_ns * 1e-9, drift_ppm=math.inf, leapt=leapt_ns != 0
+            )
 
     def is_shared(self, arrival_ns: int) -> bool:
         """Whether two clocks go on side by side, which means that two senders share this id."""
@@ -187,7 +189,9 @@ class SenderClock:
             floor.begin_again(round(new.high_ns), new.x_ns)
             proven = proven or DriftProven(math.inf, new.low_ns - sure_ns)
         if proven is not None:
-            self.change = ClockChange(True, proven.step_ns * 1e-9, proven.drift * 1e6)
+            self.change = ClockChange(
+                proven=True, step_s=proven.step_ns * 1e-9, drift_ppm=proven.drift * 1e6
+            )
         return None
 
     # --- the two timelines ------------------------------------------------------------------

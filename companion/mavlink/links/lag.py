@@ -21,7 +21,7 @@ CLEARS_NS: Final = 2_000_000_000
 """Time without a lag above the limit after which it is not behind any more."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LagSeen:
     """The lags of the last ten seconds, in seconds; None where no datagram was stamped in them.
 
@@ -57,11 +57,14 @@ class ArrivalLag:
         """The lags of the last ten seconds."""
         recent = [(at, worst) for at, worst in self._slots if at > max(0, now_ns - KEPT_NS)]
         if not recent:
-            return LagSeen(None, None, None, behind=False)
+            return LagSeen(newest_s=None, p95_s=None, max_s=None, behind=False)
         ordered = sorted(worst for _, worst in recent)
         p95_ns = ordered[ceil(0.95 * len(ordered)) - 1]
         return LagSeen(
-            self._newest_ns * 1e-9, p95_ns * 1e-9, ordered[-1] * 1e-9, _is_behind(recent, now_ns)
+            newest_s=self._newest_ns * 1e-9,
+            p95_s=p95_ns * 1e-9,
+            max_s=ordered[-1] * 1e-9,
+            behind=_is_behind(recent, now_ns),
         )
 
 

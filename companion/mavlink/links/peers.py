@@ -224,7 +224,7 @@ class Peers:
         """
         component = self._components.get(frame.source)
         if component is None:
-            counts = ComponentStatus(0, 0, frame.t_ns, frame.version)
+            counts = ComponentStatus(frames=0, gaps=0, heard_ns=frame.t_ns, version=frame.version)
             self._status.components[frame.source] = counts
             component = self._components[frame.source] = _Component(counts, peer)
         if self._senders >= SENDERS_MAX:

@@ -141,7 +141,7 @@ class Timestamps:
             raise LinkError(f"{url}: two links have the same address and key")
         kept = self._kept.get(link, _Kept(State(), clean=True))
         state = kept.state if kept.clean else kept.state.after_crash()
-        guard = Guard(key, link_id, allow_unsigned=allow_unsigned, state=state)
+        guard = Guard(key=key, link_id=link_id, allow_unsigned=allow_unsigned, state=state)
         self._guards[link] = guard
         self.write(self.snapshot(now_ns))
         return guard
@@ -241,7 +241,13 @@ def _kept(link: Mapping[str, Any]) -> _Kept:
         (sysid, compid, link_id): (newest, lead)
         for sysid, compid, link_id, newest, lead in link["streams"]
     }
-    state = State(link["clock"], link["local"], link["sent"], link["floor"], streams)
+    state = State(
+        clock=link["clock"],
+        local=link["local"],
+        sent=link["sent"],
+        floor=link["floor"],
+        streams=streams,
+    )
     return _Kept(state, link["clean"])
 
 

@@ -13,7 +13,7 @@ LinkState = Literal["up", "connecting", "down"]
 Arrival = Literal["kernel", "read"]
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class ComponentStatus:
     """One component as heard over one link.
 
@@ -29,7 +29,7 @@ class ComponentStatus:
     version: int
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class LinkStatus:
     """The state and the counts of one link.
 

@@ -76,6 +76,7 @@ class Link:
 
     def __init__(
         self,
+        *,
         url: LinkUrl,
         receive: Receive,
         now_ns: Callable[[], int],
@@ -85,7 +86,7 @@ class Link:
         twins: Twins | None = None,
     ) -> None:
         self.url = url
-        self.status = LinkStatus(str(url))
+        self.status = LinkStatus(url=str(url))
         self._receive = receive
         self._now_ns = now_ns
         self._notify = notify
@@ -93,7 +94,13 @@ class Link:
         self._lag = lag or ArrivalLag()
         self._twins = twins or Twins()
         self._peers = Peers(self.status, self._finish, splitter(url))
-        upcalls = Upcalls(self._up, self.take, self._pass_over, self._hang_up, self._overflow)
+        upcalls = Upcalls(
+            up=self._up,
+            take=self.take,
+            stale=self._pass_over,
+            hang_up=self._hang_up,
+            overflow=self._overflow,
+        )
         self._endpoint = endpoint(url, self.status, upcalls)
         self._is_out = False
         self._steady: asyncio.TimerHandle | None = None
@@ -173,7 +180,9 @@ class Link:
         if not self._twins.refuses(str(self.url), peer.address or str(self.url), item):
             return item
         who, detail = str(item.source), "two peers contradict each other"
-        return Rejection(item.t_ns, who, Reason.SHARED_ID, msgid=item.msgid, detail=detail)
+        return Rejection(
+            t_ns=item.t_ns, source=who, reason=Reason.SHARED_ID, msgid=item.msgid, detail=detail
+        )
 
     def _hang_up(self, key: Hashable) -> None:
         """Forget a peer that is gone."""
@@ -192,7 +201,9 @@ class Link:
         """Count datagrams or frames that were let go; their senders are not asked for."""
         lost = self.status.lost
         lost[Reason.SOCKET_OVERFLOW] = lost.get(Reason.SOCKET_OVERFLOW, 0) + count
-        reject = Rejection(self._now_ns(), self.status.url, Reason.SOCKET_OVERFLOW, count)
+        reject = Rejection(
+            t_ns=self._now_ns(), source=self.status.url, reason=Reason.SOCKET_OVERFLOW, count=count
+        )
         self._receive([reject])
 
     # --- sending ----------------------------------------------------------------------------
@@ -264,7 +275,11 @@ class Link:
     def _say(self, severity: Severity, what: str) -> None:
         if self._notify is not None:
             url = self.status.url
-            self._notify(Notice(self._now_ns(), severity, url, f"link {url} {what}"))
+            self._notify(
+                Notice(
+                    t_ns=self._now_ns(), severity=severity, subject=url, text=f"link {url} {what}"
+                )
+            )
 
     def _cancel_steady(self) -> None:
         if self._steady is not None:
@@ -283,7 +298,9 @@ def _answered(peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
         return item  # a request is no evidence
     detail = "TIMESYNC: not from the peer that brings its positions"
     who = str(item.source)
-    return Rejection(item.t_ns, who, Reason.UNPLACED_STAMP, msgid=TIMESYNC, detail=detail)
+    return Rejection(
+        t_ns=item.t_ns, source=who, reason=Reason.UNPLACED_STAMP, msgid=TIMESYNC, detail=detail
+    )
 
 
 def _admitted(guard: Guard, item: Frame | Rejection) -> Frame | Rejection:
@@ -291,4 +308,4 @@ def _admitted(guard: Guard, item: Frame | Rejection) -> Frame | Rejection:
     refusal = None if isinstance(item, Rejection) else guard.refusal(item)
     if refusal is None or isinstance(item, Rejection):
         return item
-    return Rejection(item.t_ns, str(item.source), refusal, msgid=item.msgid)
+    return Rejection(t_ns=item.t_ns, source=str(item.source), reason=refusal, msgid=item.msgid)

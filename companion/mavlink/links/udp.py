@@ -115,7 +115,9 @@ class UdpIn:
         """Read datagrams. No error that a peer can cause ends this."""
         self._socket = self._socket or self._bound()
         try:
-            await _Datagrams(self._socket, self._status, self._upcalls, connected=False).serve()
+            await _Datagrams(
+                sock=self._socket, status=self._status, upcalls=self._upcalls, connected=False
+            ).serve()
         finally:
             self._socket = None
 
@@ -174,7 +176,9 @@ class UdpOut:
             except OSError:
                 sock.close()
                 raise
-            self._datagrams = _Datagrams(sock, self._status, self._upcalls, connected=True)
+            self._datagrams = _Datagrams(
+                sock=sock, status=self._status, upcalls=self._upcalls, connected=True
+            )
             try:
                 await self._datagrams.serve()
             finally:
@@ -200,7 +204,7 @@ class _Datagrams:
     """
 
     def __init__(
-        self, sock: socket.socket, status: LinkStatus, upcalls: Upcalls, *, connected: bool
+        self, *, sock: socket.socket, status: LinkStatus, upcalls: Upcalls, connected: bool
     ) -> None:
         self._socket = sock
         self._status = status

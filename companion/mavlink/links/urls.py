@@ -62,7 +62,7 @@ class LinkError(UserError):
     """A link that cannot be opened. The message is one line for the user and names the link."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LinkUrl:
     """A parsed link address; ``str`` gives it as the user wrote it.
 
@@ -120,7 +120,7 @@ def parse_link(text: str, schemes: Collection[Scheme] = SCHEMES) -> LinkUrl:
         raise LinkError(f"{text!r}: an IPv6 host stands in brackets, as in udpin:[::]:14550")
     if not (_is_ipv6(host) if bracketed else _may_be_a_name(host)):
         raise LinkError(f"{text!r}: {host!r} cannot be the name or address of a host")
-    url = LinkUrl(cast(Scheme, scheme), host, int(port), way, path)
+    url = LinkUrl(scheme=cast(Scheme, scheme), host=host, port=int(port), way=way, path=path)
     if int(port) > 65535 or (int(port) == 0 and not url.listens):
         raise LinkError(f"{text!r}: {port} is not a port, 1 to 65535")
     return url
@@ -145,7 +145,7 @@ def _zenoh(text: str, address: str) -> LinkUrl:
     if wrong:
         known = "connect=tcp/HOST:PORT, listen=tcp/HOST:PORT and as=hub"
         raise LinkError(f"{text!r}: {wrong[0]!r} is none of {known}, with & between them")
-    return LinkUrl("zenoh", key, 0, "", options)
+    return LinkUrl(scheme="zenoh", host=key, port=0, way="", path=options)
 
 
 def _serial(text: str, device: str, baud: int) -> LinkUrl:
@@ -153,7 +153,7 @@ def _serial(text: str, device: str, baud: int) -> LinkUrl:
         raise LinkError(f"{text!r}: {device!r} cannot be the name of a device")
     if not 1 <= baud <= _BAUD_MAX:
         raise LinkError(f"{text!r}: {baud} is not a baud rate, 1 to {_BAUD_MAX}")
-    return LinkUrl("serial", device, baud)
+    return LinkUrl(scheme="serial", host=device, port=baud)
 
 
 def _meant(text: str) -> str:

@@ -29,7 +29,7 @@ NO_ROUTER: Final = "Unable to connect"
 """What Zenoh says when a client reaches none of its endpoints."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class BusStatus:
     """Counts, which only grow.
 
@@ -103,7 +103,9 @@ class Bus:
     @property
     def status(self) -> BusStatus:
         queue = self._to_loop
-        return BusStatus(self._sent, self._refused, queue.handed_over, queue.dropped)
+        return BusStatus(
+            sent=self._sent, refused=self._refused, heard=queue.handed_over, dropped=queue.dropped
+        )
 
     async def run(self) -> None:
         """Wait until cancelled; raises what a callback raised."""

@@ -27,7 +27,7 @@ Priority = Literal[
 Mode = Literal["peer", "client"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class BusTls:
     """Certificates for ``tls/`` and ``quic/`` endpoints, as PEM files.
 
@@ -45,7 +45,7 @@ class BusTls:
     check_name: bool = True
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class BusConfig:
     """How a session reaches others.
 

@@ -97,5 +97,5 @@ def configuration(url: LinkUrl) -> BusConfig:
     listen = tuple(value for name, _, value in options if name == "listen")
     connect = tuple(value for name, _, value in options if name == "connect")
     if listen:
-        return BusConfig("peer", listen=listen, connect=connect)
-    return BusConfig("client", listen=(), connect=connect or (ROUTER,))
+        return BusConfig(mode="peer", listen=listen, connect=connect)
+    return BusConfig(mode="client", listen=(), connect=connect or (ROUTER,))

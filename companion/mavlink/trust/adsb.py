@@ -54,7 +54,7 @@ _T = TypeVar("_T")
 _Dated = tuple[int, _T]  # when it was true, and what
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Known:
     """What is known of one aircraft."""
 
@@ -203,7 +203,7 @@ class Aircraft:
         return known.callsign[1] if known is not None and known.callsign is not None else None
 
     def _begin(self, said: AdsbVehicle) -> _Known:
-        known = self._known.setdefault(said.uav, _Known(said.t_ns))
+        known = self._known.setdefault(said.uav, _Known(news_ns=said.t_ns))
         known.hear(said.source, said.t_ns)
         if len(self._known) > AIRCRAFT_MAX:
             self._known.popitem(last=False)
@@ -250,4 +250,6 @@ def _differs(before: AdsbVehicle, said: AdsbVehicle) -> bool:
 def _rejected(said: AdsbVehicle, reason: Reason, detail: str = "") -> Rejection:
     # Without a position there is nothing to show of the aircraft: it is its relay's message.
     source = str(said.source) if reason is Reason.NO_POSITION else said.uav
-    return Rejection(said.t_ns, source, reason, msgid=ADSB_VEHICLE, detail=detail)
+    return Rejection(
+        t_ns=said.t_ns, source=source, reason=reason, msgid=ADSB_VEHICLE, detail=detail
+    )

@@ -20,7 +20,7 @@ DATUM_NS: Final = 10_000_000_000
 """How long an aircraft keeps what its heights are measured from."""
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Known:
     heard_ns: int
     uas_id: str | None = None
@@ -67,7 +67,7 @@ class RemoteIds:
         key = said.source, said.heard_as
         known = self._known.pop(key, None)
         if known is None or said.t_ns - known.heard_ns > NAMED_NS:
-            known = _Known(said.t_ns)
+            known = _Known(heard_ns=said.t_ns)
         self._known[key] = known
         known.heard_ns = said.t_ns
         if said.id_kind is not None and said.id_kind <= (known.id_kind or said.id_kind):
@@ -80,4 +80,4 @@ class RemoteIds:
 
 
 def _rejected(said: RemoteId, uav: str, reason: Reason, detail: str = "") -> Rejection:
-    return Rejection(said.t_ns, uav, reason, detail=detail)
+    return Rejection(t_ns=said.t_ns, source=uav, reason=reason, detail=detail)

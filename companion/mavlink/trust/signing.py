@@ -74,7 +74,7 @@ The lead is None for a stream of this node.
 """
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class State:
     """What a guard must not forget; times in units of 10 µs since 2015.
 
@@ -115,7 +115,13 @@ class State:
                     sent = max(sent, min(moved, FOLLOWED_MAX))
         ours = (stream for stream, (_, lead) in self.streams.items() if lead is None)
         streams.update(dict.fromkeys(ours, (sent, None)))
-        return type(self)(self.clock, self.local, sent, max(self.floor, sent), streams)
+        return type(self)(
+            clock=self.clock,
+            local=self.local,
+            sent=sent,
+            floor=max(self.floor, sent),
+            streams=streams,
+        )
 
 
 START: Final = State()
@@ -140,7 +146,7 @@ class Guard:
     """
 
     def __init__(
-        self, key: bytes, link_id: int, *, allow_unsigned: bool = False, state: State = START
+        self, *, key: bytes, link_id: int, allow_unsigned: bool = False, state: State = START
     ) -> None:
         if len(key) != KEY_BYTES:
             raise UserError(f"a signing key has {KEY_BYTES} bytes, not {len(key)}")
@@ -199,7 +205,13 @@ class Guard:
     def state(self, now_ns: int) -> State:
         """The state to keep; ``now_ns`` is the own clock, ns since the Unix epoch."""
         clock = (now_ns - EPOCH_NS) // UNIT_NS
-        return State(clock, max(self._local, clock), self._sent, self._floor, dict(self._streams))
+        return State(
+            clock=clock,
+            local=max(self._local, clock),
+            sent=self._sent,
+            floor=self._floor,
+            streams=dict(self._streams),
+        )
 
     def ahead_ns(self, now_ns: int) -> int:
         """How far the local timestamp is ahead of the own clock, ns, at least 0.

@@ -75,7 +75,7 @@ class _Path:
     reports: deque[_Said] = field(default_factory=lambda: deque(maxlen=REPORTS_KEPT))
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Sender:
     """A sender by its peers, and when they contradicted each other; ``told`` while it is known."""
 
@@ -128,7 +128,7 @@ class Twins:
             self._senders = {k: v for k, v in self._senders.items() if v.heard_ns >= before_ns}
             if len(self._senders) >= SENDERS_MAX:
                 return None
-        return self._senders.setdefault(frame.source, _Sender(frame.t_ns))
+        return self._senders.setdefault(frame.source, _Sender(heard_ns=frame.t_ns))
 
     def _meet(self, sender: _Sender, link: str, peer: str, t_ns: int) -> _Path:
         """Begin to follow a peer of a sender; those that are silent are forgotten."""
@@ -197,7 +197,13 @@ def _within(reports: deque[_Said], first: _Said, last: _Said) -> Iterator[_Said]
 
 def _said(frame: Frame) -> _Said:
     boot_ms, lat, lon, alt_mm, _, north, east, down = unpack(frame, _REPORT)
-    return _Said(boot_ms, lat, lon, alt_mm * 1e-3, (north * 1e-2, east * 1e-2, down * 1e-2))
+    return _Said(
+        boot_ms=boot_ms,
+        lat=lat,
+        lon=lon,
+        alt_m=alt_mm * 1e-3,
+        velocity_mps=(north * 1e-2, east * 1e-2, down * 1e-2),
+    )
 
 
 def _is_off(said: _Said, first: _Said, last: _Said) -> bool:

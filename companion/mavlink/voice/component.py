@@ -94,7 +94,7 @@ _REQUEST_DATA_STREAM = struct.Struct("<HBBBB")
 _TIMESYNC = struct.Struct("<qqBB")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ComponentSpec:
     """The identity of the service on the network, and the message rates that it wants.
 
@@ -134,7 +134,10 @@ class Component:
         self.settings = settings
         self._source = settings.source
         self._rates = MessageRates(
-            settings.source, settings.carrier, settings.position_hz, settings.attitude_hz
+            source=settings.source,
+            carrier=settings.carrier,
+            position_hz=settings.position_hz,
+            attitude_hz=settings.attitude_hz,
         )
         self._heartbeat_ns = 0  # no heartbeat before this time
         self._timesync_ns = 0
@@ -223,7 +226,11 @@ class Component:
         if self._conflict_ns is None or frame.t_ns - self._conflict_ns >= CONFLICT_AGAIN_NS:
             self._conflict_ns = frame.t_ns
             text = f"{frame.link}: someone else sends as {self._source}, which is this service's id"
-            said.append(Notice(frame.t_ns, Severity.WARNING, str(self._source), text))
+            said.append(
+                Notice(
+                    t_ns=frame.t_ns, severity=Severity.WARNING, subject=str(self._source), text=text
+                )
+            )
 
     def _timesync_answer(self, frame: Frame, said: list[RoundTrip | Rejection | Notice]) -> None:
         remote_ns, sent_ns, *target = unpack(frame, _TIMESYNC)
@@ -237,7 +244,9 @@ class Component:
         elif not _is_boot_time(remote_ns, frame.t_ns, *stamp):
             refused, detail = Reason.UNPLACED_STAMP, "TIMESYNC: not the clock of its positions"
         else:
-            trip = RoundTrip(frame.t_ns, frame.source, sent_ns, remote_ns)
+            trip = RoundTrip(
+                t_ns=frame.t_ns, source=frame.source, sent_ns=sent_ns, remote_ns=remote_ns
+            )
             first = answered.setdefault(frame.source, trip)
             if first is trip:
                 self._held.append(trip)
@@ -260,7 +269,9 @@ class Component:
         if t_ns - self._doubted.get(source, -CONFLICT_AGAIN_NS) >= CONFLICT_AGAIN_NS:
             self._doubted[source] = t_ns
             text = f"two answer TIMESYNC as {source}, and their clocks differ: neither is used"
-            said.append(Notice(t_ns, Severity.WARNING, str(source), text))
+            said.append(
+                Notice(t_ns=t_ns, severity=Severity.WARNING, subject=str(source), text=text)
+            )
 
     def _command_ack(self, frame: Frame) -> None:
         command, result, _, _, *target = unpack(frame, _COMMAND_ACK)
@@ -272,14 +283,20 @@ class Component:
         if command == MAV_CMD_SET_MESSAGE_INTERVAL and msgid in STREAM:
             hz = 1e6 / interval_us if interval_us > 0 else None  # stopped, or its default
             target = Source(sysid, compid)
-            self._rates.requested(Request(frame.t_ns, frame.source, target, (int(msgid),), hz))
+            self._rates.requested(
+                Request(
+                    t_ns=frame.t_ns, by=frame.source, target=target, msgids=(int(msgid),), hz=hz
+                )
+            )
 
     def _request_data_stream(self, frame: Frame) -> None:
         rate_hz, sysid, compid, stream, start = unpack(frame, _REQUEST_DATA_STREAM)
         msgids = tuple(m for m, its in STREAM.items() if stream in (its, _ALL_STREAMS))
         if msgids:
             target, hz = Source(sysid, compid), float(rate_hz if start else 0)
-            self._rates.requested(Request(frame.t_ns, frame.source, target, msgids, hz))
+            self._rates.requested(
+                Request(t_ns=frame.t_ns, by=frame.source, target=target, msgids=msgids, hz=hz)
+            )
 
     def _is_for_us(self, sysid: int, compid: int) -> bool:
         """Whether an answer may be for this service: it says so, or names nobody."""
@@ -290,7 +307,7 @@ class Component:
 
 
 def _refused(t_ns: int, source: Source, why: Reason, detail: str) -> Rejection:
-    return Rejection(t_ns, str(source), why, msgid=TIMESYNC, detail=detail)
+    return Rejection(t_ns=t_ns, source=str(source), reason=why, msgid=TIMESYNC, detail=detail)
 
 
 def _agree(one: RoundTrip, other: RoundTrip) -> bool:

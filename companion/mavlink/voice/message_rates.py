@@ -37,6 +37,7 @@ class MessageRates:
 
     def __init__(
         self,
+        *,
         source: Source,
         carrier: Source | None,
         position_hz: float | None,
@@ -112,7 +113,7 @@ class MessageRates:
 
     def _watches(self, now_ns: int, source: Source) -> dict[int, Watch]:
         return {
-            msgid: Watch(source, msgid, wanted_hz, Observed(now_ns))
+            msgid: Watch(uav=source, msgid=msgid, wanted_hz=wanted_hz, observed=Observed(now_ns))
             for msgid, wanted_hz in self._wanted_hz.items()
             if wanted_hz is not None and (msgid != ATTITUDE or source == self._carrier)
         }

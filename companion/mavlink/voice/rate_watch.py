@@ -79,7 +79,7 @@ class RateState(StrEnum):
     REFUSED = "refused"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MessageRate:
     """State of one message of one UAV.
 
@@ -144,7 +144,7 @@ class Observed:
         return median_high(b - a for a, b in pairwise(self.stamps_ms)) * 1_000_000
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Watch:
     """The state machine for one message of one UAV."""
 
@@ -176,13 +176,13 @@ class Watch:
         """The state as of when the UAV was last heard."""
         observed_hz = self.observed_hz(heard_ns)
         return MessageRate(
-            self.uav,
-            self.msgid,
-            self.wanted_hz,
-            observed_hz,
-            self.state,
-            self.asked,
-            self.changed_by,
+            uav=self.uav,
+            msgid=self.msgid,
+            wanted_hz=self.wanted_hz,
+            observed_hz=observed_hz,
+            state=self.state,
+            asked=self.asked,
+            changed_by=self.changed_by,
         )
 
     def review(self, now_ns: int, heard_ns: int, others: Iterable[Request]) -> list[Notice]:
@@ -305,4 +305,4 @@ class Watch:
         if what in self._told:
             return []
         self._told.add(what)
-        return [Notice(now_ns, Severity.WARNING, str(self.uav), text)]
+        return [Notice(t_ns=now_ns, severity=Severity.WARNING, subject=str(self.uav), text=text)]

@@ -30,14 +30,20 @@ _VERTICAL_M: Final = (*_GVA_M, 25.0, 10.0, 3.0, 1.0)
 
 def adsb(nac_p: int, nac_v: int, gva: int) -> Accuracy | None:
     """What NACp, NACv and GVA say; None where all are unknown."""
-    known = Accuracy(_of(_NACP_M, nac_p), _of(_GVA_M, gva), _of(_VELOCITY_MPS, nac_v))
+    known = Accuracy(
+        horizontal_m=_of(_NACP_M, nac_p),
+        vertical_m=_of(_GVA_M, gva),
+        velocity_mps=_of(_VELOCITY_MPS, nac_v),
+    )
     return known if any(known) else None
 
 
 def remote_id(horizontal: int, vertical: int, speed: int) -> Accuracy:
     """What the codes of a Remote ID location say."""
     return Accuracy(
-        _of(_HORIZONTAL_M, horizontal), _of(_VERTICAL_M, vertical), _of(_VELOCITY_MPS, speed)
+        horizontal_m=_of(_HORIZONTAL_M, horizontal),
+        vertical_m=_of(_VERTICAL_M, vertical),
+        velocity_mps=_of(_VELOCITY_MPS, speed),
     )
 
 

@@ -44,7 +44,9 @@ class AircraftJson:
             if written is None or not isinstance(aircraft, list):
                 raise ValueError("no time, or no aircraft")
         except (ValueError, KeyError, RecursionError):
-            return [Rejection(t_ns, self.link, Reason.GARBAGE, len(data) or 1)]
+            return [
+                Rejection(t_ns=t_ns, source=self.link, reason=Reason.GARBAGE, count=len(data) or 1)
+            ]
         if written == self._written:  # the same document as before
             return []
         self._written = written
@@ -60,9 +62,19 @@ class AircraftJson:
             position_age_s = _number(entry, "seen_pos", 0, 86_400)
         except (ValueError, OverflowError) as error:
             detail = str(error)
-            return [Rejection(t_ns, self.link, Reason.MALFORMED, msgid=ADSB_VEHICLE, detail=detail)]
+            return [
+                Rejection(
+                    t_ns=t_ns,
+                    source=self.link,
+                    reason=Reason.MALFORMED,
+                    msgid=ADSB_VEHICLE,
+                    detail=detail,
+                )
+            ]
         if isinstance(said, str):
-            return [Rejection(t_ns, self.link, Reason.UNKNOWN_MESSAGE, detail=said)]
+            return [
+                Rejection(t_ns=t_ns, source=self.link, reason=Reason.UNKNOWN_MESSAGE, detail=said)
+            ]
         if (
             said is None
             or position_age_s is None
@@ -114,15 +126,15 @@ def _said(entry: object) -> Said | str | None:
     callsign = entry.get("flight", "")
     age_s = _number(entry, "seen_pos", 0, 86_400)
     return Said(
-        int(name, 16),
-        lat_deg,
-        lon_deg,
-        altitude_ft,
-        above_ellipsoid is not None,
-        _number(entry, "gs", 0, 1200),
-        _number(entry, "track", 0, 360),
-        climb_fpm,
-        callsign.strip() if isinstance(callsign, str) and callsign.isascii() else "",
+        icao=int(name, 16),
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        altitude_ft=altitude_ft,
+        geometric=above_ellipsoid is not None,
+        speed_kt=_number(entry, "gs", 0, 1200),
+        track_deg=_number(entry, "track", 0, 360),
+        climb_fpm=climb_fpm,
+        callsign=callsign.strip() if isinstance(callsign, str) and callsign.isascii() else "",
         nac_p=int(_number(entry, "nac_p", 0, 15) or 0),
         nac_v=int(_number(entry, "nac_v", 0, 7) or 0),
         gva=int(_number(entry, "gva", 0, 3) or 0),

@@ -61,25 +61,31 @@ class BeastSplitter:
                 out += self._message(t_ns, data[at + 1], body)
             at = end
         if garbage:
-            out.append(Rejection(t_ns, self.link, Reason.GARBAGE, garbage))
+            out.append(Rejection(t_ns=t_ns, source=self.link, reason=Reason.GARBAGE, count=garbage))
         return out
 
     def finish(self, t_ns: int) -> list[Frame | Rejection]:
         """End the stream: a message that has no end is given up."""
         stray, self._pending = len(self._pending), b""
-        return [Rejection(t_ns, self.link, Reason.GARBAGE, stray)] if stray else []
+        return (
+            [Rejection(t_ns=t_ns, source=self.link, reason=Reason.GARBAGE, count=stray)]
+            if stray
+            else []
+        )
 
     def _message(self, t_ns: int, kind: int, body: bytes) -> list[Frame | Rejection]:
         if kind != 0x33:  # too short to hold a position, or not of an aircraft
             return []
         if body.startswith(_MLAT):
             detail = "MLAT: how exact it is, is not known"
-            return [Rejection(t_ns, self.link, Reason.UNKNOWN_MESSAGE, detail=detail)]
+            return [
+                Rejection(t_ns=t_ns, source=self.link, reason=Reason.UNKNOWN_MESSAGE, detail=detail)
+            ]
         late_ns = self._lateness.observe(t_ns, int.from_bytes(body[:6], "big"))
         try:
             said = self._transponders.read(t_ns - late_ns, body[7 : 7 + SIZE])
         except ValueError:
-            return [Rejection(t_ns, self.link, Reason.BAD_CRC)]
+            return [Rejection(t_ns=t_ns, source=self.link, reason=Reason.BAD_CRC)]
         if said is None:
             return []
         found = frame(t_ns, self.link, said._replace(age_s=late_ns // 1_000_000_000), self._seq)

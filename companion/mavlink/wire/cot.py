@@ -84,7 +84,7 @@ def from_xml(text: bytes) -> CotEvent:
         motion = [_optional(track.get(key)) for key in ("course", "speed", "slope")]
     except KeyError as missing:
         raise ValueError(f"no {missing.args[0]}") from missing
-    return _checked(uid, kind, how=how, time_ms=time_ms, place=place, motion=motion)
+    return _checked(uid, kind=kind, how=how, time_ms=time_ms, place=place, motion=motion)
 
 
 def _time_ms(text: str) -> int:
@@ -97,7 +97,7 @@ def _optional(text: str | None) -> float:
 
 
 def _checked(
-    uid: str, kind: str, how: str, time_ms: int, place: list[float], motion: list[float]
+    uid: str, *, kind: str, how: str, time_ms: int, place: list[float], motion: list[float]
 ) -> CotEvent:
     lat_deg, lon_deg, hae_m, ce_m, le_m = place
     course_deg, speed_mps, slope_deg = motion
@@ -108,18 +108,18 @@ def _checked(
     if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
         raise ValueError(f"latitude {lat_deg}, longitude {lon_deg}")
     return CotEvent(
-        uid,
-        kind,
-        how,
-        time_ms,
-        lat_deg,
-        lon_deg,
-        hae_m if -12_000 < hae_m < 100_000 else None,
-        ce_m if 0 < ce_m < UNKNOWN else None,
-        le_m if 0 < le_m < UNKNOWN else None,
-        course_deg if 0 <= course_deg <= 360 else None,
-        speed_mps if 0 <= speed_mps < 1000 else None,
-        slope_deg if -90 < slope_deg < 90 else None,
+        uid=uid,
+        kind=kind,
+        how=how,
+        time_ms=time_ms,
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        hae_m=hae_m if -12_000 < hae_m < 100_000 else None,
+        ce_m=ce_m if 0 < ce_m < UNKNOWN else None,
+        le_m=le_m if 0 < le_m < UNKNOWN else None,
+        course_deg=course_deg if 0 <= course_deg <= 360 else None,
+        speed_mps=speed_mps if 0 <= speed_mps < 1000 else None,
+        slope_deg=slope_deg if -90 < slope_deg < 90 else None,
     )
 
 
@@ -143,7 +143,9 @@ def from_protobuf(message: bytes) -> CotEvent | None:
     if not isinstance(time_ms, int):
         raise ValueError("no time")
     uid, kind, how = names
-    return _checked(uid, kind, how, time_ms, place, [*motion, math.nan])
+    return _checked(
+        uid, kind=kind, how=how, time_ms=time_ms, place=place, motion=[*motion, math.nan]
+    )
 
 
 def _fields(message: bytes) -> Iterator[tuple[int, int | float | bytes]]:

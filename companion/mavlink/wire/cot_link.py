@@ -74,28 +74,42 @@ class CotSplitter:
             at = end
         self._pending = data[at:]
         if garbage:
-            out.append(Rejection(t_ns, self.link, Reason.GARBAGE, garbage))
+            out.append(Rejection(t_ns=t_ns, source=self.link, reason=Reason.GARBAGE, count=garbage))
         return out
 
     def finish(self, t_ns: int) -> list[Frame | Rejection]:
         """End the stream: an event that has no end is given up."""
         stray, self._pending = len(self._pending), b""
-        return [Rejection(t_ns, self.link, Reason.GARBAGE, stray)] if stray else []
+        return (
+            [Rejection(t_ns=t_ns, source=self.link, reason=Reason.GARBAGE, count=stray)]
+            if stray
+            else []
+        )
 
     def _event(self, t_ns: int, raw: bytes) -> list[Frame | Rejection]:
         try:
             event = _tak(raw) if raw[0] == _MAGIC else from_xml(raw)
         except (ValueError, OverflowError) as why:
             detail = str(why)[:80]
-            return [Rejection(t_ns, self.link, Reason.MALFORMED, detail=detail)]
+            return [Rejection(t_ns=t_ns, source=self.link, reason=Reason.MALFORMED, detail=detail)]
         if event is None:
             return []
         unfit = _unfit(event)
         if unfit:
-            return [Rejection(t_ns, self.link, Reason.UNKNOWN_MESSAGE, detail=unfit)]
+            return [
+                Rejection(t_ns=t_ns, source=self.link, reason=Reason.UNKNOWN_MESSAGE, detail=unfit)
+            ]
         if event.hae_m is None:
-            return [Rejection(t_ns, f"cot:{_name(event.uid)}", Reason.NO_ALTITUDE)]
-        frame = Frame(t_ns, self.link, SENDER, TUNNEL, pack(_outgoing(event), self._seq))
+            return [
+                Rejection(t_ns=t_ns, source=f"cot:{_name(event.uid)}", reason=Reason.NO_ALTITUDE)
+            ]
+        frame = Frame(
+            t_ns=t_ns,
+            link=self.link,
+            source=SENDER,
+            msgid=TUNNEL,
+            raw=pack(_outgoing(event), self._seq),
+        )
         self._seq = (self._seq + 1) & 0xFF
         return [frame]
 
@@ -208,5 +222,5 @@ def report(frame: Frame) -> Report | None:
         heading_deg=course_deg,
         boot_ms=time_ms & 0xFFFF_FFFF,
         tslc_s=None,
-        accuracy=Accuracy(ce_m, le_m),
+        accuracy=Accuracy(horizontal_m=ce_m, vertical_m=le_m),
     )

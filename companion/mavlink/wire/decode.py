@@ -71,7 +71,11 @@ def decode(frame: Frame) -> Message | Rejection | None:
         return decoder(frame)
     except _RefusedError as why:
         return Rejection(
-            frame.t_ns, str(frame.source), why.reason, msgid=frame.msgid, detail=why.detail
+            t_ns=frame.t_ns,
+            source=str(frame.source),
+            reason=why.reason,
+            msgid=frame.msgid,
+            detail=why.detail,
         )
 
 
@@ -190,15 +194,15 @@ def _attitude(frame: Frame) -> Attitude:
         raise _RefusedError(Reason.MALFORMED, "an angle or rate that nothing can measure")
     roll_rad, pitch_rad, yaw_rad, rollspeed_radps, pitchspeed_radps, yawspeed_radps = angles
     return Attitude(
-        frame.t_ns,
-        frame.source,
-        boot_ms,
-        roll_rad,
-        pitch_rad,
-        yaw_rad,
-        rollspeed_radps,
-        pitchspeed_radps,
-        yawspeed_radps,
+        t_ns=frame.t_ns,
+        source=frame.source,
+        boot_ms=boot_ms,
+        roll_rad=roll_rad,
+        pitch_rad=pitch_rad,
+        yaw_rad=yaw_rad,
+        rollspeed_radps=rollspeed_radps,
+        pitchspeed_radps=pitchspeed_radps,
+        yawspeed_radps=yawspeed_radps,
     )
 
 
@@ -208,7 +212,14 @@ _ARMED: Final = 128
 
 def _heartbeat(frame: Frame) -> Presence:
     _, mav_type, autopilot, base_mode, status, _ = unpack(frame, _HEARTBEAT)
-    return Presence(frame.t_ns, frame.source, mav_type, autopilot, status, bool(base_mode & _ARMED))
+    return Presence(
+        t_ns=frame.t_ns,
+        source=frame.source,
+        mav_type=mav_type,
+        autopilot=autopilot,
+        system_status=status,
+        armed=bool(base_mode & _ARMED),
+    )
 
 
 _UNKNOWN: Final = 0xFFFF_FFFF
@@ -246,7 +257,9 @@ def _system_time(frame: Frame) -> SystemTime:
     Nothing is checked.
     """
     unix_us, boot_ms = unpack(frame, _SYSTEM_TIME)
-    return SystemTime(frame.t_ns, frame.source, unix_us or None, boot_ms)
+    return SystemTime(
+        t_ns=frame.t_ns, source=frame.source, unix_us=unix_us or None, boot_ms=boot_ms
+    )
 
 
 _EKF_STATUS_REPORT = struct.Struct("<fffffH")
@@ -259,7 +272,9 @@ def _ekf_status_report(frame: Frame) -> EstimatorStatus:
     if not math.isfinite(compass_ratio) or compass_ratio < 0.0:
         raise _RefusedError(Reason.MALFORMED, "a compass ratio that is none")
     knows = bool(flags & _KNOWS_ATTITUDE) and not flags & _UNINITIALIZED
-    return EstimatorStatus(frame.t_ns, frame.source, knows, compass_ratio)
+    return EstimatorStatus(
+        t_ns=frame.t_ns, source=frame.source, knows_attitude=knows, compass_ratio=compass_ratio
+    )
 
 
 def _remote_id(frame: Frame) -> RemoteId | None:

@@ -70,6 +70,7 @@ def global_position_int(
     source: Source,
     boot_ms: int,
     place: tuple[float, float, float],
+    *,
     relative_alt_m: float,
     velocity_ned_mps: tuple[float, float, float],
     heading_deg: float | None,
@@ -91,7 +92,7 @@ def global_position_int(
     return Outgoing(source, GLOBAL_POSITION_INT, payload)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class UtmPosition:
     """What UTM_GLOBAL_POSITION says; None: not known.
 

@@ -194,7 +194,11 @@ class Splitter:
                 self._claimed = 0
                 wanted = self._wanted is None or found[1] in self._wanted
                 source, msgid, raw = found
-                return [Frame(t_ns, self.link, source, msgid, raw)] if wanted else []
+                return (
+                    [Frame(t_ns=t_ns, link=self.link, source=source, msgid=msgid, raw=raw)]
+                    if wanted
+                    else []
+                )
         return self._split(t_ns, self._pending + data if self._pending else data, last=False)
 
     def finish(self, t_ns: int) -> list[Frame | Rejection]:
@@ -212,7 +216,7 @@ class Splitter:
                 source, msgid, raw = found
                 self.frames += 1
                 if wanted is None or msgid in wanted:
-                    out.append(Frame(t_ns, link, source, msgid, raw))
+                    out.append(Frame(t_ns=t_ns, link=link, source=source, msgid=msgid, raw=raw))
                 at += len(raw)
                 claimed_to = at
                 continue
@@ -223,16 +227,27 @@ class Splitter:
             else:
                 claims_to = claimed_to
             resume = _next_start(buffer, at + 1, end, claims_to)
-            claimed_to = self._count(lost, found, at, resume, claimed_to, buffer)
+            claimed_to = self._count(
+                lost, found, at=at, resume=resume, claimed_to=claimed_to, buffer=buffer
+            )
             at = resume
         self._pending = buffer[at:]
         self._claimed = max(0, claimed_to - at)
-        out.extend(Rejection(t_ns, self.link, why, count) for why, count in lost.items())
+        out.extend(
+            Rejection(t_ns=t_ns, source=self.link, reason=why, count=count)
+            for why, count in lost.items()
+        )
         return out
 
     @staticmethod
     def _count(
-        lost: dict[Reason, int], verdict: int, at: int, resume: int, claimed_to: int, buffer: bytes
+        lost: dict[Reason, int],
+        verdict: int,
+        *,
+        at: int,
+        resume: int,
+        claimed_to: int,
+        buffer: bytes,
     ) -> int:
         """Count what is skipped from ``at`` to ``resume``.
 

@@ -47,7 +47,7 @@ def parity(message: bytes) -> int:
     return bits
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Heard:
     """What an aircraft said that later messages need: half positions, accuracies, and when."""
 
@@ -83,7 +83,7 @@ class Transponders:
             self._heard.popitem(last=False)
         type_code, subtype = me >> 51, me >> 48 & 7
         if 1 <= type_code <= 4:
-            return Said(icao, callsign=_callsign(me))
+            return Said(icao=icao, callsign=_callsign(me))
         if 9 <= type_code <= 18 or 20 <= type_code <= 22:
             return _position(
                 heard, t_ns, icao, me, _altitude_ft(me >> 36 & 0xFFF) if type_code < 20 else None
@@ -123,10 +123,10 @@ def _position(heard: _Heard, t_ns: int, icao: int, me: int, altitude_ft: float |
     if place is not None:
         heard.place = t_ns, *place
     return Said(
-        icao,
-        lat_deg,
-        lon_deg,
-        altitude_ft,
+        icao=icao,
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        altitude_ft=altitude_ft,
         nac_p=_fresh(heard.nac_p, t_ns),
         nac_v=_fresh(heard.nac_v, t_ns),
         gva=_fresh(heard.gva, t_ns),
@@ -143,9 +143,9 @@ def _on_ground(heard: _Heard, t_ns: int, icao: int, me: int) -> Said:
     if place is not None:
         heard.place = t_ns, *place
     return Said(
-        icao,
-        lat_deg,
-        lon_deg,
+        icao=icao,
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
         speed_kt=ground_speed_kt(me >> 44 & 0x7F),
         track_deg=(me >> 36 & 0x7F) * 360 / 128 if me >> 43 & 1 else None,
         nac_p=_fresh(heard.nac_p, t_ns),
@@ -197,7 +197,7 @@ def _velocity(icao: int, me: int, knots: int) -> Said:
         speed_kt, track_deg = math.hypot(x, y), math.degrees(math.atan2(x, y)) % 360.0
     climb = me >> 10 & 0x1FF
     climb_fpm = 64.0 * (climb - 1) * (-1 if me >> 19 & 1 else 1) if climb else None
-    return Said(icao, speed_kt=speed_kt, track_deg=track_deg, climb_fpm=climb_fpm)
+    return Said(icao=icao, speed_kt=speed_kt, track_deg=track_deg, climb_fpm=climb_fpm)
 
 
 def position_deg(

@@ -50,7 +50,9 @@ def _payload(frame: Frame, layout: struct.Struct) -> bytes:
 
 
 def _begun(frame: Frame, heard_as: bytes) -> RemoteId:
-    return RemoteId(frame.t_ns, frame.link, frame.source, heard_as.rstrip(b"\0").hex())
+    return RemoteId(
+        t_ns=frame.t_ns, link=frame.link, source=frame.source, heard_as=heard_as.rstrip(b"\0").hex()
+    )
 
 
 def _basic_id(frame: Frame) -> RemoteId:
@@ -68,15 +70,15 @@ def _location(frame: Frame) -> RemoteId:
     return _located(
         _begun(frame, heard_as),
         _Place(
-            lat,
-            lon,
-            baro_m,
-            geo_m,
-            stamp_s if 0 <= stamp_s <= 3600 else None,
-            course * 0.01 if course <= 36_000 else None,
-            speed * 0.01 if speed < 25_500 else None,
-            climb * 0.01 if abs(climb) <= 6200 else None,
-            (horizontal, vertical, at_speed, at_time),
+            lat_1e7=lat,
+            lon_1e7=lon,
+            baro_m=baro_m,
+            geo_m=geo_m,
+            stamp_s=stamp_s if 0 <= stamp_s <= 3600 else None,
+            course_deg=course * 0.01 if course <= 36_000 else None,
+            speed_mps=speed * 0.01 if speed < 25_500 else None,
+            climb_mps=climb * 0.01 if abs(climb) <= 6200 else None,
+            codes=(horizontal, vertical, at_speed, at_time),
         ),
     )
 
@@ -119,15 +121,15 @@ def _packed_place(message: bytes) -> "_Place":
     course_deg = course + 180 * (flags >> 1 & 1)
     speed_mps = 0.75 * speed + 63.75 if flags & 1 else 0.25 * speed
     return _Place(
-        lat,
-        lon,
-        baro * 0.5 + _NO_ALTITUDE_M,
-        geo * 0.5 + _NO_ALTITUDE_M,
-        stamp * 0.1 if stamp <= 36_000 else None,
-        float(course_deg) if course_deg <= 360 else None,
-        speed_mps if speed_mps < 255 else None,
-        climb * 0.5 if abs(climb) <= 124 else None,
-        (codes & 15, codes >> 4, more & 15, at_time & 15),
+        lat_1e7=lat,
+        lon_1e7=lon,
+        baro_m=baro * 0.5 + _NO_ALTITUDE_M,
+        geo_m=geo * 0.5 + _NO_ALTITUDE_M,
+        stamp_s=stamp * 0.1 if stamp <= 36_000 else None,
+        course_deg=float(course_deg) if course_deg <= 360 else None,
+        speed_mps=speed_mps if speed_mps < 255 else None,
+        climb_mps=climb * 0.5 if abs(climb) <= 124 else None,
+        codes=(codes & 15, codes >> 4, more & 15, at_time & 15),
     )
 
 
@@ -146,7 +148,7 @@ def _identified(said: RemoteId, kind: int, uas_id: bytes) -> RemoteId:
     return replace(said, uas_id=text if plain else uas_id.hex(), id_kind=kind)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Place:
     """A location, in degrees by 1e7, metres, m/s (climb is positive up), and codes of accuracy."""
 

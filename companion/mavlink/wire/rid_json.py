@@ -65,28 +65,42 @@ class RidJson:
             garbage += len(self._pending)
             self._pending, self._overlong = b"", True
         if garbage:
-            out.append(Rejection(t_ns, self.link, Reason.GARBAGE, garbage))
+            out.append(Rejection(t_ns=t_ns, source=self.link, reason=Reason.GARBAGE, count=garbage))
         return out
 
     def finish(self, t_ns: int) -> list[Frame | Rejection]:
         """End the stream: an object that has no end is given up."""
         stray, self._pending, self._overlong = len(self._pending), b"", False
-        return [Rejection(t_ns, self.link, Reason.GARBAGE, stray)] if stray else []
+        return (
+            [Rejection(t_ns=t_ns, source=self.link, reason=Reason.GARBAGE, count=stray)]
+            if stray
+            else []
+        )
 
     def _object(self, t_ns: int, text: bytes) -> list[Frame | Rejection]:
         found = _parsed(text)
         if found is None:
-            return [Rejection(t_ns, self.link, Reason.GARBAGE, len(text) + 1)]
+            return [
+                Rejection(t_ns=t_ns, source=self.link, reason=Reason.GARBAGE, count=len(text) + 1)
+            ]
         try:
             return [self._frame(t_ns, *one) for one in list(_said(found))]
         except (ValueError, struct.error, OverflowError) as why:
             detail = str(why)[:80]
-            return [Rejection(t_ns, self.link, Reason.MALFORMED, msgid=LOCATION, detail=detail)]
+            return [
+                Rejection(
+                    t_ns=t_ns,
+                    source=self.link,
+                    reason=Reason.MALFORMED,
+                    msgid=LOCATION,
+                    detail=detail,
+                )
+            ]
 
     def _frame(self, t_ns: int, msgid: int, payload: bytes) -> Frame:
         raw = pack(Outgoing(SENDER, msgid, payload), self._seq)
         self._seq = (self._seq + 1) & 0xFF
-        return Frame(t_ns, self.link, SENDER, msgid, raw)
+        return Frame(t_ns=t_ns, link=self.link, source=SENDER, msgid=msgid, raw=raw)
 
 
 def _parsed(text: bytes) -> dict[str, Any] | None:
@@ -137,16 +151,16 @@ def _uas_data(mac: bytes, uas: bytes) -> Iterator[tuple[int, bytes]]:
             _location(
                 mac,
                 lat,
-                lon,
-                baro,
-                geo,
-                height,
-                more[5],
-                course,
-                speed,
-                climb,
-                _code(status),
-                (horizontal, vertical, barometer, at_speed, at_time),
+                lon_deg=lon,
+                baro_m=baro,
+                geo_m=geo,
+                height_m=height,
+                stamp_s=more[5],
+                course_deg=course,
+                speed_mps=speed,
+                climb_mps=climb,
+                status=_code(status),
+                codes=(horizontal, vertical, barometer, at_speed, at_time),
             ),
         )
 
@@ -162,7 +176,23 @@ def _captured(mac: bytes, found: dict[str, Any]) -> Iterator[tuple[int, bytes]]:
         lat, lon, geo, course, speed, stamp = [_number(found.get(key)) for key in keys]
         codes = (0, 0, 0, 0, _BY_SECOND)
         nan = math.nan
-        yield LOCATION, _location(mac, lat, lon, nan, geo, nan, stamp, course, speed, nan, 0, codes)
+        yield (
+            LOCATION,
+            _location(
+                mac,
+                lat,
+                lon_deg=lon,
+                baro_m=nan,
+                geo_m=geo,
+                height_m=nan,
+                stamp_s=stamp,
+                course_deg=course,
+                speed_mps=speed,
+                climb_mps=nan,
+                status=0,
+                codes=codes,
+            ),
+        )
 
 
 def _number(value: object) -> float:
@@ -177,6 +207,7 @@ def _code(value: int) -> int:
 def _location(
     mac: bytes,
     lat_deg: float,
+    *,
     lon_deg: float,
     baro_m: float,
     geo_m: float,

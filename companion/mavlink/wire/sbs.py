@@ -42,7 +42,11 @@ class SbsSplitter:
     def finish(self, t_ns: int) -> list[Frame | Rejection]:
         """End the stream: a line that has no end is given up."""
         stray, self._pending, self._overlong = len(self._pending), b"", False
-        return [Rejection(t_ns, self.link, Reason.GARBAGE, stray)] if stray else []
+        return (
+            [Rejection(t_ns=t_ns, source=self.link, reason=Reason.GARBAGE, count=stray)]
+            if stray
+            else []
+        )
 
     def _read(self, t_ns: int, lines: list[bytes]) -> list[Frame | Rejection]:
         out: list[Frame | Rejection] = []
@@ -60,18 +64,28 @@ class SbsSplitter:
             garbage += len(self._pending)
             self._pending, self._overlong = b"", True
         if garbage:
-            out.append(Rejection(t_ns, self.link, Reason.GARBAGE, garbage))
+            out.append(Rejection(t_ns=t_ns, source=self.link, reason=Reason.GARBAGE, count=garbage))
         return out
 
     def _said(self, t_ns: int, line: bytes, kind: bytes) -> list[Frame | Rejection]:
         if kind == b"MLAT":  # found by other receivers, however well they are placed
             detail = "MLAT: how exact it is, is not known"
-            return [Rejection(t_ns, self.link, Reason.UNKNOWN_MESSAGE, detail=detail)]
+            return [
+                Rejection(t_ns=t_ns, source=self.link, reason=Reason.UNKNOWN_MESSAGE, detail=detail)
+            ]
         try:
             found = frame(t_ns, self.link, said(line.decode("ascii")), self._seq)
         except ValueError as error:
             text = error.reason if isinstance(error, UnicodeDecodeError) else str(error)
-            return [Rejection(t_ns, self.link, Reason.MALFORMED, msgid=ADSB_VEHICLE, detail=text)]
+            return [
+                Rejection(
+                    t_ns=t_ns,
+                    source=self.link,
+                    reason=Reason.MALFORMED,
+                    msgid=ADSB_VEHICLE,
+                    detail=text,
+                )
+            ]
         if found is None:
             return []
         self._seq = (self._seq + 1) & 0xFF
@@ -87,15 +101,15 @@ def said(line: str) -> Said:
     if not re.fullmatch(r"[0-9A-Fa-f]{6}", fields[4]):
         raise ValueError(f"{fields[4]!r:.20} is not an ICAO address")
     return Said(
-        int(fields[4], 16),
-        _number(fields[14], -90, 90),
-        _number(fields[15], -180, 180),
-        _number(fields[11].removesuffix("H"), -2000, 200_000),
-        fields[11].endswith("H"),
-        _number(fields[12], 0, 1200),
-        _number(fields[13], 0, 360),
-        _number(fields[16], -60_000, 60_000),
-        fields[10],
+        icao=int(fields[4], 16),
+        lat_deg=_number(fields[14], -90, 90),
+        lon_deg=_number(fields[15], -180, 180),
+        altitude_ft=_number(fields[11].removesuffix("H"), -2000, 200_000),
+        geometric=fields[11].endswith("H"),
+        speed_kt=_number(fields[12], 0, 1200),
+        track_deg=_number(fields[13], 0, 360),
+        climb_fpm=_number(fields[16], -60_000, 60_000),
+        callsign=fields[10],
         age_s=_age_s(fields[6:10]),
     )
 

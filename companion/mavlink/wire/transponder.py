@@ -82,4 +82,4 @@ def frame(t_ns: int, link: str, said: Said, seq: int) -> Frame | None:
     if payload is None:
         return None
     raw = pack(Outgoing(SENDER, ADSB_VEHICLE, payload), seq)
-    return Frame(t_ns, link, SENDER, ADSB_VEHICLE, raw)
+    return Frame(t_ns=t_ns, link=link, source=SENDER, msgid=ADSB_VEHICLE, raw=raw)

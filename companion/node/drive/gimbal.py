@@ -41,6 +41,7 @@ class Gimbal:
 
     def __init__(
         self,
+        *,
         host: str,
         port: int,
         target: Source,
@@ -87,7 +88,7 @@ class Gimbal:
     def rest(self, safe: Safe) -> None:
         """Stay where it was told to point last, or go to its boresight."""
         if safe is Safe.BORESIGHT:
-            self._point(Shot(0, None))
+            self._point(Shot(valid_at_ns=0, unfit=None))
 
     def close(self) -> None:
         """Let go of the socket."""

@@ -51,7 +51,7 @@ class SourceLostError(Exception):
     """A service that does not answer."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Shot:
     """What is to be applied.
 
@@ -107,7 +107,7 @@ class Device(Protocol):
         """Let go of the device; raises nothing."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Told:
     """How it goes.
 
@@ -141,6 +141,7 @@ class Drive:
 
     def __init__(
         self,
+        *,
         source: Source,
         device: Device,
         update_hz: float,
@@ -227,15 +228,15 @@ class Drive:
         took, at = np.array(self._took_ns) * 1e-6, list(self._at_ns)
         spent_s = (at[-1] - at[0]) * 1e-9 if len(at) > 1 else 0.0
         return Told(
-            self._applied,
-            (len(at) - 1) / spent_s if spent_s > 0 else None,
-            float(np.percentile(took, 50)) if took.size else None,
-            float(np.percentile(took, 99)) if took.size else None,
-            self.lead_s * 1e3,
-            self._late,
-            self._skipped,
-            self._failures,
-            self._resting,
+            applied=self._applied,
+            rate_hz=(len(at) - 1) / spent_s if spent_s > 0 else None,
+            p50_ms=float(np.percentile(took, 50)) if took.size else None,
+            p99_ms=float(np.percentile(took, 99)) if took.size else None,
+            lead_ms=self.lead_s * 1e3,
+            late=self._late,
+            skipped=self._skipped,
+            failures=self._failures,
+            resting=self._resting,
         )
 
     def _reached(self) -> bool:

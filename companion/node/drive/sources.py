@@ -30,7 +30,7 @@ ANSWERS_S: Final = 5.0
 """Time after which an event loop that does not answer is lost."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Wanted:
     """Whom to follow: the first of these that has a beam, else anybody if so; and for what.
 
@@ -71,7 +71,7 @@ class OverHttp:
             )
         except ServiceError as error:
             if error.status == 409:
-                return Shot(valid_at_ns, error.title)
+                return Shot(valid_at_ns=valid_at_ns, unfit=error.title)
             raise SourceLostError(str(error)) from error
         return chosen(told, text, self._wanted, valid_at_ns)
 
@@ -81,6 +81,7 @@ class OfThisProcess:
 
     def __init__(
         self,
+        *,
         loop: asyncio.AbstractEventLoop,
         pipeline: Pipeline,
         equipment: Equipment,
@@ -115,7 +116,7 @@ def shot_of(pipeline: Pipeline, equipment: Equipment, update: Update, wanted: Wa
             table = device_table(Device.ADAR1000, beams, pipeline.array, equipment, uav)
             text = tables.encode(table)
         except UserError as error:
-            return Shot(beams.valid_at_ns, str(error))
+            return Shot(valid_at_ns=beams.valid_at_ns, unfit=str(error))
     pointed, codebook = beam_state.pointing(pipeline, update), equipment.codebook
     if wanted.takes is Takes.STORED and codebook is not None and pointed:
         best, _ = codebooks.best(codebook, pipeline.array, directions(beams))
@@ -135,7 +136,13 @@ def stored_registers(array: Array, equipment: Equipment) -> list[IntArray]:
     if codebook is None:
         raise UserError('there are no stored beams: [codebook] kind = "dft", or "file"')
     wanted = [
-        tables.WantedBeam(str(k), column, 0.0, 0.0, column.conj()[:, np.newaxis])
+        tables.WantedBeam(
+            uav=str(k),
+            weights=column,
+            azimuth_rad=0.0,
+            elevation_rad=0.0,
+            steering=column.conj()[:, np.newaxis],
+        )
         for k, column in enumerate(codebook.weights.T)
     ]
     calibration = equipment.calibration or Calibration.ideal(range(array.size))
@@ -152,32 +159,32 @@ def followed(uavs: Collection[str], wanted: Wanted) -> str | None:
 def chosen(told: dict[str, Any], text: str | None, wanted: Wanted, valid_at_ns: int) -> Shot:
     """The shot for whom is wanted, of what the API says."""
     if told["unfit"] is not None:
-        return Shot(valid_at_ns, str(told["unfit"]))
+        return Shot(valid_at_ns=valid_at_ns, unfit=str(told["unfit"]))
     named = {beam["uav"]: beam for beam in told["beams"]}
     uav = followed(named, wanted)
     if uav is None:
-        return Shot(valid_at_ns, "nobody who is to be followed has a beam")
+        return Shot(valid_at_ns=valid_at_ns, unfit="nobody who is to be followed has a beam")
     if wanted.centre:
         several = named if wanted.anybody else wanted.uavs
         return _middle([named[one] for one in several if one in named], valid_at_ns)
     beam, rows = named[uav], None if text is None else registers_of(text, uav)
     if rows is not None and not len(rows):
-        return Shot(valid_at_ns, f"{uav} has no beam in the device's table")
+        return Shot(valid_at_ns=valid_at_ns, unfit=f"{uav} has no beam in the device's table")
     stored = None
     if wanted.takes is Takes.STORED:
         size = told["codebook_beams"]
         if size is None or wanted.stored_beams not in (None, size):
-            return Shot(valid_at_ns, "the service has another codebook, or none")
+            return Shot(valid_at_ns=valid_at_ns, unfit="the service has another codebook, or none")
         stored = beam["codebook"]["best"]
     return Shot(
-        valid_at_ns,
-        None,
-        uav,
-        math.radians(beam["bearing_deg"]),
-        math.radians(beam["above_horizon_deg"]),
-        (beam["lat_deg"], beam["lon_deg"], beam["alt_m"]),
-        rows,
-        stored,
+        valid_at_ns=valid_at_ns,
+        unfit=None,
+        uav=uav,
+        bearing_rad=math.radians(beam["bearing_deg"]),
+        above_rad=math.radians(beam["above_horizon_deg"]),
+        place=(beam["lat_deg"], beam["lon_deg"], beam["alt_m"]),
+        registers=rows,
+        stored=stored,
     )
 
 
@@ -191,7 +198,10 @@ def _middle(beams: list[dict[str, Any]], valid_at_ns: int) -> Shot:
         for part in (level * np.cos(bearing), level * np.sin(bearing), np.sin(above))
     )
     if math.hypot(north, east, up) < LEAST_MEAN * len(beams):
-        return Shot(valid_at_ns, "they are all around: there is no direction to the middle of them")
+        return Shot(
+            valid_at_ns=valid_at_ns,
+            unfit="they are all around: there is no direction to the middle of them",
+        )
     lat_deg, alt_m = (
         statistics.fmean(beam[name] for beam in beams) for name in ("lat_deg", "alt_m")
     )
@@ -199,12 +209,12 @@ def _middle(beams: list[dict[str, Any]], valid_at_ns: int) -> Shot:
     east_deg = [math.remainder(beam["lon_deg"] - first_deg, 360.0) for beam in beams]
     lon_deg = math.remainder(first_deg + statistics.fmean(east_deg), 360.0)
     return Shot(
-        valid_at_ns,
-        None,
-        "+".join(beam["uav"] for beam in beams),
-        math.atan2(east, north),
-        math.atan2(up, math.hypot(north, east)),
-        (lat_deg, lon_deg, alt_m),
+        valid_at_ns=valid_at_ns,
+        unfit=None,
+        uav="+".join(beam["uav"] for beam in beams),
+        bearing_rad=math.atan2(east, north),
+        above_rad=math.atan2(up, math.hypot(north, east)),
+        place=(lat_deg, lon_deg, alt_m),
     )
 
 

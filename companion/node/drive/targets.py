@@ -58,7 +58,7 @@ def device(
                 from companion.node.drive.gimbal import Gimbal, RoiGimbal
 
                 made = Gimbal if kind == "gimbal" else RoiGimbal
-                return made(found[1].strip("[]"), numbers[0], Source(*numbers[1:]))
+                return made(host=found[1].strip("[]"), port=numbers[0], target=Source(*numbers[1:]))
         case "phaser" if where:
             from companion.node.drive.phaser import Phaser
 

@@ -13,7 +13,11 @@ def bus_config(settings: FleetSettings) -> BusConfig:
     if settings.ca is not None:
         if settings.certificate is None or settings.key is None:
             raise ConfigError("fleet.ca: a certificate and its key are needed as well")
-        tls = BusTls(Path(settings.ca), Path(settings.certificate), Path(settings.key))
+        tls = BusTls(
+            ca=Path(settings.ca),
+            certificate=Path(settings.certificate),
+            private_key=Path(settings.key),
+        )
     elif settings.certificate is not None or settings.key is not None:
         raise ConfigError("fleet.certificate: fleet.ca is needed as well")
     if settings.mode == "client" and not settings.connect:

@@ -13,7 +13,7 @@ class Listening:
     ``heard`` and ``offered`` are called with the key and the payload of what is said.
     """
 
-    def __init__(self, bus: Bus, base: str, heard: Take, offered: Take) -> None:
+    def __init__(self, *, bus: Bus, base: str, heard: Take, offered: Take) -> None:
         self._bus = bus
         self._base = base
         self._takes = {"heard": heard, "offers": offered}

@@ -60,6 +60,7 @@ class FleetNode:
 
     def __init__(
         self,
+        *,
         settings: FleetSettings,
         pipeline: Pipeline,
         step: Callable[[Event], None],
@@ -78,7 +79,12 @@ class FleetNode:
         self._now_ns = now_ns
         self._started_ns = now_ns()
         self._config = bus_config(settings)
-        self.member = Member(self.name, settings, pipeline.array.size, self._started_ns)
+        self.member = Member(
+            name=self.name,
+            settings=settings,
+            elements=pipeline.array.size,
+            started_ns=self._started_ns,
+        )
         self._around = Surroundings(pipeline, self.member)
         self._offers = Offers(pipeline, self.member.hearing.silent_s)
         self._session: Any = None  # of a peer, opened before there was a loop
@@ -109,7 +115,14 @@ class FleetNode:
                 await self._take_part()
                 has_taken_part = True
             except UserError as error:
-                self._notify(Notice(self._now_ns(), Severity.ERROR, "fleet", f"no fleet: {error}"))
+                self._notify(
+                    Notice(
+                        t_ns=self._now_ns(),
+                        severity=Severity.ERROR,
+                        subject="fleet",
+                        text=f"no fleet: {error}",
+                    )
+                )
                 if not has_taken_part:
                     return
                 await asyncio.sleep(RETRY_S)  # what was this node's own until now is free again
@@ -150,7 +163,7 @@ class FleetNode:
         mute = self._unanswered.mute(now_ns, heard_ns)
         if mute:
             text = f"no answer from {', '.join(mute)}, all nodes are connected anew"
-            self._notify(Notice(now_ns, Severity.WARNING, "fleet", text))
+            self._notify(Notice(t_ns=now_ns, severity=Severity.WARNING, subject="fleet", text=text))
         return bool(mute)
 
     async def _repeat(self, period_s: float, what: Callable[[int], None]) -> None:
@@ -172,7 +185,7 @@ class FleetNode:
         bus.serve(f"{base}/{self.name}/schema", lambda key, payload: schemas.SHARED.descriptor_set)
         bus.subscribe(f"{base}/*/standing", self._taking(self._stands))
         heard, offered = self._taking(self._shared), self._taking(self._offered)
-        self._listening = Listening(bus, base, heard, offered)
+        self._listening = Listening(bus=bus, base=base, heard=heard, offered=offered)
         bus.watch(f"{base}/*/alive", self._seen)
         bus.alive(f"{base}/{self.name}/alive")
 
@@ -342,14 +355,18 @@ class FleetNode:
             text = f"node {node} is there"
             now_ns = self._now_ns()
             self.member.came(now_ns, node)
-            self._notify(Notice(now_ns, Severity.INFO, f"node {node}", text))
+            self._notify(
+                Notice(t_ns=now_ns, severity=Severity.INFO, subject=f"node {node}", text=text)
+            )
 
     def _tell_of_twin(self) -> None:
         if self._has_twin:
             return
         self._has_twin = True
         text = f"another node says that it is {self.name} too: give each a name of its own"
-        self._notify(Notice(self._now_ns(), Severity.ERROR, "fleet", text))
+        self._notify(
+            Notice(t_ns=self._now_ns(), severity=Severity.ERROR, subject="fleet", text=text)
+        )
 
     def _tell(self, notices: list[Notice]) -> None:
         for notice in notices:
@@ -360,5 +377,9 @@ class FleetNode:
     def status(self) -> FleetStatus:
         """This node's place in the fleet."""
         return FleetStatus(
-            self.member, self.settings.site, self._sent.bps, self._heard.bps, self.damaged
+            member=self.member,
+            site=self.settings.site,
+            sent_bps=self._sent.bps,
+            heard_bps=self._heard.bps,
+            damaged=self.damaged,
         )

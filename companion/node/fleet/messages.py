@@ -87,14 +87,14 @@ def to_standing(data: bytes, node: str) -> Standing:
         raise FleetMessageError("a place that is none")
     reach_m = message.reach_m if message.HasField("reach_m") else None
     return Standing(
-        node,
-        _time(message.started_ns),
-        _time(message.t_ns),
-        (place[0], place[1], place[2]) if place else None,
-        None if reach_m is None else _number(reach_m),
-        min(message.most, OFFERS_MAX),
-        tuple((_name(one.uav), _number(one.worth_db)) for one in message.serves),
-        tuple((_name(one.uav), _name(one.to)) for one in message.handing),
+        node=node,
+        started_ns=_time(message.started_ns),
+        t_ns=_time(message.t_ns),
+        place=(place[0], place[1], place[2]) if place else None,
+        reach_m=None if reach_m is None else _number(reach_m),
+        most=min(message.most, OFFERS_MAX),
+        serves=tuple((_name(one.uav), _number(one.worth_db)) for one in message.serves),
+        handing=tuple((_name(one.uav), _name(one.to)) for one in message.handing),
     )
 
 

@@ -22,7 +22,7 @@ SAMPLE_NS: Final = 100_000_000
 """Time between two looks at who serves whom."""
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class NodeRun:
     """One node's run: its parts, its digest now and as recorded, and its duties in order."""
 
@@ -95,7 +95,7 @@ def _run(
     name: str, logs: list[Path], progress: Callable[[int, float, float], None] | None
 ) -> NodeRun:
     settings = replaying.settings_for(logs, None, None)
-    found = NodeRun(name, logs, recorded=digest_of(logs[-1]))
+    found = NodeRun(node=name, logs=logs, recorded=digest_of(logs[-1]))
     run = replaying.Run(settings, None)
     for event in replaying.log_events(logs, settings):
         run.step(event)

@@ -27,7 +27,7 @@ SETTLED_NS: Final = 2_000_000_000
 """Time for which a UAV must belong elsewhere before it is handed over."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Handover:
     """A change of who serves a UAV: when, node time; from whom and to whom, None: nobody."""
 
@@ -49,7 +49,7 @@ class Duties:
     those of them that another is to take.
     """
 
-    def __init__(self, name: str, most: int, lease_ns: int, hysteresis_db: float) -> None:
+    def __init__(self, *, name: str, most: int, lease_ns: int, hysteresis_db: float) -> None:
         self.serves: dict[str, float] = {}
         self.handing: dict[str, str] = {}
         self._name = name
@@ -138,7 +138,7 @@ class Duties:
     def _change(self, now_ns: int, uav: str, claims: Mapping[str, Mapping[str, float]]) -> Handover:
         other = _keeper(claims[uav]) if uav in claims else None
         before, after = (other, self._name) if uav in self.serves else (self._name, other)
-        return Handover(now_ns, uav, before, after)
+        return Handover(t_ns=now_ns, uav=uav, before=before, after=after)
 
     def _let_go(
         self,

@@ -133,7 +133,14 @@ class Hearing:
             self.early.append(node)
             return None
         t_ns = min(most_ns, max(now_ns, least_ns))
-        return Frame(t_ns, f"fleet:{node}", source, msgid, raw, t_ns - least_ns)
+        return Frame(
+            t_ns=t_ns,
+            link=f"fleet:{node}",
+            source=source,
+            msgid=msgid,
+            raw=raw,
+            doubt_ns=t_ns - least_ns,
+        )
 
     def was_told(self, key: bytes) -> bool:
         """Whether a report of this content was told by another node of late."""

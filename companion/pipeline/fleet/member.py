@@ -55,7 +55,9 @@ class Member:
     went, in their order, until they are back or forgotten: when, and where they were.
     """
 
-    def __init__(self, name: str, settings: FleetSettings, elements: int, started_ns: int) -> None:
+    def __init__(
+        self, *, name: str, settings: FleetSettings, elements: int, started_ns: int
+    ) -> None:
         self.name = name
         self.neighbours: dict[str, Neighbour] = {}
         self.gone: dict[str, tuple[int, Place | None]] = {}
@@ -66,7 +68,12 @@ class Member:
         self.sharing = Sharing(name, round(1e9 / settings.share_hz))
         self.trust = Trust()
         self.most = settings.most or elements
-        self.duties = Duties(name, self.most, round(settings.lease_s * 1e9), settings.hysteresis_db)
+        self.duties = Duties(
+            name=name,
+            most=self.most,
+            lease_ns=round(settings.lease_s * 1e9),
+            hysteresis_db=settings.hysteresis_db,
+        )
         self.place: Place | None = None
         self.reach_m: float | None = None
         self.near: frozenset[str] = frozenset()
@@ -107,7 +114,7 @@ class Member:
             del self.gone[next(iter(self.gone))]
         self.gone[node] = now_ns, None if known.standing is None else known.standing.place
         text = f"node {node} is gone"
-        return [Notice(now_ns, Severity.WARNING, f"node {node}", text)]
+        return [Notice(t_ns=now_ns, severity=Severity.WARNING, subject=f"node {node}", text=text)]
 
     def _drop(self, node: str) -> None:
         del self.neighbours[node]
@@ -136,7 +143,9 @@ class Member:
         text = (
             f"node {node}'s clock is {apart_ns * 1e-9:.3f} s {way} this one's; that is allowed for"
         )
-        return [Notice(received_ns, Severity.WARNING, f"node {node}", text)]
+        return [
+            Notice(t_ns=received_ns, severity=Severity.WARNING, subject=f"node {node}", text=text)
+        ]
 
     def shared(
         self, now_ns: int, node: str, said: Shared
@@ -277,14 +286,14 @@ class Member:
         for node in others.keys() - self.near:  # they are out of date from now on
             self.neighbours[node].offers = None
         return Standing(
-            self.name,
-            self._started_ns,
-            now_ns,
-            place,
-            reach_m,
-            self.most,
-            tuple(self.duties.serves.items()),
-            tuple(self.duties.handing.items()),
+            node=self.name,
+            started_ns=self._started_ns,
+            t_ns=now_ns,
+            place=place,
+            reach_m=reach_m,
+            most=self.most,
+            serves=tuple(self.duties.serves.items()),
+            handing=tuple(self.duties.handing.items()),
         )
 
     def _neighbour(self, now_ns: int, node: str) -> Neighbour | None:
@@ -295,7 +304,7 @@ class Member:
         if known is None:
             if len(self.neighbours) >= NODES_MAX:
                 return None
-            known = self.neighbours.setdefault(node, Neighbour(NeighbourClock()))
+            known = self.neighbours.setdefault(node, Neighbour(clock=NeighbourClock()))
             self.gone.pop(node, None)
         known.heard_ns = now_ns
         return known

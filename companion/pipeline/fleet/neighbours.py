@@ -71,7 +71,7 @@ class NeighbourClock:
         return None if self._newest_ns is None else self.ahead(self._newest_ns)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Neighbour:
     """Another node, as it is known here.
 
@@ -111,5 +111,8 @@ def here(trip: RoundTrip, clock: NeighbourClock) -> RoundTrip | None:
     if sent is None or received is None:
         return None
     return RoundTrip(
-        trip.t_ns + received.high_ns, trip.source, trip.sent_ns + sent.low_ns, trip.remote_ns
+        t_ns=trip.t_ns + received.high_ns,
+        source=trip.source,
+        sent_ns=trip.sent_ns + sent.low_ns,
+        remote_ns=trip.remote_ns,
     )

@@ -69,12 +69,26 @@ class Offers:
         array, alone, coverage = pipeline.array, self._alone, pipeline.coverage
 
         def make() -> dict[str, Offer]:
-            return self._make(aim(now_ns, at_ns, tracks, known, array, alone, coverage), heard_s)
+            return self._make(
+                aim(
+                    now_ns,
+                    valid_at_ns=at_ns,
+                    tracks=tracks,
+                    carrier=known,
+                    array=array,
+                    precoder=alone,
+                    coverage=coverage,
+                ),
+                heard_s,
+            )
 
         return make
 
     def _make(self, aimed: BeamSet, heard_s: dict[str, float | None]) -> dict[str, Offer]:
-        made = {uav: Offer(uav, None, None, None, since_s) for uav, since_s in heard_s.items()}
+        made = {
+            uav: Offer(uav=uav, sure_db=None, likely_db=None, sinr_db=None, heard_s=since_s)
+            for uav, since_s in heard_s.items()
+        }
         if not aimed.beams:
             return made
         sure = self._least_db(aimed, [beam.pointing_bound_rad for beam in aimed.beams])
@@ -87,7 +101,11 @@ class Offers:
             gain_db = likely[i] if sure[i] is None else sure[i]
             sinr_db = None if gain_db is None else float(snr_db[i]) + gain_db
             made[beam.uav] = Offer(
-                beam.uav, _step(sure[i]), _step(likely[i]), _step(sinr_db), heard_s[beam.uav]
+                uav=beam.uav,
+                sure_db=_step(sure[i]),
+                likely_db=_step(likely[i]),
+                sinr_db=_step(sinr_db),
+                heard_s=heard_s[beam.uav],
             )
         return made
 

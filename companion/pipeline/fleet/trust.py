@@ -141,4 +141,4 @@ def _ought_to_hear(witness: Witness, told: Told) -> bool:
 
 
 def _notice(t_ns: int, node: str, what: str, severity: Severity) -> Notice:
-    return Notice(t_ns, severity, f"node {node}", f"node {node} {what}")
+    return Notice(t_ns=t_ns, severity=severity, subject=f"node {node}", text=f"node {node} {what}")

@@ -54,18 +54,18 @@ def read(data: Bytes) -> Onboard:
     fixes, clock = fixes_of(tables["GPS"], tables["GPA"], lost)
     notes: list[str] = []
     return Onboard(
-        sysid,
-        1,
-        mav_type,
-        _ARDUPILOT,
-        _positions(tables, fixes, lost, notes),
-        _attitudes(tables["ATT"], tables["RATE"], lost),
-        fixes,
-        _truth(tables["SIM"], tables["SIM2"], lost),
-        _armed(tables["ARM"]),
-        clock,
-        lost,
-        tuple(notes),
+        sysid=sysid,
+        compid=1,
+        mav_type=mav_type,
+        autopilot=_ARDUPILOT,
+        positions=_positions(tables, fixes, lost, notes),
+        attitudes=_attitudes(tables["ATT"], tables["RATE"], lost),
+        fixes=fixes,
+        truth=_truth(tables["SIM"], tables["SIM2"], lost),
+        armed=_armed(tables["ARM"]),
+        clock=clock,
+        lost=lost,
+        notes=tuple(notes),
     )
 
 
@@ -151,7 +151,15 @@ def _positions(
     heading = _headings(boot_us, attitude)
     if not len(boot_us):
         return None
-    return Positions(boot_us, lat_1e7, lon_1e7, alt_m, height_m[sound], velocity, heading)
+    return Positions(
+        boot_us=boot_us,
+        lat_1e7=lat_1e7,
+        lon_1e7=lon_1e7,
+        alt_m=alt_m,
+        height_m=height_m[sound],
+        velocity_ned_mps=velocity,
+        heading_deg=heading,
+    )
 
 
 def _received(fixes: Fixes, tables: dict[str, Table], notes: list[str]) -> Positions | None:
@@ -165,7 +173,15 @@ def _received(fixes: Fixes, tables: dict[str, Table], notes: list[str]) -> Posit
     way = moved(boot_us, lat_1e7, lon_1e7, alt_m)
     velocity = _filled(np.full_like(way, np.nan), boot_us, fixes, way, notes)
     heading = _headings(boot_us, tables["ATT"])
-    return Positions(boot_us, lat_1e7, lon_1e7, alt_m, alt_m - alt_m[0], velocity, heading)
+    return Positions(
+        boot_us=boot_us,
+        lat_1e7=lat_1e7,
+        lon_1e7=lon_1e7,
+        alt_m=alt_m,
+        height_m=alt_m - alt_m[0],
+        velocity_ned_mps=velocity,
+        heading_deg=heading,
+    )
 
 
 def _velocities(boot_us: IntArray, tables: dict[str, Table]) -> FloatArray:
@@ -245,4 +261,11 @@ def _truth(sim: Table, motion: Table, lost: dict[Reason, int]) -> Truth | None:
     sure = np.isfinite(velocity).all(axis=1) & (np.abs(velocity) < 1e4).all(axis=1)
     there = between(boot_us, times(motion)[sure], velocity[sure], _NEAR_US // 5)
     there = np.where(np.isnan(there), moved(boot_us, lat_1e7, lon_1e7, alt_m), there)
-    return Truth(boot_us, lat_1e7, lon_1e7, alt_m, there, turned_by[sound])
+    return Truth(
+        boot_us=boot_us,
+        lat_1e7=lat_1e7,
+        lon_1e7=lon_1e7,
+        alt_m=alt_m,
+        velocity_ned_mps=there,
+        ned_from_body=turned_by[sound],
+    )

@@ -34,7 +34,9 @@ def read_capture(path: Path) -> Iterator[Event]:
         for packet in packets(file):
             if isinstance(packet, Skipped):
                 t_ns = 0 if timeline is None else timeline.t_ns
-                yield Rejection(t_ns, path.name, Reason.GARBAGE, packet.size_bytes)
+                yield Rejection(
+                    t_ns=t_ns, source=path.name, reason=Reason.GARBAGE, count=packet.size_bytes
+                )
                 continue
             found = segment(packet)
             if found is None or not (found.payload or found.tcp_syn):
@@ -53,7 +55,9 @@ def read_capture(path: Path) -> Iterator[Event]:
             if events and off_ns is not None and abs(off_ns) > LINGERS_NS:
                 way = "back" if off_ns < 0 else "ahead"
                 detail = f"{abs(off_ns) / 1e9:.6g} s {way}, clamped"
-                yield Rejection(timeline.t_ns, found.flow, Reason.BAD_STAMP, detail=detail)
+                yield Rejection(
+                    t_ns=timeline.t_ns, source=found.flow, reason=Reason.BAD_STAMP, detail=detail
+                )
             yield from events
     for flow in flows.values():
         yield from flow.finish(0 if timeline is None else timeline.t_ns)
@@ -142,7 +146,7 @@ def read_mcap(path: Path) -> Iterator[Event]:
         yield from (event for event in found if isinstance(event, Frame) or _is_frame(event))
     if walk.lost_bytes:
         t_ns = 0 if timeline is None else timeline.t_ns
-        yield Rejection(t_ns, path.name, Reason.GARBAGE, walk.lost_bytes)
+        yield Rejection(t_ns=t_ns, source=path.name, reason=Reason.GARBAGE, count=walk.lost_bytes)
 
 
 def _is_frame(refused: Rejection) -> bool:

@@ -182,13 +182,13 @@ def _onboard(
     place = lat_1e7[sound], lon_1e7[sound], alt_m[sound]
     table = {name: values[rows] for name, values in table.items()}
     return Onboard(
-        said.get("sysid"),
-        said.get("compid", 1),
-        said.get("mav_type", 0),
-        _AUTOPILOT_GENERIC,
-        _positions(boot_us, place, table, notes) if len(rows) else None,
-        _attitudes(boot_us, table) if len(rows) else None,
-        _fixes(boot_us, place, table) if len(rows) else None,
+        sysid=said.get("sysid"),
+        compid=said.get("compid", 1),
+        mav_type=said.get("mav_type", 0),
+        autopilot=_AUTOPILOT_GENERIC,
+        positions=_positions(boot_us, place, table, notes) if len(rows) else None,
+        attitudes=_attitudes(boot_us, table) if len(rows) else None,
+        fixes=_fixes(boot_us, place, table) if len(rows) else None,
         clock=clock,
         lost=lost,
         notes=tuple(notes),
@@ -204,7 +204,9 @@ def _times(seconds: FloatArray, timed: str) -> tuple[IntArray, GpsTime | None]:
     if timed == "t_s" or begin_us < FIRST_UNIX_US:
         return boot_us, None
     offset_us = begin_us - 1_000_000
-    return boot_us, GpsTime(offset_us, 0.0, 0, _RESOLUTION_S, len(boot_us))
+    return boot_us, GpsTime(
+        offset_us=offset_us, drift=0.0, at_us=0, uncertainty_s=_RESOLUTION_S, fixes=len(boot_us)
+    )
 
 
 Place = tuple[IntArray, IntArray, FloatArray]
@@ -222,13 +224,13 @@ def _positions(
         notes.append("velocities that it does not give are those between its positions")
     height_m = table.get("height_m", nothing)
     return Positions(
-        boot_us,
-        lat_1e7,
-        lon_1e7,
-        alt_m,
-        np.where(np.abs(height_m) < 1e6, height_m, alt_m - alt_m[0]),
-        np.where(np.isnan(given), velocity, given),
-        table.get("heading_deg", table.get("yaw_deg", nothing)),
+        boot_us=boot_us,
+        lat_1e7=lat_1e7,
+        lon_1e7=lon_1e7,
+        alt_m=alt_m,
+        height_m=np.where(np.abs(height_m) < 1e6, height_m, alt_m - alt_m[0]),
+        velocity_ned_mps=np.where(np.isnan(given), velocity, given),
+        heading_deg=table.get("heading_deg", table.get("yaw_deg", nothing)),
     )
 
 
@@ -250,14 +252,14 @@ def _fixes(boot_us: IntArray, place: Place, table: dict[str, FloatArray]) -> Fix
     sound = (fix_type >= 0) & (fix_type <= 255)
     accuracies = np.stack([table.get(name, nothing) for name in _ACCURACY], axis=1)
     return Fixes(
-        boot_us[sound],
-        np.zeros(int(sound.sum()), dtype=np.int64),
-        fix_type[sound].astype(np.int64),
-        np.full(int(sound.sum()), 255),
-        place[0][sound],
-        place[1][sound],
-        place[2][sound],
-        accuracies[sound],
-        nothing[sound],
-        nothing[sound],
+        boot_us=boot_us[sound],
+        unix_us=np.zeros(int(sound.sum()), dtype=np.int64),
+        fix_type=fix_type[sound].astype(np.int64),
+        satellites=np.full(int(sound.sum()), 255),
+        lat_1e7=place[0][sound],
+        lon_1e7=place[1][sound],
+        alt_m=place[2][sound],
+        accuracies=accuracies[sound],
+        speed_mps=nothing[sound],
+        course_deg=nothing[sound],
     )

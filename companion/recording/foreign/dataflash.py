@@ -131,7 +131,7 @@ def walk(data: Bytes, wanted: Collection[str]) -> Walked:
         for number in np.unique(types[asked[types]]).tolist():
             found[number].extend(at[types == number].tolist())
     places = {number: np.array(each.kept, dtype=np.int64) for number, each in found.items()}
-    return Walked(formats, places, data.size - covered, refused)
+    return Walked(formats=formats, at=places, lost=data.size - covered, refused=refused)
 
 
 def table(data: Bytes, walked: Walked, name: str) -> Table:
@@ -183,17 +183,17 @@ def _format(body: bytes) -> Format | None:
     hundredths = (
         column for column, each in zip(columns, letters, strict=True) if each in _HUNDREDTHS
     )
-    return Format(name, length, fields, frozenset(hundredths))
+    return Format(name=name, length=length, fields=fields, hundredths=frozenset(hundredths))
 
 
 _OWN: Final = Format(
-    "FMT",
-    _FORMAT_LENGTH,
-    np.dtype(
+    name="FMT",
+    length=_FORMAT_LENGTH,
+    fields=np.dtype(
         [("Type", "u1"), ("Length", "u1"), ("Name", "S4"), ("Format", "S16"), ("Columns", "S64")]
     ),
-    frozenset(),
-)  # fmt: skip
+    hundredths=frozenset(),
+)
 
 
 # --- where messages are ---------------------------------------------------------------------------

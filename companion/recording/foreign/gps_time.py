@@ -40,7 +40,7 @@ _DRIFT_MAX: Final = 1e-3
 _RESOLUTION_S: Final = 1e-3
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class GpsTime:
     """Unix time of a boot clock: ``boot + offset + drift * (boot - at)``.
 
@@ -92,11 +92,11 @@ def fit(boot_us: IntArray, fixed_us: IntArray) -> GpsTime | None:
     level_us = float(np.median(left_us))
     uncertainty_s = float(np.quantile(np.abs(left_us - level_us), 0.95)) * 1e-6
     return GpsTime(
-        middle_us + round(level_us),
-        drift,
-        at_us,
-        max(_RESOLUTION_S, uncertainty_s),
-        len(boot_us),
+        offset_us=middle_us + round(level_us),
+        drift=drift,
+        at_us=at_us,
+        uncertainty_s=max(_RESOLUTION_S, uncertainty_s),
+        fixes=len(boot_us),
     )
 
 

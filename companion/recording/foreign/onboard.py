@@ -21,7 +21,7 @@ _WILD_US: Final = 120_000_000
 METRES_PER_DEGREE: Final = 111_195.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Positions:
     """Estimated positions.
 
@@ -51,7 +51,7 @@ class Attitudes:
     rates_radps: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Fixes:
     """What the satellite receiver in use said, (N,) each.
 
@@ -74,7 +74,7 @@ class Fixes:
     course_deg: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Truth:
     """Where the simulator had it: as ``Positions``, and quaternions ned from body (N, 4), wxyz."""
 
@@ -86,7 +86,7 @@ class Truth:
     ned_from_body: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Onboard:
     """The log of one vehicle.
 

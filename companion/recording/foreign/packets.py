@@ -141,7 +141,9 @@ def _interface(body: bytes, order: str) -> _Interface:
         elif code == 14 and len(value) == 8:
             offset_ns = struct.unpack(f"{order}q", value)[0] * 1_000_000_000
         at += 4 + size + -size % 4
-    return _Interface(link_type, numerator_ns, denominator, offset_ns)
+    return _Interface(
+        link_type=link_type, numerator_ns=numerator_ns, denominator=denominator, offset_ns=offset_ns
+    )
 
 
 def _packet(
@@ -223,13 +225,20 @@ def _transport(data: bytes, at: int, kind: int, source: str, target: str) -> Seg
         ports = struct.unpack_from(">2H", data, at)
         length = int.from_bytes(data[at + 4 : at + 6], "big")
         end = at + length if length >= 8 else len(data)
-        return Segment(_flow("udp", source, target, ports), data[at + 8 : end], None, False)
+        return Segment(
+            flow=_flow("udp", source, target, ports),
+            payload=data[at + 8 : end],
+            tcp_seq=None,
+            tcp_syn=False,
+        )
     if kind == _TCP and len(data) >= at + 20:
         ports = struct.unpack_from(">2H", data, at)
         seq = int.from_bytes(data[at + 4 : at + 8], "big")
         begin = at + (data[at + 12] >> 4) * 4
         syn = bool(data[at + 13] & 0x02)
-        return Segment(_flow("tcp", source, target, ports), data[begin:], seq, syn)
+        return Segment(
+            flow=_flow("tcp", source, target, ports), payload=data[begin:], tcp_seq=seq, tcp_syn=syn
+        )
     return None
 
 

@@ -66,18 +66,18 @@ def read(data: Bytes) -> Onboard:
     status = tables["vehicle_status"]
     sysid, compid, mav_type = _identity(walked, status)
     return Onboard(
-        sysid,
-        compid,
-        mav_type,
-        _PX4,
-        _positions(tables, fixes, lost, notes),
-        _attitudes(tables, lost),
-        fixes,
-        _truth(tables, lost),
-        _armed(status),
-        clock,
-        lost,
-        tuple(notes),
+        sysid=sysid,
+        compid=compid,
+        mav_type=mav_type,
+        autopilot=_PX4,
+        positions=_positions(tables, fixes, lost, notes),
+        attitudes=_attitudes(tables, lost),
+        fixes=fixes,
+        truth=_truth(tables, lost),
+        armed=_armed(status),
+        clock=clock,
+        lost=lost,
+        notes=tuple(notes),
     )
 
 
@@ -151,16 +151,16 @@ def _fixes(gps: Table, lost: Lost) -> tuple[Fixes | None, GpsTime | None]:
     satellites = gps.numbers("satellites_used")
     accuracies = [gps.numbers(name) for name in ("eph", "epv", "s_variance_m_s")]
     fixes = Fixes(
-        boot_us,
-        unix_us,
-        fix_type,
-        np.where(np.isfinite(satellites), satellites, 255).astype(np.int64),
-        lat_1e7[sound],
-        lon_1e7[sound],
-        alt_m[sound],
-        np.stack([np.where(each > 0, each, np.nan) for each in accuracies], axis=1),
-        gps.numbers("vel_m_s"),
-        np.degrees(gps.numbers("cog_rad")),
+        boot_us=boot_us,
+        unix_us=unix_us,
+        fix_type=fix_type,
+        satellites=np.where(np.isfinite(satellites), satellites, 255).astype(np.int64),
+        lat_1e7=lat_1e7[sound],
+        lon_1e7=lon_1e7[sound],
+        alt_m=alt_m[sound],
+        accuracies=np.stack([np.where(each > 0, each, np.nan) for each in accuracies], axis=1),
+        speed_mps=gps.numbers("vel_m_s"),
+        course_deg=np.degrees(gps.numbers("cog_rad")),
     )
     return fixes, gps_time.fit(boot_us, unix_us)
 
@@ -190,7 +190,15 @@ def _positions(
     height_m = alt_m - (home_m[-1] if len(home_m) else alt_m[0])
     yaw = place.numbers("yaw")
     heading = np.where(np.isfinite(yaw), np.degrees(yaw), _headings(boot_us, local))
-    return Positions(boot_us, lat_1e7, lon_1e7, alt_m, height_m, velocity, heading)
+    return Positions(
+        boot_us=boot_us,
+        lat_1e7=lat_1e7,
+        lon_1e7=lon_1e7,
+        alt_m=alt_m,
+        height_m=height_m,
+        velocity_ned_mps=velocity,
+        heading_deg=heading,
+    )
 
 
 def _place(of: Table) -> tuple[IntArray, IntArray, FloatArray]:
@@ -210,7 +218,15 @@ def _received(fixes: Fixes, local: Table, notes: list[str]) -> Positions | None:
     level = np.stack([np.cos(course), np.sin(course)], axis=1) * speed[:, None]
     velocity[:, :2] = np.where(np.isfinite(level), level, velocity[:, :2])
     heading = _headings(boot_us, local)
-    return Positions(boot_us, lat_1e7, lon_1e7, alt_m, alt_m - alt_m[0], velocity, heading)
+    return Positions(
+        boot_us=boot_us,
+        lat_1e7=lat_1e7,
+        lon_1e7=lon_1e7,
+        alt_m=alt_m,
+        height_m=alt_m - alt_m[0],
+        velocity_ned_mps=velocity,
+        heading_deg=heading,
+    )
 
 
 def _velocities(boot_us: IntArray, local: Table) -> FloatArray:
@@ -267,4 +283,11 @@ def _truth(tables: dict[str, Table], lost: Lost) -> Truth | None:
         row = np.clip(np.searchsorted(turned_at, boot_us), 0, len(turned_at) - 1)
         close = np.abs(turned_at[row] - boot_us) < _NEAR_US // 10
         near = np.where(close[:, None], quaternions[row], 0.0)
-    return Truth(boot_us, lat_1e7, lon_1e7, alt_m, velocity, near)
+    return Truth(
+        boot_us=boot_us,
+        lat_1e7=lat_1e7,
+        lon_1e7=lon_1e7,
+        alt_m=alt_m,
+        velocity_ned_mps=velocity,
+        ned_from_body=near,
+    )

@@ -63,16 +63,16 @@ def fixes_of(
     places = gps.integers("Lat"), gps.integers("Lng")
     assert places[0] is not None and places[1] is not None
     fixes = Fixes(
-        boot_us,
-        fixed_us,
-        gps.numbers("Status").astype(np.int64),
-        np.where(np.isfinite(satellites), satellites, 255).astype(np.int64),
-        places[0],
-        places[1],
-        gps.numbers("Alt"),
-        beside[:, :3],
-        gps.numbers("Spd"),
-        gps.numbers("GCrs"),
+        boot_us=boot_us,
+        unix_us=fixed_us,
+        fix_type=gps.numbers("Status").astype(np.int64),
+        satellites=np.where(np.isfinite(satellites), satellites, 255).astype(np.int64),
+        lat_1e7=places[0],
+        lon_1e7=places[1],
+        alt_m=gps.numbers("Alt"),
+        accuracies=beside[:, :3],
+        speed_mps=gps.numbers("Spd"),
+        course_deg=gps.numbers("GCrs"),
     )
     return fixes, gps_time.fit(had_us, fixed_us)
 

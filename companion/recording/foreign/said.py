@@ -78,18 +78,20 @@ def frames(log: Onboard, link: str, source: Source, latency_s: float) -> Iterato
     timeline = RepairedStamps(times_ns[:3].tolist())
     first_ns = timeline.t_ns + latency_ns
     for reason, count in log.lost.items():
-        yield Rejection(first_ns, link, reason, count)
+        yield Rejection(t_ns=first_ns, source=link, reason=reason, count=count)
     tables = [(kind.msgid, kind.payloads.tobytes(), kind.payloads.itemsize) for kind in kinds]
     seq = 0
     for (kind, row), t_ns in _rows(order, times_ns):
         off_ns = timeline.place(t_ns)
         if off_ns is not None:
             detail = f"{abs(off_ns) / 1e9:.6g} s {'back' if off_ns < 0 else 'ahead'}, clamped"
-            yield Rejection(timeline.t_ns + latency_ns, link, Reason.BAD_STAMP, detail=detail)
+            yield Rejection(
+                t_ns=timeline.t_ns + latency_ns, source=link, reason=Reason.BAD_STAMP, detail=detail
+            )
         msgid, table, size = tables[kind]
         raw = pack(Outgoing(source, msgid, table[row * size : (row + 1) * size]), seq)
         seq = (seq + 1) & 0xFF
-        yield Frame(timeline.t_ns + latency_ns, link, source, msgid, raw)
+        yield Frame(t_ns=timeline.t_ns + latency_ns, link=link, source=source, msgid=msgid, raw=raw)
 
 
 def _rows(order: IntArray, times_ns: IntArray) -> Iterator[tuple[tuple[int, int], int]]:
@@ -121,17 +123,27 @@ def _lives(boot_us: IntArray) -> IntArray:
 def _kinds(log: Onboard) -> list[_Said]:
     said = []
     if log.attitudes is not None:
-        said.append(_Said(3, 30, log.attitudes.boot_us, _attitudes(log.attitudes)))
+        said.append(
+            _Said(
+                rank=3, msgid=30, boot_us=log.attitudes.boot_us, payloads=_attitudes(log.attitudes)
+            )
+        )
     if log.positions is not None:
-        said.append(_Said(4, 33, log.positions.boot_us, _positions(log.positions)))
+        said.append(
+            _Said(
+                rank=4, msgid=33, boot_us=log.positions.boot_us, payloads=_positions(log.positions)
+            )
+        )
     if log.fixes is not None:
-        said.append(_Said(2, 24, log.fixes.boot_us, _fixes(log.fixes)))
+        said.append(_Said(rank=2, msgid=24, boot_us=log.fixes.boot_us, payloads=_fixes(log.fixes)))
     if log.truth is not None:
-        said.append(_Said(5, 108, log.truth.boot_us, _truths(log.truth)))
+        said.append(
+            _Said(rank=5, msgid=108, boot_us=log.truth.boot_us, payloads=_truths(log.truth))
+        )
     seconds = _seconds([each.boot_us for each in said])
-    said.append(_Said(0, 0, seconds, _heartbeats(log, seconds)))
+    said.append(_Said(rank=0, msgid=0, boot_us=seconds, payloads=_heartbeats(log, seconds)))
     if log.clock is not None:
-        said.append(_Said(1, 2, seconds, _system_times(log, seconds)))
+        said.append(_Said(rank=1, msgid=2, boot_us=seconds, payloads=_system_times(log, seconds)))
     return said
 
 

@@ -104,7 +104,7 @@ def opened(logs: Sequence[tuple[Path, str]]) -> list[Vehicle]:
             if sysid is None:
                 raise LogError(f"{path}: there are no more system ids")
         given.add(sysid)
-        found.append(Vehicle(path, kind, Source(sysid, log.compid), log))
+        found.append(Vehicle(path=path, kind=kind, source=Source(sysid, log.compid), log=log))
     if len(found) > 1:
         _require_one_flight(found)
     return found

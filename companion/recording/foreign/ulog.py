@@ -57,7 +57,7 @@ class Topic(NamedTuple):
     samples: Thinned[int]
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Walked:
     """What a log holds.
 
@@ -244,7 +244,11 @@ class _Walker:
         layout = _layout(fields) if name in self._wanted else None
         self._found.refused += name in self._wanted and layout is None
         at = array("q")
-        topic = None if layout is None else Topic(name, instance, layout, at, Thinned(at))
+        topic = (
+            None
+            if layout is None
+            else Topic(name=name, instance=instance, fields=layout, at=at, samples=Thinned(at))
+        )
         self._topics[number] = topic
 
     def _size(self, name: str, depth: int) -> tuple[int, int]:

@@ -29,7 +29,7 @@ class Kind(StrEnum):
     TRUTH = "truth"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Column:
     """A column of a table.
 

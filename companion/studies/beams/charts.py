@@ -24,7 +24,7 @@ RANGE_DB: Final = 35.0
 """Range of gains drawn below the largest; lower ones are drawn at the edge."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Kind:
     """A gain that is drawn.
 
@@ -41,9 +41,9 @@ class Kind:
 
 
 KINDS: Final = (
-    Kind("predicted", 2, lambda worth: worth.gain_db),
-    Kind("true", 1, lambda worth: worth.true_gain_db, True),
-    Kind("guaranteed", 0, lambda worth: worth.guaranteed_gain_db),
+    Kind(name="predicted", line=2, value=lambda worth: worth.gain_db),
+    Kind(name="true", line=1, value=lambda worth: worth.true_gain_db, unknown=True),
+    Kind(name="guaranteed", line=0, value=lambda worth: worth.guaranteed_gain_db),
 )
 
 

@@ -44,7 +44,7 @@ TOLD_EVERY: Final = 20
 """Looks between two reports of progress."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class BeamStudy:
     """What is asked of the study.
 
@@ -87,7 +87,7 @@ class BeamStudy:
         return shlex.join([*words, "--hz", f"{self.hz:g}"])
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Watched:
     """One flight: every UAV at every look, in order of time; the array and the kind of truth."""
 
@@ -147,11 +147,11 @@ class Sight:
         sinr_db = link_budget.predicted_sinr_db(
             array,
             towards,
-            np.array([beam.range_m for beam in beam_set.beams]),
-            sent,
-            groups,
-            self.equipment.budget,
-            self.equipment.uav_antennas,
+            ranges_m=np.array([beam.range_m for beam in beam_set.beams]),
+            sent=sent,
+            groups=groups,
+            budget=self.equipment.budget,
+            uav_antennas=self.equipment.uav_antennas,
         )
         efficiency = link_budget.spectral_efficiency(10 ** (sinr_db / 10), beam_set.groups)
         return {
@@ -207,19 +207,19 @@ def look(seen: Sight, update: Update, truth: ArrayTruth | None, t_s: float) -> l
     """Samples of every tracked UAV at one update, ``t_s`` seconds into the log."""
     pipeline, carrier = seen.pipeline, update.carrier
     if carrier is None:
-        return [Sample(t_s, track.uav) for track in update.tracks]
+        return [Sample(t_s=t_s, uav=track.uav) for track in update.tracks]
     truly = _true_directions(update.tracks, carrier, pipeline, truth)
     as_set = update.beams
     sharp = as_set
     if pipeline.precoder.widen is not Widen.NO:
         sharp = aim(
             update.t_ns,
-            as_set.valid_at_ns,
-            update.tracks,
-            carrier,
-            pipeline.array,
-            replace(pipeline.precoder, widen=Widen.NO),
-            pipeline.coverage,
+            valid_at_ns=as_set.valid_at_ns,
+            tracks=update.tracks,
+            carrier=carrier,
+            array=pipeline.array,
+            precoder=replace(pipeline.precoder, widen=Widen.NO),
+            coverage=pipeline.coverage,
         )
     worths = [seen.worths(beam_set, carrier, truly) for beam_set in (as_set, sharp)]
     beams = {
@@ -230,7 +230,7 @@ def look(seen: Sight, update: Update, truth: ArrayTruth | None, t_s: float) -> l
     samples = []
     for track in update.tracks:
         if track.uav not in beams:
-            samples.append(Sample(t_s, track.uav))
+            samples.append(Sample(t_s=t_s, uav=track.uav))
             continue
         bound_rad, towards = beams[track.uav]
         true = truly.get(track.uav)
@@ -238,7 +238,17 @@ def look(seen: Sight, update: Update, truth: ArrayTruth | None, t_s: float) -> l
         off_rad = None if true is None else _angle_rad(towards, true)
         set_worth, sharp_worth = (worth.get(track.uav) for worth in worths)
         samples.append(
-            Sample(t_s, track.uav, bound_rad, off_rad, best, share, missed, set_worth, sharp_worth)
+            Sample(
+                t_s=t_s,
+                uav=track.uav,
+                pointing_bound_rad=bound_rad,
+                off_rad=off_rad,
+                codebook_best=best,
+                sweep_share=share,
+                missed=missed,
+                as_set=set_worth,
+                sharp=sharp_worth,
+            )
         )
     return samples
 
@@ -314,14 +324,14 @@ def watch(
         raise UserError(f"{name}: no UAV gets a beam in it, as far as its carrier is known")
     array = pipeline.array
     return Watched(
-        name,
-        str(pipeline.center.place),
-        f"{array.size} elements ({array.kind}) at {settings.array.frequency_hz * 1e-9:g} GHz",
-        None if seen.codebook is None else seen.codebook.size,
-        None if truth is None else truth.kind,
-        pipeline.precoder.widen is not Widen.NO,
-        looks,
-        tuple(samples),
+        log=name,
+        center=str(pipeline.center.place),
+        array=f"{array.size} elements ({array.kind}) at {settings.array.frequency_hz * 1e-9:g} GHz",
+        codebook_beams=None if seen.codebook is None else seen.codebook.size,
+        truth=None if truth is None else truth.kind,
+        widen=pipeline.precoder.widen is not Widen.NO,
+        looks=looks,
+        samples=tuple(samples),
     )
 
 

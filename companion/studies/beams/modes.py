@@ -48,7 +48,7 @@ JUMP_DB: Final = 1.0
 Row = dict[str, Any]
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Way:
     """One way of making beams, with what has been seen of it."""
 
@@ -159,9 +159,9 @@ def compare(
     """A row for each way of making beams, over one link."""
     pipeline = Pipeline(settings)
     heard, observed, local = events(logs, link, settings)
-    ways = [_Way(str(widen), widen) for widen in Widen]
+    ways = [_Way(name=str(widen), widen=widen) for widen in Widen]
     rivals = {name: _Rival(name, observed, settings) for name in RIVALS}
-    theirs = {name: _Way(f"{name}, sharp", Widen.NO) for name in RIVALS}
+    theirs = {name: _Way(name=f"{name}, sharp", widen=Widen.NO) for name in RIVALS}
     truth: ArrayTruth | None = None
     flight, sought, ticks = vehicles.named(logs), False, 0
     for event in heard:
@@ -176,11 +176,11 @@ def compare(
         ticks += 1
         looks = ticks % LOOK_EVERY == 0
         for way in ways:
-            _make(pipeline, update, update.tracks, way, truth, looks)
+            _make(pipeline, update, update.tracks, way=way, truth=truth, looks=looks)
         for name, rival in rivals.items():
             if looks:
                 tracks = rival.tracks(update, local, pipeline)
-                _make(pipeline, update, tracks, theirs[name], truth, looks)
+                _make(pipeline, update, tracks, way=theirs[name], truth=truth, looks=looks)
         if looks and ticks % (25 * LOOK_EVERY) == 0:
             progress(f"{flight}, {link.name}: {ticks} ticks")
     head = {"log": flight, "link": link.name, "truth": None if truth is None else truth.kind}
@@ -191,6 +191,7 @@ def _make(
     pipeline: Pipeline,
     update: Update,
     tracks: tuple[Track, ...],
+    *,
     way: _Way,
     truth: ArrayTruth | None,
     looks: bool,
@@ -199,13 +200,13 @@ def _make(
     assert update.carrier is not None
     made = aim(
         update.t_ns,
-        update.beams.valid_at_ns,
-        tracks,
-        update.carrier,
-        pipeline.array,
-        replace(pipeline.precoder, widen=way.widen),
-        pipeline.coverage,
-        way.state,
+        valid_at_ns=update.beams.valid_at_ns,
+        tracks=tracks,
+        carrier=update.carrier,
+        array=pipeline.array,
+        precoder=replace(pipeline.precoder, widen=way.widen),
+        coverage=pipeline.coverage,
+        before=way.state,
     )
     way.state = steady.after(way.state, made)
     steering = steering_matrix(pipeline.array, directions(made))
@@ -241,7 +242,13 @@ def _judge(pipeline: Pipeline, made: BeamSet, true: dict[str, FloatArray], way: 
     sent = link_budget.transmitted(made.weights, how.budget.tx_power_w, groups, made.normalisation)
     ranges_m = np.array([beam.range_m for beam in made.beams])
     sinr_db = link_budget.predicted_sinr_db(
-        array, there, ranges_m, sent, groups, how.budget, how.uav_antennas
+        array,
+        there,
+        ranges_m=ranges_m,
+        sent=sent,
+        groups=groups,
+        budget=how.budget,
+        uav_antennas=how.uav_antennas,
     )
     rates = link_budget.spectral_efficiency(10 ** (sinr_db / 10), made.groups)
     towards_true = np.einsum("mn,mn->n", steering_matrix(array, there), made.weights)

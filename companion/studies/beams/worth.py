@@ -16,7 +16,7 @@ SHARP: Final = "sharp_"
 """Prefix of the keys for beams with ``[beams] widen = false``; others are for those as set."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Worth:
     """One beam at one time; gains are of the array in dB, element pattern included.
 
@@ -50,7 +50,7 @@ class Worth:
         return sure is not None and true is not None and sure > true + ROUNDING_DB
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Sample:
     """One tracked UAV at one look. Without a beam all but the first two fields are None.
 

@@ -27,7 +27,7 @@ _WIDEST_SLOPE: Final = 1.0
 """Beams by sine, in codebooks: where the search begins, and at most."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Geometry:
     """The array's place in normalised coordinates, and what else few numbers say.
 
@@ -78,7 +78,16 @@ def fit(
     """The geometry by the samples that may be learned from; a simple one has no height or lag."""
     height = 0.0 if simple else _HEIGHT
     begin = [
-        Geometry(x, y, 0.0, float(np.arctan2(0.5 - y, 0.5 - x)), beams / 2, slope, height, 0.0)
+        Geometry(
+            x=x,
+            y=y,
+            stretch=0.0,
+            yaw=float(np.arctan2(0.5 - y, 0.5 - x)),
+            middle=beams / 2,
+            slope=slope,
+            height=height,
+            lag=0.0,
+        )
         for x, y in _STARTS
         for slope in (_SLOPE * beams, -_SLOPE * beams)
     ]
@@ -115,7 +124,16 @@ def _fitted(
 
     def made(values: FloatArray) -> Geometry:
         x, y, stretch, yaw, middle, slope, *height = (float(value) for value in values)
-        return Geometry(x, y, stretch, yaw, middle, slope, sum(height), begin.lag)
+        return Geometry(
+            x=x,
+            y=y,
+            stretch=stretch,
+            yaw=yaw,
+            middle=middle,
+            slope=slope,
+            height=sum(height),
+            lag=begin.lag,
+        )
 
     def off(values: FloatArray) -> FloatArray:
         found: FloatArray = made(values)._at(there) - beam[learned]

@@ -11,7 +11,7 @@ _STAYED: Final = 0.1
 """What a sample counts that is where the one before was, to one that is a mean step farther."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Samples:
     """What was measured, in order of time.
 

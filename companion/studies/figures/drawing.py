@@ -10,7 +10,7 @@ Anchor = Literal["start", "middle", "end"]
 INK: Final = "#111111"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Line:
     """Points (N, 2) joined in order.
 
@@ -23,7 +23,7 @@ class Line:
     dash: tuple[float, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Words:
     """Text whose baseline begins, has its middle or ends at x, y, by ``anchor``."""
 
@@ -35,7 +35,7 @@ class Words:
     colour: str = INK
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Drawing:
     """Lines, and words over them, on white; ``title`` is read out to those who cannot see it."""
 

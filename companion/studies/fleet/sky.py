@@ -15,7 +15,7 @@ GAIN_DB: Final = 18.0
 NEAREST_M: Final = 50.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Sky:
     """What is flown around which nodes, and over which network.
 
@@ -74,7 +74,9 @@ class Flight:
         for i in np.flatnonzero(ranges_m < self._reach_m).tolist():
             loss_db = 20 * math.log10(max(float(ranges_m[i]), NEAREST_M) / 1000)
             sinr_db = round((SNR_AT_1_KM_DB - loss_db) / STEP_DB) * STEP_DB
-            found[self.uavs[i]] = Offer(self.uavs[i], GAIN_DB, GAIN_DB, sinr_db, 0.1)
+            found[self.uavs[i]] = Offer(
+                uav=self.uavs[i], sure_db=GAIN_DB, likely_db=GAIN_DB, sinr_db=sinr_db, heard_s=0.1
+            )
         return found
 
     def report(self, uav: str, boot_ms: int) -> bytes:

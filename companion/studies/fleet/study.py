@@ -19,7 +19,7 @@ AFTER_S = 4.0
 HALF = 0.5
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Grown:
     """A fleet of one size.
 
@@ -51,7 +51,7 @@ class Grown:
     heal_s: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Asked:
     """What is to be studied: sizes as (nodes, UAVs), over how much virtual time, on which links.
 
@@ -75,9 +75,9 @@ def run(
         progress(f"{nodes} nodes, {uavs} UAVs")
         sampled = min(asked.sampled, uavs)
         sky = Sky(
-            nodes,
-            uavs,
-            asked.spacing_m,
+            nodes=nodes,
+            uavs=uavs,
+            spacing_m=asked.spacing_m,
             sampled=sampled,
             delay_s=asked.delay_s,
             loss=asked.loss,
@@ -107,19 +107,19 @@ def _grown(world: World, seconds: float) -> Grown:
     served = steady.served + steady.twice + steady.unserved or 1
     unserved = parted.served + parted.twice + parted.unserved or 1
     return Grown(
-        sky.nodes,
-        sky.uavs,
-        steady.served / served,
-        steady.twice / served,
-        steady.unserved / served,
-        60 * steady.handovers / seconds,
-        told,
-        8e-3 * received / seconds / sky.nodes,
-        cpu_s / seconds / sky.nodes,
-        takeover_s,
-        orphans,
-        parted.unserved / unserved,
-        _healed_s(world),
+        nodes=sky.nodes,
+        uavs=sky.uavs,
+        served=steady.served / served,
+        twice=steady.twice / served,
+        none=steady.unserved / served,
+        handovers_per_min=60 * steady.handovers / seconds,
+        told_kbps=told,
+        link_kbps=8e-3 * received / seconds / sky.nodes,
+        cpu_share=cpu_s / seconds / sky.nodes,
+        takeover_s=takeover_s,
+        orphans=orphans,
+        parted_none=parted.unserved / unserved,
+        heal_s=_healed_s(world),
     )
 
 

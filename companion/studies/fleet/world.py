@@ -37,7 +37,7 @@ HEADER_BYTES: Final = 110
 """Ethernet, IP and TCP heads, and Zenoh's own, of a sample on its way: measured on loopback."""
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Counted:
     """What was counted; the UAVs' counts are of UAVs that some node could serve, at ticks.
 
@@ -80,7 +80,7 @@ class World:
         self._flight = Flight(sky, self._random)
         self._names = self._flight.names
         self.members = {
-            name: Member(name, settings, 128, START_NS + number)
+            name: Member(name=name, settings=settings, elements=128, started_ns=START_NS + number)
             for number, name in enumerate(self._names)
         }
         self._clock_ns = self._random.integers(-3, 3, sky.nodes) * SECOND_NS
@@ -245,7 +245,13 @@ class World:
 
     def _hear(self, name: str, raw: bytes, uav: str) -> None:
         if name not in self.dead:
-            frame = Frame(self._local_ns(name), "udp", Source.parse(uav), REPORT, raw)
+            frame = Frame(
+                t_ns=self._local_ns(name),
+                link="udp",
+                source=Source.parse(uav),
+                msgid=REPORT,
+                raw=raw,
+            )
             self._timed(name, partial(self._heard, name, frame), of_frames=True)
 
     def _heard(self, name: str, frame: Frame) -> None:

@@ -26,7 +26,7 @@ SPEEDS_MPS: Final = (5.0, 20.0, 60.0)
 FEEDTHROUGHS_S: Final = (-0.2, 0.0, 0.2, 0.5)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Maps:
     """The maps of the study.
 
@@ -62,7 +62,14 @@ def maps() -> Maps:
         peak_s[a] = np.array(
             [closed_form.peak_gain(dt_s, d, g) for d, g in zip(feedthrough_s, gains, strict=True)]
         )
-    return Maps(alpha, feedthrough_s, dt_s, limit_s, gamma_s, peak_s)
+    return Maps(
+        alpha=alpha,
+        feedthrough_s=feedthrough_s,
+        dt_s=dt_s,
+        limit_s=limit_s,
+        gamma_s=gamma_s,
+        peak_gain_s=peak_s,
+    )
 
 
 def study(progress: Progress) -> tuple[dict[str, Any], Maps]:

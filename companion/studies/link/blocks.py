@@ -26,7 +26,7 @@ class Estimation(StrEnum):
     IDEAL = "ideal"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Sent:
     """B blocks to each of N UAVs.
 
@@ -55,7 +55,13 @@ def send(users: int, blocks: int, rng: np.random.Generator) -> Sent:
     coded = coding.encode(bits)
     symbols = modulation.modulate(coded)
     pilots = ofdm.PILOT_SIGNS[:users, np.newaxis]
-    return Sent(bits, coded, symbols, pilots, ofdm.samples(ofdm.carriers(symbols, pilots)))
+    return Sent(
+        bits=bits,
+        coded=coded,
+        symbols=symbols,
+        pilots=pilots,
+        samples=ofdm.samples(ofdm.carriers(symbols, pilots)),
+    )
 
 
 def through(taps: ComplexArray, samples: ComplexArray) -> ComplexArray:

@@ -80,7 +80,14 @@ def draw(
     towards_node = steering_matrix(uav_array, opposite)
 
     def rows(given: SalehValenzuela) -> ComplexArray:
-        channels = channel.draw(given, array, uav_array, truly, opposite, rng)
+        channels = channel.draw(
+            given,
+            array,
+            uav_array=uav_array,
+            directions_at_node=truly,
+            directions_at_uav=opposite,
+            rng=rng,
+        )
         return channel.combined_rows(channels, towards_node)
 
     scattered = 10 ** (-scattering.rician_k_db / 10)

@@ -61,7 +61,7 @@ def snrs(first_db: float, last_db: float, step_db: float) -> tuple[float, ...]:
     return tuple(round(first_db + i * step_db, 9) for i in range(count))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LinkStudy:
     """What is asked of the study.
 
@@ -127,7 +127,9 @@ Counts = dict[tuple[str, float], list[Counted]]
 def uav_array(settings: Settings) -> Array:
     """The UAVs' own antennas: a line, half a wavelength apart, at the array's frequency."""
     radio, frequency_hz = settings.radio, settings.array.frequency_hz
-    return geometry.uniform_linear(radio.uav_antennas, frequency_hz, 0.5, np.eye(3))
+    return geometry.uniform_linear(
+        radio.uav_antennas, frequency_hz, spacing_wavelengths=0.5, array_from_body=np.eye(3)
+    )
 
 
 def simulate(

@@ -58,7 +58,7 @@ class Instant:
     towards: dict[Positions, FloatArray]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
     """The instants that are studied, and the array.
 
@@ -149,7 +149,9 @@ def circles(
         f" {RATE_RADPS:g} rad/s, a report each {reports.interval_s:g} s,"
         f" {reports.latency_s:g} s late, beams for {settings.beams.actuation_delay_s:g} s ahead"
     )
-    return Scenario(description, array, found, 1 - instants / tried)
+    return Scenario(
+        description=description, array=array, instants=found, unresolved_share=1 - instants / tried
+    )
 
 
 def _resolved_times(
@@ -217,7 +219,13 @@ def _report(circle: Circle, made_s: float, latency_s: float) -> Observed:
         np.round(one / REPORTED_M) * REPORTED_M for one in circle.at(made_s)
     )
     made_ns = round(made_s * 1e9)
-    return Observed(made_ns + round(latency_s * 1e9), made_ns, made_ns, position_m, velocity_mps)
+    return Observed(
+        arrival_ns=made_ns + round(latency_s * 1e9),
+        sent_ns=made_ns,
+        sender_ns=made_ns,
+        position_ned_m=position_m,
+        velocity_ned_mps=velocity_mps,
+    )
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
@@ -255,10 +263,10 @@ def from_logs(
         raise UserError(f"{name}: at no time is there a UAV to serve whose true place is known")
     chosen = np.sort(rng.choice(len(resolved), min(instants, len(resolved)), replace=False))
     return Scenario(
-        f"{name}: array on {pipeline.center.place}",
-        array,
-        tuple(resolved[i] for i in chosen),
-        1 - len(resolved) / len(looks),
+        description=f"{name}: array on {pipeline.center.place}",
+        array=array,
+        instants=tuple(resolved[i] for i in chosen),
+        unresolved_share=1 - len(resolved) / len(looks),
     )
 
 

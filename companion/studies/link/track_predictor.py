@@ -26,29 +26,50 @@ class TrackPredictor:
         velocity = report.velocity_ned_mps
         self._tracker.accept(
             Fix(
-                _UAV,
-                report.sender_ns,
-                report.sent_ns,
-                report.arrival_ns,
-                vector(report.position_ned_m),
-                None if velocity is None else vector(velocity),
-                errors,
-                _REPORT,
+                uav=_UAV,
+                sender_ns=report.sender_ns,
+                t_ns=report.sent_ns,
+                arrival_ns=report.arrival_ns,
+                position_ned_m=vector(report.position_ned_m),
+                velocity_ned_mps=None if velocity is None else vector(velocity),
+                noise=errors,
+                report=_REPORT,
             )
         )
 
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
         """The track at that time, with its bound."""
-        at = SenderTime(at_ns, at_ns - self._offset_ns, self._clock_bound_s, self._clock_bound_s)
+        at = SenderTime(
+            node_ns=at_ns,
+            sender_ns=at_ns - self._offset_ns,
+            before_s=self._clock_bound_s,
+            after_s=self._clock_bound_s,
+        )
         track = self._tracker.track(_UAV, now_ns, at)
         if track is None:
             return None
-        return Predicted(track.position_ned_m, track.velocity_ned_mps, track.bound_m)
+        return Predicted(
+            position_ned_m=track.position_ned_m,
+            velocity_ned_mps=track.velocity_ned_mps,
+            bound_m=track.bound_m,
+        )
 
 
 _UAV: Final = "1:1"
 _REPORT: Final = Report(
-    0, "study", _UAV, Source(1, 1), 0.0, 0.0, 0.0, AltitudeDatum.MSL, None, None, None, None,
-    None, None,
-)  # fmt: skip
+    t_ns=0,
+    link="study",
+    uav=_UAV,
+    source=Source(1, 1),
+    lat_deg=0.0,
+    lon_deg=0.0,
+    alt_m=0.0,
+    alt_datum=AltitudeDatum.MSL,
+    relative_alt_m=None,
+    velocity_ne_mps=None,
+    velocity_down_mps=None,
+    heading_deg=None,
+    boot_ms=None,
+    tslc_s=None,
+)
 """Placeholder for the message of a fix, which tracking does not read."""

@@ -23,7 +23,7 @@ from companion.values import FloatArray
 GUST_RATE_RATIO: Final = 10.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PaperScenario:
     """The scenario's numbers.
 
@@ -49,7 +49,7 @@ class PaperScenario:
     steps: int = 170
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Flight:
     """K steps of N UAVs; coordinates are north and east.
 
@@ -75,7 +75,7 @@ class Flight:
         return float(stacked(self.input_mps).max())
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Tracked:
     """The observer's answers with one gain.
 
@@ -109,7 +109,12 @@ def fly(scenario: PaperScenario) -> Flight:
     start = radii[:, np.newaxis] * np.stack([np.sin(phases), np.cos(phases)], axis=-1)
     moved = scenario.dt_s * np.cumsum(inputs, axis=0)
     positions = start + np.concatenate([np.zeros((1, len(radii), 2)), moved])
-    return Flight(scenario, positions, inputs, positions[:-1] + scenario.feedthrough_s * inputs)
+    return Flight(
+        scenario=scenario,
+        position_m=positions,
+        input_mps=inputs,
+        report_m=positions[:-1] + scenario.feedthrough_s * inputs,
+    )
 
 
 def _heading(angle_rad: FloatArray) -> FloatArray:
@@ -127,12 +132,23 @@ def track(flight: Flight, gain: float, start_m: FloatArray | None = None) -> Tra
     estimate = flight.position_m[0] if start_m is None else start_m
     estimates, plain, full = [estimate], [], []
     for report in flight.report_m:
-        step = published.step(estimate, report, scenario.dt_s, scenario.feedthrough_s, gain)
+        step = published.step(
+            estimate,
+            report_m=report,
+            dt_s=scenario.dt_s,
+            feedthrough_s=scenario.feedthrough_s,
+            gain=gain,
+        )
         estimate = step.estimate_m
         estimates.append(estimate)
         plain.append(step.unknown_input_b0_mps)
         full.append(step.unknown_input_bd_mps)
-    return Tracked(gain, np.array(estimates), np.array(plain), np.array(full))
+    return Tracked(
+        gain=gain,
+        estimate_m=np.array(estimates),
+        input_b0_mps=np.array(plain),
+        input_bd_mps=np.array(full),
+    )
 
 
 def running_bounds(flight: Flight, gain: float) -> FloatArray:
@@ -207,7 +223,9 @@ def adversarial_input_error(scenario: PaperScenario, gain: float, steps: int = 4
     b, d = scenario.dt_s, scenario.feedthrough_s
     place, estimate, miss = np.zeros(1), np.zeros(1), 0.0
     for sign in [1.0] * (steps - 1) + [-1.0]:
-        step = published.step(estimate, place + d * sign, b, d, gain)
+        step = published.step(
+            estimate, report_m=place + d * sign, dt_s=b, feedthrough_s=d, gain=gain
+        )
         miss = max(miss, abs(float(step.unknown_input_b0_mps[0]) - sign))
         place, estimate = place + b * sign, step.estimate_m
     return miss

@@ -49,7 +49,7 @@ OPTIMUM: Final = "optimum"
 Progress = Callable[[str], None]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Material:
     """Material of the figures.
 
@@ -85,7 +85,7 @@ def study(seed: int, progress: Progress) -> tuple[dict[str, Any], Material]:
     compared_before = _rates(flight, tracked)
     aimed = {name: one.estimate_m for name, one in tracked.items()}
     rates = np.array(BLOCKAGES_PER_MINUTE)
-    compared = link.under_blockage(flight, aimed, rates, DRAWS, rng, progress)
+    compared = link.under_blockage(flight, aimed, rates, draws=DRAWS, rng=rng, progress=progress)
     progress("through MAVLink")
     agreement = mavlink.compare(flight)
     answer = {
@@ -107,12 +107,12 @@ def study(seed: int, progress: Progress) -> tuple[dict[str, Any], Material]:
         "paper": shown.told(),
     }
     material = Material(
-        flight,
-        tracked,
-        alphas,
-        compared_before,
-        {size: link.line(size) for size in SIZES},
-        compared,
+        flight=flight,
+        tracked=tracked,
+        alphas=alphas,
+        efficiency=compared_before,
+        arrays={size: link.line(size) for size in SIZES},
+        compared=compared,
     )
     return answer, material
 
@@ -196,9 +196,9 @@ def _designs(flight: Flight) -> tuple[list[dict[str, Any]], dict[float, Tracked]
     rows: list[dict[str, Any]] = []
     tracked = {}
     for alpha in ALPHAS:
-        least = lmi.solve(one, held, one, reported, one, alpha)
+        least = lmi.solve(one, b=held, c=one, d=reported, h=one, alpha=alpha)
         for mu_max, gain in PAPER_LEVELS:
-            feasible = lmi.solve(one, held, one, reported, one, alpha, mu_max=mu_max)
+            feasible = lmi.solve(one, b=held, c=one, d=reported, h=one, alpha=alpha, mu_max=mu_max)
             solved = float(feasible.gain[0, 0])
             rows.append(
                 {

@@ -35,7 +35,9 @@ EVERY: Final = 5
 
 def line(elements: int) -> Array:
     """The published array: half a wavelength apart, from west to east, boresight north."""
-    return uniform_linear(elements, FREQUENCY_HZ, 0.5, np.eye(3))
+    return uniform_linear(
+        elements, FREQUENCY_HZ, spacing_wavelengths=0.5, array_from_body=np.eye(3)
+    )
 
 
 def directions(position_m: FloatArray) -> FloatArray:
@@ -113,6 +115,7 @@ def under_blockage(
     flight: Flight,
     aimed_m: dict[str, FloatArray],
     blockages_per_minute: FloatArray,
+    *,
     draws: int,
     rng: np.random.Generator,
     progress: Callable[[str], None],
@@ -162,8 +165,10 @@ def _echo_efficiency(
     pointed, served = [], []
     for at, (there, places) in enumerate(zip(directions(true_m), true_m, strict=True)):
         ranges_m = np.linalg.norm(places, axis=1)
-        snr = probing.echo_snr(PROBING, BUDGET, array, there, ranges_m, lost_db[at])
-        state = probing.step(PROBING, array, state, there, snr, rng)
+        snr = probing.echo_snr(
+            PROBING, BUDGET, array, directions=there, ranges_m=ranges_m, attenuation_db=lost_db[at]
+        )
+        state = probing.step(PROBING, array, state, directions=there, snr=snr, rng=rng)
         if at % EVERY == 0:
             pointed.append(state.pointed)
             served.append(state.served)

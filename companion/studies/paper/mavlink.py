@@ -36,7 +36,7 @@ Source: https://mavlink.io/en/messages/common.html#GLOBAL_POSITION_INT.
 """
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Agreement:
     """Largest difference between the service's answers and the library's, over all UAVs and steps.
 
@@ -132,7 +132,13 @@ def compare(flight: Flight) -> Agreement:
             off_deg = float(np.degrees(np.abs(np.arctan2(np.sin(off), np.cos(off)))))
             direction_deg = max(direction_deg, off_deg)
     refused = 4 * len(flight.report_m) - reports
-    return Agreement(reports, refused, estimate_m, direction_deg, settled_m)
+    return Agreement(
+        reports=reports,
+        rejections=refused,
+        estimate_m=estimate_m,
+        direction_deg=direction_deg,
+        settled_m=settled_m,
+    )
 
 
 def _expected(flight: Flight) -> FloatArray:
@@ -146,7 +152,12 @@ def _expected(flight: Flight) -> FloatArray:
     estimates = [flight.report_m[0]]
     for report, inputs in zip(flight.report_m, flight.input_mps, strict=True):
         led = report + lead_s * inputs
-        step = published.step(estimates[-1], led, scenario.dt_s, scenario.feedthrough_s + lead_s)
+        step = published.step(
+            estimates[-1],
+            report_m=led,
+            dt_s=scenario.dt_s,
+            feedthrough_s=scenario.feedthrough_s + lead_s,
+        )
         estimates.append(step.estimate_m)
     return np.array(estimates)
 

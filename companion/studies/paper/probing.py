@@ -35,7 +35,7 @@ It measures nothing there, as a line does across its length, and none of its bea
 """
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class EchoProbing:
     """Settings of the baseline.
 
@@ -99,7 +99,7 @@ class EchoProbing:
         return math.ceil(self.sweep_beams * self.dwell_s / self.interval_s - 1e-9)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class EchoState:
     """The baseline after one interval, N UAVs.
 
@@ -125,13 +125,22 @@ def started(directions: FloatArray) -> EchoState:
     """The state of beams that have just found their UAVs at unit directions (N, 3)."""
     users = len(directions)
     yes, none = np.ones(users, dtype=bool), np.zeros(users, dtype=np.int64)
-    return EchoState(directions, yes, yes, directions, np.zeros((users, 3)), none, none)
+    return EchoState(
+        pointed=directions,
+        served=yes,
+        heard=yes,
+        estimate=directions,
+        turn_radps=np.zeros((users, 3)),
+        silent=none,
+        sweep_left=none,
+    )
 
 
 def echo_snr(
     settings: EchoProbing,
     budget: LinkBudget,
     array: Array,
+    *,
     directions: FloatArray,
     ranges_m: FloatArray,
     attenuation_db: float | FloatArray = 0.0,
@@ -163,6 +172,7 @@ def step(
     settings: EchoProbing,
     array: Array,
     state: EchoState,
+    *,
     directions: FloatArray,
     snr: FloatArray,
     rng: np.random.Generator,

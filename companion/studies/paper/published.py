@@ -41,6 +41,7 @@ class Step:
 
 def step(
     estimate_m: FloatArray,
+    *,
     report_m: FloatArray,
     dt_s: float,
     feedthrough_s: float,

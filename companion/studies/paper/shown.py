@@ -18,7 +18,7 @@ class Likeness(StrEnum):
     UNTOLD = "cannot be told"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Figure:
     """A figure of the paper: its number, what it shows, and how ours stands to it and why."""
 
@@ -38,61 +38,74 @@ class Guess:
 
 
 FIGURES: Final = (
-    Figure(1, "the parts and how they are joined", Likeness.UNTOLD, "a drawing without numbers"),
     Figure(
-        2,
-        "actual and predicted paths, and coordinates of UAV 1, α = 0.5, at the three levels",
-        Likeness.SAME,
-        "same circles, gust, gains and interval; where on its circle each begins, and over which"
-        " span it is drawn, is not said. Ours shows the outermost UAV's coordinates",
+        number=1,
+        shows="the parts and how they are joined",
+        likeness=Likeness.UNTOLD,
+        why="a drawing without numbers",
     ),
     Figure(
-        3,
-        "unknown input of UAV 1, actual and estimated, and the error, α = 0.5, three levels",
-        Likeness.SAME,
-        "same estimator (G = [B; 0]) and gains; the gust is read as printed, d/ΔT, which decides"
-        " the size of everything in it",
+        number=2,
+        shows="actual and predicted paths, and coordinates of UAV 1, α = 0.5, at the three levels",
+        likeness=Likeness.SAME,
+        why="same circles, gust, gains and interval; where on its circle each begins, and over"
+        " which span it is drawn, is not said. Ours shows the outermost UAV's coordinates",
     ),
     Figure(
-        4,
-        "the same at α = 0.5, 0.1 and 0.01, with one level for all",
-        Likeness.DIFFERS,
-        "same α and level (μ ≤ 0.25 s²; the caption has μ = √γ for γ = √μ), but the gains that"
+        number=3,
+        shows="unknown input of UAV 1, actual and estimated, and the error, α = 0.5, three levels",
+        likeness=Likeness.SAME,
+        why="same estimator (G = [B; 0]) and gains; the gust is read as printed, d/ΔT, which"
+        " decides the size of everything in it",
+    ),
+    Figure(
+        number=4,
+        shows="the same at α = 0.5, 0.1 and 0.01, with one level for all",
+        likeness=Likeness.DIFFERS,
+        why="same α and level (μ ≤ 0.25 s²; the caption has μ = √γ for γ = √μ), but the gains that"
         " the paper's solver chose there are not given: ours are another solver's",
     ),
     Figure(
-        5,
-        "spectral efficiency of each UAV over time",
-        Likeness.DIFFERS,
-        "power, noise, path loss and how efficiency follows from the SINR are not given, so the"
+        number=5,
+        shows="spectral efficiency of each UAV over time",
+        likeness=Likeness.DIFFERS,
+        why="power, noise, path loss and how efficiency follows from the SINR are not given, so the"
         " scale is ours. Ours is the mean of the UAVs, with weights that are regularised at mirror"
         " images, where the printed ones have no answer",
     ),
     Figure(
-        6,
-        "spectral efficiency of each UAV over its azimuth",
-        Likeness.DIFFERS,
-        "as figure 5; and azimuth is told by both coordinates here, where arccos folds it",
+        number=6,
+        shows="spectral efficiency of each UAV over its azimuth",
+        likeness=Likeness.DIFFERS,
+        why="as figure 5; and azimuth is told by both coordinates here, where arccos folds it",
     ),
     Figure(
-        7,
-        "pattern of the beamformer with 64 elements: in space, azimuth and elevation cuts, polar",
-        Likeness.DIFFERS,
-        "a line of elements, as the steering vector says; its elevation cut needs an element or a"
-        " second axis, of which nothing is said",
+        number=7,
+        shows="pattern of the beamformer with 64 elements: in space, azimuth and elevation cuts,"
+        " polar",
+        likeness=Likeness.DIFFERS,
+        why="a line of elements, as the steering vector says; its elevation cut needs an element"
+        " or a second axis, of which nothing is said",
     ),
     Figure(
-        8,
-        "polar patterns at two instants, and with 128 elements",
-        Likeness.UNTOLD,
-        "which instants is not said: ours are two at which no UAV is near another's mirror image",
+        number=8,
+        shows="polar patterns at two instants, and with 128 elements",
+        likeness=Likeness.UNTOLD,
+        why="which instants is not said: ours are two at which no UAV is near another's mirror"
+        " image",
     ),
-    Figure(9, "azimuth and elevation cuts of figure 8", Likeness.UNTOLD, "as figures 7 and 8"),
     Figure(
-        10,
-        "mean spectral efficiency over time, against echo probing, with blockages at some instants",
-        Likeness.DIFFERS,
-        "the instants, their depth and length, and all of the probing (waveform, cross section,"
+        number=9,
+        shows="azimuth and elevation cuts of figure 8",
+        likeness=Likeness.UNTOLD,
+        why="as figures 7 and 8",
+    ),
+    Figure(
+        number=10,
+        shows="mean spectral efficiency over time, against echo probing, with blockages at some"
+        " instants",
+        likeness=Likeness.DIFFERS,
+        why="the instants, their depth and length, and all of the probing (waveform, cross section,"
         " threshold, tracker) are not given: ours is a baseline at its best and a mean over random"
         " blockages, by how many there are",
     ),

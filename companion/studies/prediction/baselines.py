@@ -19,7 +19,7 @@ TRACKER_TIMEOUT_NS: Final = 5_000_000_000
 _S_PER_NS: Final = 1e-9
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Observed:
     """A report as it reaches a predictor.
 
@@ -82,7 +82,9 @@ class Hold:
         """The position of the report that is held, whatever the time."""
         if self._last is None:
             return None
-        return Predicted(self._last.position_ned_m, None, None)
+        return Predicted(
+            position_ned_m=self._last.position_ned_m, velocity_ned_mps=None, bound_m=None
+        )
 
 
 class DeadReckoningOnArrival:
@@ -135,5 +137,9 @@ def _straight_on(report: Observed, interval_ns: int) -> Predicted:
     """Constant velocity for an interval; without a reported velocity the position is held."""
     velocity = report.velocity_ned_mps
     if velocity is None:
-        return Predicted(report.position_ned_m, None, None)
-    return Predicted(report.position_ned_m + velocity * (interval_ns * _S_PER_NS), velocity, None)
+        return Predicted(position_ned_m=report.position_ned_m, velocity_ned_mps=None, bound_m=None)
+    return Predicted(
+        position_ned_m=report.position_ned_m + velocity * (interval_ns * _S_PER_NS),
+        velocity_ned_mps=velocity,
+        bound_m=None,
+    )

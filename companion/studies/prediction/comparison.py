@@ -63,7 +63,7 @@ LINKS: Final = ("clean", "radio", "hostile")
 """Links over which is compared unless others are named."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PredictionStudy:
     """What is asked of the study.
 
@@ -131,7 +131,7 @@ class PredictionStudy:
         return shlex.join([*words, "--seed", str(self.seed)])
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Compared:
     """A log, by its name, over one link: its rows, and the tuning that each filter was given."""
 
@@ -184,7 +184,7 @@ def compare(
             if figures:
                 counts = violations.counted(asked, given, lead)
                 rows.append(head | figures | counts | {"truth": flight.truth.kind})
-    return Compared(flown.log, flown.center, link, tuple(rows), tuned)
+    return Compared(log=flown.log, center=flown.center, link=link, rows=tuple(rows), tuned=tuned)
 
 
 def as_true(settings: Settings, kind: Kind) -> Settings:

@@ -30,7 +30,7 @@ ROUND_TRIP_NS: Final = 10_000_000
 """Length of the round trips, one a second, of which a clock that is known is known."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Delivery:
     """What a link delivers of one vehicle, in order of arrival.
 
@@ -49,7 +49,7 @@ class Delivery:
     begins_ns: int | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Sends:
     """What a vehicle sent, (M,): first its reports (N,), then its other frames, if it has frames.
 
@@ -85,13 +85,13 @@ def deliver(
     placed = on_sender_clock(clock(), heard_ns, sends.boot_ms[rows], rows < reports, trips)
     observed = tuple(
         Observed(
-            arrived,
-            sent,
-            made,
-            flight.position_ned_m[row] + noise.position_ned_m[row],
-            _reported(flight.velocity_ned_mps[row] + noise.velocity_ned_mps[row]),
-            bound,
-            flight.gnss[row],
+            arrival_ns=arrived,
+            sent_ns=sent,
+            sender_ns=made,
+            position_ned_m=flight.position_ned_m[row] + noise.position_ned_m[row],
+            velocity_ned_mps=_reported(flight.velocity_ned_mps[row] + noise.velocity_ned_mps[row]),
+            clock_bound_s=bound,
+            gnss=flight.gnss[row],
         )
         for row, arrived, made, sent, bound, known in zip(
             rows.tolist(),
@@ -118,7 +118,13 @@ def deliver(
     ]
     trips += _known(flight) if link.known_delay else ()
     everything = sorted([*events, *trips], key=lambda event: event.t_ns)
-    return Delivery(observed, tuple(everything), rate_hz, latency_s, begins_ns)
+    return Delivery(
+        observed=observed,
+        events=tuple(everything),
+        rate_hz=rate_hz,
+        latency_s=latency_s,
+        begins_ns=begins_ns,
+    )
 
 
 def _sends(flight: Flight) -> _Sends:
@@ -132,10 +138,14 @@ def _sends(flight: Flight) -> _Sends:
     reports = len(flight.arrival_ns)
     at = flight.report_at if len(flight.frames) else np.full(reports, -1, dtype=np.int64)
     return _Sends(
-        np.concatenate([flight.arrival_ns, np.array([f.t_ns for f in frames], dtype=np.int64)]),
-        np.concatenate([flight.boot_ms, np.array(said, dtype=np.int64)]),
-        np.concatenate([np.full(reports, -1), np.array([f.msgid for f in frames], dtype=np.int64)]),
-        np.concatenate([at, others]),
+        sent_ns=np.concatenate(
+            [flight.arrival_ns, np.array([f.t_ns for f in frames], dtype=np.int64)]
+        ),
+        boot_ms=np.concatenate([flight.boot_ms, np.array(said, dtype=np.int64)]),
+        kind=np.concatenate(
+            [np.full(reports, -1), np.array([f.msgid for f in frames], dtype=np.int64)]
+        ),
+        frame=np.concatenate([at, others]),
     )
 
 
@@ -202,11 +212,18 @@ def _known(flight: Flight) -> tuple[RoundTrip, ...]:
     for arrived_ns, made_ns, boot_ms in each:
         if not found or arrived_ns - found[-1].t_ns >= 1_000_000_000:
             sent_ns = min(made_ns, arrived_ns) - ROUND_TRIP_NS
-            found.append(RoundTrip(arrived_ns, source, sent_ns, int(boot_ms) * 1_000_000))
+            found.append(
+                RoundTrip(
+                    t_ns=arrived_ns,
+                    source=source,
+                    sent_ns=sent_ns,
+                    remote_ns=int(boot_ms) * 1_000_000,
+                )
+            )
     return tuple(found)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Placed:
     """Messages put in time by the product's clock, (n,) each.
 
@@ -256,10 +273,10 @@ def on_sender_clock(
         rows[row] = (start_ns + stamp.sender_ns, sent_ns, estimate.uncertainty_s, True)
     sender, sent, bound_s, placed = zip(*rows, strict=True) if rows else ((), (), (), ())
     return Placed(
-        np.array(sender, dtype=np.int64),
-        np.array(sent, dtype=np.int64),
-        np.array(bound_s, dtype=float),
-        np.array(placed, dtype=bool),
+        sender_ns=np.array(sender, dtype=np.int64),
+        sent_ns=np.array(sent, dtype=np.int64),
+        bound_s=np.array(bound_s, dtype=float),
+        known=np.array(placed, dtype=bool),
     )
 
 

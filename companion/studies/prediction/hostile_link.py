@@ -22,7 +22,7 @@ Latency = Callable[[np.random.Generator, FloatArray], FloatArray]
 """Latencies (n,) of frames sent at times (n,) in the regime, seconds both."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Regime:
     """A regime: its name in reports, how long it lasts, its latency, whether frames overtake."""
 
@@ -92,15 +92,15 @@ def _overtaking(rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
 
 
 REGIMES: Final = (
-    Regime("first-fast", 20.0, _first_fast),
-    Regime("steady", 10.0, _steady),
-    Regime("step", 20.0, _step),
-    Regime("ramp", 45.0, _ramp),
-    Regime("sawtooth", 24.0, _sawtooth),
-    Regime("ar1", 20.0, _wandering),
-    Regime("bursts", 25.0, _bursts),
-    Regime("changes", 24.0, _changes),
-    Regime("overtaking", 16.0, _overtaking, overtakes=True),
+    Regime(name="first-fast", lasts_s=20.0, latency_s=_first_fast),
+    Regime(name="steady", lasts_s=10.0, latency_s=_steady),
+    Regime(name="step", lasts_s=20.0, latency_s=_step),
+    Regime(name="ramp", lasts_s=45.0, latency_s=_ramp),
+    Regime(name="sawtooth", lasts_s=24.0, latency_s=_sawtooth),
+    Regime(name="ar1", lasts_s=20.0, latency_s=_wandering),
+    Regime(name="bursts", lasts_s=25.0, latency_s=_bursts),
+    Regime(name="changes", lasts_s=24.0, latency_s=_changes),
+    Regime(name="overtaking", lasts_s=16.0, latency_s=_overtaking, overtakes=True),
 )
 _STARTS_NS: Final = np.cumsum([0.0, *(regime.lasts_s for regime in REGIMES)]) * 1e9
 ROUND_NS: Final = int(_STARTS_NS[-1])

@@ -26,7 +26,7 @@ HISTORY: Final = 64
 _S_PER_NS: Final = 1e-9
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Tuning:
     """Noise assumed by a Kalman filter, the same on each axis.
 
@@ -97,7 +97,7 @@ class Kalman:
             acceleration = mean[..., 2, :]
             position = position + acceleration * (interval_s * interval_s / 2)
             velocity = velocity + acceleration * interval_s
-        return Predicted(position, velocity, None)
+        return Predicted(position_ned_m=position, velocity_ned_mps=velocity, bound_m=None)
 
     def _after(self, before: _Filtered | None, report: Observed) -> _Filtered:
         if before is None:

@@ -86,7 +86,11 @@ class Learned:
         # Past the last lead: straight on with the velocity reached there.
         bend = acceleration * (lead_s * lead_s / 2 + lead_s * (max(since_s, lead_s) - lead_s))
         position = window.position_ned_m + window.velocity_ned_mps * since_s + bend
-        return Predicted(position, window.velocity_ned_mps + acceleration * lead_s, None)
+        return Predicted(
+            position_ned_m=position,
+            velocity_ned_mps=window.velocity_ned_mps + acceleration * lead_s,
+            bound_m=None,
+        )
 
 
 def load(path: Path) -> Callable[[], Predictor]:

@@ -33,15 +33,17 @@ def flight(rng: np.random.Generator, uav: str, seconds: float = 60.0) -> Flight:
     boot_ms: Times = BOOT_MS + rows * round(STEP_S * 1e3)
     height = np.full(len(rows), np.nan)
     return Flight(
-        uav,
-        t_ns[rows] + DELAY_NS,
-        boot_ms,
-        position[rows] + rng.normal(0, POSITION_NOISE_M, (len(rows), 3)),
-        velocity[rows] + rng.normal(0, VELOCITY_NOISE_MPS, (len(rows), 3)),
-        height,
-        (None,) * len(rows),
-        Trajectory("SIM_STATE", t_ns, position, velocity),
-        t_ns[rows],
+        uav=uav,
+        arrival_ns=t_ns[rows] + DELAY_NS,
+        boot_ms=boot_ms,
+        position_ned_m=position[rows] + rng.normal(0, POSITION_NOISE_M, (len(rows), 3)),
+        velocity_ned_mps=velocity[rows] + rng.normal(0, VELOCITY_NOISE_MPS, (len(rows), 3)),
+        height_m=height,
+        gnss=(None,) * len(rows),
+        truth=Trajectory(
+            kind="SIM_STATE", t_ns=t_ns, position_ned_m=position, velocity_ned_mps=velocity
+        ),
+        made_ns=t_ns[rows],
     )
 
 
@@ -63,7 +65,13 @@ def link(rng: np.random.Generator) -> RadioLink:
     rate_hz = float(np.exp(rng.uniform(np.log(0.5), np.log(10.0))))
     median_s = float(np.exp(rng.uniform(np.log(0.01), np.log(1.0))))
     latency_s = (median_s, median_s * float(rng.uniform(1.0, 4.0)))
-    return RadioLink("made up", rate_hz, latency_s, float(rng.uniform(0, 0.3)), known_delay=True)
+    return RadioLink(
+        name="made up",
+        rate_hz=rate_hz,
+        latency_s=latency_s,
+        loss=float(rng.uniform(0, 0.3)),
+        known_delay=True,
+    )
 
 
 def _motion(rng: np.random.Generator, n: int) -> tuple[FloatArray, FloatArray]:

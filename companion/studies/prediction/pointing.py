@@ -23,7 +23,7 @@ HALF_BEAMWIDTH_DEG: Final = 0.79
 Row = dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Questions:
     """Questions to one UAV's pointer: at times ``now_ns`` (K,), for each lead (L,).
 
@@ -45,17 +45,17 @@ class Questions:
     def every(self, step: int) -> "Questions":
         """Each ``step``-th question."""
         return Questions(
-            self.now_ns[::step],
-            self.leads_ns,
-            self.truth_ned_m[:, ::step],
-            self.array_ned_m[:, ::step],
-            self.counts[:, ::step],
-            self.in_fault[:, ::step],
-            None if self.regime is None else self.regime[::step],
+            now_ns=self.now_ns[::step],
+            leads_ns=self.leads_ns,
+            truth_ned_m=self.truth_ned_m[:, ::step],
+            array_ned_m=self.array_ned_m[:, ::step],
+            counts=self.counts[:, ::step],
+            in_fault=self.in_fault[:, ::step],
+            regime=None if self.regime is None else self.regime[::step],
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Answers:
     """Positions (L, K, 3), bounds and usual errors (L, K); NaN where there is none.
 
@@ -95,13 +95,13 @@ def questions(
     if begins_ns is not None:
         regime = hostile_link.regimes_at(now_ns, begins_ns)[asked]
     return Questions(
-        now_ns[asked],
-        leads_ns,
-        position.reshape(*shape, 3)[:, asked],
-        array.reshape(*shape, 3)[:, asked],
-        counts[:, asked],
-        in_fault[:, asked],
-        regime,
+        now_ns=now_ns[asked],
+        leads_ns=leads_ns,
+        truth_ned_m=position.reshape(*shape, 3)[:, asked],
+        array_ned_m=array.reshape(*shape, 3)[:, asked],
+        counts=counts[:, asked],
+        in_fault=in_fault[:, asked],
+        regime=regime,
     )
 
 
@@ -145,7 +145,7 @@ def _played(
                     bound[j, k] = predicted.bound_m
                 if predicted.usual_m is not None:
                     usual[j, k] = predicted.usual_m
-    return Answers(position, bound, usual)
+    return Answers(position_ned_m=position, bound_m=bound, usual_m=usual)
 
 
 def angles_deg(towards: FloatArray, truly: FloatArray) -> FloatArray:

@@ -42,7 +42,7 @@ class Product:
     """
 
     def __init__(self, settings: Settings, uav: str, origin: tuple[float, float, float]) -> None:
-        stands = FixedCenter(origin[0], origin[1], origin[2])
+        stands = FixedCenter(lat_deg=origin[0], lon_deg=origin[1], alt_m=origin[2])
         self.uav = uav
         self.refuted_ns: list[int] = []
         self._pipeline = Pipeline(settings.override(center={"source": str(stands)}))
@@ -58,7 +58,10 @@ class Product:
         for track in self._pipeline.tracks(now_ns, at_ns):
             if track.uav == self.uav:
                 return Predicted(
-                    track.position_ned_m, track.velocity_ned_mps, track.bound_m, track.error_p95_m
+                    position_ned_m=track.position_ned_m,
+                    velocity_ned_mps=track.velocity_ned_mps,
+                    bound_m=track.bound_m,
+                    usual_m=track.error_p95_m,
                 )
         return None
 
@@ -104,7 +107,7 @@ def known_tuning(settings: Settings) -> Tuning:
     given = settings.observer
     deviation_mps2 = assembly.anyone(settings).acceleration_mps2 / given.accuracy_factor
     return Tuning(
-        deviation_mps2**2 * MANOEUVRE_S,
-        given.position_noise_m / given.accuracy_factor,
-        given.velocity_noise_mps / given.accuracy_factor,
+        process_density=deviation_mps2**2 * MANOEUVRE_S,
+        position_noise_m=given.position_noise_m / given.accuracy_factor,
+        velocity_noise_mps=given.velocity_noise_mps / given.accuracy_factor,
     )

@@ -11,7 +11,7 @@ from typing import Final
 from companion.values import UserError
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RadioLink:
     """What a link does to messages.
 
@@ -54,16 +54,18 @@ class RadioLink:
     @property
     def as_logged(self) -> bool:
         """Whether the link leaves everything as it was."""
-        return self == RadioLink(self.name)
+        return self == RadioLink(name=self.name)
 
 
-CLEAN: Final = RadioLink("clean")
+CLEAN: Final = RadioLink(name="clean")
 """The log's own link."""
-RADIO: Final = RadioLink("radio", rate_hz=1.2, latency_s=(0.6, 2.2), loss=0.1)
+RADIO: Final = RadioLink(name="radio", rate_hz=1.2, latency_s=(0.6, 2.2), loss=0.1)
 """A slow telemetry radio."""
-HOSTILE: Final = RadioLink("hostile", hostile=True)
+HOSTILE: Final = RadioLink(name="hostile", hostile=True)
 """The log's own rate, and a latency that does everything that a latency can do."""
-NOISY: Final = RadioLink("noisy", 1.25, (0.7, 1.0), noise_m=0.9, noise_mps=0.25)
+NOISY: Final = RadioLink(
+    name="noisy", rate_hz=1.25, latency_s=(0.7, 1.0), noise_m=0.9, noise_mps=0.25
+)
 """Long intervals and a poor receiver, as real logs have them: a report each 0.8 s, off by 1.4 m."""
 LINKS: Final = (CLEAN, RADIO, HOSTILE, NOISY)
 NOISE_MOST: Final = 1.7

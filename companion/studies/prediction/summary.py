@@ -19,7 +19,7 @@ class Pool(StrEnum):
     WORST = "the worst UAV"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Measure:
     """A figure of the rows and how it is shown.
 
@@ -37,39 +37,54 @@ class Measure:
     more_is_better: bool = False
 
 
-ANGLE: Final = Measure("angle_rms_deg", "RMS angle error, degrees", "deg rms")
+ANGLE: Final = Measure(key="angle_rms_deg", caption="RMS angle error, degrees", short="deg rms")
 MEASURES: Final = (
     ANGLE,
-    Measure("angle_p95_deg", "95th percentile of the angle error, degrees", "p95", Pool.WORST),
-    Measure("angle_max_deg", "largest angle error, degrees", "max", Pool.WORST),
     Measure(
-        "within_beamwidth",
-        f"share of time within the half-power beamwidth ({HALF_BEAMWIDTH_DEG}°)",
-        "in beam",
-        Pool.MEAN,
-        True,
+        key="angle_p95_deg",
+        caption="95th percentile of the angle error, degrees",
+        short="p95",
+        pool=Pool.WORST,
     ),
     Measure(
-        "se_loss_bps_hz",
-        "spectral efficiency lost against perfect knowledge, bit/s/Hz",
-        "bit/s/Hz",
-        Pool.MEAN,
-    ),
-    Measure("position_rms_m", "RMS position error, metres", "m rms"),
-    Measure("position_p95_m", "95th percentile of the position error, metres", "p95", Pool.WORST),
-    Measure("position_max_m", "largest position error, metres", "max", Pool.WORST),
-    Measure(
-        "bound_tightness",
-        "tightness: median bound over 95th percentile of the position error",
-        "tightness",
-        Pool.MEAN,
+        key="angle_max_deg", caption="largest angle error, degrees", short="max", pool=Pool.WORST
     ),
     Measure(
-        "usual_covers",
-        "share of errors no larger than the usual one that was stated (95 of 100 are meant)",
-        "covered",
-        Pool.MEAN,
-        True,
+        key="within_beamwidth",
+        caption=f"share of time within the half-power beamwidth ({HALF_BEAMWIDTH_DEG}°)",
+        short="in beam",
+        pool=Pool.MEAN,
+        more_is_better=True,
+    ),
+    Measure(
+        key="se_loss_bps_hz",
+        caption="spectral efficiency lost against perfect knowledge, bit/s/Hz",
+        short="bit/s/Hz",
+        pool=Pool.MEAN,
+    ),
+    Measure(key="position_rms_m", caption="RMS position error, metres", short="m rms"),
+    Measure(
+        key="position_p95_m",
+        caption="95th percentile of the position error, metres",
+        short="p95",
+        pool=Pool.WORST,
+    ),
+    Measure(
+        key="position_max_m", caption="largest position error, metres", short="max", pool=Pool.WORST
+    ),
+    Measure(
+        key="bound_tightness",
+        caption="tightness: median bound over 95th percentile of the position error",
+        short="tightness",
+        pool=Pool.MEAN,
+    ),
+    Measure(
+        key="usual_covers",
+        caption="share of errors no larger than the usual one that was stated (95 of 100 are"
+        " meant)",
+        short="covered",
+        pool=Pool.MEAN,
+        more_is_better=True,
     ),
 )
 

@@ -39,7 +39,11 @@ def tune(name: str, cases: Sequence[Case]) -> Tuning:
     All tunings are played at once.
     """
     tunings = [
-        Tuning(density, position_noise_m, velocity_noise_mps)
+        Tuning(
+            process_density=density,
+            position_noise_m=position_noise_m,
+            velocity_noise_mps=velocity_noise_mps,
+        )
         for density, (position_noise_m, velocity_noise_mps) in product_of(DENSITIES[name], NOISES)
     ]
     squares = [_squares(name, tunings, delivery, asked) for _, delivery, asked in cases]

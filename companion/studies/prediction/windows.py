@@ -81,7 +81,13 @@ class Recent:
                 speeds @ turned / SPEED_UNIT_MPS,
             ]
         )
-        return Window(newest.sender_ns, places[-1], speeds[-1], seen, turned)
+        return Window(
+            sender_ns=newest.sender_ns,
+            position_ned_m=places[-1],
+            velocity_ned_mps=speeds[-1],
+            seen=seen,
+            local_from_seen=turned,
+        )
 
 
 def _velocities(reports: list[Observed], ago_s: FloatArray, places: FloatArray) -> FloatArray:

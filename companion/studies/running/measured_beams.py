@@ -90,4 +90,10 @@ def _checked(
     if len({len(power) for power in powers}) > 1:
         raise UserError(f"{table}: rows differ in how many beams were measured")
     measured = np.array(powers) if powers and len(powers[0]) >= best.max() else None
-    return Samples(table.name, (place - place.min(axis=0)) / spread, best, count, measured)
+    return Samples(
+        name=table.name,
+        place=(place - place.min(axis=0)) / spread,
+        beam=best,
+        beams=count,
+        power=measured,
+    )

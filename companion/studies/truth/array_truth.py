@@ -36,7 +36,7 @@ class CarrierTruth:
     ned_from_body: Slerp
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ArrayTruth:
     """The truth that a log holds, for the array of a pipeline.
 
@@ -90,16 +90,20 @@ def load(logs: Sequence[Path], pipeline: Pipeline) -> ArrayTruth | None:
     local = pipeline.local
     assert local is not None
     lat_deg, lon_deg, alt_m = local.origin
-    flown = vehicles.load(logs, str(FixedCenter(lat_deg, lon_deg, alt_m)))
+    flown = vehicles.load(logs, str(FixedCenter(lat_deg=lat_deg, lon_deg=lon_deg, alt_m=alt_m)))
     flights = {flight.uav: flight for flight in flown.flights if flight.truth.kind == SIMULATED}
     if not isinstance(pipeline.center.place, VehicleCenter):
-        return ArrayTruth(SIMULATED, local, flights, None) if flights else None
+        return (
+            ArrayTruth(kind=SIMULATED, local=local, flights=flights, carrier=None)
+            if flights
+            else None
+        )
     own = flights.pop(str(pipeline.center.place), None)
     if not flights:
         return None
     carrier = None if own is None else _carrier_truth(own)
     kind = CARRIER_PREDICTED if carrier is None else SIMULATED
-    return ArrayTruth(kind, local, flights, carrier)
+    return ArrayTruth(kind=kind, local=local, flights=flights, carrier=carrier)
 
 
 def _carrier_truth(flight: Flight) -> CarrierTruth | None:

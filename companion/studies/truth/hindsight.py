@@ -24,7 +24,7 @@ EDGE_NS: Final = 3_000_000_000
 """Least time on one side of a stamp for which that side is asked; else a late frame is alone."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class BootClock:
     """What a log shows of one boot clock: a stamp each, in order of arrival, (N,).
 
@@ -72,7 +72,7 @@ def boot_clock(arrival_ns: Times, boot_ns: Times) -> BootClock:
         late = here[np.maximum(stops, row + 1) - 1] - here < EDGE_NS
         both = np.where(early, after, np.where(late, before, np.maximum(before, after)))
         made_ns[rows] = boot_ns[rows] + np.where(early & late, np.minimum(before, after), both)
-    return BootClock(arrival_ns, boot_ns, life, made_ns)
+    return BootClock(arrival_ns=arrival_ns, boot_ns=boot_ns, life=life, made_ns=made_ns)
 
 
 def lives(boot_ns: Times) -> IntArray:

@@ -37,7 +37,7 @@ PACE: Final = (0.5, 2.0)
 """Arrivals keep the sender's pace if the gap between two is that of their stamps times 0.5 to 2."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Brackets:
     """Truth messages (N,) in the order of their stream, and the stamped messages around each.
 
@@ -59,12 +59,12 @@ class Brackets:
     def rows(self, chosen: NDArray[np.bool_]) -> "Brackets":
         """Some of the messages."""
         return Brackets(
-            self.arrival_ns[chosen],
-            self.before_ns[chosen],
-            self.after_ns[chosen],
-            self.before_arrival_ns[chosen],
-            self.after_arrival_ns[chosen],
-            self.life[chosen],
+            arrival_ns=self.arrival_ns[chosen],
+            before_ns=self.before_ns[chosen],
+            after_ns=self.after_ns[chosen],
+            before_arrival_ns=self.before_arrival_ns[chosen],
+            after_arrival_ns=self.after_arrival_ns[chosen],
+            life=self.life[chosen],
         )
 
 

@@ -26,7 +26,7 @@ _SIM_STATE = struct.Struct("<21fii")
 _SIMSTATE = struct.Struct("<9fii")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Said:
     """A truth message.
 
@@ -50,7 +50,7 @@ class _Order:
     waiting: list[tuple[int, int, bytes]] = field(default_factory=list)  # msgid, arrival, payload
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Stream:
     """What a log holds of one vehicle, in order of arrival.
 
@@ -99,7 +99,9 @@ class Stream:
         self.stamps.append((t_ns, boot_ns))
         for msgid, came_ns, payload in order.waiting:
             assert order.last is not None
-            self.said[msgid].append(Said(came_ns, order.last, number, payload))
+            self.said[msgid].append(
+                Said(arrival_ns=came_ns, before=order.last, after=number, payload=payload)
+            )
         order.waiting.clear()
         order.last = number
 
@@ -127,12 +129,12 @@ def words(stream: Stream, msgid: int, clock: BootClock) -> Words:
     before = np.array([each.before for each in said], dtype=np.int64)
     after = np.array([each.after for each in said], dtype=np.int64)
     found = Brackets(
-        np.array([each.arrival_ns for each in said], dtype=np.int64),
-        clock.boot_ns[before],
-        clock.boot_ns[after],
-        clock.arrival_ns[before],
-        clock.arrival_ns[after],
-        clock.life[before],
+        arrival_ns=np.array([each.arrival_ns for each in said], dtype=np.int64),
+        before_ns=clock.boot_ns[before],
+        after_ns=clock.boot_ns[after],
+        before_arrival_ns=clock.arrival_ns[before],
+        after_arrival_ns=clock.arrival_ns[after],
+        life=clock.life[before],
     )
     kept = (clock.life[before] == clock.life[after]) & (found.after_ns >= found.before_ns)
     payloads = tuple(each.payload for each, keep in zip(said, kept.tolist(), strict=True) if keep)

@@ -15,7 +15,7 @@ GAP_NS: Final = 2_500_000_000
 """Longest gap between two points of a trajectory across which it is interpolated."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Trajectory:
     """Positions and velocities, (N, 3), local frame, at ascending times (N,).
 
@@ -65,4 +65,10 @@ def ascending(
         between = np.gradient(position, (times - times[0]) * 1e-9, axis=0)
         velocity = np.where(np.isnan(velocity), between, velocity)
     turned = None if ned_from_body is None else ned_from_body[rows]
-    return Trajectory(kind, times, position, velocity, turned)
+    return Trajectory(
+        kind=kind,
+        t_ns=times,
+        position_ned_m=position,
+        velocity_ned_mps=velocity,
+        ned_from_body=turned,
+    )

@@ -48,7 +48,7 @@ AFTER_FAULT_NS: Final = 5_000_000_000
 """Time after a declared fault for the vehicle's own estimate to settle."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Flight:
     """One vehicle of a log: its reports in order of arrival, and the truth.
 
@@ -98,7 +98,7 @@ class Flight:
         return flies
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Flown:
     """A log: its flights, and the array's position (fixed (3,), or a trajectory).
 
@@ -136,7 +136,7 @@ def load(logs: Path | Sequence[Path], center_text: str | None) -> Flown:
     if not streams:
         raise UserError(f"{path}: no vehicle reports a position in it")
     first = min((each.reports[0] for each in streams.values()), key=lambda report: report.t_ns)
-    home = FixedCenter(first.lat_deg, first.lon_deg, first.alt_m or 0.0)
+    home = FixedCenter(lat_deg=first.lat_deg, lon_deg=first.lon_deg, alt_m=first.alt_m or 0.0)
     stands = center if isinstance(center, FixedCenter) else home
     local = LocalFrame(stands.lat_deg, stands.lon_deg, stands.alt_m)
     faults = tuple(fault for log in logs for fault in declared_faults(log))
@@ -153,12 +153,12 @@ def load(logs: Path | Sequence[Path], center_text: str | None) -> Flown:
         carrier = flights.pop(str(center)).truth
     arrivals = [report.t_ns for stream in streams.values() for report in stream.reports]
     return Flown(
-        " + ".join(log.name for log in logs),
-        str(center if center_text and center_text != "home" else home),
-        tuple(flights.values()),
-        carrier,
-        (min(arrivals), max(arrivals)),
-        local.origin,
+        log=" + ".join(log.name for log in logs),
+        center=str(center if center_text and center_text != "home" else home),
+        flights=tuple(flights.values()),
+        carrier=carrier,
+        span_ns=(min(arrivals), max(arrivals)),
+        origin=local.origin,
     )
 
 
@@ -188,23 +188,30 @@ def _flight(
     made_ns = clock.made_ns[numbers]
     truth = _simulated(stream, clock, local)
     if truth is None:
-        truth = _placed(stream, clock, local, made_ns, position, velocity)
+        truth = _placed(
+            stream,
+            clock,
+            local,
+            made_ns=made_ns,
+            position_ned_m=position,
+            velocity_ned_mps=velocity,
+        )
     if truth is None:
         truth = ascending("reports", made_ns, position, velocity)
     return Flight(
-        uav,
-        arrival_ns,
-        boot_ms,
-        position,
-        velocity,
-        height,
-        tuple(stream.gnss),
-        truth,
-        made_ns,
-        tuple(stream.frames),
-        np.array(stream.report_at, dtype=np.int64),
-        tuple(stream.round_trips),
-        faults,
+        uav=uav,
+        arrival_ns=arrival_ns,
+        boot_ms=boot_ms,
+        position_ned_m=position,
+        velocity_ned_mps=velocity,
+        height_m=height,
+        gnss=tuple(stream.gnss),
+        truth=truth,
+        made_ns=made_ns,
+        frames=tuple(stream.frames),
+        report_at=np.array(stream.report_at, dtype=np.int64),
+        round_trips=tuple(stream.round_trips),
+        faults=faults,
     )
 
 
@@ -249,6 +256,7 @@ def _placed(
     stream: Stream,
     clock: BootClock,
     local: LocalFrame,
+    *,
     made_ns: Times,
     position_ned_m: FloatArray,
     velocity_ned_mps: FloatArray,

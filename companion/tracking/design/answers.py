@@ -45,6 +45,7 @@ class KinematicLimits:
 
 def row(
     dt_s: float,
+    *,
     feedthrough_s: float,
     alpha: float | None,
     mu_max: float | None,
@@ -91,7 +92,7 @@ def _by_lmi(dt_s: float, feedthrough_s: float, alpha: float) -> dict[str, float]
     from companion.tracking.design import lmi
 
     one = np.eye(1)
-    solved = lmi.solve(one, dt_s * one, one, feedthrough_s * one, one, alpha)
+    solved = lmi.solve(one, b=dt_s * one, c=one, d=feedthrough_s * one, h=one, alpha=alpha)
     gain = float(solved.gain[0, 0])
     return {
         "L": gain,
@@ -203,7 +204,7 @@ def _sampling(dt_s: float, motion: KinematicLimits) -> "tuple[Sampling, tuple[in
     b, d, channels = gain_table.inputs(
         dt_s, motion.acceleration_mps2, motion.position_noise_m, motion.velocity_noise_mps
     )
-    return Sampling(gain_table.transition(dt_s), b, np.eye(2)[: len(d)], d), channels
+    return Sampling(a=gain_table.transition(dt_s), b=b, c=np.eye(2)[: len(d)], d=d), channels
 
 
 def _optimum(dt_s: float, motion: KinematicLimits, alpha: float | None) -> "LmiSolution":
@@ -316,9 +317,9 @@ def _as_table(
     gains = zip(dt_s.tolist(), solved.gains, strict=True)
     p = solved.lyapunov
     found = KinematicDesign(
-        motion.acceleration_mps2,
-        motion.position_noise_m,
-        motion.velocity_noise_mps,
+        acceleration_mps2=motion.acceleration_mps2,
+        position_noise_m=motion.position_noise_m,
+        velocity_noise_mps=motion.velocity_noise_mps,
         dt_s=tuple(dt_s.tolist()),
         corrections=tuple(
             tuple((gain_table.transition(-t) @ gain).ravel().tolist()) for t, gain in gains

@@ -124,7 +124,7 @@ def peak_gain(dt_s: ArrayLike, feedthrough_s: float, l_gain: ArrayLike) -> Float
 
 
 def lmi_margin(
-    dt_s: float, feedthrough_s: float, alpha: float, l_gain: float, mu: float, p: float
+    dt_s: float, *, feedthrough_s: float, alpha: float, l_gain: float, mu: float, p: float
 ) -> float:
     """Smallest eigenvalue of both LMIs at a solution; non-negative proves it.
 
@@ -138,7 +138,7 @@ def lmi_margin(
     return float(min(np.linalg.eigvalsh(decay)[0], np.linalg.eigvalsh(output)[0]))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Design:
     """A gain for one interval and its certificate; times in seconds, mu in s²."""
 
@@ -177,5 +177,7 @@ def design(dt_s: float, feedthrough_s: float, alpha: float | None = None) -> Des
         mu=mu,
         gamma=float(np.sqrt(mu)),
         peak_gain=float(peak_gain(dt_s, feedthrough_s, l_gain)),
-        residual=lmi_margin(dt_s, feedthrough_s, alpha, l_gain, max(mu, 1 / p), p),
+        residual=lmi_margin(
+            dt_s, feedthrough_s=feedthrough_s, alpha=alpha, l_gain=l_gain, mu=max(mu, 1 / p), p=p
+        ),
     )

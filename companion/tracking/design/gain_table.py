@@ -45,7 +45,7 @@ class DesignError(UserError):
     """A design that cannot be read, or that its own certificate does not confirm."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class KinematicDesign:
     """Gains over a grid of intervals, and the proof that they hold.
 

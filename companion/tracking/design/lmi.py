@@ -46,7 +46,7 @@ class LmiError(UserError):
     """The solver gave no solution that its own certificate confirms."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Sampling:
     """The plant at one sampling time: A (n, n), B (n, m), C (r, n), D (r, m)."""
 
@@ -56,7 +56,7 @@ class Sampling:
     d: FloatArray
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LmiSolution:
     """A design and its certificate, checked by eigenvalues in numpy alone.
 
@@ -85,17 +85,19 @@ class LmiSolution:
 
 def solve(
     a: FloatArray,
+    *,
     b: FloatArray,
     c: FloatArray,
     d: FloatArray,
     h: FloatArray,
     alpha: float,
-    *,
     channels: Sequence[int] | None = None,
     mu_max: float | None = None,
 ) -> LmiSolution:
     """``solve_common`` for one sampling time: A (n, n), B (n, m), C (r, n), D (r, m), H (k, n)."""
-    return solve_common([Sampling(a, b, c, d)], h, [alpha], channels=channels, mu_max=mu_max)
+    return solve_common(
+        [Sampling(a=a, b=b, c=c, d=d)], h, [alpha], channels=channels, mu_max=mu_max
+    )
 
 
 def solve_common(
@@ -132,12 +134,23 @@ def solve_common(
     failure = LmiError("the solver was not asked")
     for states, reports in _scalings(samplings, scale):
         try:
-            found = _solve_scaled(samplings, h, alphas, widths, mu_max, slack, states, reports)
+            found = _solve_scaled(
+                samplings,
+                h,
+                alphas,
+                widths=widths,
+                mu_max=mu_max,
+                slack=slack,
+                states=states,
+                reports=reports,
+            )
         except LmiError as error:
             failure = error
             continue
         if mu_max is None and found.mu < NEARLY_ZERO * float(np.max(np.abs(h) @ states)) ** 2:
-            return _with_attainment(found, samplings, h, alphas, widths, states, reports)
+            return _with_attainment(
+                found, samplings, h, alphas=alphas, widths=widths, states=states, reports=reports
+            )
         return found
     raise failure
 
@@ -163,6 +176,7 @@ def _solve_scaled(
     samplings: Sequence[Sampling],
     h: FloatArray,
     alphas: Sequence[float],
+    *,
     widths: Sequence[int],
     mu_max: float | None,
     slack: float,
@@ -173,25 +187,30 @@ def _solve_scaled(
     unit = float(np.max(np.abs(h) @ states)) or 1.0
     scaled = [
         Sampling(
-            s.a * states / states[:, None],
-            s.b / states[:, None],
-            s.c * states / reports[:, None],
-            s.d / reports[:, None],
+            a=s.a * states / states[:, None],
+            b=s.b / states[:, None],
+            c=s.c * states / reports[:, None],
+            d=s.d / reports[:, None],
         )
         for s in samplings
     ]
     top = None if mu_max is None else mu_max / unit**2
-    p, zs, multipliers = _ask(scaled, h * states / unit, alphas, widths, top, slack)
+    p, zs, multipliers = _ask(
+        scaled, h * states / unit, alphas, widths=widths, mu_max=top, slack=slack
+    )
     gains = [np.linalg.solve(p, z) * states[:, None] / reports for z in zs]
     p = p / np.outer(states, states)
     mu = float(np.linalg.eigvalsh(h @ np.linalg.solve(p, h.T))[-1])  # what this P really gives
-    return _certified(p, gains, mu, samplings, h, multipliers, widths)
+    return _certified(
+        p, gains, mu, samplings=samplings, h=h, multipliers=multipliers, widths=widths
+    )
 
 
 def _ask(
     samplings: Sequence[Sampling],
     h: FloatArray,
     alphas: Sequence[float],
+    *,
     widths: Sequence[int],
     mu_max: float | None,
     slack: float,
@@ -237,6 +256,7 @@ def _with_attainment(
     found: LmiSolution,
     samplings: Sequence[Sampling],
     h: FloatArray,
+    *,
     alphas: Sequence[float],
     widths: Sequence[int],
     states: FloatArray,
@@ -244,7 +264,16 @@ def _with_attainment(
 ) -> LmiSolution:
     """Mark a small mu as not attained if a hundredth of it is feasible as well."""
     try:
-        _solve_scaled(samplings, h, alphas, widths, found.mu / 100, 0.0, states, reports)
+        _solve_scaled(
+            samplings,
+            h,
+            alphas,
+            widths=widths,
+            mu_max=found.mu / 100,
+            slack=0.0,
+            states=states,
+            reports=reports,
+        )
     except LmiError:
         return found
     return replace(found, attained=False)
@@ -258,6 +287,7 @@ def _certified(
     p: FloatArray,
     gains: Sequence[FloatArray],
     mu: float,
+    *,
     samplings: Sequence[Sampling],
     h: FloatArray,
     multipliers: FloatArray,
@@ -266,18 +296,33 @@ def _certified(
     """Check the solver's answer by eigenvalues in numpy alone."""
     try:
         margin = min(
-            lmi_margin(p, gain, mu, (s.a, s.b, s.c, s.d, h), sum(shares), np.repeat(shares, widths))
+            lmi_margin(
+                p,
+                gain=gain,
+                mu=mu,
+                plant=(s.a, s.b, s.c, s.d, h),
+                alpha=sum(shares),
+                shares=np.repeat(shares, widths),
+            )
             for gain, s, shares in zip(gains, samplings, multipliers, strict=True)
         )
     except np.linalg.LinAlgError as error:
         raise LmiError("the solver's answer fails its certificate: P is not positive") from error
     if not margin >= -TOLERANCE:
         raise LmiError(f"the solver's answer fails its certificate: margin {margin:.2e}")
-    return LmiSolution(tuple(gains), p, mu, multipliers.sum(axis=1), multipliers, margin)
+    return LmiSolution(
+        gains=tuple(gains),
+        lyapunov=p,
+        mu=mu,
+        alphas=multipliers.sum(axis=1),
+        multipliers=multipliers,
+        margin=margin,
+    )
 
 
 def lmi_margin(
     p: FloatArray,
+    *,
     gain: FloatArray,
     mu: float,
     plant: tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray],

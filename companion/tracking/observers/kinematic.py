@@ -66,7 +66,7 @@ class KinematicModel:
     gain: GainSchedule = deadbeat
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class KinematicState:
     """The estimate at a report's time, made before that report, its bounds, and the report.
 
@@ -105,14 +105,16 @@ class KinematicObserver:
         """
         velocity = fix.velocity_ned_mps
         return KinematicState(
-            fix,
-            fix.position_ned_m,
-            (0.0, 0.0, 0.0) if velocity is None else velocity,
-            fix.noise.horizontal_m,
-            fix.noise.vertical_m,
-            fix.noise.position_m,
-            (fix.limits or self.model).speed_mps if velocity is None else fix.noise.velocity_mps,
-            None,
+            fix=fix,
+            position_ned_m=fix.position_ned_m,
+            velocity_ned_mps=(0.0, 0.0, 0.0) if velocity is None else velocity,
+            horizontal_m=fix.noise.horizontal_m,
+            vertical_m=fix.noise.vertical_m,
+            position_m=fix.noise.position_m,
+            velocity_mps=(fix.limits or self.model).speed_mps
+            if velocity is None
+            else fix.noise.velocity_mps,
+            interval_s=None,
         )
 
     def predict(self, state: KinematicState, sender_ns: int) -> Prediction:
@@ -154,7 +156,13 @@ class KinematicObserver:
         )
         bound_m = min(bound_m, math.hypot(horizontal_m, vertical_m))
         found = Prediction(
-            position, velocity, bound_m, horizontal_m, vertical_m, velocity_mps, None
+            position_ned_m=position,
+            velocity_ned_mps=velocity,
+            bound_m=bound_m,
+            horizontal_m=horizontal_m,
+            vertical_m=vertical_m,
+            velocity_bound_mps=velocity_mps,
+            mu_s2=None,
         )
         reach_m = age * model.speed_mps
         if (
@@ -184,14 +192,14 @@ class KinematicObserver:
         assert velocity is not None
         assert bound_mps is not None
         return KinematicState(
-            fix,
-            predicted.position_ned_m,
-            velocity,
-            predicted.horizontal_m,
-            predicted.vertical_m,
-            predicted.bound_m,
-            bound_mps,
-            (fix.sender_ns - state.fix.sender_ns) * 1e-9,
+            fix=fix,
+            position_ned_m=predicted.position_ned_m,
+            velocity_ned_mps=velocity,
+            horizontal_m=predicted.horizontal_m,
+            vertical_m=predicted.vertical_m,
+            position_m=predicted.bound_m,
+            velocity_mps=bound_mps,
+            interval_s=(fix.sender_ns - state.fix.sender_ns) * 1e-9,
         )
 
     def _limited(self, fix: Fix, reach_m: float, found: Prediction, speed_mps: float) -> Prediction:
@@ -207,13 +215,13 @@ class KinematicObserver:
         bound_m = min(found.bound_m, fix.noise.position_m + reach_m + moved_m)
         fastest_mps = speed_mps + math.hypot(*found.velocity_ned_mps)
         return Prediction(
-            found.position_ned_m,
-            found.velocity_ned_mps,
-            min(bound_m, math.hypot(horizontal_m, vertical_m)),
-            horizontal_m,
-            vertical_m,
-            min(found.velocity_bound_mps, fastest_mps),
-            None,
+            position_ned_m=found.position_ned_m,
+            velocity_ned_mps=found.velocity_ned_mps,
+            bound_m=min(bound_m, math.hypot(horizontal_m, vertical_m)),
+            horizontal_m=horizontal_m,
+            vertical_m=vertical_m,
+            velocity_bound_mps=min(found.velocity_bound_mps, fastest_mps),
+            mu_s2=None,
         )
 
 

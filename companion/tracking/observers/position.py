@@ -29,7 +29,7 @@ from companion.tracking.observers.estimates import Prediction
 from companion.values import Fix, Vector
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PositionModel:
     """Settings of the observer.
 
@@ -112,7 +112,13 @@ class PositionObserver:
         changed_mps = fix.noise.velocity_mps + (fix.limits or self.model).acceleration_mps2 * abs(b)
         velocity_bound_mps = None if fix.velocity_ned_mps is None else changed_mps
         return Prediction(
-            estimate, fix.velocity_ned_mps, bound_m, bound_m, bound_m, velocity_bound_mps, mu_s2
+            position_ned_m=estimate,
+            velocity_ned_mps=fix.velocity_ned_mps,
+            bound_m=bound_m,
+            horizontal_m=bound_m,
+            vertical_m=bound_m,
+            velocity_bound_mps=velocity_bound_mps,
+            mu_s2=mu_s2,
         )
 
 

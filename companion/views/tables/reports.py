@@ -31,7 +31,7 @@ MESSAGES: Final = {
 """Messages that are reports, or may be, by id."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Heard:
     """A report that was received: with its estimate where it was used, else why it was not.
 
@@ -70,7 +70,7 @@ def heard(frame: Frame, outputs: Sequence[Output]) -> Heard | None:
         return None
     for output in outputs:
         if isinstance(output, Estimate):
-            return Heard(frame, output, None, output.fix.report)
+            return Heard(frame=frame, estimate=output, refused=None, said=output.fix.report)
     refused = next((one for one in outputs if isinstance(one, Rejection)), None)
     said = decode(frame)
     if isinstance(
@@ -80,7 +80,12 @@ def heard(frame: Frame, outputs: Sequence[Output]) -> Heard | None:
         said = replace(report, uav=named) if report is not None and named is not None else report
     if refused is None and said is None:  # a message that may be a report, and was none
         return None
-    return Heard(frame, None, refused, said if isinstance(said, Report | AdsbVehicle) else None)
+    return Heard(
+        frame=frame,
+        estimate=None,
+        refused=refused,
+        said=said if isinstance(said, Report | AdsbVehicle) else None,
+    )
 
 
 def _of_said(heard: Heard, name: str) -> float | AltitudeDatum | None:
@@ -125,50 +130,67 @@ _T, _N, _TIME, _INT, _TRUTH = Kind.TEXT, Kind.NUMBER, Kind.TIME, Kind.INTEGER, K
 
 # fmt: off
 REPORTS: Final = Table("reports", "a report received, over whatever message", (
-    Column("arrival_ns", _INT, "ns", "when it arrived, since 1970", lambda h: h.frame.t_ns),
-    Column("arrival_utc", _TIME, "UTC", "the same", lambda h: h.frame.t_ns),
-    Column("uav", _T, "", "whose position it is", lambda h: h.uav),
-    Column("message", _T, "", "the MAVLink message", lambda h: MESSAGES[h.frame.msgid]),
-    Column("link", _T, "", "the link, or the log, over which it came", lambda h: h.frame.link),
-    Column("sender", _T, "", "who sent the message: the UAV, or who relays it",
-           lambda h: h.frame.source),
-    Column("accepted", _TRUTH, "", "whether it was used", lambda h: h.estimate is not None),
-    Column("reason", _T, "", "why it was not used",
-           lambda h: None if h.refused is None else h.refused.reason),
-    Column("detail", _T, "", "more of that", lambda h: h.refused and h.refused.detail),
-    Column("true_utc", _TIME, "UTC", "when the position was true, by the sender's clock", _true_ns),
-    Column("latency_s", _N, "s", "from then to the arrival", _latency_s),
-    Column("boot_s", _N, "s", "the sender's clock since boot, as sent", _boot_s),
-    Column("tslc_s", _N, "s", "age of the position as a relay says",
-           lambda h: _of_said(h, "tslc_s")),
-    Column("lat_deg", _N, "deg", "latitude, WGS84", lambda h: _degrees(h, 0)),
-    Column("lon_deg", _N, "deg", "longitude, WGS84", lambda h: _degrees(h, 1)),
-    Column("alt_m", _N, "m", "height over `alt_datum`", lambda h: _of_said(h, "alt_m")),
-    Column("alt_datum", _T, "", "`msl`, `pressure` or `geometric`",
-           lambda h: _of_said(h, "alt_datum")),
-    Column("relative_alt_m", _N, "m", "height above its home",
-           lambda h: _of_said(h, "relative_alt_m")),
-    Column("velocity_north_mps", _N, "m/s", "velocity as sent", lambda h: _level_mps(h, 0)),
-    Column("velocity_east_mps", _N, "m/s", "velocity as sent", lambda h: _level_mps(h, 1)),
-    Column("velocity_down_mps", _N, "m/s", "velocity as sent",
-           lambda h: _of_said(h, "velocity_down_mps")),
-    Column("heading_deg", _N, "deg", "from true north, as sent",
-           lambda h: _of_said(h, "heading_deg")),
-    Column("noise_horizontal_m", _N, "m", "bound on the error of the position in the plane",
-           lambda h: _of_noise(h, "horizontal_m")),
-    Column("noise_vertical_m", _N, "m", "bound on the error of the height",
-           lambda h: _of_noise(h, "vertical_m")),
-    Column("noise_velocity_mps", _N, "m/s", "bound on the error of the velocity",
-           lambda h: _of_noise(h, "velocity_mps")),
-    Column("noise_time_s", _N, "s", "what the UAV's own lag leaves of error in `true_utc`",
-           lambda h: _of_noise(h, "time_s")),
-    Column("dt_s", _N, "s", "interval since the UAV's report before",
-           lambda h: _of_estimate(h, "dt_s")),
-    Column("innovation_m", _N, "m", "from where the UAV was expected to where it says it is",
-           lambda h: _of_estimate(h, "innovation_m")),
-    Column("bound_m", _N, "m", "bound on the error of that expectation",
-           lambda h: _of_estimate(h, "bound_m")),
-    Column("reacquired", _TRUTH, "", "whether the track was begun again with it",
-           lambda h: h.estimate is not None and h.estimate.reacquired),
+    Column(name="arrival_ns", kind=_INT, unit="ns", meaning="when it arrived, since 1970",
+           of=lambda h: h.frame.t_ns),
+    Column(name="arrival_utc", kind=_TIME, unit="UTC", meaning="the same",
+           of=lambda h: h.frame.t_ns),
+    Column(name="uav", kind=_T, unit="", meaning="whose position it is", of=lambda h: h.uav),
+    Column(name="message", kind=_T, unit="", meaning="the MAVLink message",
+           of=lambda h: MESSAGES[h.frame.msgid]),
+    Column(name="link", kind=_T, unit="", meaning="the link, or the log, over which it came",
+           of=lambda h: h.frame.link),
+    Column(name="sender", kind=_T, unit="",
+           meaning="who sent the message: the UAV, or who relays it", of=lambda h: h.frame.source),
+    Column(name="accepted", kind=_TRUTH, unit="", meaning="whether it was used",
+           of=lambda h: h.estimate is not None),
+    Column(name="reason", kind=_T, unit="", meaning="why it was not used",
+           of=lambda h: None if h.refused is None else h.refused.reason),
+    Column(name="detail", kind=_T, unit="", meaning="more of that",
+           of=lambda h: h.refused and h.refused.detail),
+    Column(name="true_utc", kind=_TIME, unit="UTC",
+           meaning="when the position was true, by the sender's clock", of=_true_ns),
+    Column(name="latency_s", kind=_N, unit="s", meaning="from then to the arrival", of=_latency_s),
+    Column(name="boot_s", kind=_N, unit="s", meaning="the sender's clock since boot, as sent",
+           of=_boot_s),
+    Column(name="tslc_s", kind=_N, unit="s", meaning="age of the position as a relay says",
+           of=lambda h: _of_said(h, "tslc_s")),
+    Column(name="lat_deg", kind=_N, unit="deg", meaning="latitude, WGS84",
+           of=lambda h: _degrees(h, 0)),
+    Column(name="lon_deg", kind=_N, unit="deg", meaning="longitude, WGS84",
+           of=lambda h: _degrees(h, 1)),
+    Column(name="alt_m", kind=_N, unit="m", meaning="height over `alt_datum`",
+           of=lambda h: _of_said(h, "alt_m")),
+    Column(name="alt_datum", kind=_T, unit="", meaning="`msl`, `pressure` or `geometric`",
+           of=lambda h: _of_said(h, "alt_datum")),
+    Column(name="relative_alt_m", kind=_N, unit="m", meaning="height above its home",
+           of=lambda h: _of_said(h, "relative_alt_m")),
+    Column(name="velocity_north_mps", kind=_N, unit="m/s", meaning="velocity as sent",
+           of=lambda h: _level_mps(h, 0)),
+    Column(name="velocity_east_mps", kind=_N, unit="m/s", meaning="velocity as sent",
+           of=lambda h: _level_mps(h, 1)),
+    Column(name="velocity_down_mps", kind=_N, unit="m/s", meaning="velocity as sent",
+           of=lambda h: _of_said(h, "velocity_down_mps")),
+    Column(name="heading_deg", kind=_N, unit="deg", meaning="from true north, as sent",
+           of=lambda h: _of_said(h, "heading_deg")),
+    Column(name="noise_horizontal_m", kind=_N, unit="m",
+           meaning="bound on the error of the position in the plane",
+           of=lambda h: _of_noise(h, "horizontal_m")),
+    Column(name="noise_vertical_m", kind=_N, unit="m", meaning="bound on the error of the height",
+           of=lambda h: _of_noise(h, "vertical_m")),
+    Column(name="noise_velocity_mps", kind=_N, unit="m/s",
+           meaning="bound on the error of the velocity", of=lambda h: _of_noise(h, "velocity_mps")),
+    Column(name="noise_time_s", kind=_N, unit="s",
+           meaning="what the UAV's own lag leaves of error in `true_utc`",
+           of=lambda h: _of_noise(h, "time_s")),
+    Column(name="dt_s", kind=_N, unit="s", meaning="interval since the UAV's report before",
+           of=lambda h: _of_estimate(h, "dt_s")),
+    Column(name="innovation_m", kind=_N, unit="m",
+           meaning="from where the UAV was expected to where it says it is",
+           of=lambda h: _of_estimate(h, "innovation_m")),
+    Column(name="bound_m", kind=_N, unit="m", meaning="bound on the error of that expectation",
+           of=lambda h: _of_estimate(h, "bound_m")),
+    Column(name="reacquired", kind=_TRUTH, unit="",
+           meaning="whether the track was begun again with it",
+           of=lambda h: h.estimate is not None and h.estimate.reacquired),
 ))
 # fmt: on

@@ -20,7 +20,12 @@ def rad(*degrees: float) -> tuple[float, ...]:
 
 def sector(*degrees: float) -> Sector:
     azimuth_from_rad, azimuth_to_rad, elevation_from_rad, elevation_to_rad = rad(*degrees)
-    return Sector(azimuth_from_rad, azimuth_to_rad, elevation_from_rad, elevation_to_rad)
+    return Sector(
+        azimuth_from_rad=azimuth_from_rad,
+        azimuth_to_rad=azimuth_to_rad,
+        elevation_from_rad=elevation_from_rad,
+        elevation_to_rad=elevation_to_rad,
+    )
 
 
 def towards(azimuth_deg: float, elevation_deg: float) -> FloatArray:
@@ -41,7 +46,9 @@ def why(coverage: Coverage, in_array: FloatArray, in_body: FloatArray) -> str | 
 def limited(azimuths_deg: tuple[float, float], elevations_deg: tuple[float, float]) -> Coverage:
     azimuths, elevations = np.radians(azimuths_deg), np.radians(elevations_deg)
     return Coverage(
-        None, (float(azimuths[0]), float(azimuths[1])), (float(elevations[0]), float(elevations[1]))
+        field_of_view_rad=None,
+        azimuth_limits_rad=(float(azimuths[0]), float(azimuths[1])),
+        elevation_limits_rad=(float(elevations[0]), float(elevations[1])),
     )
 
 
@@ -50,13 +57,13 @@ def limited(azimuths_deg: tuple[float, float], elevations_deg: tuple[float, floa
     [
         (Coverage(), towards(180, 0), towards(0, -90), None),
         (
-            Coverage(math.radians(120)),
+            Coverage(field_of_view_rad=math.radians(120)),
             towards(0, 62),
             FRONT,
             "62 degrees off boresight, outside the field of view of 120",
         ),
-        (Coverage(math.radians(120)), towards(-59.9, 0), FRONT, None),
-        (Coverage(2 * math.pi), towards(180, 0), FRONT, None),
+        (Coverage(field_of_view_rad=math.radians(120)), towards(-59.9, 0), FRONT, None),
+        (Coverage(field_of_view_rad=2 * math.pi), towards(180, 0), FRONT, None),
         (
             Coverage(azimuth_limits_rad=rad(-60, 45.5)),  # type: ignore[arg-type]
             towards(46, 10),
@@ -102,7 +109,12 @@ def test_one_clear_reason(
 
 
 def test_of_several_reasons_the_first_counts_and_each_direction_has_its_own() -> None:
-    coverage = Coverage(math.radians(90), rad(-30, 30), None, (BOX,))  # type: ignore[arg-type]
+    coverage = Coverage(
+        field_of_view_rad=math.radians(90),
+        azimuth_limits_rad=rad(-30, 30),
+        elevation_limits_rad=None,
+        hidden=(BOX,),
+    )  # type: ignore[arg-type]
     places = np.array([towards(50, 0), towards(40, 0), towards(0, 40), towards(0, 1)])
     body = np.array([towards(45, -5), towards(45, -5), towards(45, -5), FRONT])
     found = refusals(coverage, places, body)
@@ -117,8 +129,8 @@ def test_of_several_reasons_the_first_counts_and_each_direction_has_its_own() ->
     ("coverage", "in_array", "in_body", "margin_deg"),
     [
         (Coverage(), FRONT, FRONT, math.inf),
-        (Coverage(2 * math.pi), towards(180, 0), FRONT, math.inf),
-        (Coverage(math.radians(300)), towards(0, 90), FRONT, 60.0),
+        (Coverage(field_of_view_rad=2 * math.pi), towards(180, 0), FRONT, math.inf),
+        (Coverage(field_of_view_rad=math.radians(300)), towards(0, 90), FRONT, 60.0),
         (limited((-180, 180), (-90, 90)), FRONT, FRONT, math.inf),
         (limited((-180, 180), (-90, 60)), towards(77, 20), FRONT, 40.0),
         (limited((-180, 180), (-90, 60)), towards(77, -90), FRONT, 150.0),  # a pole is no edge
@@ -205,10 +217,10 @@ def test_the_margin_is_the_nearest_edge_and_nothing_nearer_is_refused(seed: int)
     azimuths = (steered.azimuth_from_rad, steered.azimuth_to_rad)
     elevations = (steered.elevation_from_rad, steered.elevation_to_rad)
     coverage = Coverage(
-        view,
-        azimuths if rng.random() < 0.4 else None,
-        elevations if rng.random() < 0.4 else None,
-        tuple(drawn(rng) for _ in range(rng.integers(4))),
+        field_of_view_rad=view,
+        azimuth_limits_rad=azimuths if rng.random() < 0.4 else None,
+        elevation_limits_rad=elevations if rng.random() < 0.4 else None,
+        hidden=tuple(drawn(rng) for _ in range(rng.integers(4))),
     )
     array_from_body = np.linalg.qr(rng.standard_normal((3, 3)))[0]
     array_from_body[0] *= np.linalg.det(array_from_body)
@@ -240,7 +252,12 @@ def test_margins_come_in_any_shape() -> None:
     rng = np.random.default_rng(5)
     directions = rng.standard_normal((4, 5, 3))
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    coverage = Coverage(math.radians(200), None, None, (BOX,))
+    coverage = Coverage(
+        field_of_view_rad=math.radians(200),
+        azimuth_limits_rad=None,
+        elevation_limits_rad=None,
+        hidden=(BOX,),
+    )
     found = margin_rad(coverage, directions, directions)
     assert found.shape == (4, 5)
     assert found[2, 3] == margin_rad(coverage, directions[2, 3], directions[2, 3])
@@ -271,7 +288,7 @@ def test_a_sector_that_is_none_is_refused(degrees: tuple[float, ...], reason: st
 @pytest.mark.parametrize("degrees", [0.0, -10.0, 360.1, math.nan, math.inf])
 def test_a_field_of_view_that_is_none_is_refused(degrees: float) -> None:
     with pytest.raises(ValueError, match=r"field of view .* degrees: above 0, at most 360"):
-        Coverage(math.radians(degrees))
+        Coverage(field_of_view_rad=math.radians(degrees))
 
 
 def test_steering_limits_that_are_none_are_refused() -> None:

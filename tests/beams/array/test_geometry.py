@@ -15,7 +15,7 @@ LIGHT = geometry.SPEED_OF_LIGHT_MPS
 
 
 def test_elements_stand_along_y() -> None:
-    array = geometry.uniform_linear(5, 3e9, 0.5, EYE)
+    array = geometry.uniform_linear(5, 3e9, spacing_wavelengths=0.5, array_from_body=EYE)
     assert array.size == 5
     assert array.wavelength_m == pytest.approx(299_792_458 / 3e9)
     spacing_m = 0.5 * 299_792_458 / 3e9
@@ -30,25 +30,31 @@ def test_elements_stand_along_y() -> None:
 )
 def test_what_is_no_array_is_refused(elements: int, frequency_hz: float, spacing: float) -> None:
     with pytest.raises(ValueError, match="at least one element"):
-        geometry.uniform_linear(elements, frequency_hz, spacing, EYE)
+        geometry.uniform_linear(
+            elements, frequency_hz, spacing_wavelengths=spacing, array_from_body=EYE
+        )
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_what_is_no_number_is_refused(bad: float) -> None:
     with pytest.raises(ValueError, match="a frequency and a spacing above 0"):
-        geometry.uniform_linear(4, bad, 0.5, EYE)
+        geometry.uniform_linear(4, bad, spacing_wavelengths=0.5, array_from_body=EYE)
     with pytest.raises(ValueError, match="a frequency and a spacing above 0"):
-        geometry.uniform_circular(4, 1e9, bad, EYE)
+        geometry.uniform_circular(4, 1e9, spacing_wavelengths=bad, array_from_body=EYE)
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(0, 4), (4, 0), (-1, -1)])
 def test_what_is_no_rectangle_is_refused(rows: int, columns: int) -> None:
     with pytest.raises(ValueError, match="at least one element"):
-        geometry.uniform_rectangular(rows, columns, 1e9, 0.5, EYE)
+        geometry.uniform_rectangular(
+            rows, columns=columns, frequency_hz=1e9, spacing_wavelengths=0.5, array_from_body=EYE
+        )
 
 
 def test_a_rectangle_is_numbered_row_by_row_to_the_right_then_down() -> None:
-    array = geometry.uniform_rectangular(3, 4, LIGHT, 0.6, EYE)
+    array = geometry.uniform_rectangular(
+        3, columns=4, frequency_hz=LIGHT, spacing_wavelengths=0.6, array_from_body=EYE
+    )
     assert (array.kind, array.size, array.grid) == ("ura", 12, (3, 4))
     for row in range(3):
         for column in range(4):
@@ -59,8 +65,10 @@ def test_a_rectangle_is_numbered_row_by_row_to_the_right_then_down() -> None:
 
 def test_one_row_is_the_line() -> None:
     row, line = (
-        geometry.uniform_rectangular(1, 5, 3e9, 0.5, EYE),
-        geometry.uniform_linear(5, 3e9, 0.5, EYE),
+        geometry.uniform_rectangular(
+            1, columns=5, frequency_hz=3e9, spacing_wavelengths=0.5, array_from_body=EYE
+        ),
+        geometry.uniform_linear(5, 3e9, spacing_wavelengths=0.5, array_from_body=EYE),
     )
     assert row.kind == line.kind == "ula"
     assert row.grid == line.grid == (1, 5)
@@ -69,7 +77,7 @@ def test_one_row_is_the_line() -> None:
 
 @pytest.mark.parametrize("elements", [2, 3, 4, 7, 32])
 def test_a_circle_has_its_spacing_between_neighbours_and_starts_at_boresight(elements: int) -> None:
-    array = geometry.uniform_circular(elements, LIGHT, 0.5, EYE)
+    array = geometry.uniform_circular(elements, LIGHT, spacing_wavelengths=0.5, array_from_body=EYE)
     assert (array.kind, array.size, array.grid) == ("uca", elements, None)
     gaps = np.linalg.norm(array.elements_m - np.roll(array.elements_m, -1, axis=0), axis=1)
     assert gaps == pytest.approx(0.5)
@@ -82,19 +90,28 @@ def test_a_circle_has_its_spacing_between_neighbours_and_starts_at_boresight(ele
 
 
 def test_a_circle_of_one_stands_at_the_origin() -> None:
-    assert not geometry.uniform_circular(1, 1e9, 0.5, EYE).elements_m.any()
+    assert not geometry.uniform_circular(
+        1, 1e9, spacing_wavelengths=0.5, array_from_body=EYE
+    ).elements_m.any()
 
 
 COSINE = Element(Pattern.COSINE)
 
 
 def test_elements_of_a_circle_face_outward_unless_they_are_isotropic() -> None:
-    array = geometry.uniform_circular(6, 1e9, 0.5, EYE, COSINE)
+    array = geometry.uniform_circular(
+        6, 1e9, spacing_wavelengths=0.5, array_from_body=EYE, element=COSINE
+    )
     turned = array.element_from_array
     assert turned is not None
     outward = array.elements_m / np.linalg.norm(array.elements_m, axis=1)[:, np.newaxis]
     assert np.einsum("mij,mj->mi", turned, outward) == pytest.approx(np.array([[1, 0, 0]] * 6))
-    assert geometry.uniform_circular(6, 1e9, 0.5, EYE).element_from_array is None
+    assert (
+        geometry.uniform_circular(
+            6, 1e9, spacing_wavelengths=0.5, array_from_body=EYE
+        ).element_from_array
+        is None
+    )
 
 
 def test_elements_face_where_they_are_told_and_stay_level() -> None:
@@ -103,7 +120,12 @@ def test_elements_face_where_they_are_told_and_stay_level() -> None:
         [rng.standard_normal((20, 3)), [[0, 0, 2], [0, 0, -0.5], [1e-13, 0, -1], [-3, 0, 0]]]
     )
     array = geometry.listed(
-        rng.uniform(-1, 1, (24, 3)), 1e9, EYE, Element(Pattern.TR38901), None, outward
+        rng.uniform(-1, 1, (24, 3)),
+        1e9,
+        array_from_body=EYE,
+        element=Element(Pattern.TR38901),
+        lever_arm_m=None,
+        outward=outward,
     )
     turned = array.element_from_array
     assert turned is not None
@@ -122,15 +144,17 @@ def test_elements_face_where_they_are_told_and_stay_level() -> None:
 def test_what_is_listed_is_kept() -> None:
     places = np.random.default_rng(4).uniform(-1, 1, (6, 3))
     lever = np.array([0.1, -0.2, 0.3])
-    array = geometry.listed(places, 2e9, EYE, COSINE, lever)
+    array = geometry.listed(places, 2e9, array_from_body=EYE, element=COSINE, lever_arm_m=lever)
     assert (array.kind, array.size, array.grid) == ("list", 6, None)
     assert array.elements_m is places
     assert array.lever_arm_m is lever
     assert array.element is COSINE
     assert array.element_from_array is None  # all along boresight
-    assert not geometry.listed(places, 2e9, EYE).lever_arm_m.any()
+    assert not geometry.listed(places, 2e9, array_from_body=EYE).lever_arm_m.any()
     for made in (geometry.uniform_linear, geometry.uniform_circular):
-        array = made(3, 1e9, 0.5, EYE, COSINE, lever)
+        array = made(
+            3, 1e9, spacing_wavelengths=0.5, array_from_body=EYE, element=COSINE, lever_arm_m=lever
+        )
         assert array.lever_arm_m is lever
         assert array.element is COSINE
 
@@ -157,4 +181,6 @@ def test_a_list_that_is_no_array_is_refused(
     places: FloatArray, outward: FloatArray | None, reason: str
 ) -> None:
     with pytest.raises(ValueError, match=reason):
-        geometry.listed(places, LIGHT, EYE, COSINE, None, outward)
+        geometry.listed(
+            places, LIGHT, array_from_body=EYE, element=COSINE, lever_arm_m=None, outward=outward
+        )

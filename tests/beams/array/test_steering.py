@@ -39,7 +39,9 @@ def unit(azimuth_rad: float, elevation_rad: float) -> tuple[float, float, float]
 def test_the_known_steering_vector() -> None:
     """Five elements at 0, .1, ..., .4 m, 1 GHz, 45 degrees."""
     elements = np.array([[0.0, 0.1 * m, 0.0] for m in range(5)])
-    array = Array("list", elements, 299_792_458 / 1e9, np.eye(3))
+    array = Array(
+        kind="list", elements_m=elements, wavelength_m=299_792_458 / 1e9, array_from_body=np.eye(3)
+    )
     found = steering.steering_matrix(array, np.array([unit(math.radians(45), 0)]))
     golden = [1, 0.0887 + 0.9961j, -0.9843 + 0.1767j, -0.2633 - 0.9647j, 0.9376 - 0.3478j]
     assert found.shape == (5, 1)
@@ -50,7 +52,7 @@ def test_the_known_steering_vector() -> None:
 def test_steering_is_the_sum_written_out(angles: list[tuple[float, float]], seed: int) -> None:
     """Elements anywhere in space."""
     elements = np.random.default_rng(seed).uniform(-0.05, 0.05, (7, 3))
-    array = Array("list", elements, 0.01, np.eye(3))
+    array = Array(kind="list", elements_m=elements, wavelength_m=0.01, array_from_body=np.eye(3))
     directions = np.array([unit(*pair) for pair in angles])
     found = steering.steering_matrix(array, directions)
     assert found.shape == (7, len(angles))
@@ -63,7 +65,7 @@ def test_steering_is_the_sum_written_out(angles: list[tuple[float, float]], seed
 @given(st.floats(-1.5, 1.5))
 def test_in_the_plane_it_is_the_published_vector(theta_rad: float) -> None:
     """exp(j 2 pi / wavelength d m sin theta)."""
-    array = uniform_linear(8, 30e9, 0.5, np.eye(3))
+    array = uniform_linear(8, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
     found = steering.steering_matrix(array, np.array([unit(theta_rad, 0.0)]))[:, 0]
     wavelength_m = SPEED_OF_LIGHT_MPS / 30e9
     phase = 2 * np.pi / wavelength_m * (wavelength_m / 2) * np.arange(8) * np.sin(theta_rad)
@@ -88,11 +90,24 @@ OUTWARD = np.random.default_rng(8).standard_normal((7, 3))
 PLACES = np.random.default_rng(9).uniform(-0.05, 0.05, (7, 3))
 SQUARE = Element(Pattern.COSINE, 2.0)
 FACING = {
-    "line": uniform_linear(5, 30e9, 0.5, np.eye(3), SQUARE),
-    "rectangle": uniform_rectangular(2, 3, 30e9, 0.5, np.eye(3), SQUARE),
-    "circle": uniform_circular(6, 30e9, 0.5, np.eye(3), SQUARE),
-    "list": listed(PLACES, 30e9, np.eye(3), SQUARE),
-    "list, each facing its way": listed(PLACES, 30e9, np.eye(3), SQUARE, None, OUTWARD),
+    "line": uniform_linear(
+        5, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3), element=SQUARE
+    ),
+    "rectangle": uniform_rectangular(
+        2,
+        columns=3,
+        frequency_hz=30e9,
+        spacing_wavelengths=0.5,
+        array_from_body=np.eye(3),
+        element=SQUARE,
+    ),
+    "circle": uniform_circular(
+        6, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3), element=SQUARE
+    ),
+    "list": listed(PLACES, 30e9, array_from_body=np.eye(3), element=SQUARE),
+    "list, each facing its way": listed(
+        PLACES, 30e9, array_from_body=np.eye(3), element=SQUARE, lever_arm_m=None, outward=OUTWARD
+    ),
 }
 
 
@@ -117,7 +132,14 @@ def test_steering_has_each_elements_gain(name: str, angles: list[tuple[float, fl
 def test_a_direction_seen_by_an_element_that_faces_right() -> None:
     """Ahead of the array is to the element's left; to the right of the array is ahead of it."""
     right = np.array([[0.0, 1.0, 0.0]])
-    array = listed(np.zeros((1, 3)), 1e9, np.eye(3), SQUARE, None, right)
+    array = listed(
+        np.zeros((1, 3)),
+        1e9,
+        array_from_body=np.eye(3),
+        element=SQUARE,
+        lever_arm_m=None,
+        outward=right,
+    )
     seen = steering.element_directions(array, np.array([unit(0, 0), unit(math.pi / 2, 0)]))
     assert seen[0] == pytest.approx(np.array([[0, -1, 0], [1, 0, 0]]))
 
@@ -173,7 +195,9 @@ def test_inside_the_ball_every_direction_is_possible(bound_m: float) -> None:
 @pytest.mark.parametrize("users", [1, 7, 300])
 def test_powers_on_a_grid_are_the_exponentials(rows: int, columns: int, users: int) -> None:
     """However many: few are taken one way and many the other."""
-    array = uniform_rectangular(rows, columns, 30e9, 0.7, np.eye(3))
+    array = uniform_rectangular(
+        rows, columns=columns, frequency_hz=30e9, spacing_wavelengths=0.7, array_from_body=np.eye(3)
+    )
     directions = np.random.default_rng(users).standard_normal((users, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, np.newaxis]
     found = steering.steering_matrix(array, directions)

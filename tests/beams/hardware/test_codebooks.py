@@ -30,10 +30,10 @@ from companion.values import FloatArray
 EYE = np.eye(3)
 GPP = Element(Pattern.TR38901)
 COSINE = Element(Pattern.COSINE, 1.0)
-LINE = line(16, 30e9, 0.5, EYE, GPP)
-GRID = grid(4, 6, 30e9, 0.5, EYE)
-CIRCLE = uniform_circular(12, 30e9, 0.5, EYE, GPP)
-CLOUD = listed(np.random.default_rng(8).uniform(-0.015, 0.015, (10, 3)), 30e9, EYE)
+LINE = line(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=GPP)
+GRID = grid(4, columns=6, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE)
+CIRCLE = uniform_circular(12, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=GPP)
+CLOUD = listed(np.random.default_rng(8).uniform(-0.015, 0.015, (10, 3)), 30e9, array_from_body=EYE)
 
 
 def drawn(array: Array, beams: int, seed: int = 1) -> Codebook:
@@ -89,7 +89,7 @@ def in_plane(sine: float) -> FloatArray:
 @pytest.mark.parametrize("oversampling", [1, 3])
 def test_the_beams_of_a_line_point_where_their_index_says(oversampling: int) -> None:
     """Full gain M at sine 2k/K, wrapped; without oversampling a null at every other such place."""
-    array = line(8, 30e9, 0.5, EYE)
+    array = line(8, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
     book = dft(array, oversampling)
     beams = 8 * oversampling
     assert (book.kind, book.size, book.weights.shape) == ("dft", beams, (8, beams))
@@ -104,7 +104,12 @@ def test_the_beams_of_a_line_point_where_their_index_says(oversampling: int) -> 
 @pytest.mark.parametrize(("rows", "columns", "oversampling"), [(3, 4, 1), (2, 3, 2), (5, 1, 2)])
 def test_the_beams_of_a_grid_are_products(rows: int, columns: int, oversampling: int) -> None:
     """Element (r, c) is r columns + c, beam (kz, ky) is kz Ky + ky; a single column has Ky = 1."""
-    book = dft(grid(rows, columns, 30e9, 0.5, EYE), oversampling)
+    book = dft(
+        grid(
+            rows, columns=columns, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
+        ),
+        oversampling,
+    )
     down = rows * oversampling
     across = columns * oversampling if columns > 1 else 1
     assert book.size == down * across
@@ -125,7 +130,7 @@ def test_beams_have_unit_power() -> None:
 
 def test_a_listed_beam_keeps_its_direction() -> None:
     weights = np.array([[3, 0, 1e-200j], [4j, 5, 0]])
-    book = codebooks.listed(weights, line(2, 1e9, 0.5, EYE))
+    book = codebooks.listed(weights, line(2, 1e9, spacing_wavelengths=0.5, array_from_body=EYE))
     assert book.kind == "listed"
     assert book.weights == pytest.approx(np.array([[0.6, 0, 1j], [0.8j, 1, 0]]))
 
@@ -177,7 +182,7 @@ def test_the_best_beam_is_the_one_received_most(name: str, monkeypatch: pytest.M
 
 
 def test_behind_the_elements_the_order_of_beams_is_that_without_their_pattern() -> None:
-    array = line(8, 30e9, 0.5, EYE, COSINE)
+    array = line(8, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=COSINE)
     indices, gains = best(dft(array), array, np.array([[-0.8, 0.6, 0.0], [0.8, 0.6, 0.0]]))
     assert indices[0] == indices[1] == 2
     assert gains[0] == 0 < gains[1]
@@ -275,7 +280,7 @@ def test_any_direction_needs_all_beams() -> None:
 
 
 def test_the_pattern_of_the_elements_does_not_matter_where_all_face_alike() -> None:
-    plain = line(16, 30e9, 0.5, EYE)
+    plain = line(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
     rng = np.random.default_rng(2)
     for bound_rad in (0.01, 0.3):
         direction = unit(rng)
@@ -399,7 +404,7 @@ def test_the_step_is_a_quarter_of_a_beam() -> None:
     assert codebooks.sampling_step_s(dft(LINE), LINE, -0.5) == pytest.approx(1 / 7.5 / 0.5 / 4)
     assert codebooks.sampling_step_s(dft(LINE, 4), LINE, 0.5) == pytest.approx(1 / 30 / 0.5 / 4)
     assert codebooks.sampling_step_s(dft(LINE), LINE, 0.0) is None
-    one = line(1, 1e9, 0.5, EYE)
+    one = line(1, 1e9, spacing_wavelengths=0.5, array_from_body=EYE)
     assert codebooks.sampling_step_s(dft(one), one, 1.0) is None
 
 

@@ -17,7 +17,9 @@ from companion.beams.hardware.digital_beams import write_oai_dbt
 from companion.cli.main import main
 from companion.values import ComplexArray, UserError
 
-PANEL = uniform_rectangular(4, 4, 28e9, 0.5, np.eye(3))
+PANEL = uniform_rectangular(
+    4, columns=4, frequency_hz=28e9, spacing_wavelengths=0.5, array_from_body=np.eye(3)
+)
 COMPLEX = re.compile(r"([+-]?[\d.]+)([+-][\d.]+)[ij]")
 
 
@@ -57,9 +59,9 @@ def test_a_calibrated_panel_radiates_the_codebook() -> None:
     """The base station's ports are the channels, and the strongest part is in range."""
     rng, book = np.random.default_rng(2), codebooks.dft(PANEL)
     calibration = Calibration(
-        tuple(rng.uniform(-3, 3, 16).tolist()),
-        (-30.0, *rng.uniform(-2, 2, 15).tolist()),
-        tuple(rng.permutation(16).tolist()),
+        phase_rad=tuple(rng.uniform(-3, 3, 16).tolist()),
+        gain_db=(-30.0, *rng.uniform(-2, 2, 15).tolist()),
+        order=tuple(rng.permutation(16).tolist()),
     )
     for beam, ports in loaded(write_oai_dbt(book, calibration)).items():
         radiated = np.zeros(16, complex)

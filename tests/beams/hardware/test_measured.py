@@ -23,8 +23,15 @@ EYE = np.eye(3)
 ORDER = (6, 7, 4, 5, 2, 3, 0, 1)
 AT_DEG = [(-40.0, 0.0), (-10.0, 5.0), (0.0, 0.0), (25.0, -10.0), (50.0, 10.0)]
 ARRAYS = {
-    "line": line(8, 10.5e9, 0.5, EYE),
-    "grid": grid(2, 4, 10.5e9, 0.6, EYE, Element(Pattern.COSINE, 1.0)),
+    "line": line(8, 10.5e9, spacing_wavelengths=0.5, array_from_body=EYE),
+    "grid": grid(
+        2,
+        columns=4,
+        frequency_hz=10.5e9,
+        spacing_wavelengths=0.6,
+        array_from_body=EYE,
+        element=Element(Pattern.COSINE, 1.0),
+    ),
 }
 
 

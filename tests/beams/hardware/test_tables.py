@@ -41,11 +41,11 @@ def wanted(sines: list[float], elements: int) -> list[WantedBeam]:
     weights = np.linalg.pinv(steering.T)
     return [
         WantedBeam(
-            f"{i + 1}:1",
-            weights[:, i],
-            math.asin(sine),
-            0.0,
-            steering[:, [i, *(j for j in range(len(sines)) if j != i)]],
+            uav=f"{i + 1}:1",
+            weights=weights[:, i],
+            azimuth_rad=math.asin(sine),
+            elevation_rad=0.0,
+            steering=steering[:, [i, *(j for j in range(len(sines)) if j != i)]],
         )
         for i, sine in enumerate(sines)
     ]
@@ -55,9 +55,9 @@ def measured(seed: int, elements: int) -> Calibration:
     """A scrambled array whose channels differ by up to 4 dB and any phase."""
     rng = np.random.default_rng(seed)
     return Calibration(
-        tuple(rng.uniform(-4, 4, elements).tolist()),
-        tuple(rng.uniform(-2, 2, elements).tolist()),
-        tuple(rng.permutation(elements).tolist()),
+        phase_rad=tuple(rng.uniform(-4, 4, elements).tolist()),
+        gain_db=tuple(rng.uniform(-2, 2, elements).tolist()),
+        order=tuple(rng.permutation(elements).tolist()),
     )
 
 
@@ -116,7 +116,7 @@ def test_a_calibration_is_checked(
     phase: tuple[float, ...], gain: tuple[float, ...], order: tuple[int, ...], said: str
 ) -> None:
     with pytest.raises(ValueError, match=said):
-        Calibration(phase, gain, order)
+        Calibration(phase_rad=phase, gain_db=gain, order=order)
 
 
 # --- what is fitted -----------------------------------------------------------------------------
@@ -154,8 +154,16 @@ def test_the_loss_is_that_of_the_array_gain() -> None:
 def test_phases_are_taken_out_not_put_in() -> None:
     """A channel that adds 90 degrees is set 90 degrees back."""
     ideal = Calibration.ideal(range(16))
-    turned = Calibration((math.pi / 2, *ideal.phase_rad[1:]), ideal.gain_db, ideal.order)
-    beam = WantedBeam("1:1", np.ones(16, dtype=complex), 0.0, 0.0, line([0.0], 16))
+    turned = Calibration(
+        phase_rad=(math.pi / 2, *ideal.phase_rad[1:]), gain_db=ideal.gain_db, order=ideal.order
+    )
+    beam = WantedBeam(
+        uav="1:1",
+        weights=np.ones(16, dtype=complex),
+        azimuth_rad=0.0,
+        elevation_rad=0.0,
+        steering=line([0.0], 16),
+    )
     phases = fit(Device.TMYTEK, [beam], turned).codes[0, :, 0]
     assert (phases[0] - phases[1]) % 360 == 270
     assert len(set(phases[1:].tolist())) == 1
@@ -164,8 +172,16 @@ def test_phases_are_taken_out_not_put_in() -> None:
 def test_gains_are_levelled_to_the_weakest() -> None:
     """The strongest setting is full gain; a channel 3 dB too strong is set 3 dB down."""
     ideal = Calibration.ideal(range(16))
-    uneven = Calibration(ideal.phase_rad, (3.0, *ideal.gain_db[1:]), ideal.order)
-    beam = WantedBeam("1:1", np.ones(16, dtype=complex), 0.0, 0.0, line([0.0], 16))
+    uneven = Calibration(
+        phase_rad=ideal.phase_rad, gain_db=(3.0, *ideal.gain_db[1:]), order=ideal.order
+    )
+    beam = WantedBeam(
+        uav="1:1",
+        weights=np.ones(16, dtype=complex),
+        azimuth_rad=0.0,
+        elevation_rad=0.0,
+        steering=line([0.0], 16),
+    )
     assert fit(Device.TMYTEK, [beam], uneven).codes[0, :, 1].tolist() == [6, *[0] * 15]
 
 
@@ -184,33 +200,47 @@ def test_gains_are_levelled_to_the_weakest() -> None:
     ],
 )
 def test_what_a_device_cannot_do_is_refused(
-    device: Device, size: int, count: int, azimuth_deg: float, elevation_deg: float, said: str
+    *, device: Device, size: int, count: int, azimuth_deg: float, elevation_deg: float, said: str
 ) -> None:
     beam = WantedBeam(
-        "7:1",
-        np.ones(size, dtype=complex),
-        math.radians(azimuth_deg),
-        math.radians(elevation_deg),
-        line([0.0], size),
+        uav="7:1",
+        weights=np.ones(size, dtype=complex),
+        azimuth_rad=math.radians(azimuth_deg),
+        elevation_rad=math.radians(elevation_deg),
+        steering=line([0.0], size),
     )
     with pytest.raises(ValueError, match=said):
         fit(device, [beam] * count, Calibration.ideal(range(size)))
 
 
 def test_the_edge_of_what_it_can_do_is_taken() -> None:
-    beam = WantedBeam("7:1", np.ones(16, dtype=complex), math.pi / 4, 0.0, line([0.7], 16))
+    beam = WantedBeam(
+        uav="7:1",
+        weights=np.ones(16, dtype=complex),
+        azimuth_rad=math.pi / 4,
+        elevation_rad=0.0,
+        steering=line([0.7], 16),
+    )
     assert fit(Device.TMYTEK, [beam] * 64, Calibration.ideal(range(16))).codes.shape[0] == 64
 
 
 def test_channels_that_differ_too_much_or_do_not_match_are_refused() -> None:
     ideal = Calibration.ideal(range(16))
     beam = wanted([0.1], 16)[0]
-    wild = Calibration(ideal.phase_rad, (7.6, *ideal.gain_db[1:]), ideal.order)
+    wild = Calibration(
+        phase_rad=ideal.phase_rad, gain_db=(7.6, *ideal.gain_db[1:]), order=ideal.order
+    )
     with pytest.raises(ValueError, match=r"differ by 7\.6 dB, tmytek can level 7\.5 dB"):
         fit(Device.TMYTEK, [beam], wild)
     with pytest.raises(ValueError, match=r"beam for 1:1: weights \(16,\)"):
         fit(Device.ADAR1000, [beam], Calibration.ideal(range(8)))
-    nowhere = WantedBeam("1:1", beam.weights, 0.0, 0.0, np.empty((16, 0), complex))
+    nowhere = WantedBeam(
+        uav="1:1",
+        weights=beam.weights,
+        azimuth_rad=0.0,
+        elevation_rad=0.0,
+        steering=np.empty((16, 0), complex),
+    )
     with pytest.raises(ValueError, match="one direction or more"):
         fit(Device.ADAR1000, [nowhere], ideal)
 
@@ -246,7 +276,14 @@ def test_every_code_survives(seed: int, device: Device) -> None:
     spread[:, 0] = 1.0
     codes = kind.nearest(spread)
     ideal = Calibration.ideal(range(size))
-    table = DeviceTable(device, ("a", "b b", "icao:4CA7B3"), codes, ideal.order, spread.T, None)
+    table = DeviceTable(
+        device=device,
+        uavs=("a", "b b", "icao:4CA7B3"),
+        codes=codes,
+        order=ideal.order,
+        weights=spread.T,
+        loss_db=None,
+    )
     found = parse(device, written(device, table), ideal)
     assert np.array_equal(found.codes, codes)
     assert found.weights == pytest.approx(kind.values(codes).T)
@@ -256,7 +293,13 @@ def test_the_adar1000_table_of_a_phaser() -> None:
     """Channel 2 of the first chip is element 8 of the CN0566, in pyadi-iio's counting."""
     calibration = Calibration.ideal(CN0566_ORDER)
     ramp = np.exp(2j * np.pi * 16 / 128 * np.arange(8))  # 45 degrees from element to element
-    beam = WantedBeam("5:1", ramp, 0.2, 0.0, ramp.conj()[:, np.newaxis])
+    beam = WantedBeam(
+        uav="5:1",
+        weights=ramp,
+        azimuth_rad=0.2,
+        elevation_rad=0.0,
+        steering=ramp.conj()[:, np.newaxis],
+    )
     header, *lines = encode(fit(Device.ADAR1000, [beam], calibration)).splitlines()
     assert header.startswith("beam,uav,chip,channel,element,phase_code,phase_deg,gain_code,")
     rows = [line.split(",") for line in lines]
@@ -312,7 +355,16 @@ def test_the_gains_of_the_adar1000_fill_its_range() -> None:
 def test_the_tmytek_table() -> None:
     table = fit(
         Device.TMYTEK,
-        [WantedBeam("1:1", np.array([1.0, 0.5, 0.0, 1j] * 4), 0.0, 0.0, line([0.0], 16))] * 2,
+        [
+            WantedBeam(
+                uav="1:1",
+                weights=np.array([1.0, 0.5, 0.0, 1j] * 4),
+                azimuth_rad=0.0,
+                elevation_rad=0.0,
+                steering=line([0.0], 16),
+            )
+        ]
+        * 2,
         Calibration.ideal(range(16)),
         UnitGains(Mode.RX, 11.5, 7.5),
     )
@@ -338,7 +390,13 @@ def test_blank_lines_of_a_tmytek_table_are_skipped() -> None:
 def test_what_is_off_does_not_count_for_full_gain() -> None:
     """A table may say any gain for a channel that is switched off."""
     ideal = Calibration.ideal(range(16))
-    beam = WantedBeam("1:1", np.array([0, *[1] * 15], complex), 0.0, 0.0, line([0.0], 16))
+    beam = WantedBeam(
+        uav="1:1",
+        weights=np.array([0, *[1] * 15], complex),
+        azimuth_rad=0.0,
+        elevation_rad=0.0,
+        steering=line([0.0], 16),
+    )
     table = fit(Device.TMYTEK, [beam], ideal)
     text = encode(table)
     assert ",1,1,-7.5," in text
@@ -373,7 +431,13 @@ def test_a_sivers_book_needs_a_frequency() -> None:
 
 @pytest.mark.parametrize("name", ["", "a,b", 'a"b', "a\nb", " a", "a\u2028b"])
 def test_names_that_would_break_a_line_are_refused(name: str) -> None:
-    beam = WantedBeam(name, np.ones(8, complex), 0.0, 0.0, line([0.0], 8))
+    beam = WantedBeam(
+        uav=name,
+        weights=np.ones(8, complex),
+        azimuth_rad=0.0,
+        elevation_rad=0.0,
+        steering=line([0.0], 8),
+    )
     with pytest.raises(ValueError, match="a name has no comma"):
         fit(Device.ADAR1000, [beam], Calibration.ideal(range(8)))
 
@@ -415,7 +479,13 @@ def test_a_broken_text_is_refused_with_its_line(
 ) -> None:
     size = SIZES[device]
     ideal = Calibration.ideal(range(size))
-    beam = WantedBeam("1:1", np.ones(size, dtype=complex), 0.0, 0.0, line([0.0], size))
+    beam = WantedBeam(
+        uav="1:1",
+        weights=np.ones(size, dtype=complex),
+        azimuth_rad=0.0,
+        elevation_rad=0.0,
+        steering=line([0.0], size),
+    )
     text = written(device, fit(device, [beam], ideal))
     assert change[0] in text
     with pytest.raises(ValueError, match=said):

@@ -34,9 +34,18 @@ def table(gains: UnitGains, seed: int, beams: int) -> DeviceTable:
     array *= 10 ** rng.uniform(-2, 0, (16, beams)) * (rng.random((16, beams)) > 0.1)
     array[0] = 1
     own: ComplexArray = np.ones((16, 1), complex)
-    wanted = [WantedBeam(f"{i}:1", array[:, i], 0.0, 0.0, own) for i in range(beams)]
+    wanted = [
+        WantedBeam(
+            uav=f"{i}:1", weights=array[:, i], azimuth_rad=0.0, elevation_rad=0.0, steering=own
+        )
+        for i in range(beams)
+    ]
     levels = rng.uniform(-gains.range_db / 2, gains.range_db / 2, 16)
-    uneven = Calibration((0.0,) * 16, tuple(levels.tolist()), tuple(rng.permutation(16).tolist()))
+    uneven = Calibration(
+        phase_rad=(0.0,) * 16,
+        gain_db=tuple(levels.tolist()),
+        order=tuple(rng.permutation(16).tolist()),
+    )
     return fit(Device.TMYTEK, wanted, uneven, gains)
 
 
@@ -104,7 +113,13 @@ def zero_beam() -> WantedBeam:
     """A beam of which one element is off."""
     weights = np.ones(16, complex)
     weights[3] = 0
-    return WantedBeam("1:1", weights, 0.0, 0.0, np.ones((16, 1), complex))
+    return WantedBeam(
+        uav="1:1",
+        weights=weights,
+        azimuth_rad=0.0,
+        elevation_rad=0.0,
+        steering=np.ones((16, 1), complex),
+    )
 
 
 def test_a_unit_without_a_range_is_set_by_phases_alone() -> None:
@@ -114,7 +129,9 @@ def test_a_unit_without_a_range_is_set_by_phases_alone() -> None:
     assert {row.split(",")[8] for row in text.splitlines()[1:]} == {"1.0"}
     assert text.splitlines()[4].split(",")[7] == "1"  # off
     with pytest.raises(UserError, match=r"differ by 1\.0 dB, tmytek can level 0\.0 dB"):
-        uneven = Calibration((0.0,) * 16, (1.0, *[0.0] * 15), tuple(range(16)))
+        uneven = Calibration(
+            phase_rad=(0.0,) * 16, gain_db=(1.0, *[0.0] * 15), order=tuple(range(16))
+        )
         fit(Device.TMYTEK, [zero_beam()], uneven, gains)
 
 

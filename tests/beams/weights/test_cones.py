@@ -14,11 +14,17 @@ from companion.values import FloatArray
 
 EYE = np.eye(3)
 GRIDS = {
-    "line": uniform_linear(16, 30e9, 0.5, EYE),
-    "odd line": uniform_linear(15, 30e9, 0.4, EYE),
-    "square": uniform_rectangular(6, 6, 30e9, 0.5, EYE),
-    "oblong": uniform_rectangular(3, 8, 30e9, 0.5, EYE),
-    "patches": uniform_linear(16, 30e9, 0.5, EYE, element=Element(Pattern.COSINE)),
+    "line": uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE),
+    "odd line": uniform_linear(15, 30e9, spacing_wavelengths=0.4, array_from_body=EYE),
+    "square": uniform_rectangular(
+        6, columns=6, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
+    ),
+    "oblong": uniform_rectangular(
+        3, columns=8, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
+    ),
+    "patches": uniform_linear(
+        16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=Element(Pattern.COSINE)
+    ),
 }
 DIRECTIONS = np.array([[0.8, 0.6, 0.0], [0.6, -0.48, 0.64], [1.0, 0.0, 0.0]])
 

@@ -73,9 +73,10 @@ def test_mmse_with_max_min_is_the_optimum(users: int, snr_db: float) -> None:
     a = steering(users, 64, users)
     ranges = np.random.default_rng(users).uniform(0.3, 3.0, users)
     radio = Radio(10 ** (snr_db / 10) / 64 * users * ranges, np.ones(users))
-    how = Precoder(Method.MMSE, power=Power.MAX_MIN, normalisation=Normalisation.TOTAL,
-                   widen=Widen.NO)  # fmt: skip
-    found = precode(a, how, None, None, radio).weights
+    how = Precoder(
+        method=Method.MMSE, power=Power.MAX_MIN, normalisation=Normalisation.TOTAL, widen=Widen.NO
+    )
+    found = precode(a, how, None, priorities=None, radio=radio).weights
     assert np.linalg.norm(found) == pytest.approx(1.0)
     ours = sinr(radio.snr[:, np.newaxis] * np.abs(a.T @ found) ** 2, np.ones(users)).min()
     share = np.full(users, 1 / users)
@@ -100,8 +101,10 @@ def test_mmse_has_a_greater_sum_of_rates_than_zero_forcing(users: int, snr_db: f
     radio = Radio(np.full(users, 10 ** (snr_db / 10) / 4), np.ones(users))
 
     def total(method: Method, power: Power) -> float:
-        how = Precoder(method, power=power, normalisation=Normalisation.TOTAL, widen=Widen.NO)
-        weights = precode(a, how, None, None, radio).weights
+        how = Precoder(
+            method=method, power=power, normalisation=Normalisation.TOTAL, widen=Widen.NO
+        )
+        weights = precode(a, how, None, priorities=None, radio=radio).weights
         found = sinr(radio.snr[:, np.newaxis] * np.abs(a.T @ weights) ** 2, np.ones(users))
         return float(np.log2(1 + found).sum())
 
@@ -112,7 +115,7 @@ def test_mmse_has_a_greater_sum_of_rates_than_zero_forcing(users: int, snr_db: f
 
 def test_without_a_radio_there_is_no_mmse() -> None:
     with pytest.raises(ValueError, match="radio"):
-        precode(steering(1, 8, 2), Precoder(Method.MMSE))
+        precode(steering(1, 8, 2), Precoder(method=Method.MMSE))
 
 
 @pytest.mark.parametrize("power", Power)
@@ -125,7 +128,9 @@ def test_channels_that_are_alike_are_shared_at_any_power(power: Power, snr_db: f
         sines[1] = sines[0]
         a = np.exp(1j * np.pi * np.outer(np.arange(8), sines))
         snr = 10 ** (snr_db / 10) * 10 ** rng.uniform(-3, 3, users)
-        how = Precoder(Method.MMSE, normalisation=Normalisation.TOTAL, widen=Widen.NO, power=power)
-        weights = precode(a, how, None, None, Radio(snr, np.ones(users))).weights
+        how = Precoder(
+            method=Method.MMSE, normalisation=Normalisation.TOTAL, widen=Widen.NO, power=power
+        )
+        weights = precode(a, how, None, priorities=None, radio=Radio(snr, np.ones(users))).weights
         assert np.isfinite(weights).all()
         assert (np.abs(weights) ** 2).sum() == pytest.approx(1.0)

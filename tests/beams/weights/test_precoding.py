@@ -64,13 +64,26 @@ def any_array(seed: int) -> Array:
     element = Element([Pattern.ISOTROPIC, Pattern.TR38901][seed // 4 % 2])
     match seed % 4:
         case 0:
-            return uniform_linear(16, 30e9, 0.5, EYE, element)
+            return uniform_linear(
+                16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=element
+            )
         case 1:
-            return uniform_rectangular(4, 4, 30e9, 0.5, EYE, element)
+            return uniform_rectangular(
+                4,
+                columns=4,
+                frequency_hz=30e9,
+                spacing_wavelengths=0.5,
+                array_from_body=EYE,
+                element=element,
+            )
         case 2:
-            return uniform_circular(16, 30e9, 0.5, EYE, element)
+            return uniform_circular(
+                16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=element
+            )
         case _:
-            return listed(rng.uniform(-0.03, 0.03, (16, 3)), 30e9, EYE, element)
+            return listed(
+                rng.uniform(-0.03, 0.03, (16, 3)), 30e9, array_from_body=EYE, element=element
+            )
 
 
 @settings(max_examples=examples(150))
@@ -83,7 +96,7 @@ def test_zero_forcing_gives_each_its_own_and_nothing_of_the_others(
     directions = somewhere(data, users)
     a = steering.steering_matrix(array, directions)
     bounds = np.random.default_rng(seed).uniform(0, 0.1, users)
-    known = Uncertain(bounds / 4, bounds)
+    known = Uncertain(likely_rad=bounds / 4, bounds_rad=bounds)
     wide = spread(array, directions, known, Widen.GUARANTEE) if widen else None
     found = precode(a, Precoder(), wide)
     assert found.weights.shape == (16, users)
@@ -143,7 +156,14 @@ def test_regularised_tends_to_zero_forcing_and_to_maximum_ratio(
     a = apart(4, 4)
 
     def made(method: Method, x: float = 0.01) -> ComplexArray:
-        how = Precoder(method, Policy.REGULARISE, 60.0, 100.0, x, normalisation)
+        how = Precoder(
+            method=method,
+            policy=Policy.REGULARISE,
+            loss_limit_db=60.0,
+            condition_limit=100.0,
+            regularisation=x,
+            normalisation=normalisation,
+        )
         return precode(a, how).weights
 
     assert made(Method.REGULARISED, 1e-12) == pytest.approx(made(Method.ZERO_FORCING), abs=1e-9)
@@ -213,7 +233,7 @@ def mirrored(offset: float) -> ComplexArray:
     sine = 0.5 + offset
     ahead = [math.sqrt(0.75), 0.5, 0.0]
     behind = [-math.sqrt(1 - sine**2), sine, 0.0]
-    line = uniform_linear(64, 30e9, 0.5, EYE)
+    line = uniform_linear(64, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
     return steering.steering_matrix(line, np.array([ahead, behind]))
 
 
@@ -273,7 +293,13 @@ def test_the_lowest_priority_is_dropped_and_it_is_said_why() -> None:
 @pytest.mark.parametrize("policy", Policy)
 def test_what_elements_radiate_there_is_no_closeness(policy: Policy) -> None:
     """Two UAVs 70 degrees apart, one of them where narrow elements hardly radiate."""
-    line = uniform_linear(64, 30e9, 0.5, EYE, Element(Pattern.COSINE, 10.0))
+    line = uniform_linear(
+        64,
+        30e9,
+        spacing_wavelengths=0.5,
+        array_from_body=EYE,
+        element=Element(Pattern.COSINE, 10.0),
+    )
     azimuth = math.radians(70)
     seen = np.array([[1.0, 0.0, 0.0], [math.cos(azimuth), math.sin(azimuth), 0.0]])
     a = steering.steering_matrix(line, seen)
@@ -333,7 +359,7 @@ def test_however_little_is_loaded_weights_are_finite(
     regularisation: float, sines: list[float]
 ) -> None:
     a = matrix(sines)
-    found = precode(a, Precoder(Method.REGULARISED, regularisation=regularisation))
+    found = precode(a, Precoder(method=Method.REGULARISED, regularisation=regularisation))
     assert np.all(np.isfinite(found.weights))
     assert np.einsum("mn,mn->n", a, found.weights) == pytest.approx(np.ones(len(sines)), abs=1e-9)
 
@@ -363,7 +389,13 @@ def test_power_is_what_its_name_says(
 
     def made(how: Normalisation) -> Precoding:
         radio = Radio(np.full(users, 0.5), np.ones(users))
-        return precode(a, Precoder(method, policy, normalisation=how), None, None, radio)
+        return precode(
+            a,
+            Precoder(method=method, policy=policy, normalisation=how),
+            None,
+            priorities=None,
+            radio=radio,
+        )
 
     plain, stream, total, antenna = map(made, Normalisation)
     response = np.diag(a[:, plain.served].T @ plain.weights)
@@ -384,7 +416,7 @@ def test_power_is_what_its_name_says(
 
 def test_mirror_images_about_the_line_cannot_be_told_apart() -> None:
     """Ahead and behind, above and below: the same to a line along y."""
-    array = uniform_linear(64, 30e9, 0.5, np.eye(3))
+    array = uniform_linear(64, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
     for image in ([-0.6, 0.8, 0.0], [0.0, 0.8, 0.6], [0.0, 0.8, -0.6]):
         a = steering.steering_matrix(array, np.array([[0.6, 0.8, 0.0], image]))
         found = precode(a, Precoder())

@@ -14,7 +14,7 @@ EYE = np.eye(3)
 
 
 def line(elements: int) -> Array:
-    return uniform_linear(elements, 30e9, 0.5, EYE)
+    return uniform_linear(elements, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
 
 
 def gains_db(phases_rad: FloatArray, width: float) -> FloatArray:
@@ -86,9 +86,27 @@ def test_a_floor_that_is_out_of_reach_is_not_paid_for() -> None:
 @pytest.mark.parametrize(
     ("array", "widest"),
     [
-        (uniform_linear(64, 30e9, 0.5, np.eye(3)), 20.0),
-        (uniform_rectangular(16, 16, 30e9, 0.5, np.eye(3)), 6.0),
-        (uniform_rectangular(32, 32, 30e9, 0.5, np.eye(3)), 12.0),
+        (uniform_linear(64, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3)), 20.0),
+        (
+            uniform_rectangular(
+                16,
+                columns=16,
+                frequency_hz=30e9,
+                spacing_wavelengths=0.5,
+                array_from_body=np.eye(3),
+            ),
+            6.0,
+        ),
+        (
+            uniform_rectangular(
+                32,
+                columns=32,
+                frequency_hz=30e9,
+                spacing_wavelengths=0.5,
+                array_from_body=np.eye(3),
+            ),
+            12.0,
+        ),
     ],
     ids=["line", "square", "large square"],
 )
@@ -126,7 +144,15 @@ def disc(width: float) -> FloatArray:
 )  # fmt: skip
 def test_the_least_gain_of_a_plane(elements: int, width: float, least_db: float) -> None:
     """Beyond four natural widths it was down to -30 dB, where one element alone has 0."""
-    across = shapes.aperture(uniform_rectangular(elements, elements, 30e9, 0.5, EYE))
+    across = shapes.aperture(
+        uniform_rectangular(
+            elements,
+            columns=elements,
+            frequency_hz=30e9,
+            spacing_wavelengths=0.5,
+            array_from_body=EYE,
+        )
+    )
     (phases,) = shapes.phases_rad(across, np.array([[width, width]]), None)
     field = np.exp(2j * np.pi * disc(width) @ across.placed.T + 1j * phases).sum(axis=1)
     assert 20 * np.log10(np.abs(field).min() / elements) > least_db
@@ -144,7 +170,13 @@ def test_no_width_is_no_shape() -> None:
 def test_shapes_follow_widths_without_a_step(
     cone: float, ratio: float, floor_db: float, plane: bool
 ) -> None:
-    array = uniform_rectangular(8, 8, 30e9, 0.5, EYE) if plane else line(64)
+    array = (
+        uniform_rectangular(
+            8, columns=8, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
+        )
+        if plane
+        else line(64)
+    )
     across = shapes.aperture(array)
     many = len(across.axes)
 
@@ -165,7 +197,7 @@ def test_any_array_has_finite_phases(seed: int) -> None:
     rng = np.random.default_rng(seed)
     for count in (1, 2, 5, 24):
         places = rng.uniform(-0.05, 0.05, (count, 3))
-        across = shapes.aperture(listed(places, 30e9, EYE))
+        across = shapes.aperture(listed(places, 30e9, array_from_body=EYE))
         shape = (4, len(across.axes))
         cones = rng.uniform(0, 40, shape)
         for likely in (None, cones * rng.random(shape)):

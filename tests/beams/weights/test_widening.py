@@ -24,9 +24,11 @@ from companion.beams.weights.widening import Spread, Uncertain
 from companion.values import ComplexArray, FloatArray, Method, Policy, Widen
 
 EYE = np.eye(3)
-LINE = uniform_linear(64, 30e9, 0.5, EYE)
-RECTANGLE = uniform_rectangular(8, 8, 30e9, 0.5, EYE)
-CIRCLE = uniform_circular(32, 30e9, 0.5, EYE)
+LINE = uniform_linear(64, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
+RECTANGLE = uniform_rectangular(
+    8, columns=8, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
+)
+CIRCLE = uniform_circular(32, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
 
 
 def towards(*angles_deg: tuple[float, float]) -> FloatArray:
@@ -64,7 +66,9 @@ def spread(
     bounds, likely = (
         np.radians(np.broadcast_to(deg, len(directions))) for deg in (bounds_deg, likely_deg)
     )
-    found = widening.spread(array, directions, Uncertain(likely, bounds), widen)
+    found = widening.spread(
+        array, directions, Uncertain(likely_rad=likely, bounds_rad=bounds), widen
+    )
     assert found is not None
     return found
 
@@ -105,7 +109,7 @@ def test_elements_all_radiate_alike() -> None:
 
 
 def test_nothing_is_widened_where_all_is_known_or_nothing_is_wanted() -> None:
-    known = Uncertain(np.full(4, 0.01), np.full(4, 0.1))
+    known = Uncertain(likely_rad=np.full(4, 0.01), bounds_rad=np.full(4, 0.1))
     assert widening.spread(LINE, FOUR, known, Widen.NO) is None
     for widen in (Widen.LIKELY, Widen.GUARANTEE):
         sharp = spread(LINE, FOUR, 0.0, 0.0, widen)
@@ -118,7 +122,7 @@ def test_points_are_beside_each_user_where_the_array_has_room() -> None:
     for array, directions, beside in (
         (LINE, FOUR, 2),
         (RECTANGLE, FOUR, 4),
-        (uniform_linear(8, 30e9, 0.5, EYE), FOUR, 0),
+        (uniform_linear(8, 30e9, spacing_wavelengths=0.5, array_from_body=EYE), FOUR, 0),
         (RECTANGLE, FOUR[:1], 0),  # nobody to be kept from
     ):
         wide = spread(array, directions, 5.0, 2.0)
@@ -159,7 +163,11 @@ def crowded(
 ) -> tuple[Spread, list[FloatArray]]:
     """Any lines and planes, bounds that overlap, users that coincide; and a crowd in each cone."""
     rng = np.random.default_rng(seed)
-    array = [LINE, RECTANGLE, uniform_linear(16, 30e9, 0.5, EYE)][seed % 3]
+    array = [
+        LINE,
+        RECTANGLE,
+        uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE),
+    ][seed % 3]
     directions = towards(*rng.uniform(-70, 70, (users, 2)).tolist())
     directions[1] = directions[0] if seed % 5 == 0 else directions[1]
     bounds = rng.uniform(0.1, most_deg, users)
@@ -203,7 +211,11 @@ def test_nulls_seldom_cost_more_between_the_places_that_are_looked_at() -> None:
     lost: list[float] = []
     for seed in range(60):
         wide, crowds = crowded(2 + seed % 9, seed, 0.5 * (1 + seed % 40), list(Widen)[seed % 2])
-        array = [LINE, RECTANGLE, uniform_linear(16, 30e9, 0.5, EYE)][seed % 3]
+        array = [
+            LINE,
+            RECTANGLE,
+            uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE),
+        ][seed % 3]
         found = nulls.nulled(wide).weights
         for user, crowd in enumerate(crowds):
             least = [power_db(array, w[:, [user]], crowd).min() for w in (wide.beams, found)]
@@ -293,7 +305,7 @@ def test_points_nulled_beside_the_others_leave_nothing_at_them(seed: int) -> Non
     """On arrays so dense that rounding costs ten digits of the nulls, if it is not taken away."""
     for spacing in (0.05, 0.1):
         rng = np.random.default_rng(seed)
-        array = uniform_linear(32, 30e9, spacing, EYE)
+        array = uniform_linear(32, 30e9, spacing_wavelengths=spacing, array_from_body=EYE)
         azimuths = np.sort(rng.uniform(-70, 70, 3 + seed % 4))
         directions = towards(*((azimuth, 0.0) for azimuth in azimuths.tolist()))
         a = steering_matrix(array, directions)
@@ -307,7 +319,7 @@ def test_points_nulled_beside_the_others_leave_nothing_at_them(seed: int) -> Non
 
 def test_maximum_ratio_takes_the_shapes_as_they_are() -> None:
     wide = spread(LINE, FOUR, 5.0)
-    found = precode(steering_matrix(LINE, FOUR), Precoder(Method.MATCHED), wide).weights
+    found = precode(steering_matrix(LINE, FOUR), Precoder(method=Method.MATCHED), wide).weights
     ratio = found / wide.beams
     assert ratio == pytest.approx(np.broadcast_to(ratio[0], ratio.shape))
 
@@ -315,18 +327,38 @@ def test_maximum_ratio_takes_the_shapes_as_they_are() -> None:
 OUTWARD = np.random.default_rng(4).standard_normal((24, 3))
 PLACES = np.random.default_rng(3).uniform(-0.03, 0.03, (24, 3))
 EVERY = {
-    "line": uniform_linear(16, 30e9, 0.5, EYE),
-    "dense": uniform_linear(16, 30e9, 0.1, EYE),
-    "sparse": uniform_linear(6, 30e9, 3.0, EYE),
-    "upright": listed(np.outer(np.arange(9) * 0.005, [0.0, 0.6, -0.8]), 30e9, EYE),
-    "cosine": uniform_linear(16, 30e9, 0.5, EYE, Element(Pattern.COSINE)),
-    "column": uniform_rectangular(12, 1, 30e9, 0.5, EYE),
-    "rectangle": uniform_rectangular(3, 8, 30e9, 0.5, EYE, Element(Pattern.TR38901)),
-    "circle": uniform_circular(13, 30e9, 0.5, EYE, Element(Pattern.COSINE)),
-    "scattered": listed(PLACES, 30e9, EYE),
-    "facing": listed(PLACES, 30e9, EYE, Element(Pattern.COSINE, 4.0), None, OUTWARD),
-    "one": uniform_linear(1, 30e9, 0.5, EYE),
-    "two": uniform_circular(2, 30e9, 0.5, EYE),
+    "line": uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE),
+    "dense": uniform_linear(16, 30e9, spacing_wavelengths=0.1, array_from_body=EYE),
+    "sparse": uniform_linear(6, 30e9, spacing_wavelengths=3.0, array_from_body=EYE),
+    "upright": listed(np.outer(np.arange(9) * 0.005, [0.0, 0.6, -0.8]), 30e9, array_from_body=EYE),
+    "cosine": uniform_linear(
+        16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=Element(Pattern.COSINE)
+    ),
+    "column": uniform_rectangular(
+        12, columns=1, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
+    ),
+    "rectangle": uniform_rectangular(
+        3,
+        columns=8,
+        frequency_hz=30e9,
+        spacing_wavelengths=0.5,
+        array_from_body=EYE,
+        element=Element(Pattern.TR38901),
+    ),
+    "circle": uniform_circular(
+        13, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=Element(Pattern.COSINE)
+    ),
+    "scattered": listed(PLACES, 30e9, array_from_body=EYE),
+    "facing": listed(
+        PLACES,
+        30e9,
+        array_from_body=EYE,
+        element=Element(Pattern.COSINE, 4.0),
+        lever_arm_m=None,
+        outward=OUTWARD,
+    ),
+    "one": uniform_linear(1, 30e9, spacing_wavelengths=0.5, array_from_body=EYE),
+    "two": uniform_circular(2, 30e9, spacing_wavelengths=0.5, array_from_body=EYE),
 }
 
 
@@ -352,7 +384,9 @@ def test_weights_are_finite_whatever_the_array_and_the_uavs(
     likely = np.minimum(rng.choice([0.0, 0.02, 0.5], len(directions)), bounds)
     widen = data.draw(st.sampled_from(list(Widen)))
     how = Precoder(policy=data.draw(st.sampled_from(list(Policy))), widen=widen)
-    wide = widening.spread(array, directions, Uncertain(likely, bounds), widen)
+    wide = widening.spread(
+        array, directions, Uncertain(likely_rad=likely, bounds_rad=bounds), widen
+    )
     found = precode(a, how, wide)
     assert np.isfinite(found.weights).all()
     served = a[:, found.served]
@@ -370,7 +404,9 @@ def test_a_least_gain_that_the_link_needs_is_what_nulls_leave() -> None:
     crowd = within(directions[0], math.radians(2.5))
     least = []
     for floor_db, worth_db in ((2.7, 0.0), (8.7, 6.0)):
-        uncertain = Uncertain(likely, bounds, floor_db, worth_db)
+        uncertain = Uncertain(
+            likely_rad=likely, bounds_rad=bounds, floor_db=floor_db, worth_db=worth_db
+        )
         wide = widening.spread(LINE, directions, uncertain, Widen.LIKELY)
         assert wide is not None
         least.append(power_db(LINE, nulls.nulled(wide).weights[:, [0]], crowd).min())

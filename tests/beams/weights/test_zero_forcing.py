@@ -44,26 +44,39 @@ def mirrored_list(size: int, rng: np.random.Generator) -> Array:
     half = rng.uniform(-0.2, 0.2, (size // 2, 3))
     centre = np.zeros((size % 2, 3))
     placed = np.concatenate([half, centre, -half]) + rng.uniform(-1, 1, 3)
-    return geometry.listed(rng.permutation(placed), 3e9, EYE)
+    return geometry.listed(rng.permutation(placed), 3e9, array_from_body=EYE)
 
 
 def any_array(kind: str, rng: np.random.Generator) -> Array:
     """With 63 to 66 elements."""
     match kind:
         case "ula":
-            return geometry.uniform_linear(64, 30e9, 0.5, EYE)
+            return geometry.uniform_linear(64, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
         case "odd ula":
-            return geometry.uniform_linear(65, 30e9, 0.5, EYE, COSINE)
+            return geometry.uniform_linear(
+                65, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=COSINE
+            )
         case "ura":
-            return geometry.uniform_rectangular(8, 8, 30e9, 0.5, EYE, COSINE)
+            return geometry.uniform_rectangular(
+                8,
+                columns=8,
+                frequency_hz=30e9,
+                spacing_wavelengths=0.5,
+                array_from_body=EYE,
+                element=COSINE,
+            )
         case "odd ura":
-            return geometry.uniform_rectangular(7, 9, 30e9, 0.5, EYE)
+            return geometry.uniform_rectangular(
+                7, columns=9, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
+            )
         case "uca":
-            return geometry.uniform_circular(64, 30e9, 0.5, EYE)
+            return geometry.uniform_circular(64, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
         case "odd uca":
-            return geometry.uniform_circular(65, 30e9, 0.5, EYE)
+            return geometry.uniform_circular(65, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
         case "outward uca":
-            return geometry.uniform_circular(64, 30e9, 0.5, EYE, COSINE)
+            return geometry.uniform_circular(
+                64, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=COSINE
+            )
         case "odd list":
             return mirrored_list(65, rng)
         case _:

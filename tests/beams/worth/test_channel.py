@@ -28,8 +28,10 @@ from companion.beams.worth.channel import (
 )
 from companion.values import FloatArray
 
-NODE = uniform_rectangular(2, 4, 30e9, 0.5, np.eye(3))
-UAV = uniform_linear(4, 30e9, 0.5, np.eye(3))
+NODE = uniform_rectangular(
+    2, columns=4, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3)
+)
+UAV = uniform_linear(4, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
 SIGHT_ONLY = SalehValenzuela(rician_k_db=math.inf)
 
 
@@ -67,7 +69,14 @@ def test_a_wavelength_that_is_none_is_refused(wavelength_m: float) -> None:
 def test_sight_alone_is_the_outer_product_written_out() -> None:
     """Not conjugated at either end, of unit magnitude, one random phase a UAV."""
     at_node, at_uav = directions(1, 3), directions(2, 3)
-    channels = draw(SIGHT_ONLY, NODE, UAV, at_node, at_uav, np.random.default_rng(3))
+    channels = draw(
+        SIGHT_ONLY,
+        NODE,
+        uav_array=UAV,
+        directions_at_node=at_node,
+        directions_at_uav=at_uav,
+        rng=np.random.default_rng(3),
+    )
     assert channels.shape == (3, 4, 8)
     k = 2 * math.pi / NODE.wavelength_m
     turns = []
@@ -91,8 +100,26 @@ def test_sight_alone_is_the_outer_product_written_out() -> None:
     [
         (NODE, UAV),
         # A cosine sends all its power, so its mean over all directions is 1.
-        (uniform_circular(6, 30e9, 0.5, np.eye(3), Element(Pattern.COSINE, 2.0)), UAV),
-        (uniform_linear(3, 30e9, 0.5, np.eye(3), Element(Pattern.COSINE)), NODE),
+        (
+            uniform_circular(
+                6,
+                30e9,
+                spacing_wavelengths=0.5,
+                array_from_body=np.eye(3),
+                element=Element(Pattern.COSINE, 2.0),
+            ),
+            UAV,
+        ),
+        (
+            uniform_linear(
+                3,
+                30e9,
+                spacing_wavelengths=0.5,
+                array_from_body=np.eye(3),
+                element=Element(Pattern.COSINE),
+            ),
+            NODE,
+        ),
     ],
     ids=["isotropic", "outward", "forward"],
 )
@@ -100,10 +127,17 @@ def test_the_mean_energy_is_that_of_antennas_and_elements(
     rician_k_db: float, node: Array, uav: Array
 ) -> None:
     many = 4000
-    model = SalehValenzuela(rician_k_db, clusters=4, rays_per_cluster=2)
+    model = SalehValenzuela(rician_k_db=rician_k_db, clusters=4, rays_per_cluster=2)
     at_node = np.tile([0.6, 0.8, 0.0], (many, 1))
     at_uav = np.tile([1.0, 0.0, 0.0], (many, 1))
-    channels = draw(model, node, uav, at_node, at_uav, np.random.default_rng(5))
+    channels = draw(
+        model,
+        node,
+        uav_array=uav,
+        directions_at_node=at_node,
+        directions_at_uav=at_uav,
+        rng=np.random.default_rng(5),
+    )
     a = steering.steering_matrix(node, at_node[:1])
     b = steering.steering_matrix(uav, at_uav[:1])
     sight = float(np.sum(np.abs(a) ** 2) * np.sum(np.abs(b) ** 2))
@@ -119,11 +153,23 @@ def test_the_mean_energy_is_that_of_antennas_and_elements(
 def test_one_pair_of_antennas_fades_as_rice_does(k_db: float) -> None:
     """Moments of a Rician amplitude: E x^2 = 1, E x^4 = 1 + (1 + 2 K) / (1 + K)^2. Exact for any
     number of rays, for their amplitudes are Gaussian."""
-    single = listed(np.zeros((1, 3)), 30e9, np.eye(3))
+    single = listed(np.zeros((1, 3)), 30e9, array_from_body=np.eye(3))
     many = 40_000
     ahead = np.tile([1.0, 0.0, 0.0], (many, 1))
-    model = SalehValenzuela(k_db, clusters=2, rays_per_cluster=2)
-    power = np.abs(draw(model, single, single, ahead, ahead, np.random.default_rng(7))) ** 2
+    model = SalehValenzuela(rician_k_db=k_db, clusters=2, rays_per_cluster=2)
+    power = (
+        np.abs(
+            draw(
+                model,
+                single,
+                uav_array=single,
+                directions_at_node=ahead,
+                directions_at_uav=ahead,
+                rng=np.random.default_rng(7),
+            )
+        )
+        ** 2
+    )
     k = 10 ** (k_db / 10)
     assert power.shape == (many, 1, 1)
     assert power.mean() == pytest.approx(1.0, abs=0.02)
@@ -132,7 +178,14 @@ def test_one_pair_of_antennas_fades_as_rice_does(k_db: float) -> None:
 
 def test_the_phase_of_the_sight_is_uniform() -> None:
     ahead = np.tile([1.0, 0.0, 0.0], (4000, 1))
-    turns = draw(SIGHT_ONLY, UAV, UAV, ahead, ahead, np.random.default_rng(11))[:, 0, 0]
+    turns = draw(
+        SIGHT_ONLY,
+        UAV,
+        uav_array=UAV,
+        directions_at_node=ahead,
+        directions_at_uav=ahead,
+        rng=np.random.default_rng(11),
+    )[:, 0, 0]
     assert abs(turns.mean()) < 0.06
     assert abs(np.mean(turns**2)) < 0.06
 
@@ -140,12 +193,30 @@ def test_the_phase_of_the_sight_is_uniform() -> None:
 def test_rays_of_one_cluster_lie_about_it() -> None:
     """Without spread the rays of a cluster are one, and the channel of rank 1; with it not."""
     ahead = np.array([[1.0, 0.0, 0.0]])
-    rank_one = SalehValenzuela(-math.inf, 1, 20, 0.0)
-    drawn = draw(rank_one, NODE, UAV, ahead, ahead, np.random.default_rng(1))[0]
+    rank_one = SalehValenzuela(
+        rician_k_db=-math.inf, clusters=1, rays_per_cluster=20, angular_spread_rad=0.0
+    )
+    drawn = draw(
+        rank_one,
+        NODE,
+        uav_array=UAV,
+        directions_at_node=ahead,
+        directions_at_uav=ahead,
+        rng=np.random.default_rng(1),
+    )[0]
     singular = np.linalg.svd(drawn, compute_uv=False)
     assert singular[1] < 1e-9 * singular[0]
-    spread = SalehValenzuela(-math.inf, 1, 20, 0.3)
-    drawn = draw(spread, NODE, UAV, ahead, ahead, np.random.default_rng(1))[0]
+    spread = SalehValenzuela(
+        rician_k_db=-math.inf, clusters=1, rays_per_cluster=20, angular_spread_rad=0.3
+    )
+    drawn = draw(
+        spread,
+        NODE,
+        uav_array=UAV,
+        directions_at_node=ahead,
+        directions_at_uav=ahead,
+        rng=np.random.default_rng(1),
+    )[0]
     singular = np.linalg.svd(drawn, compute_uv=False)
     assert singular[1] > 1e-2 * singular[0]
 
@@ -156,11 +227,24 @@ def test_the_spread_is_the_standard_deviation_across_a_cluster() -> None:
     turned by psi and lies at cosine c from the pair, give rho below. The amplitudes of rays are
     Gaussian, so E |h0 h1|^2 = 1 + |correlation|^2, and L rays have 1/L of it by chance."""
     rays, spread, apart = 30, 0.05, 2.0
-    pair = listed(np.array([[0, 0, 0], [apart * 0.01, 0, 0]]), SPEED_OF_LIGHT_MPS / 0.01, np.eye(3))
-    single = listed(np.zeros((1, 3)), 30e9, np.eye(3))
+    pair = listed(
+        np.array([[0, 0, 0], [apart * 0.01, 0, 0]]),
+        SPEED_OF_LIGHT_MPS / 0.01,
+        array_from_body=np.eye(3),
+    )
+    single = listed(np.zeros((1, 3)), 30e9, array_from_body=np.eye(3))
     ahead = np.tile([1.0, 0.0, 0.0], (8000, 1))
-    model = SalehValenzuela(-math.inf, 1, rays, spread)
-    h = draw(model, pair, single, ahead, ahead, np.random.default_rng(2))[:, 0, :]
+    model = SalehValenzuela(
+        rician_k_db=-math.inf, clusters=1, rays_per_cluster=rays, angular_spread_rad=spread
+    )
+    h = draw(
+        model,
+        pair,
+        uav_array=single,
+        directions_at_node=ahead,
+        directions_at_uav=ahead,
+        rng=np.random.default_rng(2),
+    )[:, 0, :]
     cosine, psi = np.meshgrid(np.linspace(-1, 1, 801), np.linspace(0, 2 * np.pi, 200, False))
     x = 2 * np.pi * apart * spread * np.sqrt(1 - cosine**2)
     rho = 1 / ((1 + (x * np.cos(psi)) ** 2 / 2) * (1 + (x * np.sin(psi)) ** 2 / 2))
@@ -172,13 +256,27 @@ def test_the_spread_is_the_standard_deviation_across_a_cluster() -> None:
 def test_the_same_seed_draws_the_same_and_k_changes_nothing_else() -> None:
     at_node, at_uav = directions(1, 2), directions(2, 2)
     first, again, other = (
-        draw(SalehValenzuela(), NODE, UAV, at_node, at_uav, np.random.default_rng(seed))
+        draw(
+            SalehValenzuela(),
+            NODE,
+            uav_array=UAV,
+            directions_at_node=at_node,
+            directions_at_uav=at_uav,
+            rng=np.random.default_rng(seed),
+        )
         for seed in (9, 9, 10)
     )
     assert np.array_equal(first, again)
     assert not np.allclose(first, other)
     sight, rest, mixed = (
-        draw(SalehValenzuela(k), NODE, UAV, at_node, at_uav, np.random.default_rng(9))
+        draw(
+            SalehValenzuela(rician_k_db=k),
+            NODE,
+            uav_array=UAV,
+            directions_at_node=at_node,
+            directions_at_uav=at_uav,
+            rng=np.random.default_rng(9),
+        )
         for k in (math.inf, -math.inf, 0.0)
     )
     assert mixed == pytest.approx((sight + rest) / math.sqrt(2), abs=1e-12)
@@ -186,7 +284,7 @@ def test_the_same_seed_draws_the_same_and_k_changes_nothing_else() -> None:
 
 @given(st.floats(-4000, 4000))
 def test_the_shares_are_those_of_k_at_any_k(k_db: float) -> None:
-    sight, scattered = SalehValenzuela(k_db).shares
+    sight, scattered = SalehValenzuela(rician_k_db=k_db).shares
     assert sight + scattered == pytest.approx(1.0)
     if abs(k_db) < 1000:
         assert 10 * math.log10(sight / scattered) == pytest.approx(k_db, abs=1e-6)
@@ -214,10 +312,10 @@ def test_directions_come_in_pairs(nodes: int, uavs: int) -> None:
         draw(
             SIGHT_ONLY,
             NODE,
-            UAV,
-            directions(1, nodes),
-            directions(2, uavs),
-            np.random.default_rng(1),
+            uav_array=UAV,
+            directions_at_node=directions(1, nodes),
+            directions_at_uav=directions(2, uavs),
+            rng=np.random.default_rng(1),
         )
 
 
@@ -228,7 +326,14 @@ def test_the_combiner_is_matched_and_of_unit_norm() -> None:
     """N_U times the power of one antenna; noise as at one; no other unit combiner does better."""
     at_node, at_uav = directions(1, 5), directions(2, 5)
     rng = np.random.default_rng(4)
-    channels = draw(SIGHT_ONLY, NODE, UAV, at_node, at_uav, rng)
+    channels = draw(
+        SIGHT_ONLY,
+        NODE,
+        uav_array=UAV,
+        directions_at_node=at_node,
+        directions_at_uav=at_uav,
+        rng=rng,
+    )
     b = steering.steering_matrix(UAV, at_uav)
     rows = combined_rows(channels, b)
     assert rows.shape == (5, 8)
@@ -244,7 +349,14 @@ def test_the_combiner_is_matched_and_of_unit_norm() -> None:
 def test_a_conjugate_beam_meets_the_combined_row() -> None:
     """F = a* and w^H H = |b| a^T add up in phase: M^2 N_U."""
     at_node, at_uav = directions(3, 4), directions(4, 4)
-    channels = draw(SIGHT_ONLY, NODE, UAV, at_node, at_uav, np.random.default_rng(4))
+    channels = draw(
+        SIGHT_ONLY,
+        NODE,
+        uav_array=UAV,
+        directions_at_node=at_node,
+        directions_at_uav=at_uav,
+        rng=np.random.default_rng(4),
+    )
     rows = combined_rows(channels, steering.steering_matrix(UAV, at_uav))
     f = steering.steering_matrix(NODE, at_node).conj()
     met = np.abs(np.einsum("nm,mn->n", rows, f)) ** 2

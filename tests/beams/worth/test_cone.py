@@ -23,16 +23,32 @@ GPP = Element(Pattern.TR38901)
 COSINE = Element(Pattern.COSINE, 1.5)
 SLANTED = np.outer(np.array([-2.0, -0.7, 0.1, 1.3, 1.9]), [0.004, 0.005, -0.003]) + 0.02
 ARRAYS = {
-    "line": uniform_linear(16, 30e9, 0.5, EYE),
-    "line of patterns": uniform_linear(16, 30e9, 0.5, EYE, GPP),
-    "slanted line": listed(SLANTED, 30e9, EYE, COSINE),
-    "line that faces apart": listed(
-        SLANTED, 30e9, EYE, GPP, None, np.random.default_rng(6).standard_normal((5, 3))
+    "line": uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE),
+    "line of patterns": uniform_linear(
+        16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=GPP
     ),
-    "one": uniform_linear(1, 30e9, 0.5, EYE, GPP),
-    "grid": grid(4, 6, 30e9, 0.5, EYE, COSINE),
-    "circle": uniform_circular(10, 30e9, 0.5, EYE, GPP),
-    "cloud": listed(np.random.default_rng(5).uniform(-0.02, 0.02, (9, 3)), 30e9, EYE),
+    "slanted line": listed(SLANTED, 30e9, array_from_body=EYE, element=COSINE),
+    "line that faces apart": listed(
+        SLANTED,
+        30e9,
+        array_from_body=EYE,
+        element=GPP,
+        lever_arm_m=None,
+        outward=np.random.default_rng(6).standard_normal((5, 3)),
+    ),
+    "one": uniform_linear(1, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=GPP),
+    "grid": grid(
+        4,
+        columns=6,
+        frequency_hz=30e9,
+        spacing_wavelengths=0.5,
+        array_from_body=EYE,
+        element=COSINE,
+    ),
+    "circle": uniform_circular(10, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=GPP),
+    "cloud": listed(
+        np.random.default_rng(5).uniform(-0.02, 0.02, (9, 3)), 30e9, array_from_body=EYE
+    ),
 }
 BOUNDS = st.sampled_from([0.0, 1e-9, 1e-4, 0.02, 0.3, 1.2, math.pi / 2, 2.5, math.pi])
 
@@ -191,7 +207,7 @@ def test_smaller_cells_say_more_by_the_square(phases_rad: float) -> None:
 
 def test_a_response_of_exactly_nothing_has_a_slope_all_the_same() -> None:
     """Its phase is anything."""
-    array = uniform_linear(2, 30e9, 0.5, EYE)
+    array = uniform_linear(2, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
     cones = cone.cones_around(array, np.array([[1.0, 0, 0]]), np.array([0.1]), np.ones((2, 1)))
     cells = cone.cells(cones, cone.first_boxes(cones), caps=1)
     nothing = np.zeros(len(cells.cone), dtype=complex)
@@ -237,6 +253,8 @@ def test_weights_that_cannot_be_used_are_refused(weights: FloatArray, message: s
 @pytest.mark.parametrize("scale", [1e-300, 1.0, 1e300])
 def test_unit_power_holds_at_any_scale(scale: float) -> None:
     weights = scale * np.array([[1 + 1j], [0.5], [0]] * 4).astype(complex)
-    found = cone.unit_power(uniform_linear(12, 1e9, 0.5, EYE), weights)
+    found = cone.unit_power(
+        uniform_linear(12, 1e9, spacing_wavelengths=0.5, array_from_body=EYE), weights
+    )
     assert np.sum(np.abs(found) ** 2) == pytest.approx(1.0)
     assert found[0, 0] / found[1, 0] == pytest.approx(2 + 2j)

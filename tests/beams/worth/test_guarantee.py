@@ -24,19 +24,36 @@ COSINE = Element(Pattern.COSINE, 1.5)
 DRAWN = np.random.default_rng(8)
 SLANTED = np.outer(np.array([-2.0, -0.7, 0.1, 1.3, 1.9]), [0.004, 0.005, -0.003]) + 0.5
 ARRAYS = {
-    "line": line(32, 30e9, 0.5, EYE),
-    "line of patterns": line(16, 30e9, 0.5, EYE, GPP),
-    "slanted line": listed(SLANTED, 30e9, EYE, COSINE),
+    "line": line(32, 30e9, spacing_wavelengths=0.5, array_from_body=EYE),
+    "line of patterns": line(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=GPP),
+    "slanted line": listed(SLANTED, 30e9, array_from_body=EYE, element=COSINE),
     "line that faces apart": listed(
-        SLANTED, 30e9, EYE, GPP, None, np.random.default_rng(6).standard_normal((5, 3))
+        SLANTED,
+        30e9,
+        array_from_body=EYE,
+        element=GPP,
+        lever_arm_m=None,
+        outward=np.random.default_rng(6).standard_normal((5, 3)),
     ),
-    "one": line(1, 30e9, 0.5, EYE, GPP),
-    "grid": grid(6, 8, 30e9, 0.5, EYE),
-    "grid of patterns": grid(3, 4, 30e9, 0.7, EYE, COSINE),
-    "circle": uniform_circular(16, 30e9, 0.5, EYE, GPP),
-    "cloud": listed(DRAWN.uniform(-0.02, 0.02, (20, 3)), 30e9, EYE),
+    "one": line(1, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=GPP),
+    "grid": grid(6, columns=8, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE),
+    "grid of patterns": grid(
+        3,
+        columns=4,
+        frequency_hz=30e9,
+        spacing_wavelengths=0.7,
+        array_from_body=EYE,
+        element=COSINE,
+    ),
+    "circle": uniform_circular(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=GPP),
+    "cloud": listed(DRAWN.uniform(-0.02, 0.02, (20, 3)), 30e9, array_from_body=EYE),
     "cloud of patterns": listed(
-        DRAWN.uniform(-0.02, 0.02, (12, 3)), 30e9, EYE, GPP, None, DRAWN.standard_normal((12, 3))
+        DRAWN.uniform(-0.02, 0.02, (12, 3)),
+        30e9,
+        array_from_body=EYE,
+        element=GPP,
+        lever_arm_m=None,
+        outward=DRAWN.standard_normal((12, 3)),
     ),
 }
 AHEAD = np.array([[0.96, 0.28, 0.0], [0.8, -0.36, 0.48], [0.6, 0.64, -0.48]])
@@ -187,14 +204,19 @@ def test_without_error_it_is_the_nominal_gain(name: str) -> None:
 def test_a_gain_far_down_is_a_gain() -> None:
     """Two elements that all but cancel."""
     weights = np.array([[1.0], [-0.9999]], dtype=complex)
-    (found,) = guaranteed_gains_db(line(2, 1e9, 0.5, EYE), np.array([[1.0, 0, 0]]), [0.0], weights)
+    (found,) = guaranteed_gains_db(
+        line(2, 1e9, spacing_wavelengths=0.5, array_from_body=EYE),
+        np.array([[1.0, 0, 0]]),
+        [0.0],
+        weights,
+    )
     assert found == pytest.approx(20 * math.log10(1e-4) - 10 * math.log10(1 + 0.9999**2))
 
 
 def test_a_null_at_the_predicted_direction_leaks_beside_it() -> None:
     """Exactly zero there: its phase is anything, and the slope counts all the same."""
     weights = np.array([[1.0], [-1.0]], dtype=complex)
-    array = line(2, 1e9, 0.5, EYE)
+    array = line(2, 1e9, spacing_wavelengths=0.5, array_from_body=EYE)
     ahead = np.array([[1.0, 0, 0]])
     for bound_rad in (0.01, 0.3):
         leaked = leakage_bounds(array, ahead, [bound_rad], weights)[0, 0]
@@ -205,7 +227,7 @@ def test_a_null_at_the_predicted_direction_leaks_beside_it() -> None:
 @pytest.mark.parametrize(("elements", "bound_deg"), [(64, 0.79), (128, 0.40)])
 def test_the_known_beams_lose_three_decibels(elements: int, bound_deg: float) -> None:
     """MATH: golden values. On the exact half-power angle it is a half to the tolerance."""
-    array = line(elements, 30e9, 0.5, EYE)
+    array = line(elements, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
     ahead = np.array([[1.0, 0, 0]])
     weights = np.ones((elements, 1), dtype=complex)
     full_db = 10 * math.log10(elements)
@@ -221,7 +243,7 @@ def test_the_known_beams_lose_three_decibels(elements: int, bound_deg: float) ->
 
 def test_nothing_is_sure_past_a_null() -> None:
     """The first null of 64 elements at half a wavelength lies at 1.79 degrees."""
-    array = line(64, 30e9, 0.5, EYE)
+    array = line(64, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
     weights = np.ones((64, 1), dtype=complex)
     ahead = np.array([[1.0, 0, 0]])
     for bound_deg, sure in ((1.6, True), (1.8, False), (5.0, False), (180.0, False)):
@@ -232,7 +254,7 @@ def test_nothing_is_sure_past_a_null() -> None:
 def test_nothing_is_sure_of_any_direction() -> None:
     """Without a bound: also of a single element that radiates the same everywhere."""
     weights = np.ones((1, 1), dtype=complex)
-    array = line(1, 1e9, 0.5, EYE)
+    array = line(1, 1e9, spacing_wavelengths=0.5, array_from_body=EYE)
     assert guaranteed_gains_db(array, AHEAD[:1], [None], weights) == (None,)
     for bound_rad in (math.pi, 7.0, math.inf):
         found = guaranteed_gains_db(array, AHEAD[:1], [bound_rad], weights)
@@ -250,8 +272,15 @@ def test_without_a_bound_the_most_of_any_direction_leaks() -> None:
 def test_behind_elements_that_radiate_nothing_there_nothing_arrives() -> None:
     behind = np.array([[-1.0, 0, 0]])
     for array in (
-        line(4, 1e9, 0.5, EYE, COSINE),
-        listed(SLANTED, 1e9, EYE, COSINE, None, np.tile([1.0, 0, 0], (5, 1))),
+        line(4, 1e9, spacing_wavelengths=0.5, array_from_body=EYE, element=COSINE),
+        listed(
+            SLANTED,
+            1e9,
+            array_from_body=EYE,
+            element=COSINE,
+            lever_arm_m=None,
+            outward=np.tile([1.0, 0, 0], (5, 1)),
+        ),
     ):
         weights = np.ones((array.size, 1), dtype=complex)
         for bound_rad in (0.0, 1.2):

@@ -32,7 +32,7 @@ from companion.beams.worth.link_budget import (
 from companion.values import ComplexArray, FloatArray, IntArray, Normalisation
 
 BUDGET = LinkBudget(tx_power_dbm=30.0, bandwidth_hz=50e6, noise_figure_db=7.0)
-ARRAY = uniform_linear(64, 30e9, 0.5, np.eye(3))
+ARRAY = uniform_linear(64, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
 RANGES_M = np.array([100.0, 150.0, 200.0, 250.0])
 
 
@@ -57,7 +57,7 @@ def test_noise_by_hand() -> None:
     assert 10 * math.log10(BUDGET.noise_power_w * 1e3) == pytest.approx(-174 + 76.99 + 7, abs=0.03)
     assert BUDGET.noise_power_w == pytest.approx(1e-12, rel=0.01)
     assert BUDGET.tx_power_w == pytest.approx(1.0)
-    cold = LinkBudget(0.0, 50e6, 7.0, temperature_k=29.0)
+    cold = LinkBudget(tx_power_dbm=0.0, bandwidth_hz=50e6, noise_figure_db=7.0, temperature_k=29.0)
     assert cold.noise_power_w == pytest.approx(BUDGET.noise_power_w / 10)
     assert cold.tx_power_w == pytest.approx(1e-3)
 
@@ -75,7 +75,12 @@ def test_noise_by_hand() -> None:
 )
 def test_a_budget_that_is_none_is_refused(values: tuple[float, ...], name: str) -> None:
     with pytest.raises(ValueError, match=name):
-        LinkBudget(values[0], values[1], values[2], values[3])
+        LinkBudget(
+            tx_power_dbm=values[0],
+            bandwidth_hz=values[1],
+            noise_figure_db=values[2],
+            temperature_k=values[3],
+        )
 
 
 # --- power --------------------------------------------------------------------------------------
@@ -118,10 +123,19 @@ def test_it_is_what_a_receiver_measures_on_random_symbols() -> None:
     UAV, combining; the wanted part found by correlation, the rest is interference and noise."""
     rng = np.random.default_rng(12)
     users, antennas, symbols = 3, 4, 200_000
-    uav = uniform_linear(antennas, 30e9, 0.5, np.eye(3))
+    uav = uniform_linear(antennas, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
     at_node, at_uav = in_plane(-20.0, 5.0, 30.0), in_plane(10.0, 0.0, -30.0)
-    array = uniform_rectangular(2, 4, 30e9, 0.5, np.eye(3))
-    channels = draw(SalehValenzuela(3.0), array, uav, at_node, at_uav, rng)
+    array = uniform_rectangular(
+        2, columns=4, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3)
+    )
+    channels = draw(
+        SalehValenzuela(rician_k_db=3.0),
+        array,
+        uav_array=uav,
+        directions_at_node=at_node,
+        directions_at_uav=at_uav,
+        rng=rng,
+    )
     weights = share_power(random_complex(rng, 8, users), 2.0)
     gains, noise = np.array([1.0, 0.3, 0.01]), 0.05
     s = (rng.choice([-1, 1], (2, users, symbols)) * np.array([[[1]], [[1j]]])).sum(0) / math.sqrt(2)
@@ -178,14 +192,21 @@ def test_zero_forcing_on_the_line_of_sight_leaves_noise_alone() -> None:
 
 
 def test_matched_antennas_at_the_uav_gain_their_number_exactly() -> None:
-    sight = SalehValenzuela(math.inf)
+    sight = SalehValenzuela(rician_k_db=math.inf)
     weights = share_power(precode(steering.steering_matrix(ARRAY, APART), Precoder()).weights, 1.0)
     gains = free_space_gain(RANGES_M, ARRAY.wavelength_m)
     found = []
     for antennas in (1, 4):
-        uav = uniform_linear(antennas, 30e9, 0.5, np.eye(3))
+        uav = uniform_linear(antennas, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
         at_uav = in_plane(0.0, 30.0, 80.0, -45.0)
-        channels = draw(sight, ARRAY, uav, APART, at_uav, np.random.default_rng(1))
+        channels = draw(
+            sight,
+            ARRAY,
+            uav_array=uav,
+            directions_at_node=APART,
+            directions_at_uav=at_uav,
+            rng=np.random.default_rng(1),
+        )
         rows = combined_rows(channels, steering.steering_matrix(uav, at_uav))
         found.append(sinr(rows @ weights, gains, BUDGET.noise_power_w))
     assert found[1] == pytest.approx(4 * found[0], rel=1e-9)
@@ -287,7 +308,9 @@ def test_one_uav_by_hand() -> None:
     """30 dBm + 18.06 dB (64 elements) + 6.02 dB (4 antennas) - 101.99 dB + 89.98 dBm."""
     ahead, at = in_plane(0.0), np.array([100.0])
     f = steering.steering_matrix(ARRAY, ahead).conj() * 7.0  # any normalisation
-    found = predicted_sinr_db(ARRAY, ahead, at, sent(f), None, BUDGET, uav_antennas=4)
+    found = predicted_sinr_db(
+        ARRAY, ahead, ranges_m=at, sent=sent(f), groups=None, budget=BUDGET, uav_antennas=4
+    )
     assert found == pytest.approx([30 + 18.06 + 6.02 - 101.99 + 89.98], abs=0.05)
 
 
@@ -295,15 +318,24 @@ def test_it_is_the_sinr_of_the_channel_without_scattering() -> None:
     """The whole chain with a drawn channel, for weights that leave interference."""
     weights = steering.steering_matrix(ARRAY, APART).conj()
     groups = np.array([0, 1, 0, 0])
-    uav = uniform_linear(4, 30e9, 0.5, np.eye(3))
+    uav = uniform_linear(4, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
     at_uav = in_plane(0.0, 30.0, 80.0, -45.0)
-    sight = SalehValenzuela(math.inf)
-    channels = draw(sight, ARRAY, uav, APART, at_uav, np.random.default_rng(1))
+    sight = SalehValenzuela(rician_k_db=math.inf)
+    channels = draw(
+        sight,
+        ARRAY,
+        uav_array=uav,
+        directions_at_node=APART,
+        directions_at_uav=at_uav,
+        rng=np.random.default_rng(1),
+    )
     rows = combined_rows(channels, steering.steering_matrix(uav, at_uav))
     gains = free_space_gain(RANGES_M, ARRAY.wavelength_m)
     shared = sent(weights, groups)
     wanted = 10 * np.log10(sinr(rows @ shared, gains, BUDGET.noise_power_w, groups))
-    found = predicted_sinr_db(ARRAY, APART, RANGES_M, shared, groups, BUDGET, uav_antennas=4)
+    found = predicted_sinr_db(
+        ARRAY, APART, ranges_m=RANGES_M, sent=shared, groups=groups, budget=BUDGET, uav_antennas=4
+    )
     assert found == pytest.approx(wanted, abs=1e-9)
 
 
@@ -312,27 +344,50 @@ def test_a_turn_of_its_own_has_the_whole_power_and_no_interference() -> None:
     weights = steering.steering_matrix(ARRAY, close).conj()
     at = np.array([100.0, 100.0])
     turns = np.array([0, 1])
-    together = predicted_sinr_db(ARRAY, close, at, sent(weights), None, BUDGET)
-    apart = predicted_sinr_db(ARRAY, close, at, sent(weights, turns), turns, BUDGET)
-    alone = predicted_sinr_db(ARRAY, close[:1], at[:1], sent(weights[:, :1]), None, BUDGET)
+    together = predicted_sinr_db(
+        ARRAY, close, ranges_m=at, sent=sent(weights), groups=None, budget=BUDGET
+    )
+    apart = predicted_sinr_db(
+        ARRAY, close, ranges_m=at, sent=sent(weights, turns), groups=turns, budget=BUDGET
+    )
+    alone = predicted_sinr_db(
+        ARRAY, close[:1], ranges_m=at[:1], sent=sent(weights[:, :1]), groups=None, budget=BUDGET
+    )
     assert apart == pytest.approx(np.repeat(alone, 2))
     assert (together < 5).all()
     assert (apart > 35).all()
 
 
 def test_behind_the_elements_there_is_nothing() -> None:
-    array = uniform_linear(8, 30e9, 0.5, np.eye(3), Element(Pattern.COSINE))
+    array = uniform_linear(
+        8, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3), element=Element(Pattern.COSINE)
+    )
     seen = in_plane(0.0, 180.0)
     f = np.ones((8, 2), dtype=complex)
-    found = predicted_sinr_db(array, seen, np.array([100.0, 100.0]), sent(f), None, BUDGET)
+    found = predicted_sinr_db(
+        array, seen, ranges_m=np.array([100.0, 100.0]), sent=sent(f), groups=None, budget=BUDGET
+    )
     assert found[1] == -math.inf
 
 
 def test_no_uavs_and_no_antennas() -> None:
     nothing = np.empty((64, 0), dtype=complex)
-    assert predicted_sinr_db(ARRAY, np.empty((0, 3)), np.empty(0), nothing, None, BUDGET).size == 0
+    assert (
+        predicted_sinr_db(
+            ARRAY, np.empty((0, 3)), ranges_m=np.empty(0), sent=nothing, groups=None, budget=BUDGET
+        ).size
+        == 0
+    )
     with pytest.raises(ValueError, match="uav_antennas"):
-        predicted_sinr_db(ARRAY, APART, RANGES_M, nothing, None, BUDGET, uav_antennas=0)
+        predicted_sinr_db(
+            ARRAY,
+            APART,
+            ranges_m=RANGES_M,
+            sent=nothing,
+            groups=None,
+            budget=BUDGET,
+            uav_antennas=0,
+        )
 
 
 @settings(max_examples=examples(40))
@@ -351,7 +406,15 @@ def test_no_link_within_the_bounds_is_worse_than_the_least(seed: int, turns: boo
     shared = sent(made.weights * rng.uniform(0.3, 3.0, 4), groups)  # columns of unlike powers
     powers_w = np.sum(np.abs(shared) ** 2, axis=0)
     least = least_sinr_db(
-        linear, leaks, np.array(known), far_m, groups, powers_w, BUDGET, ARRAY.wavelength_m, 4
+        linear,
+        leaks=leaks,
+        users=np.array(known),
+        farthest_m=far_m,
+        groups=groups,
+        powers_w=powers_w,
+        budget=BUDGET,
+        wavelength_m=ARRAY.wavelength_m,
+        uav_antennas=4,
     )
     for _ in range(20):
         aside = np.cross(APART, rng.standard_normal((4, 3)))
@@ -359,7 +422,9 @@ def test_no_link_within_the_bounds_is_worse_than_the_least(seed: int, turns: boo
         off = (bounds * rng.uniform(0, 1, 4))[:, np.newaxis]
         true = np.cos(off) * APART + np.sin(off) * aside
         at_m = RANGES_M + rng.uniform(-5, 5, 4)
-        found = predicted_sinr_db(ARRAY, true, at_m, shared, groups, BUDGET, 4)
+        found = predicted_sinr_db(
+            ARRAY, true, ranges_m=at_m, sent=shared, groups=groups, budget=BUDGET, uav_antennas=4
+        )
         assert (found[known] >= least - 1e-9).all()
 
 
@@ -371,9 +436,25 @@ def test_the_least_is_attained_where_nothing_is_uncertain() -> None:
     everyone, together = np.arange(4), np.zeros(4, dtype=np.int64)
     powers_w = np.sum(np.abs(sent(made.weights)) ** 2, axis=0)
     least = least_sinr_db(
-        linear, leaks, everyone, RANGES_M, together, powers_w, BUDGET, ARRAY.wavelength_m, 2
+        linear,
+        leaks=leaks,
+        users=everyone,
+        farthest_m=RANGES_M,
+        groups=together,
+        powers_w=powers_w,
+        budget=BUDGET,
+        wavelength_m=ARRAY.wavelength_m,
+        uav_antennas=2,
     )
-    same = predicted_sinr_db(ARRAY, APART, RANGES_M, sent(made.weights), together, BUDGET, 2)
+    same = predicted_sinr_db(
+        ARRAY,
+        APART,
+        ranges_m=RANGES_M,
+        sent=sent(made.weights),
+        groups=together,
+        budget=BUDGET,
+        uav_antennas=2,
+    )
     assert least == pytest.approx(same, abs=1e-6)
 
 
@@ -382,7 +463,17 @@ def test_at_the_least_only_those_of_the_same_turn_are_heard_and_share_the_power(
     gains, leaks = np.array([40.0, 50.0]), np.array([[9.0, 3.0, 8.0], [7.0, 6.0, 9.0]])
     groups, users, at = np.array([0, 0, 1]), np.array([1, 2]), np.array([900.0, 500.0])
     powers_w = np.array([0.3, 0.7, 0.9])
-    found = least_sinr_db(gains, leaks, users, at, groups, powers_w, BUDGET, 0.01, uav_antennas=2)
+    found = least_sinr_db(
+        gains,
+        leaks=leaks,
+        users=users,
+        farthest_m=at,
+        groups=groups,
+        powers_w=powers_w,
+        budget=BUDGET,
+        wavelength_m=0.01,
+        uav_antennas=2,
+    )
     path = 2 * free_space_gain(at, 0.01)
     noise_w = BUDGET.noise_power_w
     shared = path[0] * 40.0 * 0.7 / (path[0] * 9.0 * 0.3 + noise_w)

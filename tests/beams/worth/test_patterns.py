@@ -39,7 +39,13 @@ def towards(azimuth_deg: float, elevation_deg: float) -> FloatArray:
 
 
 def line(elements: int, spacing: float = 0.5, element: Element | None = None) -> Array:
-    return uniform_linear(elements, 30e9, spacing, EYE, element or Element())
+    return uniform_linear(
+        elements,
+        30e9,
+        spacing_wavelengths=spacing,
+        array_from_body=EYE,
+        element=element or Element(),
+    )
 
 
 def matched(array: Array, direction: FloatArray) -> ComplexArray:
@@ -62,7 +68,7 @@ def dirichlet(count: int, half_phase: FloatArray) -> FloatArray:
 @settings(max_examples=examples(30), deadline=None)
 def test_the_response_is_the_sum_written_out(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    array = listed(rng.uniform(-0.05, 0.05, (6, 3)), 30e9, EYE)
+    array = listed(rng.uniform(-0.05, 0.05, (6, 3)), 30e9, array_from_body=EYE)
     weights = rng.standard_normal(6) + 1j * rng.standard_normal(6)
     directions = rng.standard_normal((2, 3, 3))
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
@@ -87,7 +93,9 @@ def test_the_response_of_a_line_is_dirichlets_kernel() -> None:
 
 
 def test_the_response_of_a_rectangle_is_the_product_of_two_lines() -> None:
-    array = uniform_rectangular(3, 5, 30e9, 0.5, EYE)
+    array = uniform_rectangular(
+        3, columns=5, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
+    )
     azimuths, elevations = np.linspace(-3, 3, 37), np.linspace(-1.5, 1.5, 21)
     found = patterns.sphere(array, np.ones(15, complex), azimuths, elevations)
     assert found.shape == (21, 37)
@@ -101,7 +109,7 @@ def test_the_response_of_a_rectangle_is_the_product_of_two_lines() -> None:
 
 def test_the_response_of_a_full_circle_is_bessels() -> None:
     """Phased towards boresight: M J0^2(k r |u - x|) in its plane, with many elements."""
-    array = uniform_circular(96, 30e9, 0.25, EYE)
+    array = uniform_circular(96, 30e9, spacing_wavelengths=0.25, array_from_body=EYE)
     radius_m = float(np.linalg.norm(array.elements_m[0]))
     azimuths, found = patterns.azimuth_cut(array, matched(array, BORESIGHT), 0.0, 361)
     apart = 2 * np.abs(np.sin(azimuths / 2))
@@ -112,7 +120,7 @@ def test_the_response_of_a_full_circle_is_bessels() -> None:
 def test_the_golden_steering_vector_gives_the_full_gain_and_no_more_anywhere() -> None:
     """Five elements at 0, .1, ..., .4 m, 1 GHz, 45 degrees."""
     places = np.array([[0.0, 0.1 * m, 0.0] for m in range(5)])
-    array = listed(places, 1e9, EYE)
+    array = listed(places, 1e9, array_from_body=EYE)
     golden = np.array([1, 0.0887 + 0.9961j, -0.9843 + 0.1767j, -0.2633 - 0.9647j, 0.9376 - 0.3478j])
     full_db = 10 * math.log10(5)
     at = patterns.response_db(array, golden.conj(), towards(45, 0))
@@ -126,7 +134,7 @@ def test_the_golden_steering_vector_gives_the_full_gain_and_no_more_anywhere() -
 @settings(max_examples=examples(20), deadline=None)
 def test_no_weights_have_more_gain_than_the_matched_ones(seed: int, element: Element) -> None:
     rng = np.random.default_rng(seed)
-    array = uniform_circular(8, 30e9, 0.5, EYE, element)
+    array = uniform_circular(8, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=element)
     weights = rng.standard_normal(8) + 1j * rng.standard_normal(8)
     for _ in range(5):
         u = rng.standard_normal(3)
@@ -156,7 +164,9 @@ def test_an_exact_null_is_finite() -> None:
 
 
 def test_many_directions_are_worked_on_in_blocks_that_leave_no_seam() -> None:
-    array = uniform_rectangular(12, 12, 30e9, 0.5, EYE)
+    array = uniform_rectangular(
+        12, columns=12, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
+    )
     rng = np.random.default_rng(1)
     directions = rng.standard_normal((3 * patterns.BLOCK // 144 + 5, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, np.newaxis]
@@ -165,7 +175,9 @@ def test_many_directions_are_worked_on_in_blocks_that_leave_no_seam() -> None:
     expected = 10 * np.log10(np.abs(field) ** 2 / np.sum(np.abs(weights) ** 2))
     assert patterns.response_db(array, weights, directions) == pytest.approx(expected, abs=1e-6)
     assert patterns.response_db(array, weights, directions[:0]).shape == (0,)
-    large = uniform_rectangular(100, 100, 30e9, 0.5, EYE)  # more elements than a block
+    large = uniform_rectangular(
+        100, columns=100, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
+    )  # more elements than a block
     full = patterns.response_db(large, np.ones(10_000, complex), np.stack([BORESIGHT] * 3))
     assert full == pytest.approx([40.0] * 3)
 
@@ -191,7 +203,14 @@ def test_weights_that_are_none_are_refused(weights: ComplexArray, reason: str) -
 
 
 def test_cuts_go_through_the_directions_that_they_say() -> None:
-    array = uniform_rectangular(3, 4, 30e9, 0.5, EYE, TR38901)
+    array = uniform_rectangular(
+        3,
+        columns=4,
+        frequency_hz=30e9,
+        spacing_wavelengths=0.5,
+        array_from_body=EYE,
+        element=TR38901,
+    )
     weights = matched(array, towards(20, 30))
     azimuths, found = patterns.azimuth_cut(array, weights, math.radians(30), 73)
     assert np.degrees(azimuths) == pytest.approx(np.arange(-180, 181, 5))
@@ -248,7 +267,7 @@ def test_no_beamwidth_where_there_is_no_beam() -> None:
         line(8, element=Element(Pattern.COSINE)), -BORESIGHT
     ) == (None, None)
     # Straight up every azimuth is the same place.
-    ring = uniform_circular(16, 30e9, 0.5, EYE)
+    ring = uniform_circular(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
     azimuth, elevation = patterns.half_power_beamwidths_rad(ring, towards(0, 90))
     assert azimuth is None
     assert elevation is not None
@@ -263,7 +282,12 @@ def test_one_element_has_the_width_of_its_pattern() -> None:
         found = patterns.half_power_beamwidths_rad(mast, BORESIGHT)
         assert np.degrees(np.array(found, float)) == pytest.approx(expected)
     up = listed(
-        np.zeros((1, 3)), 30e9, EYE, Element(Pattern.COSINE, 3.0), None, towards(70, 80)[np.newaxis]
+        np.zeros((1, 3)),
+        30e9,
+        array_from_body=EYE,
+        element=Element(Pattern.COSINE, 3.0),
+        lever_arm_m=None,
+        outward=towards(70, 80)[np.newaxis],
     )
     _, elevation = patterns.half_power_beamwidths_rad(up, towards(70, 80))
     assert elevation == pytest.approx(math.radians(expected))
@@ -280,7 +304,9 @@ def test_the_width_of_a_steered_line_is_that_of_sines(azimuth_deg: float) -> Non
 
 
 def test_a_rectangle_has_the_width_of_each_line_and_more_azimuth_when_it_looks_up() -> None:
-    array = uniform_rectangular(8, 20, 30e9, 0.5, EYE)
+    array = uniform_rectangular(
+        8, columns=20, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
+    )
     azimuth, elevation = patterns.half_power_beamwidths_rad(array, BORESIGHT)
     assert azimuth == pytest.approx(math.radians(width_deg(line(20))))
     assert elevation == pytest.approx(math.radians(width_deg(line(8))))
@@ -290,7 +316,7 @@ def test_a_rectangle_has_the_width_of_each_line_and_more_azimuth_when_it_looks_u
 
 
 def test_a_full_circle_has_bessels_width_in_every_direction() -> None:
-    array = uniform_circular(64, 30e9, 0.25, EYE)
+    array = uniform_circular(64, 30e9, spacing_wavelengths=0.25, array_from_body=EYE)
     radius_m = float(np.linalg.norm(array.elements_m[0]))
     argument = brentq(lambda x: j0(x) ** 2 - 0.5, 0, 2)
     expected = 4 * math.degrees(math.asin(argument / (2 * array.wavenumber_radpm * radius_m)))
@@ -368,13 +394,13 @@ def test_grating_lobes_are_side_lobes_and_the_mirror_behind_is_not() -> None:
     assert pair.azimuth.side_lobe_db is None
     assert np.degrees(pair.azimuth.first_nulls_rad or ()) == pytest.approx([-90, 90])
     ahead = np.array([[0, 0, 0], [SPEED_OF_LIGHT_MPS / 30e9 / 4, 0, 0]])  # in line with boresight
-    cardioid = listed(ahead, 30e9, EYE)
+    cardioid = listed(ahead, 30e9, array_from_body=EYE)
     found = patterns.lobe(cardioid, matched(cardioid, BORESIGHT), towards(20, 10))
     # Its top is as flat as a fourth power: a thousandth of a radian is lost in rounding.
     assert found.azimuth.first_nulls_rad == pytest.approx((-math.pi, math.pi), abs=0.01)
     assert found.azimuth.half_power_width_rad == pytest.approx(math.pi, abs=0.01)
     assert found.azimuth.side_lobe_db is None
-    half_wave = listed(2 * ahead, 30e9, EYE)
+    half_wave = listed(2 * ahead, 30e9, array_from_body=EYE)
     found = patterns.lobe(half_wave, matched(half_wave, BORESIGHT), BORESIGHT)
     assert found.azimuth.side_lobe_db == pytest.approx(0, abs=1e-9)  # behind, no mirror
 
@@ -398,10 +424,21 @@ def test_ripple_on_a_flat_top_is_no_end_of_the_lobe() -> None:
 
 ARRAYS = {
     "line": line(24, 0.5),
-    "rectangle": uniform_rectangular(6, 9, 30e9, 0.5, EYE),
-    "rectangle of the standard's elements": uniform_rectangular(6, 9, 30e9, 0.5, EYE, TR38901),
-    "circle": uniform_circular(20, 30e9, 0.5, EYE),
-    "list": listed(np.random.default_rng(0).uniform(-0.02, 0.02, (30, 3)), 30e9, EYE),
+    "rectangle": uniform_rectangular(
+        6, columns=9, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
+    ),
+    "rectangle of the standard's elements": uniform_rectangular(
+        6,
+        columns=9,
+        frequency_hz=30e9,
+        spacing_wavelengths=0.5,
+        array_from_body=EYE,
+        element=TR38901,
+    ),
+    "circle": uniform_circular(20, 30e9, spacing_wavelengths=0.5, array_from_body=EYE),
+    "list": listed(
+        np.random.default_rng(0).uniform(-0.02, 0.02, (30, 3)), 30e9, array_from_body=EYE
+    ),
 }
 
 
@@ -485,7 +522,9 @@ def _cut(azimuth: FloatArray, elevation: FloatArray) -> tuple[FloatArray, FloatA
 @settings(max_examples=examples(40), deadline=None)
 def test_the_peak_of_a_matched_beam_is_found_from_anywhere_on_its_hill(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    array = uniform_rectangular(8, 8, 30e9, 0.5, EYE)
+    array = uniform_rectangular(
+        8, columns=8, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
+    )
     at = towards(rng.uniform(-50, 50), rng.uniform(-50, 50))
     aside = rng.uniform(-0.2, 0.2, 2)  # sines; the first nulls are at 0.25
     right, down = at[1] + aside[0], at[2] + aside[1]
@@ -499,7 +538,9 @@ def test_the_peak_of_a_matched_beam_is_found_from_anywhere_on_its_hill(seed: int
 
 
 def test_from_the_bottom_of_a_null_it_climbs_out() -> None:
-    array = uniform_rectangular(4, 8, 30e9, 0.5, EYE)
+    array = uniform_rectangular(
+        4, columns=8, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
+    )
     null = np.array([math.sqrt(1 - 0.25**2), 0.25, 0.0])
     found = patterns.lobe(array, np.ones(32, complex), null)
     assert found.peak_db > 0

@@ -21,10 +21,19 @@ GPP = Element(Pattern.TR38901)
 AHEAD = np.array([[0.96, 0.28, 0.0], [0.8, -0.36, 0.48]])
 PHASE_RAD, GAIN_DB = math.radians(6.0), 0.7
 ARRAYS = {
-    "line": line(16, 30e9, 0.5, EYE),
-    "grid of patterns": grid(4, 4, 30e9, 0.6, EYE, Element(Pattern.COSINE, 1.5)),
-    "circle": uniform_circular(12, 30e9, 0.5, EYE, GPP),
-    "cloud": listed(np.random.default_rng(8).uniform(-0.02, 0.02, (10, 3)), 30e9, EYE),
+    "line": line(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE),
+    "grid of patterns": grid(
+        4,
+        columns=4,
+        frequency_hz=30e9,
+        spacing_wavelengths=0.6,
+        array_from_body=EYE,
+        element=Element(Pattern.COSINE, 1.5),
+    ),
+    "circle": uniform_circular(12, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=GPP),
+    "cloud": listed(
+        np.random.default_rng(8).uniform(-0.02, 0.02, (10, 3)), 30e9, array_from_body=EYE
+    ),
 }
 FAULTS = ("dead", "coupling", "off", "all")
 

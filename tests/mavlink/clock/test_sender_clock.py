@@ -313,6 +313,7 @@ def exchange(
     clock: SenderClock,
     rng: random.Random,
     drift: float,
+    *,
     true_ns: int,
     there_s: float,
     back_s: float,
@@ -335,7 +336,7 @@ def test_timesync_stays_within_its_uncertainty(drift: float, there_s: float, bac
             stamp = clock.observe(arrival_ns, boot_ms)
             assert stamp is not None
             if arrival_ns - EPOCH_NS > next_ns + 10 * S:
-                exchange(clock, rng, drift, next_ns, there_s, back_s)
+                exchange(clock, rng, drift, true_ns=next_ns, there_s=there_s, back_s=back_s)
                 assert clock.timesync_refused is None
                 next_ns += 10 * S
             estimate = known(clock)

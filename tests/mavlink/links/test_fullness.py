@@ -27,9 +27,13 @@ def run(request: pytest.FixtureRequest) -> Run:
 async def serving(url: str) -> AsyncIterator[Endpoint]:
     """An endpoint at work; nobody hears what comes."""
     upcalls = Upcalls(
-        lambda: None, lambda *_: None, lambda *_: None, lambda _: None, lambda _: None
+        up=lambda: None,
+        take=lambda *_: None,
+        stale=lambda *_: None,
+        hang_up=lambda _: None,
+        overflow=lambda _: None,
     )
-    made = endpoint(parse_link(url), LinkStatus(url), upcalls)
+    made = endpoint(parse_link(url), LinkStatus(url=url), upcalls)
     made.open()
     task = asyncio.create_task(made.serve())
     try:

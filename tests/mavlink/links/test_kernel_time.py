@@ -259,7 +259,7 @@ def test_a_reader_that_fails_ends_the_link(run: Run) -> None:
         def broken(_: object) -> None:
             raise ValueError("a defect")
 
-        link = Link(parse_link("udpin:127.0.0.1:0"), broken, time.monotonic_ns)
+        link = Link(url=parse_link("udpin:127.0.0.1:0"), receive=broken, now_ns=time.monotonic_ns)
         link.open()
         with peer() as sender:
             sender.sendto(frame(1), ("127.0.0.1", port_of(link)))

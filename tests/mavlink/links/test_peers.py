@@ -25,14 +25,14 @@ def numbered(number: int, source: Source = UAV, t_ns: int = 0) -> Frame:
     """A frame as far as counting goes: its checksum has been looked at before."""
     raw = bytearray(MADE.raw)
     raw[4:7] = number & 0xFF, *source
-    return Frame(t_ns, LINK, source, MADE.msgid, bytes(raw))
+    return Frame(t_ns=t_ns, link=LINK, source=source, msgid=MADE.msgid, raw=bytes(raw))
 
 
 class Heard:
     """Peers of a link, and who was bidden farewell."""
 
     def __init__(self) -> None:
-        self.status = LinkStatus(LINK)
+        self.status = LinkStatus(url=LINK)
         self.farewells: list[Peer] = []
         self.peers = Peers(self.status, self.farewells.append)
 
@@ -157,9 +157,12 @@ def test_the_version_is_that_of_the_last_frame_and_both_are_remembered() -> None
 def test_rejections_are_counted_by_reason_and_move_nothing_else() -> None:
     heard = Heard()
     peer = heard.peers.at("a")
-    lost = [Rejection(5, LINK, Reason.GARBAGE, 7), Rejection(5, "1:1", Reason.UNSIGNED)]
+    lost = [
+        Rejection(t_ns=5, source=LINK, reason=Reason.GARBAGE, count=7),
+        Rejection(t_ns=5, source="1:1", reason=Reason.UNSIGNED),
+    ]
     heard.peers.count(peer, [*lost, *lost])
-    assert heard.status == LinkStatus(LINK, peers=1, lost={"garbage": 14, "unsigned": 2})
+    assert heard.status == LinkStatus(url=LINK, peers=1, lost={"garbage": 14, "unsigned": 2})
     assert peer.heard_ns is None and heard.peers.heard_since(0) == []
 
 

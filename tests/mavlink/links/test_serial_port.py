@@ -251,7 +251,9 @@ def test_a_fault_of_the_program_does_not_vanish(run: Run) -> None:
 
     async def test() -> None:
         with cable() as wire:
-            link = Link(parse_link(f"serial:{wire.path}:57600"), receive, lambda: 0)
+            link = Link(
+                url=parse_link(f"serial:{wire.path}:57600"), receive=receive, now_ns=lambda: 0
+            )
             link.open()
             task = asyncio.create_task(link.run())
             await until_true(lambda: link.status.state == "up")

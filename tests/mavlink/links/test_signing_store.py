@@ -30,7 +30,7 @@ NOW_NS = 1_790_000_000 * S
 
 def sent(t_ns: int, key: bytes = KEY, sysid: int = 1) -> Frame:
     """A signed heartbeat of that time."""
-    raw = Guard(key, 0).sign(encode.pack(encode.heartbeat(Source(sysid, 1)), 0), t_ns)
+    raw = Guard(key=key, link_id=0).sign(encode.pack(encode.heartbeat(Source(sysid, 1)), 0), t_ns)
     return framed(raw, t_ns)
 
 

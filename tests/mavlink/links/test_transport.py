@@ -166,7 +166,7 @@ def test_what_is_lost_is_handed_on_and_counted(run: Run) -> None:
 def test_a_port_scan_does_not_fill_the_memory() -> None:
     """The peers heard last are kept: one that keeps sending is never forgotten."""
     inbox: list[Frame | Rejection] = []
-    link = Link(parse_link("udpin:127.0.0.1:0"), inbox.extend, lambda: 0)
+    link = Link(url=parse_link("udpin:127.0.0.1:0"), receive=inbox.extend, now_ns=lambda: 0)
     link.take("old", frame(0)[:20])
     link.take("steady", frame(1)[:10])
     for n in range(2 * PEERS_MAX):
@@ -191,7 +191,7 @@ def test_a_port_in_use_is_one_line(scheme: str) -> None:
             taken.listen()
         url = f"{scheme}:127.0.0.1:{taken.getsockname()[1]}"
         with pytest.raises(LinkError) as caught:
-            Link(parse_link(url), lambda _: None, lambda: 0).open()
+            Link(url=parse_link(url), receive=lambda _: None, now_ns=lambda: 0).open()
     assert str(caught.value) == f"{url}: Address already in use"
 
 
@@ -199,7 +199,7 @@ def test_a_port_in_use_is_one_line(scheme: str) -> None:
 def test_an_address_of_another_machine_is_one_line(scheme: str) -> None:
     url = f"{scheme}:192.0.2.1:0"  # TEST-NET-1: nobody's address
     with pytest.raises(LinkError) as caught:
-        Link(parse_link(url), lambda _: None, lambda: 0).open()
+        Link(url=parse_link(url), receive=lambda _: None, now_ns=lambda: 0).open()
     assert str(caught.value) == f"{url}: Cannot assign requested address"
 
 
@@ -207,7 +207,7 @@ def test_an_address_of_another_machine_is_one_line(scheme: str) -> None:
     "url", ["tcp:127.0.0.1:1", "udpout:127.0.0.1:1", "serial:/dev/not-plugged-in:57600"]
 )
 def test_a_peer_or_a_device_that_is_away_is_no_error_at_the_start(url: str) -> None:
-    Link(parse_link(url), lambda _: None, lambda: 0).open()
+    Link(url=parse_link(url), receive=lambda _: None, now_ns=lambda: 0).open()
 
 
 @pytest.mark.parametrize("scheme", ["udpin", "tcpin"])
@@ -804,7 +804,9 @@ def test_what_the_guard_refuses_is_a_rejection_and_moves_nothing(run: Run) -> No
                 assert inbox.raws == [frame(1), frame(2)]
                 assert [item.raw for item in guard.asked] == [*mixed, frame(3, sysid=4)]
                 first = inbox.items[1]
-                assert first == Rejection(now, "2:1", Reason.BAD_SIGNATURE, 1, 33)
+                assert first == Rejection(
+                    t_ns=now, source="2:1", reason=Reason.BAD_SIGNATURE, count=1, msgid=33
+                )
                 status = link.status
                 assert status.lost == {"bad-signature": 2, "garbage": 1}
                 assert (status.frames, status.gaps) == (2, 0)
@@ -870,7 +872,11 @@ def test_a_link_that_is_stopped_while_it_opens_leaves_nothing_open(
     async def test() -> None:
         with socket.create_server(("127.0.0.1", 0)) as server:
             port = 0 if scheme.endswith("in") else server.getsockname()[1]
-            link = Link(parse_link(f"{scheme}:127.0.0.1:{port}"), lambda _: None, lambda: 0)
+            link = Link(
+                url=parse_link(f"{scheme}:127.0.0.1:{port}"),
+                receive=lambda _: None,
+                now_ns=lambda: 0,
+            )
             link.open()
             task = asyncio.create_task(link.run())
             for _ in range(turns):
@@ -947,7 +953,9 @@ def test_a_fault_of_the_program_does_not_vanish(run: Run, scheme: str) -> None:
             datagrams.settimeout(LIMIT_S)
             there = datagrams if scheme == "udpout" else server
             port = 0 if scheme.endswith("in") else there.getsockname()[1]
-            link = Link(parse_link(f"{scheme}:127.0.0.1:{port}"), receive, lambda: 0)
+            link = Link(
+                url=parse_link(f"{scheme}:127.0.0.1:{port}"), receive=receive, now_ns=lambda: 0
+            )
             link.open()
             task = asyncio.create_task(link.run())
             await until_true(lambda: link.status.state == "up")
@@ -974,7 +982,7 @@ def test_a_fault_of_the_program_does_not_vanish(run: Run, scheme: str) -> None:
 def test_a_link_may_be_run_again_on_the_port_that_it_had(run: Run, scheme: str) -> None:
     async def test() -> None:
         came: list[Frame | Rejection] = []
-        link = Link(parse_link(f"{scheme}:127.0.0.1:0"), came.extend, lambda: 0)
+        link = Link(url=parse_link(f"{scheme}:127.0.0.1:0"), receive=came.extend, now_ns=lambda: 0)
         link.open()
         port, kind = port_of(link), {"udpin": socket.SOCK_DGRAM, "tcpin": socket.SOCK_STREAM}
         for n in range(3):

@@ -133,7 +133,9 @@ def test_what_was_likely_meant_is_said(text: str, meant: str) -> None:
 
 
 def test_only_the_schemes_that_are_asked_for() -> None:
-    assert parse_link("tcp:127.0.0.1:1", ("tcp",)) == LinkUrl("tcp", "127.0.0.1", 1)
+    assert parse_link("tcp:127.0.0.1:1", ("tcp",)) == LinkUrl(
+        scheme="tcp", host="127.0.0.1", port=1
+    )
     with pytest.raises(LinkError, match=r"is not tcp:HOST:PORT$"):
         parse_link("udpin:127.0.0.1:1", ("tcp",))
     with pytest.raises(LinkError, match=r"is not udpin:HOST:PORT or serial:DEVICE:BAUD$"):

@@ -21,7 +21,7 @@ class Taken:
         self.found: list[Frame | Rejection] = []
         self.now_ns = 1_000_000_000
         link = parse_link("udpin:127.0.0.1:0")
-        self.link = Link(link, self.found.extend, lambda: self.now_ns)
+        self.link = Link(url=link, receive=self.found.extend, now_ns=lambda: self.now_ns)
 
     def take(self, peer: object, raw: bytes) -> Frame | Rejection:
         """What becomes of a frame."""

@@ -330,7 +330,7 @@ def test_who_listens_no_more_hears_nothing_and_nothing_is_sent_to_him(run: Run) 
 def test_a_client_waits_for_its_router_until_it_is_closed(run: Run) -> None:
     async def test() -> None:
         nobody = f"tcp/127.0.0.1:{free_port()}"
-        bus = Bus(BusConfig("client", connect=(nobody,)), asyncio.get_running_loop())
+        bus = Bus(BusConfig(mode="client", connect=(nobody,)), asyncio.get_running_loop())
         opening = asyncio.create_task(asyncio.to_thread(bus.open))
         await asyncio.to_thread(bus.close)
         await opening
@@ -383,7 +383,13 @@ def wrong_configurations(nowhere: Path) -> Iterator[tuple[BusConfig, str]]:
     yield BusConfig(listen=("tcp/192.0.2.1:7447",)), "192.0.2.1"
     yield BusConfig(connect=("nonsense",)), "nonsense"
     yield BusConfig(listen=("tls/127.0.0.1:0",)), "TLS private key"
-    yield BusConfig(listen=("tls/127.0.0.1:0",), tls=BusTls(nowhere, nowhere, nowhere)), "TLS"
+    yield (
+        BusConfig(
+            listen=("tls/127.0.0.1:0",),
+            tls=BusTls(ca=nowhere, certificate=nowhere, private_key=nowhere),
+        ),
+        "TLS",
+    )
     yield BusConfig(access_control=nowhere), str(nowhere)
     yield BusConfig(access_control=Path(__file__)), "configuration"
 
@@ -414,8 +420,10 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.parametrize("mutual", [True, False])
 def test_who_connects_shows_a_certificate_unless_told_otherwise(mutual: bool) -> None:
-    tls = BusTls(Path("ca.pem"), Path("me.pem"), Path("me.key"), mutual=mutual)
+    tls = BusTls(
+        ca=Path("ca.pem"), certificate=Path("me.pem"), private_key=Path("me.key"), mutual=mutual
+    )
     section = json.loads(sections(BusConfig(tls=tls))["transport/link/tls"])
     assert section["enable_mtls"] is mutual
     assert section["listen_certificate"] == section["connect_certificate"] == "me.pem"
-    assert BusTls(Path("ca.pem")).mutual
+    assert BusTls(ca=Path("ca.pem")).mutual

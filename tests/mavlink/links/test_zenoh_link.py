@@ -113,7 +113,7 @@ def test_a_defect_in_who_receives_ends_the_link(run: Run, links: tuple[str, str]
         def receive(found: object) -> None:
             raise ZeroDivisionError
 
-        link = Link(parse_link(links[1]), receive, lambda: 1)
+        link = Link(url=parse_link(links[1]), receive=receive, now_ns=lambda: 1)
         async with running(links[0]) as (hub, _):
             serving = asyncio.create_task(link.run())
             await until_true(lambda: listened_to(hub))
@@ -126,6 +126,6 @@ def test_a_defect_in_who_receives_ends_the_link(run: Run, links: tuple[str, str]
 
 def test_without_zenoh_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "zenoh", None)
-    link = Link(parse_link("zenoh:mavlink_raw"), lambda found: None, lambda: 1)
+    link = Link(url=parse_link("zenoh:mavlink_raw"), receive=lambda found: None, now_ns=lambda: 1)
     with pytest.raises(UserError, match=r"\[fleet\]"):
         link.open()

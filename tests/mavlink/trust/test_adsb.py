@@ -63,7 +63,9 @@ def said(
     )  # fmt: skip
     raw = bytes(message.pack(dialect.MAVLink(None, relay, 1)))
     t_ns = EPOCH_NS + round(t_s * 1e9)
-    found = decode(Frame(t_ns, f"udp{relay}", Source(relay, 1), ADSB_VEHICLE, raw))
+    found = decode(
+        Frame(t_ns=t_ns, link=f"udp{relay}", source=Source(relay, 1), msgid=ADSB_VEHICLE, raw=raw)
+    )
     assert isinstance(found, AdsbVehicle)
     return found
 
@@ -104,11 +106,13 @@ def test_who_a_rejection_is_of() -> None:
     """A message without a position is its relay's; all others are the aircraft's."""
     aircraft = Aircraft()
     assert aircraft.merge(said(1, None, alt=9)) == Rejection(
-        EPOCH_NS + S, "5:1", Reason.NO_POSITION, msgid=ADSB_VEHICLE
+        t_ns=EPOCH_NS + S, source="5:1", reason=Reason.NO_POSITION, msgid=ADSB_VEHICLE
     )
     aircraft.merge(said(1))
     again = aircraft.merge(said(2))
-    assert again == Rejection(EPOCH_NS + 2 * S, UAV, Reason.DUPLICATE, msgid=ADSB_VEHICLE)
+    assert again == Rejection(
+        t_ns=EPOCH_NS + 2 * S, source=UAV, reason=Reason.DUPLICATE, msgid=ADSB_VEHICLE
+    )
 
 
 def test_aircraft_are_told_apart() -> None:

@@ -29,7 +29,7 @@ def sent(
         boot_ms, lat, 85455938, 488_000, 25_000, -300, 400, -5, hdg
     )
     raw = bytes(message.pack(mav, force_mavlink1=v1))
-    return Frame(t_ns, link, Source(*source), 33, raw)
+    return Frame(t_ns=t_ns, link=link, source=Source(*source), msgid=33, raw=raw)
 
 
 def test_the_same_report_over_two_links_counts_once() -> None:

@@ -72,7 +72,13 @@ def sent(
     raw = b"\xfd" + bytes([len(payload), 1, 0, 7, sysid, compid, 33, 0, 0]) + payload
     crc = dialect.x25crc(raw[1:] + bytes([104])).crc
     raw += struct.pack("<HB", crc, link_id) + struct.pack("<Q", stamp)[:6]
-    return Frame(t_ns, "a", Source(sysid, compid), 33, raw + hashlib.sha256(key + raw).digest()[:6])
+    return Frame(
+        t_ns=t_ns,
+        link="a",
+        source=Source(sysid, compid),
+        msgid=33,
+        raw=raw + hashlib.sha256(key + raw).digest()[:6],
+    )
 
 
 def guard(**changes: object) -> Guard:
@@ -137,7 +143,12 @@ def test_a_flipped_bit_anywhere(allow_unsigned: bool) -> None:
         raw = bytearray(good)
         raw[bit // 8] ^= 1 << bit % 8
         if not allow_unsigned:  # whether or not the checksum was looked at
-            assert ours.refusal(Frame(NOW_NS, "a", Source(1, 1), 33, bytes(raw))) is not None, bit
+            assert (
+                ours.refusal(
+                    Frame(t_ns=NOW_NS, link="a", source=Source(1, 1), msgid=33, raw=bytes(raw))
+                )
+                is not None
+            ), bit
         splitter = Splitter("a")
         for item in splitter.feed(NOW_NS, bytes(raw)) + splitter.finish(NOW_NS):
             if isinstance(item, Frame):
@@ -402,7 +413,9 @@ class Run:
 
     def __init__(self, write_s: int) -> None:
         self.now_ns = NOW_NS
-        self.guard = guard(state=State(NOW, NOW + 7199 * UNITS, NOW, -1, KNOWN_AT))
+        self.guard = guard(
+            state=State(clock=NOW, local=NOW + 7199 * UNITS, sent=NOW, floor=-1, streams=KNOWN_AT)
+        )
         self.saves = [(NOW_NS, self.guard.state(NOW_NS))]
         self.taken: list[Frame] = []
         self.stamps = [-1]
@@ -541,7 +554,7 @@ def test_crash_after_crash_does_not_add_up(ahead_s: int) -> None:
     run = Run(0)
     if not ahead_s:
         streams = {stream: KNOWN_AT[stream] for stream in KNOWN if KNOWN[stream] <= 0}
-        run.guard = guard(state=State(NOW, NOW, NOW, -1, streams))
+        run.guard = guard(state=State(clock=NOW, local=NOW, sent=NOW, floor=-1, streams=streams))
         run.saves = [(NOW_NS, run.guard.state(NOW_NS))]
     for _ in range(100):
         run.send()

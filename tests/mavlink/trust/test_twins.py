@@ -71,6 +71,7 @@ def refused(judge: Twins, *streams: Stream) -> dict[str, list[float]]:
 def heard(
     peer: str,
     hz: float,
+    *,
     lasts_s: float = 60.0,
     delay_s: Callable[[], float] = lambda: 0.05,
     begins_s: float = 0.0,
@@ -110,8 +111,10 @@ def test_a_second_port_has_stamps_of_its_own(hz: float) -> None:
 def test_a_radio_that_starts_again_has_another_address() -> None:
     judge = Twins()
     found = refused(
-        judge, heard(HOME, 10, 20), heard(OTHER, 10, 60, begins_s=20.1),
-    )  # fmt: skip
+        judge,
+        heard(HOME, 10, lasts_s=20),
+        heard(OTHER, 10, lasts_s=60, begins_s=20.1),
+    )
     assert found == {HOME: [], OTHER: []}
 
 
@@ -183,8 +186,8 @@ def test_who_agree_again_are_believed_again_and_a_second_time_is_told() -> None:
         return 10 < t_s < 20 or 60 < t_s < 70
 
     judge = Twins()
-    visits = (one for one in heard(OTHER, 4, 110, told=beside(20)) if two_visits(one[0]))
-    found = refused(judge, heard(HOME, 4, 120), visits)
+    visits = (one for one in heard(OTHER, 4, lasts_s=110, told=beside(20)) if two_visits(one[0]))
+    found = refused(judge, heard(HOME, 4, lasts_s=120), visits)
     assert not [t_s for t_s in found[HOME] if 51 < t_s < 60 or t_s > 101]
     assert len(judge.told) == 2
 
@@ -218,7 +221,7 @@ def test_what_is_held_against_what_is_found_from_the_newest_on(
     """A report is near the end of a path: that all of it need not be looked at changes nothing."""
 
     def said(stamp_ms: int) -> twins._Said:
-        return twins._Said(stamp_ms, 0, 0, 0.0, (0.0, 0.0, 0.0))
+        return twins._Said(boot_ms=stamp_ms, lat=0, lon=0, alt_m=0.0, velocity_mps=(0.0, 0.0, 0.0))
 
     reports = deque(map(said, sorted(stamps)))
     first, last = said(boot_ms), said(boot_ms + later_ms)

@@ -192,7 +192,7 @@ def test_an_answer_is_a_round_trip_of_any_length(trip_ms: int) -> None:
     node.hear(position(t_ns))
     remote_ns = t_ns - BOOT_NS - trip_ms * MS // 2
     assert heard(node, answer(t_ns, sent_ns, remote_ns)) == [
-        RoundTrip(t_ns, UAV, sent_ns, remote_ns)
+        RoundTrip(t_ns=t_ns, source=UAV, sent_ns=sent_ns, remote_ns=remote_ns)
     ]
 
 
@@ -452,7 +452,7 @@ def test_any_content_is_survived(msgid: int, payload: bytes, sysid: int, ours: b
     source = OURS if ours else Source(sysid, 1)
     for payload_ in (payload, payload + struct.pack("<2f", float("inf"), float("nan")) * 4):
         raw = pack(Outgoing(source, msgid, payload_), 0)
-        node.hear(Frame(EPOCH_NS, "a", source, msgid, raw))
+        node.hear(Frame(t_ns=EPOCH_NS, link="a", source=source, msgid=msgid, raw=raw))
     node.due(EPOCH_NS + S, True, [UAV])
 
 

@@ -39,9 +39,9 @@ class Autopilot:
 
     def __init__(
         self,
+        *,
         source: Source = UAV,
         hz: float = 1.0,
-        *,
         results: tuple[int | None, ...] = (dialect.MAV_RESULT_ACCEPTED,),
         streams: bool = True,
         obeys: bool = True,
@@ -122,7 +122,11 @@ class World:
         carrier: Source | None = None,
         link: Link = lambda t_ns, raw: [(t_ns, raw)],
     ) -> None:
-        self.component = Component(ComponentSpec(OURS, carrier, position_hz, attitude_hz))
+        self.component = Component(
+            ComponentSpec(
+                source=OURS, carrier=carrier, position_hz=position_hz, attitude_hz=attitude_hz
+            )
+        )
         self.autopilots = autopilots
         self.now_ns = EPOCH_NS
         self.requests: list[tuple[int, Outgoing, Source]] = []
@@ -226,7 +230,7 @@ def test_not_before_the_rate_is_known_and_slow_for_a_while() -> None:
 
 
 def test_positions_of_all_and_attitude_of_the_carrier() -> None:
-    world = World(Autopilot(), Autopilot(CARRIER), carrier=CARRIER, attitude_hz=10.0)
+    world = World(Autopilot(), Autopilot(source=CARRIER), carrier=CARRIER, attitude_hz=10.0)
     world.run(60)
     asked = {
         (to, dialect.MAVLink(None).parse_buffer(pack(m, 0))[0].param1)
@@ -238,7 +242,7 @@ def test_positions_of_all_and_attitude_of_the_carrier() -> None:
 
 
 def test_where_any_rate_will_do_nothing_is_asked() -> None:
-    world = World(Autopilot(CARRIER, hz=0.3), carrier=CARRIER, position_hz=None)
+    world = World(Autopilot(source=CARRIER, hz=0.3), carrier=CARRIER, position_hz=None)
     world.run(120)
     assert not world.requests
     assert not world.component.rates()
@@ -246,7 +250,7 @@ def test_where_any_rate_will_do_nothing_is_asked() -> None:
 
 def test_a_message_that_never_came_is_asked_for() -> None:
     """The carrier is known by its heartbeat."""
-    carrier = Autopilot(CARRIER, hz=0.0)
+    carrier = Autopilot(source=CARRIER, hz=0.0)
     world = World(carrier, carrier=CARRIER, position_hz=None, attitude_hz=10.0)
     world.run(5)
     assert world.rate(CARRIER, ATTITUDE).observed_hz is None
@@ -302,7 +306,7 @@ def test_an_old_autopilot_knows_streams_only(results: tuple[int | None, ...], tr
 
 
 def test_the_stream_of_the_attitude() -> None:
-    carrier = Autopilot(CARRIER, results=(dialect.MAV_RESULT_UNSUPPORTED,))
+    carrier = Autopilot(source=CARRIER, results=(dialect.MAV_RESULT_UNSUPPORTED,))
     World(carrier, carrier=CARRIER, position_hz=None, attitude_hz=10.0).run(60)
     assert [m.req_stream_id for m in carrier.received[1:]] == [10]
 
@@ -394,13 +398,13 @@ def test_answers_to_others_are_not_ours() -> None:
 
 def test_one_command_at_a_time_for_a_uav() -> None:
     """An answer does not say which message it is about."""
-    carrier = Autopilot(CARRIER, results=(None,))
+    carrier = Autopilot(source=CARRIER, results=(None,))
     world = World(carrier, carrier=CARRIER, attitude_hz=5.0)
     world.run(40)
     commands = [t_ns for t_ns, m, _ in world.requests if m.msgid == 76]
     assert len(commands) == 6
     assert min(b - a for a, b in pairwise(commands)) >= 5 * S
-    other = Autopilot(CARRIER, results=(dialect.MAV_RESULT_UNSUPPORTED, 0))
+    other = Autopilot(source=CARRIER, results=(dialect.MAV_RESULT_UNSUPPORTED, 0))
     world = World(other, carrier=CARRIER, attitude_hz=5.0)
     world.run(40)
     states = {r.msgid: r.state for r in world.component.rates()}
@@ -409,7 +413,7 @@ def test_one_command_at_a_time_for_a_uav() -> None:
 
 
 def test_an_answer_is_to_what_was_asked_last() -> None:
-    carrier = Autopilot(CARRIER, results=(None, dialect.MAV_RESULT_ACCEPTED))
+    carrier = Autopilot(source=CARRIER, results=(None, dialect.MAV_RESULT_ACCEPTED))
     world = World(carrier, carrier=CARRIER, attitude_hz=5.0)
     while len(world.requests) < 2:
         world.run(0.05)
@@ -421,7 +425,7 @@ def test_an_answer_is_to_what_was_asked_last() -> None:
 
 
 def test_one_that_is_no_longer_wanted_is_left_alone() -> None:
-    rates, uav = MessageRates(OURS, None, 5.0, None), UAV
+    rates, uav = MessageRates(source=OURS, carrier=None, position_hz=5.0, attitude_hz=None), UAV
     for n in range(600):
         t_ns = EPOCH_NS + n * S // 10
         if n % 10 == 0:
@@ -634,7 +638,9 @@ def test_a_uav_that_is_gone_is_not_asked_and_then_forgotten() -> None:
 
 def test_a_fleet_is_asked_in_turn_and_not_all_at_once() -> None:
     """Whoever waits longest comes first, and there are five a second at most."""
-    fleet = [Autopilot(Source(n, 1), results=(None,), streams=False) for n in range(100, 160)]
+    fleet = [
+        Autopilot(source=Source(n, 1), results=(None,), streams=False) for n in range(100, 160)
+    ]
     world = World(*fleet)
     world.run(40)
     times = [t_ns for t_ns, *_ in world.requests]
@@ -663,7 +669,10 @@ def test_whatever_is_heard_there_are_never_more_requests_than_allowed(events: li
     """Per message never within 5 s, in total at most 5 a second, and hundreds of seconds of
     nothing but slow rates bring no more than the back-off lets through."""
     uavs = [CARRIER, UAV, Source(4, 1), Source(6, 1)]
-    rates, now_ns = MessageRates(OURS, CARRIER, 1.0, 20.0), EPOCH_NS
+    rates, now_ns = (
+        MessageRates(source=OURS, carrier=CARRIER, position_hz=1.0, attitude_hz=20.0),
+        EPOCH_NS,
+    )
     hz = dict.fromkeys(uavs, 0.5)
     sent: list[tuple[int, Source, int]] = []
 
@@ -695,7 +704,7 @@ def test_whatever_is_heard_there_are_never_more_requests_than_allowed(events: li
         elif kind == "rate":
             hz[uav] = value[0]
         else:
-            rates.requested(Request(now_ns, GCS, uav, (33,), value[0]))
+            rates.requested(Request(t_ns=now_ns, by=GCS, target=uav, msgids=(33,), hz=value[0]))
     times = [t_ns for t_ns, *_ in sent]
     assert all(b - a >= S for a, b in zip(times, times[5:], strict=False))
     for key in {(uav, msgid) for _, uav, msgid in sent}:

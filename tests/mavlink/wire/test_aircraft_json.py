@@ -120,7 +120,7 @@ def test_fields_that_cannot_be_are_refused_and_the_others_are_read(changed: Any)
 )  # fmt: skip
 def test_what_is_no_such_document_is_counted_in_bytes(data: bytes) -> None:
     (found,) = AircraftJson("x").feed(7, data)
-    assert found == Rejection(7, "x", Reason.GARBAGE, len(data) or 1)
+    assert found == Rejection(t_ns=7, source="x", reason=Reason.GARBAGE, count=len(data) or 1)
 
 
 def test_more_aircraft_than_there_can_be_take_no_memory() -> None:

@@ -184,10 +184,10 @@ def test_pieces_say_what_the_whole_says(cuts: list[int]) -> None:
 def test_what_is_between_events_is_counted() -> None:
     garbage, frame = sorted(fed(b"noise" + XML + b"more"), key=lambda one: isinstance(one, Frame))
     assert isinstance(frame, Frame)
-    assert garbage == Rejection(7, "cot:x", Reason.GARBAGE, 9)
+    assert garbage == Rejection(t_ns=7, source="cot:x", reason=Reason.GARBAGE, count=9)
     splitter = CotSplitter("x")
     assert splitter.feed(7, XML[:100]) == []
-    assert splitter.finish(8) == [Rejection(8, "x", Reason.GARBAGE, 100)]
+    assert splitter.finish(8) == [Rejection(t_ns=8, source="x", reason=Reason.GARBAGE, count=100)]
 
 
 @pytest.mark.parametrize("piece", [b"<event ", b"\xbf\xff\xff\xff\xff\x7f", b"\xbf", b"<", b"<a>"])

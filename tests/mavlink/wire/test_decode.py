@@ -39,7 +39,7 @@ def as_frame(raw: bytes) -> Frame:
     v2 = raw[0] == 0xFD
     source = Source(raw[5], raw[6]) if v2 else Source(raw[3], raw[4])
     msgid = int.from_bytes(raw[7:10], "little") if v2 else raw[5]
-    return Frame(T_NS, "udpin:x", source, msgid, raw)
+    return Frame(t_ns=T_NS, link="udpin:x", source=source, msgid=msgid, raw=raw)
 
 
 def sent(message: dialect.MAVLink_message) -> Frame:
@@ -79,6 +79,7 @@ def position(lat: int = HERE[0], lon: int = HERE[1], hdg: int = 0, **other: int)
 
 def adsb(
     flags: int = 0xFFFF,
+    *,
     lat: int = HERE[0],
     lon: int = HERE[1],
     altitude_type: int = 0,
@@ -141,54 +142,85 @@ def expected(m: dialect.MAVLink_message, t_ns: int, link: str) -> Message | None
     match m.get_type():
         case "HEARTBEAT":
             armed = m.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED != 0
-            return Presence(t_ns, source, m.type, m.autopilot, m.system_status, armed)
+            return Presence(
+                t_ns=t_ns,
+                source=source,
+                mav_type=m.type,
+                autopilot=m.autopilot,
+                system_status=m.system_status,
+                armed=armed,
+            )
         case "SYSTEM_TIME":
-            return SystemTime(t_ns, source, m.time_unix_usec or None, m.time_boot_ms)
+            return SystemTime(
+                t_ns=t_ns, source=source, unix_us=m.time_unix_usec or None, boot_ms=m.time_boot_ms
+            )
         case "ATTITUDE":
             return Attitude(
-                t_ns,
-                source,
-                m.time_boot_ms,
-                m.roll,
-                m.pitch,
-                m.yaw,
-                m.rollspeed,
-                m.pitchspeed,
-                m.yawspeed,
+                t_ns=t_ns,
+                source=source,
+                boot_ms=m.time_boot_ms,
+                roll_rad=m.roll,
+                pitch_rad=m.pitch,
+                yaw_rad=m.yaw,
+                rollspeed_radps=m.rollspeed,
+                pitchspeed_radps=m.pitchspeed,
+                yawspeed_radps=m.yawspeed,
             )
         case "EKF_STATUS_REPORT":
             knows = m.flags & dialect.EKF_ATTITUDE != 0
-            return EstimatorStatus(t_ns, source, knows, m.compass_variance)
+            return EstimatorStatus(
+                t_ns=t_ns, source=source, knows_attitude=knows, compass_ratio=m.compass_variance
+            )
         case "GPS_RAW_INT":
             h_acc, v_acc, vel_acc = (
                 value / 1000 or None for value in (m.h_acc, m.v_acc, m.vel_acc)
             )
             return GnssStatus(
-                t_ns,
-                source,
-                m.fix_type,
-                m.satellites_visible,
-                m.alt * 1e-3,
-                h_acc,
-                v_acc,
-                vel_acc,
-                m.time_usec,
+                t_ns=t_ns,
+                source=source,
+                fix_type=m.fix_type,
+                satellites=m.satellites_visible,
+                alt_m=m.alt * 1e-3,
+                h_acc_m=h_acc,
+                v_acc_m=v_acc,
+                vel_acc_mps=vel_acc,
+                time_us=m.time_usec,
             )
         case "GLOBAL_POSITION_INT":
             return Report(
-                t_ns, link, str(source), source, m.lat / 1e7, m.lon / 1e7, m.alt / 1000,
-                AltitudeDatum.MSL, m.relative_alt / 1000, (m.vx / 100, m.vy / 100), m.vz / 100,
-                m.hdg / 100, m.time_boot_ms, None,
-            )  # fmt: skip
+                t_ns=t_ns,
+                link=link,
+                uav=str(source),
+                source=source,
+                lat_deg=m.lat / 1e7,
+                lon_deg=m.lon / 1e7,
+                alt_m=m.alt / 1000,
+                alt_datum=AltitudeDatum.MSL,
+                relative_alt_m=m.relative_alt / 1000,
+                velocity_ne_mps=(m.vx / 100, m.vy / 100),
+                velocity_down_mps=m.vz / 100,
+                heading_deg=m.hdg / 100,
+                boot_ms=m.time_boot_ms,
+                tslc_s=None,
+            )
         case "ADSB_VEHICLE":
             course, speed = math.radians(m.heading / 100), m.hor_velocity / 100
             datums = (AltitudeDatum.PRESSURE, AltitudeDatum.GEOMETRIC)
             return AdsbVehicle(
-                t_ns, link, m.ICAO_address, source, m.callsign, m.emitter_type,
-                (m.lat / 1e7, m.lon / 1e7), m.altitude / 1000, datums[m.altitude_type],
-                m.heading / 100, (speed * math.cos(course), speed * math.sin(course)),
-                -m.ver_velocity / 100, m.tslc,
-            )  # fmt: skip
+                t_ns=t_ns,
+                link=link,
+                icao=m.ICAO_address,
+                source=source,
+                callsign=m.callsign,
+                emitter_type=m.emitter_type,
+                position_deg=(m.lat / 1e7, m.lon / 1e7),
+                alt_m=m.altitude / 1000,
+                alt_datum=datums[m.altitude_type],
+                heading_deg=m.heading / 100,
+                velocity_ne_mps=(speed * math.cos(course), speed * math.sin(course)),
+                velocity_down_mps=-m.ver_velocity / 100,
+                tslc_s=m.tslc,
+            )
     return None
 
 
@@ -350,6 +382,7 @@ def test_the_flags_are_those_of_the_dialect() -> None:
     emitter_type=st.integers(0, 255),
 )
 def test_an_adsb_field_is_none_exactly_when_nobody_vouches_for_it(
+    *,
     flags: int,
     altitude_type: int,
     altitude: int,
@@ -452,14 +485,35 @@ def test_trailing_zeros_that_mavlink_2_cuts_are_zeros(hdg: int, v: list[int], al
 def test_a_payload_of_one_byte() -> None:
     frame = sent(dialect.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0))
     assert len(frame.payload) == 1
-    assert decode(frame) == Attitude(T_NS, Source(7, 3), 0, 0, 0, 0, 0, 0, 0)
+    assert decode(frame) == Attitude(
+        t_ns=T_NS,
+        source=Source(7, 3),
+        boot_ms=0,
+        roll_rad=0,
+        pitch_rad=0,
+        yaw_rad=0,
+        rollspeed_radps=0,
+        pitchspeed_radps=0,
+        yawspeed_radps=0,
+    )
     frame = sent(dialect.MAVLink_heartbeat_message(0, 0, 0, 0, 0, 0))
-    assert decode(frame) == Presence(T_NS, Source(7, 3), 0, 0, 0, False)
+    assert decode(frame) == Presence(
+        t_ns=T_NS, source=Source(7, 3), mav_type=0, autopilot=0, system_status=0, armed=False
+    )
     assert rejected(sent(dialect.MAVLink_adsb_vehicle_message(
         0, 0, 0, 0, 0, 0, 0, 0, b"", 0, 0, 0, 0
     ))) is Reason.MALFORMED  # fmt: skip
     frame = sent(dialect.MAVLink_gps_raw_int_message(0, 0, 0, 0, 0, 0, 0, 0, 0, 0))
-    assert decode(frame) == GnssStatus(T_NS, Source(7, 3), 0, 0, 0.0, None, None, None)
+    assert decode(frame) == GnssStatus(
+        t_ns=T_NS,
+        source=Source(7, 3),
+        fix_type=0,
+        satellites=0,
+        alt_m=0.0,
+        h_acc_m=None,
+        v_acc_m=None,
+        vel_acc_mps=None,
+    )
 
 
 def test_an_adsb_payload_cut_within_its_flags() -> None:
@@ -470,7 +524,19 @@ def test_an_adsb_payload_cut_within_its_flags() -> None:
     assert len(frame.payload) == 23
     place = pytest.approx((HERE[0] / 1e7, HERE[1] / 1e7), abs=1e-12)
     assert traffic(frame) == AdsbVehicle(
-        T_NS, "udpin:x", 1, Source(7, 3), None, 0, place, None, None, None, None, None, 0
+        t_ns=T_NS,
+        link="udpin:x",
+        icao=1,
+        source=Source(7, 3),
+        callsign=None,
+        emitter_type=0,
+        position_deg=place,
+        alt_m=None,
+        alt_datum=None,
+        heading_deg=None,
+        velocity_ne_mps=None,
+        velocity_down_mps=None,
+        tslc_s=0,
     )
 
 
@@ -533,9 +599,9 @@ def test_satellites_255_is_unknown_and_0_is_none_in_view() -> None:
 
 def test_a_unix_clock_of_0_is_none() -> None:
     found = decode(sent(dialect.MAVLink_system_time_message(0, 4321)))
-    assert found == SystemTime(T_NS, Source(7, 3), None, 4321)
+    assert found == SystemTime(t_ns=T_NS, source=Source(7, 3), unix_us=None, boot_ms=4321)
     found = decode(sent(dialect.MAVLink_system_time_message(2**63 + 1, 2**32 - 1)))
-    assert found == SystemTime(T_NS, Source(7, 3), 2**63 + 1, 2**32 - 1)
+    assert found == SystemTime(t_ns=T_NS, source=Source(7, 3), unix_us=2**63 + 1, boot_ms=2**32 - 1)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
@@ -561,14 +627,24 @@ def test_an_attitude_that_nothing_can_measure_is_malformed(field: int) -> None:
 def test_the_fields_of_an_attitude_keep_their_order() -> None:
     angles = [struct.unpack("<f", struct.pack("<f", 0.1 * n))[0] for n in range(1, 7)]
     assert decode(attitude(angles)) == Attitude(
-        T_NS, Source(7, 3), 77, angles[0], angles[1], angles[2], angles[3], angles[4], angles[5]
+        t_ns=T_NS,
+        source=Source(7, 3),
+        boot_ms=77,
+        roll_rad=angles[0],
+        pitch_rad=angles[1],
+        yaw_rad=angles[2],
+        rollspeed_radps=angles[3],
+        pitchspeed_radps=angles[4],
+        yawspeed_radps=angles[5],
     )
 
 
 @pytest.mark.parametrize(("base_mode", "armed"), [(128, True), (127, False), (209, True)])
 def test_armed_is_one_bit(base_mode: int, armed: bool) -> None:
     found = decode(sent(dialect.MAVLink_heartbeat_message(2, 3, base_mode, 99, 4, 3)))
-    assert found == Presence(T_NS, Source(7, 3), 2, 3, 4, armed)
+    assert found == Presence(
+        t_ns=T_NS, source=Source(7, 3), mav_type=2, autopilot=3, system_status=4, armed=armed
+    )
 
 
 def test_other_messages_are_nobodys() -> None:

@@ -243,7 +243,9 @@ def test_what_is_not_used_is_counted() -> None:
     (refused,) = fed(b"\x1a3\xff\x00MLAT\x80" + EVEN)
     assert isinstance(refused, Rejection) and refused.reason is Reason.UNKNOWN_MESSAGE
     (refused,) = fed(b"GET / HTTP/1.1\r\n")
-    assert refused == Rejection(7, "readsb:radar:30005", Reason.GARBAGE, 16)
+    assert refused == Rejection(
+        t_ns=7, source="readsb:radar:30005", reason=Reason.GARBAGE, count=16
+    )
     rebroadcast = message(int.from_bytes(EVEN[4:11], "big"), head=18 << 3 | 2)
     assert fed(beast(rebroadcast)) == fed(beast(b"\0\0", kind=0x31)) == []
     garbage, frame = fed(b"\x1a3\x00\x1b" + beast(EVEN))[::-1]  # one that ends within

@@ -38,7 +38,7 @@ def padded(data: bytes, size: int = 20) -> list[int]:
 def framed(message: Any, t_ns: int = 7, source: Source = RECEIVER) -> Frame:
     mav = dialect.MAVLink(None, srcSystem=source.sysid, srcComponent=source.compid)
     raw = bytes(message.pack(mav))
-    return Frame(t_ns, "udp", source, message.get_msgId(), raw)
+    return Frame(t_ns=t_ns, link="udp", source=source, msgid=message.get_msgId(), raw=raw)
 
 
 def basic_id(text: bytes = b"1588E0123456789ABCDE", kind: int = 1, mac: bytes = MAC) -> Any:
@@ -259,7 +259,13 @@ def test_made_up_addresses_take_no_memory() -> None:
 @given(st.sampled_from(sorted(READ)), st.binary(max_size=249), st.integers(235, 239))
 def test_no_payload_is_a_defect(msgid: int, payload: bytes, compid: int) -> None:
     source = Source(9, compid)
-    frame = Frame(7, "udp", source, msgid, pack(Outgoing(source, msgid, payload), 0))
+    frame = Frame(
+        t_ns=7,
+        link="udp",
+        source=source,
+        msgid=msgid,
+        raw=pack(Outgoing(source, msgid, payload), 0),
+    )
     found = decode(frame)
     assert found is None or isinstance(found, Rejection | RemoteId)
     if isinstance(found, RemoteId):
@@ -270,7 +276,11 @@ def test_no_payload_is_a_defect(msgid: int, payload: bytes, compid: int) -> None
 def test_no_pack_is_a_defect(messages: list[bytes]) -> None:
     payload = bytes(2) + MAC.ljust(20, b"\0") + bytes([25, len(messages)]) + b"".join(messages)
     frame = Frame(
-        7, "x", RECEIVER, MESSAGE_PACK, pack(Outgoing(RECEIVER, MESSAGE_PACK, payload), 0)
+        t_ns=7,
+        link="x",
+        source=RECEIVER,
+        msgid=MESSAGE_PACK,
+        raw=pack(Outgoing(RECEIVER, MESSAGE_PACK, payload), 0),
     )
     assert isinstance(decode(frame), Rejection | RemoteId)
     assert LOCATION in READ

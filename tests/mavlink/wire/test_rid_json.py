@@ -141,7 +141,9 @@ def test_what_cannot_be_is_refused(data: bytes) -> None:
     "data", [b"x", b"[]", b"{", b"\xff\xfe", b"[" * 5000, b'{"mac": ' + b"9" * 5000 + b"}"]
 )
 def test_what_is_no_object_is_counted_in_bytes(data: bytes) -> None:
-    assert fed(data + b"\n") == [Rejection(7, "rid:x", Reason.GARBAGE, len(data) + 1)]
+    assert fed(data + b"\n") == [
+        Rejection(t_ns=7, source="rid:x", reason=Reason.GARBAGE, count=len(data) + 1)
+    ]
 
 
 STREAM = CAPTURED + scouted(uas_data()) + b"\n" + CAPTURED.strip()

@@ -120,13 +120,15 @@ def test_fields_that_cannot_be_are_refused(fields: dict[str, str]) -> None:
 
 
 def test_what_is_no_line_is_counted_in_bytes() -> None:
-    assert refused("GET / HTTP/1.1") == Rejection(7, "sbs:radar:30003", Reason.GARBAGE, 16)
+    assert refused("GET / HTTP/1.1") == Rejection(
+        t_ns=7, source="sbs:radar:30003", reason=Reason.GARBAGE, count=16
+    )
     assert refused(b"\xfd\x00" * LINE_MAX).count == 2 * LINE_MAX + 2
     assert refused(line().replace("MSG", "MLAT")).reason is Reason.UNKNOWN_MESSAGE
     assert fed("CLK,,,,,,2008/11/28,14:53:50.594,,") == fed("") == []
     ended = SbsSplitter("x")
     assert ended.feed(7, b"MSG,3") == []
-    assert ended.finish(8) == [Rejection(8, "x", Reason.GARBAGE, 5)]
+    assert ended.finish(8) == [Rejection(t_ns=8, source="x", reason=Reason.GARBAGE, count=5)]
 
 
 def test_a_line_without_an_end_takes_no_memory() -> None:
@@ -167,7 +169,9 @@ def test_an_aircraft_that_a_mavlink_relay_hears_too_stays_one() -> None:
     ).pack(relay)
     (first,) = SbsSplitter("sbs").feed(1_000_000_000, line(f9="14:53:50.700").encode() + b"\n")
     assert isinstance(first, Frame)
-    second = Frame(3_000_000_000, "udp", Source(9, 156), 246, bytes(again))
+    second = Frame(
+        t_ns=3_000_000_000, link="udp", source=Source(9, 156), msgid=246, raw=bytes(again)
+    )
     (one,) = [out for out in pipeline.step(first) if isinstance(out, Estimate)]
     (two,) = [out for out in pipeline.step(second) if isinstance(out, Estimate)]
     assert one.fix.uav == two.fix.uav == "icao:4CA2D6"

@@ -38,10 +38,10 @@ def test_a_stamp_is_read_as_pymavlink_packs_it(version: int) -> None:
     sender = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
     message = dialect.MAVLink_system_time_message(1_700_000_000_000_000, 70_000)
     raw = message.pack(sender, force_mavlink1=version == 1)
-    assert boot_ms(Frame(0, "udp", Source(1, 1), 2, raw)) == 70_000
+    assert boot_ms(Frame(t_ns=0, link="udp", source=Source(1, 1), msgid=2, raw=raw)) == 70_000
 
 
 def test_a_payload_that_ends_before_its_stamp_has_zeros() -> None:
     payload = struct.pack("<Q", 1)
     raw = bytes((0xFD, len(payload), 0, 0, 0, 1, 1, 2, 0, 0)) + payload + b"\0\0"
-    assert boot_ms(Frame(0, "udp", Source(1, 1), 2, raw)) == 0
+    assert boot_ms(Frame(t_ns=0, link="udp", source=Source(1, 1), msgid=2, raw=raw)) == 0

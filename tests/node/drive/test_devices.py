@@ -35,7 +35,7 @@ def flown() -> tuple[Shot, Any, str]:
     log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
     pipeline, update = moment.look([log], EIGHT, "3")
     equipment = assembly.equipment(EIGHT, pipeline.array)
-    wanted = Wanted(("3:1",), False, Takes.REGISTERS)
+    wanted = Wanted(uavs=("3:1",), anybody=False, takes=Takes.REGISTERS)
     shot = shot_of(pipeline, equipment, update, wanted)
     text = weight_formats.encode("adar1000", update.beams, pipeline, equipment, 0).decode()
     read = parse(Device.ADAR1000, text, Calibration.ideal(range(8)))
@@ -91,7 +91,14 @@ def test_registers_of_chips_radiate_what_the_text_says(
     shot, read, _ = flown
     device = targets.device("adar1000:0.0,0.1", print, list)
     clock = Ticking()
-    drive = Drive(Always(shot), device, 100.0, Safe.MUTE, clock.now_ns, lambda _: None)
+    drive = Drive(
+        source=Always(shot),
+        device=device,
+        update_hz=100.0,
+        safe=Safe.MUTE,
+        now_ns=clock.now_ns,
+        say=lambda _: None,
+    )
     for n in range(1, 4):
         drive.step()
         assert [chip.loads for chip in spidev.values()] == [n, n]  # one pulse an update
@@ -115,9 +122,16 @@ def test_an_attenuated_channel_is_15_db_down(
     assert registers is not None
     weak = registers[:4].copy()
     weak[:, 4], weak[:, 5] = 127, [0, 1, 0, 1]
-    shot = Shot(0, None, "3:1", registers=weak)
+    shot = Shot(valid_at_ns=0, unfit=None, uav="3:1", registers=weak)
     device = targets.device("adar1000:0.0", print, list)
-    Drive(Always(shot), device, 100.0, Safe.HOLD, Ticking().now_ns, print).step()
+    Drive(
+        source=Always(shot),
+        device=device,
+        update_hz=100.0,
+        safe=Safe.HOLD,
+        now_ns=Ticking().now_ns,
+        say=print,
+    ).step()
     got = [abs(factor(*one)) for one in spidev[0, 0].radiates]
     assert 20 * np.log10(got) == pytest.approx([0, -15, 0, -15])
 
@@ -126,7 +140,14 @@ def test_too_few_chips_are_a_mistake_of_one_line(
     spidev: dict[tuple[int, int], Chip], flown: tuple[Shot, Any, str]
 ) -> None:
     device = targets.device("adar1000:0.0", print, list)
-    drive = Drive(Always(flown[0]), device, 100.0, Safe.HOLD, Ticking().now_ns, print)
+    drive = Drive(
+        source=Always(flown[0]),
+        device=device,
+        update_hz=100.0,
+        safe=Safe.HOLD,
+        now_ns=Ticking().now_ns,
+        say=print,
+    )
     with pytest.raises(UserError, match="1 chips for 2 of the array"):
         drive.run(threading.Event())
 
@@ -136,7 +157,14 @@ def test_a_line_that_is_not_there_is_tried_again_each_second(
 ) -> None:
     clock, said = Ticking(), list[str]()
     device = targets.device("adar1000:9.0", print, list)
-    drive = Drive(Always(flown[0]), device, 100.0, Safe.HOLD, clock.now_ns, said.append)
+    drive = Drive(
+        source=Always(flown[0]),
+        device=device,
+        update_hz=100.0,
+        safe=Safe.HOLD,
+        now_ns=clock.now_ns,
+        say=said.append,
+    )
     for _ in range(300):  # three seconds
         drive.step()
         clock.t_ns += 10_000_000
@@ -168,7 +196,14 @@ def test_a_phaser_gets_the_codes_of_the_text_and_one_latch_an_update(
 ) -> None:
     shot, read, text = flown
     device = targets.device("phaser:ip:phaser.local", print, list)
-    drive = Drive(Always(shot), device, 100.0, Safe.BORESIGHT, Ticking().now_ns, print)
+    drive = Drive(
+        source=Always(shot),
+        device=device,
+        update_hz=100.0,
+        safe=Safe.BORESIGHT,
+        now_ns=Ticking().now_ns,
+        say=print,
+    )
     drive.step()
     configured = len(iio)
     before = [entry for entry in iio if entry[1] == "rx_load_spi"]
@@ -200,9 +235,18 @@ def test_an_array_that_is_no_phaser_is_refused(
 ) -> None:
     shot = flown[0]
     assert shot.registers is not None
-    half = Shot(shot.valid_at_ns, None, shot.uav, registers=shot.registers[:4])
+    half = Shot(
+        valid_at_ns=shot.valid_at_ns, unfit=None, uav=shot.uav, registers=shot.registers[:4]
+    )
     device = targets.device("phaser:ip:phaser.local", print, list)
-    drive = Drive(Always(half), device, 100.0, Safe.HOLD, Ticking().now_ns, print)
+    drive = Drive(
+        source=Always(half),
+        device=device,
+        update_hz=100.0,
+        safe=Safe.HOLD,
+        now_ns=Ticking().now_ns,
+        say=print,
+    )
     with pytest.raises(UserError, match="8 elements, the array has 4"):
         drive.step()
 
@@ -215,7 +259,7 @@ def test_a_phaser_s_memory_holds_the_codebook_and_an_update_names_a_beam(
     pipeline, update = moment.look([log], settings, "3")
     equipment = assembly.equipment(settings, pipeline.array)
     stored = stored_registers(pipeline.array, equipment)
-    wanted = Wanted(("3:1",), False, Takes.STORED, 32)
+    wanted = Wanted(uavs=("3:1",), anybody=False, takes=Takes.STORED, stored_beams=32)
     shot = shot_of(pipeline, equipment, update, wanted)
     told = beam_state.beams(pipeline, equipment, update, 0.0, 0.0)
     (beam,) = [one for one in told["beams"] if one["uav"] == "3:1"]
@@ -224,8 +268,15 @@ def test_a_phaser_s_memory_holds_the_codebook_and_an_update_names_a_beam(
 
     device = targets.device("phaser-memory:ip:phaser.local", print, lambda: stored)
     other = replace(shot, stored=(shot.stored + 5) % 32)
-    source = Always(shot, shot, other, Shot(0, "no carrier"))
-    drive = Drive(source, device, 100.0, Safe.MUTE, Ticking().now_ns, lambda _: None)
+    source = Always(shot, shot, other, Shot(valid_at_ns=0, unfit="no carrier"))
+    drive = Drive(
+        source=source,
+        device=device,
+        update_hz=100.0,
+        safe=Safe.MUTE,
+        now_ns=Ticking().now_ns,
+        say=lambda _: None,
+    )
     drive.step()
     saved = {
         where + "/" + value.split(",")[0]: value
@@ -260,11 +311,14 @@ def test_beams_of_another_codebook_are_not_pointed_to() -> None:
     beam = dict.fromkeys(("bearing_deg", "above_horizon_deg", "lat_deg", "lon_deg", "alt_m"), 0.0)
     beam |= {"uav": "1:1", "codebook": {"best": 3}}
     told = {"unfit": None, "beams": [beam], "codebook_beams": 64}
-    fits = chosen(told, None, Wanted((), True, Takes.STORED, 64), 0)
+    fits = chosen(told, None, Wanted(uavs=(), anybody=True, takes=Takes.STORED, stored_beams=64), 0)
     assert (fits.unfit, fits.stored) == (None, 3)
     for size, held in ((64, 32), (None, 32), (None, None)):
         shot = chosen(
-            told | {"codebook_beams": size}, None, Wanted((), True, Takes.STORED, held), 0
+            told | {"codebook_beams": size},
+            None,
+            Wanted(uavs=(), anybody=True, takes=Takes.STORED, stored_beams=held),
+            0,
         )
         assert shot.unfit == "the service has another codebook, or none"
 
@@ -280,7 +334,7 @@ def test_a_mount_looks_at_the_middle_of_several(flown: tuple[Shot, Any, str]) ->
     mean = sum(
         np.array([np.cos(e) * np.cos(b), np.cos(e) * np.sin(b), np.sin(e)]) for b, e in angles
     )
-    wanted = Wanted(("9:9", "2:1", "1:1"), False, Takes.POINTING, centre=True)
+    wanted = Wanted(uavs=("9:9", "2:1", "1:1"), anybody=False, takes=Takes.POINTING, centre=True)
     for shot in (shot_of(pipeline, equipment, update, wanted), chosen(told, None, wanted, 0)):
         assert shot.uav == "2:1+1:1"
         assert shot.bearing_rad == pytest.approx(np.arctan2(mean[1], mean[0]))
@@ -289,11 +343,11 @@ def test_a_mount_looks_at_the_middle_of_several(flown: tuple[Shot, Any, str]) ->
         seen = pipeline.local.position_ned_m(*shot.place)
         mid = np.mean([t.position_ned_m for t in update.tracks if t.uav in ("1:1", "2:1")], axis=0)
         np.testing.assert_allclose(seen, mid, atol=0.01)
-    everybody = Wanted(("1:1",), True, Takes.POINTING, centre=True)
+    everybody = Wanted(uavs=("1:1",), anybody=True, takes=Takes.POINTING, centre=True)
     around = shot_of(pipeline, equipment, update, everybody)
     assert "they are all around" in (around.unfit or "")  # four on one circle
     with pytest.raises(UserError, match="only a mount looks at the centre"):
-        Wanted((), True, Takes.REGISTERS, centre=True)
+        Wanted(uavs=(), anybody=True, takes=Takes.REGISTERS, centre=True)
 
 
 @pytest.mark.parametrize(("lon_deg", "middle_deg"), [((179.9, -179.7), -179.9), ((7.0, 8.0), 7.5)])
@@ -312,7 +366,7 @@ def test_a_middle_is_between_also_at_the_edge_of_the_map(
         one | {"uav": "2:1", "bearing_deg": 20.0, "lon_deg": lon_deg[1]},
     ]
     told = {"unfit": None, "beams": beams, "codebook_beams": None}
-    wanted = Wanted((), True, Takes.POINTING, centre=True)
+    wanted = Wanted(uavs=(), anybody=True, takes=Takes.POINTING, centre=True)
     shot = chosen(told, None, wanted, 0)
     assert np.degrees(shot.bearing_rad) == pytest.approx(5.0)
     assert shot.place == pytest.approx((1.0, middle_deg, 5.0))
@@ -365,9 +419,19 @@ class Recorder:
 def test_a_device_rests_once_while_there_is_nothing_and_at_the_end() -> None:
     clock = Ticking()
     device, said = Recorder(clock), list[str]()
-    fit, stale = Shot(0, None, "1:1"), Shot(0, "its attitude is too old")
+    fit, stale = (
+        Shot(valid_at_ns=0, unfit=None, uav="1:1"),
+        Shot(valid_at_ns=0, unfit="its attitude is too old"),
+    )
     source = Always(fit, stale, stale, None, None, fit, fit)
-    drive = Drive(source, device, 10.0, Safe.MUTE, clock.now_ns, said.append)
+    drive = Drive(
+        source=source,
+        device=device,
+        update_hz=10.0,
+        safe=Safe.MUTE,
+        now_ns=clock.now_ns,
+        say=said.append,
+    )
     for _ in range(7):
         drive.step()
     drive.end()
@@ -382,8 +446,10 @@ def test_a_device_rests_once_while_there_is_nothing_and_at_the_end() -> None:
 
 def test_the_lead_is_the_device_s_own_time_and_late_ones_are_counted() -> None:
     clock = Ticking()
-    device, source = Recorder(clock, 0.03), Always(Shot(0, None, "1:1"))
-    drive = Drive(source, device, 10.0, Safe.HOLD, clock.now_ns, print)
+    device, source = Recorder(clock, 0.03), Always(Shot(valid_at_ns=0, unfit=None, uav="1:1"))
+    drive = Drive(
+        source=source, device=device, update_hz=10.0, safe=Safe.HOLD, now_ns=clock.now_ns, say=print
+    )
     for _ in range(5):
         drive.step()
     assert source.leads_s == pytest.approx([0.0, 0.03, 0.03, 0.03, 0.03])
@@ -395,8 +461,19 @@ def test_the_lead_is_the_device_s_own_time_and_late_ones_are_counted() -> None:
 def test_a_device_that_fails_is_opened_again_and_rests_again() -> None:
     clock = Ticking()
     device, said = Recorder(clock), list[str]()
-    source = Always(Shot(0, "no carrier"), Shot(0, None, "1:1"), Shot(0, "no carrier"))
-    drive = Drive(source, device, 10.0, Safe.BORESIGHT, clock.now_ns, said.append)
+    source = Always(
+        Shot(valid_at_ns=0, unfit="no carrier"),
+        Shot(valid_at_ns=0, unfit=None, uav="1:1"),
+        Shot(valid_at_ns=0, unfit="no carrier"),
+    )
+    drive = Drive(
+        source=source,
+        device=device,
+        update_hz=10.0,
+        safe=Safe.BORESIGHT,
+        now_ns=clock.now_ns,
+        say=said.append,
+    )
     drive.step()
     device.fails = True
     drive.step()
@@ -429,5 +506,7 @@ def test_a_target_that_is_none_is_refused(target: str) -> None:
 def test_who_is_not_in_the_device_s_table_has_nothing_applied() -> None:
     beam = dict.fromkeys(("bearing_deg", "above_horizon_deg", "lat_deg", "lon_deg", "alt_m"), 0.0)
     told = {"unfit": None, "beams": [beam | {"uav": "1:1"}], "codebook_beams": None}
-    shot = chosen(told, "the head of a table\n", Wanted((), True, Takes.REGISTERS), 0)
+    shot = chosen(
+        told, "the head of a table\n", Wanted(uavs=(), anybody=True, takes=Takes.REGISTERS), 0
+    )
     assert shot.unfit == "1:1 has no beam in the device's table"

@@ -32,7 +32,15 @@ def test_it_is_told_where_to_look(heard: socket.socket) -> None:
     port = heard.getsockname()[1]
     gimbal = targets.device(f"gimbal:127.0.0.1:{port}:7:154", print, list)
     gimbal.open()
-    gimbal.apply(Shot(0, None, "1:1", math.radians(270), math.radians(12)))
+    gimbal.apply(
+        Shot(
+            valid_at_ns=0,
+            unfit=None,
+            uav="1:1",
+            bearing_rad=math.radians(270),
+            above_rad=math.radians(12),
+        )
+    )
     said, _ = message(heard)
     assert said.get_type() == "GIMBAL_MANAGER_SET_PITCHYAW"
     assert (said.target_system, said.target_component, said.gimbal_device_id) == (7, 154, 0)
@@ -48,14 +56,23 @@ def test_it_is_told_where_to_look(heard: socket.socket) -> None:
     assert (said.yaw, said.pitch) == (0.0, 0.0)
     gimbal.close()
     with pytest.raises(DeviceError, match="no socket"):
-        gimbal.apply(Shot(0, None))
+        gimbal.apply(Shot(valid_at_ns=0, unfit=None))
 
 
 def test_it_is_told_places_where_it_is_asked_to(heard: socket.socket) -> None:
     port = heard.getsockname()[1]
     gimbal = targets.device(f"gimbal-roi:127.0.0.1:{port}:7:154", print, list)
     gimbal.open()
-    gimbal.apply(Shot(0, None, "1:1", 1.0, 0.1, (-47.1234567, 170.7654321, 612.25)))
+    gimbal.apply(
+        Shot(
+            valid_at_ns=0,
+            unfit=None,
+            uav="1:1",
+            bearing_rad=1.0,
+            above_rad=0.1,
+            place=(-47.1234567, 170.7654321, 612.25),
+        )
+    )
     said, _ = message(heard)
     assert said.get_type() == "COMMAND_INT"
     assert said.command == dialect.MAV_CMD_DO_SET_ROI_LOCATION
@@ -76,14 +93,23 @@ def test_its_lag_is_found_from_its_attitude(
     """Over north, where angles leap; an attitude relative to the vehicle says nothing, nor does
     one of another vehicle's gimbal."""
     clock = [0]
-    gimbal = Gimbal("127.0.0.1", heard.getsockname()[1], Source(7, 154), lambda: clock[0])
+    gimbal = Gimbal(
+        host="127.0.0.1",
+        port=heard.getsockname()[1],
+        target=Source(7, 154),
+        now_ns=lambda: clock[0],
+    )
     gimbal.open()
     mav = dialect.MAVLink(None, srcSystem=sysid, srcComponent=154)
     flags = dialect.GIMBAL_DEVICE_FLAGS_YAW_LOCK if from_north else 32
     for n in range(150):
         t_s = 0.1 * n
         clock[0] = round(t_s * 1e9)
-        gimbal.apply(Shot(0, None, "1:1", math.sin(0.5 * t_s), 0.0))
+        gimbal.apply(
+            Shot(
+                valid_at_ns=0, unfit=None, uav="1:1", bearing_rad=math.sin(0.5 * t_s), above_rad=0.0
+            )
+        )
         _, sender = message(heard)
         half = math.sin(0.5 * (t_s + 0.1 - 0.3)) / 2
         told = mav.gimbal_device_attitude_status_encode(

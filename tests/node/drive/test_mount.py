@@ -135,14 +135,21 @@ def test_a_mount_is_off_by_half_of_what_one_is_that_follows_reports(
     settings = Settings().override(center={"source": "5:1"}, observer={"lag_s": (0.0, 0.0)})
     pipeline = Pipeline(settings)
     equipment = assembly.equipment(settings, pipeline.array)
-    wanted = Wanted(("1:1",), False, Takes.POINTING)
+    wanted = Wanted(uavs=("1:1",), anybody=False, takes=Takes.POINTING)
 
     class Here:
         def ask(self, lead_s: float) -> Shot:
             return shot_of(pipeline, equipment, pipeline.look(clock.t_ns, lead_s), wanted)
 
     rotator = Rotator("127.0.0.1", serving(ours, clock), clock.now_ns)
-    drive = Drive(Here(), rotator, 10.0, Safe.HOLD, clock.now_ns, lambda _: None)
+    drive = Drive(
+        source=Here(),
+        device=rotator,
+        update_hz=10.0,
+        safe=Safe.HOLD,
+        now_ns=clock.now_ns,
+        say=lambda _: None,
+    )
     seconds, off = 90.0, {"ours": list[float](), "rival": list[float]()}
     arrivals = over_radio(flown, seconds, np.random.default_rng(3))
     mav: Any = dialect.MAVLink(None)
@@ -154,7 +161,9 @@ def test_a_mount_is_off_by_half_of_what_one_is_that_follows_reports(
             at_s, vehicle, raw = arrivals.pop(0)
             msgid = int.from_bytes(raw[7:10], "little")
             at_ns = START_NS + round(at_s * 1e9)
-            pipeline.step(Frame(at_ns, "radio", vehicle.source, msgid, raw))
+            pipeline.step(
+                Frame(t_ns=at_ns, link="radio", source=vehicle.source, msgid=msgid, raw=raw)
+            )
             if vehicle.name == "1:1" and raw[7] == GLOBAL_POSITION_INT:
                 said = mav.decode(bytearray(raw))
                 north = (said.lat * 1e-7 - flown.origin.lat_deg) * 111_320.0
@@ -200,16 +209,32 @@ def opened(port: int) -> Rotator:
 def test_hamlib_s_dummy_is_driven_within_its_limits(rotctld: int) -> None:
     rotator = opened(rotctld)
     assert rotator._limits_deg == (-180.0, 450.0, 0.0, 90.0)
-    rotator.apply(Shot(0, None, "1:1", math.radians(350), math.radians(-5)))
+    rotator.apply(
+        Shot(
+            valid_at_ns=0,
+            unfit=None,
+            uav="1:1",
+            bearing_rad=math.radians(350),
+            above_rad=math.radians(-5),
+        )
+    )
     with socket.create_connection(("127.0.0.1", rotctld), HANG_S) as other:
         other.sendall(b"+p\n")
         assert b"get_pos:" in other.recv(4096)
-    rotator.apply(Shot(0, None, "1:1", math.radians(10), math.radians(95)))
+    rotator.apply(
+        Shot(
+            valid_at_ns=0,
+            unfit=None,
+            uav="1:1",
+            bearing_rad=math.radians(10),
+            above_rad=math.radians(95),
+        )
+    )
     rotator.rest(Safe.HOLD)
     rotator.rest(Safe.BORESIGHT)
     rotator.close()
     with pytest.raises(DeviceError, match="not connected"):
-        rotator.apply(Shot(0, None))
+        rotator.apply(Shot(valid_at_ns=0, unfit=None))
 
 
 def test_the_nearest_turn_within_the_limits_is_taken() -> None:

@@ -45,7 +45,9 @@ def node(
 ) -> FleetNode:
     pipeline = Pipeline(Settings().override(center={"source": "47,8,400"}))
     given = FleetSettings.model_validate({"node": "north", **settings})
-    return FleetNode(given, pipeline, lambda event: None, notify, now)
+    return FleetNode(
+        settings=given, pipeline=pipeline, step=lambda event: None, notify=notify, now_ns=now
+    )
 
 
 @pytest.mark.parametrize(
@@ -166,7 +168,17 @@ def test_another_of_its_name_is_said_once_and_not_heard(wire: Wire) -> None:
         member = node(mode="client", connect=["tcp/127.0.0.1:1"], notify=notices.append)
         task = asyncio.create_task(member.run())
         await wire.is_asked.wait()
-        said = messages.standing(Standing("north", 0, 0, None, None, 4, (("1:1", 9.0),)))
+        said = messages.standing(
+            Standing(
+                node="north",
+                started_ns=0,
+                t_ns=0,
+                place=None,
+                reach_m=None,
+                most=4,
+                serves=(("1:1", 9.0),),
+            )
+        )
         for _ in range(2):
             wire.takes["standing"]("companion/site/north/standing", said)
         assert list(member.member.neighbours) == ["south"]
@@ -212,7 +224,7 @@ def report(t_ns: int, number: int) -> Frame:
         5000 + 100 * number, 473977000, 85456000, 0, 0, 0, 0, 0, 0
     )
     raw = bytes(message.pack(mav))
-    return Frame(t_ns, "udp", Source(1, 1), message.get_msgId(), raw)
+    return Frame(t_ns=t_ns, link="udp", source=Source(1, 1), msgid=message.get_msgId(), raw=raw)
 
 
 def told(wire: Wire) -> list[Shared]:
@@ -229,7 +241,9 @@ def test_a_change_of_duty_is_said_at_once_and_a_rival_is_answered(wire: Wire) ->
         member._step = steps.append
         task = asyncio.create_task(member.run())
         await wire.is_asked.wait()
-        member.member.offer({"1:1": Offer("1:1", 10.0, 10.0, 20.0, 0.1)})
+        member.member.offer(
+            {"1:1": Offer(uav="1:1", sure_db=10.0, likely_db=10.0, sinr_db=20.0, heard_s=0.1)}
+        )
         member.ticked(now_ns[0])
         now_ns[0] += 3 * S
         wire.said.clear()
@@ -239,7 +253,15 @@ def test_a_change_of_duty_is_said_at_once_and_a_rival_is_answered(wire: Wire) ->
         ((what, payload),) = wire.said
         assert what == "standing"
         assert messages.to_standing(payload, "north").serves[0][0] == "1:1"
-        rival = Standing("south", 0, now_ns[0], None, None, 4, (("1:1", 25.0),))
+        rival = Standing(
+            node="south",
+            started_ns=0,
+            t_ns=now_ns[0],
+            place=None,
+            reach_m=None,
+            most=4,
+            serves=(("1:1", 25.0),),
+        )
         wire.takes["standing"]("companion/site/south/standing", messages.standing(rival))
         last = steps[-1]
         assert isinstance(last, Duty)

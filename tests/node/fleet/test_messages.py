@@ -20,10 +20,10 @@ FRAMES = st.lists(st.builds(SharedFrame, st.integers(0, 1 << 61), st.binary(max_
 TRIPS = st.lists(
     st.builds(
         RoundTrip,
-        TIMES,
-        st.builds(Source, st.integers(0, 255), st.integers(0, 255)),
-        TIMES,
-        st.integers(-(1 << 62), 1 << 62),
+        t_ns=TIMES,
+        source=st.builds(Source, st.integers(0, 255), st.integers(0, 255)),
+        sent_ns=TIMES,
+        remote_ns=st.integers(-(1 << 62), 1 << 62),
     ),
     max_size=5,
 )
@@ -38,14 +38,14 @@ def test_what_was_heard_comes_back(said: Shared) -> None:
 @given(
     st.builds(
         Standing,
-        st.just("north"),
-        TIMES,
-        TIMES,
-        st.none() | st.tuples(NUMBERS, NUMBERS, NUMBERS),
-        UNSURE,
-        st.integers(0, 10_000),
-        st.lists(st.tuples(NAMES, NUMBERS)).map(tuple),
-        st.lists(st.tuples(NAMES, NAMES)).map(tuple),
+        node=st.just("north"),
+        started_ns=TIMES,
+        t_ns=TIMES,
+        place=st.none() | st.tuples(NUMBERS, NUMBERS, NUMBERS),
+        reach_m=UNSURE,
+        most=st.integers(0, 10_000),
+        serves=st.lists(st.tuples(NAMES, NUMBERS)).map(tuple),
+        handing=st.lists(st.tuples(NAMES, NAMES)).map(tuple),
     )
 )
 @settings(max_examples=examples(100))
@@ -54,7 +54,14 @@ def test_what_a_node_says_of_itself_comes_back_exactly(said: Standing) -> None:
     assert messages.to_standing(messages.standing(said), "north") == said
 
 
-@given(st.lists(st.builds(Offer, NAMES, UNSURE, UNSURE, UNSURE, UNSURE), unique_by=lambda o: o.uav))
+@given(
+    st.lists(
+        st.builds(
+            Offer, uav=NAMES, sure_db=UNSURE, likely_db=UNSURE, sinr_db=UNSURE, heard_s=UNSURE
+        ),
+        unique_by=lambda o: o.uav,
+    )
+)
 @settings(max_examples=examples(100))
 def test_offers_come_back(said: list[Offer]) -> None:
     assert list(messages.to_offers(messages.offers({o.uav: o for o in said}))) == said

@@ -21,7 +21,7 @@ START_NS = 1_800_000_000 * S
 
 def events(shift_ns: int, duties: list[tuple[float, tuple[str, ...]]]) -> list[Event]:
     """Six seconds of two vehicles, on a clock of the node's own, and its duties."""
-    sky = FleetSky([], uavs=2)
+    sky = FleetSky(ports=[], uavs=2)
     found: list[Event] = []
     for step in range(60):
         now_ns = START_NS + shift_ns + step * S // 10
@@ -44,7 +44,13 @@ def record(path: Path, node: str | None, made: list[Event]) -> Path:
     """A node's recording, with the digest to which it came."""
     settings = fleet_settings(node)
     pipeline = Pipeline(settings)
-    with Writer(path, settings.to_toml(), {}, None, START_NS) as writer:
+    with Writer(
+        where=path,
+        settings_toml=settings.to_toml(),
+        versions={},
+        weights_hz=None,
+        started_ns=START_NS,
+    ) as writer:
         for event in made:
             pipeline.step(event)
             writer.event(event)
@@ -97,7 +103,14 @@ def test_the_parts_of_one_run_are_one_recording_in_any_order(
     pipeline, part = Pipeline(settings), Part.first()
     paths = [tmp_path / "one.mcap", tmp_path / "two.mcap"]
     for path, some in zip(paths, (made[:90], made[90:]), strict=True):
-        with Writer(path, settings.to_toml(), {}, None, START_NS, part=part) as writer:
+        with Writer(
+            where=path,
+            settings_toml=settings.to_toml(),
+            versions={},
+            weights_hz=None,
+            started_ns=START_NS,
+            part=part,
+        ) as writer:
             for event in some:
                 pipeline.step(event)
                 writer.event(event)
@@ -114,7 +127,13 @@ def test_the_parts_of_one_run_are_one_recording_in_any_order(
 def test_settings_of_others_may_be_anything(
     text: str, recorded: list[Path], tmp_path: Path
 ) -> None:
-    with Writer(tmp_path / "x.mcap", text, {}, None, START_NS) as writer:
+    with Writer(
+        where=tmp_path / "x.mcap",
+        settings_toml=text,
+        versions={},
+        weights_hz=None,
+        started_ns=START_NS,
+    ) as writer:
         writer.close({})
     with pytest.raises(LogError, match=r"no \[fleet\] node"):
         replaying.replay([recorded[0], tmp_path / "x.mcap"])

@@ -147,7 +147,10 @@ def test_a_full_node_makes_room_for_who_has_no_other() -> None:
 def test_what_is_only_likely_is_worth_less(
     sure: float | None, likely: float | None, sinr: float | None, worth: float | None
 ) -> None:
-    assert worth_db(Offer("1:1", sure, likely, sinr, 0.1)) == worth
+    assert (
+        worth_db(Offer(uav="1:1", sure_db=sure, likely_db=likely, sinr_db=sinr, heard_s=0.1))
+        == worth
+    )
 
 
 def test_where_not_all_have_room_those_have_it_who_gain_most() -> None:

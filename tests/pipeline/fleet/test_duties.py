@@ -19,13 +19,25 @@ class Pair:
     now_ns: int = 1000 * S
 
     def __post_init__(self) -> None:
-        self.nodes = {name: Duties(name, 50, LEASE_NS, 3.0) for name in sorted(NODES)}
+        self.nodes = {
+            name: Duties(name=name, most=50, lease_ns=LEASE_NS, hysteresis_db=3.0)
+            for name in sorted(NODES)
+        }
         self.changes: list[Handover] = []
 
     def says(self, name: str) -> Standing:
         duties = self.nodes[name]
         serves, handing = tuple(duties.serves.items()), tuple(duties.handing.items())
-        return Standing(name, 0, self.now_ns, None, None, 50, serves, handing)
+        return Standing(
+            node=name,
+            started_ns=0,
+            t_ns=self.now_ns,
+            place=None,
+            reach_m=None,
+            most=50,
+            serves=serves,
+            handing=handing,
+        )
 
     def step(self, talk: bool = True, alive: str = "ab") -> list[list[str]]:
         """One tick of 100 ms. Returns who serves what after each node's decision."""
@@ -118,7 +130,7 @@ def test_who_can_serve_it_no_more_hands_it_over_at_once() -> None:
 
 def test_a_full_node_takes_nobody_more() -> None:
     pair = Pair({"a": {}, "b": {f"{n}:1": 10.0 for n in range(5)}})
-    pair.nodes["b"] = Duties("b", 3, LEASE_NS, 3.0)
+    pair.nodes["b"] = Duties(name="b", most=3, lease_ns=LEASE_NS, hysteresis_db=3.0)
     pair.run(6)
     assert len(pair.nodes["b"].serves) == 3
 
@@ -135,14 +147,16 @@ def test_the_second_takes_what_the_first_does_not() -> None:
 
 
 def said(node: str, *serves: tuple[str, float]) -> Standing:
-    return Standing(node, 0, 0, None, None, 50, serves)
+    return Standing(
+        node=node, started_ns=0, t_ns=0, place=None, reach_m=None, most=50, serves=serves
+    )
 
 
 class Alone:
     """Node a of several, the words of the others as the test says."""
 
     def __init__(self, **offers: float) -> None:
-        self.duties = Duties("a", 50, LEASE_NS, 3.0)
+        self.duties = Duties(name="a", most=50, lease_ns=LEASE_NS, hysteresis_db=3.0)
         self.now_ns = 1000 * S
         self.worth = offers
 

@@ -26,7 +26,7 @@ SHADOW_S = 6.0
 END_S = 12.0
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Links:
     """What the links do: latencies of the vehicle's and the nodes' links, and the other's clock.
 
@@ -53,7 +53,7 @@ def ns(seconds: float) -> int:
 
 def flown(links: Links) -> tuple[list[tuple[float, float, float]], Pipeline]:
     """Errors and bounds at each tick as (time, error, bound), and the pipeline at the end."""
-    chance, sky = random.Random(links.seed), FleetSky([], uavs=1)
+    chance, sky = random.Random(links.seed), FleetSky(ports=[], uavs=1)
     pipeline = Pipeline(Settings().override(center={"source": "47.3977,8.5456,480"}))
     hearing, clock = Hearing(), NeighbourClock()
 
@@ -108,13 +108,13 @@ def flown(links: Links) -> tuple[list[tuple[float, float, float]], Pipeline]:
 @given(
     st.builds(
         Links,
-        st.floats(0.001, 0.02),
-        st.floats(0.0, 0.2),
-        st.floats(0.0005, 0.15),
-        st.floats(0.0, 0.1),
-        st.floats(-5.0, 5.0),
-        st.floats(-0.9 * DRIFT_MAX, 0.9 * DRIFT_MAX),
-        st.integers(0, 999),
+        uplink_s=st.floats(0.001, 0.02),
+        jitter_s=st.floats(0.0, 0.2),
+        way_s=st.floats(0.0005, 0.15),
+        uneven_s=st.floats(0.0, 0.1),
+        offset_s=st.floats(-5.0, 5.0),
+        drift=st.floats(-0.9 * DRIFT_MAX, 0.9 * DRIFT_MAX),
+        seed=st.integers(0, 999),
     )
 )
 @settings(max_examples=rounds(4, 60))
@@ -128,7 +128,15 @@ def test_the_bound_holds_behind_the_building(links: Links) -> None:
 
 
 def test_it_stays_small_and_would_grow_alone() -> None:
-    links = Links(0.005, 0.02, 0.001, 0.002, 3.0, 50e-6, 1)
+    links = Links(
+        uplink_s=0.005,
+        jitter_s=0.02,
+        way_s=0.001,
+        uneven_s=0.002,
+        offset_s=3.0,
+        drift=50e-6,
+        seed=1,
+    )
     seen, _ = flown(links)
     before = max(bound for t, _, bound in seen if 4 < t < SHADOW_S)
     behind = max(bound for t, _, bound in seen if t > SHADOW_S + 1)
@@ -139,7 +147,17 @@ def test_it_stays_small_and_would_grow_alone() -> None:
 def test_a_doubt_that_were_forgotten_would_be_seen() -> None:
     """The clock's doubt is in the vehicle's: a wide one widens it by as much."""
     narrow, wide = (
-        flown(Links(0.005, 0.0, 0.001, uneven_s, 3.0, 0.0, 1))[1].clock_estimate(UAV)
+        flown(
+            Links(
+                uplink_s=0.005,
+                jitter_s=0.0,
+                way_s=0.001,
+                uneven_s=uneven_s,
+                offset_s=3.0,
+                drift=0.0,
+                seed=1,
+            )
+        )[1].clock_estimate(UAV)
         for uneven_s in (0.0, 0.4)
     )
     assert narrow is not None
@@ -152,7 +170,13 @@ def test_a_doubt_that_were_forgotten_would_be_seen() -> None:
 def test_a_slow_link_between_the_nodes(seed: int) -> None:
     chance = random.Random(seed)
     links = Links(
-        0.002, chance.uniform(0, 0.5), chance.uniform(0, 0.5), 0.3, 2.0, DRIFT_MAX * 0.9, seed
+        uplink_s=0.002,
+        jitter_s=chance.uniform(0, 0.5),
+        way_s=chance.uniform(0, 0.5),
+        uneven_s=0.3,
+        offset_s=2.0,
+        drift=DRIFT_MAX * 0.9,
+        seed=seed,
     )
     seen, _ = flown(links)
     assert [one for one in seen if one[1] > one[2] + 0.02] == []

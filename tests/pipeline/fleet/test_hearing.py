@@ -37,7 +37,9 @@ def tell(hearing: Hearing, now_ns: int, data: bytes, heard_ns: int, node: str = 
 
 
 def hear(hearing: Hearing, now_ns: int, boot_ms: int) -> None:
-    hearing.heard(Frame(now_ns, "udp", UAV, GLOBAL_POSITION_INT, raw(boot_ms)))
+    hearing.heard(
+        Frame(t_ns=now_ns, link="udp", source=UAV, msgid=GLOBAL_POSITION_INT, raw=raw(boot_ms))
+    )
 
 
 def test_of_a_vehicle_that_is_heard_here_nothing_else_is_used() -> None:

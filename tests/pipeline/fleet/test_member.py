@@ -15,12 +15,25 @@ START_NS = 1_800_000_000 * S
 
 
 def member(**settings: object) -> Member:
-    return Member("a", FleetSettings.model_validate({"node": "a", **settings}), 16, START_NS)
+    return Member(
+        name="a",
+        settings=FleetSettings.model_validate({"node": "a", **settings}),
+        elements=16,
+        started_ns=START_NS,
+    )
 
 
 def standing(node: str, serves: tuple[str, ...] = ()) -> Standing:
     each = tuple((uav, 20.0) for uav in serves)
-    return Standing(node, START_NS, START_NS, (47.0, 8.0, 0.0), 500.0, 16, each)
+    return Standing(
+        node=node,
+        started_ns=START_NS,
+        t_ns=START_NS,
+        place=(47.0, 8.0, 0.0),
+        reach_m=500.0,
+        most=16,
+        serves=each,
+    )
 
 
 def word(now_ns: int, number: int) -> Shared:
@@ -105,8 +118,23 @@ def test_who_is_served_elsewhere_is_spared_where_that_is_asked_for() -> None:
 def test_who_is_far_away_is_not_near_and_its_offers_are_not_kept() -> None:
     node = member()
     for name, place in (("b", (47.0, 8.0, 0.0)), ("c", (48.0, 8.0, 0.0))):
-        node.stands(START_NS, Standing(name, START_NS, START_NS, place, 900.0, 16, ()))
-        node.offered(START_NS, name, (Offer("1:1", 10.0, 10.0, 10.0, 0.1),))
+        node.stands(
+            START_NS,
+            Standing(
+                node=name,
+                started_ns=START_NS,
+                t_ns=START_NS,
+                place=place,
+                reach_m=900.0,
+                most=16,
+                serves=(),
+            ),
+        )
+        node.offered(
+            START_NS,
+            name,
+            (Offer(uav="1:1", sure_db=10.0, likely_db=10.0, sinr_db=10.0, heard_s=0.1),),
+        )
     assert node.near == frozenset()
     node.says(START_NS, (47.0, 8.01, 0.0), 900.0)
     assert node.near == {"b"}
@@ -156,7 +184,7 @@ def test_nothing_is_taken_of_a_node_that_is_not_believed() -> None:
 
 def test_offers_stand_for_some_time() -> None:
     node, now_ns = member(), START_NS
-    node.offer({"1:1": Offer("1:1", 10.0, 10.0, 10.0, 0.1)})
+    node.offer({"1:1": Offer(uav="1:1", sure_db=10.0, likely_db=10.0, sinr_db=10.0, heard_s=0.1)})
 
     def run(seconds: int) -> None:
         nonlocal now_ns
@@ -167,7 +195,9 @@ def test_offers_stand_for_some_time() -> None:
 
     run(3)
     assert list(node.duties.serves) == ["1:1"]
-    node.offered(now_ns, "b", (Offer("1:1", 25.0, 25.0, 25.0, 0.1),))
+    node.offered(
+        now_ns, "b", (Offer(uav="1:1", sure_db=25.0, likely_db=25.0, sinr_db=25.0, heard_s=0.1),)
+    )
     run(4)
     assert node.duties.handing == {"1:1": "b"}
     run(8)

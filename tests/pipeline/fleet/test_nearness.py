@@ -15,7 +15,15 @@ DEGREE_M = 111_195.0
 
 def standing(east_m: float, reach_m: float | None) -> Standing:
     lon = HERE[1] + east_m / (DEGREE_M * math.cos(math.radians(HERE[0])))
-    return Standing("b", 1, 1, (HERE[0], lon, 500.0), reach_m, 16, ())
+    return Standing(
+        node="b",
+        started_ns=1,
+        t_ns=1,
+        place=(HERE[0], lon, 500.0),
+        reach_m=reach_m,
+        most=16,
+        serves=(),
+    )
 
 
 @given(st.floats(0, 60_000), st.floats(1, 20_000), st.floats(1, 20_000))
@@ -49,6 +57,6 @@ def test_neighbours_on_a_site_are_near_though_they_hear_little() -> None:
 
 
 def test_of_whom_nothing_is_known_may_be_near() -> None:
-    lost = Standing("b", 1, 1, None, 10.0, 16, ())
+    lost = Standing(node="b", started_ns=1, t_ns=1, place=None, reach_m=10.0, most=16, serves=())
     assert near(HERE, 10.0, {"b": lost, "c": None}, NOBODY) == {"b", "c"}
     assert near(None, 10.0, {"b": standing(90_000, 10.0)}, NOBODY) == {"b"}

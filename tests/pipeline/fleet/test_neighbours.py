@@ -43,7 +43,7 @@ def test_the_truth_is_within(
 
 def test_a_round_trip_of_another_node_is_no_shorter_here() -> None:
     clock = NeighbourClock()
-    trip = RoundTrip(500 * MS, Source(1, 1), 400 * MS, 77)
+    trip = RoundTrip(t_ns=500 * MS, source=Source(1, 1), sent_ns=400 * MS, remote_ns=77)
     assert here(trip, clock) is None
     # The other clock is 1 s behind; the question took 4 ms, the answer 6 ms.
     clock.answered(1000 * MS, 1010 * MS, 4 * MS)
@@ -57,7 +57,7 @@ def test_a_round_trip_of_another_node_is_no_shorter_here() -> None:
 
 def test_ways_of_long_ago_say_nothing_of_now() -> None:
     """A node that speaks for nobody any more has no ways, however slow its last words were."""
-    node = Neighbour(NeighbourClock())
+    node = Neighbour(clock=NeighbourClock())
     node.came(START_NS, 900 * MS)
     node.came(START_NS + WAYS_NS // 2, 5 * MS)
     assert node.ways_ns(START_NS + WAYS_NS // 2) == [900 * MS, 5 * MS]

@@ -28,7 +28,12 @@ def flown() -> tuple[Pipeline, Member, int]:
     for event in log_events([ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"], SETTINGS):
         if begun_ns is None or member is None:
             begun_ns = event.t_ns
-            member = Member("a", FleetSettings(node="a"), pipeline.array.size, begun_ns)
+            member = Member(
+                name="a",
+                settings=FleetSettings(node="a"),
+                elements=pipeline.array.size,
+                started_ns=begun_ns,
+            )
         if event.t_ns > begun_ns + 4 * S:
             return pipeline, member, event.t_ns
         pipeline.step(event)

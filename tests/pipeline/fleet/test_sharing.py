@@ -19,7 +19,9 @@ UAV = Source(1, 1)
 def report(at_ns: int, boot_ms: int, source: Source = UAV) -> Frame:
     mav = common.MAVLink(None, srcSystem=source.sysid, srcComponent=source.compid)
     message = common.MAVLink_global_position_int_message(boot_ms, 1, 2, 3, 4, 5, 6, 7, 8)
-    return Frame(at_ns, "udp", source, GLOBAL_POSITION_INT, message.pack(mav))
+    return Frame(
+        t_ns=at_ns, link="udp", source=source, msgid=GLOBAL_POSITION_INT, raw=message.pack(mav)
+    )
 
 
 @dataclass
@@ -58,7 +60,9 @@ class Nodes:
                 (boot_ms,) = struct.unpack_from("<I", one.raw, 10)
                 late_ns = self.now_ns - one.heard_ns
                 self.told.append((name, (boot_ms - 1000) // 100, late_ns))
-                frame = Frame(one.heard_ns, "", UAV, GLOBAL_POSITION_INT, one.raw)
+                frame = Frame(
+                    t_ns=one.heard_ns, link="", source=UAV, msgid=GLOBAL_POSITION_INT, raw=one.raw
+                )
                 self._on_the_way.append((self.now_ns + self.way_ns, name, frame))
 
 
@@ -97,7 +101,7 @@ def test_far_apart_they_still_find_one_speaker() -> None:
 def test_round_trips_are_told_by_the_speaker() -> None:
     nodes = Nodes(("a", "b"))
     nodes.fly(20, ("a", "b"))
-    trip = RoundTrip(nodes.now_ns, UAV, nodes.now_ns - MS, 5)
+    trip = RoundTrip(t_ns=nodes.now_ns, source=UAV, sent_ns=nodes.now_ns - MS, remote_ns=5)
     nodes.sharing["a"].answered(trip)
     nodes.sharing["b"].answered(trip)
     assert nodes.sharing["b"].due(nodes.now_ns) is None

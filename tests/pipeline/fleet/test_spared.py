@@ -16,7 +16,7 @@ START_NS = 1_800_000_000 * S
 
 def flown(pipeline: Pipeline, seconds: float, begins_ns: int = START_NS) -> list[str]:
     """What is said while two vehicles fly."""
-    sky, said = FleetSky([], uavs=2), []
+    sky, said = FleetSky(ports=[], uavs=2), []
     for step in range(round(10 * seconds)):
         now_ns = begins_ns + step * S // 10
         for number in range(2):
@@ -53,11 +53,11 @@ def test_beams_have_nulls_on_the_spared_as_long_as_they_are() -> None:
         track = pipeline.tracks(now_ns, update.beams.valid_at_ns, ["2:1"])
         seen = aim(
             now_ns,
-            update.beams.valid_at_ns,
-            track,
-            update.carrier,
-            pipeline.array,
-            pipeline.precoder,
+            valid_at_ns=update.beams.valid_at_ns,
+            tracks=track,
+            carrier=update.carrier,
+            array=pipeline.array,
+            precoder=pipeline.precoder,
         )
         there = steering.steering_matrix(pipeline.array, directions(seen))
         weights = update.beams.weights

@@ -13,13 +13,13 @@ from sitl_replay.faults.asked import KINDS, Fault, FaultError, described, in_ord
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("loss=0.1", Fault("loss", (0.1,))),
-        ("loss=0", Fault("loss", (0.0,))),
-        ("drift@3=-24000", Fault("drift", (-24000.0,), 3)),
-        ("frozen@3:1=20:5", Fault("frozen", (20.0, 5.0), 3, 1)),
-        ("glitch=30:25", Fault("glitch", (30.0, 25.0, 1.0))),
-        ("glitch@0:0=30:25:4", Fault("glitch", (30.0, 25.0, 4.0), 0, 0)),
-        ("bit-errors=1e-5", Fault("bit-errors", (1e-5,))),
+        ("loss=0.1", Fault(name="loss", values=(0.1,))),
+        ("loss=0", Fault(name="loss", values=(0.0,))),
+        ("drift@3=-24000", Fault(name="drift", values=(-24000.0,), sysid=3)),
+        ("frozen@3:1=20:5", Fault(name="frozen", values=(20.0, 5.0), sysid=3, compid=1)),
+        ("glitch=30:25", Fault(name="glitch", values=(30.0, 25.0, 1.0))),
+        ("glitch@0:0=30:25:4", Fault(name="glitch", values=(30.0, 25.0, 4.0), sysid=0, compid=0)),
+        ("bit-errors=1e-5", Fault(name="bit-errors", values=(1e-5,))),
     ],
 )
 def test_a_fault_is_read(text: str, expected: Fault) -> None:

@@ -226,7 +226,7 @@ def test_frozen_before_any_report_repeats_the_first() -> None:
 )
 @settings(max_examples=examples(60))
 def test_glitch(metres: float, lat_deg: float, lon_deg: float, seed: int) -> None:
-    glitch = Glitch(1.0, metres, 3, str(seed))
+    glitch = Glitch(at_s=1.0, metres=metres, reports=3, seed=str(seed))
     lat, lon = round(lat_deg * 1e7), round(lon_deg * 1e7)
     bearings_deg = []
     for number in range(6):
@@ -254,7 +254,7 @@ def test_each_sender_and_seed_glitches_its_own_way() -> None:
         for seed in ("1", "2")
         for sysid in range(1, 5)
         for t_s, raw in reports(1, sysid)
-        for glitched in [Glitch(0.0, 1000.0, 1, seed)(t_s, raw)]
+        for glitched in [Glitch(at_s=0.0, metres=1000.0, reports=1, seed=seed)(t_s, raw)]
     }
     assert len(places) == 8
     lats = [lat - 473977420 for lat, _ in places]

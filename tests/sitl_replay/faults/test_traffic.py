@@ -30,7 +30,10 @@ def through(
 ) -> tuple[list[Delivery], Counter[str]]:
     """What arrives, as the player takes it out, and what was touched."""
     touched: Counter[str] = Counter()
-    senders, network = Senders(faults, seed, touched), Network(faults, links, seed, touched)
+    senders, network = (
+        Senders(faults, seed, touched),
+        Network(faults=faults, links=links, seed=seed, touched=touched),
+    )
     out = []
     for t_s, raw in stream:
         out += network.due(t_s)
@@ -128,7 +131,7 @@ def test_one_fault_does_not_choose_the_frames_of_another() -> None:
 
 
 def test_what_is_on_time_comes_at_once() -> None:
-    network = Network(parsed("delay=0.5"), 1, 0, Counter())
+    network = Network(faults=parsed("delay=0.5"), links=1, seed=0, touched=Counter())
     network.take(1.0, RAWS[0])
     assert list(network.due(1.4999)) == []
     assert [one.raw for one in network.due(1.5)] == [RAWS[0]]
@@ -210,7 +213,7 @@ def test_no_burst_comes_apart_by_jitter() -> None:
 
 def test_what_is_held_is_bounded_and_the_rest_is_counted() -> None:
     touched: Counter[str] = Counter()
-    network = Network(parsed("delay=10"), 1, 0, touched)
+    network = Network(faults=parsed("delay=10"), links=1, seed=0, touched=touched)
     for number in range(HELD_MAX + 7):
         network.take(number * 1e-6, RAWS[0])
     assert touched[OVERFLOW] == 7

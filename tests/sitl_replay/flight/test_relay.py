@@ -177,7 +177,7 @@ def test_the_service_reads_each_as_it_is_meant(
 ) -> None:
     for (source, icao), found in told.items():
         for t_s, raw, message in found[:60]:
-            read = decode(Frame(round(t_s * 1e9), "a", source, 246, raw))
+            read = decode(Frame(t_ns=round(t_s * 1e9), link="a", source=source, msgid=246, raw=raw))
             assert isinstance(read, AdsbVehicle)
             assert (read.position_deg is not None) == bool(message.flags & Valid.COORDS)
             if read.position_deg is None:

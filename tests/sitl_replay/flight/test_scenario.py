@@ -86,7 +86,7 @@ def test_paper_velocity_as_printed() -> None:
 
 
 def test_gusts_keep_the_circle_about_the_carrier() -> None:
-    circle = Circle(100.0, 0.5, 0.0, 0.0)
+    circle = Circle(radius_m=100.0, rate_radps=0.5, phase_rad=0.0, height_m=0.0)
     period_s = math.tau / 0.5
     positions = [circle(t_s).position_ned_m for t_s in np.linspace(0, period_s, 1000, False)]
     assert np.mean(positions, axis=0) == pytest.approx((0, 0, 0), abs=1e-9)

@@ -171,8 +171,22 @@ def test_velocity_down_is_positive() -> None:
     def sinking(t_s: float) -> scenario.Motion:
         return scenario.Motion((0.0, 0.0, 3.0 * t_s), (0.0, 0.0, 3.0))
 
-    uav = scenario.Vehicle(Source(9, 1), sinking, scenario.Sway(), 0.1, 0.2, uptime_ms=1000)
-    falling = scenario.Scenario("sink", "", scenario.ORIGIN, 488.0, scenario.CARRIER, (uav,))
+    uav = scenario.Vehicle(
+        source=Source(9, 1),
+        trajectory=sinking,
+        attitude=scenario.Sway(),
+        report_interval_s=0.1,
+        attitude_interval_s=0.2,
+        uptime_ms=1000,
+    )
+    falling = scenario.Scenario(
+        name="sink",
+        description="",
+        origin=scenario.ORIGIN,
+        home_alt_m=488.0,
+        carrier=scenario.CARRIER,
+        uavs=(uav,),
+    )
     parser = dialect.MAVLink(None)
     read = [parser.parse_buffer(t.raw)[0] for t in schedule(falling, duration_s=2) if t[1] is uav]
     reports = [m for m in read if m.get_type() == "GLOBAL_POSITION_INT"]
@@ -290,7 +304,7 @@ def test_the_service_reads_where_each_vehicle_is(name: str) -> None:
     for t_s, vehicle, raw in itertools.islice(
         schedule(flight, 1, EPOCH_NS, duration_s=90.0), 0, None, 40
     ):
-        frame = Frame(round(t_s * 1e9), "a", vehicle.source, raw[7], raw)
+        frame = Frame(t_ns=round(t_s * 1e9), link="a", source=vehicle.source, msgid=raw[7], raw=raw)
         read = decode(frame)
         if isinstance(read, Rejection):  # an aircraft without a position
             assert (name, read.reason) == ("adsb", Reason.NO_POSITION)

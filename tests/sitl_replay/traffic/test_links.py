@@ -169,7 +169,7 @@ def test_tcp_hears_and_is_lost_when_the_peer_closes(run: Run) -> None:
         server = await asyncio.start_server(serve, "127.0.0.1", 0)
         async with server:
             port = server.sockets[0].getsockname()[1]
-            peer = await open_link(LinkUrl("tcp", "127.0.0.1", port), heard)
+            peer = await open_link(LinkUrl(scheme="tcp", host="127.0.0.1", port=port), heard)
             peer.send(FRAME)
             await until(lambda: peer.lost)
             peer.send(FRAME)
@@ -193,7 +193,7 @@ def test_what_is_dropped_is_not_kept(run: Run) -> None:
         await peer.close()
 
     with socket.create_server(("127.0.0.1", 0)) as deaf:
-        run(scene(LinkUrl("tcp", "127.0.0.1", deaf.getsockname()[1])))
+        run(scene(LinkUrl(scheme="tcp", host="127.0.0.1", port=deaf.getsockname()[1])))
 
 
 async def none_lost(link: TrafficLink, far: int, frames: list[bytes]) -> None:
@@ -223,7 +223,9 @@ async def none_lost(link: TrafficLink, far: int, frames: list[bytes]) -> None:
 
 def test_a_connection_loses_nothing_to_who_waits(run: Run) -> None:
     async def scene(server: socket.socket) -> None:
-        link = await open_link(LinkUrl("tcp", "127.0.0.1", server.getsockname()[1]))
+        link = await open_link(
+            LinkUrl(scheme="tcp", host="127.0.0.1", port=server.getsockname()[1])
+        )
         with server.accept()[0] as far:
             await none_lost(link, far.fileno(), [n.to_bytes(4, "big") * 250 for n in range(20_000)])
 

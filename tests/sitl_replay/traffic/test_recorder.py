@@ -132,7 +132,7 @@ async def serve(data: bytes) -> tuple[asyncio.Server, LinkUrl]:
 
     server = await asyncio.start_server(answer, "127.0.0.1", 0)
     port = server.sockets[0].getsockname()[1]
-    return server, LinkUrl("tcp", "127.0.0.1", port)
+    return server, LinkUrl(scheme="tcp", host="127.0.0.1", port=port)
 
 
 def test_tcp_is_recorded_to_its_end(tmp_path: Path, frames: list[bytes]) -> None:
@@ -178,7 +178,7 @@ def test_a_peer_that_leaves_before_the_duration_is_an_error(
 
 
 def test_the_duration_ends_a_recording(tmp_path: Path) -> None:
-    url = LinkUrl("udpin", "127.0.0.1", free_port(socket.SOCK_DGRAM))
+    url = LinkUrl(scheme="udpin", host="127.0.0.1", port=free_port(socket.SOCK_DGRAM))
     heard = run_async(recorder.record(url, tmp_path / "silence.tlog", 0.05))
     assert heard.frames == 0
     assert 0.05 <= heard.duration_s < 1.0
@@ -187,7 +187,7 @@ def test_the_duration_ends_a_recording(tmp_path: Path) -> None:
 def test_a_taken_port_is_told(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as owner:
         owner.bind(("127.0.0.1", 0))
-        url = LinkUrl("udpin", "127.0.0.1", owner.getsockname()[1])
+        url = LinkUrl(scheme="udpin", host="127.0.0.1", port=owner.getsockname()[1])
         with pytest.raises(LinkError, match="Address already in use"):
             run_async(recorder.record(url, tmp_path / "a.tlog"))
 
@@ -196,7 +196,7 @@ def test_a_taken_port_is_told(tmp_path: Path) -> None:
 def test_a_full_disk_is_an_error(frames: list[bytes]) -> None:
     # It ends the recording at once, though more could come.
     port = free_port(socket.SOCK_DGRAM)
-    url = LinkUrl("udpin", "127.0.0.1", port)
+    url = LinkUrl(scheme="udpin", host="127.0.0.1", port=port)
 
     async def scene() -> None:
         task = asyncio.create_task(recorder.record(url, Path("/dev/full")))
@@ -233,7 +233,10 @@ def test_what_is_played_over_any_link_is_recorded(
     """The recorder at one end, the player at the other, whoever of them listens."""
     tlog = tmp_path / "heard.tlog"
     heard, listening = recorder.Heard(), pair.split()
-    log = [Frame(10**18, "", Source(1, 1), 0, raw) for raw in frames[:ENOUGH]]
+    log = [
+        Frame(t_ns=10**18, link="", source=Source(1, 1), msgid=0, raw=raw)
+        for raw in frames[:ENOUGH]
+    ]
 
     async def told() -> int:
         async with asyncio.timeout(5.0):
@@ -268,7 +271,10 @@ def test_what_is_played_over_any_link_is_recorded(
 def test_what_is_played_over_zenoh_is_recorded(tmp_path: Path, frames: list[bytes]) -> None:
     pytest.importorskip("zenoh")
     tlog, heard = tmp_path / "heard.tlog", recorder.Heard()
-    log = [Frame(10**18, "", Source(1, 1), 0, raw) for raw in frames[:ENOUGH]]
+    log = [
+        Frame(t_ns=10**18, link="", source=Source(1, 1), msgid=0, raw=raw)
+        for raw in frames[:ENOUGH]
+    ]
 
     async def scene() -> None:
         endpoint = f"tcp/127.0.0.1:{free_port()}"
@@ -354,7 +360,7 @@ def test_what_was_heard_is_on_disk_when_it_falls_silent(
     heard = recorder.Heard()
 
     async def scene() -> None:
-        url = LinkUrl("udpin", "127.0.0.1", port)
+        url = LinkUrl(scheme="udpin", host="127.0.0.1", port=port)
         task = asyncio.create_task(recorder.record(url, tlog, heard=heard))
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             async with asyncio.timeout(5.0):

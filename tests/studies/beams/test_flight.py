@@ -83,22 +83,61 @@ def looked(cut: Path) -> tuple[Pipeline, Update]:
 
 
 def worth(gain_db: float = 10.0, **given: Any) -> Worth:
-    blank = Worth(gain_db, 1.0, None, None, 20.0, 6.0, 0, False, Method.ZERO_FORCING, 2.0)
+    blank = Worth(
+        gain_db=gain_db,
+        loss_db=1.0,
+        guaranteed_gain_db=None,
+        true_gain_db=None,
+        sinr_db=20.0,
+        spectral_efficiency=6.0,
+        group=0,
+        widened=False,
+        method=Method.ZERO_FORCING,
+        condition_number=2.0,
+    )
     return replace(blank, **given)
 
 
 def test_sums_by_hand() -> None:
     """Four looks, one without a beam and one without a guarantee."""
     samples = [
-        Sample(0.0, "1:1"),
-        Sample(1.0, "1:1", 0.02, 0.01, 3, 0.25, False, worth(12.0, true_gain_db=11.0,
-               guaranteed_gain_db=9.0, widened=True), worth(18.0, true_gain_db=16.0,
-               guaranteed_gain_db=16.5)),
-        Sample(2.0, "1:1", 0.04, 0.05, 3, 0.5, True, worth(14.0, true_gain_db=7.0,
-               guaranteed_gain_db=8.0, spectral_efficiency=3.0), worth(17.0, true_gain_db=1.0)),
-        Sample(3.0, "1:1", None, None, 3, 1.0, None, worth(6.0, method=Method.REGULARISED,
-               condition_number=50.0, group=2, sinr_db=-math.inf), worth(16.0)),
-    ]  # fmt: skip
+        Sample(t_s=0.0, uav="1:1"),
+        Sample(
+            t_s=1.0,
+            uav="1:1",
+            pointing_bound_rad=0.02,
+            off_rad=0.01,
+            codebook_best=3,
+            sweep_share=0.25,
+            missed=False,
+            as_set=worth(12.0, true_gain_db=11.0, guaranteed_gain_db=9.0, widened=True),
+            sharp=worth(18.0, true_gain_db=16.0, guaranteed_gain_db=16.5),
+        ),
+        Sample(
+            t_s=2.0,
+            uav="1:1",
+            pointing_bound_rad=0.04,
+            off_rad=0.05,
+            codebook_best=3,
+            sweep_share=0.5,
+            missed=True,
+            as_set=worth(14.0, true_gain_db=7.0, guaranteed_gain_db=8.0, spectral_efficiency=3.0),
+            sharp=worth(17.0, true_gain_db=1.0),
+        ),
+        Sample(
+            t_s=3.0,
+            uav="1:1",
+            pointing_bound_rad=None,
+            off_rad=None,
+            codebook_best=3,
+            sweep_share=1.0,
+            missed=None,
+            as_set=worth(
+                6.0, method=Method.REGULARISED, condition_number=50.0, group=2, sinr_db=-math.inf
+            ),
+            sharp=worth(16.0),
+        ),
+    ]
     row = summed_up(samples)
     assert (row["n"], row["without_beam"], row["n_true"]) == (3, 1, 2)
     assert row["pointing_bound_median_deg"] == pytest.approx(math.degrees(0.04))
@@ -126,7 +165,7 @@ def test_sums_by_hand() -> None:
 
 
 def test_without_beams_nothing_is_known() -> None:
-    row = summed_up([Sample(0.0, "1:1"), Sample(1.0, "1:1")])
+    row = summed_up([Sample(t_s=0.0, uav="1:1"), Sample(t_s=1.0, uav="1:1")])
     assert (row["n"], row["without_beam"]) == (0, 2)
     counts = {"n", "without_beam", "n_true", "sharp_n"}
     assert all(row[key] is None for key in row.keys() - counts)
@@ -280,7 +319,9 @@ def test_nothing_is_guaranteed_past_the_edge_of_coverage(
     assert sample.pointing_bound_rad is not None
     off_rad = math.acos(_unit(beam.azimuth_rad, beam.elevation_rad)[0])
     for share, sure in ((0.9, False), (1.1, True)):
-        pipeline.coverage = Coverage(2 * (off_rad + share * sample.pointing_bound_rad))
+        pipeline.coverage = Coverage(
+            field_of_view_rad=2 * (off_rad + share * sample.pointing_bound_rad)
+        )
         found = {s.uav: s.as_set for s in look(sight(pipeline), update, None, 0.0)}["2:1"]
         pipeline.coverage = EVERYWHERE
         assert found is not None
@@ -305,7 +346,7 @@ def test_an_untracked_carrier_leaves_no_beam(looked: tuple[Pipeline, Update]) ->
     pipeline, update = looked
     lost = replace(update, carrier=None)
     samples = look(sight(pipeline), lost, None, 3.0)
-    assert samples == [Sample(3.0, track.uav) for track in update.tracks]
+    assert samples == [Sample(t_s=3.0, uav=track.uav) for track in update.tracks]
 
 
 # --- the truth ----------------------------------------------------------------------------------
@@ -370,7 +411,10 @@ def test_past_the_end_of_the_truth_nothing_is_known(
     assert truth.carrier is not None
     whole = truth.carrier.flight.truth
     begun = Trajectory(
-        whole.kind, whole.t_ns[:9], whole.position_ned_m[:9], whole.velocity_ned_mps[:9]
+        kind=whole.kind,
+        t_ns=whole.t_ns[:9],
+        position_ned_m=whole.position_ned_m[:9],
+        velocity_ned_mps=whole.velocity_ned_mps[:9],
     )
     lost = replace(truth.carrier, flight=replace(truth.carrier.flight, truth=begun))
     unseen = replace(truth, carrier=lost)
@@ -449,12 +493,29 @@ def test_figures_show_the_worst_and_leave_gaps() -> None:
     """Forty looks; in ten nothing is guaranteed, and one gain is low."""
     samples = tuple(
         Sample(
-            float(t), "1:1", 0.1, None, 0, 0.5 if t == 7 else 0.25, None,
-            worth(0.0 if t == 31 else 10.0, guaranteed_gain_db=None if 10 <= t < 20 else 5.0),
+            t_s=float(t),
+            uav="1:1",
+            pointing_bound_rad=0.1,
+            off_rad=None,
+            codebook_best=0,
+            sweep_share=0.5 if t == 7 else 0.25,
+            missed=None,
+            as_set=worth(
+                0.0 if t == 31 else 10.0, guaranteed_gain_db=None if 10 <= t < 20 else 5.0
+            ),
         )
         for t in range(40)
-    )  # fmt: skip
-    watched = Watched("log", "home", "array", 64, None, True, 40, samples)
+    )
+    watched = Watched(
+        log="log",
+        center="home",
+        array="array",
+        codebook_beams=64,
+        truth=None,
+        widen=True,
+        looks=40,
+        samples=samples,
+    )
     drawn = charts(watched)
     gain = curves(drawn["gain"]().axes[0])
     assert gain.keys() == {"predicted", "guaranteed"}  # without truth nothing is true
@@ -477,12 +538,29 @@ def test_figures_show_the_worst_and_leave_gaps() -> None:
 def test_a_value_between_two_gaps_is_a_dot() -> None:
     samples = tuple(
         Sample(
-            float(t), "1:1", 0.1, None, 0, 0.5, None,
-            worth(10.0, guaranteed_gain_db=5.0 if t in (8, 9) else None),
+            t_s=float(t),
+            uav="1:1",
+            pointing_bound_rad=0.1,
+            off_rad=None,
+            codebook_best=0,
+            sweep_share=0.5,
+            missed=None,
+            as_set=worth(10.0, guaranteed_gain_db=5.0 if t in (8, 9) else None),
         )
         for t in range(20)
-    )  # fmt: skip
-    axes = charts(Watched("log", "home", "array", 64, None, True, 20, samples))["gain"]().axes[0]
+    )
+    axes = charts(
+        Watched(
+            log="log",
+            center="home",
+            array="array",
+            codebook_beams=64,
+            truth=None,
+            widen=True,
+            looks=20,
+            samples=samples,
+        )
+    )["gain"]().axes[0]
     dots = [line.get_xydata() for line in axes.lines if line.get_marker() == "."]
     places = np.concatenate([np.asarray(each) for each in dots])
     assert len(places) == 1
@@ -598,7 +676,7 @@ def test_without_a_center_it_says_where_the_array_stands(tmp_path: Path) -> None
 
 def test_a_rate_that_is_none() -> None:
     with pytest.raises(ValueError, match="--hz 1001"):
-        BeamStudy((), (), 1001.0)
+        BeamStudy(flights=(), settings=(), hz=1001.0)
 
 
 def test_where_a_bound_does_not_hold_no_more_is_lost(short: Path) -> None:

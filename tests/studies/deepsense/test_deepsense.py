@@ -56,8 +56,8 @@ def test_no_predictor_sees_what_is_tested() -> None:
     tested = blocks(len(beam), 20, 5)[1]
     lied = np.where(tested, (beam * 7 + 3) % BEAMS, beam)
     for predictor in study.PREDICTORS.values():
-        honest = predictor(Samples("x", place, beam, BEAMS), ~tested)(~tested)
-        other = predictor(Samples("x", place, lied, BEAMS), ~tested)(~tested)
+        honest = predictor(Samples(name="x", place=place, beam=beam, beams=BEAMS), ~tested)(~tested)
+        other = predictor(Samples(name="x", place=place, beam=lied, beams=BEAMS), ~tested)(~tested)
         np.testing.assert_array_equal(honest[tested], other[tested])
 
 
@@ -82,7 +82,9 @@ def test_a_height_is_found_and_tells_beams_that_the_bearing_does_not() -> None:
 
 def test_the_expected_beam_by_hand() -> None:
     """3 across, 4 away and 12 up are a sine of 3/13; looking the other way it is its negative."""
-    at = geometry.Geometry(0.0, 0.0, np.log(2.0), 0.0, 16.0, 26.0, 12.0, 0.0)
+    at = geometry.Geometry(
+        x=0.0, y=0.0, stretch=np.log(2.0), yaw=0.0, middle=16.0, slope=26.0, height=12.0, lag=0.0
+    )
     np.testing.assert_allclose(at.beams(np.array([[2.0, 3.0]])), [16 + 26 * 3 / 13])
     turned = replace(at, yaw=np.pi)
     np.testing.assert_allclose(turned.beams(np.array([[2.0, 3.0]])), [16 - 26 * 3 / 13])
@@ -110,19 +112,23 @@ def test_a_delay_is_a_shift() -> None:
 def test_what_stays_where_it_is_counts_little() -> None:
     """Of 500 samples in flight all count; of 500 that hover, a tenth."""
     way = np.concatenate([np.arange(500.0), np.full(500, 499.0)])
-    apart = Samples("x", np.stack([way, 0 * way], axis=1), np.ones(1000, int), BEAMS).apart()
+    apart = Samples(
+        name="x", place=np.stack([way, 0 * way], axis=1), beam=np.ones(1000, int), beams=BEAMS
+    ).apart()
     assert apart[:500].all() and apart[500:].sum() == 50
-    rest = Samples("x", np.zeros((300, 2)), np.ones(300, int), BEAMS).apart()
+    rest = Samples(name="x", place=np.zeros((300, 2)), beam=np.ones(300, int), beams=BEAMS).apart()
     assert 25 <= rest.sum() <= 35
 
 
 def test_the_density_is_of_what_is_near_and_else_beside_the_expected_beam() -> None:
     """Learned where beams 10 and 12 are expected, 10 and 13 are best; of 20 nothing is known."""
-    at = geometry.Geometry(0.0, 0.0, 0.0, 0.0, 0.0, 32.0, 0.0, 0.0)
+    at = geometry.Geometry(
+        x=0.0, y=0.0, stretch=0.0, yaw=0.0, middle=0.0, slope=32.0, height=0.0, lag=0.0
+    )
     sine = np.repeat([10.0, 12.0, 20.0], 50) / 32
     place = np.stack([np.sqrt(1 - sine**2), sine], axis=1) * np.linspace(1, 50, 150)[:, None]
     beam = np.repeat([10, 13, 25], 50)
-    samples = Samples("x", place, beam, BEAMS)
+    samples = Samples(name="x", place=place, beam=beam, beams=BEAMS)
     likely = predictors.density(samples, np.arange(150) < 100, at, 0.25, 5.0)
     np.testing.assert_allclose(likely.sum(axis=1), 1.0)
     assert likely[[0, 60, 120]].argmax(axis=1).tolist() == [10, 13, 20]
@@ -135,7 +141,7 @@ def test_the_density_is_of_what_is_near_and_else_beside_the_expected_beam() -> N
 
 def test_predictions_are_averaged_over_geometries() -> None:
     place, beam = flown(5, 600)
-    samples, learned = Samples("x", place, beam, BEAMS), np.arange(600) < 500
+    samples, learned = Samples(name="x", place=place, beam=beam, beams=BEAMS), np.arange(600) < 500
     at = geometry.fit(place, beam, learned, BEAMS)
     doubted = predictors._doubted(samples, learned, at)
     assert len(set(doubted)) == 4
@@ -150,7 +156,7 @@ def test_a_threshold_covers_in_other_blocks() -> None:
     beam = np.random.default_rng(3).permutation(count) % 2
     chance = np.random.default_rng(4).permutation(count) / count
     likely = np.where(np.arange(2) == beam[:, None], chance[:, None], 1 - chance[:, None])
-    samples = Samples("x", np.zeros((count, 2)), beam, 2)
+    samples = Samples(name="x", place=np.zeros((count, 2)), beam=beam, beams=2)
     seen = []
 
     def fitted(mask: BoolArray) -> FloatArray:

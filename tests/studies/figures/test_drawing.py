@@ -8,9 +8,15 @@ from companion.studies.figures.drawing import Drawing, Line, Words, svg
 
 
 def test_svg_says_what_is_drawn() -> None:
-    words = (Words(30, 20, "a < b & c", "end", 11.0, "#555555"),)
+    words = (Words(x=30, y=20, text="a < b & c", anchor="end", size=11.0, colour="#555555"),)
     text = svg(
-        Drawing(60, 40, "x > y", (Line(np.array([[1.0, 2.0], [3.0, 4.25]]), dash=(6, 3)),), words)
+        Drawing(
+            width=60,
+            height=40,
+            title="x > y",
+            lines=(Line(points=np.array([[1.0, 2.0], [3.0, 4.25]]), dash=(6, 3)),),
+            words=words,
+        )
     )
     root = ElementTree.fromstring(text)
     polyline, said = root.find("{*}polyline"), root.find("{*}text")

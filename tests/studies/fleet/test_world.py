@@ -28,7 +28,7 @@ def settled(sky: Sky, told: FleetSettings = SETTINGS) -> World:
 
 
 def test_every_uav_has_one_node() -> None:
-    world = settled(Sky(3, 100, sampled=10, loss=0.02))
+    world = settled(Sky(nodes=3, uavs=100, sampled=10, loss=0.02))
     world.run(10)
     once, _, none = shares(world.counted)
     assert once >= 0.999
@@ -36,7 +36,7 @@ def test_every_uav_has_one_node() -> None:
 
 
 def test_clocks_apart_by_seconds_are_found_and_no_lies() -> None:
-    world = settled(Sky(4, 20, sampled=10))
+    world = settled(Sky(nodes=4, uavs=20, sampled=10))
     for name, member in world.members.items():
         for other, known in member.neighbours.items():
             ahead = known.clock.newest()
@@ -48,7 +48,7 @@ def test_clocks_apart_by_seconds_are_found_and_no_lies() -> None:
 
 
 def test_a_death_leaves_nobody_alone_for_two_seconds() -> None:
-    world = settled(Sky(3, 60, sampled=0, spacing_m=500))
+    world = settled(Sky(nodes=3, uavs=60, sampled=0, spacing_m=500))
     victim = max(world.members, key=lambda name: len(world.members[name].duties.serves))
     orphans = set(world.members[victim].duties.serves)
     assert orphans
@@ -68,7 +68,9 @@ def test_a_death_leaves_nobody_alone_for_two_seconds() -> None:
 def test_parted_nobody_is_unserved_and_it_heals(
     nodes: int, loss: float, delay_s: float, cut: int, seed: int
 ) -> None:
-    sky = Sky(nodes, 20, 400.0, loss=loss, delay_s=delay_s, sampled=0, seed=seed)
+    sky = Sky(
+        nodes=nodes, uavs=20, spacing_m=400.0, loss=loss, delay_s=delay_s, sampled=0, seed=seed
+    )
     world = settled(sky)
     left = set(list(world.members)[:cut])
     world.parted = lambda one, other: (one in left) != (other in left)
@@ -87,7 +89,7 @@ def test_parted_nobody_is_unserved_and_it_heals(
 def test_reports_are_told_about_once(sampled: int) -> None:
     """All hear all; after the first moments each report is told by one of them."""
     several = SETTINGS.model_copy(update={"share_hz": 100.0})  # in a word, with its head
-    world = settled(Sky(3, sampled, 300.0, sampled=sampled), several)
+    world = settled(Sky(nodes=3, uavs=sampled, spacing_m=300.0, sampled=sampled), several)
     world.run(5)
     bits = 8 * world.counted.sent["heard"] / 5
     frames = sampled * world.sky.report_hz
@@ -98,7 +100,7 @@ def test_what_a_node_is_told_does_not_grow_with_a_fleet_that_spreads() -> None:
     """Four times as many nodes on four times the area: each has the like around it."""
     told = []
     for nodes in (4, 16):
-        sky = Sky(nodes, 2 * nodes, 9000.0, sampled=2 * nodes, report_hz=1.0)
+        sky = Sky(nodes=nodes, uavs=2 * nodes, spacing_m=9000.0, sampled=2 * nodes, report_hz=1.0)
         world = World(sky, SETTINGS)
         world.run(5)
         world.counted = Counted()
@@ -112,7 +114,7 @@ def test_what_a_node_is_told_does_not_grow_with_a_fleet_that_spreads() -> None:
 
 
 def test_what_is_told_arrives_with_its_heads() -> None:
-    world = World(Sky(3, 10, 400.0, loss=0.0, sampled=5), SETTINGS)
+    world = World(Sky(nodes=3, uavs=10, spacing_m=400.0, loss=0.0, sampled=5), SETTINGS)
     world.run(3)
     world.counted = Counted()
     world.sky = replace(world.sky, delay_s=0.0)
@@ -123,7 +125,7 @@ def test_what_is_told_arrives_with_its_heads() -> None:
 
 
 def test_parted_nothing_arrives_and_dead_nothing_is_heard() -> None:
-    world = settled(Sky(3, 10, 400.0, sampled=5))
+    world = settled(Sky(nodes=3, uavs=10, spacing_m=400.0, sampled=5))
     world.parted = lambda one, other: True
     world.run(1)
     assert world.counted.sent
@@ -138,7 +140,7 @@ def test_parted_nothing_arrives_and_dead_nothing_is_heard() -> None:
 
 
 def test_a_clock_is_known_to_the_way_there_and_back() -> None:
-    world = settled(Sky(2, 0, delay_s=0.05))
+    world = settled(Sky(nodes=2, uavs=0, delay_s=0.05))
     for member in world.members.values():
         for known in member.neighbours.values():
             ahead = known.clock.newest()

@@ -36,7 +36,9 @@ def drawn() -> Maps:
 def margin(dt_s: float, feedthrough_s: float, alpha: float, mu: float) -> float:
     """The best margin of the LMIs over all gains at a mu: the definition, by scanning."""
     return max(
-        closed_form.lmi_margin(dt_s, feedthrough_s, alpha, l_gain, mu, 1 / mu)
+        closed_form.lmi_margin(
+            dt_s, feedthrough_s=feedthrough_s, alpha=alpha, l_gain=l_gain, mu=mu, p=1 / mu
+        )
         for l_gain in np.linspace(0.0, 2.0, 401)
     )
 

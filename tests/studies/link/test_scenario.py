@@ -19,7 +19,9 @@ def scenario() -> Scenario:
 
 def test_the_circles_are_those_of_the_replay() -> None:
     for circle in PAPER:
-        flown = Flown(circle.radius_m, 0.5, circle.phase_rad, 0.0)
+        flown = Flown(
+            radius_m=circle.radius_m, rate_radps=0.5, phase_rad=circle.phase_rad, height_m=0.0
+        )
         for t_s in (0.0, 1.7, 33.3):
             position, velocity = circle.at(t_s)
             assert position == pytest.approx(flown(t_s).position_ned_m)

@@ -173,9 +173,19 @@ def test_the_least_mu_of_a_gain_is_certified_and_less_is_not(
     mu = scenario.gain_mu(dt_s, feedthrough_s, alpha, gain)
     if not 1e-3 < mu < 1e3:
         return
-    assert closed_form.lmi_margin(dt_s, feedthrough_s, alpha, gain, mu, 1 / mu) >= -1e-9
+    assert (
+        closed_form.lmi_margin(
+            dt_s, feedthrough_s=feedthrough_s, alpha=alpha, l_gain=gain, mu=mu, p=1 / mu
+        )
+        >= -1e-9
+    )
     less = 0.99 * mu
-    assert closed_form.lmi_margin(dt_s, feedthrough_s, alpha, gain, less, 1 / less) < 0
+    assert (
+        closed_form.lmi_margin(
+            dt_s, feedthrough_s=feedthrough_s, alpha=alpha, l_gain=gain, mu=less, p=1 / less
+        )
+        < 0
+    )
     assert mu >= closed_form.mu_star(dt_s, feedthrough_s, alpha) * (1 - 1e-9)
 
 
@@ -232,14 +242,17 @@ def test_the_blockages_are_the_same_for_every_scheme(answer: dict[str, Any]) -> 
 
 def test_the_same_seed_gives_the_same_rates(flight: Flight) -> None:
     short = Flight(
-        flight.scenario, flight.position_m[:12], flight.input_mps[:11], flight.report_m[:11]
+        scenario=flight.scenario,
+        position_m=flight.position_m[:12],
+        input_mps=flight.input_mps[:11],
+        report_m=flight.report_m[:11],
     )
     rates = np.array([0.0, 60.0])
 
     def rates_of(seed: int) -> dict[str, list[float]]:
         rng = np.random.default_rng(seed)
         aimed = {"right": short.position_m}
-        found = link.under_blockage(short, aimed, rates, 1, rng, lambda _: None)
+        found = link.under_blockage(short, aimed, rates, draws=1, rng=rng, progress=lambda _: None)
         return {name: means.tolist() for name, means in found.schemes.items()}
 
     assert rates_of(5) == rates_of(5) != rates_of(6)

@@ -29,9 +29,11 @@ from companion.studies.paper.probing import (
 )
 from companion.values import FloatArray
 
-LINE = uniform_linear(64, 30e9, 0.5, np.eye(3))
-PANEL = uniform_rectangular(8, 8, 30e9, 0.5, np.eye(3))
-BUDGET = LinkBudget(40.0, 50e6, 7.0)
+LINE = uniform_linear(64, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
+PANEL = uniform_rectangular(
+    8, columns=8, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3)
+)
+BUDGET = LinkBudget(tx_power_dbm=40.0, bandwidth_hz=50e6, noise_figure_db=7.0)
 HALF_BEAM_RAD = math.radians(0.79)
 NO_ECHO = np.array([0.0])
 
@@ -60,7 +62,9 @@ def flown(
     state = started(in_plane(float(azimuths_rad[0])))
     states = []
     for azimuth, strength in zip(azimuths_rad, snr, strict=True):
-        state = step(probing, array, state, in_plane(azimuth), np.array([strength]), rng)
+        state = step(
+            probing, array, state, directions=in_plane(azimuth), snr=np.array([strength]), rng=rng
+        )
         states.append(state)
     return states
 
@@ -71,7 +75,7 @@ def flown(
 def test_the_echo_by_hand() -> None:
     """Out and back: power density at the UAV, what it scatters, what the aperture collects."""
     probing = EchoProbing(cross_section_m2=0.05, dwell_s=1e-3)
-    found = echo_snr(probing, BUDGET, LINE, in_plane(0.0), np.array([200.0]))
+    found = echo_snr(probing, BUDGET, LINE, directions=in_plane(0.0), ranges_m=np.array([200.0]))
     sphere = 4 * math.pi * 200.0**2
     scattered_w = 10.0 * 64 / sphere * 0.05
     collected_w = scattered_w / sphere * 64 * LINE.wavelength_m**2 / (4 * math.pi)
@@ -84,19 +88,31 @@ def test_what_weakens_the_echo() -> None:
     """Range to the fourth; a blockage on both ways; the power shared with others; the element."""
     probing = EchoProbing()
     where, at = in_plane(0.0, 0.0), np.array([100.0, 200.0])
-    near, far = echo_snr(probing, BUDGET, LINE, where, at)
+    near, far = echo_snr(probing, BUDGET, LINE, directions=where, ranges_m=at)
     assert near / far == pytest.approx(16.0)
-    assert echo_snr(probing, BUDGET, LINE, where[:1], at[:1]) == pytest.approx([2 * near])
-    blocked = echo_snr(probing, BUDGET, LINE, where, at, np.array([25.0, 0.0]))
+    assert echo_snr(probing, BUDGET, LINE, directions=where[:1], ranges_m=at[:1]) == pytest.approx(
+        [2 * near]
+    )
+    blocked = echo_snr(
+        probing, BUDGET, LINE, directions=where, ranges_m=at, attenuation_db=np.array([25.0, 0.0])
+    )
     assert blocked == pytest.approx([near * 1e-5, far])
-    patch = uniform_linear(64, 30e9, 0.5, np.eye(3), Element(Pattern.COSINE))
-    seen = echo_snr(probing, BUDGET, patch, in_plane(0.0, math.pi), at)
+    patch = uniform_linear(
+        64,
+        30e9,
+        spacing_wavelengths=0.5,
+        array_from_body=np.eye(3),
+        element=Element(Pattern.COSINE),
+    )
+    seen = echo_snr(probing, BUDGET, patch, directions=in_plane(0.0, math.pi), ranges_m=at)
     assert seen == pytest.approx([near * 4.0**2, 0.0])  # 2 (q + 1) = 4, both ways
     with pytest.raises(ValueError, match="ranges_m"):
-        echo_snr(probing, BUDGET, LINE, where, np.array([100.0, 0.0]))
+        echo_snr(probing, BUDGET, LINE, directions=where, ranges_m=np.array([100.0, 0.0]))
 
 
-CIRCLE = uniform_circular(16, 30e9, 0.5, np.eye(3), Element(Pattern.COSINE))
+CIRCLE = uniform_circular(
+    16, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3), element=Element(Pattern.COSINE)
+)
 
 
 @pytest.mark.parametrize("array", [LINE, PANEL, CIRCLE], ids=["line", "panel", "circle"])
@@ -115,7 +131,9 @@ def test_alignment_is_the_gain_lost_by_pointing_off(array: Array) -> None:
 
 def test_a_beam_is_at_half_power_at_its_half_width() -> None:
     assert alignment(LINE, in_plane(0.0), in_plane(HALF_BEAM_RAD)) == pytest.approx([0.5], abs=0.01)
-    patch = uniform_linear(8, 30e9, 0.5, np.eye(3), Element(Pattern.COSINE))
+    patch = uniform_linear(
+        8, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3), element=Element(Pattern.COSINE)
+    )
     assert alignment(patch, in_plane(0.0), in_plane(math.pi)).tolist() == [0.0]
 
 
@@ -138,7 +156,11 @@ def test_the_error_of_a_line_is_the_published_bound(azimuth_rad: float) -> None:
 
 def test_the_error_is_what_the_best_receiver_has() -> None:
     """Maximum likelihood, simulated: the peak of the beamformed snapshot, elements and noise."""
-    line, true_sine, snr = uniform_linear(16, 30e9, 0.5, np.eye(3)), 0.3, 400.0
+    line, true_sine, snr = (
+        uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3)),
+        0.3,
+        400.0,
+    )
     rng = np.random.default_rng(6)
     index = np.arange(16)
     signal = math.sqrt(snr / 16) * np.exp(1j * np.pi * index * true_sine)
@@ -154,7 +176,9 @@ def test_the_error_is_what_the_best_receiver_has() -> None:
 @pytest.mark.parametrize("element", [Element(), Element(Pattern.TR38901)], ids=["same", "3gpp"])
 def test_the_error_of_any_array_is_the_inverse_of_its_information(element: Element) -> None:
     """Fisher information by numerical derivatives of the snapshot, amplitude and phase unknown."""
-    array = uniform_circular(12, 30e9, 0.5, np.eye(3), element)
+    array = uniform_circular(
+        12, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3), element=element
+    )
     true = np.array([0.48, 0.64, 0.6])
     axes = np.array([[-0.8, 0.6, 0.0], [-0.36, -0.48, 0.8]])
     snr, h = 50.0, 1e-6
@@ -225,12 +249,19 @@ def test_an_echo_moves_the_estimate_by_the_gains() -> None:
         interval_s=0.02, position_gain=0.6, rate_gain=0.3, patience_intervals=0, sweep_beams=1
     )
     rng = np.random.default_rng(1)
-    state = step(probing, LINE, started(in_plane(0.5)), in_plane(0.51), np.array([1e12]), rng)
+    state = step(
+        probing,
+        LINE,
+        started(in_plane(0.5)),
+        directions=in_plane(0.51),
+        snr=np.array([1e12]),
+        rng=rng,
+    )
     assert state.pointed == pytest.approx(in_plane(0.5))
     assert state.estimate == pytest.approx(in_plane(0.506), abs=1e-6)
     assert state.turn_radps == pytest.approx(np.array([[0, 0, 0.3 * 0.01 / 0.02]]), abs=1e-4)
-    state = step(probing, LINE, state, in_plane(0.51), NO_ECHO, rng)
-    state = step(probing, LINE, state, in_plane(0.9), np.array([1e12]), rng)
+    state = step(probing, LINE, state, directions=in_plane(0.51), snr=NO_ECHO, rng=rng)
+    state = step(probing, LINE, state, directions=in_plane(0.9), snr=np.array([1e12]), rng=rng)
     assert state.estimate == pytest.approx(in_plane(0.9), abs=1e-6)
 
 
@@ -305,7 +336,14 @@ def test_pointing_off_weakens_the_echo_below_detection(spare_db: float, heard: b
     there = in_plane(HALF_BEAM_RAD)
     lost_db = -10 * math.log10(float(alignment(LINE, in_plane(0.0), there)[0]))
     snr = np.array([10 ** ((13.0 + lost_db + spare_db) / 10)])
-    state = step(probing, LINE, started(in_plane(0.0)), there, snr, np.random.default_rng(1))
+    state = step(
+        probing,
+        LINE,
+        started(in_plane(0.0)),
+        directions=there,
+        snr=snr,
+        rng=np.random.default_rng(1),
+    )
     assert bool(state.heard[0]) is heard
 
 
@@ -313,10 +351,12 @@ def test_pointing_off_weakens_the_echo_below_detection(spare_db: float, heard: b
 def test_the_codebook_weakens_the_echo_of_a_sweep(spare_db: float, heard: bool) -> None:
     probing = EchoProbing(patience_intervals=0, sweep_beams=1, sweep_loss_db=3.9)
     rng = np.random.default_rng(1)
-    lost = step(probing, LINE, started(in_plane(0.0)), in_plane(0.0), NO_ECHO, rng)
+    lost = step(
+        probing, LINE, started(in_plane(0.0)), directions=in_plane(0.0), snr=NO_ECHO, rng=rng
+    )
     assert lost.sweep_left.tolist() == [1]
     snr = np.array([10 ** ((13.0 + 3.9 + spare_db) / 10)])
-    state = step(probing, LINE, lost, in_plane(1.0), snr, rng)
+    state = step(probing, LINE, lost, directions=in_plane(1.0), snr=snr, rng=rng)
     assert not state.served[0]
     assert bool(state.heard[0]) is heard
 
@@ -330,9 +370,9 @@ def test_a_weaker_echo_is_a_worse_one() -> None:
         probing,
         LINE,
         start,
-        np.tile(there, (many, 1)),
-        np.full(many, 1000.0),
-        np.random.default_rng(3),
+        directions=np.tile(there, (many, 1)),
+        snr=np.full(many, 1000.0),
+        rng=np.random.default_rng(3),
     )
     left = float(alignment(LINE, in_plane(0.0), there)[0]) * 1000.0
     wanted = math.sqrt(6 / (left / 64 * 64 * (64**2 - 1))) / math.pi
@@ -355,7 +395,7 @@ def test_whatever_happens_the_state_is_sound(seed: int, rate_gain: float, gain: 
         true = true + 0.02 * rng.normal(size=(3, 3))
         true /= np.linalg.norm(true, axis=1, keepdims=True)
         before, snr = state, 10 ** rng.uniform(-1, 5, 3)
-        state = step(probing, PANEL, state, true, snr, rng)
+        state = step(probing, PANEL, state, directions=true, snr=snr, rng=rng)
         for vectors in (state.pointed, state.estimate):
             assert np.linalg.norm(vectors, axis=1) == pytest.approx(np.ones(3))
         assert np.abs(np.sum(state.turn_radps * state.estimate, axis=1)).max() < 1e-9
@@ -373,7 +413,14 @@ def test_uavs_do_not_disturb_one_another_and_the_seed_decides() -> None:
     def run(snr_of_last: float, seed: int) -> EchoState:
         rng, state = np.random.default_rng(seed), started(true)
         for _ in range(5):
-            state = step(probing, PANEL, state, true, np.array([100.0, 50.0, snr_of_last]), rng)
+            state = step(
+                probing,
+                PANEL,
+                state,
+                directions=true,
+                snr=np.array([100.0, 50.0, snr_of_last]),
+                rng=rng,
+            )
         return state
 
     first, again, other, alone = run(70.0, 1), run(70.0, 1), run(70.0, 2), run(0.0, 1)
@@ -387,7 +434,14 @@ def test_uavs_do_not_disturb_one_another_and_the_seed_decides() -> None:
 def test_a_step_writes_to_nothing_that_it_is_given() -> None:
     state, true = started(in_plane(0.0, 0.1)), in_plane(0.01, 0.11)
     before = [np.copy(getattr(state, f.name)) for f in dataclasses.fields(state)]
-    step(EchoProbing(), PANEL, state, true, np.array([1e6, 0.0]), np.random.default_rng(1))
+    step(
+        EchoProbing(),
+        PANEL,
+        state,
+        directions=true,
+        snr=np.array([1e6, 0.0]),
+        rng=np.random.default_rng(1),
+    )
     after = [getattr(state, f.name) for f in dataclasses.fields(state)]
     assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))
     assert np.array_equal(true, in_plane(0.01, 0.11))

@@ -16,7 +16,7 @@ def errors(gain: float, b: float, d: float, w: np.ndarray) -> tuple[np.ndarray, 
     x = estimate = np.zeros(1)
     found = []
     for wk in w:
-        made = published.step(estimate, x + d * wk, b, d, gain)
+        made = published.step(estimate, report_m=x + d * wk, dt_s=b, feedthrough_s=d, gain=gain)
         found.append(
             (
                 float(estimate[0] - x[0]),
@@ -74,7 +74,7 @@ def test_the_published_bound_fails() -> None:
 def test_at_the_optimum_there_is_no_error_at_all() -> None:
     w = np.random.default_rng(1).normal(0, 100, 100)
     assert np.abs(np.array(errors(0.3, B, D, w))).max() < 1e-9
-    scheduled = published.step(np.zeros(2), np.array([3.0, -1.0]), B, D)
+    scheduled = published.step(np.zeros(2), report_m=np.array([3.0, -1.0]), dt_s=B, feedthrough_s=D)
     assert scheduled.estimate_m == pytest.approx([0.9, -0.3])
 
 
@@ -89,7 +89,9 @@ def test_irregular_intervals_keep_the_guarantee() -> None:
         for b in dts:
             gain = closed_form.gain(b, d, alpha)
             push = np.sign((1 - gain) * (estimate - x) * (gain * d - b)) + (estimate == x)
-            made = published.step(estimate, x + d * push, b, d, alpha=alpha)
+            made = published.step(
+                estimate, report_m=x + d * push, dt_s=b, feedthrough_s=d, alpha=alpha
+            )
             x, estimate = x + b * push, made.estimate_m
             worst = max(worst, float(np.abs(estimate - x)[0] / gamma))
     assert 0.9 < worst <= 1 + 1e-9
@@ -98,4 +100,4 @@ def test_irregular_intervals_keep_the_guarantee() -> None:
 @pytest.mark.parametrize("dt_s", [0.0, -1.0, float("nan")])
 def test_an_interval_is_positive(dt_s: float) -> None:
     with pytest.raises(ValueError, match="positive"):
-        published.step(np.zeros(1), np.zeros(1), dt_s, D)
+        published.step(np.zeros(1), report_m=np.zeros(1), dt_s=dt_s, feedthrough_s=D)

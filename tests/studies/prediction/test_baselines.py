@@ -23,7 +23,13 @@ from companion.studies.prediction.kalman import Kalman, Tuning
 from companion.values import FloatArray
 
 S = 1_000_000_000
-TUNING = Tuning(0.7, 0.4, 0.15, 20.0, 4.0)
+TUNING = Tuning(
+    process_density=0.7,
+    position_noise_m=0.4,
+    velocity_noise_mps=0.15,
+    start_velocity_mps=20.0,
+    start_acceleration_mps2=4.0,
+)
 ALL: list[Callable[[], Predictor]] = [
     Hold,
     DeadReckoningOnArrival,
@@ -43,11 +49,11 @@ def observed(
 ) -> Observed:
     """A report, ``late_s`` on its way, the sender's timeline ``offset_s`` behind the node's."""
     return Observed(
-        round((sent_s + late_s) * S),
-        round(sent_s * S),
-        round((sent_s - offset_s) * S),
-        np.array(position, dtype=float),
-        None if velocity is None else np.array(velocity, dtype=float),
+        arrival_ns=round((sent_s + late_s) * S),
+        sent_ns=round(sent_s * S),
+        sender_ns=round((sent_s - offset_s) * S),
+        position_ned_m=np.array(position, dtype=float),
+        velocity_ned_mps=None if velocity is None else np.array(velocity, dtype=float),
     )
 
 
@@ -228,7 +234,17 @@ def test_filter_is_the_least_squares_fit(states: int, count: int) -> None:
 
 @pytest.mark.parametrize("states", [2, 3])
 def test_several_filters_at_once_are_each_their_own(states: int) -> None:
-    tunings = [TUNING, Tuning(0.3, 0.05, 0.7, 3.0, 1.0), Tuning(90.0, 2.0, 0.2)]
+    tunings = [
+        TUNING,
+        Tuning(
+            process_density=0.3,
+            position_noise_m=0.05,
+            velocity_noise_mps=0.7,
+            start_velocity_mps=3.0,
+            start_acceleration_mps2=1.0,
+        ),
+        Tuning(process_density=90.0, position_noise_m=2.0, velocity_noise_mps=0.2),
+    ]
     together, alone = Kalman(states, *tunings), [Kalman(states, each) for each in tunings]
     for report in wandering(20):
         for predictor in (together, *alone):
@@ -252,7 +268,7 @@ def test_order_of_arrival_does_not_matter(states: int) -> None:
 
 def test_a_report_older_than_the_history_is_dropped() -> None:
     reports = wandering(kalman.HISTORY + 20)
-    stiff = Tuning(1e-6)  # it remembers, so that beginning anew would show
+    stiff = Tuning(process_density=1e-6)  # it remembers, so that beginning anew would show
     whole, late = Kalman(2, stiff), Kalman(2, stiff)
     for report in reports[1:]:
         whole.report(report)

@@ -79,9 +79,13 @@ def asked(truth_ned_m: np.ndarray, array_ned_m: np.ndarray) -> Questions:
     """One lead, everything counts."""
     n = len(truth_ned_m)
     return Questions(
-        np.arange(n), np.zeros(1, dtype=np.int64), truth_ned_m[None], array_ned_m[None],
-        np.ones((1, n), dtype=bool), np.zeros((1, n), dtype=bool),
-    )  # fmt: skip
+        now_ns=np.arange(n),
+        leads_ns=np.zeros(1, dtype=np.int64),
+        truth_ned_m=truth_ned_m[None],
+        array_ned_m=array_ned_m[None],
+        counts=np.ones((1, n), dtype=bool),
+        in_fault=np.zeros((1, n), dtype=bool),
+    )
 
 
 def test_scores_by_hand() -> None:
@@ -90,7 +94,11 @@ def test_scores_by_hand() -> None:
     true = array + np.array([100.0, 0.0, 0.0])
     errors = np.array([[0, 0, 0], [0, 1, 0], [0, 0, -2], [5, 0, 0]], dtype=float)
     usual = np.array([[np.nan, 1.0, 1.9, 6.0]])
-    given = Answers((true + errors)[None], np.array([[0.5, 0.5, 3.0, 4.0]]), usual)
+    given = Answers(
+        position_ned_m=(true + errors)[None],
+        bound_m=np.array([[0.5, 0.5, 3.0, 4.0]]),
+        usual_m=usual,
+    )
     found = score(asked(true, array), given, 0)
     assert found is not None
     angles = [0.0, math.degrees(math.atan(0.01)), math.degrees(math.atan(0.02)), 0.0]
@@ -110,11 +118,20 @@ def test_without_bounds_or_answers() -> None:
     true = np.array([[100.0, 0, 0], [0, 100.0, 0]])
     both = asked(true, np.zeros((2, 3)))
     nothing = np.full((1, 2), np.nan)
-    one = Answers(np.array([[[100.0, 0, 0], [np.nan] * 3]]), nothing, nothing)
+    one = Answers(
+        position_ned_m=np.array([[[100.0, 0, 0], [np.nan] * 3]]), bound_m=nothing, usual_m=nothing
+    )
     found = score(both, one, 0)
     assert found is not None
     assert (found["n"], found["bound_median_m"], found["usual_covers"]) == (1, None, None)
-    assert score(both, Answers(np.full((1, 2, 3), np.nan), nothing, nothing), 0) is None
+    assert (
+        score(
+            both,
+            Answers(position_ned_m=np.full((1, 2, 3), np.nan), bound_m=nothing, usual_m=nothing),
+            0,
+        )
+        is None
+    )
 
 
 def test_angles_are_exact_when_small_and_when_large() -> None:
@@ -134,13 +151,24 @@ class Witness:
 
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
         assert max(self.arrived) <= now_ns <= at_ns
-        return Predicted(np.array([now_ns, at_ns, len(self.arrived)], dtype=float), None, 1.0)
+        return Predicted(
+            position_ned_m=np.array([now_ns, at_ns, len(self.arrived)], dtype=float),
+            velocity_ned_mps=None,
+            bound_m=1.0,
+        )
 
 
 def flown(flight: Flight) -> Flown:
     """A log of one flight, seen from the origin."""
     span = (int(flight.arrival_ns[0]), int(flight.arrival_ns[-1]))
-    return Flown("made-up", "home", (flight,), np.zeros(3), span, (47.4, 8.5, 400.0))
+    return Flown(
+        log="made-up",
+        center="home",
+        flights=(flight,),
+        carrier=np.zeros(3),
+        span_ns=span,
+        origin=(47.4, 8.5, 400.0),
+    )
 
 
 def test_only_what_has_arrived_is_used(straight_flight: Callable[..., Flight]) -> None:
@@ -163,9 +191,12 @@ def test_a_straight_flight_is_all_latency(straight_flight: Callable[..., Flight]
     """Each rival errs by its speed times what it does not know of the time, and by no more."""
     flight = straight_flight(1200)
     at_once = Settings().override(observer={"lag_s": (0.0, 0.0)})
-    setting = PredictionStudy((Path("x"),), leads_s=(0.0, 1.0), settings=at_once)
+    setting = PredictionStudy(logs=(Path("x"),), leads_s=(0.0, 1.0), settings=at_once)
     speed_mps = float(np.linalg.norm(flight.velocity_ned_mps[0]))
-    for link in (CLEAN, RadioLink("radio", 1.2, (0.6, 2.2), 0.1, known_delay=True)):
+    for link in (
+        CLEAN,
+        RadioLink(name="radio", rate_hz=1.2, latency_s=(0.6, 2.2), loss=0.1, known_delay=True),
+    ):
         found = compare(flown(flight), link, setting)
         rms = {(r["predictor"], r["lead_s"]): r["position_rms_m"] for r in found.rows}
         assert {name for name, _ in rms} == NAMES
@@ -200,7 +231,7 @@ def test_the_grid_is_searched(straight_flight: Callable[..., Flight]) -> None:
         position_ned_m=flight.position_ned_m + rng.normal(0, 1.0, (300, 3)),
         velocity_ned_mps=flight.velocity_ned_mps + rng.normal(0, 0.5, (300, 3)),
     )
-    found = compare(flown(noisy), CLEAN, PredictionStudy((Path("x"),)))
+    found = compare(flown(noisy), CLEAN, PredictionStudy(logs=(Path("x"),)))
     by_name = {row["predictor"]: row["position_rms_m"] for row in found.rows}
     assert "kalman-peng" not in found.tuned
     assert found.tuned["kalman-cv"].process_density == 0.1  # the least of the grid
@@ -376,7 +407,7 @@ def compared(log: str, link: RadioLink, angles: dict[str, list[float | None]]) -
         for name, of_leads in angles.items()
         for lead_s, angle in enumerate(of_leads)
     )
-    return Compared(log, "5:1", link, rows, {})
+    return Compared(log=log, center="5:1", link=link, rows=rows, tuned={})
 
 
 def test_the_figure_shows_every_angle_and_tells_predictors_apart() -> None:
@@ -439,7 +470,12 @@ def test_the_table_that_was_measured_before() -> None:
     for link in (CLEAN, RADIO):
         delivery = deliver(flight, link, 1, lambda: assembly.clock(Settings()))
         plan = questions(log, flight, LEADS_S[:3], delivery.observed[0].arrival_ns)
-        makes = {**SIMPLE, "kalman-cv": lambda: Kalman(2, Tuning(30.0, 0.03, 0.3))}
+        makes = {
+            **SIMPLE,
+            "kalman-cv": lambda: Kalman(
+                2, Tuning(process_density=30.0, position_noise_m=0.03, velocity_noise_mps=0.3)
+            ),
+        }
         for name, make in makes.items():
             given = answers(make(), delivery.observed, plan)
             for lead, expected in enumerate(MEASURED[link.name][name]):

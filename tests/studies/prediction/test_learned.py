@@ -78,7 +78,13 @@ def test_it_has_learned_more_than_straight_flight(trained: Path) -> None:
 def observed(made_s: float, position: list[float], velocity: list[float] | None) -> Observed:
     t_ns = round(made_s * S)
     speed = None if velocity is None else np.array(velocity, dtype=float)
-    return Observed(t_ns, t_ns, t_ns, np.array(position, dtype=float), speed)
+    return Observed(
+        arrival_ns=t_ns,
+        sent_ns=t_ns,
+        sender_ns=t_ns,
+        position_ned_m=np.array(position, dtype=float),
+        velocity_ned_mps=speed,
+    )
 
 
 def test_it_answers_whatever_comes(trained: Path) -> None:

@@ -39,7 +39,15 @@ def test_a_filter_of_known_noise_against_one_written_out() -> None:
     ours = Kalman(2, tuning)
     for t_s, (p, v) in zip(times_s, measured, strict=True):
         t_ns = round(t_s * S)
-        ours.report(Observed(t_ns, t_ns, t_ns, np.array([p, 0, 0]), np.array([v, 0, 0])))
+        ours.report(
+            Observed(
+                arrival_ns=t_ns,
+                sent_ns=t_ns,
+                sender_ns=t_ns,
+                position_ned_m=np.array([p, 0, 0]),
+                velocity_ned_mps=np.array([v, 0, 0]),
+            )
+        )
     now_ns = round(times_s[-1] * S)
     found = ours.predict(now_ns, now_ns + S // 2)
     assert found is not None

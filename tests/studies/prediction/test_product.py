@@ -111,7 +111,7 @@ def test_a_radio_thins_each_kind_of_message(circling: Flown) -> None:
 
 def test_a_known_clock_is_known_by_round_trips(straight_flight: Callable[..., Flight]) -> None:
     flight = straight_flight(600)
-    known = RadioLink("radio", 1.2, (0.6, 2.2), 0.1, known_delay=True)
+    known = RadioLink(name="radio", rate_hz=1.2, latency_s=(0.6, 2.2), loss=0.1, known_delay=True)
     for link, bound_s in ((RADIO, 0.1), (known, 0.05)):
         pipeline = Pipeline(Settings())
         for event in deliver(flight, link, 1).events:
@@ -156,12 +156,21 @@ def asked_and_given(
     n = len(errors_m)
     truth = np.zeros((1, n, 3))
     asked = Questions(
-        np.arange(n) * S, np.zeros(1, dtype=np.int64), truth, truth + 100.0,
-        np.ones((1, n), dtype=bool), np.zeros((1, n), dtype=bool),
-    )  # fmt: skip
+        now_ns=np.arange(n) * S,
+        leads_ns=np.zeros(1, dtype=np.int64),
+        truth_ned_m=truth,
+        array_ned_m=truth + 100.0,
+        counts=np.ones((1, n), dtype=bool),
+        in_fault=np.zeros((1, n), dtype=bool),
+    )
     position = truth.copy()
     position[0, :, 0] = errors_m
-    return asked, Answers(position, np.ones((1, n)), np.ones((1, n)), refuted_ns)
+    return asked, Answers(
+        position_ned_m=position,
+        bound_m=np.ones((1, n)),
+        usual_m=np.ones((1, n)),
+        refuted_ns=refuted_ns,
+    )
 
 
 def test_violations_are_counted_and_what_was_announced_of_them() -> None:
@@ -202,12 +211,16 @@ def test_regimes_say_where() -> None:
 def test_the_product_notes_what_is_refuted_of_its_uav(
     monkeypatch: pytest.MonkeyPatch, circling: Flown
 ) -> None:
-    refuted = Refuted(5, "1:1", "acceleration_max_mps2", 5.0, 7.0, 10.5)
+    refuted = Refuted(
+        t_ns=5, uav="1:1", setting="acceleration_max_mps2", limit=5.0, proven=7.0, raised_to=10.5
+    )
     said: list[Any] = [[refuted], [replace(refuted, t_ns=6, uav="9:1"), "else"], []]
     monkeypatch.setattr(Pipeline, "step", lambda _self, _event: said.pop(0))
     asks = product(Settings(), "uio-position", "1:1", circling.origin)
     for _ in range(3):
-        asks.hear(RoundTrip(0, circling.flights[0].frames[0].source, 0, 0))
+        asks.hear(
+            RoundTrip(t_ns=0, source=circling.flights[0].frames[0].source, sent_ns=0, remote_ns=0)
+        )
     assert asks.refuted_ns == [5]
 
 

@@ -62,7 +62,13 @@ def test_the_envelope_leaves_the_constant_part(
     straight_flight: MakeFlight, known_delay: bool
 ) -> None:
     flight = straight_flight(3000)
-    delivery = deliver(flight, RadioLink("radio", 1.2, (0.6, 2.2), 0.1, known_delay), 1)
+    delivery = deliver(
+        flight,
+        RadioLink(
+            name="radio", rate_hz=1.2, latency_s=(0.6, 2.2), loss=0.1, known_delay=known_delay
+        ),
+        1,
+    )
     made_ns = {
         tuple(position): t_ns
         for position, t_ns in zip(flight.position_ned_m, flight.truth.t_ns, strict=True)
@@ -107,4 +113,4 @@ def test_the_senders_timeline_goes_on_after_a_restart(
 )
 def test_what_no_link_can_be(values: dict[str, float], says: str) -> None:
     with pytest.raises(ValueError, match=says):
-        RadioLink("radio", **values)  # type: ignore[arg-type]
+        RadioLink(name="radio", **values)  # type: ignore[arg-type]

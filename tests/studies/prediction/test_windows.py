@@ -30,7 +30,13 @@ def report(
     """Made and arrived on one timeline, the sender's 5 s behind it."""
     place = np.array(position, dtype=float)
     speed = None if velocity is None else np.array(velocity, dtype=float)
-    return Observed(arrived_ns or made_ns, made_ns, made_ns - 5 * S, place, speed)
+    return Observed(
+        arrival_ns=arrived_ns or made_ns,
+        sent_ns=made_ns,
+        sender_ns=made_ns - 5 * S,
+        position_ned_m=place,
+        velocity_ned_mps=speed,
+    )
 
 
 def seen(*reports: Observed) -> np.ndarray:

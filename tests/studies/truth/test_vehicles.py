@@ -29,7 +29,12 @@ def cubic(t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def test_interpolation_is_exact_for_a_cubic() -> None:
     t_s = np.array([0.0, 0.4, 1.0, 2.5])
     position, velocity = cubic(t_s)
-    trajectory = Trajectory("reports", np.round(t_s * S).astype(np.int64), position, velocity)
+    trajectory = Trajectory(
+        kind="reports",
+        t_ns=np.round(t_s * S).astype(np.int64),
+        position_ned_m=position,
+        velocity_ned_mps=velocity,
+    )
     asked_s = np.array([0.0, 0.1, 0.4, 0.9, 1.7, 2.5])
     position, velocity = trajectory.at(np.round(asked_s * S).astype(np.int64))
     expected = cubic(asked_s)
@@ -40,12 +45,22 @@ def test_interpolation_is_exact_for_a_cubic() -> None:
 def test_nothing_is_known_outside_and_in_gaps() -> None:
     t_s = np.array([0.0, 1.0, 4.0, 5.0])
     position, velocity = cubic(t_s)
-    trajectory = Trajectory("reports", np.round(t_s * S).astype(np.int64), position, velocity)
+    trajectory = Trajectory(
+        kind="reports",
+        t_ns=np.round(t_s * S).astype(np.int64),
+        position_ned_m=position,
+        velocity_ned_mps=velocity,
+    )
     position, velocity = trajectory.at(np.array([-1, S // 2, 2 * S, 3 * S, 4 * S, 6 * S]))
     known = [False, True, False, False, True, False]
     assert list(~np.isnan(position[:, 0])) == known
     assert list(~np.isnan(velocity[:, 2])) == known
-    lone = Trajectory("reports", np.array([5]), np.zeros((1, 3)), np.zeros((1, 3)))
+    lone = Trajectory(
+        kind="reports",
+        t_ns=np.array([5]),
+        position_ned_m=np.zeros((1, 3)),
+        velocity_ned_mps=np.zeros((1, 3)),
+    )
     assert np.isnan(lone.at(np.array([5]))[0]).all()
 
 
@@ -177,7 +192,9 @@ def test_flying_is_fast_and_up(straight_flight: Callable[..., Flight]) -> None:
     assert not low.flying(t_ns).any()
     assert not high.flying(high.truth.t_ns[-1:] + S).any()
     zero = high.position_ned_m * 0
-    still = Trajectory("reports", high.truth.t_ns, zero, zero)
+    still = Trajectory(
+        kind="reports", t_ns=high.truth.t_ns, position_ned_m=zero, velocity_ned_mps=zero
+    )
     assert not replace(high, truth=still).flying(t_ns).any()
 
 

@@ -28,7 +28,7 @@ def grid() -> list[tuple[float, float, float]]:
 
 @pytest.mark.parametrize(("b", "d", "alpha"), grid())
 def test_the_closed_form_is_the_optimum_of_the_lmi(b: float, d: float, alpha: float) -> None:
-    solved = lmi.solve(ONE, b * ONE, ONE, d * ONE, ONE, alpha)
+    solved = lmi.solve(ONE, b=b * ONE, c=ONE, d=d * ONE, h=ONE, alpha=alpha)
     mu = closed_form.mu_star(b, d, alpha)
     # Where mu* = 0 no P attains it, and the solver stops a little above.
     assert solved.mu == pytest.approx(mu, abs=1e-5 if mu > 0 else 1e-4)
@@ -37,7 +37,9 @@ def test_the_closed_form_is_the_optimum_of_the_lmi(b: float, d: float, alpha: fl
     p = 1 / mu if mu > 0 else 1.0
     plant = (ONE, b * ONE, ONE, d * ONE, ONE)
     l_gain = np.array([[closed_form.gain(b, d, alpha)]])
-    margin = lmi.lmi_margin(np.array([[p]]), l_gain, max(mu, 1 / p), plant, alpha)
+    margin = lmi.lmi_margin(
+        np.array([[p]]), gain=l_gain, mu=max(mu, 1 / p), plant=plant, alpha=alpha
+    )
     assert margin >= -1e-9
     assert closed_form.design(b, d, alpha).residual == pytest.approx(margin, abs=1e-9)
 
@@ -63,7 +65,12 @@ def test_the_certificate_holds_and_notices_a_wrong_gain(b: float, d: float, alph
     assert found.gamma == math.sqrt(found.mu)
     assume(found.mu > 1e-3)
     for wrong in (found.l_gain + 0.05, found.l_gain - 0.05):
-        assert closed_form.lmi_margin(b, d, alpha, wrong, found.mu, 1 / found.mu) < -1e-6
+        assert (
+            closed_form.lmi_margin(
+                b, feedthrough_s=d, alpha=alpha, l_gain=wrong, mu=found.mu, p=1 / found.mu
+            )
+            < -1e-6
+        )
 
 
 @given(INTERVALS, FEEDTHROUGHS, ALPHAS)
@@ -73,7 +80,10 @@ def test_a_smaller_mu_is_not_proved(b: float, d: float, alpha: float) -> None:
     smaller = 0.98 * mu
     for p in (1 / mu, 1 / smaller):
         gains = np.linspace(-1, 3, 401)
-        margins = [closed_form.lmi_margin(b, d, alpha, l_gain, smaller, p) for l_gain in gains]
+        margins = [
+            closed_form.lmi_margin(b, feedthrough_s=d, alpha=alpha, l_gain=l_gain, mu=smaller, p=p)
+            for l_gain in gains
+        ]
         assert max(margins) < 0
 
 

@@ -80,10 +80,16 @@ def test_acceleration_held_over_the_interval_would_prove_too_little(
     b, d, channels = gain_table.inputs(1.0, 5.0, 0.5, noise)
     c, position = np.eye(2)[: len(d)], np.array([[1.0, 0.0]])
     a = gain_table.transition(1.0)
-    ours = lmi.solve(a, b, c, d, position, alpha, channels=channels)
+    ours = lmi.solve(a, b=b, c=c, d=d, h=position, alpha=alpha, channels=channels)
     assert worst_level(ours.lyapunov, ours.gain, 1.0) <= 1
     held = lmi.solve(
-        a, np.delete(b, 1, 1), c, np.delete(d, 1, 1), position, alpha, channels=[1, *channels[1:]]
+        a,
+        b=np.delete(b, 1, 1),
+        c=c,
+        d=np.delete(d, 1, 1),
+        h=position,
+        alpha=alpha,
+        channels=[1, *channels[1:]],
     )
     assert worst_level(held.lyapunov, held.gain, 1.0) > 1.1
 
@@ -117,7 +123,14 @@ def test_the_margin_is_that_of_the_lmi(design: KinematicDesign) -> None:
         b, d, channels = gain_table.inputs(dt_s, *sizes)
         plant = (gain_table.transition(dt_s), b, np.eye(2)[: len(d)], d, position)
         margins.append(
-            lmi.lmi_margin(design.p, gain, mu, plant, sum(shares), np.repeat(shares, channels))
+            lmi.lmi_margin(
+                design.p,
+                gain=gain,
+                mu=mu,
+                plant=plant,
+                alpha=sum(shares),
+                shares=np.repeat(shares, channels),
+            )
         )
         assert gain_table.gain(design, dt_s) == pytest.approx(gain)
     assert design.margin - 1e-9 <= min(margins) == pytest.approx(design.margin, abs=1e-5)

@@ -15,7 +15,7 @@ Plant = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
 def solve(plant: Plant, alpha: float, channels: Sequence[int] | None = None) -> lmi.LmiSolution:
     """``lmi.solve`` of a plant that is given as one tuple."""
     a, b, c, d, h = plant
-    return lmi.solve(a, b, c, d, h, alpha, channels=channels)
+    return lmi.solve(a, b=b, c=c, d=d, h=h, alpha=alpha, channels=channels)
 
 
 def network(intervals_s: list[float], feedthrough_s: float) -> Plant:
@@ -41,7 +41,7 @@ def test_a_network_is_no_worse_than_its_worst_axis(
     # And the gains of the single axes, with one common P, meet the network's LMIs.
     gains = np.diag(np.repeat(closed_form.gains(intervals_s, feedthrough_s, alpha), 2))
     common = np.eye(len(gains)) / worst
-    assert lmi.lmi_margin(common, gains, worst, plant, alpha) >= -1e-9
+    assert lmi.lmi_margin(common, gain=gains, mu=worst, plant=plant, alpha=alpha) >= -1e-9
 
 
 def test_the_margin_is_the_least_eigenvalue_of_what_is_written() -> None:
@@ -66,7 +66,7 @@ def test_the_margin_is_the_least_eigenvalue_of_what_is_written() -> None:
         )
         output = np.block([[p, h.T], [h, mu * np.eye(1)]])
         least = min(np.linalg.eigvalsh(decay)[0], np.linalg.eigvalsh(output)[0])
-        margin = lmi.lmi_margin(p, gain, mu, (a, b, c, d, h), alpha)
+        margin = lmi.lmi_margin(p, gain=gain, mu=mu, plant=(a, b, c, d, h), alpha=alpha)
         assert (margin > 0) == (least > 0)
         signs.add(margin > 0)
     assert signs == {True, False}
@@ -77,8 +77,8 @@ def test_a_tampered_solution_fails_its_certificate() -> None:
     solved = solve(plant, 0.5)
     assert solved.margin > -1e-6
     assert lmi.lmi_margin(
-        solved.lyapunov, solved.gain, solved.mu, plant, 0.5
-    ) == pytest.approx(solved.margin)  # fmt: skip
+        solved.lyapunov, gain=solved.gain, mu=solved.mu, plant=plant, alpha=0.5
+    ) == pytest.approx(solved.margin)
     p, gain = solved.lyapunov, solved.gain
     certify(p, gain, solved.mu, plant)
     for bad_p, bad_gain, bad_mu in (
@@ -94,7 +94,15 @@ def test_a_tampered_solution_fails_its_certificate() -> None:
 def certify(p: FloatArray, gain: FloatArray, mu: float, plant: Plant) -> None:
     """What ``solve`` does with the solver's answer, at alpha = 0.5."""
     a, b, c, d, h = plant
-    lmi._certified(p, [gain], mu, [lmi.Sampling(a, b, c, d)], h, np.array([[0.5]]), [len(p)])
+    lmi._certified(
+        p,
+        [gain],
+        mu,
+        samplings=[lmi.Sampling(a=a, b=b, c=c, d=d)],
+        h=h,
+        multipliers=np.array([[0.5]]),
+        widths=[len(p)],
+    )
 
 
 def test_a_p_that_is_not_positive_is_no_certificate() -> None:
@@ -106,20 +114,20 @@ def test_a_p_that_is_not_positive_is_no_certificate() -> None:
 @pytest.mark.parametrize("alpha", [0.0, 1.0, -0.1, 1.1, float("nan")])
 def test_alpha_lies_between_0_and_1(alpha: float) -> None:
     with pytest.raises(ValueError, match="alpha lies strictly between 0 and 1"):
-        lmi.solve(ONE, ONE, ONE, ONE, ONE, alpha)
+        lmi.solve(ONE, b=ONE, c=ONE, d=ONE, h=ONE, alpha=alpha)
 
 
 def test_what_cannot_be_met_is_an_error() -> None:
     """A growing state that is not measured: no gain, no P."""
     unmeasured = 0 * ONE
     with pytest.raises(lmi.LmiError, match=r"^the solver"):
-        lmi.solve(2 * ONE, ONE, unmeasured, unmeasured, ONE, 0.5)
+        lmi.solve(2 * ONE, b=ONE, c=unmeasured, d=unmeasured, h=ONE, alpha=0.5)
 
 
 @pytest.mark.parametrize("dt_s", [1e-4, 1e-3, 100.0, 1000.0])
 def test_the_unit_of_time_does_not_matter(dt_s: float) -> None:
     """mu scales with the square of the interval: what is solved at 1 s is solved at any."""
-    solved = lmi.solve(ONE, dt_s * ONE, ONE, -0.3 * dt_s * ONE, ONE, 0.5)
+    solved = lmi.solve(ONE, b=dt_s * ONE, c=ONE, d=-0.3 * dt_s * ONE, h=ONE, alpha=0.5)
     assert solved.mu == pytest.approx(closed_form.mu_star(dt_s, -0.3 * dt_s, 0.5), rel=1e-3)
 
 
@@ -132,7 +140,7 @@ def test_a_network_with_weighted_outputs_on_random_plants() -> None:
         feedthrough, alpha = float(rng.uniform(-0.3, 0.5)), float(rng.uniform(0.1, 0.9))
         a, b, c, d, _ = network(intervals, feedthrough)
         weights = np.repeat(rng.uniform(0.5, 2.0, 3), 2)
-        solved = lmi.solve(a, b, c, d, np.diag(weights), alpha)
+        solved = lmi.solve(a, b=b, c=c, d=d, h=np.diag(weights), alpha=alpha)
         each = weights**2 * np.repeat(closed_form.mu_stars(intervals, feedthrough, alpha), 2)
         assert solved.mu == pytest.approx(np.max(each), abs=1e-5 if np.max(each) > 0 else 1e-4)
         if np.max(each) < 0.01:
@@ -149,38 +157,39 @@ def test_the_published_gains_are_feasible(l_gain: float, mu: float) -> None:
     """delta = 0.5 s, dt = 0.15 s, alpha = 0.5; a P exists for each, and none for a worse mu."""
     plant = (ONE, 0.15 * ONE, ONE, 0.5 * ONE, ONE)
     margins = [
-        lmi.lmi_margin(p * ONE, l_gain * ONE, mu, plant, 0.5) for p in np.geomspace(0.1, 1e3, 400)
+        lmi.lmi_margin(p * ONE, gain=l_gain * ONE, mu=mu, plant=plant, alpha=0.5)
+        for p in np.geomspace(0.1, 1e3, 400)
     ]
     assert max(margins) > 0
     needed = (l_gain * 0.5 - 0.15) ** 2 / (0.5 * (1 - (1 - l_gain) ** 2 / 0.5))
     assert needed < mu
     assert all(
-        lmi.lmi_margin(p * ONE, l_gain * ONE, 0.98 * needed, plant, 0.5) < 0
+        lmi.lmi_margin(p * ONE, gain=l_gain * ONE, mu=0.98 * needed, plant=plant, alpha=0.5) < 0
         for p in np.geomspace(0.1, 1e5, 400)
     )
 
 
 @pytest.mark.parametrize("mu_max", [0.05, 0.25, 1.0])
 def test_feasibility_under_a_limit(mu_max: float) -> None:
-    solved = lmi.solve(ONE, 0.15 * ONE, ONE, 0.5 * ONE, ONE, 0.5, mu_max=mu_max)
+    solved = lmi.solve(ONE, b=0.15 * ONE, c=ONE, d=0.5 * ONE, h=ONE, alpha=0.5, mu_max=mu_max)
     assert solved.mu <= mu_max * (1 + 1e-9)
     assert solved.margin > -1e-6
 
 
 def test_what_is_infeasible_under_a_limit() -> None:
     limit_s = closed_form.dt_limit_s(0.05, 0.5, 0.5)
-    lmi.solve(ONE, 0.999 * limit_s * ONE, ONE, 0.5 * ONE, ONE, 0.5, mu_max=0.05)
+    lmi.solve(ONE, b=0.999 * limit_s * ONE, c=ONE, d=0.5 * ONE, h=ONE, alpha=0.5, mu_max=0.05)
     with pytest.raises(lmi.LmiError):
-        lmi.solve(ONE, 1.001 * limit_s * ONE, ONE, 0.5 * ONE, ONE, 0.5, mu_max=0.05)
+        lmi.solve(ONE, b=1.001 * limit_s * ONE, c=ONE, d=0.5 * ONE, h=ONE, alpha=0.5, mu_max=0.05)
 
 
 def test_an_infimum_that_is_not_attained_is_flagged() -> None:
     """b < 2 d: mu can be made as small as one likes, by a P as large as it takes."""
     for b, d, alpha in ((0.15, 0.5, 0.5), (0.4, 0.5, 0.5), (0.65, 0.5, 0.5)):
         assert closed_form.mu_star(b, d, alpha) == 0
-        assert not lmi.solve(ONE, b * ONE, ONE, d * ONE, ONE, alpha).attained
+        assert not lmi.solve(ONE, b=b * ONE, c=ONE, d=d * ONE, h=ONE, alpha=alpha).attained
     for b, d, alpha in ((0.86, 0.5, 0.5), (0.1, 0.0, 0.9), (0.854, 0.5, 0.5)):
-        solved = lmi.solve(ONE, b * ONE, ONE, d * ONE, ONE, alpha)
+        solved = lmi.solve(ONE, b=b * ONE, c=ONE, d=d * ONE, h=ONE, alpha=alpha)
         assert solved.attained
         assert solved.mu == pytest.approx(closed_form.mu_star(b, d, alpha), rel=1e-3)
 
@@ -188,13 +197,16 @@ def test_an_infimum_that_is_not_attained_is_flagged() -> None:
 def test_several_intervals_under_one_p_cost_no_more_than_the_worst() -> None:
     """One axis: MATH's statement that p = 1 / max mu*(b) serves every b."""
     intervals, d, alpha = [0.1, 0.4, 0.9, 1.2], -0.1, 0.6
-    samplings = [lmi.Sampling(ONE, b * ONE, ONE, d * ONE) for b in intervals]
+    samplings = [lmi.Sampling(a=ONE, b=b * ONE, c=ONE, d=d * ONE) for b in intervals]
     solved = lmi.solve_common(samplings, ONE, [alpha] * 4)
     assert solved.mu == pytest.approx(closed_form.mu_star(1.2, d, alpha), abs=1e-5)
     assert solved.gains[3][0, 0] == pytest.approx(closed_form.gain(1.2, d, alpha), abs=1e-3)
     for sampling, gain in zip(samplings, solved.gains, strict=True):
         plant = (sampling.a, sampling.b, sampling.c, sampling.d, ONE)
-        assert lmi.lmi_margin(solved.lyapunov, gain, solved.mu, plant, alpha) > -1e-6
+        assert (
+            lmi.lmi_margin(solved.lyapunov, gain=gain, mu=solved.mu, plant=plant, alpha=alpha)
+            > -1e-6
+        )
 
 
 # --- position and velocity ----------------------------------------------------------------------
@@ -207,7 +219,7 @@ def held(dt_s: float, velocity: bool) -> lmi.Sampling:
     r = 2 if velocity else 1
     b = np.hstack([[[5 * dt_s**2 / 2], [5 * dt_s]], np.zeros((2, r))])
     d = np.hstack([np.zeros((r, 1)), np.diag([0.5, 0.2])[:r, :r]])
-    return lmi.Sampling(np.array([[1.0, dt_s], [0.0, 1.0]]), b, np.eye(2)[:r], d)
+    return lmi.Sampling(a=np.array([[1.0, dt_s], [0.0, 1.0]]), b=b, c=np.eye(2)[:r], d=d)
 
 
 def least_bound_m(intervals_s: list[float], velocity: bool, alphas: list[float]) -> float:
@@ -271,7 +283,7 @@ def test_the_units_of_the_states_do_not_matter(size: float) -> None:
     back = np.diag([1 / size, 1.0])
     changed = (change @ s.a @ back, change @ s.b, s.c @ back, s.d, POSITION @ back)
     solved = solve(changed, 0.9, channels=[1, 1, 1])
-    plain = lmi.solve(s.a, s.b, s.c, s.d, POSITION, 0.9, channels=[1, 1, 1])
+    plain = lmi.solve(s.a, b=s.b, c=s.c, d=s.d, h=POSITION, alpha=0.9, channels=[1, 1, 1])
     assert solved.mu == pytest.approx(plain.mu, rel=1e-4)
 
 
@@ -281,5 +293,12 @@ def test_slack_is_left_in_the_decay_lmi() -> None:
     for slack in (0.0, 1e-3):
         found = lmi.solve_common([s], POSITION, [0.9], channels=[1, 1, 1], slack=slack)
         roomy = 2 * found.mu + 1  # so that the other LMI does not decide
-        margin = lmi.lmi_margin(found.lyapunov, found.gain, roomy, plant, 0.9, found.multipliers[0])
+        margin = lmi.lmi_margin(
+            found.lyapunov,
+            gain=found.gain,
+            mu=roomy,
+            plant=plant,
+            alpha=0.9,
+            shares=found.multipliers[0],
+        )
         assert margin == pytest.approx(slack, abs=1e-5)

@@ -28,7 +28,9 @@ from companion.values import Fix, FloatArray, ReportNoise
 MakeFix = Callable[..., Fix]
 S = 1_000_000_000
 SPEED_MPS, ACCELERATION_MPS2 = 30.0, 8.0
-NOISE = ReportNoise(1.5, 2.5, math.hypot(1.5, 2.5), 0.4)
+NOISE = ReportNoise(
+    horizontal_m=1.5, vertical_m=2.5, position_m=math.hypot(1.5, 2.5), velocity_mps=0.4
+)
 ROUNDING = 1e-6
 GAINS: dict[str, GainSchedule] = {
     "deadbeat": deadbeat,
@@ -234,9 +236,15 @@ def test_the_gains_are_those_of_the_interval(fix: MakeFix) -> None:
     """By the matrices written out: x + L (y - x), carried on by A."""
     observer, t = observing("of both"), 0.7
     state = KinematicState(
-        fix(0, [3, 1, 0], [1, 0, 2], noise=NOISE), np.array([1.0, 2, 3]), np.array([4.0, 5, 6]),
-        7.0, 8.0, 10.0, 9.0, 1.0,
-    )  # fmt: skip
+        fix=fix(0, [3, 1, 0], [1, 0, 2], noise=NOISE),
+        position_ned_m=np.array([1.0, 2, 3]),
+        velocity_ned_mps=np.array([4.0, 5, 6]),
+        horizontal_m=7.0,
+        vertical_m=8.0,
+        position_m=10.0,
+        velocity_mps=9.0,
+        interval_s=1.0,
+    )
     a = np.array([[1, t], [0, 1]])
     gain = np.array(GAINS["of both"](t)).reshape(2, 2)
     x = np.array([[1.0, 2, 3], [4, 5, 6]])

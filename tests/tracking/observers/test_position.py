@@ -16,7 +16,9 @@ from companion.values import Fix, FloatArray, ReportNoise
 
 MakeFix = Callable[..., Fix]
 SPEED_MPS, ACCELERATION_MPS2 = 30.0, 8.0
-NOISE = ReportNoise(1.2, 0.9, math.hypot(1.2, 0.9), 0.4)  # 1.5 m in space
+NOISE = ReportNoise(
+    horizontal_m=1.2, vertical_m=0.9, position_m=math.hypot(1.2, 0.9), velocity_mps=0.4
+)  # 1.5 m in space
 NOISE_M = 1.5
 # For adversaries of the stacked model, in which one velocity holds from report to report.
 STILL_MPS2 = 1e-9
@@ -69,7 +71,13 @@ def observing(
     *,
     acceleration_mps2: float = ACCELERATION_MPS2,
 ) -> PositionObserver:
-    model = PositionModel(SPEED_MPS, acceleration_mps2, alpha, feedthrough_s, velocity_lead_s)
+    model = PositionModel(
+        speed_mps=SPEED_MPS,
+        acceleration_mps2=acceleration_mps2,
+        alpha=alpha,
+        feedthrough_s=feedthrough_s,
+        velocity_lead_s=velocity_lead_s,
+    )
     return PositionObserver(model)
 
 
@@ -232,6 +240,7 @@ def _gain(fix: MakeFix, observer: PositionObserver, b_ns: int) -> float:
     lead_s=st.floats(0.01, 1.0),
 )
 def test_a_constant_velocity_is_followed_exactly(
+    *,
     fix: MakeFix,
     velocity: tuple[float, float, float],
     intervals_ms: list[int],

@@ -71,7 +71,9 @@ def packages() -> list[Part]:
     text = (ROOT / "requirements.lock").read_text(encoding="utf-8")
     for name, version in re.findall(r"^([a-z0-9._-]+)==(\S+)", text, re.MULTILINE):
         if name not in TAKEN_AWAY:
-            found.append(Part(name, version, licence(name), None, "pypi"))
+            found.append(
+                Part(name=name, version=version, licence=licence(name), checksum=None, kind="pypi")
+            )
     return found
 
 
@@ -97,7 +99,13 @@ def vendored() -> list[Part]:
     text = (ROOT / "web" / "vendor" / "README.md").read_text(encoding="utf-8")
     for file, package, version, said, checksum in row.findall(text):
         if not re.search(r"LICENSE|NOTICE", file):
-            part = Part(package, version.strip(), said.strip(), checksum, "npm")
+            part = Part(
+                name=package,
+                version=version.strip(),
+                licence=said.strip(),
+                checksum=checksum,
+                kind="npm",
+            )
             found.append(part)
     return found
 

@@ -36,9 +36,11 @@ def circle(t_s: float) -> Place:
     """20 m/s, 60 m wide: 13 m/s² to its middle, more than most can."""
     angle, speed = t_s / 3, 20.0
     return Place(
-        60 * math.cos(angle), 60 * math.sin(angle), -speed * math.sin(angle),
-        speed * math.cos(angle),
-    )  # fmt: skip
+        north_m=60 * math.cos(angle),
+        east_m=60 * math.sin(angle),
+        north_mps=-speed * math.sin(angle),
+        east_mps=speed * math.cos(angle),
+    )
 
 
 def report(t_ns: int, boot_s: float, place: Place, sysid: int = 1) -> Frame:

@@ -42,6 +42,20 @@ def hear(hearing: Hearing, now_ns: int, boot_ms: int) -> None:
     )
 
 
+def test_a_frame_keeps_its_sender_in_both_versions_of_mavlink() -> None:
+    message = common.MAVLink_global_position_int_message(
+        5000, 473977000, 85456000, 0, 0, 0, 0, 0, 0
+    )
+    for in_version_1, magic in ((True, 0xFE), (False, 0xFD)):
+        mav = common.MAVLink(None, srcSystem=7, srcComponent=9)
+        data = bytes(message.pack(mav, force_mavlink1=in_version_1))
+        assert data[0] == magic
+        heard = SharedFrame(8 * S - 5 * MS, data)
+        frame = Hearing().placed(11 * S, "b", clock(), heard)
+        assert frame is not None
+        assert (frame.source, frame.msgid) == (Source(7, 9), GLOBAL_POSITION_INT)
+
+
 def test_of_a_vehicle_that_is_heard_here_nothing_else_is_used() -> None:
     hearing = Hearing()
     for number in range(20):

@@ -447,16 +447,26 @@ def main() -> None:
             least_db(aperture, interpolated(widths, sure, cone), cone, aperture.size)
             for cone in np.minimum(cones, 0.9 * aperture.reaches)
         ]
-        kinds = aperture, cones, ratios
         floors = [10 ** ((np.array(least) - loss_db) / 10) for loss_db in losses_db]
         likely: list[Array] = []
         for floor in floors:
-            likely.append(make_likely(*kinds, floor, likely[-1] if likely else None, most))
+            wider = likely[-1] if likely else None
+            likely.append(
+                make_likely(aperture, cones, ratios=ratios, floors=floor, wider=wider, most=most)
+            )
             print(name, "likely", len(likely), flush=True)
         if name == "line":
             # What is between two losses is the mean of their phases, which must be of one kind: the
             # first, which began from nothing, is made once more from the second. (A square's are.)
-            likely[0] = make_likely(*kinds, floors[0], likely[1], most, along=False)
+            likely[0] = make_likely(
+                aperture,
+                cones,
+                ratios=ratios,
+                floors=floors[0],
+                wider=likely[1],
+                most=most,
+                along=False,
+            )
         # 5e-4 of the phase, which is at most some 30 rad, is all that half precision costs.
         made |= {
             f"{name}_widths": widths, f"{name}_sure": sure.astype(np.float32),

@@ -23,6 +23,10 @@ PACKAGES = ("companion", "sitl_replay")
 LOCKS = ("requirements.lock", "requirements-dev.lock")
 LONGEST_MODULE_LINES = 300
 REASON = "Over 300 lines: "
+FIELDS_TO_NAME = 4
+"""Number of fields from which on each is given by name."""
+MOST_POSITIONAL = 5
+TAKE_ANY_NUMBER = frozenset({"max", "min", "pack", "pack_into", "zip"})
 
 # Rooms that may know sockets, files, clocks and `await`; all others are pure. Folders, not files.
 SHELL = (
@@ -263,6 +267,111 @@ def nameless(path: str, _text: str) -> list[str]:
     return [f"{path}: says nothing of what is in it"] if bad else []
 
 
+def called(node: ast.AST) -> str:
+    """The last part of the name of a class, a decorator or what a call calls."""
+    if isinstance(node, ast.Call | ast.Subscript):
+        node = node.func if isinstance(node, ast.Call) else node.value
+    return ast.unparse(node).rpartition(".")[2]
+
+
+def init_fields(node: ast.ClassDef) -> list[str]:
+    """Fields of a dataclass or NamedTuple that its constructor takes."""
+    found = []
+    for item in node.body:
+        match item:
+            case ast.AnnAssign(target=ast.Name(id=name), annotation=kind, value=value):
+                is_made = isinstance(value, ast.Call) and any(
+                    given.arg == "init" and ast.unparse(given.value) == "False"
+                    for given in value.keywords
+                )
+                if called(kind) != "ClassVar" and not is_made:
+                    found.append(name)
+    return found
+
+
+def positional_fields(path: str, text: str) -> list[str]:
+    """Classes that take four or more values, some of them by position: two can be swapped."""
+    faults = []
+    for node in nodes_of(text):
+        if not isinstance(node, ast.ClassDef):
+            continue
+        for mark in node.decorator_list:
+            is_long = called(mark) == "dataclass" and len(init_fields(node)) >= FIELDS_TO_NAME
+            if is_long and "kw_only=True" not in ast.unparse(mark):
+                faults.append(f"{path}:{node.lineno}: {node.name} is not kw_only=True")
+        for item in node.body:
+            if isinstance(item, ast.FunctionDef) and item.name == "__init__":
+                placed = [*item.args.posonlyargs, *item.args.args][1:]
+                if placed and len(placed) + len(item.args.kwonlyargs) >= FIELDS_TO_NAME:
+                    faults.append(f"{path}:{item.lineno}: {node.name}.__init__ has no * after self")
+    return faults
+
+
+@functools.cache
+def long_tuples() -> frozenset[str]:
+    """Full dotted names of the NamedTuples with four or more fields."""
+    return frozenset(
+        f"{module_of(path)}.{name}"
+        for path in sources()
+        for name in long_tuples_in((ROOT / path).read_text(encoding="utf-8"))
+    )
+
+
+def long_tuples_in(text: str) -> list[str]:
+    """Names of the NamedTuples with four or more fields that a module defines."""
+    return [
+        node.name
+        for node in nodes_of(text)
+        if isinstance(node, ast.ClassDef)
+        and "NamedTuple" in map(called, node.bases)
+        and len(init_fields(node)) >= FIELDS_TO_NAME
+    ]
+
+
+def module_of(path: str) -> str:
+    """The dotted name of the module at ``path``."""
+    return path.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+
+
+def positional_tuples(path: str, text: str) -> list[str]:
+    """Calls that give a NamedTuple with four or more fields any of them by position.
+
+    Such a class cannot be keyword-only. It is found under the name by which it was imported, also
+    from the package that passes it on.
+    """
+    names = {name: f"{module_of(path)}.{name}" for name in long_tuples_in(text)}
+    own = frozenset(names.values())
+    for node in nodes_of(text):
+        match node:
+            case ast.ImportFrom(module=str(origin), names=imported):
+                names |= {one.asname or one.name: f"{origin}.{one.name}" for one in imported}
+            case ast.Import(names=imported):
+                names |= {one.asname: one.name for one in imported if one.asname}
+    faults = []
+    for node in nodes_of(text):
+        if isinstance(node, ast.Call) and node.args:
+            head, _, rest = ast.unparse(node.func).partition(".")
+            full = ".".join(filter(None, (names.get(head, head), rest)))
+            package, _, name = full.rpartition(".")
+            if any(
+                one.endswith(f".{name}") and f"{one}.".startswith(f"{package}.")
+                for one in long_tuples() | own
+            ):
+                faults.append(f"{path}:{node.lineno}: {name} is given fields by position")
+    return faults
+
+
+def crowded_calls(path: str, text: str) -> list[str]:
+    """Calls with more than five positional arguments, except of functions that take any number."""
+    return [
+        f"{path}:{node.lineno}: {called(node)} is given {len(node.args)} arguments by position"
+        for node in nodes_of(text)
+        if isinstance(node, ast.Call)
+        and len(node.args) > MOST_POSITIONAL
+        and called(node) not in TAKE_ANY_NUMBER
+    ]
+
+
 Rule = Callable[[str, str], list[str]]
 RULES: tuple[Rule, ...] = (
     impurities,
@@ -273,6 +382,9 @@ RULES: tuple[Rule, ...] = (
     riddles,
     overlong,
     nameless,
+    positional_fields,
+    positional_tuples,
+    crowded_calls,
 )
 
 
@@ -284,8 +396,24 @@ def test_the_tree_keeps_the_rule(rule: Rule) -> None:
     assert not faults, "\n" + "\n".join(faults)
 
 
+def test_tests_and_examples_name_the_fields_of_tuples() -> None:
+    paths = sorted(
+        path for room in ("docs", "examples", "tests") for path in (ROOT / room).rglob("*.py")
+    )
+    assert ROOT / "tests/test_house.py" in paths
+    faults = [
+        fault
+        for path in paths
+        for fault in positional_tuples(
+            path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8")
+        )
+    ]
+    assert not faults, "\n" + "\n".join(faults)
+
+
 BEAMS = "companion/beams/array/steering.py"
 VALUES = "companion/values/tracked.py"
+FOUR = "\n    a: int\n    b: int\n    c: int\n    d: int"
 BAD = [
     (impurities, BEAMS, "async def f(): ..."),
     (impurities, BEAMS, "async def f():\n    return [x async for x in g()]"),
@@ -343,6 +471,20 @@ BAD = [
     (overlong, BEAMS, "x = 1\n" * (LONGEST_MODULE_LINES + 1)),
     (nameless, "companion/beams/utils.py", ""),
     (nameless, "sitl_replay/helpers.py", ""),
+    (positional_fields, BEAMS, f"@dataclass\nclass C:{FOUR}"),
+    (positional_fields, BEAMS, f"@dataclass(frozen=True, slots=True)\nclass C:{FOUR}"),
+    (positional_fields, BEAMS, f"@dataclasses.dataclass(kw_only=False)\nclass C:{FOUR}"),
+    (positional_fields, BEAMS, "class C:\n    def __init__(self, a, b, c, d): ..."),
+    (positional_fields, BEAMS, "class C:\n    def __init__(self, a, *, b, c, d): ..."),
+    (positional_tuples, BEAMS, f"class C(NamedTuple):{FOUR}\nC(1, b=2, c=3, d=4)"),
+    (positional_tuples, BEAMS, f"class C(typing.NamedTuple):{FOUR}\nC(*row)"),
+    (positional_tuples, BEAMS, "from companion.values.received import Frame\nFrame(1)"),
+    (positional_tuples, BEAMS, "from companion.values import Frame as F\nF(1)"),
+    (positional_tuples, BEAMS, "from companion.values import received\nreceived.Frame(1)"),
+    (positional_tuples, BEAMS, "import companion.values\ncompanion.values.Frame(1)"),
+    (positional_tuples, BEAMS, "import companion.values as v\nv.Frame(1)"),
+    (crowded_calls, BEAMS, "f(1, 2, 3, 4, 5, 6)"),
+    (crowded_calls, BEAMS, "f(1, 2, 3, 4, 5, *rest)"),
 ]
 
 
@@ -381,6 +523,17 @@ GOOD = [
     (riddles, BEAMS, 'x = 1\n""""""'),
     (overlong, BEAMS, "x = 1\n" * LONGEST_MODULE_LINES),
     (overlong, BEAMS, f'"""A list.\n\n{REASON}it is one."""\n' + "x = 1\n" * LONGEST_MODULE_LINES),
+    (positional_fields, BEAMS, f"@dataclass(slots=True, kw_only=True)\nclass C:{FOUR}"),
+    (positional_fields, BEAMS, f"@dataclass\nclass C:{FOUR} = field(init=False)"),
+    (positional_fields, BEAMS, f"@dataclass\nclass C:{FOUR.replace('d: int', 'd: ClassVar[int]')}"),
+    (positional_fields, BEAMS, "class C:\n    def __init__(self, *, a, b, c, d): ..."),
+    (positional_fields, BEAMS, "class C:\n    def __init__(self, a, b, c): ..."),
+    (positional_fields, BEAMS, f"class C(NamedTuple):{FOUR}"),
+    (positional_tuples, BEAMS, f"class C(NamedTuple):{FOUR}\nC(a=1, b=2, c=3, d=4)"),
+    (positional_tuples, BEAMS, "from companion.values import Frame\nFrame(**fields)"),
+    (positional_tuples, BEAMS, "from elsewhere import Frame\nFrame(1, 2, 3, 4)"),
+    (positional_tuples, BEAMS, "from companion.values import Source\nSource(1, 2)"),
+    (crowded_calls, BEAMS, "f(1, 2, 3, 4, 5, g=6)\nstruct.pack(1, 2, 3, 4, 5, 6)"),
 ]
 
 

@@ -86,6 +86,8 @@ async def _keep_shown(service: Service, voice: Voice) -> None:
 
 
 async def _serve(
+    until: asyncio.Event,
+    *,
     service: Service,
     voice: Voice,
     http: socket.socket,
@@ -94,7 +96,6 @@ async def _serve(
     traffic: Callable[[str], Coroutine[Any, Any, None]] | None,
     manager: systemd.Manager | None,
     open_page: bool,
-    until: asyncio.Event,
 ) -> None:
     others = [_keep_shown(service, voice)]
     others += [traffic(service.links()[0].url)] if traffic else []

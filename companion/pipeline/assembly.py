@@ -3,6 +3,7 @@
 Over 300 lines: a function for each section of the settings, and nothing else.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -172,7 +173,15 @@ def equipment(settings: Settings, antenna: geometry.Array) -> Equipment:
     except UserError as error:
         raise ConfigError(f"hardware.unit: {error}") from error
     channels = calibration(settings, antenna.size)
-    return Equipment(codebook, channels, *radio(settings), device, gains)
+    budget, antennas = radio(settings)
+    return Equipment(
+        codebook=codebook,
+        calibration=channels,
+        budget=budget,
+        uav_antennas=antennas,
+        device=device,
+        unit_gains=gains,
+    )
 
 
 def precoder(settings: Settings) -> Precoder:

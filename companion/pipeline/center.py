@@ -293,5 +293,13 @@ class Center:
         turn_degps2 = self._turns.limit_degps2(turn_degps2, at.sender_ns)
         bounds = carrier.AttitudeBounds(self.attitude_bound_rad, math.radians(turn_degps2))
         since_ns = at.sender_ns - made_ns
-        doubt = (at.bound_s, bounds, self._contradicted)
-        return carrier.moving(self.local, track, newest, attitude, since_ns, *doubt)
+        return carrier.moving(
+            self.local,
+            track,
+            newest,
+            attitude=attitude,
+            since_ns=since_ns,
+            doubt_s=at.bound_s,
+            bounds=bounds,
+            contradicted=self._contradicted,
+        )

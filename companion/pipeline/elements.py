@@ -21,25 +21,47 @@ def placed(settings: Settings) -> geometry.Array:
     spacing = given.spacing_wavelengths
     if given.spacing_m is not None:
         spacing = given.spacing_m * given.frequency_hz / geometry.SPEED_OF_LIGHT_MPS
-    on_carrier = (mount, element, lever_arm_m)
     try:
         match given.kind:
             case "ula":
                 return geometry.uniform_linear(
-                    given.elements, given.frequency_hz, spacing, *on_carrier
+                    given.elements,
+                    given.frequency_hz,
+                    spacing_wavelengths=spacing,
+                    array_from_body=mount,
+                    element=element,
+                    lever_arm_m=lever_arm_m,
                 )
             case "ura":
                 return geometry.uniform_rectangular(
-                    given.rows, given.columns, given.frequency_hz, spacing, *on_carrier
+                    given.rows,
+                    columns=given.columns,
+                    frequency_hz=given.frequency_hz,
+                    spacing_wavelengths=spacing,
+                    array_from_body=mount,
+                    element=element,
+                    lever_arm_m=lever_arm_m,
                 )
             case "uca":
                 return geometry.uniform_circular(
-                    given.elements, given.frequency_hz, spacing, *on_carrier
+                    given.elements,
+                    given.frequency_hz,
+                    spacing_wavelengths=spacing,
+                    array_from_body=mount,
+                    element=element,
+                    lever_arm_m=lever_arm_m,
                 )
             case "list":
                 placed = _rows(given.positions_m or ())
                 outward = placed[:, 3:6] if placed.shape[1] == 6 else None
-                return geometry.listed(placed[:, :3], given.frequency_hz, *on_carrier, outward)
+                return geometry.listed(
+                    placed[:, :3],
+                    given.frequency_hz,
+                    array_from_body=mount,
+                    element=element,
+                    lever_arm_m=lever_arm_m,
+                    outward=outward,
+                )
     except UserError as error:
         raise ConfigError(f"array: {error}") from error
 

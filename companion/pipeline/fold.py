@@ -313,11 +313,20 @@ class Pipeline:
         tracks = self._tracks(seated, now_ns, valid_at_ns)
         found = self.carrier(now_ns, valid_at_ns)
         known, unfit = (None, found) if isinstance(found, str) else (found, None)
-        parts = (self.array, self.precoder, self.coverage, self._steady)
+        before = self._steady
         spared = self._spared(now_ns, valid_at_ns, known)
 
         def made() -> Update:
-            beams = aim(now_ns, valid_at_ns, [*tracks, *spared], known, *parts)
+            beams = aim(
+                now_ns,
+                valid_at_ns=valid_at_ns,
+                tracks=[*tracks, *spared],
+                carrier=known,
+                array=self.array,
+                precoder=self.precoder,
+                coverage=self.coverage,
+                before=before,
+            )
             if spared:
                 beams = without(beams, {track.uav for track in spared})
             if others:

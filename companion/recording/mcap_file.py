@@ -77,7 +77,8 @@ class McapFile:
 
     def schema(self, name: str, encoding: str, data: bytes) -> int:
         """Describe a type of message. Returns its id."""
-        self._schemas.append(Schema(len(self._schemas) + 1, data, encoding, name))
+        number = len(self._schemas) + 1
+        self._schemas.append(Schema(id=number, data=data, encoding=encoding, name=name))
         self._describe(self._schemas[-1])
         return len(self._schemas)
 
@@ -86,7 +87,14 @@ class McapFile:
     ) -> int:
         """Begin a channel. Returns its id."""
         number = len(self._channels) + 1
-        self._channels.append(Channel(number, topic, encoding, dict(metadata or {}), schema_id))
+        channel = Channel(
+            id=number,
+            topic=topic,
+            message_encoding=encoding,
+            metadata=dict(metadata or {}),
+            schema_id=schema_id,
+        )
+        self._channels.append(channel)
         self._describe(self._channels[-1])
         return number
 
@@ -112,10 +120,22 @@ class McapFile:
     def attachment(self, at_ns: int, created_ns: int, name: str, kind: str, data: bytes) -> None:
         """Attach a file; ``kind`` is its media type."""
         at = self._stream.tell()
-        record = _bytes(Attachment(created_ns, at_ns, name, kind, data))
+        record = _bytes(
+            Attachment(
+                create_time=created_ns, log_time=at_ns, name=name, media_type=kind, data=data
+            )
+        )
         self._stream.write(record)
         self._attachments.append(
-            AttachmentIndex(at, len(record), at_ns, created_ns, len(data), name, kind)
+            AttachmentIndex(
+                offset=at,
+                length=len(record),
+                log_time=at_ns,
+                create_time=created_ns,
+                data_size=len(data),
+                name=name,
+                media_type=kind,
+            )
         )
 
     def metadata(self, name: str, data: Mapping[str, str]) -> None:
@@ -139,7 +159,14 @@ class McapFile:
         least_ns, greatest_ns = min(times), max(times)
         packed = self._compressor.compress(contents)
         chunk = _bytes(
-            Chunk("zstd", packed, greatest_ns, least_ns, zlib.crc32(contents), len(contents))
+            Chunk(
+                compression="zstd",
+                data=packed,
+                message_end_time=greatest_ns,
+                message_start_time=least_ns,
+                uncompressed_crc=zlib.crc32(contents),
+                uncompressed_size=len(contents),
+            )
         )
         chunk_at = self._stream.tell()
         self._stream.write(chunk)

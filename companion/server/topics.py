@@ -75,7 +75,7 @@ async def _beams(node: Node) -> Json:
     update = node.pipeline.last_update or node.pipeline.look(node.now_ns())
     age_s = (node.now_ns() - update.t_ns) * 1e-9
     return await run_in_threadpool(
-        beam_state.beams, node.pipeline, node.equipment, update, age_s, 0.0
+        beam_state.beams, node.pipeline, node.equipment, update, age_s=age_s, lead_ms=0.0
     )
 
 

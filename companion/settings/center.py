@@ -72,7 +72,13 @@ def parse_center(text: str) -> CenterPlace:
         raise UserError(f"{shown(text)}: latitude is within 90 degrees and longitude within 180")
     if abs(numbers[2]) > HEIGHT_MAX_M or any(abs(heading) > 360 for heading in numbers[3:]):
         raise UserError(f"{shown(text)}: altitude is within 100 km and heading within 360 degrees")
-    return FixedCenter(*numbers)
+    lat_deg, lon_deg, alt_m, *heading_deg = numbers
+    return FixedCenter(
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        alt_m=alt_m,
+        heading_deg=heading_deg[0] if heading_deg else 0.0,
+    )
 
 
 def _center_text(text: str) -> str:

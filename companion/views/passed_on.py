@@ -86,15 +86,17 @@ class Positions:
         """Its height is above the ellipsoid: it is said where the geoid's height is known."""
         known = pipeline.settings.observer.geoid_m is not None
         undulation_m, off_m = _geoid(pipeline) if known else (0.0, 0.0)
+        lat_deg, lon_deg, alt_m = place
         said = UtmPosition(
-            pipeline.utc_ns(track.valid_at_ns),
-            *place[:2],
-            place[2] + undulation_m if known else None,
-            relative_alt_m,
-            velocity_ned_mps,
-            track.horizontal_bound_m,
-            track.vertical_bound_m + off_m,
-            self._every_s,
+            utc_ns=pipeline.utc_ns(track.valid_at_ns),
+            lat_deg=lat_deg,
+            lon_deg=lon_deg,
+            hae_m=alt_m + undulation_m if known else None,
+            relative_alt_m=relative_alt_m,
+            velocity_ned_mps=velocity_ned_mps,
+            horizontal_m=track.horizontal_bound_m,
+            vertical_m=track.vertical_bound_m + off_m,
+            every_s=self._every_s,
         )
         return utm_global_position(Source.parse(track.uav), said)
 

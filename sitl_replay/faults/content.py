@@ -194,7 +194,7 @@ class Glitch:
         lat_e7, lon_e7, *altitudes_mm = _POSITION.unpack(position)
         bearing_deg = random.Random(f"{self._seed} {sender}").uniform(0.0, 360.0)
         lat_deg, lon_deg, _ = pymap3d.aer2geodetic(
-            bearing_deg, 0.0, self._metres, lat_e7 / 1e7, lon_e7 / 1e7, 0.0
+            bearing_deg, el=0.0, srange=self._metres, lat0=lat_e7 / 1e7, lon0=lon_e7 / 1e7, h0=0.0
         )
         return _POSITION.pack(round(lat_deg * 1e7), round(lon_deg * 1e7), *altitudes_mm)
 

@@ -35,8 +35,15 @@ class Leaning:
         roll, pitch = math.atan2(right, upright), math.atan2(-ahead, -below)
         roll_rate = (upright * right_rate - right * upright_rate) / (upright**2 + right**2)
         pitch_rate = (below * ahead_rate - ahead * down_rate) / upright**2
-        rates = body_rates(roll, pitch, (roll_rate, pitch_rate, yaw_rate))
-        return Pose(roll, pitch, math.remainder(yaw, math.tau), *rates)
+        p, q, r = body_rates(roll, pitch, (roll_rate, pitch_rate, yaw_rate))
+        return Pose(
+            roll_rad=roll,
+            pitch_rad=pitch,
+            yaw_rad=math.remainder(yaw, math.tau),
+            rollspeed_radps=p,
+            pitchspeed_radps=q,
+            yawspeed_radps=r,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,5 +74,12 @@ class Banked:
         roll = math.atan2(sideways, GRAVITY_MPS2)
         roll_rate = sideways_rate * GRAVITY_MPS2 / (GRAVITY_MPS2**2 + sideways**2)
         yaw = math.atan2(east, north)
-        rates = body_rates(roll, self.pitch_rad, (roll_rate, 0.0, sideways / airspeed))
-        return Pose(roll, self.pitch_rad, yaw, *rates)
+        p, q, r = body_rates(roll, self.pitch_rad, (roll_rate, 0.0, sideways / airspeed))
+        return Pose(
+            roll_rad=roll,
+            pitch_rad=self.pitch_rad,
+            yaw_rad=yaw,
+            rollspeed_radps=p,
+            pitchspeed_radps=q,
+            yawspeed_radps=r,
+        )

@@ -1,6 +1,8 @@
 """One UAV of each scenario: its path, its attitude, the wind's effect on it, and what it sends.
 
 UAVs are counted from 0; what is left to chance depends on the seed and that number alone.
+
+Over 300 lines: a function for each flight, and nothing else.
 """
 
 import math
@@ -189,6 +191,7 @@ def aircraft(uav_trajectory: Callable[[float], Motion]) -> tuple[Aircraft, ...]:
     def holding(north_m: float, east_m: float, height_m: float, speed_mps: float) -> Flight:
         centre_ned_m = (north_m, east_m, -height_m)
         radius_m = speed_mps**2 / (GRAVITY_MPS2 * math.tan(STEEPEST_BANK_RAD))
+        # Each place gives an axis and an offset that no other aircraft has.
         return Flight(
             Racetrack(
                 centre_ned_m=centre_ned_m,

@@ -110,8 +110,15 @@ class Sway:
         yaw, yaw_rate = self._swing(t_s, self.amplitude_rad / 2, 0.11)
         yaw += self.heading_rad + self.turn_rate_radps * t_s
         yaw_rate += self.turn_rate_radps
-        rates = body_rates(roll, pitch, (roll_rate, pitch_rate, yaw_rate))
-        return Pose(roll, pitch, math.remainder(yaw, math.tau), *rates)
+        p, q, r = body_rates(roll, pitch, (roll_rate, pitch_rate, yaw_rate))
+        return Pose(
+            roll_rad=roll,
+            pitch_rad=pitch,
+            yaw_rad=math.remainder(yaw, math.tau),
+            rollspeed_radps=p,
+            pitchspeed_radps=q,
+            yawspeed_radps=r,
+        )
 
     def _swing(self, t_s: float, amplitude_rad: float, frequency_hz: float) -> tuple[float, float]:
         """Angle and its derivative."""

@@ -278,7 +278,9 @@ import itertools, sys
 from pathlib import Path
 from companion.recording.writer import Writer
 from companion.values import Frame, Source
-writer = Writer(Path(sys.argv[1]), "[a]", {}, None, 0)
+writer = Writer(
+    where=Path(sys.argv[1]), settings_toml="[a]", versions={}, weights_hz=None, started_ns=0
+)
 for number in itertools.count():
     raw = bytes([0xFD, 9, 0, 0, number % 256, 1, 1, 0, 0, 0]) + number.to_bytes(11, "little")
     writer.event(Frame(number, "udp", Source(1, 1), 0, raw))

@@ -142,8 +142,14 @@ class Coverage:
 
         The whole sphere if nothing limits it.
         """
-        azimuths = self.azimuth_limits_rad or (-math.pi, math.pi)
-        return Sector(*azimuths, *(self.elevation_limits_rad or (-QUARTER, QUARTER)))
+        azimuth_from_rad, azimuth_to_rad = self.azimuth_limits_rad or (-math.pi, math.pi)
+        elevation_from_rad, elevation_to_rad = self.elevation_limits_rad or (-QUARTER, QUARTER)
+        return Sector(
+            azimuth_from_rad=azimuth_from_rad,
+            azimuth_to_rad=azimuth_to_rad,
+            elevation_from_rad=elevation_from_rad,
+            elevation_to_rad=elevation_to_rad,
+        )
 
 
 EVERYWHERE: Final = Coverage()

@@ -99,7 +99,7 @@ def _table(given: Any, size: int) -> _Table:
     frequency = given["frequency_hz"]
     if not is_number(frequency, FREQUENCY_MAX_HZ) or frequency <= 0:
         raise UserError(f"frequency_hz = {shown(frequency)} is not above 0, up to 1e15")
-    columns = []
+    columns: dict[str, FloatArray] = {}
     for name in names:
         column = given[name]
         most = GAIN_MAX_DB if name.startswith("gain") else PHASE_MAX_DEG
@@ -108,8 +108,14 @@ def _table(given: Any, size: int) -> _Table:
             raise UserError(
                 f"{name} at {frequency:.9g} Hz is not {size} finite numbers within {most:.0f}"
             )
-        columns.append(np.array(column, dtype=float))
-    return _Table(float(frequency), *columns, *([] if bounded else [None, None]))
+        columns[name] = np.array(column, dtype=float)
+    return _Table(
+        frequency_hz=float(frequency),
+        phase_deg=columns["phase_deg"],
+        gain_db=columns["gain_db"],
+        phase_error_deg=columns.get("phase_error_deg"),
+        gain_error_db=columns.get("gain_error_db"),
+    )
 
 
 def _interpolated(order: list[int], tables: list[_Table], frequency_hz: float) -> Calibration:

@@ -54,7 +54,7 @@ def solve(steering: ComplexArray) -> Solved | None:
     power, diagonal = gram.diagonal().real, inverse.diagonal().real
     if info or not power.dot(diagonal) < MOST_LOSS:
         return _unsolved(steering)
-    return Solved(zgemm(1.0, transposed, inverse, 0.0, None, 2), power * diagonal)
+    return Solved(zgemm(1.0, transposed, inverse, trans_a=2), power * diagonal)
 
 
 @lru_cache(maxsize=8)

@@ -16,6 +16,8 @@
 
 IPv6 hosts stand in brackets. Every peer has its own splitter: a frame truncated by one peer cannot
 damage another's.
+
+Over 300 lines: what a link receives, sends and reports is one class.
 """
 
 import asyncio

@@ -79,12 +79,12 @@ def from_xml(text: bytes) -> CotEvent:
     track = found.get("track", {})
     try:
         time_ms = _time_ms(event["time"])
-        names = event["uid"], event["type"], event.get("how", "")
+        uid, kind, how = event["uid"], event["type"], event.get("how", "")
         place = [float(point[key]) for key in ("lat", "lon", "hae", "ce", "le")]
         motion = [_optional(track.get(key)) for key in ("course", "speed", "slope")]
     except KeyError as missing:
         raise ValueError(f"no {missing.args[0]}") from missing
-    return _checked(*names, time_ms, place, motion)
+    return _checked(uid, kind=kind, how=how, time_ms=time_ms, place=place, motion=motion)
 
 
 def _time_ms(text: str) -> int:

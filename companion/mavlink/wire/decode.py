@@ -3,6 +3,8 @@
 Sources: the message definitions of https://mavlink.io/en/messages/common.html. MAVLink 2 cuts
 trailing zero bytes of a payload, and a version 1 frame has no extension fields: both are read as
 zeros, as the standard says. Where zero means "not sent" the value is None.
+
+Over 300 lines: a decoder for each message, and nothing else.
 """
 
 import math
@@ -177,7 +179,18 @@ def _attitude(frame: Frame) -> Attitude:
         raise _RefusedError(Reason.MALFORMED, "an angle or rate is not a number")
     if max(map(abs, angles[:3])) > TURN_RAD or max(map(abs, angles[3:])) > RATE_MAX_RADPS:
         raise _RefusedError(Reason.MALFORMED, "an angle or rate that nothing can measure")
-    return Attitude(frame.t_ns, frame.source, boot_ms, *angles)
+    roll_rad, pitch_rad, yaw_rad, rollspeed_radps, pitchspeed_radps, yawspeed_radps = angles
+    return Attitude(
+        t_ns=frame.t_ns,
+        source=frame.source,
+        boot_ms=boot_ms,
+        roll_rad=roll_rad,
+        pitch_rad=pitch_rad,
+        yaw_rad=yaw_rad,
+        rollspeed_radps=rollspeed_radps,
+        pitchspeed_radps=pitchspeed_radps,
+        yawspeed_radps=yawspeed_radps,
+    )
 
 
 _HEARTBEAT = struct.Struct("<IBBBBB")

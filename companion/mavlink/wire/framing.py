@@ -193,7 +193,12 @@ class Splitter:
                 self.frames += 1
                 self._claimed = 0
                 wanted = self._wanted is None or found[1] in self._wanted
-                return [Frame(t_ns, self.link, *found)] if wanted else []
+                source, msgid, raw = found
+                return (
+                    [Frame(t_ns=t_ns, link=self.link, source=source, msgid=msgid, raw=raw)]
+                    if wanted
+                    else []
+                )
         return self._split(t_ns, self._pending + data if self._pending else data, last=False)
 
     def finish(self, t_ns: int) -> list[Frame | Rejection]:

@@ -149,8 +149,18 @@ def _uas_data(mac: bytes, uas: bytes) -> Iterator[tuple[int, bytes]]:
         yield (
             LOCATION,
             _location(
-                *(mac, lat, lon, baro, geo, height, more[5], course, speed, climb, _code(status)),
-                (horizontal, vertical, barometer, at_speed, at_time),
+                mac,
+                lat,
+                lon_deg=lon,
+                baro_m=baro,
+                geo_m=geo,
+                height_m=height,
+                stamp_s=more[5],
+                course_deg=course,
+                speed_mps=speed,
+                climb_mps=climb,
+                status=_code(status),
+                codes=(horizontal, vertical, barometer, at_speed, at_time),
             ),
         )
 

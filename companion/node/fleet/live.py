@@ -379,5 +379,10 @@ class FleetNode:
 
     def status(self) -> FleetStatus:
         """This node's place in the fleet."""
-        rates = self._sent.bps, self._heard.bps
-        return FleetStatus(self.member, self.settings.site, *rates, self.damaged)
+        return FleetStatus(
+            member=self.member,
+            site=self.settings.site,
+            sent_bps=self._sent.bps,
+            heard_bps=self._heard.bps,
+            damaged=self.damaged,
+        )

@@ -114,8 +114,8 @@ def to_offers(data: bytes) -> tuple[Offer, ...]:
     names = ("sure_db", "likely_db", "sinr_db", "heard_s")
     return tuple(
         Offer(
-            _name(one.uav),
-            *(_number(getattr(one, name)) if one.HasField(name) else None for name in names),
+            uav=_name(one.uav),
+            **{name: _number(getattr(one, name)) if one.HasField(name) else None for name in names},
         )
         for one in message.offer
     )

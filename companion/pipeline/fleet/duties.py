@@ -138,8 +138,8 @@ class Duties:
 
     def _change(self, now_ns: int, uav: str, claims: Mapping[str, Mapping[str, float]]) -> Handover:
         other = _keeper(claims[uav]) if uav in claims else None
-        ends = (other, self._name) if uav in self.serves else (self._name, other)
-        return Handover(now_ns, uav, *ends)
+        before, after = (other, self._name) if uav in self.serves else (self._name, other)
+        return Handover(t_ns=now_ns, uav=uav, before=before, after=after)
 
     def _let_go(
         self,

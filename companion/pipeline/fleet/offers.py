@@ -66,10 +66,21 @@ class Offers:
         known = None if isinstance(carrier, str) else carrier
         tracks = pipeline.tracks(now_ns, at_ns, uavs)
         heard_s = {uav: self._silent_s(uav, now_ns) for uav in uavs}
-        parts = (pipeline.array, self._alone, pipeline.coverage)
+        array, alone, coverage = pipeline.array, self._alone, pipeline.coverage
 
         def make() -> dict[str, Offer]:
-            return self._make(aim(now_ns, at_ns, tracks, known, *parts), heard_s)
+            return self._make(
+                aim(
+                    now_ns,
+                    valid_at_ns=at_ns,
+                    tracks=tracks,
+                    carrier=known,
+                    array=array,
+                    precoder=alone,
+                    coverage=coverage,
+                ),
+                heard_s,
+            )
 
         return make
 
@@ -89,8 +100,13 @@ class Offers:
         for i, beam in enumerate(aimed.beams):
             gain_db = likely[i] if sure[i] is None else sure[i]
             sinr_db = None if gain_db is None else float(snr_db[i]) + gain_db
-            told = _step(sure[i]), _step(likely[i]), _step(sinr_db)
-            made[beam.uav] = Offer(beam.uav, *told, heard_s[beam.uav])
+            made[beam.uav] = Offer(
+                uav=beam.uav,
+                sure_db=_step(sure[i]),
+                likely_db=_step(likely[i]),
+                sinr_db=_step(sinr_db),
+                heard_s=heard_s[beam.uav],
+            )
         return made
 
     def _least_db(self, made: BeamSet, angles_rad: list[float | None]) -> tuple[float | None, ...]:

@@ -142,12 +142,24 @@ def _positions(
     height_m = np.where(np.isfinite(height_m), height_m, alt_m - alt_m[0])
     sound = on_earth(lat_1e7, lon_1e7, alt_m, height_m)
     count(lost, Reason.MALFORMED, int((~sound).sum()))
-    boot_us, place = times(pos)[sound], (lat_1e7[sound], lon_1e7[sound], alt_m[sound])
+    boot_us = times(pos)[sound]
+    lat_1e7, lon_1e7, alt_m = lat_1e7[sound], lon_1e7[sound], alt_m[sound]
     velocity = _velocities(boot_us, tables)
     if np.isnan(velocity).any():
-        velocity = _filled(velocity, boot_us, fixes, moved(boot_us, *place), notes)
+        between_m = moved(boot_us, lat_1e7, lon_1e7, alt_m)
+        velocity = _filled(velocity, boot_us, fixes, between_m, notes)
     heading = _headings(boot_us, attitude)
-    return Positions(boot_us, *place, height_m[sound], velocity, heading) if len(boot_us) else None
+    if not len(boot_us):
+        return None
+    return Positions(
+        boot_us=boot_us,
+        lat_1e7=lat_1e7,
+        lon_1e7=lon_1e7,
+        alt_m=alt_m,
+        height_m=height_m[sound],
+        velocity_ned_mps=velocity,
+        heading_deg=heading,
+    )
 
 
 def _received(fixes: Fixes, tables: dict[str, Table], notes: list[str]) -> Positions | None:
@@ -241,11 +253,19 @@ def _truth(sim: Table, motion: Table, lost: dict[Reason, int]) -> Truth | None:
     turned_by = np.stack([sim.numbers(name) for name in ("Q1", "Q2", "Q3", "Q4")], axis=1)
     sound = on_earth(lat_1e7, lon_1e7, alt_m) & np.isfinite(turned_by).all(axis=1)
     count(lost, Reason.MALFORMED, int((~sound).sum()))
-    boot_us, place = times(sim)[sound], (lat_1e7[sound], lon_1e7[sound], alt_m[sound])
+    boot_us = times(sim)[sound]
+    lat_1e7, lon_1e7, alt_m = lat_1e7[sound], lon_1e7[sound], alt_m[sound]
     if not len(boot_us):
         return None
     velocity = np.stack([motion.numbers(name) for name in ("VN", "VE", "VD")], axis=1)
     sure = np.isfinite(velocity).all(axis=1) & (np.abs(velocity) < 1e4).all(axis=1)
     there = between(boot_us, times(motion)[sure], velocity[sure], _NEAR_US // 5)
-    there = np.where(np.isnan(there), moved(boot_us, *place), there)
-    return Truth(boot_us, *place, there, turned_by[sound])
+    there = np.where(np.isnan(there), moved(boot_us, lat_1e7, lon_1e7, alt_m), there)
+    return Truth(
+        boot_us=boot_us,
+        lat_1e7=lat_1e7,
+        lon_1e7=lon_1e7,
+        alt_m=alt_m,
+        velocity_ned_mps=there,
+        ned_from_body=turned_by[sound],
+    )

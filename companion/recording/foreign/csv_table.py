@@ -215,20 +215,22 @@ Place = tuple[IntArray, IntArray, FloatArray]
 def _positions(
     boot_us: IntArray, place: Place, table: dict[str, FloatArray], notes: list[str]
 ) -> Positions:
-    velocity = moved(boot_us, *place)
+    lat_1e7, lon_1e7, alt_m = place
+    velocity = moved(boot_us, lat_1e7, lon_1e7, alt_m)
     nothing = np.full(len(boot_us), np.nan)
     given = np.stack([table.get(name, nothing) for name in _VELOCITY], axis=1)
     given = np.where(np.abs(given) < 1e4, given, np.nan)
     if np.isnan(given).any():
         notes.append("velocities that it does not give are those between its positions")
     height_m = table.get("height_m", nothing)
-    alt_m = place[2]
     return Positions(
-        boot_us,
-        *place,
-        np.where(np.abs(height_m) < 1e6, height_m, alt_m - alt_m[0]),
-        np.where(np.isnan(given), velocity, given),
-        table.get("heading_deg", table.get("yaw_deg", nothing)),
+        boot_us=boot_us,
+        lat_1e7=lat_1e7,
+        lon_1e7=lon_1e7,
+        alt_m=alt_m,
+        height_m=np.where(np.abs(height_m) < 1e6, height_m, alt_m - alt_m[0]),
+        velocity_ned_mps=np.where(np.isnan(given), velocity, given),
+        heading_deg=table.get("heading_deg", table.get("yaw_deg", nothing)),
     )
 
 

@@ -270,15 +270,24 @@ def _truth(tables: dict[str, Table], lost: Lost) -> Truth | None:
     lat_1e7, lon_1e7, alt_m = _place(of)
     sound = on_earth(lat_1e7, lon_1e7, alt_m)
     _count(lost, Reason.MALFORMED, int((~sound).sum()))
-    boot_us, place = _times(of)[sound], (lat_1e7[sound], lon_1e7[sound], alt_m[sound])
+    boot_us = _times(of)[sound]
+    lat_1e7, lon_1e7, alt_m = lat_1e7[sound], lon_1e7[sound], alt_m[sound]
     if not len(boot_us):
         return None
     velocity = _velocities(boot_us, tables[f"{_LOCAL}_groundtruth"])
-    velocity = np.where(np.isnan(velocity), moved(boot_us, *place), velocity)
+    made = moved(boot_us, lat_1e7, lon_1e7, alt_m)
+    velocity = np.where(np.isnan(velocity), made, velocity)
     turned_at, quaternions = _turns(tables[f"{_ATTITUDE}_groundtruth"], lost)
     near = np.zeros((len(boot_us), 4))
     if len(turned_at):
         row = np.clip(np.searchsorted(turned_at, boot_us), 0, len(turned_at) - 1)
         close = np.abs(turned_at[row] - boot_us) < _NEAR_US // 10
         near = np.where(close[:, None], quaternions[row], 0.0)
-    return Truth(boot_us, *place, velocity, near)
+    return Truth(
+        boot_us=boot_us,
+        lat_1e7=lat_1e7,
+        lon_1e7=lon_1e7,
+        alt_m=alt_m,
+        velocity_ned_mps=velocity,
+        ned_from_body=near,
+    )

@@ -225,8 +225,20 @@ def look(seen: Sight, update: Update, truth: ArrayTruth | None, t_s: float) -> l
         true = truly.get(track.uav)
         best, share, missed = seen.swept(towards, bound_rad, true)
         off_rad = None if true is None else _angle_rad(towards, true)
-        own = (worth.get(track.uav) for worth in worths)
-        samples.append(Sample(t_s, track.uav, bound_rad, off_rad, best, share, missed, *own))
+        set_worth, sharp_worth = (worth.get(track.uav) for worth in worths)
+        samples.append(
+            Sample(
+                t_s=t_s,
+                uav=track.uav,
+                pointing_bound_rad=bound_rad,
+                off_rad=off_rad,
+                codebook_best=best,
+                sweep_share=share,
+                missed=missed,
+                as_set=set_worth,
+                sharp=sharp_worth,
+            )
+        )
     return samples
 
 

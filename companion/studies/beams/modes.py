@@ -209,9 +209,16 @@ def _make(
 ) -> None:
     """Make beams one way, and note what they are worth."""
     assert update.carrier is not None
-    how = replace(pipeline.precoder, widen=way.widen)
-    parts = (update.carrier, pipeline.array, how, pipeline.coverage, way.state)
-    made = aim(update.t_ns, update.beams.valid_at_ns, tracks, *parts)
+    made = aim(
+        update.t_ns,
+        valid_at_ns=update.beams.valid_at_ns,
+        tracks=tracks,
+        carrier=update.carrier,
+        array=pipeline.array,
+        precoder=replace(pipeline.precoder, widen=way.widen),
+        coverage=pipeline.coverage,
+        before=way.state,
+    )
     way.state = steady.after(way.state, made)
     steering = steering_matrix(pipeline.array, directions(made))
     shapes = made.weights * steering

@@ -59,7 +59,7 @@ def files(
         "time": (CAPTIONS["time"], partial(_time, found)),
     }
     told = {
-        "spacing_m": f"{Sky(1, 1).spacing_m:g}",
+        "spacing_m": f"{Sky(nodes=1, uavs=1).spacing_m:g}",
         "delay_ms": f"{1000 * asked.delay_s:g}",
         "loss": f"{asked.loss:.0%}",
     }

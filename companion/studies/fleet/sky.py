@@ -84,7 +84,15 @@ class Flight:
         sysid, compid = Source.parse(uav)
         mav = self._mavs.setdefault(uav, common.MAVLink(None, sysid, compid))
         message = common.MAVLink_global_position_int_message(
-            boot_ms, 473977000, 85456000, 500000, 50000, 100, 100, 10, 9000
+            time_boot_ms=boot_ms,
+            lat=473977000,
+            lon=85456000,
+            alt=500000,
+            relative_alt=50000,
+            vx=100,
+            vy=100,
+            vz=10,
+            hdg=9000,
         )
         packed: bytes = message.pack(mav)
         return packed

@@ -216,7 +216,7 @@ def _flown(
 def _report(circle: Circle, made_s: float, latency_s: float) -> Observed:
     """A report as it arrives; the sender's clock is known."""
     position_m, velocity_mps = (
-        np.round(exact / REPORTED_M) * REPORTED_M for exact in circle.at(made_s)
+        np.round(one / REPORTED_M) * REPORTED_M for one in circle.at(made_s)
     )
     made_ns = round(made_s * 1e9)
     return Observed(
@@ -258,9 +258,7 @@ def from_logs(
             looks.append(seen)
         progress(f"{name}: {t_s:.0f} s of log")
     array = pipeline.array
-    resolved = [
-        seen for seen in looks if _resolved(settings, array, seen.towards[Positions.PERFECT])
-    ]
+    resolved = [one for one in looks if _resolved(settings, array, one.towards[Positions.PERFECT])]
     if not resolved:
         raise UserError(f"{name}: at no time is there a UAV to serve whose true place is known")
     chosen = np.sort(rng.choice(len(resolved), min(instants, len(resolved)), replace=False))

@@ -192,13 +192,13 @@ def _designs(flight: Flight) -> tuple[list[dict[str, Any]], dict[float, Tracked]
 
     scenario, one = flight.scenario, np.eye(1)
     b, d = scenario.dt_s, scenario.feedthrough_s
-    plant = (one, b * one, one, d * one, one)
+    held, reported = b * one, d * one
     rows: list[dict[str, Any]] = []
     tracked = {}
     for alpha in ALPHAS:
-        least = lmi.solve(*plant, alpha)
+        least = lmi.solve(one, b=held, c=one, d=reported, h=one, alpha=alpha)
         for mu_max, gain in PAPER_LEVELS:
-            feasible = lmi.solve(*plant, alpha, mu_max=mu_max)
+            feasible = lmi.solve(one, b=held, c=one, d=reported, h=one, alpha=alpha, mu_max=mu_max)
             solved = float(feasible.gain[0, 0])
             rows.append(
                 {

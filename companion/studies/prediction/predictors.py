@@ -42,7 +42,7 @@ class Product:
     """
 
     def __init__(self, settings: Settings, uav: str, origin: tuple[float, float, float]) -> None:
-        stands = FixedCenter(*origin)
+        stands = FixedCenter(lat_deg=origin[0], lon_deg=origin[1], alt_m=origin[2])
         self.uav = uav
         self.refuted_ns: list[int] = []
         self._pipeline = Pipeline(settings.override(center={"source": str(stands)}))

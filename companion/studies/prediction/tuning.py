@@ -38,8 +38,14 @@ def tune(name: str, cases: Sequence[Case]) -> Tuning:
 
     All tunings are played at once.
     """
-    grid = product_of(DENSITIES[name], NOISES)
-    tunings = [Tuning(density, *noises) for density, noises in grid]
+    tunings = [
+        Tuning(
+            process_density=density,
+            position_noise_m=position_noise_m,
+            velocity_noise_mps=velocity_noise_mps,
+        )
+        for density, (position_noise_m, velocity_noise_mps) in product_of(DENSITIES[name], NOISES)
+    ]
     squares = [_squares(name, tunings, delivery, asked) for _, delivery, asked in cases]
     costs = np.nanmean(np.concatenate(squares), axis=0)
     return tunings[int(np.argmin(costs))]

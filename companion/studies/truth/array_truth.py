@@ -89,7 +89,8 @@ def load(logs: Sequence[Path], pipeline: Pipeline) -> ArrayTruth | None:
     """
     local = pipeline.local
     assert local is not None
-    flown = vehicles.load(logs, str(FixedCenter(*local.origin)))
+    lat_deg, lon_deg, alt_m = local.origin
+    flown = vehicles.load(logs, str(FixedCenter(lat_deg=lat_deg, lon_deg=lon_deg, alt_m=alt_m)))
     flights = {flight.uav: flight for flight in flown.flights if flight.truth.kind == SIMULATED}
     if not isinstance(pipeline.center.place, VehicleCenter):
         return (

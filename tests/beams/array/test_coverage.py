@@ -19,7 +19,13 @@ def rad(*degrees: float) -> tuple[float, ...]:
 
 
 def sector(*degrees: float) -> Sector:
-    return Sector(*rad(*degrees))
+    azimuth_from_rad, azimuth_to_rad, elevation_from_rad, elevation_to_rad = rad(*degrees)
+    return Sector(
+        azimuth_from_rad=azimuth_from_rad,
+        azimuth_to_rad=azimuth_to_rad,
+        elevation_from_rad=elevation_from_rad,
+        elevation_to_rad=elevation_to_rad,
+    )
 
 
 def towards(azimuth_deg: float, elevation_deg: float) -> FloatArray:

@@ -400,11 +400,13 @@ def test_weights_are_finite_whatever_the_array_and_the_uavs(
 def test_a_least_gain_that_the_link_needs_is_what_nulls_leave() -> None:
     """Another UAV within the bound: with 6 dB needed the floor stays above them, else above 0."""
     directions = towards((0.0, 0.0), (2.0, 0.0))
-    known = (np.radians([0.6, 0.6]), np.radians([2.5, 2.5]))
+    likely, bounds = np.radians([0.6, 0.6]), np.radians([2.5, 2.5])
     crowd = within(directions[0], math.radians(2.5))
     least = []
     for floor_db, worth_db in ((2.7, 0.0), (8.7, 6.0)):
-        uncertain = Uncertain(*known, floor_db, worth_db)
+        uncertain = Uncertain(
+            likely_rad=likely, bounds_rad=bounds, floor_db=floor_db, worth_db=worth_db
+        )
         wide = widening.spread(LINE, directions, uncertain, Widen.LIKELY)
         assert wide is not None
         least.append(power_db(LINE, nulls.nulled(wide).weights[:, [0]], crowd).min())

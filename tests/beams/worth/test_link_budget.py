@@ -75,7 +75,12 @@ def test_noise_by_hand() -> None:
 )
 def test_a_budget_that_is_none_is_refused(values: tuple[float, ...], name: str) -> None:
     with pytest.raises(ValueError, match=name):
-        LinkBudget(*values)
+        LinkBudget(
+            tx_power_dbm=values[0],
+            bandwidth_hz=values[1],
+            noise_figure_db=values[2],
+            temperature_k=values[3],
+        )
 
 
 # --- power --------------------------------------------------------------------------------------

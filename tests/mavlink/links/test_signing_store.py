@@ -237,7 +237,7 @@ from companion.values import Source
 path, now_ns, key = Path(sys.argv[1]), int(sys.argv[2]), bytes.fromhex(sys.argv[3])
 timestamps = Timestamps(path)
 ours = timestamps.guard("udpin:0.0.0.0:14550", key, 7, now_ns)
-theirs = [Guard(key, 0), Guard(key, 0), Guard(key, 0)]
+theirs = [Guard(key=key, link_id=0) for _ in range(3)]
 step = 0
 while True:
     step += 1

@@ -147,15 +147,26 @@ def expected(m: dialect.MAVLink_message, t_ns: int, link: str) -> Message | None
                 t_ns=t_ns, source=source, unix_us=m.time_unix_usec or None, boot_ms=m.time_boot_ms
             )
         case "ATTITUDE":
-            rates = (m.rollspeed, m.pitchspeed, m.yawspeed)
-            return Attitude(t_ns, source, m.time_boot_ms, m.roll, m.pitch, m.yaw, *rates)
+            return Attitude(
+                t_ns=t_ns,
+                source=source,
+                boot_ms=m.time_boot_ms,
+                roll_rad=m.roll,
+                pitch_rad=m.pitch,
+                yaw_rad=m.yaw,
+                rollspeed_radps=m.rollspeed,
+                pitchspeed_radps=m.pitchspeed,
+                yawspeed_radps=m.yawspeed,
+            )
         case "EKF_STATUS_REPORT":
             knows = m.flags & dialect.EKF_ATTITUDE != 0
             return EstimatorStatus(
                 t_ns=t_ns, source=source, knows_attitude=knows, compass_ratio=m.compass_variance
             )
         case "GPS_RAW_INT":
-            accuracies = [value / 1000 or None for value in (m.h_acc, m.v_acc, m.vel_acc)]
+            h_acc, v_acc, vel_acc = (
+                value / 1000 or None for value in (m.h_acc, m.v_acc, m.vel_acc)
+            )
             return GnssStatus(
                 t_ns,
                 source,
@@ -587,7 +598,17 @@ def test_an_attitude_that_nothing_can_measure_is_malformed(field: int) -> None:
 
 def test_the_fields_of_an_attitude_keep_their_order() -> None:
     angles = [struct.unpack("<f", struct.pack("<f", 0.1 * n))[0] for n in range(1, 7)]
-    assert decode(attitude(angles)) == Attitude(T_NS, Source(7, 3), 77, *angles)
+    assert decode(attitude(angles)) == Attitude(
+        t_ns=T_NS,
+        source=Source(7, 3),
+        boot_ms=77,
+        roll_rad=angles[0],
+        pitch_rad=angles[1],
+        yaw_rad=angles[2],
+        rollspeed_radps=angles[3],
+        pitchspeed_radps=angles[4],
+        yawspeed_radps=angles[5],
+    )
 
 
 def test_a_heartbeat_says_what_it_is_of() -> None:

@@ -37,6 +37,14 @@ def word(now_ns: int, number: int) -> Shared:
     return Shared(now_ns, (SharedFrame(now_ns - 2 * MS, bytes(message.pack(mav))),))
 
 
+def test_a_node_says_when_it_started_and_when_it_speaks() -> None:
+    node = member(most=5)
+    said = node.says(START_NS + 3 * S, (47.0, 8.0, 400.0), 750.0)
+    assert (said.node, said.started_ns, said.t_ns) == ("a", START_NS, START_NS + 3 * S)
+    assert (said.place, said.reach_m, said.most) == ((47.0, 8.0, 400.0), 750.0, 5)
+    assert (said.serves, said.handing) == ((), ())
+
+
 def test_a_word_that_comes_after_its_node_went_is_forgotten_in_the_end() -> None:
     node = member()
     node.came(START_NS, "b")

@@ -28,7 +28,13 @@ def cubic(t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def test_interpolation_is_exact_for_a_cubic() -> None:
     t_s = np.array([0.0, 0.4, 1.0, 2.5])
-    trajectory = Trajectory("reports", np.round(t_s * S).astype(np.int64), *cubic(t_s))
+    position, velocity = cubic(t_s)
+    trajectory = Trajectory(
+        kind="reports",
+        t_ns=np.round(t_s * S).astype(np.int64),
+        position_ned_m=position,
+        velocity_ned_mps=velocity,
+    )
     asked_s = np.array([0.0, 0.1, 0.4, 0.9, 1.7, 2.5])
     position, velocity = trajectory.at(np.round(asked_s * S).astype(np.int64))
     expected = cubic(asked_s)
@@ -38,7 +44,13 @@ def test_interpolation_is_exact_for_a_cubic() -> None:
 
 def test_nothing_is_known_outside_and_in_gaps() -> None:
     t_s = np.array([0.0, 1.0, 4.0, 5.0])
-    trajectory = Trajectory("reports", np.round(t_s * S).astype(np.int64), *cubic(t_s))
+    position, velocity = cubic(t_s)
+    trajectory = Trajectory(
+        kind="reports",
+        t_ns=np.round(t_s * S).astype(np.int64),
+        position_ned_m=position,
+        velocity_ned_mps=velocity,
+    )
     position, velocity = trajectory.at(np.array([-1, S // 2, 2 * S, 3 * S, 4 * S, 6 * S]))
     known = [False, True, False, False, True, False]
     assert list(~np.isnan(position[:, 0])) == known

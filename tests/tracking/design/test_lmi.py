@@ -1,5 +1,7 @@
 """The LMI: its certificate, networks, and what it does not solve."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,12 @@ from companion.values import FloatArray
 
 ONE = np.eye(1)
 Plant = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
+
+
+def solve(plant: Plant, alpha: float, channels: Sequence[int] | None = None) -> lmi.LmiSolution:
+    """``lmi.solve`` of a plant that is given as one tuple."""
+    a, b, c, d, h = plant
+    return lmi.solve(a, b=b, c=c, d=d, h=h, alpha=alpha, channels=channels)
 
 
 def network(intervals_s: list[float], feedthrough_s: float) -> Plant:
@@ -26,7 +34,7 @@ def test_a_network_is_no_worse_than_its_worst_axis(
 ) -> None:
     """Unequal intervals, 2N x 2N, nothing assumed diagonal: mu is the largest of the axes'."""
     plant = network(intervals_s, feedthrough_s)
-    solved = lmi.solve(*plant, alpha)
+    solved = solve(plant, alpha)
     worst = max(closed_form.mu_star(b, feedthrough_s, alpha) for b in intervals_s)
     assert worst > 0.01
     assert solved.mu == pytest.approx(worst, abs=1e-5)
@@ -66,7 +74,7 @@ def test_the_margin_is_the_least_eigenvalue_of_what_is_written() -> None:
 
 def test_a_tampered_solution_fails_its_certificate() -> None:
     plant = network([0.6, 0.9], 0.2)
-    solved = lmi.solve(*plant, 0.5)
+    solved = solve(plant, 0.5)
     assert solved.margin > -1e-6
     assert lmi.lmi_margin(
         solved.lyapunov, gain=solved.gain, mu=solved.mu, plant=plant, alpha=0.5
@@ -256,8 +264,8 @@ def test_multipliers_a_channel_are_no_worse_than_one() -> None:
     """|w_i| <= 1 for each of three channels is |w| <= sqrt 3 for one: the bound must gain."""
     sampling = held(0.25, velocity=True)
     plant = (sampling.a, sampling.b, sampling.c, sampling.d, POSITION)
-    apart = lmi.solve(*plant, 0.9, channels=[1, 1, 1])
-    together = lmi.solve(*plant, 0.9)
+    apart = solve(plant, 0.9, channels=[1, 1, 1])
+    together = solve(plant, 0.9)
     assert np.sqrt(together.mu) < np.sqrt(apart.mu) < np.sqrt(3 * together.mu)
 
 

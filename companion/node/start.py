@@ -67,9 +67,9 @@ def run(
         service = Service(settings=settings, say=voice.say, origins=origins)
         serve = partial(
             _serve,
-            service,
-            voice,
-            http,
+            service=service,
+            voice=voice,
+            http=http,
             token=token,
             traffic=traffic,
             manager=manager,
@@ -91,7 +91,6 @@ async def _serve(
     service: Service,
     voice: Voice,
     http: socket.socket,
-    *,
     token: str | None,
     traffic: Callable[[str], Coroutine[Any, Any, None]] | None,
     manager: systemd.Manager | None,

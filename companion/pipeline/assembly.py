@@ -124,7 +124,15 @@ def coverage(settings: Settings) -> Coverage:
             field_of_view_rad=None if view is None else np.radians(view),
             azimuth_limits_rad=radians(given.azimuth_limits_deg),
             elevation_limits_rad=radians(given.elevation_limits_deg),
-            hidden=tuple(Sector(*np.radians(sector).tolist()) for sector in given.hidden_deg),
+            hidden=tuple(
+                Sector(
+                    azimuth_from_rad=math.radians(azimuth_from),
+                    azimuth_to_rad=math.radians(azimuth_to),
+                    elevation_from_rad=math.radians(elevation_from),
+                    elevation_to_rad=math.radians(elevation_to),
+                )
+                for azimuth_from, azimuth_to, elevation_from, elevation_to in given.hidden_deg
+            ),
         )
     except UserError as error:
         raise ConfigError(f"array: {error}") from error

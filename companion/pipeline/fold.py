@@ -118,7 +118,8 @@ class Pipeline:
             tracked=self.tracker,
         )
         self.targets = Targets(settings, self.center.vehicle)
-        site = Site(self.array, self.coverage, *assembly.radio(settings))
+        budget, antennas = assembly.radio(settings)
+        site = Site(array=self.array, coverage=self.coverage, budget=budget, uav_antennas=antennas)
         self.health = Health(settings.link, site)
 
     # --- the fold ---------------------------------------------------------------------------

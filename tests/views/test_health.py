@@ -9,9 +9,9 @@ WEAK = Verdict(
     level=Level.WEAK,
     blame=Blame(Cause.RATE, "reports 1.1 s apart", "ask for 10 Hz"),
     since_ns=0,
-    needed_gain_db=2.0,
-    guaranteed_gain_db=None,
-    likely_gain_db=4.5,
+    needed_db=2.0,
+    guaranteed_db=None,
+    likely_db=4.5,
 )
 
 
@@ -41,9 +41,9 @@ def test_a_machine_that_is_behind_is_to_blame_for_what_is_not_good() -> None:
         level=Level.GOOD,
         blame=None,
         since_ns=0,
-        needed_gain_db=2.0,
-        guaranteed_gain_db=3.0,
-        likely_gain_db=4.5,
+        needed_db=2.0,
+        guaranteed_db=3.0,
+        likely_db=4.5,
     )
     assert health.verdict(good, machine, UtcNs)["health"]["reason"] is None
     assert health.behind(LagSeen(newest_s=7.0, p95_s=7.0, max_s=7.04, behind=False)) is None

@@ -177,7 +177,7 @@ class Watch:
         observed_hz = self.observed_hz(heard_ns)
         return MessageRate(
             uav=self.uav,
-            msgid=self.msgid,
+            message_id=self.msgid,
             wanted_hz=self.wanted_hz,
             observed_hz=observed_hz,
             state=self.state,

@@ -168,12 +168,14 @@ def expected(m: dialect.MAVLink_message, t_ns: int, link: str) -> Message | None
                 value / 1000 or None for value in (m.h_acc, m.v_acc, m.vel_acc)
             )
             return GnssStatus(
-                t_ns,
-                source,
-                m.fix_type,
-                m.alt * 1e-3,
-                *accuracies,
-                m.time_usec,
+                t_ns=t_ns,
+                source=source,
+                fix_type=m.fix_type,
+                alt_m=m.alt * 1e-3,
+                h_acc_m=h_acc,
+                v_acc_m=v_acc,
+                vel_acc_mps=vel_acc,
+                time_us=m.time_usec,
             )
         case "GLOBAL_POSITION_INT":
             return Report(

@@ -93,12 +93,12 @@ def test_a_tampered_solution_fails_its_certificate() -> None:
 
 def certify(p: FloatArray, gain: FloatArray, mu: float, plant: Plant) -> None:
     """What ``solve`` does with the solver's answer, at alpha = 0.5."""
-    *abcd, h = plant
+    a, b, c, d, h = plant
     lmi._certified(
         p,
         [gain],
         mu,
-        samplings=[lmi.Sampling(*abcd)],
+        samplings=[lmi.Sampling(a=a, b=b, c=c, d=d)],
         h=h,
         multipliers=np.array([[0.5]]),
         widths=[len(p)],
@@ -282,7 +282,7 @@ def test_the_units_of_the_states_do_not_matter(size: float) -> None:
     s, change = held(0.25, velocity=True), np.diag([size, 1.0])
     back = np.diag([1 / size, 1.0])
     changed = (change @ s.a @ back, change @ s.b, s.c @ back, s.d, POSITION @ back)
-    solved = lmi.solve(*changed, 0.9, channels=[1, 1, 1])
+    solved = solve(changed, 0.9, channels=[1, 1, 1])
     plain = lmi.solve(s.a, b=s.b, c=s.c, d=s.d, h=POSITION, alpha=0.9, channels=[1, 1, 1])
     assert solved.mu == pytest.approx(plain.mu, rel=1e-4)
 

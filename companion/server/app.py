@@ -15,12 +15,12 @@ import companion
 from companion.server import area_map, beam_routes, file_routes, models, responses
 from companion.server.access import OPEN_PATHS, BearerToken, KnownHosts
 from companion.server.metrics import NodeCollector
-from companion.server.responses import answer, answers
+from companion.server.responses import answer, answers, encode, json_response
 from companion.server.stream import Stream
 from companion.server.turns import Turns
 from companion.values import UAV_FORMS
 from companion.views import fleet as fleet_view
-from companion.views import glance, series, settings, state
+from companion.views import glance, labels, series, settings, state
 from companion.views.as_json import as_json
 from companion.views.design import Design, DesignView
 from companion.views.link_state import Links
@@ -195,6 +195,16 @@ def _state_routes(app: FastAPI, node: Node, turns: Turns) -> None:
     )
     async def effective() -> Response:
         return answer(settings.show(node.pipeline.settings, node.origins))
+
+    shown_labels = encode(as_json(labels.labels(), node.pipeline.utc_ns))
+
+    @app.get(
+        "/v1/labels",
+        summary="Names, units and meanings of values and enumerations, for pages",
+        responses=answers(labels.Labels),
+    )
+    async def names() -> Response:
+        return json_response(shown_labels)
 
     @app.get(
         "/v1/design",

@@ -8,7 +8,7 @@ from fastapi.responses import Response
 
 from companion.server import models
 from companion.server.moments import Moments
-from companion.server.responses import answers, as_json, encode, refusals
+from companion.server.responses import answers, encode, json_response, refusals
 from companion.server.turns import Turns
 from companion.values import Update, UserError
 from companion.views import beam_state, weight_formats
@@ -41,7 +41,7 @@ def add(app: FastAPI, node: Node, turns: Turns) -> None:
         def make(update: Update) -> bytes:
             return encode(beam_state.beams(pipeline, equipment, update, 0.0, lead_ms))
 
-        return as_json(await moments.made(lead_ms, "beams", make))
+        return json_response(await moments.made(lead_ms, "beams", make))
 
     @app.get(
         "/v1/beams/weights",
@@ -88,7 +88,7 @@ def add(app: FastAPI, node: Node, turns: Turns) -> None:
                 beam_state.pattern(pipeline, update, cut, points=points, only=uav, lead_ms=lead_ms)
             )
 
-        return as_json(await moments.made(lead_ms, (cut, points, uav), make))
+        return json_response(await moments.made(lead_ms, (cut, points, uav), make))
 
 
 def _weight_answers() -> dict[int | str, dict[str, Any]]:

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from companion.values import UtcNs
-from companion.values.described import Meaning, Member, bare, members, unit
+from companion.values.described import DescribedEnum, Meaning, Member, bare, members, unit
 from companion.views.as_json import FORMER_NAMES, name_in_json
 
 
@@ -110,3 +110,11 @@ def outward(kind: Any) -> Any:
             return model(kind)
         return kind if issubclass(kind, str) else str
     return kind
+
+
+def describe_enumerations(schemas: dict[str, Any]) -> None:
+    """Add to each enumeration of an OpenAPI document what its values mean."""
+    for kind in DescribedEnum.__subclasses__():
+        if kind.__name__ in schemas:
+            meanings = [f"{one}: {one.meaning}" for one in kind]
+            schemas[kind.__name__]["description"] = f"{kind.__doc__} {'; '.join(meanings)}."

@@ -33,10 +33,10 @@ def encode(content: object) -> bytes:
 
 def answer(content: object, status: int = 200) -> Response:
     """A response with ``content`` as JSON."""
-    return as_json(encode(content), status)
+    return json_response(encode(content), status)
 
 
-def as_json(body: bytes, status: int = 200) -> Response:
+def json_response(body: bytes, status: int = 200) -> Response:
     """A response of what is JSON already."""
     return Response(body, status_code=status, media_type="application/json")
 
@@ -98,5 +98,6 @@ def _document(app: FastAPI) -> dict[str, Any]:
                     schema = content.get("application/json", {}).get("schema", {})
                     if schema.get("$ref", "").endswith("/Problem"):
                         shown["content"] = {PROBLEM_TYPE: content["application/json"]}
+        models.describe_enumerations(made["components"]["schemas"])
         app.openapi_schema = made
     return app.openapi_schema

@@ -1,85 +1,61 @@
 """Values that the beam stage makes: beams, the UAVs left out, and the weights of one update."""
 
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Annotated
 
 import numpy as np
 
-from companion.values.described import Meaning
+from companion.values.described import DescribedEnum, Meaning
 from companion.values.health import Cause
 from companion.values.numbers import ComplexArray, FloatArray, IntArray
 
 
-class Method(StrEnum):
-    """How weights are made: zero forcing, regularised zero forcing, least mean square error of what
-    is received, or maximum ratio transmission.
+class Method(DescribedEnum):
+    """How weights are computed; regularised zero forcing also replaces too costly zero forcing."""
 
-    ``REGULARISED`` is also used in place of ``ZERO_FORCING`` where that would cost too much gain.
-    """
-
-    ZERO_FORCING = "zf"
-    REGULARISED = "rzf"
-    MMSE = "mmse"
-    MATCHED = "mrt"
+    ZERO_FORCING = "zf", "zero forcing"
+    REGULARISED = "rzf", "regularised zero forcing"
+    MMSE = "mmse", "minimum mean square error"
+    MATCHED = "mrt", "maximum ratio transmission"
 
 
-class Power(StrEnum):
-    """How the beams of one turn share the power.
+class Power(DescribedEnum):
+    """How the beams of one time slot share the power."""
 
-    EQUAL         alike
-    MAX_MIN       so that the least SINR is the greatest
-    WEIGHTED_SUM  so that the weighted sum of rates is great
-    """
-
-    EQUAL = "equal"
-    MAX_MIN = "max-min"
-    WEIGHTED_SUM = "weighted-sum"
+    EQUAL = "equal", "equally"
+    MAX_MIN = "max-min", "so that the least SINR is as large as possible"
+    WEIGHTED_SUM = "weighted-sum", "so that the weighted sum of rates is large"
 
 
-class Normalisation(StrEnum):
-    """How the columns of the weights F, (M, N), are scaled. Their directions do not change.
-
-        UNIT_RESPONSE  each UAV receives 1 from its own column: AᵀF has a unit diagonal (published
-                       form)
-        STREAM         each column has unit power
-        TOTAL          all columns together have unit power, by one common factor
-        ANTENNA        the busiest element has power 1/M, its uniform share of unit power, by one
-                       factor
+class Normalisation(DescribedEnum):
+    """How the columns of the weights F, (M, N), are scaled; their directions do not change.
 
     A is the (M, N) steering matrix; see docs/math.md 7.
     """
 
-    UNIT_RESPONSE = "unit-response"
-    STREAM = "stream"
-    TOTAL = "total"
-    ANTENNA = "antenna"
+    UNIT_RESPONSE = (
+        "unit-response",
+        "each UAV receives 1 from its own column, as in the paper",
+    )
+    STREAM = "stream", "each column has unit power"
+    TOTAL = "total", "all columns together have unit power, by one common factor"
+    ANTENNA = "antenna", "the busiest element has power 1/M, by one common factor"
 
 
-class Policy(StrEnum):
-    """What is done where zero forcing would cost a user too much gain.
+class Policy(DescribedEnum):
+    """What is done where zero forcing would cost a UAV too much gain."""
 
-    REGULARISE  add a diagonal loading to the Gram matrix
-    GROUP       serve groups of UAVs one after the other
-    DROP        leave out the UAVs of lowest priority
-    """
-
-    REGULARISE = "regularise"
-    GROUP = "group"
-    DROP = "drop"
+    REGULARISE = "regularise", "add a diagonal loading to the Gram matrix"
+    GROUP = "group", "serve groups of UAVs in turn, each in a time slot"
+    DROP = "drop", "leave out the UAVs of lowest priority"
 
 
-class Widen(StrEnum):
-    """How wide beams are made.
+class Widen(DescribedEnum):
+    """How wide beams are made."""
 
-    LIKELY     for the angle within which the UAV usually is, over a floor within its bound
-    GUARANTEE  for the bound: the greatest least gain within it
-    NO         sharp
-    """
-
-    LIKELY = "likely"
-    GUARANTEE = "guarantee"
-    NO = "no"
+    LIKELY = "likely", "for the usual pointing error, with a guaranteed floor within the bound"
+    GUARANTEE = "guarantee", "for the bound: the largest guaranteed gain within it"
+    NO = "no", "as narrow as the array allows"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

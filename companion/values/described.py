@@ -6,8 +6,8 @@ Every way out derives from these declarations: the HTTP API and its OpenAPI docu
 (``companion.server.models``), recordings (``companion.recording.schemas``), exported tables
 (``companion.recording.tables``), the reference pages of ``docs`` and the labels of the dashboard.
 
-A described class is a dataclass, a ``NamedTuple`` or a ``TypedDict``. A property is described in
-the annotation of what it returns. What has no ``Meaning`` stays inside the program.
+A described class is a dataclass or a ``NamedTuple``. A property is described in the annotation of
+what it returns. What has no ``Meaning`` stays inside the program.
 
 The name of a value ends in its unit. Each way out writes that unit in its own form, by rule:
 
@@ -23,8 +23,9 @@ import operator
 import types
 import typing
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
-from typing import Any, Final, Literal, NamedTuple
+from dataclasses import KW_ONLY, dataclass, field
+from enum import StrEnum
+from typing import Any, Final, Literal, NamedTuple, Self
 
 Way = Literal["api", "recording", "export"]
 """A way out of the program."""
@@ -38,7 +39,7 @@ UNITS: Final = {
 """How the ending of a name writes its unit."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Meaning:
     """What a value means, and how it leaves the program.
 
@@ -54,11 +55,24 @@ class Meaning:
 
     text: str
     number: int | None = None
+    _: KW_ONLY
     label: str | None = None
     example: Any = None
     wire: str | None = None
     absent: Mapping[Way, str] = field(default_factory=lambda: NOWHERE)
     deprecated: str | None = None
+
+
+class DescribedEnum(StrEnum):
+    """An enumeration whose values are described: ``NAME = "value", "what it means"``."""
+
+    meaning: str
+
+    def __new__(cls, value: str, meaning: str = "") -> Self:
+        made = str.__new__(cls, value)
+        made._value_ = value
+        made.meaning = meaning
+        return made
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +149,7 @@ def _members(described: type) -> Iterator[Member]:
         if not said:
             continue
         kind, optional = bare(annotation)
-        get = _item(name) if typing.is_typeddict(described) else operator.attrgetter(name)
+        get = operator.attrgetter(name)
         if isinstance(said[0], Meaning):
             yield Member(name=name, type=kind, optional=optional, meaning=said[0], get=get)
             continue
@@ -167,10 +181,6 @@ def _metadata(annotation: Any) -> tuple[Any, ...]:
         inner, *said = typing.get_args(annotation)
         return (*said, *_metadata(inner))
     return ()
-
-
-def _item(name: str) -> Callable[[Any], Any]:
-    return lambda whole: whole[name]
 
 
 def _chain(outer: Callable[[Any], Any], inner: Callable[[Any], Any]) -> Callable[[Any], Any]:

@@ -1,56 +1,35 @@
 """Values of the verdict on a UAV's link: how good it is, why, and what can be done."""
 
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Annotated
 
-from companion.values.described import Meaning
+from companion.values.described import DescribedEnum, Meaning
 
 
-class Level(StrEnum):
-    """How good the link to a UAV is.
+class Level(DescribedEnum):
+    """How good the link to a UAV is."""
 
-    GOOD  its beam surely has the gain that the link needs
-    WEAK  it usually has it
-    NONE  it has not, or there is no beam
-    """
-
-    GOOD = "good"
-    WEAK = "weak"
-    NONE = "none"
+    GOOD = "good", "its beam has the gain that the link needs, guaranteed"
+    WEAK = "weak", "its beam usually has the gain that the link needs"
+    NONE = "none", "its beam lacks the gain that the link needs, or there is no beam"
 
 
-class Cause(StrEnum):
-    """What holds a link back most.
+class Cause(DescribedEnum):
+    """What limits a link most."""
 
-    CARRIER   where the array is, or how it is turned, is not known well enough
-    SILENT    no report has come for long
-    REFUSED   reports come, and are not used
-    RATE      its reports are far apart
-    LATE      its reports come late
-    AGILE     it may turn away quickly
-    CLOCK     its clock is not known well enough
-    POSITION  its reported positions are not accurate enough, so near
-    CROWDED   other UAVs are in the same direction, or the policy leaves it out
-    COVERAGE  the array does not reach that direction
-    RANGE     the whole gain of the array would not be enough there
-    MACHINE   this machine does not keep up
-    UNSERVED  no node of the fleet serves it
-    """
-
-    CARRIER = "carrier"
-    SILENT = "silent"
-    REFUSED = "refused"
-    RATE = "rate"
-    LATE = "late"
-    AGILE = "agile"
-    CLOCK = "clock"
-    POSITION = "position"
-    CROWDED = "crowded"
-    COVERAGE = "coverage"
-    RANGE = "range"
-    MACHINE = "machine"
-    UNSERVED = "unserved"
+    CARRIER = "carrier", "the array's position or attitude is too uncertain"
+    SILENT = "silent", "no report arrives"
+    REFUSED = "refused", "reports arrive and are not used"
+    RATE = "rate", "its reports are far apart"
+    LATE = "late", "its reports arrive late"
+    AGILE = "agile", "it can turn away quickly"
+    CLOCK = "clock", "its clock is too uncertain"
+    POSITION = "position", "its reported positions are too inaccurate at this range"
+    CROWDED = "crowded", "other UAVs are in the same direction, or the policy leaves it out"
+    COVERAGE = "coverage", "the array does not cover its direction"
+    RANGE = "range", "even the full gain of the array is too little at this range"
+    MACHINE = "machine", "this machine does not keep up"
+    UNSERVED = "unserved", "no node of the fleet serves it"
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,21 +1,20 @@
 """Values that the pipeline returns for an event."""
 
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Annotated
 
 from companion.values.aimed import BeamSet
-from companion.values.described import Meaning
+from companion.values.described import DescribedEnum, Meaning
 from companion.values.rejections import Rejection
 from companion.values.tracked import Carrier, Estimate, Refuted, Track
 
 
-class Severity(StrEnum):
+class Severity(DescribedEnum):
     """How important a notice is to an operator."""
 
-    INFO = "info"
-    WARNING = "warning"
-    ERROR = "error"
+    INFO = "info", "for information"
+    WARNING = "warning", "something is worse than it should be"
+    ERROR = "error", "something is lost or not used"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

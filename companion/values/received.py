@@ -1,10 +1,9 @@
 """Values that come in: frames, and the messages decoded from them."""
 
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Annotated, NamedTuple
 
-from companion.values.described import Meaning
+from companion.values.described import DescribedEnum, Meaning
 from companion.values.names import Source, UavKind
 
 
@@ -44,15 +43,12 @@ class Frame(NamedTuple):
         return self.raw[start : start + self.raw[1]]
 
 
-class AltitudeDatum(StrEnum):
-    """What a height is measured from.
+class AltitudeDatum(DescribedEnum):
+    """What an altitude is measured from."""
 
-    Pressure altitude can be hundreds of metres off with the weather.
-    """
-
-    MSL = "msl"
-    PRESSURE = "pressure"
-    GEOMETRIC = "geometric"
+    MSL = "msl", "mean sea level"
+    PRESSURE = "pressure", "the standard atmosphere: hundreds of metres off with the weather"
+    GEOMETRIC = "geometric", "the WGS84 ellipsoid"
 
 
 class Accuracy(NamedTuple):

@@ -1,22 +1,13 @@
 """What was received and not used, and why."""
 
 from dataclasses import dataclass
-from enum import StrEnum
-from typing import Annotated, Self
+from typing import Annotated
 
-from companion.values.described import Meaning
+from companion.values.described import DescribedEnum, Meaning
 
 
-class Reason(StrEnum):
-    """Why something received was not used. Each reason has a ``meaning`` for people."""
-
-    meaning: str
-
-    def __new__(cls, value: str, meaning: str) -> Self:
-        made = str.__new__(cls, value)
-        made._value_ = value
-        made.meaning = meaning
-        return made
+class Reason(DescribedEnum):
+    """Why something received was not used."""
 
     GARBAGE = "garbage", "bytes between frames"
     BAD_CRC = "bad-crc", "frames with a wrong checksum"

@@ -2,10 +2,9 @@
 
 import math
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Annotated, Final
 
-from companion.values.described import Inline, Meaning
+from companion.values.described import DescribedEnum, Inline, Meaning
 from companion.values.numbers import FloatArray, Vector
 from companion.values.received import Report
 
@@ -26,17 +25,12 @@ class ReportNoise:
     apart_m: float = 0.0
 
 
-class LimitSource(StrEnum):
-    """Where the limits of an aircraft come from.
+class LimitSource(DescribedEnum):
+    """Where the limits of an aircraft come from."""
 
-    SETTINGS  ``[observer]`` in the settings
-    TYPE      the aircraft's type
-    RAISED    raised, because reports refuted the limits before
-    """
-
-    SETTINGS = "settings"
-    TYPE = "type"
-    RAISED = "raised"
+    SETTINGS = "settings", "[observer] in the settings"
+    TYPE = "type", "the aircraft's type"
+    RAISED = "raised", "raised, because reports refuted the limits before"
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,19 +129,13 @@ class SenderTime:
         return max(self.before_s, self.after_s)
 
 
-class TrackState(StrEnum):
-    """How old the newest report of a UAV is; the age limits are settings (``[tracks]``).
+class TrackState(DescribedEnum):
+    """How old the newest report of a UAV is; the age limits are settings (``[tracks]``)."""
 
-    LIVE      reports arrive
-    COASTING  predicted without new reports
-    STALE     too old for a beam
-    LOST      about to be dropped
-    """
-
-    LIVE = "live"
-    COASTING = "coasting"
-    STALE = "stale"
-    LOST = "lost"
+    LIVE = "live", "reports arrive"
+    COASTING = "coasting", "predicted without new reports"
+    STALE = "stale", "too old for a beam"
+    LOST = "lost", "about to be dropped"
 
 
 _LOCAL_FRAME: Final = "coordinates of the node's own frame; `lat_deg` … and `north_m` … say where"

@@ -32,9 +32,7 @@ _DEGREES: Final = {"_rad": "_deg", "_radps": "_degps"}
 
 
 def as_json(item: Any, utc_ns: Utc) -> Json:
-    """A described value as JSON; a ``TypedDict`` is JSON already."""
-    if isinstance(item, dict):
-        return item
+    """A described value as JSON."""
     kind: Any = type(item)
     shown = {name: write(get(item), utc_ns) for name, get, write in _plan(kind)}
     for old, new in FORMER_NAMES.get(kind.__name__, {}).items():
@@ -88,8 +86,10 @@ def _writer(member: Member) -> Write:
 
 def _any(value: Any, utc_ns: Utc) -> Any:
     """Arrays and tuples as lists, described values within as objects."""
-    if value is None or isinstance(value, str | int | float | dict):
+    if value is None or isinstance(value, str | int | float):
         return value
+    if isinstance(value, dict):
+        return {key: _any(one, utc_ns) for key, one in value.items()}
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, list | tuple) and not hasattr(value, "_fields"):

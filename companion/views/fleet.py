@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import StrEnum
 from typing import Annotated
 
 import numpy as np
@@ -15,25 +14,18 @@ from companion.pipeline.fleet.neighbours import Neighbour
 from companion.pipeline.fold import Pipeline
 from companion.tracking.geodesy import Place
 from companion.values import Blame, Offer, Standing
-from companion.values.described import Inline, Meaning
+from companion.values.described import DescribedEnum, Inline, Meaning
 from companion.views.as_json import Json, as_json
 
 
-class NodeState(StrEnum):
-    """State of a node of the fleet.
+class NodeState(DescribedEnum):
+    """State of a node of the fleet."""
 
-    HERE    the node that answers
-    THERE   its messages are current
-    SILENT  no message for a lease
-    ASIDE   excluded, because its messages contradict others
-    GONE    it left
-    """
-
-    HERE = "here"
-    THERE = "there"
-    SILENT = "silent"
-    ASIDE = "aside"
-    GONE = "gone"
+    HERE = "here", "the node that answers"
+    THERE = "there", "its messages are current"
+    SILENT = "silent", "no message for a lease"
+    ASIDE = "aside", "excluded, because its messages contradict others"
+    GONE = "gone", "it left"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

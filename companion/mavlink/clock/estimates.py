@@ -2,25 +2,24 @@
 
 import math
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Annotated
 
-from companion.values.described import Meaning
+from companion.values.described import DescribedEnum, Meaning
 
 
-class ClockKind(StrEnum):
-    """The evidence from which a sender's clock is known."""
+class ClockKind(DescribedEnum):
+    """The evidence from which a sender's clock is estimated."""
 
-    TIMESYNC = "timesync"
-    GNSS = "gnss"
-    ENVELOPE = "envelope"
+    TIMESYNC = "timesync", "TIMESYNC round trips"
+    GNSS = "gnss", "SYSTEM_TIME of a GNSS receiver"
+    ENVELOPE = "envelope", "time stamps and arrivals of its frames alone"
 
 
-class Guarantee(StrEnum):
-    """Whether both ends of the interval were measured, or the lower one is assumed."""
+class Guarantee(DescribedEnum):
+    """Whether both ends of a clock's interval were measured."""
 
-    MEASURED = "measured"
-    ASSUMED = "assumed"
+    MEASURED = "measured", "both ends were measured"
+    ASSUMED = "assumed", "one end is assumed"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

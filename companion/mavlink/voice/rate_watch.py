@@ -28,7 +28,6 @@ import math
 from bisect import insort
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from enum import StrEnum
 from itertools import pairwise
 from statistics import median_high
 from typing import Annotated, Final, NamedTuple
@@ -37,7 +36,7 @@ from companion.mavlink.wire.decode import ATTITUDE
 from companion.mavlink.wire.encode import Outgoing, request_data_stream, set_message_interval
 from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
 from companion.values import Notice, Severity, Source
-from companion.values.described import Meaning
+from companion.values.described import DescribedEnum, Meaning
 
 _NS: Final = 1_000_000_000
 SLOW_BELOW: Final = 0.8
@@ -71,14 +70,14 @@ RESTART: Final = "a restart"
 NOBODY: Final = "nobody was heard asking"
 
 
-class RateState(StrEnum):
+class RateState(DescribedEnum):
     """State of the request for one message; see the head of this module."""
 
-    WATCHING = "watching"
-    ASKED = "asked"
-    ACCEPTED = "accepted"
-    STREAMING = "streaming"
-    REFUSED = "refused"
+    WATCHING = "watching", "nothing requested"
+    ASKED = "asked", "requested"
+    ACCEPTED = "accepted", "the autopilot accepted the request"
+    STREAMING = "streaming", "requested as a data stream"
+    REFUSED = "refused", "the autopilot refused"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

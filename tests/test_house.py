@@ -284,6 +284,8 @@ def init_fields(node: ast.ClassDef) -> list[str]:
                     given.arg == "init" and ast.unparse(given.value) == "False"
                     for given in value.keywords
                 )
+                if called(kind) == "KW_ONLY":
+                    return found  # those that follow are given by name
                 if called(kind) != "ClassVar" and not is_made:
                     found.append(name)
     return found

@@ -77,8 +77,10 @@ def test_silence_and_a_missing_carrier_are_told(tmp_path: Path) -> None:
     found = list(check(settings, 0.2))
     (heard,) = (each for each in found if each.text == "heard nothing")
     assert "MAVProxy" in heard.remedy
-    assert found[-1].subject == "carrier"
-    assert found[-1].grade is Grade.FAULT
+    carrier = found[-1]
+    assert (carrier.subject, carrier.grade) == ("carrier", Grade.FAULT)
+    assert carrier.text == "nobody said what carries the array"
+    assert carrier.remedy == "say --center SYSID:COMPID or LAT,LON,ALT"
 
 
 @pytest.mark.parametrize(

@@ -2,15 +2,18 @@
 
 import asyncio
 import socket
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from link_support import frame, port_of, runner, until_true
 from pymavlink.dialects.v20 import all as dialect
 
+from companion.mavlink.links.urls import LinkError
 from companion.mavlink.wire.encode import COMMAND_LONG, HEARTBEAT
 from companion.node.gateway import Gateway
 from companion.settings.model import Settings
-from companion.values import Event, Frame, Notice, Reason, Rejection, Source
+from companion.values import Event, Frame, Notice, Reason, Rejection, Severity, Source
 
 SECRET = bytes(range(100, 132))
 
@@ -48,6 +51,30 @@ def test_a_signing_key_goes_no_further_and_that_is_counted() -> None:
     assert [before.raw, after.raw] == [sent[0], sent[2]]
     assert refused == Rejection(t_ns=before.t_ns, source="255:190", reason=Reason.SECRET, msgid=256)
     assert repr(SECRET)[2:-1] not in repr(stepped)
+
+
+def test_timestamps_that_cannot_be_saved_are_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    tries, said = [], list[Notice]()
+
+    def write(_: object) -> None:
+        tries.append(1)
+        raise LinkError("timestamps.bin: no space left")
+
+    monkeypatch.setattr("companion.node.gateway.SAVE_EVERY_S", 0.001)
+    timestamps: Any = SimpleNamespace(due=lambda _: True, snapshot=lambda _: None, write=write)
+
+    async def test() -> None:
+        gateway = Gateway(
+            settings=Settings(), step=lambda _: None, notify=said.append, now_ns=lambda: 5
+        )
+        saving = asyncio.create_task(gateway._save(timestamps))
+        await until_true(lambda: len(tries) > 2)
+        saving.cancel()
+        await asyncio.wait([saving])
+
+    runner("asyncio")(test())
+    text = "timestamps.bin: no space left"
+    assert said == [Notice(t_ns=5, severity=Severity.ERROR, subject="signing", text=text)]
 
 
 def beat() -> bytes:

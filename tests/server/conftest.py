@@ -89,7 +89,7 @@ class StandIn:
 
     def links(self) -> list[LinkStatus]:
         """One link that hears one vehicle, and one that hears nobody."""
-        heard = {Source(1, 1): ComponentStatus(frames=7, gaps=1, heard_ns=self._now_ns, version=2)}
+        heard = {Source(1, 1): ComponentStatus(frames=7, gaps=1, heard_ns=self._now_ns, mavlink=2)}
         lost = {"garbage": 12}
         one = LinkStatus(
             url="udpin:127.0.0.1:14550",
@@ -126,7 +126,7 @@ class StandIn:
         return [
             MessageRate(
                 uav=Source(1, 1),
-                msgid=33,
+                message_id=33,
                 wanted_hz=10.0,
                 observed_hz=None,
                 state=RateState.ASKED,

@@ -1,6 +1,7 @@
 """A node of a fleet over HTTP: who serves whom, and what that makes of the verdicts and metrics."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 from starlette.testclient import TestClient
@@ -10,6 +11,8 @@ from companion.server import models
 from companion.server.app import create_app
 from companion.settings.fleet import FleetSettings
 from companion.values import Duty, Offer, Standing
+from companion.views import fleet as fleet_view
+from companion.views import state as state_view
 from companion.views.fleet import FleetStatus
 
 from .conftest import StandIn, settings
@@ -48,8 +51,8 @@ def client(node: StandIn) -> TestClient:
     return TestClient(create_app(node))
 
 
-def uavs(node: StandIn) -> dict[str, models.UavState]:
-    answer = models.Uavs.model_validate(client(node).get("/v1/uavs").json())
+def uavs(node: StandIn) -> dict[str, Any]:
+    answer = models.model(state_view.Uavs).model_validate(client(node).get("/v1/uavs").json())
     return {uav.id: uav for uav in answer.uavs}
 
 
@@ -64,7 +67,7 @@ def test_who_serves_a_uav_is_said_of_it(north: StandIn) -> None:
 def test_a_node_that_left_stays_in_the_list(north: StandIn) -> None:
     assert north.fleet is not None
     north.fleet.member.left(north.now_ns(), "south")
-    answer = models.Fleet.model_validate(client(north).get("/v1/fleet").json())
+    answer = models.model(fleet_view.Fleet).model_validate(client(north).get("/v1/fleet").json())
     assert [(one.node, one.state, one.serves) for one in answer.nodes] == [
         ("north", "here", 1),
         ("south", "gone", 0),
@@ -98,7 +101,7 @@ def test_who_is_served_by_nobody_has_no_link_and_why(north: StandIn) -> None:
 def test_the_headline_counts_those_of_nobody_and_names_the_others(north: StandIn) -> None:
     found = uavs(north).values()
     alone = sum(one.served_by == [] for one in found)
-    status = models.Status.model_validate(client(north).get("/v1/status").json())
+    status = models.model(state_view.Status).model_validate(client(north).get("/v1/status").json())
     assert status.node == "north"
     assert status.health.none >= alone
     assert status.health.headline.endswith("links good, 1 with other nodes")
@@ -109,7 +112,7 @@ def test_a_node_put_aside_serves_nobody(north: StandIn) -> None:
     assert north.fleet is not None
     north.fleet.member.trust.aside["south"] = "has a clock that contradicts itself"
     assert uavs(north)["2:1"].served_by == []
-    answer = models.Fleet.model_validate(client(north).get("/v1/fleet").json())
+    answer = models.model(fleet_view.Fleet).model_validate(client(north).get("/v1/fleet").json())
     assert [node.state for node in answer.nodes] == ["here", "aside"]
     assert all("south" not in uav.served_by for uav in answer.uavs)
 

@@ -19,7 +19,8 @@ from websockets.typing import Subprotocol
 from companion.server import models, stream
 from companion.server.stream import Wanted, wanted
 from companion.server.topics import Topic
-from companion.views import guaranteed_gain, records
+from companion.views import beam_state, guaranteed_gain, link_state, records
+from companion.views import state as state_view
 
 LOOPS: list[Callable[[], asyncio.AbstractEventLoop] | None] = [None, uvloop.new_event_loop]
 SOON_S = HANG_S
@@ -49,8 +50,8 @@ def test_the_state_comes_at_once_and_with_every_update(
             assert [message["topic"] for message in first] == ["uavs", "beams"]
             for message in first:
                 assert message.keys() >= {"valid_at", "topic"}
-            models.Uavs.model_validate(first[0])
-            models.Beams.model_validate(first[1])
+            models.model(state_view.Uavs).model_validate(first[0])
+            models.model(beam_state.Beams).model_validate(first[1])
             await asyncio.sleep(0.02)  # more than the period that was asked for
             node.tick()
             second = [await said(websocket) for _ in range(2)]
@@ -102,9 +103,9 @@ def test_only_those_uavs_and_topics_that_are_asked_for(make_node: Any, serving: 
             weights, uavs, beams, status, links = [await said(websocket) for _ in range(5)]
         assert {one["id"] for one in uavs["uavs"]} == {"2:1", "3:1"}
         assert {one["uav"] for one in beams["beams"]} == {"2:1", "3:1"}
-        models.Status.model_validate(status)
-        models.Links.model_validate(links)
-        models.Weights.model_validate(weights)
+        models.model(state_view.Status).model_validate(status)
+        models.model(link_state.Links).model_validate(links)
+        models.model(beam_state.Weights).model_validate(weights)
         beam_set = node.pipeline.last_update.beams
         columns = [beam_set.uavs.index(uav) for uav in weights["uavs"]]
         assert {beam_set.uavs[i] for i in columns} == {"2:1", "3:1"}

@@ -5,7 +5,7 @@ import struct
 from pymavlink.dialects.v20 import common
 
 from companion.pipeline.fleet.member import FORGET_NS, GONE_MAX, NODES_MAX, Member
-from companion.pipeline.fleet.trust import TIMES
+from companion.pipeline.fleet.trust import TIMES, UNHEARD_NS, Witness
 from companion.settings.fleet import FleetSettings
 from companion.values import Offer, Shared, SharedFrame, Standing
 
@@ -104,6 +104,22 @@ def test_the_first_answers_of_a_clock_are_not_enough() -> None:
     (boot_ms,) = struct.unpack_from("<I", frame.raw, 10)
     assert boot_ms == 1003
     assert frame.doubt_ns < 6 * MS
+
+
+def test_a_vehicle_that_one_node_alone_hears_is_said_with_that_node() -> None:
+    node = member()
+    own = Witness((0.0, 0.0, 0.0), 1000.0, frozenset())
+    offer = Offer(uav="66:1", sure_db=None, likely_db=None, sinr_db=None, heard_s=0.1)
+    said = []
+    for now_ns in range(START_NS, START_NS + 2 * UNHEARD_NS, S):
+        node.stands(now_ns, standing("b"))
+        node.offered(now_ns, "b", (offer,))
+        places = {"66:1": (300.0, 0.0, 0.0)}
+        said += node.look_for_phantoms(now_ns, places, own, lambda _: (5000.0, 0.0, 0.0))
+    assert node.trust.unconfirmed == {"66:1"}
+    assert [(one.subject, one.text) for one in said] == [
+        ("node b", "node b tells of 66:1, where nobody else hears one: hidden, or made up")
+    ]
 
 
 def test_who_is_served_elsewhere_is_spared_where_that_is_asked_for() -> None:

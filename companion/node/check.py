@@ -22,7 +22,7 @@ from companion.settings.files import embedded
 from companion.settings.model import Settings
 from companion.settings.outlets import DriveSettings, RecordSettings
 from companion.values import Level, Reason, UserError, Verdict, kind_of
-from companion.views import state
+from companion.views import uav_state
 
 LOOKS: Final = 5
 """Times that beams are computed to tell how long that takes."""
@@ -213,7 +213,7 @@ def _silent(url: str) -> str:
 
 def _uavs(service: Service) -> Iterator[Finding]:
     verdicts = service.pipeline.health.verdicts
-    shown = [one for one in state.states(service, service.now_ns()) if one.target]
+    shown = [one for one in uav_state.states(service, service.now_ns()) if one.target]
     if not shown:
         remedy = "wait for a position fix; see what /v1/uavs refuses"
         yield Finding(

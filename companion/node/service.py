@@ -40,11 +40,11 @@ from companion.settings.files import embedded
 from companion.settings.model import Settings
 from companion.settings.origins import Origins
 from companion.values import ClockSet, Event, Frame, Notice, Output, Severity, Tick, Tock, UserError
-from companion.views.fleet import FleetStatus
 from companion.views.health import behind
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
 from companion.views.series import Series
+from companion.views.served import FleetStatus
 from companion.views.state import RecordingStatus
 
 

@@ -181,10 +181,9 @@ class Center:
         self._doubted_rad = self.attitude_bound_rad
         least_deg, doubted_deg = map(math.degrees, (self._least_bound_rad, self._doubted_rad))
         name = "center.attitude_bound_deg"
-        uav = str(status.source)
         return Refuted(
             t_ns=status.t_ns,
-            uav=uav,
+            uav=str(status.source),
             setting=name,
             limit=least_deg,
             proven=doubted_deg,
@@ -222,12 +221,8 @@ class Center:
         self._begin(home)
         place = f"{home.lat_deg:.6f}, {home.lon_deg:.6f}, {home.alt_m:.1f} m"
         if self.vehicle is not None:
-            return Notice(
-                t_ns=report.t_ns,
-                severity=Severity.INFO,
-                subject="origin",
-                text=f"local frame begins at {place}",
-            )
+            text = f"local frame begins at {place}"
+            return Notice(t_ns=report.t_ns, severity=Severity.INFO, subject="origin", text=text)
         self.place, self._home_from = home, (report.uav, report.t_ns)
         text = f"home is where {report.uav} first reported: {place}; level, facing north"
         return Notice(t_ns=report.t_ns, severity=Severity.INFO, subject="home", text=text)

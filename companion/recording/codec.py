@@ -3,7 +3,7 @@
 import math
 from typing import Any, Final
 
-from companion.recording import schemas
+from companion.recording import fields, schemas
 from companion.values import (
     DUTY_MAX,
     ClockSet,
@@ -116,12 +116,12 @@ def to_frame(data: bytes, sources: dict[tuple[int, int], Source]) -> Frame:
 
 def to_round_trip(data: bytes) -> RoundTrip:
     """Read a round trip. Raises ``DecodeError`` for bytes that are no such message."""
-    return schemas.value_of(RoundTrip, schemas.RoundTripMessage.FromString(data))
+    return fields.value_of(RoundTrip, schemas.RoundTripMessage.FromString(data))
 
 
 def to_duty(data: bytes) -> Duty:
     """Read a duty. Raises ``DecodeError``, or ``ValueError`` where it names too many."""
-    found = schemas.value_of(Duty, schemas.DutyMessage.FromString(data))
+    found = fields.value_of(Duty, schemas.DutyMessage.FromString(data))
     if max(len(found.serves), len(found.spares)) > DUTY_MAX:
         raise ValueError(f"duty of more than {DUTY_MAX} UAVs")
     return found
@@ -129,7 +129,7 @@ def to_duty(data: bytes) -> Duty:
 
 def to_clock_set(data: bytes) -> ClockSet:
     """Read that the clock was set. Raises ``DecodeError``, or ``ValueError`` beyond all time."""
-    found = schemas.value_of(ClockSet, schemas.ClockSetMessage.FromString(data))
+    found = fields.value_of(ClockSet, schemas.ClockSetMessage.FromString(data))
     if abs(found.utc_offset_ns) > OFFSET_MAX_NS:
         raise ValueError("UTC offset out of range")
     return found
@@ -140,4 +140,4 @@ def to_rejection(data: bytes) -> Rejection | None:
     message = schemas.RejectionMessage.FromString(data)
     if not message.is_event:
         return None
-    return schemas.value_of(Rejection, message)
+    return fields.value_of(Rejection, message)

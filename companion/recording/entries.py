@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from companion.recording import codec, schemas
+from companion.recording import codec, fields, schemas
 from companion.recording.scene import Scene
 from companion.recording.schemas import Schema
 from companion.values import (
@@ -136,7 +136,7 @@ class Encoder:
                 self._emit(schemas.LOG_TOPIC, schemas.LOG, output.t_ns, data)
 
     def _rejection(self, rejection: Rejection, *, is_event: bool) -> None:
-        data = schemas.encode("Rejection", schemas.RecordedRejection(rejection, is_event))
+        data = schemas.encode("Rejection", fields.RecordedRejection(rejection, is_event))
         self._emit(schemas.REJECTIONS_TOPIC, schemas.REJECTION, rejection.t_ns, data)
 
     def _tracks(self, t_ns: int, tracks: tuple[Track, ...], geodetic: Geodetic) -> None:
@@ -147,11 +147,11 @@ class Encoder:
             where = codec.predicted(track, float(lat_deg), float(lon_deg), float(alt_m))
             topic = f"/uav/{track.uav}/predicted"
             self._emit(topic, schemas.LOCATION_FIX, t_ns, where.SerializeToString())
-            data = schemas.encode("Track", schemas.RecordedTrack(track, t_ns))
+            data = schemas.encode("Track", fields.RecordedTrack(track, t_ns))
             self._emit(schemas.TRACKS_TOPIC, schemas.TRACK, t_ns, data)
 
     def _beams(self, beams: BeamSet) -> None:
-        data = schemas.encode("Weights", schemas.RecordedWeights(beams))
+        data = schemas.encode("Weights", fields.RecordedWeights(beams))
         self._emit(schemas.WEIGHTS_TOPIC, schemas.WEIGHTS, beams.t_ns, data)
 
     def _draw(self, scene: Scene, update: Update, geodetic: Geodetic) -> None:

@@ -20,7 +20,7 @@ from companion.server.stream import Stream
 from companion.server.turns import Turns
 from companion.values import UAV_FORMS
 from companion.views import fleet as fleet_view
-from companion.views import glance, labels, series, settings, state
+from companion.views import glance, labels, series, settings, state, uav_state
 from companion.views.as_json import as_json
 from companion.views.design import Design, DesignView
 from companion.views.link_state import Links
@@ -139,17 +139,17 @@ def _state_routes(app: FastAPI, node: Node, turns: Turns) -> None:
     async def status() -> Response:
         return answer(state.status(node, companion.__version__))
 
-    @app.get("/v1/uavs", summary="Every UAV as it is now", responses=answers(state.Uavs))
+    @app.get("/v1/uavs", summary="Every UAV as it is now", responses=answers(uav_state.Uavs))
     async def uavs() -> Response:
-        return answer(state.uavs(node))
+        return answer(uav_state.uavs(node))
 
     @app.get(
         "/v1/uavs/{uav}",
         summary="One UAV as it is now",
-        responses=answers(state.UavState, 404, 422),
+        responses=answers(uav_state.UavState, 404, 422),
     )
     async def one_uav(uav: UavId) -> Response:
-        found = state.states(node, node.now_ns(), only=uav)
+        found = uav_state.states(node, node.now_ns(), only=uav)
         if not found:
             raise HTTPException(404, f"no UAV {uav!r} has been heard")
         return answer(as_json(found[0], node.pipeline.utc_ns))

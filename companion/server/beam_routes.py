@@ -12,13 +12,14 @@ from companion.server.responses import answers, encode, json_response, refusals
 from companion.server.turns import Turns
 from companion.values import Update, UserError
 from companion.views import beam_state, weight_formats
+from companion.views import pattern as pattern_view
 from companion.views.state import Node
 
 MOST_ANGLES: Final = 20_000
 """Beams times angles that one answer may hold: more than half a second's work."""
 LeadMs = Annotated[float, Query(ge=0, le=10_000, description="milliseconds ahead of now")]
 Cut = Annotated[
-    beam_state.Cut,
+    pattern_view.Cut,
     Query(description="the angle that varies; the other is the beam's own"),
 ]
 Points = Annotated[int, Query(ge=2, le=3601, description="angles along the cut")]
@@ -68,7 +69,7 @@ def add(app: FastAPI, node: Node, turns: Turns) -> None:
     @app.get(
         "/v1/pattern",
         summary="Array response in dB along a cut through each beam",
-        responses=answers(beam_state.Pattern, 404, 422, 503),
+        responses=answers(pattern_view.Pattern, 404, 422, 503),
     )
     async def pattern(
         cut: Cut = "azimuth",
@@ -85,7 +86,9 @@ def add(app: FastAPI, node: Node, turns: Turns) -> None:
                 wanted = f"{shown} beams at {points} angles"
                 raise HTTPException(422, f"{wanted}: say uav, or fewer points")
             return encode(
-                beam_state.pattern(pipeline, update, cut, points=points, only=uav, lead_ms=lead_ms)
+                pattern_view.pattern(
+                    pipeline, update, cut, points=points, only=uav, lead_ms=lead_ms
+                )
             )
 
         return json_response(await moments.made(lead_ms, (cut, points, uav), make))

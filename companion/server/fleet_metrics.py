@@ -6,13 +6,14 @@ from collections.abc import Iterator
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
 from companion.views import fleet
+from companion.views.served import served_uavs
 from companion.views.state import Node
 
 
 def fleet_metrics(node: Node) -> Iterator[Metric]:
     """Who is there, who serves whom, and the way between the nodes."""
     status, now_ns = node.fleet_status(), node.now_ns()
-    served = fleet.served(node.pipeline, status, now_ns)
+    served = served_uavs(node.pipeline, status, now_ns)
     if status is None or served is None:
         return
     member = status.member

@@ -11,7 +11,7 @@ from starlette.concurrency import run_in_threadpool
 import companion
 from companion.server.responses import encode
 from companion.values import BeamSet
-from companion.views import beam_state, glance, guaranteed_gain, records, state
+from companion.views import beam_state, glance, guaranteed_gain, records, state, uav_state
 from companion.views import fleet as fleet_view
 from companion.views.as_json import Json
 from companion.views.state import Node
@@ -105,7 +105,7 @@ def _status(node: Node) -> Json:
 
 
 BODIES: Final[dict[Topic, Callable[[Node], Any]]] = {
-    Topic.UAVS: state.uavs,
+    Topic.UAVS: uav_state.uavs,
     Topic.BEAMS: _beams,
     Topic.WEIGHTS: _weights,
     Topic.RECORDS: _records,

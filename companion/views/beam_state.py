@@ -8,7 +8,7 @@ import functools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from companion.beams.worth import link_budget, patterns
 from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
 from companion.tracking.geodesy import Place
-from companion.values import Beam, BeamSet, FloatArray, LeftOut, Method, Policy, Update
+from companion.values import Beam, BeamSet, FloatArray, LeftOut, Policy, Update
 from companion.values.described import Inline, Meaning
 from companion.views import guaranteed_gain
 from companion.views.as_json import Json, as_json, degrees
@@ -35,8 +35,7 @@ MOST_RESPONSES: Final = 2**28
 """Samples times beams of a codebook times elements, for all UAVs of one answer."""
 FULL_SHARE: Final = 8
 """UAVs up to which each has all the work that a question may take."""
-Cut = Literal["azimuth", "elevation"]
-_LEAD: Final = "how long after the question the beams apply; up to 10 ms more, as valid_at says"
+LEAD: Final = "how long after the question the beams apply; up to 10 ms more, as valid_at says"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,7 +108,7 @@ class Beams:
 
     made: Annotated[BeamSet, Inline()]
     age_s: Annotated[float, Meaning("time since the beams were computed")]
-    lead_ms: Annotated[float, Meaning(_LEAD)]
+    lead_ms: Annotated[float, Meaning(LEAD)]
     beams: Annotated[list[BeamState], Meaning("the beams, in the order of the weights' columns")]
     array: Annotated[ArrayState, Meaning("the antenna array")]
     policy: Annotated[
@@ -125,41 +124,11 @@ class Weights:
     """The complex weights, M rows; columns in the order of ``uavs``."""
 
     made: Annotated[BeamSet, Inline(omit=("groups", "regularised"))]
-    lead_ms: Annotated[float, Meaning(_LEAD)]
+    lead_ms: Annotated[float, Meaning(LEAD)]
     uavs: Annotated[list[str], Meaning("the UAV of each column")]
     groups: Annotated[list[int], Meaning("the time slot of each column, from 0")]
     re: Annotated[list[list[float]], Meaning("real parts, a row per element")]
     im: Annotated[list[list[float]], Meaning("imaginary parts, a row per element")]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BeamPattern:
-    """The response of one beam along the cut."""
-
-    uav: Annotated[str, Meaning("UAV of the beam", example="3:1")]
-    at_deg: Annotated[float, Meaning("the other angle of the cut, which is constant")]
-    target_deg: Annotated[float, Meaning("the UAV's own angle along the cut")]
-    response_db: Annotated[list[float], Meaning("response at each angle, over one element")]
-    peak_azimuth_deg: Annotated[float, Meaning("azimuth of the peak")]
-    peak_elevation_deg: Annotated[float, Meaning("elevation of the peak")]
-    peak_db: Annotated[float, Meaning("response at the peak, over one element")]
-    half_power_beamwidth_deg: Annotated[float | None, Meaning("width 3 dB below the peak")]
-    side_lobe_db: Annotated[float | None, Meaning("largest side lobe below the peak")]
-    null_depths_db: Annotated[
-        dict[str, float], Meaning("response towards each other UAV, over one element")
-    ]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Pattern:
-    """The array's response in dB along a cut through each beam."""
-
-    valid_at_ns: Annotated[int, Meaning("when the beams are applied")]
-    lead_ms: Annotated[float, Meaning(_LEAD)]
-    cut: Annotated[Cut, Meaning("the angle that varies along the cut")]
-    method: Annotated[Method, Meaning("how the weights were computed")]
-    angles_deg: Annotated[list[float], Meaning("angles of the cut, in the order of response_db")]
-    patterns: Annotated[list[BeamPattern], Meaning("one cut per beam")]
 
 
 def beams(
@@ -301,55 +270,3 @@ def weights(pipeline: Pipeline, beam_set: BeamSet, lead_ms: float) -> Json:
         im=beam_set.weights.imag.tolist(),
     )
     return as_json(shown, pipeline.utc_ns)
-
-
-def pattern(
-    pipeline: Pipeline, update: Update, cut: Cut, *, points: int, only: str | None, lead_ms: float
-) -> Json:
-    """The answer of ``/v1/pattern``: the response of each beam (or one) along a cut through it."""
-    array, beam_set = pipeline.array, update.beams
-    entries, angles = [], np.empty(0)
-    for i, beam in enumerate(beam_set.beams):
-        if only is not None and beam.uav != only:
-            continue
-        column = beam_set.weights[:, i]
-        if cut == "azimuth":
-            angles, response_db = patterns.azimuth_cut(array, column, beam.elevation_rad, points)
-        else:
-            angles, response_db = patterns.elevation_cut(array, column, beam.azimuth_rad, points)
-        entries.append(_pattern(pipeline, beam_set, i, cut, response_db))
-    shown = Pattern(
-        valid_at_ns=beam_set.valid_at_ns,
-        lead_ms=lead_ms,
-        cut=cut,
-        method=beam_set.method,
-        angles_deg=np.degrees(angles).tolist(),
-        patterns=entries,
-    )
-    return as_json(shown, pipeline.utc_ns)
-
-
-def _pattern(
-    pipeline: Pipeline, beam_set: BeamSet, i: int, cut: Cut, response_db: FloatArray
-) -> BeamPattern:
-    beam, column, towards = beam_set.beams[i], beam_set.weights[:, i], directions(beam_set)
-    lobe = patterns.lobe(pipeline.array, column, towards[i])
-    across = lobe.azimuth if cut == "azimuth" else lobe.elevation
-    others = [j for j, other in enumerate(beam_set.beams) if j != i and other.group == beam.group]
-    depths = patterns.null_depths_db(pipeline.array, column, lobe.peak_db, towards[others])
-    azimuth_deg, elevation_deg = np.degrees([beam.azimuth_rad, beam.elevation_rad]).tolist()
-    is_azimuth = cut == "azimuth"
-    return BeamPattern(
-        uav=beam.uav,
-        at_deg=elevation_deg if is_azimuth else azimuth_deg,
-        target_deg=azimuth_deg if is_azimuth else elevation_deg,
-        response_db=response_db.tolist(),
-        peak_azimuth_deg=math.degrees(lobe.peak_azimuth_rad),
-        peak_elevation_deg=math.degrees(lobe.peak_elevation_rad),
-        peak_db=lobe.peak_db,
-        half_power_beamwidth_deg=degrees(across.half_power_width_rad),
-        side_lobe_db=across.side_lobe_db,
-        null_depths_db={
-            beam_set.beams[j].uav: float(depth) for j, depth in zip(others, depths, strict=True)
-        },
-    )

@@ -1,21 +1,19 @@
 """The fleet as the API shows it: nodes, who serves whom, what each offers, handovers."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
 
-from companion.pipeline import blame
-from companion.pipeline.fleet.assignment import worth_db
 from companion.pipeline.fleet.duties import Handover
 from companion.pipeline.fleet.member import Member
 from companion.pipeline.fleet.neighbours import Neighbour
 from companion.pipeline.fold import Pipeline
 from companion.tracking.geodesy import Place
-from companion.values import Blame, Offer, Standing
+from companion.values import Offer
 from companion.values.described import DescribedEnum, Inline, Meaning
 from companion.views.as_json import Json, as_json
+from companion.views.served import FleetStatus, offers_of, served_by, standing
 
 
 class NodeState(DescribedEnum):
@@ -114,64 +112,6 @@ class Fleet:
     ] = 0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FleetStatus:
-    """This node's place in a fleet.
-
-    member      what it knows and decides
-    site        name of the fleet
-    sent_bps    bits per second that it tells, by what it gave to Zenoh over the last second
-    heard_bps   bits per second that others told it
-    damaged     samples of others that were none
-    """
-
-    member: Member
-    site: str
-    sent_bps: float
-    heard_bps: float
-    damaged: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Served:
-    """Who serves the UAVs for which beams are wanted.
-
-    node       this node
-    by         nodes that serve each UAV, those put aside not among them
-    nobody     why nobody serves a UAV, for each such UAV
-    elsewhere  how many other nodes serve, and this one does not
-    """
-
-    node: str
-    by: Mapping[str, list[str]]
-    nobody: Mapping[str, Blame]
-    elsewhere: int
-
-    def is_here(self, uav: str) -> bool:
-        """Whether this node serves a UAV. A verdict on another is of the time when it did."""
-        return self.node in self.by.get(uav, [])
-
-
-def served(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Served | None:
-    """Who serves whom, and why nobody does; None where there is no fleet."""
-    if status is None:
-        return None
-    member = status.member
-    by = _served_by(member, now_ns)
-    wanted = [uav for uav in pipeline.tracker.uavs if pipeline.targets.wants(uav)]
-    alone = [uav for uav in wanted if uav not in by]
-    tracks = pipeline.tracks(now_ns, now_ns, alone) if alone else []
-    full = _full(member, now_ns) if tracks else {}
-    offers = _offers(member) if tracks else {}
-    nobody = dict[str, Blame]()
-    for track in tracks:
-        given = offers.get(track.uav, {})
-        able = [full.get(node, False) for node, one in given.items() if worth_db(one) is not None]
-        nobody[track.uav] = blame.of_unserved(track, reached=bool(able), full=all(able))
-    elsewhere = sum(uav in by and member.name not in by[uav] for uav in wanted)
-    return Served(node=member.name, by=by, nobody=nobody, elsewhere=elsewhere)
-
-
 def fleet(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Json:
     """The answer of ``/v1/fleet``; ``node`` is null where there is no fleet."""
     shown = Fleet(valid_at_ns=now_ns)
@@ -256,44 +196,11 @@ def _place(place: tuple[float, float, float] | None) -> Place | None:
     return None if place is None else Place(*place)
 
 
-def _offers(member: Member) -> dict[str, dict[str, Offer]]:
-    """What each node that is believed offers, by UAV and node."""
-    found: dict[str, dict[str, Offer]] = {}
-    for uav, offer in member.offers.items():
-        found.setdefault(uav, {})[member.name] = offer
-    for name in sorted(filter(member.trust.believes, member.neighbours)):
-        for uav, offer in (member.neighbours[name].offers or {}).items():
-            found.setdefault(uav, {})[name] = offer
-    return found
-
-
-def _standing(member: Member, now_ns: int) -> dict[str, Standing]:
-    """The other nodes that are there and believed, by name."""
-    others = sorted(member.duties.others(now_ns).items())
-    return {name: said for name, said in others if member.trust.believes(name)}
-
-
-def _full(member: Member, now_ns: int) -> dict[str, bool]:
-    """Whether each node that is there serves as many as it may."""
-    others = _standing(member, now_ns).items()
-    full = {name: len(said.serves) >= said.most for name, said in others}
-    return full | {member.name: len(member.duties.serves) >= member.most}
-
-
-def _served_by(member: Member, now_ns: int) -> dict[str, list[str]]:
-    """The nodes that serve each UAV, this one first; nodes put aside are not believed."""
-    served_by: dict[str, list[str]] = {uav: [member.name] for uav in member.duties.serves}
-    for name, said in _standing(member, now_ns).items():
-        for uav, _ in said.serves:
-            served_by.setdefault(uav, []).append(name)
-    return served_by
-
-
 def _uavs(member: Member, now_ns: int) -> list[FleetUav]:
     """Every UAV that some node offers to serve or serves, and by whom it is served."""
-    offers, by = _offers(member), _served_by(member, now_ns)
+    offers, by = offers_of(member), served_by(member, now_ns)
     handing = dict(member.duties.handing)
-    for said in _standing(member, now_ns).values():
+    for said in standing(member, now_ns).values():
         handing |= dict(said.handing)
     return [
         FleetUav(

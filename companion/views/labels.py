@@ -12,7 +12,8 @@ from companion.views.beam_state import BeamState
 from companion.views.center_state import Center
 from companion.views.fleet import Fleet, FleetNode, FleetUav, NodeState
 from companion.views.link_state import HeardLink, LinkReports
-from companion.views.state import RecordingStatus, Status, UavState
+from companion.views.state import RecordingStatus, Status
+from companion.views.uav_state import UavState
 
 SHOWN: Final = (
     BeamState, Center, Fleet, FleetNode, FleetUav, HeardLink, LinkReports, RecordingStatus, Status,

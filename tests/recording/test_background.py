@@ -30,6 +30,8 @@ from companion.values import (
     Frame,
     Notice,
     Output,
+    Reason,
+    Rejection,
     Severity,
     Source,
     Tick,
@@ -91,10 +93,12 @@ def ticks(first: int, last: int) -> list[Event]:
 
 
 def incompressible(first: int, last: int) -> list[Event]:
-    """Frames that take more room than the last page of a file on a full disk may have left."""
-    make, source = Random(first), Source(1, 1)
+    """Events that take more room than the last page of a file on a full disk may have left."""
+    make = Random(first)
     return [
-        Frame(t_ns=START_NS + n, link="udp", source=source, msgid=0, raw=make.randbytes(200))
+        Rejection(
+            t_ns=START_NS + n, source="udp", reason=Reason.GARBAGE, detail=make.randbytes(200).hex()
+        )
         for n in range(first, last)
     ]
 

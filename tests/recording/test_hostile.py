@@ -374,7 +374,7 @@ def test_a_time_beyond_all_time_is_said(tmp_path: Path) -> None:
         (
             schemas.DUTIES_TOPIC,
             schemas.DutyMessage(t_ns=1, serves=["1:1"] * 10_001).SerializeToString(),
-            "a duty of too many UAVs",
+            "duty of more than 10000 UAVs",
         ),
         (
             schemas.DUTIES_TOPIC,

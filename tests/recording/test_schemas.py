@@ -5,7 +5,7 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from companion.recording import codec, schemas
+from companion.recording import codec, fields, schemas
 from companion.values import Frame, Reason, Rejection, Source
 
 TIMES = st.integers(0, 2**63 - 1)
@@ -70,9 +70,9 @@ def test_a_frame_survives_the_round_trip(frame: Frame) -> None:
 
 @given(REJECTIONS)
 def test_a_rejection_survives_the_round_trip(rejection: Rejection) -> None:
-    data = schemas.encode("Rejection", schemas.RecordedRejection(rejection, True))
+    data = schemas.encode("Rejection", fields.RecordedRejection(rejection, True))
     assert codec.to_rejection(data) == rejection
-    output = schemas.encode("Rejection", schemas.RecordedRejection(rejection, False))
+    output = schemas.encode("Rejection", fields.RecordedRejection(rejection, False))
     assert codec.to_rejection(output) is None
 
 
@@ -89,7 +89,7 @@ def test_an_optional_field_says_so_to_every_reader() -> None:
     file = FileDescriptorSet.FromString(schemas.TRACK.descriptor_set).file[0]
     [track] = [message for message in file.message_type if message.name == "Track"]
     optional = [field.name for field in track.field if field.proto3_optional]
-    assert optional == ["dt_s", "latency_s", "gamma", "innovation_m", "error_p95_m"]
+    assert optional == ["dt_s", "latency_s", "gamma", "innovation_m", "error_p95_m", "speed_mps"]
 
 
 def test_the_numbers_of_the_fields_stay() -> None:

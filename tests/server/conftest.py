@@ -19,10 +19,10 @@ from companion.server.app import create_app
 from companion.settings.model import Settings
 from companion.settings.origins import Origins
 from companion.values import Frame, Notice, Severity, Source, Tick
-from companion.views.fleet import FleetStatus
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
 from companion.views.series import Series
+from companion.views.served import FleetStatus
 from companion.views.state import RecordingStatus, ReplayStatus
 
 LOG = Path(__file__).parents[1] / "data" / "sitl_4circle_cut.tlog"

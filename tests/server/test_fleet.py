@@ -13,7 +13,8 @@ from companion.settings.fleet import FleetSettings
 from companion.values import Duty, Offer, Standing
 from companion.views import fleet as fleet_view
 from companion.views import state as state_view
-from companion.views.fleet import FleetStatus
+from companion.views import uav_state
+from companion.views.served import FleetStatus
 
 from .conftest import StandIn, settings
 
@@ -52,7 +53,7 @@ def client(node: StandIn) -> TestClient:
 
 
 def uavs(node: StandIn) -> dict[str, Any]:
-    answer = models.model(state_view.Uavs).model_validate(client(node).get("/v1/uavs").json())
+    answer = models.model(uav_state.Uavs).model_validate(client(node).get("/v1/uavs").json())
     return {uav.id: uav for uav in answer.uavs}
 
 

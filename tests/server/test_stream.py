@@ -19,7 +19,7 @@ from websockets.typing import Subprotocol
 from companion.server import models, stream
 from companion.server.stream import Wanted, wanted
 from companion.server.topics import Topic
-from companion.views import beam_state, guaranteed_gain, link_state, records
+from companion.views import beam_state, guaranteed_gain, link_state, records, uav_state
 from companion.views import state as state_view
 
 LOOPS: list[Callable[[], asyncio.AbstractEventLoop] | None] = [None, uvloop.new_event_loop]
@@ -50,7 +50,7 @@ def test_the_state_comes_at_once_and_with_every_update(
             assert [message["topic"] for message in first] == ["uavs", "beams"]
             for message in first:
                 assert message.keys() >= {"valid_at", "topic"}
-            models.model(state_view.Uavs).model_validate(first[0])
+            models.model(uav_state.Uavs).model_validate(first[0])
             models.model(beam_state.Beams).model_validate(first[1])
             await asyncio.sleep(0.02)  # more than the period that was asked for
             node.tick()

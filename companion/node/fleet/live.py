@@ -21,10 +21,10 @@ from companion.pipeline.fleet.member import Member
 from companion.pipeline.fleet.offers import Offers
 from companion.pipeline.fleet.surroundings import Surroundings
 from companion.pipeline.fold import Pipeline
-from companion.recording import schemas
+from companion.recording import fields, schemas
 from companion.settings.fleet import FleetSettings, is_node_name
 from companion.values import Event, Frame, Notice, RoundTrip, Severity, UserError
-from companion.views.fleet import FleetStatus
+from companion.views.served import FleetStatus
 
 PREFIX: Final = "companion"
 PRIORITY: Final = "data_high"
@@ -269,7 +269,7 @@ class FleetNode:
         ):
             said = schemas.TracksMessage(
                 track=[
-                    schemas.message("Track", schemas.RecordedTrack(one, update.t_ns))
+                    schemas.message("Track", fields.RecordedTrack(one, update.t_ns))
                     for one in update.tracks
                 ]
             )

@@ -1,0 +1,185 @@
+"""The fields of the recorded messages, derived from the described values of their classes.
+
+A field's number is that of its value's ``Meaning``: a number that has been written once keeps its
+meaning.
+"""
+
+import functools
+import typing
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Annotated, Any, Final, NamedTuple, TypeVar
+
+import numpy as np
+
+from companion.values import (
+    Beam,
+    BeamSet,
+    ClockSet,
+    Duty,
+    Frame,
+    LeftOut,
+    Offer,
+    Rejection,
+    RoundTrip,
+    Source,
+    Tick,
+    Tock,
+    Track,
+)
+from companion.values.described import Inline, Meaning, Member, members
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedRejection:
+    """A rejection, and whether it drove the pipeline rather than coming out of it."""
+
+    rejection: Annotated[Rejection, Inline()]
+    is_event: Annotated[bool, Meaning("whether it was made while framing, before the pipeline", 7)]
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedTrack:
+    """A track, and when the update was computed to which it belongs."""
+
+    track: Annotated[Track, Inline()]
+    t_ns: Annotated[int, Meaning("when the update was computed", 14)]
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedWeights:
+    """Beams and weights in single precision: a replay computes them again in double."""
+
+    made: Annotated[BeamSet, Inline()]
+
+    @property
+    def uavs(self) -> Annotated[tuple[str, ...], Meaning("the UAV of each column", 3)]:
+        return self.made.uavs
+
+    @property
+    def elements(self) -> Annotated[int, Meaning("rows of the weights", 4)]:
+        return len(self.made.weights)
+
+    @property
+    def weights_complex64(
+        self,
+    ) -> Annotated[
+        bytes, Meaning("weights (elements, uavs), row-major, little-endian float32 pairs re, im", 5)
+    ]:
+        return self.made.weights.astype(np.dtype("<c8")).tobytes("C")
+
+    @property
+    def beam(self) -> Annotated[tuple[Beam, ...], Meaning("the beams, one per column", 8)]:
+        return self.made.beams
+
+    @property
+    def left_out(self) -> Annotated[tuple[LeftOut, ...], Meaning("UAVs without a beam", 9)]:
+        return self.made.left_out
+
+
+CLASSES: Final[dict[str, type]] = {
+    "Frame": Frame,
+    "Tick": Tick,
+    "Tock": Tock,
+    "Rejection": RecordedRejection,
+    "RoundTrip": RoundTrip,
+    "Track": RecordedTrack,
+    "Beam": Beam,
+    "LeftOut": LeftOut,
+    "Weights": RecordedWeights,
+    "Duty": Duty,
+    "Offer": Offer,
+    "ClockSet": ClockSet,
+}
+"""The messages of recordings, and the classes whose described values are their fields."""
+
+
+class Field(NamedTuple):
+    """One field of a message: its declaration, and how it is read from a value."""
+
+    number: int
+    declared: str
+    get: Callable[[Any], Any]
+
+
+@functools.cache
+def fields(message: str) -> tuple[Field, ...]:
+    """The fields of a recorded message, by number.
+
+    The protobuf type follows from the value's: times are fixed64, other integers uint32, vectors
+    and tuples repeated, what may be None optional; a ``Source`` is two fields, sysid and compid.
+    """
+    found = (one for member in members(CLASSES[message]) for one in _fields(member))
+    return tuple(sorted(found, key=lambda one: one.number))
+
+
+def _fields(member: Member) -> Iterator[Field]:
+    number, name, kind, get = member.meaning.number, member.name, member.type, member.get
+    if number is None:
+        return
+    if kind is Source:
+        for offset, part in enumerate(("sysid", "compid")):
+            yield Field(number + offset, f"uint32 {part}", _part(get, part))
+        return
+    if "ndarray" in str(kind):
+        yield Field(number, f"repeated double {name}", _listed(get))
+        return
+    if typing.get_origin(kind) is tuple:
+        inner = typing.get_args(kind)[0]
+        known = next((named for named, of in CLASSES.items() if of is inner), None)
+        read = get if known is None else _messages(known, get)
+        yield Field(number, f"repeated {known or _scalar(inner, '')} {name}", read)
+        return
+    optional = "optional " if member.optional else ""
+    yield Field(number, f"{optional}{member.meaning.wire or _scalar(kind, name)} {name}", get)
+
+
+def _scalar(kind: Any, name: str) -> str:
+    if kind is int:
+        return "fixed64" if name.endswith("_ns") else "uint32"
+    return {float: "double", bool: "bool", bytes: "bytes"}.get(kind, "string")
+
+
+def _part(get: Callable[[Any], Any], part: str) -> Callable[[Any], Any]:
+    return lambda value: getattr(get(value), part)
+
+
+def _listed(get: Callable[[Any], Any]) -> Callable[[Any], list[float]]:
+    """A vector as a list, empty where it is unknown."""
+
+    def listed(value: Any) -> list[float]:
+        vector = get(value)
+        return [] if vector is None else vector.tolist()
+
+    return listed
+
+
+def _messages(name: str, get: Callable[[Any], Any]) -> Callable[[Any], list[dict[str, Any]]]:
+    return lambda value: [values(name, one) for one in get(value)]
+
+
+def values(message: str, value: Any) -> dict[str, Any]:
+    """The fields of a message by name."""
+    return {one.declared.rpartition(" ")[2]: one.get(value) for one in fields(message)}
+
+
+def value_of(kind: type[T], found: Any) -> T:
+    """A flat value of a class, read back from its message."""
+    values = {
+        member.name: Source(found.sysid, found.compid)
+        if member.type is Source
+        else None
+        if member.optional and not found.HasField(member.name)
+        else _native(getattr(found, member.name), member)
+        for member in members(kind)
+        if member.meaning.number is not None
+    }
+    return kind(**values)
+
+
+def _native(value: Any, member: Member) -> Any:
+    if typing.get_origin(member.type) is tuple:
+        return tuple(value)
+    return member.type(value) if isinstance(member.type, type) else value

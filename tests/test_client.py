@@ -57,7 +57,7 @@ def test_it_shows_what_the_service_says(flying: Node) -> None:
     assert len(client.get("/v1/pattern", points=7, cut="elevation")["angles_deg"]) == 7
     now, later = client.weights(), client.weights(lead_ms=5000)
     assert now.matrix.shape == (64, 4)
-    assert now.matrix.dtype == np.complex128
+    assert now.matrix.dtype == np.complex64
     assert sorted(now.uavs) == ["1:1", "2:1", "3:1", "4:1"]
     assert 5.0e9 <= later.valid_at_ns - now.valid_at_ns < 8.0e9
     assert not np.allclose(now.matrix, later.matrix)

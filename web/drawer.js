@@ -4,6 +4,7 @@ import { askOnce } from "./api.js";
 import { $, make, setChildren, setText } from "./dom.js";
 import * as format from "./format.js";
 import { LEVEL_OF, elsewhere } from "./health.js";
+import { labelOf, meaningOf } from "./meanings.js";
 import { modeOf } from "./modes.js";
 
 const ASK_MS = 2000;
@@ -67,8 +68,8 @@ export class Drawer {
     if ($("coordinates").textContent !== coordinates) setText($("copy"), "Copy");
     setText($("coordinates"), coordinates);
     const facts = factsOf(uav, isLive ? this.messages : null);
-    setChildren($("drawer-facts"), facts, () => facts.map(([name, value]) => make(
-      "div", {}, make("dt", {}, name), make("dd", {}, value),
+    setChildren($("drawer-facts"), facts, () => facts.map(([name, value, title = ""]) => make(
+      "div", { title }, make("dt", {}, name), make("dd", {}, value),
     )));
     showLines($("drawer-rejections"), rejectionsOf(uav));
     showLines($("drawer-events"), eventsOf(uav, events));
@@ -104,24 +105,27 @@ function batteryOf(status) {
   ].filter(Boolean).join(" · ") || format.UNKNOWN;
 }
 
+/** A fact under the name that the service gives its value, with its meaning for the pointer. */
+const of = (kind, name, text) => [labelOf(kind, name), text, meaningOf(kind, name)];
+
 function factsOf(uav, messages) {
   const message = (name) => messages?.[name]?.message;
   const { clock, assumptions, health } = uav;
   return [
     ["Mode", modeOf(message("HEARTBEAT")) ?? format.UNKNOWN],
     ["Battery", batteryOf(message("SYS_STATUS"))],
-    ["Speed", format.speed(uav.speed_mps)],
-    ["Gain needed", format.decibels(health?.needed_gain_db)],
-    ["Gain likely", format.decibels(health?.likely_gain_db)],
-    ["Gain guaranteed", format.decibels(health?.guaranteed_gain_db)],
-    ["Reports", `${format.count(uav.reports)}, ${format.seconds(uav.dt_s)} apart`],
-    ["Latency", format.milliseconds(uav.latency_s)],
-    ["Error, usual", format.length(uav.error_p95_m)],
-    ["Error, at most", format.length(uav.bound_m)],
+    of("UavState", "speed_mps", format.speed(uav.speed_mps)),
+    of("LinkHealth", "needed_gain_db", format.decibels(health?.needed_gain_db)),
+    of("LinkHealth", "likely_gain_db", format.decibels(health?.likely_gain_db)),
+    of("LinkHealth", "guaranteed_gain_db", format.decibels(health?.guaranteed_gain_db)),
+    of("UavState", "reports", `${format.count(uav.reports)}, ${format.seconds(uav.dt_s)} apart`),
+    of("UavState", "latency_s", format.milliseconds(uav.latency_s)),
+    of("UavState", "error_p95_m", format.length(uav.error_p95_m)),
+    of("UavState", "bound_m", format.length(uav.bound_m)),
     ["Clock", clock ? `${clock.kind}, ${clock.guarantee}, to ${
       format.milliseconds(uav.clock_bound_s)}` : format.UNKNOWN],
     ["Assumed", assumptions?.speed_max_mps ? `${format.speed(assumptions.speed_max_mps)}, ${
-      format.fixed(assumptions.acceleration_max_mps2, 1)} m/s² (${assumptions.source})`
+      format.fixed(assumptions.acceleration_max_mps2, 1)} m/s² (${assumptions.limits_source})`
       : format.UNKNOWN],
   ];
 }

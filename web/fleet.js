@@ -4,6 +4,7 @@
 import { $, make, setAttribute, setChildren, setText, toggleAttribute } from "./dom.js";
 import * as format from "./format.js";
 import { byId } from "./health.js";
+import { labelOf, meaningOf } from "./meanings.js";
 import { placedBy } from "./last_known.js";
 
 const HANDOVERS_KEPT = 30;
@@ -33,23 +34,21 @@ function clockOf({ clock_offset_s: offsetS, clock_doubt_s: doubtS }) {
     format.fixed((doubtS / 2) * each, isFar ? 3 : 1), unit].join("\u00a0");
 }
 
-const NODE_FACTS = [
-  ["Clock", clockOf, "Its clock less this node's, and how closely that is known"],
-  ["Way p99", ({ way_p99_ms: ms }) => format.milliseconds(format.known(ms) ? ms / 1000 : null),
-    "From its hearing a frame to this node's having it: 99 of 100, at most"],
-  ["Used", ({ used }) => format.count(used),
-    "Reports of UAVs that were silent here, and that it told"],
+const NODE_VALUES = [
+  ["serves", ({ serves, most }) => serves + (format.known(most) ? ` of ${most}` : "")],
+  ["clock_offset_s", clockOf],
+  ["way_p99_ms", ({ way_p99_ms: ms }) => format.milliseconds(format.known(ms) ? ms / 1000 : null)],
+  ["used", ({ used }) => format.count(used)],
 ];
 
 function nodeItem(one) {
-  const most = format.known(one.most) ? ` of ${one.most}` : "";
   const since = ["silent", "gone"].includes(one.state) && format.known(one.heard_s)
     ? ` ${format.duration(one.heard_s)}` : "";
   const head = make("p", { class: "link-head", "data-level": NODE_LEVELS[one.state] ?? "warn" },
     make("span", {}, one.node), make("b", {}, one.is_self ? "this node" : one.state + since));
-  const facts = [["Serves", () => `${one.serves}${most}`, "UAVs that it serves, and at most"],
-    ...(one.is_self ? [] : NODE_FACTS)].map(([label, show, title]) => make(
-    "div", { title }, make("dt", {}, label), make("dd", {}, show(one)),
+  const facts = NODE_VALUES.slice(0, one.is_self ? 1 : undefined).map(([name, show]) => make(
+    "div", { title: meaningOf("FleetNode", name) },
+    make("dt", {}, labelOf("FleetNode", name)), make("dd", {}, show(one)),
   ));
   const item = make("li", {}, head, make("dl", { class: "link-facts" }, ...facts));
   if (one.reason) item.append(make("p", { class: "muted" }, `not believed: it ${one.reason}`));

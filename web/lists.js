@@ -3,20 +3,20 @@
 import { $, make, setChildren, setText } from "./dom.js";
 import { save } from "./export.js";
 import * as format from "./format.js";
+import { labelOf, meaningOf } from "./meanings.js";
 import { authorised, hasToken } from "./token.js";
 
 const EVENTS_SHOWN = 60;
 export const SEVERITY_LEVEL = { info: "", warning: "warn", error: "bad" };
 
-const LINK_COLUMNS = [
-  ["Frames", (link) => format.count(link.frames)],
-  ["Bad CRC", (link) => format.count(link.bad_crc)],
-  ["Gaps", (link) => format.count(link.gaps), "Frames that its sequence numbers say are missing"],
-  ["First", (link) => format.share(link.reports?.first_share),
-    "Share of its reports that came over no other link before"],
-  ["Latency", (link) => format.millisecondsRange(
+const LINK_VALUES = [
+  ["HeardLink", "frames", (link) => format.count(link.frames)],
+  ["HeardLink", "bad_crc", (link) => format.count(link.bad_crc)],
+  ["HeardLink", "gaps", (link) => format.count(link.gaps)],
+  ["LinkReports", "first_share", (link) => format.share(link.reports?.first_share)],
+  ["LinkReports", "latency_p95_s", (link) => format.millisecondsRange(
     link.reports?.latency_p50_s, link.reports?.latency_p95_s,
-  ), "From when a report was true to its arrival: half of them, 95 of 100"],
+  )],
 ];
 
 function linkLevel(link) {
@@ -30,8 +30,8 @@ function linkItem(link) {
     ? ` · silent ${format.duration(link.age_s)}` : "";
   const head = make("p", { class: "link-head", "data-level": linkLevel(link) },
     make("span", {}, link.url), make("b", {}, link.state + quiet));
-  const facts = LINK_COLUMNS.map(([label, show, title = ""]) => make(
-    "div", { title }, make("dt", {}, label), make("dd", {}, show(link)),
+  const facts = LINK_VALUES.map(([of, name, show]) => make(
+    "div", { title: meaningOf(of, name) }, make("dt", {}, labelOf(of, name)), make("dd", {}, show(link)),
   ));
   const heard = (link.components ?? []).map((one) => one.id).join(" ");
   const item = make("li", {}, head, make("dl", { class: "link-facts" }, ...facts));

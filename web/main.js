@@ -19,6 +19,7 @@ import {
   showBeams, showConnection, showFault, showReadiness, showStatus, Rejections,
 } from "./panels.js";
 import { Ground } from "./ground.js";
+import { loadMeanings } from "./meanings.js";
 import { PlanView } from "./plan.js";
 import { showSettings } from "./settings.js";
 import { UavTable } from "./table.js";
@@ -93,6 +94,10 @@ function beamsAt(stamp) {
 /** The charts begin with what the service kept of the minutes before this page was opened. */
 async function fillCharts() {
   isFilled = true;
+  loadMeanings().then(() => {
+    table.showLabels();
+    refresh();
+  });
   const answer = await askOnce("/v1/history");
   if (Array.isArray(answer?.at)) charts.fill(answer, performance.now());
 }

@@ -2,6 +2,7 @@
 
 import { $, setAttribute, setPairs, setText, toggleAttribute } from "./dom.js";
 import * as format from "./format.js";
+import { meaningOfWord } from "./meanings.js";
 
 function setChip(element, level, text) {
   setAttribute(element, "data-level", level);
@@ -130,34 +131,6 @@ function showReplay(replay) {
   setChip(element, "warn", `replay ${replay.log} · ${Math.round(replay.at_s)}${of} s · ${how}`);
 }
 
-/** What each reason means, for the reader's pointer; an unknown reason is shown as it is. */
-export const REASONS = {
-  "garbage": "bytes between frames",
-  "bad-crc": "framed, but the checksum is wrong",
-  "unknown-message": "a message that cannot be checked",
-  "bad-stamp": "a log's time stamp stepped or leapt",
-  "malformed": "fields that cannot be what they say",
-  "zero-position": "near 0° N 0° E: sent before a fix",
-  "no-fix": "the first position of all, before its receiver had a fix",
-  "no-position": "ADS-B without valid coordinates",
-  "no-identity": "Remote ID, not named yet",
-  "no-altitude": "no altitude known",
-  "duplicate": "the same report again",
-  "out-of-order": "older than what is known",
-  "unreachable": "farther than the aircraft can have flown",
-  "altitude-jump": "the same in height: the datum has changed",
-  "frozen": "a fresh stamp on an old position",
-  "shared-id": "two vehicles send under one id",
-  "unplaced-stamp": "off the sender's clock",
-  "not-allowed": "kept out by the lists of the settings",
-  "too-many": "as many are tracked as the settings allow",
-  "unsigned": "no signature, where one is required",
-  "bad-signature": "signed with another key, or altered",
-  "replayed": "well signed, but played again",
-  "secret": "carries a signing key: not used, not recorded",
-  "socket-overflow": "lost before it was read: buffer full",
-};
-
 /** Counts by reason, and when this page last saw each of them rise. */
 export class Rejections {
   constructor() {
@@ -182,7 +155,7 @@ export class Rejections {
         const roseAt = this.seen.get(reason)?.at ?? null;
         const when = roseAt === null || roseAt > at ? "" : ` · ${ago((at - roseAt) / 1000)}`;
         const unit = reason === "garbage" ? " B" : "";
-        return [reason, `${format.count(total)}${unit}${when}`, "", REASONS[reason] ?? ""];
+        return [reason, `${format.count(total)}${unit}${when}`, "", meaningOfWord("Reason", reason)];
       });
     $("rejections-panel").hidden = pairs.length === 0;
     setPairs($("rejections"), pairs, format.UNKNOWN);
@@ -208,10 +181,7 @@ export function showStatus(status) {
 
 // --- beams --------------------------------------------------------------------------------------
 
-export const METHODS = {
-  zf: "Zero forcing", rzf: "Regularised zero forcing", mrt: "Maximum ratio",
-  mmse: "Least mean square error",
-};
+const capital = (text) => (text ? text[0].toUpperCase() + text.slice(1) : "");
 
 export function showBeams(answer) {
   if (!answer) {
@@ -222,7 +192,7 @@ export function showBeams(answer) {
   const { beams, array } = answer;
   const regularised = beams.length > 0 && (answer.regularised || answer.method === "rzf");
   setText($("beams-line"), [
-    METHODS[answer.method] ?? answer.method ?? format.UNKNOWN,
+    capital(meaningOfWord("Method", answer.method) || answer.method) || format.UNKNOWN,
     `${beams.length || "no"} beam${beams.length === 1 ? "" : "s"}`,
     beams.length ? `condition number ${conditionNumber(answer.condition_number)}` : "",
   ].filter(Boolean).join(" · "));

@@ -3,6 +3,7 @@
 import { $, make, setAttribute, setText, toggleAttribute } from "./dom.js";
 import * as format from "./format.js";
 import { elsewhere, explain, rankOf } from "./health.js";
+import { labelOf, meaningOf } from "./meanings.js";
 import { Order } from "./order.js";
 
 const halfWidthDeg = (array) =>
@@ -34,7 +35,7 @@ function range(uav) {
 
 function bound({ uav }) {
   const text = format.length(uav.bound_m);
-  if (uav.assumptions?.source !== "raised") return { text };
+  if (uav.assumptions?.limits_source !== "raised") return { text };
   return {
     text: `▲ ${text}`, level: "warn",
     title: "Its reports refuted what was assumed of this aircraft: it was raised",
@@ -59,51 +60,52 @@ const servedBy = (uav) => (elsewhere(uav) ? `by ${elsewhere(uav)}` : null);
 const STATES = ["live", "coasting", "stale", "lost"];
 
 /**
- * Columns in their order. `feed`: which answer a value stands on; `short`: for narrow screens; `by`:
- * what it is sorted by.
+ * Columns in their order. `value`: what it shows, by class and name, which the service labels;
+ * `short`: for narrow screens; `feed`: which answer it stands on; `by`: what it is sorted by.
  */
 const COLUMNS = [
-  { key: "verdict", label: "Link", feed: "uavs", title: "Whether its beam has the gain it needs",
+  { key: "verdict", value: ["UavState", "verdict"], feed: "uavs",
     by: ({ uav }) => rankOf(uav),
     show: ({ uav }) => ({ text: uav.verdict ?? servedBy(uav) ?? format.UNKNOWN,
       title: explain(uav) }) },
-  { key: "state", label: "State", feed: "uavs", by: ({ uav }) => STATES.indexOf(uav.state),
+  { key: "state", value: ["UavState", "state"], feed: "uavs", by: ({ uav }) => STATES.indexOf(uav.state),
     show: ({ uav }) => ({ text: uav.state }) },
-  { key: "range", label: "Range", feed: "uavs", title: "Slant range from the carrier",
+  { key: "range", value: ["BeamState", "range_m"], feed: "uavs",
     by: ({ uav }) => range(uav), show: ({ uav }) => ({ text: format.length(range(uav)) }) },
-  { key: "azimuth", label: "Azimuth", feed: "beams", title: "Right of the array's boresight",
+  { key: "azimuth", value: ["BeamState", "azimuth_deg"], feed: "beams",
     by: ({ beam }) => beam?.azimuth_deg,
     show: ({ beam }) => ({ text: format.signedDegrees(beam?.azimuth_deg) }) },
-  { key: "elevation", label: "Elevation", feed: "beams", title: "Above the array's boresight",
+  { key: "elevation", value: ["BeamState", "elevation_deg"], feed: "beams",
     by: ({ beam }) => beam?.elevation_deg,
     show: ({ beam }) => ({ text: format.signedDegrees(beam?.elevation_deg) }) },
-  { key: "speed", label: "Speed", feed: "uavs", by: ({ uav }) => uav.speed_mps,
+  { key: "speed", value: ["UavState", "speed_mps"], feed: "uavs", by: ({ uav }) => uav.speed_mps,
     show: ({ uav }) => ({ text: format.speed(uav.speed_mps) }) },
-  { key: "age", label: "Age", feed: "uavs", title: "Since the newest accepted report",
+  { key: "age", value: ["UavState", "age_s"], feed: "uavs",
     by: ({ uav }) => uav.age_s, show: age },
-  { key: "dt", label: "ΔT", feed: "uavs", title: "Last interval between reports",
+  { key: "dt", value: ["UavState", "dt_s"], feed: "uavs",
     by: ({ uav }) => uav.dt_s,
     show: ({ uav }) => ({ text: format.seconds(uav.dt_s) }) },
-  { key: "latency", label: "Latency", feed: "uavs",
-    title: "From when it was true to arrival; below 0: the autopilot says where it will be",
+  { key: "latency", value: ["UavState", "latency_s"], feed: "uavs",
     by: ({ uav }) => uav.latency_s,
     show: ({ uav }) => ({ text: format.milliseconds(uav.latency_s) }) },
-  { key: "bound", label: "Bound", feed: "uavs", title: "Guaranteed position error, at most",
+  { key: "bound", value: ["UavState", "bound_m"], feed: "uavs",
     by: ({ uav }) => uav.bound_m, show: bound },
-  { key: "usual", label: "Usual error", short: "Usual", feed: "uavs",
-    title: "Usual error: 95 of 100 predictions at this age were nearer, of late",
+  { key: "usual", value: ["UavState", "error_p95_m"], short: "Usual", feed: "uavs",
     by: ({ uav }) => uav.error_p95_m,
     show: ({ uav }) => ({ text: format.length(uav.error_p95_m) }) },
-  { key: "pointing", label: "Pointing bound", short: "Pointing", feed: "beams",
-    title: "Pointing bound: how far the true direction can lie from the beam", by: ({ beam }) => beam?.pointing_bound_deg,
+  { key: "pointing", value: ["BeamState", "pointing_bound_deg"], short: "Pointing", feed: "beams", by: ({ beam }) => beam?.pointing_bound_deg,
     show: pointingBound },
-  { key: "gain", label: "Gain", feed: "beams", title: "Array gain towards the prediction",
+  { key: "gain", value: ["BeamState", "gain_db"], feed: "beams",
     by: ({ beam }) => beam?.gain_db,
     show: ({ beam }) => ({ text: format.decibels(beam?.gain_db) }) },
-  { key: "guaranteed", label: "Guaranteed gain", short: "Guaranteed", feed: "beams",
-    title: "Guaranteed gain: the least gain wherever the UAV truly is within its bound", by: ({ beam }) => beam?.guaranteed_gain_db,
+  { key: "guaranteed", value: ["BeamState", "guaranteed_gain_db"], short: "Guaranteed", feed: "beams", by: ({ beam }) => beam?.guaranteed_gain_db,
     show: guaranteedGain },
 ];
+
+const HEADS = [{ key: "id", value: ["UavState", "uav"] }, ...COLUMNS];
+
+const nameCell = (cell, { value, short = labelOf(...value) }) =>
+  setAttribute(cell, "data-label", short);
 
 export class UavTable {
   constructor(table, onSelect, onOrder = () => {}) {
@@ -111,12 +113,14 @@ export class UavTable {
     this.onSelect = onSelect;
     this.rows = new Map();
     const head = table.tHead.rows[0];
-    for (const { label, title, key, short = label } of [{ label: "UAV", key: "id" }, ...COLUMNS]) {
+    this.heads = HEADS.map(({ key }) => {
+      const button = make("button", { type: "button", class: "sort" });
       const cell = make("th", { scope: "col", role: "columnheader", "data-key": key });
-      cell.title = title ?? label;
-      cell.append(make("button", { type: "button", class: "sort" }, short));
+      cell.append(button);
       head.append(cell);
-    }
+      return { cell, button };
+    });
+    this.showLabels();
     this.order = new Order(head, COLUMNS, onOrder);
     this.order.mark();
     // Where there is little room, some columns are folded until they are asked for.
@@ -126,6 +130,18 @@ export class UavTable {
       $("all-columns").setAttribute("aria-pressed", String(isAll));
     });
     this.ids = []; // as they stand in the table
+  }
+
+  /** Name the columns as the service does, as far as it has said so yet. */
+  showLabels() {
+    HEADS.forEach(({ value, short }, index) => {
+      const { cell, button } = this.heads[index];
+      setAttribute(cell, "title", meaningOf(...value) || labelOf(...value));
+      setText(button, short ?? labelOf(...value));
+    });
+    for (const { cells } of this.rows.values()) {
+      COLUMNS.forEach((column, index) => nameCell(cells[index].cell, column));
+    }
   }
 
   /** Show these UAVs. `sinceS`: seconds since the answer came. */
@@ -161,10 +177,9 @@ export class UavTable {
     button.addEventListener("click", () => this.onSelect(id));
     head.append(button);
     line.append(head);
-    const cells = COLUMNS.map(({ key, label, short = label, feed }) => {
-      const cell = make("td", {
-        role: "cell", "data-key": key, "data-label": short, "data-feed": feed,
-      });
+    const cells = COLUMNS.map((column) => {
+      const cell = make("td", { role: "cell", "data-key": column.key, "data-feed": column.feed });
+      nameCell(cell, column);
       const value = make("span");
       cell.append(value);
       line.append(cell);

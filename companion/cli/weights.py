@@ -8,8 +8,7 @@ from pathlib import Path
 import click
 
 from companion.cli.console import CENTER, CONFIG, LATENCY, Progress, tell_vehicles
-
-FORMATS = ("json", "npy", "raw", "adar1000", "tmytek", "sivers")
+from companion.values import WeightFormat
 
 
 @click.command()
@@ -23,7 +22,7 @@ FORMATS = ("json", "npy", "raw", "adar1000", "tmytek", "sivers")
 @click.option(
     "--format",
     "form",
-    type=click.Choice(FORMATS),
+    type=click.Choice([str(form) for form in WeightFormat]),
     default="json",
     show_default=True,
     help="json holds the beams as well; raw is little-endian complex64, row by row.",
@@ -92,7 +91,7 @@ def weights(
             json.dumps(told | beam_state.weights(pipeline, update.beams, lead_ms)).encode() + b"\n"
         )
     else:
-        body = weight_formats.encode(form, update.beams, pipeline, equipment, lead_ms)
+        body = weight_formats.encode(WeightFormat(form), update.beams, pipeline, equipment, lead_ms)
     if out is None:
         click.echo(body, nl=False)
     else:

@@ -10,7 +10,7 @@ from companion.server import models
 from companion.server.moments import Moments
 from companion.server.responses import answers, encode, json_response, refusals
 from companion.server.turns import Turns
-from companion.values import Update, UserError
+from companion.values import Update, UserError, WeightFormat
 from companion.views import beam_state, weight_formats
 from companion.views import pattern as pattern_view
 from companion.views.state import Node
@@ -53,7 +53,9 @@ def add(app: FastAPI, node: Node, turns: Turns) -> None:
     async def weights(request: Request, lead_ms: LeadMs = 0.0) -> Response:
         form = accepted(request.headers.get("accept", "*/*"))
         if form is None:
-            raise HTTPException(406, f"weights come as {', '.join(weight_formats.TYPES.values())}")
+            raise HTTPException(
+                406, f"weights come as {', '.join(form.media_type for form in WeightFormat)}"
+            )
 
         def make(update: Update) -> tuple[bytes, dict[str, str]]:
             made = update.beams
@@ -64,7 +66,7 @@ def add(app: FastAPI, node: Node, turns: Turns) -> None:
             body, headers = await moments.made(lead_ms, form, make)
         except UserError as error:  # what the device cannot do, as the beams are now
             raise HTTPException(409, str(error)) from error
-        return Response(body, media_type=weight_formats.TYPES[form], headers=headers)
+        return Response(body, media_type=form.media_type, headers=headers)
 
     @app.get(
         "/v1/pattern",
@@ -95,7 +97,7 @@ def add(app: FastAPI, node: Node, turns: Turns) -> None:
 
 
 def _weight_answers() -> dict[int | str, dict[str, Any]]:
-    kinds = dict.fromkeys(weight_formats.TYPES.values(), _BINARY)
+    kinds = dict.fromkeys((form.media_type for form in WeightFormat), _BINARY)
     # The model is named for its schema to be in the document; the content says where it applies.
     content = {
         "model": models.model(beam_state.Weights),
@@ -104,12 +106,12 @@ def _weight_answers() -> dict[int | str, dict[str, Any]]:
     return {200: content} | refusals(406, 409, 422, 503)
 
 
-def accepted(accept: str) -> str | None:
+def accepted(accept: str) -> WeightFormat | None:
     """The format that an Accept header prefers; None where it takes none of them.
 
     RFC 9110: the highest q, the first of equal ones.
     """
-    forms = {media_type: form for form, media_type in weight_formats.TYPES.items()}
+    forms = {form.media_type: form for form in WeightFormat}
     parts = [part.lower().replace(" ", "") for part in accept.split(",")]
     for part in sorted(parts, key=_quality, reverse=True):
         wanted = part.split(";")[0]
@@ -118,7 +120,7 @@ def accepted(accept: str) -> str | None:
         if wanted in forms:
             return forms[wanted]
         if wanted in ("*/*", "application/*", ""):
-            return "json"
+            return WeightFormat.JSON
     return None
 
 

@@ -21,6 +21,7 @@ from companion.values.aimed import (
     Normalisation,
     Policy,
     Power,
+    WeightFormat,
     Widen,
 )
 from companion.values.clock import ClockSet, UtcNs
@@ -133,6 +134,7 @@ __all__ = [
     "UtcNs",
     "Vector",
     "Verdict",
+    "WeightFormat",
     "Widen",
     "kind_of",
     "printable",

@@ -1,7 +1,8 @@
 """Values that the beam stage makes: beams, the UAVs left out, and the weights of one update."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from enum import StrEnum
+from typing import Annotated, Self
 
 import numpy as np
 
@@ -58,6 +59,28 @@ class Widen(DescribedEnum):
     NO = "no", "as narrow as the array allows"
 
 
+class WeightFormat(StrEnum):
+    """What weights can be written as, with the media type that HTTP names it by.
+
+    Those of devices are this product's own names; the makers have registered none.
+    """
+
+    media_type: str
+
+    def __new__(cls, value: str, media_type: str = "") -> Self:
+        made = str.__new__(cls, value)
+        made._value_ = value
+        made.media_type = media_type
+        return made
+
+    JSON = "json", "application/json"
+    NPY = "npy", "application/x-npy"
+    RAW = "raw", "application/octet-stream"
+    ADAR1000 = "adar1000", "application/vnd.adi.adar1000+csv"
+    TMYTEK = "tmytek", "application/vnd.tmytek.bbox+csv"
+    SIVERS = "sivers", "application/vnd.sivers.eder+text"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Beam:
     """One UAV's beam: where it points, how well, and how that direction changes.
@@ -67,7 +90,7 @@ class Beam:
         0: not shaped
     """
 
-    uav: Annotated[str, Meaning("UAV that the beam points at", 1, example="3:1")]
+    uav: Annotated[str, Meaning("UAV that the beam points at", 1, label="UAV", example="3:1")]
     azimuth_rad: Annotated[
         float, Meaning("direction in the array's frame, right of boresight positive", 2)
     ]

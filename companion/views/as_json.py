@@ -24,6 +24,7 @@ FORMER_NAMES: Final[Mapping[str, Mapping[str, str]]] = {
         "elevation_rate_dps": "elevation_rate_degps",
     },
     "Assumptions": {"source": "limits_source"},
+    "MessageRate": {"message_id": "msgid"},
     "UavState": {"altitude_datum": "alt_datum"},
 }
 """Names that values had in the version before, by class: still written, deprecated."""

@@ -52,7 +52,8 @@ class FleetNode:
         None
     )
     clock_offset_s: Annotated[
-        float | None, Meaning("its clock minus this node's, middle of the possible interval")
+        float | None,
+        Meaning("its clock minus this node's, middle of the possible interval", label="Clock"),
     ] = None
     clock_doubt_s: Annotated[float | None, Meaning("width of the possible interval")] = None
     frames: Annotated[int | None, Meaning("frames of vehicles that it shared")] = None
@@ -62,7 +63,10 @@ class FleetNode:
     way_p50_ms: Annotated[
         float | None, Meaning("median time from reception there to here over the last minute")
     ] = None
-    way_p99_ms: Annotated[float | None, Meaning("99th percentile of that time")] = None
+    way_p99_ms: Annotated[
+        float | None,
+        Meaning("99th percentile of the time from reception there to here", label="Delay p99"),
+    ] = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,13 +11,14 @@ from companion.views.as_json import name_in_json
 from companion.views.beam_state import BeamState
 from companion.views.center_state import Center
 from companion.views.fleet import Fleet, FleetNode, FleetUav, NodeState
+from companion.views.health import LinkHealth
 from companion.views.link_state import HeardLink, LinkReports
 from companion.views.state import RecordingStatus, Status
 from companion.views.uav_state import UavState
 
 SHOWN: Final = (
-    BeamState, Center, Fleet, FleetNode, FleetUav, HeardLink, LinkReports, RecordingStatus, Status,
-    UavState,
+    BeamState, Center, Fleet, FleetNode, FleetUav, HeardLink, LinkHealth, LinkReports,
+    RecordingStatus, Status, UavState,
 )  # fmt: skip
 """Classes whose values pages show."""
 ENUMERATIONS: Final[tuple[type[DescribedEnum], ...]] = (

@@ -18,9 +18,14 @@ class LinkReports:
 
     total: Annotated[int, Meaning("reports received over this link")]
     first: Annotated[int, Meaning("reports that no other link delivered before")]
-    first_share: Annotated[float | None, Meaning("share of such reports, 0 to 1")]
+    first_share: Annotated[
+        float | None,
+        Meaning("share of reports that no other link delivered before, 0 to 1", label="First"),
+    ]
     latency_p50_s: Annotated[float | None, Meaning("median age at arrival")]
-    latency_p95_s: Annotated[float | None, Meaning("95th percentile of the age at arrival")]
+    latency_p95_s: Annotated[
+        float | None, Meaning("95th percentile of the age at arrival", label="Latency")
+    ]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,32 +1,23 @@
-"""Weights in the formats that programs and devices take."""
+"""Weights in the formats that programs and devices take.
+
+``raw`` is interleaved little-endian complex64, row-major, and nothing else: what describes it is in
+``headers``. ``npy`` holds the same numbers, in C order.
+"""
 
 import io
 import json
-from typing import Final
 
 import numpy as np
 
 from companion.beams.array.geometry import SPEED_OF_LIGHT_MPS
 from companion.beams.hardware import tables
-from companion.beams.hardware.devices import MEDIA_TYPES, Device
+from companion.beams.hardware.devices import Device
 from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
-from companion.values import BeamSet
+from companion.values import BeamSet, WeightFormat
 from companion.views import beam_state
 from companion.views.as_json import rfc3339
 from companion.views.quantised import device_table
-
-TYPES: Final = {
-    "json": "application/json",
-    "npy": "application/x-npy",
-    "raw": "application/octet-stream",
-    **{str(device): media_type for device, media_type in MEDIA_TYPES.items()},
-}
-"""Names of the formats, and their media types.
-
-``raw`` is interleaved little-endian complex64, row-major, and nothing else: what tells of it is in
-``headers``. ``npy`` holds the same numbers, in C order.
-"""
 
 
 def headers(pipeline: Pipeline, beam_set: BeamSet) -> dict[str, str]:
@@ -46,22 +37,22 @@ def headers(pipeline: Pipeline, beam_set: BeamSet) -> dict[str, str]:
 
 
 def encode(
-    form: str, beam_set: BeamSet, pipeline: Pipeline, equipment: Equipment, lead_ms: float
+    form: WeightFormat, beam_set: BeamSet, pipeline: Pipeline, equipment: Equipment, lead_ms: float
 ) -> bytes:
-    """The weights in one of ``TYPES``.
+    """The weights in a format.
 
     Raises ``UserError``, with the reason, for what a device cannot do.
     """
     match form:
-        case "json":
+        case WeightFormat.JSON:
             return json.dumps(beam_state.weights(pipeline, beam_set, lead_ms)).encode()
-        case "npy":
+        case WeightFormat.NPY:
             file = io.BytesIO()
             np.save(file, beam_set.weights.astype("<c8", order="C"), allow_pickle=False)
             return file.getvalue()
-        case "raw":
+        case WeightFormat.RAW:
             return beam_set.weights.astype("<c8").tobytes("C")
     array = pipeline.array
-    table = device_table(Device(form), beam_set, array, equipment)
+    table = device_table(Device(form.value), beam_set, array, equipment)
     frequency_hz = SPEED_OF_LIGHT_MPS / array.wavelength_m
     return tables.encode(table, frequency_hz).encode()

@@ -116,7 +116,7 @@ def test_times_follow_the_clock_that_was_set_live_and_in_a_replay(
     ]
     shown = state.status(node, __version__)
     assert shown["time"].startswith("2023-11-14T22:")  # 1 700 000 000 s, and some of the first
-    uavs = uav_state.uavs(node)
+    uavs = uav_state.uavs(node)["uavs"]
     assert uavs
     assert {one["valid_at"][:14] for one in uavs} == {"2023-11-14T22:"}
     assert {one["fix"]["at"][:14] for one in uavs} == {"2023-11-14T22:"}  # also of before
@@ -127,7 +127,7 @@ def test_times_follow_the_clock_that_was_set_live_and_in_a_replay(
     again = ServedReplay(Asked(logs=[log], settings=SETTINGS, speed=None, record=None), said.append)
     run_async(again._replay(asyncio.Event()))
     assert again.pipeline.digest.hexdigest() == node.pipeline.digest.hexdigest()
-    assert uav_state.uavs(again)[0]["fix"] == uavs[0]["fix"]
+    assert uav_state.uavs(again)["uavs"][0]["fix"] == uavs[0]["fix"]
     assert said.count(told[0]) == 2
 
     tables = tmp_path / "tables"

@@ -254,7 +254,7 @@ def test_an_export_has_a_row_of_each_report_whatever_its_message() -> None:
         ("rid:010203040506", False), (RID, True), ("icao:4CA7B3", True), ("cot:HAWK", False),
         ("1:1", True),
     ]  # fmt: skip
-    assert all(one.position_deg is not None for one in found if one is not None)
+    assert all(one.position is not None for one in found if one is not None)
 
 
 def test_made_up_names_take_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:

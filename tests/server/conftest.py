@@ -126,7 +126,7 @@ class StandIn:
         return [
             MessageRate(
                 uav=Source(1, 1),
-                message_id=33,
+                msgid=33,
                 wanted_hz=10.0,
                 observed_hz=None,
                 state=RateState.ASKED,

@@ -18,7 +18,7 @@ MakeFix = Callable[..., Fix]
 S = 1_000_000_000
 WINDOW_NS = 5 * S
 OBSERVERS = {
-    "position": PositionObserver(PositionModel(speed_mps=30.0, acceleration_mps2=8.0)),
+    "position": PositionObserver(PositionModel(speed_max_mps=30.0, acceleration_max_mps2=8.0)),
     "kinematic": KinematicObserver(
         KinematicModel(30.0, 8.0, gain=lambda t: (0.7, 0.6 * t, 0.1, 0.8))
     ),

@@ -20,6 +20,10 @@ export const readPage = (name) => readFileSync(join(WEB_ROOT, name), "utf8");
 /** A module of the page; with `anew` one that nobody has loaded before, for it to start again. */
 export const load = (name, anew = "") => import(pathToFileURL(join(WEB_ROOT, name)).href + anew);
 
+/** The answer of /v1/labels, which the service made for these tests. */
+export const LABELS = JSON.parse(readFileSync(process.env.LABELS, "utf8"));
+(await load("meanings.js")).learn(LABELS);
+
 /** The properties that style.css gives the root in a theme: `live` to `#27c498`. */
 export function themeColours(theme) {
   const style = readPage("style.css");

@@ -44,7 +44,7 @@ test("a click opens the drawer with all that is known of that UAV, and asks for 
     { at: stampAt(3), severity: "info", subject: "12:1", text: "12:1 is live" },
   ] };
   const fields = { clock: { kind: "timesync", guarantee: "measured" }, clock_bound_s: 0.003,
-    assumptions: { source: "type", speed_max_mps: 30, acceleration_max_mps2: 4 },
+    assumptions: { limits_source: "type", speed_max_mps: 30, acceleration_max_mps2: 4 },
     recent_rejections: [{ at: stampAt(1), reason: "frozen", detail: "" }] };
   page.service.uavs = [uav("1:1"), uav("2:1", { ...weak(), ...fields })];
   assert.equal(page.element("drawer").hidden, true);

@@ -4,9 +4,10 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { load, openBrowser } from "./browser.mjs";
+import { LABELS, load, openBrowser } from "./browser.mjs";
 import { array, beam, beamsAnswer, stampAt, statusAnswer } from "./service.mjs";
 
+const REASONS = LABELS.enumerations.Reason;
 const panels = await load("panels.js");
 const plain = (text) => text.replaceAll("\u00a0", " ").replaceAll("\u202f", ",");
 
@@ -157,8 +158,8 @@ test("rejections stand with the most frequent first, each with what it means", (
   assert.deepEqual(lines("rejections"), ["garbage | 12,345 B", "out-of-order | 30", "frozen | 2",
     "not-known-here | 1"]);
   const titles = element("rejections").children.map(({ title }) => title);
-  assert.deepEqual(titles, [panels.REASONS.garbage, panels.REASONS["out-of-order"],
-    panels.REASONS.frozen, ""]);
+  assert.deepEqual(titles, [REASONS.garbage, REASONS["out-of-order"],
+    REASONS.frozen, ""]);
   rejections.show({}, 0);
   assert.equal(element("rejections-panel").hidden, true);
 });
@@ -208,7 +209,7 @@ test("the beams in a line: method, number, condition; the array and the lead in 
   panels.showBeams(beamsAnswer([beam("1:1")], {
     method: "mrt", condition_number: 123456, lead_ms: null, array: array({ kind: "ura" }),
   }));
-  assert.equal(text("beams-line"), "Maximum ratio · 1 beam · condition number 1.2e+5");
+  assert.equal(text("beams-line"), "Maximum ratio transmission · 1 beam · condition number 1.2e+5");
   assert.match(text("beams-array"), /\(URA\).* · lead –$/);
   panels.showBeams(beamsAnswer([], { condition_number: null, array: null }));
   assert.deepEqual([text("beams-line"), text("beams-array")],

@@ -1,6 +1,8 @@
 // What answers the page in the service's place, with answers of the shapes that the API has; and
 // it fails in the ways in which a service, or the way to it, fails.
 
+import { LABELS } from "./browser.mjs";
+
 export const START = Date.parse("2026-11-20T13:00:00.000Z");
 export const stampAt = (seconds) => new Date(START + seconds * 1000).toISOString();
 
@@ -132,6 +134,7 @@ export class Service {
     const asked = new URLSearchParams(query);
     const ids = this.beams.map((one) => one.uav);
     switch (place) {
+      case "/v1/labels": return LABELS;
       case "/v1/uavs": return { valid_at: stamp, uavs: this.uavs };
       case "/v1/beams": return beamsAnswer(this.beams, { valid_at: stamp });
       case "/v1/pattern":

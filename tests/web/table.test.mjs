@@ -83,10 +83,10 @@ test("an age grows while no answer comes, and above two seconds it is warned of"
 
 test("a bound whose assumptions were refuted is marked", () => {
   const { show, cell } = openTable();
-  show([uav("1:1", { assumptions: { source: "raised" } })]);
+  show([uav("1:1", { assumptions: { limits_source: "raised" } })]);
   assert.deepEqual([plain(cell("bound").textContent), cell("bound").dataset.level],
     ["▲ 4.2 m", "warn"]);
-  show([uav("1:1", { assumptions: { source: "type" } })]);
+  show([uav("1:1", { assumptions: { limits_source: "type" } })]);
   assert.deepEqual([plain(cell("bound").textContent), cell("bound").dataset.level], ["4.2 m", ""]);
 });
 

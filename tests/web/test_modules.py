@@ -5,6 +5,7 @@ passes when a test says so. ``WEB_ROOT=DIR`` takes them from another directory t
 """
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -12,6 +13,11 @@ from pathlib import Path
 
 import pytest
 from support import HANG_S, ROOT
+
+from companion.server.responses import encode
+from companion.values import UtcNs
+from companion.views.as_json import as_json
+from companion.views.labels import labels as made_labels
 
 HERE = Path(__file__).parent
 OLDEST = (20, 6)
@@ -52,8 +58,15 @@ def test_the_modules_of_the_page_do_what_their_tests_say(tmp_path: Path) -> None
     # In one process: `node --test` starts one for each file, which takes longer than they do.
     everything = tmp_path / "all.mjs"
     everything.write_text("".join(f"await import({json.dumps(one.as_uri())});\n" for one in tests))
-    command = [node(), "--test-reporter=spec", str(everything)]
+    labels = tmp_path / "labels.json"
+    labels.write_bytes(encode(as_json(made_labels(), UtcNs)))
     done = subprocess.run(
-        command, capture_output=True, text=True, encoding="utf-8", timeout=580, check=False
+        [node(), "--test-reporter=spec", str(everything)],
+        env=os.environ | {"LABELS": str(labels)},
+        capture_output=True,
+        text=True,
+        encoding="utf-8",
+        timeout=580,
+        check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr

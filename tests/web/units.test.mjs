@@ -84,7 +84,7 @@ test("the choice holds for the whole page, and for the next one", async () => {
   assert.equal(page.text("innovation-unit"), "ft");
   page.element("uavs").querySelector(".pick").click();
   await page.time.advance(100);
-  assert.match(plain(page.text("drawer-facts")), /Error, at most[\d.]+ ft/);
+  assert.match(plain(page.text("drawer-facts")), /Bound[\d.]+ ft/);
   use({ length: "m", speed: "m/s" });
   const next = openBrowser({ storage: page.storage });
   setUpUnits(() => {});

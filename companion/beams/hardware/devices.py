@@ -12,22 +12,15 @@ from enum import StrEnum
 from typing import Final
 
 from companion.beams.hardware.quantise import Quadrature, Resolution, SettableStates, stepped
+from companion.values import WeightFormat
 
 
 class Device(StrEnum):
     """Hardware for which weights can be written."""
 
-    ADAR1000 = "adar1000"
-    TMYTEK = "tmytek"
-    SIVERS = "sivers"
-
-
-MEDIA_TYPES: Final = {
-    Device.ADAR1000: "application/vnd.adi.adar1000+csv",
-    Device.TMYTEK: "application/vnd.tmytek.bbox+csv",
-    Device.SIVERS: "application/vnd.sivers.eder+text",
-}
-"""Media types for HTTP. They are this product's own names; the makers have registered none."""
+    ADAR1000 = WeightFormat.ADAR1000.value
+    TMYTEK = WeightFormat.TMYTEK.value
+    SIVERS = WeightFormat.SIVERS.value
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -64,5 +64,5 @@ class LinkStatus:
     components: dict[Source, ComponentStatus] = field(default_factory=dict)
 
     @property
-    def bad_crc(self) -> Annotated[int, Meaning("frames with a wrong checksum")]:
+    def bad_crc(self) -> Annotated[int, Meaning("frames with a wrong checksum", label="Bad CRC")]:
         return self.lost.get("bad-crc", 0)

@@ -85,7 +85,7 @@ class MessageRate:
     """A message whose rate is requested of a UAV."""
 
     uav: Annotated[Source, Meaning("UAV that sends the message", example="3:1")]
-    message_id: Annotated[int, Meaning("MAVLink message id")]
+    msgid: Annotated[int, Meaning("MAVLink message id")]
     wanted_hz: Annotated[float, Meaning("requested rate")]
     observed_hz: Annotated[float | None, Meaning("observed rate, by the sender's clock")]
     state: Annotated[RateState, Meaning("state of the request")]
@@ -176,7 +176,7 @@ class Watch:
         observed_hz = self.observed_hz(heard_ns)
         return MessageRate(
             uav=self.uav,
-            message_id=self.msgid,
+            msgid=self.msgid,
             wanted_hz=self.wanted_hz,
             observed_hz=observed_hz,
             state=self.state,

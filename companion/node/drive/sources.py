@@ -14,17 +14,17 @@ from companion.beams.aim import directions
 from companion.beams.array.geometry import Array
 from companion.beams.hardware import codebooks, tables
 from companion.beams.hardware.calibration import Calibration
-from companion.beams.hardware.devices import MEDIA_TYPES, Device
+from companion.beams.hardware.devices import Device
 from companion.client import Client, ServiceError
 from companion.node.drive.loop import Shot, SourceLostError, Takes
 from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
-from companion.values import IntArray, Update, UserError
+from companion.values import IntArray, Update, UserError, WeightFormat
 from companion.views import beam_state
 from companion.views.as_json import as_json
 from companion.views.quantised import device_table
 
-ADAR1000: Final = MEDIA_TYPES[Device.ADAR1000]
+ADAR1000: Final = WeightFormat.ADAR1000.media_type
 LEAST_MEAN: Final = 0.1
 """Length of the mean of unit directions below which they have no middle."""
 ANSWERS_S: Final = 5.0

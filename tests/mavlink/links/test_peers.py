@@ -147,7 +147,7 @@ def test_the_version_is_that_of_the_last_frame_and_both_are_remembered() -> None
     for version in (1, 1, 2, 1):
         (item,) = Splitter(LINK).feed(0, frame(1, version=version))
         heard.peers.count(peer, [item])
-        assert heard.status.components[UAV].version == version
+        assert heard.status.components[UAV].mavlink == version
     assert not peer.speaks_v1_only
     other = heard.peers.at("b")
     heard.peers.count(other, Splitter(LINK).feed(0, frame(1, version=1)))

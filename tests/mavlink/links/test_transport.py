@@ -626,8 +626,8 @@ def test_what_is_heard_is_counted_by_component(run: Run) -> None:
             status = link.status
             assert (status.gaps, status.repeats, status.late) == (3 + 2, 1, 1)
             one, two = status.components[Source(1, 1)], status.components[Source(2, 1)]
-            assert (one.frames, one.gaps, one.version) == (5, 3, 2)
-            assert (two.frames, two.gaps, two.version) == (2, 2, 1)
+            assert (one.frames, one.gaps, one.mavlink) == (5, 3, 2)
+            assert (two.frames, two.gaps, two.mavlink) == (2, 2, 1)
             times = {f.source: f.t_ns for f in inbox.frames}
             assert (one.heard_ns, two.heard_ns) == (times[Source(1, 1)], times[Source(2, 1)])
             assert status.heard_ns == inbox.frames[-1].t_ns

@@ -44,7 +44,7 @@ GAINS: dict[str, GainSchedule] = {
 
 
 def observing(name: str = "deadbeat", **changed: float) -> KinematicObserver:
-    limits = {"speed_mps": SPEED_MPS, "acceleration_mps2": ACCELERATION_MPS2} | changed
+    limits = {"speed_max_mps": SPEED_MPS, "acceleration_max_mps2": ACCELERATION_MPS2} | changed
     return KinematicObserver(KinematicModel(**limits, gain=GAINS[name]))
 
 

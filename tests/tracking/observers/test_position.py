@@ -69,11 +69,11 @@ def observing(
     feedthrough_s: float = 0.0,
     velocity_lead_s: float = 0.2,
     *,
-    acceleration_mps2: float = ACCELERATION_MPS2,
+    acceleration_max_mps2: float = ACCELERATION_MPS2,
 ) -> PositionObserver:
     model = PositionModel(
         speed_max_mps=SPEED_MPS,
-        acceleration_max_mps2=acceleration_mps2,
+        acceleration_max_mps2=acceleration_max_mps2,
         alpha=alpha,
         feedthrough_s=feedthrough_s,
         velocity_lead_s=velocity_lead_s,

@@ -126,10 +126,7 @@ class Client:
         return found
 
     def stream(
-        self,
-        uavs: Iterable[str] = (),
-        topics: Iterable[str] = (),
-        rate_hz: float = 10.0,
+        self, uavs: Iterable[str] = (), topics: Iterable[str] = (), rate_hz: float = 10.0
     ) -> Iterator[Json]:
         """Messages of the state as it changes; ``companion.server.stream`` describes them.
 

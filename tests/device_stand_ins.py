@@ -114,8 +114,7 @@ def iio_module(log: Written) -> ModuleType:
     ]
     made = [IioDevice(log, *name) for name in names]
     context = SimpleNamespace(
-        devices=made,
-        find_device=lambda name: next((one for one in made if one.name == name), None),
+        devices=made, find_device=lambda name: next((one for one in made if one.name == name), None)
     )
     CONTEXT[:] = [context]  # adi keeps the module that it was loaded with
     module: Any = ModuleType("iio")

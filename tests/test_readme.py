@@ -173,10 +173,7 @@ def compose(words: list[str], where: Path, start_node: Started) -> None:
     if (
         shutil.which("docker")
         and not subprocess.run(
-            ["docker", "compose", "version"],
-            capture_output=True,
-            check=False,
-            timeout=HANG_S,
+            ["docker", "compose", "version"], capture_output=True, check=False, timeout=HANG_S
         ).returncode
     ):
         subprocess.run(

@@ -36,8 +36,7 @@ from companion.values import (
     Widen,
 )
 
-AIMABLE: Final = (TrackState.LIVE, TrackState.COASTING)
-"""States of a track that gets a beam."""
+AIMABLE: Final = (TrackState.LIVE, TrackState.COASTING)  # states of a track that gets a beam
 NEAREST_M: Final = 1.0
 """Distance from the array below which a direction means nothing.
 

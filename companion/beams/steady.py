@@ -14,8 +14,7 @@ import numpy as np
 from companion.beams.weights.grouping import Turns
 from companion.values import Beam, BeamSet, Cause, FloatArray, Method
 
-PACE: Final = 3.0
-"""Most by which the angles of a shape grow or shrink in a second, as a factor."""
+PACE: Final = 3.0  # most by which the angles of a shape grow or shrink in a second, as a factor
 FOLLOWED_S: Final = 60.0
 """Longest time that is followed: a process may be stopped for days, whose powers are no number."""
 GROWN_WIDTHS: Final = 3.5
@@ -23,8 +22,7 @@ GROWN_WIDTHS: Final = 3.5
 
 The phases at the ends of the aperture go with the width itself.
 """
-SHRUNK_WIDTHS: Final = 3.0
-"""Most by which they shrink in a second, in natural widths."""
+SHRUNK_WIDTHS: Final = 3.0  # most by which they shrink in a second, in natural widths
 HELD_WIDTHS: Final = 1.0
 """The same for a bound that was as wide as its shape within the last ``HELD_NS``.
 
@@ -41,30 +39,24 @@ LEAST_WIDTHS: Final = 0.25
 """Angle in natural widths that shapes nothing: where growth by factors begins."""
 MOST_WIDTHS: Final = 16.0
 """Angle beyond which a bound shapes nothing more: what is not followed need not be left again."""
-KEPT_NS: Final = 500_000_000
-"""Time for which a method and turns are kept."""
+KEPT_NS: Final = 500_000_000  # time for which a method and turns are kept
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Steady:
     """What the beams of the last tick were.
 
-    valid_at_ns  for when they were made
     shaped       the likely angle and the bound of each UAV's shape, radians
     filled_ns    when last the bound of each UAV was no less than that of its shape
-    turns        the turn of each UAV; those left out are missing
-    known        the UAVs that could have a beam
-    turned_ns    since when these UAVs have had these turns
-    inexact_ns   when last a UAV did not lie in all nulls; None: never
     """
 
-    valid_at_ns: int
+    valid_at_ns: int  # for when they were made
     shaped: Mapping[str, tuple[float, float]]
     filled_ns: Mapping[str, int]
-    turns: Mapping[str, int]
-    known: frozenset[str]
-    turned_ns: int
-    inexact_ns: int | None
+    turns: Mapping[str, int]  # the turn of each UAV; those left out are missing
+    known: frozenset[str]  # the UAVs that could have a beam
+    turned_ns: int  # since when these UAVs have had these turns
+    inexact_ns: int | None  # when last a UAV did not lie in all nulls; None: never
 
 
 def after(before: Steady | None, made: BeamSet) -> Steady:

@@ -33,10 +33,7 @@ def _alpha(text: str) -> float | None:
     help="Seconds between reports.",
 )
 @click.option(
-    "--model",
-    type=click.Choice(["position", "kinematic"]),
-    default="position",
-    show_default=True,
+    "--model", type=click.Choice(["position", "kinematic"]), default="position", show_default=True
 )
 @click.option("--alpha", metavar="A|auto", default="auto", show_default=True, help="In (0, 1).")
 @click.option(

@@ -17,8 +17,7 @@ from companion.values import UserError
 if TYPE_CHECKING:
     from companion.client import ServiceError
 
-EVERY_S: Final = 1.0
-"""Time between two looks."""
+EVERY_S: Final = 1.0  # time between two looks
 
 
 @click.group()

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-IMPORTED_BY_S = 0.02
-"""How soon an interrupt that met an import asks again."""
+IMPORTED_BY_S = 0.02  # how soon an interrupt that met an import asks again
 
 
 @contextmanager

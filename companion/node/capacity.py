@@ -16,18 +16,13 @@ from companion.settings.model import Settings
 from companion.tracking.geodesy import LocalFrame
 from companion.values import Event, Frame, Source, Tick
 
-SHARE: Final = 0.5
-"""Share of one processor that reports and updates may take."""
-RATE_HZ: Final = 10
-"""Reports a second of each UAV."""
+SHARE: Final = 0.5  # share of one processor that reports and updates may take
+RATE_HZ: Final = 10  # reports a second of each UAV
 FEW: Final = 4
-MORE: Final = 16
-"""UAVs that are flown to tell how the time grows with them."""
-MOST: Final = 250
-"""UAVs beyond which nothing is told: they are too many more than were flown."""
+MORE: Final = 16  # UAVs that are flown to tell how the time grows with them
+MOST: Final = 250  # UAVs beyond which nothing is told: they are too many more than were flown
 SETTLED_S: Final = 2
-MEASURED_S: Final = 3
-"""Flight before it is measured, and while it is."""
+MEASURED_S: Final = 3  # flight before it is measured, and while it is
 HOME: Final = (47.0, 8.0, 500.0)
 _S: Final = 1_000_000_000
 _BEGIN_NS: Final = 1_700_000_000 * _S
@@ -35,16 +30,11 @@ _BEGIN_NS: Final = 1_700_000_000 * _S
 
 @dataclass(frozen=True, slots=True)
 class Capacity:
-    """What was measured.
+    """What was measured."""
 
-    uavs      UAVs that take ``SHARE`` of a processor; None: more than ``MOST``
-    report_s  time that a report takes
-    update_s  time that an update of ``MORE`` beams takes
-    """
-
-    uavs: int | None
-    report_s: float
-    update_s: float
+    uavs: int | None  # UAVs that take SHARE of a processor; None: more than MOST
+    report_s: float  # time that a report takes
+    update_s: float  # time that an update of MORE beams takes
 
 
 def measure(

@@ -24,12 +24,10 @@ from companion.settings.outlets import DriveSettings, RecordSettings
 from companion.values import Level, Reason, UserError, Verdict, kind_of
 from companion.views import uav_state
 
-LOOKS: Final = 5
-"""Times that beams are computed to tell how long that takes."""
+LOOKS: Final = 5  # times that beams are computed to tell how long that takes
 BUSY: Final = 0.3
 """Share of the time between updates that beams may take before that is worth a thought."""
-NOISY: Final = 0.01
-"""Share of frames with a wrong checksum from which on a link is noisy."""
+NOISY: Final = 0.01  # share of frames with a wrong checksum from which on a link is noisy
 SAYS: Final = {
     "sbs": "BaseStation lines (30003)",
     "readsb": "Beast (30005), or aircraft.json",
@@ -37,8 +35,7 @@ SAYS: Final = {
     "cot": "Cursor on Target",
 }
 """What receivers of other kinds than MAVLink say, by the scheme of their links."""
-SOME: Final = 8
-"""Most vehicles that a line names."""
+SOME: Final = 8  # most vehicles that a line names
 
 
 def check(

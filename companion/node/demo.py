@@ -7,8 +7,7 @@ from companion.settings.model import Settings
 from sitl_replay.flight import scenario
 from sitl_replay.traffic import player
 
-LINK: Final = "udpin:127.0.0.1:0"
-"""Link of the demo; the system chooses the port."""
+LINK: Final = "udpin:127.0.0.1:0"  # link of the demo; the system chooses the port
 
 
 def settings(directory: str) -> Settings:

@@ -16,10 +16,8 @@ from companion.settings.model import Settings
 from companion.values import Update
 from companion.views.tables.said import TABLES, rows
 
-SPACE: Final = "space.mcap"
-"""The file of an export for Rerun."""
-SHOW_EVERY_S: Final = 0.5
-"""Time between two calls of ``progress``."""
+SPACE: Final = "space.mcap"  # the file of an export for Rerun
+SHOW_EVERY_S: Final = 0.5  # time between two calls of progress
 
 
 def export(

@@ -22,10 +22,8 @@ from companion.settings.model import Settings
 from companion.settings.section import ConfigError
 from companion.values import Event, Frame, Notice, Reason, Rejection, Severity, Source, UserError
 
-SETUP_SIGNING: Final = 256
-"""Message that carries a signing key in plain; it is never recorded."""
-SAVE_EVERY_S: Final = 0.25
-"""Time between two checks whether signing timestamps are due to be saved."""
+SETUP_SIGNING: Final = 256  # message that carries a signing key in plain; it is never recorded
+SAVE_EVERY_S: Final = 0.25  # time between two checks whether signing timestamps are due to be saved
 
 
 class Gateway:
@@ -58,8 +56,7 @@ class Gateway:
         self._twins = Twins({*settings.links.routers, *signed})
         self._settings = settings
         self.links: list[Link] = []
-        self.lag = ArrivalLag()
-        """How far behind the arrival of datagrams their processing is."""
+        self.lag = ArrivalLag()  # how far behind the arrival of datagrams their processing is
 
     def open(self) -> None:
         """Make the links and claim their addresses.

@@ -25,8 +25,7 @@ SCARCE_BYTES: Final = 2_000_000_000
 """Free disk below which recordings are in danger: some hours of four UAVs."""
 BUFFER_BYTES: Final = 1_000_000
 """Receive buffer below which bursts of UDP may be lost (docs/links.md)."""
-UNSYNCHRONISED: Final = 5
-"""What adjtimex(2) answers where nothing keeps the clock: TIME_ERROR."""
+UNSYNCHRONISED: Final = 5  # what adjtimex(2) answers where nothing keeps the clock: TIME_ERROR
 
 
 class Grade(StrEnum):

@@ -12,8 +12,7 @@ from companion.recording.reader import utc_offset_ns
 from companion.settings.model import Settings
 from companion.values import Update, UserError
 
-TOLD_EVERY: Final = 20_000
-"""Events between two calls of ``progress``."""
+TOLD_EVERY: Final = 20_000  # events between two calls of progress
 
 ENDS_NS: Final = 60_000_000_000
 """How far the ends of a log may be off its first and last event: stamps may step back or leap."""

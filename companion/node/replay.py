@@ -29,10 +29,8 @@ from companion.settings.model import Settings
 from companion.settings.origins import Origin, Origins, changed, of_options
 from companion.values import Estimate, Event, Output, Refuted, Tick, Tock, Update
 
-FLUSH_EVERY_S: Final = 1.0
-"""Time between two flushes of the recording."""
-TICKED: Final = "mcap"
-"""Kind of log that holds the ticks of the run from which it was recorded."""
+FLUSH_EVERY_S: Final = 1.0  # time between two flushes of the recording
+TICKED: Final = "mcap"  # kind of log that holds the ticks of the run from which it was recorded
 
 
 def settings_for(logs: Sequence[Path], config: Path | None, center: str | None) -> Settings:

@@ -20,15 +20,13 @@ from companion.values import UserError
 
 MAGIC: Final = b"UAVBRING"
 VERSION: Final = 1
-SLOTS: Final = 256
-"""A quarter of a second at 1000 records/s, for a reader that is held up."""
+SLOTS: Final = 256  # a quarter of a second at 1000 records/s, for a reader that is held up
 SLOT_BYTES: Final = 1 << 16
 """Memory is taken as it is touched: a slot costs what its largest record takes."""
 HEAD_BYTES: Final = 64
 SLOT_HEAD_BYTES: Final = 16
 LARGEST_RECORD: Final = SLOT_BYTES - SLOT_HEAD_BYTES
-LIVE: Final = 1
-"""``state`` of a ring that is written to; 0: its writer has ended."""
+LIVE: Final = 1  # state of a ring that is written to; 0: its writer has ended
 
 
 def _require_ring(path: Path) -> None:

@@ -49,21 +49,16 @@ MEASURED_AT_ONCE: Final = 20_000
 class Asked:
     """What is to be replayed, and how.
 
-    logs      the logs
-    settings  those of the pipeline
-    speed     as in ``companion.node.replay.replay``
-    record    makes the recording of the replay; None: there is none
     latency_s as in ``companion.node.replay.replay``
-    origins   where the settings come from
     area_map  the map under the plan view: of the user's own settings, not of a recording's
     """
 
-    logs: Sequence[Path]
-    settings: Settings
-    speed: float | None
-    record: Callable[[], Writer] | None
+    logs: Sequence[Path]  # the logs
+    settings: Settings  # those of the pipeline
+    speed: float | None  # as in companion.node.replay.replay
+    record: Callable[[], Writer] | None  # makes the recording of the replay; None: there is none
     latency_s: float = 0.0
-    origins: Origins = field(default_factory=dict)
+    origins: Origins = field(default_factory=dict)  # where the settings come from
     area_map: str | None = None
 
 

@@ -21,12 +21,9 @@ from companion.views.state import Node
 
 T = TypeVar("T")
 
-RATE_WINDOW_S: Final = 2.0
-"""Time over which frames and updates per second are counted."""
-NOTICES_KEPT: Final = 200
-"""Newest notices kept."""
-STREAM_TAKES_BYTES: Final = 1024
-"""Largest message accepted from a WebSocket client."""
+RATE_WINDOW_S: Final = 2.0  # time over which frames and updates per second are counted
+NOTICES_KEPT: Final = 200  # newest notices kept
+STREAM_TAKES_BYTES: Final = 1024  # largest message accepted from a WebSocket client
 FAREWELL_S: Final = 2
 """How long the shutdown waits for clients that do not read, and for unfinished downloads."""
 

@@ -16,8 +16,7 @@ from companion.settings.model import Settings
 from companion.settings.origins import Origins
 from companion.values import UserError
 
-TOLD_EVERY_S: Final = 1.0
-"""Time between two words on how it goes."""
+TOLD_EVERY_S: Final = 1.0  # time between two words on how it goes
 
 
 class Voice(Protocol):

@@ -37,14 +37,7 @@ from companion.tracking.noise import NoiseSettings
 from companion.tracking.observers.kinematic import KinematicModel, KinematicObserver, scheduled
 from companion.tracking.observers.position import PositionModel, PositionObserver
 from companion.tracking.tracker import Ages, Tracker, TrackerSettings
-from companion.values import (
-    FloatArray,
-    Limits,
-    LimitSource,
-    ReportNoise,
-    UserError,
-    kind_of,
-)
+from companion.values import FloatArray, Limits, LimitSource, ReportNoise, UserError, kind_of
 
 FLOOR_SPARE_DB: Final = 2.9
 """How much more than the link needs the floor of a likely beam is, unless it is given."""
@@ -140,22 +133,14 @@ def coverage(settings: Settings) -> Coverage:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Equipment:
-    """What is needed, beside the pipeline, to answer questions about beams.
+    """What is needed, beside the pipeline, to answer questions about beams."""
 
-    codebook      stored beams; None without
-    calibration   calibration of the hardware; None without
-    budget        power, bandwidth and noise figure of the radio link
-    uav_antennas  antennas that each UAV combines
-    device        what the weights are quantised for; None: nothing
-    unit_gains    what a TMYTEK unit's channels can have
-    """
-
-    codebook: Codebook | None
-    calibration: Calibration | None
-    budget: LinkBudget
-    uav_antennas: int
-    device: Device | None = None
-    unit_gains: UnitGains = RELATIVE
+    codebook: Codebook | None  # stored beams; None without
+    calibration: Calibration | None  # calibration of the hardware; None without
+    budget: LinkBudget  # power, bandwidth and noise figure of the radio link
+    uav_antennas: int  # antennas that each UAV combines
+    device: Device | None = None  # what the weights are quantised for; None: nothing
+    unit_gains: UnitGains = RELATIVE  # what a TMYTEK unit's channels can have
 
 
 def equipment(settings: Settings, antenna: geometry.Array) -> Equipment:

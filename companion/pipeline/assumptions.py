@@ -6,8 +6,7 @@ from companion.mavlink.clock.estimates import ClockChange
 from companion.pipeline.records import UavRecord, UavRecords
 from companion.values import Estimate, Notice, Refuted, Severity
 
-AGAIN: Final = 1.25
-"""Multiple of what was told last above which it is told again."""
+AGAIN: Final = 1.25  # multiple of what was told last above which it is told again
 _UNITS: Final = {
     "observer.speed_max_mps": "m/s",
     "observer.acceleration_max_mps2": "m/s²",
@@ -16,8 +15,7 @@ _UNITS: Final = {
     "center.turn_acceleration_max_degps2": "°/s²",
     "center.attitude_bound_deg": "°",
 }
-SILENT_NS: Final = 60_000_000_000
-"""Time for which a change of a clock or link is not told again."""
+SILENT_NS: Final = 60_000_000_000  # time for which a change of a clock or link is not told again
 
 
 def told(records: UavRecords, *refuted: Refuted | None) -> list[Refuted | Notice]:

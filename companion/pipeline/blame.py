@@ -12,10 +12,8 @@ from companion.values import Beam, Blame, Carrier, Cause, LeftOut, Reason, Track
 
 CROWDED_DB: Final = 3.0
 """Loss against a beam for a UAV alone from which on the other UAVs are to blame."""
-SPARSE_S: Final = 0.25
-"""Interval between reports from which on asking for more of them helps."""
-LATE_S: Final = 0.15
-"""Latency from which on a faster link helps."""
+SPARSE_S: Final = 0.25  # interval between reports from which on asking for more of them helps
+LATE_S: Final = 0.15  # latency from which on a faster link helps
 SILENT_S: Final = 1.0
 """Age of the newest report from which on a UAV is silent, if that is several intervals too."""
 SILENT_INTERVALS: Final = 3.0
@@ -26,22 +24,14 @@ STEADIER: Final = "use a MAVLink link of steadier delay"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
-    """What is known of a UAV beside its track.
+    """What is known of a UAV beside its track."""
 
-    clock_assumed       the constant part of its latency is only assumed
-    refused             why its newest reports were not used; None where they were
-    attitude_bound_rad  what the carrier's attitudes may be off when they are made
-    attitude_age_s      how old the newest of them is
-    carrier_doubt_s     how far the carrier's clock may be off
-    carrier_assumed     the constant part of its latency is only assumed
-    """
-
-    clock_assumed: bool
-    refused: Reason | None
-    attitude_bound_rad: float = 0.0
-    attitude_age_s: float = 0.0
-    carrier_doubt_s: float = 0.0
-    carrier_assumed: bool = False
+    clock_assumed: bool  # the constant part of its latency is only assumed
+    refused: Reason | None  # why its newest reports were not used; None where they were
+    attitude_bound_rad: float = 0.0  # what the carrier's attitudes may be off when they are made
+    attitude_age_s: float = 0.0  # how old the newest of them is
+    carrier_doubt_s: float = 0.0  # how far the carrier's clock may be off
+    carrier_assumed: bool = False  # the constant part of its latency is only assumed
 
 
 def of_left_out(out: LeftOut, track: Track | None, unfit: str | None) -> Blame:
@@ -169,9 +159,7 @@ def _grown_m(track: Track, seconds: float) -> float:
 def _silence(track: Track, evidence: Evidence) -> Blame | None:
     if evidence.refused is not None:
         return Blame(
-            Cause.REFUSED,
-            f"its reports are not used: {evidence.refused}",
-            "see its rejections",
+            Cause.REFUSED, f"its reports are not used: {evidence.refused}", "see its rejections"
         )
     if track.age_s > max(SILENT_S, SILENT_INTERVALS * (track.dt_s or 0.0)):
         return _silent(track)

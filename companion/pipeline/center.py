@@ -38,17 +38,14 @@ from companion.values import (
 
 HOME_SETTLES_S: Final = 120.0
 """Time after its first report in which a UAV that is tracked anew moves ``home``."""
-HOME_HEIGHT_M: Final = 20.0
-"""Least height by which the first one must have been wrong."""
+HOME_HEIGHT_M: Final = 20.0  # least height by which the first one must have been wrong
 
 AGAIN: Final = 1.25
 """Multiple of the bound on attitudes that was told last above which it is told again."""
-PASSED_LEAST: Final = 4
-"""Attitudes that must go on before the newest to take its place."""
+PASSED_LEAST: Final = 4  # attitudes that must go on before the newest to take its place
 PASSED_NS: Final = 500_000_000
 """Time over which they must; attitudes that are resent come all at once."""
-PACE_NS: Final = 250_000_000
-"""By how much arrivals and stamps may differ from one to the next."""
+PACE_NS: Final = 250_000_000  # by how much arrivals and stamps may differ from one to the next
 
 
 @dataclass(frozen=True, slots=True)

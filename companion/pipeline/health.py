@@ -38,16 +38,12 @@ EVERY_NS: Final = 1_000_000_000
 """Time between two judgements of a link, and for which one round through all of them lasts."""
 AT_ONCE: Final = 16
 """Links that one update judges at least; more where a round would last for too long."""
-WORSE_NS: Final = 1_000_000_000
-"""Time for which a link must be judged worse before it is called so."""
-BETTER_NS: Final = 3_000_000_000
-"""Time for which it must be judged better."""
+WORSE_NS: Final = 1_000_000_000  # time for which a link must be judged worse before it is called so
+BETTER_NS: Final = 3_000_000_000  # time for which it must be judged better
 SLACK_DB: Final = 1.0
 """How far a gain may fall below what is needed before a link that had it is judged worse."""
-NAMED: Final = 6
-"""Most UAVs that one notice names."""
-RANK: Final = {Level.NONE: 0, Level.WEAK: 1, Level.GOOD: 2}
-"""Levels from the worst to the best."""
+NAMED: Final = 6  # most UAVs that one notice names
+RANK: Final = {Level.NONE: 0, Level.WEAK: 1, Level.GOOD: 2}  # levels from the worst to the best
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

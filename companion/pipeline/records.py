@@ -9,8 +9,7 @@ from companion.values import Reason
 
 RECORDS_MAX: Final = 4096
 """Records kept. Beyond it those that nothing protects are dropped, the oldest first."""
-DROPPED_AT_ONCE: Final = 256
-"""Records dropped at once: made-up ids may come in any number."""
+DROPPED_AT_ONCE: Final = 256  # records dropped at once: made-up ids may come in any number
 
 _T = TypeVar("_T")
 
@@ -52,20 +51,15 @@ class Unused:
 class UavRecord:
     """What is remembered of a UAV until it is restarted or its track is dropped.
 
-    refuted         how often assumptions about it were refuted
     proven          greatest value that was reported of each refuted setting
-    clock_told_ns   when a change of its clock or link was last reported
-    waits_ns        since when its GNSS receiver has not confirmed its reports
-    unused          the present run of reports that are not used
-    unused_told_ns  when such a run was last reported
     """
 
-    refuted: int = 0
+    refuted: int = 0  # how often assumptions about it were refuted
     proven: dict[str, float] = field(default_factory=dict)
-    clock_told_ns: int | None = None
-    waits_ns: int | None = None
-    unused: Unused | None = None
-    unused_told_ns: int | None = None
+    clock_told_ns: int | None = None  # when a change of its clock or link was last reported
+    waits_ns: int | None = None  # since when its GNSS receiver has not confirmed its reports
+    unused: Unused | None = None  # the present run of reports that are not used
+    unused_told_ns: int | None = None  # when such a run was last reported
 
 
 UavRecords = Records[UavRecord]

@@ -9,8 +9,7 @@ from companion.values import Notice, Reason, Rejection, Severity, kind_of
 
 UNHEARD_NS: Final = 1_000_000_000
 """Time for which no report of a sender is used before that is told."""
-AGAIN_NS: Final = 10_000_000_000
-"""Least time between two such notices of one sender."""
+AGAIN_NS: Final = 10_000_000_000  # least time between two such notices of one sender
 OF_REPORTS: Final = frozenset(
     {
         Reason.UNREACHABLE,
@@ -24,8 +23,7 @@ OF_REPORTS: Final = frozenset(
     }
 )
 """Reasons for which a report that is about its sender itself is not used."""
-RECENT: Final = 8
-"""Recent rejections kept per sender."""
+RECENT: Final = 8  # recent rejections kept per sender
 SENDERS_MAX: Final = 4096
 """Senders remembered; beyond it the one heard longest ago is forgotten.
 

@@ -49,15 +49,13 @@ from companion.values import (
     kind_of,
 )
 
-WAITS_NS: Final = 10_000_000_000
-"""Time for which a track waits for its receiver to vouch for it."""
+WAITS_NS: Final = 10_000_000_000  # time for which a track waits for its receiver to vouch for it
 STATED_LATE_US: Final = 30_000_000
 """Greatest time by which what a receiver states may come after something newer; a longer step back
 is another boot's. As long as reports are remembered (``dedupe``)."""
 KEPT_NS: Final = 3_600_000_000_000
 """How long a silent sender without a track is kept: each clock takes some 50 kB."""
-FIX_3D: Final = 3
-"""GPS_FIX_TYPE_3D_FIX; better fixes have greater numbers."""
+FIX_3D: Final = 3  # GPS_FIX_TYPE_3D_FIX; better fixes have greater numbers
 NEAR_HEIGHT_M: Final = 50.0
 """Greatest distance between a receiver's own height and the autopilot's that stands by it.
 
@@ -65,26 +63,22 @@ Before an autopilot stands by its height it may be hundreds of metres off (docs/
 """
 
 
-APART_SHARE: Final = 0.1
-"""Share of the newest report in how far the two heights are apart of late."""
+APART_SHARE: Final = 0.1  # share of the newest report in how far the two heights are apart of late
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlacedReport:
     """A report with its time.
 
-    sender_ns  when it was true, on the sender's timeline
-    t_ns       the same instant on the node's timeline
     noise      bounds on its errors; None for a relayed aircraft, whose errors depend on its
                speed
-    limits     what the aircraft is taken to be able to do
     """
 
     report: Report
-    sender_ns: int
-    t_ns: int
+    sender_ns: int  # when it was true, on the sender's timeline
+    t_ns: int  # the same instant on the node's timeline
     noise: ReportNoise | None
-    limits: Limits
+    limits: Limits  # what the aircraft is taken to be able to do
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,40 +105,31 @@ class Heard:
     change: ClockChange | None = None
 
 
-NOTHING: Final = Heard()
-"""The outcome of a frame that asks for nothing further."""
+NOTHING: Final = Heard()  # the outcome of a frame that asks for nothing further
 
 
 @dataclass(slots=True)
 class Sender:
-    """A sender whose stamps are placed: a vehicle, or an aircraft that broadcasts its own stamps.
-
-    stamped_ns  when the clock was last given a stamp; None if never
-    is_shared   whether it was reported that two senders share this id
-    """
+    """A sender whose stamps are placed: a vehicle, or an aircraft that broadcasts its own stamps."""
 
     clock: SenderClock
-    stamped_ns: int | None = None
-    is_shared: bool = False
+    stamped_ns: int | None = None  # when the clock was last given a stamp; None if never
+    is_shared: bool = False  # whether it was reported that two senders share this id
 
 
 @dataclass(slots=True, kw_only=True)
 class Component:
     """What a MAVLink component says beside positions.
 
-    heard_ns   when it last said any of this
-    presence   its newest heartbeat
-    receiver   its newest GNSS status
     stated_us  the receiver's own time of that status; 0 if unknown, or of the boot before
-    noise      bounds on the noise of its reports, by that status
     apart_m2   mean square of the receiver's height less the autopilot's of late, m²
     """
 
-    heard_ns: int = 0
-    presence: Presence | None = None
-    receiver: GnssStatus | None = None
+    heard_ns: int = 0  # when it last said any of this
+    presence: Presence | None = None  # its newest heartbeat
+    receiver: GnssStatus | None = None  # its newest GNSS status
     stated_us: int = 0
-    noise: ReportNoise | None = None
+    noise: ReportNoise | None = None  # bounds on the noise of its reports, by that status
     apart_m2: float | None = None
 
 

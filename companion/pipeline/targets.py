@@ -4,13 +4,7 @@ from collections.abc import Iterable, Mapping
 
 from companion.settings.model import Settings
 from companion.tracking.identity import Identities
-from companion.values import (
-    Duty,
-    Notice,
-    Severity,
-    TrackState,
-    kind_of,
-)
+from companion.values import Duty, Notice, Severity, TrackState, kind_of
 
 
 class Targets:

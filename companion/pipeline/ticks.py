@@ -7,8 +7,7 @@ from companion.values import Event, Tick
 
 LONGEST_PAUSE_NS: Final = 3_600_000_000_000
 """Longest pause of several logs together that is ticked through: none of them alone has more."""
-PAUSE_NS: Final = 60_000_000_000
-"""What counts as a pause: after it every track is lost."""
+PAUSE_NS: Final = 60_000_000_000  # what counts as a pause: after it every track is lost
 PAUSES_NS: Final = 4 * LONGEST_PAUSE_NS
 """Pauses of a log, together, that are ticked through.
 

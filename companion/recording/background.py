@@ -27,10 +27,8 @@ QUEUE_MAX: Final = 50_000
 About 60 MB where twenty UAVs report ten times a second (1.3 kB for an event with its outputs)."""
 GATHER_S: Final = 0.02
 """How long events are left to gather: to wake the thread for each costs as much as to write it."""
-AT_ONCE: Final = 500
-"""Events between two looks at whether a flush is due."""
-FLUSH_S: Final = 1.0
-"""Time between two flushes to disk."""
+AT_ONCE: Final = 500  # events between two looks at whether a flush is due
+FLUSH_S: Final = 1.0  # time between two flushes to disk
 FLUSH_FIRST_S: Final = 0.1
 """The same where a file begins, and twice as long after each: a short life leaves something too."""
 RETRY_FIRST_S: Final = 1.0
@@ -38,10 +36,8 @@ RETRY_FIRST_S: Final = 1.0
 
 Whether a full disk has room is asked without trying it, at the pace of the first attempt.
 """
-RETRY_MAX_S: Final = 30.0
-"""Longest time between two attempts."""
-STOP_MAX_S: Final = 30.0
-"""How long the end of the service waits for a disk that does not answer."""
+RETRY_MAX_S: Final = 30.0  # longest time between two attempts
+STOP_MAX_S: Final = 30.0  # how long the end of the service waits for a disk that does not answer
 GO_ON_WITH: Final = 2000
 """Events that are written at once where a recording goes on: some hundred kilobytes."""
 ROOM_BYTES: Final = 8 << 20
@@ -58,8 +54,7 @@ class Rotation:
     after_s: float | None = None
 
 
-NEVER: Final = Rotation()
-"""Never begin a new part."""
+NEVER: Final = Rotation()  # never begin a new part
 
 
 class _Item(NamedTuple):

@@ -42,15 +42,12 @@ LARGEST: Final = 1 << 25
 about a mebibyte, and the largest settings 27."""
 _LARGEST_MESSAGE: Final = 1 << 24
 _LARGEST_SUMMARY: Final = 1 << 26  # two weeks of a chunk a second
-_DESCRIPTIONS: Final = 1 << 25
-"""Most bytes of all schemas and channels together."""
+_DESCRIPTIONS: Final = 1 << 25  # most bytes of all schemas and channels together
 _LARGEST_PAIRS: Final = 1 << 16
 """Most bytes of a channel, or of a record of metadata: names and values, many of which are
 objects of far more bytes; those of this program have hundreds."""
-_PAIR: Final = 256
-"""Bytes that a name and its value take in memory, beside their own."""
-_MOST: Final = 10_000
-"""Most attachments, and most records of metadata, that are read of a file."""
+_PAIR: Final = 256  # bytes that a name and its value take in memory, beside their own
+_MOST: Final = 10_000  # most attachments, and most records of metadata, that are read of a file
 _PACKED: Final = 50
 """Most bytes of contents for each byte of a file, beside one largest chunk: as much as ten times
 what is found in recordings, where a bomb has thousands."""
@@ -95,10 +92,8 @@ class Walk:
         self.schemas: dict[int, Schema] = {}
         self._described: set[int] = {0}  # 0: a channel without a schema, of other programs
         self.channels: dict[int, Channel] = {}
-        self.complete = False
-        """True if the file's end is there, so that it was closed in order."""
-        self.lost_bytes = 0
-        """Bytes that belong to no readable record."""
+        self.complete = False  # true if the file's end is there, so that it was closed in order
+        self.lost_bytes = 0  # bytes that belong to no readable record
         self.path = path
         self._topics = topics
         self._described_bytes = 0

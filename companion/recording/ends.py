@@ -10,8 +10,7 @@ from companion.recording import container
 from companion.recording.container import MAGIC
 from companion.recording.tlog import STAMP
 
-_TAIL: Final = 1 << 16
-"""Bytes at the end of a telemetry log in which its last frame is looked for."""
+_TAIL: Final = 1 << 16  # bytes at the end of a telemetry log in which its last frame is looked for
 _LONGEST_NS: Final = 10 * 86_400 * 1_000_000_000
 """A log that seems to be longer has a wrong stamp at one end."""
 

@@ -18,14 +18,10 @@ from companion.recording.scene import Scene
 from companion.recording.schemas import Schema
 from companion.values import Estimate, Event, Output, UserError
 
-QUEUE_MAX: Final = 10_000
-"""Events waiting to be sent at most."""
-RATE_HZ: Final = 10.0
-"""Greatest rate of tracks and weights: as often as anyone can see."""
-LOOK_S: Final = 0.2
-"""Time between two checks whether anybody is watching."""
-NAME: Final = "companion"
-"""Name of the server as viewers show it."""
+QUEUE_MAX: Final = 10_000  # events waiting to be sent at most
+RATE_HZ: Final = 10.0  # greatest rate of tracks and weights: as often as anyone can see
+LOOK_S: Final = 0.2  # time between two checks whether anybody is watching
+NAME: Final = "companion"  # name of the server as viewers show it
 
 _Item = tuple[Event | None, Sequence[Output]]
 

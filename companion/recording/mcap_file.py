@@ -34,8 +34,7 @@ from zstandard import ZstdCompressor
 
 from companion.recording.container import MAGIC
 
-CHUNK_BYTES: Final = 1 << 20
-"""Size of its contents at which a chunk is ended."""
+CHUNK_BYTES: Final = 1 << 20  # size of its contents at which a chunk is ended
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
 """Opcode, length of what follows, channel, sequence, log time and publish time of a message."""
 _FIELDS: Final = _MESSAGE.size - 9  # of a message's head, without opcode and length

@@ -23,22 +23,16 @@ HOLES_MAX: Final = 1000
 """Holes of a file that are told one by one; what further ones lack is counted with the last."""
 WHY_MAX: Final = 200
 EVENTS_MAX: Final = (1 << 63) - 1
-NUMBER_DIGITS: Final = 9
-"""Most digits of a part's number."""
+NUMBER_DIGITS: Final = 9  # most digits of a part's number
 _LATEST_NS: Final = 1 << 62
 
 
 class Part(NamedTuple):
-    """Which part of which run a file is.
+    """Which part of which run a file is."""
 
-    run        the same in all parts of a run
-    number     counts from 1
-    continues  name of the file before, as it was when this one was begun
-    """
-
-    run: str
-    number: int
-    continues: str
+    run: str  # the same in all parts of a run
+    number: int  # counts from 1
+    continues: str  # name of the file before, as it was when this one was begun
 
     @classmethod
     def first(cls) -> Self:

@@ -35,20 +35,13 @@ class BeingRecordedError(LogError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recovered:
-    """The result of recovering a recording.
+    """The result of recovering a recording."""
 
-    path        the finished file
-    messages    number of messages by topic
-    last_ns     latest time among them; None without any
-    lost_bytes  bytes of the torn file that could not be used
-    changed     False for a file that was complete and is left as it was
-    """
-
-    path: Path
-    messages: Mapping[str, int]
-    last_ns: int | None
-    lost_bytes: int
-    changed: bool
+    path: Path  # the finished file
+    messages: Mapping[str, int]  # number of messages by topic
+    last_ns: int | None  # latest time among them; None without any
+    lost_bytes: int  # bytes of the torn file that could not be used
+    changed: bool  # False for a file that was complete and is left as it was
 
 
 def recover(path: Path) -> Recovered:

@@ -28,8 +28,7 @@ from companion.values import Carrier, FloatArray, Track, TrackState, Update
 MAP: Final = "map"
 CARRIER: Final = "carrier"
 ARRAY: Final = "array"
-LIFETIMES: Final = 3
-"""Periods of the scene for which a drawn thing stays."""
+LIFETIMES: Final = 3  # periods of the scene for which a drawn thing stays
 WIDEST_RAD: Final = math.pi / 3
 """Widest cone that is drawn: that of a line of elements would be open to one side."""
 HALF_POWER: Final = 0.886
@@ -147,10 +146,7 @@ class Scene:
     def _entity(self, name: str, t_ns: int) -> Any:
         lifetime_ns = int(LIFETIMES * 1e9 / self.rate_hz)
         return schemas.SceneEntityMessage(
-            timestamp=timestamp(t_ns),
-            frame_id=MAP,
-            id=name,
-            lifetime=timestamp(lifetime_ns),
+            timestamp=timestamp(t_ns), frame_id=MAP, id=name, lifetime=timestamp(lifetime_ns)
         )
 
 

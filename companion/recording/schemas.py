@@ -32,8 +32,7 @@ from google.protobuf.message_factory import GetMessageClass
 from companion.recording import fields
 from companion.values import Frame
 
-RESERVED: Final = "reserved"
-"""Stands in place of a field that is gone."""
+RESERVED: Final = "reserved"  # stands in place of a field that is gone
 _FLEET: Final[dict[str, list[str]]] = {
     "SharedFrame": ["uint64 after_ns", "bytes raw"],
     "Shared": ["fixed64 first_ns", "repeated SharedFrame frame", "repeated RoundTrip trip",
@@ -225,8 +224,7 @@ _RAW_HEADS: Final = (b"", *(bytes((_RAW,)) + _varint(size) for size in range(1, 
 """Tag and length of a frame's bytes, by their number; nothing where there are none."""
 
 
-HEADS_MAX: Final = 10_000
-"""Heads of frames that are kept packed."""
+HEADS_MAX: Final = 10_000  # heads of frames that are kept packed
 
 
 class FrameEncoder:

@@ -22,12 +22,10 @@ from companion.mavlink.wire.framing import (
 from companion.recording.stamps import LINGERS_NS, RepairedStamps
 from companion.values import Event, Frame, Reason, Rejection, Source
 
-STAMP: Final = 8
-"""Bytes of the stamp before each frame of a telemetry log."""
+STAMP: Final = 8  # bytes of the stamp before each frame of a telemetry log
 _PIECE: Final = 1 << 16
 _MANY_PAIRS: Final = 50
-_SEARCHED_BYTES: Final = 1 << 26
-"""Bytes of a file in which MAVLink is looked for."""
+_SEARCHED_BYTES: Final = 1 << 26  # bytes of a file in which MAVLink is looked for
 _REASON: Final = {UNKNOWN_MESSAGE: Reason.UNKNOWN_MESSAGE, BAD_CRC: Reason.BAD_CRC}
 _BOOT_MS_AT: Final = {33: 0, 30: 0, 2: 8}
 """Offset of time_boot_ms in the payloads of GLOBAL_POSITION_INT, ATTITUDE and SYSTEM_TIME."""

@@ -87,10 +87,8 @@ class Writer:
         scene: Scene | None = None,
         part: Part | None = None,
     ) -> None:
-        self.flushed = 0
-        """Messages that are on the disk."""
-        self.size_bytes = 0
-        """Size of the file at the last ``flush``."""
+        self.flushed = 0  # messages that are on the disk
+        self.size_bytes = 0  # size of the file at the last flush
         self._replace = where.suffix == ".mcap" and not where.is_dir()
         self._final = where if self._replace else _reserve(where, started_ns)
         self._finished = False

@@ -26,8 +26,7 @@ BEARER: Final = "bearer."
 A page in a browser cannot set headers, and an address with a token in it ends up in logs and
 histories.
 """
-UNAUTHORISED: Final = 4401
-"""Code with which a WebSocket without a right token is closed."""
+UNAUTHORISED: Final = 4401  # code with which a WebSocket without a right token is closed
 
 UNSENT_BYTES: Final = 16_384
 """Bytes that the system queues for a client that does not read; connections inherit it.

@@ -171,9 +171,7 @@ def _state_routes(app: FastAPI, node: Node, turns: Turns) -> None:
         return answer(fleet_view.fleet(node.pipeline, node.fleet_status(), node.now_ns()))
 
     @app.get(
-        "/v1/events",
-        summary="What was said to the operator last",
-        responses=answers(glance.Events),
+        "/v1/events", summary="What was said to the operator last", responses=answers(glance.Events)
     )
     async def events() -> Response:
         return answer(glance.events(node))

@@ -19,8 +19,7 @@ MOST_ANGLES: Final = 20_000
 """Beams times angles that one answer may hold: more than half a second's work."""
 LeadMs = Annotated[float, Query(ge=0, le=10_000, description="milliseconds ahead of now")]
 Cut = Annotated[
-    pattern_view.Cut,
-    Query(description="the angle that varies; the other is the beam's own"),
+    pattern_view.Cut, Query(description="the angle that varies; the other is the beam's own")
 ]
 Points = Annotated[int, Query(ge=2, le=3601, description="angles along the cut")]
 Only = Annotated[str | None, Query(description="SYSID:COMPID; every beam without it")]
@@ -74,10 +73,7 @@ def add(app: FastAPI, node: Node, turns: Turns) -> None:
         responses=answers(pattern_view.Pattern, 404, 422, 503),
     )
     async def pattern(
-        cut: Cut = "azimuth",
-        points: Points = 361,
-        uav: Only = None,
-        lead_ms: LeadMs = 0.0,
+        cut: Cut = "azimuth", points: Points = 361, uav: Only = None, lead_ms: LeadMs = 0.0
     ) -> Response:
         def make(update: Update) -> bytes:
             served = update.beams.uavs

@@ -12,15 +12,12 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 HEAD_BYTES: Final = 16_384
 """Most bytes of a request's line and headers; browsers send one or two thousand."""
-BODY_BYTES: Final = 65_536
-"""Most bytes of a request's body: nothing here takes any."""
+BODY_BYTES: Final = 65_536  # most bytes of a request's body: nothing here takes any
 HEAD_S: Final = 10.0
 """How long a client may take from connecting, or from its last answer, to a whole head."""
-STALLED_S: Final = 60.0
-"""How long a client may take nothing of an answer."""
+STALLED_S: Final = 60.0  # how long a client may take nothing of an answer
 _MOST: Final = 512
-_OWN: Final = 96
-"""Descriptors that are left for links, recordings and files."""
+_OWN: Final = 96  # descriptors that are left for links, recordings and files
 
 
 def most_connections() -> int:

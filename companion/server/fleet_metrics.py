@@ -40,9 +40,7 @@ def fleet_metrics(node: Node) -> Iterator[Metric]:
         "companion_fleet_unserved", "UAVs that no node serves", value=len(served.nobody)
     )
     yield CounterMetricFamily(
-        "companion_fleet_handovers",
-        "UAVs that this node took or gave up",
-        value=member.handed_over,
+        "companion_fleet_handovers", "UAVs that this node took or gave up", value=member.handed_over
     )
     yield CounterMetricFamily(
         "companion_fleet_damaged", "Samples of other nodes that were none", value=status.damaged

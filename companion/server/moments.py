@@ -14,8 +14,7 @@ from companion.server.turns import Turns
 from companion.values import Update
 from companion.views.state import Node
 
-EVERY_NS: Final = 10_000_000
-"""Time between two moments."""
+EVERY_NS: Final = 10_000_000  # time between two moments
 
 T = TypeVar("T")
 

@@ -9,8 +9,7 @@ from starlette.exceptions import HTTPException
 
 AT_ONCE: Final = 2
 """Requests that compute at a time; each takes its turns at the interpreter from the links."""
-WAITING: Final = 64
-"""Requests that wait for their turn; a second's work."""
+WAITING: Final = 64  # requests that wait for their turn; a second's work
 
 T = TypeVar("T")
 

@@ -205,16 +205,13 @@ class HardwareSettings(Section):
 class RadioSettings(Section):
     """The radio link, from which signal-to-noise figures are computed.
 
-    tx_power_dbm     power of all beams together
-    bandwidth_hz     noise bandwidth
     noise_figure_db  noise figure of the UAVs' receivers
-    uav_antennas     antennas that each UAV combines
     """
 
-    tx_power_dbm: Annotated[float, Field(ge=-100, le=100)] = 20.0
-    bandwidth_hz: Annotated[float, Field(ge=1, le=1e12)] = 50e6
+    tx_power_dbm: Annotated[float, Field(ge=-100, le=100)] = 20.0  # power of all beams together
+    bandwidth_hz: Annotated[float, Field(ge=1, le=1e12)] = 50e6  # noise bandwidth
     noise_figure_db: Annotated[float, Field(ge=0, le=60)] = 7.0
-    uav_antennas: Annotated[int, Field(ge=1, le=256)] = 4
+    uav_antennas: Annotated[int, Field(ge=1, le=256)] = 4  # antennas that each UAV combines
 
 
 class NeedSettings(Section):

@@ -9,8 +9,7 @@ from pydantic import AfterValidator, Field
 from companion.settings.section import Section
 from companion.values import Source, UserError, shown
 
-HEIGHT_MAX_M: Final = 1e5
-"""Most that a station may be above or below the sea."""
+HEIGHT_MAX_M: Final = 1e5  # most that a station may be above or below the sea
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,13 +3,7 @@
 import re
 from typing import Annotated, Final, Literal, Self
 
-from pydantic import (
-    AfterValidator,
-    Field,
-    ValidationInfo,
-    field_validator,
-    model_validator,
-)
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from companion.mavlink.links.urls import Scheme, parse_link
 from companion.settings.section import Section

@@ -11,15 +11,7 @@ import numpy as np
 
 from companion.tracking.geodesy import LocalFrame
 from companion.tracking.limits import MOST, Raised
-from companion.values import (
-    Attitude,
-    Carrier,
-    EstimatorStatus,
-    Fix,
-    FloatArray,
-    Refuted,
-    Track,
-)
+from companion.values import Attitude, Carrier, EstimatorStatus, Fix, FloatArray, Refuted, Track
 
 
 def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> FloatArray:
@@ -95,14 +87,10 @@ def fixed(
 
 @dataclass(frozen=True, slots=True)
 class AttitudeBounds:
-    """Bounds on how far an attitude that is carried on at its rates is off.
+    """Bounds on how far an attitude that is carried on at its rates is off."""
 
-    attitude_rad         bound on the reported attitude, as an angle
-    acceleration_radps2  greatest angular acceleration
-    """
-
-    attitude_rad: float
-    acceleration_radps2: float
+    attitude_rad: float  # bound on the reported attitude, as an angle
+    acceleration_radps2: float  # greatest angular acceleration
 
     def at(self, rate_radps: float, age_s: float, doubt_s: float) -> float:
         """The bound after a time, known to within ``doubt_s``, from a rate of turn (norm); rad.
@@ -116,14 +104,10 @@ class AttitudeBounds:
 
 @dataclass(frozen=True, slots=True)
 class Contradiction:
-    """Two attitudes of which one at least is wrong: neither follows from the other at its rates.
+    """Two attitudes of which one at least is wrong: neither follows from the other at its rates."""
 
-    apart_rad  by how much, as an angle
-    apart_s    time between them
-    """
-
-    apart_rad: float
-    apart_s: float
+    apart_rad: float  # by how much, as an angle
+    apart_s: float  # time between them
 
     def at(self, age_s: float) -> float:
         """The bound on the newer one after a time, whichever is right; rad.
@@ -133,8 +117,7 @@ class Contradiction:
         return min(math.pi, self.apart_rad * (1.0 + abs(age_s) / self.apart_s))
 
 
-APART_MAX_S: Final = 1.0
-"""Longest time between attitudes that are held against one another."""
+APART_MAX_S: Final = 1.0  # longest time between attitudes that are held against one another
 
 
 def contradiction(
@@ -165,8 +148,7 @@ def _angle(rotation: FloatArray) -> float:
     return math.acos(min(1.0, max(-1.0, (float(np.trace(rotation)) - 1.0) / 2.0)))
 
 
-STAMP_S: Final = 1e-3
-"""What a stamp of whole milliseconds may be off."""
+STAMP_S: Final = 1e-3  # what a stamp of whole milliseconds may be off
 COMPASS_RAD: Final = 0.6
 """What compass and attitude contradict one another by at a ratio of 1, as an angle.
 
@@ -189,8 +171,7 @@ def reported_bound_rad(status: EstimatorStatus | None, least_rad: float) -> floa
 
 RATES_APART_S: Final = 0.05
 """Least time between two rates of turn that are compared: stamps are whole milliseconds."""
-RATE_NOISE_DEGPS: Final = 2.0
-"""Bound on the error of a reported rate of turn."""
+RATE_NOISE_DEGPS: Final = 2.0  # bound on the error of a reported rate of turn
 
 
 class Turns:

@@ -15,34 +15,28 @@ from typing import Final, Generic
 from companion.tracking.observers.estimates import Observer, Prediction, State
 from companion.values import Fix, Reason
 
-FROZEN_SPEED_MPS = 1.0
-"""Least reported speed at which an unchanged position counts as frozen."""
+FROZEN_SPEED_MPS = 1.0  # least reported speed at which an unchanged position counts as frozen
 FROZEN_TRAVEL_M = 0.3
 """Least distance that this speed must have covered while the position stayed the same."""
 
 TURNS: Final = 3
 """Times that refused and possible reports must take turns before they are of two vehicles."""
-SHARED_S: Final = 3.0
-"""Seconds for which they must do so."""
+SHARED_S: Final = 3.0  # seconds for which they must do so
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GateSettings:
     """When refused reports become the track.
 
-    reacquire_reports  refused reports that must agree
-    reacquire_s        seconds over which they must agree
-    forget_s           seconds without another one after which they are forgotten
     lead_m             how far a report may be ahead of the position or behind it, beside its
                        noise (a feedthrough)
-    drift_max          greatest drift of a sender's clock, a ratio
     """
 
-    reacquire_reports: int = 3
-    reacquire_s: float = 1.0
-    forget_s: float = 10.0
+    reacquire_reports: int = 3  # refused reports that must agree
+    reacquire_s: float = 1.0  # seconds over which they must agree
+    forget_s: float = 10.0  # seconds without another one after which they are forgotten
     lead_m: float = 0.0
-    drift_max: float = 250e-6
+    drift_max: float = 250e-6  # greatest drift of a sender's clock, a ratio
 
     def slack_m(self, before: Fix, fix: Fix) -> float:
         """How far apart two reports of one UAV may be because of their times alone.

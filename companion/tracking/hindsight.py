@@ -23,16 +23,13 @@ from companion.values import Fix, Vector
 class Way:
     """A way of feeding acceleration forward.
 
-    window_s  time over which the slope of the reported velocities is taken; 0: none is fed
-    fewest    least number of velocities
-    fades_s   time constant with which the acceleration fades
     turns     what is across the velocity turns with it, in the plane, and does not fade; what is
               along it is left away, as most of it is from before the turn went so far
     """
 
-    window_s: float
-    fewest: int
-    fades_s: float
+    window_s: float  # time over which the slope of the reported velocities is taken; 0: none is fed
+    fewest: int  # least number of velocities
+    fades_s: float  # time constant with which the acceleration fades
     turns: bool = False
 
 
@@ -50,29 +47,23 @@ WAYS: Final = (
 """None; a quick turn, soon over or not; one that goes on; a slow one, noisy reports; circles."""
 WINDOWS: Final = sorted({(way.window_s, way.fewest) for way in WAYS if way.window_s})
 """Windows of the ways and the velocities they need, each once, ascending."""
-TURNS_MPS: Final = 1.0
-"""Speed in the plane below which there is no direction that could turn."""
-SMOOTHED: Final = 0.35
-"""Share of the newest report in a smoothed position."""
-SMOOTHED_S: Final = 5.0
-"""Gap between reports over which positions are not smoothed."""
+TURNS_MPS: Final = 1.0  # speed in the plane below which there is no direction that could turn
+SMOOTHED: Final = 0.35  # share of the newest report in a smoothed position
+SMOOTHED_S: Final = 5.0  # gap between reports over which positions are not smoothed
 NOWHERE: Final = (0.0, 0.0, 0.0)
 JUDGED_S: Final = (1.0, 2.0)
 """Least ages of the predictions by which ways are judged: soon, and as over a slow radio."""
-MEMORY_S: Final = 20.0
-"""Time constant with which what was seen is forgotten."""
+MEMORY_S: Final = 20.0  # time constant with which what was seen is forgotten
 BETTER: Final = 0.9
 """Share of the present way's mean square error that another's must be below to take its place."""
-JUDGED: Final = 4
-"""Least number of judgements before a way other than the plain one is taken."""
+JUDGED: Final = 4  # least number of judgements before a way other than the plain one is taken
 AGES_S: Final = (0.25, 1.0, 2.5)
 """Least ages of the predictions whose errors are kept for the usual error."""
 ERRORS: Final = 200
 USUAL: Final = 0.95
 """Share of the errors that the usual one is not below: of n the ceil((n + 1) USUAL)-th."""
 FEWEST: Final = 20
-SPACING_S: Final = 0.3
-"""Least time between reports that are judged: more often would say no more."""
+SPACING_S: Final = 0.3  # least time between reports that are judged: more often would say no more
 _KEPT: Final = 64
 
 

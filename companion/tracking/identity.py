@@ -12,25 +12,20 @@ from typing import Final
 
 from companion.values import Fix, Track
 
-RELAYED_MAX: Final = 8192
-"""Relayed aircraft remembered; beyond it the one heard first is forgotten."""
-REPORTS_TO_DECIDE: Final = 5
-"""Reports in a row that identify, or separate, two tracks."""
-SPEED_APART_MPS: Final = 15.0
-"""Difference in velocity above which two tracks are not one aircraft."""
+RELAYED_MAX: Final = 8192  # relayed aircraft remembered; beyond it the one heard first is forgotten
+REPORTS_TO_DECIDE: Final = 5  # reports in a row that identify, or separate, two tracks
+SPEED_APART_MPS: Final = 15.0  # difference in velocity above which two tracks are not one aircraft
 
 
 @dataclass(slots=True)
 class _Relayed:
     """A relayed aircraft: the track near its newest reports, and the track that it is.
 
-    near      the nearest better known track; empty if none is near enough
-    in_a_row  newest reports for which that is so
     same_as   the better known track that is the same aircraft; None if there is none
     """
 
-    near: str
-    in_a_row: int = 0
+    near: str  # the nearest better known track; empty if none is near enough
+    in_a_row: int = 0  # newest reports for which that is so
     same_as: str | None = None
 
 

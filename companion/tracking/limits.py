@@ -14,10 +14,8 @@ from typing import Final
 
 from companion.values import Fix, Limits, LimitSource, Refuted
 
-RAISED: Final = 1.5
-"""Multiple of what was proven that is taken for possible from then on."""
-FADES_S: Final = 120.0
-"""Time constant with which a raised limit fades."""
+RAISED: Final = 1.5  # multiple of what was proven that is taken for possible from then on
+FADES_S: Final = 120.0  # time constant with which a raised limit fades
 MOST: Final = 6.0
 """Multiple of the limit above which a proof is not believed: the report is wrong, not the limit."""
 PAIRS_S: Final = (0.001, 0.2, 0.5, 1.0, 2.0)
@@ -56,8 +54,7 @@ class AirframeLimits:
     turn_degps2: float
 
 
-ANY_LAG_S: Final = (0.0, 0.06)
-"""Lag of an autopilot of which nothing is known."""
+ANY_LAG_S: Final = (0.0, 0.06)  # lag of an autopilot of which nothing is known
 LIMITS: Final = {
     Airframe.COPTER: AirframeLimits(
         speed_mps=60.0, acceleration_mps2=4.0, lag_s=ANY_LAG_S, turn_degps2=180.0

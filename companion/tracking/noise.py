@@ -14,8 +14,7 @@ GLOBAL_POSITION_INT has steps of 1.1 cm and 1 cm/s.
 LEAST_ACCURACY_M: Final = {4: 0.2, 5: 0.1, 6: 0.01, 7: 0.01, 8: 0.01}
 """Least accuracy that a kind of fix (GPS_FIX_TYPE) is believed to have: differential, RTK floating
 and fixed, static, PPP. Some receivers state a millimetre when they mean that they do not know."""
-PLAIN_ACCURACY_M: Final = 0.3
-"""The same of any other fix."""
+PLAIN_ACCURACY_M: Final = 0.3  # the same of any other fix
 ADSB_TIME_BOUND_S: Final = 1.0
 """Uncertainty of the time of an ADS-B report: ``tslc`` is in whole seconds."""
 ADSB_NOISE_M: Final = 100.0
@@ -24,8 +23,7 @@ ADSB_NOISE_M: Final = 100.0
 It is above what most transponders vouch for (NACp 8: 93 m) and above the steps of pressure
 altitude.
 """
-ADSB_VELOCITY_NOISE_MPS: Final = 10.0
-"""Bound on the velocity error of an ADS-B report (NACv 1)."""
+ADSB_VELOCITY_NOISE_MPS: Final = 10.0  # bound on the velocity error of an ADS-B report (NACv 1)
 GEOID_M: Final = 107.0
 """Greatest distance between the ellipsoid and mean sea level (EGM96: -107 to 86 m).
 

@@ -10,8 +10,7 @@ from typing import Final
 
 from companion.values import Fix
 
-KEPT: Final = 16
-"""Reports from which the pace is taken."""
+KEPT: Final = 16  # reports from which the pace is taken
 INTERVALS: Final = 3.0
 SILENCES: Final = 1.25
 """Multiple of the second longest silence of late that is no news: a single one is."""

@@ -18,20 +18,13 @@ from companion.values import Fix, Limits, SenderTime, Vector
 
 
 class Reach(NamedTuple):
-    """Bounds about a prediction, and the least ball that holds all that is possible.
+    """Bounds about a prediction, and the least ball that holds all that is possible."""
 
-    bound_m       bound on the norm of the prediction's error
-    horizontal_m  bound on its part in the plane
-    vertical_m    bound on its height
-    center_ned_m  centre of the ball
-    radius_m      radius of the ball
-    """
-
-    bound_m: float
-    horizontal_m: float
-    vertical_m: float
-    center_ned_m: Vector
-    radius_m: float
+    bound_m: float  # bound on the norm of the prediction's error
+    horizontal_m: float  # bound on its part in the plane
+    vertical_m: float  # bound on its height
+    center_ned_m: Vector  # centre of the ball
+    radius_m: float  # radius of the ball
 
 
 def reach(fix: Fix, limits: Limits, predicted_ned_m: Vector, at: SenderTime) -> Reach:

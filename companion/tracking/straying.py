@@ -17,8 +17,7 @@ from typing import Final
 from companion.tracking.noise import NoiseSettings
 from companion.values import Fix, Refuted, ReportNoise
 
-WITHIN_NS: Final = 5_000_000_000
-"""Time within which positions are compared."""
+WITHIN_NS: Final = 5_000_000_000  # time within which positions are compared
 APART_NS: Final = 500_000_000
 """Longest time between two reports over which the way is known from their velocities."""
 STRAYS_M: Final = 0.4
@@ -32,8 +31,7 @@ COMMON_ERROR: Final = 0.07
 """Share of the noise bound that is usual in all reports alike, which none of them shows."""
 STRAYED_ERROR: Final = 0.82
 """The same of a receiver that strays: 95 of 100 lie within 2.45 deviations in the plane, of 3."""
-AGAIN: Final = 1.25
-"""Multiple of what was seen last from which it is told again."""
+AGAIN: Final = 1.25  # multiple of what was seen last from which it is told again
 
 
 class Straying:

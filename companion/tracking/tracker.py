@@ -65,21 +65,16 @@ class Ages:
 class TrackerSettings:
     """How tracks are kept.
 
-    limits                 what aircraft can do whose reports have no limits of their own
-    ages                   when a track passes from state to state
     gate                   when refused reports begin a track again
-    window_s               how late a report may come and still be put in order
-    feed_forward           whether an estimated acceleration enters predictions
-    most                   largest number of tracks
     noise                  how the bounds on the reports' noise were made; None: they are believed
     """
 
-    limits: Limits
-    ages: Ages = field(default_factory=Ages)
+    limits: Limits  # what aircraft can do whose reports have no limits of their own
+    ages: Ages = field(default_factory=Ages)  # when a track passes from state to state
     gate: GateSettings = field(default_factory=GateSettings)
-    window_s: float = 5.0
-    feed_forward: bool = False
-    most: int = 2000
+    window_s: float = 5.0  # how late a report may come and still be put in order
+    feed_forward: bool = False  # whether an estimated acceleration enters predictions
+    most: int = 2000  # largest number of tracks
     noise: NoiseSettings | None = None
 
 

@@ -30,20 +30,8 @@ from companion.values.events import DUTY_MAX, Duty, Event, RoundTrip, Tick, Tock
 from companion.values.fleet import Offer, Shared, SharedFrame, Standing
 from companion.values.health import Blame, Cause, Level, Verdict
 from companion.values.names import UAV_FORMS, Source, UavKind, kind_of
-from companion.values.numbers import (
-    BoolArray,
-    ComplexArray,
-    FloatArray,
-    IntArray,
-    Vector,
-    vector,
-)
-from companion.values.outputs import (
-    Notice,
-    Output,
-    Severity,
-    Update,
-)
+from companion.values.numbers import BoolArray, ComplexArray, FloatArray, IntArray, Vector, vector
+from companion.values.outputs import Notice, Output, Severity, Update
 from companion.values.received import (
     Accuracy,
     AdsbVehicle,

@@ -34,10 +34,7 @@ class Normalisation(DescribedEnum):
     A is the (M, N) steering matrix; see docs/math.md 7.
     """
 
-    UNIT_RESPONSE = (
-        "unit-response",
-        "each UAV receives 1 from its own column, as in the paper",
-    )
+    UNIT_RESPONSE = ("unit-response", "each UAV receives 1 from its own column, as in the paper")
     STREAM = "stream", "each column has unit power"
     TOTAL = "total", "all columns together have unit power, by one common factor"
     ANTENNA = "antenna", "the busiest element has power 1/M, by one common factor"
@@ -136,8 +133,6 @@ class LeftOut:
 class BeamSet:
     """The beams and weights of one update.
 
-    weights   F, (M, N) complex: one row per element, columns in the order of ``beams``
-    left_out  UAVs without a beam
 
     Zero forcing gives AᵀF = I within a time slot (no conjugate; diagonal under other
     normalisations): each UAV lies in a null of the others' beams. See docs/math.md 7.
@@ -148,7 +143,7 @@ class BeamSet:
     ]
     valid_at_ns: Annotated[int, Meaning("when the beams are applied", 2)]
     beams: tuple[Beam, ...]
-    weights: ComplexArray
+    weights: ComplexArray  # F, (M, N) complex: one row per element, columns in the order of beams
     method: Annotated[Method, Meaning("how the weights were computed", 6)]
     normalisation: Annotated[Normalisation, Meaning("scale of the weights' columns", 10)]
     condition_number: Annotated[
@@ -159,7 +154,7 @@ class BeamSet:
             7,
         ),
     ]
-    left_out: tuple[LeftOut, ...]
+    left_out: tuple[LeftOut, ...]  # UAVs without a beam
     exact: Annotated[
         bool, Meaning("whether each UAV lies in a null of every other beam of its time slot", 11)
     ] = False
@@ -179,9 +174,7 @@ class BeamSet:
         return np.array([beam.range_m for beam in self.beams], dtype=float)
 
     @property
-    def regularised(
-        self,
-    ) -> Annotated[bool, Meaning("whether zero forcing was regularised", 12)]:
+    def regularised(self) -> Annotated[bool, Meaning("whether zero forcing was regularised", 12)]:
         return self.method is Method.REGULARISED
 
     @property

@@ -27,8 +27,7 @@ from dataclasses import KW_ONLY, dataclass, field
 from enum import StrEnum
 from typing import Any, Final, Literal, NamedTuple, Self
 
-Way = Literal["api", "recording", "export"]
-"""A way out of the program."""
+Way = Literal["api", "recording", "export"]  # a way out of the program
 NOWHERE: Final[Mapping[Way, str]] = types.MappingProxyType({})
 
 UNITS: Final = {
@@ -77,31 +76,20 @@ class DescribedEnum(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Inline:
-    """Marks a described value whose own members stand in place of it.
+    """Marks a described value whose own members stand in place of it."""
 
-    prefix  put before their names
-    omit    members that are left out
-    """
-
-    prefix: str = ""
-    omit: tuple[str, ...] = ()
+    prefix: str = ""  # put before their names
+    omit: tuple[str, ...] = ()  # members that are left out
 
 
 class Member(NamedTuple):
-    """One described value of a class.
+    """One described value of a class."""
 
-    name      as it is inside the program, an inlined one with its prefix
-    type      annotation without ``Annotated`` and without None
-    optional  whether it may be None
-    meaning   what it means
-    get       reads it from an instance
-    """
-
-    name: str
-    type: Any
-    optional: bool
-    meaning: Meaning
-    get: Callable[[Any], Any]
+    name: str  # as it is inside the program, an inlined one with its prefix
+    type: Any  # annotation without Annotated and without None
+    optional: bool  # whether it may be None
+    meaning: Meaning  # what it means
+    get: Callable[[Any], Any]  # reads it from an instance
 
 
 def members(described: Any) -> tuple[Member, ...]:

@@ -2,8 +2,7 @@
 
 from typing import Final
 
-SHOWN_MAX: Final = 200
-"""Most characters of a value that an error repeats."""
+SHOWN_MAX: Final = 200  # most characters of a value that an error repeats
 
 
 class UserError(ValueError):

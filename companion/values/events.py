@@ -49,8 +49,7 @@ class RoundTrip:
     ]
 
 
-DUTY_MAX: Final = 10_000
-"""Most UAVs that a duty serves, and most that it spares."""
+DUTY_MAX: Final = 10_000  # most UAVs that a duty serves, and most that it spares
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,16 +16,11 @@ class SharedFrame(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Shared:
-    """What a node heard of late and tells the others; times are on its own timeline.
+    """What a node heard of late and tells the others; times are on its own timeline."""
 
-    told_ns  when it tells
-    frames   frames from vehicles, in the order in which they came
-    trips    answers of vehicles to its TIMESYNC requests
-    """
-
-    told_ns: int
-    frames: tuple[SharedFrame, ...] = ()
-    trips: tuple[RoundTrip, ...] = ()
+    told_ns: int  # when it tells
+    frames: tuple[SharedFrame, ...] = ()  # frames from vehicles, in the order in which they came
+    trips: tuple[RoundTrip, ...] = ()  # answers of vehicles to its TIMESYNC requests
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -43,15 +43,11 @@ class Blame:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """How good the link to a UAV is.
-
-    level  how good
-    blame  why it is not good; None where it is
-    """
+    """How good the link to a UAV is."""
 
     uav: str
-    level: Level
-    blame: Blame | None
+    level: Level  # how good
+    blame: Blame | None  # why it is not good; None where it is
     since_ns: Annotated[int, Meaning("since when the link is so")]
     needed_gain_db: Annotated[
         float | None, Meaning("array gain that the link needs; null without a beam")

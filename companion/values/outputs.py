@@ -31,18 +31,14 @@ class Notice:
 class Update:
     """Every tracked UAV at the time of use, and the beams towards them.
 
-    t_ns     when the update was made, node time
     carrier  where the array is; None while that is not known, and then there are no beams
-    unfit    why there are no beams; None if the service is fit to be used
-    tracks   every target, predicted to the time of use
-    beams    the weights
     """
 
-    t_ns: int
+    t_ns: int  # when the update was made, node time
     carrier: Carrier | None
-    unfit: str | None
-    tracks: tuple[Track, ...]
-    beams: BeamSet
+    unfit: str | None  # why there are no beams; None if the service is fit to be used
+    tracks: tuple[Track, ...]  # every target, predicted to the time of use
+    beams: BeamSet  # the weights
 
 
 Output = Rejection | Estimate | Notice | Refuted | Update

@@ -108,31 +108,24 @@ class Report:
 class AdsbVehicle:
     """An aircraft relayed by a receiver (ADSB_VEHICLE).
 
-        t_ns               when it arrived, node time
-        icao               24-bit ICAO address of the aircraft
-        source             the relay, not the aircraft
-        position_deg       latitude, longitude
         alt_m, alt_datum   height and what it is measured from; both None or neither
-        heading_deg        from true north, clockwise
         velocity_ne_mps    north and east, in the north-east-down frame at the aircraft
-        velocity_down_mps  positive down
-        tslc_s             whole seconds since the aircraft was last heard
         accuracy           how exact the transponder says that it is; None where no relay says
 
     A field whose own validity flag is not set is None.
     """
 
-    t_ns: int
-    icao: int
-    source: Source
+    t_ns: int  # when it arrived, node time
+    icao: int  # 24-bit ICAO address of the aircraft
+    source: Source  # the relay, not the aircraft
     callsign: str | None
-    position_deg: tuple[float, float] | None
+    position_deg: tuple[float, float] | None  # latitude, longitude
     alt_m: float | None
     alt_datum: AltitudeDatum | None
-    heading_deg: float | None
+    heading_deg: float | None  # from true north, clockwise
     velocity_ne_mps: tuple[float, float] | None
-    velocity_down_mps: float | None
-    tslc_s: int
+    velocity_down_mps: float | None  # positive down
+    tslc_s: int  # whole seconds since the aircraft was last heard
     accuracy: Accuracy | None = None
 
     @property
@@ -145,24 +138,18 @@ class AdsbVehicle:
 class RemoteId:
     """What a Remote ID receiver heard from one radio: an id, a position, or both.
 
-        heard_as   the radio's address, hexadecimal; empty where the receiver does not say
-        uas_id     the aircraft's id
-        id_kind    MAVLink's MAV_ODID_ID_TYPE of it
-        aircraft   how many aircraft the sender says to stand for
-        report     its position, under the name of the radio
-        is_flat    there was a position, and no height
 
     None stands for what was not sent.
     """
 
     t_ns: int
     source: Source
-    heard_as: str
-    uas_id: str | None = None
-    id_kind: int | None = None
-    aircraft: int | None = None
-    report: Report | None = None
-    is_flat: bool = False
+    heard_as: str  # the radio's address, hexadecimal; empty where the receiver does not say
+    uas_id: str | None = None  # the aircraft's id
+    id_kind: int | None = None  # MAVLink's MAV_ODID_ID_TYPE of it
+    aircraft: int | None = None  # how many aircraft the sender says to stand for
+    report: Report | None = None  # its position, under the name of the radio
+    is_flat: bool = False  # there was a position, and no height
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

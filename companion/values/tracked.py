@@ -64,12 +64,6 @@ class Fix:
 
         sender_ns          when the position was true, on the sender's timeline; intervals between
                            reports are taken from it, since the link cannot disturb it
-        t_ns               the same instant on the node's timeline, as known on arrival
-        arrival_ns         when the report arrived, node time
-        position_ned_m     in the local frame
-        velocity_ned_mps   in the local frame; None if not sent
-        noise              bounds on the errors of both
-        report             the report itself
         limits             what the aircraft is taken to be able to do; None: the observer's model
 
     ``arrival_ns - t_ns`` is the visible latency. A report without a sender's clock has ``sender_ns
@@ -78,12 +72,12 @@ class Fix:
 
     uav: str
     sender_ns: int
-    t_ns: int
-    arrival_ns: int
-    position_ned_m: Vector
-    velocity_ned_mps: Vector | None
-    noise: ReportNoise
-    report: Report
+    t_ns: int  # the same instant on the node's timeline, as known on arrival
+    arrival_ns: int  # when the report arrived, node time
+    position_ned_m: Vector  # in the local frame
+    velocity_ned_mps: Vector | None  # in the local frame; None if not sent
+    noise: ReportNoise  # bounds on the errors of both
+    report: Report  # the report itself
     limits: Limits | None = None
 
 
@@ -91,15 +85,13 @@ class Fix:
 class Estimate:
     """The observer's answer to an accepted report, at the time of that report.
 
-    fix             the accepted report
-    position_ned_m  local frame: the estimate before this report entered it
 
     A track is restarted from reports that disagree with it but agree with one another.
     ``innovation_m`` is None for the first report of a track; after a restart it is the jump.
     """
 
-    fix: Fix
-    position_ned_m: Vector
+    fix: Fix  # the accepted report
+    position_ned_m: Vector  # local frame: the estimate before this report entered it
     bound_m: Annotated[float, Meaning("bound on the error of the prediction for this report")]
     innovation_m: Annotated[
         float | None, Meaning("distance from the prediction to the reported position")
@@ -114,14 +106,13 @@ class SenderTime:
 
     node_ns, sender_ns  the time on both timelines
     before_s, after_s   by how much the true sender time may be less, or more, than ``sender_ns``
-    usual_s             by how much it usually is: an estimate, no bound
     """
 
     node_ns: int
     sender_ns: int
     before_s: float
     after_s: float
-    usual_s: float = 0.0
+    usual_s: float = 0.0  # by how much it usually is: an estimate, no bound
 
     @property
     def bound_s(self) -> float:
@@ -214,19 +205,15 @@ class Track:
 class Carrier:
     """Position and attitude of the array's carrier at the instant ``valid_at_ns``.
 
-    position_ned_m    (3,), local frame
-    velocity_ned_mps  (3,), local frame; None if not known
-    body_from_local   (3, 3) rotation matrix
-    body_rates_radps  (3,), angular rates about the body axes
     error_p95_m       error that positions usually stay below; None where that is not known
     attitude_p95_rad  angle by which the attitude usually is off at most; None likewise
     """
 
     valid_at_ns: int
-    position_ned_m: FloatArray
-    velocity_ned_mps: FloatArray | None
-    body_from_local: FloatArray
-    body_rates_radps: FloatArray
+    position_ned_m: FloatArray  # (3,), local frame
+    velocity_ned_mps: FloatArray | None  # (3,), local frame; None if not known
+    body_from_local: FloatArray  # (3, 3) rotation matrix
+    body_rates_radps: FloatArray  # (3,), angular rates about the body axes
     bound_m: Annotated[float, Meaning("guaranteed bound on the error of the carrier's position")]
     attitude_bound_rad: Annotated[
         float, Meaning("largest angle between the estimated and the true attitude")

@@ -15,8 +15,7 @@ from companion.values import UtcNs
 from companion.values.described import Member, members
 
 Json = dict[str, Any]
-Utc = Callable[[int], UtcNs]
-"""Function from a time on the node's timeline to UTC."""
+Utc = Callable[[int], UtcNs]  # function from a time on the node's timeline to UTC
 
 FORMER_NAMES: Final[Mapping[str, Mapping[str, str]]] = {
     "BeamState": {

@@ -25,16 +25,12 @@ from companion.values.described import Inline, Meaning
 from companion.views import guaranteed_gain
 from companion.views.as_json import Json, as_json, degrees
 
-AHEAD_S: Final = 30.0
-"""How far ahead the next beam of a codebook is looked for."""
-MOST_SAMPLES: Final = 2000
-"""Most samples of a direction over that time."""
-FEWEST_SAMPLES: Final = 32
-"""As many there are of each, however large the codebook."""
+AHEAD_S: Final = 30.0  # how far ahead the next beam of a codebook is looked for
+MOST_SAMPLES: Final = 2000  # most samples of a direction over that time
+FEWEST_SAMPLES: Final = 32  # as many there are of each, however large the codebook
 MOST_RESPONSES: Final = 2**28
 """Samples times beams of a codebook times elements, for all UAVs of one answer."""
-FULL_SHARE: Final = 8
-"""UAVs up to which each has all the work that a question may take."""
+FULL_SHARE: Final = 8  # UAVs up to which each has all the work that a question may take
 LEAD: Final = "how long after the question the beams apply; up to 10 ms more, as valid_at says"
 
 

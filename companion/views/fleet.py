@@ -151,10 +151,7 @@ def nodes(member: Member, now_ns: int) -> list[FleetNode]:
     others = [_node(name, member, now_ns) for name in sorted(member.neighbours)]
     gone = [
         FleetNode(
-            node=name,
-            state=NodeState.GONE,
-            place=_place(place),
-            heard_s=(now_ns - at_ns) * 1e-9,
+            node=name, state=NodeState.GONE, place=_place(place), heard_s=(now_ns - at_ns) * 1e-9
         )
         for name, (at_ns, place) in sorted(member.gone.items())
     ]

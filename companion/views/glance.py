@@ -12,8 +12,7 @@ from companion.views import health
 from companion.views.as_json import Json, as_json, rfc3339
 from companion.views.state import Node, summary
 
-NAMED: Final = 2
-"""Most UAVs that the line names."""
+NAMED: Final = 2  # most UAVs that the line names
 
 
 def glance(node: Node) -> Json:

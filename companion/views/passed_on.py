@@ -21,8 +21,7 @@ from companion.tracking.noise import GEOID_M
 from companion.values import AltitudeDatum, Source, Track, TrackState, kind_of
 
 KNOWN: Final = (TrackState.LIVE, TrackState.COASTING)
-_REBOOT_MS: Final = 60_000
-"""A step back of a boot clock beyond which its owner has booted anew."""
+_REBOOT_MS: Final = 60_000  # a step back of a boot clock beyond which its owner has booted anew
 
 
 class Positions:

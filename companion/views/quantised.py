@@ -11,11 +11,7 @@ from companion.values import BeamSet
 
 
 def device_table(
-    device: Device,
-    beam_set: BeamSet,
-    array: Array,
-    equipment: Equipment,
-    only: str | None = None,
+    device: Device, beam_set: BeamSet, array: Array, equipment: Equipment, only: str | None = None
 ) -> tables.DeviceTable:
     """The settings of a device that come nearest to the weights.
 

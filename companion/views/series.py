@@ -11,10 +11,8 @@ from companion.pipeline.fold import Pipeline
 from companion.values.described import Meaning, members
 from companion.views.as_json import Json, Utc, degrees, rfc3339
 
-EVERY_NS: Final = 1_000_000_000
-"""Least time between two samples."""
-SAMPLES: Final = 300
-"""Samples kept: five minutes."""
+EVERY_NS: Final = 1_000_000_000  # least time between two samples
+SAMPLES: Final = 300  # samples kept: five minutes
 Column = list[float | None]
 
 

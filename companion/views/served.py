@@ -12,36 +12,23 @@ from companion.values import Blame, Offer, Standing
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FleetStatus:
-    """This node's place in a fleet.
+    """This node's place in a fleet."""
 
-    member      what it knows and decides
-    site        name of the fleet
-    sent_bps    bits per second that it tells, by what it gave to Zenoh over the last second
-    heard_bps   bits per second that others told it
-    damaged     samples of others that were none
-    """
-
-    member: Member
-    site: str
-    sent_bps: float
-    heard_bps: float
-    damaged: int
+    member: Member  # what it knows and decides
+    site: str  # name of the fleet
+    sent_bps: float  # bits per second that it tells, by what it gave to Zenoh over the last second
+    heard_bps: float  # bits per second that others told it
+    damaged: int  # samples of others that were none
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Served:
-    """Who serves the UAVs for which beams are wanted.
+    """Who serves the UAVs for which beams are wanted."""
 
-    node       this node
-    by         nodes that serve each UAV, those put aside not among them
-    nobody     why nobody serves a UAV, for each such UAV
-    elsewhere  how many other nodes serve, and this one does not
-    """
-
-    node: str
-    by: Mapping[str, list[str]]
-    nobody: Mapping[str, Blame]
-    elsewhere: int
+    node: str  # this node
+    by: Mapping[str, list[str]]  # nodes that serve each UAV, those put aside not among them
+    nobody: Mapping[str, Blame]  # why nobody serves a UAV, for each such UAV
+    elsewhere: int  # how many other nodes serve, and this one does not
 
     def is_here(self, uav: str) -> bool:
         """Whether this node serves a UAV. A verdict on another is of the time when it did."""

@@ -10,9 +10,7 @@ from companion.mavlink.voice.rate_watch import MessageRate
 from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
 from companion.settings.origins import Origins
-from companion.values import (
-    Notice,
-)
+from companion.values import Notice
 from companion.values.described import Meaning
 from companion.views import center_state, health, link_state
 from companion.views.as_json import Json, as_json

@@ -45,8 +45,7 @@ class UavState:
 
     id: Annotated[str, Meaning("SYSID:COMPID, icao:HEX, rid:ID or cot:UID", example="3:1")]
     verdict: Annotated[
-        Level | None,
-        Meaning("whether its beam has the gain that the link needs", label="Link"),
+        Level | None, Meaning("whether its beam has the gain that the link needs", label="Link")
     ]
     health: Annotated[LinkHealth | None, Meaning("what is behind the verdict")]
     target: Annotated[bool, Meaning("whether a beam is wanted for it, of whichever node")]

@@ -13,8 +13,7 @@ from typing import Final, NamedTuple, Self
 
 from companion.values import Source, UserError
 
-Sender = tuple[int, int]
-"""System and component id."""
+Sender = tuple[int, int]  # system and component id
 
 
 class FaultError(UserError):
@@ -27,17 +26,14 @@ class FaultError(UserError):
 class Bound(NamedTuple):
     """One number of a fault's value.
 
-    letter     its letter in the help
     low, high  its limits, both allowed
-    default    its value where it is left out; None: it is required
-    whole      it must be a whole number
     """
 
-    letter: str
+    letter: str  # its letter in the help
     low: float
     high: float
-    default: float | None = None
-    whole: bool = False
+    default: float | None = None  # its value where it is left out; None: it is required
+    whole: bool = False  # it must be a whole number
 
     def read(self, text: str) -> float:
         """The number in ``text``. Raises ``FaultError`` where it is not within the limits."""

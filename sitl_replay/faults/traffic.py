@@ -29,10 +29,8 @@ from sitl_replay.faults.link import (
     Truncation,
 )
 
-HELD_MAX: Final = 100_000
-"""Frames on their way at most, over all links; further ones are lost."""
-OVERFLOW: Final = "overflow"
-"""Name under which those lost frames are counted."""
+HELD_MAX: Final = 100_000  # frames on their way at most, over all links; further ones are lost
+OVERFLOW: Final = "overflow"  # name under which those lost frames are counted
 CONTENT: Final = frozenset(("drift", "reboot", "frozen", "glitch"))
 """Faults of the senders themselves."""
 

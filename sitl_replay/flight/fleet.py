@@ -39,35 +39,20 @@ class Airframe(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Vehicle:
-    """One vehicle: who it is, how it moves, and how often it sends what.
+    """One vehicle: who it is, how it moves, and how often it sends what."""
 
-    source                its system and component id
-    trajectory            position and velocity at a time
-    attitude              attitude and body rates at a time
-    report_interval_s     of GLOBAL_POSITION_INT
-    attitude_interval_s   of ATTITUDE
-    uptime_ms             its boot clock when the scenario starts
-    heartbeat_interval_s  of HEARTBEAT
-    gnss_interval_s       of GPS_RAW_INT
-    clock_interval_s      of SYSTEM_TIME
-    airframe              copter or plane
-    hears                 the aircraft that its ADS-B receiver relays
-    twin                  tells vehicles apart that send under one source; 0 where there is no
-                          other
-    """
-
-    source: Source
-    trajectory: Callable[[float], Motion]
-    attitude: Callable[[float], Pose]
-    report_interval_s: float
-    attitude_interval_s: float
-    uptime_ms: int
-    heartbeat_interval_s: float = 1.0
-    gnss_interval_s: float = 0.5
-    clock_interval_s: float = 1.0
-    airframe: Airframe = Airframe.COPTER
-    hears: tuple[Aircraft, ...] = ()
-    twin: int = 0
+    source: Source  # its system and component id
+    trajectory: Callable[[float], Motion]  # position and velocity at a time
+    attitude: Callable[[float], Pose]  # attitude and body rates at a time
+    report_interval_s: float  # of GLOBAL_POSITION_INT
+    attitude_interval_s: float  # of ATTITUDE
+    uptime_ms: int  # its boot clock when the scenario starts
+    heartbeat_interval_s: float = 1.0  # of HEARTBEAT
+    gnss_interval_s: float = 0.5  # of GPS_RAW_INT
+    clock_interval_s: float = 1.0  # of SYSTEM_TIME
+    airframe: Airframe = Airframe.COPTER  # copter or plane
+    hears: tuple[Aircraft, ...] = ()  # the aircraft that its ADS-B receiver relays
+    twin: int = 0  # tells vehicles apart that send under one source; 0 where there is no other
 
     @property
     def name(self) -> str:

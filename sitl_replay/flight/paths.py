@@ -179,20 +179,16 @@ class Racetrack:
 
     The turn rate ramps up to speed / radius within ``roll_s`` and back, as an aircraft rolls in and
     out.
-
-        axis_rad  course of the first straight
-        offset_s  how long it has been flying at time 0
-        across_m  computed: how far apart the straights are
     """
 
     centre_ned_m: Vector
-    axis_rad: float
+    axis_rad: float  # course of the first straight
     straight_m: float
     speed_mps: float
     radius_m: float
     roll_s: float
-    offset_s: float
-    across_m: float = field(init=False)
+    offset_s: float  # how long it has been flying at time 0
+    across_m: float = field(init=False)  # computed: how far apart the straights are
 
     def __post_init__(self) -> None:
         # Twice as far as half a turn leads across.

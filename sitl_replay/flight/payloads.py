@@ -10,12 +10,7 @@ import struct
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
-from companion.mavlink.wire.decode import (
-    ATTITUDE,
-    GPS_RAW_INT,
-    HEARTBEAT,
-    SYSTEM_TIME,
-)
+from companion.mavlink.wire.decode import ATTITUDE, GPS_RAW_INT, HEARTBEAT, SYSTEM_TIME
 from companion.mavlink.wire.encode import Outgoing
 from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
 from companion.mavlink.wire.transponder import ADSB_VEHICLE
@@ -51,22 +46,14 @@ _ADSB_VEHICLE: Final = struct.Struct("<IiiiHHhHHB9sBB")
 
 
 class Sample(NamedTuple):
-    """A moment of one vehicle at which a message is made.
+    """A moment of one vehicle at which a message is made."""
 
-    local       the carrier's local frame
-    home_alt_m  height from which relative heights are measured
-    vehicle     the sender
-    t_s         since the start of the scenario
-    boot_ms     on the vehicle's clock
-    unix_us     on the clock of its GNSS receiver
-    """
-
-    local: LocalFrame
-    home_alt_m: float
-    vehicle: Vehicle
-    t_s: float
-    boot_ms: int
-    unix_us: int
+    local: LocalFrame  # the carrier's local frame
+    home_alt_m: float  # height from which relative heights are measured
+    vehicle: Vehicle  # the sender
+    t_s: float  # since the start of the scenario
+    boot_ms: int  # on the vehicle's clock
+    unix_us: int  # on the clock of its GNSS receiver
 
 
 Builder = Callable[[Sample], Outgoing]

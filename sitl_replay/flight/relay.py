@@ -17,21 +17,16 @@ from sitl_replay.flight.motion import Motion
 
 SQUITTER_INTERVAL_S: Final = 1.0
 SQUITTER_JITTER_S: Final = 0.05
-MISSED_SHARE: Final = 0.15
-"""Share of squitters that are missed one at a time."""
-DEAF_SHARE: Final = 0.02
-"""Share of squitters that begin a time in which none is heard."""
-DEAF_S: Final = (3.0, 5.0)
-"""Shortest and longest such time."""
-RELAY_INTERVAL_S: Final = (0.2, 2.6)
-"""Shortest and longest time between two relayed messages."""
+MISSED_SHARE: Final = 0.15  # share of squitters that are missed one at a time
+DEAF_SHARE: Final = 0.02  # share of squitters that begin a time in which none is heard
+DEAF_S: Final = (3.0, 5.0)  # shortest and longest such time
+RELAY_INTERVAL_S: Final = (0.2, 2.6)  # shortest and longest time between two relayed messages
 OLDEST_S: Final = 3.0
 """Age beyond which content is not sent again.
 
 With the rest, a receiver is never silent for 10 s.
 """
-GARBAGE_OCTETS: Final = 38
-"""Length of the payload of ADSB_VEHICLE."""
+GARBAGE_OCTETS: Final = 38  # length of the payload of ADSB_VEHICLE
 
 
 class Valid(IntFlag):
@@ -53,27 +48,20 @@ EVERYTHING: Final = Valid(0b1011_1111)
 class Aircraft:
     """An aircraft: how it flies (NED from the carrier) and what its transponder says of that.
 
-        icao             24-bit address
-        callsign         its callsign
-        emitter_type     ADSB_EMITTER_TYPE
-        trajectory       position and velocity at a time
-        datum            pressure or geometric altitude
-        says             flags of the fields that it fills
         placeless_share  share of squitters without a position (only altitude and squawk), as Mode S
                          replies are
-        squawk           its squawk
 
     ``str`` gives the UAV id.
     """
 
-    icao: int
-    callsign: str
-    emitter_type: int
-    trajectory: Callable[[float], Motion]
-    datum: AltitudeDatum
-    says: Valid = EVERYTHING
+    icao: int  # 24-bit address
+    callsign: str  # its callsign
+    emitter_type: int  # ADSB_EMITTER_TYPE
+    trajectory: Callable[[float], Motion]  # position and velocity at a time
+    datum: AltitudeDatum  # pressure or geometric altitude
+    says: Valid = EVERYTHING  # flags of the fields that it fills
     placeless_share: float = 0.0
-    squawk: int = 7000
+    squawk: int = 7000  # its squawk
 
     def __str__(self) -> str:
         return UavKind.ADSB.uav(f"{self.icao:06X}")

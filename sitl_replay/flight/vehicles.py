@@ -40,10 +40,7 @@ class Transmission(NamedTuple):
 
 
 def schedule(
-    scenario: Scenario,
-    seed: int = 0,
-    epoch_ns: int = 0,
-    duration_s: float | None = None,
+    scenario: Scenario, seed: int = 0, epoch_ns: int = 0, duration_s: float | None = None
 ) -> Iterator[Transmission]:
     """Every frame of the scenario in the order of sending; without end if ``duration_s`` is None.
 

@@ -21,12 +21,9 @@ from companion.mavlink.links.endpoints import HungUpError, Upcalls, reason
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.links.urls import LinkError, LinkUrl
 
-PEERS_MAX: Final = 256
-"""Peers of a listening UDP link; the one unheard for longest is forgotten."""
-LINGER_S: Final = 1.0
-"""How long closing waits for what is buffered to be sent."""
-FULL: Final = 0.5
-"""Share of a peer's buffer from which on ``writable`` waits."""
+PEERS_MAX: Final = 256  # peers of a listening UDP link; the one unheard for longest is forgotten
+LINGER_S: Final = 1.0  # how long closing waits for what is buffered to be sent
+FULL: Final = 0.5  # share of a peer's buffer from which on writable waits
 RETRY_S: Final = 1.0
 """Time from the loss of a route to the next attempt; datagrams until then are dropped."""
 _ROOM_POLL_S: Final = 0.001

@@ -11,16 +11,7 @@ from companion.beams.aim import aim
 from companion.beams.array.geometry import Array, uniform_linear, uniform_rectangular
 from companion.beams.steady import Steady
 from companion.beams.weights.precoding import Precoder
-from companion.values import (
-    BeamSet,
-    Carrier,
-    Limits,
-    Method,
-    Policy,
-    Track,
-    TrackState,
-    Widen,
-)
+from companion.values import BeamSet, Carrier, Limits, Method, Policy, Track, TrackState, Widen
 
 STILL = np.zeros(3)
 AT = Carrier(
@@ -67,10 +58,7 @@ def track(uav: str, aside_m: float, bound_m: float) -> Track:
 
 
 def flown(
-    bounds_m: list[float],
-    how: Precoder,
-    apart_m: list[float] | None = None,
-    array: Array = ARRAY,
+    bounds_m: list[float], how: Precoder, apart_m: list[float] | None = None, array: Array = ARRAY
 ) -> list[BeamSet]:
     """A UAV whose bound changes from tick to tick, and one beside it."""
     state: Steady | None = None

@@ -168,7 +168,7 @@ def fulfil(answer: Any, route: Any) -> None:
 def test_recordings_are_listed_with_a_link_where_there_are_any(demo: Node, open_page: Any) -> None:
     page = open_page("about:blank", DESKTOP)
     answers: dict[str, Any] = {
-        "/v1/recordings": {"recordings": [{"name": "a b.mcap", "bytes": 1500, "state": "closed"}]},
+        "/v1/recordings": {"recordings": [{"name": "a b.mcap", "bytes": 1500, "state": "closed"}]}
     }
     for path, answer in answers.items():
         page.route(f"**{path}", functools.partial(fulfil, answer))

@@ -81,8 +81,7 @@ def test_no_frame_of_a_busy_sky_is_lost(start_node: Any, tmp_path: Path) -> None
     assert len(uavs) == SENDERS
     assert {uav["state"] for uav in uavs} == {"live"}
     written = node.wait_until(
-        "/v1/status",
-        lambda s: s["recording"]["queued"] < 100 and s["recording"]["lag_s"] < 0.5,
+        "/v1/status", lambda s: s["recording"]["queued"] < 100 and s["recording"]["lag_s"] < 0.5
     )
     assert written["recording"]["messages"] > sent
     assert "companion_recording_lag_seconds" in node.get("/metrics")[1].decode()

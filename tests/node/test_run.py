@@ -17,10 +17,9 @@ from device_reading import parse
 from support import BIN, HANG_S, read_metadata, started
 
 from companion.beams.hardware.calibration import Calibration
-from companion.beams.hardware.devices import MEDIA_TYPES, Device
 from companion.mavlink.wire.decode import decode
 from companion.recording.reader import read_log
-from companion.values import Frame, Report
+from companion.values import Frame, Report, WeightFormat
 
 RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
 
@@ -193,8 +192,8 @@ def test_weights_for_a_device_or_the_reason_why_not(start_node: Any, tmp_path: P
     node = start_node(*RUN)
     with fly(node.udp_port, tmp_path / "flown.tlog", seconds=4) as flight:
         node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
-        status, table = node.get("/v1/beams/weights", MEDIA_TYPES[Device.ADAR1000])
-        refused, why = node.get("/v1/beams/weights", MEDIA_TYPES[Device.TMYTEK])
+        status, table = node.get("/v1/beams/weights", WeightFormat.ADAR1000.media_type)
+        refused, why = node.get("/v1/beams/weights", WeightFormat.TMYTEK.media_type)
         flight.wait(HANG_S)
     assert status == 200
     read = parse(Device.ADAR1000, table.decode(), Calibration.ideal(range(64)))

@@ -244,8 +244,7 @@ def test_a_line_that_leaps_beyond_what_frames_are_late_is_told() -> None:
     there = pipeline()
     said = run(there, (position(0.1 * n, "7:1", (n, 0, 0), (10, 0, 0)) for n in range(300)))
     said += run(
-        there,
-        (position(30 + 0.1 * n, "7:1", (300 + n, 0, 0), (10, 0, 0), 15.0) for n in range(60)),
+        there, (position(30 + 0.1 * n, "7:1", (300 + n, 0, 0), (10, 0, 0), 15.0) for n in range(60))
     )
     told = [one for one in said if isinstance(one, Refuted)]
     assert [one.setting for one in told] == ["clocks.drift_max_ppm"]

@@ -124,10 +124,7 @@ def test_reports_that_come_and_are_not_used_are_told_before_all_else() -> None:
 
 def test_a_sharp_beam_without_gain_is_crowded_or_too_far() -> None:
     crowded = replace(BEAM, gain_db=4.0, loss_db=14.0, widened=False)
-    assert blamed(beam=crowded)[:2] == (
-        Cause.CROWDED,
-        "other UAVs in its direction cost it 14 dB",
-    )
+    assert blamed(beam=crowded)[:2] == (Cause.CROWDED, "other UAVs in its direction cost it 14 dB")
     weak = replace(BEAM, gain_db=4.0, widened=False)
     assert blamed(beam=weak)[:2] == (
         Cause.RANGE,

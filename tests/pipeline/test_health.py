@@ -113,9 +113,7 @@ def test_it_is_judged_once_a_second() -> None:
     assert watch.see(1.0, [track("1:1", *SURE), track("2:1", *SURE)]) == "good good"
 
 
-def test_many_links_are_judged_in_turn_and_told_together(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_many_links_are_judged_in_turn_and_told_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each has its turn once a second; those that became worse for one cause are one notice."""
     many = {f"{n}:1": (200.0, 4.0 * n - 120.0, -10.0) for n in range(1, 61)}
     monkeypatch.setattr(f"{__name__}.PLACES", many)

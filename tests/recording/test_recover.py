@@ -220,9 +220,7 @@ def test_the_latest_time_need_not_be_the_last(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("seed", range(40))
 def test_flipped_bytes_never_raise(
-    tmp_path: Path,
-    recording: tuple[Path, list[Event], list[tuple[int, int]]],
-    seed: int,
+    tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]], seed: int
 ) -> None:
     broken = bytearray(recording[0].read_bytes())
     rng = random.Random(seed)

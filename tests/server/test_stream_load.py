@@ -110,10 +110,7 @@ def measure(
 @pytest.mark.full
 @pytest.mark.parametrize(
     ("readers", "deaf", "seconds"),
-    [
-        (18, 2, 3.0),
-        pytest.param(180, 20, 10.0, marks=pytest.mark.benchmark),
-    ],
+    [(18, 2, 3.0), pytest.param(180, 20, 10.0, marks=pytest.mark.benchmark)],
 )
 def test_a_crowd_holds_nobody_up(
     start_node: Any, tmp_path: Path, readers: int, deaf: int, seconds: float

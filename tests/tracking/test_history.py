@@ -159,8 +159,7 @@ def test_after_a_hole_longer_than_the_window_a_late_report_is_still_used(fix: Ma
 
 
 @given(
-    seed=st.integers(0, 2**32 - 1),
-    gaps_ms=st.lists(st.integers(10, 700), min_size=6, max_size=40),
+    seed=st.integers(0, 2**32 - 1), gaps_ms=st.lists(st.integers(10, 700), min_size=6, max_size=40)
 )
 def test_the_acceleration_is_the_slope_of_the_velocities(
     fix: MakeFix, seed: int, gaps_ms: list[int]

@@ -152,8 +152,7 @@ class Coverage:
         )
 
 
-EVERYWHERE: Final = Coverage()
-"""No limits at all."""
+EVERYWHERE: Final = Coverage()  # no limits at all
 
 
 def refusals(

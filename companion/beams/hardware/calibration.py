@@ -16,17 +16,13 @@ GAIN_MAX_DB: Final = 1000.0
 """Most that a gain may be, either way: beyond it factors are no numbers any more."""
 DIGITS_MAX: Final = 18
 """Most digits of a whole number: Python reads thousands, and then raises another error."""
-PHASE_MAX_DEG: Final = 1e6
-"""Most that a phase may be, either way, for it to be one still."""
+PHASE_MAX_DEG: Final = 1e6  # most that a phase may be, either way, for it to be one still
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Calibration:
     """A measured calibration of an array of M elements.
 
-        phase_rad  by element: phase that the channel adds to its setting
-        gain_db    by element: gain that the channel adds to its setting
-        order      by channel: element that it drives, counted from 0
         phase_error_rad, gain_error_db
                    by element: most that the two are off; empty: not said
 
@@ -34,9 +30,9 @@ class Calibration:
     differ, values that are not finite, or an order that is no permutation.
     """
 
-    phase_rad: tuple[float, ...]
-    gain_db: tuple[float, ...]
-    order: tuple[int, ...]
+    phase_rad: tuple[float, ...]  # by element: phase that the channel adds to its setting
+    gain_db: tuple[float, ...]  # by element: gain that the channel adds to its setting
+    order: tuple[int, ...]  # by channel: element that it drives, counted from 0
     phase_error_rad: tuple[float, ...] = ()
     gain_error_db: tuple[float, ...] = ()
 

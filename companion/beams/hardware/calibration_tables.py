@@ -33,11 +33,9 @@ from companion.values import FloatArray, UserError, read_toml, shown
 
 FARTHEST_DEG: Final = 90.0
 """Most that a channel's phase may differ from one frequency to the next, over channel 0's."""
-SAME: Final = 1e-9
-"""Share of a frequency by which it may miss a table's and still be the same."""
+SAME: Final = 1e-9  # share of a frequency by which it may miss a table's and still be the same
 FREQUENCY_MAX_HZ: Final = 1e15
-LARGEST: Final = 1 << 22
-"""Most characters of tables: those of 4096 channels at 30 frequencies."""
+LARGEST: Final = 1 << 22  # most characters of tables: those of 4096 channels at 30 frequencies
 REQUIRED: Final = ("phase_deg", "gain_db")
 BOUNDS: Final = ("phase_error_deg", "gain_error_db")
 

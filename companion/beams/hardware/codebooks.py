@@ -20,8 +20,7 @@ from companion.beams.worth import cone
 from companion.beams.worth.cone import Boxes, Cones
 from companion.values import BoolArray, ComplexArray, FloatArray, IntArray, UserError
 
-LEVELS: Final = 12
-"""Most rounds of splitting cells."""
+LEVELS: Final = 12  # most rounds of splitting cells
 MOST_RESPONSES: Final = 2**18
 """Beams times cells examined for one question; a round that has begun is finished."""
 MOST_TERMS: Final = 2**26
@@ -30,14 +29,11 @@ elements, and fewer of larger arrays."""
 MOST_TERMS_AT_FIRST: Final = 2**30
 """The same in the first round, which is finished once begun: half a second. All beams must be swept
 where it would be more."""
-MOST_ENTRIES: Final = 2**22
-"""Elements times beams of a codebook: 64 MB."""
+MOST_ENTRIES: Final = 2**22  # elements times beams of a codebook: 64 MB
 BLOCK: Final = 2**19
 """Beams times cells, or beams times directions, computed at once: some tens of megabytes."""
-RESOLUTION_S: Final = 1e-3
-"""Precision of the time at which the best beam changes."""
-SAMPLES_PER_BEAM: Final = 4
-"""Samples while a direction crosses one beam."""
+RESOLUTION_S: Final = 1e-3  # precision of the time at which the best beam changes
+SAMPLES_PER_BEAM: Final = 4  # samples while a direction crosses one beam
 
 
 WEIGHT_MAX: Final = 1e300

@@ -27,16 +27,13 @@ class Device(StrEnum):
 class Limits:
     """What a device can hold and do.
 
-    elements           number of elements; None: any
-    beams              number of beams that it stores
     off_boresight_rad  largest angle off boresight to which it steers; None: not stated
-    gain_range_db      range of its gain control
     """
 
-    elements: int | None
-    beams: int
+    elements: int | None  # number of elements; None: any
+    beams: int  # number of beams that it stores
     off_boresight_rad: float | None
-    gain_range_db: float
+    gain_range_db: float  # range of its gain control
 
 
 # --- Analog Devices ADAR1000 ------------------------------------------------------------------
@@ -95,8 +92,7 @@ def vector_modulator(phase_code: int) -> tuple[int, int]:
 
 TMYTEK_CHANNELS: Final = 16
 TMYTEK_STEP_DB: Final = 0.5
-TMYTEK_RANGE_DB: Final = 7.5
-"""What the channels of the maker's example span."""
+TMYTEK_RANGE_DB: Final = 7.5  # what the channels of the maker's example span
 TMYTEK_SETTINGS: Final = stepped(360, TMYTEK_STEP_DB, TMYTEK_RANGE_DB, off=True)
 
 

@@ -16,8 +16,7 @@ from companion.beams.hardware.codebooks import Codebook
 from companion.values import IntArray, UserError
 
 FULL_SCALE: Final = 32767
-MOST_BEAMS: Final = 1 << 16
-"""Ids of beams have 16 bits."""
+MOST_BEAMS: Final = 1 << 16  # ids of beams have 16 bits
 
 
 def q15(codebook: Codebook, calibration: Calibration) -> IntArray:

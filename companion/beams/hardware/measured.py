@@ -46,13 +46,12 @@ class Found:
     """A calibration with bounds, and what it leaves.
 
     phase_deg, gain_db  largest errors that remain, of all channels and directions
-    cost_db             most that a matched beam's guarantee loses to them
     """
 
     calibration: Calibration
     phase_deg: float
     gain_db: float
-    cost_db: float
+    cost_db: float  # most that a matched beam's guarantee loses to them
 
 
 def parse_responses(text: str) -> Responses:

@@ -34,14 +34,11 @@ import numpy as np
 
 from companion.values import ComplexArray, FloatArray, IntArray
 
-ROTATIONS: Final = 16
-"""Common rotations that are tried, over one step of phase."""
-STARTS: Final = 4
-"""Best rotations from which the descent starts."""
+ROTATIONS: Final = 16  # common rotations that are tried, over one step of phase
+STARTS: Final = 4  # best rotations from which the descent starts
 SWEEPS: Final = 100
 """Most sweeps of the coordinate descent; it ends by itself, mostly after three to eight."""
-REACH: Final = 2
-"""Steps of phase, gain, I or Q that one move may take."""
+REACH: Final = 2  # steps of phase, gain, I or Q that one move may take
 NEAR: Final = np.array([(i, j) for i in range(-REACH, REACH + 1) for j in range(-REACH, REACH + 1)])
 """All moves within ``REACH``, as pairs of steps."""
 EMPHASIS: Final = 1.0
@@ -175,15 +172,13 @@ class Quadrature:
 class Quantised:
     """The settings of one beam.
 
-    codes    (M, 2), as the settings define them
     weights  (M,) that they radiate, channel factors included; the strongest element is at full
              gain
-    cost     J over its value for weights that radiate nothing: 0 is exact, 1 worthless
     """
 
-    codes: IntArray
+    codes: IntArray  # (M, 2), as the settings define them
     weights: ComplexArray
-    cost: float
+    cost: float  # J over its value for weights that radiate nothing: 0 is exact, 1 worthless
 
 
 def quantise(

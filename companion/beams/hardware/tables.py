@@ -39,23 +39,19 @@ class WantedBeam:
 class DeviceTable:
     """The settings of a device.
 
-    uavs     names of the beams; their numbers where the text had no room for names
-    codes    (K, M, 2), by beam and channel
-    order    the element of each channel
     weights  (M, K), by element, as radiated; each beam has its strongest element at full gain,
              and what feeds the array divides the power among beams
     loss_db  array gain that each beam lost towards its own direction by the settings; None
              where the wanted weights are not known
-    gains    what the channels of a TMYTEK unit can have
     """
 
     device: Device
-    uavs: tuple[str, ...]
-    codes: IntArray
-    order: tuple[int, ...]
+    uavs: tuple[str, ...]  # names of the beams; their numbers where the text had no room for names
+    codes: IntArray  # (K, M, 2), by beam and channel
+    order: tuple[int, ...]  # the element of each channel
     weights: ComplexArray
     loss_db: tuple[float, ...] | None
-    gains: UnitGains = RELATIVE
+    gains: UnitGains = RELATIVE  # what the channels of a TMYTEK unit can have
 
 
 def fit(

@@ -18,12 +18,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from companion.beams.hardware.calibration import is_number
-from companion.beams.hardware.devices import (
-    TMYTEK_CHANNELS,
-    TMYTEK_RANGE_DB,
-    TMYTEK_STEP_DB,
-    Mode,
-)
+from companion.beams.hardware.devices import TMYTEK_CHANNELS, TMYTEK_RANGE_DB, TMYTEK_STEP_DB, Mode
 from companion.beams.hardware.quantise import Resolution, stepped
 from companion.values import UserError, read_toml, shown
 
@@ -36,16 +31,11 @@ KEYS: Final = {"mode", "common_db", "element_db"}
 
 @dataclass(frozen=True, slots=True)
 class UnitGains:
-    """The gains of all channels of a unit.
+    """The gains of all channels of a unit."""
 
-    mode          transmission or reception: each has limits of its own
-    full_gain_db  gain of an element at full gain, in steps of ``TMYTEK_STEP_DB``
-    range_db      how far below that an element can be, in such steps
-    """
-
-    mode: Mode
-    full_gain_db: float
-    range_db: float
+    mode: Mode  # transmission or reception: each has limits of its own
+    full_gain_db: float  # gain of an element at full gain, in steps of TMYTEK_STEP_DB
+    range_db: float  # how far below that an element can be, in such steps
 
     @property
     def settings(self) -> Resolution:

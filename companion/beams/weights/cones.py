@@ -21,27 +21,22 @@ from companion.beams.array.steering import steering_matrix
 from companion.beams.weights.shapes import Aperture
 from companion.values import ComplexArray, FloatArray, IntArray
 
-FINER: Final = 6
-"""Places in each natural width of a line."""
-FINER_IN_PLANE: Final = 8
-"""The same on each axis of a plane."""
-EDGE: Final = 0.25
-"""By how many places a place may be beyond a cone and count half."""
+FINER: Final = 6  # places in each natural width of a line
+FINER_IN_PLANE: Final = 8  # the same on each axis of a plane
+EDGE: Final = 0.25  # by how many places a place may be beyond a cone and count half
 MOST_INCLINED: Final = 0.95
 """Inclination beyond which ellipses are no narrower: cones there reach behind the plane."""
-RINGS: Final = 4
-"""Rings of directions in which other arrays are asked."""
+RINGS: Final = 4  # rings of directions in which other arrays are asked
 
 
 @dataclass(frozen=True, slots=True)
 class Seen:
     """Cones of K sizes about N directions, by the cosines to the axes of an aperture.
 
-    seen             (N, D), of the predicted direction
     lowest, highest  (K, N, D), the ends of the interval
     """
 
-    seen: FloatArray
+    seen: FloatArray  # (N, D), of the predicted direction
     lowest: FloatArray
     highest: FloatArray
 

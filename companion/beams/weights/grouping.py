@@ -26,8 +26,7 @@ class Turns:
     young: bool
 
 
-LENIENT_DB: Final = 1.5
-"""What turns may cost beyond the limit while they are young."""
+LENIENT_DB: Final = 1.5  # what turns may cost beyond the limit while they are young
 
 
 def kept(steering: ComplexArray, before: Turns, limits: Limits) -> list[IntArray] | None:

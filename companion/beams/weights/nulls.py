@@ -27,8 +27,7 @@ import numpy as np
 from companion.beams.weights.widening import Spread
 from companion.values import BoolArray, ComplexArray, FloatArray
 
-PRICE: Final = 0.2
-"""Gain, over the gain that is left, that one null may cost: 0.8 dB."""
+PRICE: Final = 0.2  # gain, over the gain that is left, that one null may cost: 0.8 dB
 APART: Final = 0.3
 """How unlike the user's own direction, as 1 - c^2, one is from which on a null is worth its price:
 some .33 natural widths. Nearer it would be none, and turn round where the two pass one another.
@@ -44,12 +43,10 @@ GIVEN_UP: Final = 6.0
 """Power of the share of ``ABOVE`` that a lesser least gain is, to which it may fall."""
 SHALLOW: Final = 0.05
 """Share of what there is to spare by which a dip may reach below what is kept: some .15 dB."""
-NOTHING: Final = 1e-9
-"""Least gain that is no gain."""
+NOTHING: Final = 1e-9  # least gain that is no gain
 NULL_WIDTHS: Final = 1.0
 """Natural widths from a cone's edge at which a null no longer reaches into it."""
-SOFT: Final = 0.02
-"""Loading of the points around a predicted direction, as a share of their power."""
+SOFT: Final = 0.02  # loading of the points around a predicted direction, as a share of their power
 ROUNDING: Final = 1e-10
 """Loading of the predicted directions, as a share of their power, against rounding."""
 

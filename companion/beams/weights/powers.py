@@ -20,12 +20,9 @@ import numpy as np
 
 from companion.values import ComplexArray, FloatArray
 
-ROUNDS: Final = 60
-"""Most rounds of a fixed point."""
-DUAL_ROUNDS: Final = 24
-"""Most rounds in which beams are made anew."""
-ENOUGH: Final = 1e-4
-"""Relative change of powers at which a search ends."""
+ROUNDS: Final = 60  # most rounds of a fixed point
+DUAL_ROUNDS: Final = 24  # most rounds in which beams are made anew
+ENOUGH: Final = 1e-4  # relative change of powers at which a search ends
 ROUNDING: Final = 1e-13
 """Least loading, over the greatest power: what rounding leaves of vectors that are alike."""
 LEAST_SHARE: Final = 1e-4

@@ -103,14 +103,10 @@ class Precoding:
 
 @dataclass(frozen=True, slots=True)
 class Radio:
-    """What the radio makes of N users.
+    """What the radio makes of N users."""
 
-    snr      (N,), of an isotropic antenna that has the whole power, as a power ratio
-    worths   (N,), what each one's rate is worth
-    """
-
-    snr: FloatArray
-    worths: FloatArray
+    snr: FloatArray  # (N,), of an isotropic antenna that has the whole power, as a power ratio
+    worths: FloatArray  # (N,), what each one's rate is worth
 
     def of(self, users: IntArray) -> "Radio":
         """The part that concerns some of the users."""
@@ -289,11 +285,7 @@ def _mmse_loading(
 
 
 def _shared(
-    a: ComplexArray,
-    weights: ComplexArray,
-    settings: Precoder,
-    radio: Radio | None,
-    users: IntArray,
+    a: ComplexArray, weights: ComplexArray, settings: Precoder, radio: Radio | None, users: IntArray
 ) -> ComplexArray:
     """Columns (M, K) of a turn with the power shared as the settings say; else as they are."""
     if settings.power is None:

@@ -20,8 +20,7 @@ from companion.beams.array.geometry import Array
 from companion.values import FloatArray, IntArray
 
 TABLES: Final = "shapes.npz"
-CORNERS: Final = np.indices((2, 2, 2)).reshape(3, 8).T
-"""The corners (8, 3) of a cell of three axes."""
+CORNERS: Final = np.indices((2, 2, 2)).reshape(3, 8).T  # the corners (8, 3) of a cell of three axes
 MOST: Final = 0.375
 """Widest beam in natural widths for each element: beyond it they are too far apart to shape one."""
 GIVEN_UP: Final = 2.0
@@ -38,25 +37,20 @@ class Shapes(NamedTuple):
     """The tables of one kind of aperture; phases are psi over it, times 2 pi w in radians.
 
     places    (n,), where the phases are, in apertures from the middle; on each axis of a square
-    widths    (W,), ascending
-    sure      (W, K), the greatest least gain within the width
     least_db  (W,), that gain over the number of elements, at the least: losses count from there
     losses    (L,), by how many dB the floor over the cone is below the greatest least gain
-    cones     (C,), ascending
-    ratios    (R,), the cone's width over the likely one, ascending from 1
-    likely    (L C R, K), the greatest mean gain over the likely error, above that floor
 
     Widths, losses, cones and ratios are natural logarithms.
     """
 
     places: FloatArray
-    widths: FloatArray
-    sure: FloatArray
+    widths: FloatArray  # (W,), ascending
+    sure: FloatArray  # (W, K), the greatest least gain within the width
     least_db: FloatArray
     losses: FloatArray
-    cones: FloatArray
-    ratios: FloatArray
-    likely: FloatArray
+    cones: FloatArray  # (C,), ascending
+    ratios: FloatArray  # (R,), the cone's width over the likely one, ascending from 1
+    likely: FloatArray  # (L C R, K), the greatest mean gain over the likely error, above that floor
 
 
 @functools.cache
@@ -88,19 +82,14 @@ def _even(count: int) -> FloatArray:
 class Aperture(NamedTuple):
     """An array as its shapes see it: a line, or a plane with two axes.
 
-    shapes     the tables
-    axes       (D, 3), the line, or the two axes of the plane, array frame
-    lengths_m  (D,), those of uniform apertures with the same variance
-    most       (D,), the widest beam in natural widths that elements so far apart can make
-    placed     (M, D), the elements in apertures from the middle
     knots      (K, M), interpolation from a line's table to its elements; empty for a plane
     """
 
-    shapes: Shapes
-    axes: FloatArray
-    lengths_m: FloatArray
-    most: FloatArray
-    placed: FloatArray
+    shapes: Shapes  # the tables
+    axes: FloatArray  # (D, 3), the line, or the two axes of the plane, array frame
+    lengths_m: FloatArray  # (D,), those of uniform apertures with the same variance
+    most: FloatArray  # (D,), the widest beam in natural widths that elements so far apart can make
+    placed: FloatArray  # (M, D), the elements in apertures from the middle
     knots: FloatArray
 
 

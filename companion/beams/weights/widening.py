@@ -17,55 +17,41 @@ from companion.beams.weights import cones, shapes
 from companion.beams.weights.cones import Cones, Seen
 from companion.values import BoolArray, ComplexArray, FloatArray, IntArray, Widen
 
-WIDEST_RAD: Final = np.pi / 2
-"""Angle beyond which beams are not widened further."""
+WIDEST_RAD: Final = np.pi / 2  # angle beyond which beams are not widened further
 NULLED_AT: Final = 0.7
 """Place of the points around a UAV, in likely angles from where it is predicted."""
-LEAST_RAD: Final = 1e-6
-"""Likely angle below which nobody is nulled beside his place."""
+LEAST_RAD: Final = 1e-6  # likely angle below which nobody is nulled beside his place
 BROADENED: Final = 0.9
 """Share of the sharp beam's gain at its middle below which a beam counts as broadened."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Uncertain:
-    """How far N directions are off.
+    """How far N directions are off."""
 
-    likely_rad  (N,), the angle within which the UAV usually is
-    bounds_rad  (N,), that within which it surely is; 0: no such angle counts
-    floor_db    least gain that a likely beam keeps within the bound, where it can
-    worth_db    least gain that is worth keeping
-    """
-
-    likely_rad: FloatArray
-    bounds_rad: FloatArray
-    floor_db: float = 2.9
-    worth_db: float = 0.0
+    likely_rad: FloatArray  # (N,), the angle within which the UAV usually is
+    bounds_rad: FloatArray  # (N,), that within which it surely is; 0: no such angle counts
+    floor_db: float = 2.9  # least gain that a likely beam keeps within the bound, where it can
+    worth_db: float = 0.0  # least gain that is worth keeping
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spread:
     """How to widen the beams and nulls of N users.
 
-    beams      (M, N), the shaped beams by themselves
-    broadened  (N,), which of them are broadened
     points     (M, N K), steering vectors, K per user in the order of the users: the predicted
                direction, then those around it that are to be nulled as well
-    gram       (N K, N K), S^T S* of the points S
-    reached    (N K, N), what the beams radiate to the points
     outside    (N K, N), how far each point is outside each user's cone, in natural widths; 0 within
-    cones      where the least gain of each beam is looked for
-    worth      least gain that is worth keeping
     """
 
-    beams: ComplexArray
-    broadened: BoolArray
+    beams: ComplexArray  # (M, N), the shaped beams by themselves
+    broadened: BoolArray  # (N,), which of them are broadened
     points: ComplexArray
-    gram: ComplexArray
-    reached: ComplexArray
+    gram: ComplexArray  # (N K, N K), S^T S* of the points S
+    reached: ComplexArray  # (N K, N), what the beams radiate to the points
     outside: FloatArray
-    cones: Cones
-    worth: float
+    cones: Cones  # where the least gain of each beam is looked for
+    worth: float  # least gain that is worth keeping
 
     @property
     def each(self) -> int:

@@ -22,20 +22,15 @@ from companion.beams.worth import cone
 from companion.beams.worth.cone import Boxes, Cells, Cones
 from companion.values import ComplexArray, FloatArray, IntArray
 
-TOLERANCE_DB: Final = 0.05
-"""Difference between bound and attained gain at which the search ends."""
-TOLERANCE: Final = 1 - 10 ** (-TOLERANCE_DB / 20)
-"""The same as a relative amplitude."""
+TOLERANCE_DB: Final = 0.05  # difference between bound and attained gain at which the search ends
+TOLERANCE: Final = 1 - 10 ** (-TOLERANCE_DB / 20)  # the same as a relative amplitude
 NOTHING_DB: Final = 40.0
 """Depth below the weights' greatest possible gain beyond which a gain is not refined."""
-LEVELS: Final = 12
-"""Most rounds of splitting cells."""
+LEVELS: Final = 12  # most rounds of splitting cells
 CAPS: Final = 8
 """Caps, plus one, that cover the arc of a first cell on a line; each split doubles them."""
-MOST_SPLIT: Final = 4096
-"""Most cells split for one cone; those with many caps count as more."""
-BLOCK: Final = 2**18
-"""Elements or caps, times cells, computed at once: some megabytes."""
+MOST_SPLIT: Final = 4096  # most cells split for one cone; those with many caps count as more
+BLOCK: Final = 2**18  # elements or caps, times cells, computed at once: some megabytes
 
 
 def guaranteed_gains_db(

@@ -27,19 +27,15 @@ BOLTZMANN_JPK: Final = 1.380649e-23
 class LinkBudget:
     """Power of the transmitter and noise of a receiver.
 
-        tx_power_dbm     power of all streams together
-        bandwidth_hz     noise bandwidth
-        noise_figure_db  over thermal noise at ``temperature_k``
-        temperature_k    at 290 K thermal noise is -173.98 dBm/Hz
 
     Raises ``ValueError`` for a value that is not finite, a bandwidth or temperature not above 0, or
     a noise figure below 0.
     """
 
-    tx_power_dbm: float
-    bandwidth_hz: float
-    noise_figure_db: float
-    temperature_k: float = 290.0
+    tx_power_dbm: float  # power of all streams together
+    bandwidth_hz: float  # noise bandwidth
+    noise_figure_db: float  # over thermal noise at temperature_k
+    temperature_k: float = 290.0  # at 290 K thermal noise is -173.98 dBm/Hz
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.tx_power_dbm):

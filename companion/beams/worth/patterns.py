@@ -24,27 +24,21 @@ from companion.values import ComplexArray, FloatArray
 
 FLOOR_DB: Final = -200.0
 """Lowest value returned, also for an exact null: JSON has no minus infinity."""
-BLOCK: Final = 8192
-"""Entries of a steering matrix computed at once, so that they stay in the cache."""
-POINTS_PER_SIDE_LOBE: Final = 8
-"""Points of a scan over the narrowest lobe that the array can make."""
-LEAST_POINTS: Final = 360
-"""Least number of points of a scan around a circle."""
-NEAR: Final = 64
-"""Points examined first to either side of a peak; nearly always they suffice."""
+BLOCK: Final = 8192  # entries of a steering matrix computed at once, so that they stay in the cache
+POINTS_PER_SIDE_LOBE: Final = 8  # points of a scan over the narrowest lobe that the array can make
+LEAST_POINTS: Final = 360  # least number of points of a scan around a circle
+NEAR: Final = 64  # points examined first to either side of a peak; nearly always they suffice
 SECTIONS: Final = np.linspace(0.0, 1.0, 17)
 """Places examined to narrow an interval: 16 times for a crossing, 8 times for an extreme."""
 HALVING_ROUNDS: Final = 10
 EXTREME_ROUNDS: Final = 12
 RIVALS_DB: Final = 0.5
 """Difference to the highest side lobe of the scan within which another may be the highest."""
-ABREAST: Final = 1e-4
-"""Boresight component below which a direction counts as square to boresight."""
+ABREAST: Final = 1e-4  # boresight component below which a direction counts as square to boresight
 RIPPLE_DB: Final = 1.0
 """How far the gain may rise above the peak within a lobe, as it does on a broadened one."""
 CLIMB_MOVES: Final = 400
-SINGULAR: Final = 1e-9
-"""Slope and curvature, relative to the gain, below which they are rounding."""
+SINGULAR: Final = 1e-9  # slope and curvature, relative to the gain, below which they are rounding
 
 _GRID = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), axis=-1).reshape(9, 2)
 _X, _Y = _GRID.T

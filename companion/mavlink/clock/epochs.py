@@ -35,29 +35,20 @@ WRAP_NS: Final = _WRAP_MS * _NS_PER_MS
 """Period of a boot clock: its 32-bit milliseconds wrap after 49.7 days."""
 _EARLY_NS: Final = -_NS
 """Least lateness of a stamp that fits an established line; negative: it may be 1 s early."""
-_ESTABLISHED: Final = 20
-"""Stamps from which on a line is not moved by a single one."""
-_RUN_KEPT: Final = 64
-"""Stamps kept of a run."""
+_ESTABLISHED: Final = 20  # stamps from which on a line is not moved by a single one
+_RUN_KEPT: Final = 64  # stamps kept of a run
 _RIVAL_LASTS_NS: Final = 3 * _NS
 """Time over which a second clock must be heard before it counts as one."""
-_RIVAL_SILENT_NS: Final = 10 * _NS
-"""Silence after which a second clock is forgotten."""
+_RIVAL_SILENT_NS: Final = 10 * _NS  # silence after which a second clock is forgotten
 
 
 class Placed(NamedTuple):
-    """A stamp on a line.
+    """A stamp on a line."""
 
-    x_ns      the sender's time since boot, unwrapped
-    new_line  True for the first stamp on a new line
-    rebooted  True if the new line was begun by a reboot
-    leapt_ns  by how much a new line is higher than the one before, else; 0 otherwise
-    """
-
-    x_ns: int
-    new_line: bool = False
-    rebooted: bool = False
-    leapt_ns: int = 0
+    x_ns: int  # the sender's time since boot, unwrapped
+    new_line: bool = False  # True for the first stamp on a new line
+    rebooted: bool = False  # True if the new line was begun by a reboot
+    leapt_ns: int = 0  # by how much a new line is higher than the one before, else; 0 otherwise
 
 
 @dataclass(slots=True, kw_only=True)

@@ -26,22 +26,16 @@ class Guarantee(DescribedEnum):
 class ClockAssumptions:
     """What is assumed of a sender's clock and its link.
 
-    constant_delay_s  known smallest latency, which stamps alone cannot show
-    trust_gnss        use SYSTEM_TIME, if ``node_utc_error_s`` is known
     node_utc_error_s  bound on the node's distance from UTC; None: its timeline is not UTC
-    gnss_error_s      bound on the sender's distance from UTC
-    window_s          how far back latencies are sampled
-    drift_max_ppm     greatest drift taken for possible
-    late_max_s        greatest lateness of any frame
     """
 
-    constant_delay_s: float = 0.0
-    trust_gnss: bool = False
+    constant_delay_s: float = 0.0  # known smallest latency, which stamps alone cannot show
+    trust_gnss: bool = False  # use SYSTEM_TIME, if node_utc_error_s is known
     node_utc_error_s: float | None = None
-    gnss_error_s: float = 0.02
-    window_s: float = 60.0
-    drift_max_ppm: float = 250.0
-    late_max_s: float = 10.0
+    gnss_error_s: float = 0.02  # bound on the sender's distance from UTC
+    window_s: float = 60.0  # how far back latencies are sampled
+    drift_max_ppm: float = 250.0  # greatest drift taken for possible
+    late_max_s: float = 10.0  # greatest lateness of any frame
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.constant_delay_s < math.inf:
@@ -70,16 +64,13 @@ class Stamp:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockEstimate:
-    """A sender's clock against the node's.
-
-    offset_ns  most likely difference, node time minus sender time
-    """
+    """A sender's clock against the node's."""
 
     kind: Annotated[ClockKind, Meaning("evidence that leaves the least uncertainty")]
     guarantee: Annotated[
         Guarantee, Meaning("measured: both ends of the interval are; assumed: one end is assumed")
     ]
-    offset_ns: int
+    offset_ns: int  # most likely difference, node time minus sender time
     before_s: Annotated[float, Meaning("how much earlier the sender's time may be than estimated")]
     after_s: Annotated[float, Meaning("how much later the sender's time may be than estimated")]
     drift_ppm: Annotated[

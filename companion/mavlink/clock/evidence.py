@@ -18,14 +18,11 @@ import math
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-AGREE: Final = 3
-"""Pieces of evidence in a row after a contradiction that end the doubt."""
+AGREE: Final = 3  # pieces of evidence in a row after a contradiction that end the doubt
 STEP: Final = 0.02
 """Least drift, a ratio, that is taken for a step: no clock runs like that for long."""
-RAISED: Final = 1.5
-"""Multiple of the drift proven that is taken for possible from then on."""
-FADES_NS: Final = 60e9
-"""Time constant with which a raised drift fades."""
+RAISED: Final = 1.5  # multiple of the drift proven that is taken for possible from then on
+FADES_NS: Final = 60e9  # time constant with which a raised drift fades
 
 
 class Interval(NamedTuple):

@@ -45,18 +45,12 @@ _RARE: Final = 7.0
 
 
 class Heights(NamedTuple):
-    """Heights of a floor at one sender time, ns.
+    """Heights of a floor at one sender time, ns."""
 
-    sure     above the offset if the clock ran within its drift
-    highest  above the offset, even if the clock changed before the last frames
-    line     the most likely height of the floor
-    least    the least height that the frame nearest to the offset can have
-    """
-
-    sure: int
-    highest: int
-    line: int
-    least: int
+    sure: int  # above the offset if the clock ran within its drift
+    highest: int  # above the offset, even if the clock changed before the last frames
+    line: int  # the most likely height of the floor
+    least: int  # the least height that the frame nearest to the offset can have
 
 
 class _Level:

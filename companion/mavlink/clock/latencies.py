@@ -12,11 +12,9 @@ from typing import Final
 
 import numpy as np
 
-PIECES: Final = 16
-"""Pieces of the window whose least heights are kept."""
+PIECES: Final = 16  # pieces of the window whose least heights are kept
 SAMPLES: Final = 256
-RESOLUTION_NS: Final = 1e6
-"""Step of the stamps."""
+RESOLUTION_NS: Final = 1e6  # step of the stamps
 _LOTS: Final = 1 << 32
 _STEADY: Final = 0.1
 """Share of the level line's mean gap below which a sloped line's is a steady drift."""

@@ -20,30 +20,22 @@ CHANGE_NS: Final = 750_000_000
 """Least time over which all frames must be late to be a change: a busy host is late for less."""
 LEAST_CHANGE_NS: Final = 5e6
 """Least change that is looked for: some milliseconds are the stamps' own steps."""
-FEWEST: Final = 8
-"""Least number of frames that make a change."""
+FEWEST: Final = 8  # least number of frames that make a change
 FOLLOWED: Final = 40.0
 """Multiple of their lateness for which all frames must be late before the line follows them."""
-FOLLOWED_NS: Final = 20_000_000_000
-"""Time after which it does so in any case."""
+FOLLOWED_NS: Final = 20_000_000_000  # time after which it does so in any case
 _BLOCK_NS: Final = 250_000_000
 _BLOCKS: Final = 240
 _BLOCK_COUNT: Final = 4  # frames of a block that count as independent
 
 
 class Late(NamedTuple):
-    """A spell in which all frames are late.
+    """A spell in which all frames are late."""
 
-    height    least height of the late frames, aged to the newest, ns
-    since_ns  sender time of the first of them
-    is_news   whether it was not told before
-    followed  whether it has lasted for so long that the line is to begin again there
-    """
-
-    height: float
-    since_ns: int
-    is_news: bool
-    followed: bool
+    height: float  # least height of the late frames, aged to the newest, ns
+    since_ns: int  # sender time of the first of them
+    is_news: bool  # whether it was not told before
+    followed: bool  # whether it has lasted for so long that the line is to begin again there
 
 
 class _Block:

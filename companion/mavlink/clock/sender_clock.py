@@ -37,8 +37,7 @@ _DEEPEST_NS: Final = 10 * _NS
 """Greatest depth of the offset below the floor that evidence may claim."""
 _LATENCY_S: Final = (-0.02, 5.0)
 """Least and greatest latency that a trusted GNSS time may imply, seconds."""
-_GNSS_CHECKS: Final = 5
-"""GNSS times in a row that must be plausible before one is used."""
+_GNSS_CHECKS: Final = 5  # GNSS times in a row that must be plausible before one is used
 INVISIBLE: Final = 0.1
 """Share of the median visible latency that is taken for the invisible part of it.
 

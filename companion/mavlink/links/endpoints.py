@@ -15,26 +15,22 @@ from typing import Any, NamedTuple, Protocol
 
 from companion.mavlink.links.urls import LinkUrl
 
-Address = tuple[Any, ...]
-"""A socket address as the system writes it: for IPv6 with flow and scope."""
+Address = tuple[Any, ...]  # a socket address as the system writes it: for IPv6 with flow and scope
 
 
 class Upcalls(NamedTuple):
     """Functions by which an endpoint tells its link what happens.
 
-    up        a connection stands
     take      a peer, named by the endpoint's key for it, sent bytes; the last argument is how long
               ago they arrived by the system's own stamp, ns, or None where they bear none
     stale     bytes of a peer that had waited for too long to be believed
-    hang_up   that peer is gone
-    overflow  the system has dropped this many more datagrams
     """
 
-    up: Callable[[], None]
+    up: Callable[[], None]  # a connection stands
     take: Callable[[Hashable, bytes, int | None], None]
     stale: Callable[[Hashable, bytes], None]
-    hang_up: Callable[[Hashable], None]
-    overflow: Callable[[int], None]
+    hang_up: Callable[[Hashable], None]  # that peer is gone
+    overflow: Callable[[int], None]  # the system has dropped this many more datagrams
 
 
 class Endpoint(Protocol):

@@ -12,10 +12,8 @@ from typing import Final
 
 from companion.mavlink.links.kernel_time import since_boot_ns
 
-HELD_UP_NS: Final = 2_500_000_000
-"""Time without a look beyond which what waits is stale."""
-LOOK_S: Final = 0.5
-"""Time between two looks."""
+HELD_UP_NS: Final = 2_500_000_000  # time without a look beyond which what waits is stale
+LOOK_S: Final = 0.5  # time between two looks
 
 
 class HeldUp:

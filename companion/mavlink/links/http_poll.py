@@ -10,8 +10,7 @@ from companion.mavlink.links.urls import LinkUrl
 
 PERIOD_S: Final = 1.0
 """Seconds from one request to the next; receivers write a document about once a second."""
-ANSWER_S: Final = 5.0
-"""Longest time that a request may take."""
+ANSWER_S: Final = 5.0  # longest time that a request may take
 HEAD_MAX: Final = 16 << 10
 BODY_MAX: Final = 16 << 20
 

@@ -17,8 +17,7 @@ from typing import Final
 
 SO_TIMESTAMPNS: Final[int] = getattr(socket, "SO_TIMESTAMPNS", 35)
 """Linux, include/uapi/asm-generic/socket.h; the type of the control message as well."""
-SET_NS: Final = 1_000_000
-"""Step of the wall clock that counts; a shorter one does no harm."""
+SET_NS: Final = 1_000_000  # step of the wall clock that counts; a shorter one does no harm
 
 _BOOTTIME: Final[int] = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 """Linux's clock that goes on in a sleep; elsewhere the one that stands still in it."""

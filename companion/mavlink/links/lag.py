@@ -11,12 +11,9 @@ from typing import Annotated, Final
 
 from companion.values.described import Meaning
 
-SLOT_NS: Final = 100_000_000
-"""Time of which the worst lag is kept."""
-KEPT_NS: Final = 10_000_000_000
-"""Time over which lags are judged."""
-LIMIT_NS: Final = 500_000_000
-"""Lag above which beams are aimed by news that is too old."""
+SLOT_NS: Final = 100_000_000  # time of which the worst lag is kept
+KEPT_NS: Final = 10_000_000_000  # time over which lags are judged
+LIMIT_NS: Final = 500_000_000  # lag above which beams are aimed by news that is too old
 LASTS_NS: Final = 1_000_000_000
 """Time over which every lag must be above the limit for the machine to be behind."""
 CLEARS_NS: Final = 2_000_000_000

@@ -26,15 +26,13 @@ from companion.mavlink.wire.decode import POSE
 from companion.mavlink.wire.framing import MAGIC_V2, Splitter
 from companion.values import Frame, Rejection, Source
 
-PEERS_MAX: Final = 4096
-"""Peers kept, the last heard: a scan of the port must not fill the memory."""
+PEERS_MAX: Final = 4096  # peers kept, the last heard: a scan of the port must not fill the memory
 SENDERS_MAX: Final = 16_384
 """Sequences followed over all peers, so that invented senders do not fill the memory either.
 
 When there are more, all are begun anew, which costs no more than the holes of that moment.
 """
-RESTART_RUN: Final = 3
-"""Late frames in a row, each further on, that show a restart of the sender."""
+RESTART_RUN: Final = 3  # late frames in a row, each further on, that show a restart of the sender
 
 STAMPS_KEPT_NS: Final = 30_000_000_000
 _HALF_ROUND: Final = 128

@@ -21,8 +21,7 @@ from typing import Any, Final, NamedTuple
 from companion.mavlink.links.urls import LinkError
 from companion.mavlink.trust.signing import KEY_BYTES, Guard, State, fingerprint
 
-SAVE_NS: Final = 1_000_000_000
-"""Shortest time between two writes."""
+SAVE_NS: Final = 1_000_000_000  # shortest time between two writes
 REFRESH_NS: Final = 3_000_000_000
 """Longest time between two writes: a silent link still has a clock that goes on."""
 _VERSION: Final = 1

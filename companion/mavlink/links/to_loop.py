@@ -9,8 +9,7 @@ from typing import Final
 
 QUEUE_MAX: Final = 20_000
 """Calls that may wait for the loop; what comes beyond is dropped and counted."""
-TURN_S: Final = 0.003
-"""Time after which other work of the loop has its turn."""
+TURN_S: Final = 0.003  # time after which other work of the loop has its turn
 
 
 class ToLoop:

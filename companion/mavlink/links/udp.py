@@ -26,16 +26,14 @@ RECEIVE_BUFFER_BYTES: Final = 4 << 20
 
 Measured: docs/field-notes.md 3.
 """
-OVERFLOW_CHECK_S: Final = 1.0
-"""Longest time between two looks at the system's drop counter."""
+OVERFLOW_CHECK_S: Final = 1.0  # longest time between two looks at the system's drop counter
 OVERFLOW_CHECK_DATAGRAMS: Final = 1024
 """Datagrams after which the drop counter is read even before that time."""
 STALE_NS: Final = 2_000_000_000
 """Age at which a datagram is let go unread: a busy machine then sees what is new, not a backlog."""
 READ_AT_ONCE: Final = 32
 """Datagrams read at most before others have their turn, as in libuv; fewer in ``TURN_S``."""
-DATAGRAM_BYTES: Final = 1 << 16
-"""More than any datagram has."""
+DATAGRAM_BYTES: Final = 1 << 16  # more than any datagram has
 
 _SO_MEMINFO: Final = 55  # Linux, include/uapi/asm-generic/socket.h
 _SK_MEMINFO_BYTES: Final = 36  # nine 32-bit numbers, include/uapi/linux/sock_diag.h

@@ -35,15 +35,12 @@ class BusStatus:
 
     sent     samples given to Zenoh. What it then drops at a congested link it does not tell: number
              what is published, and the other end sees the holes
-    refused  samples that Zenoh did not take, or after ``close``
-    heard    samples, answers and signs of life handed over
-    dropped  those for which there was no room while the loop was busy
     """
 
     sent: int
-    refused: int
-    heard: int
-    dropped: int
+    refused: int  # samples that Zenoh did not take, or after close
+    heard: int  # samples, answers and signs of life handed over
+    dropped: int  # those for which there was no room while the loop was busy
 
 
 def open_peer(config: BusConfig) -> "zenoh.Session":

@@ -12,8 +12,7 @@ QUEUED: Final = 16
 
 With its own 2, and without waiting for room, of 5 samples in a row sent express 2 arrive.
 """
-LINKS_MAX: Final = 4
-"""Links to one neighbour: two of each kind, where both connect to each other."""
+LINKS_MAX: Final = 4  # links to one neighbour: two of each kind, where both connect to each other
 
 Priority = Literal[
     "real_time",
@@ -31,18 +30,14 @@ Mode = Literal["peer", "client"]
 class BusTls:
     """Certificates for ``tls/`` and ``quic/`` endpoints, as PEM files.
 
-    ca           what signed the certificates of others
     certificate  this node's own; None only for one that connects to who does not ask for it
-    private_key  its key
-    mutual       whether who connects must show a certificate too
-    check_name   whether a certificate must be that of the host that was connected to
     """
 
-    ca: Path
+    ca: Path  # what signed the certificates of others
     certificate: Path | None = None
-    private_key: Path | None = None
-    mutual: bool = True
-    check_name: bool = True
+    private_key: Path | None = None  # its key
+    mutual: bool = True  # whether who connects must show a certificate too
+    check_name: bool = True  # whether a certificate must be that of the host that was connected to
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,26 +49,20 @@ class BusConfig:
     listen          endpoints of this node, as in tcp/127.0.0.1:7447; empty: it only connects. A
                     client has none. Beside one with ?rel=1 one with ?rel=0 may stand, ``udp/`` or
                     ``quic/`` (datagrams, by TLS), for what need not be reliable
-    connect         endpoints of others or of routers
-    tls             certificates; None: endpoints are not ``tls/``
     access_control  a file with Zenoh's section ``access_control``; None: who connects may do all
-    scouting        whether others are looked for by multicast
-    lease_s         silence after which a neighbour is given up
-    keep_alive      signs of life in one lease
-    retry_s         time from one attempt to connect to the next
     attempt_s       longest time that an attempt takes: 3 round trips over TCP, 5 with TLS. More
                     on a slow link; what began in a parting delays its end
     """
 
     mode: Mode = "peer"
     listen: tuple[str, ...] = ("tcp/127.0.0.1:0",)
-    connect: tuple[str, ...] = ()
-    tls: BusTls | None = None
+    connect: tuple[str, ...] = ()  # endpoints of others or of routers
+    tls: BusTls | None = None  # certificates; None: endpoints are not tls/
     access_control: Path | None = None
-    scouting: bool = False
-    lease_s: float = 1.5
-    keep_alive: int = 4
-    retry_s: float = 0.25
+    scouting: bool = False  # whether others are looked for by multicast
+    lease_s: float = 1.5  # silence after which a neighbour is given up
+    keep_alive: int = 4  # signs of life in one lease
+    retry_s: float = 0.25  # time from one attempt to connect to the next
     attempt_s: float = 1.0
 
 

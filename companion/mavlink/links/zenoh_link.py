@@ -23,10 +23,8 @@ from companion.mavlink.links.zenoh_bus import Bus, check
 from companion.mavlink.links.zenoh_config import BusConfig
 from companion.values import UserError
 
-ROUTER: Final = "tcp/127.0.0.1:7447"
-"""Where Zenoh's router listens unless told otherwise."""
-OPEN_S: Final = 5.0
-"""How long a router is waited for before it is said to be away."""
+ROUTER: Final = "tcp/127.0.0.1:7447"  # where Zenoh's router listens unless told otherwise
+OPEN_S: Final = 5.0  # how long a router is waited for before it is said to be away
 
 
 class ZenohLink:

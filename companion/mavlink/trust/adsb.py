@@ -47,8 +47,7 @@ POSITIONS_KEPT: Final = 32
 
 At two a second, a relay may lag 16 s behind another; 4.8 s have been seen.
 """
-RELAYS_KEPT: Final = 16
-"""Relays remembered of each aircraft."""
+RELAYS_KEPT: Final = 16  # relays remembered of each aircraft
 
 _T = TypeVar("_T")
 _Dated = tuple[int, _T]  # when it was true, and what

@@ -13,23 +13,19 @@ from companion.values import Frame
 
 WINDOW_NS: Final = 30_000_000_000
 """How long a report is remembered: longer than any link has been seen to lag behind another."""
-LINKS_MAX: Final = 4096
-"""Links that are counted: a log may name one for each of its frames."""
-LATENCIES_KEPT: Final = 256
-"""Newest latencies kept per link."""
+LINKS_MAX: Final = 4096  # links that are counted: a log may name one for each of its frames
+LATENCIES_KEPT: Final = 256  # newest latencies kept per link
 
 
 @dataclass(slots=True)
 class LinkShare:
     """What one link has contributed.
 
-    first        reports that it brought before any other link
-    repeats      reports that had already come
     latencies_s  how old the newest reports were when they came over this link, repeats included
     """
 
-    first: int = 0
-    repeats: int = 0
+    first: int = 0  # reports that it brought before any other link
+    repeats: int = 0  # reports that had already come
     latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=LATENCIES_KEPT))
 
 

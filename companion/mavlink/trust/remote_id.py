@@ -12,12 +12,10 @@ from typing import Final
 
 from companion.values import AltitudeDatum, Reason, Rejection, RemoteId, Report, Source, UavKind
 
-NAMED_NS: Final = 60_000_000_000
-"""How long a name holds after its address was last heard."""
+NAMED_NS: Final = 60_000_000_000  # how long a name holds after its address was last heard
 ADDRESSES_MAX: Final = 4096
 """Addresses remembered; beyond it the one not heard for longest is forgotten."""
-DATUM_NS: Final = 10_000_000_000
-"""How long an aircraft keeps what its heights are measured from."""
+DATUM_NS: Final = 10_000_000_000  # how long an aircraft keeps what its heights are measured from
 
 
 @dataclass(slots=True, kw_only=True)

@@ -49,15 +49,11 @@ from companion.values import Frame, Reason, UserError
 KEY_BYTES: Final = 32
 EPOCH_NS: Final = 1_420_070_400_000_000_000
 """2015-01-01T00:00:00Z in nanoseconds since the Unix epoch."""
-UNIT_NS: Final = 10_000
-"""Nanoseconds per unit of a timestamp."""
-SECOND: Final = 100_000
-"""Units of a timestamp in a second."""
+UNIT_NS: Final = 10_000  # nanoseconds per unit of a timestamp
+SECOND: Final = 100_000  # units of a timestamp in a second
 MINUTE: Final = 60 * SECOND
-STREAMS_MAX: Final = 4096
-"""Streams remembered per link."""
-LATEST: Final = (1 << 48) - 1
-"""Largest timestamp of 48 bits."""
+STREAMS_MAX: Final = 4096  # streams remembered per link
+LATEST: Final = (1 << 48) - 1  # largest timestamp of 48 bits
 FOLLOWED_MAX: Final = LATEST - 3650 * 24 * 60 * MINUTE
 """Largest timestamp that the local timestamp follows: ten years before ``LATEST``."""
 MARGIN: Final = 5 * SECOND
@@ -65,8 +61,7 @@ MARGIN: Final = 5 * SECOND
 BURST: Final = SECOND
 """More than the frames sent in ``MARGIN``: each takes one unit where the clock is behind."""
 
-Stream = tuple[int, int, int]
-"""System id and component id of the sender, and its link id."""
+Stream = tuple[int, int, int]  # system id and component id of the sender, and its link id
 Heard = tuple[int, int | None]
 """Newest timestamp of a stream, and its lead over the own clock when it was accepted.
 
@@ -76,20 +71,13 @@ The lead is None for a stream of this node.
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class State:
-    """What a guard must not forget; times in units of 10 µs since 2015.
+    """What a guard must not forget; times in units of 10 µs since 2015."""
 
-    clock    the own clock when this was made
-    local    the local timestamp
-    sent     newest timestamp of this node's frames
-    floor    streams not in ``streams`` must be newer than this
-    streams  newest timestamp of each stream
-    """
-
-    clock: int = 0
-    local: int = 0
-    sent: int = 0
-    floor: int = -1
-    streams: Mapping[Stream, Heard] = field(default_factory=dict)
+    clock: int = 0  # the own clock when this was made
+    local: int = 0  # the local timestamp
+    sent: int = 0  # newest timestamp of this node's frames
+    floor: int = -1  # streams not in streams must be newer than this
+    streams: Mapping[Stream, Heard] = field(default_factory=dict)  # newest timestamp of each stream
 
     def after_crash(self) -> Self:
         """The state to go on with if the process ended up to ``MARGIN`` after this one was made.
@@ -124,8 +112,7 @@ class State:
         )
 
 
-START: Final = State()
-"""Nothing heard and nothing sent."""
+START: Final = State()  # nothing heard and nothing sent
 
 
 def fingerprint(key: bytes) -> str:
@@ -154,8 +141,7 @@ class Guard:
             raise ValueError(f"a link id is 0 to 255, not {link_id}")
         self.link_id = link_id
         self.allow_unsigned = allow_unsigned
-        self.moves = 0
-        """Number of times the remembered state has changed."""
+        self.moves = 0  # number of times the remembered state has changed
         self._key = key
         self._local = state.local
         self._sent = state.sent

@@ -30,26 +30,20 @@ from companion.values import Frame, Vector
 CONTRADICTIONS: Final = 5
 SPACED_NS: Final = 500_000_000
 """Time within which contradictions count as one: a position that is reset makes a few."""
-KEPT_NS: Final = 30_000_000_000
-"""How long a peer and a contradiction are remembered."""
+KEPT_NS: Final = 30_000_000_000  # how long a peer and a contradiction are remembered
 SLACK_M: Final = 3.0
 STALE_S: Final = 0.1
 SLACK_MPS: Final = 1.0
 ACCELERATION_MPS2: Final = 20.0
 STRETCH_MS: Final = 2000
 """Longest time between two reports of a peer that another one is held against."""
-RESTARTED_MS: Final = 10_000
-"""A stamp that steps back so far is of another boot."""
+RESTARTED_MS: Final = 10_000  # a stamp that steps back so far is of another boot
 
-SENDERS_MAX: Final = 4096
-"""Senders followed; who was there before is not given up for who is new."""
-PEERS_MAX: Final = 4
-"""Peers followed of one sender, the last heard."""
-REPORTS_KEPT: Final = 32
-"""Newest reports kept of a peer."""
+SENDERS_MAX: Final = 4096  # senders followed; who was there before is not given up for who is new
+PEERS_MAX: Final = 4  # peers followed of one sender, the last heard
+REPORTS_KEPT: Final = 32  # newest reports kept of a peer
 
-_METRES: Final = 111_195.0 * 1e-7
-"""Metres in 1e-7 degrees of latitude."""
+_METRES: Final = 111_195.0 * 1e-7  # metres in 1e-7 degrees of latitude
 
 
 @dataclass(slots=True)

@@ -62,16 +62,12 @@ COMMAND_ACK: Final = 77
 HEARD: Final = POSE | {HEARTBEAT, REQUEST_DATA_STREAM, COMMAND_LONG, COMMAND_ACK, TIMESYNC}
 """Ids of the messages that ``Component.hear`` must be given."""
 
-HEARTBEAT_NS: Final = _NS
-"""Time between two heartbeats."""
+HEARTBEAT_NS: Final = _NS  # time between two heartbeats
 TIMESYNC_NS: Final = (1 * _NS, 5 * _NS)
 """Time between TIMESYNC requests: for the first ``TIMESYNC_FIRST``, and later."""
-TIMESYNC_FIRST: Final = 10
-"""Requests sent at the shorter interval."""
-LONGEST_TRIP_NS: Final = 10 * _NS
-"""Longest round trip that is used."""
-KEPT_NS: Final = 30 * _NS
-"""How long sent messages and senders' newest stamps are remembered."""
+TIMESYNC_FIRST: Final = 10  # requests sent at the shorter interval
+LONGEST_TRIP_NS: Final = 10 * _NS  # longest round trip that is used
+KEPT_NS: Final = 30 * _NS  # how long sent messages and senders' newest stamps are remembered
 HELD_NS: Final = 2 * _NS
 """How long an answer waits for another one that contradicts it: as long as a slow radio takes."""
 CLOCKS_APART_NS: Final = 60 * _NS
@@ -81,8 +77,7 @@ Beyond it, it is about another clock.
 """
 _UPTIME_MAX_NS: Final = 10 * 365 * 86_400 * _NS
 """Greatest time since boot that is believed. Unix time has exceeded it since 1980."""
-CONFLICT_AGAIN_NS: Final = 300 * _NS
-"""Time after which a conflict of ids is reported again."""
+CONFLICT_AGAIN_NS: Final = 300 * _NS  # time after which a conflict of ids is reported again
 
 _BROADCAST: Final = 0
 _NOT_OURS: Final = frozenset({0, 1, 190})  # everybody, an autopilot, a ground station
@@ -99,19 +94,15 @@ _TIMESYNC = struct.Struct("<qqBB")
 class ComponentSpec:
     """The identity of the service on the network, and the message rates that it wants.
 
-        source       system and component id of the service
-        carrier      the vehicle that carries the array; None for a fixed array
-        position_hz  rate of GLOBAL_POSITION_INT wanted of every UAV and of the carrier
-        attitude_hz  rate of ATTITUDE wanted of the carrier
 
     A rate of None asks for nothing. Raises ``UserError`` for ids that belong to ground stations,
     autopilots or everybody, for a source that is the carrier, and for rates outside 0.1 to 100 Hz.
     """
 
-    source: Source
-    carrier: Source | None
-    position_hz: float | None
-    attitude_hz: float | None
+    source: Source  # system and component id of the service
+    carrier: Source | None  # the vehicle that carries the array; None for a fixed array
+    position_hz: float | None  # rate of GLOBAL_POSITION_INT wanted of every UAV and of the carrier
+    attitude_hz: float | None  # rate of ATTITUDE wanted of the carrier
 
     def __post_init__(self) -> None:
         if not 1 <= self.source.sysid <= 254:

@@ -15,12 +15,9 @@ from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
 from companion.values import Notice, Source
 
 _NS: Final = 1_000_000_000
-GONE_NS: Final = 5 * _NS
-"""Silence after which a UAV is not asked for anything."""
-FORGET_NS: Final = 30 * _NS
-"""Silence after which a UAV is forgotten."""
-REQUESTS_PER_S: Final = 5
-"""Most requests sent in any second."""
+GONE_NS: Final = 5 * _NS  # silence after which a UAV is not asked for anything
+FORGET_NS: Final = 30 * _NS  # silence after which a UAV is forgotten
+REQUESTS_PER_S: Final = 5  # most requests sent in any second
 
 
 @dataclass(slots=True)

@@ -39,12 +39,10 @@ from companion.values import Notice, Severity, Source
 from companion.values.described import DescribedEnum, Meaning
 
 _NS: Final = 1_000_000_000
-SLOW_BELOW: Final = 0.8
-"""Fraction of the wanted rate below which a rate is slow."""
+SLOW_BELOW: Final = 0.8  # fraction of the wanted rate below which a rate is slow
 SETTLE_NS: Final = 5 * _NS
 """How long a rate must be slow, or in order, to count as such: at least this, and five messages."""
-TRIES: Final = 3
-"""SET_MESSAGE_INTERVAL requests in one round before REQUEST_DATA_STREAM is tried."""
+TRIES: Final = 3  # SET_MESSAGE_INTERVAL requests in one round before REQUEST_DATA_STREAM is tried
 BACKOFF_NS: Final = (5 * _NS, 300 * _NS)
 """Shortest and longest time between two requests for one message of one UAV."""
 IN_ORDER_NS: Final = 600 * _NS
@@ -57,8 +55,7 @@ _PROGRESS_NS: Final = 60 * _NS
 """How long after a request IN_PROGRESS answers still postpone the next one."""
 _LATE_MS: Final = 30_000
 """Largest step back of a stamp that counts as a late frame; a larger one is a restart."""
-_STAMPS: Final = 12
-"""Newest stamps kept per message."""
+_STAMPS: Final = 12  # newest stamps kept per message
 _ENOUGH: Final = 5  # intervals, for a rate or to settle
 _WRAP_MS: Final = 1 << 32
 

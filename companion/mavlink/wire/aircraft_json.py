@@ -14,10 +14,8 @@ from typing import Any, Final
 from companion.mavlink.wire.transponder import ADSB_VEHICLE, Said, frame
 from companion.values import Frame, Reason, Rejection
 
-DOCUMENT_MAX: Final = 8 << 20
-"""Bytes of a document at most: some 10 000 aircraft."""
-AIRCRAFT_MAX: Final = 10_000
-"""Aircraft read of one document, and remembered."""
+DOCUMENT_MAX: Final = 8 << 20  # bytes of a document at most: some 10 000 aircraft
+AIRCRAFT_MAX: Final = 10_000  # aircraft read of one document, and remembered
 _NOT_SEEN: Final = ("mlat", "tisb_icao", "tisb_trackfile", "tisb_other", "mode_s", "mode_ac")
 """Types of an aircraft that said no position itself."""
 

@@ -18,8 +18,7 @@ from companion.mavlink.wire.transponder import frame
 from companion.values import Frame, Reason, Rejection
 
 _ESCAPE: Final = b"\x1a"
-_SIZES: Final = {0x31: 9, 0x32: 14, 0x33: 21, 0x34: 21, 0xE3: 8}
-"""Bytes behind a message's kind."""
+_SIZES: Final = {0x31: 9, 0x32: 14, 0x33: 21, 0x34: 21, 0xE3: 8}  # bytes behind a message's kind
 _START: Final = re.compile(rb"\x1a(?=[\x31-\x34\xe3])")
 _MLAT: Final = b"\xff\x00MLAT"
 _TICK_NS: Final = 1000 / 12

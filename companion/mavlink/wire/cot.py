@@ -14,8 +14,7 @@ from datetime import UTC, datetime
 from typing import Any, Final, NamedTuple
 from xml.parsers import expat
 
-DEPTH_MAX: Final = 32
-"""Elements within one another that are read."""
+DEPTH_MAX: Final = 32  # elements within one another that are read
 UNKNOWN: Final = 9_999_999.0
 OWN: Final = "uav-companion-beams."
 """What the ids begin with of events that this program says of others."""

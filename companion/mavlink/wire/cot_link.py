@@ -29,10 +29,8 @@ from companion.values import (
 )
 
 TUNNEL: Final = 385
-SENDER: Final = Source(0, 25)
-"""Who says it: no system, MAV_COMP_ID_USER1."""
-EVENT_MAX: Final = 16 << 10
-"""Bytes of an event at most; a longer one is garbage."""
+SENDER: Final = Source(0, 25)  # who says it: no system, MAV_COMP_ID_USER1
+EVENT_MAX: Final = 16 << 10  # bytes of an event at most; a longer one is garbage
 _KIND: Final = 0xC07A
 _EVENT = struct.Struct("<Qii6f")
 _HEAD = struct.Struct("<HBBB")

@@ -11,10 +11,8 @@ from xml.sax.saxutils import escape, quoteattr
 
 from companion.mavlink.wire.cot import OWN, UNKNOWN
 
-KIND: Final = "a-u-A"
-"""Something that flies, and of which nobody said whose it is."""
-HOW: Final = "m-f"
-"""By a machine, from several reports."""
+KIND: Final = "a-u-A"  # something that flies, and of which nobody said whose it is
+HOW: Final = "m-f"  # by a machine, from several reports
 
 
 class Place(NamedTuple):

@@ -280,5 +280,4 @@ _DECODERS: Final[dict[int, Callable[[Frame], Message | None]]] = {
     cot_link.TUNNEL: _tunnel,
     **dict.fromkeys(remote_id.READ, _remote_id),
 }
-DECODED: Final = frozenset(_DECODERS)
-"""Message ids that ``decode`` reads."""
+DECODED: Final = frozenset(_DECODERS)  # message ids that decode reads

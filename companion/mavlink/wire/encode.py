@@ -96,25 +96,20 @@ def global_position_int(
 class UtmPosition:
     """What UTM_GLOBAL_POSITION says; None: not known.
 
-    utc_ns            time of the position
     lat_deg, lon_deg  WGS84
-    hae_m             height above the ellipsoid
-    relative_alt_m    height above home
-    velocity_ned_mps  over ground
     horizontal_m, vertical_m
                       said as its uncertainties
-    every_s           time between two of them
     """
 
-    utc_ns: int
+    utc_ns: int  # time of the position
     lat_deg: float
     lon_deg: float
-    hae_m: float | None
-    relative_alt_m: float | None
-    velocity_ned_mps: tuple[float, float, float]
+    hae_m: float | None  # height above the ellipsoid
+    relative_alt_m: float | None  # height above home
+    velocity_ned_mps: tuple[float, float, float]  # over ground
     horizontal_m: float
     vertical_m: float
-    every_s: float
+    every_s: float  # time between two of them
 
 
 def utm_global_position(source: Source, said: UtmPosition) -> Outgoing:

@@ -24,11 +24,9 @@ from companion.values import Frame, Reason, Rejection, Source
 
 MAGIC_V1: Final = 0xFE
 MAGIC_V2: Final = 0xFD
-SIGNED: Final = 0x01
-"""The only incompatibility flag defined; frames with any other must be dropped."""
+SIGNED: Final = 0x01  # the only incompatibility flag defined; frames with any other must be dropped
 
-SHORTEST: Final = 8
-"""Bytes of a MAVLink 1 frame without a payload."""
+SHORTEST: Final = 8  # bytes of a MAVLink 1 frame without a payload
 KNOWN_MAX: Final = 8192
 """Distinct pairs of sender and message of which a stream keeps what it knows."""
 
@@ -37,10 +35,7 @@ NOT_A_FRAME: Final = -1
 UNKNOWN_MESSAGE: Final = -2
 BAD_CRC: Final = -3
 
-_REASON: Final = {
-    UNKNOWN_MESSAGE: Reason.UNKNOWN_MESSAGE,
-    BAD_CRC: Reason.BAD_CRC,
-}
+_REASON: Final = {UNKNOWN_MESSAGE: Reason.UNKNOWN_MESSAGE, BAD_CRC: Reason.BAD_CRC}
 _SEED: Final = {msgid: bytes([seed]) for msgid, seed in CRC_EXTRA.items()}
 _mcrf4xx = crc16.mcrf4xx
 _find_magic = re.compile(b"[\xfd\xfe]").search
@@ -175,8 +170,7 @@ class Splitter:
 
     def __init__(self, link: str, wanted: frozenset[int] | None = None) -> None:
         self.link = link
-        self.frames = 0
-        """Frames whose checksum held, wanted or not."""
+        self.frames = 0  # frames whose checksum held, wanted or not
         self._wanted = wanted
         self._pending = b""
         self._claimed = 0  # bytes ahead that a failed frame laid claim to

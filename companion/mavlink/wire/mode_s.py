@@ -16,8 +16,7 @@ from typing import Final
 
 from companion.mavlink.wire.transponder import Said
 
-SIZE: Final = 14
-"""Bytes of an extended squitter."""
+SIZE: Final = 14  # bytes of an extended squitter
 PAIR_NS: Final = 10_000_000_000
 """Greatest time between the even and the odd position that are one place (DO-260B, A.1.7.7)."""
 STATUS_NS: Final = 30_000_000_000

@@ -21,23 +21,17 @@ GLOBAL_POSITION_INT: Final = 33
 class OwnPosition(NamedTuple):
     """A position that a vehicle sent of itself; None stands for what its message does not have.
 
-    boot_ms           milliseconds since the vehicle's boot when the position was true
     lat_1e7, lon_1e7  WGS84, 1e-7 degrees
-    alt_m             height above mean sea level
-    relative_alt_m    height above home
-    velocity_ned_mps  north, east, down
-    heading_deg       from true north, clockwise
-    accuracy          accuracy that the message states
     """
 
-    boot_ms: int
+    boot_ms: int  # milliseconds since the vehicle's boot when the position was true
     lat_1e7: int
     lon_1e7: int
-    alt_m: float
-    relative_alt_m: float | None
-    velocity_ned_mps: Vector | None
-    heading_deg: float | None
-    accuracy: Accuracy | None = None
+    alt_m: float  # height above mean sea level
+    relative_alt_m: float | None  # height above home
+    velocity_ned_mps: Vector | None  # north, east, down
+    heading_deg: float | None  # from true north, clockwise
+    accuracy: Accuracy | None = None  # accuracy that the message states
 
 
 class PositionMessage(NamedTuple):
@@ -76,8 +70,7 @@ POSITIONS: Final = {
 }
 """Messages that carry a position, or may, by id."""
 _READERS: Final = {msgid: one.read for msgid, one in POSITIONS.items() if one.read is not None}
-OWN: Final = frozenset(_READERS)
-"""Messages in which vehicles report their own positions."""
+OWN: Final = frozenset(_READERS)  # messages in which vehicles report their own positions
 
 
 def read(frame: Frame) -> OwnPosition:

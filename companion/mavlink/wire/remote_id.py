@@ -21,8 +21,7 @@ BASIC_ID: Final = 12900
 LOCATION: Final = 12901
 SYSTEM: Final = 12904
 MESSAGE_PACK: Final = 12915
-RECEIVERS: Final = range(236, 239)
-"""Components that hear others (MAV_COMP_ID_ODID_TXRX_1 to 3)."""
+RECEIVERS: Final = range(236, 239)  # components that hear others (MAV_COMP_ID_ODID_TXRX_1 to 3)
 _UNPLACED: Final = (0, 0)
 _NO_ALTITUDE_M: Final = -1000.0
 _MESSAGE_BYTES: Final = 25
@@ -132,8 +131,7 @@ def _packed_place(message: bytes) -> "_Place":
 
 
 _READERS: Final = {BASIC_ID: _basic_id, LOCATION: _location, SYSTEM: _system, MESSAGE_PACK: _pack}
-READ: Final = frozenset(_READERS)
-"""Message ids that ``remote_id`` reads."""
+READ: Final = frozenset(_READERS)  # message ids that remote_id reads
 
 
 def _identified(said: RemoteId, kind: int, uas_id: bytes) -> RemoteId:

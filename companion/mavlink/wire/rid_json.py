@@ -22,13 +22,10 @@ from companion.mavlink.wire.encode import Outgoing, pack
 from companion.mavlink.wire.remote_id import BASIC_ID, LOCATION, SYSTEM
 from companion.values import Frame, Reason, Rejection, Source
 
-SENDER: Final = Source(0, 236)
-"""Who says it: no system, MAV_COMP_ID_ODID_TXRX_1."""
-OBJECT_MAX: Final = 16 << 10
-"""Bytes of an object at most; a longer one is garbage."""
+SENDER: Final = Source(0, 236)  # who says it: no system, MAV_COMP_ID_ODID_TXRX_1
+OBJECT_MAX: Final = 16 << 10  # bytes of an object at most; a longer one is garbage
 _UNKNOWN_STAMP_S: Final = 65_535.0
-_BY_SECOND: Final = 10
-"""MAV_ODID_TIME_ACC of a stamp in whole seconds."""
+_BY_SECOND: Final = 10  # MAV_ODID_TIME_ACC of a stamp in whole seconds
 _BASIC_ID = struct.Struct("<2x20sBB20s")
 _LOCATION = struct.Struct("<iiffffHHh2x20s7B")
 _SYSTEM = struct.Struct("<24xH4x20s4x")

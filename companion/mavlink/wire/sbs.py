@@ -18,8 +18,7 @@ from typing import Final
 from companion.mavlink.wire.transponder import ADSB_VEHICLE, Said, frame
 from companion.values import Frame, Reason, Rejection
 
-LINE_MAX: Final = 512
-"""Bytes of a line at most; a longer one is garbage."""
+LINE_MAX: Final = 512  # bytes of a line at most; a longer one is garbage
 _SILENT: Final = frozenset((b"SEL", b"ID", b"AIR", b"STA", b"CLK"))
 """Lines about the writer's own display."""
 _NUMBER: Final = re.compile(r"-?\d{1,9}(?:\.\d{1,9})?")

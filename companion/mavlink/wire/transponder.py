@@ -13,8 +13,7 @@ from companion.mavlink.wire.encode import Outgoing, pack
 from companion.values import Frame, Source
 
 ADSB_VEHICLE: Final = 246
-SENDER: Final = Source(0, 156)
-"""Who says it: no system, MAV_COMP_ID_ADSB."""
+SENDER: Final = Source(0, 156)  # who says it: no system, MAV_COMP_ID_ADSB
 _LAYOUT: Final = struct.Struct("<IiiiHHhHHB9sBBBBB")
 _COORDS, _ALTITUDE, _HEADING, _VELOCITY, _CALLSIGN, _VERTICAL = 1, 2, 4, 8, 16, 128  # ADSB_FLAGS
 _PRESSURE, _GEOMETRIC = 0, 1  # ADSB_ALTITUDE_TYPE

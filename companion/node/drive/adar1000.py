@@ -17,8 +17,7 @@ RX_GAIN: Final = 0x10
 RX_MODULATOR: Final = 0x14
 LOAD: Final = 0x28
 LOAD_RX: Final = 0x01
-BYPASSED: Final = 0x80
-"""Bit of a gain register that takes the attenuator out."""
+BYPASSED: Final = 0x80  # bit of a gain register that takes the attenuator out
 FULL_GAIN: Final = BYPASSED | 127
 CLOCK_HZ: Final = 10_000_000
 

@@ -40,12 +40,7 @@ class Gimbal:
     takes = Takes.POINTING
 
     def __init__(
-        self,
-        *,
-        host: str,
-        port: int,
-        target: Source,
-        now_ns: Callable[[], int] = time.monotonic_ns,
+        self, *, host: str, port: int, target: Source, now_ns: Callable[[], int] = time.monotonic_ns
     ) -> None:
         self._address = host, port
         self.target = target

@@ -7,11 +7,9 @@ import numpy as np
 
 from companion.values import FloatArray
 
-MOST_S: Final = 2.0
-"""Greatest lag that is looked for."""
+MOST_S: Final = 2.0  # greatest lag that is looked for
 STEP_S: Final = 0.01
-FEWEST: Final = 20
-"""Reports from which on a lag is told."""
+FEWEST: Final = 20  # reports from which on a lag is told
 LEAST_RAD: Final = np.radians(2.0)
 """Movement over the time that is kept, below which the lag stays what it was."""
 MOST_LEFT: Final = 0.2

@@ -17,12 +17,9 @@ import numpy as np
 
 from companion.values import IntArray, UserError
 
-REMEMBERED: Final = 1000
-"""Updates of which times are kept."""
-LEADING: Final = 51
-"""Updates whose median time is the next one's lead."""
-AGAIN_NS: Final = 1_000_000_000
-"""Time between two attempts to reach a device."""
+REMEMBERED: Final = 1000  # updates of which times are kept
+LEADING: Final = 51  # updates whose median time is the next one's lead
+AGAIN_NS: Final = 1_000_000_000  # time between two attempts to reach a device
 LATE_SHARE: Final = 0.1
 """Share of the time between two updates by which one may come after its moment."""
 
@@ -55,26 +52,20 @@ class SourceLostError(Exception):
 class Shot:
     """What is to be applied.
 
-    valid_at_ns  for when it is right
-    unfit        why there is nothing to apply; None: there is
-    uav          who is served
-    bearing_rad  from true north, clockwise
-    above_rad    above the horizon
     place        of the UAV: latitude and longitude in degrees, height above mean sea level in
                  metres; None where it is not known
     registers    (M, 8), as the text for ADAR1000 has them: chip, channel, element, phase code,
                  gain code, attenuator, I and Q; None where nobody asked
-    stored       index of the codebook's best beam; None where nobody asked
     """
 
-    valid_at_ns: int
-    unfit: str | None
-    uav: str = ""
-    bearing_rad: float = 0.0
-    above_rad: float = 0.0
+    valid_at_ns: int  # for when it is right
+    unfit: str | None  # why there is nothing to apply; None: there is
+    uav: str = ""  # who is served
+    bearing_rad: float = 0.0  # from true north, clockwise
+    above_rad: float = 0.0  # above the horizon
     place: tuple[float, float, float] | None = None
     registers: IntArray | None = None
-    stored: int | None = None
+    stored: int | None = None  # index of the codebook's best beam; None where nobody asked
 
 
 class Source(Protocol):
@@ -87,11 +78,10 @@ class Source(Protocol):
 class Device(Protocol):
     """What beams are applied to. Every method may raise ``DeviceError``.
 
-    takes   what a shot needs to say
     lead_s  lag that the device shows by itself; None: the time to apply is all
     """
 
-    takes: Takes
+    takes: Takes  # what a shot needs to say
 
     @property
     def lead_s(self) -> float | None: ...
@@ -111,25 +101,18 @@ class Device(Protocol):
 class Told:
     """How it goes.
 
-    applied        updates that the device has taken
-    rate_hz        of late; None before there is one
     p50_ms, p99_ms time from asking to applied; None before there is one
-    lead_ms        what is asked ahead now
-    late           updates that were applied after their moment
-    skipped        moments that were left out, since the device was not ready
-    failures       of the device; each is followed by a new attempt
-    resting        why there is nothing to apply; None: there is
     """
 
-    applied: int
-    rate_hz: float | None
+    applied: int  # updates that the device has taken
+    rate_hz: float | None  # of late; None before there is one
     p50_ms: float | None
     p99_ms: float | None
-    lead_ms: float
-    late: int
-    skipped: int
-    failures: int
-    resting: str | None
+    lead_ms: float  # what is asked ahead now
+    late: int  # updates that were applied after their moment
+    skipped: int  # moments that were left out, since the device was not ready
+    failures: int  # of the device; each is followed by a new attempt
+    resting: str | None  # why there is nothing to apply; None: there is
 
 
 class Drive:

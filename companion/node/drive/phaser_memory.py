@@ -13,8 +13,7 @@ from companion.node.drive.loop import DeviceError, Safe, Shot, Takes
 from companion.node.drive.phaser import DEGREES, ELEMENTS, FULL_GAIN, Phaser
 from companion.values import IntArray, UserError
 
-POSITIONS: Final = 121
-"""Beams that an ADAR1000 stores for reception."""
+POSITIONS: Final = 121  # beams that an ADAR1000 stores for reception
 BORESIGHT: Final = POSITIONS - 2
 MUTE: Final = POSITIONS - 1
 

@@ -9,8 +9,7 @@ from typing import Final
 from companion.node.drive.loop import Drive, Told
 
 TOLD_EVERY_S: Final = 1.0
-ENDS_S: Final = 5.0
-"""Time for a device to go to its safe state at the end."""
+ENDS_S: Final = 5.0  # time for a device to go to its safe state at the end
 
 
 def until_told(drive: Drive, show: Callable[[Told], None], seconds: float | None) -> None:

@@ -25,10 +25,8 @@ from companion.views.as_json import as_json
 from companion.views.quantised import device_table
 
 ADAR1000: Final = WeightFormat.ADAR1000.media_type
-LEAST_MEAN: Final = 0.1
-"""Length of the mean of unit directions below which they have no middle."""
-ANSWERS_S: Final = 5.0
-"""Time after which an event loop that does not answer is lost."""
+LEAST_MEAN: Final = 0.1  # length of the mean of unit directions below which they have no middle
+ANSWERS_S: Final = 5.0  # time after which an event loop that does not answer is lost
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

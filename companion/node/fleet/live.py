@@ -28,22 +28,16 @@ from companion.views.served import FleetStatus
 
 PREFIX: Final = "companion"
 PRIORITY: Final = "data_high"
-STANDING_S: Final = 0.2
-"""Time between two words of this node on what it does."""
-ASKED_S: Final = 0.5
-"""Time between two questions for another node's clock."""
-ANSWERED_S: Final = 3.0
-"""Longest time that an answer may take."""
+STANDING_S: Final = 0.2  # time between two words of this node on what it does
+ASKED_S: Final = 0.5  # time between two questions for another node's clock
+ANSWERED_S: Final = 3.0  # longest time that an answer may take
 PATIENCE_S: Final = 6.0
 """Least time without answers of a node that is there, after which all is connected anew."""
-RETRY_S: Final = 2.0
-"""Time after which a session that could not be opened again is tried once more."""
-PATIENCE_LEASES: Final = 4.0
-"""The least such time in leases."""
+RETRY_S: Final = 2.0  # time after which a session that could not be opened again is tried once more
+PATIENCE_LEASES: Final = 4.0  # the least such time in leases
 LOOK_S: Final = 0.3
 """Time between two looks at what to offer; its multiples are not those of updates."""
-OFFERED_S: Final = 1.0
-"""Time between two tellings of offers, and of tracks."""
+OFFERED_S: Final = 1.0  # time between two tellings of offers, and of tracks
 
 
 class FleetNode:

@@ -14,8 +14,7 @@ from google.protobuf.message import DecodeError
 from companion.recording import codec, schemas
 from companion.values import Offer, Shared, SharedFrame, Standing
 
-FRAMES_MAX: Final = 4096
-"""Most frames, or round trips, of one message."""
+FRAMES_MAX: Final = 4096  # most frames, or round trips, of one message
 CLOCK: Final = struct.Struct("<qq")
 """Answer to a question for the clock: when the node started, and its time now; ns."""
 OFFERS_MAX: Final = 10_000
@@ -58,10 +57,7 @@ def to_shared(data: bytes) -> Shared:
 def standing(said: Standing) -> bytes:
     """What a node says of itself."""
     message = schemas.StandingMessage(
-        node=said.node,
-        place=said.place or (),
-        reach_m=said.reach_m,
-        most=said.most,
+        node=said.node, place=said.place or (), reach_m=said.reach_m, most=said.most
     )
     for uav, worth_db in said.serves:
         message.serves.add(uav=uav, worth_db=worth_db)

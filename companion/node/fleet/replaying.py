@@ -16,10 +16,8 @@ from companion.settings.model import sections
 from companion.settings.section import ConfigError
 from companion.values import Duty, Frame
 
-TOLD_EVERY: Final = 20_000
-"""Frames between two calls of ``progress``."""
-SAMPLE_NS: Final = 100_000_000
-"""Time between two looks at who serves whom."""
+TOLD_EVERY: Final = 20_000  # frames between two calls of progress
+SAMPLE_NS: Final = 100_000_000  # time between two looks at who serves whom
 
 
 @dataclass(slots=True, kw_only=True)

@@ -23,14 +23,11 @@ from companion.values import FloatArray, IntArray, Offer
 
 UNSURE_DB: Final = 10.0
 """How much less a gain that is only likely is worth than one that is guaranteed."""
-STEP_DB: Final = 0.1
-"""Offers are told in whole steps, so that every node has the same numbers."""
+STEP_DB: Final = 0.1  # offers are told in whole steps, so that every node has the same numbers
 NOBODY_DB: Final = -1e6
 """What it is worth to be served by nobody: so little that whoever can be served is."""
-MOVES: Final = 1000
-"""Most rings of moves that one decision makes."""
-ROUNDING_DB: Final = 1e-7
-"""What is less is no gain, but arithmetic."""
+MOVES: Final = 1000  # most rings of moves that one decision makes
+ROUNDING_DB: Final = 1e-7  # what is less is no gain, but arithmetic
 
 
 def worth_db(offer: Offer) -> float | None:

@@ -22,8 +22,7 @@ from companion.values.described import Meaning
 
 GRACE_NS: Final = 500_000_000
 """Time without a holder after which a UAV is claimed: longer than a word takes to come."""
-ASSIGNED_NS: Final = 500_000_000
-"""Time between two assignments while the same nodes are there."""
+ASSIGNED_NS: Final = 500_000_000  # time between two assignments while the same nodes are there
 SETTLED_NS: Final = 2_000_000_000
 """Time for which a UAV must belong elsewhere before it is handed over."""
 
@@ -166,10 +165,7 @@ class Duties:
         self._elsewhere.pop(uav, None)
 
     def _hand_over(
-        self,
-        now_ns: int,
-        wanted: Mapping[str, str],
-        offers: Mapping[str, Mapping[str, float]],
+        self, now_ns: int, wanted: Mapping[str, str], offers: Mapping[str, Mapping[str, float]]
     ) -> None:
         """Say of UAVs that have belonged elsewhere for long who is to take them."""
         for uav in self.serves:

@@ -20,14 +20,11 @@ from companion.values import Frame, SharedFrame, Source
 
 SHARED: Final = OWN | {HEARTBEAT, GPS_RAW_INT}
 """Messages that nodes tell one another: where a vehicle is, how exact, and what it is."""
-KEPT_NS: Final = 10_000_000_000
-"""How long it is remembered what was heard, and by whom."""
+KEPT_NS: Final = 10_000_000_000  # how long it is remembered what was heard, and by whom
 SILENT_INTERVALS: Final = 2.5
 """Usual intervals without a report after which a vehicle is silent here."""
-SILENT_NS: Final = (200_000_000, 2_000_000_000)
-"""Least and greatest time for that."""
-MISSED: Final = 64
-"""Reports kept of each vehicle that were told by others and not heard here."""
+SILENT_NS: Final = (200_000_000, 2_000_000_000)  # least and greatest time for that
+MISSED: Final = 64  # reports kept of each vehicle that were told by others and not heard here
 VEHICLES_MAX: Final = 4096
 """Vehicles followed; one more is followed by nobody's ears, and its reports are taken as told."""
 FUTURE_NS: Final = 1_000_000

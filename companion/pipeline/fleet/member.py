@@ -33,14 +33,12 @@ from companion.values import (
     Vector,
 )
 
-NODES_MAX: Final = 256
-"""Other nodes followed; one more is not heard."""
+NODES_MAX: Final = 256  # other nodes followed; one more is not heard
 HANDOVERS_KEPT: Final = 500
 OFFERS_KEPT_NS: Final = 10_000_000_000
 """How long a node's offers stand while it says nothing new of them."""
 FORGET_NS: Final = 600_000_000_000
-GONE_MAX: Final = 64
-"""Nodes that went, and are remembered."""
+GONE_MAX: Final = 64  # nodes that went, and are remembered
 
 ToLocal = Callable[[Place], Vector]
 

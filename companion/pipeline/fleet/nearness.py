@@ -15,8 +15,7 @@ from companion.values import Standing
 Place = tuple[float, float, float]
 COMES: Final = 1.1
 """Share of both reaches within which a node is near: more than 1, as reach is what was heard."""
-GOES: Final = 1.3
-"""Share of both beyond which one that was near is so no more."""
+GOES: Final = 1.3  # share of both beyond which one that was near is so no more
 ALWAYS_M: Final = 10_000.0
 """Distance that is near whatever is heard: the farthest vehicle of a moment is no array's limit."""
 

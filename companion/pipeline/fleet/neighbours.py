@@ -23,8 +23,7 @@ DRIFT_MAX: Final = 200e-6
 ANSWERS: Final = 3
 """Answers from which on what a node hears is used: the first, slow one would leave its doubt."""
 WAYS_KEPT: Final = 4096
-WAYS_NS: Final = 60_000_000_000
-"""How long it counts how long a report was on its way."""
+WAYS_NS: Final = 60_000_000_000  # how long it counts how long a report was on its way
 TOLD_APART_NS: Final = 100_000_000
 """Difference of two nodes' clocks from which on it is told: with NTP there is none."""
 
@@ -73,22 +72,15 @@ class NeighbourClock:
 
 @dataclass(slots=True, kw_only=True)
 class Neighbour:
-    """Another node, as it is known here.
+    """Another node, as it is known here."""
 
-    clock       its clock
-    standing    what it said last of itself; None before it did
-    offers      its offers by UAV
-    frames      frames that it told, ``used`` those that the pipeline had
-    heard_ns    when there was word of it last
-    """
-
-    clock: NeighbourClock
+    clock: NeighbourClock  # its clock
     started_ns: int | None = None
-    standing: Standing | None = None
-    heard_ns: int = 0
+    standing: Standing | None = None  # what it said last of itself; None before it did
+    heard_ns: int = 0  # when there was word of it last
     offered_ns: int = 0
-    offers: dict[str, Offer] | None = None
-    frames: int = 0
+    offers: dict[str, Offer] | None = None  # its offers by UAV
+    frames: int = 0  # frames that it told, used those that the pipeline had
     used: int = 0
     apart_told: bool = False
     _ways_ns: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=WAYS_KEPT))

@@ -17,10 +17,8 @@ from companion.pipeline.fleet.assignment import STEP_DB
 from companion.pipeline.fold import Pipeline
 from companion.values import BeamSet, Method, Offer, Policy, Power
 
-ROUND_NS: Final = 2_000_000_000
-"""Time in which every UAV has its turn."""
-LEAST: Final = 2
-"""UAVs at least that one call makes offers for."""
+ROUND_NS: Final = 2_000_000_000  # time in which every UAV has its turn
+LEAST: Final = 2  # UAVs at least that one call makes offers for
 
 
 class Offers:

@@ -17,10 +17,8 @@ from companion.values import Frame, RoundTrip, Shared, SharedFrame, Source
 
 HOLD_NS: Final = (60_000_000, 2_000_000_000)
 """Least and greatest time for which a report is held back: longer than a word from another node."""
-HOLD: Final = 1.5
-"""Multiple of the longest way of another's word for which a report is held."""
-FADES: Final = 0.999
-"""Share of that time that is left after each report that another told in time."""
+HOLD: Final = 1.5  # multiple of the longest way of another's word for which a report is held
+FADES: Final = 0.999  # share of that time that is left after each report that another told in time
 SPEAKS_AFTER: Final = 2
 """Reports in a row that nobody else told, after which this node speaks for the vehicle."""
 HELD_MAX: Final = 20_000

@@ -17,13 +17,10 @@ from typing import Final, NamedTuple
 
 from companion.values import Notice, Severity
 
-TIMES: Final = 3
-"""Contradictions within ``WITHIN_NS`` after which a node is put aside."""
+TIMES: Final = 3  # contradictions within WITHIN_NS after which a node is put aside
 WITHIN_NS: Final = 30_000_000_000
-ASIDE_NS: Final = 300_000_000_000
-"""How long a node is put aside before it is tried again."""
-PHANTOMS: Final = 2
-"""Vehicles that nobody else can hear, from which on their node is put aside."""
+ASIDE_NS: Final = 300_000_000_000  # how long a node is put aside before it is tried again
+PHANTOMS: Final = 2  # vehicles that nobody else can hear, from which on their node is put aside
 UNHEARD_NS: Final = 8_000_000_000
 """Time after which a vehicle that others ought to hear is one that they cannot."""
 REACH_SHARE: Final = 0.7
@@ -31,16 +28,11 @@ REACH_SHARE: Final = 0.7
 
 
 class Witness(NamedTuple):
-    """A node that can say whether a vehicle is where another says.
+    """A node that can say whether a vehicle is where another says."""
 
-    place_ned_m  of its array, in the local frame
-    reach_m      distance of the farthest vehicle that it hears itself
-    heard        vehicles that it has heard itself
-    """
-
-    place_ned_m: tuple[float, float, float]
-    reach_m: float
-    heard: frozenset[str]
+    place_ned_m: tuple[float, float, float]  # of its array, in the local frame
+    reach_m: float  # distance of the farthest vehicle that it hears itself
+    heard: frozenset[str]  # vehicles that it has heard itself
 
 
 class Told(NamedTuple):

@@ -20,18 +20,15 @@ RECEIVER_LAG_S: Final = 0.2
 
 Two logs are put together no better than their receivers differ in it.
 """
-GPS_EPOCH_S: Final = 315_964_800
-"""1980-01-06, Unix time."""
+GPS_EPOCH_S: Final = 315_964_800  # 1980-01-06, Unix time
 WEEK_S: Final = 604_800
 _LEAPS: Final = (
     (1_483_228_800, 18), (1_435_708_800, 17), (1_341_100_800, 16), (1_230_768_000, 15),
     (1_136_073_600, 14),
 )  # fmt: skip
 """Unix time from which GPS time has been ahead by so many seconds; 13 before 2006."""
-FIRST_UNIX_US: Final = 1_104_537_600_000_000
-"""2005: there was no such log before."""
-LAST_UNIX_US: Final = 4_102_444_800_000_000
-"""The year 2100. A time outside is no time."""
+FIRST_UNIX_US: Final = 1_104_537_600_000_000  # 2005: there was no such log before
+LAST_UNIX_US: Final = 4_102_444_800_000_000  # the year 2100. A time outside is no time
 _APART_US: Final = 1_000_000
 """How far differences may be apart for one clock; others are of a receiver without the time."""
 _POINTS: Final = 100
@@ -42,17 +39,13 @@ _RESOLUTION_S: Final = 1e-3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GpsTime:
-    """Unix time of a boot clock: ``boot + offset + drift * (boot - at)``.
-
-    uncertainty_s  what 95 of 100 fixes stray from it at most, and at least a millisecond
-    fixes          how many fixes it rests on
-    """
+    """Unix time of a boot clock: ``boot + offset + drift * (boot - at)``."""
 
     offset_us: int
     drift: float
     at_us: int
-    uncertainty_s: float
-    fixes: int
+    uncertainty_s: float  # what 95 of 100 fixes stray from it at most, and at least a millisecond
+    fixes: int  # how many fixes it rests on
 
     def unix_us(self, boot_us: IntArray) -> IntArray:
         """Unix times (N,) of boot times (N,), microseconds."""

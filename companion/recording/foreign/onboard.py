@@ -13,8 +13,7 @@ import numpy as np
 from companion.recording.foreign.gps_time import GpsTime
 from companion.values import BoolArray, FloatArray, IntArray, Reason
 
-REBOOT_US: Final = 10_000_000
-"""A step back of a boot clock that is no mere disorder in the file."""
+REBOOT_US: Final = 10_000_000  # a step back of a boot clock that is no mere disorder in the file
 _NEAR: Final = 4
 _WILD_US: Final = 120_000_000
 """How far a stamp may be off the middle of those around it in the file."""
@@ -25,21 +24,16 @@ METRES_PER_DEGREE: Final = 111_195.0
 class Positions:
     """Estimated positions.
 
-    boot_us           (N,)
     lat_1e7, lon_1e7  (N,), 1e-7 degrees
-    alt_m             (N,), above mean sea level
-    height_m          (N,), above home
-    velocity_ned_mps  (N, 3)
-    heading_deg       (N,), from true north; NaN: unknown
     """
 
-    boot_us: IntArray
+    boot_us: IntArray  # (N,)
     lat_1e7: IntArray
     lon_1e7: IntArray
-    alt_m: FloatArray
-    height_m: FloatArray
-    velocity_ned_mps: FloatArray
-    heading_deg: FloatArray
+    alt_m: FloatArray  # (N,), above mean sea level
+    height_m: FloatArray  # (N,), above home
+    velocity_ned_mps: FloatArray  # (N, 3)
+    heading_deg: FloatArray  # (N,), from true north; NaN: unknown
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,25 +47,18 @@ class Attitudes:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Fixes:
-    """What the satellite receiver in use said, (N,) each.
-
-    unix_us      the time of the fix; 0: unknown
-    fix_type     MAVLink's GPS_FIX_TYPE
-    accuracies   (N, 3): horizontal m, vertical m, speed m/s; NaN: unknown
-    speed_mps    over ground
-    course_deg   over ground, from true north
-    """
+    """What the satellite receiver in use said, (N,) each."""
 
     boot_us: IntArray
-    unix_us: IntArray
-    fix_type: IntArray
+    unix_us: IntArray  # the time of the fix; 0: unknown
+    fix_type: IntArray  # MAVLink's GPS_FIX_TYPE
     satellites: IntArray
     lat_1e7: IntArray
     lon_1e7: IntArray
     alt_m: FloatArray
-    accuracies: FloatArray
-    speed_mps: FloatArray
-    course_deg: FloatArray
+    accuracies: FloatArray  # (N, 3): horizontal m, vertical m, speed m/s; NaN: unknown
+    speed_mps: FloatArray  # over ground
+    course_deg: FloatArray  # over ground, from true north
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -88,30 +75,20 @@ class Truth:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Onboard:
-    """The log of one vehicle.
+    """The log of one vehicle."""
 
-    sysid      its MAVLink system id, if the log says it
-    compid     its component id
-    mav_type   MAV_TYPE
-    autopilot  MAV_AUTOPILOT
-    armed      boot times and whether it was armed from then on
-    clock      its boot clock on GPS time; None where the log has no time
-    lost       what of the file could not be used
-    notes      what had to be made up for, for the user
-    """
-
-    sysid: int | None
-    compid: int
-    mav_type: int
-    autopilot: int
+    sysid: int | None  # its MAVLink system id, if the log says it
+    compid: int  # its component id
+    mav_type: int  # MAV_TYPE
+    autopilot: int  # MAV_AUTOPILOT
     positions: Positions | None
     attitudes: Attitudes | None = None
     fixes: Fixes | None = None
     truth: Truth | None = None
-    armed: tuple[tuple[int, bool], ...] = ()
-    clock: GpsTime | None = None
-    lost: Mapping[Reason, int] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    armed: tuple[tuple[int, bool], ...] = ()  # boot times and whether it was armed from then on
+    clock: GpsTime | None = None  # its boot clock on GPS time; None where the log has no time
+    lost: Mapping[Reason, int] = field(default_factory=dict)  # what of the file could not be used
+    notes: tuple[str, ...] = ()  # what had to be made up for, for the user
 
 
 # --- samples that can be used ---------------------------------------------------------------------

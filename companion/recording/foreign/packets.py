@@ -17,8 +17,7 @@ PCAP: Final = {
 }
 """The first bytes of a pcap: the order of its bytes, and nanoseconds of a unit of its stamps."""
 PCAPNG: Final = b"\x0a\x0d\x0d\x0a"
-_LARGEST: Final = 1 << 18
-"""Longest packet or block that is believed, bytes: no link carries more."""
+_LARGEST: Final = 1 << 18  # longest packet or block that is believed, bytes: no link carries more
 _INTERFACES_MAX: Final = 1024
 _SECTION, _INTERFACE, _SIMPLE, _ENHANCED = 0x0A0D0D0A, 1, 3, 6
 _NANOSECONDS_OPTION: Final = 9

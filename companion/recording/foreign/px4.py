@@ -135,10 +135,7 @@ def _degrees(of: Table, old: str, new: str) -> IntArray:
 
 
 def _fixes(gps: Table, lost: Lost) -> tuple[Fixes | None, GpsTime | None]:
-    lat_1e7, lon_1e7 = (
-        _degrees(gps, "lat", "latitude_deg"),
-        _degrees(gps, "lon", "longitude_deg"),
-    )
+    lat_1e7, lon_1e7 = (_degrees(gps, "lat", "latitude_deg"), _degrees(gps, "lon", "longitude_deg"))
     alt_m = gps.numbers("alt") * 1e-3 if "alt" in gps else gps.numbers("altitude_msl_m")
     sound = on_earth(lat_1e7, lon_1e7, alt_m, gps.numbers("fix_type"))
     _count(lost, Reason.MALFORMED, int((~sound).sum()))

@@ -13,8 +13,7 @@ from companion.recording.foreign.gps_time import GpsTime
 from companion.recording.foreign.onboard import Fixes, in_time, on_earth
 from companion.values import FloatArray, IntArray, Reason
 
-_BESIDE_US: Final = 5_000
-"""GPA is written with its GPS."""
+_BESIDE_US: Final = 5_000  # GPA is written with its GPS
 _LATE_US: Final = 2e6
 
 

@@ -28,8 +28,7 @@ READERS: Final[dict[str, Callable[[Bytes], Onboard]]] = {
     "csv": csv_table.read,
 }
 """What reads the log of one vehicle, by the kind of log."""
-KEPT: Final = 8
-"""Logs that are kept once they were read."""
+KEPT: Final = 8  # logs that are kept once they were read
 _NAMES: Final = {"dataflash": "DataFlash", "ulog": "ULog", "csv": "a table"}
 
 

@@ -59,22 +59,14 @@ class Topic(NamedTuple):
 
 @dataclass(slots=True, kw_only=True)
 class Walked:
-    """What a log holds.
+    """What a log holds."""
 
-    topics      of those wanted, the ones with samples
-    parameters  as they were at the start
-    lost        bytes that belong to no message
-    refused     descriptions and samples that do not fit one another
-    dropouts    how often the logger itself lost something
-    unknown     True if the file says that it cannot be read without knowing more
-    """
-
-    topics: list[Topic] = field(default_factory=list)
-    parameters: dict[str, float] = field(default_factory=dict)
-    lost: int = 0
-    refused: int = 0
-    dropouts: int = 0
-    unknown: bool = False
+    topics: list[Topic] = field(default_factory=list)  # of those wanted, the ones with samples
+    parameters: dict[str, float] = field(default_factory=dict)  # as they were at the start
+    lost: int = 0  # bytes that belong to no message
+    refused: int = 0  # descriptions and samples that do not fit one another
+    dropouts: int = 0  # how often the logger itself lost something
+    unknown: bool = False  # True if the file says that it cannot be read without knowing more
 
 
 class Table:

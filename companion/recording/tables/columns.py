@@ -8,8 +8,7 @@ from typing import Any, Final
 
 from companion.values.described import Member, members, unit
 
-Value = str | int | float | bool | None
-"""A value in a table; None: unknown, or not there."""
+Value = str | int | float | bool | None  # a value in a table; None: unknown, or not there
 _AXES: Final = ("north", "east", "down")
 
 

@@ -18,8 +18,7 @@ from companion.recording.tables.csv_file import CsvFile
 from companion.recording.tables.parquet_file import ParquetFile
 from companion.recording.writer import ACTIVE, open_alone, sync_folder
 
-CONTENTS: Final = "export.json"
-"""What an export holds; written last."""
+CONTENTS: Final = "export.json"  # what an export holds; written last
 
 
 class TableFile(Protocol):
@@ -48,8 +47,7 @@ class TableFolder:
     """
 
     def __init__(self, where: Path, form: str, tables: Sequence[Table]) -> None:
-        self.rows = {table.name: 0 for table in tables}
-        """Rows so far, by table."""
+        self.rows = {table.name: 0 for table in tables}  # rows so far, by table
         self._where, self._form = where, form
         self._tables = {table.name: table for table in tables}
         self._open: dict[str, BufferedWriter] = {}

@@ -9,8 +9,7 @@ from typing import IO, Any, Final
 from companion.recording.tables.columns import Column, Kind, Table, Value
 from companion.values.extras import needs
 
-BATCH: Final = 8192
-"""Rows of a group: as many are held in memory."""
+BATCH: Final = 8192  # rows of a group: as many are held in memory
 ALWAYS: Final = (Kind.INTEGER, Kind.TRUTH)
 
 

@@ -18,26 +18,18 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WIDTH_IN: Final = 7.2
-BINS: Final = 330
-"""Points of a line over time; the worst value of each bin is drawn."""
-RANGE_DB: Final = 35.0
-"""Range of gains drawn below the largest; lower ones are drawn at the edge."""
+BINS: Final = 330  # points of a line over time; the worst value of each bin is drawn
+RANGE_DB: Final = 35.0  # range of gains drawn below the largest; lower ones are drawn at the edge
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Kind:
-    """A gain that is drawn.
+    """A gain that is drawn."""
 
-    name     its name in the legend
-    line     number of its line style
-    value    reads it from a ``Worth``
-    unknown  whether None means "not known" rather than "nothing is guaranteed"
-    """
-
-    name: str
-    line: int
-    value: Callable[[Worth], float | None]
-    unknown: bool = False
+    name: str  # its name in the legend
+    line: int  # number of its line style
+    value: Callable[[Worth], float | None]  # reads it from a Worth
+    unknown: bool = False  # whether None means "not known" rather than "nothing is guaranteed
 
 
 KINDS: Final = (
@@ -160,10 +152,7 @@ def _least(samples: Sequence[Sample], edges: FloatArray, kind: Kind) -> FloatArr
 
 
 def _worst(
-    samples: Sequence[Sample],
-    edges: FloatArray,
-    value: Callable[[Sample], float],
-    worse: np.ufunc,
+    samples: Sequence[Sample], edges: FloatArray, value: Callable[[Sample], float], worse: np.ufunc
 ) -> FloatArray:
     """The worst value in each bin (B,); NaN for an empty bin, and for infinite values."""
     found = np.full(len(edges) - 1, np.nan)

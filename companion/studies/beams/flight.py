@@ -40,29 +40,23 @@ from companion.studies.truth.array_truth import ArrayTruth
 from companion.studies.truth.vehicles import named
 from companion.values import BeamSet, Carrier, FloatArray, Track, Update, UserError, Widen, kind_of
 
-TOLD_EVERY: Final = 20
-"""Looks between two reports of progress."""
+TOLD_EVERY: Final = 20  # looks between two reports of progress
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BeamStudy:
     """What is asked of the study.
 
-        flights   the logs, by flight
-        settings  those of each flight
-        hz        looks per second of log
-        center    as on the command line
-        config    as on the command line
         links     names of the links over which ways of making beams are compared; none: not at all
 
     Raises ``UserError`` for a rate out of range.
     """
 
-    flights: tuple[tuple[Path, ...], ...]
-    settings: tuple[Settings, ...]
-    hz: float = 5.0
-    center: str | None = None
-    config: str | None = None
+    flights: tuple[tuple[Path, ...], ...]  # the logs, by flight
+    settings: tuple[Settings, ...]  # those of each flight
+    hz: float = 5.0  # looks per second of log
+    center: str | None = None  # as on the command line
+    config: str | None = None  # as on the command line
     links: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -49,12 +49,9 @@ from companion.values import (
 
 RIVALS: Final = ("hold", "kalman-peng", "dead-reckoning-arrival")
 """Predictors whose beams are sharp and stand beside the product's."""
-LOOK_EVERY: Final = 4
-"""Ticks from one look to the next; beams are made at each."""
-ALIKE: Final = 0.9
-"""Correlation of two shapes of one beam below which it has changed."""
-JUMP_DB: Final = 1.0
-"""Change of a predicted gain from tick to tick that is a jump."""
+LOOK_EVERY: Final = 4  # ticks from one look to the next; beams are made at each
+ALIKE: Final = 0.9  # correlation of two shapes of one beam below which it has changed
+JUMP_DB: Final = 1.0  # change of a predicted gain from tick to tick that is a jump
 
 Row = dict[str, Any]
 

@@ -13,10 +13,7 @@ COMPARED: Final = (
     ("predicted gain, dB: 5 % / median", ("gain_p5_db", "gain_median_db")),
     ("true gain, dB: 5 % / median", ("true_gain_p5_db", "true_gain_median_db")),
     ("looks with a guarantee", ("guaranteed_share",)),
-    (
-        "guaranteed gain, dB: 5 % / median",
-        ("guaranteed_gain_p5_db", "guaranteed_gain_median_db"),
-    ),
+    ("guaranteed gain, dB: 5 % / median", ("guaranteed_gain_p5_db", "guaranteed_gain_median_db")),
     ("truly less than guaranteed / within the bound", ("violations", "violations_within_bound")),
     ("loss, dB: median / 95 %", ("loss_median_db", "loss_p95_db")),
     ("predicted SINR, dB: median", ("sinr_median_db",)),

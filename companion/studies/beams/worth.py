@@ -10,8 +10,7 @@ import numpy as np
 from companion.values import Method
 
 Row = dict[str, Any]
-ROUNDING_DB: Final = 1e-9
-"""Difference up to which a true gain below the guaranteed one is rounding."""
+ROUNDING_DB: Final = 1e-9  # difference up to which a true gain below the guaranteed one is rounding
 SHARP: Final = "sharp_"
 """Prefix of the keys for beams with ``[beams] widen = false``; others are for those as set."""
 
@@ -20,28 +19,19 @@ SHARP: Final = "sharp_"
 class Worth:
     """One beam at one time; gains are of the array in dB, element pattern included.
 
-    gain_db              towards the predicted direction
-    loss_db              what it lacks against a beam for the UAV alone
     guaranteed_gain_db   least gain within the pointing bound; None: nothing is guaranteed
-    true_gain_db         towards the true direction; None: it is not known
-    sinr_db              as predicted; -inf where no element faces the UAV
-    spectral_efficiency  bit/s/Hz, turns counted
-    group                number of its turn
-    widened              its main lobe was broadened
-    method               how the weights were made
-    condition_number     of the steering matrix
     """
 
-    gain_db: float
-    loss_db: float
+    gain_db: float  # towards the predicted direction
+    loss_db: float  # what it lacks against a beam for the UAV alone
     guaranteed_gain_db: float | None
-    true_gain_db: float | None
-    sinr_db: float
-    spectral_efficiency: float
-    group: int
-    widened: bool
-    method: Method
-    condition_number: float
+    true_gain_db: float | None  # towards the true direction; None: it is not known
+    sinr_db: float  # as predicted; -inf where no element faces the UAV
+    spectral_efficiency: float  # bit/s/Hz, turns counted
+    group: int  # number of its turn
+    widened: bool  # its main lobe was broadened
+    method: Method  # how the weights were made
+    condition_number: float  # of the steering matrix
 
     @property
     def violated(self) -> bool:
@@ -54,26 +44,20 @@ class Worth:
 class Sample:
     """One tracked UAV at one look. Without a beam all but the first two fields are None.
 
-    t_s                 seconds into the log
-    uav                 its name
     pointing_bound_rad  bound on the angle between predicted and true direction
-    off_rad             that angle
     codebook_best       index of the stored beam that serves the predicted direction best
     sweep_share         share of the codebook that must be swept to be sure of the best
-    missed              the truly best stored beam is not in that share
-    as_set              the beam that the settings make
-    sharp               the same beam not widened
     """
 
-    t_s: float
-    uav: str
+    t_s: float  # seconds into the log
+    uav: str  # its name
     pointing_bound_rad: float | None = None
-    off_rad: float | None = None
+    off_rad: float | None = None  # that angle
     codebook_best: int | None = None
     sweep_share: float | None = None
-    missed: bool | None = None
-    as_set: Worth | None = None
-    sharp: Worth | None = None
+    missed: bool | None = None  # the truly best stored beam is not in that share
+    as_set: Worth | None = None  # the beam that the settings make
+    sharp: Worth | None = None  # the same beam not widened
 
     @property
     def beyond(self) -> bool:

@@ -17,36 +17,29 @@ from scipy.optimize import least_squares
 
 from companion.values import BoolArray, FloatArray, IntArray
 
-LAGS: Final = tuple(step * 0.5 for step in range(9))
-"""Lags that are tried, samples."""
+LAGS: Final = tuple(step * 0.5 for step in range(9))  # lags that are tried, samples
 _STARTS: Final = ((0.5, -0.3), (0.5, 1.3), (-0.3, 0.5), (1.3, 0.5))
 _HEIGHT: Final = 0.3
 _HIGHEST: Final = 3.0
 _SLOPE: Final = 0.4
-_WIDEST_SLOPE: Final = 1.0
-"""Beams by sine, in codebooks: where the search begins, and at most."""
+_WIDEST_SLOPE: Final = 1.0  # beams by sine, in codebooks: where the search begins, and at most
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Geometry:
     """The array's place in normalised coordinates, and what else few numbers say.
 
-    stretch  log of the scale of the first axis to that of the second
-    yaw      the way that the array looks, rad
-    middle   the beam that looks there
-    slope    beams by sine of the angle from there
     height   of the flight above the array, in the scale of the second axis; one for all samples
-    lag      samples by which the beam is older than the position beside it
     """
 
     x: float
     y: float
-    stretch: float
-    yaw: float
-    middle: float
-    slope: float
+    stretch: float  # log of the scale of the first axis to that of the second
+    yaw: float  # the way that the array looks, rad
+    middle: float  # the beam that looks there
+    slope: float  # beams by sine of the angle from there
     height: float
-    lag: float
+    lag: float  # samples by which the beam is older than the position beside it
 
     def beams(self, place: FloatArray) -> FloatArray:
         """The beams that are expected at positions (N, 2) in order of time, with fractions."""

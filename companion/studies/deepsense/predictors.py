@@ -27,8 +27,7 @@ KERNELS: Final = tuple((width, weight) for width in (0.25, 0.5) for weight in (5
 """Widths of the kernel, in beams, and weights of the prior, in samples, that are tried."""
 _INNER: Final = (16, 4)
 _CELL: Final = 0.05
-_FAR: Final = 1.3
-"""Beams within which the prior falls to 1/e."""
+_FAR: Final = 1.3  # beams within which the prior falls to 1/e
 _REFLECTED: Final = 0.01
 
 

@@ -15,17 +15,13 @@ _STAYED: Final = 0.1
 class Samples:
     """What was measured, in order of time.
 
-    name       of the table
-    place      (N, 2), both coordinates from 0 to 1: which way they point is not known
-    beam       (N,), the beam of the greatest received power
-    beams      how many beams the codebook has
     power      (N, beams), received power of each, linear; None where the table has none
     """
 
-    name: str
-    place: FloatArray
-    beam: IntArray
-    beams: int
+    name: str  # of the table
+    place: FloatArray  # (N, 2), both coordinates from 0 to 1: which way they point is not known
+    beam: IntArray  # (N,), the beam of the greatest received power
+    beams: int  # how many beams the codebook has
     power: FloatArray | None = None
 
     def neighbours_alike(self) -> float:

@@ -21,8 +21,7 @@ PREDICTORS: Final[dict[str, Predictor]] = {
     "plain geometry": predictors.plain,
     "geometry and kernel": predictors.kernel,
 }
-TARGETS: Final = {1: 45.0, 3: 82.0, 5: 95.0}
-"""Percent on blocks that the product means to reach."""
+TARGETS: Final = {1: 45.0, 3: 82.0, 5: 95.0}  # percent on blocks that the product means to reach
 _CALIBRATION: Final = (16, 4)
 _AIMED: Final = 1 - 0.75 * (1 - COVERAGE)
 """A quarter of what sets may miss is held in reserve: other blocks are missed more often."""
@@ -33,10 +32,7 @@ def study(
 ) -> dict[str, Any]:
     """The answer as it is written to ``deepsense.json``."""
     count = len(samples.beam)
-    splits = {
-        "blocks": blocks(count, BLOCKS, FOLDS),
-        "shuffled": shuffled(count, FOLDS, seed),
-    }
+    splits = {"blocks": blocks(count, BLOCKS, FOLDS), "shuffled": shuffled(count, FOLDS, seed)}
     rows = []
     for split, folds in splits.items():
         for name, predictor in PREDICTORS.items():

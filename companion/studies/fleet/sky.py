@@ -20,22 +20,16 @@ class Sky:
     """What is flown around which nodes, and over which network.
 
     nodes, uavs   how many
-    spacing_m     between neighbouring nodes, on a square grid
-    reach_m       distance at which a node hears a UAV, and can serve it
-    report_hz     reports of a UAV
-    sampled       UAVs whose reports are told; the others are counted as alike
-    delay_s       one way between two nodes
-    loss          share of messages lost, 0 to 1
     """
 
     nodes: int
     uavs: int
-    spacing_m: float = 1500.0
-    reach_m: float = 2500.0
-    report_hz: float = 10.0
-    sampled: int = 50
-    delay_s: float = 0.02
-    loss: float = 0.0
+    spacing_m: float = 1500.0  # between neighbouring nodes, on a square grid
+    reach_m: float = 2500.0  # distance at which a node hears a UAV, and can serve it
+    report_hz: float = 10.0  # reports of a UAV
+    sampled: int = 50  # UAVs whose reports are told; the others are counted as alike
+    delay_s: float = 0.02  # one way between two nodes
+    loss: float = 0.0  # share of messages lost, 0 to 1
     seed: int = 1
 
 

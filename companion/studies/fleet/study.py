@@ -12,10 +12,8 @@ from companion.settings.fleet import FleetSettings
 from companion.studies.fleet.sky import Sky
 from companion.studies.fleet.world import Counted, World
 
-SETTLE_S = 8.0
-"""Virtual time that a fleet has to find who serves whom."""
-AFTER_S = 4.0
-"""Virtual time for which a fleet is watched after a node has died."""
+SETTLE_S = 8.0  # virtual time that a fleet has to find who serves whom
+AFTER_S = 4.0  # virtual time for which a fleet is watched after a node has died
 HALF = 0.5
 
 
@@ -24,31 +22,24 @@ class Grown:
     """A fleet of one size.
 
     nodes, uavs         how many
-    served              share of the time in which a UAV within reach had one node
     twice, none         in which it had several, or none
-    handovers_per_min   of all UAVs
     told_kbps           kilobits per second that a node tells, heads left out, by what it is
-    link_kbps           kilobits per second to a node, of all others together, heads included
-    cpu_share           processor time of a node over time, beside its pipeline
     takeover_s          time to the last of a dead node's UAVs being served, where any node can
-    orphans             UAVs that the dead node served
-    parted_none         share of the time unserved while the fleet is in two parts
-    heal_s              time from the end of that until no UAV has two nodes
     """
 
     nodes: int
     uavs: int
-    served: float
+    served: float  # share of the time in which a UAV within reach had one node
     twice: float
     none: float
-    handovers_per_min: float
+    handovers_per_min: float  # of all UAVs
     told_kbps: dict[str, float]
-    link_kbps: float
-    cpu_share: float
+    link_kbps: float  # kilobits per second to a node, of all others together, heads included
+    cpu_share: float  # processor time of a node over time, beside its pipeline
     takeover_s: float | None
-    orphans: int
-    parted_none: float
-    heal_s: float
+    orphans: int  # UAVs that the dead node served
+    parted_none: float  # share of the time unserved while the fleet is in two parts
+    heal_s: float  # time from the end of that until no UAV has two nodes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

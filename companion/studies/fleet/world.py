@@ -29,10 +29,8 @@ STANDING_TICKS: Final = 2
 OFFER_TICKS: Final = 10
 ASK_TICKS: Final = 5
 DEGREE_M: Final = 111_195.0
-ENTRY_S: Final = 2.0
-"""Time from a UAV's coming within reach until it counts as served or not."""
-STAGGER_NS: Final = 7_919_000
-"""Time by which the reports of two UAVs are apart."""
+ENTRY_S: Final = 2.0  # time from a UAV's coming within reach until it counts as served or not
+STAGGER_NS: Final = 7_919_000  # time by which the reports of two UAVs are apart
 HEADER_BYTES: Final = 110
 """Ethernet, IP and TCP heads, and Zenoh's own, of a sample on its way: measured on loopback."""
 

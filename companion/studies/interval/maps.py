@@ -28,22 +28,14 @@ FEEDTHROUGHS_S: Final = (-0.2, 0.0, 0.2, 0.5)
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Maps:
-    """The maps of the study.
+    """The maps of the study."""
 
-    alpha          (A,), axis of the decay
-    feedthrough_s  (D,), axis of the feedthrough
-    dt_s           (T,), axis of the interval
-    limit_s        by mu: the largest feasible interval, (D, A)
-    gamma_s        by alpha: gamma of the optimal gain, (D, T)
-    peak_gain_s    by alpha: peak gain of the optimal gain, (D, T)
-    """
-
-    alpha: FloatArray
-    feedthrough_s: FloatArray
-    dt_s: FloatArray
-    limit_s: dict[float, FloatArray]
-    gamma_s: dict[float, FloatArray]
-    peak_gain_s: dict[float, FloatArray]
+    alpha: FloatArray  # (A,), axis of the decay
+    feedthrough_s: FloatArray  # (D,), axis of the feedthrough
+    dt_s: FloatArray  # (T,), axis of the interval
+    limit_s: dict[float, FloatArray]  # by mu: the largest feasible interval, (D, A)
+    gamma_s: dict[float, FloatArray]  # by alpha: gamma of the optimal gain, (D, T)
+    peak_gain_s: dict[float, FloatArray]  # by alpha: peak gain of the optimal gain, (D, T)
 
 
 def maps() -> Maps:

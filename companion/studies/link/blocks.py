@@ -28,20 +28,13 @@ class Estimation(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Sent:
-    """B blocks to each of N UAVs.
+    """B blocks to each of N UAVs."""
 
-    bits     (N, B, 306)
-    coded    (N, B, 936), coded bits
-    symbols  (N, B, 234)
-    pilots   (N, 1, 8)
-    samples  (N, B, 320)
-    """
-
-    bits: BoolArray
-    coded: BoolArray
-    symbols: ComplexArray
-    pilots: FloatArray
-    samples: ComplexArray
+    bits: BoolArray  # (N, B, 306)
+    coded: BoolArray  # (N, B, 936), coded bits
+    symbols: ComplexArray  # (N, B, 234)
+    pilots: FloatArray  # (N, 1, 8)
+    samples: ComplexArray  # (N, B, 320)
 
 
 def send(users: int, blocks: int, rng: np.random.Generator) -> Sent:
@@ -86,24 +79,15 @@ def noise(users: int, blocks: int, rng: np.random.Generator) -> ComplexArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Counted:
-    """Errors by UAV and block, (N, B) each.
+    """Errors by UAV and block, (N, B) each."""
 
-    raw_errors      coded bits decided wrongly one by one
-    decoded_errors  bits wrong after decoding
-    square_error    mean square error of a symbol over the energy of one
-    """
-
-    raw_errors: IntArray
-    decoded_errors: IntArray
-    square_error: FloatArray
+    raw_errors: IntArray  # coded bits decided wrongly one by one
+    decoded_errors: IntArray  # bits wrong after decoding
+    square_error: FloatArray  # mean square error of a symbol over the energy of one
 
 
 def receive(
-    sent: Sent,
-    heard: ComplexArray,
-    noise_power: float,
-    taps: ComplexArray,
-    estimation: Estimation,
+    sent: Sent, heard: ComplexArray, noise_power: float, taps: ComplexArray, estimation: Estimation
 ) -> Counted:
     """Decode received carriers (N, B, 256), noise included.
 

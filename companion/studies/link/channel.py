@@ -25,22 +25,19 @@ from companion.studies.link.scenario import Instant, Positions
 from companion.values import ComplexArray, FloatArray, UserError
 
 SAMPLE_RATE_HZ: Final = 50e6
-SPREADS: Final = 5.0
-"""Delay spreads beyond which delays are left out."""
+SPREADS: Final = 5.0  # delay spreads beyond which delays are left out
 
 
 @dataclass(frozen=True, slots=True)
 class Scattering:
     """Power and delay of the scattered rays.
 
-        rician_k_db     power of the line of sight over that of all scattered rays
-        delay_spread_s  mean delay of the scattered rays behind the line of sight
 
     Raises ``UserError`` for a channel without line of sight, or with delays that pass the prefix.
     """
 
-    rician_k_db: float = 10.0
-    delay_spread_s: float = 50e-9
+    rician_k_db: float = 10.0  # power of the line of sight over that of all scattered rays
+    delay_spread_s: float = 50e-9  # mean delay of the scattered rays behind the line of sight
 
     def __post_init__(self) -> None:
         if not self.rician_k_db >= 0:

@@ -19,11 +19,9 @@ from companion.values import BoolArray, FloatArray
 
 GENERATORS: Final = (0o133, 0o171, 0o165)
 CONSTRAINT: Final = 7
-TAIL: Final = CONSTRAINT - 1
-"""Zeros after each block."""
+TAIL: Final = CONSTRAINT - 1  # zeros after each block
 STATES: Final = 1 << TAIL
-TOGETHER: Final = 128
-"""Blocks decoded at once: their path metrics stay in the processor's cache."""
+TOGETHER: Final = 128  # blocks decoded at once: their path metrics stay in the processor's cache
 
 _TAPS: Final = np.array(
     [[bool(g >> (TAIL - i) & 1) for i in range(CONSTRAINT)] for g in GENERATORS], dtype=np.bool_

@@ -11,8 +11,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-LEAST: Final = {"ber": 1e-6, "bler": 1e-4}
-"""Least error rate that is drawn."""
+LEAST: Final = {"ber": 1e-6, "bler": 1e-4}  # least error rate that is drawn
 LABELS: Final = {
     "perfect": "perfect positions",
     "held": "held positions",

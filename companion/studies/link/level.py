@@ -37,14 +37,11 @@ from companion.studies.link.scenario import Positions, Reports, Scenario, circle
 from companion.studies.prediction.pointing import angles_deg
 from companion.values import ComplexArray, UserError
 
-SYMBOL_S: Final = ofdm.SAMPLES / SAMPLE_RATE_HZ
-"""Duration of an OFDM symbol."""
+SYMBOL_S: Final = ofdm.SAMPLES / SAMPLE_RATE_HZ  # duration of an OFDM symbol
 AWGN: Final = "awgn"
 KINDS: Final = (AWGN, *(kind.value for kind in Positions))
-MOST_POINTS: Final = 100
-"""Most points of a curve."""
-TARGET: Final = 1e-3
-"""Bit error rate at which curves are compared."""
+MOST_POINTS: Final = 100  # most points of a curve
+TARGET: Final = 1e-3  # bit error rate at which curves are compared
 
 
 def snrs(first_db: float, last_db: float, step_db: float) -> tuple[float, ...]:
@@ -66,31 +63,21 @@ class LinkStudy:
     """What is asked of the study.
 
         logs        of one flight with the simulator's truth; none: the paper's circles
-        center      as on the command line
-        config      as on the command line
-        settings    those of the array and the tracking
-        snr_db      first, last and step
-        instants    times of the flight
-        blocks      sent to each UAV at each instant, for each SNR
-        estimation  how receivers know their channel
-        reports     when the circling UAVs report
-        scattering  the scattered rays
-        seed        of all random numbers
 
     Raises ``UserError`` for values out of range.
     """
 
     logs: tuple[Path, ...] = ()
-    center: str | None = None
-    config: str | None = None
-    settings: Settings = field(default_factory=Settings)
-    snr_db: tuple[float, float, float] = (-2.0, 30.0, 1.0)
-    instants: int = 96
-    blocks: int = 16
-    estimation: Estimation = Estimation.PILOTS
-    reports: Reports = field(default_factory=Reports)
-    scattering: Scattering = field(default_factory=Scattering)
-    seed: int = 1
+    center: str | None = None  # as on the command line
+    config: str | None = None  # as on the command line
+    settings: Settings = field(default_factory=Settings)  # those of the array and the tracking
+    snr_db: tuple[float, float, float] = (-2.0, 30.0, 1.0)  # first, last and step
+    instants: int = 96  # times of the flight
+    blocks: int = 16  # sent to each UAV at each instant, for each SNR
+    estimation: Estimation = Estimation.PILOTS  # how receivers know their channel
+    reports: Reports = field(default_factory=Reports)  # when the circling UAVs report
+    scattering: Scattering = field(default_factory=Scattering)  # the scattered rays
+    seed: int = 1  # of all random numbers
 
     def __post_init__(self) -> None:
         snrs(*self.snr_db)
@@ -170,10 +157,7 @@ def exchange(
         for snr_db in snrs(*setting.snr_db):
             noise_power = 10 ** (-snr_db / 10)
             heard = clean + np.sqrt(noise_power) * white
-            yield (
-                (kind, snr_db),
-                blocks.receive(sent, heard, noise_power, taps, estimation),
-            )
+            yield ((kind, snr_db), blocks.receive(sent, heard, noise_power, taps, estimation))
 
 
 def study(

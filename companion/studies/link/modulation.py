@@ -15,10 +15,8 @@ from scipy.special import erfc
 
 from companion.values import BoolArray, ComplexArray, FloatArray
 
-BITS: Final = 4
-"""Bits in a symbol."""
-SCALE: Final = 1 / np.sqrt(10.0)
-"""Factor from the levels -3, -1, 1, 3 to symbols of mean energy 1."""
+BITS: Final = 4  # bits in a symbol
+SCALE: Final = 1 / np.sqrt(10.0)  # factor from the levels -3, -1, 1, 3 to symbols of mean energy 1
 
 
 def modulate(bits: BoolArray) -> ComplexArray:

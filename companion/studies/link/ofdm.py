@@ -15,13 +15,11 @@ from companion.values import ComplexArray, FloatArray, IntArray
 
 CARRIERS: Final = 256
 PREFIX: Final = 64
-SAMPLES: Final = CARRIERS + PREFIX
-"""Samples of one OFDM symbol."""
+SAMPLES: Final = CARRIERS + PREFIX  # samples of one OFDM symbol
 NULLS: Final = np.array([*range(7), 128, *range(250, 256)], dtype=np.int64)
 PILOTS: Final = np.array([26, 54, 90, 118, 140, 168, 204, 232], dtype=np.int64) - 1
 DATA: Final[IntArray] = np.setdiff1d(np.arange(CARRIERS), np.concatenate([NULLS, PILOTS]))
-STREAMS: Final = len(PILOTS)
-"""Number of streams that pilots can tell apart."""
+STREAMS: Final = len(PILOTS)  # number of streams that pilots can tell apart
 PILOT_SIGNS: Final[FloatArray] = hadamard(STREAMS).astype(float)
 """(8, 8): one row of pilots per stream, by Sylvester's construction.
 

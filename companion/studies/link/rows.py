@@ -10,8 +10,7 @@ from companion.studies.link.blocks import BLOCK_BITS, CODED_BITS, Counted
 from companion.values import FloatArray
 
 Row = dict[str, Any]
-Z95: Final = 1.959963984540054
-"""Half the width of a 95 per cent interval, in standard deviations."""
+Z95: Final = 1.959963984540054  # half the width of a 95 per cent interval, in standard deviations
 
 
 def row(

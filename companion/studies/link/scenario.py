@@ -30,16 +30,14 @@ from companion.values import FloatArray, Method, Update, UserError, kind_of
 
 RADII_M: Final = (100.0, 150.0, 200.0, 250.0)
 RATE_RADPS: Final = 0.5
-GUST: Final = 0.2
-"""Share of the gusts in the speed; they turn ten times as fast."""
+GUST: Final = 0.2  # share of the gusts in the speed; they turn ten times as fast
 GUST_RATIO: Final = 10.0
 REPORTED_M: Final = 0.01
 """Steps of a reported position, and (0.01 m/s) of a velocity, in GLOBAL_POSITION_INT."""
 WARM_UP_S: Final = 5.0
 DURATION_S: Final = 60.0
 LOOKS_HZ: Final = 10.0
-MOST_DRAWN: Final = 100
-"""Times drawn for each one found before the array is given up."""
+MOST_DRAWN: Final = 100  # times drawn for each one found before the array is given up
 
 
 class Positions(StrEnum):

@@ -27,41 +27,28 @@ GUST_RATE_RATIO: Final = 10.0
 class PaperScenario:
     """The scenario's numbers.
 
-        radii_m        one for each UAV
-        rate_radps     angular rate of all
-        dt_s           interval between reports
-        feedthrough_s  time by which a report leads the position
-        alpha          decay of the certificate
-        gust           |d| over |v|
-        literal        take the gust as printed
-        steps          reports of each UAV
 
     UAVs begin a quarter turn from one another.
     """
 
-    radii_m: tuple[float, ...] = (100.0, 150.0, 200.0, 250.0)
-    rate_radps: float = 0.5
-    dt_s: float = 0.15
-    feedthrough_s: float = 0.5
-    alpha: float = 0.5
-    gust: float = 0.2
-    literal: bool = True
-    steps: int = 170
+    radii_m: tuple[float, ...] = (100.0, 150.0, 200.0, 250.0)  # one for each UAV
+    rate_radps: float = 0.5  # angular rate of all
+    dt_s: float = 0.15  # interval between reports
+    feedthrough_s: float = 0.5  # time by which a report leads the position
+    alpha: float = 0.5  # decay of the certificate
+    gust: float = 0.2  # |d| over |v|
+    literal: bool = True  # take the gust as printed
+    steps: int = 170  # reports of each UAV
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Flight:
-    """K steps of N UAVs; coordinates are north and east.
-
-    position_m  (K + 1, N, 2)
-    input_mps   W, (K, N, 2)
-    report_m    y, (K, N, 2)
-    """
+    """K steps of N UAVs; coordinates are north and east."""
 
     scenario: PaperScenario
-    position_m: FloatArray
-    input_mps: FloatArray
-    report_m: FloatArray
+    position_m: FloatArray  # (K + 1, N, 2)
+    input_mps: FloatArray  # W, (K, N, 2)
+    report_m: FloatArray  # y, (K, N, 2)
 
     @property
     def time_s(self) -> FloatArray:
@@ -77,18 +64,12 @@ class Flight:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Tracked:
-    """The observer's answers with one gain.
+    """The observer's answers with one gain."""
 
-    gain          l
-    estimate_m    (K + 1, N, 2), made one report ahead
-    input_b0_mps  (K, N, 2), the unknown input with G = [b; 0] (as published)
-    input_bd_mps  (K, N, 2), the unknown input with G = [b; d]
-    """
-
-    gain: float
-    estimate_m: FloatArray
-    input_b0_mps: FloatArray
-    input_bd_mps: FloatArray
+    gain: float  # l
+    estimate_m: FloatArray  # (K + 1, N, 2), made one report ahead
+    input_b0_mps: FloatArray  # (K, N, 2), the unknown input with G = [b; 0] (as published)
+    input_bd_mps: FloatArray  # (K, N, 2), the unknown input with G = [b; d]
 
 
 def stacked(vectors: FloatArray) -> FloatArray:
@@ -183,16 +164,11 @@ def gain_mu(dt_s: float, feedthrough_s: float, alpha: float, gain: float) -> flo
 
 @dataclass(frozen=True, slots=True)
 class Irregular:
-    """Largest |e| / sup|w| over random intervals with an adversary's input.
+    """Largest |e| / sup|w| over random intervals with an adversary's input."""
 
-    fixed_s      with a fixed gain
-    scheduled_s  with a gain that follows the interval
-    gamma_s      gamma over the same intervals
-    """
-
-    fixed_s: float
-    scheduled_s: float
-    gamma_s: float
+    fixed_s: float  # with a fixed gain
+    scheduled_s: float  # with a gain that follows the interval
+    gamma_s: float  # gamma over the same intervals
 
 
 def irregular(

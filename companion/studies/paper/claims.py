@@ -22,24 +22,15 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Claim:
-    """A statement of the paper and how it is judged.
+    """A statement of the paper and how it is judged."""
 
-    statement   what the paper says
-    key         path of the number that decides
-    found       text with ``{value}`` for the number
-    decides     predicate of the number
-    if_true     verdict where the predicate is true
-    if_false    verdict where it is not
-    correction  what a reader of the paper must change
-    """
-
-    statement: str
-    key: str
-    found: str
-    decides: Callable[[float], bool]
-    if_true: Verdict
-    if_false: Verdict
-    correction: str = ""
+    statement: str  # what the paper says
+    key: str  # path of the number that decides
+    found: str  # text with {value} for the number
+    decides: Callable[[float], bool]  # predicate of the number
+    if_true: Verdict  # verdict where the predicate is true
+    if_false: Verdict  # verdict where it is not
+    correction: str = ""  # what a reader of the paper must change
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -35,14 +35,12 @@ ALPHAS: Final = (0.5, 0.1, 0.01)
 PAPER_ALPHA: Final = 0.5
 PAPER_SUBCARRIERS: Final = 234
 PAPER_CYCLIC_PREFIX: Final = 64
-PAPER_BITS: Final = 4
-"""Bits of a symbol, by 16-QAM."""
+PAPER_BITS: Final = 4  # bits of a symbol, by 16-QAM
 PAPER_CODE_RATE: Final = 1 / 3
 SIZES: Final = (64, 128)
 INSTANTS: Final = (14, 58)
 """Steps at which the patterns are drawn: no UAV is near another's mirror image there."""
-LONG: Final = 2000
-"""Steps over which a steady error is sought."""
+LONG: Final = 2000  # steps over which a steady error is sought
 BLOCKAGES_PER_MINUTE: Final = (0.0, 6.0, 15.0, 30.0, 60.0)
 DRAWS: Final = 2
 OPTIMUM: Final = "optimum"
@@ -51,22 +49,14 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Material:
-    """Material of the figures.
+    """Material of the figures."""
 
-    flight      the flight
-    tracked     the observer by the gain's name
-    alphas      the observer by alpha, with a solver's gain
-    efficiency  (K + 1, N), by the gain's name
-    arrays      the array by its number of elements
-    compared    the schemes under blockage
-    """
-
-    flight: Flight
-    tracked: dict[str, Tracked]
-    alphas: dict[float, Tracked]
-    efficiency: dict[str, FloatArray]
-    arrays: dict[int, Array]
-    compared: Compared
+    flight: Flight  # the flight
+    tracked: dict[str, Tracked]  # the observer by the gain's name
+    alphas: dict[float, Tracked]  # the observer by alpha, with a solver's gain
+    efficiency: dict[str, FloatArray]  # (K + 1, N), by the gain's name
+    arrays: dict[int, Array]  # the array by its number of elements
+    compared: Compared  # the schemes under blockage
 
 
 def level_name(gain: float) -> str:

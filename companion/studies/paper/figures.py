@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 Answer = dict[str, Any]
 LEVELS = tuple(level_name(gain) for _, gain in PAPER_LEVELS)
 TITLES = tuple(f"{level_name(gain)}, μ ≤ {mu:g} s²" for mu, gain in PAPER_LEVELS)
-SHOWN_S = 13.0
-"""Time shown in figures: a little over one turn."""
+SHOWN_S = 13.0  # time shown in figures: a little over one turn
 
 
 def drawings(answer: Answer, material: Material) -> dict[str, tuple[str, Callable[[], "Figure"]]]:

@@ -29,8 +29,7 @@ PRECODER: Final = Precoder(widen=Widen.NO)
 PROBING: Final = EchoProbing(dwell_s=0.005, position_gain=0.9, rate_gain=0.5)
 """Baseline at its best: it listens half of all time, and a tracker of rates follows the turn."""
 MEAN_BLOCKAGE_S: Final = 0.5
-EVERY: Final = 5
-"""Probing intervals from one computed rate to the next."""
+EVERY: Final = 5  # probing intervals from one computed rate to the next
 
 
 def line(elements: int) -> Array:

@@ -38,20 +38,13 @@ Source: https://mavlink.io/en/messages/common.html#GLOBAL_POSITION_INT.
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Agreement:
-    """Largest difference between the service's answers and the library's, over all UAVs and steps.
+    """Largest difference between the service's answers and the library's, over all UAVs and steps."""
 
-    reports        reports accepted
-    rejections     reports rejected
-    estimate_m     of predictions of the next report's place
-    direction_deg  of beams aimed at it
-    settled_m      largest error against the truth in the last quarter
-    """
-
-    reports: int
-    rejections: int
-    estimate_m: float
-    direction_deg: float
-    settled_m: float
+    reports: int  # reports accepted
+    rejections: int  # reports rejected
+    estimate_m: float  # of predictions of the next report's place
+    direction_deg: float  # of beams aimed at it
+    settled_m: float  # largest error against the truth in the last quarter
 
 
 def settings(flight: Flight) -> Settings:

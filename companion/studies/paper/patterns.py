@@ -16,8 +16,7 @@ from companion.values import ComplexArray, FloatArray
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-FLOOR_DB: Final = -30.0
-"""Lowest gain drawn; lower ones are drawn at this value."""
+FLOOR_DB: Final = -30.0  # lowest gain drawn; lower ones are drawn at this value
 POLAR_FLOOR_DB: Final = -15.0
 TOP_DB: Final = 24.0
 

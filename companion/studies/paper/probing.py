@@ -39,33 +39,27 @@ It measures nothing there, as a line does across its length, and none of its bea
 class EchoProbing:
     """Settings of the baseline.
 
-        interval_s          from one probe to the next
         dwell_s             how long an echo is integrated coherently, and the time that each beam
                             of a sweep takes; at most ``interval_s``
-        cross_section_m2    radar cross section of a UAV
         detection_snr_db    least SNR of an echo after integration, at the output of the array
         lobe_db             how far the beam's gain towards the UAV may be below its peak for the
                             echo to count; inf: side lobes count as well
-        patience_intervals  how many intervals in a row may bring no echo before the sweep
-        sweep_beams         beams of the codebook
         sweep_loss_db       what the best of them lacks towards the UAV; 3.9 dB is halfway between
                             two orthogonal beams of a line
-        position_gain       gain alpha of an alpha-beta tracker of the direction
-        rate_gain           gain beta; 1 and 0 point each beam where the last echo came from
 
     Raises ``ValueError`` for values out of range.
     """
 
-    interval_s: float = 0.01
+    interval_s: float = 0.01  # from one probe to the next
     dwell_s: float = 0.001
-    cross_section_m2: float = 0.05
+    cross_section_m2: float = 0.05  # radar cross section of a UAV
     detection_snr_db: float = 13.0
     lobe_db: float = 10.0
-    patience_intervals: int = 10
-    sweep_beams: int = 64
+    patience_intervals: int = 10  # how many intervals in a row may bring no echo before the sweep
+    sweep_beams: int = 64  # beams of the codebook
     sweep_loss_db: float = 3.9
-    position_gain: float = 1.0
-    rate_gain: float = 0.0
+    position_gain: float = 1.0  # gain alpha of an alpha-beta tracker of the direction
+    rate_gain: float = 0.0  # gain beta; 1 and 0 point each beam where the last echo came from
 
     def __post_init__(self) -> None:
         if not 0 < self.dwell_s <= self.interval_s < math.inf:
@@ -101,24 +95,15 @@ class EchoProbing:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EchoState:
-    """The baseline after one interval, N UAVs.
+    """The baseline after one interval, N UAVs."""
 
-    pointed     (N, 3), where the beams pointed in it: unit vectors, array frame
-    served      (N,), whether the UAV had its beam in it; False during a sweep
-    heard       (N,), whether an echo was used
-    estimate    (N, 3), where the UAV is thought to be in the next interval
-    turn_radps  (N, 3), how that turns: a rotation vector across it
-    silent      (N,), intervals in a row without an echo
-    sweep_left  (N,), intervals that a sweep still takes; 0 without one
-    """
-
-    pointed: FloatArray
-    served: NDArray[np.bool_]
-    heard: NDArray[np.bool_]
-    estimate: FloatArray
-    turn_radps: FloatArray
-    silent: IntArray
-    sweep_left: IntArray
+    pointed: FloatArray  # (N, 3), where the beams pointed in it: unit vectors, array frame
+    served: NDArray[np.bool_]  # (N,), whether the UAV had its beam in it; False during a sweep
+    heard: NDArray[np.bool_]  # (N,), whether an echo was used
+    estimate: FloatArray  # (N, 3), where the UAV is thought to be in the next interval
+    turn_radps: FloatArray  # (N, 3), how that turns: a rotation vector across it
+    silent: IntArray  # (N,), intervals in a row without an echo
+    sweep_left: IntArray  # (N,), intervals that a sweep still takes; 0 without one
 
 
 def started(directions: FloatArray) -> EchoState:

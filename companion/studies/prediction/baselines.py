@@ -23,24 +23,17 @@ _S_PER_NS: Final = 1e-9
 class Observed:
     """A report as it reaches a predictor.
 
-        arrival_ns        when it arrived, node time
-        sent_ns           when it was made, node time, by the best clock known on arrival
-        sender_ns         when it was made, on the sender's timeline
-        position_ned_m    (3,), local frame
-        velocity_ned_mps  (3,), local frame; None if not reported
-        clock_bound_s     bound on the error of ``sent_ns``
-        gnss              what the sender last said of its receiver
 
     The baselines do not use the last two.
     """
 
-    arrival_ns: int
-    sent_ns: int
-    sender_ns: int
-    position_ned_m: FloatArray
-    velocity_ned_mps: FloatArray | None
-    clock_bound_s: float = 0.0
-    gnss: GnssStatus | None = None
+    arrival_ns: int  # when it arrived, node time
+    sent_ns: int  # when it was made, node time, by the best clock known on arrival
+    sender_ns: int  # when it was made, on the sender's timeline
+    position_ned_m: FloatArray  # (3,), local frame
+    velocity_ned_mps: FloatArray | None  # (3,), local frame; None if not reported
+    clock_bound_s: float = 0.0  # bound on the error of sent_ns
+    gnss: GnssStatus | None = None  # what the sender last said of its receiver
 
 
 class Predicted(NamedTuple):

@@ -59,42 +59,30 @@ from companion.studies.truth.vehicles import Flown
 from companion.values import UserError
 
 LEADS_S: Final = (0.0, 0.1, 0.3, 1.0)
-LINKS: Final = ("clean", "radio", "hostile")
-"""Links over which is compared unless others are named."""
+LINKS: Final = ("clean", "radio", "hostile")  # links over which is compared unless others are named
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictionStudy:
     """What is asked of the study.
 
-        logs      the logs
-        center    as on the command line
-        leads_s   leads, seconds
         links     names of the links over which is compared, of those in ``radio_link``
-        radio     the slow radio
-        seed      of all random numbers
-        settings  those of the array and the tracking
-        config    as on the command line
-        learned   a file of ``companion study train``
-        snr_db    SNR for the loss in spectral efficiency
-        jobs      processes; None: as many as cores
-        cluster   address of a cluster that works instead
 
     Who works does not change the rows. Raises ``UserError`` for values out of range.
     """
 
-    logs: tuple[Path, ...]
-    center: str | None = None
-    leads_s: tuple[float, ...] = LEADS_S
+    logs: tuple[Path, ...]  # the logs
+    center: str | None = None  # as on the command line
+    leads_s: tuple[float, ...] = LEADS_S  # leads, seconds
     links: tuple[str, ...] = LINKS
-    radio: RadioLink = RADIO
-    seed: int = 1
-    settings: Settings = field(default_factory=Settings)
-    config: str | None = None
-    learned: Path | None = None
-    snr_db: float = SNR_DB
-    jobs: int | None = 1
-    cluster: str | None = None
+    radio: RadioLink = RADIO  # the slow radio
+    seed: int = 1  # of all random numbers
+    settings: Settings = field(default_factory=Settings)  # those of the array and the tracking
+    config: str | None = None  # as on the command line
+    learned: Path | None = None  # a file of companion study train
+    snr_db: float = SNR_DB  # SNR for the loss in spectral efficiency
+    jobs: int | None = 1  # processes; None: as many as cores
+    cluster: str | None = None  # address of a cluster that works instead
 
     def __post_init__(self) -> None:
         if not -100 <= self.snr_db <= 100:

@@ -24,8 +24,7 @@ from companion.studies.truth.trajectory import Times
 from companion.studies.truth.vehicles import Flight
 from companion.values import BoolArray, FloatArray, Frame, IntArray, RoundTrip, Source
 
-P95: Final = 1.6448536269514722
-"""The 95th percentile of the standard normal distribution."""
+P95: Final = 1.6448536269514722  # the 95th percentile of the standard normal distribution
 ROUND_TRIP_NS: Final = 10_000_000
 """Length of the round trips, one a second, of which a clock that is known is known."""
 
@@ -34,35 +33,25 @@ ROUND_TRIP_NS: Final = 10_000_000
 class Delivery:
     """What a link delivers of one vehicle, in order of arrival.
 
-    observed   the reports
     events     the frames with the times of their arrival, and round trips; none for a flight
                without frames
-    rate_hz    nominal rate of reports, or that of the log
-    latency_s  nominal median latency, or that seen by the clock
-    begins_ns  when a hostile link was switched on; None for others
     """
 
-    observed: tuple[Observed, ...]
+    observed: tuple[Observed, ...]  # the reports
     events: tuple[Frame | RoundTrip, ...]
-    rate_hz: float
-    latency_s: float
-    begins_ns: int | None = None
+    rate_hz: float  # nominal rate of reports, or that of the log
+    latency_s: float  # nominal median latency, or that seen by the clock
+    begins_ns: int | None = None  # when a hostile link was switched on; None for others
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Sends:
-    """What a vehicle sent, (M,): first its reports (N,), then its other frames, if it has frames.
+    """What a vehicle sent, (M,): first its reports (N,), then its other frames, if it has frames."""
 
-    sent_ns  when it arrived over the log's own link
-    boot_ms  its boot stamp; -1 where it has none
-    kind     its message id
-    frame    its place among the flight's frames; -1 without
-    """
-
-    sent_ns: Times
-    boot_ms: Times
-    kind: IntArray
-    frame: IntArray
+    sent_ns: Times  # when it arrived over the log's own link
+    boot_ms: Times  # its boot stamp; -1 where it has none
+    kind: IntArray  # its message id
+    frame: IntArray  # its place among the flight's frames; -1 without
 
 
 def deliver(
@@ -130,8 +119,7 @@ def deliver(
 def _sends(flight: Flight) -> _Sends:
     # Further frames with a position are repeats, or positions before a fix.
     others = np.array(
-        [at for at, frame in enumerate(flight.frames) if frame.msgid not in OWN],
-        dtype=np.int64,
+        [at for at, frame in enumerate(flight.frames) if frame.msgid not in OWN], dtype=np.int64
     )
     frames = [flight.frames[at] for at in others.tolist()]
     said = [stamp_of(frame) if frame.msgid in STAMPED else -1 for frame in frames]
@@ -229,15 +217,12 @@ class Placed:
 
     sender_ns  on the sender's timeline, which begins where its clock is first placed, and again
                after a restart
-    sent_ns    on the node's timeline, as known on arrival
-    bound_s    bound on the error of that
-    known      whether it is a report whose stamp could be placed at all
     """
 
     sender_ns: Times
-    sent_ns: Times
-    bound_s: FloatArray
-    known: BoolArray
+    sent_ns: Times  # on the node's timeline, as known on arrival
+    bound_s: FloatArray  # bound on the error of that
+    known: BoolArray  # whether it is a report whose stamp could be placed at all
 
 
 def on_sender_clock(

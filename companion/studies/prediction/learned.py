@@ -30,8 +30,7 @@ from companion.values import FloatArray, UserError
 
 FORMAT: Final = "companion lstm 1"
 HIDDEN: Final = 48
-LEAD_MAX_S: Final = 4.0
-"""Longest time since the newest report for which the network was trained."""
+LEAD_MAX_S: Final = 4.0  # longest time since the newest report for which the network was trained
 ACCELERATION_UNIT_MPS2: Final = 2.0
 BATCH: Final = 256
 RATE: Final = 3e-3

@@ -15,8 +15,7 @@ from companion.studies.truth.vehicles import Flight
 from companion.values import FloatArray
 
 STEP_S: Final = 0.05
-REPORT_STEPS: Final = 2
-"""Steps between reports: one each 0.1 s, which a link then thins."""
+REPORT_STEPS: Final = 2  # steps between reports: one each 0.1 s, which a link then thins
 EPOCH_NS: Final = 1_700_000_000_000_000_000
 BOOT_MS: Final = 5000
 DELAY_NS: Final = 5_000_000

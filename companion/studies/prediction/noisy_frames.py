@@ -15,8 +15,7 @@ from companion.values import FloatArray, Frame
 
 _REPORT: Final = struct.Struct("<IiiiihhhH")
 _ACCURACY: Final = struct.Struct("<III")
-_ACCURACY_AT: Final = 34
-"""Offset of h_acc, v_acc (mm) and vel_acc (mm/s) in GPS_RAW_INT."""
+_ACCURACY_AT: Final = 34  # offset of h_acc, v_acc (mm) and vel_acc (mm/s) in GPS_RAW_INT
 _GPS_RAW_INT_SIZE: Final = 52
 _METRES_PER_DEGREE: Final = 111_195.0
 

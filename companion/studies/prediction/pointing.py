@@ -27,19 +27,16 @@ Row = dict[str, Any]
 class Questions:
     """Questions to one UAV's pointer: at times ``now_ns`` (K,), for each lead (L,).
 
-    truth_ned_m  (L, K, 3), the UAV's true position at now + lead
-    array_ned_m  (L, K, 3), the array's true position at now + lead
     counts       (L, K), whether the answer is scored: the UAV flies then, and both are known
-    in_fault     (L, K), whether a declared fault lies between now and then
     regime       (K,), the regime of a hostile link, by its number; None over other links
     """
 
     now_ns: Times
     leads_ns: Times
-    truth_ned_m: FloatArray
-    array_ned_m: FloatArray
+    truth_ned_m: FloatArray  # (L, K, 3), the UAV's true position at now + lead
+    array_ned_m: FloatArray  # (L, K, 3), the array's true position at now + lead
     counts: NDArray[np.bool_]
-    in_fault: NDArray[np.bool_]
+    in_fault: NDArray[np.bool_]  # (L, K), whether a declared fault lies between now and then
     regime: IntArray | None = None
 
     def every(self, step: int) -> "Questions":

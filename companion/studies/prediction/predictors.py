@@ -28,8 +28,7 @@ from companion.values.extras import needs
 
 Make = Callable[[], Predictor]
 KALMAN_STATES: Final = {"kalman-cv": 2, "kalman-ca": 3}
-MANOEUVRE_S: Final = 1.0
-"""Time for which an acceleration lasts, as ``kalman-peng`` assumes."""
+MANOEUVRE_S: Final = 1.0  # time for which an acceleration lasts, as kalman-peng assumes
 
 
 class Product:

@@ -15,14 +15,8 @@ from companion.values import UserError
 class RadioLink:
     """What a link does to messages.
 
-        name         its name in tables
-        rate_hz      rate to which each kind is thinned; None: as in the log
         latency_s    median and 95th percentile of the added latency; None: none is added
-        loss         share of messages that never arrive
         known_delay  the sender's clock is known as well as over the log's own link, as by TIMESYNC
-        hostile      latency as in ``hostile_link`` instead
-        noise_m      deviation, each axis, of what is added to reported positions
-        noise_mps    the same of velocities
 
     Noise that is added is cut off at ``NOISE_MOST`` deviations, and the receiver's accuracy says
     that it is there.
@@ -30,14 +24,14 @@ class RadioLink:
     Raises ``UserError`` for values out of range.
     """
 
-    name: str
-    rate_hz: float | None = None
+    name: str  # its name in tables
+    rate_hz: float | None = None  # rate to which each kind is thinned; None: as in the log
     latency_s: tuple[float, float] | None = None
-    loss: float = 0.0
+    loss: float = 0.0  # share of messages that never arrive
     known_delay: bool = False
-    hostile: bool = False
-    noise_m: float = 0.0
-    noise_mps: float = 0.0
+    hostile: bool = False  # latency as in hostile_link instead
+    noise_m: float = 0.0  # deviation, each axis, of what is added to reported positions
+    noise_mps: float = 0.0  # the same of velocities
 
     def __post_init__(self) -> None:
         if self.rate_hz is not None and not 0 < self.rate_hz < math.inf:
@@ -57,8 +51,7 @@ class RadioLink:
         return self == RadioLink(name=self.name)
 
 
-CLEAN: Final = RadioLink(name="clean")
-"""The log's own link."""
+CLEAN: Final = RadioLink(name="clean")  # the log's own link
 RADIO: Final = RadioLink(name="radio", rate_hz=1.2, latency_s=(0.6, 2.2), loss=0.1)
 """A slow telemetry radio."""
 HOSTILE: Final = RadioLink(name="hostile", hostile=True)

@@ -24,8 +24,7 @@ from companion.beams.array.steering import steering_matrix
 from companion.values import FloatArray
 
 SNR_DB: Final = 20.0
-AT_ONCE: Final = 1_000_000
-"""Entries of a steering matrix that are held at a time."""
+AT_ONCE: Final = 1_000_000  # entries of a steering matrix that are held at a time
 
 
 def array_from_local(truly: FloatArray) -> FloatArray:

@@ -21,20 +21,13 @@ class Pool(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measure:
-    """A figure of the rows and how it is shown.
+    """A figure of the rows and how it is shown."""
 
-    key             its key in a row
-    caption         caption of its table
-    short           its heading in the text
-    pool            how the UAVs' figures become one
-    more_is_better  whether a larger one is better
-    """
-
-    key: str
-    caption: str
-    short: str
-    pool: Pool = Pool.RMS
-    more_is_better: bool = False
+    key: str  # its key in a row
+    caption: str  # caption of its table
+    short: str  # its heading in the text
+    pool: Pool = Pool.RMS  # how the UAVs' figures become one
+    more_is_better: bool = False  # whether a larger one is better
 
 
 ANGLE: Final = Measure(key="angle_rms_deg", caption="RMS angle error, degrees", short="deg rms")

@@ -15,8 +15,7 @@ import numpy as np
 from companion.studies.prediction.baselines import Observed
 from companion.values import FloatArray
 
-REPORTS: Final = 10
-"""K: how many of the last reports are used."""
+REPORTS: Final = 10  # K: how many of the last reports are used
 FORGOTTEN_NS: Final = 20_000_000_000
 """Age relative to the newest report beyond which a report is not used."""
 FEATURES: Final = 7
@@ -26,20 +25,13 @@ SPEED_UNIT_MPS: Final = 10.0
 
 
 class Window(NamedTuple):
-    """The newest report and the network's input.
+    """The newest report and the network's input."""
 
-    sender_ns         when it was made, sender's timeline
-    position_ned_m    (3,), its position
-    velocity_ned_mps  (3,), its velocity
-    seen              (n, 7), the input, oldest report first
-    local_from_seen   (3, 3), rotation from the input's frame to the local frame
-    """
-
-    sender_ns: int
-    position_ned_m: FloatArray
-    velocity_ned_mps: FloatArray
-    seen: FloatArray
-    local_from_seen: FloatArray
+    sender_ns: int  # when it was made, sender's timeline
+    position_ned_m: FloatArray  # (3,), its position
+    velocity_ned_mps: FloatArray  # (3,), its velocity
+    seen: FloatArray  # (n, 7), the input, oldest report first
+    local_from_seen: FloatArray  # (3, 3), rotation from the input's frame to the local frame
 
 
 class Recent:

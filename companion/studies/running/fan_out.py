@@ -24,8 +24,7 @@ from companion.values.extras import needs
 
 Asked = TypeVar("Asked")
 Answer = TypeVar("Answer")
-Told = Callable[[int], None]
-"""Function that is given the number of finished pieces."""
+Told = Callable[[int], None]  # function that is given the number of finished pieces
 
 CLUSTER_ANSWERS_S: Final = 10
 ADDRESS: Final = re.compile(r"(tcp|tls)://([\w.-]+|\[[0-9a-fA-F:.]+\]):\d{1,5}")

@@ -40,16 +40,13 @@ class CarrierTruth:
 class ArrayTruth:
     """The truth that a log holds, for the array of a pipeline.
 
-    kind     its name in reports
-    local    the pipeline's local frame
-    flights  flights with truth, by UAV
     carrier  the carrier's truth; None: its pose is as predicted, which for a fixed station is
              exact
     """
 
-    kind: str
-    local: LocalFrame
-    flights: Mapping[str, Flight]
+    kind: str  # its name in reports
+    local: LocalFrame  # the pipeline's local frame
+    flights: Mapping[str, Flight]  # flights with truth, by UAV
     carrier: CarrierTruth | None
 
     def directions(self, tracks: Sequence[Track], predicted: Carrier, array: Array) -> FloatArray:

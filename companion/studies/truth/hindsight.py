@@ -26,18 +26,12 @@ EDGE_NS: Final = 3_000_000_000
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class BootClock:
-    """What a log shows of one boot clock: a stamp each, in order of arrival, (N,).
+    """What a log shows of one boot clock: a stamp each, in order of arrival, (N,)."""
 
-    arrival_ns  when it arrived
-    boot_ns     what it said
-    life        how often the clock had been restarted
-    made_ns     when it was made, the log's timeline
-    """
-
-    arrival_ns: Times
-    boot_ns: Times
-    life: IntArray
-    made_ns: Times
+    arrival_ns: Times  # when it arrived
+    boot_ns: Times  # what it said
+    life: IntArray  # how often the clock had been restarted
+    made_ns: Times  # when it was made, the log's timeline
 
     def node_ns(self, boot_ns: Times, life: IntArray) -> Times:
         """Boot times (K,) of given lives on the log's timeline, (K,)."""

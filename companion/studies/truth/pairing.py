@@ -25,8 +25,7 @@ NEAR_NS: Final = (1_000_000_000, 10_000_000_000)
 
 The farther, the more do velocities that are a little wrong add up.
 """
-NARROW_NS: Final = 5_000_000
-"""Width of a bracket within which its middle is as good as any."""
+NARROW_NS: Final = 5_000_000  # width of a bracket within which its middle is as good as any
 TOGETHER_NS: Final = 7_000_000
 """Messages of one go have been seen to arrive this far apart, where the link holds nothing back."""
 ROUNDED_NS: Final = 2_000_000
@@ -39,22 +38,14 @@ PACE: Final = (0.5, 2.0)
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Brackets:
-    """Truth messages (N,) in the order of their stream, and the stamped messages around each.
+    """Truth messages (N,) in the order of their stream, and the stamped messages around each."""
 
-    arrival_ns         when the truth message arrived
-    before_ns          boot time of the stamped message before it
-    after_ns           that of the one after it
-    before_arrival_ns  when the one before arrived
-    after_arrival_ns   when the one after arrived
-    life               how often the boot clock had been restarted
-    """
-
-    arrival_ns: Times
-    before_ns: Times
-    after_ns: Times
-    before_arrival_ns: Times
-    after_arrival_ns: Times
-    life: IntArray
+    arrival_ns: Times  # when the truth message arrived
+    before_ns: Times  # boot time of the stamped message before it
+    after_ns: Times  # that of the one after it
+    before_arrival_ns: Times  # when the one before arrived
+    after_arrival_ns: Times  # when the one after arrived
+    life: IntArray  # how often the boot clock had been restarted
 
     def rows(self, chosen: NDArray[np.bool_]) -> "Brackets":
         """Some of the messages."""

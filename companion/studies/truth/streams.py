@@ -29,18 +29,12 @@ _SIMSTATE = struct.Struct("<9fii")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Said:
-    """A truth message.
+    """A truth message."""
 
-    arrival_ns  when it arrived
-    before      the number of the stamp before it on its link, among the stamps of its vehicle
-    after       the number of the stamp after it
-    payload     its payload
-    """
-
-    arrival_ns: int
-    before: int
-    after: int
-    payload: bytes
+    arrival_ns: int  # when it arrived
+    before: int  # the number of the stamp before it on its link, among the stamps of its vehicle
+    after: int  # the number of the stamp after it
+    payload: bytes  # its payload
 
 
 @dataclass(slots=True)

@@ -52,34 +52,23 @@ AFTER_FAULT_NS: Final = 5_000_000_000
 class Flight:
     """One vehicle of a log: its reports in order of arrival, and the truth.
 
-    uav               its name
-    arrival_ns        (N,), when each report arrived
-    boot_ms           (N,), its boot time
-    position_ned_m    (N, 3), local frame
-    velocity_ned_mps  (N, 3), local frame; NaN: not reported
-    height_m          (N,), height above the vehicle's home; NaN: not reported
     gnss              what the vehicle had last said of its receiver when each report came
-    truth             where it truly was
-    made_ns           (N,), when each report was made, in hindsight
-    frames            its frames in order of arrival, but for the simulator's words
     report_at         (N,), the place of each report among the frames; empty without frames
-    round_trips       TIMESYNC round trips with it
-    faults            windows of faults that were declared of it: from, to
     """
 
-    uav: str
-    arrival_ns: Times
-    boot_ms: Times
-    position_ned_m: FloatArray
-    velocity_ned_mps: FloatArray
-    height_m: FloatArray
+    uav: str  # its name
+    arrival_ns: Times  # (N,), when each report arrived
+    boot_ms: Times  # (N,), its boot time
+    position_ned_m: FloatArray  # (N, 3), local frame
+    velocity_ned_mps: FloatArray  # (N, 3), local frame; NaN: not reported
+    height_m: FloatArray  # (N,), height above the vehicle's home; NaN: not reported
     gnss: tuple[GnssStatus | None, ...]
-    truth: Trajectory
-    made_ns: Times
-    frames: tuple[Frame, ...] = ()
+    truth: Trajectory  # where it truly was
+    made_ns: Times  # (N,), when each report was made, in hindsight
+    frames: tuple[Frame, ...] = ()  # its frames in order of arrival, but for the simulator's words
     report_at: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    round_trips: tuple[RoundTrip, ...] = ()
-    faults: tuple[tuple[int, int], ...] = ()
+    round_trips: tuple[RoundTrip, ...] = ()  # TIMESYNC round trips with it
+    faults: tuple[tuple[int, int], ...] = ()  # windows of faults that were declared of it: from, to
 
     def in_fault(self, from_ns: Times, to_ns: Times) -> BoolArray:
         """Whether the window of a declared fault meets each of these intervals, (...)."""

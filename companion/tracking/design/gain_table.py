@@ -33,12 +33,10 @@ from numpy.typing import ArrayLike
 from companion.values import FloatArray, UserError
 
 FORMAT: Final = "kinematic-design-1"
-LARGEST: Final = 1 << 20
-"""Most characters of a design: that of the program has 4500."""
+LARGEST: Final = 1 << 20  # most characters of a design: that of the program has 4500
 NUMBER_MAX: Final = 1e30
 """Most that a number of a design may be; its intervals are no shorter than one over it."""
-FINER: Final = 5
-"""Intervals that ``verify`` checks for each step of the design's grid."""
+FINER: Final = 5  # intervals that verify checks for each step of the design's grid
 
 
 class DesignError(UserError):
@@ -49,30 +47,24 @@ class DesignError(UserError):
 class KinematicDesign:
     """Gains over a grid of intervals, and the proof that they hold.
 
-        acceleration_mps2   bound on the acceleration
-        position_noise_m    bound on the error of a reported position
         velocity_noise_mps  bound on the error of a reported velocity; None: not reported
-        dt_s                (K,) intervals, ascending
         corrections         M at each interval, row by row: m11, m12, m21, m22 where velocity is
                             reported, else m11, m21
-        lyapunov            P as p11, p12, p22
         multipliers         at each interval, of acceleration, position noise and (if reported)
                             velocity noise; they sum to alpha
-        margin              the result of ``verify`` when the design was made
-        provenance          how the design was made
 
     The fields are plain numbers, so that a design can be compared, hashed and written down.
     """
 
-    acceleration_mps2: float
-    position_noise_m: float
+    acceleration_mps2: float  # bound on the acceleration
+    position_noise_m: float  # bound on the error of a reported position
     velocity_noise_mps: float | None
-    dt_s: tuple[float, ...]
+    dt_s: tuple[float, ...]  # (K,) intervals, ascending
     corrections: tuple[tuple[float, ...], ...]
-    lyapunov: tuple[float, float, float]
+    lyapunov: tuple[float, float, float]  # P as p11, p12, p22
     multipliers: tuple[tuple[float, ...], ...]
-    margin: float
-    provenance: str
+    margin: float  # the result of verify when the design was made
+    provenance: str  # how the design was made
 
     @property
     def has_velocity(self) -> bool:

@@ -60,22 +60,16 @@ class Sampling:
 class LmiSolution:
     """A design and its certificate, checked by eigenvalues in numpy alone.
 
-    gains        L (n, r) for each of the K sampling times
-    lyapunov     P (n, n)
-    mu           certified bound on |H e|²
-    alphas       (K,)
-    multipliers  (K, channels), which sum to ``alphas``
-    margin       smallest eigenvalue of all LMIs, scaled by congruence
     attained     False where mu can be lowered to 0 while P grows without bound: the mu given is
                  certified, but is not the smallest
     """
 
-    gains: tuple[FloatArray, ...]
-    lyapunov: FloatArray
-    mu: float
-    alphas: FloatArray
-    multipliers: FloatArray
-    margin: float
+    gains: tuple[FloatArray, ...]  # L (n, r) for each of the K sampling times
+    lyapunov: FloatArray  # P (n, n)
+    mu: float  # certified bound on |H e|²
+    alphas: FloatArray  # (K,)
+    multipliers: FloatArray  # (K, channels), which sum to alphas
+    margin: float  # smallest eigenvalue of all LMIs, scaled by congruence
     attained: bool = True
 
     @property

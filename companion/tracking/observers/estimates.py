@@ -10,25 +10,19 @@ State = TypeVar("State")
 class Prediction(NamedTuple):
     """A UAV at a given time; vectors are in the local frame.
 
-        position_ned_m      estimated position
-        velocity_ned_mps    estimated velocity; None if there is none
-        bound_m             bound on the norm of the position error
-        horizontal_m        bound on its norm in the plane
-        vertical_m          bound on its height
         velocity_bound_mps  bound on the norm of the velocity error; None without a velocity
-        mu_s2               mu of the design for this interval, s²; None where the model has none
 
     The position error lies in the upright cylinder of ``horizontal_m`` and ``vertical_m``. It is a
     tuple because several are made for each report.
     """
 
-    position_ned_m: Vector
-    velocity_ned_mps: Vector | None
-    bound_m: float
-    horizontal_m: float
-    vertical_m: float
+    position_ned_m: Vector  # estimated position
+    velocity_ned_mps: Vector | None  # estimated velocity; None if there is none
+    bound_m: float  # bound on the norm of the position error
+    horizontal_m: float  # bound on its norm in the plane
+    vertical_m: float  # bound on its height
     velocity_bound_mps: float | None
-    mu_s2: float | None
+    mu_s2: float | None  # mu of the design for this interval, s²; None where the model has none
 
 
 class Observer(Protocol[State]):

@@ -24,10 +24,8 @@ from companion.tracking.design.gain_table import KinematicDesign, correction
 from companion.tracking.observers.estimates import Prediction
 from companion.values import Fix, Vector
 
-Gain = tuple[float, float, float, float]
-"""L row by row: l11 (1), l12 (s), l21 (1/s), l22 (1)."""
-GainSchedule = Callable[[float], Gain]
-"""Function from an interval in seconds to the gain."""
+Gain = tuple[float, float, float, float]  # l row by row: l11 (1), l12 (s), l21 (1/s), l22 (1)
+GainSchedule = Callable[[float], Gain]  # function from an interval in seconds to the gain
 
 
 VELOCITY_SHARE = 0.5
@@ -72,21 +70,16 @@ class KinematicState:
 
     position_ned_m, velocity_ned_mps
                   the estimate, local frame
-    horizontal_m  bound on the position error in the plane
-    vertical_m    bound on the error in height
-    position_m    bound on the norm of the position error
-    velocity_mps  bound on the norm of the velocity error
-    interval_s    interval since the report before; None for the first
     """
 
     fix: Fix
     position_ned_m: Vector
     velocity_ned_mps: Vector
-    horizontal_m: float
-    vertical_m: float
-    position_m: float
-    velocity_mps: float
-    interval_s: float | None
+    horizontal_m: float  # bound on the position error in the plane
+    vertical_m: float  # bound on the error in height
+    position_m: float  # bound on the norm of the position error
+    velocity_mps: float  # bound on the norm of the velocity error
+    interval_s: float | None  # interval since the report before; None for the first
 
 
 class KinematicObserver:

@@ -117,9 +117,7 @@ class Heard:
         return np.array([*level_mps, math.nan if down_mps is None else down_mps])
 
     @property
-    def heading_deg(
-        self,
-    ) -> Annotated[float | None, Meaning("heading from true north, as sent")]:
+    def heading_deg(self) -> Annotated[float | None, Meaning("heading from true north, as sent")]:
         return self._number("heading_deg")
 
     @property

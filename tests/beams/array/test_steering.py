@@ -29,11 +29,7 @@ DIRECTIONS = st.lists(st.tuples(AZIMUTHS, ELEVATIONS), min_size=1, max_size=6)
 def unit(azimuth_rad: float, elevation_rad: float) -> tuple[float, float, float]:
     """x boresight, y right, z down."""
     level = math.cos(elevation_rad)
-    return (
-        level * math.cos(azimuth_rad),
-        level * math.sin(azimuth_rad),
-        -math.sin(elevation_rad),
-    )
+    return (level * math.cos(azimuth_rad), level * math.sin(azimuth_rad), -math.sin(elevation_rad))
 
 
 def test_the_known_steering_vector() -> None:

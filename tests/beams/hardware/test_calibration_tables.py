@@ -8,11 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.beams.hardware.calibration import (
-    CALIBRATION_HEADER,
-    Calibration,
-    parse_calibration,
-)
+from companion.beams.hardware.calibration import CALIBRATION_HEADER, Calibration, parse_calibration
 from companion.beams.hardware.calibration_tables import calibration_at
 from companion.pipeline import assembly
 from companion.settings.files import load

@@ -12,13 +12,7 @@ from support import examples
 
 from companion.beams.hardware import devices
 from companion.beams.hardware.calibration import Calibration, parse_calibration
-from companion.beams.hardware.devices import (
-    LIMITS,
-    MEDIA_TYPES,
-    SETTINGS,
-    Device,
-    Mode,
-)
+from companion.beams.hardware.devices import LIMITS, SETTINGS, Device, Mode
 from companion.beams.hardware.tables import DeviceTable, WantedBeam, encode, fit
 from companion.beams.hardware.unit_gains import UnitGains
 from companion.values import ComplexArray
@@ -500,5 +494,4 @@ def test_a_table_for_another_array_is_refused() -> None:
 
 
 def test_every_device_has_limits_settings_and_a_media_type_of_its_own() -> None:
-    assert set(LIMITS) == set(SETTINGS) == set(MEDIA_TYPES) == set(Device)
-    assert len(set(MEDIA_TYPES.values())) == len(Device)
+    assert set(LIMITS) == set(SETTINGS) == set(Device)

@@ -33,9 +33,7 @@ def run(arrival: int, boot: int, count: int, every: int = 200) -> Seen:
 
 @pytest.mark.parametrize("back_ms", [1_200, 4_800, 9_700])
 def test_a_late_frame_is_no_reboot(back_ms: int) -> None:
-    stamps = observe_all(
-        [*run(0, 300_000, 50), (9_810, 309_800 - back_ms), (10_000, 310_000)],
-    )
+    stamps = observe_all([*run(0, 300_000, 50), (9_810, 309_800 - back_ms), (10_000, 310_000)])
     assert not reboots(stamps)
     late, after = stamps[-2:]
     assert late is not None and after is not None

@@ -328,8 +328,7 @@ def test_a_link_may_be_there_before_its_server(run: Run) -> None:
 
 
 def test_after_a_connection_the_first_retry_is_quick_again(
-    run: Run,
-    monkeypatch: pytest.MonkeyPatch,
+    run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(transport, "RETRY_S", (0.0, 2 * LIMIT_S))
 

@@ -342,10 +342,7 @@ def test_a_neighbour_that_comes_later_is_found(run: Run) -> None:
     async def test() -> None:
         endpoint = f"tcp/127.0.0.1:{free_port()}"
         config = BusConfig(connect=(endpoint,), retry_s=0.02)
-        async with (
-            opened(config) as early,
-            opened(BusConfig(listen=(endpoint,))) as late,
-        ):
+        async with opened(config) as early, opened(BusConfig(listen=(endpoint,))) as late:
             await joined(early, late)
 
     run(test())

@@ -112,11 +112,7 @@ def test_a_second_port_has_stamps_of_its_own(hz: float) -> None:
 
 def test_a_radio_that_starts_again_has_another_address() -> None:
     judge = Twins()
-    found = refused(
-        judge,
-        heard(HOME, 10, lasts_s=20),
-        heard(OTHER, 10, lasts_s=60, begins_s=20.1),
-    )
+    found = refused(judge, heard(HOME, 10, lasts_s=20), heard(OTHER, 10, lasts_s=60, begins_s=20.1))
     assert found == {HOME: [], OTHER: []}
 
 

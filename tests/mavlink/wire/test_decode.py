@@ -289,8 +289,7 @@ def test_heading_65535_is_unknown_and_0_is_north() -> None:
 
 @pytest.mark.parametrize("make", [position, adsb])
 @pytest.mark.parametrize(
-    ("lat", "lon"),
-    [(0, 0), (353, -129), (-1, 0), (440_000, 0), (0, -440_000), (310_000, 310_000)],
+    ("lat", "lon"), [(0, 0), (353, -129), (-1, 0), (440_000, 0), (0, -440_000), (310_000, 310_000)]
 )
 def test_near_null_island_nothing_is_believed(make: Make, lat: int, lon: int) -> None:
     assert rejected(make(lat=lat, lon=lon)) is Reason.ZERO_POSITION

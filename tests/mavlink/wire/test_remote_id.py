@@ -12,15 +12,7 @@ from companion.mavlink.trust.remote_id import ADDRESSES_MAX, DATUM_NS, NAMED_NS,
 from companion.mavlink.wire.decode import decode
 from companion.mavlink.wire.encode import Outgoing, pack
 from companion.mavlink.wire.remote_id import LOCATION, MESSAGE_PACK, READ
-from companion.values import (
-    AltitudeDatum,
-    Frame,
-    Reason,
-    Rejection,
-    RemoteId,
-    Report,
-    Source,
-)
+from companion.values import AltitudeDatum, Frame, Reason, Rejection, RemoteId, Report, Source
 
 S = 1_000_000_000
 RECEIVER = Source(9, 236)

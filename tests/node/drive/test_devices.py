@@ -23,7 +23,7 @@ from companion.node.drive.loop import DeviceError, Drive, Safe, Shot, SourceLost
 from companion.node.drive.sources import Wanted, chosen, shot_of, stored_registers
 from companion.pipeline import assembly
 from companion.settings.model import Settings
-from companion.values import UserError
+from companion.values import UserError, WeightFormat
 from companion.views import beam_state, weight_formats
 
 EIGHT = Settings().override(center={"source": "5:1"}, array={"elements": 8, "frequency_hz": 10.5e9})
@@ -37,7 +37,9 @@ def flown() -> tuple[Shot, Any, str]:
     equipment = assembly.equipment(EIGHT, pipeline.array)
     wanted = Wanted(uavs=("3:1",), anybody=False, takes=Takes.REGISTERS)
     shot = shot_of(pipeline, equipment, update, wanted)
-    text = weight_formats.encode("adar1000", update.beams, pipeline, equipment, 0).decode()
+    text = weight_formats.encode(
+        WeightFormat.ADAR1000, update.beams, pipeline, equipment, 0
+    ).decode()
     read = parse(Device.ADAR1000, text, Calibration.ideal(range(8)))
     return shot, read, text
 

@@ -21,17 +21,7 @@ from companion.pipeline.fold import Pipeline
 from companion.settings.fleet import FleetSettings
 from companion.settings.model import Settings
 from companion.settings.section import ConfigError
-from companion.values import (
-    Duty,
-    Event,
-    Frame,
-    Notice,
-    Offer,
-    Shared,
-    Source,
-    Standing,
-    UserError,
-)
+from companion.values import Duty, Event, Frame, Notice, Offer, Shared, Source, Standing, UserError
 
 pytest.importorskip("zenoh")
 MS = 1_000_000

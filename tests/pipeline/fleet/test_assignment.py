@@ -76,8 +76,7 @@ def test_it_is_the_best_of_all(offers: dict[str, dict[str, float]], room: dict[s
 )
 @settings(max_examples=examples(200))
 @example(
-    {node: {f"{n}:1": 20.0 for n in range(6)} for node in NODES},
-    {f"{n}:1": "a" for n in range(6)},
+    {node: {f"{n}:1": 20.0 for n in range(6)} for node in NODES}, {f"{n}:1": "a" for n in range(6)}
 )
 def test_it_is_the_best_wherever_it_begins(
     offers: dict[str, dict[str, float]], held: dict[str, str]
@@ -138,11 +137,7 @@ def test_a_full_node_makes_room_for_who_has_no_other() -> None:
 
 @pytest.mark.parametrize(
     ("sure", "likely", "sinr", "worth"),
-    [
-        (12.0, 17.0, 25.0, 25.0),
-        (None, 17.0, 25.0, 25.0 - UNSURE_DB),
-        (None, None, None, None),
-    ],
+    [(12.0, 17.0, 25.0, 25.0), (None, 17.0, 25.0, 25.0 - UNSURE_DB), (None, None, None, None)],
 )
 def test_what_is_only_likely_is_worth_less(
     sure: float | None, likely: float | None, sinr: float | None, worth: float | None

@@ -9,11 +9,7 @@ HERE = Witness((0.0, 0.0, 0.0), 1000.0, frozenset({"1:1"}))
 
 
 def look(
-    trust: Trust,
-    told: list[Told],
-    witnesses: dict[str, Witness],
-    seconds: int,
-    others: int = 0,
+    trust: Trust, told: list[Told], witnesses: dict[str, Witness], seconds: int, others: int = 0
 ) -> list[str]:
     said = []
     for second in range(seconds):

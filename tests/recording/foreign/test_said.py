@@ -113,11 +113,7 @@ def test_a_leap_is_clamped_and_said(log: Onboard) -> None:
     later = log.positions.boot_us.copy()
     later[100:] += 5 * 3_600_000_000
     log = replace(
-        log,
-        positions=replace(log.positions, boot_us=later),
-        attitudes=None,
-        fixes=None,
-        truth=None,
+        log, positions=replace(log.positions, boot_us=later), attitudes=None, fixes=None, truth=None
     )
     events = list(said.frames(log, "x", Source(1, 1), 0.0))
     refused = [event for event in events if isinstance(event, Rejection)]

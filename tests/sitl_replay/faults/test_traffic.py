@@ -23,10 +23,7 @@ def parsed(*texts: str) -> list[Fault]:
 
 
 def through(
-    faults: list[Fault],
-    links: int = 1,
-    seed: int = 0,
-    stream: list[tuple[float, bytes]] = STREAM,
+    faults: list[Fault], links: int = 1, seed: int = 0, stream: list[tuple[float, bytes]] = STREAM
 ) -> tuple[list[Delivery], Counter[str]]:
     """What arrives, as the player takes it out, and what was touched."""
     touched: Counter[str] = Counter()

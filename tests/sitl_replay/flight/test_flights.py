@@ -33,12 +33,7 @@ def path_of(uav: Vehicle) -> Path:
     return uav.trajectory.path
 
 
-@given(
-    st.sampled_from(NEW),
-    st.integers(0, 1000),
-    st.integers(3, 40),
-    st.floats(0.0, 7200.0),
-)
+@given(st.sampled_from(NEW), st.integers(0, 1000), st.integers(3, 40), st.floats(0.0, 7200.0))
 @settings(max_examples=examples(150), deadline=None)
 def test_each_derivative_is_that_of_the_one_before(
     name: str, seed: int, uavs: int, t_s: float

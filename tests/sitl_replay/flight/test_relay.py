@@ -102,9 +102,7 @@ def test_content_stays_until_the_next_contact_but_for_tslc(
 
 
 def test_what_counts_is_true_and_the_rest_is_garbage(
-    flight: Scenario,
-    told: dict[tuple[Source, int], list[Told]],
-    aircraft: dict[int, Aircraft],
+    flight: Scenario, told: dict[tuple[Source, int], list[Told]], aircraft: dict[int, Aircraft]
 ) -> None:
     garbage = defaultdict(set)
     for (source, icao), found in told.items():

@@ -253,9 +253,7 @@ def test_heartbeat(messages: dict[str, list[tuple[float, Vehicle, Any]]]) -> Non
         assert message.system_status == dialect.MAV_STATE_ACTIVE
 
 
-def test_both_clocks_of_system_time(
-    messages: dict[str, list[tuple[float, Vehicle, Any]]],
-) -> None:
+def test_both_clocks_of_system_time(messages: dict[str, list[tuple[float, Vehicle, Any]]]) -> None:
     offsets_us = defaultdict(set)
     for t_s, vehicle, message in messages["SYSTEM_TIME"]:
         offsets_us[vehicle.source].add(message.time_unix_usec - 1000 * message.time_boot_ms)

@@ -308,9 +308,7 @@ def test_a_codebook_that_is_missed_is_said(looked: tuple[Pipeline, Update], cut:
         assert samples[uav].as_set.true_gain_db is None
 
 
-def test_nothing_is_guaranteed_past_the_edge_of_coverage(
-    looked: tuple[Pipeline, Update],
-) -> None:
+def test_nothing_is_guaranteed_past_the_edge_of_coverage(looked: tuple[Pipeline, Update]) -> None:
     pipeline, update = looked
     (sample,) = (s for s in look(sight(pipeline), update, None, 0.0) if s.uav == "2:1")
     (beam,) = (beam for beam in update.beams.beams if beam.uav == "2:1")
@@ -331,8 +329,7 @@ def test_nothing_is_guaranteed_past_the_edge_of_coverage(
 def test_turns_are_in_the_spectral_efficiency(looked: tuple[Pipeline, Update]) -> None:
     pipeline, update = looked
     grouped = replace(
-        update.beams,
-        beams=tuple(replace(b, group=i) for i, b in enumerate(update.beams.beams)),
+        update.beams, beams=tuple(replace(b, group=i) for i, b in enumerate(update.beams.beams))
     )
     assert update.carrier is not None
     found = sight(pipeline).worths(grouped, update.carrier, {})

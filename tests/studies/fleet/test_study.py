@@ -20,9 +20,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
     return out, json.loads(ran.stdout)
 
 
-def test_every_uav_has_one_node_and_a_death_is_followed(
-    found: tuple[Path, dict[str, Any]],
-) -> None:
+def test_every_uav_has_one_node_and_a_death_is_followed(found: tuple[Path, dict[str, Any]]) -> None:
     _, answer = found
     assert [(one["nodes"], one["uavs"]) for one in answer["sizes"]] == [(2, 8), (4, 16)]
     for one in answer["sizes"]:

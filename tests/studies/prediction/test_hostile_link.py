@@ -3,12 +3,7 @@
 import numpy as np
 import pytest
 
-from companion.studies.prediction.hostile_link import (
-    REGIMES,
-    ROUND_NS,
-    arrivals_ns,
-    regimes_at,
-)
+from companion.studies.prediction.hostile_link import REGIMES, ROUND_NS, arrivals_ns, regimes_at
 
 S = 1_000_000_000
 BEGINS_NS = 1_700_000_000 * S

@@ -82,9 +82,7 @@ def test_the_envelope_leaves_the_constant_part(
         assert abs(np.median(off_s)) < 0.3
 
 
-def test_the_senders_timeline_goes_on_after_a_restart(
-    straight_flight: MakeFlight,
-) -> None:
+def test_the_senders_timeline_goes_on_after_a_restart(straight_flight: MakeFlight) -> None:
     """Intervals are the sender's own; where its clock began anew, the node's."""
     flight = straight_flight(600)
     restarted = flight.boot_ms.copy()

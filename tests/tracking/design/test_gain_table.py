@@ -151,9 +151,7 @@ def test_the_certificate_notices(design: KinematicDesign) -> None:
             gain_table.verify(bad)
 
 
-def test_between_the_points_the_certificate_looks_as_well(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_between_the_points_the_certificate_looks_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
     """A grid of its ends alone passes there, and is refused for what lies between."""
     ends = replace(
         WITHOUT,

@@ -110,7 +110,7 @@ NOTHING: Final = Heard()  # the outcome of a frame that asks for nothing further
 
 @dataclass(slots=True)
 class Sender:
-    """A sender whose stamps are placed: a vehicle, or an aircraft that broadcasts its own stamps."""
+    """A sender with a clock: a vehicle, or an aircraft that broadcasts its own time stamps."""
 
     clock: SenderClock
     stamped_ns: int | None = None  # when the clock was last given a stamp; None if never

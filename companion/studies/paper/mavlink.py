@@ -38,7 +38,7 @@ Source: https://mavlink.io/en/messages/common.html#GLOBAL_POSITION_INT.
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Agreement:
-    """Largest difference between the service's answers and the library's, over all UAVs and steps."""
+    """Largest difference between the answers of service and library, over all UAVs and steps."""
 
     reports: int  # reports accepted
     rejections: int  # reports rejected

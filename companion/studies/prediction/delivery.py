@@ -46,7 +46,7 @@ class Delivery:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Sends:
-    """What a vehicle sent, (M,): first its reports (N,), then its other frames, if it has frames."""
+    """What a vehicle sent, (M,): first its reports (N,), then its other frames, if any."""
 
     sent_ns: Times  # when it arrived over the log's own link
     boot_ms: Times  # its boot stamp; -1 where it has none

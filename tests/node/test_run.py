@@ -17,6 +17,7 @@ from device_reading import parse
 from support import BIN, HANG_S, read_metadata, started
 
 from companion.beams.hardware.calibration import Calibration
+from companion.beams.hardware.devices import Device
 from companion.mavlink.wire.decode import decode
 from companion.recording.reader import read_log
 from companion.values import Frame, Report, WeightFormat

@@ -1,5 +1,7 @@
 """Builds the elements of the array from the settings."""
 
+from typing import Any
+
 import numpy as np
 
 from companion.beams.array import geometry
@@ -7,7 +9,7 @@ from companion.beams.array.elements import Element, Pattern
 from companion.settings.model import Settings
 from companion.settings.section import ConfigError
 from companion.tracking.carrier import body_from_ned
-from companion.values import FloatArray, UserError
+from companion.values import ArrayKind, FloatArray, UserError
 
 
 def placed(settings: Settings) -> geometry.Array:
@@ -21,47 +23,25 @@ def placed(settings: Settings) -> geometry.Array:
     spacing = given.spacing_wavelengths
     if given.spacing_m is not None:
         spacing = given.spacing_m * given.frequency_hz / geometry.SPEED_OF_LIGHT_MPS
+    mounted: dict[str, Any] = {
+        "array_from_body": mount, "element": element, "lever_arm_m": lever_arm_m
+    }  # fmt: skip
+    spaced = mounted | {"spacing_wavelengths": spacing}
+    elements, frequency_hz = given.elements, given.frequency_hz
     try:
         match given.kind:
-            case "ula":
-                return geometry.uniform_linear(
-                    given.elements,
-                    given.frequency_hz,
-                    spacing_wavelengths=spacing,
-                    array_from_body=mount,
-                    element=element,
-                    lever_arm_m=lever_arm_m,
-                )
-            case "ura":
+            case ArrayKind.ULA:
+                return geometry.uniform_linear(elements, frequency_hz, **spaced)
+            case ArrayKind.URA:
                 return geometry.uniform_rectangular(
-                    given.rows,
-                    columns=given.columns,
-                    frequency_hz=given.frequency_hz,
-                    spacing_wavelengths=spacing,
-                    array_from_body=mount,
-                    element=element,
-                    lever_arm_m=lever_arm_m,
+                    given.rows, columns=given.columns, frequency_hz=frequency_hz, **spaced
                 )
-            case "uca":
-                return geometry.uniform_circular(
-                    given.elements,
-                    given.frequency_hz,
-                    spacing_wavelengths=spacing,
-                    array_from_body=mount,
-                    element=element,
-                    lever_arm_m=lever_arm_m,
-                )
-            case "list":
+            case ArrayKind.UCA:
+                return geometry.uniform_circular(elements, frequency_hz, **spaced)
+            case ArrayKind.LIST:
                 placed = _rows(given.positions_m or ())
                 outward = placed[:, 3:6] if placed.shape[1] == 6 else None
-                return geometry.listed(
-                    placed[:, :3],
-                    given.frequency_hz,
-                    array_from_body=mount,
-                    element=element,
-                    lever_arm_m=lever_arm_m,
-                    outward=outward,
-                )
+                return geometry.listed(placed[:, :3], frequency_hz, outward=outward, **mounted)
     except UserError as error:
         raise ConfigError(f"array: {error}") from error
 

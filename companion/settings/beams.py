@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from companion.settings.section import Section
-from companion.values import Method, Normalisation, Policy, Power, UserError, Widen
+from companion.values import ArrayKind, Method, Normalisation, Policy, Power, UserError, Widen
 
 Metres = Annotated[float, Field(ge=-1e4, le=1e4)]
 Degrees = Annotated[float, Field(ge=-360, le=360)]
@@ -61,7 +61,7 @@ class ArraySettings(Section):
     with f; it is read into ``coupling_stored`` (its bytes, base64).
     """
 
-    kind: Literal["ula", "ura", "uca", "list"] = "ula"
+    kind: ArrayKind = ArrayKind.ULA
     elements: Annotated[int, Field(ge=1, le=4096)] = 64
     rows: Annotated[int, Field(ge=1, le=256)] = 8
     columns: Annotated[int, Field(ge=1, le=256)] = 8
@@ -87,9 +87,9 @@ class ArraySettings(Section):
     @model_validator(mode="after")
     def _listed(self) -> Self:
         listed = self.positions is not None or self.positions_m is not None
-        if (self.kind == "list") != listed:
+        if (self.kind is ArrayKind.LIST) != listed:
             raise UserError('kind = "list" goes with positions or positions_m, and they with it')
-        if self.kind == "ura" and self.rows * self.columns > 4096:
+        if self.kind is ArrayKind.URA and self.rows * self.columns > 4096:
             raise UserError("rows x columns is at most 4096")
         return self
 

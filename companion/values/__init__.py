@@ -14,6 +14,7 @@ Arrays inside these values are not to be written to.
 """
 
 from companion.values.aimed import (
+    ArrayKind,
     Beam,
     BeamSet,
     LeftOut,
@@ -67,6 +68,7 @@ __all__ = [
     "Accuracy",
     "AdsbVehicle",
     "AltitudeDatum",
+    "ArrayKind",
     "Attitude",
     "Beam",
     "BeamSet",

@@ -20,6 +20,15 @@ class Method(DescribedEnum):
     MATCHED = "mrt", "maximum ratio transmission"
 
 
+class ArrayKind(DescribedEnum):
+    """The geometry of an array, in the array frame (x boresight, y right, z down)."""
+
+    ULA = "ula", "uniform line along y"
+    URA = "ura", "uniform rectangle of rows down and columns to the right"
+    UCA = "uca", "uniform circle in the xy plane"
+    LIST = "list", "elements at listed positions"
+
+
 class Power(DescribedEnum):
     """How the beams of one time slot share the power."""
 

@@ -20,7 +20,7 @@ from companion.beams.worth import link_budget, patterns
 from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
 from companion.tracking.geodesy import Place
-from companion.values import Beam, BeamSet, FloatArray, LeftOut, Policy, Update
+from companion.values import ArrayKind, Beam, BeamSet, FloatArray, LeftOut, Policy, Update
 from companion.values.described import Inline, Meaning
 from companion.views import guaranteed_gain
 from companion.views.as_json import Json, as_json, degrees
@@ -86,7 +86,7 @@ class BeamState:
 class ArrayState:
     """The antenna array."""
 
-    kind: Annotated[str, Meaning("ula: line; ura: plane; uca: circle; list: listed elements")]
+    kind: Annotated[ArrayKind, Meaning("geometry of the array")]
     elements: Annotated[int, Meaning("number of elements")]
     frequency_hz: Annotated[float, Meaning("carrier frequency")]
     half_power_beamwidth_deg: Annotated[float | None, Meaning("width 3 dB below the peak")]

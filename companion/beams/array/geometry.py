@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from companion.beams.array.elements import ISOTROPIC, Element, Pattern
-from companion.values import BoolArray, ComplexArray, FloatArray, UserError
+from companion.values import ArrayKind, BoolArray, ComplexArray, FloatArray, UserError
 
 SPEED_OF_LIGHT_MPS: Final = 299_792_458.0
 SAME_PLACE_WAVELENGTHS: Final = 1e-9
@@ -25,7 +25,6 @@ LINE_WAVELENGTHS: Final = 1e-6
 class Array:
     """Element positions at a wavelength, and the mounting of the array.
 
-        kind                "ula", "ura", "uca" or "list"
         elements_m          (M, 3), array frame
         wavelength_m        wavelength
         array_from_body     (3, 3), the mounting
@@ -47,7 +46,7 @@ class Array:
         axis                (3,), the line on which they stand; None where they do not
     """
 
-    kind: str
+    kind: ArrayKind
     elements_m: FloatArray
     wavelength_m: float
     array_from_body: FloatArray
@@ -133,7 +132,7 @@ def uniform_rectangular(
     spacing_m = spacing_wavelengths * wavelength_m
     row, column = np.divmod(np.arange(rows * columns), columns)
     elements_m = np.stack([np.zeros(rows * columns), column * spacing_m, row * spacing_m], axis=1)
-    kind = "ula" if rows == 1 else "ura"
+    kind = ArrayKind.ULA if rows == 1 else ArrayKind.URA
     lever = np.zeros(3) if lever_arm_m is None else lever_arm_m
     return Array(
         kind=kind,
@@ -173,7 +172,7 @@ def uniform_circular(
         element=element,
         lever_arm_m=lever_arm_m,
         outward=outward,
-        kind="uca",
+        kind=ArrayKind.UCA,
     )
 
 
@@ -185,7 +184,7 @@ def listed(
     element: Element = ISOTROPIC,
     lever_arm_m: FloatArray | None = None,
     outward: FloatArray | None = None,
-    kind: str = "list",
+    kind: ArrayKind = ArrayKind.LIST,
 ) -> Array:
     """Elements at any positions (M, 3); ``outward`` (M, 3) is where each faces (None: boresight).
 

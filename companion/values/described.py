@@ -146,7 +146,7 @@ def _members(described: type) -> Iterator[Member]:
                 yield inner._replace(
                     name=said[0].prefix + inner.name,
                     optional=optional or inner.optional,
-                    get=_through(get, inner.get) if optional else _chain(get, inner.get),
+                    get=_through(get, inner.get) if optional else _chain(name, inner.get),
                 )
 
 
@@ -171,8 +171,13 @@ def _metadata(annotation: Any) -> tuple[Any, ...]:
     return ()
 
 
-def _chain(outer: Callable[[Any], Any], inner: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    return lambda whole: inner(outer(whole))
+def _chain(outer: str, inner: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Getter through an attribute: one call where both are attributes."""
+    if isinstance(inner, operator.attrgetter):
+        path = str(inner.__reduce__()[1][0])
+        return operator.attrgetter(f"{outer}.{path}")
+    get = operator.attrgetter(outer)
+    return lambda whole: inner(get(whole))
 
 
 def _through(outer: Callable[[Any], Any], inner: Callable[[Any], Any]) -> Callable[[Any], Any]:

@@ -4,10 +4,11 @@ The names follow by rule from those inside the program (``companion.values.descr
 """
 
 import functools
+import typing
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from enum import StrEnum
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -34,8 +35,11 @@ _DEGREES: Final = {"_rad": "_deg", "_radps": "_degps"}
 def as_json(item: Any, utc_ns: Utc) -> Json:
     """A described value as JSON."""
     kind: Any = type(item)
-    shown = {name: write(get(item), utc_ns) for name, get, write in _plan(kind)}
-    for old, new in FORMER_NAMES.get(kind.__name__, {}).items():
+    plan, former = _plan(kind)
+    shown = {
+        name: get(item) if write is None else write(get(item), utc_ns) for name, get, write in plan
+    }
+    for old, new in former:
         shown[old] = shown[new]
     return shown
 
@@ -51,7 +55,13 @@ def name_in_json(name: str) -> str:
 def rfc3339(t_ns: UtcNs) -> str:
     """A time in UTC with milliseconds: 2026-11-20T13:00:00.123Z."""
     seconds, milliseconds = divmod(t_ns // 1_000_000, 1000)
-    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{milliseconds:03d}Z"
+    return f"{_to_the_second(seconds)}.{milliseconds:03d}Z"
+
+
+@functools.lru_cache(maxsize=1024)
+def _to_the_second(seconds: int) -> str:
+    """Date and time; an answer has many times of the same few seconds."""
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}"
 
 
 def degrees(angle_rad: float | None) -> float | None:
@@ -60,27 +70,42 @@ def degrees(angle_rad: float | None) -> float | None:
 
 
 Write = Callable[[Any, Utc], Any]
+Plan = tuple[tuple[str, Callable[[Any], Any], Write | None], ...]
+_PLAIN: Final = (str, int, float, bool)
 
 
 @functools.cache
-def _plan(kind: Any) -> tuple[tuple[str, Callable[[Any], Any], Write], ...]:
-    """Name, getter and writer of each value of a class."""
-    return tuple(
+def _plan(kind: Any) -> tuple[Plan, tuple[tuple[str, str], ...]]:
+    """Name, getter and writer of each value of a class, and former names of some of them.
+
+    What is JSON as it is has no writer.
+    """
+    plan = tuple(
         (name_in_json(member.name), member.get, _writer(member))
         for member in members(kind)
         if "api" not in member.meaning.absent
     )
+    return plan, tuple(FORMER_NAMES.get(kind.__name__, {}).items())
 
 
-def _writer(member: Member) -> Write:
+def _writer(member: Member) -> Write | None:
     if member.name.endswith(tuple(_DEGREES)):
         return lambda angle_rad, _: degrees(angle_rad)
     if member.name.endswith("_ns"):
         return lambda t_ns, utc_ns: None if t_ns is None else rfc3339(utc_ns(t_ns))
-    if member.type in (str, int, float, bool):
-        return lambda value, _: value
-    if isinstance(member.type, type) and issubclass(member.type, StrEnum):
-        return lambda value, _: None if value is None else str(value)
+    kind, inner = member.type, typing.get_args(member.type)
+    if kind in _PLAIN or typing.get_origin(kind) is Literal:
+        return None
+    if isinstance(kind, type) and issubclass(kind, StrEnum):
+        return None  # it is a str
+    if typing.get_origin(kind) in (dict, list) and inner[-1] in _PLAIN:
+        return None
+    if "ndarray" in str(kind):
+        return lambda array, _: None if array is None else array.tolist()
+    if typing.get_origin(kind) is list and members(inner[0]):
+        return lambda items, utc_ns: [as_json(item, utc_ns) for item in items]
+    if isinstance(kind, type) and members(kind):
+        return lambda item, utc_ns: None if item is None else as_json(item, utc_ns)
     return _any
 
 
@@ -90,10 +115,6 @@ def _any(value: Any, utc_ns: Utc) -> Any:
         return value
     if isinstance(value, dict):
         return {key: _any(one, utc_ns) for key, one in value.items()}
-    if isinstance(value, np.ndarray):
-        return value.tolist()
     if isinstance(value, list | tuple) and not hasattr(value, "_fields"):
         return [_any(one, utc_ns) for one in value]
-    if members(type(value)):
-        return as_json(value, utc_ns)
-    return str(value)
+    return as_json(value, utc_ns) if members(type(value)) else str(value)

@@ -110,7 +110,8 @@ def meaning(described: Any, name: str) -> Meaning:
 
 def is_described(kind: Any) -> bool:
     """True for a class whose values are described."""
-    return isinstance(kind, type) and not issubclass(kind, str | int) and bool(members(kind))
+    is_class = isinstance(kind, type) and typing.get_origin(kind) is None
+    return is_class and not issubclass(kind, str | int) and bool(members(kind))
 
 
 def bare(annotation: Any) -> tuple[Any, bool]:

@@ -13,7 +13,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from companion.values import UtcNs
-from companion.values.described import Member, members
+from companion.values.described import Member, is_described, members
 
 Json = dict[str, Any]
 Utc = Callable[[int], UtcNs]  # function from a time on the node's timeline to UTC
@@ -102,9 +102,9 @@ def _writer(member: Member) -> Write | None:
         return None
     if "ndarray" in str(kind):
         return lambda array, _: None if array is None else array.tolist()
-    if typing.get_origin(kind) is list and members(inner[0]):
+    if typing.get_origin(kind) is list and is_described(inner[0]):
         return lambda items, utc_ns: [as_json(item, utc_ns) for item in items]
-    if isinstance(kind, type) and members(kind):
+    if is_described(kind):
         return lambda item, utc_ns: None if item is None else as_json(item, utc_ns)
     return _any
 

@@ -51,7 +51,7 @@ class Weights:
     uavs         names of the N UAVs
     matrix       (M, N) complex, columns in the order of ``uavs``
     valid_at_ns  when they are to be applied, ns since the Unix epoch on the service's clock
-    groups       the turn of each UAV
+    groups       the time slot of each UAV
     """
 
     uavs: tuple[str, ...]
@@ -101,7 +101,7 @@ class Client:
             body, headers = _read(answer), answer.headers
         uavs = tuple(name for name in headers["x-uavs"].split(",") if name)
         matrix = np.load(io.BytesIO(body), allow_pickle=False)
-        groups = tuple(int(turn) for turn in headers["x-groups"].split(",") if turn)
+        groups = tuple(int(slot) for slot in headers["x-groups"].split(",") if slot)
         return Weights(
             uavs=uavs, matrix=matrix, valid_at_ns=int(headers["x-valid-at-ns"]), groups=groups
         )

@@ -19,7 +19,7 @@ from companion.beams.hardware.devices import (
     TMYTEK_CHANNELS,
     TMYTEK_SETTINGS,
     TMYTEK_STEP_DB,
-    Device,
+    Beamformer,
     Mode,
     vector_modulator,
 )
@@ -27,19 +27,19 @@ from companion.beams.hardware.tables import DeviceTable
 from companion.values import IntArray
 
 
-def parse(device: Device, text: str, calibration: Calibration) -> DeviceTable:
+def parse(device: Beamformer, text: str, calibration: Calibration) -> DeviceTable:
     """The table that a text sets, and what it radiates with this calibration.
 
     ``ValueError`` where the text is not the device's, or is for another array.
     """
     order = calibration.order
     match device:
-        case Device.ADAR1000:
+        case Beamformer.ADAR1000:
             uavs, codes, order = read_adar1000(text)
-        case Device.TMYTEK:
+        case Beamformer.TMYTEK:
             codes = read_tmytek(text)
             uavs = tuple(str(beam + 1) for beam in range(len(codes)))
-        case Device.SIVERS:
+        case Beamformer.SIVERS:
             uavs, codes = read_sivers(text)
     if codes.shape[1] != len(calibration.order) or order != calibration.order:
         raise ValueError(
@@ -71,7 +71,7 @@ def read_adar1000(text: str) -> tuple[tuple[str, ...], IntArray, tuple[int, ...]
     order: dict[int, int] = {}
     rows: dict[tuple[int, int], tuple[int, int]] = {}
     for number, found in fields(text, ADAR1000_HEADER):
-        beam = whole(number, "beam", found[0], 0, LIMITS[Device.ADAR1000].beams - 1)
+        beam = whole(number, "beam", found[0], 0, LIMITS[Beamformer.ADAR1000].beams - 1)
         chip = whole(number, "chip", found[2], 0, 9999)
         channel = whole(number, "channel", found[3], 1, ADAR1000_CHANNELS)
         place = chip * ADAR1000_CHANNELS + channel - 1
@@ -120,7 +120,7 @@ def read_tmytek(text: str) -> IntArray:
             raise ValueError(
                 f"line {number}: BeamType {kind!r}: only 1, tables of channels, is read"
             )
-        beam = whole(number, "BeamID", found[1], 1, LIMITS[Device.TMYTEK].beams)
+        beam = whole(number, "BeamID", found[1], 1, LIMITS[Beamformer.TMYTEK].beams)
         channel = whole(number, "ch", found[6], 1, TMYTEK_CHANNELS) - 1
         if (beam, channel) in found_at:
             raise ValueError(f"line {number}: beam {beam} has channel {channel + 1} already")

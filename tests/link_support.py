@@ -13,7 +13,7 @@ from pymavlink.dialects.v10 import all as dialect_v1
 from pymavlink.dialects.v20 import all as dialect
 
 from companion.mavlink.links import kernel_time
-from companion.mavlink.links.transport import Guard, Link
+from companion.mavlink.links.transport import Link, MessageSigning
 from companion.mavlink.links.urls import parse_link
 from companion.values import Frame, Notice, Rejection
 
@@ -110,7 +110,7 @@ async def until_true(enough: Callable[[], bool]) -> None:
 
 @contextlib.asynccontextmanager
 async def running(
-    url: str, now_ns: Callable[[], int] | None = None, guard: Guard | None = None
+    url: str, now_ns: Callable[[], int] | None = None, guard: MessageSigning | None = None
 ) -> AsyncIterator[tuple[Link, Inbox]]:
     """A link that is open and runs, and is cancelled at the end. Its time is 1, 2, 3 …"""
     inbox, clock = Inbox(), count(1)

@@ -10,7 +10,7 @@ app.openapi  # FastAPI asks for the document by it
 message.position_covariance_type  # a field of protobuf's
 field.type_name, field.proto3_optional, field.oneof_index  # fields of a protobuf descriptor
 Severity.publish_time_ns  # the layout of a record of MCAP
-Device.RX, Normalisation.ANTENNA, Policy.DROP  # members chosen by their value in the settings
+Beamformer.RX, Normalisation.ANTENNA, Policy.DROP  # members chosen by their value in the settings
 sample.codebook_best  # written to the study's JSON by its fields
 numbers.find_class  # pickle asks by it
 told.resting  # written to JSON by its fields

@@ -7,12 +7,12 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from companion.beams import line_of_sight, steady
+from companion.beams import hysteresis, line_of_sight
 from companion.beams.array import steering
 from companion.beams.array.coverage import EVERYWHERE, Coverage, refusals
-from companion.beams.array.elements import Pattern
+from companion.beams.array.elements import ElementPattern
 from companion.beams.array.geometry import Array
-from companion.beams.steady import Steady
+from companion.beams.hysteresis import Steady
 from companion.beams.weights import shapes, widening
 from companion.beams.weights.precoding import (
     Precoder,
@@ -100,7 +100,7 @@ def aim(
         valid_at_ns=valid_at_ns,
         beams=beams,
         weights=made.weights,
-        method=steady.named(before, valid_at_ns, made.method, made.exact),
+        method=hysteresis.named(before, valid_at_ns, made.method, made.exact),
         normalisation=made.normalisation,
         condition_number=made.condition_number,
         left_out=left_out,
@@ -109,19 +109,18 @@ def aim(
 
 
 def without(beam_set: BeamSet, uavs: Collection[str]) -> BeamSet:
-    """The beams of all others: the UAVs named keep the nulls that those have on them, and no beam.
+    """The beam set without the beams of some UAVs; the nulls towards these UAVs stay.
 
-    What of the power was theirs goes to the others of their turn, and a turn that was theirs alone
-    is none any more.
+    The other beams of a time slot share its power. A slot without beams is removed.
     """
     kept = [i for i, beam in enumerate(beam_set.beams) if beam.uav not in uavs]
     weights = beam_set.weights[:, kept]
-    turns = np.unique([beam_set.beams[i].group for i in kept], return_inverse=True)[1]
+    slots = np.unique([beam_set.beams[i].group for i in kept], return_inverse=True)[1]
     beams = tuple(
-        replace(beam_set.beams[i], group=turn) for i, turn in zip(kept, turns.tolist(), strict=True)
+        replace(beam_set.beams[i], group=slot) for i, slot in zip(kept, slots.tolist(), strict=True)
     )
     if kept:
-        normalise(weights, beam_set.normalisation, turns)
+        normalise(weights, beam_set.normalisation, slots)
     left_out = tuple(one for one in beam_set.left_out if one.uav not in uavs)
     return replace(beam_set, beams=beams, weights=weights, left_out=left_out)
 
@@ -163,8 +162,8 @@ def _beams(
     wanted = [(0.0, 0.0) if b is None else (u, b) for u, b in zip(usual, bounds, strict=True)]
     natural_rad = array.wavelength_m / max(float(shapes.aperture(array).lengths_m.max()), 1e-9)
     sure_plane = precoder.widen is Widen.GUARANTEE and array.axis is None
-    pace = steady.SURE_PLANE if sure_plane else 1.0
-    shaped = steady.followed_rad(
+    pace = hysteresis.SURE_PLANE if sure_plane else 1.0
+    shaped = hysteresis.followed_rad(
         before, valid_at_ns, uavs, wanted_rad=np.array(wanted), natural_rad=natural_rad, pace=pace
     )
     spread = widening.spread(
@@ -189,7 +188,7 @@ def _beams(
             link_budget.isotropic_snr(ranges_m, array, precoder.budget, precoder.uav_antennas),
             worths,
         ),
-        before=steady.turns(before, valid_at_ns, uavs),
+        before=hysteresis.slots(before, valid_at_ns, uavs),
     )
     azimuths, elevations = steering.angles_rad(directions)
     served = matrix[:, made.served]
@@ -233,7 +232,7 @@ def _out_of_reach(
     reasons: list[str | None] = [None] * len(directions)
     if coverage != EVERYWHERE:
         reasons = refusals(coverage, directions, directions @ array.array_from_body)
-    if array.element.pattern is not Pattern.ISOTROPIC:
+    if array.element.pattern is not ElementPattern.ISOTROPIC:
         amplitudes = steering.amplitudes(array, directions)
         if array.live is not None:  # those that face there may be those that are dead
             amplitudes = amplitudes * array.live[:, np.newaxis]

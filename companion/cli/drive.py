@@ -13,7 +13,7 @@ from companion.cli.console import CONFIG
 from companion.values import UserError
 
 if TYPE_CHECKING:
-    from companion.node.drive.loop import Told
+    from companion.node.drive.loop import DriveStatus
     from companion.values import IntArray
 
 
@@ -78,7 +78,7 @@ def drive(
     from companion.client import Client
     from companion.node.drive import running, targets
     from companion.node.drive.loop import Drive, Safe
-    from companion.node.drive.sources import OverHttp, Wanted, stored_registers
+    from companion.node.drive.sources import BeamRequest, OverHttp, stored_registers
     from companion.pipeline import assembly
     from companion.settings.files import load
 
@@ -97,7 +97,7 @@ def drive(
     driven = Drive(
         source=OverHttp(
             client,
-            Wanted(
+            BeamRequest(
                 uavs=uavs,
                 anybody=not uavs,
                 takes=device.takes,
@@ -112,7 +112,7 @@ def drive(
         say=lambda text: click.echo(text, err=True),
     )
 
-    def show(told: "Told") -> None:
+    def show(told: "DriveStatus") -> None:
         if as_json:
             click.echo(json.dumps(asdict(told)))
 
@@ -123,7 +123,7 @@ def drive(
         raise UserError("nothing was applied: there were no beams, or the device took none")
 
 
-def _text(told: "Told") -> str:
+def _text(told: "DriveStatus") -> str:
     times = ""
     if told.p50_ms is not None:
         times = f", to apply p50 {told.p50_ms:.1f} ms p99 {told.p99_ms:.1f} ms"

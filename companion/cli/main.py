@@ -220,7 +220,7 @@ def replay(
 
         own = load(config).override(server={"listen": listen})
         served_replay.serve(
-            served_replay.Asked(
+            served_replay.ReplayRequest(
                 logs=logs,
                 settings=settings,
                 speed=pace,

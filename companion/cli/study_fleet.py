@@ -76,7 +76,7 @@ def fleet(
 
     progress = Progress()
     sizes = tuple(zip(_steps(nodes, steps), _steps(uavs, steps), strict=True))
-    asked = study.Asked(
+    asked = study.FleetStudy(
         sizes=sizes, seconds=seconds, delay_s=delay, loss=loss, spacing_m=spacing, seed=seed
     )
     make_folder(out)

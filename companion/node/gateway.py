@@ -14,7 +14,7 @@ from companion.mavlink.links.signing_store import Timestamps, key_warning, load_
 from companion.mavlink.links.transport import Link
 from companion.mavlink.links.urls import LinkError, parse_link
 from companion.mavlink.trust.twins import Twins
-from companion.mavlink.voice.component import HEARD, Component, ComponentSpec
+from companion.mavlink.voice.component import HEARD, ComponentSpec, ServiceComponent
 from companion.mavlink.voice.rate_watch import MessageRate
 from companion.mavlink.wire.encode import Outgoing
 from companion.settings.center import VehicleCenter, parse_center
@@ -207,7 +207,7 @@ class Gateway:
         return self._component.rates() if self._component else []
 
 
-def component(settings: Settings) -> Component | None:
+def component(settings: Settings) -> ServiceComponent | None:
     """The service as a MAVLink component; None where it is to be silent. Raises ``ConfigError``."""
     given, center = settings.presence, settings.center.source
     if not given.enabled:
@@ -221,7 +221,7 @@ def component(settings: Settings) -> Component | None:
             " of a system, such as 200"
         )
     try:
-        return Component(
+        return ServiceComponent(
             ComponentSpec(
                 source=Source(sysid, given.component_id),
                 carrier=carrier,

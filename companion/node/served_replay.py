@@ -26,7 +26,7 @@ from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.trust.dedupe import LINKS_MAX
 from companion.mavlink.voice.rate_watch import MessageRate
 from companion.node.replay import FLUSH_EVERY_S, Run, log_events, missing, told
-from companion.node.serving import NOTICES_KEPT, Server, Throughput, address, pause, run_until_told
+from companion.node.serving import NOTICES_KEPT, RateMeter, Server, address, pause, run_until_told
 from companion.pipeline import assembly
 from companion.recording.writer import Writer
 from companion.server import area_map
@@ -39,14 +39,14 @@ from companion.views.lateness import Lateness
 from companion.views.series import Series
 from companion.views.state import RecordingStatus, ReplayStatus
 
-TURN_S: Final = 0.005
-"""Longest time that the replay holds the event loop before others have their turn."""
+SLICE_S: Final = 0.005
+"""Time slice: the longest time that the replay holds the event loop."""
 MEASURED_AT_ONCE: Final = 20_000
 """Events read at once while measuring the log; measuring can be stopped only in between."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Asked:
+class ReplayRequest:
     """What is to be replayed, and how.
 
     latency_s as in ``companion.node.replay.replay``
@@ -63,7 +63,7 @@ class Asked:
 
 
 def serve(
-    asked: Asked,
+    asked: ReplayRequest,
     listen: str,
     show: Callable[[dict[str, Any]], None],
     *,
@@ -92,7 +92,7 @@ class ServedReplay:
     log, ``ConfigError`` for settings, ``OSError`` for a recording that cannot be used.
     """
 
-    def __init__(self, asked: Asked, say: Callable[[str], None]) -> None:
+    def __init__(self, asked: ReplayRequest, say: Callable[[str], None]) -> None:
         logs, settings = asked.logs, asked.settings
         self._area = area_map.find(asked.area_map)
         events = log_events(logs, settings, asked.latency_s)
@@ -112,7 +112,7 @@ class ServedReplay:
         self._finished = False
         self._of_s: float | None = None
         self._notices: deque[Notice] = deque(maxlen=NOTICES_KEPT)
-        self._rates = Throughput()
+        self._rates = RateMeter()
         self._links: dict[str, _ReplayedLink] = {}
         self.last_messages = LastMessages()
         self.lateness = Lateness()
@@ -157,25 +157,25 @@ class ServedReplay:
         """Step through every event at its time, until told to stop."""
         loop = asyncio.get_running_loop()
         began_s, first_ns = loop.time(), self._now_ns
-        turn_s = flush_s = began_s
+        slice_s = flush_s = began_s
         for event in self._events:
             now_s = loop.time()
             if self._speed is not None:
                 due_s = began_s + (event.t_ns - first_ns) * 1e-9 / self._speed
                 if due_s > now_s:
                     await pause(until, due_s - now_s)
-                    now_s = turn_s = loop.time()
+                    now_s = slice_s = loop.time()
                     self.lateness.observe(now_s - due_s)
-            if now_s - turn_s > TURN_S:
+            if now_s - slice_s > SLICE_S:
                 await asyncio.sleep(0)
-                turn_s = loop.time()
+                slice_s = loop.time()
             if until.is_set():
                 self._say(f"stopped after {self._run.at_s:.1f} s of {self.name}")
                 return
             self._step(event)
             if self._run.writer and now_s - flush_s > FLUSH_EVERY_S:
                 await asyncio.to_thread(self._run.writer.flush)
-                flush_s = turn_s = loop.time()
+                flush_s = slice_s = loop.time()
         self._finished = True
         self._of_s = self._run.at_s
 

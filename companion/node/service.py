@@ -20,12 +20,12 @@ from companion.node.clock import NodeClock
 from companion.node.drive import targets
 from companion.node.drive.loop import Drive, Safe
 from companion.node.drive.running import beside
-from companion.node.drive.sources import OfThisProcess, Wanted, stored_registers
-from companion.node.fleet.live import FleetNode
+from companion.node.drive.sources import BeamRequest, OfThisProcess, stored_registers
+from companion.node.fleet.live import LiveFleetNode
 from companion.node.gateway import Gateway
 from companion.node.outlet import Outlet
 from companion.node.push import Push
-from companion.node.serving import NOTICES_KEPT, Server, Throughput, aside
+from companion.node.serving import NOTICES_KEPT, RateMeter, Server, aside
 from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
 from companion.recording.background import BackgroundRecorder, Rotation
@@ -83,7 +83,7 @@ class Service:
         self._say = say
         self._timeline = clock or NodeClock()
         self._started_ns = self._timeline.now_ns()
-        self._rates = Throughput()
+        self._rates = RateMeter()
         self._defects: asyncio.Queue[Exception] = asyncio.Queue()
         self._recorder: BackgroundRecorder | None = None
         self._live = self._open_live()
@@ -167,11 +167,11 @@ class Service:
             await asyncio.to_thread(self._recorder.stop, metadata)
             self._tell_of_recorder(self._recorder)
 
-    def _fleet_node(self, settings: Settings) -> FleetNode | None:
+    def _fleet_node(self, settings: Settings) -> LiveFleetNode | None:
         if settings.fleet.node is None:
             return None
         now_ns = self._timeline.now_ns
-        return FleetNode(
+        return LiveFleetNode(
             settings=settings.fleet,
             pipeline=self.pipeline,
             step=self._step,
@@ -219,7 +219,7 @@ class Service:
 
         try:
             centre = kept.drive.aim == "centre"
-            wanted = Wanted(
+            wanted = BeamRequest(
                 uavs=uavs, anybody=not kept.drive.uavs, takes=self._device.takes, centre=centre
             )
             source = OfThisProcess(

@@ -64,7 +64,7 @@ class Server(uvicorn.Server):
         yield
 
 
-class Throughput:
+class RateMeter:
     """Frames and beam updates per second over the last seconds."""
 
     def __init__(self) -> None:

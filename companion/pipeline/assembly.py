@@ -15,7 +15,7 @@ from companion.beams.hardware import codebooks
 from companion.beams.hardware.calibration import Calibration, channel_error
 from companion.beams.hardware.calibration_tables import calibration_at
 from companion.beams.hardware.codebooks import Codebook
-from companion.beams.hardware.devices import Device
+from companion.beams.hardware.devices import Beamformer
 from companion.beams.hardware.unit_gains import RELATIVE, UnitGains, parse_unit_gains
 from companion.beams.weights.precoding import Precoder
 from companion.beams.worth.link_budget import LinkBudget
@@ -139,7 +139,7 @@ class Equipment:
     calibration: Calibration | None  # calibration of the hardware; None without
     budget: LinkBudget  # power, bandwidth and noise figure of the radio link
     uav_antennas: int  # antennas that each UAV combines
-    device: Device | None = None  # what the weights are quantised for; None: nothing
+    device: Beamformer | None = None  # what the weights are quantised for; None: nothing
     unit_gains: UnitGains = RELATIVE  # what a TMYTEK unit's channels can have
 
 
@@ -159,7 +159,7 @@ def equipment(settings: Settings, antenna: geometry.Array) -> Equipment:
         raise
     except UserError as error:
         raise ConfigError(f"codebook: {error}") from error
-    device = None if settings.hardware.device is None else Device(settings.hardware.device)
+    device = None if settings.hardware.device is None else Beamformer(settings.hardware.device)
     text = unit_text(settings)
     try:
         gains = RELATIVE if text is None else parse_unit_gains(text)
@@ -225,7 +225,7 @@ def noise(settings: Settings) -> NoiseSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class Assumed:
+class AircraftAssumptions:
     """What is assumed of one aircraft: its limits, the lag of its positions, how it turns."""
 
     limits: Limits
@@ -243,7 +243,9 @@ class Assumed:
         return (self.lag_s[1] - self.lag_s[0]) / 2
 
 
-def assumed(settings: Settings, uav: str, mav_type: int | None, autopilot: int | None) -> Assumed:
+def assumed(
+    settings: Settings, uav: str, mav_type: int | None, autopilot: int | None
+) -> AircraftAssumptions:
     """What is assumed of a UAV: by its own settings, its type's, everybody's, or its type.
 
     ``mav_type`` and ``autopilot`` are those of its heartbeat; None where none was heard.
@@ -264,7 +266,9 @@ def assumed(settings: Settings, uav: str, mav_type: int | None, autopilot: int |
     apart_s = settings.clocks.apart_s.get(uav, 0.0)
     lag = lag[0] - apart_s, lag[1] + apart_s
     turn_degps2 = settings.center.turn_acceleration_max_degps2
-    return Assumed(limits, lag, known.turn_degps2 if turn_degps2 is None else turn_degps2)
+    return AircraftAssumptions(
+        limits, lag, known.turn_degps2 if turn_degps2 is None else turn_degps2
+    )
 
 
 def anyone(settings: Settings) -> Limits:

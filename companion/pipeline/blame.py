@@ -23,7 +23,7 @@ STEADIER: Final = "use a MAVLink link of steadier delay"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Evidence:
+class LinkEvidence:
     """What is known of a UAV beside its track."""
 
     clock_assumed: bool  # the constant part of its latency is only assumed
@@ -74,7 +74,7 @@ def of_unserved(track: Track, *, reached: bool, full: bool) -> Blame:
 
 
 def of_beam(
-    beam: Beam, track: Track, carrier: Carrier, needed_db: float, evidence: Evidence
+    beam: Beam, track: Track, carrier: Carrier, needed_db: float, evidence: LinkEvidence
 ) -> Blame:
     """Why a beam surely does not have the gain that its link needs, or likely does not."""
     silence = _silence(track, evidence)
@@ -89,7 +89,7 @@ def of_beam(
     return _far_off(beam, track, carrier, evidence)
 
 
-def _turned(carrier: Carrier, evidence: Evidence) -> Blame:
+def _turned(carrier: Carrier, evidence: LinkEvidence) -> Blame:
     """Why the carrier's attitude may be far off: by itself, by its age, or by its clock."""
     if carrier.attitude_bound_rad < 1.5 * evidence.attitude_bound_rad:
         remedy = "give it a better compass, and say so ([center] attitude_bound_deg)"
@@ -118,7 +118,7 @@ def _short_of_gain(beam: Beam, needed_db: float) -> Blame:
     )
 
 
-def _far_off(beam: Beam, track: Track, carrier: Carrier, evidence: Evidence) -> Blame:
+def _far_off(beam: Beam, track: Track, carrier: Carrier, evidence: LinkEvidence) -> Blame:
     """Why the position may be far off, as seen from the array."""
     aged_s = max(track.age_s, track.dt_s or 0.0)
     grown_m = _grown_m(track, aged_s)
@@ -156,7 +156,7 @@ def _grown_m(track: Track, seconds: float) -> float:
     return min(track.limits.acceleration_max_mps2 * seconds**2 / 2, way_m)
 
 
-def _silence(track: Track, evidence: Evidence) -> Blame | None:
+def _silence(track: Track, evidence: LinkEvidence) -> Blame | None:
     if evidence.refused is not None:
         return Blame(
             Cause.REFUSED, f"its reports are not used: {evidence.refused}", "see its rejections"
@@ -186,7 +186,7 @@ def _aged(track: Track) -> Blame:
     )
 
 
-def _clock(track: Track, evidence: Evidence) -> Blame:
+def _clock(track: Track, evidence: LinkEvidence) -> Blame:
     doubt_s = track.clock_bound_s
     known = f"{doubt_s * 1e3:.0f} ms" if doubt_s < 1.0 else f"{doubt_s:.1f} s"
     if evidence.clock_assumed:

@@ -49,7 +49,7 @@ PACE_NS: Final = 250_000_000  # by how much arrivals and stamps may differ from 
 
 
 @dataclass(frozen=True, slots=True)
-class _Run:
+class _AttitudeRun:
     """Attitudes one after the other: arrival of the first, arrival and stamp of the last."""
 
     began_ns: int
@@ -57,7 +57,7 @@ class _Run:
     count: int
 
 
-class Center:
+class CarrierTracker:
     """Position and attitude of the array.
 
     place    the fixed station, or the vehicle that is followed; ``home`` until the first report
@@ -72,8 +72,8 @@ class Center:
         self._home_from: tuple[str, int] | None = None  # who home began with, and when
         self._attitude: tuple[int, Attitude] | None = None  # sender's time, attitude
         self._contradicted: Contradiction | None = None  # of the newest and the one before
-        self._turns = carrier.Turns()
-        self._passed: _Run | None = None  # attitudes that were stamped before the newest
+        self._angular_acceleration = carrier.AngularAcceleration()
+        self._passed: _AttitudeRun | None = None  # attitudes that were stamped before the newest
         self._least_bound_rad = math.radians(settings.center.attitude_bound_deg)
         self._estimator: EstimatorStatus | None = None
         self._doubted_rad = self._least_bound_rad  # the most that was told
@@ -144,19 +144,19 @@ class Center:
         if self._attitude is not None and placed.sender_ns <= self._attitude[0]:
             if not self._goes_on_before(placed):
                 return None
-            self._turns = carrier.Turns()
+            self._angular_acceleration = carrier.AngularAcceleration()
             self._attitude = None
         self._passed = None
         self._contradicted = self._contradicts(placed, turn_degps2)
         self._attitude = placed.sender_ns, placed.attitude
-        return self._turns.look(placed.attitude, placed.sender_ns, turn_degps2)
+        return self._angular_acceleration.look(placed.attitude, placed.sender_ns, turn_degps2)
 
     def _contradicts(self, placed: PlacedAttitude, turn_degps2: float) -> Contradiction | None:
         """What the newest attitude and this one are apart beyond reason: one of them is wrong."""
         if self._attitude is None:
             return None
         before_ns, before = self._attitude
-        limit_degps2 = self._turns.limit_degps2(turn_degps2, placed.sender_ns)
+        limit_degps2 = self._angular_acceleration.limit_degps2(turn_degps2, placed.sender_ns)
         bounds = carrier.AttitudeBounds(self.attitude_bound_rad, math.radians(limit_degps2))
         apart_s = (placed.sender_ns - before_ns) * 1e-9
         return carrier.contradiction(before, placed.attitude, apart_s, bounds)
@@ -200,7 +200,7 @@ class Center:
             if sender_step_ns <= 0 or abs(step_ns - sender_step_ns) > PACE_NS:
                 run = None
         began_ns, count = (at[0], 0) if run is None else (run.began_ns, run.count)
-        self._passed = _Run(began_ns, at, count + 1)
+        self._passed = _AttitudeRun(began_ns, at, count + 1)
         return at[0] - began_ns >= PASSED_NS and count + 1 >= PASSED_LEAST
 
     def restarted(self, uav: str) -> None:
@@ -210,7 +210,7 @@ class Center:
             self._contradicted = None
             self._estimator = None
             self._passed = None
-            self._turns = carrier.Turns()
+            self._angular_acceleration = carrier.AngularAcceleration()
 
     def _first(self, report: Report) -> Notice:
         """Make the first position of all the origin of the local frame, and of ``home``."""
@@ -282,7 +282,7 @@ class Center:
         made_ns, attitude = self._attitude
         if now.sender_ns - made_ns > self._attitude_kept_s * 1e9:
             return f"the attitude of the carrier {self.vehicle} is too old"
-        turn_degps2 = self._turns.limit_degps2(turn_degps2, at.sender_ns)
+        turn_degps2 = self._angular_acceleration.limit_degps2(turn_degps2, at.sender_ns)
         bounds = carrier.AttitudeBounds(self.attitude_bound_rad, math.radians(turn_degps2))
         since_ns = at.sender_ns - made_ns
         return carrier.moving(

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from companion.beams.array import geometry
-from companion.beams.array.elements import Element, Pattern
+from companion.beams.array.elements import Element, ElementPattern
 from companion.settings.model import Settings
 from companion.settings.section import ConfigError
 from companion.tracking.carrier import body_from_ned
@@ -18,7 +18,7 @@ def placed(settings: Settings) -> geometry.Array:
     mount = body_from_ned(
         *np.radians([given.mount_roll_deg, given.mount_pitch_deg, given.mount_yaw_deg])
     )
-    element = Element(Pattern(given.element), given.element_exponent)
+    element = Element(ElementPattern(given.element), given.element_exponent)
     lever_arm_m = np.array(given.lever_arm_m)
     spacing = given.spacing_wavelengths
     if given.spacing_m is not None:

@@ -21,17 +21,17 @@ from dataclasses import replace
 from functools import cache, partial
 from typing import Final, NamedTuple
 
-from companion.beams import steady
+from companion.beams import hysteresis
 from companion.beams.aim import aim, without
-from companion.beams.steady import Steady
+from companion.beams.hysteresis import Steady
 from companion.mavlink.clock.estimates import ClockChange, ClockEstimate, Guarantee
 from companion.mavlink.wire.decode import DECODED
 from companion.mavlink.wire.stamps import STAMPED
 from companion.pipeline import assembly, assumptions
-from companion.pipeline.blame import Evidence
-from companion.pipeline.center import Center
+from companion.pipeline.blame import LinkEvidence
+from companion.pipeline.center import CarrierTracker
 from companion.pipeline.digest import Digest
-from companion.pipeline.health import Health, Site, Weighed
+from companion.pipeline.health import HealthMonitor, Site, Weighed
 from companion.pipeline.records import Records, UavRecord
 from companion.pipeline.refusals import Refusals
 from companion.pipeline.senders import NOTHING, PlacedAttitude, PlacedReport, Senders
@@ -107,7 +107,7 @@ class Pipeline:
         self.array = assembly.array(settings)
         self.coverage = assembly.coverage(settings)
         self.precoder = assembly.precoder(settings)
-        self.center = Center(settings)
+        self.center = CarrierTracker(settings)
         self.tracker = assembly.tracker(settings)
         self.records = Records(UavRecord, self.tracker.__contains__)
         self.refusals = Refusals(self.records)
@@ -120,7 +120,7 @@ class Pipeline:
         self.targets = Targets(settings, self.center.vehicle)
         budget, antennas = assembly.radio(settings)
         site = Site(array=self.array, coverage=self.coverage, budget=budget, uav_antennas=antennas)
-        self.health = Health(settings.link, site)
+        self.health = HealthMonitor(settings.link, site)
 
     # --- the fold ---------------------------------------------------------------------------
 
@@ -253,7 +253,7 @@ class Pipeline:
         made = self._aimed_of(self.sighted(now_ns)) if is_old else aiming.made
         self.last_update, weighed = made()
         self.last_carrier = self.last_update.carrier or self.last_carrier
-        self._steady = steady.after(self._steady, self.last_update.beams)
+        self._steady = hysteresis.after(self._steady, self.last_update.beams)
         states = {track.uav: track.state for track in self.last_update.tracks}
         if self.center.vehicle is not None:
             now = self.senders.time(self.center.vehicle, now_ns)
@@ -270,11 +270,11 @@ class Pipeline:
 
         return made
 
-    def _evidence(self, now_ns: int, uav: str) -> Evidence:
+    def _evidence(self, now_ns: int, uav: str) -> LinkEvidence:
         vehicle = self.center.vehicle
         now = None if vehicle is None else self.senders.time(vehicle, now_ns)
         age_s = None if now is None else self.center.attitude_age_s(now)
-        return Evidence(
+        return LinkEvidence(
             clock_assumed=self._is_assumed(uav),
             refused=self.refusals.unheard(uav),
             attitude_bound_rad=self.center.attitude_bound_rad,

@@ -1,8 +1,8 @@
 """Verdicts on the links to all UAVs, and the notices when one changes.
 
 Once a second the gain that each beam surely has, and the one that it likely has, is held against
-what the link needs. Many links are judged in turn, some at each update, so that no update is held
-up by all of them. A verdict changes only once it has been another for a while, and not for a hair's
+what the link needs. Links are judged in batches, one at each update, so that no update is delayed by
+all of them. A verdict changes only once it has been another for a while, and not for a hair's
 breadth, so that it does not flap.
 """
 
@@ -19,7 +19,7 @@ from companion.beams.array.geometry import Array
 from companion.beams.worth import guarantee, link_budget
 from companion.beams.worth.link_budget import LinkBudget
 from companion.pipeline import blame
-from companion.pipeline.blame import Evidence
+from companion.pipeline.blame import LinkEvidence
 from companion.settings.beams import NeedSettings
 from companion.values import (
     Beam,
@@ -73,7 +73,7 @@ class Weighed(NamedTuple):
     links: list[_Link]
 
 
-class Health:
+class HealthMonitor:
     """The verdicts. ``verdicts`` holds the present one of each target, by its name."""
 
     def __init__(self, need: NeedSettings, site: Site) -> None:
@@ -88,7 +88,7 @@ class Health:
         self._unfit: str | None = None
 
     def weigh(self, update: Update) -> Weighed | None:
-        """What the links whose turn it is have, and need; None: it is nobody's.
+        """The next batch of links to assess, with what they have and need; None: none is due.
 
         Changes nothing. It takes milliseconds, and may be made on any thread.
         """
@@ -117,9 +117,9 @@ class Health:
         ]
 
     def judge(
-        self, update: Update, weighed: Weighed | None, evidence: Callable[[str], Evidence]
+        self, update: Update, weighed: Weighed | None, evidence: Callable[[str], LinkEvidence]
     ) -> list[Notice]:
-        """Judge the links that were weighed, and tell what changed when all have had their turn.
+        """Judge one batch of links; return notices of what changed once all batches are done.
 
         ``evidence`` says what is known of a UAV beside its track; it is asked of UAVs whose link is
         not good.
@@ -146,7 +146,7 @@ class Health:
         update: Update,
         link: _Link,
         tracks: dict[str, Track],
-        evidence: Callable[[str], Evidence],
+        evidence: Callable[[str], LinkEvidence],
     ) -> Verdict:
         uav, carrier = link.beam.uav, update.carrier
         level = self._level(uav, link.needed_db, link.sure_db, link.likely_db)

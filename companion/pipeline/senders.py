@@ -90,7 +90,7 @@ class PlacedAttitude:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Heard:
+class FrameOutcome:
     """The outcome of one frame.
 
     message    a message with its time; None if nothing is to be done further
@@ -105,7 +105,7 @@ class Heard:
     change: ClockChange | None = None
 
 
-NOTHING: Final = Heard()  # the outcome of a frame that asks for nothing further
+NOTHING: Final = FrameOutcome()  # the outcome of a frame that asks for nothing further
 
 
 @dataclass(slots=True)
@@ -118,7 +118,7 @@ class Sender:
 
 
 @dataclass(slots=True, kw_only=True)
-class Component:
+class ComponentState:
     """What a MAVLink component says beside positions.
 
     stated_us  the receiver's own time of that status; 0 if unknown, or of the boot before
@@ -160,7 +160,7 @@ class Senders:
         self._records = records
         self._tracked = tracked
         self._senders = Records(lambda: Sender(assembly.clock(settings)), self._is_kept)
-        self._components: defaultdict[Source, Component] = defaultdict(Component)
+        self._components: defaultdict[Source, ComponentState] = defaultdict(ComponentState)
         self._noise_settings = assembly.noise(settings)
         self._dedupe = Dedupe()  # by content, over all links
         self._admits = admission(settings.tracks.allow, settings.tracks.deny)
@@ -169,15 +169,15 @@ class Senders:
 
     # --- what they say ----------------------------------------------------------------------
 
-    def hear(self, frame: Frame) -> Heard:
+    def hear(self, frame: Frame) -> FrameOutcome:
         """Take in one frame of a message that is decoded (``decode.DECODED``)."""
         if frame.msgid == ATTITUDE and frame.source != self._carrier_source:
             change = self.notice(frame)
-            return NOTHING if change is None else Heard(change=change)
+            return NOTHING if change is None else FrameOutcome(change=change)
         message = decode(frame)
         match message:
             case Rejection():
-                return Heard(said=(message,))
+                return FrameOutcome(said=(message,))
             case Report():
                 if self._dedupe.is_repeat(frame):
                     return _refused(message, Reason.DUPLICATE)
@@ -194,13 +194,13 @@ class Senders:
                 return self._attitude(message)
             case EstimatorStatus():
                 carries = message.source == self._carrier_source
-                return Heard(message=message) if carries else NOTHING
+                return FrameOutcome(message=message) if carries else NOTHING
             case None:
                 return NOTHING
             case _:
                 return self._beside(frame, message)
 
-    def _beside(self, frame: Frame, message: GnssStatus | SystemTime | Presence) -> Heard:
+    def _beside(self, frame: Frame, message: GnssStatus | SystemTime | Presence) -> FrameOutcome:
         """Take in what is said beside positions: of a receiver, a clock, a vehicle."""
         match message:
             case GnssStatus():
@@ -217,12 +217,12 @@ class Senders:
                     clock = self._senders[str(message.source)].clock
                     on_timeline_us = message.unix_us - self._utc_offset_ns // 1000
                     clock.system_time(message.t_ns, on_timeline_us, message.boot_ms)
-                return NOTHING if change is None else Heard(change=change)
+                return NOTHING if change is None else FrameOutcome(change=change)
             case Presence():
                 self._heard(message).presence = message
         return NOTHING
 
-    def _heard(self, message: GnssStatus | Presence) -> Component:
+    def _heard(self, message: GnssStatus | Presence) -> ComponentState:
         component = self._components[message.source]
         component.heard_ns = message.t_ns
         return component
@@ -253,7 +253,7 @@ class Senders:
         for sender in self._senders.values():
             sender.clock.forget_gnss()
 
-    def _telemetry(self, report: Report, doubt_ns: int = 0) -> Heard:
+    def _telemetry(self, report: Report, doubt_ns: int = 0) -> FrameOutcome:
         """Place a report by its stamp; its noise is a vehicle's own matter if it reports itself.
 
         ``doubt_ns`` is that of its frame.
@@ -267,12 +267,12 @@ class Senders:
         stamp, said = self._stamp(sender, uav, t_ns, report.boot_ms, doubt_ns)
         restarted = uav if said else None
         if sender.clock.is_shared(t_ns):
-            return Heard(
+            return FrameOutcome(
                 message=None, said=(*said, *_shared_id(sender, uav, t_ns)), restarted=restarted
             )
         sender.is_shared = False
         if stamp is None:
-            return Heard(
+            return FrameOutcome(
                 message=None,
                 said=(*said, Rejection(t_ns=t_ns, source=uav, reason=Reason.UNPLACED_STAMP)),
                 restarted=restarted,
@@ -289,7 +289,9 @@ class Senders:
             noise=errors,
             limits=assumed.limits,
         )
-        return Heard(message=placed, said=said, restarted=restarted, change=sender.clock.change)
+        return FrameOutcome(
+            message=placed, said=said, restarted=restarted, change=sender.clock.change
+        )
 
     def _errors(self, report: Report, time_s: float) -> ReportNoise:
         """Bounds on the errors of a report, with by how much two heights differ of late.
@@ -308,7 +310,7 @@ class Senders:
             component.apart_m2, apart_m = apart_m2, math.sqrt(apart_m2)
         return replace(component.noise, time_s=time_s, apart_m=apart_m)
 
-    def _relayed(self, said: AdsbVehicle) -> Heard:
+    def _relayed(self, said: AdsbVehicle) -> FrameOutcome:
         """Place a report of an aircraft that a receiver relays.
 
         A track is begun anew when the altitude datum changes, since datums differ by the weather.
@@ -316,28 +318,28 @@ class Senders:
         datum = self.aircraft.datum(said.uav)
         merged = self.aircraft.merge(said)
         if isinstance(merged, Rejection):
-            return Heard(said=(merged,))
+            return FrameOutcome(said=(merged,))
         true_ns = merged.t_ns - round((merged.tslc_s or 0.0) * 1e9)
         limits = self.assumed(said.uav).limits
         placed = PlacedReport(
             report=merged, sender_ns=true_ns, t_ns=true_ns, noise=None, limits=limits
         )
         if datum in (None, merged.alt_datum):
-            return Heard(message=placed)
+            return FrameOutcome(message=placed)
         text = f"{said.uav} is tracked anew: its altitude is {merged.alt_datum} now, not {datum}"
-        return Heard(
+        return FrameOutcome(
             message=placed,
             said=(Notice(t_ns=said.t_ns, severity=Severity.INFO, subject=said.uav, text=text),),
             restarted=said.uav,
         )
 
-    def _remote_id(self, frame: Frame, said: RemoteId) -> Heard:
+    def _remote_id(self, frame: Frame, said: RemoteId) -> FrameOutcome:
         """Place a position that an aircraft broadcasts, by the stamp that it has."""
         named = self.remote_ids.named(said)
         if named is None:
             return NOTHING
         if isinstance(named, Rejection):
-            return Heard(said=(named,))
+            return FrameOutcome(said=(named,))
         if not self._admits(named.uav):
             return _refused(named, Reason.NOT_ALLOWED)
         if self._dedupe.is_repeat(frame):
@@ -346,12 +348,12 @@ class Senders:
             return _refused(named, Reason.UNPLACED_STAMP)
         return self._telemetry(named)
 
-    def _attitude(self, attitude: Attitude) -> Heard:
+    def _attitude(self, attitude: Attitude) -> FrameOutcome:
         carrier = str(attitude.source)
         sender = self._senders[carrier]
         stamp, said = self._stamp(sender, carrier, attitude.t_ns, attitude.boot_ms)
         placed = None if stamp is None else PlacedAttitude(attitude, stamp.sender_ns)
-        return Heard(
+        return FrameOutcome(
             message=placed,
             said=said,
             restarted=carrier if said else None,
@@ -414,7 +416,7 @@ class Senders:
         sender = self._senders.get(uav)
         return sender.clock.estimate() if sender else None
 
-    def assumed(self, uav: str) -> assembly.Assumed:
+    def assumed(self, uav: str) -> assembly.AircraftAssumptions:
         """What is assumed of a UAV, by its newest heartbeat."""
         vehicle = kind_of(uav).reports_itself
         component = self._components.get(Source.parse(uav)) if vehicle else None
@@ -449,8 +451,8 @@ class Senders:
         return self._dedupe.shares.get(link) or LinkShare()
 
 
-def _refused(message: Report | AdsbVehicle, reason: Reason) -> Heard:
-    return Heard(said=(Rejection(t_ns=message.t_ns, source=message.uav, reason=reason),))
+def _refused(message: Report | AdsbVehicle, reason: Reason) -> FrameOutcome:
+    return FrameOutcome(said=(Rejection(t_ns=message.t_ns, source=message.uav, reason=reason),))
 
 
 def _shared_id(sender: Sender, uav: str, t_ns: int) -> tuple[Notice | Rejection, ...]:

@@ -52,7 +52,7 @@ NAMED: Final = (
 """Topics that exist in any run; those of each UAV come with it."""
 
 
-class Pace:
+class RateLimit:
     """Limits a rate, by the times of what comes; a rate of None is no limit."""
 
     def __init__(self, rate_hz: float | None) -> None:
@@ -80,9 +80,9 @@ class Encoder:
 
     def __init__(self, emit: Emit, weights_hz: float | None, scene: Scene | None) -> None:
         self._emit = emit
-        self._weights = Pace(weights_hz)
+        self._weights = RateLimit(weights_hz)
         self._scene = scene
-        self._scenes = Pace(scene.rate_hz if scene else None)
+        self._scenes = RateLimit(scene.rate_hz if scene else None)
         self._last_event: Event | None = None
         self._frame_bytes = schemas.FrameEncoder().encode
 

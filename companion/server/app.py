@@ -17,7 +17,7 @@ from companion.server.access import OPEN_PATHS, BearerToken, KnownHosts
 from companion.server.metrics import NodeCollector
 from companion.server.responses import answer, answers, encode, json_response
 from companion.server.stream import Stream
-from companion.server.turns import Turns
+from companion.server.work_slots import WorkSlots
 from companion.values import UAV_FORMS
 from companion.views import fleet as fleet_view
 from companion.views import glance, labels, series, settings, state, uav_state
@@ -59,9 +59,9 @@ def create_app(node: Node, token: str | None = None, area: Path | None = None) -
     responses.install(app)
     stream = Stream(node)
     _health_routes(app, node, stream)
-    turns = Turns()
-    _state_routes(app, node, turns)
-    beam_routes.add(app, node, turns)
+    work_slots = WorkSlots()
+    _state_routes(app, node, work_slots)
+    beam_routes.add(app, node, work_slots)
     file_routes.add(app, node)
     area_map.add(app, area)
 
@@ -128,7 +128,7 @@ def _health_routes(app: FastAPI, node: Node, stream: Stream) -> None:
         return Response(generate_latest(registry), media_type="text/plain; version=0.0.4")
 
 
-def _state_routes(app: FastAPI, node: Node, turns: Turns) -> None:
+def _state_routes(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
     design_view = DesignView(node.pipeline.settings)
 
     @app.get(
@@ -184,7 +184,7 @@ def _state_routes(app: FastAPI, node: Node, turns: Turns) -> None:
     async def history() -> Response:
         samples, now_ns = node.series.samples(), node.now_ns()
         utc_ns = node.pipeline.utc_ns
-        return await turns.run(lambda: answer(series.show(samples, now_ns, utc_ns)))
+        return await work_slots.run(lambda: answer(series.show(samples, now_ns, utc_ns)))
 
     @app.get(
         "/v1/settings",

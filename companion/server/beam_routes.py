@@ -9,7 +9,7 @@ from fastapi.responses import Response
 from companion.server import models
 from companion.server.moments import Moments
 from companion.server.responses import answers, encode, json_response, refusals
-from companion.server.turns import Turns
+from companion.server.work_slots import WorkSlots
 from companion.values import Update, UserError, WeightFormat
 from companion.views import beam_state, weight_formats
 from companion.views import pattern as pattern_view
@@ -27,10 +27,10 @@ _JSON = {"schema": {"$ref": "#/components/schemas/Weights"}}
 _BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
 
 
-def add(app: FastAPI, node: Node, turns: Turns) -> None:
-    """Add the routes to the application; what they compute is done in ``turns``."""
+def add(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
+    """Add the routes to the application; what they compute is done in ``work_slots``."""
     pipeline, equipment = node.pipeline, node.equipment
-    moments = Moments(node, turns)
+    moments = Moments(node, work_slots)
 
     @app.get(
         "/v1/beams",

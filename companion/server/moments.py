@@ -2,7 +2,7 @@
 
 Moments are ``EVERY_NS`` apart. Who asks between two of them is answered for the next one: beams are
 never for a time that has passed, and at most that much later than asked for. On the event loop UAVs
-are predicted, as all is known there; the rest is done off it, in turn.
+are predicted, as all is known there; the rest is done in a work slot off it.
 """
 
 import asyncio
@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Hashable
 from typing import Any, Final, TypeVar
 
-from companion.server.turns import Turns
+from companion.server.work_slots import WorkSlots
 from companion.values import Update
 from companion.views.state import Node
 
@@ -22,9 +22,9 @@ T = TypeVar("T")
 class Moments:
     """What was made for the present moment. One for a node, used on its event loop."""
 
-    def __init__(self, node: Node, turns: Turns) -> None:
+    def __init__(self, node: Node, work_slots: WorkSlots) -> None:
         self._node = node
-        self._turns = turns
+        self._work_slots = work_slots
         self._moment = 0
         self._looks: dict[float, Callable[[], Update]] = {}
         self._answers: dict[tuple[float, Hashable], asyncio.Task[Any]] = {}
@@ -44,9 +44,9 @@ class Moments:
             self._answers.clear()
         task = self._answers.get((lead_ms, what))
         if task is None:
-            self._turns.refuse_if_full()  # before anything is predicted
+            self._work_slots.refuse_if_full()  # before anything is predicted
             look = self._look(now_ns, moment * EVERY_NS - now_ns, lead_ms)
-            task = asyncio.create_task(self._turns.run(lambda: make(look())))
+            task = asyncio.create_task(self._work_slots.run(lambda: make(look())))
             task.add_done_callback(_seen)
             self._answers[lead_ms, what] = task
         found: T = await asyncio.shield(task)  # one who leaves does not take it from the others

@@ -109,7 +109,7 @@ class BeamSettings(Section):
         loss_limit_db      most that zero forcing may cost any UAV against a sharp beam for it alone
         condition_limit    largest condition number of the steering matrix
         policy             what is done beyond either limit: load as little as will do, serve groups
-                           in turns, or drop the UAVs of lowest priority
+                           in time slots, or drop the UAVs of lowest priority
         priority           UAVs in descending order; the others follow in the order first heard
         widen              how wide beams are: "likely", for the error that is usual, over a floor
                            within the pointing bound; "guarantee", for the bound: the greatest least

@@ -174,7 +174,7 @@ RATES_APART_S: Final = 0.05
 RATE_NOISE_DEGPS: Final = 2.0  # bound on the error of a reported rate of turn
 
 
-class Turns:
+class AngularAcceleration:
     """What a carrier's reported rates of turn prove of its angular acceleration."""
 
     def __init__(self) -> None:

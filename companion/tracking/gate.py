@@ -19,8 +19,8 @@ FROZEN_SPEED_MPS = 1.0  # least reported speed at which an unchanged position co
 FROZEN_TRAVEL_M = 0.3
 """Least distance that this speed must have covered while the position stayed the same."""
 
-TURNS: Final = 3
-"""Times that refused and possible reports must take turns before they are of two vehicles."""
+ALTERNATIONS: Final = 3
+"""Alternations of refused and possible reports that show two vehicles."""
 SHARED_S: Final = 3.0  # seconds for which they must do so
 
 
@@ -93,7 +93,7 @@ class Suspects(Generic[State]):
         self._settings = settings
         self._run: deque[Fix] = deque(maxlen=64)
         self._begun_ns = 0
-        self._turns = 0
+        self._alternations = 0
         self._interrupted = False
 
     def add(self, fix: Fix) -> None:
@@ -108,8 +108,8 @@ class Suspects(Generic[State]):
             if old or refusal(predicted, fix, slack_m) is not None:
                 self._run.clear()
         if not self._run:
-            self._begun_ns, self._turns, self._interrupted = fix.sender_ns, 0, False
-        self._turns += self._interrupted
+            self._begun_ns, self._alternations, self._interrupted = fix.sender_ns, 0, False
+        self._alternations += self._interrupted
         self._interrupted = False
         self._run.append(fix)
 
@@ -131,11 +131,11 @@ class Suspects(Generic[State]):
         Longer where possible reports came between: it may be another vehicle's.
         """
         least_s = self._settings.reacquire_s
-        return max(least_s, SHARED_S) if self._turns else least_s
+        return max(least_s, SHARED_S) if self._alternations else least_s
 
     def goes_on(self, sender_ns: int) -> bool:
         """Whether the run is a second vehicle's: it goes on while possible reports come between."""
-        if len(self._run) < self._settings.reacquire_reports or self._turns < TURNS:
+        if len(self._run) < self._settings.reacquire_reports or self._alternations < ALTERNATIONS:
             return False
         if self._run[-1].sender_ns - self._begun_ns < SHARED_S * 1e9:
             return False

@@ -26,7 +26,7 @@ class Entry(Generic[State]):
     predicted: Prediction | None
 
 
-class History(Generic[State]):
+class ReportHistory(Generic[State]):
     """The reports of one UAV within the window.
 
     ``entries`` are in order of the sender's time, and never empty.

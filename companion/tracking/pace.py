@@ -16,7 +16,7 @@ SILENCES: Final = 1.25
 """Multiple of the second longest silence of late that is no news: a single one is."""
 
 
-class Pace:
+class ReportTiming:
     """Intervals, latencies and silences of the newest reports. ``add`` takes those accepted."""
 
     def __init__(self) -> None:

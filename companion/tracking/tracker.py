@@ -15,11 +15,11 @@ import numpy as np
 
 from companion.tracking.gate import GateSettings, Suspects, is_frozen, refusal
 from companion.tracking.hindsight import WAYS, WINDOWS, Hindsight, fed
-from companion.tracking.history import History
+from companion.tracking.history import ReportHistory
 from companion.tracking.limits import Refutations
 from companion.tracking.noise import NoiseSettings
 from companion.tracking.observers.estimates import Observer, Prediction
-from companion.tracking.pace import Pace
+from companion.tracking.pace import ReportTiming
 from companion.tracking.reach import Reach, reach
 from companion.tracking.straying import Straying
 from companion.values import (
@@ -51,7 +51,7 @@ class Ages:
     stale_s: float = 15.0
     lost_s: float = 60.0
 
-    def state(self, age_s: float, pace: Pace) -> TrackState:
+    def state(self, age_s: float, pace: ReportTiming) -> TrackState:
         """The state of a track whose newest report is this old, by its own pace."""
         coasting_s = pace.silence_s(self.coasting_s, self.stale_s)
         if age_s > self.lost_s:
@@ -84,7 +84,7 @@ class _Past:
 
     refutations: Refutations
     straying: Straying | None
-    pace: Pace
+    pace: ReportTiming
 
 
 @dataclass(slots=True, kw_only=True)
@@ -92,7 +92,7 @@ class _Tracked:
     """One track: its newest reports, and what they have shown."""
 
     past: _Past
-    history: History[Any]
+    history: ReportHistory[Any]
     suspects: Suspects[Any]
     arrived: Fix
     newest: Estimate
@@ -139,7 +139,7 @@ class Tracker:
 
     def _new_past(self) -> _Past:
         noise = self._settings.noise
-        return _Past(Refutations(), None if noise is None else Straying(noise), Pace())
+        return _Past(Refutations(), None if noise is None else Straying(noise), ReportTiming())
 
     def _held_to(self, past: _Past, fix: Fix) -> tuple[Fix, list[Refuted]]:
         """A report with the bounds that reports have shown, and what it refutes of them."""
@@ -196,7 +196,7 @@ class Tracker:
         past.pace.add(fix)
         self._tracked[fix.uav] = _Tracked(
             past=past,
-            history=History(self._observer, fix, round(self._settings.window_s * 1e9)),
+            history=ReportHistory(self._observer, fix, round(self._settings.window_s * 1e9)),
             suspects=Suspects(self._observer, self._settings.gate),
             arrived=fix,
             newest=first,
@@ -477,7 +477,7 @@ def _cut(acceleration: Vector | None, most_mps2: float) -> Vector | None:
     return share * north, share * east, share * down
 
 
-def _unknown_input(history: History[Any]) -> Vector | None:
+def _unknown_input(history: ReportHistory[Any]) -> Vector | None:
     """Unknown input over the newest interval: W^ = (x^+ - x^) / dT, m/s.
 
     See docs/math.md 3; None where there are fewer than two reports.

@@ -53,7 +53,7 @@ class Policy(DescribedEnum):
     """What is done where zero forcing would cost a UAV too much gain."""
 
     REGULARISE = "regularise", "add a diagonal loading to the Gram matrix"
-    GROUP = "group", "serve groups of UAVs in turn, each in a time slot"
+    GROUP = "group", "serve groups of UAVs, each in a time slot of its own"
     DROP = "drop", "leave out the UAVs of lowest priority"
 
 

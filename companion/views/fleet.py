@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 
 from companion.pipeline.fleet.duties import Handover
-from companion.pipeline.fleet.member import Member
+from companion.pipeline.fleet.member import FleetMember
 from companion.pipeline.fleet.neighbours import Neighbour
 from companion.pipeline.fold import Pipeline
 from companion.tracking.geodesy import Place
@@ -136,7 +136,7 @@ def fleet(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Json:
     return as_json(shown, pipeline.utc_ns)
 
 
-def nodes(member: Member, now_ns: int) -> list[FleetNode]:
+def nodes(member: FleetMember, now_ns: int) -> list[FleetNode]:
     """This node, then the others by name, and then those that left."""
     own = FleetNode(
         node=member.name,
@@ -158,7 +158,7 @@ def nodes(member: Member, now_ns: int) -> list[FleetNode]:
     return [own, *others, *gone]
 
 
-def _node(name: str, member: Member, now_ns: int) -> FleetNode:
+def _node(name: str, member: FleetMember, now_ns: int) -> FleetNode:
     known: Neighbour = member.neighbours[name]
     said, ahead = known.standing, known.clock.newest()
     reason = member.trust.aside.get(name)
@@ -197,7 +197,7 @@ def _place(place: tuple[float, float, float] | None) -> Place | None:
     return None if place is None else Place(*place)
 
 
-def _uavs(member: Member, now_ns: int) -> list[FleetUav]:
+def _uavs(member: FleetMember, now_ns: int) -> list[FleetUav]:
     """Every UAV that some node offers to serve or serves, and by whom it is served."""
     offers, by = offers_of(member), served_by(member, now_ns)
     handing = dict(member.duties.handing)

@@ -122,7 +122,7 @@ def _event(pipeline: Pipeline, track: Track, stale_s: float) -> bytes:
     if velocity is not None:
         course_deg = math.degrees(math.atan2(velocity[1], velocity[0])) % 360
         speed_mps = math.hypot(velocity[0], velocity[1])
-    where = cot_text.Place(
+    where = cot_text.CotPosition(
         lat_deg=lat_deg,
         lon_deg=lon_deg,
         hae_m=alt_m + undulation_m if known else None,

@@ -5,13 +5,17 @@ from companion.beams.array.geometry import Array
 from companion.beams.array.steering import steering_matrix
 from companion.beams.hardware import tables
 from companion.beams.hardware.calibration import Calibration
-from companion.beams.hardware.devices import Device
+from companion.beams.hardware.devices import Beamformer
 from companion.pipeline.assembly import Equipment
 from companion.values import BeamSet
 
 
 def device_table(
-    device: Device, beam_set: BeamSet, array: Array, equipment: Equipment, only: str | None = None
+    device: Beamformer,
+    beam_set: BeamSet,
+    array: Array,
+    equipment: Equipment,
+    only: str | None = None,
 ) -> tables.DeviceTable:
     """The settings of a device that come nearest to the weights.
 

@@ -21,7 +21,7 @@ MAGIC: Final = b"UAVBEAMS"
 VERSION: Final = 1
 COMPLEX64: Final = 1  # dtype of weights that are pairs of float32, real part first
 WIDENED: Final = 1  # flag of a beam whose main lobe was broadened
-EXACT: Final = 1  # flag of a record in which each UAV lies in a null of all other beams of its turn
+EXACT: Final = 1  # flag of a record in which each UAV lies in a null of all other beams of its slot
 CHECKED_FROM: Final = 20
 """First byte that the checksum (CRC-32 as of zlib) covers; it ends with the record."""
 ID_BYTES: Final = 72

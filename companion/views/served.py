@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from companion.pipeline import blame
 from companion.pipeline.fleet.assignment import worth_db
-from companion.pipeline.fleet.member import Member
+from companion.pipeline.fleet.member import FleetMember
 from companion.pipeline.fold import Pipeline
 from companion.values import Blame, Offer, Standing
 
@@ -14,7 +14,7 @@ from companion.values import Blame, Offer, Standing
 class FleetStatus:
     """This node's place in a fleet."""
 
-    member: Member  # what it knows and decides
+    member: FleetMember  # what it knows and decides
     site: str  # name of the fleet
     sent_bps: float  # bits per second that it tells, by what it gave to Zenoh over the last second
     heard_bps: float  # bits per second that others told it
@@ -55,7 +55,7 @@ def served_uavs(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> 
     return Served(node=member.name, by=by, nobody=nobody, elsewhere=elsewhere)
 
 
-def offers_of(member: Member) -> dict[str, dict[str, Offer]]:
+def offers_of(member: FleetMember) -> dict[str, dict[str, Offer]]:
     """What each node that is believed offers, by UAV and node."""
     found: dict[str, dict[str, Offer]] = {}
     for uav, offer in member.offers.items():
@@ -66,20 +66,20 @@ def offers_of(member: Member) -> dict[str, dict[str, Offer]]:
     return found
 
 
-def standing(member: Member, now_ns: int) -> dict[str, Standing]:
+def standing(member: FleetMember, now_ns: int) -> dict[str, Standing]:
     """The other nodes that are there and believed, by name."""
     others = sorted(member.duties.others(now_ns).items())
     return {name: said for name, said in others if member.trust.believes(name)}
 
 
-def _full(member: Member, now_ns: int) -> dict[str, bool]:
+def _full(member: FleetMember, now_ns: int) -> dict[str, bool]:
     """Whether each node that is there serves as many as it may."""
     others = standing(member, now_ns).items()
     full = {name: len(said.serves) >= said.most for name, said in others}
     return full | {member.name: len(member.duties.serves) >= member.most}
 
 
-def served_by(member: Member, now_ns: int) -> dict[str, list[str]]:
+def served_by(member: FleetMember, now_ns: int) -> dict[str, list[str]]:
     """The nodes that serve each UAV, this one first; nodes put aside are not believed."""
     served_by: dict[str, list[str]] = {uav: [member.name] for uav in member.duties.serves}
     for name, said in standing(member, now_ns).items():

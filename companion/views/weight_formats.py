@@ -11,7 +11,7 @@ import numpy as np
 
 from companion.beams.array.geometry import SPEED_OF_LIGHT_MPS
 from companion.beams.hardware import tables
-from companion.beams.hardware.devices import Device
+from companion.beams.hardware.devices import Beamformer
 from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
 from companion.values import BeamSet, WeightFormat
@@ -53,6 +53,6 @@ def encode(
         case WeightFormat.RAW:
             return beam_set.weights.astype("<c8").tobytes("C")
     array = pipeline.array
-    table = device_table(Device(form.value), beam_set, array, equipment)
+    table = device_table(Beamformer(form.value), beam_set, array, equipment)
     frequency_hz = SPEED_OF_LIGHT_MPS / array.wavelength_m
     return tables.encode(table, frequency_hz).encode()

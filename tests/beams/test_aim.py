@@ -13,7 +13,7 @@ from support import examples
 from companion.beams.aim import aim, directions, without
 from companion.beams.array import steering
 from companion.beams.array.coverage import Coverage, Sector
-from companion.beams.array.elements import Element, Pattern
+from companion.beams.array.elements import Element, ElementPattern
 from companion.beams.array.geometry import Array, listed, uniform_circular, uniform_linear
 from companion.beams.weights.precoding import Precoder
 from companion.values import (
@@ -333,7 +333,7 @@ def test_turning_array_and_carrier_is_turning_the_world_for_every_array(seed: in
     turn, mount, pose = (m.as_matrix() for m in Rotation.random(3, rng=rng))
     elements = rng.uniform(-0.02, 0.02, (12, 3))
     outward, lever = rng.standard_normal((12, 3)), rng.uniform(-2, 2, 3)
-    element = Element(Pattern.TR38901)
+    element = Element(ElementPattern.TR38901)
     array = listed(
         elements, 30e9, array_from_body=mount, element=element, lever_arm_m=lever, outward=outward
     )
@@ -360,7 +360,11 @@ def test_turning_array_and_carrier_is_turning_the_world_for_every_array(seed: in
 
 def test_behind_an_element_that_radiates_forward_there_is_no_beam() -> None:
     array = uniform_linear(
-        16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=Element(Pattern.COSINE)
+        16,
+        30e9,
+        spacing_wavelengths=0.5,
+        array_from_body=EYE,
+        element=Element(ElementPattern.COSINE),
     )
     tracks = [track("ahead", (80, 60, 0)), track("behind", (-80, 60, 0))]
     found = pointed(tracks, carrier(), array)
@@ -372,7 +376,7 @@ def test_behind_an_element_that_radiates_forward_there_is_no_beam() -> None:
 
 def test_where_all_elements_that_face_a_uav_are_dead_there_is_no_beam() -> None:
     ring = uniform_circular(
-        8, 5e9, spacing_wavelengths=0.5, array_from_body=EYE, element=Element(Pattern.COSINE)
+        8, 5e9, spacing_wavelengths=0.5, array_from_body=EYE, element=Element(ElementPattern.COSINE)
     )
     array = replace(ring, live=np.isin(np.arange(8), (3, 4, 5)))
     tracks = [track("ahead", (100, 0, 0)), track("behind", (-100, 20, 0))]
@@ -493,7 +497,11 @@ def test_what_is_said_of_a_beam_is_of_its_own_uav_when_others_are_dropped() -> N
         track("vague", (80, -20, 0), bound_m=30.0),
     ]
     array = uniform_linear(
-        16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=Element(Pattern.COSINE)
+        16,
+        30e9,
+        spacing_wavelengths=0.5,
+        array_from_body=EYE,
+        element=Element(ElementPattern.COSINE),
     )
     how = Precoder(policy=Policy.DROP, priority=("kept", "vague"))
     found = aim(7, valid_at_ns=9, tracks=tracks, carrier=carrier(), array=array, precoder=how)
@@ -507,7 +515,7 @@ def test_what_is_said_of_a_beam_is_of_its_own_uav_when_others_are_dropped() -> N
         assert beam.gain_db - alone.gain_db == pytest.approx(0.0, abs=3.0)
         assert beam.loss_db >= -1e-9
     assert [beam.widened for beam in found.beams] == [False, True]
-    cosine = Element(Pattern.COSINE).amplitude(np.array([[0.8, 0.6, 0.0]]))[0]
+    cosine = Element(ElementPattern.COSINE).amplitude(np.array([[0.8, 0.6, 0.0]]))[0]
     most_db = 10 * math.log10(16 * cosine**2)
     assert found.beams[0].gain_db + found.beams[0].loss_db == pytest.approx(most_db)
 
@@ -517,7 +525,11 @@ def test_what_is_not_covered_is_left_out_in_the_frames_that_its_limits_are_in() 
     what the airframe hides with the carrier."""
     right = Rotation.from_euler("z", math.pi / 2).as_matrix().T
     array = uniform_linear(
-        16, 30e9, spacing_wavelengths=0.5, array_from_body=right, element=Element(Pattern.COSINE)
+        16,
+        30e9,
+        spacing_wavelengths=0.5,
+        array_from_body=right,
+        element=Element(ElementPattern.COSINE),
     )
     east = carrier(turn=right)
     hidden = Sector(

@@ -23,7 +23,7 @@ from companion.node import replay as replaying
 from companion.node.replay import log_events
 from companion.pipeline.fold import Pipeline
 from companion.recording.tables import folder, parquet_file
-from companion.recording.tables.columns import Kind, Table
+from companion.recording.tables.columns import ColumnKind, Table
 from companion.settings.model import Settings
 from companion.values import Estimate, Notice, Output, Refuted, Rejection, Update
 from companion.views.tables.said import TABLES
@@ -36,18 +36,18 @@ LOG = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
 CENTER = ("--center", "5:1")
 BY_NAME = {table.name: table for table in TABLES}
 DUCKDB = {
-    Kind.TEXT: "VARCHAR",
-    Kind.NUMBER: "DOUBLE",
-    Kind.TIME: "TIMESTAMP",
-    Kind.INTEGER: "BIGINT",
-    Kind.TRUTH: "BOOLEAN",
+    ColumnKind.TEXT: "VARCHAR",
+    ColumnKind.NUMBER: "DOUBLE",
+    ColumnKind.TIME: "TIMESTAMP",
+    ColumnKind.INTEGER: "BIGINT",
+    ColumnKind.TRUTH: "BOOLEAN",
 }
 ARROW = {
-    Kind.TEXT: "string",
-    Kind.NUMBER: "double",
-    Kind.TIME: "timestamp[us]",
-    Kind.INTEGER: "int64",
-    Kind.TRUTH: "bool",
+    ColumnKind.TEXT: "string",
+    ColumnKind.NUMBER: "double",
+    ColumnKind.TIME: "timestamp[us]",
+    ColumnKind.INTEGER: "int64",
+    ColumnKind.TRUTH: "bool",
 }
 
 
@@ -128,7 +128,7 @@ def test_names_end_in_their_units(table: Table) -> None:
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
 def test_pandas_tells_the_types(table: Table, as_csv: Path) -> None:
-    times = [column.name for column in table.columns if column.kind is Kind.TIME]
+    times = [column.name for column in table.columns if column.kind is ColumnKind.TIME]
     frame = pandas.read_csv(as_csv / f"{table.name}.csv", parse_dates=times)
     assert list(frame.columns) == [column.name for column in table.columns]
     assert len(frame) > 0
@@ -136,8 +136,13 @@ def test_pandas_tells_the_types(table: Table, as_csv: Path) -> None:
         found = frame[column.name]
         if found.isna().all():
             continue
-        kind = {"i": Kind.INTEGER, "f": Kind.NUMBER, "b": Kind.TRUTH, "M": Kind.TIME}
-        assert kind.get(found.dtype.kind, Kind.TEXT) is column.kind, column.name
+        kind = {
+            "i": ColumnKind.INTEGER,
+            "f": ColumnKind.NUMBER,
+            "b": ColumnKind.TRUTH,
+            "M": ColumnKind.TIME,
+        }
+        assert kind.get(found.dtype.kind, ColumnKind.TEXT) is column.kind, column.name
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
@@ -160,7 +165,7 @@ def test_parquet_says_the_types_and_holds_the_same(
     for column, field in zip(table.columns, found.schema, strict=True):
         assert (field.name, str(field.type)) == (column.name, ARROW[column.kind])
         assert field.metadata[b"meaning"].decode() == column.meaning
-        assert field.nullable == (column.kind not in (Kind.INTEGER, Kind.TRUTH))
+        assert field.nullable == (column.kind not in (ColumnKind.INTEGER, ColumnKind.TRUTH))
     rows = [tuple(row.values()) for row in arrow(file)]
     assert rows == duck(as_csv / f"{table.name}.csv") == duck(file)
     assert json.loads((as_parquet / folder.CONTENTS).read_text())["rows"][file.name] == len(rows)

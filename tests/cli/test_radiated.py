@@ -12,7 +12,7 @@ from device_reading import parse
 from companion.beams.array.geometry import uniform_rectangular
 from companion.beams.array.steering import steering_matrix, unit_directions
 from companion.beams.hardware.calibration import BOUNDED_HEADER, parse_calibration
-from companion.beams.hardware.devices import Device
+from companion.beams.hardware.devices import Beamformer
 from companion.beams.worth.guarantee import guaranteed_gains_db
 from companion.cli.main import main
 from companion.pipeline import assembly
@@ -44,7 +44,7 @@ def test_no_device_within_its_calibration_s_bounds_has_less(cut_log: Path, tmp_p
         f'[hardware]\ndevice = "adar1000"\ncalibration = "{measured}"\n'
     )
     calibration = parse_calibration(measured.read_text())
-    device = parse(Device.ADAR1000, told(cut_log, config, "adar1000").decode(), calibration)
+    device = parse(Beamformer.ADAR1000, told(cut_log, config, "adar1000").decode(), calibration)
     answer: dict[str, Any] = json.loads(told(cut_log, config, "json"))
     live = np.ones(16)
     live[list(DEAD)] = 0.0

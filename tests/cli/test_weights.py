@@ -12,7 +12,7 @@ from device_reading import parse
 from support import ROOT
 
 from companion.beams.hardware.calibration import CALIBRATION_HEADER, Calibration, parse_calibration
-from companion.beams.hardware.devices import Device
+from companion.beams.hardware.devices import Beamformer
 from companion.cli.main import main
 from companion.node import moment
 from companion.node.replay import log_events
@@ -95,9 +95,9 @@ def test_a_device_s_table_reads_back_as_what_was_fitted(
     pipeline, update = looked
     text = weights(cut_log, "--lead-ms", "100", "--format", "adar1000").decode()
     ideal = Calibration.ideal(range(64))
-    read = parse(Device.ADAR1000, text, ideal)
+    read = parse(Beamformer.ADAR1000, text, ideal)
     equipment = assembly.equipment(pipeline.settings, pipeline.array)
-    fitted = quantised.device_table(Device.ADAR1000, update.beams, pipeline.array, equipment)
+    fitted = quantised.device_table(Beamformer.ADAR1000, update.beams, pipeline.array, equipment)
     assert read.uavs == update.beams.uavs
     assert np.array_equal(read.codes, fitted.codes)
     for i, wanted in enumerate(update.beams.weights.T):
@@ -117,8 +117,8 @@ def test_a_calibration_turns_a_device_s_settings(cut_log: Path, tmp_path: Path) 
     config.write_text(f'{SMALL}[hardware]\ncalibration = "{table}"\n', encoding="utf-8")
     turned = weights(cut_log, "--config", str(config), "--format", "sivers").decode()
     measured = parse_calibration(table.read_text(encoding="utf-8"))
-    one = parse(Device.SIVERS, plain, Calibration.ideal(range(16)))
-    other = parse(Device.SIVERS, turned, measured)
+    one = parse(Beamformer.SIVERS, plain, Calibration.ideal(range(16)))
+    other = parse(Beamformer.SIVERS, turned, measured)
     assert plain != turned
     for a, b in zip(one.weights.T, other.weights.T, strict=True):
         assert abs(np.vdot(a, b)) > 0.99 * np.linalg.norm(a) * np.linalg.norm(b)

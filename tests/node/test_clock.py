@@ -10,7 +10,7 @@ from companion import __version__
 from companion.node.clock import NodeClock
 from companion.node.export import export
 from companion.node.moment import look
-from companion.node.served_replay import Asked, ServedReplay
+from companion.node.served_replay import ReplayRequest, ServedReplay
 from companion.node.service import Service
 from companion.pipeline.fold import Pipeline
 from companion.pipeline.ticks import with_ticks
@@ -124,7 +124,9 @@ def test_times_follow_the_clock_that_was_set_live_and_in_a_replay(
 
     (log,) = (tmp_path / "recordings").iterdir()
     assert sum(isinstance(event, ClockSet) for event in read_log(log)) == 1
-    again = ServedReplay(Asked(logs=[log], settings=SETTINGS, speed=None, record=None), said.append)
+    again = ServedReplay(
+        ReplayRequest(logs=[log], settings=SETTINGS, speed=None, record=None), said.append
+    )
     run_async(again._replay(asyncio.Event()))
     assert again.pipeline.digest.hexdigest() == node.pipeline.digest.hexdigest()
     assert uav_state.uavs(again)["uavs"][0]["fix"] == uavs[0]["fix"]

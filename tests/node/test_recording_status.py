@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from companion.node.replay import writer_for
-from companion.node.served_replay import Asked, ServedReplay
+from companion.node.served_replay import ReplayRequest, ServedReplay
 from companion.node.service import Service
 from companion.settings.model import Settings
 from companion.views.state import RecordingStatus
@@ -45,7 +45,7 @@ def test_each_figure_of_a_running_recording_is_its_own() -> None:
 
 def test_each_figure_of_a_replays_recording_is_its_own(short_log: Path, tmp_path: Path) -> None:
     out = tmp_path / "replayed.mcap"
-    asked = Asked(
+    asked = ReplayRequest(
         logs=[short_log],
         settings=SETTINGS,
         speed=None,

@@ -17,7 +17,7 @@ from device_reading import parse
 from support import BIN, HANG_S, read_metadata, started
 
 from companion.beams.hardware.calibration import Calibration
-from companion.beams.hardware.devices import Device
+from companion.beams.hardware.devices import Beamformer
 from companion.mavlink.wire.decode import decode
 from companion.recording.reader import read_log
 from companion.values import Frame, Report, WeightFormat
@@ -197,7 +197,7 @@ def test_weights_for_a_device_or_the_reason_why_not(start_node: Any, tmp_path: P
         refused, why = node.get("/v1/beams/weights", WeightFormat.TMYTEK.media_type)
         flight.wait(HANG_S)
     assert status == 200
-    read = parse(Device.ADAR1000, table.decode(), Calibration.ideal(range(64)))
+    read = parse(Beamformer.ADAR1000, table.decode(), Calibration.ideal(range(64)))
     assert sorted(read.uavs) == ["1:1", "2:1", "3:1", "4:1"]
     assert read.weights.shape == (64, 4)
     assert refused == 409

@@ -18,7 +18,7 @@ from link_support import frame
 from support import BIN, HANG_S, Node, end, line_of, read_metadata, run_async
 
 from companion.node.replay import replay
-from companion.node.served_replay import Asked, ServedReplay
+from companion.node.served_replay import ReplayRequest, ServedReplay
 from companion.recording.reader import read_log
 from companion.recording.writer import Writer
 from companion.settings.model import Settings
@@ -148,7 +148,7 @@ def test_on_plain_asyncio_as_fast_as_it_goes(cut_log: Path, unserved: dict[str, 
     async def serve() -> ServedReplay:
         settings = Settings().override(center={"source": "5:1"})
         node = ServedReplay(
-            Asked(logs=[cut_log], settings=settings, speed=None, record=None), said.append
+            ReplayRequest(logs=[cut_log], settings=settings, speed=None, record=None), said.append
         )
         until = asyncio.Event()
 
@@ -188,7 +188,8 @@ def test_now_does_not_go_back_for_a_frame_that_waited(tmp_path: Path) -> None:
     async def served() -> tuple[int, float]:
         node, until = (
             ServedReplay(
-                Asked(logs=[log], settings=settings, speed=None, record=None), lambda _: None
+                ReplayRequest(logs=[log], settings=settings, speed=None, record=None),
+                lambda _: None,
             ),
             Event(),
         )

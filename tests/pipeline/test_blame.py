@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from companion.pipeline import blame
-from companion.pipeline.blame import Evidence
+from companion.pipeline.blame import LinkEvidence
 from companion.values import Beam, Carrier, Cause, LeftOut, Limits, Reason, Track, TrackState
 
-FINE = Evidence(clock_assumed=False, refused=None)
+FINE = LinkEvidence(clock_assumed=False, refused=None)
 TRACK = Track(
     uav="3:1", state=TrackState.LIVE, valid_at_ns=9, age_s=0.1, position_ned_m=np.zeros(3),
     velocity_ned_mps=np.array([20.0, 0.0, 0.0]), unknown_input_mps=None,
@@ -43,7 +43,10 @@ BEAM = Beam(
 
 
 def blamed(
-    track: Track = TRACK, carrier: Carrier = CARRIER, beam: Beam = BEAM, evidence: Evidence = FINE
+    track: Track = TRACK,
+    carrier: Carrier = CARRIER,
+    beam: Beam = BEAM,
+    evidence: LinkEvidence = FINE,
 ) -> tuple[Cause, str, str]:
     found = blame.of_beam(beam, track, carrier, 10.0, evidence)
     return found.cause, found.reason, found.remedy
@@ -89,7 +92,7 @@ def test_slow_reports_are_not_silence() -> None:
 
 
 def test_an_assumed_clock_is_helped_by_timesync() -> None:
-    assumed = Evidence(clock_assumed=True, refused=None)
+    assumed = LinkEvidence(clock_assumed=True, refused=None)
     cause, reason, remedy = blamed(replace(TRACK, clock_bound_s=0.1), evidence=assumed)
     assert (cause, reason) == (Cause.CLOCK, "clock only assumed, to 100 ms")
     assert "TIMESYNC" in remedy
@@ -116,7 +119,7 @@ def test_the_carrier_is_to_blame_for_its_attitude_and_its_position() -> None:
 
 
 def test_reports_that_come_and_are_not_used_are_told_before_all_else() -> None:
-    refused = Evidence(clock_assumed=False, refused=Reason.UNREACHABLE)
+    refused = LinkEvidence(clock_assumed=False, refused=Reason.UNREACHABLE)
     far = replace(CARRIER, attitude_bound_rad=0.5)
     found = blamed(replace(TRACK, age_s=9.0), far, evidence=refused)
     assert found[:2] == (Cause.REFUSED, "its reports are not used: unreachable")

@@ -11,8 +11,8 @@ from companion.beams.array.coverage import EVERYWHERE
 from companion.beams.array.geometry import uniform_linear
 from companion.beams.weights.precoding import Precoder
 from companion.beams.worth.link_budget import LinkBudget
-from companion.pipeline.blame import Evidence
-from companion.pipeline.health import AT_ONCE, Health, Site
+from companion.pipeline.blame import LinkEvidence
+from companion.pipeline.health import AT_ONCE, HealthMonitor, Site
 from companion.settings.beams import NeedSettings
 from companion.values import Carrier, Limits, Notice, Severity, Track, TrackState, Update
 
@@ -76,14 +76,14 @@ class Watch:
     """A health of 10 dB that is asked, and what it said."""
 
     def __init__(self, **need: float) -> None:
-        self.health = Health(NeedSettings(**(need or {"needed_db": 10.0})), SITE)
+        self.health = HealthMonitor(NeedSettings(**(need or {"needed_db": 10.0})), SITE)
         self.said: list[Notice] = []
 
     def see(self, t_s: float, tracks: list[Track], carrier: Carrier | None = CARRIER) -> str:
         news = update(t_s, tracks, carrier)
         weighed = self.health.weigh(news)
         self.said += self.health.judge(
-            news, weighed, lambda _uav: Evidence(clock_assumed=False, refused=None)
+            news, weighed, lambda _uav: LinkEvidence(clock_assumed=False, refused=None)
         )
         return " ".join(str(one.level) for one in self.health.verdicts.values())
 

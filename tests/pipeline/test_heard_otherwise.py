@@ -9,7 +9,7 @@ import pytest
 from pymavlink.dialects.v20 import all as dialect
 
 from companion.mavlink.wire.cot_link import CotSplitter
-from companion.mavlink.wire.transponder import Said
+from companion.mavlink.wire.transponder import AircraftState
 from companion.mavlink.wire.transponder import frame as transponder_frame
 from companion.pipeline import records, senders
 from companion.pipeline.fold import Pipeline
@@ -80,7 +80,7 @@ def naming(t_s: float, receiver: int = 9) -> Frame:
 
 def transponder(t_s: float, **codes: int) -> Frame:
     lat, lon, alt = there(t_s, 8.0)
-    said = Said(
+    said = AircraftState(
         icao=0x4CA7B3,
         lat_deg=lat,
         lon_deg=lon,

@@ -9,7 +9,7 @@ import pytest
 from pymavlink.dialects.v20 import common
 
 from companion.mavlink.trust.admission import KNOWN_MAX, admission
-from companion.pipeline.center import Center
+from companion.pipeline.center import CarrierTracker
 from companion.pipeline.fold import Pipeline
 from companion.pipeline.records import DROPPED_AT_ONCE, RECORDS_MAX, Records, UavRecord
 from companion.pipeline.senders import PlacedAttitude, Senders
@@ -225,7 +225,7 @@ def turning() -> Callable[[list[PlacedAttitude]], list[float]]:
     """``turning(attitudes)``: the yaw that is known after each, degrees."""
 
     def run(attitudes: list[PlacedAttitude]) -> list[float]:
-        center = Center(Settings().override(center={"source": "5:1"}))
+        center = CarrierTracker(Settings().override(center={"source": "5:1"}))
         known = []
         for one in attitudes:
             center.turn(one, 40.0)

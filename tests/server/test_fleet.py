@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from companion.pipeline.fleet.member import Member
+from companion.pipeline.fleet.member import FleetMember
 from companion.server import models
 from companion.server.app import create_app
 from companion.settings.fleet import FleetSettings
@@ -33,7 +33,7 @@ def flown() -> StandIn:
 def north(flown: StandIn) -> Iterator[StandIn]:
     """It serves 1:1 in a fleet; another, south, serves 2:1, and nobody serves the rest."""
     now_ns = flown.now_ns()
-    member = Member(
+    member = FleetMember(
         name="north", settings=FleetSettings(node="north"), elements=16, started_ns=now_ns
     )
     member.duties.serves["1:1"] = 20.0

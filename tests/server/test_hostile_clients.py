@@ -19,7 +19,7 @@ from companion.pipeline import assembly
 from companion.server import connections
 from companion.server.access import KnownHosts, bind
 from companion.server.app import create_app
-from companion.server.turns import Turns
+from companion.server.work_slots import WorkSlots
 from companion.settings.model import Settings
 from companion.values import UserError, UtcNs
 from companion.views import beam_state, series
@@ -222,7 +222,7 @@ def test_a_name_is_asked_for_before_a_token(make_node: Any) -> None:
 
 def test_work_is_done_in_turns_and_the_rest_is_told_to_come_again(make_node: Any) -> None:
     async def crowd() -> list[str]:
-        turns, begun, free = Turns(at_once=2, waiting=3), [], asyncio.Event()
+        work_slots, begun, free = WorkSlots(at_once=2, waiting=3), [], asyncio.Event()
         loop = asyncio.get_running_loop()
 
         def work() -> str:
@@ -231,11 +231,11 @@ def test_work_is_done_in_turns_and_the_rest_is_told_to_come_again(make_node: Any
             assert len(begun) <= 2 or free.is_set()
             return "done"
 
-        tasks = [asyncio.create_task(turns.run(work)) for _ in range(9)]
+        tasks = [asyncio.create_task(work_slots.run(work)) for _ in range(9)]
         refused = [task async for task in _first(tasks, 4)]
         free.set()
         rest = await asyncio.gather(*(task for task in tasks if task not in refused))
-        assert await turns.run(lambda: "again") == "again"
+        assert await work_slots.run(lambda: "again") == "again"
         return [*(str(task.exception()) for task in refused), *rest]
 
     told = run_async(crowd())

@@ -9,7 +9,7 @@ import pytest
 from starlette.exceptions import HTTPException
 
 from companion.server.moments import EVERY_NS, Moments
-from companion.server.turns import Turns
+from companion.server.work_slots import WorkSlots
 from companion.values import Update
 
 pytestmark = pytest.mark.anyio
@@ -31,7 +31,7 @@ def moments(shared_node: Any, monkeypatch: pytest.MonkeyPatch) -> Moments:
         return counted_too
 
     monkeypatch.setattr(shared_node.pipeline, "sighted", counted)
-    return Moments(shared_node, Turns())
+    return Moments(shared_node, WorkSlots())
 
 
 async def test_many_who_ask_at_once_share_one_answer(moments: Moments, shared_node: Any) -> None:
@@ -75,7 +75,7 @@ async def test_who_finds_no_room_costs_no_prediction(
 ) -> None:
     monkeypatch.setattr(shared_node.pipeline, "sighted", lambda *_: pytest.fail("predicted"))
     with pytest.raises(HTTPException) as refused:
-        await Moments(shared_node, Turns(0, 0)).made(0.0, "npy", lambda update: update)
+        await Moments(shared_node, WorkSlots(0, 0)).made(0.0, "npy", lambda update: update)
     assert refused.value.status_code == 503
 
 

@@ -238,7 +238,7 @@ def turning(rate_degps: float) -> Attitude:
 
 def test_rates_prove_an_angular_acceleration_and_raise_the_limit() -> None:
     """From 0 to 54 degrees a second in .25 s, less 2 degrees a second of noise at each end."""
-    turns = carrier.Turns()
+    turns = carrier.AngularAcceleration()
     assert turns.look(turning(0.0), 0, 180.0) is None
     refuted = turns.look(turning(54.0), 250_000_000, 180.0)
     assert refuted is not None
@@ -251,7 +251,7 @@ def test_rates_prove_an_angular_acceleration_and_raise_the_limit() -> None:
 
 
 def test_what_is_possible_or_beyond_belief_raises_nothing() -> None:
-    turns = carrier.Turns()
+    turns = carrier.AngularAcceleration()
     rates = [0.0, 40.0, 0.0, 3000.0, 0.0]  # the third step is 16 times what is possible
     for at, rate in enumerate(rates):
         assert turns.look(turning(rate), at * 250_000_000, 180.0) is None

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from support import examples
 
 from companion.tracking.hindsight import PLAIN, WAYS, WINDOWS, Hindsight, Way, fading, fed
-from companion.tracking.history import History
+from companion.tracking.history import ReportHistory
 from companion.tracking.observers.kinematic import KinematicModel, KinematicObserver
 from companion.values import Fix
 
@@ -47,7 +47,7 @@ def flown(
             velocity + rng.normal(0, noise_mps, 3),
         )
         if history is None:
-            history = History(OBSERVER, made, 5 * S)
+            history = ReportHistory(OBSERVER, made, 5 * S)
         else:
             history.insert(len(history.entries), made)
         hindsight.smooth(made)
@@ -154,7 +154,7 @@ def test_positions_of_a_poor_receiver_are_smoothed(fix: Callable[..., Fix]) -> N
             t_s = 0.8 * n
             position, velocity = (np.array(one) for one in place(t_s))
             made = fix(round(t_s * S), position + rng.normal(0, 3.0, 3), velocity)
-            history = history or History(OBSERVER, made, 5 * S)
+            history = history or ReportHistory(OBSERVER, made, 5 * S)
             hindsight.smooth(made)
             hindsight.add(made, (None,) * len(WAYS))
             off.append(

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import examples
 
-from companion.tracking.history import History
+from companion.tracking.history import ReportHistory
 from companion.tracking.observers.kinematic import KinematicModel, KinematicObserver, KinematicState
 from companion.tracking.observers.position import PositionModel, PositionObserver
 from companion.values import Fix
@@ -36,8 +36,8 @@ def reports(fix: MakeFix, seed: int, gaps_ms: list[int], told: float = 0.8) -> l
     return made
 
 
-def told(observer: object, arriving: list[Fix], window_ns: int = WINDOW_NS) -> History:
-    history = History(observer, arriving[0], window_ns)
+def told(observer: object, arriving: list[Fix], window_ns: int = WINDOW_NS) -> ReportHistory:
+    history = ReportHistory(observer, arriving[0], window_ns)
     for fix in arriving[1:]:
         index = history.index(fix.sender_ns)
         assert index is not None
@@ -131,7 +131,7 @@ def test_where_a_report_belongs_and_when_it_is_too_old(
 def test_the_window_does_not_grow(fix: MakeFix) -> None:
     """In order or not, no more is kept than the window holds, however long the flight."""
     rng = np.random.default_rng(1)
-    history = History(KINEMATIC, fix(0, [0, 0, 0]), WINDOW_NS)
+    history = ReportHistory(KINEMATIC, fix(0, [0, 0, 0]), WINDOW_NS)
     order = sorted(range(1, 1000), key=lambda n: n + rng.uniform(0, 8))
     for number in order:
         index = history.index(number * S // 10)

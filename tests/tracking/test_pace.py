@@ -5,14 +5,14 @@ from collections.abc import Callable
 
 import pytest
 
-from companion.tracking.pace import Pace
+from companion.tracking.pace import ReportTiming
 from companion.values import Fix
 
 S = 1_000_000_000
 
 
-def heard(fix: Callable[..., Fix], interval_s: float, latencies_s: list[float]) -> Pace:
-    pace = Pace()
+def heard(fix: Callable[..., Fix], interval_s: float, latencies_s: list[float]) -> ReportTiming:
+    pace = ReportTiming()
     for n, late_s in enumerate(latencies_s):
         pace.add(fix(round(n * interval_s * S), [n, 0, 0], late_ns=round(late_s * S)))
     return pace
@@ -35,7 +35,7 @@ def test_before_there_is_a_pace_the_least_counts(fix: Callable[..., Fix]) -> Non
 @pytest.mark.parametrize("seed", range(5))
 def test_a_slow_radio_does_not_flap(fix: Callable[..., Fix], seed: int) -> None:
     """1.2 reports a second, a tenth of them lost, up to some seconds late: over an hour."""
-    rng, pace, changes, coasts = random.Random(seed), Pace(), 0, False
+    rng, pace, changes, coasts = random.Random(seed), ReportTiming(), 0, False
     arrivals = sorted(
         (n / 1.2 + min(6.0, rng.lognormvariate(-0.5, 0.79)), n / 1.2)
         for n in range(4000)

@@ -14,7 +14,7 @@ import numpy as np
 from companion.values import FloatArray, UserError
 
 
-class Pattern(StrEnum):
+class ElementPattern(StrEnum):
     """Shape of an element's pattern."""
 
     ISOTROPIC = "isotropic"
@@ -40,7 +40,7 @@ class Element:
     Raises ``UserError`` for an exponent below 0.
     """
 
-    pattern: Pattern = Pattern.ISOTROPIC
+    pattern: ElementPattern = ElementPattern.ISOTROPIC
     exponent: float = 1.0
 
     def __post_init__(self) -> None:
@@ -50,11 +50,11 @@ class Element:
     def amplitude(self, directions: FloatArray) -> FloatArray:
         """Amplitude towards unit directions (..., 3) in the element frame; shape (...)."""
         match self.pattern:
-            case Pattern.ISOTROPIC:
+            case ElementPattern.ISOTROPIC:
                 return np.ones(directions.shape[:-1])
-            case Pattern.COSINE:
+            case ElementPattern.COSINE:
                 return self._cosine(directions[..., 0])
-            case Pattern.TR38901:
+            case ElementPattern.TR38901:
                 return _tr38901(*_aside_and_up(directions))
 
     def amplitude_range(
@@ -66,15 +66,15 @@ class Element:
         bounded by the extremes of each.
         """
         match self.pattern:
-            case Pattern.ISOTROPIC:
+            case ElementPattern.ISOTROPIC:
                 both = np.ones(directions.shape[:-1])
                 return both, both
-            case Pattern.COSINE:
+            case ElementPattern.COSINE:
                 aside = np.hypot(directions[..., 1], directions[..., 2])
                 off = np.arctan2(aside, directions[..., 0])  # arccos is 1e-8 off near 0
                 least = np.cos(np.minimum(off + radius_rad, np.pi))
                 return self._cosine(least), self._cosine(np.cos(np.maximum(off - radius_rad, 0.0)))
-            case Pattern.TR38901:
+            case ElementPattern.TR38901:
                 return _tr38901_range(directions, radius_rad)
 
     def _cosine(self, cosine: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from companion.beams.array.elements import ISOTROPIC, Element, Pattern
+from companion.beams.array.elements import ISOTROPIC, Element, ElementPattern
 from companion.values import ArrayKind, BoolArray, ComplexArray, FloatArray, UserError
 
 SPEED_OF_LIGHT_MPS: Final = 299_792_458.0
@@ -197,7 +197,7 @@ def listed(
     if len(np.unique(places, axis=0)) < len(places):
         raise UserError("two elements stand at one place")
     turned = None
-    if outward is not None and element.pattern is not Pattern.ISOTROPIC:
+    if outward is not None and element.pattern is not ElementPattern.ISOTROPIC:
         turned = _facing(outward, len(elements_m))
     lever = np.zeros(3) if lever_arm_m is None else lever_arm_m
     return Array(

@@ -16,7 +16,7 @@ from typing import Final
 
 import numpy as np
 
-from companion.beams.array.elements import Pattern
+from companion.beams.array.elements import ElementPattern
 from companion.beams.array.geometry import Array
 from companion.values import ComplexArray, FloatArray
 
@@ -41,7 +41,7 @@ def unit_directions(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> Float
 def steering_matrix(array: Array, directions: FloatArray) -> ComplexArray:
     """A, (M, N): one steering vector per column, for unit directions (N, 3)."""
     matrix = phase_factors(array, directions)
-    if array.element.pattern is not Pattern.ISOTROPIC:
+    if array.element.pattern is not ElementPattern.ISOTROPIC:
         matrix *= amplitudes(array, directions)
     if array.coupling is not None:
         matrix = array.coupling.T @ matrix

@@ -17,7 +17,7 @@ import numpy as np
 from companion.beams.array import steering
 from companion.beams.array.geometry import Array
 from companion.beams.worth import cone
-from companion.beams.worth.cone import Boxes, Cones
+from companion.beams.worth.cone import Boxes, DirectionCones
 from companion.values import BoolArray, ComplexArray, FloatArray, IntArray, UserError
 
 LEVELS: Final = 12  # most rounds of splitting cells
@@ -40,7 +40,7 @@ WEIGHT_MAX: Final = 1e300
 """Most that a weight of a list may be; the greatest of a beam is at least one over it."""
 
 
-class Kind(StrEnum):
+class CodebookKind(StrEnum):
     """Origin of a codebook."""
 
     DFT = "dft"
@@ -51,7 +51,7 @@ class Kind(StrEnum):
 class Codebook:
     """K beams: ``weights`` (M, K), columns of unit power, in the order of their indices."""
 
-    kind: Kind
+    kind: CodebookKind
     weights: ComplexArray
 
     @property
@@ -89,7 +89,7 @@ def dft(array: Array, oversampling: int = 1) -> Codebook:
     if entries > MOST_ENTRIES:
         raise UserError(f"a codebook of {entries} weights is larger than {MOST_ENTRIES}")
     down, across = (_line(count, oversampling) for count in array.grid)
-    return Codebook(Kind.DFT, np.kron(down, across).astype(np.complex128))
+    return Codebook(CodebookKind.DFT, np.kron(down, across).astype(np.complex128))
 
 
 def _beams(count: int, oversampling: int) -> int:
@@ -121,7 +121,7 @@ def listed(weights: ComplexArray, array: Array) -> Codebook:
     most = np.maximum(np.abs(weights.real), np.abs(weights.imag)).max(axis=0)
     if most.max() > WEIGHT_MAX or most.min() < 1 / WEIGHT_MAX:
         raise UserError(f"the greatest weight of each beam is within {WEIGHT_MAX:.0e}")
-    return Codebook(Kind.LISTED, cone.unit_power(array, weights))
+    return Codebook(CodebookKind.LISTED, cone.unit_power(array, weights))
 
 
 def best(codebook: Codebook, array: Array, directions: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -206,7 +206,9 @@ def candidates(
     return np.flatnonzero(found)
 
 
-def _contest(cones: Cones, boxes: Boxes, weights: ComplexArray) -> tuple[BoolArray, BoolArray]:
+def _contest(
+    cones: DirectionCones, boxes: Boxes, weights: ComplexArray
+) -> tuple[BoolArray, BoolArray]:
     """Beams that can be best somewhere in each box, (K, C), and those best at any middle, (K,)."""
     size, beams = weights.shape
     placed = cones.positions_m.T[:, :, np.newaxis] * weights

@@ -15,7 +15,7 @@ from companion.beams.hardware.quantise import Quadrature, Resolution, SettableSt
 from companion.values import WeightFormat
 
 
-class Device(StrEnum):
+class Beamformer(StrEnum):
     """Hardware for which weights can be written."""
 
     ADAR1000 = WeightFormat.ADAR1000.value
@@ -24,7 +24,7 @@ class Device(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Limits:
+class DeviceLimits:
     """What a device can hold and do.
 
     off_boresight_rad  largest angle off boresight to which it steers; None: not stated
@@ -114,8 +114,8 @@ SIVERS_ANTENNAS: Final = 16
 SIVERS_ROWS: Final = 64
 SIVERS_OFFSET: Final = 31
 
-SETTINGS: Final[dict[Device, SettableStates]] = {
-    Device.ADAR1000: Resolution(
+SETTINGS: Final[dict[Beamformer, SettableStates]] = {
+    Beamformer.ADAR1000: Resolution(
         ADAR1000_PHASES,
         (
             *(
@@ -124,20 +124,22 @@ SETTINGS: Final[dict[Device, SettableStates]] = {
             ),
         ),
     ),
-    Device.TMYTEK: TMYTEK_SETTINGS,
-    Device.SIVERS: Quadrature(SIVERS_OFFSET),
+    Beamformer.TMYTEK: TMYTEK_SETTINGS,
+    Beamformer.SIVERS: Quadrature(SIVERS_OFFSET),
 }
 """Settings of one channel of each device."""
 
 LIMITS: Final = {
-    Device.ADAR1000: Limits(elements=None, beams=121, off_boresight_rad=None, gain_range_db=31.0),
-    Device.TMYTEK: Limits(
+    Beamformer.ADAR1000: DeviceLimits(
+        elements=None, beams=121, off_boresight_rad=None, gain_range_db=31.0
+    ),
+    Beamformer.TMYTEK: DeviceLimits(
         elements=TMYTEK_CHANNELS,
         beams=64,
         off_boresight_rad=math.radians(45),
         gain_range_db=TMYTEK_RANGE_DB,
     ),
-    Device.SIVERS: Limits(
+    Beamformer.SIVERS: DeviceLimits(
         elements=SIVERS_ANTENNAS,
         beams=SIVERS_ROWS,
         off_boresight_rad=None,

@@ -11,7 +11,7 @@ import numpy as np
 
 from companion.beams.hardware import device_text
 from companion.beams.hardware.calibration import Calibration
-from companion.beams.hardware.devices import LIMITS, SETTINGS, Device
+from companion.beams.hardware.devices import LIMITS, SETTINGS, Beamformer
 from companion.beams.hardware.quantise import quantise
 from companion.beams.hardware.unit_gains import RELATIVE, UnitGains
 from companion.beams.weights.precoding import gain_db
@@ -45,7 +45,7 @@ class DeviceTable:
              where the wanted weights are not known
     """
 
-    device: Device
+    device: Beamformer
     uavs: tuple[str, ...]  # names of the beams; their numbers where the text had no room for names
     codes: IntArray  # (K, M, 2), by beam and channel
     order: tuple[int, ...]  # the element of each channel
@@ -55,7 +55,7 @@ class DeviceTable:
 
 
 def fit(
-    device: Device,
+    device: Beamformer,
     beams: Sequence[WantedBeam],
     calibration: Calibration,
     gains: UnitGains = RELATIVE,
@@ -66,7 +66,7 @@ def fit(
     """
     _check(device, beams, calibration, gains)
     factors = calibration.factors
-    states = gains.settings if device is Device.TMYTEK else SETTINGS[device]
+    states = gains.settings if device is Beamformer.TMYTEK else SETTINGS[device]
     found = [quantise(b.weights, states, b.steering, factors) for b in beams]
     codes = np.stack([one.codes[list(calibration.order)] for one in found])
     losses = tuple(
@@ -96,22 +96,22 @@ def encode(table: DeviceTable, frequency_hz: float | None = None) -> str:
     cannot hold.
     """
     match table.device:
-        case Device.ADAR1000:
+        case Beamformer.ADAR1000:
             return device_text.write_adar1000(table.uavs, table.codes, table.order)
-        case Device.TMYTEK:
+        case Beamformer.TMYTEK:
             return device_text.write_tmytek(table.codes, table.gains)
-        case Device.SIVERS:
+        case Beamformer.SIVERS:
             if frequency_hz is None:
                 raise UserError("a Sivers beam book needs the frequency that it is for")
             return device_text.write_sivers(table.uavs, table.codes, frequency_hz)
 
 
 def _check(
-    device: Device, beams: Sequence[WantedBeam], calibration: Calibration, gains: UnitGains
+    device: Beamformer, beams: Sequence[WantedBeam], calibration: Calibration, gains: UnitGains
 ) -> None:
     """Raise ``UserError`` for what the device cannot do."""
     limits, size = LIMITS[device], len(calibration.order)
-    range_db = gains.range_db if device is Device.TMYTEK else limits.gain_range_db
+    range_db = gains.range_db if device is Beamformer.TMYTEK else limits.gain_range_db
     if limits.elements is not None and size != limits.elements:
         raise UserError(f"{device} drives {limits.elements} elements, the array has {size}")
     if not 1 <= len(beams) <= limits.beams:

@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from companion.beams.array.elements import Pattern
+from companion.beams.array.elements import ElementPattern
 from companion.beams.array.geometry import Array
 from companion.beams.array.steering import steering_matrix
 from companion.beams.weights.shapes import Aperture
@@ -76,7 +76,7 @@ def seen_within(across: Aperture, directions: FloatArray, angles_rad: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Cones:
+class ConeSamples:
     """Where N beams are looked at, at P places each.
 
     turns    (M, N), phase factors that turn all beams to one direction, on a grid
@@ -105,10 +105,10 @@ class Cones:
         plane: ComplexArray = (down.T @ (stood @ along)).reshape(len(stood), -1)
         return plane
 
-    def of(self, users: IntArray) -> "Cones":
+    def of(self, users: IntArray) -> "ConeSamples":
         """The cones of some of the users."""
         vectors = self.vectors if self.waves else self.vectors[users]
-        return Cones(
+        return ConeSamples(
             turns=self.turns[:, users],
             waves=self.waves,
             vectors=vectors,
@@ -118,19 +118,22 @@ class Cones:
 
 def cones(
     array: Array, across: Aperture, directions: FloatArray, seen: Seen, centres: ComplexArray
-) -> Cones:
+) -> ConeSamples:
     """Where the beams towards unit directions (N, 3) are looked at.
 
     ``seen`` has the cones of the bound and of the likely angle; ``centres`` (M, N) are the steering
     vectors of the directions.
     """
-    apart = array.element_from_array is not None and array.element.pattern is not Pattern.ISOTROPIC
+    apart = (
+        array.element_from_array is not None
+        and array.element.pattern is not ElementPattern.ISOTROPIC
+    )
     if array.grid is None or apart or array.coupling is not None:
         return _asked(array, across, directions, seen)
     waves, counts = _about(across, seen, array.grid, array.wavelength_m)
     turns = centres / np.maximum(np.abs(centres).max(axis=0), 1e-300)
     nothing: ComplexArray = np.empty((0, 0, 0), dtype=complex)
-    return Cones(turns=turns, waves=tuple(waves), vectors=nothing, counts=counts)
+    return ConeSamples(turns=turns, waves=tuple(waves), vectors=nothing, counts=counts)
 
 
 def _about(
@@ -185,7 +188,7 @@ def _all_waves(count: int, finer: int, reach: int) -> ComplexArray:
     return waves
 
 
-def _asked(array: Array, across: Aperture, directions: FloatArray, seen: Seen) -> Cones:
+def _asked(array: Array, across: Aperture, directions: FloatArray, seen: Seen) -> ConeSamples:
     """Steering vectors of directions in rings about each predicted one, out to either cone."""
     users = len(directions)
     held, likely = seen.halves
@@ -210,7 +213,7 @@ def _asked(array: Array, across: Aperture, directions: FloatArray, seen: Seen) -
     counts = np.ones((2, users, len(share)))
     counts[1] = from_likely
     nothing: ComplexArray = np.empty((0, users), dtype=complex)
-    return Cones(turns=nothing, waves=(), vectors=vectors, counts=counts)
+    return ConeSamples(turns=nothing, waves=(), vectors=vectors, counts=counts)
 
 
 def outside(across: Aperture, seen: Seen, around: FloatArray, wavelength_m: float) -> FloatArray:

@@ -11,7 +11,7 @@ from companion.values import ComplexArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class ZeroForcingLimits:
     """What zero forcing may cost: the loss of any user, dB, and the condition number."""
 
     loss_db: float
@@ -19,17 +19,19 @@ class Limits:
 
 
 @dataclass(frozen=True, slots=True)
-class Turns:
-    """The turns of before: the number of each user's, -1 if left out; ``young`` if they are new."""
+class PreviousSlots:
+    """The slots of before: the number of each user's, -1 if left out; ``young`` if they are new."""
 
     numbers: IntArray
     young: bool
 
 
-LENIENT_DB: Final = 1.5  # what turns may cost beyond the limit while they are young
+LENIENT_DB: Final = 1.5  # what slots may cost beyond the limit while they are young
 
 
-def kept(steering: ComplexArray, before: Turns, limits: Limits) -> list[IntArray] | None:
+def kept(
+    steering: ComplexArray, before: PreviousSlots, limits: ZeroForcingLimits
+) -> list[IntArray] | None:
     """The groups of before, if they still do; None if others must be found."""
     groups = [np.flatnonzero(before.numbers == n) for n in range(int(before.numbers.max()) + 1)]
     most_db = limits.loss_db + (LENIENT_DB if before.young else 0.0)
@@ -38,7 +40,7 @@ def kept(steering: ComplexArray, before: Turns, limits: Limits) -> list[IntArray
     return groups
 
 
-def lost_db(steering: ComplexArray, limits: Limits) -> float:
+def lost_db(steering: ComplexArray, limits: ZeroForcingLimits) -> float:
     """What zero forcing costs the worst of the users, dB; infinite past the condition limit.
 
     Judged with columns of one length: that elements radiate less towards a user brings him no
@@ -48,7 +50,7 @@ def lost_db(steering: ComplexArray, limits: Limits) -> float:
     return _lost_db(unit.T @ unit.conj(), len(steering), limits)
 
 
-def _lost_db(gram: ComplexArray, elements: int, limits: Limits) -> float:
+def _lost_db(gram: ComplexArray, elements: int, limits: ZeroForcingLimits) -> float:
     if len(gram) > elements:
         return math.inf
     values, vectors = np.linalg.eigh(gram)
@@ -61,7 +63,9 @@ def _lost_db(gram: ComplexArray, elements: int, limits: Limits) -> float:
 class _Group:
     """A group that grows: the inverse of its Gram matrix, bordered with each user it takes in."""
 
-    def __init__(self, *, gram: ComplexArray, first: int, elements: int, limits: Limits) -> None:
+    def __init__(
+        self, *, gram: ComplexArray, first: int, elements: int, limits: ZeroForcingLimits
+    ) -> None:
         self.members = [first]
         self._gram, self._elements, self._limits = gram, elements, limits
         self._inverse: ComplexArray = np.array([[1.0 / gram[first, first]]])
@@ -101,7 +105,9 @@ class _Group:
         return bool(values[-1] <= square * values[0])
 
 
-def semi_orthogonal(steering: ComplexArray, order: Sequence[int], limits: Limits) -> list[IntArray]:
+def semi_orthogonal(
+    steering: ComplexArray, order: Sequence[int], limits: ZeroForcingLimits
+) -> list[IntArray]:
     """Groups of users, each within the limits, in the order in which they are served.
 
         steering  A, (M, N)
@@ -144,7 +150,9 @@ def semi_orthogonal(steering: ComplexArray, order: Sequence[int], limits: Limits
     return groups
 
 
-def without_the_lowest(steering: ComplexArray, order: Sequence[int], limits: Limits) -> IntArray:
+def without_the_lowest(
+    steering: ComplexArray, order: Sequence[int], limits: ZeroForcingLimits
+) -> IntArray:
     """The users kept: by descending priority, each that fits with those kept before."""
     unit: ComplexArray = steering / np.linalg.norm(steering, axis=0)
     kept = _Group(gram=unit.conj().T @ unit, first=order[0], elements=len(steering), limits=limits)

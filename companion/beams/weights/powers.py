@@ -1,4 +1,4 @@
-"""How the beams of one turn share the transmitter's power, and what that means for the beams.
+"""How the beams of one time slot share the transmitter's power, and what that means for the beams.
 
 With the coupling c_ij = SNR of user i from beam j alone if that had all the power,
 

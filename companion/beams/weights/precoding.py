@@ -12,9 +12,9 @@ points elsewhere: one of the two must be conjugated; docs/math.md 8.4.)
 The inverse alone says what zero forcing costs user i: its gain falls from |a_i|^2 to 1 / [(A^T
 A*)^-1]_ii. Past ``loss_limit_db`` for any user, or past a condition number of A, the policy
 decides: load the matrix by the least x at which no user loses more (each loss falls with x, see
-``_least_loading``), serve groups in turns, or leave out the lowest priorities. This is judged with
-the columns of A scaled to one length, since a weak element pattern is not closeness. It happens at
-mirror images about a line array, or with two UAVs behind one another. See docs/math.md 7.
+``_least_loading``), serve groups in time slots, or leave out the lowest priorities. This is judged
+with the columns of A scaled to one length, since a weak element pattern is not closeness. It
+happens at mirror images about a line array, or with two UAVs behind one another. See docs/math.md 7.
 
 Over 300 lines: the ways of making weights fall back on one another.
 """
@@ -27,7 +27,7 @@ from typing import Final
 import numpy as np
 
 from companion.beams.weights import grouping, powers, zero_forcing
-from companion.beams.weights.grouping import Turns
+from companion.beams.weights.grouping import PreviousSlots
 from companion.beams.weights.nulls import nulled
 from companion.beams.weights.widening import Spread, power_gains
 from companion.beams.worth.link_budget import LinkBudget
@@ -96,7 +96,7 @@ class Precoding:
     normalisation: Normalisation
     condition_number: float | None
     served: IntArray  # (K,), indices of the users served
-    groups: IntArray  # (K,), the turn of each
+    groups: IntArray  # (K,), the slot of each
     dropped: dict[int, str]  # why a user is not served, by index
     exact: bool = False  # whether A^T F is diagonal within each group
 
@@ -128,7 +128,7 @@ def precode(
     *,
     priorities: Sequence[int] | None = None,
     radio: Radio | None = None,
-    before: Turns | None = None,
+    before: PreviousSlots | None = None,
 ) -> Precoding:
     """Weights for a steering matrix (M, N).
 
@@ -159,25 +159,25 @@ def precode(
             groups=everyone,
             dropped={},
         )
-    groups, dropped = _turns(steering, settings, priorities, before)
+    groups, dropped = _slots(steering, settings, priorities, before)
     made = [_columns(steering, settings, spread, radio, group) for group in groups]
     served = np.sort(np.concatenate(groups))
     weights: ComplexArray = np.empty((size, len(served)), dtype=complex)
-    turns = np.zeros(users, dtype=np.int64)
-    for turn, (group, one) in enumerate(zip(groups, made, strict=True)):
-        turns[group] = turn
+    slots = np.zeros(users, dtype=np.int64)
+    for slot, (group, one) in enumerate(zip(groups, made, strict=True)):
+        slots[group] = slot
         shared = _shared(steering[:, group], one.weights, settings, radio, group)
         weights[:, np.searchsorted(served, group)] = shared
     method = max((one.method for one in made), key=_METHODS.index)
     condition = max(one.condition_number for one in made)
-    normalise(weights, settings.normalisation, turns[served])
+    normalise(weights, settings.normalisation, slots[served])
     return Precoding(
         weights=weights,
         method=method,
         normalisation=settings.normalisation,
         condition_number=condition,
         served=served,
-        groups=turns[served],
+        groups=slots[served],
         dropped=dropped,
         exact=method is Method.ZERO_FORCING,
     )
@@ -186,21 +186,21 @@ def precode(
 _METHODS: Final = (Method.ZERO_FORCING, Method.REGULARISED, Method.MMSE, Method.MATCHED)
 
 
-def _turns(
+def _slots(
     steering: ComplexArray,
     settings: Precoder,
     priorities: Sequence[int] | None,
-    before: Turns | None,
+    before: PreviousSlots | None,
 ) -> tuple[list[IntArray], dict[int, str]]:
     """Who is served together, and who is not served and why.
 
-    What was before stays while it does, for a while at least, and until there are fewer turns or
+    What was before stays while it does, for a while at least, and until there are fewer slots or
     more are served.
     """
     everyone = np.arange(steering.shape[1])
     if settings.policy is Policy.REGULARISE or settings.method is not Method.ZERO_FORCING:
         return [everyone], {}
-    limits = grouping.Limits(settings.loss_limit_db, settings.condition_limit)
+    limits = grouping.ZeroForcingLimits(settings.loss_limit_db, settings.condition_limit)
     lost_db = grouping.lost_db(steering, limits)
     stays = None if before is None else grouping.kept(steering, before, limits)
     young = before is not None and before.young
@@ -287,7 +287,7 @@ def _mmse_loading(
 def _shared(
     a: ComplexArray, weights: ComplexArray, settings: Precoder, radio: Radio | None, users: IntArray
 ) -> ComplexArray:
-    """Columns (M, K) of a turn with the power shared as the settings say; else as they are."""
+    """Columns (M, K) of a slot with the power shared as the settings say; else as they are."""
     if settings.power is None:
         return weights
     unit: ComplexArray = weights / np.linalg.norm(weights, axis=0)
@@ -426,8 +426,8 @@ def _least_loading(a: ComplexArray, gram: ComplexArray, settings: Precoder) -> f
     return float(max(found, least))
 
 
-def normalise(weights: ComplexArray, how: Normalisation, turns: IntArray) -> None:
-    """Scale columns in place; the columns of one turn share one factor.
+def normalise(weights: ComplexArray, how: Normalisation, slots: IntArray) -> None:
+    """Scale columns in place; the columns of one slot share one factor.
 
     Those of unit response stay as they are.
     """
@@ -436,8 +436,8 @@ def normalise(weights: ComplexArray, how: Normalisation, turns: IntArray) -> Non
     if how is Normalisation.STREAM:
         weights /= np.linalg.norm(weights, axis=0)
         return
-    for turn in range(int(turns.max()) + 1):
-        columns = turns == turn
+    for slot in range(int(slots.max()) + 1):
+        columns = slots == slot
         power = np.abs(weights[:, columns]) ** 2
         if how is Normalisation.TOTAL:
             weights[:, columns] /= np.sqrt(power.sum())

@@ -14,7 +14,7 @@ import numpy as np
 from companion.beams.array.geometry import Array
 from companion.beams.array.steering import steering_matrix
 from companion.beams.weights import cones, shapes
-from companion.beams.weights.cones import Cones, Seen
+from companion.beams.weights.cones import ConeSamples, Seen
 from companion.values import BoolArray, ComplexArray, FloatArray, IntArray, Widen
 
 WIDEST_RAD: Final = np.pi / 2  # angle beyond which beams are not widened further
@@ -50,7 +50,7 @@ class Spread:
     gram: ComplexArray  # (N K, N K), S^T S* of the points S
     reached: ComplexArray  # (N K, N), what the beams radiate to the points
     outside: FloatArray
-    cones: Cones  # where the least gain of each beam is looked for
+    cones: ConeSamples  # where the least gain of each beam is looked for
     worth: float  # least gain that is worth keeping
 
     @property

@@ -27,7 +27,7 @@ from typing import Final
 import numpy as np
 
 from companion.beams.array import steering
-from companion.beams.array.elements import Pattern
+from companion.beams.array.elements import ElementPattern
 from companion.beams.array.geometry import SAME_PLACE_WAVELENGTHS, Array
 from companion.values import BoolArray, ComplexArray, FloatArray, IntArray
 
@@ -46,7 +46,7 @@ ROUNDING_RAD: Final = 1e-12
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Cones:
+class DirectionCones:
     """N cones of directions, and what bounds the responses of one array over them.
 
     w are the largest magnitudes of the weights, patterns included if they differ.
@@ -91,7 +91,7 @@ class Cells:
 
     cone: IntArray  # (C,), the cone of each
     middles: FloatArray  # (C, 3), a direction in each cell and in its cone
-    axes: FloatArray  # (C, D, B), orthonormal except for the columns that ``Cones`` leaves out
+    axes: FloatArray  # (C, D, B), orthonormal but for columns that ``DirectionCones`` leaves out
     reach: FloatArray  # (C, D)
     caps: FloatArray  # (C, K, 3), unit directions in the middles of the caps
     caps_rad: FloatArray  # (C, K), radius of each cap
@@ -134,12 +134,15 @@ def unit_power(array: Array, weights: ComplexArray) -> ComplexArray:
 
 def faces_apart(array: Array) -> bool:
     """Whether the elements radiate differently, so that their pattern is no common factor."""
-    return array.element_from_array is not None and array.element.pattern is not Pattern.ISOTROPIC
+    return (
+        array.element_from_array is not None
+        and array.element.pattern is not ElementPattern.ISOTROPIC
+    )
 
 
 def cones_around(
     array: Array, directions: FloatArray, bounds_rad: FloatArray, magnitudes: FloatArray
-) -> Cones:
+) -> DirectionCones:
     """Cones within ``bounds_rad`` (N,) of unit directions (N, 3).
 
     They are for the responses of weights that are at most ``magnitudes`` (M, N).
@@ -166,7 +169,7 @@ def cones_around(
     unsure += 4 * wavenumber * aside_m if line else 0.0
     poles = np.broadcast_to(along, directions.shape) if line else directions
     frames, tilts = _frames(poles, directions)
-    return Cones(
+    return DirectionCones(
         array=array,
         frames=frames,
         tilts_rad=tilts,
@@ -198,7 +201,7 @@ def _frames(poles: FloatArray, towards: FloatArray) -> tuple[FloatArray, FloatAr
     return np.stack([poles, e1, np.cross(poles, e1)], axis=1), np.arctan2(sines, cosines)
 
 
-def first_boxes(cones: Cones) -> Boxes:
+def first_boxes(cones: DirectionCones) -> Boxes:
     """Boxes that cover every cone, finer where the phases of the elements turn faster."""
     spread = np.einsum("nii->ni", cones.curvatures).max(axis=1, initial=0.0) / cones.ceilings
     turned_rad = np.sqrt(np.maximum(spread, 0.0)) * cones.bounds_rad
@@ -240,7 +243,7 @@ def _sectors(rings: int) -> tuple[FloatArray, FloatArray]:
     return low, np.stack([(ring + 1) / rings, (sector + 1) * width], axis=1)
 
 
-def split(cones: Cones, boxes: Boxes) -> Boxes:
+def split(cones: DirectionCones, boxes: Boxes) -> Boxes:
     """Each box in four: quarters of the angle on a line, else halves both ways."""
     angles, turns = (4, 1) if cones.line else (2, 2)
     quarter = np.stack(np.divmod(np.arange(angles * turns), turns), axis=1)
@@ -251,7 +254,7 @@ def split(cones: Cones, boxes: Boxes) -> Boxes:
     )
 
 
-def cells(cones: Cones, boxes: Boxes, caps: int) -> Cells:
+def cells(cones: DirectionCones, boxes: Boxes, caps: int) -> Cells:
     """The boxes in space.
 
     ``caps`` is the number of caps that cover the arc of a cell on a line, an odd number; 1 does not
@@ -260,7 +263,7 @@ def cells(cones: Cones, boxes: Boxes, caps: int) -> Cells:
     return _strips(cones, boxes, caps) if cones.line else _patches(cones, boxes)
 
 
-def _strips(cones: Cones, boxes: Boxes, caps: int) -> Cells:
+def _strips(cones: DirectionCones, boxes: Boxes, caps: int) -> Cells:
     """Cells of a line: arcs of the cone about it, of which it sees the angle alone."""
     low, high = boxes.low[:, 0], boxes.high[:, 0]
     angle, half = (low + high) / 2, (high - low) / 2
@@ -287,7 +290,7 @@ def _strips(cones: Cones, boxes: Boxes, caps: int) -> Cells:
     )
 
 
-def _turn_rad(cones: Cones, boxes: Boxes) -> FloatArray:
+def _turn_rad(cones: DirectionCones, boxes: Boxes) -> FloatArray:
     """The largest turn about the line at which a direction is both in the cell and in its cone.
 
     sin^2(t / 2) = sin((bound + r - tilt) / 2) sin((bound - r + tilt) / 2) / (sin r sin tilt); its
@@ -305,7 +308,7 @@ def _turn_rad(cones: Cones, boxes: Boxes) -> FloatArray:
     return turns
 
 
-def _patches(cones: Cones, boxes: Boxes) -> Cells:
+def _patches(cones: DirectionCones, boxes: Boxes) -> Cells:
     """Cells of a disc, with axes inward, along r and along t.
 
     u.e_r = sin(r - r_s) - sin r cos r_s (1 - cos(t - t_s)),   u.e_t = sin r sin(t - t_s).
@@ -368,7 +371,7 @@ def _angle_rad(inward: FloatArray) -> FloatArray:
     return angle
 
 
-def phasors(cones: Cones, pieces: Cells) -> tuple[ComplexArray, FloatArray | None]:
+def phasors(cones: DirectionCones, pieces: Cells) -> tuple[ComplexArray, FloatArray | None]:
     """Response of each element to the middle of each cell, (M, C), and its largest change in it.
 
     The change is None where all elements face alike; their pattern is then left out. Phases are
@@ -385,7 +388,7 @@ def phasors(cones: Cones, pieces: Cells) -> tuple[ComplexArray, FloatArray | Non
 
 
 def response_range(
-    cones: Cones, pieces: Cells, responses: ComplexArray, moments: ComplexArray
+    cones: DirectionCones, pieces: Cells, responses: ComplexArray, moments: ComplexArray
 ) -> tuple[FloatArray, FloatArray]:
     """Lower and upper bounds of |response| over each cell, (..., C) both; the lower may be
     negative.

@@ -16,10 +16,10 @@ import numpy as np
 
 from companion.beams.array import steering
 from companion.beams.array.coverage import Coverage, margin_rad
-from companion.beams.array.elements import Pattern
+from companion.beams.array.elements import ElementPattern
 from companion.beams.array.geometry import Array
 from companion.beams.worth import cone
-from companion.beams.worth.cone import Boxes, Cells, Cones
+from companion.beams.worth.cone import Boxes, Cells, DirectionCones
 from companion.values import ComplexArray, FloatArray, IntArray
 
 TOLERANCE_DB: Final = 0.05  # difference between bound and attained gain at which the search ends
@@ -125,7 +125,7 @@ def _extremes(
     if len(unit) == 0:
         return np.empty(0)
     cones = cone.cones_around(array, unit, bounds, np.abs(weights))
-    patterned = array.element.pattern is not Pattern.ISOTROPIC
+    patterned = array.element.pattern is not ElementPattern.ISOTROPIC
     scales = 1.0 if cone.faces_apart(array) else array.element.amplitude_range(unit, bounds)[1]
     nothing = 10 ** (-NOTHING_DB / 20) * scales * cones.ceilings
     proven, attained = np.full((2, len(unit)), np.inf)
@@ -149,7 +149,7 @@ def _extremes(
 
 
 def _over_boxes(
-    cones: Cones, boxes: Boxes, weights: ComplexArray, caps: int, most: bool
+    cones: DirectionCones, boxes: Boxes, weights: ComplexArray, caps: int, most: bool
 ) -> tuple[FloatArray, FloatArray]:
     """For each box a proven lower bound (C,) of the least response, and a value attained in it."""
     step = max(1, BLOCK // max(cones.array.size, caps))
@@ -162,7 +162,7 @@ def _over_boxes(
 
 
 def _over_cells(
-    cones: Cones, cells: Cells, weights: ComplexArray, most: bool
+    cones: DirectionCones, cells: Cells, weights: ComplexArray, most: bool
 ) -> tuple[FloatArray, FloatArray]:
     received, unsure = cone.phasors(cones, cells)
     sums = _by_cone(cones, weights, received, cells.cone)
@@ -182,7 +182,7 @@ def _over_cells(
 
 
 def _by_cone(
-    cones: Cones, weights: ComplexArray, received: ComplexArray, cone_of: IntArray
+    cones: DirectionCones, weights: ComplexArray, received: ComplexArray, cone_of: IntArray
 ) -> ComplexArray:
     """For each cell the response of its cone's weights, and its moments by position, (1 + B, C).
 

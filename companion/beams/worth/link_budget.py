@@ -6,7 +6,7 @@ weights in square roots of watts (docs/math.md 7),
     SINR_i = g_i |h_i f_i|^2 / ( g_i sum_j |h_i f_j|^2 + noise ),  j != i and in the same group
 
 Groups are served one after the other: they do not interfere with each other, and each has the whole
-power in its turn.
+power in its time slot.
 """
 
 import math
@@ -74,7 +74,7 @@ def share_power(
     """Weights (M, N) with the total power shared equally by the streams of each group.
 
     Column j becomes f_j / |f_j| sqrt(power / streams of its group), in square roots of watts;
-    ``groups`` (N,) numbers each UAV's turn (None: all at once). A column of zeros is a stream that
+    ``groups`` (N,) numbers each UAV's slot (None: all at once). A column of zeros is a stream that
     is not sent: it stays, and the others share its power. Raises ``ValueError`` for a power not
     above 0.
     """
@@ -100,7 +100,7 @@ def sinr(
                        weights in square roots of watts (``share_power``)
         path_gains     (..., N), power gains of the paths, blockage included
         noise_power_w  after combining with unit norm
-        groups         (N,), the turn of each UAV; None: all at once
+        groups         (N,), the slot of each UAV; None: all at once
 
     Raises ``ValueError`` where shapes disagree or the noise is not above 0.
     """
@@ -131,19 +131,19 @@ def _together(groups: IntArray | None, users: int) -> FloatArray:
     return same
 
 
-def spectral_efficiency(ratio: float | FloatArray, turns: int = 1) -> FloatArray:
-    """log2(1 + SINR) / turns, bit/s/Hz: Shannon's limit for Gaussian interference.
+def spectral_efficiency(ratio: float | FloatArray, slots: int = 1) -> FloatArray:
+    """log2(1 + SINR) / slots, bit/s/Hz: Shannon's limit for Gaussian interference.
 
-    ``ratio`` is the SINR as a power ratio, any shape; ``turns`` the number of groups served one
+    ``ratio`` is the SINR as a power ratio, any shape; ``slots`` the number of groups served one
     after the other, for equal times. Raises ``ValueError`` for a negative SINR or less than one
-    turn.
+    slot.
     """
     ratios = np.asarray(ratio, dtype=float)
     if not (ratios >= 0).all():
         raise ValueError("a SINR must be a number of at least 0")
-    if turns < 1:
-        raise ValueError(f"turns {turns} must be at least 1")
-    efficiency: FloatArray = np.log1p(ratios) / (math.log(2) * turns)
+    if slots < 1:
+        raise ValueError(f"slots {slots} must be at least 1")
+    efficiency: FloatArray = np.log1p(ratios) / (math.log(2) * slots)
     return efficiency
 
 
@@ -157,7 +157,7 @@ def transmitted(
 
         weights        as they are delivered
         power_w        power of all streams of a group together
-        groups         (N,), the turn of each UAV; None: all at once
+        groups         (N,), the slot of each UAV; None: all at once
         normalisation  ``ANTENNA``: no element sends more than ``power_w`` / M; else the group sends
                        all of it
 
@@ -186,12 +186,12 @@ def predicted_sinr_db(
         directions    (N, 3), predicted unit directions, array frame
         ranges_m      (N,), predicted ranges
         sent          (M, N), weights as they are sent (``transmitted``)
-        groups        (N,), the turn of each UAV; None: all at once
+        groups        (N,), the slot of each UAV; None: all at once
         budget        noise
         uav_antennas  isotropic antennas of each UAV, combined towards the node
 
-    Free space, no scattering, no blockage; -inf where no element faces the UAV. That a group is
-    served in its turn only is in the rate, not in the SINR. Raises ``ValueError`` as its parts do.
+    Free space, no scattering, no blockage; -inf where no element faces the UAV. Time slots
+    reduce the rate, not the SINR. Raises ``ValueError`` as its parts do.
     """
     if uav_antennas < 1:
         raise ValueError(f"uav_antennas {uav_antennas} must be at least 1")
@@ -248,7 +248,7 @@ def least_sinr_db(
         leaks        (K, N), largest array gain of each beam towards it, linear
         users        (K,), indices below N of the UAVs asked about
         farthest_m   (K,), largest possible ranges
-        groups       (N,), the turn of each UAV
+        groups       (N,), the slot of each UAV
         powers_w     (N,), power that each beam is sent with
         budget       noise
 

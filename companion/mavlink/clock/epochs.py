@@ -42,7 +42,7 @@ _RIVAL_LASTS_NS: Final = 3 * _NS
 _RIVAL_SILENT_NS: Final = 10 * _NS  # silence after which a second clock is forgotten
 
 
-class Placed(NamedTuple):
+class PlacedStamp(NamedTuple):
     """A stamp on a line."""
 
     x_ns: int  # the sender's time since boot, unwrapped
@@ -52,7 +52,7 @@ class Placed(NamedTuple):
 
 
 @dataclass(slots=True, kw_only=True)
-class _Run:
+class _RivalLine:
     """Stamps off the line, (arrival ns, boot ms), that lie on a line of their own."""
 
     stamps: list[tuple[int, int]] = field(default_factory=list)
@@ -105,11 +105,11 @@ class BootLine:
         self._late_max_ns = late_max_ns
         self.floor = Floor(*self._shape)
         self.newest_ns = 0
-        self._run = _Run()
-        self._rival = _Run()
+        self._run = _RivalLine()
+        self._rival = _RivalLine()
         self._previous: tuple[Floor, int] | None = None  # the line before, and when it was left
 
-    def observe(self, arrival_ns: int, boot_ms: int) -> Placed | None:
+    def observe(self, arrival_ns: int, boot_ms: int) -> PlacedStamp | None:
         """Place a stamp.
 
         Returns None for a frame of the previous line, and for a stamp off the line that others have
@@ -162,12 +162,12 @@ class BootLine:
         """Whether a stamp can belong to the line."""
         return bool(self.floor) and abs(self.late_ns(arrival_ns, x_ns)) <= self._late_max_ns
 
-    def _accept(self, arrival_ns: int, x_ns: int) -> Placed:
+    def _accept(self, arrival_ns: int, x_ns: int) -> PlacedStamp:
         self.floor.add(x_ns, arrival_ns - x_ns)
         self.newest_ns = max(self.newest_ns, x_ns)
-        return Placed(x_ns=x_ns)
+        return PlacedStamp(x_ns=x_ns)
 
-    def _near(self, arrival_ns: int, boot_ms: int, x_ns: int) -> Placed | None:
+    def _near(self, arrival_ns: int, boot_ms: int, x_ns: int) -> PlacedStamp | None:
         """Place a stamp on the line: in order, late, or in the first seconds of a second boot."""
         if x_ns > self.newest_ns:
             early = self.late_ns(arrival_ns, x_ns) < _EARLY_NS
@@ -183,7 +183,7 @@ class BootLine:
             return self._begin_again(rebooted=True)
         return self._accept(arrival_ns, x_ns)
 
-    def _ahead(self, arrival_ns: int, boot_ms: int) -> Placed | None:
+    def _ahead(self, arrival_ns: int, boot_ms: int) -> PlacedStamp | None:
         """Place a stamp that shows all before it to have been late, once others confirm it.
 
         One alone would move the clock by all that it is ahead, whoever made it up.
@@ -196,12 +196,12 @@ class BootLine:
         self._run.stamps.clear()
         return self._accept(arrival_ns, _unwrap(boot_ms, self.newest_ns))
 
-    def _stalled(self, arrival_ns: int, boot_ms: int, x_ns: int) -> Placed:
+    def _stalled(self, arrival_ns: int, boot_ms: int, x_ns: int) -> PlacedStamp:
         """Place a stamp in order but too late: the link stalled, or the clock stood still."""
         if self._run.add(arrival_ns, boot_ms, _NS) and self._run.lasts(5, 2 * _NS):
             return self._begin_again(rebooted=False)
         self.newest_ns = x_ns
-        return Placed(x_ns=x_ns)
+        return PlacedStamp(x_ns=x_ns)
 
     def _is_straggler(self, arrival_ns: int, boot_ms: int, late_ns: int) -> bool:
         """Whether a stamp fits the previous line and not the present one."""
@@ -216,7 +216,7 @@ class BootLine:
         fits_before = _EARLY_NS <= was_late_ns <= self._late_max_ns
         return fits_before and not _EARLY_NS <= late_ns <= self._late_max_ns
 
-    def _begin_again(self, *, rebooted: bool) -> Placed:
+    def _begin_again(self, *, rebooted: bool) -> PlacedStamp:
         """Make the run the line. After a reboot the sender's timeline begins anew."""
         stamps = list(self._run.stamps)
         self._run.stamps.clear()
@@ -230,7 +230,7 @@ class BootLine:
             self.floor.add(x_ns, arrival_ns - x_ns)
         self.newest_ns = x_ns
         leapt_ns = 0 if rebooted else self.floor.at(x_ns) - before.at(x_ns)
-        return Placed(x_ns=x_ns, new_line=True, rebooted=rebooted, leapt_ns=leapt_ns)
+        return PlacedStamp(x_ns=x_ns, new_line=True, rebooted=rebooted, leapt_ns=leapt_ns)
 
 
 def _unwrap(boot_ms: int, newest_ns: int) -> int:

@@ -44,7 +44,7 @@ class DriftProven:
     step_ns: float
 
 
-class Evidence:
+class OffsetEvidence:
     """What the evidence of one kind leaves of the offset.
 
     drift_max    greatest drift taken for possible, a ratio

@@ -27,7 +27,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from companion.mavlink.clock.latencies import RESOLUTION_NS, Latencies
-from companion.mavlink.clock.lateness import CHANGE, LEAST_CHANGE_NS, Late, Lateness
+from companion.mavlink.clock.lateness import CHANGE, LEAST_CHANGE_NS, LateSpell, SenderLateness
 
 LIKELY_DRIFT: Final = 50e-6
 """Drift of an ordinary crystal, by which the most likely line rises while no frame touches it."""
@@ -107,7 +107,7 @@ class Floor:
         self._since_ns = 0  # x from which the line is what it is
         self._risen = -np.inf  # height of the last few frames, where they are suspiciously late
         self._recent: deque[tuple[int, float]] = deque(maxlen=RECENT)
-        self._lateness = Lateness(drift_max)
+        self._lateness = SenderLateness(drift_max)
         self._visible = Latencies(window_ns, drift_max)
         self._looked = 0
 
@@ -180,7 +180,7 @@ class Floor:
                 return least
         return -np.inf
 
-    def _all_late(self, spell: Late) -> None:
+    def _all_late(self, spell: LateSpell) -> None:
         """Tell that all frames are late, once; begin the line again there in time."""
         if spell.is_news:
             rose_ns = spell.height - max(self._line, self._sure)

@@ -29,7 +29,7 @@ _BLOCKS: Final = 240
 _BLOCK_COUNT: Final = 4  # frames of a block that count as independent
 
 
-class Late(NamedTuple):
+class LateSpell(NamedTuple):
     """A spell in which all frames are late."""
 
     height: float  # least height of the late frames, aged to the newest, ns
@@ -50,7 +50,7 @@ class _Block:
         self.gap_ns = self.height = math.inf
 
 
-class Lateness:
+class SenderLateness:
     """How far the frames of one sender lie above its line. ``add`` takes the newest ones.
 
     ``height`` is that of the spell that goes on, -inf without one.
@@ -68,7 +68,7 @@ class Lateness:
         self._blocks.clear()
         self.height = -math.inf
 
-    def add(self, x_ns: int, height: float, gap: float, spread: float) -> Late | None:
+    def add(self, x_ns: int, height: float, gap: float, spread: float) -> LateSpell | None:
         """Take in the newest frame: its height, and how far it is above the line before it.
 
         ``spread`` is what is usual of that. As a block ends, returns the spell that goes on then.
@@ -92,7 +92,7 @@ class Lateness:
             block.gap_ns, block.height, block.x_ns = gap, height, x_ns
         return found
 
-    def _spell(self, x_ns: int, spread: float) -> Late | None:
+    def _spell(self, x_ns: int, spread: float) -> LateSpell | None:
         count, least, height, found = 0, math.inf, math.inf, None
         for block in reversed(self._blocks):
             count += min(block.count, _BLOCK_COUNT)
@@ -106,7 +106,7 @@ class Lateness:
             as_before = abs(height - self._before) < LEAST_CHANGE_NS
             followed = as_before or lasted_ns >= min(FOLLOWED * least, FOLLOWED_NS)
             if found is None or followed:
-                found = Late(
+                found = LateSpell(
                     height=height,
                     since_ns=block.first_ns,
                     is_news=self.height == -math.inf,

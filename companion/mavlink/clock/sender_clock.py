@@ -29,7 +29,7 @@ from companion.mavlink.clock.estimates import (
     Guarantee,
     Stamp,
 )
-from companion.mavlink.clock.evidence import DriftProven, Evidence, Interval
+from companion.mavlink.clock.evidence import DriftProven, Interval, OffsetEvidence
 
 _NS: Final = 1_000_000_000
 _NS_PER_MS: Final = 1_000_000
@@ -64,8 +64,8 @@ class SenderClock:
         self._line = BootLine(
             round(self._settings.window_s * _NS), drift_max, round(self._settings.late_max_s * _NS)
         )
-        self._timesync = Evidence(drift_max)
-        self._gnss = Evidence(drift_max)
+        self._timesync = OffsetEvidence(drift_max)
+        self._gnss = OffsetEvidence(drift_max)
         self._gnss_plausible = 0
         self._latency_s = 0.0
         self._doubt_ns = 0  # the greatest of all stamps
@@ -169,7 +169,7 @@ class SenderClock:
         offset_ns = unix_us * 1000 - x_ns
         return self._prove(self._gnss, Interval(x_ns, offset_ns - error_ns, offset_ns + error_ns))
 
-    def _prove(self, evidence: Evidence, new: Interval) -> str | None:
+    def _prove(self, evidence: OffsetEvidence, new: Interval) -> str | None:
         """Add an interval to the evidence. Returns None, or why it cannot be about this clock."""
         floor = self._line.floor
         sure_ns, highest_ns, _, _ = floor.heights(new.x_ns)

@@ -58,7 +58,7 @@ class _Component:
         self.peer = peer
 
 
-class _Sender:
+class _PeerSender:
     """One source as one peer delivers it: the sequence number due, and the run of late ones."""
 
     __slots__ = ("component", "due", "late", "run", "stamped_ns")
@@ -83,7 +83,7 @@ class Peer:
         self.key = key
         self.address = address_text(key) if isinstance(key, tuple) else str(key or "")
         self.splitter = splitter
-        self.senders: dict[Source, _Sender] = {}
+        self.senders: dict[Source, _PeerSender] = {}
         self.heard_ns: int | None = None
         self.versions = 0  # bit 0: MAVLink 1 was heard, bit 1: MAVLink 2
         self._sequence = 0
@@ -193,9 +193,9 @@ class Peers:
                 sender.due = (number + 1) & 0xFF
                 sender.run = 0
             else:
-                self._out_of_turn(sender, number)
+                self._out_of_order(sender, number)
 
-    def _out_of_turn(self, sender: _Sender, number: int) -> None:
+    def _out_of_order(self, sender: _PeerSender, number: int) -> None:
         step = (number - sender.due + 1) & 0xFF
         if step == 0:
             self._status.repeats += 1
@@ -213,7 +213,7 @@ class Peers:
         sender.due = (number + 1) & 0xFF
         sender.run = 0
 
-    def _meet(self, peer: Peer, frame: Frame) -> _Sender:
+    def _meet(self, peer: Peer, frame: Frame) -> _PeerSender:
         """Begin to follow a source of this peer.
 
         The number of its first frame counts as the one due.
@@ -227,6 +227,6 @@ class Peers:
             for known in self._peers.values():
                 known.senders.clear()
             self._senders = 0
-        sender = peer.senders[frame.source] = _Sender(component, frame.seq)
+        sender = peer.senders[frame.source] = _PeerSender(component, frame.seq)
         self._senders += 1
         return sender

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from companion.mavlink.links.urls import LinkError
-from companion.mavlink.trust.signing import KEY_BYTES, Guard, State, fingerprint
+from companion.mavlink.trust.signing import KEY_BYTES, LinkSigning, State, fingerprint
 
 SAVE_NS: Final = 1_000_000_000  # shortest time between two writes
 REFRESH_NS: Final = 3_000_000_000
@@ -91,7 +91,7 @@ class _Kept(NamedTuple):
     clean: bool
 
 
-class Snapshot(NamedTuple):
+class SigningSnapshot(NamedTuple):
     """States to be written; ``number`` counts the snapshots."""
 
     number: int
@@ -113,7 +113,7 @@ class Timestamps:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._guards: dict[_LinkKey, Guard] = {}
+        self._guards: dict[_LinkKey, LinkSigning] = {}
         self._number = 0
         self._snapshot_ns = 0
         self._moves = 0
@@ -129,7 +129,7 @@ class Timestamps:
 
     def guard(
         self, url: str, key: bytes, link_id: int, now_ns: int, *, allow_unsigned: bool = False
-    ) -> Guard:
+    ) -> LinkSigning:
         """The guard of a link, with the state it had when last in use with this key.
 
         When this returns, the file says that the link is in use: should the process be killed, the
@@ -140,7 +140,7 @@ class Timestamps:
             raise LinkError(f"{url}: two links have the same address and key")
         kept = self._kept.get(link, _Kept(State(), clean=True))
         state = kept.state if kept.clean else kept.state.after_crash()
-        guard = Guard(key=key, link_id=link_id, allow_unsigned=allow_unsigned, state=state)
+        guard = LinkSigning(key=key, link_id=link_id, allow_unsigned=allow_unsigned, state=state)
         self._guards[link] = guard
         self.write(self.snapshot(now_ns))
         return guard
@@ -152,11 +152,11 @@ class Timestamps:
             SAVE_NS if moved else REFRESH_NS
         )
 
-    def snapshot(self, now_ns: int) -> Snapshot:
+    def snapshot(self, now_ns: int) -> SigningSnapshot:
         """The state of all links; cheap. ``now_ns`` is the own clock, ns since the Unix epoch."""
         return self._snapshot(now_ns, clean=False)
 
-    def write(self, snapshot: Snapshot) -> None:
+    def write(self, snapshot: SigningSnapshot) -> None:
         """Write a snapshot to disk, from any thread; one older than the file is skipped.
 
         When this returns, a loss of power no longer takes it away.
@@ -177,16 +177,16 @@ class Timestamps:
         finally:
             os.close(self._lock)
 
-    def _snapshot(self, now_ns: int, *, clean: bool) -> Snapshot:
+    def _snapshot(self, now_ns: int, *, clean: bool) -> SigningSnapshot:
         self._number += 1
         self._snapshot_ns = now_ns
         self._moves = sum(guard.moves for guard in self._guards.values())
         current = {link: _Kept(guard.state(now_ns), clean) for link, guard in self._guards.items()}
-        return Snapshot(self._number, self._kept | current)
+        return SigningSnapshot(self._number, self._kept | current)
 
     def _write_now(self) -> None:
         self._number += 1
-        self.write(Snapshot(self._number, self._kept))
+        self.write(SigningSnapshot(self._number, self._kept))
 
 
 def _locked(path: Path) -> int:

@@ -9,7 +9,7 @@ from typing import Final
 
 QUEUE_MAX: Final = 20_000
 """Calls that may wait for the loop; what comes beyond is dropped and counted."""
-TURN_S: Final = 0.003  # time after which other work of the loop has its turn
+SLICE_S: Final = 0.003  # time slice, after which other work of the event loop runs
 
 
 class ToLoop:
@@ -63,7 +63,7 @@ class ToLoop:
         await asyncio.shield(self._fault)
 
     def _hand_over(self) -> None:
-        until_s = time.monotonic() + TURN_S
+        until_s = time.monotonic() + SLICE_S
         while time.monotonic() < until_s:
             with self._lock:
                 if not self._waiting:

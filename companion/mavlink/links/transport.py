@@ -36,7 +36,7 @@ from companion.mavlink.wire.decode import POSE
 from companion.mavlink.wire.encode import TIMESYNC, Outgoing, pack
 from companion.values import Frame, Notice, Reason, Rejection, Severity, Source
 
-__all__ = ["Guard", "Link", "LinkStatus", "Notify", "Receive", "endpoint"]
+__all__ = ["Link", "LinkStatus", "MessageSigning", "Notify", "Receive", "endpoint"]
 
 RETRY_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
 """Seconds from one attempt to serve a lost link to the next; the last is repeated."""
@@ -52,7 +52,7 @@ Receive = Callable[[list[Frame | Rejection]], None]
 Notify = Callable[[Notice], None]
 
 
-class Guard(Protocol):
+class MessageSigning(Protocol):
     """Message signing of one link (https://mavlink.io/en/guide/message_signing.html)."""
 
     def refusal(self, frame: Frame) -> Reason | None:
@@ -82,7 +82,7 @@ class Link:
         receive: Receive,
         now_ns: Callable[[], int],
         notify: Notify | None = None,
-        guard: Guard | None = None,
+        guard: MessageSigning | None = None,
         lag: ArrivalLag | None = None,
         twins: Twins | None = None,
     ) -> None:
@@ -304,7 +304,7 @@ def _answered(peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
     )
 
 
-def _admitted(guard: Guard, item: Frame | Rejection) -> Frame | Rejection:
+def _admitted(guard: MessageSigning, item: Frame | Rejection) -> Frame | Rejection:
     """The item itself, or the guard's refusal of it."""
     refusal = None if isinstance(item, Rejection) else guard.refusal(item)
     if refusal is None or isinstance(item, Rejection):

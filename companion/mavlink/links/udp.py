@@ -18,7 +18,7 @@ from typing import Final, cast
 from companion.mavlink.links import kernel_time
 from companion.mavlink.links.endpoints import Address, Upcalls, bound, resolved, settle
 from companion.mavlink.links.status import LinkStatus
-from companion.mavlink.links.to_loop import TURN_S
+from companion.mavlink.links.to_loop import SLICE_S
 from companion.mavlink.links.urls import LinkUrl
 
 RECEIVE_BUFFER_BYTES: Final = 4 << 20
@@ -32,7 +32,7 @@ OVERFLOW_CHECK_DATAGRAMS: Final = 1024
 STALE_NS: Final = 2_000_000_000
 """Age at which a datagram is let go unread: a busy machine then sees what is new, not a backlog."""
 READ_AT_ONCE: Final = 32
-"""Datagrams read at most before others have their turn, as in libuv; fewer in ``TURN_S``."""
+"""Datagrams read at most before other work runs, as in libuv; fewer in ``SLICE_S``."""
 DATAGRAM_BYTES: Final = 1 << 16  # more than any datagram has
 
 _SO_MEMINFO: Final = 55  # Linux, include/uapi/asm-generic/socket.h
@@ -252,7 +252,7 @@ class _Datagrams:
     def _read(self) -> None:
         """Hand on the datagrams that wait, each with its age."""
         was_set = self._wall_clock.was_set()
-        until_s = time.monotonic() + TURN_S
+        until_s = time.monotonic() + SLICE_S
         for _ in range(READ_AT_ONCE):
             if time.monotonic() > until_s:
                 return

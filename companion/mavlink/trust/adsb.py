@@ -54,7 +54,7 @@ _Dated = tuple[int, _T]  # when it was true, and what
 
 
 @dataclass(slots=True, kw_only=True)
-class _Known:
+class _RelayedAircraft:
     """What is known of one aircraft."""
 
     news_ns: int = 0
@@ -148,7 +148,9 @@ class Aircraft:
     """
 
     def __init__(self) -> None:
-        self._known: OrderedDict[str, _Known] = OrderedDict()  # the longest without news first
+        self._known: OrderedDict[str, _RelayedAircraft] = (
+            OrderedDict()
+        )  # the longest without news first
 
     def merge(self, said: AdsbVehicle) -> Report | Rejection:
         """Take in a message: a report if its position is news, else the reason why there is none.
@@ -200,8 +202,8 @@ class Aircraft:
         known = self._known.get(uav)
         return known.callsign[1] if known is not None and known.callsign is not None else None
 
-    def _begin(self, said: AdsbVehicle) -> _Known:
-        known = self._known.setdefault(said.uav, _Known(news_ns=said.t_ns))
+    def _begin(self, said: AdsbVehicle) -> _RelayedAircraft:
+        known = self._known.setdefault(said.uav, _RelayedAircraft(news_ns=said.t_ns))
         known.hear(said.source, said.t_ns)
         if len(self._known) > AIRCRAFT_MAX:
             self._known.popitem(last=False)

@@ -19,7 +19,7 @@ DATUM_NS: Final = 10_000_000_000  # how long an aircraft keeps what its heights 
 
 
 @dataclass(slots=True, kw_only=True)
-class _Known:
+class _AddressRecord:
     heard_ns: int
     uas_id: str | None = None
     id_kind: int | None = None
@@ -32,7 +32,7 @@ class RemoteIds:
     """What is known of each address, for each receiver. ``named`` takes messages as they arrive."""
 
     def __init__(self) -> None:
-        self._known: OrderedDict[tuple[Source, str], _Known] = OrderedDict()
+        self._known: OrderedDict[tuple[Source, str], _AddressRecord] = OrderedDict()
 
     def named(self, said: RemoteId) -> Report | Rejection | None:
         """The report that a message completes, under its aircraft's name; None if it has none.
@@ -61,11 +61,11 @@ class RemoteIds:
         known.datum, known.placed_ns = report.alt_datum, said.t_ns
         return replace(report, uav=uav)
 
-    def _learned(self, said: RemoteId) -> _Known:
+    def _learned(self, said: RemoteId) -> _AddressRecord:
         key = said.source, said.heard_as
         known = self._known.pop(key, None)
         if known is None or said.t_ns - known.heard_ns > NAMED_NS:
-            known = _Known(heard_ns=said.t_ns)
+            known = _AddressRecord(heard_ns=said.t_ns)
         self._known[key] = known
         known.heard_ns = said.t_ns
         if said.id_kind is not None and said.id_kind <= (known.id_kind or said.id_kind):

@@ -27,8 +27,8 @@ back to the node would otherwise carry a good signature.
 the standard has it. Known streams go on by their own clocks. New streams on this link are refused
 until their sender has heard a frame of this node, which then carries the high timestamp and takes
 it along, or until time has caught up; a replay is never accepted instead. Other links do not
-notice. ``Guard.ahead_ns`` shows it. Timestamps in the last ten years of the 48 bits (to 2104) are
-not followed, or one frame could leave no timestamps for anybody else.
+notice. ``LinkSigning.ahead_ns`` shows it. Timestamps in the last ten years of the 48 bits (to
+2104) are not followed, or one frame could leave no timestamps for anybody else.
 
 **Memory.** At most ``STREAMS_MAX`` streams are remembered. The one with the oldest timestamp gives
 way to a new one; from then on new streams must be newer than what was forgotten.
@@ -120,7 +120,7 @@ def fingerprint(key: bytes) -> str:
     return sha256(sha256(key).digest()).hexdigest()[:8]
 
 
-class Guard:
+class LinkSigning:
     """The signing state of one link: its key, and what was heard and sent with it.
 
         key             32 bytes

@@ -56,7 +56,7 @@ class _Path:
 
 
 @dataclass(slots=True, kw_only=True)
-class _Sender:
+class _SenderPaths:
     """A sender by its peers, and when they contradicted each other; ``told`` while it is known."""
 
     heard_ns: int
@@ -75,7 +75,7 @@ class Twins:
     def __init__(self, routers: Collection[str] = ()) -> None:
         self.told: list[tuple[str, tuple[str, ...]]] = []
         self._routers = frozenset(routers)
-        self._senders: dict[tuple[int, int], _Sender] = {}
+        self._senders: dict[tuple[int, int], _SenderPaths] = {}
 
     def refuses(self, link: str, peer: str, frame: Frame) -> bool:
         """Take in a frame of ``decode.POSE``. Returns whether it is not to be believed.
@@ -101,16 +101,16 @@ class Twins:
                 when.append(frame.t_ns)
         return self._are_two(frame, sender) and not path.is_router
 
-    def _follow(self, frame: Frame) -> _Sender | None:
+    def _follow(self, frame: Frame) -> _SenderPaths | None:
         """Begin to follow a sender; None where there is no room for one that is new."""
         if len(self._senders) >= SENDERS_MAX:
             before_ns = frame.t_ns - KEPT_NS
             self._senders = {k: v for k, v in self._senders.items() if v.heard_ns >= before_ns}
             if len(self._senders) >= SENDERS_MAX:
                 return None
-        return self._senders.setdefault(frame.source, _Sender(heard_ns=frame.t_ns))
+        return self._senders.setdefault(frame.source, _SenderPaths(heard_ns=frame.t_ns))
 
-    def _meet(self, sender: _Sender, link: str, peer: str, t_ns: int) -> _Path:
+    def _meet(self, sender: _SenderPaths, link: str, peer: str, t_ns: int) -> _Path:
         """Begin to follow a peer of a sender; those that are silent are forgotten."""
         paths = sender.paths
         for name in [name for name, path in paths.items() if t_ns - path.heard_ns > KEPT_NS]:
@@ -121,7 +121,7 @@ class Twins:
         known = {link, peer, peer.rpartition(":")[0].strip("[]")}
         return paths.setdefault(peer, _Path(not known.isdisjoint(self._routers), t_ns))
 
-    def _contradicts(self, sender: _Sender, path: _Path, said: OwnPosition) -> bool:
+    def _contradicts(self, sender: _SenderPaths, path: _Path, said: OwnPosition) -> bool:
         """Add a report to its path. Returns whether that shows two senders.
 
         It is held against the stretches of other peers, and their reports against the stretch that
@@ -144,7 +144,7 @@ class Twins:
                 return True
         return False
 
-    def _are_two(self, frame: Frame, sender: _Sender) -> bool:
+    def _are_two(self, frame: Frame, sender: _SenderPaths) -> bool:
         """Whether the peers of a sender contradict each other, which is told once."""
         when = sender.contradicted_ns
         while when and frame.t_ns - when[0] > KEPT_NS:

@@ -60,7 +60,7 @@ from companion.values import (
 _NS: Final = 1_000_000_000
 COMMAND_ACK: Final = 77
 HEARD: Final = POSE | {HEARTBEAT, REQUEST_DATA_STREAM, COMMAND_LONG, COMMAND_ACK, TIMESYNC}
-"""Ids of the messages that ``Component.hear`` must be given."""
+"""Ids of the messages that ``ServiceComponent.hear`` must be given."""
 
 HEARTBEAT_NS: Final = _NS  # time between two heartbeats
 TIMESYNC_NS: Final = (1 * _NS, 5 * _NS)
@@ -119,7 +119,7 @@ class ComponentSpec:
                 raise UserError(f"{name} is {rate_hz}, allowed: 0.1 to 100")
 
 
-class Component:
+class ServiceComponent:
     """The service as a MAVLink component. Times are node times and do not go back."""
 
     def __init__(self, settings: ComponentSpec) -> None:

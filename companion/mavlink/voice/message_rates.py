@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
-from companion.mavlink.voice.rate_watch import MessageRate, Observed, RateState, Request, Watch
+from companion.mavlink.voice.rate_watch import MessageRate, ObservedRate, RateState, Request, Watch
 from companion.mavlink.wire.decode import ATTITUDE
 from companion.mavlink.wire.encode import Outgoing
 from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
@@ -111,7 +111,9 @@ class MessageRates:
 
     def _watches(self, now_ns: int, source: Source) -> dict[int, Watch]:
         return {
-            msgid: Watch(uav=source, msgid=msgid, wanted_hz=wanted_hz, observed=Observed(now_ns))
+            msgid: Watch(
+                uav=source, msgid=msgid, wanted_hz=wanted_hz, observed=ObservedRate(now_ns)
+            )
             for msgid, wanted_hz in self._wanted_hz.items()
             if wanted_hz is not None and (msgid != ATTITUDE or source == self._carrier)
         }

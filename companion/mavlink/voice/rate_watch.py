@@ -107,7 +107,7 @@ class Request(NamedTuple):
         return addressed and msgid in self.msgids and (self.hz is None or self.hz < wanted_hz)
 
 
-class Observed:
+class ObservedRate:
     """The rate of a message by its sender's own stamps, and when it last came."""
 
     __slots__ = ("_newest_ms", "last_ns", "restarted_ns", "stamps_ms")
@@ -147,7 +147,7 @@ class Watch:
     uav: Source
     msgid: int
     wanted_hz: float
-    observed: Observed
+    observed: ObservedRate
     state: RateState = RateState.WATCHING
     asked: int = 0
     changed_by: str | None = None

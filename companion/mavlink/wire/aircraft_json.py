@@ -11,7 +11,7 @@ import math
 from collections import OrderedDict
 from typing import Any, Final
 
-from companion.mavlink.wire.transponder import ADSB_VEHICLE, Said, frame
+from companion.mavlink.wire.transponder import ADSB_VEHICLE, AircraftState, frame
 from companion.values import Frame, Reason, Rejection
 
 DOCUMENT_MAX: Final = 8 << 20  # bytes of a document at most: some 10 000 aircraft
@@ -85,7 +85,7 @@ class AircraftJson:
         self._seq = (self._seq + 1) & 0xFF
         return [found]
 
-    def _is_news(self, said: Said, true_at: float) -> bool:
+    def _is_news(self, said: AircraftState, true_at: float) -> bool:
         """Whether a position is newer than what was read before; ages are in tenths of seconds."""
         before = self._true_at.pop(said.icao, None)
         self._true_at[said.icao] = true_at
@@ -94,7 +94,7 @@ class AircraftJson:
         return before is None or not before - 60 < true_at <= before + 0.15
 
 
-def _said(entry: object) -> Said | str | None:
+def _said(entry: object) -> AircraftState | str | None:
     """What is said of one aircraft; None: no position. Text: why it is not used.
 
     Raises ``ValueError`` where its fields cannot be what they say.
@@ -123,7 +123,7 @@ def _said(entry: object) -> Said | str | None:
         climb_fpm = _number(entry, "baro_rate", -60_000, 60_000)
     callsign = entry.get("flight", "")
     age_s = _number(entry, "seen_pos", 0, 86_400)
-    return Said(
+    return AircraftState(
         icao=int(name, 16),
         lat_deg=lat_deg,
         lon_deg=lon_deg,

@@ -15,7 +15,7 @@ KIND: Final = "a-u-A"  # something that flies, and of which nobody said whose it
 HOW: Final = "m-f"  # by a machine, from several reports
 
 
-class Place(NamedTuple):
+class CotPosition(NamedTuple):
     """Where an aircraft is, how far it may be off, and how it moves; None is unknown.
 
     ``ce_m`` and ``le_m`` bound the error in the plane and in height.
@@ -30,7 +30,7 @@ class Place(NamedTuple):
     speed_mps: float | None = None
 
 
-def event(uav: str, at_ns: int, stale_ns: int, place: Place, remarks: str) -> bytes:
+def event(uav: str, at_ns: int, stale_ns: int, place: CotPosition, remarks: str) -> bytes:
     """One event, valid from one Unix time to another."""
     at, stale = _time(at_ns), _time(stale_ns)
     hae, le = (UNKNOWN if one is None else one for one in (place.hae_m, place.le_m))

@@ -14,7 +14,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import Final
 
-from companion.mavlink.wire.transponder import Said
+from companion.mavlink.wire.transponder import AircraftState
 
 SIZE: Final = 14  # bytes of an extended squitter
 PAIR_NS: Final = 10_000_000_000
@@ -63,7 +63,7 @@ class Transponders:
     def __init__(self) -> None:
         self._heard: OrderedDict[int, _Heard] = OrderedDict()
 
-    def read(self, t_ns: int, message: bytes) -> Said | None:
+    def read(self, t_ns: int, message: bytes) -> AircraftState | None:
         """What a message says that came whole at ``t_ns``; None where that is nothing of use.
 
         Raises ``ValueError`` where its parity is wrong.
@@ -82,7 +82,7 @@ class Transponders:
             self._heard.popitem(last=False)
         type_code, subtype = me >> 51, me >> 48 & 7
         if 1 <= type_code <= 4:
-            return Said(icao=icao, callsign=_callsign(me))
+            return AircraftState(icao=icao, callsign=_callsign(me))
         if 9 <= type_code <= 18 or 20 <= type_code <= 22:
             return _position(
                 heard, t_ns, icao, me, _altitude_ft(me >> 36 & 0xFFF) if type_code < 20 else None
@@ -111,7 +111,9 @@ def _status(heard: _Heard, t_ns: int, me: int, *, airborne: bool) -> None:
         heard.gva = (me >> 6 & 3 if known else 0, t_ns)
 
 
-def _position(heard: _Heard, t_ns: int, icao: int, me: int, altitude_ft: float | None) -> Said:
+def _position(
+    heard: _Heard, t_ns: int, icao: int, me: int, altitude_ft: float | None
+) -> AircraftState:
     odd = me >> 34 & 1
     heard.halves[odd] = (t_ns, me >> 17 & 0x1FFFF, me & 0x1FFFF)
     other = heard.halves.get(1 - odd)
@@ -121,7 +123,7 @@ def _position(heard: _Heard, t_ns: int, icao: int, me: int, altitude_ft: float |
     lat_deg, lon_deg = place or (None, None)
     if place is not None:
         heard.place = t_ns, *place
-    return Said(
+    return AircraftState(
         icao=icao,
         lat_deg=lat_deg,
         lon_deg=lon_deg,
@@ -132,7 +134,7 @@ def _position(heard: _Heard, t_ns: int, icao: int, me: int, altitude_ft: float |
     )
 
 
-def _on_ground(heard: _Heard, t_ns: int, icao: int, me: int) -> Said:
+def _on_ground(heard: _Heard, t_ns: int, icao: int, me: int) -> AircraftState:
     """A position on the ground, near the newest place that is known, and how it moves."""
     place = None
     if heard.place is not None and t_ns - heard.place[0] <= GROUND_NS:
@@ -141,7 +143,7 @@ def _on_ground(heard: _Heard, t_ns: int, icao: int, me: int) -> Said:
     lat_deg, lon_deg = place or (None, None)
     if place is not None:
         heard.place = t_ns, *place
-    return Said(
+    return AircraftState(
         icao=icao,
         lat_deg=lat_deg,
         lon_deg=lon_deg,
@@ -186,7 +188,7 @@ def _altitude_ft(code: int) -> float | None:
     return 25.0 * (code >> 5 << 4 | code & 15) - 1000.0
 
 
-def _velocity(icao: int, me: int, knots: int) -> Said:
+def _velocity(icao: int, me: int, knots: int) -> AircraftState:
     """Speed and course over ground, and climb; a field of 0 is unknown."""
     east, north = me >> 32 & 0x3FF, me >> 21 & 0x3FF
     speed_kt = track_deg = None
@@ -196,7 +198,7 @@ def _velocity(icao: int, me: int, knots: int) -> Said:
         speed_kt, track_deg = math.hypot(x, y), math.degrees(math.atan2(x, y)) % 360.0
     climb = me >> 10 & 0x1FF
     climb_fpm = 64.0 * (climb - 1) * (-1 if me >> 19 & 1 else 1) if climb else None
-    return Said(icao=icao, speed_kt=speed_kt, track_deg=track_deg, climb_fpm=climb_fpm)
+    return AircraftState(icao=icao, speed_kt=speed_kt, track_deg=track_deg, climb_fpm=climb_fpm)
 
 
 def position_deg(

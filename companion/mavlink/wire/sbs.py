@@ -15,7 +15,7 @@ import re
 from datetime import datetime
 from typing import Final
 
-from companion.mavlink.wire.transponder import ADSB_VEHICLE, Said, frame
+from companion.mavlink.wire.transponder import ADSB_VEHICLE, AircraftState, frame
 from companion.values import Frame, Reason, Rejection
 
 LINE_MAX: Final = 512  # bytes of a line at most; a longer one is garbage
@@ -91,7 +91,7 @@ class SbsSplitter:
         return [found]
 
 
-def said(line: str) -> Said:
+def said(line: str) -> AircraftState:
     """What a MSG line says. Raises ``ValueError`` where its fields cannot be what they say."""
     fields = [field.strip() for field in line.split(",")]
     if len(fields) < 10:
@@ -99,7 +99,7 @@ def said(line: str) -> Said:
     fields += [""] * (22 - len(fields))
     if not re.fullmatch(r"[0-9A-Fa-f]{6}", fields[4]):
         raise ValueError(f"{fields[4]!r:.20} is not an ICAO address")
-    return Said(
+    return AircraftState(
         icao=int(fields[4], 16),
         lat_deg=_number(fields[14], -90, 90),
         lon_deg=_number(fields[15], -180, 180),

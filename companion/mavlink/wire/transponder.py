@@ -22,7 +22,7 @@ _KNOT_CMPS: Final = 1852 / 36
 _FPM_CMPS: Final = 30.48 / 60
 
 
-class Said(NamedTuple):
+class AircraftState(NamedTuple):
     """What was said of one aircraft, in aviation's units; None: nothing.
 
     geometric   the altitude is above the ellipsoid, not that of the standard pressure
@@ -75,7 +75,7 @@ class Said(NamedTuple):
         )
 
 
-def frame(t_ns: int, link: str, said: Said, seq: int) -> Frame | None:
+def frame(t_ns: int, link: str, said: AircraftState, seq: int) -> Frame | None:
     """The frame that says it, as if it had come over ``link``; None where nothing is said."""
     payload = said.payload()
     if payload is None:

@@ -68,7 +68,7 @@ class Shot:
     stored: int | None = None  # index of the codebook's best beam; None where nobody asked
 
 
-class Source(Protocol):
+class BeamSource(Protocol):
     """Where beams come from."""
 
     def ask(self, lead_s: float) -> Shot:
@@ -98,7 +98,7 @@ class Device(Protocol):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Told:
+class DriveStatus:
     """How it goes.
 
     p50_ms, p99_ms time from asking to applied; None before there is one
@@ -125,7 +125,7 @@ class Drive:
     def __init__(
         self,
         *,
-        source: Source,
+        source: BeamSource,
         device: Device,
         update_hz: float,
         safe: Safe,
@@ -206,11 +206,11 @@ class Drive:
             return own_s
         return statistics.median(list(self._took_ns)[-LEADING:]) * 1e-9 if self._took_ns else 0.0
 
-    def told(self) -> Told:
+    def told(self) -> DriveStatus:
         """How it goes."""
         took, at = np.array(self._took_ns) * 1e-6, list(self._at_ns)
         spent_s = (at[-1] - at[0]) * 1e-9 if len(at) > 1 else 0.0
-        return Told(
+        return DriveStatus(
             applied=self._applied,
             rate_hz=(len(at) - 1) / spent_s if spent_s > 0 else None,
             p50_ms=float(np.percentile(took, 50)) if took.size else None,

@@ -6,13 +6,13 @@ import threading
 from collections.abc import Callable
 from typing import Final
 
-from companion.node.drive.loop import Drive, Told
+from companion.node.drive.loop import Drive, DriveStatus
 
 TOLD_EVERY_S: Final = 1.0
 ENDS_S: Final = 5.0  # time for a device to go to its safe state at the end
 
 
-def until_told(drive: Drive, show: Callable[[Told], None], seconds: float | None) -> None:
+def until_told(drive: Drive, show: Callable[[DriveStatus], None], seconds: float | None) -> None:
     """Drive until SIGINT, SIGTERM or ``seconds`` have passed; ``show`` is called once a second.
 
     Raises what ended the drive.

@@ -14,7 +14,7 @@ from companion.beams.aim import directions
 from companion.beams.array.geometry import Array
 from companion.beams.hardware import codebooks, tables
 from companion.beams.hardware.calibration import Calibration
-from companion.beams.hardware.devices import Device
+from companion.beams.hardware.devices import Beamformer
 from companion.client import Client, ServiceError
 from companion.node.drive.loop import Shot, SourceLostError, Takes
 from companion.pipeline.assembly import Equipment
@@ -30,7 +30,7 @@ ANSWERS_S: Final = 5.0  # time after which an event loop that does not answer is
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Wanted:
+class BeamRequest:
     """Whom to follow: the first of these that has a beam, else anybody if so; and for what.
 
     centre        a mount looks at the middle of all of them instead
@@ -53,7 +53,7 @@ class Wanted:
 class OverHttp:
     """Beams of a service elsewhere."""
 
-    def __init__(self, client: Client, wanted: Wanted) -> None:
+    def __init__(self, client: Client, wanted: BeamRequest) -> None:
         self._client = client
         self._wanted = wanted
 
@@ -85,7 +85,7 @@ class OfThisProcess:
         pipeline: Pipeline,
         equipment: Equipment,
         now_ns: Callable[[], int],
-        wanted: Wanted,
+        wanted: BeamRequest,
     ) -> None:
         self._loop = loop
         self._pipeline = pipeline
@@ -106,13 +106,13 @@ class OfThisProcess:
         return self._pipeline.look(self._now_ns(), lead_s)
 
 
-def shot_of(pipeline: Pipeline, equipment: Equipment, update: Update, wanted: Wanted) -> Shot:
+def shot_of(pipeline: Pipeline, equipment: Equipment, update: Update, wanted: BeamRequest) -> Shot:
     """What is to be applied of one update. Only the beam that is wanted is fitted to the device."""
     beams, text = update.beams, None
     uav = followed(beams.uavs, wanted)
     if update.unfit is None and uav is not None and wanted.takes is Takes.REGISTERS:
         try:
-            table = device_table(Device.ADAR1000, beams, pipeline.array, equipment, uav)
+            table = device_table(Beamformer.ADAR1000, beams, pipeline.array, equipment, uav)
             text = tables.encode(table)
         except UserError as error:
             return Shot(valid_at_ns=beams.valid_at_ns, unfit=str(error))
@@ -149,17 +149,17 @@ def stored_registers(array: Array, equipment: Equipment) -> list[IntArray]:
         for k, column in enumerate(codebook.weights.T)
     ]
     calibration = equipment.calibration or Calibration.ideal(range(array.size))
-    text = tables.encode(tables.fit(Device.ADAR1000, wanted, calibration))
+    text = tables.encode(tables.fit(Beamformer.ADAR1000, wanted, calibration))
     return [registers_of(text, beam.uav) for beam in wanted]
 
 
-def followed(uavs: Collection[str], wanted: Wanted) -> str | None:
+def followed(uavs: Collection[str], wanted: BeamRequest) -> str | None:
     """Who of those that have beams is served; None where nobody is."""
     uav = next((one for one in wanted.uavs if one in uavs), None)
     return next(iter(uavs), None) if uav is None and wanted.anybody else uav
 
 
-def chosen(told: dict[str, Any], text: str | None, wanted: Wanted, valid_at_ns: int) -> Shot:
+def chosen(told: dict[str, Any], text: str | None, wanted: BeamRequest, valid_at_ns: int) -> Shot:
     """The shot for whom is wanted, of what the API says."""
     if told["unfit"] is not None:
         return Shot(valid_at_ns=valid_at_ns, unfit=str(told["unfit"]))

@@ -1,4 +1,4 @@
-"""The live node in a fleet: Zenoh on one side, a ``Member`` and the pipeline on the other.  [shell]
+"""The live node in a fleet: Zenoh on one side, ``FleetMember`` and pipeline on the other.  [shell]
 
 What is said, how often and under which keys is described in docs/fleet.md.
 
@@ -17,7 +17,7 @@ from companion.node.fleet.config import bus_config
 from companion.node.fleet.listening import Listening
 from companion.node.fleet.messages import FleetMessageError
 from companion.node.fleet.traffic import Rate
-from companion.pipeline.fleet.member import Member
+from companion.pipeline.fleet.member import FleetMember
 from companion.pipeline.fleet.offers import Offers
 from companion.pipeline.fleet.surroundings import Surroundings
 from companion.pipeline.fold import Pipeline
@@ -40,7 +40,7 @@ LOOK_S: Final = 0.3
 OFFERED_S: Final = 1.0  # time between two tellings of offers, and of tracks
 
 
-class FleetNode:
+class LiveFleetNode:
     """This node among others. ``open`` blocks; ``run`` serves until cancelled.
 
         settings  [fleet], with a name
@@ -73,7 +73,7 @@ class FleetNode:
         self._now_ns = now_ns
         self._started_ns = now_ns()
         self._config = bus_config(settings)
-        self.member = Member(
+        self.member = FleetMember(
             name=self.name,
             settings=settings,
             elements=pipeline.array.size,

@@ -32,7 +32,7 @@ FUTURE_NS: Final = 1_000_000
 HERE: Final = "here"
 
 
-class Recent:
+class RecentFrames:
     """Contents of frames, each remembered for ``KEPT_NS`` after it was first noted."""
 
     def __init__(self) -> None:
@@ -80,8 +80,8 @@ class Hearing:
         self.contradicted: list[str] = []
         self.early: list[str] = []
         self.behind_ns = 0
-        self._heard = Recent()
-        self._told = Recent()
+        self._heard = RecentFrames()
+        self._told = RecentFrames()
         self._ears: dict[Source, _Ears] = {}
         self._twins = Twins({HERE})
 

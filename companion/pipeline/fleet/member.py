@@ -18,7 +18,7 @@ from companion.pipeline.fleet.hearing import SHARED, Hearing
 from companion.pipeline.fleet.nearness import Place, near
 from companion.pipeline.fleet.neighbours import TOLD_APART_NS, Neighbour, NeighbourClock, here
 from companion.pipeline.fleet.sharing import Sharing
-from companion.pipeline.fleet.trust import Told, Trust, Witness
+from companion.pipeline.fleet.trust import Trust, UnconfirmedVehicle, Witness
 from companion.settings.fleet import FleetSettings
 from companion.values import (
     DUTY_MAX,
@@ -43,7 +43,7 @@ GONE_MAX: Final = 64  # nodes that went, and are remembered
 ToLocal = Callable[[Place], Vector]
 
 
-class Member:
+class FleetMember:
     """One node's part. ``name`` is its name; ``elements`` is the size of its array.
 
     ``neighbours`` are the other nodes by name, ``offers`` this node's own, ``handovers`` the newest
@@ -265,7 +265,7 @@ class Member:
             if said.place is not None and said.reach_m is not None:
                 witnesses[node] = Witness(local(said.place), said.reach_m, heard)
         told = [
-            Told(uav, nodes[0], positions[uav])
+            UnconfirmedVehicle(uav, nodes[0], positions[uav])
             for uav, nodes in hearers.items()
             if len(nodes) == 1 and uav not in own.heard and uav in positions
         ]

@@ -15,7 +15,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Final
 
-from companion.mavlink.clock.evidence import DriftProven, Evidence, Interval
+from companion.mavlink.clock.evidence import DriftProven, Interval, OffsetEvidence
 from companion.values import Offer, RoundTrip, Standing
 
 DRIFT_MAX: Final = 200e-6
@@ -45,7 +45,7 @@ class NeighbourClock:
     """The clock of one other node."""
 
     def __init__(self) -> None:
-        self._evidence = Evidence(DRIFT_MAX)
+        self._evidence = OffsetEvidence(DRIFT_MAX)
         self._newest_ns: int | None = None
         self._answers = 0
 

@@ -1,6 +1,6 @@
 """What this node offers each UAV: the gain that its array would have, if it served it alone.
 
-Made in turn, some at each call: every UAV has its turn about every two seconds, a new one at once.
+Offers are made in batches, one at each call: for a new UAV at once, else every two seconds or so.
 UAVs are predicted by whoever holds the pipeline; the beams are made on any thread.
 """
 
@@ -17,7 +17,7 @@ from companion.pipeline.fleet.assignment import STEP_DB
 from companion.pipeline.fold import Pipeline
 from companion.values import BeamSet, Method, Offer, Policy, Power
 
-ROUND_NS: Final = 2_000_000_000  # time in which every UAV has its turn
+ROUND_NS: Final = 2_000_000_000  # time in which the offers for all UAVs are renewed
 LEAST: Final = 2  # UAVs at least that one call makes offers for
 
 
@@ -35,7 +35,7 @@ class Offers:
         self._last_ns: int | None = None
 
     def look(self, now_ns: int) -> Callable[[], dict[str, Offer]] | None:
-        """What makes the offers whose turn it is, on any thread; None: it is nobody's.
+        """What makes the offers that are due, on any thread; None: none is due.
 
         Give what it makes to ``take``. Call this some times a second, not at every update: it costs
         milliseconds, however few UAVs it is for.

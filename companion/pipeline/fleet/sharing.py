@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple, TypeVar
 
 from companion.mavlink.wire.positions import OWN
-from companion.pipeline.fleet.hearing import VEHICLES_MAX, Recent
+from companion.pipeline.fleet.hearing import VEHICLES_MAX, RecentFrames
 from companion.values import Frame, RoundTrip, Shared, SharedFrame, Source
 
 HOLD_NS: Final = (60_000_000, 2_000_000_000)
@@ -62,8 +62,8 @@ class Sharing:
         self._voices: dict[Source, _Voice] = {}
         self._hold_ns: float = HOLD_NS[0]
         self._held: deque[_Held] = deque()
-        self._by_others = Recent()
-        self._by_me = Recent()
+        self._by_others = RecentFrames()
+        self._by_me = RecentFrames()
         self._frames: deque[SharedFrame] = deque()
         self._trips: deque[RoundTrip] = deque()
 

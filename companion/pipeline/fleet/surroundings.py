@@ -3,7 +3,7 @@
 import math
 from typing import Final
 
-from companion.pipeline.fleet.member import Member
+from companion.pipeline.fleet.member import FleetMember
 from companion.pipeline.fleet.nearness import Place
 from companion.pipeline.fleet.trust import Witness
 from companion.pipeline.fold import Pipeline
@@ -16,7 +16,7 @@ HEARD_S: Final = 5.0
 class Surroundings:
     """The sky of one node, as its pipeline has it, for its part in the fleet."""
 
-    def __init__(self, pipeline: Pipeline, member: Member) -> None:
+    def __init__(self, pipeline: Pipeline, member: FleetMember) -> None:
         self._pipeline = pipeline
         self._member = member
 

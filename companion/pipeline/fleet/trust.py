@@ -35,7 +35,7 @@ class Witness(NamedTuple):
     heard: frozenset[str]  # vehicles that it has heard itself
 
 
-class Told(NamedTuple):
+class UnconfirmedVehicle(NamedTuple):
     """A vehicle that only one other node has told of: which, and where it is said to be."""
 
     uav: str
@@ -68,7 +68,7 @@ class Trust:
     def vehicles(
         self,
         now_ns: int,
-        told: Iterable[Told],
+        told: Iterable[UnconfirmedVehicle],
         witnesses: Mapping[str, Witness],
         heard: Mapping[str, int],
     ) -> list[Notice]:
@@ -126,7 +126,7 @@ class Trust:
         return [_notice(now_ns, node, text, Severity.WARNING)]
 
 
-def _ought_to_hear(witness: Witness, told: Told) -> bool:
+def _ought_to_hear(witness: Witness, told: UnconfirmedVehicle) -> bool:
     """Whether a vehicle is said to be where a node hears everybody."""
     away_m = math.dist(witness.place_ned_m, told.position_ned_m)
     return away_m < REACH_SHARE * witness.reach_m

@@ -9,12 +9,12 @@ from typing import Final
 
 import numpy as np
 
-from companion.recording.foreign.dataflash import Bytes, Table, table, walk
+from companion.recording.foreign.dataflash import Bytes, DataflashTable, table, walk
 from companion.recording.foreign.onboard import (
     Attitudes,
     Fixes,
     Onboard,
-    Positions,
+    OnboardPositions,
     Truth,
     between,
     in_time,
@@ -69,7 +69,7 @@ def read(data: Bytes) -> Onboard:
     )
 
 
-def _timed(of: Table, lost: dict[Reason, int]) -> Table:
+def _timed(of: DataflashTable, lost: dict[Reason, int]) -> DataflashTable:
     """The rows in order of time; those of several cores or receivers at one time all stay."""
     boot_us = times(of)
     if len(boot_us) != len(of):
@@ -93,7 +93,7 @@ def _timed(of: Table, lost: dict[Reason, int]) -> Table:
 # --- who it is ------------------------------------------------------------------------------------
 
 
-def _identity(parameters: Table, versions: Table) -> tuple[int | None, int]:
+def _identity(parameters: DataflashTable, versions: DataflashTable) -> tuple[int | None, int]:
     """System id, where the log has it, and MAV_TYPE; 0 (generic) where it does not tell."""
     values: dict[bytes, float] = {}
     if "Name" in parameters and "Value" in parameters:
@@ -121,7 +121,7 @@ def _build(values: dict[bytes, float]) -> int:
     return 2 if b"FRAME_CLASS" in values else 0
 
 
-def _armed(of: Table) -> tuple[tuple[int, bool], ...]:
+def _armed(of: DataflashTable) -> tuple[tuple[int, bool], ...]:
     state = of.integers("ArmState")
     if state is None:
         return ()
@@ -132,8 +132,11 @@ def _armed(of: Table) -> tuple[tuple[int, bool], ...]:
 
 
 def _positions(
-    tables: dict[str, Table], fixes: Fixes | None, lost: dict[Reason, int], notes: list[str]
-) -> Positions | None:
+    tables: dict[str, DataflashTable],
+    fixes: Fixes | None,
+    lost: dict[Reason, int],
+    notes: list[str],
+) -> OnboardPositions | None:
     pos, attitude = tables["POS"], tables["ATT"]
     lat_1e7, lon_1e7 = pos.integers("Lat"), pos.integers("Lng")
     if lat_1e7 is None or lon_1e7 is None or not len(pos):
@@ -151,7 +154,7 @@ def _positions(
     heading = _headings(boot_us, attitude)
     if not len(boot_us):
         return None
-    return Positions(
+    return OnboardPositions(
         boot_us=boot_us,
         lat_1e7=lat_1e7,
         lon_1e7=lon_1e7,
@@ -162,7 +165,9 @@ def _positions(
     )
 
 
-def _received(fixes: Fixes, tables: dict[str, Table], notes: list[str]) -> Positions | None:
+def _received(
+    fixes: Fixes, tables: dict[str, DataflashTable], notes: list[str]
+) -> OnboardPositions | None:
     """The receiver's own positions, where the log has no estimated ones."""
     fixed = fixes.fix_type >= 3
     if not fixed.any():
@@ -173,7 +178,7 @@ def _received(fixes: Fixes, tables: dict[str, Table], notes: list[str]) -> Posit
     way = moved(boot_us, lat_1e7, lon_1e7, alt_m)
     velocity = _filled(np.full_like(way, np.nan), boot_us, fixes, way, notes)
     heading = _headings(boot_us, tables["ATT"])
-    return Positions(
+    return OnboardPositions(
         boot_us=boot_us,
         lat_1e7=lat_1e7,
         lon_1e7=lon_1e7,
@@ -184,7 +189,7 @@ def _received(fixes: Fixes, tables: dict[str, Table], notes: list[str]) -> Posit
     )
 
 
-def _velocities(boot_us: IntArray, tables: dict[str, Table]) -> FloatArray:
+def _velocities(boot_us: IntArray, tables: dict[str, DataflashTable]) -> FloatArray:
     """The estimator's velocities (N, 3) at times (N,); NaN where it has none."""
     older = tables["ATT"].integers("AEKF")
     second = older is not None and len(older) > 0 and int(np.median(older)) == 2
@@ -222,7 +227,7 @@ def _filled(
     return np.where(missing[:, None], put, velocity)
 
 
-def _headings(boot_us: IntArray, attitude: Table) -> FloatArray:
+def _headings(boot_us: IntArray, attitude: DataflashTable) -> FloatArray:
     yaw_deg = attitude.numbers("Yaw")
     sound = np.isfinite(yaw_deg) & (np.abs(yaw_deg) < 1e4)
     if not sound.any():
@@ -231,7 +236,9 @@ def _headings(boot_us: IntArray, attitude: Table) -> FloatArray:
     return between(boot_us, times(attitude)[sound], straight, _NEAR_US)
 
 
-def _attitudes(of: Table, gyro: Table, lost: dict[Reason, int]) -> Attitudes | None:
+def _attitudes(
+    of: DataflashTable, gyro: DataflashTable, lost: dict[Reason, int]
+) -> Attitudes | None:
     angles = np.stack([of.numbers(name) for name in ("Roll", "Pitch", "Yaw")], axis=1)
     sound = np.isfinite(angles).all(axis=1) & (np.abs(angles) < 1e4).all(axis=1)
     count(lost, Reason.MALFORMED, int((~sound).sum()))
@@ -245,7 +252,7 @@ def _attitudes(of: Table, gyro: Table, lost: dict[Reason, int]) -> Attitudes | N
     return Attitudes(boot_us, euler, np.where(np.isnan(there), rates, there))
 
 
-def _truth(sim: Table, motion: Table, lost: dict[Reason, int]) -> Truth | None:
+def _truth(sim: DataflashTable, motion: DataflashTable, lost: dict[Reason, int]) -> Truth | None:
     lat_1e7, lon_1e7 = sim.integers("Lat"), sim.integers("Lng")
     if lat_1e7 is None or lon_1e7 is None or not len(sim):
         return None

@@ -27,7 +27,7 @@ from companion.recording.foreign.onboard import (
     Attitudes,
     Fixes,
     Onboard,
-    Positions,
+    OnboardPositions,
     in_time,
     moved,
     on_earth,
@@ -214,7 +214,7 @@ Place = tuple[IntArray, IntArray, FloatArray]
 
 def _positions(
     boot_us: IntArray, place: Place, table: dict[str, FloatArray], notes: list[str]
-) -> Positions:
+) -> OnboardPositions:
     lat_1e7, lon_1e7, alt_m = place
     velocity = moved(boot_us, lat_1e7, lon_1e7, alt_m)
     nothing = np.full(len(boot_us), np.nan)
@@ -223,7 +223,7 @@ def _positions(
     if np.isnan(given).any():
         notes.append("velocities that it does not give are those between its positions")
     height_m = table.get("height_m", nothing)
-    return Positions(
+    return OnboardPositions(
         boot_us=boot_us,
         lat_1e7=lat_1e7,
         lon_1e7=lon_1e7,

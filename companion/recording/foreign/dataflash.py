@@ -50,7 +50,7 @@ class Format(NamedTuple):
     hundredths: frozenset[str]
 
 
-class Walked(NamedTuple):
+class DataflashIndex(NamedTuple):
     """What a log holds.
 
     formats  by type
@@ -66,7 +66,7 @@ class Walked(NamedTuple):
     refused: int
 
 
-class Table:
+class DataflashTable:
     """The messages of one type, as columns. Empty where the log has none."""
 
     def __init__(self, data: Bytes, layout: Format | None, at: IntArray) -> None:
@@ -109,15 +109,15 @@ class Table:
         found: IntArray = values.astype(np.int64)
         return found
 
-    def rows(self, chosen: IntArray | NDArray[np.bool_]) -> "Table":
+    def rows(self, chosen: IntArray | NDArray[np.bool_]) -> "DataflashTable":
         """Some of the messages."""
-        picked = Table.__new__(Table)
+        picked = DataflashTable.__new__(DataflashTable)
         picked._layout, picked._at = self._layout, self._at[chosen]
         picked._records = self._records[chosen]
         return picked
 
 
-def walk(data: Bytes, wanted: Collection[str]) -> Walked:
+def walk(data: Bytes, wanted: Collection[str]) -> DataflashIndex:
     """Find the messages of a log; those named in ``wanted`` are told where they are."""
     formats, refused = _describe(data)
     lengths = np.zeros(256, dtype=np.int64)
@@ -131,15 +131,15 @@ def walk(data: Bytes, wanted: Collection[str]) -> Walked:
         for number in np.unique(types[asked[types]]).tolist():
             found[number].extend(at[types == number].tolist())
     places = {number: np.array(each.kept, dtype=np.int64) for number, each in found.items()}
-    return Walked(formats=formats, at=places, lost=data.size - covered, refused=refused)
+    return DataflashIndex(formats=formats, at=places, lost=data.size - covered, refused=refused)
 
 
-def table(data: Bytes, walked: Walked, name: str) -> Table:
+def table(data: Bytes, walked: DataflashIndex, name: str) -> DataflashTable:
     """The messages of one name."""
     for number, layout in walked.formats.items():
         if layout.name == name and number in walked.at:
-            return Table(data, layout, walked.at[number])
-    return Table(data, None, np.zeros(0, dtype=np.int64))
+            return DataflashTable(data, layout, walked.at[number])
+    return DataflashTable(data, None, np.zeros(0, dtype=np.int64))
 
 
 # --- what is described ----------------------------------------------------------------------------

@@ -21,7 +21,7 @@ METRES_PER_DEGREE: Final = 111_195.0
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Positions:
+class OnboardPositions:
     """Estimated positions.
 
     lat_1e7, lon_1e7  (N,), 1e-7 degrees
@@ -63,7 +63,7 @@ class Fixes:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Truth:
-    """Where the simulator had it: as ``Positions``, and quaternions ned from body (N, 4), wxyz."""
+    """The simulator's positions, and its quaternions ned from body (N, 4), wxyz."""
 
     boot_us: IntArray
     lat_1e7: IntArray
@@ -81,7 +81,7 @@ class Onboard:
     compid: int  # its component id
     mav_type: int  # MAV_TYPE
     autopilot: int  # MAV_AUTOPILOT
-    positions: Positions | None
+    positions: OnboardPositions | None
     attitudes: Attitudes | None = None
     fixes: Fixes | None = None
     truth: Truth | None = None

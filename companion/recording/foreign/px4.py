@@ -16,7 +16,7 @@ from companion.recording.foreign.onboard import (
     Attitudes,
     Fixes,
     Onboard,
-    Positions,
+    OnboardPositions,
     Truth,
     between,
     euler_of,
@@ -25,7 +25,7 @@ from companion.recording.foreign.onboard import (
     on_earth,
     turned,
 )
-from companion.recording.foreign.ulog import Table, table, walk
+from companion.recording.foreign.ulog import UlogTable, table, walk
 from companion.values import BoolArray, FloatArray, IntArray, Reason
 
 _GLOBAL: Final = "vehicle_global_position"
@@ -86,14 +86,14 @@ def _count(lost: Lost, reason: Reason, number: int) -> None:
         lost[reason] = lost.get(reason, 0) + number
 
 
-def _times(of: Table) -> IntArray:
+def _times(of: UlogTable) -> IntArray:
     """When samples were true: the time of what they are made of, where it is said."""
     sampled = of.integers("timestamp_sample")
     found = of.integers("timestamp") if sampled is None or not sampled.all() else sampled
     return np.zeros(0, dtype=np.int64) if found is None else found
 
 
-def _timed(of: Table, lost: Lost) -> Table:
+def _timed(of: UlogTable, lost: Lost) -> UlogTable:
     times = _times(of)
     if len(times) != len(of):
         _count(lost, Reason.MALFORMED, len(of))
@@ -103,7 +103,7 @@ def _timed(of: Table, lost: Lost) -> Table:
     return of.rows(rows)
 
 
-def _identity(walked: ulog.Walked, status: Table) -> tuple[int | None, int, int]:
+def _identity(walked: ulog.UlogIndex, status: UlogTable) -> tuple[int | None, int, int]:
     """System id, component id and MAV_TYPE: by the parameters, else by the vehicle's status."""
 
     def said(parameter: str, column: str) -> int | None:
@@ -117,14 +117,14 @@ def _identity(walked: ulog.Walked, status: Table) -> tuple[int | None, int, int]
     return sysid, said("MAV_COMP_ID", "component_id") or 1, said("MAV_TYPE", "system_type") or 0
 
 
-def _armed(status: Table) -> tuple[tuple[int, bool], ...]:
+def _armed(status: UlogTable) -> tuple[tuple[int, bool], ...]:
     state = status.integers("arming_state")
     if state is None:
         return ()
     return tuple(zip(_times(status).tolist(), (state == _ARMED).tolist(), strict=True))
 
 
-def _degrees(of: Table, old: str, new: str) -> IntArray:
+def _degrees(of: UlogTable, old: str, new: str) -> IntArray:
     """Latitudes or longitudes, 1e-7 degrees: integers in old logs, degrees in new ones."""
     whole = of.integers(old)
     if whole is not None:
@@ -134,7 +134,7 @@ def _degrees(of: Table, old: str, new: str) -> IntArray:
     return np.where(sound, np.round(np.where(sound, degrees, 0.0) * 1e7), 1 << 40).astype(np.int64)
 
 
-def _fixes(gps: Table, lost: Lost) -> tuple[Fixes | None, GpsTime | None]:
+def _fixes(gps: UlogTable, lost: Lost) -> tuple[Fixes | None, GpsTime | None]:
     lat_1e7, lon_1e7 = (_degrees(gps, "lat", "latitude_deg"), _degrees(gps, "lon", "longitude_deg"))
     alt_m = gps.numbers("alt") * 1e-3 if "alt" in gps else gps.numbers("altitude_msl_m")
     sound = on_earth(lat_1e7, lon_1e7, alt_m, gps.numbers("fix_type"))
@@ -163,8 +163,8 @@ def _fixes(gps: Table, lost: Lost) -> tuple[Fixes | None, GpsTime | None]:
 
 
 def _positions(
-    tables: dict[str, Table], fixes: Fixes | None, lost: Lost, notes: list[str]
-) -> Positions | None:
+    tables: dict[str, UlogTable], fixes: Fixes | None, lost: Lost, notes: list[str]
+) -> OnboardPositions | None:
     place, local = tables[_GLOBAL], tables[_LOCAL]
     if not len(place):
         return None if fixes is None else _received(fixes, local, notes)
@@ -187,7 +187,7 @@ def _positions(
     height_m = alt_m - (home_m[-1] if len(home_m) else alt_m[0])
     yaw = place.numbers("yaw")
     heading = np.where(np.isfinite(yaw), np.degrees(yaw), _headings(boot_us, local))
-    return Positions(
+    return OnboardPositions(
         boot_us=boot_us,
         lat_1e7=lat_1e7,
         lon_1e7=lon_1e7,
@@ -198,11 +198,11 @@ def _positions(
     )
 
 
-def _place(of: Table) -> tuple[IntArray, IntArray, FloatArray]:
+def _place(of: UlogTable) -> tuple[IntArray, IntArray, FloatArray]:
     return _degrees(of, "", "lat"), _degrees(of, "", "lon"), of.numbers("alt")
 
 
-def _received(fixes: Fixes, local: Table, notes: list[str]) -> Positions | None:
+def _received(fixes: Fixes, local: UlogTable, notes: list[str]) -> OnboardPositions | None:
     """The receiver's own positions, where the estimator had none."""
     fixed = fixes.fix_type >= 3
     if not fixed.any():
@@ -215,7 +215,7 @@ def _received(fixes: Fixes, local: Table, notes: list[str]) -> Positions | None:
     level = np.stack([np.cos(course), np.sin(course)], axis=1) * speed[:, None]
     velocity[:, :2] = np.where(np.isfinite(level), level, velocity[:, :2])
     heading = _headings(boot_us, local)
-    return Positions(
+    return OnboardPositions(
         boot_us=boot_us,
         lat_1e7=lat_1e7,
         lon_1e7=lon_1e7,
@@ -226,13 +226,13 @@ def _received(fixes: Fixes, local: Table, notes: list[str]) -> Positions | None:
     )
 
 
-def _velocities(boot_us: IntArray, local: Table) -> FloatArray:
+def _velocities(boot_us: IntArray, local: UlogTable) -> FloatArray:
     velocity = np.stack([local.numbers(name) for name in ("vx", "vy", "vz")], axis=1)
     sound = np.isfinite(velocity).all(axis=1) & (np.abs(velocity) < 1e4).all(axis=1)
     return between(boot_us, _times(local)[sound], velocity[sound], _NEAR_US)
 
 
-def _headings(boot_us: IntArray, local: Table) -> FloatArray:
+def _headings(boot_us: IntArray, local: UlogTable) -> FloatArray:
     heading = local.numbers("heading" if "heading" in local else "yaw")
     sound = np.isfinite(heading) & (np.abs(heading) < 1e3)
     if not sound.any():
@@ -241,7 +241,7 @@ def _headings(boot_us: IntArray, local: Table) -> FloatArray:
     return between(boot_us, _times(local)[sound], straight, _NEAR_US)
 
 
-def _turns(of: Table, lost: Lost) -> tuple[IntArray, FloatArray]:
+def _turns(of: UlogTable, lost: Lost) -> tuple[IntArray, FloatArray]:
     """Times (N,) and quaternions (N, 4) of length 1."""
     quaternions = of.numbers("q", 4)
     length = np.linalg.norm(quaternions, axis=1) if len(of) else np.zeros(0)
@@ -250,7 +250,7 @@ def _turns(of: Table, lost: Lost) -> tuple[IntArray, FloatArray]:
     return _times(of)[sound], quaternions[sound] / length[sound, None]
 
 
-def _attitudes(tables: dict[str, Table], lost: Lost) -> Attitudes | None:
+def _attitudes(tables: dict[str, UlogTable], lost: Lost) -> Attitudes | None:
     boot_us, quaternions = _turns(tables[_ATTITUDE], lost)
     if not len(boot_us):
         return None
@@ -262,7 +262,7 @@ def _attitudes(tables: dict[str, Table], lost: Lost) -> Attitudes | None:
     return Attitudes(boot_us, euler, np.where(np.isnan(rates), turned(boot_us, euler), rates))
 
 
-def _truth(tables: dict[str, Table], lost: Lost) -> Truth | None:
+def _truth(tables: dict[str, UlogTable], lost: Lost) -> Truth | None:
     of = tables[f"{_GLOBAL}_groundtruth"]
     lat_1e7, lon_1e7, alt_m = _place(of)
     sound = on_earth(lat_1e7, lon_1e7, alt_m)

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from companion.recording.foreign import gps_time
-from companion.recording.foreign.dataflash import Table
+from companion.recording.foreign.dataflash import DataflashTable
 from companion.recording.foreign.gps_time import GpsTime
 from companion.recording.foreign.onboard import Fixes, in_time, on_earth
 from companion.values import FloatArray, IntArray, Reason
@@ -17,7 +17,7 @@ _BESIDE_US: Final = 5_000  # GPA is written with its GPS
 _LATE_US: Final = 2e6
 
 
-def times(of: Table) -> IntArray:
+def times(of: DataflashTable) -> IntArray:
     """Boot times (N,) of messages, microseconds; empty where they have none."""
     exact = of.integers("TimeUS")
     if exact is not None:
@@ -33,7 +33,7 @@ def count(lost: dict[Reason, int], reason: Reason, number: int) -> None:
 
 
 def fixes_of(
-    gps: Table, accuracy: Table, lost: dict[Reason, int]
+    gps: DataflashTable, accuracy: DataflashTable, lost: dict[Reason, int]
 ) -> tuple[Fixes | None, GpsTime | None]:
     """What the receiver in use said, and the boot clock on GPS time."""
     used, instance = gps.integers("U"), gps.integers("I")
@@ -81,7 +81,7 @@ def _by_time(boot_us: IntArray) -> IntArray:
     return rows
 
 
-def _beside(boot_us: IntArray, gps: Table, accuracy: Table) -> FloatArray:
+def _beside(boot_us: IntArray, gps: DataflashTable, accuracy: DataflashTable) -> FloatArray:
     """Accuracies and the boot time at which the fix was had, ms, (N, 4), from GPA; NaN: unknown."""
     found = np.full((len(boot_us), 4), np.nan)
     mine, other = gps.integers("I"), accuracy.integers("I")

@@ -17,7 +17,7 @@ from companion.recording.foreign.onboard import (
     Attitudes,
     Fixes,
     Onboard,
-    Positions,
+    OnboardPositions,
     Truth,
     euler_of,
 )
@@ -195,7 +195,7 @@ def _attitudes(attitudes: Attitudes) -> Payloads:
     return made
 
 
-def _positions(positions: Positions) -> Payloads:
+def _positions(positions: OnboardPositions) -> Payloads:
     made = np.zeros(len(positions.boot_us), dtype=_POSITION)
     made["boot_ms"] = _ms(positions.boot_us)
     made["place"][:, 0], made["place"][:, 1] = positions.lat_1e7, positions.lon_1e7

@@ -44,7 +44,7 @@ _APPENDED: Final = 0x01
 _candidates = re.compile(rb"(?=[\s\S]{2}[BFIMPQARDLCSO])").finditer
 
 
-class Topic(NamedTuple):
+class UlogTopic(NamedTuple):
     """One instance of a topic: its fields, and where its samples lie in the file.
 
     Of very many samples it is every n-th.
@@ -58,10 +58,10 @@ class Topic(NamedTuple):
 
 
 @dataclass(slots=True, kw_only=True)
-class Walked:
+class UlogIndex:
     """What a log holds."""
 
-    topics: list[Topic] = field(default_factory=list)  # of those wanted, the ones with samples
+    topics: list[UlogTopic] = field(default_factory=list)  # of those wanted, the ones with samples
     parameters: dict[str, float] = field(default_factory=dict)  # as they were at the start
     lost: int = 0  # bytes that belong to no message
     refused: int = 0  # descriptions and samples that do not fit one another
@@ -69,10 +69,10 @@ class Walked:
     unknown: bool = False  # True if the file says that it cannot be read without knowing more
 
 
-class Table:
+class UlogTable:
     """The samples of a topic, as columns. Empty where the log has none."""
 
-    def __init__(self, data: Bytes, topic: Topic | None) -> None:
+    def __init__(self, data: Bytes, topic: UlogTopic | None) -> None:
         self._records: NDArray[np.void] = np.zeros(0, dtype=[])
         if topic is not None and len(topic.at):
             room = data.size - topic.fields.itemsize + 1
@@ -108,23 +108,23 @@ class Table:
         found: IntArray = values.astype(np.int64)
         return found
 
-    def rows(self, chosen: IntArray | NDArray[np.bool_]) -> "Table":
+    def rows(self, chosen: IntArray | NDArray[np.bool_]) -> "UlogTable":
         """Some of the samples."""
-        picked = Table.__new__(Table)
+        picked = UlogTable.__new__(UlogTable)
         picked._records = self._records[chosen]
         return picked
 
 
-def table(data: Bytes, walked: Walked, *names: str) -> Table:
+def table(data: Bytes, walked: UlogIndex, *names: str) -> UlogTable:
     """The samples of the first of these topics that the log has, of its lowest instance."""
     for name in names:
         there = [topic for topic in walked.topics if topic.name == name and len(topic.at)]
         if there:
-            return Table(data, min(there, key=lambda topic: topic.instance))
-    return Table(data, None)
+            return UlogTable(data, min(there, key=lambda topic: topic.instance))
+    return UlogTable(data, None)
 
 
-def walk(data: Bytes, wanted: Collection[str]) -> Walked:
+def walk(data: Bytes, wanted: Collection[str]) -> UlogIndex:
     """Find the samples of the topics that are wanted, and the parameters."""
     return _Walker(data, wanted).walk()
 
@@ -135,13 +135,13 @@ class _Walker:
     def __init__(self, data: Bytes, wanted: Collection[str]) -> None:
         self._data = memoryview(data.data)
         self._wanted = wanted
-        self._found = Walked()
+        self._found = UlogIndex()
         self._formats: dict[str, str] = {}
-        self._topics: dict[int, Topic | None] = {}
+        self._topics: dict[int, UlogTopic | None] = {}
         self._sizes: dict[int, tuple[int, int]] = {}
         self._ends: list[int] = []
 
-    def walk(self) -> Walked:
+    def walk(self) -> UlogIndex:
         begin = _HEADER
         for end in (*self._parts(), len(self._data)):
             if end > begin:
@@ -239,7 +239,7 @@ class _Walker:
         topic = (
             None
             if layout is None
-            else Topic(name=name, instance=instance, fields=layout, at=at, samples=Thinned(at))
+            else UlogTopic(name=name, instance=instance, fields=layout, at=at, samples=Thinned(at))
         )
         self._topics[number] = topic
 

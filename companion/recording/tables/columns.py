@@ -12,7 +12,7 @@ Value = str | int | float | bool | None  # a value in a table; None: unknown, or
 _AXES: Final = ("north", "east", "down")
 
 
-class Kind(StrEnum):
+class ColumnKind(StrEnum):
     """What the values of a column are.
 
     TEXT     words; empty words are unknown
@@ -36,14 +36,14 @@ class Column:
     """A column of a table; ``get`` takes its value from a row."""
 
     name: str
-    kind: Kind
+    kind: ColumnKind
     meaning: str
     get: Callable[[Any], Any]
 
     @property
     def unit(self) -> str:
         """The unit of its values; empty where they have none."""
-        return unit(self.name) if self.kind is not Kind.TIME else "UTC"
+        return unit(self.name) if self.kind is not ColumnKind.TIME else "UTC"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,7 +79,7 @@ class Table:
         values = [_CLEAN[column.kind](column.get(item)) for column in self.columns]
         if utc_offset_ns:
             for i, (column, value) in enumerate(zip(self.columns, values, strict=True)):
-                if column.kind is Kind.TIME and isinstance(value, int):
+                if column.kind is ColumnKind.TIME and isinstance(value, int):
                     values[i] = value + utc_offset_ns
         return values
 
@@ -93,31 +93,31 @@ def _columns(row_class: type) -> Iterator[Column]:
         if name.endswith("_ns"):
             if not member.optional:
                 yield Column(
-                    name=name, kind=Kind.INTEGER, meaning=f"{meaning}, since 1970", get=get
+                    name=name, kind=ColumnKind.INTEGER, meaning=f"{meaning}, since 1970", get=get
                 )
             utc = name.removesuffix("_ns") + "_utc"
-            yield Column(name=utc, kind=Kind.TIME, meaning=meaning, get=get)
+            yield Column(name=utc, kind=ColumnKind.TIME, meaning=meaning, get=get)
         elif "ndarray" in str(member.type):
             for axis, direction in enumerate(_AXES):
                 yield Column(
                     name=_along(name, direction),
-                    kind=Kind.NUMBER,
+                    kind=ColumnKind.NUMBER,
                     meaning=f"{meaning}: {direction}",
                     get=_element(get, axis),
                 )
         elif name.endswith(("_rad", "_radps")):
             outside = name.replace("_radps", "_degps").replace("_rad", "_deg")
-            yield Column(name=outside, kind=Kind.NUMBER, meaning=meaning, get=_degrees(get))
+            yield Column(name=outside, kind=ColumnKind.NUMBER, meaning=meaning, get=_degrees(get))
         else:
             yield Column(name=name, kind=_kind(member), meaning=meaning, get=get)
 
 
-def _kind(member: Member) -> Kind:
+def _kind(member: Member) -> ColumnKind:
     if member.type is bool:
-        return Kind.TRUTH
+        return ColumnKind.TRUTH
     if member.type is int and not member.optional:
-        return Kind.INTEGER
-    return Kind.NUMBER if member.type in (int, float) else Kind.TEXT
+        return ColumnKind.INTEGER
+    return ColumnKind.NUMBER if member.type in (int, float) else ColumnKind.TEXT
 
 
 def _along(name: str, direction: str) -> str:
@@ -164,10 +164,10 @@ def _truth(value: object) -> bool:
     return bool(value)
 
 
-_CLEAN: dict[Kind, Callable[[Any], Value]] = {
-    Kind.TEXT: _text,
-    Kind.NUMBER: _number,
-    Kind.TIME: _time,
-    Kind.INTEGER: int,
-    Kind.TRUTH: _truth,
+_CLEAN: dict[ColumnKind, Callable[[Any], Value]] = {
+    ColumnKind.TEXT: _text,
+    ColumnKind.NUMBER: _number,
+    ColumnKind.TIME: _time,
+    ColumnKind.INTEGER: int,
+    ColumnKind.TRUTH: _truth,
 }

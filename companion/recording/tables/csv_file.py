@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from datetime import datetime, timedelta
 from typing import IO, Final
 
-from companion.recording.tables.columns import Kind, Table, Value
+from companion.recording.tables.columns import ColumnKind, Table, Value
 
 _BEGINNING: Final = datetime(1970, 1, 1)  # UTC without saying so: what all readers take for a time
 
@@ -18,8 +18,8 @@ class CsvFile:
         self._text = io.TextIOWrapper(file, encoding="utf-8", newline="")
         self._rows = csv.writer(self._text, lineterminator="\n")
         self._rows.writerow([column.name for column in table.columns])
-        self._times = [i for i, col in enumerate(table.columns) if col.kind is Kind.TIME]
-        self._truths = [i for i, col in enumerate(table.columns) if col.kind is Kind.TRUTH]
+        self._times = [i for i, col in enumerate(table.columns) if col.kind is ColumnKind.TIME]
+        self._truths = [i for i, col in enumerate(table.columns) if col.kind is ColumnKind.TRUTH]
 
     def add(self, row: Sequence[Value]) -> None:
         """Write a row. Raises ``OSError`` where it cannot be."""

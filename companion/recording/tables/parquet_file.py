@@ -6,11 +6,11 @@ The metadata of the schema say what a row is; those of a field, its unit and mea
 from collections.abc import Sequence
 from typing import IO, Any, Final
 
-from companion.recording.tables.columns import Column, Kind, Table, Value
+from companion.recording.tables.columns import Column, ColumnKind, Table, Value
 from companion.values.extras import needs
 
 BATCH: Final = 8192  # rows of a group: as many are held in memory
-ALWAYS: Final = (Kind.INTEGER, Kind.TRUTH)
+ALWAYS: Final = (ColumnKind.INTEGER, ColumnKind.TRUTH)
 
 
 class ParquetFile:
@@ -27,17 +27,17 @@ class ParquetFile:
         fields = [self._field(column) for column in table.columns]
         self._schema = pyarrow.schema(fields, {"row": table.row_is})
         self._waiting: list[Sequence[Value]] = []
-        self._times = [i for i, col in enumerate(table.columns) if col.kind is Kind.TIME]
+        self._times = [i for i, col in enumerate(table.columns) if col.kind is ColumnKind.TIME]
         self._writer: Any = parquet.ParquetWriter(file, self._schema, compression="zstd")
 
     def _field(self, column: Column) -> Any:
         arrow = self._arrow
         types = {
-            Kind.TEXT: arrow.string(),
-            Kind.NUMBER: arrow.float64(),
-            Kind.TIME: arrow.timestamp("us"),  # UTC without saying so, as in CSV
-            Kind.INTEGER: arrow.int64(),
-            Kind.TRUTH: arrow.bool_(),
+            ColumnKind.TEXT: arrow.string(),
+            ColumnKind.NUMBER: arrow.float64(),
+            ColumnKind.TIME: arrow.timestamp("us"),  # UTC without saying so, as in CSV
+            ColumnKind.INTEGER: arrow.int64(),
+            ColumnKind.TRUTH: arrow.bool_(),
         }
         said = {"unit": column.unit, "meaning": column.meaning}
         return arrow.field(column.name, types[column.kind], column.kind not in ALWAYS, said)

@@ -23,7 +23,7 @@ RANGE_DB: Final = 35.0  # range of gains drawn below the largest; lower ones are
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Kind:
+class GainCurve:
     """A gain that is drawn."""
 
     name: str  # its name in the legend
@@ -33,9 +33,9 @@ class Kind:
 
 
 KINDS: Final = (
-    Kind(name="predicted", line=2, value=lambda worth: worth.gain_db),
-    Kind(name="true", line=1, value=lambda worth: worth.true_gain_db, unknown=True),
-    Kind(name="guaranteed", line=0, value=lambda worth: worth.guaranteed_gain_db),
+    GainCurve(name="predicted", line=2, value=lambda worth: worth.gain_db),
+    GainCurve(name="true", line=1, value=lambda worth: worth.true_gain_db, unknown=True),
+    GainCurve(name="guaranteed", line=0, value=lambda worth: worth.guaranteed_gain_db),
 )
 
 
@@ -119,7 +119,7 @@ def _over_time(
     axes.plot(middles[alone], values[alone], ".", color=how["color"])
 
 
-def _gains(worths: Sequence[Worth | None], kind: Kind) -> FloatArray:
+def _gains(worths: Sequence[Worth | None], kind: GainCurve) -> FloatArray:
     """Gains of one kind, ascending; -inf where nothing is guaranteed."""
     found = np.array([_of(worth, kind.value) for worth in worths if worth is not None])
     if kind.unknown:
@@ -127,7 +127,7 @@ def _gains(worths: Sequence[Worth | None], kind: Kind) -> FloatArray:
     return np.sort(found)
 
 
-def _kinds(watched: Watched) -> list[Kind]:
+def _kinds(watched: Watched) -> list[GainCurve]:
     return [kind for kind in KINDS if watched.truth or not kind.unknown]
 
 
@@ -146,7 +146,7 @@ def _bin(edges: FloatArray) -> str:
     return f"{edges[1] - edges[0]:.2g} s"
 
 
-def _least(samples: Sequence[Sample], edges: FloatArray, kind: Kind) -> FloatArray:
+def _least(samples: Sequence[Sample], edges: FloatArray, kind: GainCurve) -> FloatArray:
     """The least gain of a kind in each bin (B,)."""
     return _worst(samples, edges, lambda sample: _of(sample.as_set, kind.value), np.fmin)
 

@@ -15,10 +15,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from companion.beams import steady
+from companion.beams import hysteresis
 from companion.beams.aim import aim, directions
 from companion.beams.array.steering import steering_matrix
-from companion.beams.steady import Steady
+from companion.beams.hysteresis import Steady
 from companion.beams.worth import guarantee, link_budget
 from companion.node.replay import log_events
 from companion.pipeline import assembly
@@ -26,7 +26,7 @@ from companion.pipeline.fold import Pipeline
 from companion.pipeline.ticks import with_ticks
 from companion.recording.reader import read_flight
 from companion.settings.model import Settings
-from companion.studies.prediction.baselines import Observed, Predictor
+from companion.studies.prediction.baselines import ObservedReport, Predictor
 from companion.studies.prediction.delivery import deliver
 from companion.studies.prediction.kalman import Kalman
 from companion.studies.prediction.predictors import SIMPLE, known_tuning
@@ -106,7 +106,7 @@ def _share(marks: Any) -> float | None:
 
 def events(
     logs: Sequence[Path], link: RadioLink, settings: Settings, seed: int = 1
-) -> tuple[Iterator[Event], dict[str, list[Observed]], LocalFrame]:
+) -> tuple[Iterator[Event], dict[str, list[ObservedReport]], LocalFrame]:
     """What a node hears over a link, with ticks; each UAV's reports, and the frame they are in."""
     center = settings.center.source or "home"
     flown = vehicles.load(logs, center)
@@ -133,7 +133,9 @@ def events(
 class _Rival:
     """A predictor of each UAV, in the pipeline's frame."""
 
-    def __init__(self, name: str, observed: dict[str, list[Observed]], settings: Settings) -> None:
+    def __init__(
+        self, name: str, observed: dict[str, list[ObservedReport]], settings: Settings
+    ) -> None:
         tuning = known_tuning(settings)
         self._make: Callable[[], Predictor] = SIMPLE.get(name, lambda: Kalman(2, tuning))
         self._waiting = {uav: list(reversed(reports)) for uav, reports in observed.items()}
@@ -216,7 +218,7 @@ def _make(
         coverage=pipeline.coverage,
         before=way.state,
     )
-    way.state = steady.after(way.state, made)
+    way.state = hysteresis.after(way.state, made)
     steering = steering_matrix(pipeline.array, directions(made))
     shapes = made.weights * steering
     seen = {

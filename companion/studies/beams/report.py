@@ -20,7 +20,7 @@ COMPARED: Final = (
     ("spectral efficiency, bit/s/Hz: mean", ("spectral_efficiency_mean",)),
     ("widened", ("widened_share",)),
     ("regularised", ("regularised_share",)),
-    ("turns: most", ("turns_max",)),
+    ("time slots: most", ("turns_max",)),
     ("condition number: largest", ("condition_number_max",)),
 )
 """Figures shown for beams as set and for sharp ones, side by side."""

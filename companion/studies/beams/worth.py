@@ -27,8 +27,8 @@ class Worth:
     guaranteed_gain_db: float | None
     true_gain_db: float | None  # towards the true direction; None: it is not known
     sinr_db: float  # as predicted; -inf where no element faces the UAV
-    spectral_efficiency: float  # bit/s/Hz, turns counted
-    group: int  # number of its turn
+    spectral_efficiency: float  # bit/s/Hz, time slots counted
+    group: int  # number of its time slot
     widened: bool  # its main lobe was broadened
     method: Method  # how the weights were made
     condition_number: float  # of the steering matrix

@@ -24,7 +24,7 @@ class Line:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Words:
+class TextLabel:
     """Text whose baseline begins, has its middle or ends at x, y, by ``anchor``."""
 
     x: float
@@ -43,7 +43,7 @@ class Drawing:
     height: int
     title: str
     lines: tuple[Line, ...]
-    words: tuple[Words, ...]
+    words: tuple[TextLabel, ...]
 
 
 def svg(drawing: Drawing) -> str:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from companion.studies.figures import plotting
 from companion.studies.fleet.sky import Sky
-from companion.studies.fleet.study import Asked, Grown
+from companion.studies.fleet.study import FleetSize, FleetStudy
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,7 +22,7 @@ CAPTIONS: Final = {
 }
 
 
-def cells(one: Grown) -> list[str]:
+def cells(one: FleetSize) -> list[str]:
     """One size as a row of the table."""
     return [
         str(one.nodes),
@@ -40,7 +40,7 @@ def cells(one: Grown) -> list[str]:
     ]
 
 
-def text(found: Sequence[Grown]) -> str:
+def text(found: Sequence[FleetSize]) -> str:
     """The table as text."""
     rows = [list(COLUMNS), *map(cells, found)]
     widths = [max(len(row[i]) for row in rows) for i in range(len(COLUMNS))]
@@ -51,7 +51,10 @@ def text(found: Sequence[Grown]) -> str:
 
 
 def files(
-    asked: Asked, found: Sequence[Grown], answer: dict[str, Any], progress: Callable[[str], None]
+    asked: FleetStudy,
+    found: Sequence[FleetSize],
+    answer: dict[str, Any],
+    progress: Callable[[str], None],
 ) -> dict[str, bytes]:
     """The page and every figure as SVG and PNG, by file name."""
     drawings = {
@@ -67,7 +70,7 @@ def files(
     return plotting.files("fleet", "fleet/report.html.j2", drawings, values, progress)
 
 
-def _traffic(found: Sequence[Grown]) -> "Figure":
+def _traffic(found: Sequence[FleetSize]) -> "Figure":
     figure, (left, right) = plotting.new(1, 2, (7.2, 3.0))
     nodes = [one.nodes for one in found]
     for number, what in enumerate(found[0].told_kbps):
@@ -82,7 +85,7 @@ def _traffic(found: Sequence[Grown]) -> "Figure":
     return figure
 
 
-def _time(found: Sequence[Grown]) -> "Figure":
+def _time(found: Sequence[FleetSize]) -> "Figure":
     figure, (left, right) = plotting.new(1, 2, (7.2, 3.0))
     nodes = [one.nodes for one in found]
     left.plot(nodes, [100 * one.cpu_share for one in found], **plotting.marked(0))

@@ -33,7 +33,7 @@ class Sky:
     seed: int = 1
 
 
-class Flight:
+class SkySimulation:
     """The sky in time; times are seconds since its start.
 
     ``names`` are the nodes, ``uavs`` the UAVs, ``places_m`` (nodes, 2) where the nodes stand.

@@ -10,7 +10,7 @@ import numpy as np
 import companion
 from companion.settings.fleet import FleetSettings
 from companion.studies.fleet.sky import Sky
-from companion.studies.fleet.world import Counted, World
+from companion.studies.fleet.world import FleetCounts, World
 
 SETTLE_S = 8.0  # virtual time that a fleet has to find who serves whom
 AFTER_S = 4.0  # virtual time for which a fleet is watched after a node has died
@@ -18,7 +18,7 @@ HALF = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Grown:
+class FleetSize:
     """A fleet of one size.
 
     nodes, uavs         how many
@@ -43,7 +43,7 @@ class Grown:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Asked:
+class FleetStudy:
     """What is to be studied: sizes as (nodes, UAVs), over how much virtual time, on which links.
 
     ``spacing_m`` is between neighbouring nodes.
@@ -59,8 +59,10 @@ class Asked:
 
 
 def run(
-    asked: Asked, cpu_s: Callable[[], float], progress: Callable[[str], None] = lambda text: None
-) -> Iterator[Grown]:
+    asked: FleetStudy,
+    cpu_s: Callable[[], float],
+    progress: Callable[[str], None] = lambda text: None,
+) -> Iterator[FleetSize]:
     """Fly the fleet at each size; ``cpu_s`` reads the processor time used."""
     for nodes, uavs in asked.sizes:
         progress(f"{nodes} nodes, {uavs} UAVs")
@@ -77,7 +79,7 @@ def run(
         yield _grown(World(sky, FleetSettings(node="any"), cpu_s), asked.seconds)
 
 
-def _grown(world: World, seconds: float) -> Grown:
+def _grown(world: World, seconds: float) -> FleetSize:
     sky = world.sky
     world.run(SETTLE_S)
     steady = _counted(world, seconds)
@@ -97,7 +99,7 @@ def _grown(world: World, seconds: float) -> Grown:
     world.parted = lambda one, other: False
     served = steady.served + steady.twice + steady.unserved or 1
     unserved = parted.served + parted.twice + parted.unserved or 1
-    return Grown(
+    return FleetSize(
         nodes=sky.nodes,
         uavs=sky.uavs,
         served=steady.served / served,
@@ -114,11 +116,11 @@ def _grown(world: World, seconds: float) -> Grown:
     )
 
 
-def _counted(world: World, seconds: float) -> Counted:
+def _counted(world: World, seconds: float) -> FleetCounts:
     """What is counted over so long."""
-    world.counted = counted = Counted()
+    world.counted = counted = FleetCounts()
     world.run(seconds)
-    world.counted = Counted()  # what comes later is counted elsewhere
+    world.counted = FleetCounts()  # what comes later is counted elsewhere
     return counted
 
 
@@ -154,7 +156,7 @@ def _healed_s(world: World) -> float:
     return (last_ns - began_ns) * 1e-9
 
 
-def answer(asked: Asked, found: Sequence[Grown], command: str) -> dict[str, Any]:
+def answer(asked: FleetStudy, found: Sequence[FleetSize], command: str) -> dict[str, Any]:
     """What was asked and found, as JSON has it."""
     versions = {
         "companion": companion.__version__,

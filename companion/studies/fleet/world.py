@@ -17,9 +17,9 @@ import numpy as np
 
 from companion.mavlink.wire.positions import GLOBAL_POSITION_INT as REPORT
 from companion.node.fleet import messages
-from companion.pipeline.fleet.member import Member
+from companion.pipeline.fleet.member import FleetMember
 from companion.settings.fleet import FleetSettings
-from companion.studies.fleet.sky import Flight, Sky
+from companion.studies.fleet.sky import Sky, SkySimulation
 from companion.values import FloatArray, Frame, Source
 
 SECOND_NS: Final = 1_000_000_000
@@ -36,7 +36,7 @@ HEADER_BYTES: Final = 110
 
 
 @dataclass(slots=True, kw_only=True)
-class Counted:
+class FleetCounts:
     """What was counted; the UAVs' counts are of UAVs that some node could serve, at ticks.
 
     A UAV counts once it has been within reach for ``ENTRY_S``: so long a new one may wait.
@@ -69,16 +69,18 @@ class World:
     ) -> None:
         self.sky = sky
         self._cpu_s = cpu_s
-        self.counted = Counted()
+        self.counted = FleetCounts()
         self.now_ns = START_NS
         self.dead: set[str] = set()
         self.parted: Callable[[str, str], bool] = lambda one, other: False
         self.handovers: list[tuple[int, str, str | None, str | None]] = []
         self._random = np.random.default_rng(sky.seed)
-        self._flight = Flight(sky, self._random)
+        self._flight = SkySimulation(sky, self._random)
         self._names = self._flight.names
         self.members = {
-            name: Member(name=name, settings=settings, elements=128, started_ns=START_NS + number)
+            name: FleetMember(
+                name=name, settings=settings, elements=128, started_ns=START_NS + number
+            )
             for number, name in enumerate(self._names)
         }
         self._clock_ns = self._random.integers(-3, 3, sky.nodes) * SECOND_NS
@@ -119,7 +121,7 @@ class World:
                 member = self.members[other]
                 self._at(at_ns, partial(self._lose, member, name))
 
-    def _lose(self, member: Member, node: str) -> None:
+    def _lose(self, member: FleetMember, node: str) -> None:
         member.left(self._local_ns(member.name), node)
 
     def clock_ns(self, name: str) -> int:
@@ -144,8 +146,8 @@ class World:
 
     def _act(self, name: str, number: int) -> None:
         member, now_ns = self.members[name], self._local_ns(name)
-        turn = self._tick + number
-        if turn % OFFER_TICKS == 0:
+        tick = self._tick + number
+        if tick % OFFER_TICKS == 0:
             member.offer(self._flight.offers(self._ranges_m()[number]))
             self._tell(name, "offers", messages.offers(member.offers))
         member.decide(now_ns)
@@ -153,11 +155,11 @@ class World:
             self.handovers.append((self.now_ns, one.uav, one.before, one.after))
             self.counted.handovers += one.after == name and one.before is not None
         member.handovers.clear()
-        if turn % STANDING_TICKS == 0:
+        if tick % STANDING_TICKS == 0:
             lat_deg, lon_deg = (self._flight.places_m[number] / DEGREE_M).tolist()
             said = member.says(now_ns, (lat_deg, lon_deg, 0.0), self.sky.reach_m)
             self._tell(name, "standing", messages.standing(said))
-        if turn % ASK_TICKS == 0:
+        if tick % ASK_TICKS == 0:
             for other in sorted(member.near):
                 self._ask(name, other)
 

@@ -78,7 +78,7 @@ def noise(users: int, blocks: int, rng: np.random.Generator) -> ComplexArray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Counted:
+class BlockErrors:
     """Errors by UAV and block, (N, B) each."""
 
     raw_errors: IntArray  # coded bits decided wrongly one by one
@@ -88,7 +88,7 @@ class Counted:
 
 def receive(
     sent: Sent, heard: ComplexArray, noise_power: float, taps: ComplexArray, estimation: Estimation
-) -> Counted:
+) -> BlockErrors:
     """Decode received carriers (N, B, 256), noise included.
 
         sent         what was sent
@@ -116,4 +116,4 @@ def receive(
         wrong = coding.decode(soft[doubtful]) != sent.bits[doubtful]
         decoded_errors[doubtful] = np.count_nonzero(wrong, axis=-1)
     square_error = np.mean(np.abs(equalised - sent.symbols) ** 2, axis=-1)
-    return Counted(raw_errors, decoded_errors, square_error)
+    return BlockErrors(raw_errors, decoded_errors, square_error)

@@ -21,7 +21,7 @@ from companion.beams.worth import channel
 from companion.beams.worth.channel import SalehValenzuela
 from companion.beams.worth.link_budget import share_power
 from companion.studies.link.ofdm import PREFIX
-from companion.studies.link.scenario import Instant, Positions
+from companion.studies.link.scenario import Instant, PositionSource
 from companion.values import ComplexArray, FloatArray, UserError
 
 SAMPLE_RATE_HZ: Final = 50e6
@@ -98,10 +98,10 @@ def draw(
     return taps
 
 
-def weights(array: Array, instant: Instant, by: Positions, precoder: Precoder) -> ComplexArray:
+def weights(array: Array, instant: Instant, by: PositionSource, precoder: Precoder) -> ComplexArray:
     """Weights (M, N) with columns of unit norm, not widened, for the directions known by ``by``.
 
-    Raises ``UserError`` where the precoder serves some UAVs only, or in turns.
+    Raises ``UserError`` where the precoder serves some UAVs only, or in time slots.
     """
     made = precode(steering_matrix(array, instant.towards[by]), precoder)
     users = len(instant.towards[by])

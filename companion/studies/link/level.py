@@ -30,16 +30,16 @@ from companion.beams.array.geometry import Array
 from companion.pipeline import assembly
 from companion.settings.model import Settings
 from companion.studies.link import blocks, channel, modulation, ofdm
-from companion.studies.link.blocks import BLOCK_BITS, CODED_BITS, Counted, Estimation
+from companion.studies.link.blocks import BLOCK_BITS, CODED_BITS, BlockErrors, Estimation
 from companion.studies.link.channel import SAMPLE_RATE_HZ, Scattering
 from companion.studies.link.rows import Row, crossing_db, row
-from companion.studies.link.scenario import Positions, Reports, Scenario, circles, from_logs
+from companion.studies.link.scenario import PositionSource, Reports, Scenario, circles, from_logs
 from companion.studies.prediction.pointing import angles_deg
 from companion.values import ComplexArray, UserError
 
 SYMBOL_S: Final = ofdm.SAMPLES / SAMPLE_RATE_HZ  # duration of an OFDM symbol
 AWGN: Final = "awgn"
-KINDS: Final = (AWGN, *(kind.value for kind in Positions))
+KINDS: Final = (AWGN, *(kind.value for kind in PositionSource))
 MOST_POINTS: Final = 100  # most points of a curve
 TARGET: Final = 1e-3  # bit error rate at which curves are compared
 
@@ -107,7 +107,7 @@ class LinkStudy:
         return shlex.join([*words, "--seed", str(self.seed)])
 
 
-Counts = dict[tuple[str, float], list[Counted]]
+Counts = dict[tuple[str, float], list[BlockErrors]]
 """Counts by kind of positions and SNR in dB: one entry for each instant."""
 
 
@@ -129,11 +129,11 @@ def simulate(
     for number, instant in enumerate(scenario.instants):
         progress(f"instant {number + 1} of {len(scenario.instants)}")
         rng = np.random.default_rng([setting.seed, 1, number])
-        truly = instant.towards[Positions.PERFECT]
+        truly = instant.towards[PositionSource.PERFECT]
         rows = channel.draw(setting.scattering, array, own, truly, rng)
         alone = channel.alone(array, own, truly)
         channels: dict[str, ComplexArray] = {AWGN: np.eye(len(truly), dtype=complex)[np.newaxis]}
-        for kind in Positions:
+        for kind in PositionSource:
             sent = channel.weights(array, instant, kind, precoder)
             channels[kind.value] = channel.responses(rows, sent, alone)
         for key, counted in exchange(setting, channels, rng):
@@ -143,7 +143,7 @@ def simulate(
 
 def exchange(
     setting: LinkStudy, channels: dict[str, ComplexArray], rng: np.random.Generator
-) -> Iterable[tuple[tuple[str, float], Counted]]:
+) -> Iterable[tuple[tuple[str, float], BlockErrors]]:
     """Send the same blocks with the same noise over every channel (T, N, N), at every SNR.
 
     Over ``awgn`` the receiver knows its channel.
@@ -195,7 +195,7 @@ def study(
                 "coded": coded,
                 "snr_at_ber_1e-3_db": crossing_db(rows, kind, coded, TARGET),
                 **_floor(rows, kind, coded),
-                **({} if kind == AWGN else _pointing(scenario, Positions(kind))),
+                **({} if kind == AWGN else _pointing(scenario, PositionSource(kind))),
             }
             for kind in KINDS
             for coded in (False, True)
@@ -225,11 +225,11 @@ def _floor(rows: list[Row], kind: str, coded: bool) -> Row:
     return {"ber_at_highest_snr": last["ber"], "rate_at_highest_snr_bps": last["rate_bps"]}
 
 
-def _pointing(scenario: Scenario, kind: Positions) -> Row:
+def _pointing(scenario: Scenario, kind: PositionSource) -> Row:
     """Pointing error of the beams, degrees."""
     off_deg = np.concatenate(
         [
-            angles_deg(instant.towards[kind], instant.towards[Positions.PERFECT])
+            angles_deg(instant.towards[kind], instant.towards[PositionSource.PERFECT])
             for instant in scenario.instants
         ]
     )

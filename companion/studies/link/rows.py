@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from companion.studies.link.blocks import BLOCK_BITS, CODED_BITS, Counted
+from companion.studies.link.blocks import BLOCK_BITS, CODED_BITS, BlockErrors
 from companion.values import FloatArray
 
 Row = dict[str, Any]
@@ -14,7 +14,7 @@ Z95: Final = 1.959963984540054  # half the width of a 95 per cent interval, in s
 
 
 def row(
-    positions: str, snr_db: float, coded: bool, counted: Sequence[Counted], symbol_s: float
+    positions: str, snr_db: float, coded: bool, counted: Sequence[BlockErrors], symbol_s: float
 ) -> Row:
     """One point of a curve, all UAVs and instants together; ``counted`` has one entry per instant.
 

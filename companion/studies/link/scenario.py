@@ -23,7 +23,7 @@ from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
 from companion.studies.beams.flight import updates
 from companion.studies.link.track_predictor import TrackPredictor
-from companion.studies.prediction.baselines import Hold, Observed, Predictor
+from companion.studies.prediction.baselines import Hold, ObservedReport, Predictor
 from companion.studies.truth import array_truth
 from companion.studies.truth.vehicles import named
 from companion.values import FloatArray, Method, Update, UserError, kind_of
@@ -40,7 +40,7 @@ LOOKS_HZ: Final = 10.0
 MOST_DRAWN: Final = 100  # times drawn for each one found before the array is given up
 
 
-class Positions(StrEnum):
+class PositionSource(StrEnum):
     """Positions by which the beams are pointed."""
 
     PERFECT = "perfect"
@@ -53,7 +53,7 @@ class Instant:
     """Unit directions (N, 3) in the array frame by kind of positions, UAVs in the same order."""
 
     t_s: float
-    towards: dict[Positions, FloatArray]
+    towards: dict[PositionSource, FloatArray]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -131,7 +131,7 @@ def circles(
     array = assembly.array(settings)
     times_s, tried = _resolved_times(settings, array, instants, rng)
     bounded = _bounded(settings)
-    towards: dict[Positions, list[FloatArray]] = {kind: [] for kind in Positions}
+    towards: dict[PositionSource, list[FloatArray]] = {kind: [] for kind in PositionSource}
     for number, circle in enumerate(PAPER):
         starts_s = number / len(PAPER) * reports.interval_s  # out of step with one another
         answers = _flown(circle, starts_s, times_s, reports, bounded)
@@ -139,7 +139,7 @@ def circles(
             towards[kind].append(positions @ array.array_from_body.T)
     seen = {kind: _unit(np.stack(found, axis=1)) for kind, found in towards.items()}
     found = tuple(
-        Instant(float(t_s), {kind: seen[kind][i] for kind in Positions})
+        Instant(float(t_s), {kind: seen[kind][i] for kind in PositionSource})
         for i, t_s in enumerate(times_s)
     )
     description = (
@@ -188,13 +188,13 @@ def _bounded(settings: Settings) -> Settings:
 
 def _flown(
     circle: Circle, starts_s: float, times_s: FloatArray, reports: Reports, settings: Settings
-) -> dict[Positions, FloatArray]:
+) -> dict[PositionSource, FloatArray]:
     """Positions (K, 3) of one UAV at the times of use (K,), by kind."""
-    rivals: dict[Positions, Predictor] = {
-        Positions.PREDICTED: TrackPredictor(settings),
-        Positions.HELD: Hold(),
+    rivals: dict[PositionSource, Predictor] = {
+        PositionSource.PREDICTED: TrackPredictor(settings),
+        PositionSource.HELD: Hold(),
     }
-    found: dict[Positions, list[FloatArray]] = {kind: [] for kind in Positions}
+    found: dict[PositionSource, list[FloatArray]] = {kind: [] for kind in PositionSource}
     sent = 0
     for t_s in times_s.tolist():
         now_s = t_s - settings.beams.actuation_delay_s
@@ -202,7 +202,7 @@ def _flown(
             for rival in rivals.values():
                 rival.report(_report(circle, made_s, reports.latency_s))
             sent += 1
-        found[Positions.PERFECT].append(circle.at(t_s)[0])
+        found[PositionSource.PERFECT].append(circle.at(t_s)[0])
         for kind, rival in rivals.items():
             predicted = rival.predict(round(now_s * 1e9), round(t_s * 1e9))
             if predicted is None:
@@ -211,13 +211,13 @@ def _flown(
     return {kind: np.array(positions) for kind, positions in found.items()}
 
 
-def _report(circle: Circle, made_s: float, latency_s: float) -> Observed:
+def _report(circle: Circle, made_s: float, latency_s: float) -> ObservedReport:
     """A report as it arrives; the sender's clock is known."""
     position_m, velocity_mps = (
         np.round(one / REPORTED_M) * REPORTED_M for one in circle.at(made_s)
     )
     made_ns = round(made_s * 1e9)
-    return Observed(
+    return ObservedReport(
         arrival_ns=made_ns + round(latency_s * 1e9),
         sent_ns=made_ns,
         sender_ns=made_ns,
@@ -256,7 +256,9 @@ def from_logs(
             looks.append(seen)
         progress(f"{name}: {t_s:.0f} s of log")
     array = pipeline.array
-    resolved = [one for one in looks if _resolved(settings, array, one.towards[Positions.PERFECT])]
+    resolved = [
+        one for one in looks if _resolved(settings, array, one.towards[PositionSource.PERFECT])
+    ]
     if not resolved:
         raise UserError(f"{name}: at no time is there a UAV to serve whose true place is known")
     chosen = np.sort(rng.choice(len(resolved), min(instants, len(resolved)), replace=False))
@@ -291,8 +293,8 @@ def _seen(
     return Instant(
         t_s,
         {
-            Positions.PERFECT: truly[known],
-            Positions.PREDICTED: line_of_sight.directions(tracks, carrier, pipeline.array)[1],
-            Positions.HELD: line_of_sight.directions(held, carrier, pipeline.array)[1],
+            PositionSource.PERFECT: truly[known],
+            PositionSource.PREDICTED: line_of_sight.directions(tracks, carrier, pipeline.array)[1],
+            PositionSource.HELD: line_of_sight.directions(held, carrier, pipeline.array)[1],
         },
     )

@@ -4,7 +4,7 @@ from typing import Final
 
 from companion.pipeline import assembly
 from companion.settings.model import Settings
-from companion.studies.prediction.baselines import Observed, Predicted
+from companion.studies.prediction.baselines import ObservedReport, Predicted
 from companion.tracking.noise import reported
 from companion.values import AltitudeDatum, Fix, Report, SenderTime, Source, vector
 
@@ -18,7 +18,7 @@ class TrackPredictor:
         self._offset_ns = 0
         self._clock_bound_s = 0.0
 
-    def report(self, report: Observed) -> None:
+    def report(self, report: ObservedReport) -> None:
         """Take in a fix; the tracker decides whether it is used."""
         self._offset_ns = report.sent_ns - report.sender_ns
         self._clock_bound_s = report.clock_bound_s

@@ -42,7 +42,7 @@ class PaperScenario:
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Flight:
+class PaperFlight:
     """K steps of N UAVs; coordinates are north and east."""
 
     scenario: PaperScenario
@@ -78,7 +78,7 @@ def stacked(vectors: FloatArray) -> FloatArray:
     return norms
 
 
-def fly(scenario: PaperScenario) -> Flight:
+def fly(scenario: PaperScenario) -> PaperFlight:
     """The flight, which starts on the circles."""
     radii = np.array(scenario.radii_m)
     phases = np.arange(len(radii)) * np.pi / 2
@@ -90,7 +90,7 @@ def fly(scenario: PaperScenario) -> Flight:
     start = radii[:, np.newaxis] * np.stack([np.sin(phases), np.cos(phases)], axis=-1)
     moved = scenario.dt_s * np.cumsum(inputs, axis=0)
     positions = start + np.concatenate([np.zeros((1, len(radii), 2)), moved])
-    return Flight(
+    return PaperFlight(
         scenario=scenario,
         position_m=positions,
         input_mps=inputs,
@@ -104,7 +104,7 @@ def _heading(angle_rad: FloatArray) -> FloatArray:
     return heading
 
 
-def track(flight: Flight, gain: float, start_m: FloatArray | None = None) -> Tracked:
+def track(flight: PaperFlight, gain: float, start_m: FloatArray | None = None) -> Tracked:
     """The published observer over the flight, from ``start_m`` (N, 2).
 
     None: without initial error.
@@ -132,7 +132,7 @@ def track(flight: Flight, gain: float, start_m: FloatArray | None = None) -> Tra
     )
 
 
-def running_bounds(flight: Flight, gain: float) -> FloatArray:
+def running_bounds(flight: PaperFlight, gain: float) -> FloatArray:
     """The running bound on ||E_k||, (K + 1,), from the actual ||W_k||: |q| e + |l d - b| ||W||."""
     scenario, bounds = flight.scenario, [0.0]
     enters = abs(gain * scenario.feedthrough_s - scenario.dt_s)
@@ -141,7 +141,7 @@ def running_bounds(flight: Flight, gain: float) -> FloatArray:
     return np.array(bounds)
 
 
-def angle_errors_rad(flight: Flight, estimate_m: FloatArray) -> FloatArray:
+def angle_errors_rad(flight: PaperFlight, estimate_m: FloatArray) -> FloatArray:
     """Angle between the true and the estimated direction from the array, (K + 1, N)."""
     true, seen = flight.position_m, estimate_m
     cross = true[..., 0] * seen[..., 1] - true[..., 1] * seen[..., 0]

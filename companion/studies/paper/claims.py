@@ -12,7 +12,7 @@ from enum import StrEnum
 from typing import Any, Final
 
 
-class Verdict(StrEnum):
+class ClaimVerdict(StrEnum):
     """The verdict on a claim."""
 
     HOLDS = "holds"
@@ -28,8 +28,8 @@ class Claim:
     key: str  # path of the number that decides
     found: str  # text with {value} for the number
     decides: Callable[[float], bool]  # predicate of the number
-    if_true: Verdict  # verdict where the predicate is true
-    if_false: Verdict  # verdict where it is not
+    if_true: ClaimVerdict  # verdict where the predicate is true
+    if_false: ClaimVerdict  # verdict where it is not
     correction: str = ""  # what a reader of the paper must change
 
 
@@ -41,7 +41,7 @@ class Judged:
     key: str
     value: float
     found: str
-    verdict: Verdict
+    verdict: ClaimVerdict
     correction: str
 
 
@@ -80,7 +80,7 @@ def judge(answer: dict[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
-_HOLDS, _CORRECTED, _FAILS = Verdict.HOLDS, Verdict.CORRECTED, Verdict.FAILS
+_HOLDS, _CORRECTED, _FAILS = ClaimVerdict.HOLDS, ClaimVerdict.CORRECTED, ClaimVerdict.FAILS
 _NEVER_OFF_S: Final = 1e-9
 
 
@@ -266,7 +266,7 @@ CLAIMS: Final = (
         if_true=_CORRECTED,
         if_false=_HOLDS,
         correction="A line array cannot tell a direction from its mirror image about its axis,"
-        " where the circling UAVs meet. Regularise or serve in turns there.",
+        " where the circling UAVs meet. Regularise or serve in time slots there.",
     ),
     Claim(
         statement="The gust enters as d/ΔT.",

@@ -21,8 +21,8 @@ from companion.beams.hardware import quantise
 from companion.beams.worth import patterns
 from companion.studies.paper import circles as published_scenario
 from companion.studies.paper import link, mavlink, published, shown
-from companion.studies.paper.circles import Flight, PaperScenario, Tracked
-from companion.studies.paper.link import Compared
+from companion.studies.paper.circles import PaperFlight, PaperScenario, Tracked
+from companion.studies.paper.link import BlockageComparison
 from companion.tracking.design import closed_form
 from companion.values import FloatArray
 
@@ -51,12 +51,12 @@ Progress = Callable[[str], None]
 class Material:
     """Material of the figures."""
 
-    flight: Flight  # the flight
+    flight: PaperFlight  # the flight
     tracked: dict[str, Tracked]  # the observer by the gain's name
     alphas: dict[float, Tracked]  # the observer by alpha, with a solver's gain
     efficiency: dict[str, FloatArray]  # (K + 1, N), by the gain's name
     arrays: dict[int, Array]  # the array by its number of elements
-    compared: Compared  # the schemes under blockage
+    compared: BlockageComparison  # the schemes under blockage
 
 
 def level_name(gain: float) -> str:
@@ -116,7 +116,7 @@ def versions() -> dict[str, str]:
 # --- the observer -------------------------------------------------------------------------------
 
 
-def _tracked(flight: Flight) -> dict[str, Tracked]:
+def _tracked(flight: PaperFlight) -> dict[str, Tracked]:
     """The observer with the three published gains and the optimum, each begun without error."""
     scenario = flight.scenario
     best = closed_form.gain(scenario.dt_s, scenario.feedthrough_s, scenario.alpha)
@@ -124,7 +124,7 @@ def _tracked(flight: Flight) -> dict[str, Tracked]:
     return {name: published_scenario.track(flight, gain) for name, gain in gains.items()}
 
 
-def _scenario(flight: Flight) -> dict[str, Any]:
+def _scenario(flight: PaperFlight) -> dict[str, Any]:
     other = published_scenario.fly(replace(flight.scenario, literal=False))
     gust = np.linalg.norm(flight.input_mps - other.input_mps, axis=-1)
     return {
@@ -139,7 +139,7 @@ def _scenario(flight: Flight) -> dict[str, Any]:
     }
 
 
-def _levels(flight: Flight, tracked: dict[str, Tracked]) -> dict[str, dict[str, float]]:
+def _levels(flight: PaperFlight, tracked: dict[str, Tracked]) -> dict[str, dict[str, float]]:
     """Errors and bounds of each gain: over many steps where steady, and from a wrong start."""
     scenario, found = flight.scenario, {}
     long_flight = published_scenario.fly(replace(scenario, steps=LONG))
@@ -172,7 +172,7 @@ def _levels(flight: Flight, tracked: dict[str, Tracked]) -> dict[str, dict[str, 
     return found
 
 
-def _designs(flight: Flight) -> tuple[list[dict[str, Any]], dict[float, Tracked]]:
+def _designs(flight: PaperFlight) -> tuple[list[dict[str, Any]], dict[float, Tracked]]:
     """Gains by a solver asked for feasibility, and for the least mu, beside the closed form.
 
     Also returns the observer at each alpha with the gain that the solver found feasible at mu <=
@@ -212,7 +212,7 @@ def _designs(flight: Flight) -> tuple[list[dict[str, Any]], dict[float, Tracked]
     return rows, tracked
 
 
-def _alphas(flight: Flight, alphas: dict[float, Tracked]) -> dict[str, Any]:
+def _alphas(flight: PaperFlight, alphas: dict[float, Tracked]) -> dict[str, Any]:
     """Largest errors at each alpha over many steps, with the gain of the figure."""
     long_flight = published_scenario.fly(replace(flight.scenario, steps=LONG))
     found = {}
@@ -261,7 +261,7 @@ def _limits() -> dict[str, dict[str, float]]:
     return found
 
 
-def _unknown_input(flight: Flight, tracked: dict[str, Tracked]) -> dict[str, dict[str, float]]:
+def _unknown_input(flight: PaperFlight, tracked: dict[str, Tracked]) -> dict[str, dict[str, float]]:
     """Errors of W^ over sup||W||: in the scenario, at the exact worst, and as published."""
     scenario, found = flight.scenario, {}
     levels = {level_name(gain): mu for mu, gain in PAPER_LEVELS}
@@ -304,7 +304,7 @@ def _irregular(scenario: PaperScenario, rng: np.random.Generator) -> dict[str, f
 # --- the array ----------------------------------------------------------------------------------
 
 
-def _array(flight: Flight) -> dict[str, Any]:
+def _array(flight: PaperFlight) -> dict[str, Any]:
     """Beams of the published array: widths, nulls, phase steps, and where its formulas point."""
     sizes = {}
     for size in SIZES:
@@ -369,7 +369,7 @@ def _phase_loss_db(array: Array, bits: int) -> float:
     return float(-10 * np.log10(gains.mean()))
 
 
-def _rates(flight: Flight, tracked: dict[str, Tracked]) -> dict[str, FloatArray]:
+def _rates(flight: PaperFlight, tracked: dict[str, Tracked]) -> dict[str, FloatArray]:
     array = link.line(SIZES[0])
     found = {}
     for name, one in tracked.items():
@@ -386,7 +386,7 @@ def _rate_numbers(found: FloatArray) -> dict[str, float]:
     }
 
 
-def _blockage(compared: Compared) -> dict[str, Any]:
+def _blockage(compared: BlockageComparison) -> dict[str, Any]:
     """Means by scheme, and the gain of each over echo probing at the middle rate of blockages."""
     echo, middle = compared.schemes["echo probing"], len(compared.blockages_per_minute) // 2
     return {

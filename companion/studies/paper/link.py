@@ -18,7 +18,7 @@ from companion.beams.weights.precoding import Precoder, precode
 from companion.beams.worth import channel, link_budget
 from companion.beams.worth.link_budget import LinkBudget
 from companion.studies.paper import probing
-from companion.studies.paper.circles import Flight
+from companion.studies.paper.circles import PaperFlight
 from companion.studies.paper.probing import EchoProbing
 from companion.values import ComplexArray, FloatArray, Widen
 
@@ -90,7 +90,7 @@ def conjugate_responses(array: Array, position_m: FloatArray) -> tuple[FloatArra
     return right, np.abs(np.einsum("mn,mn->n", steering.conj(), weights))
 
 
-def between(flight: Flight, place_m: FloatArray, time_s: FloatArray) -> FloatArray:
+def between(flight: PaperFlight, place_m: FloatArray, time_s: FloatArray) -> FloatArray:
     """Places (T, N, 2) at times between the steps, from places (K + 1, N, 2) at the steps."""
     at = time_s / flight.scenario.dt_s
     step = np.minimum(np.floor(at + 1e-9).astype(int), len(place_m) - 2)
@@ -100,7 +100,7 @@ def between(flight: Flight, place_m: FloatArray, time_s: FloatArray) -> FloatArr
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Compared:
+class BlockageComparison:
     """Mean spectral efficiency per UAV, bit/s/Hz, by scheme.
 
     Arrays are (B,), over blockages per minute (B,).
@@ -111,14 +111,14 @@ class Compared:
 
 
 def under_blockage(
-    flight: Flight,
+    flight: PaperFlight,
     aimed_m: dict[str, FloatArray],
     blockages_per_minute: FloatArray,
     *,
     draws: int,
     rng: np.random.Generator,
     progress: Callable[[str], None],
-) -> Compared:
+) -> BlockageComparison:
     """Location-aware beams aimed at estimates (K + 1, N, 2), compared with echo probing.
 
     Every scheme has the same blockages, in as many ``draws`` for each rate, and the same precoder.
@@ -144,7 +144,9 @@ def under_blockage(
             totals["echo probing"] += float(echoed.mean()) / draws
         for name, total in totals.items():
             found[name].append(total)
-    return Compared(blockages_per_minute, {name: np.array(seen) for name, seen in found.items()})
+    return BlockageComparison(
+        blockages_per_minute, {name: np.array(seen) for name, seen in found.items()}
+    )
 
 
 def _attenuation_db(

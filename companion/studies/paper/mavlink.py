@@ -20,7 +20,7 @@ from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
 from companion.studies.paper import published
-from companion.studies.paper.circles import Flight
+from companion.studies.paper.circles import PaperFlight
 from companion.tracking.geodesy import LocalFrame
 from companion.values import Estimate, FloatArray, Frame, Source
 
@@ -47,7 +47,7 @@ class Agreement:
     settled_m: float  # largest error against the truth in the last quarter
 
 
-def settings(flight: Flight) -> Settings:
+def settings(flight: PaperFlight) -> Settings:
     """The service's settings for the scenario.
 
     A level array that faces north, and the limits of this motion. Stamps are exact and frames
@@ -72,7 +72,7 @@ def settings(flight: Flight) -> Settings:
     )
 
 
-def frames(flight: Flight) -> list[bytes]:
+def frames(flight: PaperFlight) -> list[bytes]:
     """The frames of each step, joined: what the UAVs send, 1:1 first."""
     local = LocalFrame(*ORIGIN)
     sent = []
@@ -96,7 +96,7 @@ def frames(flight: Flight) -> list[bytes]:
     return sent
 
 
-def compare(flight: Flight) -> Agreement:
+def compare(flight: PaperFlight) -> Agreement:
     """Fly the scenario through splitter, pipeline and beams, and through the library."""
     pipeline, splitter = Pipeline(settings(flight)), Splitter("paper")
     names = [f"{number + 1}:1" for number in range(len(flight.scenario.radii_m))]
@@ -134,7 +134,7 @@ def compare(flight: Flight) -> Agreement:
     )
 
 
-def _expected(flight: Flight) -> FloatArray:
+def _expected(flight: PaperFlight) -> FloatArray:
     """The library's estimates (K + 1, N, 2).
 
     The published step with the service's use of a velocity, begun like a track of the service from

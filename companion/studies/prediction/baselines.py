@@ -20,7 +20,7 @@ _S_PER_NS: Final = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Observed:
+class ObservedReport:
     """A report as it reaches a predictor.
 
 
@@ -54,7 +54,7 @@ class Predicted(NamedTuple):
 class Predictor(Protocol):
     """One UAV's predictor. Reports come in the order in which they arrive."""
 
-    def report(self, report: Observed) -> None:
+    def report(self, report: ObservedReport) -> None:
         """Take in a report that has just arrived."""
 
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
@@ -65,9 +65,9 @@ class Hold:
     """Holds the last report to arrive."""
 
     def __init__(self) -> None:
-        self._last: Observed | None = None
+        self._last: ObservedReport | None = None
 
-    def report(self, report: Observed) -> None:
+    def report(self, report: ObservedReport) -> None:
         """Replace the report that is held."""
         self._last = report
 
@@ -90,9 +90,9 @@ class DeadReckoningOnArrival:
     """
 
     def __init__(self) -> None:
-        self._last: Observed | None = None
+        self._last: ObservedReport | None = None
 
-    def report(self, report: Observed) -> None:
+    def report(self, report: ObservedReport) -> None:
         """Keep the newest report by arrival, however old it was when it came."""
         self._last = report
 
@@ -109,10 +109,10 @@ class DeadReckoning:
     """Straight on from the report that was made last, by the sender's clock."""
 
     def __init__(self) -> None:
-        self._newest: Observed | None = None
+        self._newest: ObservedReport | None = None
         self._offset_ns = 0
 
-    def report(self, report: Observed) -> None:
+    def report(self, report: ObservedReport) -> None:
         """Keep the newest report; one that was overtaken on its way only updates the clock."""
         self._offset_ns = report.sent_ns - report.sender_ns
         if self._newest is None or report.sender_ns > self._newest.sender_ns:
@@ -126,7 +126,7 @@ class DeadReckoning:
         return _straight_on(newest, at_ns - self._offset_ns - newest.sender_ns)
 
 
-def _straight_on(report: Observed, interval_ns: int) -> Predicted:
+def _straight_on(report: ObservedReport, interval_ns: int) -> Predicted:
     """Constant velocity for an interval; without a reported velocity the position is held."""
     velocity = report.velocity_ned_mps
     if velocity is None:

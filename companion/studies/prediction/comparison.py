@@ -120,7 +120,7 @@ class PredictionStudy:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Compared:
+class LogComparison:
     """A log, by its name, over one link: its rows, and the tuning that each filter was given."""
 
     log: str
@@ -135,7 +135,7 @@ def compare(
     link: RadioLink,
     setting: PredictionStudy,
     progress: Callable[[str], None] = lambda _text: None,
-) -> Compared:
+) -> LogComparison:
     """Every predictor on every UAV of a log, over one link. No rows where none flies."""
     cases: list[Case] = []
 
@@ -172,7 +172,9 @@ def compare(
             if figures:
                 counts = violations.counted(asked, given, lead)
                 rows.append(head | figures | counts | {"truth": flight.truth.kind})
-    return Compared(log=flown.log, center=flown.center, link=link, rows=tuple(rows), tuned=tuned)
+    return LogComparison(
+        log=flown.log, center=flown.center, link=link, rows=tuple(rows), tuned=tuned
+    )
 
 
 def as_true(settings: Settings, kind: Kind) -> Settings:
@@ -203,7 +205,7 @@ class Piece:
     link: RadioLink
 
 
-def work(piece: Piece, progress: Callable[[str], None] = lambda _text: None) -> Compared:
+def work(piece: Piece, progress: Callable[[str], None] = lambda _text: None) -> LogComparison:
     """Read a log and compare.
 
     Raises ``UserError`` or ``LogError`` where it has nothing to study.
@@ -215,7 +217,7 @@ def work(piece: Piece, progress: Callable[[str], None] = lambda _text: None) -> 
 
 def study(
     setting: PredictionStudy, progress: Callable[[str], None] = lambda _text: None
-) -> tuple[dict[str, Any], list[Compared]]:
+) -> tuple[dict[str, Any], list[LogComparison]]:
     """The answer as it is written to ``prediction.json``, and what the report shows.
 
     Raises ``UserError`` or ``LogError`` for a log in which there is nothing to study.
@@ -254,7 +256,7 @@ def study(
 
 def _compared(
     setting: PredictionStudy, pieces: Sequence[Piece], progress: Callable[[str], None]
-) -> list[Compared]:
+) -> list[LogComparison]:
     """The results of the pieces, in their order."""
 
     def told(done: int) -> None:

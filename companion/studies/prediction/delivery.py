@@ -18,7 +18,7 @@ from companion.mavlink.wire.positions import OWN
 from companion.mavlink.wire.stamps import STAMPED
 from companion.mavlink.wire.stamps import boot_ms as stamp_of
 from companion.studies.prediction import hostile_link, noisy_frames
-from companion.studies.prediction.baselines import Observed
+from companion.studies.prediction.baselines import ObservedReport
 from companion.studies.prediction.radio_link import RadioLink
 from companion.studies.truth.trajectory import Times
 from companion.studies.truth.vehicles import Flight
@@ -37,7 +37,7 @@ class Delivery:
                without frames
     """
 
-    observed: tuple[Observed, ...]  # the reports
+    observed: tuple[ObservedReport, ...]  # the reports
     events: tuple[Frame | RoundTrip, ...]
     rate_hz: float  # nominal rate of reports, or that of the log
     latency_s: float  # nominal median latency, or that seen by the clock
@@ -73,7 +73,7 @@ def deliver(
     heard_ns = sends.sent_ns[rows] if link.known_delay else arrival_ns
     placed = on_sender_clock(clock(), heard_ns, sends.boot_ms[rows], rows < reports, trips)
     observed = tuple(
-        Observed(
+        ObservedReport(
             arrival_ns=arrived,
             sent_ns=sent,
             sender_ns=made,
@@ -212,7 +212,7 @@ def _known(flight: Flight) -> tuple[RoundTrip, ...]:
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Placed:
+class PlacedMessages:
     """Messages put in time by the product's clock, (n,) each.
 
     sender_ns  on the sender's timeline, which begins where its clock is first placed, and again
@@ -231,7 +231,7 @@ def on_sender_clock(
     boot_ms: Times,
     is_report: BoolArray,
     trips: tuple[RoundTrip, ...] = (),
-) -> Placed:
+) -> PlacedMessages:
     """When reports among messages (n,) were made, by the product's clock; a stamp of -1 is none.
 
     The clock hears the others, and ``trips``, as in the pipeline. Only here does the study use it.
@@ -257,7 +257,7 @@ def on_sender_clock(
             start_ns = sent_ns - stamp.sender_ns
         rows[row] = (start_ns + stamp.sender_ns, sent_ns, estimate.uncertainty_s, True)
     sender, sent, bound_s, placed = zip(*rows, strict=True) if rows else ((), (), (), ())
-    return Placed(
+    return PlacedMessages(
         sender_ns=np.array(sender, dtype=np.int64),
         sent_ns=np.array(sent, dtype=np.int64),
         bound_s=np.array(bound_s, dtype=float),

@@ -122,10 +122,10 @@ def arrivals_ns(
     rounds = (sent_ns - begins_ns) // ROUND_NS
     regime = regimes_at(sent_ns, begins_ns)
     queued = np.zeros(len(sent_ns), dtype=bool)
-    for turn in np.unique(rounds[arrives]).tolist():
+    for cycle in np.unique(rounds[arrives]).tolist():
         for number, one in enumerate(REGIMES):
-            here = arrives & (rounds == turn) & (regime == number)
-            from_ns = begins_ns + turn * ROUND_NS + _STARTS_NS[number]
+            here = arrives & (rounds == cycle) & (regime == number)
+            from_ns = begins_ns + cycle * ROUND_NS + _STARTS_NS[number]
             latency_s = one.latency_s(rng, (sent_ns[here] - from_ns) * 1e-9)
             arrival_ns[here] += np.round(latency_s * 1e9).astype(np.int64)
             queued |= here & (not one.overtakes)

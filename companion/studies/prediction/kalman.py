@@ -18,7 +18,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from companion.studies.prediction.baselines import Observed, Predicted
+from companion.studies.prediction.baselines import ObservedReport, Predicted
 from companion.values import FloatArray
 
 HISTORY: Final = 64
@@ -45,7 +45,7 @@ class Tuning:
 class _Filtered(NamedTuple):
     """A report and the state after it: mean (n, 3), covariance (n, n) common to the axes."""
 
-    report: Observed
+    report: ObservedReport
     mean: FloatArray
     covariance: FloatArray
 
@@ -70,7 +70,7 @@ class Kalman:
         self._history: list[_Filtered] = []
         self._offset_ns = 0
 
-    def report(self, report: Observed) -> None:
+    def report(self, report: ObservedReport) -> None:
         """Filter a report, in the order in which the reports were made."""
         self._offset_ns = report.sent_ns - report.sender_ns
         history = self._history
@@ -99,7 +99,7 @@ class Kalman:
             velocity = velocity + acceleration * interval_s
         return Predicted(position_ned_m=position, velocity_ned_mps=velocity, bound_m=None)
 
-    def _after(self, before: _Filtered | None, report: Observed) -> _Filtered:
+    def _after(self, before: _Filtered | None, report: ObservedReport) -> _Filtered:
         if before is None:
             mean, covariance = self._start(report)
         else:
@@ -119,7 +119,7 @@ class Kalman:
             )
         return _Filtered(report, mean, covariance)
 
-    def _start(self, report: Observed) -> tuple[FloatArray, FloatArray]:
+    def _start(self, report: ObservedReport) -> tuple[FloatArray, FloatArray]:
         """The first position as reported; unknown states are 0 with large deviations."""
         deviations = self._deviations
         mean = np.zeros((*deviations.shape, 3))

@@ -23,9 +23,9 @@ import torch
 from torch import nn
 
 from companion.studies.prediction import made_up
-from companion.studies.prediction.baselines import Observed, Predicted, Predictor
+from companion.studies.prediction.baselines import ObservedReport, Predicted, Predictor
 from companion.studies.prediction.delivery import deliver
-from companion.studies.prediction.windows import FEATURES, REPORTS, Recent, Window
+from companion.studies.prediction.windows import FEATURES, REPORTS, RecentReports, Window
 from companion.values import FloatArray, UserError
 
 FORMAT: Final = "companion lstm 1"
@@ -60,11 +60,11 @@ class Learned:
 
     def __init__(self, net: Network) -> None:
         self._net = net
-        self._recent = Recent()
+        self._recent = RecentReports()
         self._window: Window | None = None
         self._state: Any = None
 
-    def report(self, report: Observed) -> None:
+    def report(self, report: ObservedReport) -> None:
         """Take in a report; the recurrent part runs once for each."""
         if self._recent.add(report):
             self._window = self._recent.window()
@@ -136,7 +136,7 @@ def examples(
             continue
         sender_ns = np.array([each.sender_ns for each in observed])
         true_ns = made_up.made_ns(made, sender_ns, observed[0].position_ned_m)
-        recent = Recent()
+        recent = RecentReports()
         for each in observed:
             if not recent.add(each):
                 continue

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from companion.beams.array.geometry import Array
 from companion.studies.prediction import hostile_link
-from companion.studies.prediction.baselines import Observed, Predicted, Predictor
+from companion.studies.prediction.baselines import ObservedReport, Predicted, Predictor
 from companion.studies.prediction.predictors import Product
 from companion.studies.prediction.spectral import SNR_DB, loss_bps_hz
 from companion.studies.truth.trajectory import Times
@@ -102,7 +102,7 @@ def questions(
     )
 
 
-def answers(predictor: Predictor, observed: Sequence[Observed], asked: Questions) -> Answers:
+def answers(predictor: Predictor, observed: Sequence[ObservedReport], asked: Questions) -> Answers:
     """Play the reports to a predictor, and ask it in between."""
     came_ns = [each.arrival_ns for each in observed]
     return _played(predictor.report, observed, came_ns, predictor.predict, asked)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from companion.studies.figures import plotting
 from companion.studies.prediction import summary
-from companion.studies.prediction.comparison import Compared
+from companion.studies.prediction.comparison import LogComparison
 from companion.studies.prediction.pointing import HALF_BEAMWIDTH_DEG
 from companion.studies.prediction.summary import ANGLE, MEASURES, Measure, pooled
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def files(
-    answer: dict[str, Any], found: Sequence[Compared], progress: Callable[[str], None]
+    answer: dict[str, Any], found: Sequence[LogComparison], progress: Callable[[str], None]
 ) -> dict[str, bytes]:
     """The page and every figure as SVG and PNG, by file name: ``angle_`` and the link's name.
 
@@ -33,7 +33,7 @@ def files(
     )
 
 
-def drawings(found: Sequence[Compared]) -> dict[str, tuple[str, plotting.Draw]]:
+def drawings(found: Sequence[LogComparison]) -> dict[str, tuple[str, plotting.Draw]]:
     """Caption and drawing of each figure by its name."""
     return {
         name: (f"{ANGLE.caption}, over lead: {summary.title(compared)}", partial(_curves, compared))
@@ -41,7 +41,7 @@ def drawings(found: Sequence[Compared]) -> dict[str, tuple[str, plotting.Draw]]:
     }
 
 
-def _named(found: Sequence[Compared]) -> dict[str, Compared]:
+def _named(found: Sequence[LogComparison]) -> dict[str, LogComparison]:
     """The comparisons that have rows, by the name of their figure."""
     named = {}
     seen = Counter[str]()
@@ -54,7 +54,7 @@ def _named(found: Sequence[Compared]) -> dict[str, Compared]:
     return named
 
 
-def _section(name: str, compared: Compared) -> dict[str, Any]:
+def _section(name: str, compared: LogComparison) -> dict[str, Any]:
     """What the page shows of one log over one link."""
     leads, predictors = summary.axes_of(compared)
     rows = compared.rows
@@ -82,7 +82,7 @@ def _section(name: str, compared: Compared) -> dict[str, Any]:
     }
 
 
-def _table(compared: Compared, measure: Measure) -> dict[str, Any]:
+def _table(compared: LogComparison, measure: Measure) -> dict[str, Any]:
     """The caption, and of each predictor its figure at each lead and whether it is the best."""
     leads, predictors = summary.axes_of(compared)
     cells = {
@@ -107,7 +107,7 @@ def _table(compared: Compared, measure: Measure) -> dict[str, Any]:
     return {"caption": f"{measure.caption}; {measure.pool}", "rows": rows}
 
 
-def _curves(compared: Compared) -> "Figure":
+def _curves(compared: LogComparison) -> "Figure":
     """RMS angle (logarithmic) over lead, one line per predictor.
 
     Zero has no place on the axis and is left out.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from companion.studies.prediction.comparison import Compared
+from companion.studies.prediction.comparison import LogComparison
 from companion.studies.prediction.pointing import HALF_BEAMWIDTH_DEG, Row
 
 
@@ -100,7 +100,7 @@ def pooled(
             return float(max(value for _, value in values))
 
 
-def regimes(compared: Compared) -> list[tuple[str, dict[str, str]]]:
+def regimes(compared: LogComparison) -> list[tuple[str, dict[str, str]]]:
     """How many bounds were broken in each regime of a hostile link, by predictor."""
     sums: dict[str, dict[str, Counter[str]]] = {}
     for row in compared.rows:
@@ -118,7 +118,7 @@ def _beyond(counts: Mapping[str, int]) -> str:
     return f"{counts['violations']}{told} of {counts['answers']}"
 
 
-def left_out(compared: Compared) -> list[str]:
+def left_out(compared: LogComparison) -> list[str]:
     """A line on answers in the windows of declared faults, if there are any."""
     left = {row["predictor"]: 0 for row in compared.rows if row["in_faults"]}
     for row in compared.rows:
@@ -127,18 +127,18 @@ def left_out(compared: Compared) -> list[str]:
     return [f"not counted for the bounds: {most} answers in windows of declared faults"][: most > 0]
 
 
-def axes_of(compared: Compared) -> tuple[list[float], list[str]]:
+def axes_of(compared: LogComparison) -> tuple[list[float], list[str]]:
     """The leads and the predictors, in the order in which they come."""
     leads = dict.fromkeys(row["lead_s"] for row in compared.rows)
     return list(leads), list(dict.fromkeys(row["predictor"] for row in compared.rows))
 
 
-def title(compared: Compared) -> str:
+def title(compared: LogComparison) -> str:
     """The log and the link, as headings name them."""
     return f"{compared.log}, {compared.link.name} link"
 
 
-def broken(compared: Compared, predictor: str) -> str:
+def broken(compared: LogComparison, predictor: str) -> str:
     """How many of a predictor's errors went beyond its own bound, over all rows."""
     rows = [row for row in compared.rows if row["predictor"] == predictor]
     if any(row["violations"] is None for row in rows):

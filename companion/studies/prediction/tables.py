@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 
 from companion.studies.prediction import summary
-from companion.studies.prediction.comparison import Compared
+from companion.studies.prediction.comparison import LogComparison
 from companion.studies.prediction.summary import MEASURES, pooled
 
 
-def text(found: Sequence[Compared]) -> str:
+def text(found: Sequence[LogComparison]) -> str:
     """The tables as text: RMS angle at each lead, every measure at the longest, and the regimes."""
     shown = [compared for compared in found if compared.rows]
     tables = [
@@ -16,7 +16,7 @@ def text(found: Sequence[Compared]) -> str:
     return "\n\n".join(table for table in tables if table)
 
 
-def _text_table(compared: Compared) -> str:
+def _text_table(compared: LogComparison) -> str:
     leads, predictors = summary.axes_of(compared)
     lines = [
         f"{summary.title(compared)}: RMS angle error, degrees, at a lead of",
@@ -30,7 +30,7 @@ def _text_table(compared: Compared) -> str:
     return "\n".join(lines)
 
 
-def _text_measures(compared: Compared) -> str:
+def _text_measures(compared: LogComparison) -> str:
     leads, predictors = summary.axes_of(compared)
     lead_s = max(leads)
     lines = [
@@ -43,7 +43,7 @@ def _text_measures(compared: Compared) -> str:
     return "\n".join(lines)
 
 
-def _text_regimes(compared: Compared) -> str:
+def _text_regimes(compared: LogComparison) -> str:
     """Where bounds were broken over a hostile link; empty over others."""
     regimes = summary.regimes(compared)
     if not regimes:

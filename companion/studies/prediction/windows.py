@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from companion.studies.prediction.baselines import Observed
+from companion.studies.prediction.baselines import ObservedReport
 from companion.values import FloatArray
 
 REPORTS: Final = 10  # K: how many of the last reports are used
@@ -34,14 +34,14 @@ class Window(NamedTuple):
     local_from_seen: FloatArray  # (3, 3), rotation from the input's frame to the local frame
 
 
-class Recent:
+class RecentReports:
     """The last reports of one UAV, in the order in which they were made."""
 
     def __init__(self) -> None:
-        self._reports: list[Observed] = []
+        self._reports: list[ObservedReport] = []
         self.offset_ns = 0
 
-    def add(self, report: Observed) -> bool:
+    def add(self, report: ObservedReport) -> bool:
         """Add a report; returns whether the window has changed.
 
         A report too old only updates the clock.
@@ -82,7 +82,7 @@ class Recent:
         )
 
 
-def _velocities(reports: list[Observed], ago_s: FloatArray, places: FloatArray) -> FloatArray:
+def _velocities(reports: list[ObservedReport], ago_s: FloatArray, places: FloatArray) -> FloatArray:
     """Reported velocities; where there is none, that since the report before.
 
     The first report takes that to the next; a single report is at rest.

@@ -28,7 +28,7 @@ _SIMSTATE = struct.Struct("<9fii")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Said:
+class TruthMessage:
     """A truth message."""
 
     arrival_ns: int  # when it arrived
@@ -46,7 +46,7 @@ class _Order:
 
 
 @dataclass(slots=True, kw_only=True)
-class Stream:
+class VehicleStream:
     """What a log holds of one vehicle, in order of arrival.
 
     reports      its reports, each once
@@ -64,7 +64,9 @@ class Stream:
     frames: list[Frame] = field(default_factory=list)
     round_trips: list[RoundTrip] = field(default_factory=list)
     stamps: list[tuple[int, int]] = field(default_factory=list)
-    said: dict[int, list[Said]] = field(default_factory=lambda: {SIM_STATE: [], SIMSTATE: []})
+    said: dict[int, list[TruthMessage]] = field(
+        default_factory=lambda: {SIM_STATE: [], SIMSTATE: []}
+    )
     _newest: GnssStatus | None = None
     _links: dict[str, _Order] = field(default_factory=dict)
 
@@ -95,7 +97,7 @@ class Stream:
         for msgid, came_ns, payload in order.waiting:
             assert order.last is not None
             self.said[msgid].append(
-                Said(arrival_ns=came_ns, before=order.last, after=number, payload=payload)
+                TruthMessage(arrival_ns=came_ns, before=order.last, after=number, payload=payload)
             )
         order.waiting.clear()
         order.last = number
@@ -111,14 +113,14 @@ class Stream:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Words:
+class TruthMessages:
     """Truth messages in the order of their stream: their brackets and their payloads."""
 
     brackets: Brackets
     payloads: tuple[bytes, ...]
 
 
-def words(stream: Stream, msgid: int, clock: BootClock) -> Words:
+def words(stream: VehicleStream, msgid: int, clock: BootClock) -> TruthMessages:
     """The truth messages of one kind that lie between two stamps of one life."""
     said = stream.said[msgid]
     before = np.array([each.before for each in said], dtype=np.int64)
@@ -133,7 +135,7 @@ def words(stream: Stream, msgid: int, clock: BootClock) -> Words:
     )
     kept = (clock.life[before] == clock.life[after]) & (found.after_ns >= found.before_ns)
     payloads = tuple(each.payload for each, keep in zip(said, kept.tolist(), strict=True) if keep)
-    return Words(found.rows(kept), payloads)
+    return TruthMessages(found.rows(kept), payloads)
 
 
 def sim_state(payload: bytes) -> tuple[float, ...]:
@@ -146,15 +148,15 @@ def simstate(payload: bytes) -> tuple[float, ...]:
     return _SIMSTATE.unpack(payload.ljust(_SIMSTATE.size, b"\0")[: _SIMSTATE.size])
 
 
-def gather(logs: Sequence[Path]) -> dict[str, Stream]:
+def gather(logs: Sequence[Path]) -> dict[str, VehicleStream]:
     """The streams of a flight's logs by vehicle: of those that report a position."""
-    found: dict[str, Stream] = {}
+    found: dict[str, VehicleStream] = {}
     dedupe = Dedupe()
     for event in _events(logs):
         name = str(event.source)
         stream = found.get(name)
         if stream is None:
-            stream = found.setdefault(name, Stream())
+            stream = found.setdefault(name, VehicleStream())
         if isinstance(event, RoundTrip):
             stream.round_trips.append(event)
         else:

@@ -22,7 +22,7 @@ from companion.studies.truth.hindsight import BootClock
 from companion.studies.truth.streams import (
     SIM_STATE,
     SIMSTATE,
-    Stream,
+    VehicleStream,
     gather,
     sim_state,
     simstate,
@@ -151,7 +151,9 @@ def load(logs: Path | Sequence[Path], center_text: str | None) -> Flown:
     )
 
 
-def _windows(faults: tuple[DeclaredFault, ...], stream: Stream) -> tuple[tuple[int, int], ...]:
+def _windows(
+    faults: tuple[DeclaredFault, ...], stream: VehicleStream
+) -> tuple[tuple[int, int], ...]:
     """The windows of a vehicle's faults, before which and after which its assumptions hold."""
     sysid = stream.reports[0].source.sysid
     return tuple(
@@ -162,7 +164,7 @@ def _windows(faults: tuple[DeclaredFault, ...], stream: Stream) -> tuple[tuple[i
 
 
 def _flight(
-    uav: str, stream: Stream, local: LocalFrame, faults: tuple[tuple[int, int], ...]
+    uav: str, stream: VehicleStream, local: LocalFrame, faults: tuple[tuple[int, int], ...]
 ) -> Flight:
     reports = stream.reports
     arrival_ns = np.array([report.t_ns for report in reports])
@@ -216,7 +218,7 @@ def _velocity(local: LocalFrame, report: Report) -> FloatArray:
     return velocity
 
 
-def _simulated(stream: Stream, clock: BootClock, local: LocalFrame) -> Trajectory | None:
+def _simulated(stream: VehicleStream, clock: BootClock, local: LocalFrame) -> Trajectory | None:
     """The trajectory by SIM_STATE; None where it has no place on Earth or cannot be put in time."""
     said = words(stream, SIM_STATE, clock)
     points, attitudes, kept = [], [], []
@@ -242,7 +244,7 @@ def _simulated(stream: Stream, clock: BootClock, local: LocalFrame) -> Trajector
 
 
 def _placed(
-    stream: Stream,
+    stream: VehicleStream,
     clock: BootClock,
     local: LocalFrame,
     *,

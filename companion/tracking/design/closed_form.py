@@ -139,7 +139,7 @@ def lmi_margin(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Design:
+class ClosedFormDesign:
     """A gain for one interval and its certificate; times in seconds, mu in s²."""
 
     dt_s: float
@@ -153,7 +153,7 @@ class Design:
     residual: float
 
 
-def design(dt_s: float, feedthrough_s: float, alpha: float | None = None) -> Design:
+def design(dt_s: float, feedthrough_s: float, alpha: float | None = None) -> ClosedFormDesign:
     """The optimal gain at one interval. ``alpha=None`` chooses it by ``best_alpha``.
 
     Where mu* = 0 the infimum over P is not attained: the certificate is then given at p = 1, which
@@ -168,7 +168,7 @@ def design(dt_s: float, feedthrough_s: float, alpha: float | None = None) -> Des
     mu = mu_star(dt_s, feedthrough_s, alpha)
     l_gain = gain(dt_s, feedthrough_s, alpha)
     p = 1 / mu if mu > 0 else 1.0
-    return Design(
+    return ClosedFormDesign(
         dt_s=dt_s,
         alpha=alpha,
         feedthrough_s=feedthrough_s,

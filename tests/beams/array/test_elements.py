@@ -8,15 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import examples
 
-from companion.beams.array.elements import ISOTROPIC, Element, Pattern
+from companion.beams.array.elements import ISOTROPIC, Element, ElementPattern
 from companion.values import FloatArray
 
 SEEDS = st.integers(0, 2**32 - 1)
-TR38901 = Element(Pattern.TR38901)
+TR38901 = Element(ElementPattern.TR38901)
 ELEMENTS = [
     ISOTROPIC,
     TR38901,
-    *(Element(Pattern.COSINE, exponent) for exponent in (0.5, 1.0, 2.0, 6.5)),
+    *(Element(ElementPattern.COSINE, exponent) for exponent in (0.5, 1.0, 2.0, 6.5)),
 ]
 
 
@@ -68,7 +68,7 @@ def test_a_cosine_element_radiates_all_of_its_power(exponent: float) -> None:
     nodes, shares = np.polynomial.legendre.leggauss(400)
     cosine, weight = (nodes + 1) / 2, shares / 2  # ahead; nothing is behind
     across = np.sqrt(1 - cosine**2)
-    element = Element(Pattern.COSINE, exponent)
+    element = Element(ElementPattern.COSINE, exponent)
     total = 0.0
     for turn in np.linspace(0, 2 * math.pi, 24, endpoint=False):
         directions = np.stack([cosine, across * math.cos(turn), across * math.sin(turn)], axis=1)
@@ -78,12 +78,12 @@ def test_a_cosine_element_radiates_all_of_its_power(exponent: float) -> None:
 
 
 def test_a_cosine_element_has_the_shape_of_its_name() -> None:
-    best = gain_dbi(Element(Pattern.COSINE, 2.0), 0, 0)
+    best = gain_dbi(Element(ElementPattern.COSINE, 2.0), 0, 0)
     assert best == pytest.approx(10 * math.log10(6))
-    aside = gain_dbi(Element(Pattern.COSINE, 2.0), 40, 30)
+    aside = gain_dbi(Element(ElementPattern.COSINE, 2.0), 40, 30)
     cosine = math.cos(math.radians(40)) * math.cos(math.radians(30))
     assert aside - best == pytest.approx(20 * math.log10(cosine))
-    assert Element(Pattern.COSINE).amplitude(towards(90.001, 0)) == 0
+    assert Element(ElementPattern.COSINE).amplitude(towards(90.001, 0)) == 0
 
 
 @pytest.mark.parametrize("element", ELEMENTS)
@@ -133,7 +133,7 @@ def test_no_direction_within_the_radius_is_out_of_the_range(element: Element, se
     found = element.amplitude(about(direction, radius * share, rng))
     # A direction is rounded to 1e-16; level aside, where a root of the cosine is steep, that shows.
     slack = 1e-12
-    if element.pattern is Pattern.COSINE:
+    if element.pattern is ElementPattern.COSINE:
         slack += 3 * (1e-15) ** (element.exponent / 2)
     assert float(least) <= found.min() + slack
     assert found.max() <= float(most) + slack
@@ -147,7 +147,7 @@ def test_no_direction_within_the_radius_is_out_of_the_range(element: Element, se
 def test_the_range_is_attained_by_the_cosine(seed: int) -> None:
     """Straight towards outward and straight away from it."""
     rng = np.random.default_rng(seed)
-    element = Element(Pattern.COSINE, float(rng.uniform(1, 4)))
+    element = Element(ElementPattern.COSINE, float(rng.uniform(1, 4)))
     off, radius, turn = rng.uniform(0, math.pi), rng.uniform(0, math.pi), rng.uniform(0, 6.3)
 
     def at(angle: float) -> float:
@@ -180,4 +180,4 @@ def test_the_range_of_the_standards_element_is_tight_in_its_main_cuts(degrees: f
 @pytest.mark.parametrize("exponent", [-0.1, -3.0, math.nan, math.inf])
 def test_an_exponent_below_zero_is_refused(exponent: float) -> None:
     with pytest.raises(ValueError, match=r"the exponent .* of a cosine pattern is not 0 or more"):
-        Element(Pattern.COSINE, exponent)
+        Element(ElementPattern.COSINE, exponent)

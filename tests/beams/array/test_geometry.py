@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from companion.beams.array import geometry
-from companion.beams.array.elements import Element, Pattern
+from companion.beams.array.elements import Element, ElementPattern
 from companion.values import FloatArray
 
 EYE = np.eye(3)
@@ -95,7 +95,7 @@ def test_a_circle_of_one_stands_at_the_origin() -> None:
     ).elements_m.any()
 
 
-COSINE = Element(Pattern.COSINE)
+COSINE = Element(ElementPattern.COSINE)
 
 
 def test_elements_of_a_circle_face_outward_unless_they_are_isotropic() -> None:
@@ -123,7 +123,7 @@ def test_elements_face_where_they_are_told_and_stay_level() -> None:
         rng.uniform(-1, 1, (24, 3)),
         1e9,
         array_from_body=EYE,
-        element=Element(Pattern.TR38901),
+        element=Element(ElementPattern.TR38901),
         lever_arm_m=None,
         outward=outward,
     )

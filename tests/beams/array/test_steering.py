@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from support import examples
 
 from companion.beams.array import steering
-from companion.beams.array.elements import Element, Pattern
+from companion.beams.array.elements import Element, ElementPattern
 from companion.beams.array.geometry import (
     SPEED_OF_LIGHT_MPS,
     Array,
@@ -84,7 +84,7 @@ def written_out(array: Array, direction: FloatArray) -> list[complex]:
 
 OUTWARD = np.random.default_rng(8).standard_normal((7, 3))
 PLACES = np.random.default_rng(9).uniform(-0.05, 0.05, (7, 3))
-SQUARE = Element(Pattern.COSINE, 2.0)
+SQUARE = Element(ElementPattern.COSINE, 2.0)
 FACING = {
     "line": uniform_linear(
         5, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3), element=SQUARE

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from support import examples
 
 from companion.beams.array import steering
-from companion.beams.array.elements import Element, Pattern
+from companion.beams.array.elements import Element, ElementPattern
 from companion.beams.array.geometry import Array, listed, uniform_circular
 from companion.beams.array.geometry import uniform_linear as line
 from companion.beams.array.geometry import uniform_rectangular as grid
@@ -28,8 +28,8 @@ from companion.beams.hardware.codebooks import (
 from companion.values import FloatArray
 
 EYE = np.eye(3)
-GPP = Element(Pattern.TR38901)
-COSINE = Element(Pattern.COSINE, 1.0)
+GPP = Element(ElementPattern.TR38901)
+COSINE = Element(ElementPattern.COSINE, 1.0)
 LINE = line(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=GPP)
 GRID = grid(4, columns=6, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE)
 CIRCLE = uniform_circular(12, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=GPP)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from companion.beams.array.geometry import uniform_rectangular
 from companion.beams.hardware import codebooks
 from companion.beams.hardware.calibration import Calibration
-from companion.beams.hardware.codebooks import Codebook, Kind
+from companion.beams.hardware.codebooks import Codebook, CodebookKind
 from companion.beams.hardware.digital_beams import write_oai_dbt
 from companion.cli.main import main
 from companion.values import ComplexArray, UserError
@@ -73,7 +73,7 @@ def test_a_calibrated_panel_radiates_the_codebook() -> None:
 
 
 def test_ids_have_sixteen_bits() -> None:
-    many = Codebook(Kind.LISTED, np.ones((1, 65_537), complex))
+    many = Codebook(CodebookKind.LISTED, np.ones((1, 65_537), complex))
     with pytest.raises(UserError, match="65537 beams: a digital beam table has at most 65536"):
         write_oai_dbt(many, Calibration.ideal([0]))
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from companion.beams.array.elements import Element, Pattern
+from companion.beams.array.elements import Element, ElementPattern
 from companion.beams.array.geometry import Array
 from companion.beams.array.geometry import uniform_linear as line
 from companion.beams.array.geometry import uniform_rectangular as grid
@@ -30,7 +30,7 @@ ARRAYS = {
         frequency_hz=10.5e9,
         spacing_wavelengths=0.6,
         array_from_body=EYE,
-        element=Element(Pattern.COSINE, 1.0),
+        element=Element(ElementPattern.COSINE, 1.0),
     ),
 }
 
@@ -42,7 +42,7 @@ def measured(array: Array, phase: FloatArray, gain_db: FloatArray, noise: float)
     for azimuth, elevation in AT_DEG:
         az, el = np.radians([azimuth, elevation])
         u = np.array([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), -np.sin(el)])
-        pattern = 1.0 if array.element.pattern is Pattern.ISOTROPIC else np.sqrt(4 * u[0])
+        pattern = 1.0 if array.element.pattern is ElementPattern.ISOTROPIC else np.sqrt(4 * u[0])
         turned = 2 * np.pi / array.wavelength_m * (array.elements_m @ u)
         source = rng.uniform(-9, 9), rng.uniform(-3, 3)
         for channel, m in enumerate(ORDER):

@@ -12,12 +12,12 @@ from support import examples
 
 from companion.beams.hardware import devices
 from companion.beams.hardware.calibration import Calibration, parse_calibration
-from companion.beams.hardware.devices import LIMITS, SETTINGS, Device, Mode
+from companion.beams.hardware.devices import LIMITS, SETTINGS, Beamformer, Mode
 from companion.beams.hardware.tables import DeviceTable, WantedBeam, encode, fit
 from companion.beams.hardware.unit_gains import UnitGains
 from companion.values import ComplexArray
 
-SIZES = {Device.ADAR1000: 8, Device.TMYTEK: 16, Device.SIVERS: 16}
+SIZES = {Beamformer.ADAR1000: 8, Beamformer.TMYTEK: 16, Beamformer.SIVERS: 16}
 CN0566_ORDER = (6, 7, 4, 5, 2, 3, 0, 1)
 """Which element each channel of the ADALM-PHASER drives, from pyadi-iio's CN0566."""
 SEEDS = st.integers(0, 2**32 - 1)
@@ -55,9 +55,9 @@ def measured(seed: int, elements: int) -> Calibration:
     )
 
 
-def written(device: Device, table: DeviceTable) -> str:
+def written(device: Beamformer, table: DeviceTable) -> str:
     """The text of a table, with what the device needs beside."""
-    return encode(table, frequency_hz=60.48e9 if device is Device.SIVERS else None)
+    return encode(table, frequency_hz=60.48e9 if device is Beamformer.SIVERS else None)
 
 
 # --- calibration --------------------------------------------------------------------------------
@@ -116,8 +116,8 @@ def test_a_calibration_is_checked(
 # --- what is fitted -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("device", list(Device))
-def test_the_channels_radiate_the_wanted_beams(device: Device) -> None:
+@pytest.mark.parametrize("device", list(Beamformer))
+def test_the_channels_radiate_the_wanted_beams(device: Beamformer) -> None:
     """Element by element from the codes: setting of its channel times what the channel adds."""
     size = SIZES[device]
     calibration = measured(4, size)
@@ -138,7 +138,7 @@ def test_the_channels_radiate_the_wanted_beams(device: Device) -> None:
 
 def test_the_loss_is_that_of_the_array_gain() -> None:
     beam = wanted([0.3, -0.4], 16)[0]
-    table = fit(Device.TMYTEK, [beam], measured(9, 16))
+    table = fit(Beamformer.TMYTEK, [beam], measured(9, 16))
     sent, own = table.weights[:, 0], beam.steering[:, 0]
     before = abs(own @ beam.weights) ** 2 / np.vdot(beam.weights, beam.weights).real
     after = abs(own @ sent) ** 2 / np.vdot(sent, sent).real
@@ -158,7 +158,7 @@ def test_phases_are_taken_out_not_put_in() -> None:
         elevation_rad=0.0,
         steering=line([0.0], 16),
     )
-    phases = fit(Device.TMYTEK, [beam], turned).codes[0, :, 0]
+    phases = fit(Beamformer.TMYTEK, [beam], turned).codes[0, :, 0]
     assert (phases[0] - phases[1]) % 360 == 270
     assert len(set(phases[1:].tolist())) == 1
 
@@ -176,25 +176,31 @@ def test_gains_are_levelled_to_the_weakest() -> None:
         elevation_rad=0.0,
         steering=line([0.0], 16),
     )
-    assert fit(Device.TMYTEK, [beam], uneven).codes[0, :, 1].tolist() == [6, *[0] * 15]
+    assert fit(Beamformer.TMYTEK, [beam], uneven).codes[0, :, 1].tolist() == [6, *[0] * 15]
 
 
 @pytest.mark.parametrize(
     ("device", "size", "count", "azimuth_deg", "elevation_deg", "said"),
     [
-        (Device.TMYTEK, 8, 1, 0, 0, "tmytek drives 16 elements, the array has 8"),
-        (Device.SIVERS, 64, 1, 0, 0, "sivers drives 16 elements, the array has 64"),
-        (Device.TMYTEK, 16, 65, 0, 0, "stores 1 to 64 beams, not 65"),
-        (Device.SIVERS, 16, 0, 0, 0, "stores 1 to 64 beams, not 0"),
-        (Device.ADAR1000, 8, 122, 0, 0, "stores 1 to 121 beams, not 122"),
-        (Device.TMYTEK, 16, 1, 45.1, 0, "beam for 7:1 is 45.1 degrees off boresight"),
-        (Device.TMYTEK, 16, 1, 40, 40, "54.1 degrees off boresight"),
-        (Device.TMYTEK, 16, 1, 180, 0, "180.0 degrees off boresight"),
-        (Device.TMYTEK, 16, 1, math.nan, 0, "nan degrees off boresight"),
+        (Beamformer.TMYTEK, 8, 1, 0, 0, "tmytek drives 16 elements, the array has 8"),
+        (Beamformer.SIVERS, 64, 1, 0, 0, "sivers drives 16 elements, the array has 64"),
+        (Beamformer.TMYTEK, 16, 65, 0, 0, "stores 1 to 64 beams, not 65"),
+        (Beamformer.SIVERS, 16, 0, 0, 0, "stores 1 to 64 beams, not 0"),
+        (Beamformer.ADAR1000, 8, 122, 0, 0, "stores 1 to 121 beams, not 122"),
+        (Beamformer.TMYTEK, 16, 1, 45.1, 0, "beam for 7:1 is 45.1 degrees off boresight"),
+        (Beamformer.TMYTEK, 16, 1, 40, 40, "54.1 degrees off boresight"),
+        (Beamformer.TMYTEK, 16, 1, 180, 0, "180.0 degrees off boresight"),
+        (Beamformer.TMYTEK, 16, 1, math.nan, 0, "nan degrees off boresight"),
     ],
 )
 def test_what_a_device_cannot_do_is_refused(
-    *, device: Device, size: int, count: int, azimuth_deg: float, elevation_deg: float, said: str
+    *,
+    device: Beamformer,
+    size: int,
+    count: int,
+    azimuth_deg: float,
+    elevation_deg: float,
+    said: str,
 ) -> None:
     beam = WantedBeam(
         uav="7:1",
@@ -215,7 +221,7 @@ def test_the_edge_of_what_it_can_do_is_taken() -> None:
         elevation_rad=0.0,
         steering=line([0.7], 16),
     )
-    assert fit(Device.TMYTEK, [beam] * 64, Calibration.ideal(range(16))).codes.shape[0] == 64
+    assert fit(Beamformer.TMYTEK, [beam] * 64, Calibration.ideal(range(16))).codes.shape[0] == 64
 
 
 def test_channels_that_differ_too_much_or_do_not_match_are_refused() -> None:
@@ -225,9 +231,9 @@ def test_channels_that_differ_too_much_or_do_not_match_are_refused() -> None:
         phase_rad=ideal.phase_rad, gain_db=(7.6, *ideal.gain_db[1:]), order=ideal.order
     )
     with pytest.raises(ValueError, match=r"differ by 7\.6 dB, tmytek can level 7\.5 dB"):
-        fit(Device.TMYTEK, [beam], wild)
+        fit(Beamformer.TMYTEK, [beam], wild)
     with pytest.raises(ValueError, match=r"beam for 1:1: weights \(16,\)"):
-        fit(Device.ADAR1000, [beam], Calibration.ideal(range(8)))
+        fit(Beamformer.ADAR1000, [beam], Calibration.ideal(range(8)))
     nowhere = WantedBeam(
         uav="1:1",
         weights=beam.weights,
@@ -236,15 +242,15 @@ def test_channels_that_differ_too_much_or_do_not_match_are_refused() -> None:
         steering=np.empty((16, 0), complex),
     )
     with pytest.raises(ValueError, match="one direction or more"):
-        fit(Device.ADAR1000, [nowhere], ideal)
+        fit(Beamformer.ADAR1000, [nowhere], ideal)
 
 
 # --- the texts ----------------------------------------------------------------------------------
 
 
 @settings(max_examples=examples(25), deadline=None)
-@given(SEEDS, st.sampled_from(list(Device)), st.integers(1, 4))
-def test_what_is_written_is_read_back(seed: int, device: Device, count: int) -> None:
+@given(SEEDS, st.sampled_from(list(Beamformer)), st.integers(1, 4))
+def test_what_is_written_is_read_back(seed: int, device: Beamformer, count: int) -> None:
     size = SIZES[device]
     rng = np.random.default_rng(seed)
     sines = np.linspace(-0.6, 0.6, count) + rng.uniform(-0.1, 0.1, count)
@@ -254,15 +260,15 @@ def test_what_is_written_is_read_back(seed: int, device: Device, count: int) -> 
     assert np.array_equal(found.codes, table.codes)
     assert found.weights == pytest.approx(table.weights, abs=1e-12)
     assert found.order == calibration.order
-    named = device is not Device.TMYTEK
+    named = device is not Beamformer.TMYTEK
     assert found.uavs == (table.uavs if named else tuple(str(k + 1) for k in range(count)))
     assert found.loss_db is None
     assert written(device, found) == written(device, table) or not named
 
 
 @settings(max_examples=examples(40), deadline=None)
-@given(SEEDS, st.sampled_from(list(Device)))
-def test_every_code_survives(seed: int, device: Device) -> None:
+@given(SEEDS, st.sampled_from(list(Beamformer)))
+def test_every_code_survives(seed: int, device: Beamformer) -> None:
     """Any codes at all, off and lowest among them; full gain somewhere, as every beam has it."""
     rng = np.random.default_rng(seed)
     size, kind = SIZES[device], SETTINGS[device]
@@ -294,7 +300,7 @@ def test_the_adar1000_table_of_a_phaser() -> None:
         elevation_rad=0.0,
         steering=ramp.conj()[:, np.newaxis],
     )
-    header, *lines = encode(fit(Device.ADAR1000, [beam], calibration)).splitlines()
+    header, *lines = encode(fit(Beamformer.ADAR1000, [beam], calibration)).splitlines()
     assert header.startswith("beam,uav,chip,channel,element,phase_code,phase_deg,gain_code,")
     rows = [line.split(",") for line in lines]
     assert [row[:5] for row in rows][:2] == [
@@ -334,7 +340,7 @@ def test_the_vector_modulator_points_where_its_code_says() -> None:
 def test_the_gains_of_the_adar1000_fill_its_range() -> None:
     """31 dB, every step finer than the 0.5 dB of the data sheet, then off."""
     levels = np.array(
-        devices.SETTINGS[Device.ADAR1000]
+        devices.SETTINGS[Beamformer.ADAR1000]
         .values(np.array([(0, i) for i in range(len(devices.ADAR1000_GAINS))]))
         .real
     )
@@ -348,7 +354,7 @@ def test_the_gains_of_the_adar1000_fill_its_range() -> None:
 
 def test_the_tmytek_table() -> None:
     table = fit(
-        Device.TMYTEK,
+        Beamformer.TMYTEK,
         [
             WantedBeam(
                 uav="1:1",
@@ -376,9 +382,9 @@ def test_the_tmytek_table() -> None:
 def test_blank_lines_of_a_tmytek_table_are_skipped() -> None:
     """As the maker's own examples have them."""
     ideal = Calibration.ideal(range(16))
-    table = fit(Device.TMYTEK, wanted([0.1], 16), ideal)
+    table = fit(Beamformer.TMYTEK, wanted([0.1], 16), ideal)
     text = encode(table).replace("\n", "\n,,,,,,,,,\n", 1)
-    assert np.array_equal(parse(Device.TMYTEK, text, ideal).codes, table.codes)
+    assert np.array_equal(parse(Beamformer.TMYTEK, text, ideal).codes, table.codes)
 
 
 def test_what_is_off_does_not_count_for_full_gain() -> None:
@@ -391,16 +397,16 @@ def test_what_is_off_does_not_count_for_full_gain() -> None:
         elevation_rad=0.0,
         steering=line([0.0], 16),
     )
-    table = fit(Device.TMYTEK, [beam], ideal)
+    table = fit(Beamformer.TMYTEK, [beam], ideal)
     text = encode(table)
     assert ",1,1,-7.5," in text
-    found = parse(Device.TMYTEK, text.replace(",1,1,-7.5,", ",1,1,9.0,"), ideal)
+    found = parse(Beamformer.TMYTEK, text.replace(",1,1,-7.5,", ",1,1,9.0,"), ideal)
     assert np.array_equal(found.codes, table.codes)
 
 
 def test_the_sivers_book_loads_as_the_makers_scripts_load_it() -> None:
     """Their way: bytes from the line after the tag, two to a word, antenna 15 first."""
-    table = fit(Device.SIVERS, wanted([-0.3, 0.4], 16), measured(1, 16))
+    table = fit(Beamformer.SIVERS, wanted([-0.3, 0.4], 16), measured(1, 16))
     lines = encode(table, frequency_hz=60.48e9).splitlines()
     start = next(i for i, line in enumerate(lines) if line.startswith("START_TABLE FREQ:"))
     head = lines[start]
@@ -417,7 +423,7 @@ def test_the_sivers_book_loads_as_the_makers_scripts_load_it() -> None:
 
 
 def test_a_sivers_book_needs_a_frequency() -> None:
-    table = fit(Device.SIVERS, wanted([0.1], 16), Calibration.ideal(range(16)))
+    table = fit(Beamformer.SIVERS, wanted([0.1], 16), Calibration.ideal(range(16)))
     for frequency, said in ((None, "needs the frequency"), (0.0, "not above 0"), (math.inf, "inf")):
         with pytest.raises(ValueError, match=said):
             encode(table, frequency_hz=frequency)
@@ -433,43 +439,43 @@ def test_names_that_would_break_a_line_are_refused(name: str) -> None:
         steering=line([0.0], 8),
     )
     with pytest.raises(ValueError, match="a name has no comma"):
-        fit(Device.ADAR1000, [beam], Calibration.ideal(range(8)))
+        fit(Beamformer.ADAR1000, [beam], Calibration.ideal(range(8)))
 
 
 BROKEN = [
-    (Device.ADAR1000, ("beam,uav", "uav,beam"), "line 1"),
-    (Device.ADAR1000, ("0,1:1,0,1,0,", "0,1:1,0,5,0,"), "line 2: channel '5'"),
-    (Device.ADAR1000, ("0,1:1,0,2,1,", "0,1:1,0,1,1,"), "line 3: element 1"),
-    (Device.ADAR1000, ("0,1:1,0,2,1,", "0,1:1,0,1,0,"), "line 3: beam 0 has this channel"),
-    (Device.ADAR1000, ("0,1:1,0,2,1,", "121,1:1,0,2,1,"), "line 3: beam '121'"),
-    (Device.ADAR1000, ("0,1:1,0,2,1,", "0,2:1,0,2,1,"), "line 3: uav '2:1'"),
-    (Device.ADAR1000, ("0,1:1,0,2,1,", "2,1:1,0,2,1,"), "beam 0 has no line for channel 1"),
-    (Device.ADAR1000, (",127,0,", ",3,0,"), "line 2: gain_code 3 with attenuator 0"),
-    (Device.ADAR1000, (",127,0,", ",128,0,"), "line 2: gain_code '128'"),
-    (Device.ADAR1000, (",0,0.0000,", ",0,2.8125,"), "phase_deg 2.8125"),
-    (Device.ADAR1000, (",0,0.0000,127,0,3F,", ",0,0.0000,127,0,3E,"), "vm_i, vm_q"),
-    (Device.TMYTEK, ("TX,1,1,,,,1,", "QX,1,1,,,,1,"), "line 2: Mode 'QX'"),
-    (Device.TMYTEK, ("TX,1,1,,,,2,", "RX,1,1,,,,2,"), "line 3: Mode 'RX'"),
-    (Device.TMYTEK, ("TX,1,1,,,,2,", "TX,1,0,,30,,2,"), "line 3: BeamType '0'"),
-    (Device.TMYTEK, ("TX,1,1,,,,2,", "TX,65,1,,,,2,"), "line 3: BeamID '65'"),
-    (Device.TMYTEK, ("TX,1,1,,,,2,", "TX,1,1,,,,17,"), "line 3: ch '17'"),
-    (Device.TMYTEK, ("TX,1,1,,,,2,", "TX,1,1,,,,1,"), "line 3: beam 1 has channel 1"),
-    (Device.TMYTEK, ("TX,1,1,,,,2,0,0.0,", "TX,1,1,,,,2,2,0.0,"), "line 3: ch_sw '2'"),
-    (Device.TMYTEK, ("TX,1,1,,,,2,0,0.0,", "TX,1,1,,,,2,0,-0.2,"), "line 3: ch_db -0.2"),
-    (Device.TMYTEK, ("TX,1,1,,,,2,0,0.0,", "TX,1,1,,,,2,0,-8.0,"), "line 3: ch_db -8.0"),
-    (Device.TMYTEK, ("TX,1,1,,,,2,0,0.0,0", "TX,1,1,,,,2,0,0.0,360"), "line 3: ch_deg '360"),
-    (Device.SIVERS, ("START_TABLE", "START"), "one table"),
-    (Device.SIVERS, ("END_TABLE", "END"), "one table"),
-    (Device.SIVERS, ("# row 0", "# row 1"), "line 1: '# row 1"),
-    (Device.SIVERS, ("0x1F", "0x3F"), "line 4: '0x3F'"),
-    (Device.SIVERS, ("0x1F,", ""), "line 4: 31 values"),
-    (Device.SIVERS, ("END_TABLE", "0x1F\nEND_TABLE"), "65 rows"),
+    (Beamformer.ADAR1000, ("beam,uav", "uav,beam"), "line 1"),
+    (Beamformer.ADAR1000, ("0,1:1,0,1,0,", "0,1:1,0,5,0,"), "line 2: channel '5'"),
+    (Beamformer.ADAR1000, ("0,1:1,0,2,1,", "0,1:1,0,1,1,"), "line 3: element 1"),
+    (Beamformer.ADAR1000, ("0,1:1,0,2,1,", "0,1:1,0,1,0,"), "line 3: beam 0 has this channel"),
+    (Beamformer.ADAR1000, ("0,1:1,0,2,1,", "121,1:1,0,2,1,"), "line 3: beam '121'"),
+    (Beamformer.ADAR1000, ("0,1:1,0,2,1,", "0,2:1,0,2,1,"), "line 3: uav '2:1'"),
+    (Beamformer.ADAR1000, ("0,1:1,0,2,1,", "2,1:1,0,2,1,"), "beam 0 has no line for channel 1"),
+    (Beamformer.ADAR1000, (",127,0,", ",3,0,"), "line 2: gain_code 3 with attenuator 0"),
+    (Beamformer.ADAR1000, (",127,0,", ",128,0,"), "line 2: gain_code '128'"),
+    (Beamformer.ADAR1000, (",0,0.0000,", ",0,2.8125,"), "phase_deg 2.8125"),
+    (Beamformer.ADAR1000, (",0,0.0000,127,0,3F,", ",0,0.0000,127,0,3E,"), "vm_i, vm_q"),
+    (Beamformer.TMYTEK, ("TX,1,1,,,,1,", "QX,1,1,,,,1,"), "line 2: Mode 'QX'"),
+    (Beamformer.TMYTEK, ("TX,1,1,,,,2,", "RX,1,1,,,,2,"), "line 3: Mode 'RX'"),
+    (Beamformer.TMYTEK, ("TX,1,1,,,,2,", "TX,1,0,,30,,2,"), "line 3: BeamType '0'"),
+    (Beamformer.TMYTEK, ("TX,1,1,,,,2,", "TX,65,1,,,,2,"), "line 3: BeamID '65'"),
+    (Beamformer.TMYTEK, ("TX,1,1,,,,2,", "TX,1,1,,,,17,"), "line 3: ch '17'"),
+    (Beamformer.TMYTEK, ("TX,1,1,,,,2,", "TX,1,1,,,,1,"), "line 3: beam 1 has channel 1"),
+    (Beamformer.TMYTEK, ("TX,1,1,,,,2,0,0.0,", "TX,1,1,,,,2,2,0.0,"), "line 3: ch_sw '2'"),
+    (Beamformer.TMYTEK, ("TX,1,1,,,,2,0,0.0,", "TX,1,1,,,,2,0,-0.2,"), "line 3: ch_db -0.2"),
+    (Beamformer.TMYTEK, ("TX,1,1,,,,2,0,0.0,", "TX,1,1,,,,2,0,-8.0,"), "line 3: ch_db -8.0"),
+    (Beamformer.TMYTEK, ("TX,1,1,,,,2,0,0.0,0", "TX,1,1,,,,2,0,0.0,360"), "line 3: ch_deg '360"),
+    (Beamformer.SIVERS, ("START_TABLE", "START"), "one table"),
+    (Beamformer.SIVERS, ("END_TABLE", "END"), "one table"),
+    (Beamformer.SIVERS, ("# row 0", "# row 1"), "line 1: '# row 1"),
+    (Beamformer.SIVERS, ("0x1F", "0x3F"), "line 4: '0x3F'"),
+    (Beamformer.SIVERS, ("0x1F,", ""), "line 4: 31 values"),
+    (Beamformer.SIVERS, ("END_TABLE", "0x1F\nEND_TABLE"), "65 rows"),
 ]
 
 
 @pytest.mark.parametrize(("device", "change", "said"), BROKEN)
 def test_a_broken_text_is_refused_with_its_line(
-    device: Device, change: tuple[str, str], said: str
+    device: Beamformer, change: tuple[str, str], said: str
 ) -> None:
     size = SIZES[device]
     ideal = Calibration.ideal(range(size))
@@ -487,11 +493,11 @@ def test_a_broken_text_is_refused_with_its_line(
 
 
 def test_a_table_for_another_array_is_refused() -> None:
-    text = encode(fit(Device.ADAR1000, wanted([0.2], 8), Calibration.ideal(range(8))))
+    text = encode(fit(Beamformer.ADAR1000, wanted([0.2], 8), Calibration.ideal(range(8))))
     for other in (Calibration.ideal(CN0566_ORDER), Calibration.ideal(range(12))):
         with pytest.raises(ValueError, match="drives elements"):
-            parse(Device.ADAR1000, text, other)
+            parse(Beamformer.ADAR1000, text, other)
 
 
 def test_every_device_has_limits_settings_and_a_media_type_of_its_own() -> None:
-    assert set(LIMITS) == set(SETTINGS) == set(Device)
+    assert set(LIMITS) == set(SETTINGS) == set(Beamformer)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.beams.hardware.calibration import Calibration
-from companion.beams.hardware.devices import Device, Mode
+from companion.beams.hardware.devices import Beamformer, Mode
 from companion.beams.hardware.tables import DeviceTable, WantedBeam, encode, fit
 from companion.beams.hardware.unit_gains import UnitGains, parse_unit_gains
 from companion.values import ComplexArray, UserError
@@ -46,7 +46,7 @@ def table(gains: UnitGains, seed: int, beams: int) -> DeviceTable:
         gain_db=tuple(levels.tolist()),
         order=tuple(rng.permutation(16).tolist()),
     )
-    return fit(Device.TMYTEK, wanted, uneven, gains)
+    return fit(Beamformer.TMYTEK, wanted, uneven, gains)
 
 
 def refused(text: str, boards: list[Board]) -> list[str]:
@@ -105,7 +105,7 @@ def test_the_strongest_element_is_as_loud_as_every_board_can_be() -> None:
 def test_relative_gains_leave_the_limits_of_a_unit() -> None:
     """Why a unit's own are asked for."""
     boards: list[Board] = [((5.0, 9.5), 4.0)] * 4
-    relative = fit(Device.TMYTEK, [zero_beam()], Calibration.ideal(range(16)))
+    relative = fit(Beamformer.TMYTEK, [zero_beam()], Calibration.ideal(range(16)))
     assert refused(encode(relative), boards)
 
 
@@ -125,14 +125,14 @@ def zero_beam() -> WantedBeam:
 def test_a_unit_without_a_range_is_set_by_phases_alone() -> None:
     gains = parse_unit_gains(described([((1.0, 1.0), 0.0)] * 4, "RX"))
     assert gains == UnitGains(Mode.RX, 1.0, 0.0)
-    text = encode(fit(Device.TMYTEK, [zero_beam()], Calibration.ideal(range(16)), gains))
+    text = encode(fit(Beamformer.TMYTEK, [zero_beam()], Calibration.ideal(range(16)), gains))
     assert {row.split(",")[8] for row in text.splitlines()[1:]} == {"1.0"}
     assert text.splitlines()[4].split(",")[7] == "1"  # off
     with pytest.raises(UserError, match=r"differ by 1\.0 dB, tmytek can level 0\.0 dB"):
         uneven = Calibration(
             phase_rad=(0.0,) * 16, gain_db=(1.0, *[0.0] * 15), order=tuple(range(16))
         )
-        fit(Device.TMYTEK, [zero_beam()], uneven, gains)
+        fit(Beamformer.TMYTEK, [zero_beam()], uneven, gains)
 
 
 @pytest.mark.parametrize(
@@ -216,5 +216,5 @@ def test_the_maker_s_own_package_applies_every_beam(tmp_path: Path) -> None:
                 assert low <= board["common_db"] <= high
                 ours = [one["db"] for name, one in board.items() if name != "common_db"]
                 assert -SLACK <= min(ours) <= max(ours) <= element + SLACK
-    path.write_text(encode(fit(Device.TMYTEK, [zero_beam()], Calibration.ideal(range(16)))))
+    path.write_text(encode(fit(Beamformer.TMYTEK, [zero_beam()], Calibration.ideal(range(16)))))
     assert not batch.TMYBeamConfig("D2252E058-28", Unit(boards, codes.OK), str(path)).applyBeams()

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from companion.beams.array.elements import Element, Pattern
+from companion.beams.array.elements import Element, ElementPattern
 from companion.beams.array.geometry import Array, uniform_linear, uniform_rectangular
 from companion.beams.array.steering import steering_matrix
 from companion.beams.weights import shapes
-from companion.beams.weights.cones import FINER, FINER_IN_PLANE, Cones, cones, seen_within
+from companion.beams.weights.cones import FINER, FINER_IN_PLANE, ConeSamples, cones, seen_within
 from companion.values import FloatArray
 
 EYE = np.eye(3)
@@ -23,19 +23,23 @@ GRIDS = {
         3, columns=8, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
     ),
     "patches": uniform_linear(
-        16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=Element(Pattern.COSINE)
+        16,
+        30e9,
+        spacing_wavelengths=0.5,
+        array_from_body=EYE,
+        element=Element(ElementPattern.COSINE),
     ),
 }
 DIRECTIONS = np.array([[0.8, 0.6, 0.0], [0.6, -0.48, 0.64], [1.0, 0.0, 0.0]])
 
 
-def looked_at(array: Array, angles_deg: list[list[float]]) -> Cones:
+def looked_at(array: Array, angles_deg: list[list[float]]) -> ConeSamples:
     across = shapes.aperture(array)
     seen = seen_within(across, DIRECTIONS, np.radians(angles_deg))
     return cones(array, across, DIRECTIONS, seen, steering_matrix(array, DIRECTIONS))
 
 
-def offsets(array: Array, found: Cones) -> list[FloatArray]:
+def offsets(array: Array, found: ConeSamples) -> list[FloatArray]:
     """The places of each axis, as cosines beside the predicted direction's."""
     finer = FINER if len(found.waves) == 1 else FINER_IN_PLANE
     across = shapes.aperture(array)

@@ -8,8 +8,8 @@ from support import examples
 
 from companion.beams.weights.grouping import (
     LENIENT_DB,
-    Limits,
-    Turns,
+    PreviousSlots,
+    ZeroForcingLimits,
     kept,
     lost_db,
     semi_orthogonal,
@@ -17,7 +17,7 @@ from companion.beams.weights.grouping import (
 )
 from companion.values import ComplexArray
 
-LIMITS = Limits(3.0, 100.0)
+LIMITS = ZeroForcingLimits(3.0, 100.0)
 
 
 def drawn(seed: int, elements: int, users: int) -> ComplexArray:
@@ -101,8 +101,8 @@ def test_turns_are_kept_while_they_do_and_a_little_longer_while_young(young: boo
         )
         return made
 
-    turns = Turns(np.array([0, 0, 0, 0, 0, 0]), young)
-    found = {apart: kept(at(apart), turns, LIMITS) for apart in (0.12, 0.056, 0.01)}
+    slots = PreviousSlots(np.array([0, 0, 0, 0, 0, 0]), young)
+    found = {apart: kept(at(apart), slots, LIMITS) for apart in (0.12, 0.056, 0.01)}
     assert found[0.12] is not None
     assert [group.tolist() for group in found[0.12]] == [[0, 1, 2, 3, 4, 5]]
     assert LIMITS.loss_db < lost_db(at(0.056), LIMITS) < LIMITS.loss_db + LENIENT_DB

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from support import examples
 
 from companion.beams.array import steering
-from companion.beams.array.elements import Element, Pattern
+from companion.beams.array.elements import Element, ElementPattern
 from companion.beams.array.geometry import (
     Array,
     listed,
@@ -61,7 +61,7 @@ def somewhere(data: st.DataObject, users: int) -> FloatArray:
 def any_array(seed: int) -> Array:
     """A line, a rectangle, a circle or elements scattered in space: 16 of them."""
     rng = np.random.default_rng(seed)
-    element = Element([Pattern.ISOTROPIC, Pattern.TR38901][seed // 4 % 2])
+    element = Element([ElementPattern.ISOTROPIC, ElementPattern.TR38901][seed // 4 % 2])
     match seed % 4:
         case 0:
             return uniform_linear(
@@ -262,9 +262,9 @@ def test_groups_serve_everybody_once_and_each_is_within_the_limits(
     assert list(found.served) == list(range(users))
     assert found.method is Method.ZERO_FORCING
     assert set(found.groups) == set(range(int(found.groups.max()) + 1))
-    for turn in set(found.groups):
-        together = a[:, found.groups == turn]
-        weights = found.weights[:, found.groups == turn]
+    for slot in set(found.groups):
+        together = a[:, found.groups == slot]
+        weights = found.weights[:, found.groups == slot]
         assert np.abs(together.T @ weights - np.eye(together.shape[1])).max() < 1e-9
         assert np.linalg.cond(together) <= 100 * (1 + 1e-9)
         assert loss_db(together, weights).max() <= 3 + 1e-6
@@ -298,7 +298,7 @@ def test_what_elements_radiate_there_is_no_closeness(policy: Policy) -> None:
         30e9,
         spacing_wavelengths=0.5,
         array_from_body=EYE,
-        element=Element(Pattern.COSINE, 10.0),
+        element=Element(ElementPattern.COSINE, 10.0),
     )
     azimuth = math.radians(70)
     seen = np.array([[1.0, 0.0, 0.0], [math.cos(azimuth), math.sin(azimuth), 0.0]])
@@ -403,11 +403,11 @@ def test_power_is_what_its_name_says(
     assert np.sum(np.abs(stream.weights) ** 2, axis=0) == pytest.approx(
         np.ones(len(stream.served)), abs=1e-12
     )
-    for turn in set(total.groups):
-        assert np.sum(np.abs(total.weights[:, total.groups == turn]) ** 2) == pytest.approx(
+    for slot in set(total.groups):
+        assert np.sum(np.abs(total.weights[:, total.groups == slot]) ** 2) == pytest.approx(
             1.0, abs=1e-12
         )
-        rows = np.sum(np.abs(antenna.weights[:, antenna.groups == turn]) ** 2, axis=1)
+        rows = np.sum(np.abs(antenna.weights[:, antenna.groups == slot]) ** 2, axis=1)
         assert rows.max() == pytest.approx(1 / 16, abs=1e-12)
     for scaled in (stream, total, antenna):
         ratio = scaled.weights / plain.weights

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import examples
 
-from companion.beams.array.elements import Element, Pattern
+from companion.beams.array.elements import Element, ElementPattern
 from companion.beams.array.geometry import (
     Array,
     listed,
@@ -294,8 +294,8 @@ def test_turns_are_exact(policy: Policy, seed: int) -> None:
     found = precode(a, Precoder(policy=policy), wide)
     assert found.method is Method.ZERO_FORCING
     assert found.groups.max() > 0 or found.dropped
-    for turn in range(found.groups.max() + 1):
-        now = found.groups == turn
+    for slot in range(found.groups.max() + 1):
+        now = found.groups == slot
         response = a[:, found.served[now]].T @ found.weights[:, now]
         assert np.abs(response - np.eye(now.sum())).max() < 1e-9
 
@@ -311,8 +311,8 @@ def test_points_nulled_beside_the_others_leave_nothing_at_them(seed: int) -> Non
         a = steering_matrix(array, directions)
         how = Precoder(policy=Policy.GROUP, loss_limit_db=60.0, condition_limit=1000.0)
         found = precode(a, how, spread(array, directions, 11.0, 11.0))
-        for turn in range(found.groups.max() + 1):
-            now = found.groups == turn
+        for slot in range(found.groups.max() + 1):
+            now = found.groups == slot
             response = a[:, now].T @ found.weights[:, now]
             assert np.abs(response - np.eye(now.sum())).max() <= 1e-10
 
@@ -332,7 +332,11 @@ EVERY = {
     "sparse": uniform_linear(6, 30e9, spacing_wavelengths=3.0, array_from_body=EYE),
     "upright": listed(np.outer(np.arange(9) * 0.005, [0.0, 0.6, -0.8]), 30e9, array_from_body=EYE),
     "cosine": uniform_linear(
-        16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=Element(Pattern.COSINE)
+        16,
+        30e9,
+        spacing_wavelengths=0.5,
+        array_from_body=EYE,
+        element=Element(ElementPattern.COSINE),
     ),
     "column": uniform_rectangular(
         12, columns=1, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
@@ -343,17 +347,21 @@ EVERY = {
         frequency_hz=30e9,
         spacing_wavelengths=0.5,
         array_from_body=EYE,
-        element=Element(Pattern.TR38901),
+        element=Element(ElementPattern.TR38901),
     ),
     "circle": uniform_circular(
-        13, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=Element(Pattern.COSINE)
+        13,
+        30e9,
+        spacing_wavelengths=0.5,
+        array_from_body=EYE,
+        element=Element(ElementPattern.COSINE),
     ),
     "scattered": listed(PLACES, 30e9, array_from_body=EYE),
     "facing": listed(
         PLACES,
         30e9,
         array_from_body=EYE,
-        element=Element(Pattern.COSINE, 4.0),
+        element=Element(ElementPattern.COSINE, 4.0),
         lever_arm_m=None,
         outward=OUTWARD,
     ),

@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 from support import examples
 
 from companion.beams.array import geometry, steering
-from companion.beams.array.elements import Element, Pattern
+from companion.beams.array.elements import Element, ElementPattern
 from companion.beams.array.geometry import Array
 from companion.beams.weights.zero_forcing import Solved, solve
 from companion.values import ComplexArray, FloatArray
 
 EYE = np.eye(3)
-COSINE = Element(Pattern.COSINE, 1.5)
+COSINE = Element(ElementPattern.COSINE, 1.5)
 SIZES = [(64, 32), (64, 8)]
 """Elements and users."""
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from support import examples
 
 from companion.beams.array import steering
-from companion.beams.array.elements import Element, Pattern
+from companion.beams.array.elements import Element, ElementPattern
 from companion.beams.array.geometry import (
     SPEED_OF_LIGHT_MPS,
     Array,
@@ -106,7 +106,7 @@ def test_sight_alone_is_the_outer_product_written_out() -> None:
                 30e9,
                 spacing_wavelengths=0.5,
                 array_from_body=np.eye(3),
-                element=Element(Pattern.COSINE, 2.0),
+                element=Element(ElementPattern.COSINE, 2.0),
             ),
             UAV,
         ),
@@ -116,7 +116,7 @@ def test_sight_alone_is_the_outer_product_written_out() -> None:
                 30e9,
                 spacing_wavelengths=0.5,
                 array_from_body=np.eye(3),
-                element=Element(Pattern.COSINE),
+                element=Element(ElementPattern.COSINE),
             ),
             NODE,
         ),

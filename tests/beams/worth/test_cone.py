@@ -11,16 +11,16 @@ from hypothesis import strategies as st
 from support import examples
 
 from companion.beams.array import steering
-from companion.beams.array.elements import Element, Pattern
+from companion.beams.array.elements import Element, ElementPattern
 from companion.beams.array.geometry import Array, listed, uniform_circular, uniform_linear
 from companion.beams.array.geometry import uniform_rectangular as grid
 from companion.beams.worth import cone
-from companion.beams.worth.cone import Boxes, Cells, Cones
+from companion.beams.worth.cone import Boxes, Cells, DirectionCones
 from companion.values import FloatArray
 
 EYE = np.eye(3)
-GPP = Element(Pattern.TR38901)
-COSINE = Element(Pattern.COSINE, 1.5)
+GPP = Element(ElementPattern.TR38901)
+COSINE = Element(ElementPattern.COSINE, 1.5)
 SLANTED = np.outer(np.array([-2.0, -0.7, 0.1, 1.3, 1.9]), [0.004, 0.005, -0.003]) + 0.02
 ARRAYS = {
     "line": uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE),
@@ -73,7 +73,9 @@ def angle_rad(a: FloatArray, b: FloatArray) -> FloatArray:
     return found
 
 
-def drawn_cones(array: Array, bound_rad: float, seed: int, endfire: bool) -> tuple[Cones, Boxes]:
+def drawn_cones(
+    array: Array, bound_rad: float, seed: int, endfire: bool
+) -> tuple[DirectionCones, Boxes]:
     """One cone, in any direction or along the line of the elements, and its boxes, split or not."""
     rng = np.random.default_rng(seed)
     direction = anywhere(rng, 1)
@@ -86,13 +88,13 @@ def drawn_cones(array: Array, bound_rad: float, seed: int, endfire: bool) -> tup
     return cones, cone.split(cones, boxes) if seed % 2 else boxes
 
 
-def predicted_of(cones: Cones) -> FloatArray:
+def predicted_of(cones: DirectionCones) -> FloatArray:
     tilt_rad, (pole, aside, _) = cones.tilts_rad[0], cones.frames[0]
     predicted: FloatArray = math.cos(tilt_rad) * pole + math.sin(tilt_rad) * aside
     return predicted
 
 
-def whole(cones: Cones) -> Cones:
+def whole(cones: DirectionCones) -> DirectionCones:
     """With all columns, in which a direction can be compared."""
     return dataclasses.replace(cones, columns=np.arange(3))
 

@@ -9,7 +9,7 @@ import pytest
 from support import rounds
 
 from companion.beams.array import steering
-from companion.beams.array.elements import Element, Pattern
+from companion.beams.array.elements import Element, ElementPattern
 from companion.beams.array.geometry import Array, listed, uniform_circular
 from companion.beams.array.geometry import uniform_linear as line
 from companion.beams.array.geometry import uniform_rectangular as grid
@@ -19,8 +19,8 @@ from companion.beams.worth.patterns import half_power_beamwidths_rad
 from companion.values import ComplexArray, FloatArray
 
 EYE = np.eye(3)
-GPP = Element(Pattern.TR38901)
-COSINE = Element(Pattern.COSINE, 1.5)
+GPP = Element(ElementPattern.TR38901)
+COSINE = Element(ElementPattern.COSINE, 1.5)
 DRAWN = np.random.default_rng(8)
 SLANTED = np.outer(np.array([-2.0, -0.7, 0.1, 1.3, 1.9]), [0.004, 0.005, -0.003]) + 0.5
 ARRAYS = {

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from support import examples
 
 from companion.beams.array import steering
-from companion.beams.array.elements import Element, Pattern
+from companion.beams.array.elements import Element, ElementPattern
 from companion.beams.array.geometry import uniform_linear, uniform_rectangular
 from companion.beams.weights.precoding import Precoder, precode
 from companion.beams.worth.channel import (
@@ -88,14 +88,14 @@ def test_a_budget_that_is_none_is_refused(values: tuple[float, ...], name: str) 
 
 @settings(max_examples=examples(40))
 @given(st.integers(0, 1000), st.lists(st.integers(0, 2), min_size=1, max_size=6))
-def test_each_group_sends_the_whole_power_in_equal_streams(seed: int, turns: list[int]) -> None:
+def test_each_group_sends_the_whole_power_in_equal_streams(seed: int, slots: list[int]) -> None:
     rng = np.random.default_rng(seed)
-    weights = random_complex(rng, 5, len(turns)) * 10.0 ** rng.integers(-9, 9, len(turns))
-    groups = np.array(turns)
+    weights = random_complex(rng, 5, len(slots)) * 10.0 ** rng.integers(-9, 9, len(slots))
+    groups = np.array(slots)
     shared = share_power(weights, 3.0, groups)
     powers = np.sum(np.abs(shared) ** 2, axis=0)
-    for turn in set(turns):
-        mine = powers[groups == turn]
+    for slot in set(slots):
+        mine = powers[groups == slot]
         assert mine == pytest.approx(np.full(len(mine), 3.0 / len(mine)))
     # The directions of the columns are as they were.
     assert shared / np.sqrt(powers) == pytest.approx(weights / np.linalg.norm(weights, axis=0))
@@ -153,17 +153,17 @@ def test_it_is_what_a_receiver_measures_on_random_symbols() -> None:
 
 @settings(max_examples=examples(40))
 @given(st.integers(0, 1000), st.lists(st.integers(0, 2), min_size=1, max_size=6))
-def test_it_is_the_sum_written_out(seed: int, turns: list[int]) -> None:
+def test_it_is_the_sum_written_out(seed: int, slots: list[int]) -> None:
     rng = np.random.default_rng(seed)
-    users = len(turns)
+    users = len(slots)
     responses = random_complex(rng, users, users)
     gains = rng.uniform(0.1, 2.0, users)
-    found = sinr(responses, gains, 0.3, np.array(turns))
+    found = sinr(responses, gains, 0.3, np.array(slots))
     for i in range(users):
         rest = sum(
             gains[i] * abs(responses[i, j]) ** 2
             for j in range(users)
-            if j != i and turns[j] == turns[i]
+            if j != i and slots[j] == slots[i]
         )
         assert found[i] == pytest.approx(gains[i] * abs(responses[i, i]) ** 2 / (rest + 0.3))
     alone = sinr(responses, gains, 0.3, np.arange(users))
@@ -241,9 +241,9 @@ def test_interference_far_below_the_signal_is_not_rounded_away() -> None:
 def test_what_does_not_fit_is_refused(
     responses: tuple[int, int], gains: int, noise: float, groups: int | None, name: str
 ) -> None:
-    turns = None if groups is None else np.zeros(groups, dtype=np.int64)
+    slots = None if groups is None else np.zeros(groups, dtype=np.int64)
     with pytest.raises(ValueError, match=name):
-        sinr(np.ones(responses, dtype=complex), np.ones(gains), noise, turns)
+        sinr(np.ones(responses, dtype=complex), np.ones(gains), noise, slots)
 
 
 # --- spectral efficiency ------------------------------------------------------------------------
@@ -251,7 +251,7 @@ def test_what_does_not_fit_is_refused(
 
 def test_it_is_the_logarithm_to_two() -> None:
     assert spectral_efficiency(np.array([0.0, 1.0, 3.0, 1023.0])) == pytest.approx([0, 1, 2, 10])
-    assert float(spectral_efficiency(1.0, turns=4)) == pytest.approx(0.25)
+    assert float(spectral_efficiency(1.0, slots=4)) == pytest.approx(0.25)
     assert float(spectral_efficiency(1e-18)) == pytest.approx(1e-18 / math.log(2), abs=0)
 
 
@@ -265,8 +265,8 @@ def test_a_rate_that_is_none_is_refused() -> None:
     for ratio in (-0.1, math.nan):
         with pytest.raises(ValueError, match="SINR"):
             spectral_efficiency(np.array([1.0, ratio]))
-    with pytest.raises(ValueError, match="turns"):
-        spectral_efficiency(1.0, turns=0)
+    with pytest.raises(ValueError, match="slots"):
+        spectral_efficiency(1.0, slots=0)
 
 
 # --- what is shown ------------------------------------------------------------------------------
@@ -281,18 +281,18 @@ def sent(weights: ComplexArray, groups: IntArray | None = None) -> ComplexArray:
 def test_what_is_sent_is_the_matrix_that_is_delivered(
     normalisation: Normalisation, groups: IntArray | None
 ) -> None:
-    """Up to one factor for each turn; all of the power, or its share at the busiest element."""
+    """Up to one factor for each slot; all of the power, or its share at the busiest element."""
     rng = np.random.default_rng(1)
     weights = random_complex(rng, 8, 4) * np.array([1.0, 2.0, 0.1, 5.0])
     if normalisation is Normalisation.ANTENNA:
-        for turn in (0, 1):
-            now = np.zeros(4) == turn if groups is None else groups == turn
+        for slot in (0, 1):
+            now = np.zeros(4) == slot if groups is None else groups == slot
             if now.any():
                 busiest = np.sum(np.abs(weights[:, now]) ** 2, axis=1).max()
                 weights[:, now] /= np.sqrt(busiest * 8)
     found = transmitted(weights, 3.0, groups, normalisation)
-    for turn in (0, 1):
-        now = np.zeros(4) == turn if groups is None else groups == turn
+    for slot in (0, 1):
+        now = np.zeros(4) == slot if groups is None else groups == slot
         if not now.any():
             continue
         ratio = found[:, now] / weights[:, now]
@@ -343,12 +343,12 @@ def test_a_turn_of_its_own_has_the_whole_power_and_no_interference() -> None:
     close = in_plane(10.0, 10.5)
     weights = steering.steering_matrix(ARRAY, close).conj()
     at = np.array([100.0, 100.0])
-    turns = np.array([0, 1])
+    slots = np.array([0, 1])
     together = predicted_sinr_db(
         ARRAY, close, ranges_m=at, sent=sent(weights), groups=None, budget=BUDGET
     )
     apart = predicted_sinr_db(
-        ARRAY, close, ranges_m=at, sent=sent(weights, turns), groups=turns, budget=BUDGET
+        ARRAY, close, ranges_m=at, sent=sent(weights, slots), groups=slots, budget=BUDGET
     )
     alone = predicted_sinr_db(
         ARRAY, close[:1], ranges_m=at[:1], sent=sent(weights[:, :1]), groups=None, budget=BUDGET
@@ -360,7 +360,11 @@ def test_a_turn_of_its_own_has_the_whole_power_and_no_interference() -> None:
 
 def test_behind_the_elements_there_is_nothing() -> None:
     array = uniform_linear(
-        8, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3), element=Element(Pattern.COSINE)
+        8,
+        30e9,
+        spacing_wavelengths=0.5,
+        array_from_body=np.eye(3),
+        element=Element(ElementPattern.COSINE),
     )
     seen = in_plane(0.0, 180.0)
     f = np.ones((8, 2), dtype=complex)
@@ -392,12 +396,12 @@ def test_no_uavs_and_no_antennas() -> None:
 
 @settings(max_examples=examples(40))
 @given(st.integers(0, 2**32 - 1), st.booleans())
-def test_no_link_within_the_bounds_is_worse_than_the_least(seed: int, turns: bool) -> None:
+def test_no_link_within_the_bounds_is_worse_than_the_least(seed: int, slots: bool) -> None:
     """True directions and ranges anywhere in their bounds, against the worst of each together."""
     rng = np.random.default_rng(seed)
     bounds = rng.uniform(0.001, 0.03, 4)
     made = precode(steering.steering_matrix(ARRAY, APART), Precoder())
-    groups = np.array([0, 1, 0, 1]) if turns else np.zeros(4, dtype=np.int64)
+    groups = np.array([0, 1, 0, 1]) if slots else np.zeros(4, dtype=np.int64)
     gains_db = guaranteed_gains_db(ARRAY, APART, list(bounds), made.weights)
     known = [i for i, gain_db in enumerate(gains_db) if gain_db is not None]
     leaks = leakage_bounds(ARRAY, APART[known], list(bounds[known]), made.weights)
@@ -459,7 +463,7 @@ def test_the_least_is_attained_where_nothing_is_uncertain() -> None:
 
 
 def test_at_the_least_only_those_of_the_same_turn_are_heard_and_share_the_power() -> None:
-    """Three UAVs, the last in a turn of its own: the sums written out."""
+    """Three UAVs, the last in a slot of its own: the sums written out."""
     gains, leaks = np.array([40.0, 50.0]), np.array([[9.0, 3.0, 8.0], [7.0, 6.0, 9.0]])
     groups, users, at = np.array([0, 0, 1]), np.array([1, 2]), np.array([900.0, 500.0])
     powers_w = np.array([0.3, 0.7, 0.9])

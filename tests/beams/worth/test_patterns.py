@@ -14,7 +14,7 @@ from scipy.special import j0
 from support import examples
 
 from companion.beams.array import steering
-from companion.beams.array.elements import Element, Pattern
+from companion.beams.array.elements import Element, ElementPattern
 from companion.beams.array.geometry import (
     SPEED_OF_LIGHT_MPS,
     Array,
@@ -29,7 +29,7 @@ from companion.values import ComplexArray, FloatArray
 EYE = np.eye(3)
 BORESIGHT = np.array([1.0, 0.0, 0.0])
 SEEDS = st.integers(0, 2**32 - 1)
-TR38901 = Element(Pattern.TR38901)
+TR38901 = Element(ElementPattern.TR38901)
 
 
 def towards(azimuth_deg: float, elevation_deg: float) -> FloatArray:
@@ -130,7 +130,7 @@ def test_the_golden_steering_vector_gives_the_full_gain_and_no_more_anywhere() -
     assert math.degrees(azimuths[180:541][found[180:541].argmax()]) == pytest.approx(45)
 
 
-@given(SEEDS, st.sampled_from([Element(), TR38901, Element(Pattern.COSINE, 1.5)]))
+@given(SEEDS, st.sampled_from([Element(), TR38901, Element(ElementPattern.COSINE, 1.5)]))
 @settings(max_examples=examples(20), deadline=None)
 def test_no_weights_have_more_gain_than_the_matched_ones(seed: int, element: Element) -> None:
     rng = np.random.default_rng(seed)
@@ -158,7 +158,7 @@ def test_an_exact_null_is_finite() -> None:
         assert np.isfinite(found)
     assert patterns.response_db(array, np.array([1.0, -1.0 + 0j]), BORESIGHT) == patterns.FLOOR_DB
     behind = patterns.response_db(
-        line(3, element=Element(Pattern.COSINE)), np.ones(3, complex), -BORESIGHT
+        line(3, element=Element(ElementPattern.COSINE)), np.ones(3, complex), -BORESIGHT
     )
     assert behind == patterns.FLOOR_DB
 
@@ -264,7 +264,7 @@ def test_no_beamwidth_where_there_is_no_beam() -> None:
     # A line has no width upward; what faces ahead has no beam behind.
     assert patterns.half_power_beamwidths_rad(line(8), BORESIGHT)[1] is None
     assert patterns.half_power_beamwidths_rad(
-        line(8, element=Element(Pattern.COSINE)), -BORESIGHT
+        line(8, element=Element(ElementPattern.COSINE)), -BORESIGHT
     ) == (None, None)
     # Straight up every azimuth is the same place.
     ring = uniform_circular(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
@@ -276,8 +276,8 @@ def test_no_beamwidth_where_there_is_no_beam() -> None:
 def test_one_element_has_the_width_of_its_pattern() -> None:
     """12 (angle / 65)^2 dB is 3.01 dB; cos^3 is a half at 37.5 degrees; also over a pole."""
     expected = 65 * math.sqrt(10 * math.log10(2) / 3)
-    for mast in (line(1, element=TR38901), line(1, element=Element(Pattern.COSINE, 3.0))):
-        if mast.element.pattern is Pattern.COSINE:
+    for mast in (line(1, element=TR38901), line(1, element=Element(ElementPattern.COSINE, 3.0))):
+        if mast.element.pattern is ElementPattern.COSINE:
             expected = 2 * math.degrees(math.acos(0.5 ** (1 / 3)))
         found = patterns.half_power_beamwidths_rad(mast, BORESIGHT)
         assert np.degrees(np.array(found, float)) == pytest.approx(expected)
@@ -285,7 +285,7 @@ def test_one_element_has_the_width_of_its_pattern() -> None:
         np.zeros((1, 3)),
         30e9,
         array_from_body=EYE,
-        element=Element(Pattern.COSINE, 3.0),
+        element=Element(ElementPattern.COSINE, 3.0),
         lever_arm_m=None,
         outward=towards(70, 80)[np.newaxis],
     )

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support import rounds
 
-from companion.beams.array.elements import Element, Pattern
+from companion.beams.array.elements import Element, ElementPattern
 from companion.beams.array.geometry import Array, listed, uniform_circular
 from companion.beams.array.geometry import uniform_linear as line
 from companion.beams.array.geometry import uniform_rectangular as grid
@@ -17,7 +17,7 @@ from companion.beams.worth.guarantee import guaranteed_gains_db, leakage_bounds
 from companion.values import ComplexArray, FloatArray
 
 EYE = np.eye(3)
-GPP = Element(Pattern.TR38901)
+GPP = Element(ElementPattern.TR38901)
 AHEAD = np.array([[0.96, 0.28, 0.0], [0.8, -0.36, 0.48]])
 PHASE_RAD, GAIN_DB = math.radians(6.0), 0.7
 ARRAYS = {
@@ -28,7 +28,7 @@ ARRAYS = {
         frequency_hz=30e9,
         spacing_wavelengths=0.6,
         array_from_body=EYE,
-        element=Element(Pattern.COSINE, 1.5),
+        element=Element(ElementPattern.COSINE, 1.5),
     ),
     "circle": uniform_circular(12, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=GPP),
     "cloud": listed(

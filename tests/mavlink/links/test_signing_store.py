@@ -16,7 +16,7 @@ from support import HANG_S, line_of, started
 
 from companion.mavlink.links.signing_store import Timestamps, key_warning, load_key
 from companion.mavlink.links.urls import LinkError
-from companion.mavlink.trust.signing import EPOCH_NS, UNIT_NS, Guard, fingerprint
+from companion.mavlink.trust.signing import EPOCH_NS, UNIT_NS, LinkSigning, fingerprint
 from companion.mavlink.wire import encode
 from companion.mavlink.wire.framing import Splitter
 from companion.values import Frame, Reason, Source
@@ -30,7 +30,9 @@ NOW_NS = 1_790_000_000 * S
 
 def sent(t_ns: int, key: bytes = KEY, sysid: int = 1) -> Frame:
     """A signed heartbeat of that time."""
-    raw = Guard(key=key, link_id=0).sign(encode.pack(encode.heartbeat(Source(sysid, 1)), 0), t_ns)
+    raw = LinkSigning(key=key, link_id=0).sign(
+        encode.pack(encode.heartbeat(Source(sysid, 1)), 0), t_ns
+    )
     return framed(raw, t_ns)
 
 

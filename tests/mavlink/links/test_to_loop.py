@@ -9,7 +9,7 @@ from companion.mavlink.links import to_loop
 from companion.mavlink.links.to_loop import ToLoop
 
 CALLS = 20
-EACH_S = to_loop.TURN_S / 2
+EACH_S = to_loop.SLICE_S / 2
 
 
 def test_other_work_has_its_turn_among_many_calls() -> None:

@@ -15,7 +15,7 @@ from companion.mavlink.trust.signing import (
     FOLLOWED_MAX,
     LATEST,
     STREAMS_MAX,
-    Guard,
+    LinkSigning,
     State,
     fingerprint,
 )
@@ -81,8 +81,8 @@ def sent(
     )
 
 
-def guard(**changes: object) -> Guard:
-    return Guard(**({"key": KEY, "link_id": 9} | changes))  # type: ignore[arg-type]
+def guard(**changes: object) -> LinkSigning:
+    return LinkSigning(**({"key": KEY, "link_id": 9} | changes))  # type: ignore[arg-type]
 
 
 def stamp_of(raw: bytes) -> int:

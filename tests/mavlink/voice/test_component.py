@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import all as dialect
 from support import examples
 
 from companion.mavlink.clock.sender_clock import ClockKind, SenderClock
-from companion.mavlink.voice.component import HEARD, HELD_NS, Component, ComponentSpec
+from companion.mavlink.voice.component import HEARD, HELD_NS, ComponentSpec, ServiceComponent
 from companion.mavlink.wire.encode import Outgoing, pack
 from companion.mavlink.wire.framing import Splitter
 from companion.values import Frame, Notice, Reason, Rejection, RoundTrip, Severity, Source
@@ -30,9 +30,9 @@ TIMESYNC, HEARTBEAT = 111, 0
 Said = list[RoundTrip | Rejection | Notice]
 
 
-def component(**changed: Any) -> Component:
+def component(**changed: Any) -> ServiceComponent:
     values = {"source": OURS, "carrier": None, "position_hz": None, "attitude_hz": None}
-    return Component(ComponentSpec(**{**values, **changed}))
+    return ServiceComponent(ComponentSpec(**{**values, **changed}))
 
 
 def frame(t_ns: int, source: Source, message: Any, link: str = "a", *, v1: bool = False) -> Frame:
@@ -66,7 +66,7 @@ def addressed(t_ns: int, sent_ns: int, remote_ns: int, target: Source) -> Frame:
     return echo(t_ns, Outgoing(UAV, TIMESYNC, payload))
 
 
-def heard(node: Component, one: Frame) -> Said:
+def heard(node: ServiceComponent, one: Frame) -> Said:
     """What comes of a frame once nothing can contradict it any more."""
     settled = dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
     return node.hear(one) + node.hear(frame(one.t_ns + HELD_NS, GCS, settled))
@@ -76,7 +76,7 @@ def ticks(start_ns: int, seconds: float, every_ms: int = 100) -> Iterator[int]:
     return iter(range(start_ns, start_ns + round(seconds * S), every_ms * MS))
 
 
-def request(node: Component, now_ns: int) -> int:
+def request(node: ServiceComponent, now_ns: int) -> int:
     """``ts1`` of the TIMESYNC request that is due now."""
     (sent,) = (m for m, _ in node.due(now_ns, False, []) if m.msgid == TIMESYNC)
     (message,) = dialect.MAVLink(None).parse_buffer(pack(sent, 0))
@@ -115,7 +115,7 @@ def test_what_makes_sense() -> None:
 # --- heartbeat ----------------------------------------------------------------------------------
 
 
-def beats(node: Component, times: Iterator[int], fit: bool = True) -> list[int]:
+def beats(node: ServiceComponent, times: Iterator[int], fit: bool = True) -> list[int]:
     found = []
     for t_ns in times:
         for message, to in node.due(t_ns, fit, []):

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
 from support import examples
 
-from companion.mavlink.voice.component import Component, ComponentSpec
+from companion.mavlink.voice.component import ComponentSpec, ServiceComponent
 from companion.mavlink.voice.message_rates import MessageRates
 from companion.mavlink.voice.rate_watch import MessageRate, RateState, Request
 from companion.mavlink.wire.encode import Outgoing, pack
@@ -122,7 +122,7 @@ class World:
         carrier: Source | None = None,
         link: Link = lambda t_ns, raw: [(t_ns, raw)],
     ) -> None:
-        self.component = Component(
+        self.component = ServiceComponent(
             ComponentSpec(
                 source=OURS, carrier=carrier, position_hz=position_hz, attitude_hz=attitude_hz
             )

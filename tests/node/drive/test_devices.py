@@ -16,11 +16,11 @@ from device_stand_ins import CHIPS, Chip, iio_module, spidev_module
 from support import ROOT
 
 from companion.beams.hardware.calibration import Calibration
-from companion.beams.hardware.devices import Device
+from companion.beams.hardware.devices import Beamformer
 from companion.node import moment
 from companion.node.drive import targets
 from companion.node.drive.loop import DeviceError, Drive, Safe, Shot, SourceLostError, Takes
-from companion.node.drive.sources import Wanted, chosen, shot_of, stored_registers
+from companion.node.drive.sources import BeamRequest, chosen, shot_of, stored_registers
 from companion.pipeline import assembly
 from companion.settings.model import Settings
 from companion.values import UserError, WeightFormat
@@ -35,12 +35,12 @@ def flown() -> tuple[Shot, Any, str]:
     log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
     pipeline, update = moment.look([log], EIGHT, "3")
     equipment = assembly.equipment(EIGHT, pipeline.array)
-    wanted = Wanted(uavs=("3:1",), anybody=False, takes=Takes.REGISTERS)
+    wanted = BeamRequest(uavs=("3:1",), anybody=False, takes=Takes.REGISTERS)
     shot = shot_of(pipeline, equipment, update, wanted)
     text = weight_formats.encode(
         WeightFormat.ADAR1000, update.beams, pipeline, equipment, 0
     ).decode()
-    read = parse(Device.ADAR1000, text, Calibration.ideal(range(8)))
+    read = parse(Beamformer.ADAR1000, text, Calibration.ideal(range(8)))
     return shot, read, text
 
 
@@ -261,7 +261,7 @@ def test_a_phaser_s_memory_holds_the_codebook_and_an_update_names_a_beam(
     pipeline, update = moment.look([log], settings, "3")
     equipment = assembly.equipment(settings, pipeline.array)
     stored = stored_registers(pipeline.array, equipment)
-    wanted = Wanted(uavs=("3:1",), anybody=False, takes=Takes.STORED, stored_beams=32)
+    wanted = BeamRequest(uavs=("3:1",), anybody=False, takes=Takes.STORED, stored_beams=32)
     shot = shot_of(pipeline, equipment, update, wanted)
     told = beam_state.beams(pipeline, equipment, update, 0.0, 0.0)
     (beam,) = [one for one in told["beams"] if one["uav"] == "3:1"]
@@ -313,13 +313,15 @@ def test_beams_of_another_codebook_are_not_pointed_to() -> None:
     beam = dict.fromkeys(("bearing_deg", "above_horizon_deg", "lat_deg", "lon_deg", "alt_m"), 0.0)
     beam |= {"uav": "1:1", "codebook": {"best": 3}}
     told = {"unfit": None, "beams": [beam], "codebook_beams": 64}
-    fits = chosen(told, None, Wanted(uavs=(), anybody=True, takes=Takes.STORED, stored_beams=64), 0)
+    fits = chosen(
+        told, None, BeamRequest(uavs=(), anybody=True, takes=Takes.STORED, stored_beams=64), 0
+    )
     assert (fits.unfit, fits.stored) == (None, 3)
     for size, held in ((64, 32), (None, 32), (None, None)):
         shot = chosen(
             told | {"codebook_beams": size},
             None,
-            Wanted(uavs=(), anybody=True, takes=Takes.STORED, stored_beams=held),
+            BeamRequest(uavs=(), anybody=True, takes=Takes.STORED, stored_beams=held),
             0,
         )
         assert shot.unfit == "the service has another codebook, or none"
@@ -336,7 +338,9 @@ def test_a_mount_looks_at_the_middle_of_several(flown: tuple[Shot, Any, str]) ->
     mean = sum(
         np.array([np.cos(e) * np.cos(b), np.cos(e) * np.sin(b), np.sin(e)]) for b, e in angles
     )
-    wanted = Wanted(uavs=("9:9", "2:1", "1:1"), anybody=False, takes=Takes.POINTING, centre=True)
+    wanted = BeamRequest(
+        uavs=("9:9", "2:1", "1:1"), anybody=False, takes=Takes.POINTING, centre=True
+    )
     for shot in (shot_of(pipeline, equipment, update, wanted), chosen(told, None, wanted, 0)):
         assert shot.uav == "2:1+1:1"
         assert shot.bearing_rad == pytest.approx(np.arctan2(mean[1], mean[0]))
@@ -345,11 +349,11 @@ def test_a_mount_looks_at_the_middle_of_several(flown: tuple[Shot, Any, str]) ->
         seen = pipeline.local.position_ned_m(*shot.place)
         mid = np.mean([t.position_ned_m for t in update.tracks if t.uav in ("1:1", "2:1")], axis=0)
         np.testing.assert_allclose(seen, mid, atol=0.01)
-    everybody = Wanted(uavs=("1:1",), anybody=True, takes=Takes.POINTING, centre=True)
+    everybody = BeamRequest(uavs=("1:1",), anybody=True, takes=Takes.POINTING, centre=True)
     around = shot_of(pipeline, equipment, update, everybody)
     assert "they are all around" in (around.unfit or "")  # four on one circle
     with pytest.raises(UserError, match="only a mount looks at the centre"):
-        Wanted(uavs=(), anybody=True, takes=Takes.REGISTERS, centre=True)
+        BeamRequest(uavs=(), anybody=True, takes=Takes.REGISTERS, centre=True)
 
 
 @pytest.mark.parametrize(("lon_deg", "middle_deg"), [((179.9, -179.7), -179.9), ((7.0, 8.0), 7.5)])
@@ -368,7 +372,7 @@ def test_a_middle_is_between_also_at_the_edge_of_the_map(
         one | {"uav": "2:1", "bearing_deg": 20.0, "lon_deg": lon_deg[1]},
     ]
     told = {"unfit": None, "beams": beams, "codebook_beams": None}
-    wanted = Wanted(uavs=(), anybody=True, takes=Takes.POINTING, centre=True)
+    wanted = BeamRequest(uavs=(), anybody=True, takes=Takes.POINTING, centre=True)
     shot = chosen(told, None, wanted, 0)
     assert np.degrees(shot.bearing_rad) == pytest.approx(5.0)
     assert shot.place == pytest.approx((1.0, middle_deg, 5.0))
@@ -509,6 +513,6 @@ def test_who_is_not_in_the_device_s_table_has_nothing_applied() -> None:
     beam = dict.fromkeys(("bearing_deg", "above_horizon_deg", "lat_deg", "lon_deg", "alt_m"), 0.0)
     told = {"unfit": None, "beams": [beam | {"uav": "1:1"}], "codebook_beams": None}
     shot = chosen(
-        told, "the head of a table\n", Wanted(uavs=(), anybody=True, takes=Takes.REGISTERS), 0
+        told, "the head of a table\n", BeamRequest(uavs=(), anybody=True, takes=Takes.REGISTERS), 0
     )
     assert shot.unfit == "1:1 has no beam in the device's table"

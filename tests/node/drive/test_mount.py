@@ -17,7 +17,7 @@ from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
 from companion.node.drive.lag import MountLag
 from companion.node.drive.loop import DeviceError, Drive, Safe, Shot, Takes
 from companion.node.drive.rotctld import Rotator
-from companion.node.drive.sources import Wanted, shot_of
+from companion.node.drive.sources import BeamRequest, shot_of
 from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
@@ -135,7 +135,7 @@ def test_a_mount_is_off_by_half_of_what_one_is_that_follows_reports(
     settings = Settings().override(center={"source": "5:1"}, observer={"lag_s": (0.0, 0.0)})
     pipeline = Pipeline(settings)
     equipment = assembly.equipment(settings, pipeline.array)
-    wanted = Wanted(uavs=("1:1",), anybody=False, takes=Takes.POINTING)
+    wanted = BeamRequest(uavs=("1:1",), anybody=False, takes=Takes.POINTING)
 
     class Here:
         def ask(self, lead_s: float) -> Shot:

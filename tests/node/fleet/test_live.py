@@ -15,7 +15,7 @@ from companion.mavlink.links.zenoh_bus import open_peer
 from companion.mavlink.links.zenoh_config import BusConfig
 from companion.node.fleet import live, messages
 from companion.node.fleet.config import bus_config
-from companion.node.fleet.live import FleetNode
+from companion.node.fleet.live import LiveFleetNode
 from companion.node.fleet.traffic import Rate
 from companion.pipeline.fold import Pipeline
 from companion.settings.fleet import FleetSettings
@@ -32,10 +32,10 @@ def node(
     notify: Callable[[Notice], Any] = lambda notice: None,
     now: Callable[[], int] = lambda: 0,
     **settings: object,
-) -> FleetNode:
+) -> LiveFleetNode:
     pipeline = Pipeline(Settings().override(center={"source": "47,8,400"}))
     given = FleetSettings.model_validate({"node": "north", **settings})
-    return FleetNode(
+    return LiveFleetNode(
         settings=given, pipeline=pipeline, step=lambda event: None, notify=notify, now_ns=now
     )
 

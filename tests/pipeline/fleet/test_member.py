@@ -4,7 +4,7 @@ import struct
 
 from pymavlink.dialects.v20 import common
 
-from companion.pipeline.fleet.member import FORGET_NS, GONE_MAX, NODES_MAX, Member
+from companion.pipeline.fleet.member import FORGET_NS, GONE_MAX, NODES_MAX, FleetMember
 from companion.pipeline.fleet.trust import TIMES, UNHEARD_NS, Witness
 from companion.settings.fleet import FleetSettings
 from companion.values import Offer, Shared, SharedFrame, Standing
@@ -14,8 +14,8 @@ S = 1000 * MS
 START_NS = 1_800_000_000 * S
 
 
-def member(**settings: object) -> Member:
-    return Member(
+def member(**settings: object) -> FleetMember:
+    return FleetMember(
         name="a",
         settings=FleetSettings.model_validate({"node": "a", **settings}),
         elements=16,
@@ -148,7 +148,7 @@ def test_who_is_far_away_is_not_near_and_its_offers_are_not_kept() -> None:
 
 
 def answered(
-    node: Member, now_ns: int, ahead_s: float, started_ns: int, times: int = 3
+    node: FleetMember, now_ns: int, ahead_s: float, started_ns: int, times: int = 3
 ) -> list[str]:
     """Answers of a node whose clock is so much behind, 4 ms apart; what was said of them."""
     notices = []

@@ -8,7 +8,7 @@ from support import ROOT
 
 from companion.beams.worth import link_budget
 from companion.node.replay import log_events
-from companion.pipeline.fleet.member import Member
+from companion.pipeline.fleet.member import FleetMember
 from companion.pipeline.fleet.offers import Offers
 from companion.pipeline.fleet.surroundings import Surroundings
 from companion.pipeline.fold import Pipeline
@@ -21,14 +21,14 @@ SETTINGS = Settings().override(center={"source": "5:1"})
 
 
 @pytest.fixture(scope="module")
-def flown() -> tuple[Pipeline, Member, int]:
+def flown() -> tuple[Pipeline, FleetMember, int]:
     """A pipeline after some seconds of flight, what its node heard, and the time."""
     pipeline = Pipeline(SETTINGS)
     begun_ns, member = None, None
     for event in log_events([ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"], SETTINGS):
         if begun_ns is None or member is None:
             begun_ns = event.t_ns
-            member = Member(
+            member = FleetMember(
                 name="a",
                 settings=FleetSettings(node="a"),
                 elements=pipeline.array.size,
@@ -42,7 +42,9 @@ def flown() -> tuple[Pipeline, Member, int]:
     raise AssertionError
 
 
-def test_an_offer_is_worth_its_gain_over_the_range(flown: tuple[Pipeline, Member, int]) -> None:
+def test_an_offer_is_worth_its_gain_over_the_range(
+    flown: tuple[Pipeline, FleetMember, int],
+) -> None:
     pipeline, member, now_ns = flown
     offers = Offers(pipeline, member.hearing.silent_s)
     for _ in range(4):
@@ -64,7 +66,7 @@ def test_an_offer_is_worth_its_gain_over_the_range(flown: tuple[Pipeline, Member
 
 
 def test_it_hears_as_far_as_the_farthest_that_it_hears_now(
-    flown: tuple[Pipeline, Member, int],
+    flown: tuple[Pipeline, FleetMember, int],
 ) -> None:
     pipeline, member, now_ns = flown
     around = Surroundings(pipeline, member)

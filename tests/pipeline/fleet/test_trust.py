@@ -2,14 +2,25 @@
 
 from collections import Counter
 
-from companion.pipeline.fleet.trust import ASIDE_NS, TIMES, UNHEARD_NS, Told, Trust, Witness
+from companion.pipeline.fleet.trust import (
+    ASIDE_NS,
+    TIMES,
+    UNHEARD_NS,
+    Trust,
+    UnconfirmedVehicle,
+    Witness,
+)
 
 S = 1_000_000_000
 HERE = Witness((0.0, 0.0, 0.0), 1000.0, frozenset({"1:1"}))
 
 
 def look(
-    trust: Trust, told: list[Told], witnesses: dict[str, Witness], seconds: int, others: int = 0
+    trust: Trust,
+    told: list[UnconfirmedVehicle],
+    witnesses: dict[str, Witness],
+    seconds: int,
+    others: int = 0,
 ) -> list[str]:
     said = []
     for second in range(seconds):
@@ -36,7 +47,10 @@ def test_one_contradiction_is_none_and_several_are() -> None:
 
 def test_vehicles_that_nobody_else_can_hear_put_their_node_aside() -> None:
     trust = Trust()
-    phantoms = [Told("66:1", "b", (300.0, 0.0, 0.0)), Told("67:1", "b", (0.0, 400.0, 0.0))]
+    phantoms = [
+        UnconfirmedVehicle("66:1", "b", (300.0, 0.0, 0.0)),
+        UnconfirmedVehicle("67:1", "b", (0.0, 400.0, 0.0)),
+    ]
     far = Witness((5000.0, 0.0, 0.0), 1000.0, frozenset())  # it can say nothing
     said = look(trust, phantoms, {"a": HERE, "c": far}, UNHEARD_NS // S + 2)
     assert len(said) == 1
@@ -46,7 +60,7 @@ def test_vehicles_that_nobody_else_can_hear_put_their_node_aside() -> None:
 
 def test_one_hidden_vehicle_is_unconfirmed_and_no_lie() -> None:
     trust = Trust()
-    hidden = [Told("66:1", "b", (300.0, 0.0, 0.0))]
+    hidden = [UnconfirmedVehicle("66:1", "b", (300.0, 0.0, 0.0))]
     (said,) = look(trust, hidden, {"a": HERE}, 60)
     assert "node b tells of 66:1, where nobody else hears one: hidden, or made up" in said
     assert trust.unconfirmed == {"66:1"}
@@ -56,7 +70,7 @@ def test_one_hidden_vehicle_is_unconfirmed_and_no_lie() -> None:
 def test_a_few_among_many_are_said_and_their_node_is_believed() -> None:
     """A team behind a building is heard by the node beside it alone."""
     trust = Trust()
-    hidden = [Told(f"6{n}:1", "b", (100.0 + n, 0.0, 0.0)) for n in range(4)]
+    hidden = [UnconfirmedVehicle(f"6{n}:1", "b", (100.0 + n, 0.0, 0.0)) for n in range(4)]
     (said,) = look(trust, hidden, {"a": HERE}, 60, others=6)
     assert "60:1, 61:1, 62:1, 63:1" in said
     assert trust.believes("b")
@@ -64,9 +78,9 @@ def test_a_few_among_many_are_said_and_their_node_is_believed() -> None:
 
 def test_who_is_far_away_or_was_heard_before_is_no_phantom() -> None:
     trust = Trust()
-    far = [Told(f"6{n}:1", "b", (900.0 + n, 0.0, 0.0)) for n in range(5)]
+    far = [UnconfirmedVehicle(f"6{n}:1", "b", (900.0 + n, 0.0, 0.0)) for n in range(5)]
     assert look(trust, far, {"a": HERE}, 60) == []
-    near = [Told(f"6{n}:1", "b", (100.0 + n, 0.0, 0.0)) for n in range(5)]
+    near = [UnconfirmedVehicle(f"6{n}:1", "b", (100.0 + n, 0.0, 0.0)) for n in range(5)]
     heard = Witness((0.0, 0.0, 0.0), 1000.0, frozenset(one.uav for one in near))
     assert look(trust, near, {"a": HERE, "c": heard}, 60) == []
     assert look(trust, near, {"b": HERE}, 60) == []  # nobody is its own witness

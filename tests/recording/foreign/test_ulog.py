@@ -32,7 +32,7 @@ def test_every_value_is_that_of_pyulog() -> None:
     }  # they are nested
     compared = 0
     for topic in walked.topics:
-        ours = ulog.Table(data, topic)
+        ours = ulog.UlogTable(data, topic)
         if not len(ours):
             continue
         expected = theirs.get_dataset(topic.name, topic.instance).data

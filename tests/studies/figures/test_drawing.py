@@ -4,11 +4,11 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from companion.studies.figures.drawing import Drawing, Line, Words, svg
+from companion.studies.figures.drawing import Drawing, Line, TextLabel, svg
 
 
 def test_svg_says_what_is_drawn() -> None:
-    words = (Words(x=30, y=20, text="a < b & c", anchor="end", size=11.0, colour="#555555"),)
+    words = (TextLabel(x=30, y=20, text="a < b & c", anchor="end", size=11.0, colour="#555555"),)
     text = svg(
         Drawing(
             width=60,

@@ -46,7 +46,7 @@ def test_the_page_and_its_figures_are_there(found: tuple[Path, dict[str, Any]]) 
 
 def test_the_same_again_is_the_same(found: tuple[Path, dict[str, Any]]) -> None:
     _, answer = found
-    asked = study.Asked(sizes=((2, 8),), seconds=2.0)
+    asked = study.FleetStudy(sizes=((2, 8),), seconds=2.0)
     (again,) = study.answer(asked, list(study.run(asked, lambda: 0.0)), "")["sizes"]
     before = answer["sizes"][0] | {"cpu_share": 0.0}
     assert again == before
@@ -61,7 +61,11 @@ def test_a_span_that_is_none_is_said(span: str, tmp_path: Path) -> None:
 
 def test_a_sample_of_the_reports_counts_for_all() -> None:
     all_of_them, half = (
-        next(study.run(study.Asked(sizes=((2, 8),), seconds=1.0, loss=0.0, sampled=n), lambda: 0.0))
+        next(
+            study.run(
+                study.FleetStudy(sizes=((2, 8),), seconds=1.0, loss=0.0, sampled=n), lambda: 0.0
+            )
+        )
         for n in (8, 4)
     )
     assert half.told_kbps["heard"] == pytest.approx(all_of_them.told_kbps["heard"], rel=0.3)

@@ -9,12 +9,12 @@ from support import examples
 
 from companion.settings.fleet import FleetSettings
 from companion.studies.fleet.sky import Sky
-from companion.studies.fleet.world import HEADER_BYTES, Counted, World
+from companion.studies.fleet.world import HEADER_BYTES, FleetCounts, World
 
 SETTINGS = FleetSettings(node="any")
 
 
-def shares(counted: Counted) -> tuple[float, float, float]:
+def shares(counted: FleetCounts) -> tuple[float, float, float]:
     """Shares of one, several, and no node."""
     found = counted.served, counted.twice, counted.unserved
     return tuple(one / sum(found) for one in found)  # type: ignore[return-value]
@@ -23,7 +23,7 @@ def shares(counted: Counted) -> tuple[float, float, float]:
 def settled(sky: Sky, told: FleetSettings = SETTINGS) -> World:
     world = World(sky, told)
     world.run(8)
-    world.counted = Counted()
+    world.counted = FleetCounts()
     return world
 
 
@@ -78,7 +78,7 @@ def test_parted_nobody_is_unserved_and_it_heals(
     _, _, none = shares(world.counted)
     assert none == 0
     world.parted = lambda one, other: False
-    world.counted = Counted()
+    world.counted = FleetCounts()
     world.run(SETTINGS.lease_s + 2 * delay_s)
     assert shares(world.counted)[2] == 0
     handed = {uav for one in world.members.values() for uav in one.duties.handing}
@@ -103,7 +103,7 @@ def test_what_a_node_is_told_does_not_grow_with_a_fleet_that_spreads() -> None:
         sky = Sky(nodes=nodes, uavs=2 * nodes, spacing_m=9000.0, sampled=2 * nodes, report_hz=1.0)
         world = World(sky, SETTINGS)
         world.run(5)
-        world.counted = Counted()
+        world.counted = FleetCounts()
         world.run(2)
         once, _, none = shares(world.counted)
         assert once >= 0.99
@@ -116,7 +116,7 @@ def test_what_a_node_is_told_does_not_grow_with_a_fleet_that_spreads() -> None:
 def test_what_is_told_arrives_with_its_heads() -> None:
     world = World(Sky(nodes=3, uavs=10, spacing_m=400.0, loss=0.0, sampled=5), SETTINGS)
     world.run(3)
-    world.counted = Counted()
+    world.counted = FleetCounts()
     world.sky = replace(world.sky, delay_s=0.0)
     world.run(1)
     for what, samples in world.counted.samples.items():

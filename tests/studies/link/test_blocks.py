@@ -7,7 +7,7 @@ from companion.studies.link import coding, level, modulation, ofdm
 from companion.studies.link.blocks import (
     BLOCK_BITS,
     CODED_BITS,
-    Counted,
+    BlockErrors,
     Estimation,
     noise,
     receive,
@@ -95,7 +95,7 @@ def test_error_rates_over_white_noise_are_those_of_theory() -> None:
     the noise; coded, 1e-3 is reached at 5.3 dB, where commpy's own modem and decoder on 200 blocks
     of 306 bits gave 2.0e-3 at 5.0 dB and 4.7e-4 at 5.5 dB: too slow to be done again here."""
     setting = LinkStudy(snr_db=(4, 16, 1), blocks=40)
-    counts: dict[tuple[str, float], list[Counted]] = {}
+    counts: dict[tuple[str, float], list[BlockErrors]] = {}
     channels = {AWGN: np.eye(4, dtype=complex)[np.newaxis]}
     for number in range(12):
         for key, counted in exchange(setting, channels, np.random.default_rng([6, number])):

@@ -14,7 +14,7 @@ from companion.settings.model import Settings
 from companion.studies.link import channel, ofdm
 from companion.studies.link.channel import Scattering
 from companion.studies.link.level import uav_array
-from companion.studies.link.scenario import Instant, Positions
+from companion.studies.link.scenario import Instant, PositionSource
 from companion.values import ComplexArray, FloatArray
 
 SIGHT = Scattering(math.inf)
@@ -28,13 +28,13 @@ def seen_at(azimuths: FloatArray) -> FloatArray:
 def instant(off_deg: float = 0.0) -> Instant:
     """Four UAVs apart; predicted and held positions off by so much and twice that."""
     off = np.radians(off_deg)
-    kinds = zip(Positions, (0.0, off, 2 * off), strict=True)
+    kinds = zip(PositionSource, (0.0, off, 2 * off), strict=True)
     return Instant(0.0, {kind: seen_at(AZIMUTHS + by) for kind, by in kinds})
 
 
-def heard(seen: Instant, by: Positions, scattering: Scattering = SIGHT) -> ComplexArray:
+def heard(seen: Instant, by: PositionSource, scattering: Scattering = SIGHT) -> ComplexArray:
     array, own = assembly.array(Settings()), uav_array(Settings())
-    truly = seen.towards[Positions.PERFECT]
+    truly = seen.towards[PositionSource.PERFECT]
     rows = channel.draw(scattering, array, own, truly, np.random.default_rng(3))
     sent = channel.weights(array, seen, by, Precoder())
     return channel.responses(rows, sent, channel.alone(array, own, truly))
@@ -42,8 +42,10 @@ def heard(seen: Instant, by: Positions, scattering: Scattering = SIGHT) -> Compl
 
 def test_zero_forcing_by_the_truth_leaves_no_interference() -> None:
     """And costs each UAV its loss factor, against 1 for a beam on it alone."""
-    (amplitudes,) = heard(instant(), Positions.PERFECT)
-    steering = steering_matrix(assembly.array(Settings()), instant().towards[Positions.PERFECT])
+    (amplitudes,) = heard(instant(), PositionSource.PERFECT)
+    steering = steering_matrix(
+        assembly.array(Settings()), instant().towards[PositionSource.PERFECT]
+    )
     solved = solve(steering)
     assert solved is not None
     assert np.abs(amplitudes.diagonal()) == pytest.approx(solved.loss_factors**-0.5)
@@ -51,7 +53,9 @@ def test_zero_forcing_by_the_truth_leaves_no_interference() -> None:
 
 
 def test_beams_that_miss_interfere() -> None:
-    (near,), (far,) = (heard(instant(0.1), by) for by in (Positions.PREDICTED, Positions.HELD))
+    (near,), (far,) = (
+        heard(instant(0.1), by) for by in (PositionSource.PREDICTED, PositionSource.HELD)
+    )
     stray = [np.abs(one[~np.eye(4, dtype=bool)]).max() for one in (near, far)]
     assert 1e-3 < stray[0] < stray[1]
 
@@ -87,8 +91,10 @@ def test_all_delays_stay_within_the_prefix() -> None:
 
 
 def test_a_policy_that_does_not_serve_all_is_refused() -> None:
-    close = replace(instant(), towards=dict.fromkeys(Positions, seen_at(np.radians([0.0, 0.1]))))
+    close = replace(
+        instant(), towards=dict.fromkeys(PositionSource, seen_at(np.radians([0.0, 0.1])))
+    )
     for policy in ("group", "drop"):
         precoder = assembly.precoder(Settings().override(beams={"policy": policy}))
         with pytest.raises(ValueError, match=f"policy = '{policy}'"):
-            channel.weights(assembly.array(Settings()), close, Positions.PERFECT, precoder)
+            channel.weights(assembly.array(Settings()), close, PositionSource.PERFECT, precoder)

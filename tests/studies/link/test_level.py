@@ -19,7 +19,7 @@ from companion.settings.model import Settings
 from companion.studies.link import channel, figures
 from companion.studies.link.channel import Scattering
 from companion.studies.link.level import LinkStudy, simulate, snrs
-from companion.studies.link.scenario import Positions, Reports, Scenario, circles
+from companion.studies.link.scenario import PositionSource, Reports, Scenario, circles
 
 
 @pytest.fixture(scope="module")
@@ -33,15 +33,18 @@ def test_errors_that_noise_does_not_make_are_interference(scenario: Scenario) ->
     setting = LinkStudy(snr_db=(80, 80, 1), blocks=3, scattering=Scattering(math.inf))
     counts = simulate(setting, scenario)
     errors = {
-        kind: np.array([each.raw_errors for each in counts[kind.value, 80]]) for kind in Positions
+        kind: np.array([each.raw_errors for each in counts[kind.value, 80]])
+        for kind in PositionSource
     }
-    assert not errors[Positions.PERFECT].any()
-    few, many = (np.mean(errors[kind] > 0) for kind in (Positions.PREDICTED, Positions.HELD))
+    assert not errors[PositionSource.PERFECT].any()
+    few, many = (
+        np.mean(errors[kind] > 0) for kind in (PositionSource.PREDICTED, PositionSource.HELD)
+    )
     assert few < 0.1 and many > 0.5
     precoder = assembly.precoder(Settings())
-    for seen, wrong in zip(scenario.instants, errors[Positions.HELD], strict=True):
-        truly = seen.towards[Positions.PERFECT]
-        sent = channel.weights(scenario.array, seen, Positions.HELD, precoder)
+    for seen, wrong in zip(scenario.instants, errors[PositionSource.HELD], strict=True):
+        truly = seen.towards[PositionSource.PERFECT]
+        sent = channel.weights(scenario.array, seen, PositionSource.HELD, precoder)
         power = np.abs(steering_matrix(scenario.array, truly).T @ sent) ** 2
         ratio = power.diagonal() / (power.sum(axis=1) - power.diagonal())
         assert not wrong[ratio > 100].any()

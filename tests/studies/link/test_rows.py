@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.studies.link.blocks import Counted
+from companion.studies.link.blocks import BlockErrors
 from companion.studies.link.rows import crossing_db, interval, row
 
 
@@ -26,8 +26,8 @@ def test_intervals() -> None:
 def test_a_row_by_hand() -> None:
     """Two instants of one UAV and two blocks each."""
     counted = [
-        Counted(np.array([[0, 9]]), np.array([[0, 3]]), np.array([[0.01, 0.04]])),
-        Counted(np.array([[1, 0]]), np.array([[0, 0]]), np.array([[0.04, 0.04]])),
+        BlockErrors(np.array([[0, 9]]), np.array([[0, 3]]), np.array([[0.01, 0.04]])),
+        BlockErrors(np.array([[1, 0]]), np.array([[0, 0]]), np.array([[0.04, 0.04]])),
     ]
     plain, coded = (row("held", 3.0, how, counted, 6.4e-6) for how in (False, True))
     assert (plain["ber"], plain["bler"], plain["n_bits"]) == (10 / 3744, 0.5, 3744)

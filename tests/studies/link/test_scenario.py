@@ -7,7 +7,7 @@ from companion.beams.array.steering import steering_matrix
 from companion.beams.weights.zero_forcing import solve
 from companion.pipeline import assembly
 from companion.settings.model import Settings
-from companion.studies.link.scenario import PAPER, Positions, Reports, Scenario, circles
+from companion.studies.link.scenario import PAPER, PositionSource, Reports, Scenario, circles
 from companion.studies.prediction.pointing import angles_deg
 from sitl_replay.flight.motion import Circle as Flown
 
@@ -35,8 +35,8 @@ def test_perfect_is_the_truth_and_held_is_as_late_as_its_report(scenario: Scenar
         for i, circle in enumerate(PAPER):
             was = np.array([circle.at(seen.t_s - age_s)[0] for age_s in ages_s])
             was /= np.linalg.norm(was, axis=1)[:, None]
-            assert seen.towards[Positions.PERFECT][i] == pytest.approx(was[0])
-            held = np.tile(seen.towards[Positions.HELD][i], (len(was), 1))
+            assert seen.towards[PositionSource.PERFECT][i] == pytest.approx(was[0])
+            held = np.tile(seen.towards[PositionSource.HELD][i], (len(was), 1))
             age_s = ages_s[np.argmin(angles_deg(held, was))]
             assert 0.058 <= age_s <= 0.212
 
@@ -44,20 +44,20 @@ def test_perfect_is_the_truth_and_held_is_as_late_as_its_report(scenario: Scenar
 def test_prediction_points_within_the_beam(scenario: Scenario) -> None:
     off = {
         kind: np.concatenate([
-            angles_deg(seen.towards[kind], seen.towards[Positions.PERFECT])
+            angles_deg(seen.towards[kind], seen.towards[PositionSource.PERFECT])
             for seen in scenario.instants
         ])
-        for kind in Positions
+        for kind in PositionSource
     }  # fmt: skip
-    assert off[Positions.PREDICTED].max() < 1.0
-    assert np.median(off[Positions.PREDICTED]) < 0.1 * np.median(off[Positions.HELD])
+    assert off[PositionSource.PREDICTED].max() < 1.0
+    assert np.median(off[PositionSource.PREDICTED]) < 0.1 * np.median(off[PositionSource.HELD])
 
 
 def test_what_the_array_cannot_tell_apart_is_left_out(scenario: Scenario) -> None:
     """A line array sees its front and its back alike: seldom three decibels are lost for it."""
     array = assembly.array(Settings())
     for seen in scenario.instants:
-        solved = solve(steering_matrix(array, seen.towards[Positions.PERFECT]))
+        solved = solve(steering_matrix(array, seen.towards[PositionSource.PERFECT]))
         assert solved is not None and solved.loss_factors.max() <= 10**0.3
     assert 0.02 < scenario.unresolved_share < 0.4
     with pytest.raises(ValueError, match="can hardly ever tell the circling UAVs apart"):

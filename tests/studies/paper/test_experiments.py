@@ -17,8 +17,8 @@ from pymavlink.dialects.v20 import common  # the oracle: tests alone may import 
 
 from companion.studies.paper import circles as scenario
 from companion.studies.paper import claims, link, mavlink
-from companion.studies.paper.circles import Flight, PaperScenario
-from companion.studies.paper.claims import Claim, Verdict
+from companion.studies.paper.circles import PaperFlight, PaperScenario
+from companion.studies.paper.claims import Claim, ClaimVerdict
 from companion.tracking.design import closed_form
 
 LEVELS = ("L = 0.39", "L = 0.60", "L = 0.76")
@@ -37,7 +37,7 @@ def answer(made: Path) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def flight() -> Flight:
+def flight() -> PaperFlight:
     return scenario.fly(PaperScenario())
 
 
@@ -123,7 +123,7 @@ def test_every_figure_of_the_paper_is_held_against_ours(answer: dict[str, Any], 
 # --- the scenario and its bounds ----------------------------------------------------------------
 
 
-def test_the_flight_is_the_one_written_out_step_by_step(flight: Flight) -> None:
+def test_the_flight_is_the_one_written_out_step_by_step(flight: PaperFlight) -> None:
     """By complex numbers and a loop: north + j east."""
     for uav, radius in enumerate((100, 150, 200, 250)):
         phase = uav * math.pi / 2
@@ -148,7 +148,7 @@ def test_the_other_reading_of_the_gust_is_a_velocity() -> None:
 
 
 @pytest.mark.parametrize("gain", [0.3, 0.39, 0.6, 0.76, 0.9])
-def test_the_estimate_is_what_the_matrices_give(flight: Flight, gain: float) -> None:
+def test_the_estimate_is_what_the_matrices_give(flight: PaperFlight, gain: float) -> None:
     """The stacked observer, X^ = Q X^ + L Y, as 8 x 8 matrices."""
     tracked = scenario.track(flight, gain)
     q, big_l = (1 - gain) * np.eye(8), gain * np.eye(8)
@@ -162,7 +162,7 @@ def test_the_estimate_is_what_the_matrices_give(flight: Flight, gain: float) -> 
 
 @pytest.mark.parametrize("gain", [0.2, 0.3, 0.39, 0.6, 0.76, 0.95])
 def test_every_error_stays_below_the_running_bound_and_that_below_the_others(
-    flight: Flight, gain: float
+    flight: PaperFlight, gain: float
 ) -> None:
     tracked = scenario.track(flight, gain)
     errors = scenario.stacked(tracked.estimate_m - flight.position_m)
@@ -216,7 +216,7 @@ def test_a_scheduled_gain_keeps_its_bound_on_irregular_intervals() -> None:
     assert found.scheduled_s <= found.gamma_s < found.fixed_s
 
 
-def test_angle_errors_do_not_know_where_north_is(flight: Flight) -> None:
+def test_angle_errors_do_not_know_where_north_is(flight: PaperFlight) -> None:
     turned = np.array([[0.0, 1.0], [-1.0, 0.0]])
     off = np.degrees(scenario.angle_errors_rad(flight, flight.position_m @ turned))
     assert off == pytest.approx(np.full_like(off, 90.0))
@@ -225,7 +225,7 @@ def test_angle_errors_do_not_know_where_north_is(flight: Flight) -> None:
 # --- the link and the service -------------------------------------------------------------------
 
 
-def test_a_beam_that_points_right_is_worth_shannon(flight: Flight) -> None:
+def test_a_beam_that_points_right_is_worth_shannon(flight: PaperFlight) -> None:
     """One UAV alone: 64 elements, 4 antennas, 30 dBm, free space, by hand."""
     place = np.array([[[120.0, 40.0]]])
     array = link.line(64)
@@ -238,7 +238,7 @@ def test_a_beam_that_points_right_is_worth_shannon(flight: Flight) -> None:
     assert blocked == pytest.approx(math.log2(1 + 64 * 4 * loss / noise_w / 10**2.5))
 
 
-def test_places_between_the_steps_are_on_the_way(flight: Flight) -> None:
+def test_places_between_the_steps_are_on_the_way(flight: PaperFlight) -> None:
     step = flight.scenario.dt_s
     found = link.between(flight, flight.position_m, np.array([0.0, 0.5, 1.0, 1.5]) * step)
     first, second, third = flight.position_m[:3]
@@ -254,8 +254,8 @@ def test_the_blockages_are_the_same_for_every_scheme(answer: dict[str, Any]) -> 
         assert all(rate <= best for rate, best in zip(found, means["optimum"], strict=True))
 
 
-def test_the_same_seed_gives_the_same_rates(flight: Flight) -> None:
-    short = Flight(
+def test_the_same_seed_gives_the_same_rates(flight: PaperFlight) -> None:
+    short = PaperFlight(
         scenario=flight.scenario,
         position_m=flight.position_m[:12],
         input_mps=flight.input_mps[:11],
@@ -281,7 +281,7 @@ def test_the_service_agrees_with_the_library(answer: dict[str, Any]) -> None:
     assert found["settled_m"] < 0.02
 
 
-def test_the_frames_are_what_pymavlink_reads(flight: Flight) -> None:
+def test_the_frames_are_what_pymavlink_reads(flight: PaperFlight) -> None:
     parser = common.MAVLink(None)
     data = b"".join(mavlink.frames(flight)[:3])
     messages = parser.parse_buffer(data)
@@ -304,36 +304,36 @@ def test_every_claim_is_backed_by_its_number(answer: dict[str, Any]) -> None:
         value = claims.lookup(answer, row["key"])
         assert row["value"] == value
         assert row["found"] == claim.found.format(value=value) != claim.found
-        if row["verdict"] != Verdict.HOLDS:
+        if row["verdict"] != ClaimVerdict.HOLDS:
             assert row["correction"]
 
 
 VERDICTS = {
-    "designs/0/printed_sign_eigenvalue": Verdict.CORRECTED,
-    "scenario/feedthrough_matrix_rows": Verdict.CORRECTED,
-    "levels/L = 0.39/error_over_gamma_bound": Verdict.HOLDS,
-    "levels/L = 0.60/error_over_gamma_bound": Verdict.HOLDS,
-    "levels/L = 0.76/error_over_gamma_bound": Verdict.HOLDS,
-    "designs/0/feasible_gain": Verdict.CORRECTED,
-    "levels/L = 0.39/angle_error_deg": Verdict.FAILS,
-    "levels/L = 0.39/gamma_s": Verdict.CORRECTED,
-    "alphas/least_step_down": Verdict.HOLDS,
-    "scenario/farthest_m": Verdict.HOLDS,
-    "limits/0.05/off_s": Verdict.HOLDS,
-    "limits/0.25/off_s": Verdict.HOLDS,
-    "limits/1/off_s": Verdict.HOLDS,
-    "unknown_input/L = 0.76/b0_in_scenario": Verdict.HOLDS,
-    "unknown_input/L = 0.76/b0_adversary": Verdict.FAILS,
-    "irregular/fixed_over_gamma": Verdict.CORRECTED,
-    "array/arccos_error_deg": Verdict.CORRECTED,
-    "array/opposite_sines_apart": Verdict.CORRECTED,
-    "array/conjugated_response_max": Verdict.CORRECTED,
-    "array/zero_forcing_over_3_db_share": Verdict.CORRECTED,
-    "scenario/input_sup_mps": Verdict.CORRECTED,
-    "array/sizes/64/half_power_deg": Verdict.HOLDS,
-    "waveform/most_bit_s_hz": Verdict.CORRECTED,
-    "blockage/gain_over_echo_bit_s_hz/optimum": Verdict.HOLDS,
-    "blockage/gain_over_echo_bit_s_hz/L = 0.39": Verdict.FAILS,
+    "designs/0/printed_sign_eigenvalue": ClaimVerdict.CORRECTED,
+    "scenario/feedthrough_matrix_rows": ClaimVerdict.CORRECTED,
+    "levels/L = 0.39/error_over_gamma_bound": ClaimVerdict.HOLDS,
+    "levels/L = 0.60/error_over_gamma_bound": ClaimVerdict.HOLDS,
+    "levels/L = 0.76/error_over_gamma_bound": ClaimVerdict.HOLDS,
+    "designs/0/feasible_gain": ClaimVerdict.CORRECTED,
+    "levels/L = 0.39/angle_error_deg": ClaimVerdict.FAILS,
+    "levels/L = 0.39/gamma_s": ClaimVerdict.CORRECTED,
+    "alphas/least_step_down": ClaimVerdict.HOLDS,
+    "scenario/farthest_m": ClaimVerdict.HOLDS,
+    "limits/0.05/off_s": ClaimVerdict.HOLDS,
+    "limits/0.25/off_s": ClaimVerdict.HOLDS,
+    "limits/1/off_s": ClaimVerdict.HOLDS,
+    "unknown_input/L = 0.76/b0_in_scenario": ClaimVerdict.HOLDS,
+    "unknown_input/L = 0.76/b0_adversary": ClaimVerdict.FAILS,
+    "irregular/fixed_over_gamma": ClaimVerdict.CORRECTED,
+    "array/arccos_error_deg": ClaimVerdict.CORRECTED,
+    "array/opposite_sines_apart": ClaimVerdict.CORRECTED,
+    "array/conjugated_response_max": ClaimVerdict.CORRECTED,
+    "array/zero_forcing_over_3_db_share": ClaimVerdict.CORRECTED,
+    "scenario/input_sup_mps": ClaimVerdict.CORRECTED,
+    "array/sizes/64/half_power_deg": ClaimVerdict.HOLDS,
+    "waveform/most_bit_s_hz": ClaimVerdict.CORRECTED,
+    "blockage/gain_over_echo_bit_s_hz/optimum": ClaimVerdict.HOLDS,
+    "blockage/gain_over_echo_bit_s_hz/L = 0.39": ClaimVerdict.FAILS,
 }
 """The verdict on each claim, by the number that decides it."""
 
@@ -342,13 +342,13 @@ def test_the_verdicts(answer: dict[str, Any]) -> None:
     assert {row["key"]: row["verdict"] for row in answer["claims"]} == VERDICTS
     by_statement = {row["statement"]: row["verdict"] for row in answer["claims"]}
     for part, verdict in (
-        ("last diagonal block +P", Verdict.CORRECTED),
-        ("ΔT = 0.89", Verdict.HOLDS),
-        ("3γ sup‖W‖ bounds", Verdict.FAILS),
-        ("arccos", Verdict.CORRECTED),
-        ("N × 2N", Verdict.CORRECTED),
-        ("exceed echo probing", Verdict.HOLDS),
-        ("paper's own gain", Verdict.FAILS),
+        ("last diagonal block +P", ClaimVerdict.CORRECTED),
+        ("ΔT = 0.89", ClaimVerdict.HOLDS),
+        ("3γ sup‖W‖ bounds", ClaimVerdict.FAILS),
+        ("arccos", ClaimVerdict.CORRECTED),
+        ("N × 2N", ClaimVerdict.CORRECTED),
+        ("exceed echo probing", ClaimVerdict.HOLDS),
+        ("paper's own gain", ClaimVerdict.FAILS),
     ):
         assert [by_statement[one] for one in by_statement if part in one] == [verdict]
 
@@ -359,8 +359,8 @@ def test_another_number_is_another_verdict(answer: dict[str, Any]) -> None:
     answer["limits"]["0.25"]["off_s"] = 0.01
     answer["blockage"]["gain_over_echo_bit_s_hz"]["optimum"] = -0.1
     changed = {row["key"]: row["verdict"] for row in claims.judge(answer)}
-    assert changed["limits/0.25/off_s"] == Verdict.FAILS
-    assert changed["blockage/gain_over_echo_bit_s_hz/optimum"] == Verdict.FAILS
+    assert changed["limits/0.25/off_s"] == ClaimVerdict.FAILS
+    assert changed["blockage/gain_over_echo_bit_s_hz/optimum"] == ClaimVerdict.FAILS
 
 
 @pytest.mark.parametrize("key", ["limits", "limits/2", "designs/99/alpha", "command", "command/x"])

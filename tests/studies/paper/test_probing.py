@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from support import examples
 
 from companion.beams.array import steering
-from companion.beams.array.elements import Element, Pattern
+from companion.beams.array.elements import Element, ElementPattern
 from companion.beams.array.geometry import (
     Array,
     uniform_circular,
@@ -102,7 +102,7 @@ def test_what_weakens_the_echo() -> None:
         30e9,
         spacing_wavelengths=0.5,
         array_from_body=np.eye(3),
-        element=Element(Pattern.COSINE),
+        element=Element(ElementPattern.COSINE),
     )
     seen = echo_snr(probing, BUDGET, patch, directions=in_plane(0.0, math.pi), ranges_m=at)
     assert seen == pytest.approx([near * 4.0**2, 0.0])  # 2 (q + 1) = 4, both ways
@@ -111,7 +111,11 @@ def test_what_weakens_the_echo() -> None:
 
 
 CIRCLE = uniform_circular(
-    16, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3), element=Element(Pattern.COSINE)
+    16,
+    30e9,
+    spacing_wavelengths=0.5,
+    array_from_body=np.eye(3),
+    element=Element(ElementPattern.COSINE),
 )
 
 
@@ -132,7 +136,11 @@ def test_alignment_is_the_gain_lost_by_pointing_off(array: Array) -> None:
 def test_a_beam_is_at_half_power_at_its_half_width() -> None:
     assert alignment(LINE, in_plane(0.0), in_plane(HALF_BEAM_RAD)) == pytest.approx([0.5], abs=0.01)
     patch = uniform_linear(
-        8, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3), element=Element(Pattern.COSINE)
+        8,
+        30e9,
+        spacing_wavelengths=0.5,
+        array_from_body=np.eye(3),
+        element=Element(ElementPattern.COSINE),
     )
     assert alignment(patch, in_plane(0.0), in_plane(math.pi)).tolist() == [0.0]
 
@@ -173,7 +181,9 @@ def test_the_error_is_what_the_best_receiver_has() -> None:
     assert drawn.std() == pytest.approx(measured.std(), rel=0.1)
 
 
-@pytest.mark.parametrize("element", [Element(), Element(Pattern.TR38901)], ids=["same", "3gpp"])
+@pytest.mark.parametrize(
+    "element", [Element(), Element(ElementPattern.TR38901)], ids=["same", "3gpp"]
+)
 def test_the_error_of_any_array_is_the_inverse_of_its_information(element: Element) -> None:
     """Fisher information by numerical derivatives of the snapshot, amplitude and phase unknown."""
     array = uniform_circular(

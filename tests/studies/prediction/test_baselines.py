@@ -15,7 +15,7 @@ from companion.studies.prediction.baselines import (
     DeadReckoning,
     DeadReckoningOnArrival,
     Hold,
-    Observed,
+    ObservedReport,
     Predicted,
     Predictor,
 )
@@ -46,9 +46,9 @@ def observed(
     velocity: ArrayLike | None = None,
     late_s: float = 0.0,
     offset_s: float = 0.0,
-) -> Observed:
+) -> ObservedReport:
     """A report, ``late_s`` on its way, the sender's timeline ``offset_s`` behind the node's."""
-    return Observed(
+    return ObservedReport(
         arrival_ns=round((sent_s + late_s) * S),
         sent_ns=round(sent_s * S),
         sender_ns=round((sent_s - offset_s) * S),
@@ -57,7 +57,7 @@ def observed(
     )
 
 
-def straight(sent_s: float, late_s: float = 0.0) -> Observed:
+def straight(sent_s: float, late_s: float = 0.0) -> ObservedReport:
     """A report of a straight flight."""
     return observed(sent_s, P0 + V0 * sent_s, V0, late_s)
 
@@ -69,7 +69,7 @@ def ask(predictor: Predictor, now_s: float, lead_s: float = 0.0) -> Predicted:
     return predicted
 
 
-def wandering(n: int, seed: int = 5, late_s: float = 0.0) -> list[Observed]:
+def wandering(n: int, seed: int = 5, late_s: float = 0.0) -> list[ObservedReport]:
     """Irregular reports of nothing in particular; every third is without velocity."""
     rng = np.random.default_rng(seed)
     times = np.cumsum(rng.uniform(0.05, 1.5, n))
@@ -182,7 +182,7 @@ def test_model_is_the_integral_of_the_noise(states: int) -> None:
     assert kalman.transition(states, interval_s) == pytest.approx(moved)
 
 
-def least_squares(reports: Sequence[Observed], states: int, tuning: Tuning) -> FloatArray:
+def least_squares(reports: Sequence[ObservedReport], states: int, tuning: Tuning) -> FloatArray:
     """The last state (n, 3) by one weighted least-squares fit of all states to everything known.
 
     Each line says: these states, so combined, are this, give or take one standard deviation.

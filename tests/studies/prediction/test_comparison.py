@@ -19,10 +19,10 @@ from companion.cli.main import main
 from companion.pipeline import assembly
 from companion.settings.model import Settings
 from companion.studies.prediction import pointing, report
-from companion.studies.prediction.baselines import Observed, Predicted
+from companion.studies.prediction.baselines import ObservedReport, Predicted
 from companion.studies.prediction.comparison import (
     LEADS_S,
-    Compared,
+    LogComparison,
     PredictionStudy,
     as_true,
     compare,
@@ -146,7 +146,7 @@ class Witness:
     def __init__(self) -> None:
         self.arrived: list[int] = []
 
-    def report(self, report: Observed) -> None:
+    def report(self, report: ObservedReport) -> None:
         self.arrived.append(report.arrival_ns)
 
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
@@ -400,14 +400,14 @@ def test_the_page_needs_nothing_else(cut_log: Path, tmp_path: Path) -> None:
         assert f"<td>{name}</td>" in text
 
 
-def compared(log: str, link: RadioLink, angles: dict[str, list[float | None]]) -> Compared:
+def compared(log: str, link: RadioLink, angles: dict[str, list[float | None]]) -> LogComparison:
     """One UAV, 10 answers at each lead of 0, 1, ... seconds, with these angles."""
     rows = tuple(
         {"predictor": name, "lead_s": float(lead_s), "n": 10, "angle_rms_deg": angle}
         for name, of_leads in angles.items()
         for lead_s, angle in enumerate(of_leads)
     )
-    return Compared(log=log, center="5:1", link=link, rows=rows, tuned={})
+    return LogComparison(log=log, center="5:1", link=link, rows=rows, tuned={})
 
 
 def test_the_figure_shows_every_angle_and_tells_predictors_apart() -> None:

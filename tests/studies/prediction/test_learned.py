@@ -12,7 +12,7 @@ torch = pytest.importorskip("torch", reason="PyTorch (the extra [learned]) is no
 
 from companion.cli.main import main  # noqa: E402
 from companion.studies.prediction import learned, made_up  # noqa: E402
-from companion.studies.prediction.baselines import DeadReckoning, Observed, Predictor  # noqa: E402
+from companion.studies.prediction.baselines import DeadReckoning, ObservedReport, Predictor  # noqa: E402
 from companion.studies.prediction.delivery import deliver  # noqa: E402
 from companion.studies.prediction.windows import REPORTS  # noqa: E402
 
@@ -75,10 +75,10 @@ def test_it_has_learned_more_than_straight_flight(trained: Path) -> None:
     assert np.sqrt(np.mean(ours**2)) < 0.85 * np.sqrt(np.mean(straight**2))
 
 
-def observed(made_s: float, position: list[float], velocity: list[float] | None) -> Observed:
+def observed(made_s: float, position: list[float], velocity: list[float] | None) -> ObservedReport:
     t_ns = round(made_s * S)
     speed = None if velocity is None else np.array(velocity, dtype=float)
-    return Observed(
+    return ObservedReport(
         arrival_ns=t_ns,
         sent_ns=t_ns,
         sender_ns=t_ns,

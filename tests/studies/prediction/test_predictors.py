@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from companion.settings.model import Settings
-from companion.studies.prediction.baselines import Observed
+from companion.studies.prediction.baselines import ObservedReport
 from companion.studies.prediction.kalman import Kalman
 from companion.studies.prediction.predictors import MANOEUVRE_S, known_tuning
 
@@ -40,7 +40,7 @@ def test_a_filter_of_known_noise_against_one_written_out() -> None:
     for t_s, (p, v) in zip(times_s, measured, strict=True):
         t_ns = round(t_s * S)
         ours.report(
-            Observed(
+            ObservedReport(
                 arrival_ns=t_ns,
                 sent_ns=t_ns,
                 sender_ns=t_ns,

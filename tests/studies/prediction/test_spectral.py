@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import examples
 
-from companion.beams.array.elements import Element, Pattern
+from companion.beams.array.elements import Element, ElementPattern
 from companion.pipeline import assembly
 from companion.settings.model import Settings
 from companion.studies.prediction import spectral
@@ -84,7 +84,7 @@ def test_many_are_the_mean_of_each() -> None:
 
 def test_where_no_element_radiates_nothing_is_given() -> None:
     """Behind: the beam that would be formed there is none."""
-    ahead_only = replace(ARRAY, element=Element(Pattern.COSINE, 1.0))
+    ahead_only = replace(ARRAY, element=Element(ElementPattern.COSINE, 1.0))
     assert spectral.gains(ahead_only, direction(180), direction(0)) == pytest.approx([0.0])
     assert spectral.loss_bps_hz(ahead_only, direction(180), direction(0), 20) == pytest.approx(
         math.log2(101)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from support import examples
 
 from companion.studies.prediction import made_up
-from companion.studies.prediction.baselines import Observed
+from companion.studies.prediction.baselines import ObservedReport
 from companion.studies.prediction.delivery import deliver
 from companion.studies.prediction.windows import (
     FEATURES,
@@ -15,7 +15,7 @@ from companion.studies.prediction.windows import (
     REPORTS,
     SPEED_UNIT_MPS,
     WAY_UNIT_M,
-    Recent,
+    RecentReports,
 )
 
 S = 1_000_000_000
@@ -26,11 +26,11 @@ def report(
     position: list[float] | np.ndarray,
     velocity: list[float] | np.ndarray | None,
     arrived_ns: int | None = None,
-) -> Observed:
+) -> ObservedReport:
     """Made and arrived on one timeline, the sender's 5 s behind it."""
     place = np.array(position, dtype=float)
     speed = None if velocity is None else np.array(velocity, dtype=float)
-    return Observed(
+    return ObservedReport(
         arrival_ns=arrived_ns or made_ns,
         sent_ns=made_ns,
         sender_ns=made_ns - 5 * S,
@@ -39,8 +39,8 @@ def report(
     )
 
 
-def seen(*reports: Observed) -> np.ndarray:
-    recent = Recent()
+def seen(*reports: ObservedReport) -> np.ndarray:
+    recent = RecentReports()
     for each in reports:
         recent.add(each)
     return recent.window().seen
@@ -74,7 +74,7 @@ def test_neither_place_nor_north_nor_order_matters(seed: int, turn: float) -> No
 
 
 def test_the_last_reports_are_kept() -> None:
-    recent = Recent()
+    recent = RecentReports()
     for k in range(REPORTS + 5):
         assert recent.add(report((k + 1) * S, [k, 0, 0], [1, 0, 0]))
     assert len(recent.window().seen) == REPORTS

@@ -1,4 +1,4 @@
-"""Beams that stay: shapes change at their pace, names and turns not at every update."""
+"""Beams that stay: shapes change at their pace, names and slots not at every update."""
 
 import itertools
 import math
@@ -6,10 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from companion.beams import steady
+from companion.beams import hysteresis
 from companion.beams.aim import aim
 from companion.beams.array.geometry import Array, uniform_linear, uniform_rectangular
-from companion.beams.steady import Steady
+from companion.beams.hysteresis import Steady
 from companion.beams.weights.precoding import Precoder
 from companion.values import BeamSet, Carrier, Limits, Method, Policy, Track, TrackState, Widen
 
@@ -78,7 +78,7 @@ def flown(
                 before=state,
             )
         )
-        state = steady.after(state, found[-1])
+        state = hysteresis.after(state, found[-1])
     return found
 
 
@@ -166,15 +166,15 @@ def test_beams_go_on_after_any_pause(stopped_s: float) -> None:
         valid_at_ns=0,
         shaped={"1:1": (0.01, 0.2)},
         filled_ns={},
-        turns={"1:1": 0},
+        slots={"1:1": 0},
         known=frozenset({"1:1"}),
-        turned_ns=0,
+        slots_since_ns=0,
         inexact_ns=None,
     )
     wanted = np.array([[0.05, 0.3]])
     at_ns = round(stopped_s * 1e9)
     for then_ns in (at_ns, -at_ns):
         assert np.array_equal(
-            steady.followed_rad(before, then_ns, ["1:1"], wanted_rad=wanted, natural_rad=0.1),
+            hysteresis.followed_rad(before, then_ns, ["1:1"], wanted_rad=wanted, natural_rad=0.1),
             wanted,
         )

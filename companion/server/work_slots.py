@@ -1,4 +1,4 @@
-"""Work for requests off the event loop: few at once, some in wait, and the rest is refused."""
+"""Slots for work off the event loop: few run at once, some wait, and the rest is refused."""
 
 import asyncio
 from collections.abc import Callable
@@ -8,14 +8,14 @@ from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
 AT_ONCE: Final = 2
-"""Requests that compute at a time; each takes its turns at the interpreter from the links."""
-WAITING: Final = 64  # requests that wait for their turn; a second's work
+"""Requests that compute at a time; each takes interpreter time from the links."""
+WAITING: Final = 64  # requests that wait for a slot; one second of work
 
 T = TypeVar("T")
 
 
-class Turns:
-    """One for a node. A request that finds too many before it is told to come again (503)."""
+class WorkSlots:
+    """Work slots of one node. A request beyond the queue is refused with status 503."""
 
     def __init__(self, at_once: int = AT_ONCE, waiting: int = WAITING) -> None:
         self._free = asyncio.Semaphore(at_once)
@@ -27,7 +27,7 @@ class Turns:
             raise HTTPException(503, "too many ask at once", {"retry-after": "1"})
 
     async def run(self, work: Callable[[], T]) -> T:
-        """Do the work on another thread, in turn. Raises ``HTTPException`` 503."""
+        """Do the work on another thread when a slot is free. Raises ``HTTPException`` 503."""
         self.refuse_if_full()
         self._room -= 1
         try:

@@ -1,7 +1,7 @@
-"""What keeps beams steady: their shapes, method and turns follow what is known, but not at once.
+"""What keeps beams steady: their shapes, method and slots follow what is known, but not at once.
 
 A report changes what is known of a UAV from one moment to the next, by a factor over a slow radio.
-A beam's shape follows at a limited pace. A method and a set of turns are kept for a while after
+A beam's shape follows at a limited pace. A method and a set of slots are kept for a while after
 they were chosen, unless they no longer do. The state is that of the last tick of the pipeline.
 """
 
@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from companion.beams.weights.grouping import Turns
+from companion.beams.weights.grouping import PreviousSlots
 from companion.values import Beam, BeamSet, Cause, FloatArray, Method
 
 PACE: Final = 3.0  # most by which the angles of a shape grow or shrink in a second, as a factor
@@ -39,7 +39,7 @@ LEAST_WIDTHS: Final = 0.25
 """Angle in natural widths that shapes nothing: where growth by factors begins."""
 MOST_WIDTHS: Final = 16.0
 """Angle beyond which a bound shapes nothing more: what is not followed need not be left again."""
-KEPT_NS: Final = 500_000_000  # time for which a method and turns are kept
+KEPT_NS: Final = 500_000_000  # time for which a method and slots are kept
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,24 +53,24 @@ class Steady:
     valid_at_ns: int  # for when they were made
     shaped: Mapping[str, tuple[float, float]]
     filled_ns: Mapping[str, int]
-    turns: Mapping[str, int]  # the turn of each UAV; those left out are missing
+    slots: Mapping[str, int]  # the slot of each UAV; those left out are missing
     known: frozenset[str]  # the UAVs that could have a beam
-    turned_ns: int  # since when these UAVs have had these turns
+    slots_since_ns: int  # since when these UAVs have had these slots
     inexact_ns: int | None  # when last a UAV did not lie in all nulls; None: never
 
 
 def after(before: Steady | None, made: BeamSet) -> Steady:
     """The state once these beams were made."""
-    turns = {beam.uav: beam.group for beam in made.beams}
-    same = before is not None and before.turns == turns
+    slots = {beam.uav: beam.group for beam in made.beams}
+    same = before is not None and before.slots == slots
     inexact_ns = None if before is None else before.inexact_ns
     return Steady(
         valid_at_ns=made.valid_at_ns,
         shaped={beam.uav: (beam.shaped_likely_rad, beam.shaped_bound_rad) for beam in made.beams},
         filled_ns={beam.uav: _filled_ns(before, beam, made.valid_at_ns) for beam in made.beams},
-        turns=turns,
-        known=frozenset(turns) | {out.uav for out in made.left_out if out.cause is Cause.CROWDED},
-        turned_ns=before.turned_ns if before is not None and same else made.valid_at_ns,
+        slots=slots,
+        known=frozenset(slots) | {out.uav for out in made.left_out if out.cause is Cause.CROWDED},
+        slots_since_ns=before.slots_since_ns if before is not None and same else made.valid_at_ns,
         inexact_ns=inexact_ns if made.exact else made.valid_at_ns,
     )
 
@@ -118,15 +118,15 @@ def followed_rad(
     return followed
 
 
-def turns(before: Steady | None, valid_at_ns: int, uavs: list[str]) -> Turns | None:
-    """The turns of these UAVs before, and whether it is too early to leave them.
+def slots(before: Steady | None, valid_at_ns: int, uavs: list[str]) -> PreviousSlots | None:
+    """The slots of these UAVs before, and whether it is too early to leave them.
 
-    None if there were other UAVs. The turn of one that was left out is -1.
+    None if there were other UAVs. The slot of one that was left out is -1.
     """
     if before is None or before.known != frozenset(uavs):
         return None
-    numbers = np.array([before.turns.get(uav, -1) for uav in uavs])
-    return Turns(numbers, valid_at_ns - before.turned_ns < KEPT_NS)
+    numbers = np.array([before.slots.get(uav, -1) for uav in uavs])
+    return PreviousSlots(numbers, valid_at_ns - before.slots_since_ns < KEPT_NS)
 
 
 def named(before: Steady | None, valid_at_ns: int, method: Method, exact: bool) -> Method:

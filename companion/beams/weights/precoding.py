@@ -1,8 +1,9 @@
 """Weights from steering vectors: zero forcing, and what is done where it costs too much.
 
-UAV i receives y_i = h_i a(u_i)^T F s + noise. With A = [a(u_1) ... a(u_N)], (M, N),
+UAV i receives y_i = h_i a(u_i)^T F s + noise (docs/math.md 7, paper eq. (1)). With A = [a(u_1) ...
+a(u_N)], (M, N),
 
-    zero forcing (ZF)        F = A* (A^T A*)^-1           A^T F = I
+    zero forcing (ZF)        F = A* (A^T A*)^-1           A^T F = I       paper eq. (7)
     regularised (RZF)        F = A* (A^T A* + x I)^-1 D   D: so that A^T F has a unit diagonal
     maximum ratio (MRT)      F = A* D
 

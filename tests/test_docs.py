@@ -135,7 +135,39 @@ def headings(page: str) -> set[str]:
 @pytest.mark.parametrize("page", ["math.md", "field-notes.md"])
 def test_every_section_that_is_cited_exists(page: str) -> None:
     there, cited = headings(page), set()
+    one = r"\d+(?:\.\d+)?"
     for path in CODE:
-        text = re.sub(r"\s*\n\s*#?\s*", " ", path.read_text(encoding="utf-8"))
-        cited |= set(re.findall(rf"docs/{re.escape(page)}[ ,]+(?:section )?(\d+(?:\.\d+)?)", text))
+        for listed in re.findall(
+            rf"docs/{re.escape(page)}[ ,]+(?:section )?({one}(?:(?:,| and) {one})*)",
+            unwrapped(path),
+        ):
+            cited |= set(re.findall(one, listed))
     assert cited <= there, cited - there
+
+
+def test_every_equation_of_the_paper_that_is_cited_is_in_the_mathematics() -> None:
+    there = equations(DOCS / "math.md")
+    for path in CODE:
+        assert equations(path) <= there, path
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "tracking/observers/position.py", "tracking/observers/kinematic.py",
+        "tracking/design/closed_form.py", "tracking/design/lmi.py", "beams/array/steering.py",
+        "beams/weights/zero_forcing.py", "beams/weights/precoding.py", "beams/worth/channel.py",
+    ],
+)  # fmt: skip
+def test_the_code_of_the_method_cites_its_equations(path: str) -> None:
+    assert equations(ROOT / "companion" / path)
+
+
+def equations(path: Path) -> set[str]:
+    """The numbers of the paper's equations that a file cites."""
+    return set(re.findall(r"paper eq\. \((\d+)\)", unwrapped(path)))
+
+
+def unwrapped(path: Path) -> str:
+    """The text of a file, its comments and paragraphs on one line."""
+    return re.sub(r"\s*\n\s*#?\s*", " ", path.read_text(encoding="utf-8"))

@@ -53,7 +53,7 @@ def layers_for(
     options = {"center": {"source": center_of(logs, center)}}
     recorded = read_settings(logs[0]) if config is None else None
     if recorded:
-        settings = Settings.from_recording(recorded, str(logs[0]))
+        settings = Settings.from_recording(recorded.text, str(logs[0]), recorded.files)
         origins = changed(settings, Origin("recording", str(logs[0])))
         return settings.override(**options), {**origins, **of_options(options)}
     settings, origins = layered(config, options)
@@ -66,7 +66,7 @@ def layers_for(
 
 def writer_for(logs: Sequence[Path], settings: Settings, out: Path | None) -> Writer:
     """A recording of the replay: at ``out``, else in the settings' directory or ``recordings/``."""
-    kept = settings.recording
+    complete, kept = embedded(settings), settings.recording
     first_ns = next(read_flight(logs)).t_ns
     where = out or Path(kept.directory or "recordings")
     weights_hz = None if kept.weights_hz == "all" else kept.weights_hz
@@ -74,7 +74,8 @@ def writer_for(logs: Sequence[Path], settings: Settings, out: Path | None) -> Wr
     versions = {"companion": companion.__version__}
     return Writer(
         where=where,
-        settings_toml=embedded(settings).to_toml(),
+        settings_toml=complete.to_toml(),
+        files=complete.files,
         versions=versions,
         weights_hz=weights_hz,
         started_ns=first_ns,

@@ -462,6 +462,7 @@ class Service:
         return Writer(
             where=where,
             settings_toml=self._settings.to_toml(),
+            files=self._settings.files,
             versions={"companion": companion.__version__},
             weights_hz=None if kept.weights_hz == "all" else kept.weights_hz,
             started_ns=self.pipeline.utc_ns(

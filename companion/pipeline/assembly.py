@@ -22,14 +22,8 @@ from companion.beams.worth.link_budget import LinkBudget
 from companion.mavlink.clock.estimates import ClockAssumptions
 from companion.mavlink.clock.sender_clock import SenderClock
 from companion.pipeline import elements
-from companion.settings.files import (
-    calibration_text,
-    codebook_file,
-    coupling_file,
-    kinematic_design,
-    unit_text,
-)
-from companion.settings.model import Settings
+from companion.settings.files import kinematic_design, matrix_of, text_of
+from companion.settings.model import CALIBRATION, CODEBOOK, COUPLING, UNIT, Settings
 from companion.settings.section import ConfigError
 from companion.tracking.gate import GateSettings
 from companion.tracking.limits import LIMITS, Airframe, airframe, lag_s
@@ -60,7 +54,7 @@ def array(settings: Settings) -> geometry.Array:
             raise ConfigError(f"array.dead: {dead[-1]} of {size} elements from 0, not all of them")
         live = np.ones(size, dtype=bool)
         live[dead] = False
-    coupling = coupling_file(settings)
+    coupling = matrix_of(settings, COUPLING)
     if coupling is not None:
         if coupling.shape != (size, size) or not np.isfinite(coupling).all():
             shape = f"{coupling.shape} for {size} elements"
@@ -93,7 +87,7 @@ def calibration(settings: Settings, size: int) -> Calibration | None:
 
     Raises ``ConfigError``.
     """
-    text = calibration_text(settings)
+    text = text_of(settings, CALIBRATION)
     try:
         found = None if text is None else calibration_at(text, settings.array.frequency_hz)
     except UserError as error:
@@ -153,14 +147,14 @@ def equipment(settings: Settings, antenna: geometry.Array) -> Equipment:
     try:
         if kept.kind == "dft":
             codebook = codebooks.dft(antenna, kept.oversampling)
-        elif kept.kind == "file":
-            codebook = codebooks.listed(codebook_file(settings), antenna)
+        elif (listed := matrix_of(settings, CODEBOOK)) is not None:
+            codebook = codebooks.listed(listed, antenna)
     except ConfigError:
         raise
     except UserError as error:
         raise ConfigError(f"codebook: {error}") from error
     device = None if settings.hardware.device is None else Beamformer(settings.hardware.device)
-    text = unit_text(settings)
+    text = text_of(settings, UNIT)
     try:
         gains = RELATIVE if text is None else parse_unit_gains(text)
     except UserError as error:

@@ -1,8 +1,8 @@
 """Verdicts on the links to all UAVs, and the notices when one changes.
 
 Once a second the gain that each beam surely has, and the one that it likely has, is held against
-what the link needs. Links are judged in batches, one at each update, so that no update is delayed by
-all of them. A verdict changes only once it has been another for a while, and not for a hair's
+what the link needs. Links are judged in batches, one at each update, so that no update is delayed
+by all of them. A verdict changes only once it has been another for a while, and not for a hair's
 breadth, so that it does not flap.
 """
 

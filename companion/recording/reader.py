@@ -14,7 +14,7 @@ import os
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import IO, Final, Literal, cast
+from typing import IO, Final, Literal, NamedTuple, cast
 
 from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Metadata
@@ -26,12 +26,14 @@ from companion.recording.errors import LogError
 from companion.recording.foreign import capture, kinds, together
 from companion.recording.foreign.together import Vehicle
 from companion.recording.writer import SETTINGS, SUMMARY
+from companion.settings.model import NAMED_FILES
 from companion.values import Event, Frame, Reason, Rejection, Source, Tick, Tock
 
 __all__ = ["LogError", "LogKind", "center_of", "flights", "log_kind", "read_flight", "read_log",
            "read_parts", "read_settings", "utc_offset_ns", "vehicles"]  # fmt: skip
 
 LogKind = Literal["tlog", "mavlink", "mcap", "foreign-mcap", "capture", "dataflash", "ulog", "csv"]
+ATTACHMENTS: Final = frozenset(file.attachment for file in NAMED_FILES)
 _MAPPED_BYTES: Final = 1 << 26
 """Size from which on a log is left to the system's pages rather than read into memory."""
 _LATEST_NS: Final = 1 << 62
@@ -150,14 +152,26 @@ def read_parts(paths: Sequence[Path]) -> Iterator[Event]:
     return chain.from_iterable(map(_recorded, paths))
 
 
-def read_settings(path: Path) -> str | None:
-    """The settings (TOML) with which a recording was made; None where the log has none."""
+class RecordedSettings(NamedTuple):
+    """The settings with which a recording was made."""
+
+    text: str  # TOML
+    files: dict[str, bytes]  # files that they name, by the names of their attachments
+
+
+def read_settings(path: Path) -> RecordedSettings | None:
+    """The settings with which a recording was made; None where the log has none."""
     if log_kind(path) != "mcap":
         return None
+    files: dict[str, bytes] = {}
     for content in Walk(path, frozenset()):
-        if isinstance(content, Attachment) and content.name == SETTINGS:
+        if not isinstance(content, Attachment):
+            continue
+        if content.name in ATTACHMENTS:
+            files.setdefault(content.name, content.data)
+        if content.name == SETTINGS:
             try:
-                return content.data.decode()
+                return RecordedSettings(content.data.decode(), files)
             except UnicodeDecodeError:
                 raise LogError(f"{path}: its settings are not UTF-8 text") from None
     return None

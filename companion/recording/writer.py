@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from io import BufferedWriter
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final, Self
 
 from companion.recording import schemas
@@ -26,6 +27,14 @@ FILE_MODE: Final = 0o640
 FOLDER_MODE: Final = 0o750
 ACTIVE: Final = ".active"
 SETTINGS: Final = "settings.toml"
+NO_FILES: Final[Mapping[str, bytes]] = MappingProxyType({})
+MEDIA_TYPES: Final = {
+    ".toml": "application/toml",
+    ".json": "application/json",
+    ".csv": "text/csv",
+    ".npy": "application/x-npy",
+}
+"""Media types of attachments, by the endings of their names."""
 VERSIONS: Final = "versions"
 SUMMARY: Final = "summary"
 
@@ -67,6 +76,7 @@ class Writer:
                        where that is taken; or, when the name ends in ``.mcap``, the file itself,
                        which replaces one of that name on ``close``
         settings_toml  the settings, attached to the file
+        files          files that the settings name, attached before them; by attachment
         versions       versions of programs, as a metadata record
         weights_hz     as for ``Encoder``
         started_ns     when the recording begins
@@ -84,6 +94,7 @@ class Writer:
         versions: Mapping[str, str],
         weights_hz: float | None,
         started_ns: int,
+        files: Mapping[str, bytes] = NO_FILES,
         scene: Scene | None = None,
         part: Part | None = None,
     ) -> None:
@@ -97,15 +108,15 @@ class Writer:
         self._topics = _Topics(self._mcap)
         self._encoder = Encoder(self._topics.add, weights_hz, scene)
         try:
-            self._write_head(settings_toml, versions, max(0, started_ns), part)
+            at_ns = max(0, started_ns)
+            for name, data in {**files, SETTINGS: settings_toml.encode()}.items():
+                self._mcap.attachment(at_ns, at_ns, name, MEDIA_TYPES[Path(name).suffix], data)
+            self._write_head(versions, part)
         except OSError:
             self.salvage()  # a file without a head would be recovered as a recording of nothing
             raise
 
-    def _write_head(
-        self, settings_toml: str, versions: Mapping[str, str], at_ns: int, part: Part | None
-    ) -> None:
-        self._mcap.attachment(at_ns, at_ns, SETTINGS, "application/toml", settings_toml.encode())
+    def _write_head(self, versions: Mapping[str, str], part: Part | None) -> None:
         self._mcap.metadata(VERSIONS, versions)
         if part is not None:
             self._mcap.metadata(PART, part.metadata())

@@ -58,7 +58,7 @@ class ArraySettings(Section):
 
     ``dead`` lists elements, from 0, that radiate nothing: weights are made without them.
     ``coupling`` is a .npy file of the matrix C (M, M) by which elements carry C f when they are fed
-    with f; it is read into ``coupling_stored`` (its bytes, base64).
+    with f.
     """
 
     kind: ArrayKind = ArrayKind.ULA
@@ -82,7 +82,6 @@ class ArraySettings(Section):
     hidden_deg: tuple[HiddenSector, ...] = ()
     dead: Annotated[tuple[Annotated[int, Field(ge=0, le=4095)], ...], Field(max_length=4095)] = ()
     coupling: str | None = None
-    coupling_stored: str | None = None
 
     @model_validator(mode="after")
     def _listed(self) -> Self:
@@ -163,19 +162,16 @@ class CodebookSettings(Section):
 
     dft   for lines and rectangles: ``oversampling`` times as many beams as elements on each
           axis
-    file  a .npy file with a row per element (M) and a column per beam, which is read into
-          ``stored`` (its bytes, base64)
+    file  a .npy file with a row per element (M) and a column per beam
     """
 
     kind: Literal["none", "dft", "file"] = "none"
     oversampling: Annotated[int, Field(ge=1, le=16)] = 1
     file: str | None = None
-    stored: str | None = None
 
     @model_validator(mode="after")
     def _named(self) -> Self:
-        named = self.file is not None or self.stored is not None
-        if (self.kind == "file") != named:
+        if (self.kind == "file") != (self.file is not None):
             raise UserError('kind = "file" goes with file, and file with it')
         return self
 
@@ -185,21 +181,19 @@ class HardwareSettings(Section):
 
     ``calibration`` names a table of its channels (CSV: channel, element, phase_deg, gain_db, and if
     known phase_error_deg, gain_error_db), or TOML with a table for each of several frequencies
-    (``companion/beams/hardware/calibration_tables.py``). It is read into ``calibration_csv``.
+    (``companion/beams/hardware/calibration_tables.py``).
     ``phase_error_deg`` and ``gain_error_db`` are the most that each channel is off after it: bounds
     for which guaranteed gains then hold. A table that says bounds of its own has the last word.
     ``device`` is what the weights are quantised for: guaranteed gains in the API are then of what
     it radiates. ``unit`` names a file of what gains a TMYTEK unit can have
-    (``companion/beams/hardware/unit_gains.py``), which is read into ``unit_toml``.
+    (``companion/beams/hardware/unit_gains.py``).
     """
 
     calibration: str | None = None
-    calibration_csv: str | None = None
     phase_error_deg: Annotated[float, Field(ge=0, le=180)] = 0.0
     gain_error_db: Annotated[float, Field(ge=0, le=60)] = 0.0
     device: Literal["adar1000", "tmytek", "sivers"] | None = None
     unit: str | None = None
-    unit_toml: str | None = None
 
 
 class RadioSettings(Section):

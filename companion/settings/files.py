@@ -1,7 +1,5 @@
 """Settings read from a TOML file, together with the files that they name."""
 
-import base64
-import binascii
 import errno
 from collections.abc import Mapping
 from importlib import resources
@@ -14,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.settings.beams import ArraySettings
-from companion.settings.model import Settings
+from companion.settings.model import DESIGN, NAMED_FILES, NamedFile, Settings
 from companion.settings.origins import Origin, Origins, given, of_options
 from companion.settings.section import ConfigError
 from companion.tracking.design.gain_table import KinematicDesign
@@ -42,12 +40,13 @@ def load(path: Path | None) -> Settings:
 
 
 def embedded(settings: Settings) -> Settings:
-    """Settings with all files read in that they name, so that a recording of them is complete.
+    """Settings with all files read that they name, so that a recording of them is complete.
 
     Raises ``ConfigError`` where one cannot be read.
     """
-    placed = _with_coupling(_with_positions(settings))
-    return _with_unit(_with_codebook(_with_calibration(_with_design(placed))))
+    placed = _with_positions(settings)
+    read = {file.attachment: _content(placed, file) for file in NAMED_FILES}
+    return placed.with_files({name: data for name, data in read.items() if data is not None})
 
 
 def layered(path: Path | None, options: Mapping[str, dict[str, Any]]) -> tuple[Settings, Origins]:
@@ -67,8 +66,8 @@ def _with_positions(settings: Settings) -> Settings:
     if named is None:
         return settings
     rows = [tuple(row) for row in numbers_file("array.positions", named, 3).tolist()]
-    given = settings.array.model_dump(mode="json", exclude_unset=True)
-    array = {**given, "positions": None, "positions_m": rows}
+    given = settings.array.model_dump(mode="json", exclude_unset=True, exclude={"positions"})
+    array = {**given, "positions_m": rows}
     return settings.model_copy(update={"array": ArraySettings.model_validate(array)})
 
 
@@ -112,100 +111,53 @@ def _npy(where: str, data: bytes, kinds: str) -> NDArray[Any]:
     return found
 
 
-def _with_codebook(settings: Settings) -> Settings:
-    """Settings with the stored beams read in."""
-    name = settings.codebook.file
-    if name is None or settings.codebook.stored is not None:
-        return settings
-    stored = base64.b64encode(_bytes("codebook.file", name)).decode()
-    return settings.override(codebook={"stored": stored})
-
-
-def _with_coupling(settings: Settings) -> Settings:
-    """Settings with the coupling matrix read in."""
-    name = settings.array.coupling
-    if name is None or settings.array.coupling_stored is not None:
-        return settings
-    stored = base64.b64encode(_bytes("array.coupling", name)).decode()
-    return settings.override(array={"coupling_stored": stored})
-
-
-def coupling_file(settings: Settings) -> ComplexArray | None:
-    """The matrix of ``array.coupling_stored``, else of ``array.coupling``; None without.
+def matrix_of(settings: Settings, file: NamedFile) -> ComplexArray | None:
+    """The matrix in a .npy file that the settings name; None if they name none.
 
     Raises ``ConfigError`` if the file cannot be read or is not a matrix.
     """
-    kept = _with_coupling(settings).array
-    if kept.coupling_stored is None:
+    data = _content(settings, file)
+    if data is None:
         return None
-    where = (
-        "array.coupling_stored" if kept.coupling is None else f"array.coupling = {kept.coupling!r}"
-    )
-    return _matrix(where, kept.coupling_stored)
-
-
-def codebook_file(settings: Settings) -> ComplexArray:
-    """The beams of ``codebook.stored``, else of ``codebook.file``: complex (M, K), a column each.
-
-    Raises ``ConfigError`` if the file cannot be read or is not a matrix.
-    """
-    kept = _with_codebook(settings).codebook
-    where = "codebook.stored" if kept.file is None else f"codebook.file = {kept.file!r}"
-    return _matrix(where, kept.stored or "")
-
-
-def _matrix(where: str, stored: str) -> ComplexArray:
-    """The matrix in the bytes (base64) of a .npy file. Raises ``ConfigError``."""
-    try:
-        data = base64.b64decode(stored, validate=True)
-    except binascii.Error as error:
-        raise ConfigError(f"{where}: not base64: {error}") from error
+    where = _where(settings, file)
     found = _npy(where, data, "fciu")
     if found.ndim != 2:
         raise ConfigError(f"{where}: not a matrix, but of shape {found.shape}")
-    beams: ComplexArray = found.astype(np.complex128)
-    return beams
+    matrix: ComplexArray = found.astype(np.complex128)
+    return matrix
 
 
-def _with_calibration(settings: Settings) -> Settings:
-    """Settings with the table of the hardware's channels read in."""
-    name = settings.hardware.calibration
-    if name is None or settings.hardware.calibration_csv is not None:
-        return settings
-    text = _text("hardware.calibration", name)
-    return settings.override(hardware={"calibration_csv": text})
-
-
-def calibration_text(settings: Settings) -> str | None:
-    """The text of the hardware's calibration table; None if the settings name none.
+def text_of(settings: Settings, file: NamedFile) -> str | None:
+    """The text of a file that the settings name; None if they name none.
 
     Raises ``ConfigError`` if it cannot be read.
     """
-    return _with_calibration(settings).hardware.calibration_csv
-
-
-def _with_unit(settings: Settings) -> Settings:
-    """Settings with the gains of a unit read in."""
-    name = settings.hardware.unit
-    if name is None or settings.hardware.unit_toml is not None:
-        return settings
-    return settings.override(hardware={"unit_toml": _text("hardware.unit", name)})
-
-
-def unit_text(settings: Settings) -> str | None:
-    """The text of a unit's gains; None if the settings name none.
-
-    Raises ``ConfigError`` if it cannot be read.
-    """
-    return _with_unit(settings).hardware.unit_toml
-
-
-def _text(key: str, name: str) -> str:
-    """The text of a file that a setting names. Raises ``ConfigError``, naming ``key``."""
+    data = _content(settings, file)
     try:
-        return _bytes(key, name).decode()
+        return None if data is None else data.decode()
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{key} = {name!r}: not UTF-8 text") from error
+        raise ConfigError(f"{_where(settings, file)}: not UTF-8 text") from error
+
+
+def _content(settings: Settings, file: NamedFile) -> bytes | None:
+    """The bytes of a file, read unless the settings hold them; None if they do not name it.
+
+    Raises ``ConfigError``.
+    """
+    path = _path(settings, file)
+    if path is None:
+        return None
+    held = settings.files.get(file.attachment)
+    return _bytes(file.setting, path) if held is None else held
+
+
+def _path(settings: Settings, file: NamedFile) -> str | None:
+    path: str | None = getattr(getattr(settings, file.section), file.key)
+    return path
+
+
+def _where(settings: Settings, file: NamedFile) -> str:
+    return f"{file.setting} = {_path(settings, file)!r}"
 
 
 def _bytes(key: str, name: str) -> bytes:
@@ -225,24 +177,16 @@ def _read(path: Path) -> bytes:
     return data
 
 
-def _with_design(settings: Settings) -> Settings:
-    """Settings with the observer's gains read in."""
-    named = settings.observer.design
-    if named is None or settings.observer.design_json is not None:
-        return settings
-    return settings.override(observer={"design_json": _text("observer.design", named)})
-
-
 def kinematic_design(settings: Settings) -> KinematicDesign:
     """The gains of the kinematic observer: those named in the settings, or those of the program.
 
     Their certificate is verified. Raises ``ConfigError`` where they cannot be used.
     """
-    given = _with_design(settings).observer
-    try:
-        if given.design_json is not None:
-            return KinematicDesign.from_json(given.design_json)
+    text = text_of(settings, DESIGN)
+    if text is None:
         source = resources.files("companion.tracking.design") / DEFAULT_DESIGN
-        return KinematicDesign.from_json(source.read_text(encoding="utf-8"))
+        text = source.read_text(encoding="utf-8")
+    try:
+        return KinematicDesign.from_json(text)
     except UserError as error:
-        raise ConfigError(f"observer.design = {given.design!r}: {error}") from error
+        raise ConfigError(f"{_where(settings, DESIGN)}: {error}") from error

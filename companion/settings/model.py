@@ -4,11 +4,13 @@ Each section lists its keys with unit, default and range. An error names the key
 is allowed.
 """
 
+import base64
 import difflib
-from typing import Any, Final, Self
+from collections.abc import Mapping
+from typing import Any, Final, NamedTuple, Self
 
 import tomli_w
-from pydantic import ValidationError
+from pydantic import PrivateAttr, ValidationError
 
 from companion.settings.beams import (
     ArraySettings,
@@ -48,15 +50,30 @@ MODELLED: Final = frozenset(
     )
 )  # fmt: skip
 """Sections that make estimates and beams: what a recording has to say to its replay."""
-EMBEDDED: Final = (
-    ("array", "positions", "positions_m"),
-    ("array", "coupling", "coupling_stored"),
-    ("observer", "design", "design_json"),
-    ("codebook", "file", "stored"),
-    ("hardware", "calibration", "calibration_csv"),
-    ("hardware", "unit", "unit_toml"),
-)
-"""Section; its key that names a file; its key that holds what is in that file."""
+
+
+class NamedFile(NamedTuple):
+    """A file that a setting names, and that recordings have as an attachment."""
+
+    setting: str
+    attachment: str  # its name in a recording
+    former_key: str  # key that held its contents in older recordings: text, base64 for .npy
+
+    @property
+    def section(self) -> str:
+        return self.setting.partition(".")[0]
+
+    @property
+    def key(self) -> str:
+        return self.setting.partition(".")[2]
+
+
+COUPLING: Final = NamedFile("array.coupling", "coupling.npy", "coupling_stored")
+CODEBOOK: Final = NamedFile("codebook.file", "codebook.npy", "stored")
+CALIBRATION: Final = NamedFile("hardware.calibration", "calibration.csv", "calibration_csv")
+UNIT: Final = NamedFile("hardware.unit", "unit.toml", "unit_toml")
+DESIGN: Final = NamedFile("observer.design", "design.json", "design_json")
+NAMED_FILES: Final = (COUPLING, CODEBOOK, CALIBRATION, UNIT, DESIGN)
 
 
 class Settings(Section):
@@ -83,29 +100,39 @@ class Settings(Section):
     fleet: FleetSettings = FleetSettings()
     page: PageSettings = PageSettings()
 
+    _files: Mapping[str, bytes] = PrivateAttr(default_factory=dict)
+
     @classmethod
     def from_toml(cls, text: str, where: str) -> Self:
         """Read settings from TOML text.
 
         Raises ``ConfigError``, its message beginning with ``where``, if they cannot be used.
         """
-        return cls._from_sections(sections(text, where), where)
+        found = sections(text, where)
+        files = _former_files(found, where)
+        return cls._from_sections(found, where).with_files(files)
 
     @classmethod
-    def from_recording(cls, text: str, where: str) -> Self:
-        """The settings of a recording, as far as they make estimates and beams.
+    def from_recording(cls, text: str, where: str, attached: Mapping[str, bytes]) -> Self:
+        """Read the settings of a recording, as far as they make estimates and beams.
 
         Whoever made the recording is not trusted with anything else: where it listened, what it
-        sent, where it wrote, and any path are left out. What a file held that they name is in the
-        settings themselves. Raises ``ConfigError`` as ``from_toml``, and where it is not.
+        sent, where it wrote, and any path are left out. A file that the settings name is in
+        ``attached``, by its name there. Raises ``ConfigError`` as ``from_toml``, and if a file is
+        missing.
         """
         found = {name: kept for name, kept in sections(text, where).items() if name in MODELLED}
-        for section, key, content in EMBEDDED:
-            keys = found.get(section)
-            if isinstance(keys, dict) and keys.pop(key, None) is not None and content not in keys:
-                said = f"what {section}.{key} named is not in the recording"
-                raise ConfigError(f"{where}: {said}: give the settings with --config")
-        return cls._from_sections(found, where)
+        attached = {**attached, **_former_files(found, where)}
+        files = {}
+        for file in NAMED_FILES:
+            if file.key in (keys := _table(found, file.section)):
+                if file.attachment not in attached:
+                    raise _missing(where, file.setting)
+                keys[file.key] = file.attachment
+                files[file.attachment] = attached[file.attachment]
+        if "positions" in _table(found, "array"):  # a recording has ``positions_m`` instead
+            raise _missing(where, "array.positions")
+        return cls._from_sections(found, where).with_files(files)
 
     @classmethod
     def _from_sections(cls, found: dict[str, Any], where: str) -> Self:
@@ -113,6 +140,17 @@ class Settings(Section):
             return cls.model_validate(found)
         except ValidationError as error:
             raise ConfigError(f"{where}: {_first(error)}") from error
+
+    @property
+    def files(self) -> Mapping[str, bytes]:
+        """Contents of the files that settings name, as far as they were read; by attachment."""
+        return self._files
+
+    def with_files(self, files: Mapping[str, bytes]) -> Self:
+        """A copy with other ``files``."""
+        copy = self.model_copy()
+        copy._files = files
+        return copy
 
     def to_toml(self) -> str:
         """All settings, defaults included, as ``from_toml`` reads them."""
@@ -129,10 +167,51 @@ class Settings(Section):
             merged.setdefault(name, {}).update(
                 {key: value for key, value in keys.items() if value is not None}
             )
+        files = {
+            file.attachment: self.files[file.attachment]
+            for file in NAMED_FILES
+            if file.attachment in self.files
+            and sections.get(file.section, {}).get(file.key) is None
+        }
         try:
-            return Settings.model_validate(merged)
+            return Settings.model_validate(merged).with_files(files)
         except ValidationError as error:
             raise ConfigError(_first(error)) from error
+
+
+def _former_files(found: dict[str, Any], where: str) -> dict[str, bytes]:
+    """Take the contents of files out of the settings of an older recording.
+
+    Returns them by the name of their attachment. Raises ``ConfigError``.
+    """
+    files = {}
+    for file in NAMED_FILES:
+        keys = _table(found, file.section)
+        if file.former_key not in keys:
+            continue
+        text = keys.pop(file.former_key)
+        try:
+            binary = file.attachment.endswith(".npy")
+            data = base64.b64decode(text, validate=True) if binary else text.encode()
+        except (AttributeError, TypeError, ValueError) as error:
+            key = f"{file.section}.{file.former_key}"
+            kind = "base64" if binary else "text"
+            raise ConfigError(f"{where}: {key} = {shown(text)}: not {kind}") from error
+        files[file.attachment] = data
+        keys.setdefault(file.key, file.attachment)
+    return files
+
+
+def _table(found: dict[str, Any], section: str) -> dict[str, Any]:
+    """A section of unchecked settings; empty if it is missing or not a table."""
+    keys = found.get(section)
+    return keys if isinstance(keys, dict) else {}
+
+
+def _missing(where: str, setting: str) -> ConfigError:
+    return ConfigError(
+        f"{where}: what {setting} named is not in the recording: give the settings with --config"
+    )
 
 
 def sections(text: str, where: str) -> dict[str, Any]:

@@ -73,8 +73,7 @@ class ObserverSettings(LimitSettings):
     velocity_lead_s        position model: least lead made from a reported velocity, seconds
     feed_forward           kinematic model: feed an estimated acceleration forward
     design                 kinematic model: file of gains written by ``companion design --model
-                           kinematic --out``, which is read into ``design_json``
-    design_json            the gains themselves
+                           kinematic --out``
     speed_max_mps          greatest speed, norm of a 3-vector; None: by the type of aircraft
     acceleration_max_mps2  greatest acceleration, norm of a 3-vector; None: likewise
     lag_s                  least and greatest lag of positions, seconds; None: by autopilot and type
@@ -97,7 +96,6 @@ class ObserverSettings(LimitSettings):
     velocity_lead_s: Annotated[float, Field(gt=0, le=10)] = 0.2
     feed_forward: bool = True
     design: str | None = None
-    design_json: str | None = None
     types: dict[AirframeName, LimitSettings] = Field(default_factory=dict)
     uav: dict[str, LimitSettings] = Field(default_factory=dict)
     position_noise_m: Annotated[float, Field(gt=0, le=1e5)] = 3.0

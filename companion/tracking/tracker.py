@@ -480,7 +480,7 @@ def _cut(acceleration: Vector | None, most_mps2: float) -> Vector | None:
 def _unknown_input(history: ReportHistory[Any]) -> Vector | None:
     """Unknown input over the newest interval: W^ = (x^+ - x^) / dT, m/s.
 
-    See docs/math.md 3; None where there are fewer than two reports.
+    See docs/math.md 3, paper eq. (12); None if there are fewer than two reports.
     """
     if len(history.entries) < 2:
         return None

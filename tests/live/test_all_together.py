@@ -19,11 +19,9 @@ from support import BALLAST, HANG_S, ROOT, Node, end, fill, read_metadata, run_a
 from websockets.asyncio.client import connect
 
 from companion.mavlink.wire.encode import heartbeat, pack
-from companion.node.replay import replay
+from companion.node.replay import replay, settings_for
 from companion.recording.parts import read_story
-from companion.recording.reader import read_settings
 from companion.recording.recover import recover_leftovers
-from companion.settings.model import Settings
 from companion.values import Source
 
 UAVS = 20
@@ -237,7 +235,7 @@ def test_whatever_goes_wrong_at_once_it_goes_on_and_all_is_recorded(
     shutil.copytree(small_disk, kept, dirs_exist_ok=True)
     recover_leftovers(kept)  # as the next start does, of what the full disk cut short
     parts = sorted(kept.iterdir(), key=lambda path: getattr(read_story(path).part, "number", 0))
-    settings = Settings.from_recording(read_settings(parts[0]) or "", parts[0].name)
+    settings = settings_for(parts, None, None)
     summary = replay(parts, settings)
     tell(table, seconds, Seen(healthy_s, memory, page.ages_s))
     name = f"{seconds:.0f} s of all faults: "

@@ -14,11 +14,10 @@ from typing import Any
 import pytest
 from support import BIN, HANG_S, ROOT, Node, end, read_metadata
 
-from companion.node.replay import replay
+from companion.node.replay import replay, settings_for
 from companion.recording.parts import read_story
-from companion.recording.reader import read_parts, read_settings
+from companion.recording.reader import read_parts
 from companion.recording.recover import Recovered, recover_leftovers
-from companion.settings.model import Settings
 from companion.values import Frame
 
 RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "1:1")
@@ -62,8 +61,7 @@ def killed_while_recording(folder: Path, seconds: float) -> float:
     assert isinstance(found, Recovered)
     assert list(read_parts([found.path])) == before
     if before:  # killed later than after a second
-        settings = Settings.from_toml(read_settings(found.path) or "", "")
-        summary = replay([found.path], settings)
+        summary = replay([found.path], settings_for([found.path], None, None))
         assert summary["frames"] == sum(isinstance(event, Frame) for event in before) > 0
         assert summary["missing"] == []
     return (killed_ns - (before[-1].t_ns if before else begun_ns)) * 1e-9

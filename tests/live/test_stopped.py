@@ -10,9 +10,7 @@ from typing import Any
 import pytest
 from support import ROOT, end, read_metadata
 
-from companion.node.replay import replay
-from companion.recording.reader import read_settings
-from companion.settings.model import Settings
+from companion.node.replay import replay, settings_for
 
 RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "1:1")
 STOPPED_S = 8.0
@@ -48,5 +46,5 @@ def test_a_service_that_was_stopped_goes_on_within_seconds(start_node: Any, tmp_
     assert took_s < 5.0
     assert all(track["age_s"] < 2.0 for track in tracks), "nothing old is served as if it were new"
     (log,) = tmp_path.iterdir()
-    summary = replay([log], Settings.from_recording(read_settings(log) or "", log.name))
+    summary = replay([log], settings_for([log], None, None))
     assert summary["digest"] == read_metadata(log)["summary"]["digest"]

@@ -1,24 +1,29 @@
 """A recording's settings are data: replaying what others made touches no file that they name."""
 
+import base64
 import json
 import os
 import subprocess
+from functools import partial
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import tomli_w
+from mcap.records import Attachment
 from support import BIN, HANG_S
 
 from companion.beams.hardware.devices import Mode
 from companion.beams.hardware.unit_gains import UnitGains
-from companion.node.replay import settings_for, writer_for
+from companion.node.replay import replay, settings_for, writer_for
 from companion.pipeline import assembly
-from companion.recording.reader import read_log
+from companion.recording.container import Walk
+from companion.recording.reader import read_log, read_settings
 from companion.recording.writer import Writer
 from companion.settings.files import load
-from companion.settings.model import EMBEDDED, MODELLED, Settings
+from companion.settings.model import MODELLED, NAMED_FILES, Settings
 from companion.settings.section import ConfigError
 from companion.values import Frame
 
@@ -111,46 +116,124 @@ def test_equipment_that_a_recording_only_names_is_refused(
     assert settings_for([log], config, None).center.source == "5:1"
 
 
-def test_what_equipment_files_held_is_in_the_recording(cut_log: Path, tmp_path: Path) -> None:
-    beams = np.exp(1j * np.arange(12.0)).reshape(4, 3)
-    np.save(tmp_path / "beams.npy", beams)
-    table = tmp_path / "measured.csv"
+def equipped(folder: Path) -> Settings:
+    """Settings that name a file of every kind; the files are gone once they are read."""
+    np.save(folder / "beams.npy", np.exp(1j * np.arange(12.0)).reshape(4, 3))
+    np.save(folder / "mixed.npy", np.eye(4) + 0.1j)
     lines = [f"{c},{3 - c},{10 * c},0" for c in range(4)]
-    table.write_text("channel,element,phase_deg,gain_db\n" + "\n".join(lines))
-    unit = tmp_path / "unit.toml"
-    unit.write_text(
+    (folder / "measured.csv").write_text("channel,element,phase_deg,gain_db\n" + "\n".join(lines))
+    (folder / "unit.toml").write_text(
         "mode = 'RX'\ncommon_db = [[0, 9], [0, 9], [0, 9], [0, 9]]\nelement_db = [4, 4, 4, 4]\n"
     )
-    config = tmp_path / "settings.toml"
-    config.write_text(
-        f"[center]\nsource = '5:1'\n[array]\nelements = 4\n"
-        f"[codebook]\nkind = 'file'\nfile = '{tmp_path}/beams.npy'\n"
-        f"[hardware]\ncalibration = '{table}'\nunit = '{unit}'\n"
+    shipped = resources.files("companion.tracking.design") / "kinematic_default.json"
+    (folder / "gains.json").write_text(json.dumps(json.loads(shipped.read_text())))
+    (folder / "settings.toml").write_text(
+        f"[center]\nsource = '5:1'\n[array]\nelements = 4\ncoupling = '{folder}/mixed.npy'\n"
+        f"[codebook]\nkind = 'file'\nfile = '{folder}/beams.npy'\n"
+        f"[hardware]\ncalibration = '{folder}/measured.csv'\nunit = '{folder}/unit.toml'\n"
+        f"[observer]\ndesign = '{folder}/gains.json'\n"
     )
-    given = load(config)
-    wanted = assembly.equipment(given, assembly.array(given))
-    log = tmp_path / "kept.mcap"
-    with writer_for([cut_log], given, log) as writer:
-        for event in read_log(cut_log):
-            writer.event(event)
-        writer.close({})
-    for file in (table, unit, config, tmp_path / "beams.npy"):
+    given = load(folder / "settings.toml")
+    for file in folder.iterdir():
         file.unlink()
+    return given
+
+
+def same_equipment(one: Settings, other: Settings) -> bool:
+    """Whether all files of both say the same."""
+    array, again = assembly.array(one), assembly.array(other)
+    kept, found = assembly.equipment(one, array), assembly.equipment(other, again)
+    assert kept.codebook is not None
+    assert found.codebook is not None
+    assert found.calibration is not None
+    return (
+        np.array_equal(kept.codebook.weights, found.codebook.weights)
+        and np.array_equal(array.coupling, again.coupling)
+        and found.calibration.order == (3, 2, 1, 0)
+        and found.unit_gains == kept.unit_gains == UnitGains(Mode.RX, 13.0, 4.0)
+    )
+
+
+def test_files_that_settings_name_are_attached_to_the_recording(
+    cut_log: Path, tmp_path: Path
+) -> None:
+    given, log = equipped(tmp_path), tmp_path / "kept.mcap"
+    digest = replay([cut_log], given, lambda: writer_for([cut_log], given, log))["digest"]
+    attached = [one for one in Walk(log, frozenset()) if isinstance(one, Attachment)]
+    assert {one.name: one.media_type for one in attached} == {
+        "coupling.npy": "application/x-npy", "codebook.npy": "application/x-npy",
+        "calibration.csv": "text/csv", "unit.toml": "application/toml",
+        "design.json": "application/json", "settings.toml": "application/toml",
+    }  # fmt: skip
 
     held = settings_for([log], None, None)
-    found = assembly.equipment(held, assembly.array(held))
-    assert found.codebook is not None
-    assert wanted.codebook is not None
-    assert np.array_equal(found.codebook.weights, wanted.codebook.weights)
-    assert found.calibration is not None
-    assert found.calibration.order == (3, 2, 1, 0)
-    assert found.unit_gains == wanted.unit_gains == UnitGains(Mode.RX, 13.0, 4.0)
-    assert (held.codebook.file, held.hardware.calibration) == (None, None)
+    assert same_equipment(given, held)
+    assert replay([log], held)["digest"] == digest
+    assert (held.codebook.file, held.hardware.calibration) == ("codebook.npy", "calibration.csv")
     again = tmp_path / "again.mcap"  # a recording of the replay is as complete
     with writer_for([log], held, again) as writer:
         writer.event(next(read_log(log)))
         writer.close({})
     assert settings_for([again], None, None) == held
+
+
+@pytest.mark.parametrize("paths", [True, False])
+def test_files_within_the_settings_of_an_older_recording_are_used(
+    cut_log: Path, tmp_path: Path, paths: bool
+) -> None:
+    """The first recording had the paths as well; one of its replay had none."""
+    given, log = equipped(tmp_path), tmp_path / "older.mcap"
+    sections = given.model_dump(mode="json", exclude_none=True)
+    for file in NAMED_FILES:
+        data = given.files[file.attachment]
+        binary = file.attachment.endswith(".npy")
+        kept = base64.b64encode(data) if binary else data
+        sections[file.section][file.former_key] = kept.decode()
+        if not paths:
+            del sections[file.section][file.key]
+    digest = replay(
+        [cut_log],
+        given,
+        lambda: Writer(
+            where=log,
+            settings_toml=tomli_w.dumps(sections),
+            versions={},
+            weights_hz=None,
+            started_ns=0,
+        ),
+    )["digest"]
+    held = settings_for([log], None, None)
+    assert held.files == given.files
+    assert same_equipment(given, held)
+    assert replay([log], held)["digest"] == digest
+    assert Settings.from_toml(tomli_w.dumps(sections), "x").files == given.files
+
+
+@pytest.mark.parametrize("content", ["'%'", "7"])
+def test_contents_of_files_that_are_invalid_are_refused(content: str) -> None:
+    for section, key in (("codebook", "stored"), ("array", "coupling_stored")):
+        with pytest.raises(ConfigError, match=rf"^x: {section}\.{key} = .*: not base64$"):
+            Settings.from_recording(f"[{section}]\n{key} = {content}\n", "x", {})
+
+
+def test_attachments_that_settings_do_not_name_are_not_kept(cut_log: Path, tmp_path: Path) -> None:
+    given, log = equipped(tmp_path), tmp_path / "x.mcap"
+    files = {"codebook.npy": b"1", "other.csv": b"2"}
+    with Writer(
+        where=log,
+        settings_toml="[codebook]\nkind = 'file'\nfile = 'mine.npy'\n",
+        files=files,
+        versions={},
+        weights_hz=None,
+        started_ns=0,
+    ) as writer:
+        writer.close({})
+    recorded = read_settings(log)
+    assert recorded is not None
+    assert recorded.files == {"codebook.npy": b"1"}
+    assert settings_for([log], None, None).files == recorded.files
+    assert Settings.from_recording("", "x", given.files).files == {}
+    assert given.override(codebook={"file": "new.npy"}).files.keys() == given.files.keys() - files
 
 
 def test_each_key_that_names_a_file_is_known() -> None:
@@ -161,9 +244,8 @@ def test_each_key_that_names_a_file_is_known() -> None:
         for key, field in type(getattr(Settings(), section)).model_fields.items()
         if field.annotation == str | None and field.metadata == []
     }
-    named = {(section, key) for section, key, _ in EMBEDDED}
-    contents = {(section, content) for section, _, content in EMBEDDED}
-    assert paths - contents - {("center", "source")} == named
+    named = {(file.section, file.key) for file in NAMED_FILES}
+    assert paths - {("center", "source"), ("array", "positions")} == named
     assert Settings().model_fields_set == set()
     assert set(Settings.model_fields) - MODELLED == set(PATHS)
 
@@ -181,7 +263,7 @@ def test_each_key_that_names_a_file_is_known() -> None:
     ids=["arrays", "tables", "key", "header", "quotes", "many"],
 )
 def test_nested_settings_are_refused_in_a_line(text: str) -> None:
-    for read in (Settings.from_toml, Settings.from_recording):
+    for read in (Settings.from_toml, partial(Settings.from_recording, attached={})):
         with pytest.raises(ConfigError, match=r"^there: ") as caught:
             read(text, "there")
         assert len(str(caught.value).splitlines()) == 1
@@ -192,7 +274,7 @@ def test_the_largest_array_is_not_too_large() -> None:
     rows = np.random.default_rng(1).uniform(-1e4, 1e4, (4096, 6)).tolist()
     text = f"[array]\nkind = 'list'\npositions_m = {rows}\n"
     found = Settings.from_toml(text, "x")
-    assert Settings.from_recording(found.to_toml(), "x") == found
+    assert Settings.from_recording(found.to_toml(), "x", {}) == found
 
 
 def test_a_file_without_end_is_refused(tmp_path: Path) -> None:

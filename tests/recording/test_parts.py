@@ -147,6 +147,7 @@ def test_a_recording_holds_the_gains_of_its_observer(tmp_path: Path, short_log: 
         lambda: Writer(
             where=path,
             settings_toml=settings.to_toml(),
+            files=settings.files,
             versions={},
             weights_hz=None,
             started_ns=START_NS,
@@ -154,7 +155,7 @@ def test_a_recording_holds_the_gains_of_its_observer(tmp_path: Path, short_log: 
     )["digest"]
     design.write_text("another")
     held = settings_for([path], None, None)
-    assert held.observer.design_json == changed_text
+    assert held.files == {"design.json": changed_text.encode()}
     assert replay([path], held)["digest"] == digest
     design.unlink()
     assert replay([path], settings_for([path], None, None))["digest"] == digest

@@ -79,7 +79,7 @@ def test_cut_anywhere_no_more_than_one_flush_is_lost(
             isinstance(event, Frame | Tick) for event in kept
         )
         if cut >= flushed[0][0]:
-            assert read_settings(result.path) == "[a]\n"
+            assert read_settings(result.path) == ("[a]\n", {})
             assert read_metadata(result.path)["versions"] == {"companion": "1"}
         with result.path.open("rb") as file:
             summary = make_reader(file, validate_crcs=True).get_summary()
@@ -308,4 +308,4 @@ def test_a_killed_process_loses_nothing_that_was_flushed(tmp_path: Path) -> None
     assert [event.t_ns for event in events] == list(range(len(events)))
     assert len(events) >= flushed
     assert result.messages == {"/mavlink/frames": len(events)}
-    assert read_settings(result.path) == "[a]"
+    assert read_settings(result.path) == ("[a]", {})

@@ -92,7 +92,7 @@ def test_the_file_has_its_name_settings_and_metadata(tmp_path: Path, record: Rec
     path = writer.close({"digest": "d1"})
     assert path == writer.path == tmp_path / "new folder" / "companion-20231114T221320Z.mcap"
     assert [file.name for file in path.parent.iterdir()] == [path.name]
-    assert read_settings(path) == "[beams]\nlead_s = 0.1\n"
+    assert read_settings(path) == ("[beams]\nlead_s = 0.1\n", {})
     assert read_metadata(path) == {"versions": {"companion": "1"}, "summary": {"digest": "d1"}}
     assert writer.close({}) == path
     assert writer.size_bytes == path.stat().st_size

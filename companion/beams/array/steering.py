@@ -6,7 +6,7 @@ Angles of a unit direction u in the array frame: azimuth = atan2(u_y, u_x), to t
     a(u)_m = g_m(u) exp(+j 2 pi / wavelength  p_m . u)
 
 with p_m the position of element m and g_m its amplitude (docs/math.md 7). For isotropic elements
-along y this is the published exp(j 2 pi / wavelength d m sin theta). Where elements couple, and
+along y this is exp(j 2 pi / wavelength d m sin theta), paper eq. (2). Where elements couple, and
 carry C f when they are fed with f, the vector is C^T a(u): what each channel does. It is 0 where an
 element is dead.
 """

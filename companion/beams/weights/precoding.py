@@ -1,8 +1,9 @@
 """Weights from steering vectors: zero forcing, and what is done where it costs too much.
 
-UAV i receives y_i = h_i a(u_i)^T F s + noise. With A = [a(u_1) ... a(u_N)], (M, N),
+UAV i receives y_i = h_i a(u_i)^T F s + noise (docs/math.md 7, paper eq. (1)). With A = [a(u_1) ...
+a(u_N)], (M, N),
 
-    zero forcing (ZF)        F = A* (A^T A*)^-1           A^T F = I
+    zero forcing (ZF)        F = A* (A^T A*)^-1           A^T F = I       paper eq. (7)
     regularised (RZF)        F = A* (A^T A* + x I)^-1 D   D: so that A^T F has a unit diagonal
     maximum ratio (MRT)      F = A* D
 
@@ -14,7 +15,8 @@ A*)^-1]_ii. Past ``loss_limit_db`` for any user, or past a condition number of A
 decides: load the matrix by the least x at which no user loses more (each loss falls with x, see
 ``_least_loading``), serve groups in time slots, or leave out the lowest priorities. This is judged
 with the columns of A scaled to one length, since a weak element pattern is not closeness. It
-happens at mirror images about a line array, or with two UAVs behind one another. See docs/math.md 7.
+happens at mirror images about a line array, or with two UAVs behind one another.
+See docs/math.md 7.
 
 Over 300 lines: the ways of making weights fall back on one another.
 """

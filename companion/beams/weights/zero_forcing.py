@@ -2,7 +2,7 @@
 
 With A = [a(u_1) ... a(u_N)], (M, N), and UAV i receiving a(u_i)^T F s (docs/math.md 7):
 
-    F = A* H,  H = (A^T A*)^-1        A^T F = I
+    F = A* H,  H = (A^T A*)^-1        A^T F = I        paper eq. (7)
 
 The diagonal of H says what zero forcing costs. The array gain of column i of F is 1 / H_ii, that of
 a beam for this user alone |a_i|^2; their ratio, the loss factor |a_i|^2 H_ii, is at least 1 and

@@ -2,12 +2,12 @@
 
 A UAV with N_U antennas of its own receives, from M elements with weights F and symbols s,
 
-    y = sqrt(g) H F s + n                               H: (N_U, M)
+    y = sqrt(g) H F s + n                               H: (N_U, M), paper eq. (1)
     H = sqrt(K/(K+1)) exp(j phi) b a^T  +  sqrt(1/(K+1)) sum_l alpha_l b_l a_l^T
 
-g is the power gain of free space, a and b the steering vectors of the line of sight at the node and
-at the UAV, a_l and b_l those of scattered rays. All are transposed, none conjugated: a beam at
-direction u is F = a(u)* (docs/math.md 7). The channel is flat over the band.
+g is the power gain of free space, a and b the steering vectors (paper eq. (2)) of the line of sight
+at the node and at the UAV, a_l and b_l those of scattered rays. All are transposed, none
+conjugated: a beam at direction u is F = a(u)* (docs/math.md 7). The channel is flat over the band.
 
 Model: rays in clusters, A. Saleh and R. Valenzuela (1987), without their delays; for arrays at
 millimetre waves O. El Ayach et al. (2014), M. Akdeniz et al. (2014).

@@ -73,7 +73,9 @@ def replay(
 
 def _name(log: Path) -> str:
     try:
-        name = sections(read_settings(log) or "", str(log)).get("fleet", {}).get("node")
+        recorded = read_settings(log)
+        text = recorded.text if recorded else ""
+        name = sections(text, str(log)).get("fleet", {}).get("node")
     except (AttributeError, ConfigError):  # "fleet" may be anything in what others wrote
         name = None
     if not isinstance(name, str):

@@ -5,7 +5,8 @@ the unknown input), decay a in (0, 1), output weight 1. The observer is
 
     x+ = q x + l y,  q = 1 - l;      error  e+ = q e + (l d - b) w,  |w| the unknown input
 
-and the smallest mu = gamma^2 for which the LMIs can be met, with the gain that meets it, is
+(docs/math.md 2, paper eq. (8)). The smallest mu = gamma^2 for which the LMIs (paper eq. (10)) can
+be met, with the gain that meets it (paper eq. (11)), is
 
     mu*(b) = max(0, ((d - b)^2 - (1 - a) d^2) / a)
     q*     = (1 - a) d / (d - b)   where (d - b)^2 > (1 - a) d^2,   else 1 - b/d (and mu* = 0)
@@ -15,8 +16,7 @@ mu*(b) serves every b at once, so the guarantee |e| <= gamma sup|w| holds with g
 the interval that really occurred, in any order (docs/math.md 2.3).
 
 The scalar functions run for every report and are plain arithmetic; those in the plural take arrays.
-Source: the optimum over P and Z of the LMIs of Mohammadi, Rahmati and Malik (after Chakrabarty et
-al., 2017); derivation in docs/math.md 2.2.
+Source: the optimum over P and Z of the LMIs; derivation in docs/math.md 2.2.
 """
 
 from dataclasses import dataclass
@@ -47,12 +47,15 @@ def _check(dt_s: ArrayLike, alpha: float) -> FloatArray:
 
 
 def mu_star(dt_s: float, feedthrough_s: float, alpha: float) -> float:
-    """The smallest feasible mu (s²) at one interval; 0 where the error can be cancelled."""
+    """The smallest feasible mu (s²) at one interval; 0 if the error can be cancelled.
+
+    mu*(b) of docs/math.md 2.2.
+    """
     return max(0.0, _excess(dt_s, feedthrough_s, alpha) / alpha)
 
 
 def gain(dt_s: float, feedthrough_s: float, alpha: float | None = None) -> float:
-    """The optimal gain l* on the report at one interval; q* = 1 - l*.
+    """The optimal gain l* on the report at one interval; q* = 1 - l* (docs/math.md 2.2).
 
     ``alpha=None``: ``best_alpha``.
 

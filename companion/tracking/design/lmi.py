@@ -16,8 +16,8 @@ Then |H e| <= sqrt(mu) from e = 0, and in the limit from anywhere, in whatever o
 times occur: {e : e^T P e <= 1} is invariant. The inputs w for which it holds depend on the
 channels. With one channel, diag(alpha_i) = alpha I and |w| <= 1. With several, alpha is the sum of
 the alpha_i, all non-negative and found by the solver (the S-procedure, one multiplier per channel),
-and |w_i| <= 1 for each block w_i of w. Source: Mohammadi, Rahmati and Malik, with the sign of the
-last block corrected (printed +P, which is infeasible; docs/math.md 2 and 8.4).
+and |w_i| <= 1 for each block w_i of w. The inequalities are docs/math.md 2, paper eq. (10), with
+the sign of the last block corrected (docs/math.md 8.4); L is paper eq. (11), H e paper eq. (9).
 
 Only this module imports cvxpy, which takes more than a second to load, and only commands that
 design import this module.

@@ -13,7 +13,8 @@ of all three obey it, each with its own noise. Gains come from a design with one
 over a range of T (``gain_table.KinematicDesign``); the bound holds whatever they are.
 
 The same step predicts, with T the time since the report; backwards too, with |T| in the last terms.
-The greatest speed ``speed_max_mps`` limits the bound over long gaps. See docs/math.md 4.
+The greatest speed ``speed_max_mps`` limits the bound over long gaps. See docs/math.md 4; the step
+is paper eq. (8) with A(T) - L for Q.
 """
 
 import math

@@ -3,12 +3,13 @@
 Per axis, over an interval b from one report to the next,
 
     x+ = x + b w,     y = x + d w + noise,     w the mean velocity over the interval, unknown
-    x^+ = x^ + l (y - x^),   l = l*(b, d)          (``closed_form.gain``)
+    x^+ = q x^ + l y,   q = 1 - l,   l = l*(b, d)          (``closed_form.gain``)
     |e+| <= |1 - l| |e| + |l d - b| W + |l| N       the running bound, exact for given W and N
 
 where W bounds the speed and N the report's noise. The same step predicts, with b the time since the
 report: the estimate at t is what the observer would hold if its next report came at t. The gain is
-the same for all axes, so norms of 3-vectors obey the same bound. See docs/math.md 2.
+the same for all axes, so norms of 3-vectors obey the same bound. The model is docs/math.md 1, paper
+eq. (6), the step docs/math.md 2, paper eq. (8), the bound docs/math.md 2.4.
 
 A sender that itself leads by d has mean velocities over d and over b that differ by at most A |b -
 d| / 2, with A a bound on acceleration; N has d times that added.

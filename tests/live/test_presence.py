@@ -39,7 +39,7 @@ def test_it_beats_asks_and_is_acknowledged(start_node: Any, settings: str, tmp_p
         assert (asked.command, asked.param1, asked.param2) == (511, 33, 100_000)
 
         def in_order(links: Any) -> bool:
-            found = {(r["uav"], r["message_id"]): r for r in links["message_rates"]}
+            found = {(r["uav"], r["msgid"]): r for r in links["message_rates"]}
             return all(
                 found.get(key, {}).get("state") == "accepted"
                 and (found[key]["observed_hz"] or 0) > 0.8 * found[key]["wanted_hz"]

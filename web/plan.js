@@ -259,17 +259,16 @@ export class PlanView {
   }
 
   drawBound(uav) {
-    const [northM, eastM] = uav.bound_cylinder_ned_m ?? [];
-    if (!format.known(northM) || !format.known(eastM)) return;
+    if (!format.known(uav.horizontal_bound_m)) return;
     const { context } = this;
-    const [alongPx, acrossPx] = [northM * this.pxPerM, eastM * this.pxPerM];
-    if (Math.max(alongPx, acrossPx) > 4 * Math.hypot(this.width, this.height)) return;
+    const radiusPx = uav.horizontal_bound_m * this.pxPerM;
+    if (radiusPx > 4 * Math.hypot(this.width, this.height)) return;
     context.beginPath();
     context.ellipse(
-      ...this.at(uav.north_m, uav.east_m), acrossPx, alongPx, 0, 0, 2 * Math.PI,
+      ...this.at(uav.north_m, uav.east_m), radiusPx, radiusPx, 0, 0, 2 * Math.PI,
     );
     // One as large as the picture says it by its rim: several would cover all else.
-    if (Math.max(alongPx, acrossPx) < this.outerPx) {
+    if (radiusPx < this.outerPx) {
       context.fillStyle = withAlpha(this.colourOf(uav), 0.1);
       context.fill();
     }

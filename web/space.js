@@ -64,11 +64,10 @@ export class Space {
 
   // --- ground -----------------------------------------------------------------------------------
 
-  circle([north, east, down], radiusNorth, radiusEast) {
+  circle([north, east, down], radiusM) {
     return Array.from({ length: STEPS }, (_, i) => {
       const angle = (2 * Math.PI * i) / STEPS;
-      return this.at([north + radiusNorth * Math.cos(angle), east + radiusEast * Math.sin(angle),
-        down]);
+      return this.at([north + radiusM * Math.cos(angle), east + radiusM * Math.sin(angle), down]);
     });
   }
 
@@ -76,7 +75,7 @@ export class Space {
     const { context } = view;
     const [radiusM, stepM] = view.scale.rings;
     for (let m = stepM; m <= radiusM * 1.001; m += stepM) {
-      stroke(context, this.circle([0, 0, 0], m, m), view.colour.grid, m >= radiusM ? 1.6 : 1, true);
+      stroke(context, this.circle([0, 0, 0], m), view.colour.grid, m >= radiusM ? 1.6 : 1, true);
       const [x, y] = this.at([-m * Math.SQRT1_2, -m * Math.SQRT1_2, 0]);
       view.write(format.length(m), x, y, { colour: "gridtext", size: 11, align: "center" });
     }
@@ -163,11 +162,13 @@ export class Space {
 
   /** The cylinder in which it surely is. */
   drawBound(view, uav) {
-    const [northM, eastM, downM] = uav.bound_cylinder_ned_m ?? [];
-    if (![northM, eastM, downM].every(format.known)) return;
-    if (Math.max(northM, eastM, downM) * view.pxPerM > view.outerPx) return;
+    const { horizontal_bound_m: radiusM, vertical_bound_m: heightM } = uav;
+    if (!format.known(radiusM) || !format.known(heightM)) return;
+    if (Math.max(radiusM, heightM) * view.pxPerM > view.outerPx) return;
     const [north, east, down] = placeOf(uav);
-    const ends = [-downM, downM].map((off) => this.circle([north, east, down + off], northM, eastM));
+    const ends = [-heightM, heightM].map(
+      (off) => this.circle([north, east, down + off], radiusM),
+    );
     const { context } = view;
     const colour = view.colourOf(uav);
     context.fillStyle = withAlpha(colour, 0.12);

@@ -153,7 +153,7 @@ test("where UAVs alone are not answered, the plan is not live", async () => {
 
 const IMPOSSIBLE = {
   "/v1/links": { links: [{ url: "udpin:a", state: "up", components: 7 }] },
-  "/v1/uavs": { valid_at: null, uavs: [uav("1:1", { bound_cylinder_ned_m: [-4, 4, 2] })] },
+  "/v1/uavs": { valid_at: null, uavs: [uav("1:1", { horizontal_bound_m: -4 })] },
   "/v1/pattern": { angles_deg: [], patterns: [{ uav: "1:1", peak_db: 18 }] },
   "/v1/beams/weights": { uavs: ["1:1"], re: [[1]], im: [] },
 };

@@ -68,14 +68,14 @@ test("a UAV in the northeast is above and to the right, twice as far east as nor
   near(stillAt(picture), { x: CENTRE.x + 1.2 * PX, y: CENTRE.y - 0.6 * PX });
 });
 
-test("the error bound is as wide as it reaches east and as high as it reaches north", async () => {
+test("the error bound is a circle of the horizontal bound", async () => {
   const view = await openPlan();
   const picture = view.show({
-    uavs: [uav("1:1", { east_m: 50, bound_cylinder_ned_m: [10, 30, 99] })],
+    uavs: [uav("1:1", { east_m: 50, horizontal_bound_m: 30, vertical_bound_m: 99 })],
   });
   const [bound] = ellipses(picture);
   near(bound, { x: CENTRE.x + PX / 2, y: CENTRE.y - PX });
-  near([bound.halfX, bound.halfY], [0.3 * PX, 0.1 * PX]);
+  near([bound.halfX, bound.halfY], [0.3 * PX, 0.3 * PX]);
   assert.deepEqual(bound.dash, []);
 });
 
@@ -87,8 +87,8 @@ test("the bound of an estimate that coasts is dashed", async () => {
 
 test("a bound larger than the picture, or unknown, is not drawn", async () => {
   const view = await openPlan();
-  for (const bound of [[9e3, 5, 5], [5, 9e3, 5], null]) {
-    const picture = view.show({ uavs: [uav("1:1", { bound_cylinder_ned_m: bound })] });
+  for (const bound of [9e3, null]) {
+    const picture = view.show({ uavs: [uav("1:1", { horizontal_bound_m: bound })] });
     assert.deepEqual(ellipses(picture), []);
   }
 });

@@ -25,7 +25,7 @@ for (const [state, name] of Object.entries(COLOUR_OF)) {
 
 test("a UAV that is lost is a cross", async () => {
   const view = await openPlan();
-  const lost = uav("1:1", { state: "lost", bound_cylinder_ned_m: null });
+  const lost = uav("1:1", { state: "lost", horizontal_bound_m: null });
   const picture = view.show({ uavs: [lost, uav("2:1", { north_m: -100 })] });
   const y = CENTRE.y - (100 * OUTER_PX) / 150;
   const cross = picture.of("stroke", ({ path }) => path.some((point) => point.y === y - 6));
@@ -107,7 +107,7 @@ test("a bound as large as the picture is a rim: several would cover all else", a
   const view = await openPlan();
   const drawn = (boundM) => {
     const picture = view.show({
-      uavs: [uav("1:1", { bound_cylinder_ned_m: [boundM, boundM, 2] })],
+      uavs: [uav("1:1", { horizontal_bound_m: boundM })],
     });
     return ["fill", "stroke"].map((kind) =>
       picture.of(kind, ({ path }) => path.length === 1 && path[0].op === "ellipse").length);

@@ -61,7 +61,7 @@ test("a UAV stands over its foot, can be chosen, and has its name", async () => 
 
 test("a beam is a cone of the likely angle, of the bound where there is none", async () => {
   const view = await openSpace({ bearingDeg: 0, aboveDeg: 90 });
-  const flat = uav("1:1", { north_m: 100, east_m: 0, down_m: 0, bound_cylinder_ned_m: null });
+  const flat = uav("1:1", { north_m: 100, east_m: 0, down_m: 0, horizontal_bound_m: null });
   const halfWidthM = (fields) => {
     const picture = view.show({ uavs: [flat], beams: [beam("1:1", fields)], array: array() });
     const rim = picture.of("stroke", (one) => one.strokeStyle === view.browser.colour("beam")
@@ -81,7 +81,7 @@ test("what is not true any more is grey, and what is not known does no harm", as
   }
   picture.text("NOT LIVE – connection lost");
   view.show({
-    uavs: [uav("2:1", { down_m: null, bound_cylinder_ned_m: null, velocity_ned_mps: null }),
+    uavs: [uav("2:1", { down_m: null, horizontal_bound_m: null, velocity_ned_mps: null }),
       uav("3:1", { north_m: null })],
     beams: [beam("9:1", { bearing_deg: null }),
       beam("8:1", { range_m: null, elevation_deg: null, pointing_bound_deg: null })],

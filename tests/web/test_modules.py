@@ -16,8 +16,10 @@ from support import HANG_S, ROOT
 
 from companion.server.responses import encode
 from companion.values import UtcNs
-from companion.views.as_json import as_json
+from companion.values.described import members
+from companion.views.as_json import FORMER_NAMES, as_json
 from companion.views.labels import labels as made_labels
+from companion.views.uav_state import UavState
 
 HERE = Path(__file__).parent
 OLDEST = (20, 6)
@@ -70,3 +72,11 @@ def test_the_modules_of_the_page_do_what_their_tests_say(tmp_path: Path) -> None
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_page_uses_no_deprecated_name() -> None:
+    """They go with the next version."""
+    old = {name for names in FORMER_NAMES.values() for name in names} - {"source"}
+    old |= {member.name for member in members(UavState) if member.meaning.deprecated}
+    used = " ".join(file.read_text("utf-8") for file in (ROOT / "web").glob("*.js"))
+    assert not [name for name in old if re.search(rf"\b{name}\b", used)]

@@ -5,6 +5,7 @@ Names follow Prometheus: base units, ``_total`` for what only grows. The process
 """
 
 from collections.abc import Iterator
+from typing import Any, Final
 
 from prometheus_client.core import (
     CounterMetricFamily,
@@ -15,10 +16,24 @@ from prometheus_client.core import (
 from prometheus_client.registry import Collector
 
 import companion
+from companion.mavlink.links.lag import LagSeen
+from companion.mavlink.links.status import LinkStatus
 from companion.server.fleet_metrics import fleet_metrics
 from companion.server.stream import Stream
-from companion.values import Level
-from companion.views.state import Node
+from companion.values import BeamSet, Level, Track, Verdict
+from companion.values.described import meaning
+from companion.views.state import Node, RecordingStatus
+
+LINK_COUNTS: Final = (
+    "frames", "bytes", "gaps", "sent", "send_dropped", "misstamped", "overflowed"
+)  # fmt: skip
+GAINS: Final = ("needed", "guaranteed", "likely")
+
+
+def _help(described: Any, name: str) -> str:
+    """What a value means, as in the API."""
+    text = meaning(described, name).text
+    return text[0].upper() + text[1:]
 
 
 class NodeCollector(Collector):
@@ -74,29 +89,20 @@ class NodeCollector(Collector):
 
     def _arrival_lag(self) -> Iterator[Metric]:
         seen = self._node.arrival_lag.seen(self._node.now_ns())
-        lags = {
-            "": (seen.newest_s, "From the arrival of the newest datagram to its processing"),
-            "_p95": (seen.p95_s, "The same, 95 of 100 tenths of a second, over ten seconds"),
-            "_max": (seen.max_s, "The same, the worst of ten seconds"),
-        }
-        for name, (value_s, text) in lags.items():
+        for name, field in (("", "newest_s"), ("_p95", "p95_s"), ("_max", "max_s")):
+            value_s = getattr(seen, field)
             if value_s is not None:
-                yield GaugeMetricFamily(f"companion_arrival_lag{name}_seconds", text, value=value_s)
+                yield GaugeMetricFamily(
+                    f"companion_arrival_lag{name}_seconds", _help(LagSeen, field), value=value_s
+                )
 
     def _links(self) -> Iterator[Metric]:
         up = GaugeMetricFamily("companion_link_up", "1 if the link is up", labels=["link"])
-        counted = {
-            "frames": "Frames that came",
-            "bytes": "Bytes that came",
-            "gaps": "Frames missing by their sequence numbers",
-            "sent": "Frames that were sent",
-            "send_dropped": "Frames that a peer did not take",
-            "misstamped": "Datagrams whose stamp of arrival could not be true",
-            "overflowed": "Datagrams that the system dropped",
-        }
         families = {
-            name: CounterMetricFamily(f"companion_link_{name}", text, labels=["link"])
-            for name, text in counted.items()
+            name: CounterMetricFamily(
+                f"companion_link_{name}", _help(LinkStatus, name), labels=["link"]
+            )
+            for name in LINK_COUNTS
         }
         lost = CounterMetricFamily(
             "companion_link_lost", "Refused, by reason; garbage in bytes", labels=["link", "reason"]
@@ -114,10 +120,14 @@ class NodeCollector(Collector):
     def _uavs(self) -> Iterator[Metric]:
         pipeline, now_ns = self._node.pipeline, self._node.now_ns()
         states = GaugeMetricFamily("companion_uavs", "UAVs by state", labels=["state"])
-        bounds = GaugeMetricFamily("companion_bound_meters", "Position bound", labels=["uav"])
-        latency = GaugeMetricFamily("companion_latency_seconds", "Latency seen", labels=["uav"])
+        bounds = GaugeMetricFamily(
+            "companion_bound_meters", _help(Track, "bound_m"), labels=["uav"]
+        )
+        latency = GaugeMetricFamily(
+            "companion_latency_seconds", _help(Track, "latency_s"), labels=["uav"]
+        )
         likely = GaugeMetricFamily(
-            "companion_likely_error_meters", "95 of 100 predictions were nearer", labels=["uav"]
+            "companion_likely_error_meters", _help(Track, "error_p95_m"), labels=["uav"]
         )
         by_state: dict[str, int] = {}
         for track in pipeline.tracks(now_ns, now_ns):
@@ -137,7 +147,7 @@ class NodeCollector(Collector):
             if beams.condition_number is not None:
                 yield GaugeMetricFamily(
                     "companion_condition_number",
-                    "Condition number of the steering matrix",
+                    _help(BeamSet, "condition_number"),
                     value=beams.condition_number,
                 )
 
@@ -148,21 +158,16 @@ class NodeCollector(Collector):
             labels=["uav", "verdict"],
         )
         gains = {
-            name: GaugeMetricFamily(f"companion_{name}_gain_decibels", text, labels=["uav"])
-            for name, text in (
-                ("needed", "Array gain that the link needs"),
-                ("guaranteed", "Least gain within the bound; absent where none is sure"),
-                ("likely", "Least gain where the UAV usually is; absent where none is sure"),
+            name: GaugeMetricFamily(
+                f"companion_{name}_gain_decibels", _help(Verdict, f"{name}_gain_db"), labels=["uav"]
             )
+            for name in GAINS
         }
         for found in self._node.pipeline.health.verdicts.values():
             for level in Level:
                 levels.add_metric([found.uav, str(level)], float(found.level is level))
-            for name, gain_db in (
-                ("needed", found.needed_gain_db),
-                ("guaranteed", found.guaranteed_gain_db),
-                ("likely", found.likely_gain_db),
-            ):
+            for name in GAINS:
+                gain_db = getattr(found, f"{name}_gain_db")
                 if gain_db is not None:
                     gains[name].add_metric([found.uav], gain_db)
         yield from (levels, *gains.values())
@@ -175,19 +180,19 @@ class NodeCollector(Collector):
             value=float(recording.state == "recording"),
         )
         yield GaugeMetricFamily(
-            "companion_recording_bytes", "Of the file being written", value=recording.bytes
+            "companion_recording_bytes", _help(RecordingStatus, "bytes"), value=recording.bytes
         )
         yield GaugeMetricFamily(
-            "companion_recording_queue", "Events that wait to be written", value=recording.queued
+            "companion_recording_queue", _help(RecordingStatus, "queued"), value=recording.queued
         )
         if recording.lag_s is not None:
             yield GaugeMetricFamily(
                 "companion_recording_lag_seconds",
-                "How far behind the newest written event is",
+                _help(RecordingStatus, "lag_s"),
                 value=recording.lag_s,
             )
         yield CounterMetricFamily(
             "companion_recording_dropped",
-            "Events that the recorder could not take",
+            _help(RecordingStatus, "dropped"),
             value=recording.dropped,
         )

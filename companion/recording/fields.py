@@ -102,6 +102,7 @@ class Field(NamedTuple):
     number: int
     declared: str
     get: Callable[[Any], Any]
+    meaning: str
 
 
 @functools.cache
@@ -117,23 +118,26 @@ def fields(message: str) -> tuple[Field, ...]:
 
 def _fields(member: Member) -> Iterator[Field]:
     number, name, kind, get = member.meaning.number, member.name, member.type, member.get
+
+    def field(declared: str, read: Callable[[Any], Any], offset: int = 0) -> Field:
+        at = (number or 0) + offset
+        return Field(number=at, declared=declared, get=read, meaning=member.meaning.text)
+
     if number is None:
         return
     if kind is Source:
-        for offset, part in enumerate(("sysid", "compid")):
-            yield Field(number + offset, f"uint32 {part}", _part(get, part))
-        return
-    if "ndarray" in str(kind):
-        yield Field(number, f"repeated double {name}", _listed(get))
-        return
-    if typing.get_origin(kind) is tuple:
+        yield field("uint32 sysid", _part(get, "sysid"))
+        yield field("uint32 compid", _part(get, "compid"), 1)
+    elif "ndarray" in str(kind):
+        yield field(f"repeated double {name}", _listed(get))
+    elif typing.get_origin(kind) is tuple:
         inner = typing.get_args(kind)[0]
         known = next((named for named, of in CLASSES.items() if of is inner), None)
         read = get if known is None else _messages(known, get)
-        yield Field(number, f"repeated {known or _scalar(inner, '')} {name}", read)
-        return
-    optional = "optional " if member.optional else ""
-    yield Field(number, f"{optional}{member.meaning.wire or _scalar(kind, name)} {name}", get)
+        yield field(f"repeated {known or _scalar(inner, '')} {name}", read)
+    else:
+        optional = "optional " if member.optional else ""
+        yield field(f"{optional}{member.meaning.wire or _scalar(kind, name)} {name}", get)
 
 
 def _scalar(kind: Any, name: str) -> str:

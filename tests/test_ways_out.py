@@ -6,6 +6,7 @@ description, or here.
 """
 
 import math
+import re
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -182,6 +183,24 @@ def test_two_names_never_hold_the_same_values(
         if stem(one.split()[1]) != stem(other.split()[1]) and all(map(same, values, others))
     }
     assert twice <= set(SAME_THING), twice - set(SAME_THING)
+
+
+@pytest.mark.parametrize("subject", SUBJECTS)
+def test_one_name_holds_the_same_values_on_every_way(
+    flown: tuple[Pipeline, Any, list[Update]], subject: str
+) -> None:
+    """Angles in degrees: the recording has them in radians."""
+    found = {
+        name: values for name, values in columns(flown)[subject].items()
+        if isinstance(values[0], float) and not re.search("_(north|east|down)_", name)
+    }  # fmt: skip
+    compared = 0
+    for one, values in found.items():
+        for other, others in found.items():
+            if one != other and stem(one.split()[1]) == stem(other.split()[1]):
+                assert all(map(same, values, others)), (one, other)
+                compared += 1
+    assert compared > 15
 
 
 def test_no_table_names_a_column_twice_and_old_names_say_what_is_new() -> None:

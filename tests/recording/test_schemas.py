@@ -106,3 +106,43 @@ def test_the_numbers_of_the_fields_stay() -> None:
         ("Rej", "reason"): 3, ("Rej", "count"): 4, ("Rej", "msgid"): 5, ("Rej", "detail"): 6,
         ("Rej", "is_event"): 7,
     }  # fmt: skip
+
+
+NUMBERS = {
+    "Frame": ("t_ns=1 link=2 sysid=3 compid=4 msgid=5 raw=6 doubt_ns=7"),
+    "Tick": ("t_ns=1 in_two=2"),
+    "Tock": ("t_ns=1"),
+    "Rejection": ("t_ns=1 source=2 reason=3 count=4 msgid=5 detail=6 is_event=7"),
+    "RoundTrip": ("t_ns=1 sysid=2 compid=3 sent_ns=4 remote_ns=5"),
+    "Track": (
+        "uav=1 state=2 valid_at_ns=3 age_s=4 position_ned_m=5 velocity_ned_mps=6 "
+        "unknown_input_mps=7 bound_m=8 dt_s=9 latency_s=10 gamma=11 innovation_m=12 "
+        "reports=13 t_ns=14 acceleration_ned_mps2=15 horizontal_bound_m=16 "
+        "vertical_bound_m=17 clock_bound_s=18 set_center_ned_m=19 set_radius_m=20 "
+        "speed_max_mps=21 acceleration_max_mps2=22 limits_source=23 error_p95_m=24 "
+        "speed_mps=25"
+    ),
+    "Beam": (
+        "uav=1 azimuth_rad=2 elevation_rad=3 range_m=4 pointing_bound_rad=5 gain_db=6 "
+        "azimuth_rate_radps=7 elevation_rate_radps=8 range_rate_mps=9 loss_db=10 group=11 "
+        "widened=12 pointing_p95_rad=13"
+    ),
+    "LeftOut": ("uav=1 reason=2"),
+    "Weights": (
+        "t_ns=1 valid_at_ns=2 uavs=3 elements=4 weights_complex64=5 method=6 "
+        "condition_number=7 beam=8 left_out=9 normalisation=10 exact=11 regularised=12 "
+        "groups=13"
+    ),
+    "Duty": ("t_ns=1 serves=2 spares=3"),
+    "Offer": ("uav=1 sure_db=2 likely_db=3 sinr_db=4 heard_s=5"),
+    "ClockSet": ("t_ns=1 utc_offset_ns=2"),
+}
+"""The number of each field that a version has written. A number keeps its meaning for good."""
+
+
+def test_a_number_that_was_written_once_keeps_its_meaning() -> None:
+    for message, written in NUMBERS.items():
+        now = {one.declared.rpartition(" ")[2]: one.number for one in fields.fields(message)}
+        then = {name: int(number) for name, number in (one.split("=") for one in written.split())}
+        assert {name: now.get(name) for name in then} == then, message
+        assert len(set(now.values())) == len(now), message

@@ -100,7 +100,7 @@ class FrameOutcome:
     """
 
     message: PlacedReport | PlacedAttitude | EstimatorStatus | None = None
-    said: tuple[Notice | Rejection, ...] = ()
+    outputs: tuple[Notice | Rejection, ...] = ()
     restarted: str | None = None
     change: ClockChange | None = None
 
@@ -177,7 +177,7 @@ class Senders:
         message = decode(frame)
         match message:
             case Rejection():
-                return FrameOutcome(said=(message,))
+                return FrameOutcome(outputs=(message,))
             case Report():
                 if self._dedupe.is_repeat(frame):
                     return _refused(message, Reason.DUPLICATE)
@@ -268,13 +268,13 @@ class Senders:
         restarted = uav if said else None
         if sender.clock.is_shared(t_ns):
             return FrameOutcome(
-                message=None, said=(*said, *_shared_id(sender, uav, t_ns)), restarted=restarted
+                message=None, outputs=(*said, *_shared_id(sender, uav, t_ns)), restarted=restarted
             )
         sender.is_shared = False
         if stamp is None:
             return FrameOutcome(
                 message=None,
-                said=(*said, Rejection(t_ns=t_ns, source=uav, reason=Reason.UNPLACED_STAMP)),
+                outputs=(*said, Rejection(t_ns=t_ns, source=uav, reason=Reason.UNPLACED_STAMP)),
                 restarted=restarted,
             )
         self._dedupe.took(stamp.latency_s)
@@ -290,7 +290,7 @@ class Senders:
             limits=assumed.limits,
         )
         return FrameOutcome(
-            message=placed, said=said, restarted=restarted, change=sender.clock.change
+            message=placed, outputs=said, restarted=restarted, change=sender.clock.change
         )
 
     def _errors(self, report: Report, time_s: float) -> ReportNoise:
@@ -318,7 +318,7 @@ class Senders:
         datum = self.aircraft.datum(said.uav)
         merged = self.aircraft.merge(said)
         if isinstance(merged, Rejection):
-            return FrameOutcome(said=(merged,))
+            return FrameOutcome(outputs=(merged,))
         true_ns = merged.t_ns - round((merged.tslc_s or 0.0) * 1e9)
         limits = self.assumed(said.uav).limits
         placed = PlacedReport(
@@ -329,7 +329,7 @@ class Senders:
         text = f"{said.uav} is tracked anew: its altitude is {merged.alt_datum} now, not {datum}"
         return FrameOutcome(
             message=placed,
-            said=(Notice(t_ns=said.t_ns, severity=Severity.INFO, subject=said.uav, text=text),),
+            outputs=(Notice(t_ns=said.t_ns, severity=Severity.INFO, subject=said.uav, text=text),),
             restarted=said.uav,
         )
 
@@ -339,7 +339,7 @@ class Senders:
         if named is None:
             return NOTHING
         if isinstance(named, Rejection):
-            return FrameOutcome(said=(named,))
+            return FrameOutcome(outputs=(named,))
         if not self._admits(named.uav):
             return _refused(named, Reason.NOT_ALLOWED)
         if self._dedupe.is_repeat(frame):
@@ -355,7 +355,7 @@ class Senders:
         placed = None if stamp is None else PlacedAttitude(attitude, stamp.sender_ns)
         return FrameOutcome(
             message=placed,
-            said=said,
+            outputs=said,
             restarted=carrier if said else None,
             change=sender.clock.change,
         )
@@ -452,7 +452,7 @@ class Senders:
 
 
 def _refused(message: Report | AdsbVehicle, reason: Reason) -> FrameOutcome:
-    return FrameOutcome(said=(Rejection(t_ns=message.t_ns, source=message.uav, reason=reason),))
+    return FrameOutcome(outputs=(Rejection(t_ns=message.t_ns, source=message.uav, reason=reason),))
 
 
 def _shared_id(sender: Sender, uav: str, t_ns: int) -> tuple[Notice | Rejection, ...]:

@@ -131,7 +131,7 @@ def fleet(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Json:
             sent_bps=status.sent_bps,
             heard_bps=status.heard_bps,
             damaged=status.damaged,
-            untold=member.sharing.untold,
+            untold=member.sharing.dropped,
         )
     return as_json(shown, pipeline.utc_ns)
 
@@ -160,8 +160,8 @@ def nodes(member: FleetMember, now_ns: int) -> list[FleetNode]:
 
 def _node(name: str, member: FleetMember, now_ns: int) -> FleetNode:
     known: Neighbour = member.neighbours[name]
-    said, ahead = known.standing, known.clock.newest()
-    reason = member.trust.aside.get(name)
+    said, ahead = known.standing, known.clock.newest_offset()
+    reason = member.trust.excluded.get(name)
     is_there = name in member.duties.others(now_ns)
     median_ms, p99_ms = _ways_ms(known, now_ns)
     state = NodeState.THERE if is_there else NodeState.SILENT

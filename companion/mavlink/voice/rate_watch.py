@@ -159,7 +159,7 @@ class Watch:
     _slow_since_ns: int | None = None
     _order_since_ns: int | None = None
     _was_in_order: bool = False  # settled in order since the newest request
-    _told: set[str] = field(default_factory=set)
+    _notified: set[str] = field(default_factory=set)
 
     def observed_hz(self, heard_ns: int) -> float | None:
         """The rate as of when the UAV was last heard; None while too little is known."""
@@ -264,7 +264,7 @@ class Watch:
         self._was_in_order |= self._is_settled(self._order_since_ns, now_ns)
         if now_ns - self._order_since_ns >= IN_ORDER_NS:
             self._backoff_ns = 0
-            self._told.clear()
+            self._notified.clear()
             self.changed_by = None
 
     def _slow(
@@ -298,7 +298,7 @@ class Watch:
         return max((c for c in causes if after_ns <= c[0] <= since_ns), default=(0, NOBODY))[1]
 
     def _tell(self, now_ns: int, what: str, text: str) -> list[Notice]:
-        if what in self._told:
+        if what in self._notified:
             return []
-        self._told.add(what)
+        self._notified.add(what)
         return [Notice(t_ns=now_ns, severity=Severity.WARNING, subject=str(self.uav), text=text)]

@@ -80,7 +80,7 @@ class LiveFleetNode:
             started_ns=self._started_ns,
         )
         self._around = Surroundings(pipeline, self.member)
-        self._offers = Offers(pipeline, self.member.hearing.silent_s)
+        self._offers = Offers(pipeline, self.member.reception.silent_s)
         self._session: Any = None  # of a peer, opened before there was a loop
         self._bus: Bus | None = None  # once all is declared
         self._flushing: asyncio.TimerHandle | None = None
@@ -212,7 +212,7 @@ class LiveFleetNode:
         self._tell(notices)
 
     def _tell_of_heard(self, now_ns: int) -> None:
-        said = self.member.sharing.due(now_ns)
+        said = self.member.sharing.next_message(now_ns)
         if said is not None:
             self._put("heard", messages.shared(said), express=True, reliable=False)
         wait_ns = self.member.sharing.wait_ns(now_ns)
@@ -333,7 +333,7 @@ class LiveFleetNode:
         now_ns = self._now_ns()
         self.member.stands(now_ns, said)
         serves = self.member.duties.serves
-        if self.member.trust.believes(node) and any(uav in serves for uav, _ in said.serves):
+        if self.member.trust.is_trusted(node) and any(uav in serves for uav, _ in said.serves):
             self.ticked(now_ns)  # one of them is to let go
 
     def _offered(self, node: str, payload: bytes) -> None:

@@ -24,12 +24,12 @@ ANSWERS: Final = 3
 """Answers from which on what a node hears is used: the first, slow one would leave its doubt."""
 WAYS_KEPT: Final = 4096
 WAYS_NS: Final = 60_000_000_000  # how long it counts how long a report was on its way
-TOLD_APART_NS: Final = 100_000_000
+NOTICED_OFFSET_NS: Final = 100_000_000
 """Difference of two nodes' clocks from which on it is told: with NTP there is none."""
 
 
 @dataclass(frozen=True, slots=True)
-class Ahead:
+class ClockOffset:
     """By how much this node's timeline is ahead of another's: an interval, ns."""
 
     low_ns: int
@@ -49,7 +49,7 @@ class NeighbourClock:
         self._newest_ns: int | None = None
         self._answers = 0
 
-    def answered(self, sent_ns: int, received_ns: int, remote_ns: int) -> DriftProven | None:
+    def note_answer(self, sent_ns: int, received_ns: int, remote_ns: int) -> DriftProven | None:
         """Take in a reading of the other clock; returns what it contradicts, None where nothing."""
         self._newest_ns = remote_ns
         self._answers += 1
@@ -60,14 +60,18 @@ class NeighbourClock:
         """Whether frames can be placed by it; a sender's clock keeps the doubt of the worst."""
         return self._answers >= ANSWERS
 
-    def ahead(self, remote_ns: int) -> Ahead | None:
+    def offset(self, remote_ns: int) -> ClockOffset | None:
         """What is known at a time of the other node; None before the first answer."""
         known = self._evidence.at(remote_ns)
-        return None if known is None else Ahead(math.floor(known.low_ns), math.ceil(known.high_ns))
+        return (
+            None
+            if known is None
+            else ClockOffset(math.floor(known.low_ns), math.ceil(known.high_ns))
+        )
 
-    def newest(self) -> Ahead | None:
+    def newest_offset(self) -> ClockOffset | None:
         """What was known at the newest answer; None before the first."""
-        return None if self._newest_ns is None else self.ahead(self._newest_ns)
+        return None if self._newest_ns is None else self.offset(self._newest_ns)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -99,7 +103,7 @@ def here(trip: RoundTrip, clock: NeighbourClock) -> RoundTrip | None:
 
     None while that node's clock is not known.
     """
-    sent, received = clock.ahead(trip.sent_ns), clock.ahead(trip.t_ns)
+    sent, received = clock.offset(trip.sent_ns), clock.offset(trip.t_ns)
     if sent is None or received is None:
         return None
     return RoundTrip(

@@ -33,7 +33,7 @@ class Surroundings:
         carrier = self._pipeline.last_carrier
         if carrier is None:
             return None
-        here, hearing = carrier.position_ned_m.tolist(), self._member.hearing
+        here, hearing = carrier.position_ned_m.tolist(), self._member.reception
         away_m = [
             math.dist(here, position)
             for uav, position in self._positions().items()
@@ -46,7 +46,7 @@ class Surroundings:
         local, carrier = self._pipeline.local, self._pipeline.last_carrier
         if local is None or carrier is None:
             return []
-        positions, hearing = self._positions(), self._member.hearing
+        positions, hearing = self._positions(), self._member.reception
         heard = frozenset(u for u in positions if hearing.silent_s(u, now_ns) is not None)
         north, east, down = carrier.position_ned_m.tolist()
         own = Witness((north, east, down), self.reach_m(now_ns) or 0.0, heard)

@@ -171,7 +171,7 @@ class World:
 
     def _tell_of_heard(self, name: str) -> None:
         sharing = self.members[name].sharing
-        said = sharing.due(self._local_ns(name))
+        said = sharing.next_message(self._local_ns(name))
         if said is not None:
             self._tell(name, "heard", messages.shared(said))
         wait_ns = sharing.wait_ns(self._local_ns(name))

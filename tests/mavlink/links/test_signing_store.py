@@ -231,7 +231,7 @@ CHILD = """
 import sys, time
 from pathlib import Path
 from companion.mavlink.links.signing_store import Timestamps
-from companion.mavlink.trust.signing import Guard
+from companion.mavlink.trust.signing import LinkSigning
 from companion.mavlink.wire import encode
 from companion.mavlink.wire.framing import Splitter
 from companion.values import Source
@@ -239,7 +239,7 @@ from companion.values import Source
 path, now_ns, key = Path(sys.argv[1]), int(sys.argv[2]), bytes.fromhex(sys.argv[3])
 timestamps = Timestamps(path)
 ours = timestamps.guard("udpin:0.0.0.0:14550", key, 7, now_ns)
-theirs = [Guard(key=key, link_id=0) for _ in range(3)]
+theirs = [LinkSigning(key=key, link_id=0) for _ in range(3)]
 step = 0
 while True:
     step += 1

@@ -6,7 +6,7 @@ from pymavlink.dialects.v20 import all as dialect
 from companion.mavlink.voice.component import HEARD
 from companion.mavlink.wire.decode import DECODED, POSE
 from companion.mavlink.wire.positions import OWN, POSITIONS
-from companion.pipeline.fleet.hearing import SHARED
+from companion.pipeline.fleet.reception import SHARED
 
 
 @pytest.mark.parametrize("msgid", POSITIONS)

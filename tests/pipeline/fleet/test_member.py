@@ -5,7 +5,7 @@ import struct
 from pymavlink.dialects.v20 import common
 
 from companion.pipeline.fleet.member import FORGET_NS, GONE_MAX, NODES_MAX, FleetMember
-from companion.pipeline.fleet.trust import TIMES, UNHEARD_NS, Witness
+from companion.pipeline.fleet.trust import CONTRADICTIONS, UNHEARD_NS, Witness
 from companion.settings.fleet import FleetSettings
 from companion.values import Offer, Shared, SharedFrame, Standing
 
@@ -169,7 +169,7 @@ def test_another_life_of_a_node_has_another_clock() -> None:
     said = word(now_ns - 100 * S, 1)
     (frame,), _ = node.shared(now_ns + MS, "b", said)
     assert frame.doubt_ns < 6 * MS
-    assert node.trust.believes("b")
+    assert node.trust.is_trusted("b")
 
 
 def test_a_clock_that_is_ahead_is_said_to_be() -> None:
@@ -182,8 +182,8 @@ def test_nothing_is_taken_of_a_node_that_is_not_believed() -> None:
     answered(node, START_NS, 0.0, START_NS)
     now_ns = START_NS + 2 * S
     assert len(node.shared(now_ns, "b", word(now_ns, 1))[0]) == 1
-    for _ in range(TIMES):
-        node.trust.against(now_ns, "b", "tells what cannot be")
+    for _ in range(CONTRADICTIONS):
+        node.trust.note_contradiction(now_ns, "b", "tells what cannot be")
     assert node.shared(now_ns, "b", word(now_ns, 2)) == ([], [])
 
 

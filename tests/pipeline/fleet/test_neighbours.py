@@ -29,10 +29,10 @@ def test_the_truth_is_within(
     for there_ms, back_ms in ways:
         sent_ns, read_ns = t_ns, t_ns + there_ms * MS
         received_ns = read_ns + back_ms * MS
-        assert clock.answered(sent_ns, received_ns, remote(read_ns)) is None
+        assert clock.note_answer(sent_ns, received_ns, remote(read_ns)) is None
         t_ns = received_ns + 500 * MS
     then_ns = t_ns + asked_ms * MS
-    ahead = clock.ahead(remote(then_ns))
+    ahead = clock.offset(remote(then_ns))
     assert ahead is not None
     assert ahead.low_ns - 2 <= then_ns - remote(then_ns) <= ahead.high_ns + 2
     # No wider than the best round trip and what drift can have added since.
@@ -46,7 +46,7 @@ def test_a_round_trip_of_another_node_is_no_shorter_here() -> None:
     trip = RoundTrip(t_ns=500 * MS, source=Source(1, 1), sent_ns=400 * MS, remote_ns=77)
     assert here(trip, clock) is None
     # The other clock is 1 s behind; the question took 4 ms, the answer 6 ms.
-    clock.answered(1000 * MS, 1010 * MS, 4 * MS)
+    clock.note_answer(1000 * MS, 1010 * MS, 4 * MS)
     placed = here(trip, clock)
     assert placed is not None
     assert placed.sent_ns <= 1400 * MS

@@ -65,7 +65,7 @@ def check(
     if urls and seconds > 0:
         show(f"listening for {seconds:g} s")
         service = _listen(_to_listen(settings, urls), seconds)
-        yield from _heard(service, settings)
+        yield from _reception(service, settings)
 
 
 def _capacity(settings: Settings) -> Finding:
@@ -119,7 +119,7 @@ def _listen(settings: Settings, seconds: float) -> Service:
     return service
 
 
-def _heard(service: Service, settings: Settings) -> Iterator[Finding]:
+def _reception(service: Service, settings: Settings) -> Iterator[Finding]:
     yield from _links(service)
     pipeline = service.pipeline
     update = pipeline.last_update

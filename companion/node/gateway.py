@@ -14,7 +14,7 @@ from companion.mavlink.links.signing_store import Timestamps, key_warning, load_
 from companion.mavlink.links.transport import Link
 from companion.mavlink.links.urls import LinkError, parse_link
 from companion.mavlink.trust.duplicate_ids import DuplicateIds
-from companion.mavlink.voice.component import HEARD, ComponentSpec, ServiceComponent
+from companion.mavlink.voice.component import ACCEPTED_IDS, ComponentSpec, ServiceComponent
 from companion.mavlink.voice.rate_watch import MessageRate
 from companion.mavlink.wire.encode import Outgoing
 from companion.settings.center import VehicleCenter, parse_center
@@ -50,7 +50,7 @@ class Gateway:
         self._notify = notify
         self._now_ns = now_ns
         self._component = component(settings)
-        self._hear = HEARD if self._component else frozenset()
+        self._hear = ACCEPTED_IDS if self._component else frozenset()
         self._timestamps: Timestamps | None = None
         signed = set(settings.signing.keys) - set(settings.signing.allow_unsigned)
         self._duplicate_ids = DuplicateIds({*settings.links.routers, *signed})
@@ -160,9 +160,9 @@ class Gateway:
                         self._notify(found)
                     else:
                         self._step(found)
-        self._tell_of_twins()
+        self._notify_duplicates()
 
-    def _tell_of_twins(self) -> None:
+    def _notify_duplicates(self) -> None:
         for who, peers in self._duplicate_ids.found:
             text = (
                 f"{who} is heard from {' and '.join(peers)}, which contradict each other: not"
@@ -174,7 +174,7 @@ class Gateway:
         self._duplicate_ids.found.clear()
 
     @property
-    def has_voice(self) -> bool:
+    def has_component(self) -> bool:
         """Whether this service says anything of itself."""
         return self._component is not None
 

@@ -184,7 +184,7 @@ class Service:
     def _hear(self, event: Event) -> None:
         """Take in what came over this node's own links."""
         if self.fleet is not None:
-            self.fleet.heard(event)  # first: others wait for it
+            self.fleet.on_event(event)  # first: others wait for it
         self._step(event)
 
     def _step(self, event: Event) -> None:
@@ -308,7 +308,7 @@ class Service:
             self._rates.count(self.now_ns(), self.pipeline.frames, self.pipeline.updates)
             if self._recorder:
                 self._tell_of_recorder(self._recorder)
-            if self._traffic.has_voice:
+            if self._traffic.has_component:
                 self._traffic.speak(not self.unfit(), self.pipeline.reporters())
             self._tell_of_machine()
             self.series.add(self.pipeline)

@@ -19,7 +19,7 @@ from companion.values import UserError
 STATUS_EVERY_S: Final = 1.0  # time between two words on how it goes
 
 
-class Voice(Protocol):
+class Console(Protocol):
     """How a run speaks to whoever started it."""
 
     def say(self, text: str) -> None:
@@ -34,7 +34,7 @@ class Voice(Protocol):
 
 def run(
     settings: Settings,
-    voice: Voice,
+    voice: Console,
     *,
     origins: Origins | None = None,
     token: str | None = None,
@@ -77,7 +77,7 @@ def run(
         run_until_stopped(serve, seconds)
 
 
-async def _keep_shown(service: Service, voice: Voice) -> None:
+async def _keep_shown(service: Service, voice: Console) -> None:
     """Show how it goes, again and again."""
     while True:
         await asyncio.sleep(STATUS_EVERY_S)
@@ -88,7 +88,7 @@ async def _serve(
     until: asyncio.Event,
     *,
     service: Service,
-    voice: Voice,
+    voice: Console,
     http: socket.socket,
     token: str | None,
     traffic: Callable[[str], Coroutine[Any, Any, None]] | None,

@@ -6,7 +6,7 @@ from companion.mavlink.clock.estimates import ClockChange
 from companion.pipeline.records import UavRecord, UavRecords
 from companion.values import Estimate, Notice, Refuted, Severity
 
-AGAIN: Final = 1.25  # multiple of the value last reported, above which a notice is repeated
+NOTICE_RATIO: Final = 1.25  # multiple of the value last reported, above which a notice is repeated
 _UNITS: Final = {
     "observer.speed_max_mps": "m/s",
     "observer.acceleration_max_mps2": "m/s²",
@@ -25,7 +25,7 @@ def notices(records: UavRecords, *refuted: Refuted | None) -> list[Refuted | Not
         out.append(one)
         record = records[one.uav]
         record.refuted += 1
-        if one.proven > AGAIN * record.proven.get(one.setting, 0.0):
+        if one.proven > NOTICE_RATIO * record.proven.get(one.setting, 0.0):
             record.proven[one.setting] = one.proven
             out.append(
                 Notice(

@@ -67,7 +67,7 @@ DROP_EVERY: Final = 100
 """Updates between two searches for tracks that have been silent for too long."""
 PROTECTED_SHARE: Final = 4
 """Elements of the array for each protected UAV of another node: a null costs one."""
-TOLD_STEP_S: Final = 0.5
+NOTICED_STEP_S: Final = 0.5
 """Step of the wall clock that is told; shorter ones are followed in silence."""
 NEAR_M: Final = 2000.0
 """Largest distance between two reports of one aircraft, whatever its speed and their latency."""
@@ -156,7 +156,7 @@ class Pipeline:
         step_s = (event.utc_offset_ns - self.utc_offset_ns) * 1e-9
         self.utc_offset_ns = event.utc_offset_ns
         self.senders.utc_is(event.utc_offset_ns)
-        if abs(step_s) < TOLD_STEP_S:
+        if abs(step_s) < NOTICED_STEP_S:
             return []
         way = "forward" if step_s > 0 else "back"
         text = (

@@ -83,7 +83,7 @@ class HealthMonitor:
         self._begun_ns: int | None = None  # the present round
         self._last_ns: int | None = None  # the update before
         self._waiting: list[str] = []  # those that the round has not come to
-        self._told_of: dict[str, Verdict] = {}  # verdicts when last something was told
+        self._noticed: dict[str, Verdict] = {}  # verdicts when last something was told
         self._unsettled: dict[str, tuple[bool, int]] = {}  # judged better or worse, since when
         self._unfit: str | None = None
 
@@ -142,7 +142,7 @@ class HealthMonitor:
         names = dict.fromkeys((*tracks, *(out.uav for out in update.beams.left_out)))
         self.verdicts = {uav: held[uav] for uav in names if uav in held}
         self._unsettled = {uav: kept for uav, kept in self._unsettled.items() if uav in tracks}
-        return [] if self._waiting else self._told(update)
+        return [] if self._waiting else self._notices(update)
 
     def _of_link(
         self,
@@ -216,9 +216,9 @@ class HealthMonitor:
         why = None if held.level is Level.GOOD else fresh.blame or held.blame
         return replace(fresh, level=held.level, blame=why, since_ns=held.since_ns)
 
-    def _told(self, update: Update) -> list[Notice]:
+    def _notices(self, update: Update) -> list[Notice]:
         """What changed: for all at once where the carrier is the cause, which all share."""
-        before, self._told_of = self._told_of, self.verdicts
+        before, self._noticed = self._noticed, self.verdicts
         was, self._unfit = self._unfit, update.unfit
         if update.unfit is not None:
             text = f"no links: {update.unfit}"

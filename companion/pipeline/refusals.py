@@ -9,7 +9,7 @@ from companion.values import Notice, Reason, Rejection, Severity, kind_of
 
 UNHEARD_NS: Final = 1_000_000_000
 """Time for which no report of a sender is used before that is told."""
-AGAIN_NS: Final = 10_000_000_000  # least time between two such notices of one sender
+NOTICE_INTERVAL_NS: Final = 10_000_000_000  # least time between two such notices of one sender
 OF_REPORTS: Final = frozenset(
     {
         Reason.UNREACHABLE,
@@ -69,7 +69,7 @@ class Refusals:
             return None  # that is told by itself
         run.is_reported = True
         told_ns = record.unused_notice_ns
-        if told_ns is not None and refused.t_ns - told_ns < AGAIN_NS:
+        if told_ns is not None and refused.t_ns - told_ns < NOTICE_INTERVAL_NS:
             return None
         record.unused_notice_ns = refused.t_ns
         why = f"{refused.reason}, {refused.detail}" if refused.detail else str(refused.reason)

@@ -198,13 +198,15 @@ class Senders:
             case None:
                 return NOTHING
             case _:
-                return self._beside(frame, message)
+                return self._take_other(frame, message)
 
-    def _beside(self, frame: Frame, message: GnssStatus | SystemTime | Presence) -> FrameOutcome:
+    def _take_other(
+        self, frame: Frame, message: GnssStatus | SystemTime | Presence
+    ) -> FrameOutcome:
         """Take in what is said beside positions: of a receiver, a clock, a vehicle."""
         match message:
             case GnssStatus():
-                component = self._heard(message)
+                component = self._component(message)
                 stated_us, newest_us = message.time_us, component.stated_us
                 # What is older comes over a second link that lags behind.
                 if not 0 < stated_us < newest_us <= stated_us + STATED_LATE_US:
@@ -219,10 +221,10 @@ class Senders:
                     clock.system_time(message.t_ns, on_timeline_us, message.boot_ms)
                 return NOTHING if change is None else FrameOutcome(change=change)
             case Presence():
-                self._heard(message).presence = message
+                self._component(message).presence = message
         return NOTHING
 
-    def _heard(self, message: GnssStatus | Presence) -> ComponentState:
+    def _component(self, message: GnssStatus | Presence) -> ComponentState:
         component = self._components[message.source]
         component.heard_ns = message.t_ns
         return component
@@ -335,7 +337,7 @@ class Senders:
 
     def _remote_id(self, frame: Frame, said: RemoteId) -> FrameOutcome:
         """Place a position that an aircraft broadcasts, by the stamp that it has."""
-        named = self.remote_ids.named(said)
+        named = self.remote_ids.merge(said)
         if named is None:
             return NOTHING
         if isinstance(named, Rejection):

@@ -31,7 +31,7 @@ COMMON_ERROR: Final = 0.07
 """Share of the noise bound that is usual in all reports alike, which none of them shows."""
 COMMON_ERROR_REFUTED: Final = 0.82
 """The same of a receiver that strays: 95 of 100 lie within 2.45 deviations in the plane, of 3."""
-AGAIN: Final = 1.25  # multiple of what was seen last from which it is told again
+NOTICE_RATIO: Final = 1.25  # multiple of what was seen last from which it is told again
 
 
 class ReceiverCheck:
@@ -74,7 +74,7 @@ class ReceiverCheck:
             <= max(GOOD_DEVIATION_M, math.sqrt(2.0) * stated_m) + lag_m + UNSEEN * unseen_m
         ):
             return None
-        if strayed_m <= AGAIN * self._deviation_m:
+        if strayed_m <= NOTICE_RATIO * self._deviation_m:
             return None
         self._deviation_m = strayed_m
         to_m = self.noise(fix.noise).horizontal_m

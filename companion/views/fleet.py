@@ -176,7 +176,7 @@ def _node(name: str, member: FleetMember, now_ns: int) -> FleetNode:
         most=None if said is None else said.most,
         heard_s=None if said is None else (now_ns - known.heard_ns) * 1e-9,
         clock_offset_s=None if ahead is None else -(ahead.low_ns + ahead.high_ns) / 2e9,
-        clock_doubt_s=None if ahead is None else ahead.doubt_ns * 1e-9,
+        clock_doubt_s=None if ahead is None else ahead.width_ns * 1e-9,
         frames=known.frames,
         used=known.used,
         way_p50_ms=median_ms,
@@ -186,7 +186,7 @@ def _node(name: str, member: FleetMember, now_ns: int) -> FleetNode:
 
 def _ways_ms(known: Neighbour, now_ns: int) -> tuple[float | None, float | None]:
     """Median and 99th percentile of how long reports were on their way; None: none came."""
-    ways_ns = known.ways_ns(now_ns)
+    ways_ns = known.delays_ns(now_ns)
     if not ways_ns:
         return None, None
     median_ns, p99_ns = np.percentile(ways_ns, (50, 99)).tolist()

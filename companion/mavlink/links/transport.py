@@ -217,7 +217,7 @@ class Link:
         """
         keys = self._endpoint.peers()
         if keys is None:
-            peers = self._peers.heard_since(self._now_ns() - int(PEER_ACTIVE_S * 1e9))
+            peers = self._peers.active_since(self._now_ns() - int(PEER_ACTIVE_S * 1e9))
         else:
             peers = [self._peers.at(key) for key in keys]
         return sum([self._send(peer, message) for peer in peers])

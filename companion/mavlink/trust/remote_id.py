@@ -29,12 +29,12 @@ class _AddressRecord:
 
 
 class RemoteIds:
-    """What is known of each address, for each receiver. ``named`` takes messages as they arrive."""
+    """What is known of each address, for each receiver. ``merge`` takes messages as they arrive."""
 
     def __init__(self) -> None:
         self._known: OrderedDict[tuple[Source, str], _AddressRecord] = OrderedDict()
 
-    def named(self, message: RemoteId) -> Report | Rejection | None:
+    def merge(self, message: RemoteId) -> Report | Rejection | None:
         """The report that a message completes, under its aircraft's name; None if it has none.
 
         Rejections and their reasons:

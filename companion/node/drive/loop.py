@@ -19,7 +19,7 @@ from companion.values import IntArray, UserError
 
 REMEMBERED: Final = 1000  # updates of which times are kept
 LEADING: Final = 51  # updates whose median time is the next one's lead
-AGAIN_NS: Final = 1_000_000_000  # time between two attempts to reach a device
+RETRY_NS: Final = 1_000_000_000  # time between two attempts to reach a device
 LATE_SHARE: Final = 0.1
 """Share of the time between two updates by which one may come after its moment."""
 
@@ -237,7 +237,7 @@ class Drive:
         self._resting = None  # what it does once it is back is not known
         self._device.close()
         self._open = False
-        self._again_ns = self._now_ns() + AGAIN_NS
+        self._again_ns = self._now_ns() + RETRY_NS
 
     def _rest(self, why: str) -> None:
         """Go to the safe state, once for each reason."""

@@ -81,26 +81,26 @@ class FleetMember:
 
     # --- what this node hears itself --------------------------------------------------------
 
-    def heard(self, now_ns: int, frame: Frame) -> None:
+    def frame_received(self, now_ns: int, frame: Frame) -> None:
         """Take in a frame that came over one of this node's own links, as it is read."""
         self.reception.behind_ns = max(now_ns - frame.t_ns, 0)
         if frame.msgid in SHARED:
             key = self.reception.take_received(frame)
             if self.neighbours:
-                self.sharing.heard(now_ns, frame, key)
+                self.sharing.frame_received(now_ns, frame, key)
 
-    def answered(self, trip: RoundTrip) -> None:
+    def round_trip_measured(self, trip: RoundTrip) -> None:
         """Take in a TIMESYNC round trip of this node's own."""
         if self.neighbours:
-            self.sharing.answered(trip)
+            self.sharing.round_trip_measured(trip)
 
     # --- what other nodes say ---------------------------------------------------------------
 
-    def came(self, now_ns: int, node: str) -> None:
+    def node_joined(self, now_ns: int, node: str) -> None:
         """Another node is there."""
         self._neighbour(now_ns, node)
 
-    def left(self, now_ns: int, node: str) -> list[Notice]:
+    def node_left(self, now_ns: int, node: str) -> list[Notice]:
         """Another node is gone: its process ended, or its connection did."""
         self.duties.gone(now_ns, node)
         known = self.neighbours.get(node)
@@ -146,7 +146,7 @@ class FleetMember:
             Notice(t_ns=received_ns, severity=Severity.WARNING, subject=f"node {node}", text=text)
         ]
 
-    def shared(
+    def take_shared(
         self, now_ns: int, node: str, said: Shared
     ) -> tuple[list[Frame | RoundTrip], list[Notice]]:
         """Take in what another node heard. Returns what the pipeline is to have, and notices."""
@@ -166,7 +166,7 @@ class FleetMember:
             key = content(frame.raw)
             if frame.msgid in OWN:
                 if not self.reception.was_shared(key):  # the second time it is late, and no matter
-                    known.came(now_ns, now_ns - frame.t_ns + frame.doubt_ns)
+                    known.note_delay(now_ns, now_ns - frame.t_ns + frame.doubt_ns)
                 self.sharing.note_shared(now_ns, node, frame.source, key, way_ns)
             events += self.reception.take_shared(now_ns, node, frame, key)
         for trip in said.trips:
@@ -191,14 +191,14 @@ class FleetMember:
         self.reception.contradicted.clear()
         return notices
 
-    def stands(self, now_ns: int, said: Standing) -> None:
+    def take_standing(self, now_ns: int, said: Standing) -> None:
         """Take in what another node says of itself."""
         known = self._neighbour(now_ns, said.node)
         if known is not None:
             known.standing = said
             self.duties.hear(now_ns, said)
 
-    def offered(self, now_ns: int, node: str, offers: tuple[Offer, ...]) -> None:
+    def take_offers(self, now_ns: int, node: str, offers: tuple[Offer, ...]) -> None:
         """Take in another node's offers, all of them."""
         known = self._neighbour(now_ns, node)
         if known is not None:
@@ -207,7 +207,7 @@ class FleetMember:
 
     # --- what follows -----------------------------------------------------------------------
 
-    def offer(self, offers: Mapping[str, Offer]) -> None:
+    def set_offers(self, offers: Mapping[str, Offer]) -> None:
         """Take in this node's own offers, as it tells them to the others."""
         self.offers = dict(offers)
 
@@ -250,7 +250,7 @@ class FleetMember:
         for node in [n for n, (at_ns, _) in self.gone.items() if at_ns < before_ns]:
             del self.gone[node]
 
-    def look_for_phantoms(
+    def check_vehicles(
         self, now_ns: int, positions: Mapping[str, Vector], own: Witness, local: ToLocal
     ) -> list[Notice]:
         """Hold vehicles that only one other node has heard against all who ought to hear them.
@@ -278,7 +278,7 @@ class FleetMember:
         counts = {node: len(heard) for node, heard in heard_by.items()}
         return self.trust.check_vehicles(now_ns, told, witnesses, counts)
 
-    def says(self, now_ns: int, place: Place | None, reach_m: float | None) -> Standing:
+    def own_standing(self, now_ns: int, place: Place | None, reach_m: float | None) -> Standing:
         """What this node says of itself: where its array is, and how far it hears.
 
         By that and by what others said, ``near`` is found anew.

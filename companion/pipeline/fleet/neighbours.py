@@ -22,8 +22,8 @@ DRIFT_MAX: Final = 200e-6
 """Greatest drift between two nodes' clocks, a ratio: two ordinary crystals, disciplined or not."""
 ANSWERS: Final = 3
 """Answers from which on what a node hears is used: the first, slow one would leave its doubt."""
-WAYS_KEPT: Final = 4096
-WAYS_NS: Final = 60_000_000_000  # how long it counts how long a report was on its way
+DELAYS_KEPT: Final = 4096
+DELAYS_WINDOW_NS: Final = 60_000_000_000  # time for which the delay of a report is remembered
 NOTICED_OFFSET_NS: Final = 100_000_000
 """Difference of two nodes' clocks from which on it is told: with NTP there is none."""
 
@@ -36,7 +36,7 @@ class ClockOffset:
     high_ns: int
 
     @property
-    def doubt_ns(self) -> int:
+    def width_ns(self) -> int:
         """The width of the interval."""
         return self.high_ns - self.low_ns
 
@@ -87,15 +87,16 @@ class Neighbour:
     frames: int = 0  # frames that it told, used those that the pipeline had
     used: int = 0
     apart_told: bool = False
-    _ways_ns: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=WAYS_KEPT))
+    _delays_ns: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=DELAYS_KEPT))
 
-    def came(self, now_ns: int, way_ns: int) -> None:
-        """A report came that no other node had told before, so long after it was heard there."""
-        self._ways_ns.append((now_ns, way_ns))
+    def note_delay(self, now_ns: int, way_ns: int) -> None:
+        """Note the most that a report from this node was on its way."""
+        self._delays_ns.append((now_ns, way_ns))
 
-    def ways_ns(self, now_ns: int) -> list[int]:
-        """How long the reports of late were on their way, at most."""
-        return [way_ns for came_ns, way_ns in self._ways_ns if now_ns - came_ns < WAYS_NS]
+    def delays_ns(self, now_ns: int) -> list[int]:
+        """The most that each recent report was on its way."""
+        oldest_ns = now_ns - DELAYS_WINDOW_NS
+        return [way_ns for came_ns, way_ns in self._delays_ns if came_ns > oldest_ns]
 
 
 def here(trip: RoundTrip, clock: NeighbourClock) -> RoundTrip | None:

@@ -67,7 +67,7 @@ class Sharing:
         self._frames: deque[SharedFrame] = deque()
         self._trips: deque[RoundTrip] = deque()
 
-    def heard(self, now_ns: int, frame: Frame, key: bytes) -> None:
+    def frame_received(self, now_ns: int, frame: Frame, key: bytes) -> None:
         """Take in a frame heard here, with its content, as it is read.
 
         It is held from now on and not from when it came: where frames wait to be read, what others
@@ -88,7 +88,7 @@ class Sharing:
         elif frame.msgid in OWN:
             self._wait(self._held, _Held(now_ns + round(self._hold_ns), key, frame))
 
-    def answered(self, trip: RoundTrip) -> None:
+    def round_trip_measured(self, trip: RoundTrip) -> None:
         """Take in a round trip with a vehicle for which this node speaks."""
         speaker = self._speakers.get(trip.source)
         if speaker is not None and speaker.is_own:

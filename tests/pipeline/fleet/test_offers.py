@@ -38,7 +38,7 @@ def flown() -> tuple[Pipeline, FleetMember, int]:
             return pipeline, member, event.t_ns
         pipeline.step(event)
         if isinstance(event, Frame):
-            member.heard(event.t_ns, event)
+            member.frame_received(event.t_ns, event)
     raise AssertionError
 
 

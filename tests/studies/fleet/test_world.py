@@ -43,7 +43,7 @@ def test_clocks_apart_by_seconds_are_found_and_no_lies() -> None:
             assert ahead is not None
             apart_ns = world.clock_ns(name) - world.clock_ns(other)
             assert ahead.low_ns <= apart_ns <= ahead.high_ns
-            assert ahead.doubt_ns < 70_000_000
+            assert ahead.width_ns < 70_000_000
         assert not member.trust.excluded
 
 
@@ -145,4 +145,4 @@ def test_a_clock_is_known_to_the_way_there_and_back() -> None:
         for known in member.neighbours.values():
             ahead = known.clock.newest_offset()
             assert ahead is not None
-            assert ahead.doubt_ns > 99_000_000
+            assert ahead.width_ns > 99_000_000

@@ -7,6 +7,7 @@ It is read by `make check` alone, and is never imported.
 served.should_exit  # uvicorn's server looks at it
 made.redirect_slashes  # Starlette's router looks at it
 app.openapi  # FastAPI asks for the document by it
+fleet.untold  # shown by the API by its name
 message.position_covariance_type  # a field of protobuf's
 field.type_name, field.proto3_optional, field.oneof_index  # fields of a protobuf descriptor
 Severity.publish_time_ns  # the layout of a record of MCAP

@@ -48,7 +48,7 @@ class Heights(NamedTuple):
     """Heights of a floor at one sender time, ns."""
 
     upper_bound: int  # above the offset if the clock ran within its drift
-    upper_bound_changed: int  # above the offset, even if the clock changed before the last frames
+    highest: int  # above the offset, even if the clock changed before the last frames
     line: int  # the most likely height of the floor
     least: int  # the least height that the frame nearest to the offset can have
 
@@ -237,7 +237,7 @@ class Floor:
             least = min(least, level - aged)
         return Heights(
             upper_bound=base_ns + round(sure + slack),
-            upper_bound_changed=base_ns + round(highest + slack),
+            highest=base_ns + round(highest + slack),
             line=base_ns + round(line + moved),
             least=base_ns + round(least - slack),
         )

@@ -262,7 +262,7 @@ def test_the_sure_side_is_above_the_offset_and_below_every_stamp(
         seen = floor.heights(x_ns)
         assert seen.upper_bound >= offset_ns - 2
         assert seen.upper_bound <= offset_ns + latency_ns + 2
-        assert seen.upper_bound_changed >= seen.upper_bound
+        assert seen.highest >= seen.upper_bound
         assert floor.at(x_ns) <= offset_ns + latency_ns + 2
 
 

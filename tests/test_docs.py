@@ -139,3 +139,14 @@ def test_every_section_that_is_cited_exists(page: str) -> None:
         text = re.sub(r"\s*\n\s*#?\s*", " ", path.read_text(encoding="utf-8"))
         cited |= set(re.findall(rf"docs/{re.escape(page)}[ ,]+(?:section )?(\d+(?:\.\d+)?)", text))
     assert cited <= there, cited - there
+
+
+def test_every_class_that_the_glossary_names_is_there() -> None:
+    text = (DOCS / "glossary.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`([A-Z][a-z]+[A-Za-z]*)(?:\.\w+)*`", text))
+    sources = "".join(
+        path.read_text(encoding="utf-8") for path in (ROOT / "companion").rglob("*.py")
+    )
+    defined = set(re.findall(r"^class (\w+)", sources, re.MULTILINE))
+    assert len(named) > 40
+    assert named <= defined, named - defined

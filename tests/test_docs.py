@@ -171,3 +171,14 @@ def equations(path: Path) -> set[str]:
 def unwrapped(path: Path) -> str:
     """The text of a file, its comments and paragraphs on one line."""
     return re.sub(r"\s*\n\s*#?\s*", " ", path.read_text(encoding="utf-8"))
+
+
+def test_every_class_that_the_glossary_names_is_there() -> None:
+    text = (DOCS / "glossary.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`([A-Z][a-z]+[A-Za-z]*)(?:\.\w+)*`", text))
+    sources = "".join(
+        path.read_text(encoding="utf-8") for path in (ROOT / "companion").rglob("*.py")
+    )
+    defined = set(re.findall(r"^class (\w+)", sources, re.MULTILINE))
+    assert len(named) > 40
+    assert named <= defined, named - defined

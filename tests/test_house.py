@@ -12,7 +12,8 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -75,6 +76,20 @@ CLOCK_CALLS = frozenset({"now", "today", "utcnow"})
 RIDDLE = re.compile(
     r"\s*(Of|So|And|But|Or|Nor|Also|Then|Thus|Hence|For\s+(?:so|that|which))\b", re.IGNORECASE
 )
+
+# Words that name nothing which a textbook, an RFC or the MAVLink documentation knows.
+OBSCURE = frozenset(
+    {"anew", "aside", "ears", "lent", "nobody", "said", "seated", "spared", "sure", "told", "twins",
+     "unsure", "untold", "vouch"}
+)  # fmt: skip
+OBSCURE_KEPT = {
+    "said": "modules of frames and of rows, named in docs/architecture.md",
+    "_said": "a row's own getter",
+    "_Said": "a payload with its time",
+}
+REPEATED_CLASSES = {
+    "Weights": "the client's class holds the answer that the view's class describes"
+}
 
 # In parts, so that this file does not hold what it looks for.
 # fmt: off
@@ -374,6 +389,40 @@ def crowded_calls(path: str, text: str) -> list[str]:
     ]
 
 
+def defined_names(text: str) -> Iterator[tuple[int, str]]:
+    """Line and name of every class and function, and of every constant of a module."""
+    for node in nodes_of(text):
+        if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            yield node.lineno, node.name
+    for node in parsed(text).body:
+        match node:
+            case ast.AnnAssign(target=ast.Name(id=name)) | ast.Assign(targets=[ast.Name(id=name)]):
+                yield node.lineno, name
+
+
+def obscure_names(path: str, text: str) -> list[str]:
+    """Names of modules, classes, functions and constants that a reader must look up."""
+    if not path.startswith("companion/"):
+        return []
+    faults = []
+    for line, name in ((1, Path(path).stem), *defined_names(text)):
+        words = {word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", name)}
+        faults += [
+            f"{path}:{line}: {name} says {word!r}: use the field's word"
+            for word in sorted(words & OBSCURE)
+            if name not in OBSCURE_KEPT
+        ]
+    return faults
+
+
+def repeated_classes(texts: Iterable[str]) -> list[str]:
+    """Names that more than one class of these modules has."""
+    counts = Counter(
+        node.name for text in texts for node in nodes_of(text) if isinstance(node, ast.ClassDef)
+    )
+    return sorted(name for name, times in counts.items() if times > 1)
+
+
 Rule = Callable[[str, str], list[str]]
 RULES: tuple[Rule, ...] = (
     impurities,
@@ -387,6 +436,7 @@ RULES: tuple[Rule, ...] = (
     positional_fields,
     positional_tuples,
     crowded_calls,
+    obscure_names,
 )
 
 
@@ -676,6 +726,19 @@ def test_an_endless_wait_is_found() -> None:
     )
     assert [fault.partition(": ")[0] for fault in sorted(endless_waits(text))] == [*"1234"]
     assert endless_waits("subprocess.run(a, timeout=HANG_S)\nb.communicate(timeout=HANG_S)") == []
+
+
+def test_class_names_are_unique() -> None:
+    texts = (p.read_text(encoding="utf-8") for p in sorted((ROOT / "companion").rglob("*.py")))
+    assert repeated_classes(texts) == sorted(REPEATED_CLASSES)
+
+
+def test_a_repeated_class_and_an_obscure_name_are_found() -> None:
+    assert repeated_classes(["class A:\n    class B: ...", "class B: ..."]) == ["B"]
+    text = "TOLD_S: Final = 1\ndef sure_db(): ...\nclass Twins:\n    def is_insured(self): ..."
+    found = obscure_names("companion/pipeline/aside.py", text)
+    assert sorted(fault.split(":")[1] for fault in found) == [*"1123"]
+    assert obscure_names("sitl_replay/aside.py", text) == []
 
 
 # --- what is committed --------------------------------------------------------------------------

@@ -7,13 +7,14 @@ It is read by `make check` alone, and is never imported.
 served.should_exit  # uvicorn's server looks at it
 made.redirect_slashes  # Starlette's router looks at it
 app.openapi  # FastAPI asks for the document by it
+fleet.untold  # shown by the API by its name
 message.position_covariance_type  # a field of protobuf's
 field.type_name, field.proto3_optional, field.oneof_index  # fields of a protobuf descriptor
 Severity.publish_time_ns  # the layout of a record of MCAP
 Beamformer.RX, Normalisation.ANTENNA, Policy.DROP  # members chosen by their value in the settings
 sample.codebook_best  # written to the study's JSON by its fields
 numbers.find_class  # pickle asks by it
-told.resting  # written to JSON by its fields
+status.resting  # written to JSON by its fields
 line.max_speed_hz  # spidev's line looks at it
 one.rx_phase, one.rx_gain, one.rx_attenuator  # pyadi-iio writes them to the chip
 one.rx_beam_state, chip.beam_mem_enable  # the same

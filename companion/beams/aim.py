@@ -12,7 +12,7 @@ from companion.beams.array import steering
 from companion.beams.array.coverage import EVERYWHERE, Coverage, refusals
 from companion.beams.array.elements import ElementPattern
 from companion.beams.array.geometry import Array
-from companion.beams.hysteresis import Steady
+from companion.beams.hysteresis import Hysteresis
 from companion.beams.weights import shapes, widening
 from companion.beams.weights.precoding import (
     Precoder,
@@ -22,7 +22,7 @@ from companion.beams.weights.precoding import (
     normalise,
     precode,
 )
-from companion.beams.weights.widening import Uncertain
+from companion.beams.weights.widening import DirectionErrors
 from companion.beams.worth import link_budget
 from companion.values import (
     Beam,
@@ -60,7 +60,7 @@ def aim(
     array: Array,
     precoder: Precoder,
     coverage: Coverage = EVERYWHERE,
-    before: Steady | None = None,
+    before: Hysteresis | None = None,
 ) -> BeamSet:
     """Make one beam on every track that can be aimed at, with nulls on the others.
 
@@ -100,7 +100,7 @@ def aim(
         valid_at_ns=valid_at_ns,
         beams=beams,
         weights=made.weights,
-        method=hysteresis.named(before, valid_at_ns, made.method, made.exact),
+        method=hysteresis.reported_method(before, valid_at_ns, made.method, made.exact),
         normalisation=made.normalisation,
         condition_number=made.condition_number,
         left_out=left_out,
@@ -146,7 +146,7 @@ def _beams(
     array: Array,
     *,
     precoder: Precoder,
-    before: Steady | None,
+    before: Hysteresis | None,
     valid_at_ns: int,
 ) -> tuple[tuple[Beam, ...], Precoding, dict[str, str]]:
     """The beams, their weights, and the UAVs that the policy left out with the reason."""
@@ -162,14 +162,14 @@ def _beams(
     wanted = [(0.0, 0.0) if b is None else (u, b) for u, b in zip(usual, bounds, strict=True)]
     natural_rad = array.wavelength_m / max(float(shapes.aperture(array).lengths_m.max()), 1e-9)
     sure_plane = precoder.widen is Widen.GUARANTEE and array.axis is None
-    pace = hysteresis.SURE_PLANE if sure_plane else 1.0
-    shaped = hysteresis.followed_rad(
+    pace = hysteresis.GUARANTEE_PLANE_SHARE if sure_plane else 1.0
+    shaped = hysteresis.rate_limited_rad(
         before, valid_at_ns, uavs, wanted_rad=np.array(wanted), natural_rad=natural_rad, pace=pace
     )
     spread = widening.spread(
         array,
         directions,
-        Uncertain(
+        DirectionErrors(
             likely_rad=shaped[:, 0],
             bounds_rad=shaped[:, 1],
             floor_db=precoder.floor_db,
@@ -188,7 +188,7 @@ def _beams(
             link_budget.isotropic_snr(ranges_m, array, precoder.budget, precoder.uav_antennas),
             worths,
         ),
-        before=hysteresis.slots(before, valid_at_ns, uavs),
+        before=hysteresis.previous_slots(before, valid_at_ns, uavs),
     )
     azimuths, elevations = steering.angles_rad(directions)
     served = matrix[:, made.served]

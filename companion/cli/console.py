@@ -57,7 +57,7 @@ def tell_vehicles(logs: Sequence[Path]) -> None:
     from companion.recording.reader import vehicles
 
     for one in vehicles(logs):
-        say(one.told(), err=True)
+        say(one.notice(), err=True)
 
 
 JSON_LINES = click.option(

@@ -77,7 +77,7 @@ def drive(
     """
     from companion.client import Client
     from companion.node.drive import running, targets
-    from companion.node.drive.loop import Drive, Safe
+    from companion.node.drive.loop import Drive, SafeState
     from companion.node.drive.sources import BeamRequest, OverHttp, stored_registers
     from companion.pipeline import assembly
     from companion.settings.files import load
@@ -107,7 +107,7 @@ def drive(
         ),
         device=device,
         update_hz=update_hz,
-        safe=Safe(on_stale),
+        safe=SafeState(on_stale),
         now_ns=time.time_ns,
         say=lambda text: click.echo(text, err=True),
     )
@@ -116,8 +116,8 @@ def drive(
         if as_json:
             click.echo(json.dumps(asdict(told)))
 
-    running.until_told(driven, show, seconds)
-    told = driven.told()
+    running.run_until_stopped(driven, show, seconds)
+    told = driven.status()
     click.echo(_text(told), err=as_json)
     if not told.applied:
         raise UserError("nothing was applied: there were no beams, or the device took none")

@@ -44,7 +44,7 @@ from companion.cli.weights import weights
 from companion.values import UserError
 
 if TYPE_CHECKING:
-    from companion.node.start import Voice
+    from companion.node.start import Console
     from companion.recording.writer import Writer
 
 
@@ -106,7 +106,7 @@ def run(
     start.run(settings, voice, origins=origins, token=token, insecure=insecure)
 
 
-def _voice(as_json: bool) -> "Voice":
+def _voice(as_json: bool) -> "Console":
     from companion.cli.voice import JsonLines, Lines
 
     return JsonLines() if as_json else Lines()

@@ -136,7 +136,7 @@ def prediction(
     click.echo(json.dumps(answer) if as_json else tables.text(found))
     took_s = time.monotonic() - began_s
     click.echo(f"{len(logs)} logs over {len(setting.over)} links in {took_s:.0f} s", err=True)
-    broken = violations.said(answer["rows"])
+    broken = violations.notice(answer["rows"])
     if broken is not None:
         say(f"companion: {broken}", err=True)
         click.get_current_context().exit(3)

@@ -15,7 +15,7 @@ from companion.mavlink.links.urls import MAVLINK
 from companion.node import capacity, machine
 from companion.node.machine import Finding, Grade
 from companion.node.service import Service
-from companion.node.serving import run_until_told
+from companion.node.serving import run_until_stopped
 from companion.pipeline.fold import Pipeline
 from companion.server.access import bind
 from companion.settings.files import embedded
@@ -24,18 +24,18 @@ from companion.settings.outlets import DriveSettings, RecordSettings
 from companion.values import Level, Reason, UserError, Verdict, kind_of
 from companion.views import uav_state
 
-LOOKS: Final = 5  # times that beams are computed to tell how long that takes
+TIMED_UPDATES: Final = 5  # times that beams are computed to tell how long that takes
 BUSY: Final = 0.3
 """Share of the time between updates that beams may take before that is worth a thought."""
 NOISY: Final = 0.01  # share of frames with a wrong checksum from which on a link is noisy
-SAYS: Final = {
+FORMATS: Final = {
     "sbs": "BaseStation lines (30003)",
     "readsb": "Beast (30005), or aircraft.json",
     "rid": "Remote ID in JSON",
     "cot": "Cursor on Target",
 }
 """What receivers of other kinds than MAVLink say, by the scheme of their links."""
-SOME: Final = 8  # most vehicles that a line names
+NAMED_MAX: Final = 8  # most vehicles that a line names
 
 
 def check(
@@ -65,7 +65,7 @@ def check(
     if urls and seconds > 0:
         show(f"listening for {seconds:g} s")
         service = _listen(_to_listen(settings, urls), seconds)
-        yield from _heard(service, settings)
+        yield from _reception(service, settings)
 
 
 def _capacity(settings: Settings) -> Finding:
@@ -115,18 +115,18 @@ def _listen(settings: Settings, seconds: float) -> Service:
     """A service that ran so long, with nobody to see it but this process."""
     with bind("127.0.0.1:0", token=None, insecure=False) as http:
         service = Service(settings=settings, say=lambda _: None)
-        run_until_told(lambda until: service.run(http, None, until), seconds)
+        run_until_stopped(lambda until: service.run(http, None, until), seconds)
     return service
 
 
-def _heard(service: Service, settings: Settings) -> Iterator[Finding]:
+def _reception(service: Service, settings: Settings) -> Iterator[Finding]:
     yield from _links(service)
     pipeline = service.pipeline
     update = pipeline.last_update
     names = [track.uav for track in update.tracks] if update else []
     own = [uav for uav in names if kind_of(uav).reports_itself]
     if settings.center.source is None:
-        heard = f"; heard: {', '.join(own[:SOME])}" if own else ""
+        heard = f"; heard: {', '.join(own[:NAMED_MAX])}" if own else ""
         remedy = f"say --center SYSID:COMPID or LAT,LON,ALT{heard}"
         yield Finding(
             subject="carrier",
@@ -138,7 +138,9 @@ def _heard(service: Service, settings: Settings) -> Iterator[Finding]:
     subject = f"carrier {settings.center.source}"
     if update is None or update.unfit is not None:
         unfit = "no beam update was made" if update is None else str(update.unfit)
-        remedy = f"is it one of {', '.join(own[:SOME])}?" if own else "nobody else is heard either"
+        remedy = (
+            f"is it one of {', '.join(own[:NAMED_MAX])}?" if own else "nobody else is heard either"
+        )
         yield Finding(subject=subject, grade=Grade.FAULT, text=unfit, remedy=remedy)
     else:
         yield Finding(subject=subject, grade=Grade.OK, text="its place and attitude are known")
@@ -150,7 +152,7 @@ def _links(service: Service) -> Iterator[Finding]:
     for link in service.links():
         subject, heard = f"link {link.url}", sorted(map(str, link.components))
         bad = link.lost.get(str(Reason.BAD_CRC), 0)
-        said = f"{link.frames} frames of {', '.join(heard[:SOME]) or 'nobody'}"
+        said = f"{link.frames} frames of {', '.join(heard[:NAMED_MAX]) or 'nobody'}"
         scheme = link.url.partition(":")[0]
         if scheme not in MAVLINK and link.frames == 0 and link.bytes > 0:
             yield _not_understood(subject, scheme, link)
@@ -191,13 +193,13 @@ def _not_understood(subject: str, scheme: str, link: LinkStatus) -> Finding:
         subject=subject,
         grade=Grade.FAULT,
         text=said,
-        remedy=f"is this the port that says {SAYS[scheme]}?",
+        remedy=f"is this the port that says {FORMATS[scheme]}?",
     )
 
 
 def _silent(url: str) -> str:
     if url.startswith(("rid:udp", "cot:udp")):
-        return f"does anybody send {SAYS[url.partition(':')[0]]} here?"
+        return f"does anybody send {FORMATS[url.partition(':')[0]]} here?"
     if url.startswith(("udpin", "tcpin")):
         port = url.rpartition(":")[2]
         return f"does anybody send here? MAVProxy: --out udp:THIS_MACHINE:{port}"
@@ -236,7 +238,9 @@ def _judged(name: str, text: str, verdict: Verdict | None) -> Finding:
 
 
 def _speed(service: Service, update_hz: float) -> Iterator[Finding]:
-    took_s = sorted(_look_s(service.pipeline, service.now_ns()) for _ in range(LOOKS))[LOOKS // 2]
+    took_s = sorted(_look_s(service.pipeline, service.now_ns()) for _ in range(TIMED_UPDATES))[
+        TIMED_UPDATES // 2
+    ]
     share = took_s * update_hz
     text = f"beams take {took_s * 1e3:.1f} ms, {share:.0%} of the time between updates"
     if share > BUSY:

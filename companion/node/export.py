@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import companion
-from companion.node.replay import Run, log_events, missing, told
+from companion.node.replay import Run, log_events, missing, vehicle_logs
 from companion.recording.reader import utc_offset_ns
 from companion.recording.scene import Scene
 from companion.recording.space_file import SpaceFile
@@ -50,7 +50,7 @@ def export(
             if time.monotonic() >= due_s:
                 due_s += SHOW_EVERY_S
                 progress(run.pipeline.frames, run.at_s, run.took_s)
-        summary = run.finish() | {"logs": told(logs), "missing": missing(logs)}
+        summary = run.finish() | {"logs": vehicle_logs(logs), "missing": missing(logs)}
         del summary["recording"]
         summary["rows"] = dict(folder.rows)
         said = {"companion": companion.__version__, "from": [log.name for log in logs]}
@@ -88,6 +88,6 @@ def export_space(
         made.rename(whole)
     finally:
         made.unlink(missing_ok=True)
-    summary = run.finish() | {"logs": told(logs), "missing": missing(logs)}
+    summary = run.finish() | {"logs": vehicle_logs(logs), "missing": missing(logs)}
     del summary["recording"]
     return summary | {"rows": {"clouds": file.clouds}, "files": [str(whole)]}

@@ -13,8 +13,8 @@ from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.signing_store import Timestamps, key_warning, load_key
 from companion.mavlink.links.transport import Link
 from companion.mavlink.links.urls import LinkError, parse_link
-from companion.mavlink.trust.twins import Twins
-from companion.mavlink.voice.component import HEARD, ComponentSpec, ServiceComponent
+from companion.mavlink.trust.duplicate_ids import DuplicateIds
+from companion.mavlink.voice.component import ACCEPTED_IDS, ComponentSpec, ServiceComponent
 from companion.mavlink.voice.rate_watch import MessageRate
 from companion.mavlink.wire.encode import Outgoing
 from companion.settings.center import VehicleCenter, parse_center
@@ -50,10 +50,10 @@ class Gateway:
         self._notify = notify
         self._now_ns = now_ns
         self._component = component(settings)
-        self._hear = HEARD if self._component else frozenset()
+        self._hear = ACCEPTED_IDS if self._component else frozenset()
         self._timestamps: Timestamps | None = None
         signed = set(settings.signing.keys) - set(settings.signing.allow_unsigned)
-        self._twins = Twins({*settings.links.routers, *signed})
+        self._duplicate_ids = DuplicateIds({*settings.links.routers, *signed})
         self._settings = settings
         self.links: list[Link] = []
         self.lag = ArrivalLag()  # how far behind the arrival of datagrams their processing is
@@ -100,7 +100,7 @@ class Gateway:
             notify=self._notify,
             guard=guard,
             lag=self.lag,
-            twins=self._twins,
+            twins=self._duplicate_ids,
         )
 
     async def run(self) -> None:
@@ -160,10 +160,10 @@ class Gateway:
                         self._notify(found)
                     else:
                         self._step(found)
-        self._tell_of_twins()
+        self._notify_duplicates()
 
-    def _tell_of_twins(self) -> None:
-        for who, peers in self._twins.told:
+    def _notify_duplicates(self) -> None:
+        for who, peers in self._duplicate_ids.found:
             text = (
                 f"{who} is heard from {' and '.join(peers)}, which contradict each other: not"
                 " believed; [links] routers names whom to believe"
@@ -171,10 +171,10 @@ class Gateway:
             self._notify(
                 Notice(t_ns=self._now_ns(), severity=Severity.WARNING, subject=who, text=text)
             )
-        self._twins.told.clear()
+        self._duplicate_ids.found.clear()
 
     @property
-    def has_voice(self) -> bool:
+    def has_component(self) -> bool:
         """Whether this service says anything of itself."""
         return self._component is not None
 

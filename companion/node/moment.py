@@ -12,7 +12,7 @@ from companion.recording.reader import utc_offset_ns
 from companion.settings.model import Settings
 from companion.values import Update, UserError
 
-TOLD_EVERY: Final = 20_000  # events between two calls of progress
+PROGRESS_EVERY: Final = 20_000  # events between two calls of progress
 
 ENDS_NS: Final = 60_000_000_000
 """How far the ends of a log may be off its first and last event: stamps may step back or leap."""
@@ -56,7 +56,7 @@ def look(
             break
         pipeline.step(event)
         seen, t_ns = seen + 1, max(t_ns, event.t_ns)
-        if progress and seen % TOLD_EVERY == 0:
+        if progress and seen % PROGRESS_EVERY == 0:
             progress((t_ns - begins_ns) * 1e-9)
     else:
         if at_ns is None or at_ns > t_ns:

@@ -86,7 +86,7 @@ class Outlet:
         named = self._pipeline.tracks(now_ns, now_ns)
         tracks = [track for track in named if self._admits(track.uav)]
         if self._frames:
-            for message in self._positions.said(self._pipeline, tracks):
+            for message in self._positions.outgoing(self._pipeline, tracks):
                 number = self._sequences.get(message.source, 0)
                 self._sequences[message.source] = (number + 1) & 0xFF
                 raw = pack(message, number)

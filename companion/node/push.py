@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from companion.node.ring import LARGEST_RECORD, Ring
-from companion.node.serving import aside
+from companion.node.serving import in_daemon_thread
 from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
 from companion.settings.outlets import RecordSettings, host_and_port
@@ -77,7 +77,7 @@ class Push:
             assert self._newest is not None
             (update, number), sure = self._newest, None
             if self._settings.guaranteed:
-                sure = await aside(
+                sure = await in_daemon_thread(
                     partial(guaranteed_gain.gains_db, self._pipeline, self._equipment, update)
                 )
             self._send(update, number, sure)

@@ -170,7 +170,7 @@ def replay(
                 writer.flush()
             if progress:
                 progress(run.pipeline.frames, run.at_s, run.took_s)
-    return run.finish() | {"logs": told(logs), "missing": missing(logs)}
+    return run.finish() | {"logs": vehicle_logs(logs), "missing": missing(logs)}
 
 
 def length_s(logs: Sequence[Path]) -> float | None:
@@ -179,8 +179,8 @@ def length_s(logs: Sequence[Path]) -> float | None:
     return None if span_ns is None else (span_ns[1] - span_ns[0]) * 1e-9
 
 
-def told(logs: Sequence[Path]) -> list[dict[str, Any]]:
-    """What is known of the vehicles whose own logs are among these. Raises ``LogError``."""
+def vehicle_logs(logs: Sequence[Path]) -> list[dict[str, Any]]:
+    """The vehicles whose own logs are among these, as JSON. Raises ``LogError``."""
     return [one.as_json() for one in vehicles(logs)]
 
 

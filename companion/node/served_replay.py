@@ -25,8 +25,15 @@ from companion.mavlink.links.peers import Peers
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.trust.dedupe import LINKS_MAX
 from companion.mavlink.voice.rate_watch import MessageRate
-from companion.node.replay import FLUSH_EVERY_S, Run, log_events, missing, told
-from companion.node.serving import NOTICES_KEPT, RateMeter, Server, address, pause, run_until_told
+from companion.node.replay import FLUSH_EVERY_S, Run, log_events, missing, vehicle_logs
+from companion.node.serving import (
+    NOTICES_KEPT,
+    RateMeter,
+    Server,
+    address,
+    pause,
+    run_until_stopped,
+)
 from companion.pipeline import assembly
 from companion.recording.writer import Writer
 from companion.server import area_map
@@ -78,7 +85,7 @@ def serve(
     with bind(listen, token=token, insecure=insecure) as http:
         node = ServedReplay(asked, _say)
         _say(f"companion serves {address(http)} and replays {node.name}")
-        run_until_told(partial(node.run, http, token, show))
+        run_until_stopped(partial(node.run, http, token, show))
 
 
 def _say(text: str) -> None:
@@ -102,7 +109,7 @@ class ServedReplay:
         self.origins = asked.origins
         self.equipment = assembly.equipment(settings, self.pipeline.array)
         self.name = ", ".join(log.name for log in logs)
-        self._missing = {"logs": told(logs), "missing": missing(logs)}
+        self._missing = {"logs": vehicle_logs(logs), "missing": missing(logs)}
         self._measured = (islice(log_events(logs, settings, asked.latency_s), 1, None), first.t_ns)
         self._events = chain((first,), events)
         self._now_ns = first.t_ns

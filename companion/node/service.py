@@ -18,14 +18,14 @@ from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.voice.rate_watch import MessageRate
 from companion.node.clock import NodeClock
 from companion.node.drive import targets
-from companion.node.drive.loop import Drive, Safe
-from companion.node.drive.running import beside
+from companion.node.drive.loop import Drive, SafeState
+from companion.node.drive.running import run_in_thread
 from companion.node.drive.sources import BeamRequest, OfThisProcess, stored_registers
 from companion.node.fleet.live import LiveFleetNode
 from companion.node.gateway import Gateway
 from companion.node.outlet import Outlet
 from companion.node.push import Push
-from companion.node.serving import NOTICES_KEPT, RateMeter, Server, aside
+from companion.node.serving import NOTICES_KEPT, RateMeter, Server, in_daemon_thread
 from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
 from companion.recording.background import BackgroundRecorder, Rotation
@@ -184,7 +184,7 @@ class Service:
     def _hear(self, event: Event) -> None:
         """Take in what came over this node's own links."""
         if self.fleet is not None:
-            self.fleet.heard(event)  # first: others wait for it
+            self.fleet.on_event(event)  # first: others wait for it
         self._step(event)
 
     def _step(self, event: Event) -> None:
@@ -229,7 +229,7 @@ class Service:
                 now_ns=self.now_ns,
                 wanted=wanted,
             )
-            safe = Safe(kept.drive.on_stale)
+            safe = SafeState(kept.drive.on_stale)
             drive = Drive(
                 source=source,
                 device=self._device,
@@ -238,7 +238,7 @@ class Service:
                 now_ns=self.now_ns,
                 say=say,
             )
-            await beside(drive)
+            await run_in_thread(drive)
         except UserError as error:
             text = f"the device is driven no more: {error}"
             self._notify(
@@ -308,7 +308,7 @@ class Service:
             self._rates.count(self.now_ns(), self.pipeline.frames, self.pipeline.updates)
             if self._recorder:
                 self._tell_of_recorder(self._recorder)
-            if self._traffic.has_voice:
+            if self._traffic.has_component:
                 self._traffic.speak(not self.unfit(), self.pipeline.reporters())
             self._tell_of_machine()
             self.series.add(self.pipeline)
@@ -421,7 +421,7 @@ class Service:
         directory = self._settings.recording.directory
         if directory is None:
             return
-        for found in await aside(partial(recover_leftovers, Path(directory))):
+        for found in await in_daemon_thread(partial(recover_leftovers, Path(directory))):
             if isinstance(found, LogError):
                 self._say(str(found))
             else:

@@ -100,8 +100,8 @@ async def pause(until: asyncio.Event, seconds: float) -> None:
         await asyncio.wait_for(until.wait(), seconds)
 
 
-async def aside(work: Callable[[], T]) -> T:
-    """What a function returns, on a thread for which the end of the service does not wait.
+async def in_daemon_thread(work: Callable[[], T]) -> T:
+    """Run a function on a daemon thread, for which the end of the service does not wait.
 
     It must leave nothing half done behind that matters.
     """
@@ -116,11 +116,11 @@ async def aside(work: Callable[[], T]) -> T:
         with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits any more
             loop.call_soon_threadsafe(lambda: None if done.done() else settle())
 
-    threading.Thread(target=run, name="aside", daemon=True).start()
+    threading.Thread(target=run, name="background", daemon=True).start()
     return await done
 
 
-def run_until_told(
+def run_until_stopped(
     main: Callable[[asyncio.Event], Coroutine[Any, Any, None]], seconds: float | None = None
 ) -> None:
     """Run ``main`` on an event loop of its own.
@@ -130,10 +130,10 @@ def run_until_told(
     """
     _tame_interpreter()
     with asyncio.Runner(loop_factory=_loop_factory()) as runner:
-        runner.run(_told(main, seconds))
+        runner.run(_stopped_by_signal(main, seconds))
 
 
-async def _told(
+async def _stopped_by_signal(
     main: Callable[[asyncio.Event], Coroutine[Any, Any, None]], seconds: float | None
 ) -> None:
     loop, until = asyncio.get_running_loop(), asyncio.Event()
@@ -150,7 +150,7 @@ def _tame_interpreter() -> None:
     A collection takes time in proportion to what it examines: what is loaded by now is left out,
     small collections are frequent and full ones rare (measured at 10 000 frames/s: 3 ms for 2 000
     objects, 50 ms for 50 000). The recorder's thread yields after a millisecond, because each
-    answer over HTTP waits for its turn several times.
+    answer over HTTP waits for the interpreter several times.
     """
     sys.setswitchinterval(0.001)
     gc.collect()

@@ -10,16 +10,16 @@ from typing import Any, Final, Protocol
 
 from companion.node import systemd
 from companion.node.service import Service, require_center
-from companion.node.serving import address, run_until_told
+from companion.node.serving import address, run_until_stopped
 from companion.server.access import bind
 from companion.settings.model import Settings
 from companion.settings.origins import Origins
 from companion.values import UserError
 
-TOLD_EVERY_S: Final = 1.0  # time between two words on how it goes
+STATUS_EVERY_S: Final = 1.0  # time between two words on how it goes
 
 
-class Voice(Protocol):
+class Console(Protocol):
     """How a run speaks to whoever started it."""
 
     def say(self, text: str) -> None:
@@ -34,7 +34,7 @@ class Voice(Protocol):
 
 def run(
     settings: Settings,
-    voice: Voice,
+    voice: Console,
     *,
     origins: Origins | None = None,
     token: str | None = None,
@@ -74,13 +74,13 @@ def run(
             manager=manager,
             open_page=open_page,
         )
-        run_until_told(serve, seconds)
+        run_until_stopped(serve, seconds)
 
 
-async def _keep_shown(service: Service, voice: Voice) -> None:
+async def _keep_shown(service: Service, voice: Console) -> None:
     """Show how it goes, again and again."""
     while True:
-        await asyncio.sleep(TOLD_EVERY_S)
+        await asyncio.sleep(STATUS_EVERY_S)
         voice.show(service)
 
 
@@ -88,7 +88,7 @@ async def _serve(
     until: asyncio.Event,
     *,
     service: Service,
-    voice: Voice,
+    voice: Console,
     http: socket.socket,
     token: str | None,
     traffic: Callable[[str], Coroutine[Any, Any, None]] | None,

@@ -1,4 +1,4 @@
-"""What reports refute, told once: which assumption was wrong, and by which setting it is held."""
+"""Refuted assumptions: which one was wrong, and which setting holds it. Each is reported once."""
 
 from typing import Final
 
@@ -6,7 +6,7 @@ from companion.mavlink.clock.estimates import ClockChange
 from companion.pipeline.records import UavRecord, UavRecords
 from companion.values import Estimate, Notice, Refuted, Severity
 
-AGAIN: Final = 1.25  # multiple of what was told last above which it is told again
+NOTICE_RATIO: Final = 1.25  # multiple of the value last reported, above which a notice is repeated
 _UNITS: Final = {
     "observer.speed_max_mps": "m/s",
     "observer.acceleration_max_mps2": "m/s²",
@@ -15,20 +15,25 @@ _UNITS: Final = {
     "center.turn_acceleration_max_degps2": "°/s²",
     "center.attitude_bound_deg": "°",
 }
-SILENT_NS: Final = 60_000_000_000  # time for which a change of a clock or link is not told again
+SILENT_NS: Final = 60_000_000_000  # least time between two notices of a change of a clock or link
 
 
-def told(records: UavRecords, *refuted: Refuted | None) -> list[Refuted | Notice]:
+def notices(records: UavRecords, *refuted: Refuted | None) -> list[Refuted | Notice]:
     """The refutations, each followed by a notice if it goes beyond what was reported before."""
     out: list[Refuted | Notice] = []
     for one in filter(None, refuted):
         out.append(one)
         record = records[one.uav]
         record.refuted += 1
-        if one.proven > AGAIN * record.proven.get(one.setting, 0.0):
+        if one.proven > NOTICE_RATIO * record.proven.get(one.setting, 0.0):
             record.proven[one.setting] = one.proven
             out.append(
-                Notice(t_ns=one.t_ns, severity=Severity.WARNING, subject=one.uav, text=_said(one))
+                Notice(
+                    t_ns=one.t_ns,
+                    severity=Severity.WARNING,
+                    subject=one.uav,
+                    text=_refutation_text(one),
+                )
             )
     return out
 
@@ -49,9 +54,9 @@ def clock_changed(
             raised_to=drift,
         )
     ]
-    told_ns = record.clock_told_ns
+    told_ns = record.clock_notice_ns
     if change.leapt or told_ns is None or t_ns - told_ns >= SILENT_NS:
-        record.clock_told_ns = t_ns
+        record.clock_notice_ns = t_ns
         out.append(
             Notice(
                 t_ns=t_ns,
@@ -75,7 +80,7 @@ def _clock_text(sender: str, change: ClockChange) -> str:
     return f"all of {sender} comes {step} later than before: {why}"
 
 
-def jumped(record: UavRecord, begun: Estimate) -> Refuted:
+def track_restarted(record: UavRecord, begun: Estimate) -> Refuted:
     """A track that was begun again from reports that were refused, as a refutation.
 
     They agree among themselves, so what they were refused by is wrong.
@@ -94,7 +99,7 @@ def jumped(record: UavRecord, begun: Estimate) -> Refuted:
     )
 
 
-def _said(one: Refuted) -> str:
+def _refutation_text(one: Refuted) -> str:
     if one.setting == "observer.follow_accuracy":
         return (
             f"the receiver of {one.uav} states {one.limit:.2g} m, but strays by {one.proven:.2g} m "

@@ -40,7 +40,7 @@ HOME_SETTLES_S: Final = 120.0
 """Time after its first report in which a UAV that is tracked anew moves ``home``."""
 HOME_HEIGHT_M: Final = 20.0  # least height by which the first one must have been wrong
 
-AGAIN: Final = 1.25
+NOTICE_RATIO: Final = 1.25
 """Multiple of the bound on attitudes that was told last above which it is told again."""
 PASSED_LEAST: Final = 4  # attitudes that must go on before the newest to take its place
 PASSED_NS: Final = 500_000_000
@@ -173,7 +173,7 @@ class CarrierTracker:
     def trust(self, status: EstimatorStatus) -> Refuted | None:
         """Take in what the carrier's estimator says of its attitude. Returns it if it is news."""
         self._estimator = status
-        if self.attitude_bound_rad <= AGAIN * self._doubted_rad:
+        if self.attitude_bound_rad <= NOTICE_RATIO * self._doubted_rad:
             return None
         self._doubted_rad = self.attitude_bound_rad
         least_deg, doubted_deg = map(math.degrees, (self._least_bound_rad, self._doubted_rad))

@@ -23,7 +23,7 @@ from typing import Final, NamedTuple
 
 from companion.beams import hysteresis
 from companion.beams.aim import aim, without
-from companion.beams.hysteresis import Steady
+from companion.beams.hysteresis import Hysteresis
 from companion.mavlink.clock.estimates import ClockChange, ClockEstimate, Guarantee
 from companion.mavlink.wire.decode import DECODED
 from companion.mavlink.wire.stamps import STAMPED
@@ -31,7 +31,7 @@ from companion.pipeline import assembly, assumptions
 from companion.pipeline.blame import LinkEvidence
 from companion.pipeline.center import CarrierTracker
 from companion.pipeline.digest import Digest
-from companion.pipeline.health import HealthMonitor, Site, Weighed
+from companion.pipeline.health import HealthMonitor, LinkBatch, Site
 from companion.pipeline.records import Records, UavRecord
 from companion.pipeline.refusals import Refusals
 from companion.pipeline.senders import NOTHING, PlacedAttitude, PlacedReport, Senders
@@ -65,9 +65,9 @@ from companion.values import (
 
 DROP_EVERY: Final = 100
 """Updates between two searches for tracks that have been silent for too long."""
-SPARED_SHARE: Final = 4
-"""Elements of the array for each UAV of another node that beams spare: a null costs one."""
-TOLD_STEP_S: Final = 0.5
+PROTECTED_SHARE: Final = 4
+"""Elements of the array for each protected UAV of another node: a null costs one."""
+NOTICED_STEP_S: Final = 0.5
 """Step of the wall clock that is told; shorter ones are followed in silence."""
 NEAR_M: Final = 2000.0
 """Largest distance between two reports of one aircraft, whatever its speed and their latency."""
@@ -80,7 +80,7 @@ class Aiming(NamedTuple):
     local  the local frame that they are in
     """
 
-    made: Callable[[], tuple[Update, Weighed | None]]
+    made: Callable[[], tuple[Update, LinkBatch | None]]
     local: LocalFrame | None
 
 
@@ -102,7 +102,9 @@ class Pipeline:
         self.last_update: Update | None = None
         self.last_carrier: Carrier | None = None
         self.aiming: Aiming | None = None
-        self._steady: Steady | None = None  # changes with ticks alone, so that looks change nothing
+        self._hysteresis: Hysteresis | None = (
+            None  # changes with ticks alone, so that looks change nothing
+        )
         self.digest = Digest()
         self.array = assembly.array(settings)
         self.coverage = assembly.coverage(settings)
@@ -154,7 +156,7 @@ class Pipeline:
         step_s = (event.utc_offset_ns - self.utc_offset_ns) * 1e-9
         self.utc_offset_ns = event.utc_offset_ns
         self.senders.utc_is(event.utc_offset_ns)
-        if abs(step_s) < TOLD_STEP_S:
+        if abs(step_s) < NOTICED_STEP_S:
             return []
         way = "forward" if step_s > 0 else "back"
         text = (
@@ -173,7 +175,7 @@ class Pipeline:
         if heard.restarted is not None:
             self.restarts[heard.restarted] += 1
             self._restart(heard.restarted)
-        said: list[Output] = list(heard.said)
+        said: list[Output] = list(heard.outputs)
         if heard.change is not None:
             said += self._changed(frame.t_ns, str(frame.source), heard.change)
         if isinstance(heard.message, PlacedReport):
@@ -181,9 +183,9 @@ class Pipeline:
         elif isinstance(heard.message, PlacedAttitude):
             turn_degps2 = self.senders.assumed(str(frame.source)).turn_degps2
             refuted = self.center.turn(heard.message, turn_degps2)
-            said += assumptions.told(self.records, refuted)
+            said += assumptions.notices(self.records, refuted)
         elif isinstance(heard.message, EstimatorStatus):
-            said += assumptions.told(self.records, self.center.trust(heard.message))
+            said += assumptions.notices(self.records, self.center.trust(heard.message))
         return said
 
     def _changed(self, t_ns: int, sender: str, change: ClockChange) -> list[Output]:
@@ -201,16 +203,16 @@ class Pipeline:
             return [Rejection(t_ns=report.t_ns, source=report.uav, reason=Reason.NO_FIX)]
         fix, begun = self.center.fix(placed)
         accepted, refuted = self.tracker.accept(fix)
-        said: list[Output] = [*begun, *assumptions.told(self.records, *refuted)]
+        said: list[Output] = [*begun, *assumptions.notices(self.records, *refuted)]
         if isinstance(accepted, Rejection):
             return [*said, accepted]
         fix = accepted.fix  # with what reports have shown of its bounds
         self.refusals.used(fix.uav)
         if not kind_of(fix.uav).reports_itself:
-            near = self.targets.betters(fix.uav, self.tracker.near(fix.position_ned_m, NEAR_M))
+            near = self.targets.better_known(fix.uav, self.tracker.near(fix.position_ned_m, NEAR_M))
             self.targets.identities.observe(fix, self._tracks(near, fix.t_ns, fix.t_ns))
         if accepted.reacquired:
-            said.append(assumptions.jumped(self.records[fix.uav], accepted))
+            said.append(assumptions.track_restarted(self.records[fix.uav], accepted))
             said += self._move_home(placed, accepted)
             text = f"{fix.uav} is tracked anew: its reports agree, but not with its past"
             return [
@@ -241,9 +243,9 @@ class Pipeline:
         return [*dropped] if tick.in_two else [*dropped, *self._tock(tick.t_ns)]
 
     def _tock(self, now_ns: int) -> list[Output]:
-        """What follows from the beams of the tick before.
+        """Take in the beams of the last tick, and judge links.
 
-        They are made anew where the local frame has begun again since: its places are none of this.
+        Recompute the beams if the local frame was re-anchored meanwhile.
         """
         aiming, self.aiming = self.aiming, None
         if aiming is None:
@@ -253,7 +255,7 @@ class Pipeline:
         made = self._aimed_of(self.sighted(now_ns)) if is_old else aiming.made
         self.last_update, weighed = made()
         self.last_carrier = self.last_update.carrier or self.last_carrier
-        self._steady = hysteresis.after(self._steady, self.last_update.beams)
+        self._hysteresis = hysteresis.updated(self._hysteresis, self.last_update.beams)
         states = {track.uav: track.state for track in self.last_update.tracks}
         if self.center.vehicle is not None:
             now = self.senders.time(self.center.vehicle, now_ns)
@@ -263,10 +265,12 @@ class Pipeline:
         judged = self.health.judge(self.last_update, weighed, partial(self._evidence, now_ns))
         return [*said, *judged, self.last_update]
 
-    def _aimed_of(self, make: Callable[[], Update]) -> Callable[[], tuple[Update, Weighed | None]]:
-        def made() -> tuple[Update, Weighed | None]:
+    def _aimed_of(
+        self, make: Callable[[], Update]
+    ) -> Callable[[], tuple[Update, LinkBatch | None]]:
+        def made() -> tuple[Update, LinkBatch | None]:
             update = make()
-            return update, self.health.weigh(update)
+            return update, self.health.next_batch(update)
 
         return made
 
@@ -310,26 +314,26 @@ class Pipeline:
         """
         delay_s = self.settings.beams.actuation_delay_s + lead_s
         valid_at_ns = now_ns + round(delay_s * 1e9)
-        seated, others = self._seated(now_ns)
-        tracks = self._tracks(seated, now_ns, valid_at_ns)
+        selected, others = self._selected(now_ns)
+        tracks = self._tracks(selected, now_ns, valid_at_ns)
         found = self.carrier(now_ns, valid_at_ns)
         known, unfit = (None, found) if isinstance(found, str) else (found, None)
-        before = self._steady
-        spared = self._spared(now_ns, valid_at_ns, known)
+        before = self._hysteresis
+        protected = self._protected(now_ns, valid_at_ns, known)
 
         def made() -> Update:
             beams = aim(
                 now_ns,
                 valid_at_ns=valid_at_ns,
-                tracks=[*tracks, *spared],
+                tracks=[*tracks, *protected],
                 carrier=known,
                 array=self.array,
                 precoder=self.precoder,
                 coverage=self.coverage,
                 before=before,
             )
-            if spared:
-                beams = without(beams, {track.uav for track in spared})
+            if protected:
+                beams = without(beams, {track.uav for track in protected})
             if others:
                 beams = replace(beams, left_out=(*beams.left_out, *others))
             return Update(
@@ -338,10 +342,10 @@ class Pipeline:
 
         return made
 
-    def _seated(self, now_ns: int) -> tuple[list[str], list[LeftOut]]:
-        """The targets that are looked at, and those for whom there is no room.
+    def _selected(self, now_ns: int) -> tuple[list[str], list[LeftOut]]:
+        """Targets that get beams, and those beyond ``[beams] most``.
 
-        Those of priority come first, then those that are heard, then who was here first.
+        UAVs of priority come first, then those that report, then those tracked for longest.
         """
         wanted, most = self.targets.among(self.tracker.uavs), self.settings.beams.most
         if len(wanted) <= most:
@@ -350,20 +354,20 @@ class Pipeline:
         silent = frozenset(self.tracker.silent(now_ns, self.settings.tracks.lost_s))
         ranked = sorted(wanted, key=lambda uav: (uav not in first, uav in silent))
         why = f"{most} others have beams, which is the most"
-        seated = frozenset(ranked[:most])
+        selected = frozenset(ranked[:most])
         left = [LeftOut(uav, Cause.MACHINE, why) for uav in ranked[most:]]
-        return [uav for uav in wanted if uav in seated], left
+        return [uav for uav in wanted if uav in selected], left
 
-    def _spared(self, now_ns: int, valid_at_ns: int, carrier: Carrier | None) -> list[Track]:
-        """UAVs of other nodes that the beams spare: the nearest, as many as cost little.
+    def _protected(self, now_ns: int, valid_at_ns: int, carrier: Carrier | None) -> list[Track]:
+        """UAVs of other nodes to protect by nulls: the nearest, as many as cost little.
 
         There are some in a fleet alone, where ``[fleet] nulls`` asks for them.
         """
-        spared = self._tracks(self.targets.spared(self.tracker.uavs), now_ns, valid_at_ns)
-        if carrier is None or not spared:
+        protected = self._tracks(self.targets.protected(self.tracker.uavs), now_ns, valid_at_ns)
+        if carrier is None or not protected:
             return []
-        spared.sort(key=lambda one: math.dist(one.position_ned_m, carrier.position_ned_m))
-        return spared[: self.array.size // SPARED_SHARE]
+        protected.sort(key=lambda one: math.dist(one.position_ned_m, carrier.position_ned_m))
+        return protected[: self.array.size // PROTECTED_SHARE]
 
     def tracks(
         self, now_ns: int, valid_at_ns: int, uavs: Iterable[str] | None = None

@@ -1,8 +1,8 @@
 """Verdicts on the links to all UAVs, and the notices when one changes.
 
 Once a second the gain that each beam surely has, and the one that it likely has, is held against
-what the link needs. Links are judged in batches, one at each update, so that no update is delayed
-by all of them. A verdict changes only once it has been another for a while, and not for a hair's
+what the link needs. Links are judged in batches, one at each update, so that all of them delay no
+update. A verdict changes only once it has been another for a while, and not for a hair's
 breadth, so that it does not flap.
 """
 
@@ -61,11 +61,11 @@ class _Link(NamedTuple):
 
     beam: Beam
     needed_db: float
-    sure_db: float | None
+    guaranteed_db: float | None
     likely_db: float | None
 
 
-class Weighed(NamedTuple):
+class LinkBatch(NamedTuple):
     """Links that are to be judged: whether a round begins, who still waits in it, and they."""
 
     begins: bool
@@ -83,11 +83,11 @@ class HealthMonitor:
         self._begun_ns: int | None = None  # the present round
         self._last_ns: int | None = None  # the update before
         self._waiting: list[str] = []  # those that the round has not come to
-        self._told_of: dict[str, Verdict] = {}  # verdicts when last something was told
+        self._noticed: dict[str, Verdict] = {}  # verdicts when last something was told
         self._unsettled: dict[str, tuple[bool, int]] = {}  # judged better or worse, since when
         self._unfit: str | None = None
 
-    def weigh(self, update: Update) -> Weighed | None:
+    def next_batch(self, update: Update) -> LinkBatch | None:
         """The next batch of links to assess, with what they have and need; None: none is due.
 
         Changes nothing. It takes milliseconds, and may be made on any thread.
@@ -103,7 +103,7 @@ class HealthMonitor:
         chosen = frozenset(waiting[:many])
         which = [i for i, beam in enumerate(update.beams.beams) if beam.uav in chosen]
         links = [] if update.carrier is None or not which else self._links(update.beams, which)
-        return Weighed(begins, waiting[many:], links)
+        return LinkBatch(begins, waiting[many:], links)
 
     def _links(self, beam_set: BeamSet, which: Sequence[int]) -> list[_Link]:
         towards = directions(beam_set)
@@ -111,13 +111,16 @@ class HealthMonitor:
         least_db = self._least_db(beam_set, towards, which)
         return [
             _Link(
-                beam=beam_set.beams[i], needed_db=needed_db[i], sure_db=sure_db, likely_db=likely_db
+                beam=beam_set.beams[i],
+                needed_db=needed_db[i],
+                guaranteed_db=sure_db,
+                likely_db=likely_db,
             )
             for i, sure_db, likely_db in zip(which, *least_db, strict=True)
         ]
 
     def judge(
-        self, update: Update, weighed: Weighed | None, evidence: Callable[[str], LinkEvidence]
+        self, update: Update, weighed: LinkBatch | None, evidence: Callable[[str], LinkEvidence]
     ) -> list[Notice]:
         """Judge one batch of links; return notices of what changed once all batches are done.
 
@@ -139,7 +142,7 @@ class HealthMonitor:
         names = dict.fromkeys((*tracks, *(out.uav for out in update.beams.left_out)))
         self.verdicts = {uav: held[uav] for uav in names if uav in held}
         self._unsettled = {uav: kept for uav, kept in self._unsettled.items() if uav in tracks}
-        return [] if self._waiting else self._told(update)
+        return [] if self._waiting else self._notices(update)
 
     def _of_link(
         self,
@@ -149,7 +152,7 @@ class HealthMonitor:
         evidence: Callable[[str], LinkEvidence],
     ) -> Verdict:
         uav, carrier = link.beam.uav, update.carrier
-        level = self._level(uav, link.needed_db, link.sure_db, link.likely_db)
+        level = self._level(uav, link.needed_db, link.guaranteed_db, link.likely_db)
         why = None
         if level is not Level.GOOD and carrier is not None:
             known = tracks[uav], carrier, link.needed_db, evidence(uav)
@@ -160,7 +163,7 @@ class HealthMonitor:
             blame=why,
             since_ns=update.t_ns,
             needed_gain_db=link.needed_db,
-            guaranteed_gain_db=link.sure_db,
+            guaranteed_gain_db=link.guaranteed_db,
             likely_gain_db=link.likely_db,
         )
 
@@ -213,9 +216,9 @@ class HealthMonitor:
         why = None if held.level is Level.GOOD else fresh.blame or held.blame
         return replace(fresh, level=held.level, blame=why, since_ns=held.since_ns)
 
-    def _told(self, update: Update) -> list[Notice]:
+    def _notices(self, update: Update) -> list[Notice]:
         """What changed: for all at once where the carrier is the cause, which all share."""
-        before, self._told_of = self._told_of, self.verdicts
+        before, self._noticed = self._noticed, self.verdicts
         was, self._unfit = self._unfit, update.unfit
         if update.unfit is not None:
             text = f"no links: {update.unfit}"

@@ -38,13 +38,13 @@ class Records(dict[str, _T]):
 
 
 @dataclass(slots=True, kw_only=True)
-class Unused:
+class UnusedRun:
     """A run of reports of which none was used: since when, and why the newest was not."""
 
     since_ns: int
     reason: Reason
     reports: int = 0
-    is_told: bool = False
+    is_reported: bool = False
 
 
 @dataclass(slots=True, kw_only=True)
@@ -56,10 +56,10 @@ class UavRecord:
 
     refuted: int = 0  # how often assumptions about it were refuted
     proven: dict[str, float] = field(default_factory=dict)
-    clock_told_ns: int | None = None  # when a change of its clock or link was last reported
+    clock_notice_ns: int | None = None  # when a change of its clock or link was last reported
     waits_ns: int | None = None  # since when its GNSS receiver has not confirmed its reports
-    unused: Unused | None = None  # the present run of reports that are not used
-    unused_told_ns: int | None = None  # when such a run was last reported
+    unused: UnusedRun | None = None  # the present run of reports that are not used
+    unused_notice_ns: int | None = None  # when such a run was last reported
 
 
 UavRecords = Records[UavRecord]

@@ -4,12 +4,12 @@ from collections import Counter, OrderedDict, deque
 from dataclasses import dataclass, field
 from typing import Final
 
-from companion.pipeline.records import UavRecords, Unused
+from companion.pipeline.records import UavRecords, UnusedRun
 from companion.values import Notice, Reason, Rejection, Severity, kind_of
 
 UNHEARD_NS: Final = 1_000_000_000
 """Time for which no report of a sender is used before that is told."""
-AGAIN_NS: Final = 10_000_000_000  # least time between two such notices of one sender
+NOTICE_INTERVAL_NS: Final = 10_000_000_000  # least time between two such notices of one sender
 OF_REPORTS: Final = frozenset(
     {
         Reason.UNREACHABLE,
@@ -58,20 +58,20 @@ class Refusals:
             return None
         record = self._records[uav]
         if record.unused is None:
-            record.unused = Unused(since_ns=refused.t_ns, reason=refused.reason)
+            record.unused = UnusedRun(since_ns=refused.t_ns, reason=refused.reason)
         run = record.unused
         run.reports += 1
         run.reason = refused.reason
         lasted_ns = refused.t_ns - run.since_ns
-        if run.is_told or run.reports < 2 or lasted_ns < UNHEARD_NS:
+        if run.is_reported or run.reports < 2 or lasted_ns < UNHEARD_NS:
             return None
         if refused.reason is Reason.SHARED_ID:
             return None  # that is told by itself
-        run.is_told = True
-        told_ns = record.unused_told_ns
-        if told_ns is not None and refused.t_ns - told_ns < AGAIN_NS:
+        run.is_reported = True
+        told_ns = record.unused_notice_ns
+        if told_ns is not None and refused.t_ns - told_ns < NOTICE_INTERVAL_NS:
             return None
-        record.unused_told_ns = refused.t_ns
+        record.unused_notice_ns = refused.t_ns
         why = f"{refused.reason}, {refused.detail}" if refused.detail else str(refused.reason)
         text = f"no report of {uav} was used for {lasted_ns * 1e-9:.1f} s: {why}"
         return Notice(t_ns=refused.t_ns, severity=Severity.WARNING, subject=uav, text=text)

@@ -100,7 +100,7 @@ class FrameOutcome:
     """
 
     message: PlacedReport | PlacedAttitude | EstimatorStatus | None = None
-    said: tuple[Notice | Rejection, ...] = ()
+    outputs: tuple[Notice | Rejection, ...] = ()
     restarted: str | None = None
     change: ClockChange | None = None
 
@@ -177,7 +177,7 @@ class Senders:
         message = decode(frame)
         match message:
             case Rejection():
-                return FrameOutcome(said=(message,))
+                return FrameOutcome(outputs=(message,))
             case Report():
                 if self._dedupe.is_repeat(frame):
                     return _refused(message, Reason.DUPLICATE)
@@ -198,13 +198,15 @@ class Senders:
             case None:
                 return NOTHING
             case _:
-                return self._beside(frame, message)
+                return self._take_other(frame, message)
 
-    def _beside(self, frame: Frame, message: GnssStatus | SystemTime | Presence) -> FrameOutcome:
+    def _take_other(
+        self, frame: Frame, message: GnssStatus | SystemTime | Presence
+    ) -> FrameOutcome:
         """Take in what is said beside positions: of a receiver, a clock, a vehicle."""
         match message:
             case GnssStatus():
-                component = self._heard(message)
+                component = self._component(message)
                 stated_us, newest_us = message.time_us, component.stated_us
                 # What is older comes over a second link that lags behind.
                 if not 0 < stated_us < newest_us <= stated_us + STATED_LATE_US:
@@ -219,10 +221,10 @@ class Senders:
                     clock.system_time(message.t_ns, on_timeline_us, message.boot_ms)
                 return NOTHING if change is None else FrameOutcome(change=change)
             case Presence():
-                self._heard(message).presence = message
+                self._component(message).presence = message
         return NOTHING
 
-    def _heard(self, message: GnssStatus | Presence) -> ComponentState:
+    def _component(self, message: GnssStatus | Presence) -> ComponentState:
         component = self._components[message.source]
         component.heard_ns = message.t_ns
         return component
@@ -268,13 +270,13 @@ class Senders:
         restarted = uav if said else None
         if sender.clock.is_shared(t_ns):
             return FrameOutcome(
-                message=None, said=(*said, *_shared_id(sender, uav, t_ns)), restarted=restarted
+                message=None, outputs=(*said, *_shared_id(sender, uav, t_ns)), restarted=restarted
             )
         sender.is_shared = False
         if stamp is None:
             return FrameOutcome(
                 message=None,
-                said=(*said, Rejection(t_ns=t_ns, source=uav, reason=Reason.UNPLACED_STAMP)),
+                outputs=(*said, Rejection(t_ns=t_ns, source=uav, reason=Reason.UNPLACED_STAMP)),
                 restarted=restarted,
             )
         self._dedupe.took(stamp.latency_s)
@@ -290,7 +292,7 @@ class Senders:
             limits=assumed.limits,
         )
         return FrameOutcome(
-            message=placed, said=said, restarted=restarted, change=sender.clock.change
+            message=placed, outputs=said, restarted=restarted, change=sender.clock.change
         )
 
     def _errors(self, report: Report, time_s: float) -> ReportNoise:
@@ -318,7 +320,7 @@ class Senders:
         datum = self.aircraft.datum(said.uav)
         merged = self.aircraft.merge(said)
         if isinstance(merged, Rejection):
-            return FrameOutcome(said=(merged,))
+            return FrameOutcome(outputs=(merged,))
         true_ns = merged.t_ns - round((merged.tslc_s or 0.0) * 1e9)
         limits = self.assumed(said.uav).limits
         placed = PlacedReport(
@@ -329,17 +331,17 @@ class Senders:
         text = f"{said.uav} is tracked anew: its altitude is {merged.alt_datum} now, not {datum}"
         return FrameOutcome(
             message=placed,
-            said=(Notice(t_ns=said.t_ns, severity=Severity.INFO, subject=said.uav, text=text),),
+            outputs=(Notice(t_ns=said.t_ns, severity=Severity.INFO, subject=said.uav, text=text),),
             restarted=said.uav,
         )
 
     def _remote_id(self, frame: Frame, said: RemoteId) -> FrameOutcome:
         """Place a position that an aircraft broadcasts, by the stamp that it has."""
-        named = self.remote_ids.named(said)
+        named = self.remote_ids.merge(said)
         if named is None:
             return NOTHING
         if isinstance(named, Rejection):
-            return FrameOutcome(said=(named,))
+            return FrameOutcome(outputs=(named,))
         if not self._admits(named.uav):
             return _refused(named, Reason.NOT_ALLOWED)
         if self._dedupe.is_repeat(frame):
@@ -355,7 +357,7 @@ class Senders:
         placed = None if stamp is None else PlacedAttitude(attitude, stamp.sender_ns)
         return FrameOutcome(
             message=placed,
-            said=said,
+            outputs=said,
             restarted=carrier if said else None,
             change=sender.clock.change,
         )
@@ -452,7 +454,7 @@ class Senders:
 
 
 def _refused(message: Report | AdsbVehicle, reason: Reason) -> FrameOutcome:
-    return FrameOutcome(said=(Rejection(t_ns=message.t_ns, source=message.uav, reason=reason),))
+    return FrameOutcome(outputs=(Rejection(t_ns=message.t_ns, source=message.uav, reason=reason),))
 
 
 def _shared_id(sender: Sender, uav: str, t_ns: int) -> tuple[Notice | Rejection, ...]:

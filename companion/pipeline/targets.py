@@ -40,16 +40,16 @@ class Targets:
         served = frozenset(self.duty.serves)
         return [uav for uav in wanted if uav in served]
 
-    def spared(self, uavs: Iterable[str]) -> list[str]:
-        """The UAVs that others serve, on which beams are to have nulls, in the order given."""
+    def protected(self, uavs: Iterable[str]) -> list[str]:
+        """UAVs of other nodes that nulls are to protect, in the order given."""
         spares = frozenset(self.duty.spares if self.duty else ())
         return [uav for uav in uavs if uav in spares and self.wants(uav)]
 
-    def betters(self, uav: str, others: Iterable[str]) -> list[str]:
+    def better_known(self, uav: str, others: Iterable[str]) -> list[str]:
         """Those of the others by which a relayed aircraft would rather be known.
 
-        Telemetry before Remote ID, ADS-B and Cursor on Target, in this order; who is known by
-        another track himself is none of them.
+        Telemetry before Remote ID, ADS-B and Cursor on Target, in this order; tracks already
+        merged into another one are excluded.
         """
         own = kind_of(uav).rank
         same_as = self.identities.same_as

@@ -40,7 +40,7 @@ _LATEST_NS: Final = 1 << 62
 """Latest time of an event, the year 2116: what is worked out from times stays in 63 bits."""
 LARGEST_EVENT: Final = 1 << 21
 """Most bytes of an event: a duty of all the names that it may have has no more."""
-_DOUBT_MAX_NS: Final = 3_600_000_000_000
+_UNCERTAINTY_MAX_NS: Final = 3_600_000_000_000
 """Greatest doubt of a frame's arrival: what is worked out from it stays in 63 bits."""
 _EVENT_TOPICS: Final = frozenset(
     (
@@ -303,7 +303,11 @@ def _event(topic: str, data: bytes, sources: dict[tuple[int, int], Source]) -> E
         raise ValueError("an event that is longer than any")
     if topic == schemas.FRAMES_TOPIC:
         frame = codec.to_frame(data, sources)
-        if not is_shaped(frame.raw) or max(frame.source) > 255 or frame.doubt_ns > _DOUBT_MAX_NS:
+        if (
+            not is_shaped(frame.raw)
+            or max(frame.source) > 255
+            or frame.doubt_ns > _UNCERTAINTY_MAX_NS
+        ):
             raise ValueError("a frame that is none")
         return frame
     if topic == schemas.TICKS_TOPIC:

@@ -77,15 +77,15 @@ def recover_leftovers(folder: Path) -> list[Recovered | LogError]:
         except BeingRecordedError:
             continue
         except UnreadableError as error:
-            results.append(_set_aside(path, str(error)))
+            results.append(_keep_damaged(path, str(error)))
         except LogError as error:
             results.append(error)
         except Exception as error:  # whatever a leftover does, the service starts
-            results.append(_set_aside(path, f"{path}: {type(error).__name__}: {error}"))
+            results.append(_keep_damaged(path, f"{path}: {type(error).__name__}: {error}"))
     return results
 
 
-def _set_aside(path: Path, why: str) -> LogError:
+def _keep_damaged(path: Path, why: str) -> LogError:
     """Rename a leftover to ``x.mcap.damaged``; returns what is to be said."""
     aside = free_name(path.with_suffix(DAMAGED))
     try:

@@ -48,7 +48,7 @@ def fleet_metrics(node: Node) -> Iterator[Metric]:
     yield CounterMetricFamily(
         "companion_fleet_untold",
         "Frames that nobody was told of, for want of room",
-        value=member.sharing.untold,
+        value=member.sharing.dropped,
     )
     ways = GaugeMetricFamily(
         "companion_fleet_way_p99_seconds",

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from companion.tracking.geodesy import LocalFrame
-from companion.tracking.limits import MOST, Raised
+from companion.tracking.limits import MOST, RaisedLimit
 from companion.values import Attitude, Carrier, EstimatorStatus, Fix, FloatArray, Refuted, Track
 
 
@@ -178,7 +178,7 @@ class AngularAcceleration:
     """What a carrier's reported rates of turn prove of its angular acceleration."""
 
     def __init__(self) -> None:
-        self._raised = Raised()
+        self._raised = RaisedLimit()
         self._newest: tuple[int, float, float, float] | None = None
 
     def limit_degps2(self, base_degps2: float, sender_ns: int) -> float:

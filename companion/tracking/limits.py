@@ -106,7 +106,7 @@ def lag_s(kind: Airframe, autopilot: int | None) -> tuple[float, float]:
 
 
 @dataclass(slots=True)
-class Raised:
+class RaisedLimit:
     """A limit that was raised: to how much, and when on the sender's timeline."""
 
     to: float = 0.0
@@ -129,8 +129,8 @@ class Refutations:
     """What the reports of one UAV have proven of its limits. ``look`` takes them in any order."""
 
     def __init__(self) -> None:
-        self.speed = Raised()
-        self.acceleration = Raised()
+        self.speed = RaisedLimit()
+        self.acceleration = RaisedLimit()
         self._times_ns: list[int] = []
         self._velocities: list[tuple[float, float, float, float, float]] = []
 
@@ -183,7 +183,7 @@ class Refutations:
         return most
 
     def _raise(
-        self, raised: Raised, fix: Fix, setting: str, limit: float, proven: float
+        self, raised: RaisedLimit, fix: Fix, setting: str, limit: float, proven: float
     ) -> Refuted:
         to = raised.to_hold(proven, fix.sender_ns)
         return Refuted(

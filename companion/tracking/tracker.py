@@ -14,14 +14,19 @@ from typing import Any, Final
 import numpy as np
 
 from companion.tracking.gate import GateSettings, Suspects, is_frozen, refusal
-from companion.tracking.hindsight import WAYS, WINDOWS, Hindsight, fed
 from companion.tracking.history import ReportHistory
 from companion.tracking.limits import Refutations
 from companion.tracking.noise import NoiseSettings
 from companion.tracking.observers.estimates import Observer, Prediction
 from companion.tracking.pace import ReportTiming
+from companion.tracking.past_predictions import (
+    ACCELERATION_MODELS,
+    WINDOWS,
+    PastPredictions,
+    fed_forward,
+)
 from companion.tracking.reach import Reach, reach
-from companion.tracking.straying import Straying
+from companion.tracking.receiver_check import ReceiverCheck
 from companion.values import (
     Estimate,
     Fix,
@@ -80,10 +85,10 @@ class TrackerSettings:
 
 @dataclass(slots=True)
 class _Past:
-    """What outlasts a track that is begun again; ``straying`` is None if noise is believed."""
+    """What outlasts a restarted track; ``receiver_check`` is None if stated noise is trusted."""
 
     refutations: Refutations
-    straying: Straying | None
+    receiver_check: ReceiverCheck | None
     pace: ReportTiming
 
 
@@ -101,7 +106,7 @@ class _Tracked:
     unknown_input: Vector | None = None
     mu_max_s2: float | None = None
     acceleration: Vector | None = None
-    hindsight: Hindsight = field(default_factory=Hindsight)
+    predictions: PastPredictions = field(default_factory=PastPredictions)
 
 
 class Tracker:
@@ -139,17 +144,17 @@ class Tracker:
 
     def _new_past(self) -> _Past:
         noise = self._settings.noise
-        return _Past(Refutations(), None if noise is None else Straying(noise), ReportTiming())
+        return _Past(Refutations(), None if noise is None else ReceiverCheck(noise), ReportTiming())
 
     def _held_to(self, past: _Past, fix: Fix) -> tuple[Fix, list[Refuted]]:
         """A report with the bounds that reports have shown, and what it refutes of them."""
         given = self._limits(fix)
         found = past.refutations.look(fix if fix.limits else replace(fix, limits=given))
         limits, noise = past.refutations.limits(given, fix.sender_ns), fix.noise
-        if past.straying is not None:
-            strays = past.straying.look(fix, limits.acceleration_max_mps2)
-            noise = past.straying.noise(noise)
-            found += [] if strays is None else [strays]
+        if past.receiver_check is not None:
+            refuted = past.receiver_check.look(fix, limits.acceleration_max_mps2)
+            noise = past.receiver_check.noise(noise)
+            found += [] if refuted is None else [refuted]
         if limits is given and noise is fix.noise:
             return fix, found
         return replace(fix, limits=limits, noise=noise), found
@@ -285,19 +290,19 @@ class Tracker:
 
         Accelerations are cut to the greatest possible size.
         """
-        hindsight = tracked.hindsight
+        predictions = tracked.predictions
         if self._settings.feed_forward:
-            hindsight.smooth(fix)
-        if not hindsight.is_due(fix.sender_ns):
+            predictions.smooth(fix)
+        if not predictions.is_due(fix.sender_ns):
             return
         if not self._settings.feed_forward:
-            hindsight.add(fix, (None,) * len(WAYS))
+            predictions.add(fix, (None,) * len(ACCELERATION_MODELS))
             return
         most_mps2 = self._limits(fix).acceleration_max_mps2
         slopes = [_cut(one, most_mps2) for one in tracked.history.accelerations(WINDOWS)]
         by_window = {window[0]: slope for window, slope in zip(WINDOWS, slopes, strict=True)}
-        hindsight.add(fix, tuple(by_window.get(way.window_s) for way in WAYS))
-        tracked.acceleration = by_window.get(hindsight.way.window_s)
+        predictions.add(fix, tuple(by_window.get(way.window_s) for way in ACCELERATION_MODELS))
+        tracked.acceleration = by_window.get(predictions.model.window_s)
 
     def forget(self, uav: str) -> None:
         """Forget a track, because its sender was restarted or is gone."""
@@ -337,7 +342,7 @@ class Tracker:
             set_center_ned_m=np.array(possible.center_ned_m),
             set_radius_m=possible.radius_m,
             limits=self._limits(newest.fix),
-            error_p95_m=self._usual_m(tracked, velocity, at, possible.bound_m),
+            error_p95_m=self._error_p95_m(tracked, velocity, at, possible.bound_m),
             clock_bound_s=at.bound_s,
             dt_s=last.dt_s,
             latency_s=(newest.fix.arrival_ns - newest.fix.t_ns) * 1e-9,
@@ -378,7 +383,7 @@ class Tracker:
             ),
         )
 
-    def _usual_m(
+    def _error_p95_m(
         self, tracked: _Tracked, velocity: Vector | None, at: SenderTime, bound_m: float
     ) -> float | None:
         """The error that is usual at a time: what reports have shown, and the clock's share.
@@ -386,13 +391,15 @@ class Tracker:
         What reports have shown is of the near past, and may be more than can be now.
         """
         age_s = (at.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
-        seen_m = tracked.hindsight.usual_m(age_s)
+        seen_m = tracked.predictions.error_p95_m(age_s)
         if seen_m is None:
             return None
         if velocity is not None:
             newest = tracked.history.newest.fix
-            straying = tracked.past.straying
-            common_m = 0.0 if straying is None else straying.usual_m(newest.noise)
+            receiver_check = tracked.past.receiver_check
+            common_m = (
+                0.0 if receiver_check is None else receiver_check.common_error_m(newest.noise)
+            )
             seen_m = math.hypot(seen_m, common_m, math.hypot(*velocity) * at.usual_s)
         return min(seen_m, bound_m)
 
@@ -447,12 +454,12 @@ def _rejected(fix: Fix, reason: Reason, detail: str) -> Rejection:
 def _fed(
     tracked: _Tracked, at: SenderTime, position: Vector, velocity: Vector
 ) -> tuple[Vector, Vector]:
-    """A predicted position and velocity with what hindsight has chosen to add."""
+    """A predicted position and velocity with what past predictions have chosen to add."""
     ahead_s = (at.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
-    position = _sum(position, tracked.hindsight.aside)
+    position = _sum(position, tracked.predictions.smoothing_offset)
     if tracked.acceleration is None or ahead_s <= 0:
         return position, velocity
-    moved, gained = fed(tracked.hindsight.way, tracked.acceleration, velocity, ahead_s)
+    moved, gained = fed_forward(tracked.predictions.model, tracked.acceleration, velocity, ahead_s)
     return _sum(position, moved), _sum(velocity, gained)
 
 

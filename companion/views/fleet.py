@@ -131,7 +131,7 @@ def fleet(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Json:
             sent_bps=status.sent_bps,
             heard_bps=status.heard_bps,
             damaged=status.damaged,
-            untold=member.sharing.untold,
+            untold=member.sharing.dropped,
         )
     return as_json(shown, pipeline.utc_ns)
 
@@ -160,8 +160,8 @@ def nodes(member: FleetMember, now_ns: int) -> list[FleetNode]:
 
 def _node(name: str, member: FleetMember, now_ns: int) -> FleetNode:
     known: Neighbour = member.neighbours[name]
-    said, ahead = known.standing, known.clock.newest()
-    reason = member.trust.aside.get(name)
+    said, ahead = known.standing, known.clock.newest_offset()
+    reason = member.trust.excluded.get(name)
     is_there = name in member.duties.others(now_ns)
     median_ms, p99_ms = _ways_ms(known, now_ns)
     state = NodeState.THERE if is_there else NodeState.SILENT
@@ -176,7 +176,7 @@ def _node(name: str, member: FleetMember, now_ns: int) -> FleetNode:
         most=None if said is None else said.most,
         heard_s=None if said is None else (now_ns - known.heard_ns) * 1e-9,
         clock_offset_s=None if ahead is None else -(ahead.low_ns + ahead.high_ns) / 2e9,
-        clock_doubt_s=None if ahead is None else ahead.doubt_ns * 1e-9,
+        clock_doubt_s=None if ahead is None else ahead.width_ns * 1e-9,
         frames=known.frames,
         used=known.used,
         way_p50_ms=median_ms,
@@ -186,7 +186,7 @@ def _node(name: str, member: FleetMember, now_ns: int) -> FleetNode:
 
 def _ways_ms(known: Neighbour, now_ns: int) -> tuple[float | None, float | None]:
     """Median and 99th percentile of how long reports were on their way; None: none came."""
-    ways_ns = known.ways_ns(now_ns)
+    ways_ns = known.delays_ns(now_ns)
     if not ways_ns:
         return None, None
     median_ns, p99_ns = np.percentile(ways_ns, (50, 99)).tolist()

@@ -35,7 +35,7 @@ class Positions:
         self._every_s = every_s
         self._boot_ms: dict[str, int] = {}  # of what was said last
 
-    def said(self, pipeline: Pipeline, tracks: Iterable[Track]) -> list[Outgoing]:
+    def outgoing(self, pipeline: Pipeline, tracks: Iterable[Track]) -> list[Outgoing]:
         """What is to be said of the tracks at their time, by their own clocks."""
         found = [
             message

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from companion.pipeline import blame
-from companion.pipeline.fleet.assignment import worth_db
+from companion.pipeline.fleet.assignment import offer_value_db
 from companion.pipeline.fleet.member import FleetMember
 from companion.pipeline.fold import Pipeline
 from companion.values import Blame, Offer, Standing
@@ -49,7 +49,9 @@ def served_uavs(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> 
     nobody = dict[str, Blame]()
     for track in tracks:
         given = offers.get(track.uav, {})
-        able = [full.get(node, False) for node, one in given.items() if worth_db(one) is not None]
+        able = [
+            full.get(node, False) for node, one in given.items() if offer_value_db(one) is not None
+        ]
         nobody[track.uav] = blame.of_unserved(track, reached=bool(able), full=all(able))
     elsewhere = sum(uav in by and member.name not in by[uav] for uav in wanted)
     return Served(node=member.name, by=by, nobody=nobody, elsewhere=elsewhere)
@@ -60,7 +62,7 @@ def offers_of(member: FleetMember) -> dict[str, dict[str, Offer]]:
     found: dict[str, dict[str, Offer]] = {}
     for uav, offer in member.offers.items():
         found.setdefault(uav, {})[member.name] = offer
-    for name in sorted(filter(member.trust.believes, member.neighbours)):
+    for name in sorted(filter(member.trust.is_trusted, member.neighbours)):
         for uav, offer in (member.neighbours[name].offers or {}).items():
             found.setdefault(uav, {})[name] = offer
     return found
@@ -69,7 +71,7 @@ def offers_of(member: FleetMember) -> dict[str, dict[str, Offer]]:
 def standing(member: FleetMember, now_ns: int) -> dict[str, Standing]:
     """The other nodes that are there and believed, by name."""
     others = sorted(member.duties.others(now_ns).items())
-    return {name: said for name, said in others if member.trust.believes(name)}
+    return {name: said for name, said in others if member.trust.is_trusted(name)}
 
 
 def _full(member: FleetMember, now_ns: int) -> dict[str, bool]:

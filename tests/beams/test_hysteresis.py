@@ -9,7 +9,7 @@ import pytest
 from companion.beams import hysteresis
 from companion.beams.aim import aim
 from companion.beams.array.geometry import Array, uniform_linear, uniform_rectangular
-from companion.beams.hysteresis import Steady
+from companion.beams.hysteresis import Hysteresis
 from companion.beams.weights.precoding import Precoder
 from companion.values import BeamSet, Carrier, Limits, Method, Policy, Track, TrackState, Widen
 
@@ -61,7 +61,7 @@ def flown(
     bounds_m: list[float], how: Precoder, apart_m: list[float] | None = None, array: Array = ARRAY
 ) -> list[BeamSet]:
     """A UAV whose bound changes from tick to tick, and one beside it."""
-    state: Steady | None = None
+    state: Hysteresis | None = None
     found = []
     for tick, bound_m in enumerate(bounds_m):
         at_ns = tick * TICK_NS
@@ -78,7 +78,7 @@ def flown(
                 before=state,
             )
         )
-        state = hysteresis.after(state, found[-1])
+        state = hysteresis.updated(state, found[-1])
     return found
 
 
@@ -162,7 +162,7 @@ def test_turns_do_not_change_to_and_fro(policy: Policy) -> None:
 @pytest.mark.parametrize("stopped_s", [100.0, 1000.0, 86_400.0, 2.0**31])
 def test_beams_go_on_after_any_pause(stopped_s: float) -> None:
     """A process that was stopped (SIGSTOP) or a machine that was suspended ticks on much later."""
-    before = Steady(
+    before = Hysteresis(
         valid_at_ns=0,
         shaped={"1:1": (0.01, 0.2)},
         filled_ns={},
@@ -175,6 +175,8 @@ def test_beams_go_on_after_any_pause(stopped_s: float) -> None:
     at_ns = round(stopped_s * 1e9)
     for then_ns in (at_ns, -at_ns):
         assert np.array_equal(
-            hysteresis.followed_rad(before, then_ns, ["1:1"], wanted_rad=wanted, natural_rad=0.1),
+            hysteresis.rate_limited_rad(
+                before, then_ns, ["1:1"], wanted_rad=wanted, natural_rad=0.1
+            ),
             wanted,
         )

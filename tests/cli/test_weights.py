@@ -240,7 +240,7 @@ def test_whole_numbers_are_a_codebook(cut_log: Path, tmp_path: Path) -> None:
 def test_progress_is_told_and_the_look_is_the_same(
     cut_log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(moment, "TOLD_EVERY", 200)
+    monkeypatch.setattr(moment, "PROGRESS_EVERY", 200)
     told: list[float] = []
     settings = Settings().override(center={"source": "5:1"})
     _, update = moment.look([cut_log], settings, "3", progress=told.append)

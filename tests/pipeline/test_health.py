@@ -81,7 +81,7 @@ class Watch:
 
     def see(self, t_s: float, tracks: list[Track], carrier: Carrier | None = CARRIER) -> str:
         news = update(t_s, tracks, carrier)
-        weighed = self.health.weigh(news)
+        weighed = self.health.next_batch(news)
         self.said += self.health.judge(
             news, weighed, lambda _uav: LinkEvidence(clock_assumed=False, refused=None)
         )

@@ -38,7 +38,7 @@ def north(flown: StandIn) -> Iterator[StandIn]:
     )
     member.duties.serves["1:1"] = 20.0
     place = (47.0, 8.0, 480.0)
-    member.stands(
+    member.take_standing(
         now_ns, Standing(node="south", place=place, reach_m=900.0, most=1, serves=(("2:1", 25.0),))
     )
     flown.fleet = FleetStatus(member=member, site="harbour", sent_bps=1e3, heard_bps=2e3, damaged=0)
@@ -67,7 +67,7 @@ def test_who_serves_a_uav_is_said_of_it(north: StandIn) -> None:
 
 def test_a_node_that_left_stays_in_the_list(north: StandIn) -> None:
     assert north.fleet is not None
-    north.fleet.member.left(north.now_ns(), "south")
+    north.fleet.member.node_left(north.now_ns(), "south")
     answer = models.model(fleet_view.Fleet).model_validate(client(north).get("/v1/fleet").json())
     assert [(one.node, one.state, one.serves) for one in answer.nodes] == [
         ("north", "here", 1),
@@ -93,9 +93,9 @@ def test_who_is_served_by_nobody_has_no_link_and_why(north: StandIn) -> None:
 
     assert said() == ("coverage", "no node of the fleet reaches it")
     member = north.fleet.member
-    member.offered(north.now_ns(), "south", (offer(alone), offer("2:1")))
+    member.take_offers(north.now_ns(), "south", (offer(alone), offer("2:1")))
     assert said() == ("unserved", "every node that reaches it is full")
-    member.offer({alone: offer(alone)})
+    member.set_offers({alone: offer(alone)})
     assert said() == ("unserved", "no node of the fleet serves it")
 
 
@@ -111,7 +111,7 @@ def test_the_headline_counts_those_of_nobody_and_names_the_others(north: StandIn
 
 def test_a_node_put_aside_serves_nobody(north: StandIn) -> None:
     assert north.fleet is not None
-    north.fleet.member.trust.aside["south"] = "has a clock that contradicts itself"
+    north.fleet.member.trust.excluded["south"] = "has a clock that contradicts itself"
     assert uavs(north)["2:1"].served_by == []
     answer = models.model(fleet_view.Fleet).model_validate(client(north).get("/v1/fleet").json())
     assert [node.state for node in answer.nodes] == ["here", "aside"]
@@ -128,7 +128,7 @@ def test_the_metrics_have_what_one_is_woken_for(north: StandIn) -> None:
     assert north.fleet is not None
     member = north.fleet.member
     for _ in range(100):
-        member.neighbours["south"].came(north.now_ns(), 10_000_000)
+        member.neighbours["south"].note_delay(north.now_ns(), 10_000_000)
     member.handed_over = 3
     alone = sum(one.served_by == [] for one in uavs(north).values())
     lines = client(north).get("/metrics").text.splitlines()

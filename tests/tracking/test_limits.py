@@ -16,7 +16,7 @@ from companion.tracking.limits import (
     FADES_S,
     RAISED,
     Airframe,
-    Raised,
+    RaisedLimit,
     Refutations,
     airframe,
     lag_s,
@@ -97,7 +97,7 @@ def test_what_keeps_within_its_limits_is_never_refuted(
             return
         stamped = math.floor(t_s * 1e3) / 1e3
         assert known.look(told(fix, stamped, velocity + wrong)) == []
-    assert known.speed == known.acceleration == Raised()
+    assert known.speed == known.acceleration == RaisedLimit()
 
 
 def test_a_turn_beyond_the_limit_is_proven_raised_and_fades(fix: Callable[..., Fix]) -> None:

@@ -71,7 +71,7 @@ def tracks(fold: Pipeline, t_s: float) -> list[Track]:
 def said(fold: Pipeline, t_s: float, out: passed_on.Positions | None = None) -> list[Any]:
     """What is said at a time, as pymavlink reads it."""
     mav: Any = dialect.MAVLink(None)
-    messages = (out or passed_on.Positions()).said(fold, tracks(fold, t_s))
+    messages = (out or passed_on.Positions()).outgoing(fold, tracks(fold, t_s))
     return [mav.decode(bytearray(pack(message, 0))) for message in messages]
 
 

@@ -55,7 +55,7 @@ class Element:
             case ElementPattern.COSINE:
                 return self._cosine(directions[..., 0])
             case ElementPattern.TR38901:
-                return _tr38901(*_aside_and_up(directions))
+                return _tr38901(*_azimuth_and_elevation(directions))
 
     def amplitude_range(
         self, directions: FloatArray, radius_rad: float | FloatArray
@@ -86,7 +86,7 @@ class Element:
 ISOTROPIC: Final = Element()
 
 
-def _aside_and_up(directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _azimuth_and_elevation(directions: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Absolute azimuth and elevation; by arctan2, exact to rounding up to the poles."""
     x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
     return np.abs(np.arctan2(y, x)), np.arctan2(np.abs(z), np.hypot(x, y))
@@ -104,7 +104,7 @@ def _tr38901(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> FloatArray:
 def _tr38901_range(
     directions: FloatArray, radius_rad: float | FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    azimuth, elevation = _aside_and_up(directions)
+    azimuth, elevation = _azimuth_and_elevation(directions)
     # A cap around elevation e reaches asin(sin(radius) / cos(e)) in azimuth, or over the pole.
     over = elevation + radius_rad >= np.pi / 2
     sine = np.sin(np.minimum(radius_rad, np.pi / 2)) / np.maximum(np.cos(elevation), 1e-300)

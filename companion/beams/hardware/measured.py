@@ -34,7 +34,7 @@ MEASURED_HEADER: Final = "azimuth_deg,elevation_deg,channel,phase_deg,gain_db"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Responses:
+class ChannelResponses:
     """Responses (K, M) of channels by themselves to a source at unit directions (K, 3)."""
 
     directions: FloatArray
@@ -42,7 +42,7 @@ class Responses:
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Found:
+class FittedCalibration:
     """A calibration with bounds, and what it leaves.
 
     phase_deg, gain_db  largest errors that remain, of all channels and directions
@@ -54,7 +54,7 @@ class Found:
     cost_db: float  # most that a matched beam's guarantee loses to them
 
 
-def parse_responses(text: str) -> Responses:
+def parse_responses(text: str) -> ChannelResponses:
     """Read CSV with the header ``MEASURED_HEADER``: a line for each direction and channel.
 
     Raises ``UserError`` that names the line, or what is missing.
@@ -79,10 +79,10 @@ def parse_responses(text: str) -> Responses:
         raise UserError("there is no response at all")
     angles = np.radians(np.array(list(found)))
     responses = np.array([[one[c] for c in range(size)] for one in found.values()])
-    return Responses(unit_directions(angles[:, 0], angles[:, 1]), responses)
+    return ChannelResponses(unit_directions(angles[:, 0], angles[:, 1]), responses)
 
 
-def fitted(measured: Responses, array: Array, order: Sequence[int]) -> Found:
+def fitted(measured: ChannelResponses, array: Array, order: Sequence[int]) -> FittedCalibration:
     """The calibration nearest to the responses; ``order`` is the element of each channel.
 
     Its bounds are the largest errors that remain for each channel: of what was measured, no more.
@@ -116,7 +116,7 @@ def fitted(measured: Responses, array: Array, order: Sequence[int]) -> Found:
         gain_error_db=tuple(gain_off.tolist()),
     )
     share = 1 - float(channel_error(phase_off, gain_off).mean())
-    return Found(
+    return FittedCalibration(
         calibration=calibration,
         phase_deg=float(np.degrees(phase_off.max())),
         gain_db=float(gain_off.max()),

@@ -30,7 +30,7 @@ RINGS: Final = 4  # rings of directions in which other arrays are asked
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class ApertureCones:
     """Cones of K sizes about N directions, by the cosines to the axes of an aperture.
 
     lowest, highest  (K, N, D), the ends of the interval
@@ -66,13 +66,15 @@ class Seen:
         return np.maximum(self.highest - self.seen, self.seen - self.lowest)
 
 
-def seen_within(across: Aperture, directions: FloatArray, angles_rad: FloatArray) -> Seen:
+def cones_on_aperture(
+    across: Aperture, directions: FloatArray, angles_rad: FloatArray
+) -> ApertureCones:
     """The cones within angles (K, N) of unit directions (N, 3)."""
     cosines = np.minimum(np.maximum(directions @ across.axes.T, -1.0), 1.0)
     angle, wide = np.arccos(cosines), angles_rad[:, :, np.newaxis]
     lowest = np.cos(np.minimum(angle + wide, np.pi))
     highest = np.cos(np.maximum(angle - wide, 0.0))
-    return Seen(cosines, np.minimum(lowest, cosines), np.maximum(highest, cosines))
+    return ApertureCones(cosines, np.minimum(lowest, cosines), np.maximum(highest, cosines))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,7 +119,11 @@ class ConeSamples:
 
 
 def cones(
-    array: Array, across: Aperture, directions: FloatArray, seen: Seen, centres: ComplexArray
+    array: Array,
+    across: Aperture,
+    directions: FloatArray,
+    seen: ApertureCones,
+    centres: ComplexArray,
 ) -> ConeSamples:
     """Where the beams towards unit directions (N, 3) are looked at.
 
@@ -137,7 +143,7 @@ def cones(
 
 
 def _about(
-    across: Aperture, seen: Seen, grid: tuple[int, int], wavelength_m: float
+    across: Aperture, seen: ApertureCones, grid: tuple[int, int], wavelength_m: float
 ) -> tuple[list[ComplexArray], FloatArray]:
     """The places about each predicted direction: their waves on each axis, and how they count."""
     wide = across.lengths_m / wavelength_m
@@ -188,7 +194,9 @@ def _all_waves(count: int, finer: int, reach: int) -> ComplexArray:
     return waves
 
 
-def _asked(array: Array, across: Aperture, directions: FloatArray, seen: Seen) -> ConeSamples:
+def _asked(
+    array: Array, across: Aperture, directions: FloatArray, seen: ApertureCones
+) -> ConeSamples:
     """Steering vectors of directions in rings about each predicted one, out to either cone."""
     users = len(directions)
     held, likely = seen.halves
@@ -216,7 +224,9 @@ def _asked(array: Array, across: Aperture, directions: FloatArray, seen: Seen) -
     return ConeSamples(turns=nothing, waves=(), vectors=vectors, counts=counts)
 
 
-def outside(across: Aperture, seen: Seen, around: FloatArray, wavelength_m: float) -> FloatArray:
+def outside(
+    across: Aperture, seen: ApertureCones, around: FloatArray, wavelength_m: float
+) -> FloatArray:
     """How far directions (P, 3) are outside of the first of K cones, in natural widths, (P, N).
 
     0 within.

@@ -20,21 +20,21 @@ class ZeroForcingLimits:
 
 @dataclass(frozen=True, slots=True)
 class PreviousSlots:
-    """The slots of before: the number of each user's, -1 if left out; ``young`` if they are new."""
+    """Slot number of each user, -1 if left out; ``young`` if the slots are new."""
 
     numbers: IntArray
     young: bool
 
 
-LENIENT_DB: Final = 1.5  # what slots may cost beyond the limit while they are young
+YOUNG_MARGIN_DB: Final = 1.5  # loss accepted beyond the limit while slots are young
 
 
-def kept(
+def kept_groups(
     steering: ComplexArray, before: PreviousSlots, limits: ZeroForcingLimits
 ) -> list[IntArray] | None:
-    """The groups of before, if they still do; None if others must be found."""
+    """The previous groups if they are still within the limits; else None."""
     groups = [np.flatnonzero(before.numbers == n) for n in range(int(before.numbers.max()) + 1)]
-    most_db = limits.loss_db + (LENIENT_DB if before.young else 0.0)
+    most_db = limits.loss_db + (YOUNG_MARGIN_DB if before.young else 0.0)
     if not groups or any(not len(g) or lost_db(steering[:, g], limits) > most_db for g in groups):
         return None
     return groups
@@ -80,7 +80,9 @@ class _Group:
         if rest <= 1e-12:
             return False
         losses = np.append(self._inverse.diagonal().real + np.abs(moved) ** 2 / rest, 1.0 / rest)
-        if losses.max() > 10 ** (self._limits.loss_db / 10) or not self._told_apart(user, losses):
+        if losses.max() > 10 ** (self._limits.loss_db / 10) or not self._is_well_conditioned(
+            user, losses
+        ):
             return False
         count = len(self.members)
         inverse = np.empty((count + 1, count + 1), dtype=complex)
@@ -92,7 +94,7 @@ class _Group:
         self.members.append(user)
         return True
 
-    def _told_apart(self, user: int, losses: FloatArray) -> bool:
+    def _is_well_conditioned(self, user: int, losses: FloatArray) -> bool:
         """Whether the condition number is within its limit.
 
         Its square is at most the product of the traces, which mostly settles it.

@@ -51,14 +51,14 @@ ROUNDING: Final = 1e-10
 """Loading of the predicted directions, as a share of their power, against rounding."""
 
 
-class Nulled(NamedTuple):
+class NulledBeams(NamedTuple):
     """Beams (M, N) with nulls, and whether each predicted direction (N,) is left wholly dark."""
 
     weights: ComplexArray
     exact: BoolArray
 
 
-def nulled(spread: Spread, noise: FloatArray | None = None, exact: bool = False) -> Nulled:
+def with_nulls(spread: Spread, noise: FloatArray | None = None, exact: bool = False) -> NulledBeams:
     """The beams of a spread with nulls on one another.
 
     spread  how wide beams and nulls are
@@ -67,7 +67,7 @@ def nulled(spread: Spread, noise: FloatArray | None = None, exact: bool = False)
     """
     users, each = spread.beams.shape[1], spread.each
     if users == 1:
-        return Nulled(spread.beams.copy(), np.ones(1, dtype=bool))
+        return NulledBeams(spread.beams.copy(), np.ones(1, dtype=bool))
     fields, counts = spread.cones.fields(spread.beams), spread.cones.counts
     power = _power(spread.beams)
     gains = _squared(fields) / power[:, np.newaxis]
@@ -84,10 +84,10 @@ def nulled(spread: Spread, noise: FloatArray | None = None, exact: bool = False)
     dark[own, own] = True
     whole = np.asarray(dark.all(axis=0))
     if exact:
-        return Nulled(spread.beams - taken, whole)
+        return NulledBeams(spread.beams - taken, whole)
     least = (counts * kept[:, :, np.newaxis]).max(axis=0)
     back = _back(spread, taken, (fields, power), least)
-    return Nulled(spread.beams - back * taken, whole & (back >= 1.0))
+    return NulledBeams(spread.beams - back * taken, whole & (back >= 1.0))
 
 
 def _squared(values: ComplexArray) -> FloatArray:

@@ -15,8 +15,7 @@ A*)^-1]_ii. Past ``loss_limit_db`` for any user, or past a condition number of A
 decides: load the matrix by the least x at which no user loses more (each loss falls with x, see
 ``_least_loading``), serve groups in time slots, or leave out the lowest priorities. This is judged
 with the columns of A scaled to one length, since a weak element pattern is not closeness. It
-happens at mirror images about a line array, or with two UAVs behind one another.
-See docs/math.md 7.
+happens at mirror images about a line array, or with two UAVs behind one another (docs/math.md 7).
 
 Over 300 lines: the ways of making weights fall back on one another.
 """
@@ -30,7 +29,7 @@ import numpy as np
 
 from companion.beams.weights import grouping, powers, zero_forcing
 from companion.beams.weights.grouping import PreviousSlots
-from companion.beams.weights.nulls import nulled
+from companion.beams.weights.nulls import with_nulls
 from companion.beams.weights.widening import Spread, power_gains
 from companion.beams.worth.link_budget import LinkBudget
 from companion.values import (
@@ -204,7 +203,7 @@ def _slots(
         return [everyone], {}
     limits = grouping.ZeroForcingLimits(settings.loss_limit_db, settings.condition_limit)
     lost_db = grouping.lost_db(steering, limits)
-    stays = None if before is None else grouping.kept(steering, before, limits)
+    stays = None if before is None else grouping.kept_groups(steering, before, limits)
     young = before is not None and before.young
     if lost_db <= settings.loss_limit_db and not (young and stays is not None):
         return [everyone], {}
@@ -256,7 +255,7 @@ def _columns(
             loading = np.full(len(users), max(settings.regularisation * len(a), least))
             if settings.method is Method.MMSE:
                 loading = np.maximum(_mmse_loading(gram, settings, radio, users), least)
-            found = _loaded(a, gram, loading) if wide is None else nulled(wide, loading).weights
+            found = _loaded(a, gram, loading) if wide is None else with_nulls(wide, loading).weights
             return _Columns(_unit_response(a, found), settings.method, condition)
         case Method.ZERO_FORCING:
             made = _zero_forcing(even, gram, condition, settings) if wide is None else None
@@ -327,7 +326,7 @@ def _wide_zero_forcing(
 ) -> _Columns:
     """Shaped beams with nulls on the others: exact where no beam's least gain would suffer."""
     told_apart = condition <= settings.condition_limit
-    found = nulled(wide, exact=settings.policy is not Policy.REGULARISE and told_apart)
+    found = with_nulls(wide, exact=settings.policy is not Policy.REGULARISE and told_apart)
     if told_apart and found.exact.all():
         exact = _unit_response(a, _exactly(a, found.weights))
         return _Columns(exact, Method.ZERO_FORCING, condition)

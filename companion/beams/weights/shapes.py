@@ -45,7 +45,7 @@ class Shapes(NamedTuple):
 
     places: FloatArray
     widths: FloatArray  # (W,), ascending
-    sure: FloatArray  # (W, K), the greatest least gain within the width
+    guaranteed: FloatArray  # (W, K), the greatest least gain within the width
     least_db: FloatArray
     losses: FloatArray
     cones: FloatArray  # (C,), ascending
@@ -63,7 +63,7 @@ def _table(name: str) -> Shapes:
         return Shapes(
             places=(np.arange(count) - (count - 1) / 2) / count,
             widths=np.log(held[f"{name}_widths"]),
-            sure=held[f"{name}_sure"].astype(float),
+            guaranteed=held[f"{name}_sure"].astype(float),
             least_db=held[f"{name}_least_db"],
             losses=np.log(held[f"{name}_losses_db"]),
             cones=np.log(held[f"{name}_cones"]),
@@ -192,14 +192,14 @@ def _psi(
     """Phases psi (N, K) of the table for each column of widths (N, D): their sum is one shape."""
     columns = range(cones.shape[1])
     if likely is None:
-        return [_sure(shapes, cones[:, d]) for d in columns]
+        return [_guaranteed_phases(shapes, cones[:, d]) for d in columns]
     best_db = np.interp(np.log(np.maximum(cones, 1e-9)), shapes.widths, shapes.least_db).sum(axis=1)
     best_db += 10 * math.log10(elements)
     least_db = len(columns) * math.exp(shapes.losses[0])
     lacking_db = np.maximum(worth_db + SPARE_DB + least_db - best_db, 0.0)
     loss_db = np.maximum(best_db - floor_db, least_db) + GIVEN_UP * lacking_db
     loss_db /= len(columns)
-    return [_likely(shapes, cones[:, d], likely[:, d], loss_db) for d in columns]
+    return [_likely_phases(shapes, cones[:, d], likely[:, d], loss_db) for d in columns]
 
 
 def _between(knots: FloatArray, at: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -224,14 +224,16 @@ def _on_axes(axes: Sequence[FloatArray], at: Sequence[FloatArray]) -> tuple[IntA
     return before, places - before
 
 
-def _sure(shapes: Shapes, widths: FloatArray) -> FloatArray:
+def _guaranteed_phases(shapes: Shapes, widths: FloatArray) -> FloatArray:
     (before,), (share,) = _on_axes([shapes.widths], [np.log(np.maximum(widths, 1e-300))])
     part = share[:, np.newaxis]
-    found: FloatArray = (1 - part) * shapes.sure[before] + part * shapes.sure[before + 1]
+    found: FloatArray = (1 - part) * shapes.guaranteed[before] + part * shapes.guaranteed[
+        before + 1
+    ]
     return found
 
 
-def _likely(
+def _likely_phases(
     shapes: Shapes, cones: FloatArray, likely: FloatArray, losses_db: FloatArray
 ) -> FloatArray:
     loss, cone, wide = np.log(np.maximum(np.stack([losses_db, cones, likely]), 1e-300))

@@ -14,7 +14,7 @@ import numpy as np
 from companion.beams.array.geometry import Array
 from companion.beams.array.steering import steering_matrix
 from companion.beams.weights import cones, shapes
-from companion.beams.weights.cones import ConeSamples, Seen
+from companion.beams.weights.cones import ApertureCones, ConeSamples
 from companion.values import BoolArray, ComplexArray, FloatArray, IntArray, Widen
 
 WIDEST_RAD: Final = np.pi / 2  # angle beyond which beams are not widened further
@@ -26,7 +26,7 @@ BROADENED: Final = 0.9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Uncertain:
+class DirectionErrors:
     """How far N directions are off."""
 
     likely_rad: FloatArray  # (N,), the angle within which the UAV usually is
@@ -80,13 +80,15 @@ class Spread:
         )
 
 
-def spread(array: Array, directions: FloatArray, known: Uncertain, widen: Widen) -> Spread | None:
+def spread(
+    array: Array, directions: FloatArray, known: DirectionErrors, widen: Widen
+) -> Spread | None:
     """How to widen for unit directions (N, 3) in the array frame; None: not at all."""
     if widen is Widen.NO:
         return None
     across = shapes.aperture(array)
     angles_rad = np.minimum(np.array([known.bounds_rad, known.likely_rad]), WIDEST_RAD)
-    seen = cones.seen_within(across, directions, angles_rad)
+    seen = cones.cones_on_aperture(across, directions, angles_rad)
     around = _around(array, across, directions, angles_rad[1])
     each = around.shape[1]
     around = around.reshape(-1, 3)
@@ -110,7 +112,7 @@ def spread(array: Array, directions: FloatArray, known: Uncertain, widen: Widen)
     )
 
 
-def _for_the_bound_rad(array: Array, across: shapes.Aperture, seen: Seen) -> FloatArray:
+def _for_the_bound_rad(array: Array, across: shapes.Aperture, seen: ApertureCones) -> FloatArray:
     """Phases (N, M) for the bound alone: each beam looks at the middle of what is seen of it."""
     shaped = shapes.phases_rad(across, seen.halves[0] * across.lengths_m / array.wavelength_m, None)
     aside = (seen.middles[0] - seen.seen) @ (array.centred_m @ across.axes.T).T

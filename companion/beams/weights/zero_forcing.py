@@ -23,7 +23,7 @@ MOST_LOSS: Final = 1e12
 """Sum of all loss factors above which there is no answer: 120 dB, where rounding dominates."""
 
 
-class Solved(NamedTuple):
+class ZeroForcingSolution(NamedTuple):
     """Zero-forcing weights and what they cost. A tuple, because it is made faster than a dataclass.
 
     weights       F (M, N), complex128, in Fortran order: those of one user lie together
@@ -34,7 +34,7 @@ class Solved(NamedTuple):
     loss_factors: FloatArray
 
 
-def solve(steering: ComplexArray) -> Solved | None:
+def solve(steering: ComplexArray) -> ZeroForcingSolution | None:
     """Zero-forcing weights for a steering matrix A, (M, N), complex128; C order is the fast one.
 
     None where there is no answer: more users than elements, a column of zeros, or columns so nearly
@@ -54,7 +54,7 @@ def solve(steering: ComplexArray) -> Solved | None:
     power, diagonal = gram.diagonal().real, inverse.diagonal().real
     if info or not power.dot(diagonal) < MOST_LOSS:
         return _unsolved(steering)
-    return Solved(zgemm(1.0, transposed, inverse, trans_a=2), power * diagonal)
+    return ZeroForcingSolution(zgemm(1.0, transposed, inverse, trans_a=2), power * diagonal)
 
 
 @lru_cache(maxsize=8)
@@ -64,8 +64,8 @@ def _identity(users: int) -> ComplexArray:
     return identity
 
 
-def _unsolved(steering: ComplexArray) -> Solved | None:
+def _unsolved(steering: ComplexArray) -> ZeroForcingSolution | None:
     """The answer where Cholesky has none, or where there are no users."""
     if not np.isfinite(steering).all():
         raise ValueError("a steering vector holds what is not a finite number")
-    return None if steering.shape[1] else Solved(np.empty_like(steering), np.empty(0))
+    return None if steering.shape[1] else ZeroForcingSolution(np.empty_like(steering), np.empty(0))

@@ -7,13 +7,13 @@ What is seen of a sender is
 No frame arrives before it was sent, so the offset is nowhere above any y; and since it changes by
 no more than the greatest drift D, a y once seen limits it for ever:
 
-    offset(x) <= min over all stamps of  y_k + D |x - x_k|          (``sure``, docs/math.md 6)
+    offset(x) <= min over all stamps of  y_k + D |x - x_k|     (``upper_bound``, docs/math.md 6)
 
 That limit is one number, aged by D: nothing that still proves something is forgotten, and there is
 no cliff at the end of a window.
 
 A clock that stands still for a moment and a link that is slower from now on look alike: every y is
-higher. Which of them it was cannot be told, so both are kept: ``sure`` holds if the clock ran on,
+higher. They cannot be distinguished, so both are kept: ``upper_bound`` holds if the clock ran on,
 ``line`` begins again where all frames have lain above it for long, far beyond what their spread
 explains (``lateness.py``). Likewise where frames come steadily later for a whole window: a clock
 that is slow, or a queue that fills. The line follows it, and a level floor is kept beside it until
@@ -47,7 +47,7 @@ _RARE: Final = 7.0
 class Heights(NamedTuple):
     """Heights of a floor at one sender time, ns."""
 
-    sure: int  # above the offset if the clock ran within its drift
+    upper_bound: int  # above the offset if the clock ran within its drift
     highest: int  # above the offset, even if the clock changed before the last frames
     line: int  # the most likely height of the floor
     least: int  # the least height that the frame nearest to the offset can have
@@ -56,22 +56,22 @@ class Heights(NamedTuple):
 class _Level:
     """The floor under stamps that lie along a slope, if the clock ran within its drift after all.
 
-    sure        height above the offset then, at the newest stamp, above the level base
+    upper_bound height above the offset then, at the newest stamp, above the level base
     touched_ns  sender time of the stamp that it comes from
     """
 
-    __slots__ = ("sure", "touched_ns")
+    __slots__ = ("touched_ns", "upper_bound")
 
     def __init__(self, sure: float, touched_ns: int) -> None:
-        self.sure = sure
+        self.upper_bound = sure
         self.touched_ns = touched_ns
 
     def add(self, x_ns: int, height: float, ahead_ns: int, drift_max: float) -> None:
         """Take in a stamp that is so much ahead of the newest."""
-        self.sure += drift_max * max(0, ahead_ns)
+        self.upper_bound += drift_max * max(0, ahead_ns)
         as_of_now = height + drift_max * max(0, -ahead_ns)
-        if as_of_now <= self.sure:
-            self.sure, self.touched_ns = as_of_now, x_ns
+        if as_of_now <= self.upper_bound:
+            self.upper_bound, self.touched_ns = as_of_now, x_ns
 
 
 class Floor:
@@ -101,9 +101,9 @@ class Floor:
         self.rose_ns = 0.0
         self._first_arrival_ns = self._newest_arrival_ns = 0
         self._base = (0, 0)  # x, y: heights below are above base y + drift * (x - base x)
-        self._sure = self._line = 0.0  # heights at newest_ns
+        self._upper_bound = self._line = 0.0  # heights at newest_ns
         self._level: _Level | None = None  # the floor, if what looks like a drift is a queue
-        self._touched_ns = 0  # x of the stamp that ``sure`` comes from
+        self._touched_ns = 0  # x of the stamp that ``upper_bound`` comes from
         self._since_ns = 0  # x from which the line is what it is
         self._risen = -np.inf  # height of the last few frames, where they are suspiciously late
         self._recent: deque[tuple[int, float]] = deque(maxlen=RECENT)
@@ -131,13 +131,13 @@ class Floor:
             self._level.add(x_ns, y_ns - self._base[1], ahead_ns, self._drift_max)
         if ahead_ns > 0:
             self.newest_ns = x_ns
-            self._sure += self._drift_max * ahead_ns
+            self._upper_bound += self._drift_max * ahead_ns
             self._line += self._likely_drift * ahead_ns
             as_of_now = height
         else:
             as_of_now = height - self._drift_max * ahead_ns
-        if as_of_now <= self._sure:
-            self._sure, self._touched_ns = as_of_now, x_ns
+        if as_of_now <= self._upper_bound:
+            self._upper_bound, self._touched_ns = as_of_now, x_ns
         gap = as_of_now - self._line
         self._line = min(self._line, as_of_now)
         self._recent.append((x_ns, height))
@@ -148,11 +148,11 @@ class Floor:
             late_spell = self._lateness.add(x_ns, height, gap, self._spread)
             if late_spell is not None:
                 self._all_late(late_spell)
-        if self._line - self._sure > WORST_LATENCY_NS:
+        if self._line - self._upper_bound > WORST_LATENCY_NS:
             # No frame is as late as that: the clock did change.
-            self._sure, self._touched_ns = self._line, x_ns
+            self._upper_bound, self._touched_ns = self._line, x_ns
         level = self._level
-        if level is not None and self._tilted(self._line) - level.sure > WORST_LATENCY_NS:
+        if level is not None and self._tilted(self._line) - level.upper_bound > WORST_LATENCY_NS:
             self._level = None  # no queue is as long as that: the clock does drift
         if self.count < 4 * RECENT or self.count - self._looked >= 64 or gap < -RESOLUTION_NS:
             self._measure()
@@ -183,7 +183,7 @@ class Floor:
     def _all_late(self, spell: LateSpell) -> None:
         """Tell that all frames are late, once; begin the line again there in time."""
         if spell.is_news:
-            rose_ns = spell.height - max(self._line, self._sure)
+            rose_ns = spell.height - max(self._line, self._upper_bound)
             self.rose_ns = rose_ns if rose_ns > LEAST_CHANGE_NS else 0.0
         if spell.followed:
             self._line, self._since_ns = spell.height, spell.since_ns
@@ -200,11 +200,11 @@ class Floor:
 
     def _drifts(self) -> None:
         """Lay the floor anew along the drift, on the least heights of the window."""
-        newest_ns, level = self.newest_ns, self._sure
+        newest_ns, level = self.newest_ns, self._upper_bound
         self._level = _Level(0.0, self._touched_ns)
         self._base = (newest_ns, self._base[1] + round(level))
         points = self._visible.tilt(self.drift, newest_ns, level)
-        self._sure = self._line = min(
+        self._upper_bound = self._line = min(
             height + self._drift_max * (newest_ns - at_ns) for at_ns, height in points
         )
         self._since_ns = self._touched_ns = points[0][0]
@@ -221,7 +221,7 @@ class Floor:
         """What the floor says of the offset at a sender time."""
         drift_max, newest_ns = self._drift_max, self.newest_ns
         base_ns = self._base[1]
-        sure, line, recent = self._sure, self._line, self._risen
+        sure, line, recent = self._upper_bound, self._line, self._risen
         slack = drift_max * abs(x_ns - newest_ns)
         moved = self.drift * (x_ns - self._base[0])
         if len(self._recent) == RECENT:
@@ -231,12 +231,12 @@ class Floor:
         highest, least = max(sure, line, recent) + moved, sure - aged + moved
         sure += moved
         if self._level is not None:
-            level = self._level.sure
+            level = self._level.upper_bound
             aged = 2.0 * drift_max * (newest_ns - self._level.touched_ns)
             sure, highest = min(sure, level), max(highest, level)
             least = min(least, level - aged)
         return Heights(
-            sure=base_ns + round(sure + slack),
+            upper_bound=base_ns + round(sure + slack),
             highest=base_ns + round(highest + slack),
             line=base_ns + round(line + moved),
             least=base_ns + round(least - slack),
@@ -285,7 +285,7 @@ class Floor:
     def begin_again(self, height_ns: int, x_ns: int) -> None:
         """Begin again at a height that was measured at a sender time: the clock did change."""
         measured = self._height(x_ns, height_ns)
-        self._sure = self._line = measured + self._drift_max * abs(self.newest_ns - x_ns)
+        self._upper_bound = self._line = measured + self._drift_max * abs(self.newest_ns - x_ns)
         self._level = None
         self._since_ns = self._touched_ns = x_ns
         self._risen = -np.inf

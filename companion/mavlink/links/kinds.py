@@ -3,8 +3,8 @@
 from collections.abc import Callable
 
 from companion.mavlink.links.endpoints import Endpoint, Upcalls
-from companion.mavlink.links.hearing import TcpListen, UdpListen
 from companion.mavlink.links.http_poll import HttpPoll
+from companion.mavlink.links.listen_only import TcpListen, UdpListen
 from companion.mavlink.links.peers import Splits
 from companion.mavlink.links.serial_port import SerialPort
 from companion.mavlink.links.status import LinkStatus

@@ -152,7 +152,7 @@ class Peers:
         del self._peers[peer.key]
         self._senders -= len(peer.senders)
 
-    def heard_since(self, t_ns: int) -> list[Peer]:
+    def active_since(self, t_ns: int) -> list[Peer]:
         """Peers from which a frame came at ``t_ns`` or later."""
         return [p for p in self._peers.values() if p.heard_ns is not None and p.heard_ns >= t_ns]
 

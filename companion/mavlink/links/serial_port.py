@@ -11,7 +11,7 @@ from collections.abc import Collection, Hashable
 from typing import Any, Final, cast
 
 from companion.mavlink.links.endpoints import Upcalls, settle
-from companion.mavlink.links.held_up import HeldUp
+from companion.mavlink.links.stale_bytes import StaleBytes
 from companion.mavlink.links.urls import LinkUrl
 
 WRITE_BUFFER_BYTES: Final = 4096
@@ -30,7 +30,7 @@ class SerialPort:
         self._upcalls = upcalls
         self._descriptor: int | None = None
         self._lost: asyncio.Future[Exception] | None = None
-        self._held_up: HeldUp | None = None
+        self._held_up: StaleBytes | None = None
         self._unsent = bytearray()
 
     def open(self) -> None:
@@ -43,7 +43,7 @@ class SerialPort:
         self._descriptor = descriptor = port.fileno()
         self._lost = loop.create_future()
         self._unsent.clear()
-        self._held_up = HeldUp(descriptor)
+        self._held_up = StaleBytes(descriptor)
         self._held_up.watch()
         loop.add_reader(descriptor, self._read, descriptor)
         self._upcalls.up()

@@ -16,7 +16,7 @@ from companion.mavlink.links.endpoints import (
     resolved,
     settle,
 )
-from companion.mavlink.links.held_up import HeldUp
+from companion.mavlink.links.stale_bytes import StaleBytes
 from companion.mavlink.links.urls import LinkUrl
 
 WRITE_BUFFER_BYTES: Final = 64 << 10
@@ -147,7 +147,7 @@ class _Stream(asyncio.Protocol):
         self._transport: asyncio.Transport | None = None
         self._welcome = welcome
         self._address = ""
-        self._held_up: HeldUp | None = None
+        self._held_up: StaleBytes | None = None
 
     def __str__(self) -> str:
         return self._address
@@ -155,7 +155,7 @@ class _Stream(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)
         self._address = address_text(transport.get_extra_info("peername"))
-        self._held_up = HeldUp(transport.get_extra_info("socket").fileno())
+        self._held_up = StaleBytes(transport.get_extra_info("socket").fileno())
         self._held_up.watch()
         if not self._welcome:
             self._transport.abort()

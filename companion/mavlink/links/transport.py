@@ -31,7 +31,7 @@ from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.peers import Peer, Peers
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.links.urls import LinkError, LinkUrl
-from companion.mavlink.trust.twins import Twins
+from companion.mavlink.trust.duplicate_ids import DuplicateIds
 from companion.mavlink.wire.decode import POSE
 from companion.mavlink.wire.encode import TIMESYNC, Outgoing, pack
 from companion.values import Frame, Notice, Reason, Rejection, Severity, Source
@@ -84,7 +84,7 @@ class Link:
         notify: Notify | None = None,
         guard: MessageSigning | None = None,
         lag: ArrivalLag | None = None,
-        twins: Twins | None = None,
+        twins: DuplicateIds | None = None,
     ) -> None:
         self.url = url
         self.status = LinkStatus(url=str(url))
@@ -93,7 +93,7 @@ class Link:
         self._notify = notify
         self._guard = guard
         self._lag = lag or ArrivalLag()
-        self._twins = twins or Twins()
+        self._twins = twins or DuplicateIds()
         self._peers = Peers(self.status, self._finish, splitter(url))
         upcalls = Upcalls(
             up=self._up,
@@ -178,7 +178,7 @@ class Link:
         """The item itself, or the refusal of what its sender's peers contradict each other in."""
         if isinstance(item, Rejection) or item.msgid not in POSE:
             return item
-        if not self._twins.refuses(str(self.url), peer.address or str(self.url), item):
+        if not self._twins.rejects(str(self.url), peer.address or str(self.url), item):
             return item
         who, detail = str(item.source), "two peers contradict each other"
         return Rejection(
@@ -217,7 +217,7 @@ class Link:
         """
         keys = self._endpoint.peers()
         if keys is None:
-            peers = self._peers.heard_since(self._now_ns() - int(PEER_ACTIVE_S * 1e9))
+            peers = self._peers.active_since(self._now_ns() - int(PEER_ACTIVE_S * 1e9))
         else:
             peers = [self._peers.at(key) for key in keys]
         return sum([self._send(peer, message) for peer in peers])

@@ -50,7 +50,7 @@ def open_peer(config: BusConfig) -> "zenoh.Session":
     try:
         return zenoh.open(_configured(config))
     except zenoh.ZError as error:
-        raise UserError(f"Zenoh: {_said(error)}") from error
+        raise UserError(f"Zenoh: {_error_text(error)}") from error
 
 
 class Bus:
@@ -92,7 +92,7 @@ class Bus:
                 break
             except zenoh.ZError as error:
                 if self._config.mode != "client" or NO_ROUTER not in str(error):
-                    raise UserError(f"Zenoh: {_said(error)}") from error
+                    raise UserError(f"Zenoh: {_error_text(error)}") from error
             self._ended.wait(self._config.retry_s)
         if self._ended.is_set() and self._session is not None:  # closed meanwhile
             _close(self._session)
@@ -308,7 +308,7 @@ def _close(session: "zenoh.Session") -> None:
         session.close()  # type: ignore[no-untyped-call]
 
 
-def _said(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
     """What an error of Zenoh says, in one line without the places in its source."""
     return " ".join(str(error).split(" at ")[0].split())
 
@@ -321,5 +321,5 @@ def _configured(config: BusConfig) -> "zenoh.Config":
         try:
             made.insert_json5(place, text)
         except zenoh.ZError as error:
-            raise UserError(f"Zenoh's configuration, {place}: {_said(error)}") from error
+            raise UserError(f"Zenoh's configuration, {place}: {_error_text(error)}") from error
     return made

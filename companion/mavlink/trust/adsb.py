@@ -69,39 +69,39 @@ class _RelayedAircraft:
     relays: OrderedDict[Source, int] = field(default_factory=OrderedDict)  # heard from at
 
     def hear(self, relay: Source, t_ns: int) -> None:
-        """Note that a relay spoke of the aircraft at ``t_ns``, whatever it said."""
+        """Note that a relay reported the aircraft at ``t_ns``."""
         self.relays[relay] = t_ns
         self.relays.move_to_end(relay)
         while len(self.relays) > RELAYS_KEPT or _is_past(next(iter(self.relays.values())), t_ns):
             self.relays.popitem(last=False)
 
-    def learn(self, said: AdsbVehicle, true_ns: int) -> None:
+    def learn(self, message: AdsbVehicle, true_ns: int) -> None:
         """Take in every field that is present and newer than what is known."""
-        if said.alt_datum is not None:
-            altitude = _newest(self.altitudes.get(said.alt_datum), true_ns, said.alt_m)
+        if message.alt_datum is not None:
+            altitude = _newest(self.altitudes.get(message.alt_datum), true_ns, message.alt_m)
             if altitude is not None:
-                self.altitudes[said.alt_datum] = altitude
-        self.heading = _newest(self.heading, true_ns, said.heading_deg)
-        self.velocity_ne = _newest(self.velocity_ne, true_ns, said.velocity_ne_mps)
-        self.velocity_down = _newest(self.velocity_down, true_ns, said.velocity_down_mps)
-        self.callsign = _newest(self.callsign, true_ns, said.callsign)
+                self.altitudes[message.alt_datum] = altitude
+        self.heading = _newest(self.heading, true_ns, message.heading_deg)
+        self.velocity_ne = _newest(self.velocity_ne, true_ns, message.velocity_ne_mps)
+        self.velocity_down = _newest(self.velocity_down, true_ns, message.velocity_down_mps)
+        self.callsign = _newest(self.callsign, true_ns, message.callsign)
 
-    def repeated(self, said: AdsbVehicle) -> AdsbVehicle | None:
+    def repeated(self, message: AdsbVehicle) -> AdsbVehicle | None:
         """The reported message that this one repeats; None where it has something new."""
-        assert said.position_deg is not None
-        before = self.reported.get(said.position_deg)
-        if before is None or _differs(before, said):
+        assert message.position_deg is not None
+        before = self.reported.get(message.position_deg)
+        if before is None or _differs(before, message):
             return None
-        is_later = _true_ns(said) - _true_ns(before) >= SLACK_NS
-        return None if is_later and said.t_ns - before.t_ns > REPEATED_NS else before
+        is_later = _true_ns(message) - _true_ns(before) >= SLACK_NS
+        return None if is_later and message.t_ns - before.t_ns > REPEATED_NS else before
 
-    def altitude(self, said: AdsbVehicle) -> tuple[AltitudeDatum, float, int] | None:
+    def altitude(self, message: AdsbVehicle) -> tuple[AltitudeDatum, float, int] | None:
         """Datum, metres and age (ns) of the altitude that is joined to a position just learned."""
-        true_ns = _true_ns(said)
-        choice = (self.datum, said.alt_datum, AltitudeDatum.GEOMETRIC, AltitudeDatum.PRESSURE)
+        true_ns = _true_ns(message)
+        choice = (self.datum, message.alt_datum, AltitudeDatum.GEOMETRIC, AltitudeDatum.PRESSURE)
         for datum in choice:
-            if datum is not None and datum is said.alt_datum and said.alt_m is not None:
-                return datum, said.alt_m, 0
+            if datum is not None and datum is message.alt_datum and message.alt_m is not None:
+                return datum, message.alt_m, 0
             known = self.altitudes.get(datum) if datum is not None else None
             if datum is not None and known is not None:
                 age_ns = abs(true_ns - known[0])
@@ -109,34 +109,34 @@ class _RelayedAircraft:
                     return datum, known[1], age_ns
         return None
 
-    def report(self, said: AdsbVehicle, at_deg: tuple[float, float]) -> Report | None:
+    def report(self, message: AdsbVehicle, at_deg: tuple[float, float]) -> Report | None:
         """The report of a position that is news; None where no altitude is known for it."""
-        altitude = self.altitude(said)
+        altitude = self.altitude(message)
         if altitude is None:
             return None
-        true_ns = _true_ns(said)
+        true_ns = _true_ns(message)
         self.datum, alt_m, age_ns = altitude
         self.position_ns = max(true_ns, self.position_ns or true_ns)
-        self.reported[at_deg] = said
+        self.reported[at_deg] = message
         self.reported.move_to_end(at_deg)
         if len(self.reported) > POSITIONS_KEPT:
             self.reported.popitem(last=False)
         return Report(
-            t_ns=said.t_ns,
-            uav=said.uav,
-            source=said.source,
+            t_ns=message.t_ns,
+            uav=message.uav,
+            source=message.source,
             lat_deg=at_deg[0],
             lon_deg=at_deg[1],
             alt_m=alt_m,
             alt_datum=self.datum,
             relative_alt_m=None,
-            velocity_ne_mps=_fitting(said.velocity_ne_mps, self.velocity_ne, true_ns),
-            velocity_down_mps=_fitting(said.velocity_down_mps, self.velocity_down, true_ns),
-            heading_deg=_fitting(said.heading_deg, self.heading, true_ns),
+            velocity_ne_mps=_fitting(message.velocity_ne_mps, self.velocity_ne, true_ns),
+            velocity_down_mps=_fitting(message.velocity_down_mps, self.velocity_down, true_ns),
+            heading_deg=_fitting(message.heading_deg, self.heading, true_ns),
             boot_ms=None,
-            tslc_s=float(said.tslc_s),
+            tslc_s=float(message.tslc_s),
             alt_age_s=age_ns * 1e-9,
-            accuracy=said.accuracy,
+            accuracy=message.accuracy,
         )
 
 
@@ -152,7 +152,7 @@ class Aircraft:
             OrderedDict()
         )  # the longest without news first
 
-    def merge(self, said: AdsbVehicle) -> Report | Rejection:
+    def merge(self, message: AdsbVehicle) -> Report | Rejection:
         """Take in a message: a report if its position is news, else the reason why there is none.
 
         The report is completed from earlier messages. Reasons:
@@ -162,30 +162,30 @@ class Aircraft:
             DUPLICATE     the position was reported before
             OUT_OF_ORDER  certainly older than a reported one, or not heard for ``FORGOTTEN_S``
         """
-        self._forget(said.t_ns)
-        known = self._known.get(said.uav)
+        self._forget(message.t_ns)
+        known = self._known.get(message.uav)
         if known is not None:
-            known.hear(said.source, said.t_ns)
-        if said.tslc_s >= FORGOTTEN_S:
-            return _rejected(said, Reason.OUT_OF_ORDER, f"not heard for {said.tslc_s} s")
+            known.hear(message.source, message.t_ns)
+        if message.tslc_s >= FORGOTTEN_S:
+            return _rejected(message, Reason.OUT_OF_ORDER, f"not heard for {message.tslc_s} s")
         if known is None:
-            known = self._begin(said)
-        if said.position_deg is not None:
-            before = known.repeated(said)
+            known = self._begin(message)
+        if message.position_deg is not None:
+            before = known.repeated(message)
             if before is not None:
-                known.learn(said, _true_ns(before))
-                return _rejected(said, Reason.DUPLICATE)
-        true_ns = _true_ns(said)
-        known.learn(said, true_ns)
-        known.news_ns = said.t_ns
-        self._known.move_to_end(said.uav)
-        if said.position_deg is None:
-            return _rejected(said, Reason.NO_POSITION)
+                known.learn(message, _true_ns(before))
+                return _rejected(message, Reason.DUPLICATE)
+        true_ns = _true_ns(message)
+        known.learn(message, true_ns)
+        known.news_ns = message.t_ns
+        self._known.move_to_end(message.uav)
+        if message.position_deg is None:
+            return _rejected(message, Reason.NO_POSITION)
         if known.position_ns is not None and true_ns <= known.position_ns - SLACK_NS:
             late_s = (known.position_ns - true_ns) * 1e-9
-            return _rejected(said, Reason.OUT_OF_ORDER, f"{late_s:.1f} s before the newest")
-        report = known.report(said, said.position_deg)
-        return report if report is not None else _rejected(said, Reason.NO_ALTITUDE)
+            return _rejected(message, Reason.OUT_OF_ORDER, f"{late_s:.1f} s before the newest")
+        report = known.report(message, message.position_deg)
+        return report if report is not None else _rejected(message, Reason.NO_ALTITUDE)
 
     def relays(self, uav: str) -> tuple[Source, ...]:
         """Relays that spoke of an aircraft in the last ``FORGOTTEN_S``, the newest first."""
@@ -202,9 +202,9 @@ class Aircraft:
         known = self._known.get(uav)
         return known.callsign[1] if known is not None and known.callsign is not None else None
 
-    def _begin(self, said: AdsbVehicle) -> _RelayedAircraft:
-        known = self._known.setdefault(said.uav, _RelayedAircraft(news_ns=said.t_ns))
-        known.hear(said.source, said.t_ns)
+    def _begin(self, message: AdsbVehicle) -> _RelayedAircraft:
+        known = self._known.setdefault(message.uav, _RelayedAircraft(news_ns=message.t_ns))
+        known.hear(message.source, message.t_ns)
         if len(self._known) > AIRCRAFT_MAX:
             self._known.popitem(last=False)
         return known
@@ -218,12 +218,12 @@ def _is_past(then_ns: int, t_ns: int) -> bool:
     return t_ns - then_ns > FORGOTTEN_S * _NS
 
 
-def _true_ns(said: AdsbVehicle) -> int:
-    return said.t_ns - said.tslc_s * _NS
+def _true_ns(message: AdsbVehicle) -> int:
+    return message.t_ns - message.tslc_s * _NS
 
 
 def _newest(before: _Dated[_T] | None, true_ns: int, value: _T | None) -> _Dated[_T] | None:
-    """The value said now with its time; the known one if nothing was said or it was true later."""
+    """The newer of a value that was just received, with its time, and the known one."""
     if value is None or (before is not None and true_ns < before[0]):
         return before
     return true_ns, value
@@ -236,20 +236,20 @@ def _fitting(own: _T | None, known: _Dated[_T] | None, true_ns: int) -> _T | Non
     return known[1]
 
 
-def _differs(before: AdsbVehicle, said: AdsbVehicle) -> bool:
+def _differs(before: AdsbVehicle, message: AdsbVehicle) -> bool:
     """Whether two messages with one position disagree in velocity or altitude."""
     pairs = [
-        (before.velocity_ne_mps, said.velocity_ne_mps),
-        (before.velocity_down_mps, said.velocity_down_mps),
+        (before.velocity_ne_mps, message.velocity_ne_mps),
+        (before.velocity_down_mps, message.velocity_down_mps),
     ]
-    if before.alt_datum is said.alt_datum:
-        pairs.append((before.alt_m, said.alt_m))
+    if before.alt_datum is message.alt_datum:
+        pairs.append((before.alt_m, message.alt_m))
     return any(a is not None and b is not None and a != b for a, b in pairs)
 
 
-def _rejected(said: AdsbVehicle, reason: Reason, detail: str = "") -> Rejection:
+def _rejected(message: AdsbVehicle, reason: Reason, detail: str = "") -> Rejection:
     # Without a position there is nothing to show of the aircraft: it is its relay's message.
-    source = str(said.source) if reason is Reason.NO_POSITION else said.uav
+    source = str(message.source) if reason is Reason.NO_POSITION else message.uav
     return Rejection(
-        t_ns=said.t_ns, source=source, reason=reason, msgid=ADSB_VEHICLE, detail=detail
+        t_ns=message.t_ns, source=source, reason=reason, msgid=ADSB_VEHICLE, detail=detail
     )

@@ -62,7 +62,7 @@ BURST: Final = SECOND
 """More than the frames sent in ``MARGIN``: each takes one unit where the clock is behind."""
 
 Stream = tuple[int, int, int]  # system id and component id of the sender, and its link id
-Heard = tuple[int, int | None]
+ReceivedTimestamp = tuple[int, int | None]
 """Newest timestamp of a stream, and its lead over the own clock when it was accepted.
 
 The lead is None for a stream of this node.
@@ -77,7 +77,9 @@ class State:
     local: int = 0  # the local timestamp
     sent: int = 0  # newest timestamp of this node's frames
     floor: int = -1  # streams not in streams must be newer than this
-    streams: Mapping[Stream, Heard] = field(default_factory=dict)  # newest timestamp of each stream
+    streams: Mapping[Stream, ReceivedTimestamp] = field(
+        default_factory=dict
+    )  # newest timestamp of each stream
 
     def after_crash(self) -> Self:
         """The state to go on with if the process ended up to ``MARGIN`` after this one was made.
@@ -94,7 +96,7 @@ class State:
         that.
         """
         sent = max(self.sent + BURST, max(self.local, self.clock) + MARGIN)
-        streams: dict[Stream, Heard] = {}
+        streams: dict[Stream, ReceivedTimestamp] = {}
         for stream, (newest, lead) in self.streams.items():
             if lead is not None:
                 moved = max(newest, self.clock + lead + MARGIN)
@@ -210,7 +212,7 @@ class LinkSigning:
         """The newest timestamp with which no new stream may begin."""
         return max(self._floor, max(self._local, clock) - MINUTE - 1)
 
-    def _remember(self, stream: Stream, heard: Heard) -> None:
+    def _remember(self, stream: Stream, heard: ReceivedTimestamp) -> None:
         streams = self._streams
         if stream not in streams and len(streams) >= STREAMS_MAX:
             oldest = min(streams, key=lambda other: streams[other][0])

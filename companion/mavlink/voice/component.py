@@ -59,7 +59,7 @@ from companion.values import (
 
 _NS: Final = 1_000_000_000
 COMMAND_ACK: Final = 77
-HEARD: Final = POSE | {HEARTBEAT, REQUEST_DATA_STREAM, COMMAND_LONG, COMMAND_ACK, TIMESYNC}
+ACCEPTED_IDS: Final = POSE | {HEARTBEAT, REQUEST_DATA_STREAM, COMMAND_LONG, COMMAND_ACK, TIMESYNC}
 """Ids of the messages that ``ServiceComponent.hear`` must be given."""
 
 HEARTBEAT_NS: Final = _NS  # time between two heartbeats
@@ -77,7 +77,7 @@ Beyond it, it is about another clock.
 """
 _UPTIME_MAX_NS: Final = 10 * 365 * 86_400 * _NS
 """Greatest time since boot that is believed. Unix time has exceeded it since 1980."""
-CONFLICT_AGAIN_NS: Final = 300 * _NS  # time after which a conflict of ids is reported again
+CONFLICT_NOTICE_NS: Final = 300 * _NS  # time after which a conflict of ids is reported again
 
 _BROADCAST: Final = 0
 _NOT_OURS: Final = frozenset({0, 1, 190})  # everybody, an autopilot, a ground station
@@ -142,7 +142,7 @@ class ServiceComponent:
         self._conflict_ns: int | None = None
 
     def hear(self, frame: Frame) -> list[RoundTrip | Rejection | Notice]:
-        """Take in a frame whose id is in ``HEARD``.
+        """Take in a frame whose id is in ``ACCEPTED_IDS``.
 
         Returns round trips, rejections and notices that came of it, or since the last call.
         """
@@ -155,7 +155,7 @@ class ServiceComponent:
             self._stamps[frame.source] = (frame.t_ns, boot_ms)
             self._rates.stamped(frame.t_ns, frame.source, frame.msgid, boot_ms)
         else:
-            self._rates.heard(frame.t_ns, frame.source)
+            self._rates.message_received(frame.t_ns, frame.source)
             if frame.msgid == TIMESYNC:
                 self._timesync_answer(frame, said)
             elif frame.msgid == COMMAND_ACK:
@@ -207,7 +207,7 @@ class ServiceComponent:
         self._answered = {t_ns: who for t_ns, who in self._answered.items() if t_ns >= oldest_ns}
         self._sent = {content: t_ns for content, t_ns in self._sent.items() if t_ns >= oldest_ns}
         self._stamps = {who: at for who, at in self._stamps.items() if at[0] >= oldest_ns}
-        told = {who: at for who, at in self._doubted.items() if oldest_ns - at < CONFLICT_AGAIN_NS}
+        told = {who: at for who, at in self._doubted.items() if oldest_ns - at < CONFLICT_NOTICE_NS}
         self._doubted = told
 
     def _own_name(self, frame: Frame, said: list[RoundTrip | Rejection | Notice]) -> None:
@@ -215,7 +215,7 @@ class ServiceComponent:
         sent_ns = self._sent.get(_content(frame.msgid, frame.payload))
         if sent_ns is not None and frame.t_ns - sent_ns <= KEPT_NS:
             return
-        if self._conflict_ns is None or frame.t_ns - self._conflict_ns >= CONFLICT_AGAIN_NS:
+        if self._conflict_ns is None or frame.t_ns - self._conflict_ns >= CONFLICT_NOTICE_NS:
             self._conflict_ns = frame.t_ns
             text = f"{frame.link}: someone else sends as {self._source}, which is this service's id"
             said.append(
@@ -258,7 +258,7 @@ class ServiceComponent:
         detail = "TIMESYNC: two answers contradict each other"
         said += [_refused(one.t_ns, one.source, Reason.SHARED_ID, detail) for one in discarded]
         t_ns, source = second.t_ns, second.source
-        if t_ns - self._doubted.get(source, -CONFLICT_AGAIN_NS) >= CONFLICT_AGAIN_NS:
+        if t_ns - self._doubted.get(source, -CONFLICT_NOTICE_NS) >= CONFLICT_NOTICE_NS:
             self._doubted[source] = t_ns
             text = f"two answer TIMESYNC as {source}, and their clocks differ: neither is used"
             said.append(

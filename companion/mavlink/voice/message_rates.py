@@ -51,7 +51,7 @@ class MessageRates:
         self._others: deque[Request] = deque(maxlen=256)
         self._sent: deque[int] = deque(maxlen=REQUESTS_PER_S)
 
-    def heard(self, t_ns: int, source: Source) -> None:
+    def message_received(self, t_ns: int, source: Source) -> None:
         """Note that a message of this sender came, whichever it is."""
         uav = self._uavs.get(source)
         if uav is not None:
@@ -61,7 +61,7 @@ class MessageRates:
 
     def stamped(self, t_ns: int, source: Source, msgid: int, boot_ms: int) -> None:
         """Note a position or an attitude with its sender's stamp."""
-        self.heard(t_ns, source)
+        self.message_received(t_ns, source)
         uav = self._uavs.get(source)
         watch = uav.watches.get(msgid) if uav is not None else None
         if watch is not None:

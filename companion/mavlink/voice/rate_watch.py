@@ -64,7 +64,7 @@ STREAM: Final = {GLOBAL_POSITION_INT: 6, ATTITUDE: 10}
 """Data stream that carries a message: MAV_DATA_STREAM_POSITION, MAV_DATA_STREAM_EXTRA1."""
 _ACCEPTED, _TEMPORARILY_REJECTED, _IN_PROGRESS = 0, 1, 5  # MAV_RESULT; all others are refusals
 RESTART: Final = "a restart"
-NOBODY: Final = "nobody was heard asking"
+NO_REQUEST_SEEN: Final = "nobody was heard asking"
 
 
 class RateState(DescribedEnum):
@@ -159,7 +159,7 @@ class Watch:
     _slow_since_ns: int | None = None
     _order_since_ns: int | None = None
     _was_in_order: bool = False  # settled in order since the newest request
-    _told: set[str] = field(default_factory=set)
+    _notified: set[str] = field(default_factory=set)
 
     def observed_hz(self, heard_ns: int) -> float | None:
         """The rate as of when the UAV was last heard; None while too little is known."""
@@ -264,7 +264,7 @@ class Watch:
         self._was_in_order |= self._is_settled(self._order_since_ns, now_ns)
         if now_ns - self._order_since_ns >= IN_ORDER_NS:
             self._backoff_ns = 0
-            self._told.clear()
+            self._notified.clear()
             self.changed_by = None
 
     def _slow(
@@ -276,7 +276,7 @@ class Watch:
         if self._was_in_order:
             self._was_in_order = False
             self.changed_by = self._who_changed(since_ns, others)
-            by = "" if self.changed_by == NOBODY else "changed by "
+            by = "" if self.changed_by == NO_REQUEST_SEEN else "changed by "
             return self._tell(now_ns, self.changed_by, text + by + self.changed_by)
         if self.state is RateState.STREAMING and now_ns >= self.next_ns:
             self.state = RateState.REFUSED
@@ -295,10 +295,12 @@ class Watch:
         ]
         if self.observed.restarted_ns is not None:
             causes.append((self.observed.restarted_ns, RESTART))
-        return max((c for c in causes if after_ns <= c[0] <= since_ns), default=(0, NOBODY))[1]
+        return max(
+            (c for c in causes if after_ns <= c[0] <= since_ns), default=(0, NO_REQUEST_SEEN)
+        )[1]
 
     def _tell(self, now_ns: int, what: str, text: str) -> list[Notice]:
-        if what in self._told:
+        if what in self._notified:
             return []
-        self._told.add(what)
+        self._notified.add(what)
         return [Notice(t_ns=now_ns, severity=Severity.WARNING, subject=str(self.uav), text=text)]

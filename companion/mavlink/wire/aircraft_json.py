@@ -17,7 +17,7 @@ from companion.values import Frame, Reason, Rejection
 DOCUMENT_MAX: Final = 8 << 20  # bytes of a document at most: some 10 000 aircraft
 AIRCRAFT_MAX: Final = 10_000  # aircraft read of one document, and remembered
 _NOT_SEEN: Final = ("mlat", "tisb_icao", "tisb_trackfile", "tisb_other", "mode_s", "mode_ac")
-"""Types of an aircraft that said no position itself."""
+"""Types of an aircraft that report no position themselves."""
 
 
 class AircraftJson:
@@ -56,7 +56,7 @@ class AircraftJson:
 
     def _one(self, t_ns: int, entry: object, written: float) -> list[Frame | Rejection]:
         try:
-            said = _said(entry)
+            message = _aircraft_state(entry)
             position_age_s = _number(entry, "seen_pos", 0, 86_400)
         except (ValueError, OverflowError) as error:
             detail = str(error)
@@ -69,33 +69,35 @@ class AircraftJson:
                     detail=detail,
                 )
             ]
-        if isinstance(said, str):
+        if isinstance(message, str):
             return [
-                Rejection(t_ns=t_ns, source=self.link, reason=Reason.UNKNOWN_MESSAGE, detail=said)
+                Rejection(
+                    t_ns=t_ns, source=self.link, reason=Reason.UNKNOWN_MESSAGE, detail=message
+                )
             ]
         if (
-            said is None
+            message is None
             or position_age_s is None
-            or not self._is_news(said, written - position_age_s)
+            or not self._is_news(message, written - position_age_s)
         ):
             return []
-        found = frame(t_ns, self.link, said, self._seq)
+        found = frame(t_ns, self.link, message, self._seq)
         if found is None:
             return []
         self._seq = (self._seq + 1) & 0xFF
         return [found]
 
-    def _is_news(self, said: AircraftState, true_at: float) -> bool:
+    def _is_news(self, message: AircraftState, true_at: float) -> bool:
         """Whether a position is newer than what was read before; ages are in tenths of seconds."""
-        before = self._true_at.pop(said.icao, None)
-        self._true_at[said.icao] = true_at
+        before = self._true_at.pop(message.icao, None)
+        self._true_at[message.icao] = true_at
         if len(self._true_at) > AIRCRAFT_MAX:
             self._true_at.popitem(last=False)
         return before is None or not before - 60 < true_at <= before + 0.15
 
 
-def _said(entry: object) -> AircraftState | str | None:
-    """What is said of one aircraft; None: no position. Text: why it is not used.
+def _aircraft_state(entry: object) -> AircraftState | str | None:
+    """The state of one aircraft; None: no position. Text: why it is not used.
 
     Raises ``ValueError`` where its fields cannot be what they say.
     """

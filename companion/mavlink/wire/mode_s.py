@@ -47,7 +47,7 @@ def parity(message: bytes) -> int:
 
 
 @dataclass(slots=True, kw_only=True)
-class _Heard:
+class _AircraftMemory:
     """What an aircraft said that later messages need: half positions, accuracies, and when."""
 
     halves: dict[int, tuple[int, int, int]] = field(default_factory=dict)  # odd: t_ns, lat, lon
@@ -61,7 +61,7 @@ class Transponders:
     """Puts messages of many aircraft together. ``read`` takes them in order of arrival."""
 
     def __init__(self) -> None:
-        self._heard: OrderedDict[int, _Heard] = OrderedDict()
+        self._heard: OrderedDict[int, _AircraftMemory] = OrderedDict()
 
     def read(self, t_ns: int, message: bytes) -> AircraftState | None:
         """What a message says that came whole at ``t_ns``; None where that is nothing of use.
@@ -76,7 +76,7 @@ class Transponders:
         icao, me = int.from_bytes(message[1:4], "big"), int.from_bytes(message[4:11], "big")
         if icao == 0:
             return None
-        heard = self._heard.setdefault(icao, _Heard())
+        heard = self._heard.setdefault(icao, _AircraftMemory())
         self._heard.move_to_end(icao)
         if len(self._heard) > AIRCRAFT_MAX:
             self._heard.popitem(last=False)
@@ -102,7 +102,7 @@ def _callsign(me: int) -> str:
     return "" if "?" in letters else letters
 
 
-def _status(heard: _Heard, t_ns: int, me: int, *, airborne: bool) -> None:
+def _status(heard: _AircraftMemory, t_ns: int, me: int, *, airborne: bool) -> None:
     """Take in the accuracies of an operational status; version 0 has none, the ground no GVA."""
     version = me >> 13 & 7
     if version in (1, 2):
@@ -112,7 +112,7 @@ def _status(heard: _Heard, t_ns: int, me: int, *, airborne: bool) -> None:
 
 
 def _position(
-    heard: _Heard, t_ns: int, icao: int, me: int, altitude_ft: float | None
+    heard: _AircraftMemory, t_ns: int, icao: int, me: int, altitude_ft: float | None
 ) -> AircraftState:
     odd = me >> 34 & 1
     heard.halves[odd] = (t_ns, me >> 17 & 0x1FFFF, me & 0x1FFFF)
@@ -134,7 +134,7 @@ def _position(
     )
 
 
-def _on_ground(heard: _Heard, t_ns: int, icao: int, me: int) -> AircraftState:
+def _on_ground(heard: _AircraftMemory, t_ns: int, icao: int, me: int) -> AircraftState:
     """A position on the ground, near the newest place that is known, and how it moves."""
     place = None
     if heard.place is not None and t_ns - heard.place[0] <= GROUND_NS:

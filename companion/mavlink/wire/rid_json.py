@@ -81,7 +81,7 @@ class RidJson:
                 Rejection(t_ns=t_ns, source=self.link, reason=Reason.GARBAGE, count=len(text) + 1)
             ]
         try:
-            return [self._frame(t_ns, *one) for one in list(_said(found))]
+            return [self._frame(t_ns, *one) for one in list(_messages(found))]
         except (ValueError, struct.error, OverflowError) as why:
             detail = str(why)[:80]
             return [
@@ -108,7 +108,7 @@ def _parsed(text: bytes) -> dict[str, Any] | None:
     return found if isinstance(found, dict) else None
 
 
-def _said(found: dict[str, Any]) -> Iterator[tuple[int, bytes]]:
+def _messages(found: dict[str, Any]) -> Iterator[tuple[int, bytes]]:
     """Message ids and payloads of what an object says; nothing of one that says something else."""
     data = found.get("data")
     if isinstance(data, dict) and isinstance(data.get("UASdata"), str):

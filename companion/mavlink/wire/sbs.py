@@ -56,7 +56,7 @@ class SbsSplitter:
                 garbage += len(line) + 1
                 self._overlong = False
             elif kind in (b"MSG", b"MLAT"):
-                out += self._said(t_ns, line, kind)
+                out += self._line(t_ns, line, kind)
             elif line.strip() and kind not in _SILENT:
                 garbage += len(line) + 1
         if len(self._pending) > LINE_MAX:
@@ -66,14 +66,14 @@ class SbsSplitter:
             out.append(Rejection(t_ns=t_ns, source=self.link, reason=Reason.GARBAGE, count=garbage))
         return out
 
-    def _said(self, t_ns: int, line: bytes, kind: bytes) -> list[Frame | Rejection]:
+    def _line(self, t_ns: int, line: bytes, kind: bytes) -> list[Frame | Rejection]:
         if kind == b"MLAT":  # found by other receivers, however well they are placed
             detail = "MLAT: how exact it is, is not known"
             return [
                 Rejection(t_ns=t_ns, source=self.link, reason=Reason.UNKNOWN_MESSAGE, detail=detail)
             ]
         try:
-            found = frame(t_ns, self.link, said(line.decode("ascii")), self._seq)
+            found = frame(t_ns, self.link, aircraft_state(line.decode("ascii")), self._seq)
         except ValueError as error:
             text = error.reason if isinstance(error, UnicodeDecodeError) else str(error)
             return [
@@ -91,7 +91,7 @@ class SbsSplitter:
         return [found]
 
 
-def said(line: str) -> AircraftState:
+def aircraft_state(line: str) -> AircraftState:
     """What a MSG line says. Raises ``ValueError`` where its fields cannot be what they say."""
     fields = [field.strip() for field in line.split(",")]
     if len(fields) < 10:

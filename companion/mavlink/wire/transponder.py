@@ -1,4 +1,4 @@
-"""What a transponder said, as the ADSB_VEHICLE that a MAVLink receiver would send of it.
+"""What a transponder message, as the ADSB_VEHICLE that a MAVLink receiver would send of it.
 
 Behind the fields that the message has stand three bytes more: NACp, NACv and GVA, each 0 where it
 is unknown. MAVLink 2 lets a message grow so (https://mavlink.io/en/guide/serialization.html):
@@ -23,7 +23,7 @@ _FPM_CMPS: Final = 30.48 / 60
 
 
 class AircraftState(NamedTuple):
-    """What was said of one aircraft, in aviation's units; None: nothing.
+    """The state of one aircraft in aviation's units; None: unknown.
 
     geometric   the altitude is above the ellipsoid, not that of the standard pressure
     age_s       whole seconds since it was true
@@ -69,15 +69,15 @@ class AircraftState(NamedTuple):
             0,  # squawk: nobody here reads it
             _GEOMETRIC if self.geometric else _PRESSURE,
             self.callsign[:8].encode(),
-            0,  # kind of aircraft: not said
+            0,  # kind of aircraft: unknown
             min(255, max(0, self.age_s)),
             *(self.nac_p, self.nac_v, self.gva),
         )
 
 
-def frame(t_ns: int, link: str, said: AircraftState, seq: int) -> Frame | None:
-    """The frame that says it, as if it had come over ``link``; None where nothing is said."""
-    payload = said.payload()
+def frame(t_ns: int, link: str, message: AircraftState, seq: int) -> Frame | None:
+    """The frame that says it, as if it had come over ``link``; None where nothing is known."""
+    payload = message.payload()
     if payload is None:
         return None
     raw = pack(Outgoing(SENDER, ADSB_VEHICLE, payload), seq)

@@ -10,7 +10,7 @@ the table, modulo 4. It was never on the air: what is tested is what a chip's re
 from typing import Any, Final
 
 from companion.beams.hardware.devices import ADAR1000_CHANNELS, vector_modulator
-from companion.node.drive.loop import DeviceError, Safe, Shot, Takes, require
+from companion.node.drive.loop import DeviceCommand, DeviceError, DeviceInput, SafeState, require
 from companion.values import IntArray, UserError
 
 RX_GAIN: Final = 0x10
@@ -25,16 +25,16 @@ CLOCK_HZ: Final = 10_000_000
 class Chips:
     """Chips by bus and device number, in the order of the table's chips."""
 
-    takes = Takes.REGISTERS
+    takes = DeviceInput.REGISTERS
     lead_s = None
 
     def __init__(self, places: list[tuple[int, int]]) -> None:
         self._places = places
         self._lines: list[Any] = []
 
-    def check(self, safe: Safe) -> None:
+    def check(self, safe: SafeState) -> None:
         """They have them all."""
-        require(safe, tuple(Safe), "an ADAR1000")
+        require(safe, tuple(SafeState), "an ADAR1000")
 
     def open(self) -> None:
         """Open the lines. Raises ``UserError`` without spidev."""
@@ -51,17 +51,17 @@ class Chips:
         except OSError as error:
             raise DeviceError(f"SPI {bus}.{number}: {error.strerror or error}") from error
 
-    def apply(self, shot: Shot) -> None:
+    def apply(self, command: DeviceCommand) -> None:
         """Write gain, I and Q of every channel, then one load pulse to each chip."""
-        assert shot.registers is not None
-        self._write(shot.registers)
+        assert command.registers is not None
+        self._write(command.registers)
 
-    def rest(self, safe: Safe) -> None:
+    def rest(self, safe: SafeState) -> None:
         """Hold, look along boresight, or silence every channel."""
-        if safe is Safe.HOLD:
+        if safe is SafeState.HOLD:
             return
         i, q = vector_modulator(0)
-        gain = FULL_GAIN if safe is Safe.BORESIGHT else 0
+        gain = FULL_GAIN if safe is SafeState.BORESIGHT else 0
         self._send([[(gain, i, q)] * ADAR1000_CHANNELS for _ in self._places])
 
     def close(self) -> None:

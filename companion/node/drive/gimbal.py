@@ -19,7 +19,7 @@ from typing import Final
 from companion.mavlink.wire.encode import Outgoing, pack
 from companion.mavlink.wire.framing import Splitter
 from companion.node.drive.lag import MountLag
-from companion.node.drive.loop import DeviceError, Safe, Shot, Takes, require
+from companion.node.drive.loop import DeviceCommand, DeviceError, DeviceInput, SafeState, require
 from companion.values import Frame, Source
 
 COMMAND_INT: Final = 75
@@ -37,7 +37,7 @@ ONBOARD_COMPUTER: Final = 191
 class Gimbal:
     """A gimbal; its boresight is north, level."""
 
-    takes = Takes.POINTING
+    takes = DeviceInput.POINTING
 
     def __init__(
         self, *, host: str, port: int, target: Source, now_ns: Callable[[], int] = time.monotonic_ns
@@ -56,9 +56,9 @@ class Gimbal:
         """Its lag, as its own attitude shows it; 0 before that, or where it says none."""
         return self._lag.lag_s
 
-    def check(self, safe: Safe) -> None:
+    def check(self, safe: SafeState) -> None:
         """A gimbal radiates nothing that could be muted."""
-        require(safe, (Safe.HOLD, Safe.BORESIGHT), "a gimbal")
+        require(safe, (SafeState.HOLD, SafeState.BORESIGHT), "a gimbal")
 
     def open(self) -> None:
         """Open a socket to it; whether it is there is not known."""
@@ -72,18 +72,18 @@ class Gimbal:
             self.close()
             raise DeviceError(f"gimbal at {host}:{port}: {error.strerror or error}") from error
 
-    def apply(self, shot: Shot) -> None:
+    def apply(self, command: DeviceCommand) -> None:
         """Hear where it points, and point."""
         self._hear()
-        yaw_rad = _near(shot.bearing_rad, self._last_rad)
+        yaw_rad = _near(command.bearing_rad, self._last_rad)
         self._last_rad = yaw_rad
-        self._point(shot)
-        self._lag.told(self._now_ns(), yaw_rad)
+        self._point(command)
+        self._lag.note_command(self._now_ns(), yaw_rad)
 
-    def rest(self, safe: Safe) -> None:
+    def rest(self, safe: SafeState) -> None:
         """Stay where it was told to point last, or go to its boresight."""
-        if safe is Safe.BORESIGHT:
-            self._point(Shot(valid_at_ns=0, unfit=None))
+        if safe is SafeState.BORESIGHT:
+            self._point(DeviceCommand(valid_at_ns=0, unfit=None))
 
     def close(self) -> None:
         """Let go of the socket."""
@@ -91,12 +91,12 @@ class Gimbal:
             self._socket.close()
             self._socket = None
 
-    def _point(self, shot: Shot) -> None:
-        """Say where to point; the direction of a shot that says none is its boresight."""
-        yaw_rad = math.remainder(shot.bearing_rad, 2 * math.pi)
+    def _point(self, command: DeviceCommand) -> None:
+        """Say where to point; the direction of a command without one is boresight."""
+        yaw_rad = math.remainder(command.bearing_rad, 2 * math.pi)
         rates = math.nan, math.nan  # of pitch and yaw: not commanded
         whom = *self.target, 0  # every gimbal of that manager
-        angles = shot.above_rad, yaw_rad
+        angles = command.above_rad, yaw_rad
         self.say(SET_PITCHYAW, struct.pack("<I4f3B", IN_EARTH_FRAME, *angles, *rates, *whom))
 
     def say(self, msgid: int, payload: bytes) -> None:
@@ -131,19 +131,19 @@ class Gimbal:
         yaw_rad = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         if flags & YAW_FROM_NORTH and math.isfinite(yaw_rad):
             self._seen_rad = _near(yaw_rad, self._seen_rad)
-            self._lag.seen(frame.t_ns, self._seen_rad)
+            self._lag.note_report(frame.t_ns, self._seen_rad)
 
 
 class RoiGimbal(Gimbal):
     """A gimbal that is told places; at its boresight it is free of them."""
 
-    def _point(self, shot: Shot) -> None:
+    def _point(self, command: DeviceCommand) -> None:
         """Say which place to look at, or none."""
-        lat_deg, lon_deg, alt_m = shot.place or (0.0, 0.0, 0.0)
-        command = DO_SET_ROI_NONE if shot.place is None else DO_SET_ROI_LOCATION
+        lat_deg, lon_deg, alt_m = command.place or (0.0, 0.0, 0.0)
+        number = DO_SET_ROI_NONE if command.place is None else DO_SET_ROI_LOCATION
         where = round(lat_deg * 1e7), round(lon_deg * 1e7), alt_m
         whom = *self.target, 0, 0, 0  # MAV_FRAME_GLOBAL: above mean sea level; not of a mission
-        self.say(COMMAND_INT, struct.pack("<4f2ifH5B", 0.0, 0.0, 0.0, 0.0, *where, command, *whom))
+        self.say(COMMAND_INT, struct.pack("<4f2ifH5B", 0.0, 0.0, 0.0, 0.0, *where, number, *whom))
 
 
 def _near(angle_rad: float, other_rad: float) -> float:

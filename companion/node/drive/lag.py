@@ -9,7 +9,7 @@ from companion.values import FloatArray
 
 MOST_S: Final = 2.0  # greatest lag that is looked for
 STEP_S: Final = 0.01
-FEWEST: Final = 20  # reports from which on a lag is told
+FEWEST: Final = 20  # least number of reports for an estimate
 LEAST_RAD: Final = np.radians(2.0)
 """Movement over the time that is kept, below which the lag stays what it was."""
 MOST_LEFT: Final = 0.2
@@ -18,24 +18,24 @@ KEPT: Final = 100
 
 
 class MountLag:
-    """Told commands and reports with their times, it tells the time between them."""
+    """Estimates the lag of a mount from the times of commands and of reports."""
 
     def __init__(self) -> None:
         self.lag_s = 0.0
-        self._told: deque[tuple[float, float]] = deque(maxlen=2 * KEPT)
-        self._seen: deque[tuple[float, float]] = deque(maxlen=KEPT)
+        self._commands: deque[tuple[float, float]] = deque(maxlen=2 * KEPT)
+        self._reports: deque[tuple[float, float]] = deque(maxlen=KEPT)
 
-    def told(self, at_ns: int, azimuth_rad: float) -> None:
+    def note_command(self, at_ns: int, azimuth_rad: float) -> None:
         """Note a command; azimuths do not leap by whole turns."""
-        self._told.append((at_ns * 1e-9, azimuth_rad))
+        self._commands.append((at_ns * 1e-9, azimuth_rad))
 
-    def seen(self, at_ns: int, azimuth_rad: float) -> None:
-        """Note where the mount is, and find the lag anew."""
-        self._seen.append((at_ns * 1e-9, azimuth_rad))
-        if len(self._seen) >= FEWEST:
-            self._find(np.array(self._told).T, np.array(self._seen).T)
+    def note_report(self, at_ns: int, azimuth_rad: float) -> None:
+        """Note where the mount is, and estimate the lag again."""
+        self._reports.append((at_ns * 1e-9, azimuth_rad))
+        if len(self._reports) >= FEWEST:
+            self._estimate(np.array(self._commands).T, np.array(self._reports).T)
 
-    def _find(self, told: FloatArray, seen: FloatArray) -> None:
+    def _estimate(self, told: FloatArray, seen: FloatArray) -> None:
         """The lag at which commands and reports differ least."""
         late = seen[:, seen[0] >= told[0, 0] + MOST_S]
         if late.shape[1] < FEWEST // 2 or np.ptp(late[1]) < LEAST_RAD:

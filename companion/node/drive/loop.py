@@ -19,21 +19,21 @@ from companion.values import IntArray, UserError
 
 REMEMBERED: Final = 1000  # updates of which times are kept
 LEADING: Final = 51  # updates whose median time is the next one's lead
-AGAIN_NS: Final = 1_000_000_000  # time between two attempts to reach a device
+RETRY_NS: Final = 1_000_000_000  # time between two attempts to reach a device
 LATE_SHARE: Final = 0.1
 """Share of the time between two updates by which one may come after its moment."""
 
 
-class Safe(StrEnum):
-    """What a device does while there is nothing to apply, and at the end."""
+class SafeState(StrEnum):
+    """State of a device while there is nothing to apply, and at the end."""
 
     HOLD = "hold"
     BORESIGHT = "boresight"
     MUTE = "mute"
 
 
-class Takes(StrEnum):
-    """What a device takes of an update, beside where its beam points."""
+class DeviceInput(StrEnum):
+    """The part of an update that a device applies."""
 
     POINTING = "pointing"
     REGISTERS = "adar1000"
@@ -49,7 +49,7 @@ class SourceLostError(Exception):
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Shot:
+class DeviceCommand:
     """What is to be applied.
 
     place        of the UAV: latitude and longitude in degrees, height above mean sea level in
@@ -71,7 +71,7 @@ class Shot:
 class BeamSource(Protocol):
     """Where beams come from."""
 
-    def ask(self, lead_s: float) -> Shot:
+    def ask(self, lead_s: float) -> DeviceCommand:
         """What is to be applied so long from now. Raises ``SourceLostError``."""
 
 
@@ -81,16 +81,16 @@ class Device(Protocol):
     lead_s  lag that the device shows by itself; None: the time to apply is all
     """
 
-    takes: Takes  # what a shot needs to say
+    takes: DeviceInput  # what a command needs to hold
 
     @property
     def lead_s(self) -> float | None: ...
-    def check(self, safe: Safe) -> None:
+    def check(self, safe: SafeState) -> None:
         """Raise ``UserError`` for a safe state that the device does not have."""
 
     def open(self) -> None: ...
-    def apply(self, shot: Shot) -> None: ...
-    def rest(self, safe: Safe) -> None:
+    def apply(self, command: DeviceCommand) -> None: ...
+    def rest(self, safe: SafeState) -> None:
         """Go to a safe state."""
 
     def close(self) -> None:
@@ -128,7 +128,7 @@ class Drive:
         source: BeamSource,
         device: Device,
         update_hz: float,
-        safe: Safe,
+        safe: SafeState,
         now_ns: Callable[[], int],
         say: Callable[[str], None],
     ) -> None:
@@ -167,14 +167,14 @@ class Drive:
                 return
             began_ns = self._now_ns()
             try:
-                shot = self._source.ask(self.lead_s)
+                command = self._source.ask(self.lead_s)
             except SourceLostError as error:
                 self._rest(f"the service is lost: {error}")
                 return
-            if shot.unfit is not None:
-                self._rest(shot.unfit)
+            if command.unfit is not None:
+                self._rest(command.unfit)
                 return
-            self._device.apply(shot)
+            self._device.apply(command)
         except DeviceError as error:
             self._failed(error)
             return
@@ -183,7 +183,7 @@ class Drive:
         self._at_ns.append(ended_ns)
         self._applied += 1
         if self._device.lead_s is None:  # a mount is behind by nature, and led by its lag
-            self._late += ended_ns > shot.valid_at_ns + LATE_SHARE * self._period_ns
+            self._late += ended_ns > command.valid_at_ns + LATE_SHARE * self._period_ns
         if self._resting is not None:
             self._resting = None
             self._say("beams are applied")
@@ -206,7 +206,7 @@ class Drive:
             return own_s
         return statistics.median(list(self._took_ns)[-LEADING:]) * 1e-9 if self._took_ns else 0.0
 
-    def told(self) -> DriveStatus:
+    def status(self) -> DriveStatus:
         """How it goes."""
         took, at = np.array(self._took_ns) * 1e-6, list(self._at_ns)
         spent_s = (at[-1] - at[0]) * 1e-9 if len(at) > 1 else 0.0
@@ -237,7 +237,7 @@ class Drive:
         self._resting = None  # what it does once it is back is not known
         self._device.close()
         self._open = False
-        self._again_ns = self._now_ns() + AGAIN_NS
+        self._again_ns = self._now_ns() + RETRY_NS
 
     def _rest(self, why: str) -> None:
         """Go to the safe state, once for each reason."""
@@ -248,7 +248,7 @@ class Drive:
             self._say(f"{self._safe}: {why}")
 
 
-def require(safe: Safe, allowed: tuple[Safe, ...], device: str) -> None:
+def require(safe: SafeState, allowed: tuple[SafeState, ...], device: str) -> None:
     """Raise ``UserError`` for a safe state that a device does not have."""
     if safe not in allowed:
         raise UserError(f"{device} can {' or '.join(allowed)}, not {safe}")

@@ -10,7 +10,7 @@ that records.
 
 from typing import Any, Final
 
-from companion.node.drive.loop import DeviceError, Safe, Shot, Takes, require
+from companion.node.drive.loop import DeviceCommand, DeviceError, DeviceInput, SafeState, require
 from companion.values import IntArray, UserError
 
 ELEMENTS: Final = 8
@@ -21,7 +21,7 @@ FULL_GAIN: Final = 127
 class Phaser:
     """A Phaser, found by a URI of libiio."""
 
-    takes = Takes.REGISTERS
+    takes = DeviceInput.REGISTERS
     lead_s = None
 
     def __init__(self, uri: str) -> None:
@@ -29,9 +29,9 @@ class Phaser:
         self._phaser: Any = None
         self._shown: dict[int, tuple[int, int, int]] = {}
 
-    def check(self, safe: Safe) -> None:
+    def check(self, safe: SafeState) -> None:
         """It has them all."""
-        require(safe, tuple(Safe), "a Phaser")
+        require(safe, tuple(SafeState), "a Phaser")
 
     def open(self) -> None:
         """Connect and put it on receive. Raises ``UserError`` without pyadi-iio."""
@@ -46,10 +46,10 @@ class Phaser:
             raise DeviceError(f"no Phaser at {self._uri}: {error}") from error
         self._shown = {}
 
-    def apply(self, shot: Shot) -> None:
+    def apply(self, command: DeviceCommand) -> None:
         """Write what has changed, and latch once."""
-        assert shot.registers is not None
-        self._set(self.settings_of(shot.registers))
+        assert command.registers is not None
+        self._set(self.settings_of(command.registers))
 
     @staticmethod
     def settings_of(registers: IntArray) -> dict[int, tuple[int, int, int]]:
@@ -59,14 +59,14 @@ class Phaser:
             raise UserError(f"a Phaser has {ELEMENTS} elements, the array has {len(rows)}")
         return {element: (phase, gain, off) for element, phase, gain, off in rows}
 
-    def rest(self, safe: Safe) -> None:
+    def rest(self, safe: SafeState) -> None:
         """Hold, look along boresight, or silence every element."""
         match safe:
-            case Safe.BORESIGHT:
+            case SafeState.BORESIGHT:
                 self._set(dict.fromkeys(range(ELEMENTS), (0, FULL_GAIN, 0)))
-            case Safe.MUTE:
+            case SafeState.MUTE:
                 self._set(dict.fromkeys(range(ELEMENTS), (0, 0, 1)))
-            case Safe.HOLD:
+            case SafeState.HOLD:
                 pass
 
     def close(self) -> None:

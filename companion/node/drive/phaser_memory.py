@@ -9,7 +9,7 @@ It was never on the air: what is tested is its own class over attributes of a li
 from collections.abc import Sequence
 from typing import Final
 
-from companion.node.drive.loop import DeviceError, Safe, Shot, Takes
+from companion.node.drive.loop import DeviceCommand, DeviceError, DeviceInput, SafeState
 from companion.node.drive.phaser import DEGREES, ELEMENTS, FULL_GAIN, Phaser
 from companion.values import IntArray, UserError
 
@@ -21,7 +21,7 @@ MUTE: Final = POSITIONS - 1
 class PhaserMemory(Phaser):
     """A Phaser whose memory holds a codebook, given as registers (8, 8) of each beam."""
 
-    takes = Takes.STORED
+    takes = DeviceInput.STORED
 
     def __init__(self, uri: str, codebook: Sequence[IntArray]) -> None:
         super().__init__(uri)
@@ -47,15 +47,15 @@ class PhaserMemory(Phaser):
             raise DeviceError(f"the Phaser at {self._uri}: {error}") from error
         self._position = None
 
-    def apply(self, shot: Shot) -> None:
+    def apply(self, command: DeviceCommand) -> None:
         """Point all channels to a beam, and latch once."""
-        assert shot.stored is not None
-        self._use(shot.stored)
+        assert command.stored is not None
+        self._use(command.stored)
 
-    def rest(self, safe: Safe) -> None:
+    def rest(self, safe: SafeState) -> None:
         """Hold, look along boresight, or silence every element."""
-        if safe is not Safe.HOLD:
-            self._use(BORESIGHT if safe is Safe.BORESIGHT else MUTE)
+        if safe is not SafeState.HOLD:
+            self._use(BORESIGHT if safe is SafeState.BORESIGHT else MUTE)
 
     def _use(self, position: int) -> None:
         try:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Final
 
 from companion.node.drive.lag import MountLag
-from companion.node.drive.loop import DeviceError, Safe, Shot, Takes, require
+from companion.node.drive.loop import DeviceCommand, DeviceError, DeviceInput, SafeState, require
 
 TIMEOUT_S: Final = 2.0
 
@@ -23,7 +23,7 @@ class Rotator:
     Its boresight is azimuth and elevation 0.
     """
 
-    takes = Takes.POINTING
+    takes = DeviceInput.POINTING
 
     def __init__(self, host: str, port: int, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self._address = host, port
@@ -39,9 +39,9 @@ class Rotator:
         """Its lag, as its own reports show it; 0 before it has moved."""
         return self._lag.lag_s
 
-    def check(self, safe: Safe) -> None:
+    def check(self, safe: SafeState) -> None:
         """A rotator radiates nothing that could be muted."""
-        require(safe, (Safe.HOLD, Safe.BORESIGHT), "a rotator")
+        require(safe, (SafeState.HOLD, SafeState.BORESIGHT), "a rotator")
 
     def open(self) -> None:
         """Connect, and ask for its limits."""
@@ -58,21 +58,21 @@ class Rotator:
             self._limits_deg = low, high, least, most
         self._last_deg = self._where_deg()[0]
 
-    def apply(self, shot: Shot) -> None:
+    def apply(self, command: DeviceCommand) -> None:
         """Note where it points now, and point.
 
         Asked first: a rotator that begins its motion anew at each command has had the whole time
         since the one before.
         """
         seen_deg = self._where_deg()[0]
-        self._lag.seen(self._now_ns(), math.radians(seen_deg))
-        azimuth_deg = self._near(math.degrees(shot.bearing_rad))
-        self._point(azimuth_deg, math.degrees(shot.above_rad))
-        self._lag.told(self._now_ns(), math.radians(azimuth_deg))
+        self._lag.note_report(self._now_ns(), math.radians(seen_deg))
+        azimuth_deg = self._near(math.degrees(command.bearing_rad))
+        self._point(azimuth_deg, math.degrees(command.above_rad))
+        self._lag.note_command(self._now_ns(), math.radians(azimuth_deg))
 
-    def rest(self, safe: Safe) -> None:
+    def rest(self, safe: SafeState) -> None:
         """Stop where it is, or go to its park position."""
-        if safe is Safe.HOLD:
+        if safe is SafeState.HOLD:
             self._ask("+S")
         else:
             self._point(0.0, 0.0)

@@ -8,11 +8,13 @@ from typing import Final
 
 from companion.node.drive.loop import Drive, DriveStatus
 
-TOLD_EVERY_S: Final = 1.0
+STATUS_EVERY_S: Final = 1.0
 ENDS_S: Final = 5.0  # time for a device to go to its safe state at the end
 
 
-def until_told(drive: Drive, show: Callable[[DriveStatus], None], seconds: float | None) -> None:
+def run_until_stopped(
+    drive: Drive, show: Callable[[DriveStatus], None], seconds: float | None
+) -> None:
     """Drive until SIGINT, SIGTERM or ``seconds`` have passed; ``show`` is called once a second.
 
     Raises what ended the drive.
@@ -25,10 +27,10 @@ def until_told(drive: Drive, show: Callable[[DriveStatus], None], seconds: float
     thread.start()
     left_s = seconds
     while thread.is_alive() and not stop.is_set():
-        step_s = TOLD_EVERY_S if left_s is None else min(TOLD_EVERY_S, left_s)
+        step_s = STATUS_EVERY_S if left_s is None else min(STATUS_EVERY_S, left_s)
         if stop.wait(step_s):
             break
-        show(drive.told())
+        show(drive.status())
         if left_s is not None:
             left_s -= step_s
             if left_s <= 0:
@@ -39,7 +41,7 @@ def until_told(drive: Drive, show: Callable[[DriveStatus], None], seconds: float
         raise failed[0]
 
 
-async def beside(drive: Drive) -> None:
+async def run_in_thread(drive: Drive) -> None:
     """Drive on a thread until cancelled; raises what ended it."""
     stop, failed = threading.Event(), list[BaseException]()
     loop, ended = asyncio.get_running_loop(), asyncio.Event()

@@ -16,7 +16,7 @@ from companion.beams.hardware import codebooks, tables
 from companion.beams.hardware.calibration import Calibration
 from companion.beams.hardware.devices import Beamformer
 from companion.client import Client, ServiceError
-from companion.node.drive.loop import Shot, SourceLostError, Takes
+from companion.node.drive.loop import DeviceCommand, DeviceInput, SourceLostError
 from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
 from companion.values import IntArray, Update, UserError, WeightFormat
@@ -41,12 +41,12 @@ class BeamRequest:
 
     uavs: tuple[str, ...]
     anybody: bool
-    takes: Takes
+    takes: DeviceInput
     stored_beams: int | None = None
     centre: bool = False
 
     def __post_init__(self) -> None:
-        if self.centre and self.takes is not Takes.POINTING:
+        if self.centre and self.takes is not DeviceInput.POINTING:
             raise UserError('only a mount looks at the centre of several: aim = "first"')
 
 
@@ -57,7 +57,7 @@ class OverHttp:
         self._client = client
         self._wanted = wanted
 
-    def ask(self, lead_s: float) -> Shot:
+    def ask(self, lead_s: float) -> DeviceCommand:
         """What is to be applied so long from now, in two questions for one moment at most."""
         lead_ms = min(max(lead_s, 0.0), 10.0) * 1e3
         valid_at_ns = time.time_ns() + round(lead_ms * 1e6)
@@ -65,14 +65,14 @@ class OverHttp:
             told = self._client.beams(lead_ms)
             text = (
                 self._client.table(ADAR1000, lead_ms)
-                if self._wanted.takes is Takes.REGISTERS
+                if self._wanted.takes is DeviceInput.REGISTERS
                 else None
             )
         except ServiceError as error:
             if error.status == 409:
-                return Shot(valid_at_ns=valid_at_ns, unfit=error.title)
+                return DeviceCommand(valid_at_ns=valid_at_ns, unfit=error.title)
             raise SourceLostError(str(error)) from error
-        return chosen(told, text, self._wanted, valid_at_ns)
+        return command_for(told, text, self._wanted, valid_at_ns)
 
 
 class OfThisProcess:
@@ -93,7 +93,7 @@ class OfThisProcess:
         self._now_ns = now_ns
         self._wanted = wanted
 
-    def ask(self, lead_s: float) -> Shot:
+    def ask(self, lead_s: float) -> DeviceCommand:
         """What is to be applied so long from now: made on the loop, worded here."""
         asked = asyncio.run_coroutine_threadsafe(self._look(lead_s), self._loop)
         try:
@@ -106,28 +106,30 @@ class OfThisProcess:
         return self._pipeline.look(self._now_ns(), lead_s)
 
 
-def shot_of(pipeline: Pipeline, equipment: Equipment, update: Update, wanted: BeamRequest) -> Shot:
+def shot_of(
+    pipeline: Pipeline, equipment: Equipment, update: Update, wanted: BeamRequest
+) -> DeviceCommand:
     """What is to be applied of one update. Only the beam that is wanted is fitted to the device."""
     beams, text = update.beams, None
-    uav = followed(beams.uavs, wanted)
-    if update.unfit is None and uav is not None and wanted.takes is Takes.REGISTERS:
+    uav = followed_uavs(beams.uavs, wanted)
+    if update.unfit is None and uav is not None and wanted.takes is DeviceInput.REGISTERS:
         try:
             table = device_table(Beamformer.ADAR1000, beams, pipeline.array, equipment, uav)
             text = tables.encode(table)
         except UserError as error:
-            return Shot(valid_at_ns=beams.valid_at_ns, unfit=str(error))
+            return DeviceCommand(valid_at_ns=beams.valid_at_ns, unfit=str(error))
     pointed, codebook = beam_state.pointing(pipeline, update), equipment.codebook
     shown: list[dict[str, Any]] = [
         {"uav": uav} | as_json(one, pipeline.utc_ns)
         for uav, one in zip(beams.uavs, pointed, strict=bool(pointed))
     ]
-    if wanted.takes is Takes.STORED and codebook is not None and shown:
+    if wanted.takes is DeviceInput.STORED and codebook is not None and shown:
         best, _ = codebooks.best(codebook, pipeline.array, directions(beams))
         for beam, index in zip(shown, best.tolist(), strict=True):
             beam["codebook"] = {"best": index}
     size = None if codebook is None else codebook.size
     told = {"unfit": update.unfit, "beams": shown, "codebook_beams": size}
-    return chosen(told, text, wanted, beams.valid_at_ns)
+    return command_for(told, text, wanted, beams.valid_at_ns)
 
 
 def stored_registers(array: Array, equipment: Equipment) -> list[IntArray]:
@@ -153,33 +155,41 @@ def stored_registers(array: Array, equipment: Equipment) -> list[IntArray]:
     return [registers_of(text, beam.uav) for beam in wanted]
 
 
-def followed(uavs: Collection[str], wanted: BeamRequest) -> str | None:
+def followed_uavs(uavs: Collection[str], wanted: BeamRequest) -> str | None:
     """Who of those that have beams is served; None where nobody is."""
     uav = next((one for one in wanted.uavs if one in uavs), None)
     return next(iter(uavs), None) if uav is None and wanted.anybody else uav
 
 
-def chosen(told: dict[str, Any], text: str | None, wanted: BeamRequest, valid_at_ns: int) -> Shot:
-    """The shot for whom is wanted, of what the API says."""
+def command_for(
+    told: dict[str, Any], text: str | None, wanted: BeamRequest, valid_at_ns: int
+) -> DeviceCommand:
+    """The command for the requested UAV, from an answer of the API."""
     if told["unfit"] is not None:
-        return Shot(valid_at_ns=valid_at_ns, unfit=str(told["unfit"]))
+        return DeviceCommand(valid_at_ns=valid_at_ns, unfit=str(told["unfit"]))
     named = {beam["uav"]: beam for beam in told["beams"]}
-    uav = followed(named, wanted)
+    uav = followed_uavs(named, wanted)
     if uav is None:
-        return Shot(valid_at_ns=valid_at_ns, unfit="nobody who is to be followed has a beam")
+        return DeviceCommand(
+            valid_at_ns=valid_at_ns, unfit="nobody who is to be followed has a beam"
+        )
     if wanted.centre:
         several = named if wanted.anybody else wanted.uavs
         return _middle([named[one] for one in several if one in named], valid_at_ns)
     beam, rows = named[uav], None if text is None else registers_of(text, uav)
     if rows is not None and not len(rows):
-        return Shot(valid_at_ns=valid_at_ns, unfit=f"{uav} has no beam in the device's table")
+        return DeviceCommand(
+            valid_at_ns=valid_at_ns, unfit=f"{uav} has no beam in the device's table"
+        )
     stored = None
-    if wanted.takes is Takes.STORED:
+    if wanted.takes is DeviceInput.STORED:
         size = told["codebook_beams"]
         if size is None or wanted.stored_beams not in (None, size):
-            return Shot(valid_at_ns=valid_at_ns, unfit="the service has another codebook, or none")
+            return DeviceCommand(
+                valid_at_ns=valid_at_ns, unfit="the service has another codebook, or none"
+            )
         stored = beam["codebook"]["best"]
-    return Shot(
+    return DeviceCommand(
         valid_at_ns=valid_at_ns,
         unfit=None,
         uav=uav,
@@ -191,7 +201,7 @@ def chosen(told: dict[str, Any], text: str | None, wanted: BeamRequest, valid_at
     )
 
 
-def _middle(beams: list[dict[str, Any]], valid_at_ns: int) -> Shot:
+def _middle(beams: list[dict[str, Any]], valid_at_ns: int) -> DeviceCommand:
     """The mean direction of these beams, and the mean of their places, which are near together."""
     bearing = np.radians([beam["bearing_deg"] for beam in beams])
     above = np.radians([beam["above_horizon_deg"] for beam in beams])
@@ -201,7 +211,7 @@ def _middle(beams: list[dict[str, Any]], valid_at_ns: int) -> Shot:
         for part in (level * np.cos(bearing), level * np.sin(bearing), np.sin(above))
     )
     if math.hypot(north, east, up) < LEAST_MEAN * len(beams):
-        return Shot(
+        return DeviceCommand(
             valid_at_ns=valid_at_ns,
             unfit="they are all around: there is no direction to the middle of them",
         )
@@ -211,7 +221,7 @@ def _middle(beams: list[dict[str, Any]], valid_at_ns: int) -> Shot:
     first_deg = beams[0]["lon_deg"]
     east_deg = [math.remainder(beam["lon_deg"] - first_deg, 360.0) for beam in beams]
     lon_deg = math.remainder(first_deg + statistics.fmean(east_deg), 360.0)
-    return Shot(
+    return DeviceCommand(
         valid_at_ns=valid_at_ns,
         unfit=None,
         uav="+".join(beam["uav"] for beam in beams),

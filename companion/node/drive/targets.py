@@ -20,7 +20,7 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from companion.node.drive.loop import Device, Safe, Shot, Takes
+from companion.node.drive.loop import Device, DeviceCommand, DeviceInput, SafeState
 from companion.values import IntArray, Source, UserError
 
 FORMS: Final = {
@@ -72,8 +72,8 @@ def device(
 
             places = [tuple(map(int, one.split("."))) for one in where.split(",")]
             return Chips([(bus, number) for bus, number in places])
-        case "none" if where in tuple(Takes):
-            return DryRun(Takes(where), say)
+        case "none" if where in tuple(DeviceInput):
+            return DryRun(DeviceInput(where), say)
     if kind in FORMS:
         raise UserError(f"{target!r} is not {FORMS[kind]}")
     near = difflib.get_close_matches(kind, FORMS, 1)
@@ -86,17 +86,17 @@ class DryRun:
 
     lead_s = None
 
-    def __init__(self, takes: Takes, say: Callable[[str], None]) -> None:
+    def __init__(self, takes: DeviceInput, say: Callable[[str], None]) -> None:
         self.takes = takes
         self._say = say
 
-    def check(self, safe: Safe) -> None:
+    def check(self, safe: SafeState) -> None:
         """Any state will do."""
 
     def open(self) -> None:
         """There is nothing to open."""
 
-    def apply(self, shot: Shot) -> None:
+    def apply(self, shot: DeviceCommand) -> None:
         """Say what would be sent."""
         if shot.stored is not None:
             self._say(f"{shot.uav}: stored beam {shot.stored}")
@@ -109,7 +109,7 @@ class DryRun:
         sets = [f"{one[2]}:{one[3]}/{one[4]}{'a' if one[5] else ''}" for one in shot.registers]
         self._say(f"{shot.uav}: element:phase/gain {' '.join(sets)}")
 
-    def rest(self, safe: Safe) -> None:
+    def rest(self, safe: SafeState) -> None:
         """Say where it would go."""
         self._say(f"safe state: {safe}")
 

@@ -80,7 +80,7 @@ class LiveFleetNode:
             started_ns=self._started_ns,
         )
         self._around = Surroundings(pipeline, self.member)
-        self._offers = Offers(pipeline, self.member.hearing.silent_s)
+        self._offers = Offers(pipeline, self.member.reception.silent_s)
         self._session: Any = None  # of a peer, opened before there was a loop
         self._bus: Bus | None = None  # once all is declared
         self._flushing: asyncio.TimerHandle | None = None
@@ -137,7 +137,7 @@ class LiveFleetNode:
                     group.create_task(self._repeat(OFFERED_S, self._offer), name="offers"),
                     group.create_task(self._make_offers(), name="looks"),
                 ]
-                while not self._is_half_heard(self._now_ns()):
+                while not self._is_link_one_way(self._now_ns()):
                     await asyncio.sleep(1.0)
                 for task in tasks:
                     task.cancel()
@@ -149,11 +149,11 @@ class LiveFleetNode:
                 self._flushing = None
             await asyncio.to_thread(bus.close)
 
-    def _is_half_heard(self, now_ns: int) -> bool:
+    def _is_link_one_way(self, now_ns: int) -> bool:
         """Whether a node is there, and does not answer; tells who is not there any more."""
         heard_ns = {node: known.heard_ns for node, known in self.member.neighbours.items()}
         for node in self._unanswered.gone(now_ns, heard_ns):
-            self._tell(self.member.left(now_ns, node))
+            self._tell(self.member.node_left(now_ns, node))
         mute = self._unanswered.mute(now_ns, heard_ns)
         if mute:
             text = f"no answer from {', '.join(mute)}, all nodes are connected anew"
@@ -188,20 +188,20 @@ class LiveFleetNode:
 
     # --- what this node hears itself, and decides -------------------------------------------
 
-    def heard(self, event: Event) -> None:
+    def on_event(self, event: Event) -> None:
         """Take in what came over this node's own links, before the pipeline has it.
 
         What this node speaks for is told at once, unless something was told just now.
         """
         now_ns = self._now_ns()
         if isinstance(event, Frame):
-            self.member.heard(now_ns, event)
+            self.member.frame_received(now_ns, event)
         elif isinstance(event, RoundTrip):
-            self.member.answered(event)
+            self.member.round_trip_measured(event)
         else:
             return
         if self.member.neighbours and self._bus is not None:
-            self._tell_of_heard(now_ns)
+            self._publish_received(now_ns)
 
     def ticked(self, now_ns: int) -> None:
         """Decide whom this node serves. Call it at every update, after the pipeline had it."""
@@ -211,8 +211,8 @@ class LiveFleetNode:
             self._stand(now_ns)  # at once: whom it took from another is served by two until then
         self._tell(notices)
 
-    def _tell_of_heard(self, now_ns: int) -> None:
-        said = self.member.sharing.due(now_ns)
+    def _publish_received(self, now_ns: int) -> None:
+        said = self.member.sharing.next_message(now_ns)
         if said is not None:
             self._put("heard", messages.shared(said), express=True, reliable=False)
         wait_ns = self.member.sharing.wait_ns(now_ns)
@@ -228,7 +228,7 @@ class LiveFleetNode:
 
     def _flush(self) -> None:
         self._flushing = None
-        self._tell_of_heard(self._now_ns())
+        self._publish_received(self._now_ns())
 
     # --- what it says -----------------------------------------------------------------------
 
@@ -245,7 +245,7 @@ class LiveFleetNode:
             )
 
     def _stand(self, now_ns: int) -> None:
-        said = self.member.says(now_ns, self._around.place(), self._around.reach_m(now_ns))
+        said = self.member.own_standing(now_ns, self._around.place(), self._around.reach_m(now_ns))
         self._put("standing", messages.standing(said))
         if self._listening is not None:
             self._listening.to(self.member.near)
@@ -253,7 +253,7 @@ class LiveFleetNode:
     def _offer(self, now_ns: int) -> None:
         """Tell this node's offers and the tracks of those it serves, and look for phantoms."""
         offers = dict(self._offers.made)
-        self.member.offer(offers)
+        self.member.set_offers(offers)
         self._put("offers", messages.offers(offers))
         update = self._pipeline.last_update
         if (
@@ -320,7 +320,7 @@ class LiveFleetNode:
 
     def _shared(self, node: str, payload: bytes) -> None:
         now_ns = self._now_ns()
-        events, notices = self.member.shared(now_ns, node, messages.to_shared(payload))
+        events, notices = self.member.take_shared(now_ns, node, messages.to_shared(payload))
         for event in events:
             self._step(event)
         self._tell(notices)
@@ -328,16 +328,16 @@ class LiveFleetNode:
     def _stands(self, node: str, payload: bytes) -> None:
         said = messages.to_standing(payload, node)
         if node == self.name:
-            self._tell_of_twin()
+            self._notify_duplicate()
             return
         now_ns = self._now_ns()
-        self.member.stands(now_ns, said)
+        self.member.take_standing(now_ns, said)
         serves = self.member.duties.serves
-        if self.member.trust.believes(node) and any(uav in serves for uav, _ in said.serves):
+        if self.member.trust.is_trusted(node) and any(uav in serves for uav, _ in said.serves):
             self.ticked(now_ns)  # one of them is to let go
 
     def _offered(self, node: str, payload: bytes) -> None:
-        self.member.offered(self._now_ns(), node, messages.to_offers(payload))
+        self.member.take_offers(self._now_ns(), node, messages.to_offers(payload))
 
     def _seen(self, key: str, is_alive: bool) -> None:
         node = self._node(key)
@@ -345,18 +345,18 @@ class LiveFleetNode:
             return
         if not is_alive:
             self._unanswered.alive.discard(node)
-            self._tell(self.member.left(self._now_ns(), node))
+            self._tell(self.member.node_left(self._now_ns(), node))
             return
         self._unanswered.alive.add(node)
         if node not in self.member.neighbours:
             text = f"node {node} is there"
             now_ns = self._now_ns()
-            self.member.came(now_ns, node)
+            self.member.node_joined(now_ns, node)
             self._notify(
                 Notice(t_ns=now_ns, severity=Severity.INFO, subject=f"node {node}", text=text)
             )
 
-    def _tell_of_twin(self) -> None:
+    def _notify_duplicate(self) -> None:
         if self._has_twin:
             return
         self._has_twin = True

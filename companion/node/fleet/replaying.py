@@ -16,7 +16,7 @@ from companion.settings.model import sections
 from companion.settings.section import ConfigError
 from companion.values import Duty, Frame
 
-TOLD_EVERY: Final = 20_000  # frames between two calls of progress
+PROGRESS_EVERY: Final = 20_000  # frames between two calls of progress
 SAMPLE_NS: Final = 100_000_000  # time between two looks at who serves whom
 
 
@@ -103,7 +103,7 @@ def _run(
             found.duties.append(event)
         elif isinstance(event, Frame):
             found.told += event.link.startswith("fleet:")
-            if progress and run.pipeline.frames % TOLD_EVERY == 0:
+            if progress and run.pipeline.frames % PROGRESS_EVERY == 0:
                 progress(run.pipeline.frames, run.at_s, run.took_s)
     found.digest = run.pipeline.digest.hexdigest()
     found.frames = run.pipeline.frames

@@ -21,25 +21,25 @@ import numpy as np
 
 from companion.values import FloatArray, IntArray, Offer
 
-UNSURE_DB: Final = 10.0
-"""How much less a gain that is only likely is worth than one that is guaranteed."""
+LIKELY_PENALTY_DB: Final = 10.0
+"""Deduction for a gain that is only likely, not guaranteed."""
 STEP_DB: Final = 0.1  # offers are told in whole steps, so that every node has the same numbers
-NOBODY_DB: Final = -1e6
-"""What it is worth to be served by nobody: so little that whoever can be served is."""
+UNSERVED_DB: Final = -1e6
+"""Value of not being served: so low that every UAV that can be served is."""
 MOVES: Final = 1000  # most rings of moves that one decision makes
 ROUNDING_DB: Final = 1e-7  # what is less is no gain, but arithmetic
 
 
-def worth_db(offer: Offer) -> float | None:
-    """What an offer is worth to its UAV; None where the node cannot serve it."""
+def offer_value_db(offer: Offer) -> float | None:
+    """Value of an offer to its UAV; None where the node cannot serve it."""
     if offer.sinr_db is None or offer.sure_db is not None:
         return offer.sinr_db
-    return offer.sinr_db - UNSURE_DB
+    return offer.sinr_db - LIKELY_PENALTY_DB
 
 
-def worths_db(offers: Mapping[str, Offer]) -> dict[str, float]:
-    """What each offer is worth, of those that are worth anything."""
-    found = ((uav, worth_db(offer)) for uav, offer in offers.items())
+def offer_values_db(offers: Mapping[str, Offer]) -> dict[str, float]:
+    """The value of each offer that has one."""
+    found = ((uav, offer_value_db(offer)) for uav, offer in offers.items())
     return {uav: worth for uav, worth in found if worth is not None}
 
 
@@ -64,7 +64,7 @@ def assign(
         return {}
     nobody = len(nodes)
     given = [[offers[node].get(uav, -np.inf) for node in nodes] for uav in uavs]
-    worth = np.column_stack([np.array(given), np.full(len(uavs), NOBODY_DB)])
+    worth = np.column_stack([np.array(given), np.full(len(uavs), UNSERVED_DB)])
     rank = {node: number for number, node in enumerate(nodes)}
     at = np.array([rank.get(holders.get(uav, ""), nobody) for uav in uavs])
     each = np.arange(len(uavs))

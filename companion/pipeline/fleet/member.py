@@ -12,11 +12,11 @@ from typing import Final
 
 from companion.mavlink.trust.dedupe import content
 from companion.mavlink.wire.positions import OWN
-from companion.pipeline.fleet.assignment import worths_db
+from companion.pipeline.fleet.assignment import offer_values_db
 from companion.pipeline.fleet.duties import Duties, Handover
-from companion.pipeline.fleet.hearing import SHARED, Hearing
 from companion.pipeline.fleet.nearness import Place, near
-from companion.pipeline.fleet.neighbours import TOLD_APART_NS, Neighbour, NeighbourClock, here
+from companion.pipeline.fleet.neighbours import NOTICED_OFFSET_NS, Neighbour, NeighbourClock, here
+from companion.pipeline.fleet.reception import SHARED, Reception
 from companion.pipeline.fleet.sharing import Sharing
 from companion.pipeline.fleet.trust import Trust, UnconfirmedVehicle, Witness
 from companion.settings.fleet import FleetSettings
@@ -62,7 +62,7 @@ class FleetMember:
         self.offers: dict[str, Offer] = {}
         self.handovers: deque[Handover] = deque(maxlen=HANDOVERS_KEPT)
         self.handed_over = 0
-        self.hearing = Hearing()
+        self.reception = Reception()
         self.sharing = Sharing(name, round(1e9 / settings.share_hz))
         self.trust = Trust()
         self.most = settings.most or elements
@@ -81,26 +81,26 @@ class FleetMember:
 
     # --- what this node hears itself --------------------------------------------------------
 
-    def heard(self, now_ns: int, frame: Frame) -> None:
+    def frame_received(self, now_ns: int, frame: Frame) -> None:
         """Take in a frame that came over one of this node's own links, as it is read."""
-        self.hearing.behind_ns = max(now_ns - frame.t_ns, 0)
+        self.reception.behind_ns = max(now_ns - frame.t_ns, 0)
         if frame.msgid in SHARED:
-            key = self.hearing.heard(frame)
+            key = self.reception.take_received(frame)
             if self.neighbours:
-                self.sharing.heard(now_ns, frame, key)
+                self.sharing.frame_received(now_ns, frame, key)
 
-    def answered(self, trip: RoundTrip) -> None:
+    def round_trip_measured(self, trip: RoundTrip) -> None:
         """Take in a TIMESYNC round trip of this node's own."""
         if self.neighbours:
-            self.sharing.answered(trip)
+            self.sharing.round_trip_measured(trip)
 
     # --- what other nodes say ---------------------------------------------------------------
 
-    def came(self, now_ns: int, node: str) -> None:
+    def node_joined(self, now_ns: int, node: str) -> None:
         """Another node is there."""
         self._neighbour(now_ns, node)
 
-    def left(self, now_ns: int, node: str) -> list[Notice]:
+    def node_left(self, now_ns: int, node: str) -> list[Notice]:
         """Another node is gone: its process ended, or its connection did."""
         self.duties.gone(now_ns, node)
         known = self.neighbours.get(node)
@@ -116,7 +116,7 @@ class FleetMember:
     def _drop(self, node: str) -> None:
         del self.neighbours[node]
         if not self.neighbours:
-            self.sharing.alone()
+            self.sharing.clear()
 
     def read_clock(
         self, node: str, started_ns: int, sent_ns: int, received_ns: int, remote_ns: int
@@ -127,13 +127,15 @@ class FleetMember:
             return []
         if known.started_ns != started_ns:  # another life has another timeline
             known.started_ns, known.clock = started_ns, NeighbourClock()
-        if known.clock.answered(sent_ns, received_ns, remote_ns) is not None:
-            return self.trust.against(received_ns, node, "has a clock that contradicts itself")
-        ahead = known.clock.newest()
+        if known.clock.note_answer(sent_ns, received_ns, remote_ns) is not None:
+            return self.trust.note_contradiction(
+                received_ns, node, "has a clock that contradicts itself"
+            )
+        ahead = known.clock.newest_offset()
         if known.apart_told or ahead is None:
             return []
         apart_ns = max(ahead.low_ns, -ahead.high_ns)
-        if apart_ns < TOLD_APART_NS:
+        if apart_ns < NOTICED_OFFSET_NS:
             return []
         known.apart_told = True
         way = "behind" if ahead.low_ns > 0 else "ahead of"
@@ -144,31 +146,31 @@ class FleetMember:
             Notice(t_ns=received_ns, severity=Severity.WARNING, subject=f"node {node}", text=text)
         ]
 
-    def shared(
+    def take_shared(
         self, now_ns: int, node: str, said: Shared
     ) -> tuple[list[Frame | RoundTrip], list[Notice]]:
         """Take in what another node heard. Returns what the pipeline is to have, and notices."""
         known = self._neighbour(now_ns, node)
-        if known is None or not self.trust.believes(node):
+        if known is None or not self.trust.is_trusted(node):
             return [], []
-        ahead = known.clock.ahead(said.told_ns)
+        ahead = known.clock.offset(said.told_ns)
         if ahead is None or not known.clock.is_settled:
             return [], []
         way_ns = max(now_ns - said.told_ns - ahead.low_ns, 0)
         events: list[Frame | RoundTrip] = []
         for one in said.frames:
-            frame = self.hearing.placed(now_ns, node, known.clock, one)
+            frame = self.reception.to_own_timeline(now_ns, node, known.clock, one)
             known.frames += 1
             if frame is None:
                 continue
             key = content(frame.raw)
             if frame.msgid in OWN:
-                if not self.hearing.was_told(key):  # the second time it is late, and no matter
-                    known.came(now_ns, now_ns - frame.t_ns + frame.doubt_ns)
-                self.sharing.told(now_ns, node, frame.source, key, way_ns)
-            events += self.hearing.told(now_ns, node, frame, key)
+                if not self.reception.was_shared(key):  # the second time it is late, and no matter
+                    known.note_delay(now_ns, now_ns - frame.t_ns + frame.doubt_ns)
+                self.sharing.note_shared(now_ns, node, frame.source, key, way_ns)
+            events += self.reception.take_shared(now_ns, node, frame, key)
         for trip in said.trips:
-            silent_s = self.hearing.silent_s(str(trip.source), now_ns - self.hearing.behind_ns)
+            silent_s = self.reception.silent_s(str(trip.source), now_ns - self.reception.behind_ns)
             placed = here(trip, known.clock) if silent_s is None or silent_s > 1.0 else None
             if placed is not None:
                 events.append(placed)
@@ -177,22 +179,26 @@ class FleetMember:
 
     def _contradictions(self, now_ns: int) -> list[Notice]:
         notices = []
-        for node in self.hearing.early:
-            notices += self.trust.against(now_ns, node, "tells frames before they can be heard")
-        for node in self.hearing.contradicted:
-            notices += self.trust.against(now_ns, node, "tells reports that contradict others")
-        self.hearing.early.clear()
-        self.hearing.contradicted.clear()
+        for node in self.reception.early:
+            notices += self.trust.note_contradiction(
+                now_ns, node, "tells frames before they can be heard"
+            )
+        for node in self.reception.contradicted:
+            notices += self.trust.note_contradiction(
+                now_ns, node, "tells reports that contradict others"
+            )
+        self.reception.early.clear()
+        self.reception.contradicted.clear()
         return notices
 
-    def stands(self, now_ns: int, said: Standing) -> None:
+    def take_standing(self, now_ns: int, said: Standing) -> None:
         """Take in what another node says of itself."""
         known = self._neighbour(now_ns, said.node)
         if known is not None:
             known.standing = said
             self.duties.hear(now_ns, said)
 
-    def offered(self, now_ns: int, node: str, offers: tuple[Offer, ...]) -> None:
+    def take_offers(self, now_ns: int, node: str, offers: tuple[Offer, ...]) -> None:
         """Take in another node's offers, all of them."""
         known = self._neighbour(now_ns, node)
         if known is not None:
@@ -201,19 +207,19 @@ class FleetMember:
 
     # --- what follows -----------------------------------------------------------------------
 
-    def offer(self, offers: Mapping[str, Offer]) -> None:
+    def set_offers(self, offers: Mapping[str, Offer]) -> None:
         """Take in this node's own offers, as it tells them to the others."""
         self.offers = dict(offers)
 
     def decide(self, now_ns: int) -> tuple[Duty | None, list[Notice]]:
         """Decide whom this node serves: its new duty, None where it is as before; and notices."""
-        notices = self.trust.again(now_ns)
-        trusted = frozenset(node for node in self.neighbours if self.trust.believes(node))
-        offers = {self.name: worths_db(self.offers)}
+        notices = self.trust.readmit(now_ns)
+        trusted = frozenset(node for node in self.neighbours if self.trust.is_trusted(node))
+        offers = {self.name: offer_values_db(self.offers)}
         for node in trusted:
             known = self.neighbours[node]
             if known.offers is not None and now_ns - known.offered_ns < OFFERS_KEPT_NS:
-                offers[node] = worths_db(known.offers)
+                offers[node] = offer_values_db(known.offers)
         changes = self.duties.decide(now_ns, offers, trusted)
         self.handovers += changes
         self.handed_over += len(changes)
@@ -235,7 +241,7 @@ class FleetMember:
         A word that was on its way when its node went makes it known again, with no sign of life to
         end.
         """
-        self.hearing.forget(now_ns, FORGET_NS)
+        self.reception.forget(now_ns, FORGET_NS)
         self.sharing.forget(now_ns, FORGET_NS)
         self.trust.forget(now_ns)
         before_ns = now_ns - FORGET_NS
@@ -244,7 +250,7 @@ class FleetMember:
         for node in [n for n, (at_ns, _) in self.gone.items() if at_ns < before_ns]:
             del self.gone[node]
 
-    def look_for_phantoms(
+    def check_vehicles(
         self, now_ns: int, positions: Mapping[str, Vector], own: Witness, local: ToLocal
     ) -> list[Notice]:
         """Hold vehicles that only one other node has heard against all who ought to hear them.
@@ -256,7 +262,7 @@ class FleetMember:
         heard_by = dict[str, frozenset[str]]()
         for node, known in self.neighbours.items():
             said = known.standing
-            if not self.trust.believes(node) or known.offers is None or said is None:
+            if not self.trust.is_trusted(node) or known.offers is None or said is None:
                 continue
             heard = frozenset(u for u, offer in known.offers.items() if offer.heard_s is not None)
             heard_by[node] = heard
@@ -270,9 +276,9 @@ class FleetMember:
             if len(nodes) == 1 and uav not in own.heard and uav in positions
         ]
         counts = {node: len(heard) for node, heard in heard_by.items()}
-        return self.trust.vehicles(now_ns, told, witnesses, counts)
+        return self.trust.check_vehicles(now_ns, told, witnesses, counts)
 
-    def says(self, now_ns: int, place: Place | None, reach_m: float | None) -> Standing:
+    def own_standing(self, now_ns: int, place: Place | None, reach_m: float | None) -> Standing:
         """What this node says of itself: where its array is, and how far it hears.
 
         By that and by what others said, ``near`` is found anew.

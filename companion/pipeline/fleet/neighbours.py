@@ -22,21 +22,21 @@ DRIFT_MAX: Final = 200e-6
 """Greatest drift between two nodes' clocks, a ratio: two ordinary crystals, disciplined or not."""
 ANSWERS: Final = 3
 """Answers from which on what a node hears is used: the first, slow one would leave its doubt."""
-WAYS_KEPT: Final = 4096
-WAYS_NS: Final = 60_000_000_000  # how long it counts how long a report was on its way
-TOLD_APART_NS: Final = 100_000_000
+DELAYS_KEPT: Final = 4096
+DELAYS_WINDOW_NS: Final = 60_000_000_000  # time for which the delay of a report is remembered
+NOTICED_OFFSET_NS: Final = 100_000_000
 """Difference of two nodes' clocks from which on it is told: with NTP there is none."""
 
 
 @dataclass(frozen=True, slots=True)
-class Ahead:
+class ClockOffset:
     """By how much this node's timeline is ahead of another's: an interval, ns."""
 
     low_ns: int
     high_ns: int
 
     @property
-    def doubt_ns(self) -> int:
+    def width_ns(self) -> int:
         """The width of the interval."""
         return self.high_ns - self.low_ns
 
@@ -49,7 +49,7 @@ class NeighbourClock:
         self._newest_ns: int | None = None
         self._answers = 0
 
-    def answered(self, sent_ns: int, received_ns: int, remote_ns: int) -> DriftProven | None:
+    def note_answer(self, sent_ns: int, received_ns: int, remote_ns: int) -> DriftProven | None:
         """Take in a reading of the other clock; returns what it contradicts, None where nothing."""
         self._newest_ns = remote_ns
         self._answers += 1
@@ -60,14 +60,18 @@ class NeighbourClock:
         """Whether frames can be placed by it; a sender's clock keeps the doubt of the worst."""
         return self._answers >= ANSWERS
 
-    def ahead(self, remote_ns: int) -> Ahead | None:
+    def offset(self, remote_ns: int) -> ClockOffset | None:
         """What is known at a time of the other node; None before the first answer."""
         known = self._evidence.at(remote_ns)
-        return None if known is None else Ahead(math.floor(known.low_ns), math.ceil(known.high_ns))
+        return (
+            None
+            if known is None
+            else ClockOffset(math.floor(known.low_ns), math.ceil(known.high_ns))
+        )
 
-    def newest(self) -> Ahead | None:
+    def newest_offset(self) -> ClockOffset | None:
         """What was known at the newest answer; None before the first."""
-        return None if self._newest_ns is None else self.ahead(self._newest_ns)
+        return None if self._newest_ns is None else self.offset(self._newest_ns)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -83,15 +87,16 @@ class Neighbour:
     frames: int = 0  # frames that it told, used those that the pipeline had
     used: int = 0
     apart_told: bool = False
-    _ways_ns: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=WAYS_KEPT))
+    _delays_ns: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=DELAYS_KEPT))
 
-    def came(self, now_ns: int, way_ns: int) -> None:
-        """A report came that no other node had told before, so long after it was heard there."""
-        self._ways_ns.append((now_ns, way_ns))
+    def note_delay(self, now_ns: int, way_ns: int) -> None:
+        """Note the most that a report from this node was on its way."""
+        self._delays_ns.append((now_ns, way_ns))
 
-    def ways_ns(self, now_ns: int) -> list[int]:
-        """How long the reports of late were on their way, at most."""
-        return [way_ns for came_ns, way_ns in self._ways_ns if now_ns - came_ns < WAYS_NS]
+    def delays_ns(self, now_ns: int) -> list[int]:
+        """The most that each recent report was on its way."""
+        oldest_ns = now_ns - DELAYS_WINDOW_NS
+        return [way_ns for came_ns, way_ns in self._delays_ns if came_ns > oldest_ns]
 
 
 def here(trip: RoundTrip, clock: NeighbourClock) -> RoundTrip | None:
@@ -99,7 +104,7 @@ def here(trip: RoundTrip, clock: NeighbourClock) -> RoundTrip | None:
 
     None while that node's clock is not known.
     """
-    sent, received = clock.ahead(trip.sent_ns), clock.ahead(trip.t_ns)
+    sent, received = clock.offset(trip.sent_ns), clock.offset(trip.t_ns)
     if sent is None or received is None:
         return None
     return RoundTrip(

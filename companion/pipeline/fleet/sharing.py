@@ -12,14 +12,14 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple, TypeVar
 
 from companion.mavlink.wire.positions import OWN
-from companion.pipeline.fleet.hearing import VEHICLES_MAX, RecentFrames
+from companion.pipeline.fleet.reception import VEHICLES_MAX, RecentFrames
 from companion.values import Frame, RoundTrip, Shared, SharedFrame, Source
 
 HOLD_NS: Final = (60_000_000, 2_000_000_000)
 """Least and greatest time for which a report is held back: longer than a word from another node."""
 HOLD: Final = 1.5  # multiple of the longest way of another's word for which a report is held
-FADES: Final = 0.999  # share of that time that is left after each report that another told in time
-SPEAKS_AFTER: Final = 2
+HOLD_DECAY: Final = 0.999  # share of that time left after each report that another shared in time
+SPEAKER_AFTER: Final = 2
 """Reports in a row that nobody else told, after which this node speaks for the vehicle."""
 HELD_MAX: Final = 20_000
 """Frames held back, frames to be told and round trips to be told, of each at most."""
@@ -31,13 +31,13 @@ _T = TypeVar("_T")
 
 
 @dataclass(slots=True)
-class _Voice:
+class _SpeakerState:
     """A vehicle heard here: when last, whether this node speaks for it, and how many reports in a
     row it told late.
     """
 
     heard_ns: int
-    mine: bool = False
+    is_own: bool = False
     late: int = 0
 
 
@@ -51,15 +51,15 @@ class Sharing:
     """Decides what is told. ``name`` is this node's; ``every_ns`` is the least time between two
     words.
 
-    ``untold`` counts frames and round trips that nobody was told of, for want of room.
+    ``dropped`` counts frames and round trips that were not shared because the queue was full.
     """
 
     def __init__(self, name: str, every_ns: int = 0) -> None:
-        self.untold = 0
+        self.dropped = 0
         self._every_ns = every_ns
         self._said_ns = -every_ns
         self._name = name
-        self._voices: dict[Source, _Voice] = {}
+        self._speakers: dict[Source, _SpeakerState] = {}
         self._hold_ns: float = HOLD_NS[0]
         self._held: deque[_Held] = deque()
         self._by_others = RecentFrames()
@@ -67,47 +67,47 @@ class Sharing:
         self._frames: deque[SharedFrame] = deque()
         self._trips: deque[RoundTrip] = deque()
 
-    def heard(self, now_ns: int, frame: Frame, key: bytes) -> None:
+    def frame_received(self, now_ns: int, frame: Frame, key: bytes) -> None:
         """Take in a frame heard here, with its content, as it is read.
 
         It is held from now on and not from when it came: where frames wait to be read, what others
         tell of them waits as well. Else a node that is short of time would tell everybody's
         reports too, and leave the others less.
         """
-        voice = self._voices.get(frame.source)
-        if voice is None:
-            if len(self._voices) >= VEHICLES_MAX:
-                self.untold += 1
+        speaker = self._speakers.get(frame.source)
+        if speaker is None:
+            if len(self._speakers) >= VEHICLES_MAX:
+                self.dropped += 1
                 return
-            voice = self._voices.setdefault(frame.source, _Voice(frame.t_ns))
-        voice.heard_ns = frame.t_ns
-        if voice.mine:
-            self._tell(frame.t_ns, key, frame)
+            speaker = self._speakers.setdefault(frame.source, _SpeakerState(frame.t_ns))
+        speaker.heard_ns = frame.t_ns
+        if speaker.is_own:
+            self._queue_frame(frame.t_ns, key, frame)
         elif key in self._by_others:
-            voice.late = 0
+            speaker.late = 0
         elif frame.msgid in OWN:
             self._wait(self._held, _Held(now_ns + round(self._hold_ns), key, frame))
 
-    def answered(self, trip: RoundTrip) -> None:
+    def round_trip_measured(self, trip: RoundTrip) -> None:
         """Take in a round trip with a vehicle for which this node speaks."""
-        voice = self._voices.get(trip.source)
-        if voice is not None and voice.mine:
+        speaker = self._speakers.get(trip.source)
+        if speaker is not None and speaker.is_own:
             self._wait(self._trips, trip)
 
-    def told(self, now_ns: int, node: str, source: Source, key: bytes, way_ns: int) -> None:
-        """Take in that another node told a report, and for how long that was on its way at most."""
+    def note_shared(self, now_ns: int, node: str, source: Source, key: bytes, way_ns: int) -> None:
+        """Note that another node shared a report, and the most that its message took."""
         self._by_others.note(now_ns, key)
         if key in self._by_me:
-            voice = self._voices.get(source)
-            if voice is not None and node < self._name:
-                voice.mine, voice.late = False, 0
+            speaker = self._speakers.get(source)
+            if speaker is not None and node < self._name:
+                speaker.is_own, speaker.late = False, 0
             self._hold_ns = min(max(self._hold_ns, HOLD * way_ns), HOLD_NS[1])
         else:
-            self._hold_ns = max(FADES * self._hold_ns, HOLD_NS[0])
+            self._hold_ns = max(HOLD_DECAY * self._hold_ns, HOLD_NS[0])
 
-    def due(self, now_ns: int) -> Shared | None:
-        """What is to be told now; None where it is nothing, or where the last word was just now."""
-        self._let_go(now_ns)
+    def next_message(self, now_ns: int) -> Shared | None:
+        """The message to publish now; None if nothing waits, or if the last was just now."""
+        self._release_held(now_ns)
         if 0 <= now_ns - self._said_ns < self._every_ns:
             return None
         frames, trips = _first(self._frames), _first(self._trips)
@@ -116,23 +116,23 @@ class Sharing:
         self._said_ns = now_ns
         return Shared(now_ns, frames, trips)
 
-    def _let_go(self, now_ns: int) -> None:
-        """Let go of what was held: what another told, and what it did not tell in time."""
+    def _release_held(self, now_ns: int) -> None:
+        """Drop held frames that another node shared; queue those that none shared in time."""
         while self._held:
             due_ns, key, frame = self._held[0]
-            voice = self._voices.get(frame.source)
-            is_told = voice is None or key in self._by_others
+            speaker = self._speakers.get(frame.source)
+            is_told = speaker is None or key in self._by_others
             if not is_told and now_ns < due_ns:
                 return
             self._held.popleft()
-            if voice is None:
+            if speaker is None:
                 continue
             if is_told:
-                voice.late = 0
+                speaker.late = 0
                 continue
-            voice.late += 1
-            voice.mine = voice.mine or voice.late >= SPEAKS_AFTER
-            self._tell(now_ns, key, frame)
+            speaker.late += 1
+            speaker.is_own = speaker.is_own or speaker.late >= SPEAKER_AFTER
+            self._queue_frame(now_ns, key, frame)
 
     def wait_ns(self, now_ns: int) -> int | None:
         """How long it is until something is to be told; None: nothing is, and nothing is held."""
@@ -146,17 +146,17 @@ class Sharing:
 
     def forget(self, now_ns: int, after_ns: int) -> None:
         """Forget vehicles that were not heard here for so long."""
-        self._voices = {k: v for k, v in self._voices.items() if now_ns - v.heard_ns < after_ns}
+        self._speakers = {k: v for k, v in self._speakers.items() if now_ns - v.heard_ns < after_ns}
 
-    def alone(self) -> None:
-        """Nobody else is there: whoever comes will find everybody without a speaker."""
-        self._voices.clear()
+    def clear(self) -> None:
+        """Forget all: no other node is connected."""
+        self._speakers.clear()
         self._held.clear()
         self._frames.clear()
         self._trips.clear()
         self._hold_ns = HOLD_NS[0]
 
-    def _tell(self, now_ns: int, key: bytes, frame: Frame) -> None:
+    def _queue_frame(self, now_ns: int, key: bytes, frame: Frame) -> None:
         self._by_me.note(now_ns, key)
         self._wait(self._frames, SharedFrame(frame.t_ns, frame.raw))
 
@@ -164,7 +164,7 @@ class Sharing:
         """Let one more wait; where there is no room the oldest is given up."""
         if len(waiting) >= HELD_MAX:
             waiting.popleft()
-            self.untold += 1
+            self.dropped += 1
         waiting.append(one)
 
 

@@ -9,7 +9,7 @@ from companion.pipeline.fleet.trust import Witness
 from companion.pipeline.fold import Pipeline
 from companion.values import Notice, Vector, kind_of
 
-HEARD_S: Final = 5.0
+RECENT_S: Final = 5.0
 """How long ago a vehicle may have been heard that shows how far this node hears."""
 
 
@@ -33,11 +33,11 @@ class Surroundings:
         carrier = self._pipeline.last_carrier
         if carrier is None:
             return None
-        here, hearing = carrier.position_ned_m.tolist(), self._member.hearing
+        here, hearing = carrier.position_ned_m.tolist(), self._member.reception
         away_m = [
             math.dist(here, position)
             for uav, position in self._positions().items()
-            if (silent_s := hearing.silent_s(uav, now_ns)) is not None and silent_s < HEARD_S
+            if (silent_s := hearing.silent_s(uav, now_ns)) is not None and silent_s < RECENT_S
         ]
         return max(away_m, default=None)
 
@@ -46,7 +46,7 @@ class Surroundings:
         local, carrier = self._pipeline.local, self._pipeline.last_carrier
         if local is None or carrier is None:
             return []
-        positions, hearing = self._positions(), self._member.hearing
+        positions, hearing = self._positions(), self._member.reception
         heard = frozenset(u for u in positions if hearing.silent_s(u, now_ns) is not None)
         north, east, down = carrier.position_ned_m.tolist()
         own = Witness((north, east, down), self.reach_m(now_ns) or 0.0, heard)
@@ -54,7 +54,7 @@ class Surroundings:
         def to_local(place: Place) -> Vector:
             return local.localise(*place, None)[0]
 
-        return self._member.look_for_phantoms(now_ns, positions, own, to_local)
+        return self._member.check_vehicles(now_ns, positions, own, to_local)
 
     def _positions(self) -> dict[str, Vector]:
         """Where every vehicle that reports itself was last, in the local frame."""

@@ -1,6 +1,6 @@
-"""Which nodes are believed: found by contradiction, put aside with a notice, tried again later.
+"""Which nodes are trusted. Contradictions exclude a node for a while, with a notice.
 
-A node is put aside that
+A node is excluded that
 
 - tells frames before they can have been heard, by all that is known of its clock;
 - has a clock that contradicts itself: round trips that no drift explains, again and again;
@@ -17,10 +17,10 @@ from typing import Final, NamedTuple
 
 from companion.values import Notice, Severity
 
-TIMES: Final = 3  # contradictions within WITHIN_NS after which a node is put aside
+CONTRADICTIONS: Final = 3  # contradictions within WITHIN_NS after which a node is excluded
 WITHIN_NS: Final = 30_000_000_000
-ASIDE_NS: Final = 300_000_000_000  # how long a node is put aside before it is tried again
-PHANTOMS: Final = 2  # vehicles that nobody else can hear, from which on their node is put aside
+EXCLUDED_NS: Final = 300_000_000_000  # how long a node is excluded
+PHANTOMS: Final = 2  # vehicles that nobody else can hear, from which on their node is excluded
 UNHEARD_NS: Final = 8_000_000_000
 """Time after which a vehicle that others ought to hear is one that they cannot."""
 REACH_SHARE: Final = 0.7
@@ -44,28 +44,28 @@ class UnconfirmedVehicle(NamedTuple):
 
 
 class Trust:
-    """Who is believed. ``aside`` holds the nodes that are not, with the reason."""
+    """Trust in the other nodes. ``excluded`` holds the nodes that are not, with the reason."""
 
     def __init__(self) -> None:
-        self.aside: dict[str, str] = {}
+        self.excluded: dict[str, str] = {}
         self._until_ns: dict[str, int] = {}
         self._times: dict[tuple[str, str], deque[int]] = {}
         self._unheard: dict[str, tuple[str, int]] = {}
-        self._told_of: set[str] = set()
+        self._notified: set[str] = set()
 
-    def believes(self, node: str) -> bool:
-        """Whether a node is believed."""
-        return node not in self.aside
+    def is_trusted(self, node: str) -> bool:
+        """Whether the messages of a node are used."""
+        return node not in self.excluded
 
-    def against(self, now_ns: int, node: str, what: str) -> list[Notice]:
+    def note_contradiction(self, now_ns: int, node: str, what: str) -> list[Notice]:
         """Take in a contradiction, in words that go on after "it"."""
-        times = self._times.setdefault((node, what), deque(maxlen=TIMES))
+        times = self._times.setdefault((node, what), deque(maxlen=CONTRADICTIONS))
         times.append(now_ns)
-        if len(times) < TIMES or now_ns - times[0] > WITHIN_NS:
+        if len(times) < CONTRADICTIONS or now_ns - times[0] > WITHIN_NS:
             return []
-        return self._put_aside(now_ns, node, what)
+        return self._exclude(now_ns, node, what)
 
-    def vehicles(
+    def check_vehicles(
         self,
         now_ns: int,
         told: Iterable[UnconfirmedVehicle],
@@ -80,7 +80,7 @@ class Trust:
         for one in told:
             others = [w for name, w in witnesses.items() if name != one.node]
             has_been_heard = any(one.uav in w.heard for w in others)
-            if not has_been_heard and any(_ought_to_hear(w, one) for w in others):
+            if not has_been_heard and any(_should_receive(w, one) for w in others):
                 node, since_ns = before.get(one.uav, (one.node, now_ns))
                 self._unheard[one.uav] = (one.node, since_ns if node == one.node else now_ns)
         phantoms = dict[str, list[str]]()
@@ -92,12 +92,12 @@ class Trust:
             names = ", ".join(sorted(uavs)[:6])
             if len(uavs) >= PHANTOMS and 2 * len(uavs) > heard.get(node, 0):
                 what = f"tells of vehicles where nobody else hears one: {names}"
-                said += self._put_aside(now_ns, node, what)
-            elif not self._told_of.issuperset(uavs):
+                said += self._exclude(now_ns, node, what)
+            elif not self._notified.issuperset(uavs):
                 text = f"tells of {names}, where nobody else hears one: hidden, or made up"
                 said.append(_notice(now_ns, node, text, Severity.WARNING))
-            self._told_of.update(uavs)
-        self._told_of &= self._unheard.keys()
+            self._notified.update(uavs)
+        self._notified &= self._unheard.keys()
         return said
 
     @property
@@ -110,23 +110,23 @@ class Trust:
         before_ns = now_ns - WITHIN_NS
         self._times = {what: times for what, times in self._times.items() if times[-1] > before_ns}
 
-    def again(self, now_ns: int) -> list[Notice]:
+    def readmit(self, now_ns: int) -> list[Notice]:
         """Try again those whose time is over."""
         over = [node for node, until_ns in self._until_ns.items() if now_ns >= until_ns]
         for node in over:
-            del self._until_ns[node], self.aside[node]
+            del self._until_ns[node], self.excluded[node]
         return [_notice(now_ns, node, "is believed again", Severity.INFO) for node in over]
 
-    def _put_aside(self, now_ns: int, node: str, what: str) -> list[Notice]:
-        if node in self.aside:
+    def _exclude(self, now_ns: int, node: str, what: str) -> list[Notice]:
+        if node in self.excluded:
             return []
-        self.aside[node] = what
-        self._until_ns[node] = now_ns + ASIDE_NS
-        text = f"is not believed for {ASIDE_NS / 60e9:.0f} minutes: it {what}"
+        self.excluded[node] = what
+        self._until_ns[node] = now_ns + EXCLUDED_NS
+        text = f"is not believed for {EXCLUDED_NS / 60e9:.0f} minutes: it {what}"
         return [_notice(now_ns, node, text, Severity.WARNING)]
 
 
-def _ought_to_hear(witness: Witness, told: UnconfirmedVehicle) -> bool:
+def _should_receive(witness: Witness, told: UnconfirmedVehicle) -> bool:
     """Whether a vehicle is said to be where a node hears everybody."""
     away_m = math.dist(witness.place_ned_m, told.position_ned_m)
     return away_m < REACH_SHARE * witness.reach_m

@@ -75,16 +75,16 @@ class _Flow:
         """The frames that end in a packet."""
         if found.tcp_seq is None:
             whole = self._splitter.feed(t_ns, found.payload)
-            return self._heard(whole)
-        return self._heard(self._splitter.feed(t_ns, self._in_order(found, found.tcp_seq)))
+            return self._frames_only(whole)
+        return self._frames_only(self._splitter.feed(t_ns, self._in_order(found, found.tcp_seq)))
 
     def finish(self, t_ns: int) -> list[Frame | Rejection]:
         """What is left when the way ends."""
         rest = b"".join(self._ahead[seq] for seq in sorted(self._ahead))
         self._ahead.clear()
-        return self._heard([*self._splitter.feed(t_ns, rest), *self._splitter.finish(t_ns)])
+        return self._frames_only([*self._splitter.feed(t_ns, rest), *self._splitter.finish(t_ns)])
 
-    def _heard(self, events: list[Frame | Rejection]) -> list[Frame | Rejection]:
+    def _frames_only(self, events: list[Frame | Rejection]) -> list[Frame | Rejection]:
         return events if self._splitter.frames else []
 
     def _in_order(self, found: Segment, seq: int) -> bytes:

@@ -44,10 +44,10 @@ _ACCURACY: Final = ("h_acc_m", "v_acc_m", "vel_acc_mps")
 COLUMNS: Final = (
     *TIMES, *PLACE, "height_m", *_VELOCITY, "heading_deg", *_EULER, *_ACCURACY, "fix_type",
 )  # fmt: skip
-_SAID: Final = {"sysid": 255, "compid": 255, "mav_type": 255}
+_ID_LIMITS: Final = {"sysid": 255, "compid": 255, "mav_type": 255}
 _AUTOPILOT_GENERIC: Final = 0
 _LINE_MAX: Final = 1 << 16
-_SAID_MAX: Final = 100
+_NOTICES_MAX: Final = 100
 _RESOLUTION_S: Final = 1e-3
 
 
@@ -106,16 +106,16 @@ def _header(lines: Iterator[str]) -> tuple[dict[str, int], str]:
     """What the lines before the header say, and the header."""
     said: dict[str, int] = {}
     for number, line in enumerate(lines):
-        if number > _SAID_MAX:
+        if number > _NOTICES_MAX:
             break
         if not line.strip():
             continue
         if not line.startswith("#"):
             return said, line.rstrip("\n")
         name, equals, value = (part.strip() for part in line[1:].partition("="))
-        if equals and name in _SAID:
-            if not value.isdecimal() or not 0 < int(value[:9]) <= _SAID[name]:
-                raise NoTableError(f"a table whose {name} is not 1 to {_SAID[name]}")
+        if equals and name in _ID_LIMITS:
+            if not value.isdecimal() or not 0 < int(value[:9]) <= _ID_LIMITS[name]:
+                raise NoTableError(f"a table whose {name} is not 1 to {_ID_LIMITS[name]}")
             said[name] = int(value)
     raise NoTableError("text, and no table")
 

@@ -106,15 +106,15 @@ def _timed(of: UlogTable, lost: Lost) -> UlogTable:
 def _identity(walked: ulog.UlogIndex, status: UlogTable) -> tuple[int | None, int, int]:
     """System id, component id and MAV_TYPE: by the parameters, else by the vehicle's status."""
 
-    def said(parameter: str, column: str) -> int | None:
+    def stated(parameter: str, column: str) -> int | None:
         value = walked.parameters.get(parameter)
         values = status.integers(column)
         if value is None and values is not None and len(values):
             value = float(values[-1])
         return int(value) if value is not None and 0 < value <= 255 else None
 
-    sysid = said("MAV_SYS_ID", "system_id")
-    return sysid, said("MAV_COMP_ID", "component_id") or 1, said("MAV_TYPE", "system_type") or 0
+    sysid = stated("MAV_SYS_ID", "system_id")
+    return sysid, stated("MAV_COMP_ID", "component_id") or 1, stated("MAV_TYPE", "system_type") or 0
 
 
 def _armed(status: UlogTable) -> tuple[tuple[int, bool], ...]:

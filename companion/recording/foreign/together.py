@@ -51,7 +51,7 @@ class Vehicle(NamedTuple):
             return 0.0
         return clock.uncertainty_s + RECEIVER_LAG_S / 2
 
-    def told(self) -> str:
+    def notice(self) -> str:
         """One line for the user: who it is, how well its time is known, what was made up for."""
         clock = self.log.clock
         if clock is None:

@@ -40,7 +40,7 @@ from companion.studies.truth.array_truth import ArrayTruth
 from companion.studies.truth.vehicles import named
 from companion.values import BeamSet, Carrier, FloatArray, Track, Update, UserError, Widen, kind_of
 
-TOLD_EVERY: Final = 20  # looks between two reports of progress
+PROGRESS_EVERY: Final = 20  # looks between two reports of progress
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -301,7 +301,7 @@ def watch(
         if update.tracks:
             samples += look(seen, update, truth, t_s)
             looks += 1
-        if looks % TOLD_EVERY == 0:
+        if looks % PROGRESS_EVERY == 0:
             progress(f"{name}: {t_s:.0f} s of log")
     if not any(sample.as_set or sample.sharp for sample in samples):
         raise UserError(f"{name}: no UAV gets a beam in it, as far as its carrier is known")

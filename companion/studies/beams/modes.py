@@ -18,7 +18,7 @@ import numpy as np
 from companion.beams import hysteresis
 from companion.beams.aim import aim, directions
 from companion.beams.array.steering import steering_matrix
-from companion.beams.hysteresis import Steady
+from companion.beams.hysteresis import Hysteresis
 from companion.beams.worth import guarantee, link_budget
 from companion.node.replay import log_events
 from companion.pipeline import assembly
@@ -62,7 +62,7 @@ class _Way:
 
     name: str
     widen: Widen
-    state: Steady | None = None
+    state: Hysteresis | None = None
     last: dict[str, tuple[Any, float]] = field(default_factory=dict)
     true_db: list[float] = field(default_factory=list)
     predicted_db: list[float] = field(default_factory=list)
@@ -218,7 +218,7 @@ def _make(
         coverage=pipeline.coverage,
         before=way.state,
     )
-    way.state = hysteresis.after(way.state, made)
+    way.state = hysteresis.updated(way.state, made)
     steering = steering_matrix(pipeline.array, directions(made))
     shapes = made.weights * steering
     seen = {

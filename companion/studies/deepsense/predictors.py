@@ -57,7 +57,7 @@ def plain(samples: Samples, learned: BoolArray) -> Fitted:
 def kernel(samples: Samples, learned: BoolArray) -> Fitted:
     """The density of beams over the expected one, its kernel chosen within what is learned."""
     at, (width, weight) = chosen(samples, learned)
-    return lambda mask: averaged(samples, mask, _doubted(samples, mask, at), width, weight)
+    return lambda mask: averaged(samples, mask, _leave_one_out(samples, mask, at), width, weight)
 
 
 def chosen(samples: Samples, learned: BoolArray) -> tuple[Geometry, tuple[float, float]]:
@@ -67,14 +67,14 @@ def chosen(samples: Samples, learned: BoolArray) -> tuple[Geometry, tuple[float,
     worth = dict.fromkeys(KERNELS, 0.0)
     for part in inner(learned, *_INNER):
         mask = learned & ~part
-        geometries = _doubted(samples, mask, at)
+        geometries = _leave_one_out(samples, mask, at)
         for width, weight in KERNELS:
             likely = averaged(samples, mask, geometries, width, weight)
             worth[width, weight] += float(np.log(own(likely, samples.beam)[part]).sum())
     return at, max(KERNELS, key=lambda one: worth[one])
 
 
-def _doubted(samples: Samples, learned: BoolArray, at: Geometry) -> list[Geometry]:
+def _leave_one_out(samples: Samples, learned: BoolArray, at: Geometry) -> list[Geometry]:
     """Geometries that leave out each a part of what is learned: how far they differ is doubt."""
     counted = learned & samples.apart()
     return [

@@ -92,7 +92,7 @@ class World:
         for name in self._names:
             for other in self._names:
                 if other != name:
-                    self.members[name].came(self._local_ns(name), other)
+                    self.members[name].node_joined(self._local_ns(name), other)
 
     # --- time -------------------------------------------------------------------------------
 
@@ -122,7 +122,7 @@ class World:
                 self._at(at_ns, partial(self._lose, member, name))
 
     def _lose(self, member: FleetMember, node: str) -> None:
-        member.left(self._local_ns(member.name), node)
+        member.node_left(self._local_ns(member.name), node)
 
     def clock_ns(self, name: str) -> int:
         """By how much a node's timeline is ahead of the world's."""
@@ -148,7 +148,7 @@ class World:
         member, now_ns = self.members[name], self._local_ns(name)
         tick = self._tick + number
         if tick % OFFER_TICKS == 0:
-            member.offer(self._flight.offers(self._ranges_m()[number]))
+            member.set_offers(self._flight.offers(self._ranges_m()[number]))
             self._tell(name, "offers", messages.offers(member.offers))
         member.decide(now_ns)
         for one in member.handovers:
@@ -157,7 +157,7 @@ class World:
         member.handovers.clear()
         if tick % STANDING_TICKS == 0:
             lat_deg, lon_deg = (self._flight.places_m[number] / DEGREE_M).tolist()
-            said = member.says(now_ns, (lat_deg, lon_deg, 0.0), self.sky.reach_m)
+            said = member.own_standing(now_ns, (lat_deg, lon_deg, 0.0), self.sky.reach_m)
             self._tell(name, "standing", messages.standing(said))
         if tick % ASK_TICKS == 0:
             for other in sorted(member.near):
@@ -167,11 +167,11 @@ class World:
         """Tell what is due of what was heard, as the live node does."""
         if self._flushing.get(name) == self.now_ns and name not in self.dead:  # else it is put off
             del self._flushing[name]
-            self._tell_of_heard(name)
+            self._publish_received(name)
 
-    def _tell_of_heard(self, name: str) -> None:
+    def _publish_received(self, name: str) -> None:
         sharing = self.members[name].sharing
-        said = sharing.due(self._local_ns(name))
+        said = sharing.next_message(self._local_ns(name))
         if said is not None:
             self._tell(name, "heard", messages.shared(said))
         wait_ns = sharing.wait_ns(self._local_ns(name))
@@ -208,11 +208,11 @@ class World:
         member, now_ns = self.members[name], self._local_ns(name)
         match what:
             case "heard":
-                member.shared(now_ns, node, messages.to_shared(payload))
+                member.take_shared(now_ns, node, messages.to_shared(payload))
             case "standing":
-                member.stands(now_ns, messages.to_standing(payload, node))
+                member.take_standing(now_ns, messages.to_standing(payload, node))
             case "offers":
-                member.offered(now_ns, node, messages.to_offers(payload))
+                member.take_offers(now_ns, node, messages.to_offers(payload))
 
     def _ask(self, name: str, other: str) -> None:
         if other in self.dead or not (self._arrives(name, other) and self._arrives(other, name)):
@@ -252,11 +252,11 @@ class World:
                 msgid=REPORT,
                 raw=raw,
             )
-            self._timed(name, partial(self._heard, name, frame), of_frames=True)
+            self._timed(name, partial(self._was_received, name, frame), of_frames=True)
 
-    def _heard(self, name: str, frame: Frame) -> None:
-        self.members[name].heard(self._local_ns(name), frame)
-        self._tell_of_heard(name)
+    def _was_received(self, name: str, frame: Frame) -> None:
+        self.members[name].frame_received(self._local_ns(name), frame)
+        self._publish_received(name)
 
     # --- counting ---------------------------------------------------------------------------
 

@@ -94,7 +94,7 @@ def study(seed: int, progress: Progress) -> tuple[dict[str, Any], Material]:
         "rates": {name: _rate_numbers(found) for name, found in compared_before.items()},
         "blockage": _blockage(compared),
         "mavlink": asdict(agreement),
-        "paper": shown.told(),
+        "paper": shown.as_json(),
     }
     material = Material(
         flight=flight,

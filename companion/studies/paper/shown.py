@@ -127,7 +127,7 @@ GUESSES: Final = (
 )
 
 
-def told() -> dict[str, Any]:
+def as_json() -> dict[str, Any]:
     """Figures and guesses as JSON has them."""
     return {
         "figures": [asdict(one) for one in FIGURES],

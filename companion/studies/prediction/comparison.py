@@ -259,16 +259,16 @@ def _compared(
 ) -> list[LogComparison]:
     """The results of the pieces, in their order."""
 
-    def told(done: int) -> None:
+    def progressed(done: int) -> None:
         progress(f"{done} of {len(pieces)} done (a log over a link each)")
 
-    told(0)
+    progressed(0)
     if setting.cluster is not None:
         there = [
             replace(piece, logs=tuple(log.absolute() for log in piece.logs)) for piece in pieces
         ]
-        return fan_out.on_cluster(work, there, setting.cluster, told)
+        return fan_out.on_cluster(work, there, setting.cluster, progressed)
     jobs = setting.jobs or fan_out.cores()
     if jobs > 1 and len(pieces) > 1:
-        return fan_out.on_cores(work, pieces, jobs, told)
+        return fan_out.on_cores(work, pieces, jobs, progressed)
     return [work(piece, progress) for piece in pieces]

@@ -117,12 +117,12 @@ def product_answers(
     return replace(given, refuted_ns=tuple(product.refuted_ns))
 
 
-Heard = TypeVar("Heard")
+Received = TypeVar("Received")
 
 
 def _played(
-    hear: Callable[[Heard], None],
-    said: Sequence[Heard],
+    hear: Callable[[Received], None],
+    said: Sequence[Received],
     came_ns: Sequence[int],
     predict: Callable[[int, int], Predicted | None],
     asked: Questions,

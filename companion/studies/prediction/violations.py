@@ -76,7 +76,7 @@ def unannounced(rows: Iterable[Row]) -> int:
     )
 
 
-def said(rows: Sequence[Row]) -> str | None:
+def notice(rows: Sequence[Row]) -> str | None:
     """One line on bounds that were broken without a word, by the worst row; None if none was."""
     total = unannounced(rows)
     if not total:

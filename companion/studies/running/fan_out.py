@@ -24,7 +24,7 @@ from companion.values.extras import needs
 
 Asked = TypeVar("Asked")
 Answer = TypeVar("Answer")
-Told = Callable[[int], None]  # function that is given the number of finished pieces
+Progress = Callable[[int], None]  # function that is given the number of finished pieces
 
 CLUSTER_ANSWERS_S: Final = 10
 ADDRESS: Final = re.compile(r"(tcp|tls)://([\w.-]+|\[[0-9a-fA-F:.]+\]):\d{1,5}")
@@ -37,7 +37,7 @@ def cores() -> int:
 
 
 def on_cores(
-    work: Callable[[Asked], Answer], asked: Sequence[Asked], jobs: int, told: Told
+    work: Callable[[Asked], Answer], asked: Sequence[Asked], jobs: int, told: Progress
 ) -> list[Answer]:
     """The answers, by ``jobs`` processes; ``work`` must be a function of a module."""
     count = min(jobs, len(asked))
@@ -55,7 +55,7 @@ def on_cores(
             raise
 
 
-def _gathered(futures: "Sequence[Future[Answer]]", told: Told) -> list[Answer]:
+def _gathered(futures: "Sequence[Future[Answer]]", told: Progress) -> list[Answer]:
     """The answers in order.
 
     The first error in order is raised as soon as it is known to be the first.
@@ -93,7 +93,7 @@ def on_cluster(
     work: Callable[[Asked], Answer],
     asked: Sequence[Asked],
     address: str,
-    told: Told,
+    told: Progress,
     answers_s: float = CLUSTER_ANSWERS_S,
 ) -> list[Answer]:
     """The answers, by the workers of the Dask scheduler at an address.

@@ -9,7 +9,13 @@ from companion.beams.array.elements import Element, ElementPattern
 from companion.beams.array.geometry import Array, uniform_linear, uniform_rectangular
 from companion.beams.array.steering import steering_matrix
 from companion.beams.weights import shapes
-from companion.beams.weights.cones import FINER, FINER_IN_PLANE, ConeSamples, cones, seen_within
+from companion.beams.weights.cones import (
+    FINER,
+    FINER_IN_PLANE,
+    ConeSamples,
+    cones,
+    cones_on_aperture,
+)
 from companion.values import FloatArray
 
 EYE = np.eye(3)
@@ -35,7 +41,7 @@ DIRECTIONS = np.array([[0.8, 0.6, 0.0], [0.6, -0.48, 0.64], [1.0, 0.0, 0.0]])
 
 def looked_at(array: Array, angles_deg: list[list[float]]) -> ConeSamples:
     across = shapes.aperture(array)
-    seen = seen_within(across, DIRECTIONS, np.radians(angles_deg))
+    seen = cones_on_aperture(across, DIRECTIONS, np.radians(angles_deg))
     return cones(array, across, DIRECTIONS, seen, steering_matrix(array, DIRECTIONS))
 
 

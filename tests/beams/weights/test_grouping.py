@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from support import examples
 
 from companion.beams.weights.grouping import (
-    LENIENT_DB,
+    YOUNG_MARGIN_DB,
     PreviousSlots,
     ZeroForcingLimits,
-    kept,
+    kept_groups,
     lost_db,
     semi_orthogonal,
     without_the_lowest,
@@ -102,9 +102,9 @@ def test_turns_are_kept_while_they_do_and_a_little_longer_while_young(young: boo
         return made
 
     slots = PreviousSlots(np.array([0, 0, 0, 0, 0, 0]), young)
-    found = {apart: kept(at(apart), slots, LIMITS) for apart in (0.12, 0.056, 0.01)}
+    found = {apart: kept_groups(at(apart), slots, LIMITS) for apart in (0.12, 0.056, 0.01)}
     assert found[0.12] is not None
     assert [group.tolist() for group in found[0.12]] == [[0, 1, 2, 3, 4, 5]]
-    assert LIMITS.loss_db < lost_db(at(0.056), LIMITS) < LIMITS.loss_db + LENIENT_DB
+    assert LIMITS.loss_db < lost_db(at(0.056), LIMITS) < LIMITS.loss_db + YOUNG_MARGIN_DB
     assert (found[0.056] is not None) is young
     assert found[0.01] is None

@@ -19,7 +19,7 @@ from companion.beams.array.geometry import (
     uniform_rectangular,
 )
 from companion.beams.weights.precoding import Precoder, Precoding, Radio, gain_db, precode
-from companion.beams.weights.widening import Uncertain, spread
+from companion.beams.weights.widening import DirectionErrors, spread
 from companion.settings.model import BeamSettings
 from companion.values import ComplexArray, FloatArray, Method, Normalisation, Policy, Widen
 
@@ -96,7 +96,7 @@ def test_zero_forcing_gives_each_its_own_and_nothing_of_the_others(
     directions = somewhere(data, users)
     a = steering.steering_matrix(array, directions)
     bounds = np.random.default_rng(seed).uniform(0, 0.1, users)
-    known = Uncertain(likely_rad=bounds / 4, bounds_rad=bounds)
+    known = DirectionErrors(likely_rad=bounds / 4, bounds_rad=bounds)
     wide = spread(array, directions, known, Widen.GUARANTEE) if widen else None
     found = precode(a, Precoder(), wide)
     assert found.weights.shape == (16, users)

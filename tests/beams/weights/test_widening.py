@@ -20,7 +20,7 @@ from companion.beams.array.geometry import (
 from companion.beams.array.steering import steering_matrix
 from companion.beams.weights import nulls, widening
 from companion.beams.weights.precoding import Precoder, gain_db, precode
-from companion.beams.weights.widening import Spread, Uncertain
+from companion.beams.weights.widening import DirectionErrors, Spread
 from companion.values import ComplexArray, FloatArray, Method, Policy, Widen
 
 EYE = np.eye(3)
@@ -67,7 +67,7 @@ def spread(
         np.radians(np.broadcast_to(deg, len(directions))) for deg in (bounds_deg, likely_deg)
     )
     found = widening.spread(
-        array, directions, Uncertain(likely_rad=likely, bounds_rad=bounds), widen
+        array, directions, DirectionErrors(likely_rad=likely, bounds_rad=bounds), widen
     )
     assert found is not None
     return found
@@ -109,7 +109,7 @@ def test_elements_all_radiate_alike() -> None:
 
 
 def test_nothing_is_widened_where_all_is_known_or_nothing_is_wanted() -> None:
-    known = Uncertain(likely_rad=np.full(4, 0.01), bounds_rad=np.full(4, 0.1))
+    known = DirectionErrors(likely_rad=np.full(4, 0.01), bounds_rad=np.full(4, 0.1))
     assert widening.spread(LINE, FOUR, known, Widen.NO) is None
     for widen in (Widen.LIKELY, Widen.GUARANTEE):
         sharp = spread(LINE, FOUR, 0.0, 0.0, widen)
@@ -191,7 +191,7 @@ def test_nulls_cost_no_least_gain_more_than_their_price(
 ) -> None:
     """Where it is looked at, over the cone and over its likely part."""
     wide, _ = crowded(users, seed, most_deg, widen)
-    found = nulls.nulled(wide).weights
+    found = nulls.with_nulls(wide).weights
     assert np.isfinite(found).all()
     gains = [
         np.abs(wide.cones.fields(weights)) ** 2 / np.sum(np.abs(weights) ** 2, axis=0)[:, None]
@@ -216,7 +216,7 @@ def test_nulls_seldom_cost_more_between_the_places_that_are_looked_at() -> None:
             RECTANGLE,
             uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE),
         ][seed % 3]
-        found = nulls.nulled(wide).weights
+        found = nulls.with_nulls(wide).weights
         for user, crowd in enumerate(crowds):
             least = [power_db(array, w[:, [user]], crowd).min() for w in (wide.beams, found)]
             lost.append(float(least[0] - least[1]))
@@ -229,8 +229,8 @@ def test_two_uavs_close_together_keep_their_floors() -> None:
     """Bounds of 4.7 degrees, 5 degrees apart: exact nulls would leave nothing of the floors."""
     directions = towards((0.0, 0.0), (5.0, 0.0))
     wide = spread(LINE, directions, 4.7, 1.2)
-    found = nulls.nulled(wide)
-    exact = nulls.nulled(wide, exact=True)
+    found = nulls.with_nulls(wide)
+    exact = nulls.with_nulls(wide, exact=True)
     for user in range(2):
         crowd = within(directions[user], math.radians(4.7))
         kept = power_db(LINE, found.weights[:, user : user + 1], crowd).min()
@@ -275,7 +275,7 @@ def least_alike(seed: int, widen: Widen) -> float:
         moved = angles.copy()
         moved[:, 0] += 0.02 * step * ways
         directions = towards(*map(tuple, moved.tolist()))
-        weights = nulls.nulled(spread(LINE, directions, bounds, likely, widen)).weights
+        weights = nulls.with_nulls(spread(LINE, directions, bounds, likely, widen)).weights
         shape = weights * steering_matrix(LINE, directions)
         shapes.append(shape / np.linalg.norm(shape, axis=0))
     pairs = itertools.pairwise(shapes)
@@ -393,7 +393,7 @@ def test_weights_are_finite_whatever_the_array_and_the_uavs(
     widen = data.draw(st.sampled_from(list(Widen)))
     how = Precoder(policy=data.draw(st.sampled_from(list(Policy))), widen=widen)
     wide = widening.spread(
-        array, directions, Uncertain(likely_rad=likely, bounds_rad=bounds), widen
+        array, directions, DirectionErrors(likely_rad=likely, bounds_rad=bounds), widen
     )
     found = precode(a, how, wide)
     assert np.isfinite(found.weights).all()
@@ -412,11 +412,11 @@ def test_a_least_gain_that_the_link_needs_is_what_nulls_leave() -> None:
     crowd = within(directions[0], math.radians(2.5))
     least = []
     for floor_db, worth_db in ((2.7, 0.0), (8.7, 6.0)):
-        uncertain = Uncertain(
+        uncertain = DirectionErrors(
             likely_rad=likely, bounds_rad=bounds, floor_db=floor_db, worth_db=worth_db
         )
         wide = widening.spread(LINE, directions, uncertain, Widen.LIKELY)
         assert wide is not None
-        least.append(power_db(LINE, nulls.nulled(wide).weights[:, [0]], crowd).min())
+        least.append(power_db(LINE, nulls.with_nulls(wide).weights[:, [0]], crowd).min())
     assert 0.0 < least[0] < 5.0
     assert least[1] > 6.0

@@ -9,7 +9,7 @@ from support import examples
 from companion.beams.array import geometry, steering
 from companion.beams.array.elements import Element, ElementPattern
 from companion.beams.array.geometry import Array
-from companion.beams.weights.zero_forcing import Solved, solve
+from companion.beams.weights.zero_forcing import ZeroForcingSolution, solve
 from companion.values import ComplexArray, FloatArray
 
 EYE = np.eye(3)
@@ -86,7 +86,7 @@ def any_array(kind: str, rng: np.random.Generator) -> Array:
 KINDS = ["ula", "odd ula", "ura", "odd ura", "uca", "odd uca", "outward uca", "list", "odd list"]
 
 
-def check(found: Solved | None, a: ComplexArray, tolerance: float = 1e-12) -> None:
+def check(found: ZeroForcingSolution | None, a: ComplexArray, tolerance: float = 1e-12) -> None:
     """Against the pseudo-inverse; gains and loss factors by their definitions."""
     assert found is not None
     condition = np.linalg.cond(a)

@@ -260,9 +260,9 @@ def test_the_sure_side_is_above_the_offset_and_below_every_stamp(
         offset_ns = 5 * S + drift * x_ns
         floor.add(x_ns, round(offset_ns + latency_ns))
         seen = floor.heights(x_ns)
-        assert seen.sure >= offset_ns - 2
-        assert seen.sure <= offset_ns + latency_ns + 2
-        assert seen.highest >= seen.sure
+        assert seen.upper_bound >= offset_ns - 2
+        assert seen.upper_bound <= offset_ns + latency_ns + 2
+        assert seen.highest >= seen.upper_bound
         assert floor.at(x_ns) <= offset_ns + latency_ns + 2
 
 

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import pytest
 from link_support import LOOPS, Run, frame, port_of, runner, running, stamping, until_true
 
-from companion.mavlink.links import held_up, kernel_time, udp
+from companion.mavlink.links import kernel_time, stale_bytes, udp
 from companion.mavlink.links.transport import Link
 from companion.mavlink.links.urls import parse_link
 from companion.mavlink.wire.encode import heartbeat
@@ -217,7 +217,7 @@ def test_what_waited_in_a_stream_while_nobody_read_is_let_go(
 ) -> None:
     """As long as by SIGSTOP or a sleep of the machine: frames of then must not look like now."""
     away_ns = [0]
-    monkeypatch.setattr(held_up, "since_boot_ns", lambda: away_ns[0])
+    monkeypatch.setattr(stale_bytes, "since_boot_ns", lambda: away_ns[0])
 
     async def test() -> None:
         async with running("tcpin:127.0.0.1:0", time.monotonic_ns) as (link, inbox):
@@ -225,7 +225,7 @@ def test_what_waited_in_a_stream_while_nobody_read_is_let_go(
             writer.write(frame(1))
             await inbox.until(1)
             writer.write(b"".join(frame(n) for n in range(2, 102)))
-            away_ns[0] += held_up.HELD_UP_NS + 1
+            away_ns[0] += stale_bytes.STALE_NS + 1
             await until_true(lambda: link.status.lost.get("socket-overflow") == 100)
             writer.write(frame(102))
             await inbox.until(2)
@@ -239,13 +239,13 @@ def test_what_waited_in_a_stream_while_nobody_read_is_let_go(
 
 def test_a_look_knows_how_much_waits_before_it_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
     now_ns = [0]
-    monkeypatch.setattr(held_up, "since_boot_ns", lambda: now_ns[0])
+    monkeypatch.setattr(stale_bytes, "since_boot_ns", lambda: now_ns[0])
     ours, theirs = socket.socketpair()
     with ours, theirs:
-        watch = held_up.HeldUp(ours.fileno())
+        watch = stale_bytes.StaleBytes(ours.fileno())
         theirs.send(bytes(30))
         assert watch.stale(b"") == 0
-        now_ns[0] += held_up.HELD_UP_NS + 1
+        now_ns[0] += stale_bytes.STALE_NS + 1
         assert watch.stale(b"") == 0
         theirs.send(bytes(5))  # after it
         assert [watch.stale(ours.recv(20)), watch.stale(ours.recv(20))] == [20, 10]

@@ -163,7 +163,7 @@ def test_rejections_are_counted_by_reason_and_move_nothing_else() -> None:
     ]
     heard.peers.count(peer, [*lost, *lost])
     assert heard.status == LinkStatus(url=LINK, peers=1, lost={"garbage": 14, "unsigned": 2})
-    assert peer.heard_ns is None and heard.peers.heard_since(0) == []
+    assert peer.heard_ns is None and heard.peers.active_since(0) == []
 
 
 def test_a_source_is_where_it_was_heard_last() -> None:
@@ -183,7 +183,7 @@ def test_a_source_is_where_it_was_heard_last() -> None:
 def test_peers_heard_lately() -> None:
     heard = Heard().hear([1], "old", t_ns=99).hear([1], "new", t_ns=100)
     heard.peers.at("silent")
-    assert [peer.key for peer in heard.peers.heard_since(100)] == ["new"]
+    assert [peer.key for peer in heard.peers.active_since(100)] == ["new"]
 
 
 def test_each_peer_is_counted_to_by_itself() -> None:

@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import all as dialect
 from support import examples
 
 from companion.mavlink.clock.sender_clock import ClockKind, SenderClock
-from companion.mavlink.voice.component import HEARD, HELD_NS, ComponentSpec, ServiceComponent
+from companion.mavlink.voice.component import ACCEPTED_IDS, HELD_NS, ComponentSpec, ServiceComponent
 from companion.mavlink.wire.encode import Outgoing, pack
 from companion.mavlink.wire.framing import Splitter
 from companion.values import Frame, Notice, Reason, Rejection, RoundTrip, Severity, Source
@@ -444,7 +444,12 @@ def test_a_heartbeat_like_ours_long_after_our_last_is_another_s() -> None:
 
 
 @settings(max_examples=examples(300), deadline=None)
-@given(st.sampled_from(sorted(HEARD)), st.binary(max_size=60), st.integers(0, 255), st.booleans())
+@given(
+    st.sampled_from(sorted(ACCEPTED_IDS)),
+    st.binary(max_size=60),
+    st.integers(0, 255),
+    st.booleans(),
+)
 def test_any_content_is_survived(msgid: int, payload: bytes, sysid: int, ours: bool) -> None:
     """Infinities, numbers that are none, fields cut off or beyond the end."""
     node = component(position_hz=5.0, carrier=CARRIER, attitude_hz=5.0)

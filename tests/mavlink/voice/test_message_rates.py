@@ -693,7 +693,7 @@ def test_whatever_is_heard_there_are_never_more_requests_than_allowed(events: li
                 for uav in uavs if kind == "wait" else ():
                     if n % max(1, round(1000 / step_ms / hz[uav])) == 0:
                         rates.stamped(now_ns, uav, POSITION, now_ns // MS % 2**32)
-                    rates.heard(now_ns, uav)
+                    rates.message_received(now_ns, uav)
                 step(now_ns)
             continue
         uav = uavs[which]

@@ -187,7 +187,7 @@ def test_ids_that_are_no_text_are_hexadecimal() -> None:
 
 
 def named(ids: RemoteIds, message: Any, t_ns: int = 7, source: Source = RECEIVER) -> Any:
-    return ids.named(said(message, t_ns, source))
+    return ids.merge(said(message, t_ns, source))
 
 
 def refused(found: Any) -> Reason:
@@ -261,7 +261,7 @@ def test_no_payload_is_a_defect(msgid: int, payload: bytes, compid: int) -> None
     found = decode(frame)
     assert found is None or isinstance(found, Rejection | RemoteId)
     if isinstance(found, RemoteId):
-        RemoteIds().named(found)
+        RemoteIds().merge(found)
 
 
 @given(st.lists(st.binary(min_size=25, max_size=25), min_size=1, max_size=9))

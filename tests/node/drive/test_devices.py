@@ -19,8 +19,15 @@ from companion.beams.hardware.calibration import Calibration
 from companion.beams.hardware.devices import Beamformer
 from companion.node import moment
 from companion.node.drive import targets
-from companion.node.drive.loop import DeviceError, Drive, Safe, Shot, SourceLostError, Takes
-from companion.node.drive.sources import BeamRequest, chosen, shot_of, stored_registers
+from companion.node.drive.loop import (
+    DeviceCommand,
+    DeviceError,
+    DeviceInput,
+    Drive,
+    SafeState,
+    SourceLostError,
+)
+from companion.node.drive.sources import BeamRequest, command_for, shot_of, stored_registers
 from companion.pipeline import assembly
 from companion.settings.model import Settings
 from companion.values import UserError, WeightFormat
@@ -30,12 +37,12 @@ EIGHT = Settings().override(center={"source": "5:1"}, array={"elements": 8, "fre
 
 
 @pytest.fixture(scope="module")
-def flown() -> tuple[Shot, Any, str]:
+def flown() -> tuple[DeviceCommand, Any, str]:
     """A shot of a real flight, its UAV's beam as the device's text reads back, and that text."""
     log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
     pipeline, update = moment.look([log], EIGHT, "3")
     equipment = assembly.equipment(EIGHT, pipeline.array)
-    wanted = BeamRequest(uavs=("3:1",), anybody=False, takes=Takes.REGISTERS)
+    wanted = BeamRequest(uavs=("3:1",), anybody=False, takes=DeviceInput.REGISTERS)
     shot = shot_of(pipeline, equipment, update, wanted)
     text = weight_formats.encode(
         WeightFormat.ADAR1000, update.beams, pipeline, equipment, 0
@@ -47,11 +54,11 @@ def flown() -> tuple[Shot, Any, str]:
 class Always:
     """A source that has always the same; None is a service that is lost."""
 
-    def __init__(self, *shots: Shot | None) -> None:
+    def __init__(self, *shots: DeviceCommand | None) -> None:
         self._shots = list(shots)
         self.leads_s: list[float] = []
 
-    def ask(self, lead_s: float) -> Shot:
+    def ask(self, lead_s: float) -> DeviceCommand:
         self.leads_s.append(lead_s)
         shot = self._shots.pop(0) if len(self._shots) > 1 else self._shots[0]
         if shot is None:
@@ -88,7 +95,7 @@ def factor(gain: int, i: int, q: int) -> complex:
 
 
 def test_registers_of_chips_radiate_what_the_text_says(
-    spidev: dict[tuple[int, int], Chip], flown: tuple[Shot, Any, str]
+    spidev: dict[tuple[int, int], Chip], flown: tuple[DeviceCommand, Any, str]
 ) -> None:
     shot, read, _ = flown
     device = targets.device("adar1000:0.0,0.1", print, list)
@@ -97,7 +104,7 @@ def test_registers_of_chips_radiate_what_the_text_says(
         source=Always(shot),
         device=device,
         update_hz=100.0,
-        safe=Safe.MUTE,
+        safe=SafeState.MUTE,
         now_ns=clock.now_ns,
         say=lambda _: None,
     )
@@ -118,19 +125,19 @@ def test_registers_of_chips_radiate_what_the_text_says(
 
 
 def test_an_attenuated_channel_is_15_db_down(
-    spidev: dict[tuple[int, int], Chip], flown: tuple[Shot, Any, str]
+    spidev: dict[tuple[int, int], Chip], flown: tuple[DeviceCommand, Any, str]
 ) -> None:
     registers = flown[0].registers
     assert registers is not None
     weak = registers[:4].copy()
     weak[:, 4], weak[:, 5] = 127, [0, 1, 0, 1]
-    shot = Shot(valid_at_ns=0, unfit=None, uav="3:1", registers=weak)
+    shot = DeviceCommand(valid_at_ns=0, unfit=None, uav="3:1", registers=weak)
     device = targets.device("adar1000:0.0", print, list)
     Drive(
         source=Always(shot),
         device=device,
         update_hz=100.0,
-        safe=Safe.HOLD,
+        safe=SafeState.HOLD,
         now_ns=Ticking().now_ns,
         say=print,
     ).step()
@@ -139,14 +146,14 @@ def test_an_attenuated_channel_is_15_db_down(
 
 
 def test_too_few_chips_are_a_mistake_of_one_line(
-    spidev: dict[tuple[int, int], Chip], flown: tuple[Shot, Any, str]
+    spidev: dict[tuple[int, int], Chip], flown: tuple[DeviceCommand, Any, str]
 ) -> None:
     device = targets.device("adar1000:0.0", print, list)
     drive = Drive(
         source=Always(flown[0]),
         device=device,
         update_hz=100.0,
-        safe=Safe.HOLD,
+        safe=SafeState.HOLD,
         now_ns=Ticking().now_ns,
         say=print,
     )
@@ -155,7 +162,7 @@ def test_too_few_chips_are_a_mistake_of_one_line(
 
 
 def test_a_line_that_is_not_there_is_tried_again_each_second(
-    spidev: dict[tuple[int, int], Chip], flown: tuple[Shot, Any, str]
+    spidev: dict[tuple[int, int], Chip], flown: tuple[DeviceCommand, Any, str]
 ) -> None:
     clock, said = Ticking(), list[str]()
     device = targets.device("adar1000:9.0", print, list)
@@ -163,14 +170,14 @@ def test_a_line_that_is_not_there_is_tried_again_each_second(
         source=Always(flown[0]),
         device=device,
         update_hz=100.0,
-        safe=Safe.HOLD,
+        safe=SafeState.HOLD,
         now_ns=clock.now_ns,
         say=said.append,
     )
     for _ in range(300):  # three seconds
         drive.step()
         clock.t_ns += 10_000_000
-    assert drive.told().failures == 3
+    assert drive.status().failures == 3
     assert said == ["the device failed: SPI 9.0: No such file or directory"]
 
 
@@ -194,7 +201,7 @@ MAP = {"BEAM0": [7, 8, 5, 6], "BEAM1": [3, 4, 1, 2]}
 
 
 def test_a_phaser_gets_the_codes_of_the_text_and_one_latch_an_update(
-    iio: list[tuple[str, str, str]], flown: tuple[Shot, Any, str]
+    iio: list[tuple[str, str, str]], flown: tuple[DeviceCommand, Any, str]
 ) -> None:
     shot, read, text = flown
     device = targets.device("phaser:ip:phaser.local", print, list)
@@ -202,7 +209,7 @@ def test_a_phaser_gets_the_codes_of_the_text_and_one_latch_an_update(
         source=Always(shot),
         device=device,
         update_hz=100.0,
-        safe=Safe.BORESIGHT,
+        safe=SafeState.BORESIGHT,
         now_ns=Ticking().now_ns,
         say=print,
     )
@@ -233,11 +240,11 @@ def test_a_phaser_gets_the_codes_of_the_text_and_one_latch_an_update(
 
 
 def test_an_array_that_is_no_phaser_is_refused(
-    iio: list[tuple[str, str, str]], flown: tuple[Shot, Any, str]
+    iio: list[tuple[str, str, str]], flown: tuple[DeviceCommand, Any, str]
 ) -> None:
     shot = flown[0]
     assert shot.registers is not None
-    half = Shot(
+    half = DeviceCommand(
         valid_at_ns=shot.valid_at_ns, unfit=None, uav=shot.uav, registers=shot.registers[:4]
     )
     device = targets.device("phaser:ip:phaser.local", print, list)
@@ -245,7 +252,7 @@ def test_an_array_that_is_no_phaser_is_refused(
         source=Always(half),
         device=device,
         update_hz=100.0,
-        safe=Safe.HOLD,
+        safe=SafeState.HOLD,
         now_ns=Ticking().now_ns,
         say=print,
     )
@@ -261,21 +268,21 @@ def test_a_phaser_s_memory_holds_the_codebook_and_an_update_names_a_beam(
     pipeline, update = moment.look([log], settings, "3")
     equipment = assembly.equipment(settings, pipeline.array)
     stored = stored_registers(pipeline.array, equipment)
-    wanted = BeamRequest(uavs=("3:1",), anybody=False, takes=Takes.STORED, stored_beams=32)
+    wanted = BeamRequest(uavs=("3:1",), anybody=False, takes=DeviceInput.STORED, stored_beams=32)
     shot = shot_of(pipeline, equipment, update, wanted)
     told = beam_state.beams(pipeline, equipment, update, 0.0, 0.0)
     (beam,) = [one for one in told["beams"] if one["uav"] == "3:1"]
     assert shot.stored == beam["codebook"]["best"]
-    assert chosen(told, None, wanted, 0).stored == shot.stored  # the same over HTTP
+    assert command_for(told, None, wanted, 0).stored == shot.stored  # the same over HTTP
 
     device = targets.device("phaser-memory:ip:phaser.local", print, lambda: stored)
     other = replace(shot, stored=(shot.stored + 5) % 32)
-    source = Always(shot, shot, other, Shot(valid_at_ns=0, unfit="no carrier"))
+    source = Always(shot, shot, other, DeviceCommand(valid_at_ns=0, unfit="no carrier"))
     drive = Drive(
         source=source,
         device=device,
         update_hz=100.0,
-        safe=Safe.MUTE,
+        safe=SafeState.MUTE,
         now_ns=Ticking().now_ns,
         say=lambda _: None,
     )
@@ -313,21 +320,21 @@ def test_beams_of_another_codebook_are_not_pointed_to() -> None:
     beam = dict.fromkeys(("bearing_deg", "above_horizon_deg", "lat_deg", "lon_deg", "alt_m"), 0.0)
     beam |= {"uav": "1:1", "codebook": {"best": 3}}
     told = {"unfit": None, "beams": [beam], "codebook_beams": 64}
-    fits = chosen(
-        told, None, BeamRequest(uavs=(), anybody=True, takes=Takes.STORED, stored_beams=64), 0
+    fits = command_for(
+        told, None, BeamRequest(uavs=(), anybody=True, takes=DeviceInput.STORED, stored_beams=64), 0
     )
     assert (fits.unfit, fits.stored) == (None, 3)
     for size, held in ((64, 32), (None, 32), (None, None)):
-        shot = chosen(
+        shot = command_for(
             told | {"codebook_beams": size},
             None,
-            BeamRequest(uavs=(), anybody=True, takes=Takes.STORED, stored_beams=held),
+            BeamRequest(uavs=(), anybody=True, takes=DeviceInput.STORED, stored_beams=held),
             0,
         )
         assert shot.unfit == "the service has another codebook, or none"
 
 
-def test_a_mount_looks_at_the_middle_of_several(flown: tuple[Shot, Any, str]) -> None:
+def test_a_mount_looks_at_the_middle_of_several(flown: tuple[DeviceCommand, Any, str]) -> None:
     """Against their own directions and places; who is not wanted does not count."""
     log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
     pipeline, update = moment.look([log], EIGHT, "3")
@@ -339,9 +346,9 @@ def test_a_mount_looks_at_the_middle_of_several(flown: tuple[Shot, Any, str]) ->
         np.array([np.cos(e) * np.cos(b), np.cos(e) * np.sin(b), np.sin(e)]) for b, e in angles
     )
     wanted = BeamRequest(
-        uavs=("9:9", "2:1", "1:1"), anybody=False, takes=Takes.POINTING, centre=True
+        uavs=("9:9", "2:1", "1:1"), anybody=False, takes=DeviceInput.POINTING, centre=True
     )
-    for shot in (shot_of(pipeline, equipment, update, wanted), chosen(told, None, wanted, 0)):
+    for shot in (shot_of(pipeline, equipment, update, wanted), command_for(told, None, wanted, 0)):
         assert shot.uav == "2:1+1:1"
         assert shot.bearing_rad == pytest.approx(np.arctan2(mean[1], mean[0]))
         assert shot.above_rad == pytest.approx(np.arcsin(mean[2] / np.linalg.norm(mean)))
@@ -349,11 +356,11 @@ def test_a_mount_looks_at_the_middle_of_several(flown: tuple[Shot, Any, str]) ->
         seen = pipeline.local.position_ned_m(*shot.place)
         mid = np.mean([t.position_ned_m for t in update.tracks if t.uav in ("1:1", "2:1")], axis=0)
         np.testing.assert_allclose(seen, mid, atol=0.01)
-    everybody = BeamRequest(uavs=("1:1",), anybody=True, takes=Takes.POINTING, centre=True)
+    everybody = BeamRequest(uavs=("1:1",), anybody=True, takes=DeviceInput.POINTING, centre=True)
     around = shot_of(pipeline, equipment, update, everybody)
     assert "they are all around" in (around.unfit or "")  # four on one circle
     with pytest.raises(UserError, match="only a mount looks at the centre"):
-        BeamRequest(uavs=(), anybody=True, takes=Takes.REGISTERS, centre=True)
+        BeamRequest(uavs=(), anybody=True, takes=DeviceInput.REGISTERS, centre=True)
 
 
 @pytest.mark.parametrize(("lon_deg", "middle_deg"), [((179.9, -179.7), -179.9), ((7.0, 8.0), 7.5)])
@@ -372,12 +379,12 @@ def test_a_middle_is_between_also_at_the_edge_of_the_map(
         one | {"uav": "2:1", "bearing_deg": 20.0, "lon_deg": lon_deg[1]},
     ]
     told = {"unfit": None, "beams": beams, "codebook_beams": None}
-    wanted = BeamRequest(uavs=(), anybody=True, takes=Takes.POINTING, centre=True)
-    shot = chosen(told, None, wanted, 0)
+    wanted = BeamRequest(uavs=(), anybody=True, takes=DeviceInput.POINTING, centre=True)
+    shot = command_for(told, None, wanted, 0)
     assert np.degrees(shot.bearing_rad) == pytest.approx(5.0)
     assert shot.place == pytest.approx((1.0, middle_deg, 5.0))
     beams[1]["bearing_deg"] = 170.0
-    assert "they are all around" in (chosen(told, None, wanted, 0).unfit or "")
+    assert "they are all around" in (command_for(told, None, wanted, 0).unfit or "")
 
 
 def test_what_a_phaser_cannot_store_is_said() -> None:
@@ -396,7 +403,7 @@ def test_what_a_phaser_cannot_store_is_said() -> None:
 class Recorder:
     """A device that notes what is asked of it, and takes its time."""
 
-    takes = Takes.POINTING
+    takes = DeviceInput.POINTING
     lead_s = None
 
     def __init__(self, clock: Ticking, takes_s: float = 0.0) -> None:
@@ -404,18 +411,18 @@ class Recorder:
         self.fails = False
         self._clock, self._takes_ns = clock, round(takes_s * 1e9)
 
-    def check(self, safe: Safe) -> None: ...
+    def check(self, safe: SafeState) -> None: ...
 
     def open(self) -> None:
         self.did.append("open")
 
-    def apply(self, shot: Shot) -> None:
+    def apply(self, shot: DeviceCommand) -> None:
         if self.fails:
             raise DeviceError("cable")
         self._clock.t_ns += self._takes_ns
         self.did.append("apply")
 
-    def rest(self, safe: Safe) -> None:
+    def rest(self, safe: SafeState) -> None:
         self.did.append(str(safe))
 
     def close(self) -> None:
@@ -426,15 +433,15 @@ def test_a_device_rests_once_while_there_is_nothing_and_at_the_end() -> None:
     clock = Ticking()
     device, said = Recorder(clock), list[str]()
     fit, stale = (
-        Shot(valid_at_ns=0, unfit=None, uav="1:1"),
-        Shot(valid_at_ns=0, unfit="its attitude is too old"),
+        DeviceCommand(valid_at_ns=0, unfit=None, uav="1:1"),
+        DeviceCommand(valid_at_ns=0, unfit="its attitude is too old"),
     )
     source = Always(fit, stale, stale, None, None, fit, fit)
     drive = Drive(
         source=source,
         device=device,
         update_hz=10.0,
-        safe=Safe.MUTE,
+        safe=SafeState.MUTE,
         now_ns=clock.now_ns,
         say=said.append,
     )
@@ -452,14 +459,22 @@ def test_a_device_rests_once_while_there_is_nothing_and_at_the_end() -> None:
 
 def test_the_lead_is_the_device_s_own_time_and_late_ones_are_counted() -> None:
     clock = Ticking()
-    device, source = Recorder(clock, 0.03), Always(Shot(valid_at_ns=0, unfit=None, uav="1:1"))
+    device, source = (
+        Recorder(clock, 0.03),
+        Always(DeviceCommand(valid_at_ns=0, unfit=None, uav="1:1")),
+    )
     drive = Drive(
-        source=source, device=device, update_hz=10.0, safe=Safe.HOLD, now_ns=clock.now_ns, say=print
+        source=source,
+        device=device,
+        update_hz=10.0,
+        safe=SafeState.HOLD,
+        now_ns=clock.now_ns,
+        say=print,
     )
     for _ in range(5):
         drive.step()
     assert source.leads_s == pytest.approx([0.0, 0.03, 0.03, 0.03, 0.03])
-    told = drive.told()
+    told = drive.status()
     assert (told.p50_ms, told.p99_ms) == pytest.approx((30.0, 30.0))
     assert told.late == 5  # they were all right at 0
 
@@ -468,15 +483,15 @@ def test_a_device_that_fails_is_opened_again_and_rests_again() -> None:
     clock = Ticking()
     device, said = Recorder(clock), list[str]()
     source = Always(
-        Shot(valid_at_ns=0, unfit="no carrier"),
-        Shot(valid_at_ns=0, unfit=None, uav="1:1"),
-        Shot(valid_at_ns=0, unfit="no carrier"),
+        DeviceCommand(valid_at_ns=0, unfit="no carrier"),
+        DeviceCommand(valid_at_ns=0, unfit=None, uav="1:1"),
+        DeviceCommand(valid_at_ns=0, unfit="no carrier"),
     )
     drive = Drive(
         source=source,
         device=device,
         update_hz=10.0,
-        safe=Safe.BORESIGHT,
+        safe=SafeState.BORESIGHT,
         now_ns=clock.now_ns,
         say=said.append,
     )
@@ -488,7 +503,7 @@ def test_a_device_that_fails_is_opened_again_and_rests_again() -> None:
     clock.t_ns += 1_000_000_000
     drive.step()
     assert device.did == ["open", "boresight", "close", "open", "boresight"]
-    assert drive.told().failures == 1
+    assert drive.status().failures == 1
 
 
 @pytest.mark.parametrize(
@@ -512,7 +527,10 @@ def test_a_target_that_is_none_is_refused(target: str) -> None:
 def test_who_is_not_in_the_device_s_table_has_nothing_applied() -> None:
     beam = dict.fromkeys(("bearing_deg", "above_horizon_deg", "lat_deg", "lon_deg", "alt_m"), 0.0)
     told = {"unfit": None, "beams": [beam | {"uav": "1:1"}], "codebook_beams": None}
-    shot = chosen(
-        told, "the head of a table\n", BeamRequest(uavs=(), anybody=True, takes=Takes.REGISTERS), 0
+    shot = command_for(
+        told,
+        "the head of a table\n",
+        BeamRequest(uavs=(), anybody=True, takes=DeviceInput.REGISTERS),
+        0,
     )
     assert shot.unfit == "1:1 has no beam in the device's table"

@@ -11,7 +11,7 @@ from support import HANG_S
 
 from companion.node.drive import targets
 from companion.node.drive.gimbal import Gimbal
-from companion.node.drive.loop import DeviceError, Safe, Shot
+from companion.node.drive.loop import DeviceCommand, DeviceError, SafeState
 from companion.values import Source, UserError
 
 
@@ -33,7 +33,7 @@ def test_it_is_told_where_to_look(heard: socket.socket) -> None:
     gimbal = targets.device(f"gimbal:127.0.0.1:{port}:7:154", print, list)
     gimbal.open()
     gimbal.apply(
-        Shot(
+        DeviceCommand(
             valid_at_ns=0,
             unfit=None,
             uav="1:1",
@@ -50,13 +50,13 @@ def test_it_is_told_where_to_look(heard: socket.socket) -> None:
     assert math.isnan(said.pitch_rate)
     flags = dialect.GIMBAL_MANAGER_FLAGS_YAW_IN_EARTH_FRAME | dialect.GIMBAL_MANAGER_FLAGS_YAW_LOCK
     assert said.flags & flags == flags
-    gimbal.rest(Safe.HOLD)
-    gimbal.rest(Safe.BORESIGHT)
+    gimbal.rest(SafeState.HOLD)
+    gimbal.rest(SafeState.BORESIGHT)
     said, _ = message(heard)
     assert (said.yaw, said.pitch) == (0.0, 0.0)
     gimbal.close()
     with pytest.raises(DeviceError, match="no socket"):
-        gimbal.apply(Shot(valid_at_ns=0, unfit=None))
+        gimbal.apply(DeviceCommand(valid_at_ns=0, unfit=None))
 
 
 def test_it_is_told_places_where_it_is_asked_to(heard: socket.socket) -> None:
@@ -64,7 +64,7 @@ def test_it_is_told_places_where_it_is_asked_to(heard: socket.socket) -> None:
     gimbal = targets.device(f"gimbal-roi:127.0.0.1:{port}:7:154", print, list)
     gimbal.open()
     gimbal.apply(
-        Shot(
+        DeviceCommand(
             valid_at_ns=0,
             unfit=None,
             uav="1:1",
@@ -79,8 +79,8 @@ def test_it_is_told_places_where_it_is_asked_to(heard: socket.socket) -> None:
     assert (said.target_system, said.target_component) == (7, 154)
     assert said.frame == dialect.MAV_FRAME_GLOBAL
     assert (said.x, said.y, said.z) == (-471234567, 1707654321, 612.25)
-    gimbal.rest(Safe.HOLD)
-    gimbal.rest(Safe.BORESIGHT)
+    gimbal.rest(SafeState.HOLD)
+    gimbal.rest(SafeState.BORESIGHT)
     said, _ = message(heard)
     assert said.command == dialect.MAV_CMD_DO_SET_ROI_NONE
     gimbal.close()
@@ -106,7 +106,7 @@ def test_its_lag_is_found_from_its_attitude(
         t_s = 0.1 * n
         clock[0] = round(t_s * 1e9)
         gimbal.apply(
-            Shot(
+            DeviceCommand(
                 valid_at_ns=0, unfit=None, uav="1:1", bearing_rad=math.sin(0.5 * t_s), above_rad=0.0
             )
         )
@@ -122,7 +122,7 @@ def test_its_lag_is_found_from_its_attitude(
 
 def test_a_gimbal_is_not_muted() -> None:
     with pytest.raises(UserError, match="hold or boresight, not mute"):
-        targets.device("gimbal:127.0.0.1:1:1:154", print, list).check(Safe.MUTE)
+        targets.device("gimbal:127.0.0.1:1:1:154", print, list).check(SafeState.MUTE)
 
 
 @pytest.mark.parametrize(

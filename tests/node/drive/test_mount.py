@@ -15,7 +15,7 @@ from support import HANG_S
 
 from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
 from companion.node.drive.lag import MountLag
-from companion.node.drive.loop import DeviceError, Drive, Safe, Shot, Takes
+from companion.node.drive.loop import DeviceCommand, DeviceError, DeviceInput, Drive, SafeState
 from companion.node.drive.rotctld import Rotator
 from companion.node.drive.sources import BeamRequest, shot_of
 from companion.pipeline import assembly
@@ -135,10 +135,10 @@ def test_a_mount_is_off_by_half_of_what_one_is_that_follows_reports(
     settings = Settings().override(center={"source": "5:1"}, observer={"lag_s": (0.0, 0.0)})
     pipeline = Pipeline(settings)
     equipment = assembly.equipment(settings, pipeline.array)
-    wanted = BeamRequest(uavs=("1:1",), anybody=False, takes=Takes.POINTING)
+    wanted = BeamRequest(uavs=("1:1",), anybody=False, takes=DeviceInput.POINTING)
 
     class Here:
-        def ask(self, lead_s: float) -> Shot:
+        def ask(self, lead_s: float) -> DeviceCommand:
             return shot_of(pipeline, equipment, pipeline.look(clock.t_ns, lead_s), wanted)
 
     rotator = Rotator("127.0.0.1", serving(ours, clock), clock.now_ns)
@@ -146,7 +146,7 @@ def test_a_mount_is_off_by_half_of_what_one_is_that_follows_reports(
         source=Here(),
         device=rotator,
         update_hz=10.0,
-        safe=Safe.HOLD,
+        safe=SafeState.HOLD,
         now_ns=clock.now_ns,
         say=lambda _: None,
     )
@@ -184,7 +184,7 @@ def test_a_mount_is_off_by_half_of_what_one_is_that_follows_reports(
     rms = {who: float(np.sqrt(np.mean(np.square(values)))) for who, values in off.items()}
     drive.end()
     print(name, smooth, rms, rotator.lead_s)
-    assert drive.told().applied > 800
+    assert drive.status().applied > 800
     assert rms["ours"] <= 0.5 * rms["rival"]
     assert 0.15 <= rotator.lead_s <= 0.4
 
@@ -210,7 +210,7 @@ def test_hamlib_s_dummy_is_driven_within_its_limits(rotctld: int) -> None:
     rotator = opened(rotctld)
     assert rotator._limits_deg == (-180.0, 450.0, 0.0, 90.0)
     rotator.apply(
-        Shot(
+        DeviceCommand(
             valid_at_ns=0,
             unfit=None,
             uav="1:1",
@@ -222,7 +222,7 @@ def test_hamlib_s_dummy_is_driven_within_its_limits(rotctld: int) -> None:
         other.sendall(b"+p\n")
         assert b"get_pos:" in other.recv(4096)
     rotator.apply(
-        Shot(
+        DeviceCommand(
             valid_at_ns=0,
             unfit=None,
             uav="1:1",
@@ -230,11 +230,11 @@ def test_hamlib_s_dummy_is_driven_within_its_limits(rotctld: int) -> None:
             above_rad=math.radians(95),
         )
     )
-    rotator.rest(Safe.HOLD)
-    rotator.rest(Safe.BORESIGHT)
+    rotator.rest(SafeState.HOLD)
+    rotator.rest(SafeState.BORESIGHT)
     rotator.close()
     with pytest.raises(DeviceError, match="not connected"):
-        rotator.apply(Shot(valid_at_ns=0, unfit=None))
+        rotator.apply(DeviceCommand(valid_at_ns=0, unfit=None))
 
 
 def test_the_nearest_turn_within_the_limits_is_taken() -> None:
@@ -248,7 +248,7 @@ def test_the_nearest_turn_within_the_limits_is_taken() -> None:
 
 def test_a_rotator_radiates_nothing_that_could_be_muted() -> None:
     with pytest.raises(UserError, match="hold or boresight, not mute"):
-        Rotator("127.0.0.1", 1).check(Safe.MUTE)
+        Rotator("127.0.0.1", 1).check(SafeState.MUTE)
 
 
 def test_nobody_listens() -> None:
@@ -265,8 +265,8 @@ def test_a_lag_is_found_from_reports(lag_s: float) -> None:
 
     for n in range(200):
         t_s = 0.1 * n
-        lag.told(round(t_s * 1e9), at_rad(t_s))
-        lag.seen(round(t_s * 1e9), at_rad(t_s - lag_s) + 0.005 * rng.standard_normal())
+        lag.note_command(round(t_s * 1e9), at_rad(t_s))
+        lag.note_report(round(t_s * 1e9), at_rad(t_s - lag_s) + 0.005 * rng.standard_normal())
     assert lag.lag_s == pytest.approx(lag_s, abs=0.03)
 
 
@@ -274,22 +274,22 @@ def test_a_lag_is_found_where_reports_count_from_another_turn() -> None:
     lag = MountLag()
     for n in range(100):
         t_s = 0.1 * n
-        lag.told(round(t_s * 1e9), 0.3 * t_s)
-        lag.seen(round(t_s * 1e9), 0.3 * (t_s - 0.4) + 2 * math.pi)
+        lag.note_command(round(t_s * 1e9), 0.3 * t_s)
+        lag.note_report(round(t_s * 1e9), 0.3 * (t_s - 0.4) + 2 * math.pi)
     assert lag.lag_s == pytest.approx(0.4, abs=0.02)
 
 
 def test_a_mount_that_stands_still_shows_no_lag() -> None:
     lag = MountLag()
     for n in range(200):
-        lag.told(n * 100_000_000, 1.0)
-        lag.seen(n * 100_000_000, 1.0)
+        lag.note_command(n * 100_000_000, 1.0)
+        lag.note_report(n * 100_000_000, 1.0)
     assert lag.lag_s == 0.0
 
 
 def test_a_mount_that_goes_its_own_way_has_no_lag() -> None:
     lag, rng = MountLag(), np.random.default_rng(3)
     for n in range(200):
-        lag.told(n * 50_000_000, math.sin(0.5 * n * 0.05))
-        lag.seen(n * 50_000_000, float(rng.uniform(-1, 1)))
+        lag.note_command(n * 50_000_000, math.sin(0.5 * n * 0.05))
+        lag.note_report(n * 50_000_000, float(rng.uniform(-1, 1)))
     assert lag.lag_s == 0.0

@@ -140,7 +140,7 @@ def test_an_answer_came_when_zenoh_had_it(wire: Wire) -> None:
         now_ns[0] = 1090 * S
         remote_ns = 1005 * S
         wire.asked[0](messages.CLOCK.pack(1, remote_ns), time.monotonic_ns() - 20 * S)
-        ahead = member.member.neighbours["south"].clock.newest()
+        ahead = member.member.neighbours["south"].clock.newest_offset()
         assert ahead is not None
         assert ahead.low_ns == 1000 * S - remote_ns
         assert ahead.high_ns <= 1070 * S - remote_ns
@@ -188,9 +188,9 @@ def test_what_is_heard_is_told_at_once_but_not_too_often(wire: Wire, loop: str) 
         counts = []
         for number, wait_ms in enumerate((0, 100, 100, 9_899, 1, 9_999, 1)):
             now_ns[0] += wait_ms * MS
-            member.heard(report(now_ns[0] - 70 * MS, number))
+            member.on_event(report(now_ns[0] - 70 * MS, number))
             counts.append([len(said.frames) for said in told(wire)])
-        assert member.member.hearing.behind_ns == 70 * MS
+        assert member.member.reception.behind_ns == 70 * MS
         # The first is held for 60 ms, in which another might tell it. Who has told two speaks.
         assert counts == [[], [1], [1], [1], [1, 4], [1, 4], [1, 4, 2]]
         task.cancel()
@@ -223,7 +223,7 @@ def test_a_change_of_duty_is_said_at_once_and_a_rival_is_answered(wire: Wire) ->
         member._step = steps.append
         task = asyncio.create_task(member.run())
         await wire.is_asked.wait()
-        member.member.offer(
+        member.member.set_offers(
             {"1:1": Offer(uav="1:1", sure_db=10.0, likely_db=10.0, sinr_db=20.0, heard_s=0.1)}
         )
         member.ticked(now_ns[0])

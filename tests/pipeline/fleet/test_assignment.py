@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from support import examples
 
-from companion.pipeline.fleet.assignment import UNSURE_DB, assign, worth_db
+from companion.pipeline.fleet.assignment import LIKELY_PENALTY_DB, assign, offer_value_db
 from companion.values import Offer
 
 NODES = ("a", "b", "c")
@@ -137,13 +137,17 @@ def test_a_full_node_makes_room_for_who_has_no_other() -> None:
 
 @pytest.mark.parametrize(
     ("sure", "likely", "sinr", "worth"),
-    [(12.0, 17.0, 25.0, 25.0), (None, 17.0, 25.0, 25.0 - UNSURE_DB), (None, None, None, None)],
+    [
+        (12.0, 17.0, 25.0, 25.0),
+        (None, 17.0, 25.0, 25.0 - LIKELY_PENALTY_DB),
+        (None, None, None, None),
+    ],
 )
 def test_what_is_only_likely_is_worth_less(
     sure: float | None, likely: float | None, sinr: float | None, worth: float | None
 ) -> None:
     assert (
-        worth_db(Offer(uav="1:1", sure_db=sure, likely_db=likely, sinr_db=sinr, heard_s=0.1))
+        offer_value_db(Offer(uav="1:1", sure_db=sure, likely_db=likely, sinr_db=sinr, heard_s=0.1))
         == worth
     )
 

@@ -12,8 +12,8 @@ from support import rounds
 
 from companion.mavlink.trust.dedupe import content
 from companion.mavlink.wire.framing import Splitter
-from companion.pipeline.fleet.hearing import Hearing
 from companion.pipeline.fleet.neighbours import DRIFT_MAX, NeighbourClock
+from companion.pipeline.fleet.reception import Reception
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
 from companion.values import Event, Frame, SharedFrame, Tick
@@ -55,7 +55,7 @@ def flown(links: Links) -> tuple[list[tuple[float, float, float]], Pipeline]:
     """Errors and bounds at each tick as (time, error, bound), and the pipeline at the end."""
     chance, sky = random.Random(links.seed), FleetSky(ports=[], uavs=1)
     pipeline = Pipeline(Settings().override(center={"source": "47.3977,8.5456,480"}))
-    hearing, clock = Hearing(), NeighbourClock()
+    hearing, clock = Reception(), NeighbourClock()
 
     def there_ns(at_s: float) -> int:
         return ns(at_s + links.offset_s + links.drift * at_s)
@@ -86,12 +86,14 @@ def flown(links: Links) -> tuple[list[tuple[float, float, float]], Pipeline]:
                 events = [Tick(ns(at_s))]
             case Frame():
                 events = [what]
-                hearing.heard(what)
+                hearing.take_received(what)
             case SharedFrame():
-                frame = hearing.placed(ns(at_s), "b", clock, what)
-                events += hearing.told(ns(at_s), "b", frame, content(frame.raw)) if frame else []
+                frame = hearing.to_own_timeline(ns(at_s), "b", clock, what)
+                events += (
+                    hearing.take_shared(ns(at_s), "b", frame, content(frame.raw)) if frame else []
+                )
             case (sent_ns, remote_ns):
-                clock.answered(sent_ns, ns(at_s), remote_ns)
+                clock.note_answer(sent_ns, ns(at_s), remote_ns)
         for event in events:
             pipeline.step(event)
         if isinstance(what, Tick):

@@ -5,7 +5,7 @@ import struct
 from pymavlink.dialects.v20 import common
 
 from companion.pipeline.fleet.member import FORGET_NS, GONE_MAX, NODES_MAX, FleetMember
-from companion.pipeline.fleet.trust import TIMES, UNHEARD_NS, Witness
+from companion.pipeline.fleet.trust import CONTRADICTIONS, UNHEARD_NS, Witness
 from companion.settings.fleet import FleetSettings
 from companion.values import Offer, Shared, SharedFrame, Standing
 
@@ -39,7 +39,7 @@ def word(now_ns: int, number: int) -> Shared:
 
 def test_a_node_says_where_its_array_is_and_how_much_it_can_do() -> None:
     node = member(most=5)
-    said = node.says(START_NS + 3 * S, (47.0, 8.0, 400.0), 750.0)
+    said = node.own_standing(START_NS + 3 * S, (47.0, 8.0, 400.0), 750.0)
     assert said.node == "a"
     assert (said.place, said.reach_m, said.most) == ((47.0, 8.0, 400.0), 750.0, 5)
     assert (said.serves, said.handing) == ((), ())
@@ -47,10 +47,10 @@ def test_a_node_says_where_its_array_is_and_how_much_it_can_do() -> None:
 
 def test_a_word_that_comes_after_its_node_went_is_forgotten_in_the_end() -> None:
     node = member()
-    node.came(START_NS, "b")
-    assert [notice.text for notice in node.left(START_NS + S, "b")] == ["node b is gone"]
+    node.node_joined(START_NS, "b")
+    assert [notice.text for notice in node.node_left(START_NS + S, "b")] == ["node b is gone"]
     assert node.gone == {"b": (START_NS + S, None)}
-    node.stands(START_NS + 2 * S, standing("b"))
+    node.take_standing(START_NS + 2 * S, standing("b"))
     assert list(node.neighbours) == ["b"]
     assert not node.gone
     node.decide(START_NS + FORGET_NS)
@@ -62,8 +62,8 @@ def test_a_word_that_comes_after_its_node_went_is_forgotten_in_the_end() -> None
 def test_who_went_is_remembered_for_a_while_and_in_bounded_number() -> None:
     node = member()
     for number in range(GONE_MAX + 6):
-        node.came(START_NS, str(number))
-        node.left(START_NS + number, str(number))
+        node.node_joined(START_NS, str(number))
+        node.node_left(START_NS + number, str(number))
     assert list(node.gone) == [str(number) for number in range(6, GONE_MAX + 6)]
     node.decide(START_NS + FORGET_NS + 8)
     assert next(iter(node.gone)) == "8"
@@ -74,7 +74,7 @@ def test_an_answer_of_who_went_makes_nobody_known_and_is_no_word() -> None:
     node = member()
     node.read_clock("b", START_NS, START_NS, START_NS + MS, START_NS)
     assert not node.neighbours
-    node.came(START_NS, "b")
+    node.node_joined(START_NS, "b")
     node.read_clock("b", START_NS, START_NS + S, START_NS + S + MS, START_NS + S)
     assert node.neighbours["b"].heard_ns == START_NS
 
@@ -82,25 +82,25 @@ def test_an_answer_of_who_went_makes_nobody_known_and_is_no_word() -> None:
 def test_invented_nodes_take_no_room_for_ever() -> None:
     node = member()
     for number in range(NODES_MAX + 10):
-        node.stands(START_NS, standing(f"n{number}"))
-    node.stands(START_NS, standing("b"))
+        node.take_standing(START_NS, standing(f"n{number}"))
+    node.take_standing(START_NS, standing("b"))
     assert len(node.neighbours) == NODES_MAX
     assert "b" not in node.neighbours
     node.decide(START_NS + 2 * FORGET_NS)
-    node.stands(START_NS + 2 * FORGET_NS, standing("b"))
+    node.take_standing(START_NS + 2 * FORGET_NS, standing("b"))
     assert list(node.neighbours) == ["b"]
 
 
 def test_the_first_answers_of_a_clock_are_not_enough() -> None:
     """The doubt with which a frame was placed stays with its sender's clock."""
     node, now_ns = member(), START_NS
-    node.came(now_ns, "b")
+    node.node_joined(now_ns, "b")
     for number, wide_ms in enumerate((900, 4, 4)):
         now_ns += 500 * MS
-        events, _ = node.shared(now_ns, "b", word(now_ns, number))
+        events, _ = node.take_shared(now_ns, "b", word(now_ns, number))
         assert events == []
         node.read_clock("b", START_NS, now_ns - wide_ms * MS, now_ns, now_ns - wide_ms * MS // 2)
-    (frame,), _ = node.shared(now_ns + MS, "b", word(now_ns + MS, 3))
+    (frame,), _ = node.take_shared(now_ns + MS, "b", word(now_ns + MS, 3))
     (boot_ms,) = struct.unpack_from("<I", frame.raw, 10)
     assert boot_ms == 1003
     assert frame.doubt_ns < 6 * MS
@@ -112,10 +112,10 @@ def test_a_vehicle_that_one_node_alone_hears_is_said_with_that_node() -> None:
     offer = Offer(uav="66:1", sure_db=None, likely_db=None, sinr_db=None, heard_s=0.1)
     said = []
     for now_ns in range(START_NS, START_NS + 2 * UNHEARD_NS, S):
-        node.stands(now_ns, standing("b"))
-        node.offered(now_ns, "b", (offer,))
+        node.take_standing(now_ns, standing("b"))
+        node.take_offers(now_ns, "b", (offer,))
         places = {"66:1": (300.0, 0.0, 0.0)}
-        said += node.look_for_phantoms(now_ns, places, own, lambda _: (5000.0, 0.0, 0.0))
+        said += node.check_vehicles(now_ns, places, own, lambda _: (5000.0, 0.0, 0.0))
     assert node.trust.unconfirmed == {"66:1"}
     assert [(one.subject, one.text) for one in said] == [
         ("node b", "node b tells of 66:1, where nobody else hears one: hidden, or made up")
@@ -125,7 +125,7 @@ def test_a_vehicle_that_one_node_alone_hears_is_said_with_that_node() -> None:
 def test_who_is_served_elsewhere_is_spared_where_that_is_asked_for() -> None:
     for nulls, spares in ((True, ("2:1",)), (False, ())):
         node = member(nulls=nulls)
-        node.stands(START_NS, standing("b", ("2:1",)))
+        node.take_standing(START_NS, standing("b", ("2:1",)))
         duty, _ = node.decide(START_NS + MS)
         assert duty is not None
         assert duty.spares == spares
@@ -134,14 +134,16 @@ def test_who_is_served_elsewhere_is_spared_where_that_is_asked_for() -> None:
 def test_who_is_far_away_is_not_near_and_its_offers_are_not_kept() -> None:
     node = member()
     for name, place in (("b", (47.0, 8.0, 0.0)), ("c", (48.0, 8.0, 0.0))):
-        node.stands(START_NS, Standing(node=name, place=place, reach_m=900.0, most=16, serves=()))
-        node.offered(
+        node.take_standing(
+            START_NS, Standing(node=name, place=place, reach_m=900.0, most=16, serves=())
+        )
+        node.take_offers(
             START_NS,
             name,
             (Offer(uav="1:1", sure_db=10.0, likely_db=10.0, sinr_db=10.0, heard_s=0.1),),
         )
     assert node.near == frozenset()
-    node.says(START_NS, (47.0, 8.01, 0.0), 900.0)
+    node.own_standing(START_NS, (47.0, 8.01, 0.0), 900.0)
     assert node.near == {"b"}
     assert node.neighbours["b"].offers is not None
     assert node.neighbours["c"].offers is None
@@ -152,7 +154,7 @@ def answered(
 ) -> list[str]:
     """Answers of a node whose clock is so much behind, 4 ms apart; what was said of them."""
     notices = []
-    node.came(now_ns, "b")
+    node.node_joined(now_ns, "b")
     for number in range(times):
         sent_ns = now_ns + number * 500 * MS
         remote_ns = sent_ns + 2 * MS - round(ahead_s * S)
@@ -167,9 +169,9 @@ def test_another_life_of_a_node_has_another_clock() -> None:
     assert text.startswith("node b's clock is 99.998 s behind this one's")
     now_ns = START_NS + 12 * S
     said = word(now_ns - 100 * S, 1)
-    (frame,), _ = node.shared(now_ns + MS, "b", said)
+    (frame,), _ = node.take_shared(now_ns + MS, "b", said)
     assert frame.doubt_ns < 6 * MS
-    assert node.trust.believes("b")
+    assert node.trust.is_trusted("b")
 
 
 def test_a_clock_that_is_ahead_is_said_to_be() -> None:
@@ -181,26 +183,28 @@ def test_nothing_is_taken_of_a_node_that_is_not_believed() -> None:
     node = member()
     answered(node, START_NS, 0.0, START_NS)
     now_ns = START_NS + 2 * S
-    assert len(node.shared(now_ns, "b", word(now_ns, 1))[0]) == 1
-    for _ in range(TIMES):
-        node.trust.against(now_ns, "b", "tells what cannot be")
-    assert node.shared(now_ns, "b", word(now_ns, 2)) == ([], [])
+    assert len(node.take_shared(now_ns, "b", word(now_ns, 1))[0]) == 1
+    for _ in range(CONTRADICTIONS):
+        node.trust.note_contradiction(now_ns, "b", "tells what cannot be")
+    assert node.take_shared(now_ns, "b", word(now_ns, 2)) == ([], [])
 
 
 def test_offers_stand_for_some_time() -> None:
     node, now_ns = member(), START_NS
-    node.offer({"1:1": Offer(uav="1:1", sure_db=10.0, likely_db=10.0, sinr_db=10.0, heard_s=0.1)})
+    node.set_offers(
+        {"1:1": Offer(uav="1:1", sure_db=10.0, likely_db=10.0, sinr_db=10.0, heard_s=0.1)}
+    )
 
     def run(seconds: int) -> None:
         nonlocal now_ns
         for _ in range(10 * seconds):
             now_ns += 100 * MS
-            node.stands(now_ns, standing("b"))
+            node.take_standing(now_ns, standing("b"))
             node.decide(now_ns)
 
     run(3)
     assert list(node.duties.serves) == ["1:1"]
-    node.offered(
+    node.take_offers(
         now_ns, "b", (Offer(uav="1:1", sure_db=25.0, likely_db=25.0, sinr_db=25.0, heard_s=0.1),)
     )
     run(4)

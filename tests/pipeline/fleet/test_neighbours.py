@@ -4,7 +4,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import examples
 
-from companion.pipeline.fleet.neighbours import DRIFT_MAX, WAYS_NS, Neighbour, NeighbourClock, here
+from companion.pipeline.fleet.neighbours import (
+    DELAYS_WINDOW_NS,
+    DRIFT_MAX,
+    Neighbour,
+    NeighbourClock,
+    here,
+)
 from companion.values import RoundTrip, Source
 
 MS = 1_000_000
@@ -29,16 +35,16 @@ def test_the_truth_is_within(
     for there_ms, back_ms in ways:
         sent_ns, read_ns = t_ns, t_ns + there_ms * MS
         received_ns = read_ns + back_ms * MS
-        assert clock.answered(sent_ns, received_ns, remote(read_ns)) is None
+        assert clock.note_answer(sent_ns, received_ns, remote(read_ns)) is None
         t_ns = received_ns + 500 * MS
     then_ns = t_ns + asked_ms * MS
-    ahead = clock.ahead(remote(then_ns))
+    ahead = clock.offset(remote(then_ns))
     assert ahead is not None
     assert ahead.low_ns - 2 <= then_ns - remote(then_ns) <= ahead.high_ns + 2
     # No wider than the best round trip and what drift can have added since.
     best_ns = min(there + back for there, back in ways) * MS
     aged_ns = 2 * DRIFT_MAX * (abs(then_ns - START_NS) + 25_000 * MS)
-    assert ahead.doubt_ns <= best_ns + aged_ns
+    assert ahead.width_ns <= best_ns + aged_ns
 
 
 def test_a_round_trip_of_another_node_is_no_shorter_here() -> None:
@@ -46,7 +52,7 @@ def test_a_round_trip_of_another_node_is_no_shorter_here() -> None:
     trip = RoundTrip(t_ns=500 * MS, source=Source(1, 1), sent_ns=400 * MS, remote_ns=77)
     assert here(trip, clock) is None
     # The other clock is 1 s behind; the question took 4 ms, the answer 6 ms.
-    clock.answered(1000 * MS, 1010 * MS, 4 * MS)
+    clock.note_answer(1000 * MS, 1010 * MS, 4 * MS)
     placed = here(trip, clock)
     assert placed is not None
     assert placed.sent_ns <= 1400 * MS
@@ -58,8 +64,8 @@ def test_a_round_trip_of_another_node_is_no_shorter_here() -> None:
 def test_ways_of_long_ago_say_nothing_of_now() -> None:
     """A node that speaks for nobody any more has no ways, however slow its last words were."""
     node = Neighbour(clock=NeighbourClock())
-    node.came(START_NS, 900 * MS)
-    node.came(START_NS + WAYS_NS // 2, 5 * MS)
-    assert node.ways_ns(START_NS + WAYS_NS // 2) == [900 * MS, 5 * MS]
-    assert node.ways_ns(START_NS + WAYS_NS) == [5 * MS]
-    assert node.ways_ns(START_NS + 2 * WAYS_NS) == []
+    node.note_delay(START_NS, 900 * MS)
+    node.note_delay(START_NS + DELAYS_WINDOW_NS // 2, 5 * MS)
+    assert node.delays_ns(START_NS + DELAYS_WINDOW_NS // 2) == [900 * MS, 5 * MS]
+    assert node.delays_ns(START_NS + DELAYS_WINDOW_NS) == [5 * MS]
+    assert node.delays_ns(START_NS + 2 * DELAYS_WINDOW_NS) == []

@@ -38,7 +38,7 @@ def flown() -> tuple[Pipeline, FleetMember, int]:
             return pipeline, member, event.t_ns
         pipeline.step(event)
         if isinstance(event, Frame):
-            member.heard(event.t_ns, event)
+            member.frame_received(event.t_ns, event)
     raise AssertionError
 
 
@@ -46,7 +46,7 @@ def test_an_offer_is_worth_its_gain_over_the_range(
     flown: tuple[Pipeline, FleetMember, int],
 ) -> None:
     pipeline, member, now_ns = flown
-    offers = Offers(pipeline, member.hearing.silent_s)
+    offers = Offers(pipeline, member.reception.silent_s)
     for _ in range(4):
         make = offers.look(now_ns)
         assert make is not None

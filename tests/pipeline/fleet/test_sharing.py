@@ -7,7 +7,7 @@ from pymavlink.dialects.v20 import common
 
 from companion.mavlink.trust.dedupe import content
 from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
-from companion.pipeline.fleet.hearing import VEHICLES_MAX
+from companion.pipeline.fleet.reception import VEHICLES_MAX
 from companion.pipeline.fleet.sharing import AT_ONCE, HELD_MAX, HOLD_NS, Sharing
 from companion.values import Frame, RoundTrip, Source
 
@@ -42,7 +42,7 @@ class Nodes:
         for number in range(first, first + reports):
             frame = report(self.now_ns, 1000 + 100 * number)
             for name in hearers:
-                self.sharing[name].heard(frame.t_ns, frame, content(frame.raw))
+                self.sharing[name].frame_received(frame.t_ns, frame, content(frame.raw))
             for _ in range(20):
                 self._pass(5 * MS)
 
@@ -53,9 +53,9 @@ class Nodes:
             for name in self.names:
                 if name != teller:
                     key = content(frame.raw)
-                    self.sharing[name].told(self.now_ns, teller, UAV, key, self.way_ns)
+                    self.sharing[name].note_shared(self.now_ns, teller, UAV, key, self.way_ns)
         for name in self.names:
-            said = self.sharing[name].due(self.now_ns)
+            said = self.sharing[name].next_message(self.now_ns)
             for one in said.frames if said else ():
                 (boot_ms,) = struct.unpack_from("<I", one.raw, 10)
                 late_ns = self.now_ns - one.heard_ns
@@ -102,10 +102,10 @@ def test_round_trips_are_told_by_the_speaker() -> None:
     nodes = Nodes(("a", "b"))
     nodes.fly(20, ("a", "b"))
     trip = RoundTrip(t_ns=nodes.now_ns, source=UAV, sent_ns=nodes.now_ns - MS, remote_ns=5)
-    nodes.sharing["a"].answered(trip)
-    nodes.sharing["b"].answered(trip)
-    assert nodes.sharing["b"].due(nodes.now_ns) is None
-    said = nodes.sharing["a"].due(nodes.now_ns)
+    nodes.sharing["a"].round_trip_measured(trip)
+    nodes.sharing["b"].round_trip_measured(trip)
+    assert nodes.sharing["b"].next_message(nodes.now_ns) is None
+    said = nodes.sharing["a"].next_message(nodes.now_ns)
     assert said is not None
     assert said.trips == (trip,)
 
@@ -121,10 +121,10 @@ def test_a_burst_is_told_in_several_words_and_all_of_it() -> None:
     sharing, now_ns = spoken_for(), 60_000 * MS
     for number in range(1200):
         frame = report(now_ns, 60_000 + number)
-        sharing.heard(frame.t_ns, frame, content(frame.raw))
+        sharing.frame_received(frame.t_ns, frame, content(frame.raw))
     counts, boots = [], []
     while sharing.wait_ns(now_ns) is not None:
-        said = sharing.due(now_ns)
+        said = sharing.next_message(now_ns)
         assert said is not None
         counts.append(len(said.frames))
         boots += [struct.unpack_from("<I", one.raw, 10)[0] for one in said.frames]
@@ -137,44 +137,44 @@ def test_what_waits_too_long_is_given_up_oldest_first_and_counted() -> None:
     sharing = Sharing("a")
     for number in range(HELD_MAX + 3):
         frame = report(number, number)
-        sharing.heard(frame.t_ns, frame, content(frame.raw))
-    assert sharing.untold == 3
-    said = sharing.due(10 * S)
+        sharing.frame_received(frame.t_ns, frame, content(frame.raw))
+    assert sharing.dropped == 3
+    said = sharing.next_message(10 * S)
     assert said is not None
     assert struct.unpack_from("<I", said.frames[0].raw, 10)[0] == 3
     told = len(said.frames)
-    while (said := sharing.due(10 * S)) is not None:
+    while (said := sharing.next_message(10 * S)) is not None:
         told += len(said.frames)
     assert told == HELD_MAX
-    assert sharing.untold == 3
+    assert sharing.dropped == 3
 
 
 def test_vehicles_of_yesterday_make_room_for_those_of_today() -> None:
     sharing = Sharing("a")
     for number in range(VEHICLES_MAX):
         frame = report(0, 1, Source(1 + number % 255, number // 255))
-        sharing.heard(frame.t_ns, frame, content(frame.raw))
+        sharing.frame_received(frame.t_ns, frame, content(frame.raw))
     while sharing.wait_ns(S) is not None:
-        sharing.due(S)
+        sharing.next_message(S)
     late = Source(200, 201)
     for number in range(2):
         frame = report(3600 * S + number * S, 1000 * number, late)
-        sharing.heard(frame.t_ns, frame, content(frame.raw))
-    assert sharing.due(3610 * S) is None  # no room
-    assert sharing.untold == 2
+        sharing.frame_received(frame.t_ns, frame, content(frame.raw))
+    assert sharing.next_message(3610 * S) is None  # no room
+    assert sharing.dropped == 2
     sharing.forget(3620 * S, 600 * S)
     frame = report(3620 * S, 9000, late)
-    sharing.heard(frame.t_ns, frame, content(frame.raw))
-    said = sharing.due(3630 * S)
+    sharing.frame_received(frame.t_ns, frame, content(frame.raw))
+    said = sharing.next_message(3630 * S)
     assert said is not None
     assert [one.raw for one in said.frames] == [frame.raw]
 
 
 def test_what_is_held_of_a_forgotten_vehicle_is_not_told() -> None:
     sharing, frame = Sharing("a"), report(0, 1)
-    sharing.heard(frame.t_ns, frame, content(frame.raw))
+    sharing.frame_received(frame.t_ns, frame, content(frame.raw))
     sharing.forget(601 * S, 600 * S)
-    assert sharing.due(602 * S) is None
+    assert sharing.next_message(602 * S) is None
     assert sharing.wait_ns(602 * S) is None
 
 
@@ -184,16 +184,16 @@ def test_it_says_how_long_to_wait_and_nobody_looks_before() -> None:
     assert sharing.wait_ns(S) is None
     frames = [report(S + number * MS, number) for number in range(3)]
     for frame in frames:
-        sharing.heard(frame.t_ns, frame, content(frame.raw))
+        sharing.frame_received(frame.t_ns, frame, content(frame.raw))
     assert sharing.wait_ns(S + 10 * MS) == 50 * MS
-    sharing.told(S + 11 * MS, "a", frames[0].source, content(frames[0].raw), MS)
-    assert sharing.due(S + 12 * MS) is None
+    sharing.note_shared(S + 11 * MS, "a", frames[0].source, content(frames[0].raw), MS)
+    assert sharing.next_message(S + 12 * MS) is None
     assert sharing.wait_ns(S + 12 * MS) == 49 * MS  # the next one's
-    assert sharing.due(S + 60 * MS) is None
-    assert sharing.due(S + 61 * MS) is not None
-    assert sharing.due(S + 62 * MS) is None
+    assert sharing.next_message(S + 60 * MS) is None
+    assert sharing.next_message(S + 61 * MS) is not None
+    assert sharing.next_message(S + 62 * MS) is None
     assert sharing.wait_ns(S + 62 * MS) == 1 * MS
-    assert sharing.due(S + 63 * MS) is not None
+    assert sharing.next_message(S + 63 * MS) is not None
     assert sharing.wait_ns(S + 63 * MS) is None
 
 
@@ -203,10 +203,10 @@ def test_what_others_tell_waits_too_where_this_node_is_behind() -> None:
     frames = [report(S + number * 100 * MS, number) for number in range(3)]
     now_ns = S + 900 * MS
     for frame in frames:
-        sharing.heard(now_ns, frame, content(frame.raw))
-    assert sharing.due(now_ns) is None
+        sharing.frame_received(now_ns, frame, content(frame.raw))
+    assert sharing.next_message(now_ns) is None
     assert sharing.wait_ns(now_ns) == 60 * MS
     for frame in frames:
-        sharing.told(now_ns + MS, "a", frame.source, content(frame.raw), MS)
-    assert sharing.due(now_ns + 2 * MS) is None
+        sharing.note_shared(now_ns + MS, "a", frame.source, content(frame.raw), MS)
+    assert sharing.next_message(now_ns + 2 * MS) is None
     assert sharing.wait_ns(now_ns + 2 * MS) is None

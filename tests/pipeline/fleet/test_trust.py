@@ -3,8 +3,8 @@
 from collections import Counter
 
 from companion.pipeline.fleet.trust import (
-    ASIDE_NS,
-    TIMES,
+    CONTRADICTIONS,
+    EXCLUDED_NS,
     UNHEARD_NS,
     Trust,
     UnconfirmedVehicle,
@@ -25,24 +25,28 @@ def look(
     said = []
     for second in range(seconds):
         heard = Counter(one.node for one in told)
-        said += trust.vehicles(second * S, told, witnesses, heard + Counter({"b": others}))
+        said += trust.check_vehicles(second * S, told, witnesses, heard + Counter({"b": others}))
     return [notice.text for notice in said]
 
 
 def test_one_contradiction_is_none_and_several_are() -> None:
     trust = Trust()
-    for number in range(TIMES - 1):
-        assert trust.against(number * S, "b", "lies") == []
-    assert trust.believes("b")
-    assert trust.against(100 * S, "b", "lies") == []  # the others are long ago
-    (notice, *_) = [n for t in range(TIMES) for n in trust.against((101 + t) * S, "b", "lies")]
+    for number in range(CONTRADICTIONS - 1):
+        assert trust.note_contradiction(number * S, "b", "lies") == []
+    assert trust.is_trusted("b")
+    assert trust.note_contradiction(100 * S, "b", "lies") == []  # the others are long ago
+    (notice, *_) = [
+        n
+        for t in range(CONTRADICTIONS)
+        for n in trust.note_contradiction((101 + t) * S, "b", "lies")
+    ]
     assert "node b is not believed for 5 minutes: it lies" in notice.text
-    assert not trust.believes("b")
-    assert trust.believes("c")
-    assert trust.again(110 * S) == []
-    (again,) = trust.again(110 * S + ASIDE_NS)
+    assert not trust.is_trusted("b")
+    assert trust.is_trusted("c")
+    assert trust.readmit(110 * S) == []
+    (again,) = trust.readmit(110 * S + EXCLUDED_NS)
     assert "believed again" in again.text
-    assert trust.believes("b")
+    assert trust.is_trusted("b")
 
 
 def test_vehicles_that_nobody_else_can_hear_put_their_node_aside() -> None:
@@ -64,7 +68,7 @@ def test_one_hidden_vehicle_is_unconfirmed_and_no_lie() -> None:
     (said,) = look(trust, hidden, {"a": HERE}, 60)
     assert "node b tells of 66:1, where nobody else hears one: hidden, or made up" in said
     assert trust.unconfirmed == {"66:1"}
-    assert trust.believes("b")
+    assert trust.is_trusted("b")
 
 
 def test_a_few_among_many_are_said_and_their_node_is_believed() -> None:
@@ -73,7 +77,7 @@ def test_a_few_among_many_are_said_and_their_node_is_believed() -> None:
     hidden = [UnconfirmedVehicle(f"6{n}:1", "b", (100.0 + n, 0.0, 0.0)) for n in range(4)]
     (said,) = look(trust, hidden, {"a": HERE}, 60, others=6)
     assert "60:1, 61:1, 62:1, 63:1" in said
-    assert trust.believes("b")
+    assert trust.is_trusted("b")
 
 
 def test_who_is_far_away_or_was_heard_before_is_no_phantom() -> None:

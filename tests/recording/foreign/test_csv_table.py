@@ -71,7 +71,7 @@ def test_attitudes_and_accuracies_are_said(tmp_path: Path) -> None:
     assert one.log.fixes.accuracies.tolist() == [[1.5, 2.5, 0.3]] * 2
     kinds = [event.msgid for event in read_log(path) if isinstance(event, Frame)]
     assert kinds == [0, 2, 24, 30, 33] * 2
-    assert "its time is taken as it stands" in one.told()
+    assert "its time is taken as it stands" in one.notice()
 
 
 @pytest.mark.parametrize(

@@ -45,14 +45,14 @@ def test_two_logs_are_one_flight_on_gps_time(aeroplane: Path, carrier: Path) -> 
     assert 100 < middle.count(one.source) < 300  # they fly side by side
     assert one.log.clock and five.log.clock
     assert one.as_json()["clock_uncertainty_s"] == 0.001
-    assert "on GPS time to 0.001 s by 100 fixes" in one.told()
+    assert "on GPS time to 0.001 s by 100 fixes" in one.notice()
 
 
 def test_vehicles_of_one_id_are_told_apart(aeroplane: Path, tmp_path: Path) -> None:
     again = Path(shutil.copy(aeroplane, tmp_path / "again.bin"))
     first, second = vehicles([aeroplane, again])
     assert (first.source.sysid, second.source.sysid) == (1, 2)
-    assert "it says 1, which another has" in second.told()
+    assert "it says 1, which another has" in second.notice()
 
 
 def test_an_id_that_another_log_says_is_not_given_away(
@@ -62,7 +62,7 @@ def test_an_id_that_another_log_says_is_not_given_away(
     nameless.write_bytes(aeroplane.read_bytes().replace(b"MAV_SYSID", b"MAV_SISID"))
     found = [one.source.sysid for one in vehicles([nameless, aeroplane, carrier])]
     assert found == [2, 1, 5]
-    assert "it names no id" in vehicles([nameless])[0].told()
+    assert "it names no id" in vehicles([nameless])[0].notice()
 
 
 def test_a_log_may_name_the_carrier(aeroplane: Path, carrier: Path, cut_log: Path) -> None:

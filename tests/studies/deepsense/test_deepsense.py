@@ -143,7 +143,7 @@ def test_predictions_are_averaged_over_geometries() -> None:
     place, beam = flown(5, 600)
     samples, learned = Samples(name="x", place=place, beam=beam, beams=BEAMS), np.arange(600) < 500
     at = geometry.fit(place, beam, learned, BEAMS)
-    doubted = predictors._doubted(samples, learned, at)
+    doubted = predictors._leave_one_out(samples, learned, at)
     assert len(set(doubted)) == 4
     each = [predictors.density(samples, learned, one, 0.5, 5.0) for one in doubted]
     mean = predictors.averaged(samples, learned, doubted, 0.5, 5.0)

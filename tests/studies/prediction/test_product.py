@@ -185,11 +185,11 @@ def test_violations_are_counted_and_what_was_announced_of_them() -> None:
     assert (silent["violations"], silent["announced"]) == (3, 0)
     head = {"predictor": "p", "uav": "1:1", "log": "x", "link": "clean", "lead_s": 0.0}
     assert violations.unannounced([head | found, head | silent]) == 1 + 3
-    said = violations.said([head | found, head | silent])
+    said = violations.notice([head | found, head | silent])
     assert said is not None
     assert "3 of 6, by p on 1:1 of x over the clean link at a lead of 0 s" in said
     kept = violations.counted(*asked_and_given([0.1]), 0)
-    assert violations.said([head | kept]) is None
+    assert violations.notice([head | kept]) is None
 
 
 def test_declared_faults_do_not_count() -> None:

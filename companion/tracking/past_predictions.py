@@ -1,4 +1,4 @@
-"""What predictions were worth, by the reports that came later.
+"""Errors of past predictions, as later reports show them.
 
 Every report shows how far earlier predictions for its time were off. That chooses, for each UAV,
 the way of feeding an acceleration forward that would have predicted its own last reports best, or
@@ -20,11 +20,11 @@ from companion.values import Fix, Vector
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Way:
-    """A way of feeding acceleration forward.
+class AccelerationModel:
+    """A model of the acceleration that is fed forward.
 
-    turns     what is across the velocity turns with it, in the plane, and does not fade; what is
-              along it is left away, as most of it is from before the turn went so far
+    turns     coordinated turn: the lateral acceleration rotates with the velocity and does not
+              decay; the longitudinal part is dropped
     """
 
     window_s: float  # time over which the slope of the reported velocities is taken; 0: none is fed
@@ -33,70 +33,74 @@ class Way:
     turns: bool = False
 
 
-PLAIN: Final = Way(window_s=0.0, fewest=0, fades_s=1.0)
-WAYS: Final = (
-    PLAIN,
-    Way(window_s=1.0, fewest=3, fades_s=3.0),
-    Way(window_s=1.0, fewest=3, fades_s=10.0),
-    Way(window_s=2.5, fewest=3, fades_s=10.0),
-    Way(window_s=5.0, fewest=5, fades_s=3.0),
-    Way(window_s=1.0, fewest=3, fades_s=3.0, turns=True),
-    Way(window_s=2.5, fewest=3, fades_s=3.0, turns=True),
-    Way(window_s=5.0, fewest=5, fades_s=3.0, turns=True),
+CONSTANT_VELOCITY: Final = AccelerationModel(window_s=0.0, fewest=0, fades_s=1.0)
+ACCELERATION_MODELS: Final = (
+    CONSTANT_VELOCITY,
+    AccelerationModel(window_s=1.0, fewest=3, fades_s=3.0),
+    AccelerationModel(window_s=1.0, fewest=3, fades_s=10.0),
+    AccelerationModel(window_s=2.5, fewest=3, fades_s=10.0),
+    AccelerationModel(window_s=5.0, fewest=5, fades_s=3.0),
+    AccelerationModel(window_s=1.0, fewest=3, fades_s=3.0, turns=True),
+    AccelerationModel(window_s=2.5, fewest=3, fades_s=3.0, turns=True),
+    AccelerationModel(window_s=5.0, fewest=5, fades_s=3.0, turns=True),
 )
 """None; a quick turn, soon over or not; one that goes on; a slow one, noisy reports; circles."""
-WINDOWS: Final = sorted({(way.window_s, way.fewest) for way in WAYS if way.window_s})
+WINDOWS: Final = sorted({(way.window_s, way.fewest) for way in ACCELERATION_MODELS if way.window_s})
 """Windows of the ways and the velocities they need, each once, ascending."""
-TURNS_MPS: Final = 1.0  # speed in the plane below which there is no direction that could turn
-SMOOTHED: Final = 0.35  # share of the newest report in a smoothed position
-SMOOTHED_S: Final = 5.0  # gap between reports over which positions are not smoothed
-NOWHERE: Final = (0.0, 0.0, 0.0)
-JUDGED_S: Final = (1.0, 2.0)
+TURNING_MPS: Final = 1.0  # speed in the plane below which there is no direction that could turn
+SMOOTHING_SHARE: Final = 0.35  # share of the newest report in a smoothed position
+SMOOTHING_GAP_S: Final = 5.0  # gap between reports over which positions are not smoothed
+ZERO: Final = (0.0, 0.0, 0.0)
+COMPARED_AGES_S: Final = (1.0, 2.0)
 """Least ages of the predictions by which ways are judged: soon, and as over a slow radio."""
 MEMORY_S: Final = 20.0  # time constant with which what was seen is forgotten
-BETTER: Final = 0.9
+SWITCH_RATIO: Final = 0.9
 """Share of the present way's mean square error that another's must be below to take its place."""
-JUDGED: Final = 4  # least number of judgements before a way other than the plain one is taken
+SWITCH_AFTER: Final = 4  # least number of judgements before a way other than the plain one is taken
 AGES_S: Final = (0.25, 1.0, 2.5)
 """Least ages of the predictions whose errors are kept for the usual error."""
-ERRORS: Final = 200
-USUAL: Final = 0.95
+ERRORS_KEPT: Final = 200
+QUANTILE: Final = 0.95
 """Share of the errors that the usual one is not below: of n the ceil((n + 1) USUAL)-th."""
-FEWEST: Final = 20
+ERRORS_LEAST: Final = 20
 SPACING_S: Final = 0.3  # least time between reports that are judged: more often would say no more
 _KEPT: Final = 64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Made:
-    """What was known at a report: from it predictions by every way can be made again."""
+class _PastPrediction:
+    """State at a report, from which the predictions of all models can be repeated."""
 
     sender_ns: int
     position: Vector
     velocity: Vector
     accelerations: tuple[Vector | None, ...]
-    aside: Vector  # of the smoothed position from the reported one
+    smoothing_offset: Vector  # of the smoothed position from the reported one
 
-    def off_m(self, way: int, there: Vector, ahead_s: float) -> float:
+    def error_m(self, way: int, there: Vector, ahead_s: float) -> float:
         """How far the prediction by a way is from a position reported later.
 
-        The numbers of ways are those of ``WAYS``, and then once more over smoothed positions.
+        Models are numbered as in ``ACCELERATION_MODELS``, then once more over smoothed positions.
         """
-        (reported_m,), (smoothed_m,) = self.offs_m((way % len(WAYS),), there, ahead_s)
-        return reported_m if way < len(WAYS) else smoothed_m
+        (reported_m,), (smoothed_m,) = self.errors_m(
+            (way % len(ACCELERATION_MODELS),), there, ahead_s
+        )
+        return reported_m if way < len(ACCELERATION_MODELS) else smoothed_m
 
-    def offs_m(
+    def errors_m(
         self, ways: Sequence[int], there: Vector, ahead_s: float
     ) -> tuple[list[float], list[float]]:
-        """The same of several of ``WAYS``: over reported positions, and over smoothed ones."""
+        """The errors of several models: over reported positions, and over smoothed ones."""
         (n, e, d), (vn, ve, vd), (tn, te, td) = self.position, self.velocity, there
         n, e, d = n + vn * ahead_s - tn, e + ve * ahead_s - te, d + vd * ahead_s - td
-        aside_n, aside_e, aside_d = self.aside
+        aside_n, aside_e, aside_d = self.smoothing_offset
         reported, smoothed = [], []
         for way in ways:
             given, north, east, down = self.accelerations[way], n, e, d
             if given is not None:
-                (by_n, by_e, by_d), _ = fed(WAYS[way], given, self.velocity, ahead_s)
+                (by_n, by_e, by_d), _ = fed_forward(
+                    ACCELERATION_MODELS[way], given, self.velocity, ahead_s
+                )
                 north, east, down = north + by_n, east + by_e, down + by_d
             reported.append(math.sqrt(north * north + east * east + down * down))
             north, east, down = north + aside_n, east + aside_e, down + aside_d
@@ -108,65 +112,65 @@ class _Made:
 class _Errors:
     """The newest errors of predictions of about one age."""
 
-    in_order: deque[float] = field(default_factory=lambda: deque(maxlen=ERRORS))
+    in_order: deque[float] = field(default_factory=lambda: deque(maxlen=ERRORS_KEPT))
     sorted_m: list[float] = field(default_factory=list)
     age_s: float = 0.0
     judged_ns: int = 0
-    usual_m: float | None = None
+    error_p95_m: float | None = None
 
     def add(self, error_m: float, age_s: float) -> None:
-        if len(self.in_order) == ERRORS:
+        if len(self.in_order) == ERRORS_KEPT:
             self.sorted_m.remove(self.in_order[0])
         self.in_order.append(error_m)
         insort(self.sorted_m, error_m)
         n = len(self.sorted_m)
         self.age_s += (age_s - self.age_s) / min(n, 20)
-        if n >= FEWEST:  # split-conformal
-            self.usual_m = self.sorted_m[min(math.ceil((n + 1) * USUAL), n) - 1]
+        if n >= ERRORS_LEAST:  # split-conformal
+            self.error_p95_m = self.sorted_m[min(math.ceil((n + 1) * QUANTILE), n) - 1]
 
 
-class Hindsight:
+class PastPredictions:
     """The past predictions of one UAV. ``add`` takes its reports in order of the sender's time."""
 
     def __init__(self) -> None:
-        self._made: deque[_Made] = deque(maxlen=_KEPT)
-        self._costs = [0.0] * (2 * len(WAYS))
-        self._judged = 0
-        self._judged_ns = 0
-        self._way = 0
+        self._made: deque[_PastPrediction] = deque(maxlen=_KEPT)
+        self._costs = [0.0] * (2 * len(ACCELERATION_MODELS))
+        self._comparisons = 0
+        self._compared_ns = 0
+        self._model = 0
         self._errors = tuple(_Errors() for _ in AGES_S)
         self._smoothed: tuple[int, Vector, Vector] | None = None  # when, the place, the velocity
-        self._aside: Vector = NOWHERE
+        self._smoothing_offset: Vector = ZERO
 
     @property
-    def way(self) -> Way:
-        """The way of feeding forward that is in use."""
-        return WAYS[self._way % len(WAYS)]
+    def model(self) -> AccelerationModel:
+        """The acceleration model in use."""
+        return ACCELERATION_MODELS[self._model % len(ACCELERATION_MODELS)]
 
     @property
-    def aside(self) -> Vector:
-        """Where the UAV is taken to be, from its newest reported position; m, local frame."""
-        return self._aside if self._way >= len(WAYS) else NOWHERE
+    def smoothing_offset(self) -> Vector:
+        """Offset of the position used from the newest reported one; m, local frame."""
+        return self._smoothing_offset if self._model >= len(ACCELERATION_MODELS) else ZERO
 
     def smooth(self, fix: Fix) -> None:
         """Take the newest report into the smoothed position: every one, before ``add``."""
         before, velocity = self._smoothed, fix.velocity_ned_mps
-        self._smoothed, self._aside = None, NOWHERE
+        self._smoothed, self._smoothing_offset = None, ZERO
         if velocity is None:
             return
         place = fix.position_ned_m
         if before is not None:
             then_ns, (n, e, d), (v_n, v_e, v_d) = before
             dt_s = (fix.sender_ns - then_ns) * 1e-9
-            if 0 < dt_s <= SMOOTHED_S:
+            if 0 < dt_s <= SMOOTHING_GAP_S:
                 (z_n, z_e, z_d), (w_n, w_e, w_d) = place, velocity
-                half, rest = dt_s / 2.0, 1.0 - SMOOTHED
-                self._aside = (
+                half, rest = dt_s / 2.0, 1.0 - SMOOTHING_SHARE
+                self._smoothing_offset = (
                     rest * (n + half * (v_n + w_n) - z_n),
                     rest * (e + half * (v_e + w_e) - z_e),
                     rest * (d + half * (v_d + w_d) - z_d),
                 )
-                aside = self._aside
+                aside = self._smoothing_offset
                 place = (z_n + aside[0], z_e + aside[1], z_d + aside[2])
         self._smoothed = (fix.sender_ns, place, velocity)
 
@@ -177,29 +181,29 @@ class Hindsight:
     def add(self, fix: Fix, accelerations: tuple[Vector | None, ...]) -> None:
         """Judge earlier predictions by a report; remember what can be predicted from it.
 
-        ``accelerations``: what each of ``WAYS`` would feed forward from this report, m/s².
+        ``accelerations``: what each model would feed forward from this report, m/s².
         """
         there = fix.position_ned_m
-        self._judge(fix.sender_ns, there)
+        self._compare(fix.sender_ns, there)
         for errors, least_s in zip(self._errors, AGES_S, strict=True):
             made = self._older(fix.sender_ns, least_s)
             if made is not None and made.sender_ns > errors.judged_ns:
                 errors.judged_ns = made.sender_ns
                 age_s = (fix.sender_ns - made.sender_ns) * 1e-9
-                errors.add(made.off_m(self._way, there, age_s), age_s)
+                errors.add(made.error_m(self._model, there, age_s), age_s)
         if fix.velocity_ned_mps is not None:
-            velocity, aside = fix.velocity_ned_mps, self._aside
+            velocity, aside = fix.velocity_ned_mps, self._smoothing_offset
             self._made.append(
-                _Made(
+                _PastPrediction(
                     sender_ns=fix.sender_ns,
                     position=there,
                     velocity=velocity,
                     accelerations=accelerations,
-                    aside=aside,
+                    smoothing_offset=aside,
                 )
             )
 
-    def _older(self, sender_ns: int, least_s: float) -> _Made | None:
+    def _older(self, sender_ns: int, least_s: float) -> _PastPrediction | None:
         """The newest of what is remembered that is at least so old, and not twice as old."""
         newest_ns = sender_ns - round(least_s * 1e9)
         for made in reversed(self._made):
@@ -208,32 +212,34 @@ class Hindsight:
                 return made if age_s < 2.0 * least_s + 2.0 else None
         return None
 
-    def _judge(self, sender_ns: int, there: Vector) -> None:
-        made = self._older(sender_ns, JUDGED_S[0])
-        if made is None or made.sender_ns <= self._judged_ns:
+    def _compare(self, sender_ns: int, there: Vector) -> None:
+        made = self._older(sender_ns, COMPARED_AGES_S[0])
+        if made is None or made.sender_ns <= self._compared_ns:
             return
-        memory = math.exp(-(made.sender_ns - self._judged_ns) * 1e-9 / MEMORY_S)
-        self._judged_ns = made.sender_ns
+        memory = math.exp(-(made.sender_ns - self._compared_ns) * 1e-9 / MEMORY_S)
+        self._compared_ns = made.sender_ns
         self._costs = [memory * cost for cost in self._costs]
-        for one in (made, self._older(sender_ns, JUDGED_S[1])):
+        for one in (made, self._older(sender_ns, COMPARED_AGES_S[1])):
             if one is not None:
                 ahead_s = (sender_ns - one.sender_ns) * 1e-9
-                off_m = chain(*one.offs_m(range(len(WAYS)), there, ahead_s))
+                off_m = chain(*one.errors_m(range(len(ACCELERATION_MODELS)), there, ahead_s))
                 self._costs = [c + m * m for c, m in zip(self._costs, off_m, strict=True)]
-        self._judged += 1
-        if self._judged < JUDGED:
+        self._comparisons += 1
+        if self._comparisons < SWITCH_AFTER:
             return
         best = min(range(len(self._costs)), key=self._costs.__getitem__)
-        if self._costs[best] < BETTER * self._costs[self._way]:
-            self._way = best
+        if self._costs[best] < SWITCH_RATIO * self._costs[self._model]:
+            self._model = best
 
-    def usual_m(self, age_s: float) -> float | None:
+    def error_p95_m(self, age_s: float) -> float | None:
         """The error that 95 of 100 predictions of this age stay below, as reports have shown.
 
         Between the ages seen it is interpolated, beyond them carried on with the square of the age.
         None before there are enough.
         """
-        known = [(one.age_s, one.usual_m) for one in self._errors if one.usual_m is not None]
+        known = [
+            (one.age_s, one.error_p95_m) for one in self._errors if one.error_p95_m is not None
+        ]
         if not known:
             return None
         first_s, first_m = known[0]
@@ -246,16 +252,18 @@ class Hindsight:
         return last_m * (age_s / last_s) ** 2
 
 
-def fed(way: Way, acceleration: Vector, velocity: Vector, ahead_s: float) -> tuple[Vector, Vector]:
-    """What an acceleration adds to straight flight within a time: metres, and metres per second.
+def fed_forward(
+    way: AccelerationModel, acceleration: Vector, velocity: Vector, ahead_s: float
+) -> tuple[Vector, Vector]:
+    """Displacement (m) and change of velocity (m/s) that an acceleration causes within a time.
 
     A turn in the plane at the rate w = (v x a) / v^2 turns the velocity by w t, and the way is the
     integral of that (docs/math.md 5.1).
     """
-    way_s2, gain_s = fading(ahead_s, way.fades_s)
+    way_s2, gain_s = fading_response(ahead_s, way.fades_s)
     (a, b, c), (north, east, _) = acceleration, velocity
     level = north * north + east * east
-    if not way.turns or level < TURNS_MPS**2:
+    if not way.turns or level < TURNING_MPS**2:
         return (way_s2 * a, way_s2 * b, way_s2 * c), (gain_s * a, gain_s * b, gain_s * c)
     rate = (north * b - east * a) / level
     angle = min(max(rate * ahead_s, -math.pi), math.pi)
@@ -269,7 +277,7 @@ def fed(way: Way, acceleration: Vector, velocity: Vector, ahead_s: float) -> tup
     )
 
 
-def fading(ahead_s: float, fades_s: float) -> tuple[float, float]:
+def fading_response(ahead_s: float, fades_s: float) -> tuple[float, float]:
     """Displacement (s²) and gain in speed (s) by a fading acceleration of 1 within a time.
 
     s(τ) of docs/math.md 5.1, and its derivative.

@@ -20,7 +20,7 @@ from companion.values import Fix, Refuted, ReportNoise
 WITHIN_NS: Final = 5_000_000_000  # time within which positions are compared
 APART_NS: Final = 500_000_000
 """Longest time between two reports over which the way is known from their velocities."""
-STRAYS_M: Final = 0.4
+GOOD_DEVIATION_M: Final = 0.4
 """What good receivers' positions stray, whatever they state: velocities err, too."""
 UNSEEN: Final = 0.5
 """Multiple of the root of the sum of squares of what may be flown unseen between the reports.
@@ -29,13 +29,13 @@ It is hardly ever the most that the aircraft can do.
 """
 COMMON_ERROR: Final = 0.07
 """Share of the noise bound that is usual in all reports alike, which none of them shows."""
-STRAYED_ERROR: Final = 0.82
+COMMON_ERROR_REFUTED: Final = 0.82
 """The same of a receiver that strays: 95 of 100 lie within 2.45 deviations in the plane, of 3."""
-AGAIN: Final = 1.25  # multiple of what was seen last from which it is told again
+NOTICE_RATIO: Final = 1.25  # multiple of what was seen last from which it is told again
 
 
-class Straying:
-    """The reports of one UAV, beside the way of their velocities. ``look`` takes the newest.
+class ReceiverCheck:
+    """Compares the positions of one UAV with its velocities. ``look`` takes the newest report.
 
     ``settings`` are those by which the bounds on their noise were made.
     """
@@ -45,7 +45,7 @@ class Straying:
         # Sender time, off the way north and east in m, sum of squares of what was unseen till then.
         self._seen: deque[tuple[int, float, float, float]] = deque()
         self._newest: Fix | None = None
-        self._strayed_m = 0.0
+        self._deviation_m = 0.0
 
     def look(self, fix: Fix, acceleration_mps2: float) -> Refuted | None:
         """Take in a report. Returns what it says against its receiver, if that is news.
@@ -64,16 +64,19 @@ class Straying:
             return None
         stated_m = fix.noise.horizontal_m / factor
         lag_m = 2.0 * fix.noise.time_s * math.hypot(*velocity)
-        north_m, east_m, unseen_m = _aside(before, fix, acceleration_mps2)
+        north_m, east_m, unseen_m = _step_deviation(before, fix, acceleration_mps2)
         if math.hypot(north_m, east_m) > 2.0 * fix.noise.horizontal_m + lag_m + unseen_m:
             self._begin(fix)  # a leap, which the gate judges
             return None
-        strayed_m, unseen_m = self._strays(fix.sender_ns, north_m, east_m, unseen_m)
-        if strayed_m <= max(STRAYS_M, math.sqrt(2.0) * stated_m) + lag_m + UNSEEN * unseen_m:
+        strayed_m, unseen_m = self._deviation(fix.sender_ns, north_m, east_m, unseen_m)
+        if (
+            strayed_m
+            <= max(GOOD_DEVIATION_M, math.sqrt(2.0) * stated_m) + lag_m + UNSEEN * unseen_m
+        ):
             return None
-        if strayed_m <= AGAIN * self._strayed_m:
+        if strayed_m <= NOTICE_RATIO * self._deviation_m:
             return None
-        self._strayed_m = strayed_m
+        self._deviation_m = strayed_m
         to_m = self.noise(fix.noise).horizontal_m
         name = "observer.follow_accuracy"
         return Refuted(
@@ -89,11 +92,13 @@ class Straying:
         self._seen.clear()
         self._seen.append((fix.sender_ns, 0.0, 0.0, 0.0))
 
-    def _strays(
+    def _deviation(
         self, sender_ns: int, north_m: float, east_m: float, unseen_m: float
     ) -> tuple[float, float]:
-        """How far the newest position is off the way from the one some seconds before, in metres;
-        and how far that way may be another one. Takes what ``_aside`` says of the newest."""
+        """Deviation over the last seconds, and what may have been flown unseen; metres.
+
+        The arguments are what ``_step_deviation`` returns for the newest report.
+        """
         seen = self._seen
         _, north, east, unseen_m2 = seen[-1]
         seen.append((sender_ns, north + north_m, east + east_m, unseen_m2 + unseen_m**2))
@@ -108,27 +113,27 @@ class Straying:
     def noise(self, stated: ReportNoise) -> ReportNoise:
         """The bounds on a report's noise, by what its receiver states and what was seen of it."""
         factor = self._settings.factor
-        if not self._strayed_m or factor is None:
+        if not self._deviation_m or factor is None:
             return stated
-        level_m = max(self._settings.default.horizontal_m, factor * self._strayed_m)
+        level_m = max(self._settings.default.horizontal_m, factor * self._deviation_m)
         if level_m <= stated.horizontal_m:
             return stated
         return replace(
             stated, horizontal_m=level_m, position_m=math.hypot(level_m, stated.vertical_m)
         )
 
-    def usual_m(self, noise: ReportNoise) -> float:
+    def common_error_m(self, noise: ReportNoise) -> float:
         """What positions usually err by alike, so that reports do not show it."""
-        if self._strayed_m:
-            return STRAYED_ERROR * noise.horizontal_m
+        if self._deviation_m:
+            return COMMON_ERROR_REFUTED * noise.horizontal_m
         return min(noise.apart_m, noise.vertical_m) or COMMON_ERROR * noise.position_m
 
 
-def _aside(before: Fix, fix: Fix, acceleration_mps2: float) -> tuple[float, float, float]:
-    """How far a position is off the way from the one before it, north and east in metres; and how
-    far that way may be another one, since no velocity is known between two reports.
+def _step_deviation(before: Fix, fix: Fix, acceleration_mps2: float) -> tuple[float, float, float]:
+    """Deviation of a position from dead reckoning by the velocities, north and east, metres.
 
-    In the plane: heights come from a barometer.
+    The third value bounds what may have been flown unseen between the two reports. In the plane
+    alone: heights come from a barometer.
     """
     assert before.velocity_ned_mps is not None and fix.velocity_ned_mps is not None
     half_s = (fix.sender_ns - before.sender_ns) * 0.5e-9

@@ -12,11 +12,11 @@ from typing import Final
 
 from companion.mavlink.links.kernel_time import since_boot_ns
 
-HELD_UP_NS: Final = 2_500_000_000  # time without a look beyond which what waits is stale
+STALE_NS: Final = 2_500_000_000  # time without a look beyond which what waits is stale
 LOOK_S: Final = 0.5  # time between two looks
 
 
-class HeldUp:
+class StaleBytes:
     """Tells which bytes of a stream are stale, from ``watch`` until ``close``; for a descriptor."""
 
     def __init__(self, descriptor: int) -> None:
@@ -38,7 +38,7 @@ class HeldUp:
     def stale(self, data: bytes) -> int:
         """How many of the bytes that were read just now, from their first, are stale."""
         before_ns, self._seen_ns = self._seen_ns, since_boot_ns()
-        if self._seen_ns - before_ns > HELD_UP_NS:
+        if self._seen_ns - before_ns > STALE_NS:
             self._stale_bytes = len(data) + _unread(self._descriptor)
         stale = min(self._stale_bytes, len(data))
         self._stale_bytes -= stale

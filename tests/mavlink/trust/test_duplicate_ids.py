@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.mavlink.trust import twins
-from companion.mavlink.trust.twins import KEPT_NS, Twins
+from companion.mavlink.trust import duplicate_ids
+from companion.mavlink.trust.duplicate_ids import KEPT_NS, DuplicateIds
 from companion.mavlink.wire.encode import Outgoing, pack
 from companion.mavlink.wire.framing import Splitter
 from companion.mavlink.wire.positions import GLOBAL_POSITION_INT, OwnPosition
@@ -61,11 +61,11 @@ Stream = Iterable[tuple[float, float, str, Place]]
 """When it arrives, what its clock says, who brings it, where it says to be."""
 
 
-def refused(judge: Twins, *streams: Stream) -> dict[str, list[float]]:
+def refused(judge: DuplicateIds, *streams: Stream) -> dict[str, list[float]]:
     """When something of each peer was refused, of streams that come together."""
     found: dict[str, list[float]] = {HOME: [], OTHER: []}
     for arrives_s, boot_s, peer, place in sorted(one for stream in streams for one in stream):
-        if judge.refuses(LINK, peer, report(round(arrives_s * S), boot_s, place)):
+        if judge.rejects(LINK, peer, report(round(arrives_s * S), boot_s, place)):
             found[peer].append(arrives_s)
     return found
 
@@ -92,10 +92,10 @@ def beside(metres: float) -> Callable[[float], Place]:
 
 
 def test_the_same_reports_over_two_routes_are_of_one(delays: random.Random) -> None:
-    judge = Twins()
+    judge = DuplicateIds()
     slow = heard(OTHER, 10, delay_s=lambda: 0.3 + 2 * delays.random())
     assert refused(judge, heard(HOME, 10), slow) == {HOME: [], OTHER: []}
-    assert judge.told == []
+    assert judge.found == []
 
 
 @pytest.fixture
@@ -105,13 +105,13 @@ def delays() -> random.Random:
 
 @pytest.mark.parametrize("hz", [1, 2.5, 10, 50])
 def test_a_second_port_has_stamps_of_its_own(hz: float) -> None:
-    judge = Twins()
+    judge = DuplicateIds()
     found = refused(judge, heard(HOME, 4, begins_s=0.01), heard(OTHER, hz, begins_s=0.137))
     assert found == {HOME: [], OTHER: []}
 
 
 def test_a_radio_that_starts_again_has_another_address() -> None:
-    judge = Twins()
+    judge = DuplicateIds()
     found = refused(judge, heard(HOME, 10, lasts_s=20), heard(OTHER, 10, lasts_s=60, begins_s=20.1))
     assert found == {HOME: [], OTHER: []}
 
@@ -120,7 +120,7 @@ def test_a_position_that_is_reset_now_and_then_is_no_second_vehicle() -> None:
     def glitches(t_s: float) -> Place:
         return beside(30.0 if t_s % 20 > 10 else 0.0)(t_s)
 
-    judge = Twins()
+    judge = DuplicateIds()
     both = heard(HOME, 4, told=glitches), heard(OTHER, 5, told=glitches)
     assert refused(judge, *both) == {HOME: [], OTHER: []}
 
@@ -129,7 +129,7 @@ def test_a_restart_is_no_second_vehicle() -> None:
     def again(stream: Stream) -> Stream:
         return ((at + 61, boot - 99, peer, beside(500)(at)) for at, boot, peer, _ in stream)
 
-    judge = Twins()
+    judge = DuplicateIds()
     slow = heard(OTHER, 5, delay_s=lambda: 2.0)
     both = heard(HOME, 4), slow, again(heard(HOME, 4)), again(heard(OTHER, 5))
     assert refused(judge, *both) == {HOME: [], OTHER: []}
@@ -141,40 +141,40 @@ def test_a_restart_is_no_second_vehicle() -> None:
 @pytest.mark.parametrize("forged_hz", [1, 4, 20])
 @pytest.mark.parametrize("metres", [8.0, -8.0, 30.0])
 def test_who_copies_the_clock_and_stays_near_is_found(forged_hz: float, metres: float) -> None:
-    judge = Twins()
+    judge = DuplicateIds()
     forged = heard(OTHER, forged_hz, begins_s=10.03, told=beside(metres))
     found = refused(judge, heard(HOME, 4), forged)
     for peer in (HOME, OTHER):
         assert 12 < found[peer][0] < 17, "from then on neither is believed"
         assert found[peer][-1] > 58
-    assert judge.told == [("1:1", (HOME, OTHER))]
+    assert judge.found == [("1:1", (HOME, OTHER))]
 
 
 def test_a_velocity_that_is_none_is_found_too() -> None:
     def drifts(t_s: float) -> Place:
         return circle(t_s)._replace(east_mps=circle(t_s).east_mps + 10)
 
-    judge = Twins()
+    judge = DuplicateIds()
     assert refused(judge, heard(HOME, 4), heard(OTHER, 4, begins_s=10.1, told=drifts))[OTHER]
 
 
 def test_stamps_ahead_and_stamps_behind_are_held_against_the_path() -> None:
     for delay_s in (0.0, 1.5):
-        judge = Twins()
+        judge = DuplicateIds()
         late = heard(OTHER, 5, told=beside(10), delay_s=lambda by_s=delay_s: by_s)
         assert refused(judge, heard(HOME, 5, delay_s=lambda: 0.7), late)[OTHER]
 
 
 @pytest.mark.parametrize("named", [HOME, "10.0.0.1"])
 def test_a_named_router_is_believed_and_the_other_is_not(named: str) -> None:
-    judge = Twins([named])
+    judge = DuplicateIds([named])
     found = refused(judge, heard(HOME, 4), heard(OTHER, 4, begins_s=10.1, told=beside(20)))
     assert found[HOME] == []
     assert len(found[OTHER]) > 150
 
 
 def test_of_a_named_link_all_are_believed() -> None:
-    judge = Twins([LINK])
+    judge = DuplicateIds([LINK])
     found = refused(judge, heard(HOME, 4), heard(OTHER, 4, begins_s=10.1, told=beside(20)))
     assert found == {HOME: [], OTHER: []}
 
@@ -183,28 +183,28 @@ def test_who_agree_again_are_believed_again_and_a_second_time_is_told() -> None:
     def two_visits(t_s: float) -> bool:
         return 10 < t_s < 20 or 60 < t_s < 70
 
-    judge = Twins()
+    judge = DuplicateIds()
     visits = (one for one in heard(OTHER, 4, lasts_s=110, told=beside(20)) if two_visits(one[0]))
     found = refused(judge, heard(HOME, 4, lasts_s=120), visits)
     assert not [t_s for t_s in found[HOME] if 51 < t_s < 60 or t_s > 101]
-    assert len(judge.told) == 2
+    assert len(judge.found) == 2
 
 
 # --- bounds ---------------------------------------------------------------------------------------
 
 
 def test_ids_and_addresses_without_end_take_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(twins, "SENDERS_MAX", 8)
-    judge = Twins()
+    monkeypatch.setattr(duplicate_ids, "SENDERS_MAX", 8)
+    judge = DuplicateIds()
     for number in range(200):
         peer, sysid = f"10.0.0.9:{number}", number % 100 + 1
-        judge.refuses(LINK, peer, report(number, number, circle(0), sysid))
-        judge.refuses(LINK, peer, report(number, number, circle(0)))
+        judge.rejects(LINK, peer, report(number, number, circle(0), sysid))
+        judge.rejects(LINK, peer, report(number, number, circle(0)))
     assert len(judge._senders) == 8
-    assert max(len(sender.paths) for sender in judge._senders.values()) <= twins.PEERS_MAX
+    assert max(len(sender.paths) for sender in judge._senders.values()) <= duplicate_ids.PEERS_MAX
     assert judge._senders.keys() == {(number, 1) for number in range(1, 9)}
     later_ns = 200 + KEPT_NS
-    judge.refuses(LINK, HOME, report(later_ns, 1, circle(0), 99))
+    judge.rejects(LINK, HOME, report(later_ns, 1, circle(0), 99))
     assert (99, 1) in judge._senders
 
 
@@ -233,5 +233,5 @@ def test_what_is_held_against_what_is_found_from_the_newest_on(
     first, last = said(boot_ms), said(boot_ms + later_ms)
     around = [one for one in pairwise(reports) if one[0].boot_ms <= boot_ms <= one[1].boot_ms]
     within = [one for one in reports if first.boot_ms <= one.boot_ms <= last.boot_ms]
-    assert list(twins._around(reports, boot_ms)) == around[::-1]
-    assert list(twins._within(reports, first, last)) == within[::-1]
+    assert list(duplicate_ids._around(reports, boot_ms)) == around[::-1]
+    assert list(duplicate_ids._within(reports, first, last)) == within[::-1]

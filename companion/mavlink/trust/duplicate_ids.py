@@ -57,27 +57,27 @@ class _Path:
 
 @dataclass(slots=True, kw_only=True)
 class _SenderPaths:
-    """A sender by its peers, and when they contradicted each other; ``told`` while it is known."""
+    """A sender by its peers, and when they contradicted each other."""
 
     heard_ns: int
     paths: dict[str, _Path] = field(default_factory=dict)
     contradicted_ns: deque[int] = field(default_factory=lambda: deque(maxlen=CONTRADICTIONS))
-    told: bool = False
+    is_reported: bool = False
 
 
-class Twins:
-    """Judges the frames of all links by who brought them.
+class DuplicateIds:
+    """Finds two senders under one id, by the peers that bring their frames.
 
     ``routers`` names peers that are believed: a link as in the settings, HOST or HOST:PORT.
-    ``told`` holds what is new for the operator: a source's id, and the peers that bring it.
+    ``found`` holds the ids found since it was last emptied, and the peers that bring them.
     """
 
     def __init__(self, routers: Collection[str] = ()) -> None:
-        self.told: list[tuple[str, tuple[str, ...]]] = []
+        self.found: list[tuple[str, tuple[str, ...]]] = []
         self._routers = frozenset(routers)
         self._senders: dict[tuple[int, int], _SenderPaths] = {}
 
-    def refuses(self, link: str, peer: str, frame: Frame) -> bool:
+    def rejects(self, link: str, peer: str, frame: Frame) -> bool:
         """Take in a frame of ``decode.POSE``. Returns whether it is not to be believed.
 
         ``link`` is the link as it stands in the settings, ``peer`` the peer's HOST:PORT, or the
@@ -149,12 +149,12 @@ class Twins:
         when = sender.contradicted_ns
         while when and frame.t_ns - when[0] > KEPT_NS:
             when.popleft()
-        if sender.told:
-            sender.told = bool(when)
+        if sender.is_reported:
+            sender.is_reported = bool(when)
         elif len(when) >= CONTRADICTIONS:
-            sender.told = True
-            self.told.append((str(frame.source), tuple(sender.paths)))
-        return sender.told
+            sender.is_reported = True
+            self.found.append((str(frame.source), tuple(sender.paths)))
+        return sender.is_reported
 
 
 def _around(reports: deque[OwnPosition], boot_ms: int) -> Iterator[tuple[OwnPosition, OwnPosition]]:

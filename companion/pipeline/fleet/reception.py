@@ -1,9 +1,9 @@
-"""What this node hears itself, and what it takes from others: its own ears first.
+"""Frames that this node receives itself, and those that it takes from others: its own first.
 
 A report that another node heard is used only of a vehicle that is silent here: one that sends
 wrong reports in a vehicle's name can then do nothing to those whom this node hears. What is told of
-a vehicle that is heard here is held against what is heard (``mavlink/trust/twins.py``); what was
-missed here is taken up when the vehicle falls silent.
+a vehicle that is heard here is compared with that (``mavlink/trust/duplicate_ids.py``); what
+was missed here is taken up when the vehicle falls silent.
 """
 
 from collections import OrderedDict, deque
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from companion.mavlink.trust.dedupe import content
-from companion.mavlink.trust.twins import Twins
+from companion.mavlink.trust.duplicate_ids import DuplicateIds
 from companion.mavlink.wire.decode import GPS_RAW_INT, HEARTBEAT
 from companion.mavlink.wire.framing import MAGIC_V2, SHORTEST, examine
 from companion.mavlink.wire.positions import OWN
@@ -26,7 +26,7 @@ SILENT_INTERVALS: Final = 2.5
 SILENT_NS: Final = (200_000_000, 2_000_000_000)  # least and greatest time for that
 MISSED: Final = 64  # reports kept of each vehicle that were told by others and not heard here
 VEHICLES_MAX: Final = 4096
-"""Vehicles followed; one more is followed by nobody's ears, and its reports are taken as told."""
+"""Vehicles followed; reports of any other are taken from other nodes as they come."""
 FUTURE_NS: Final = 1_000_000
 """By how much a frame may have been heard after now, by all that is known of the clocks."""
 HERE: Final = "here"
@@ -52,8 +52,8 @@ class RecentFrames:
 
 
 @dataclass(slots=True)
-class _Ears:
-    """A vehicle as it is heard here: when last, at what interval, and what others told beside."""
+class _VehicleReception:
+    """Reception of one vehicle: time of the last report, interval, and what other nodes shared."""
 
     heard_ns: int
     interval_ns: float = 0.0
@@ -66,8 +66,8 @@ class _Ears:
         return now_ns - self.heard_ns > wait_ns
 
 
-class Hearing:
-    """What was heard here, and what of the others' frames the pipeline is to have.
+class Reception:
+    """Frames received here, and which of the others' frames the pipeline is to have.
 
     ``contradicted`` and ``early`` hold names of nodes whose frames contradicted what is heard here
     or another node, or came before they can have been heard; whoever reads them empties them.
@@ -81,31 +81,31 @@ class Hearing:
         self.early: list[str] = []
         self.behind_ns = 0
         self._heard = RecentFrames()
-        self._told = RecentFrames()
-        self._ears: dict[Source, _Ears] = {}
-        self._twins = Twins({HERE})
+        self._shared = RecentFrames()
+        self._vehicles: dict[Source, _VehicleReception] = {}
+        self._duplicate_ids = DuplicateIds({HERE})
 
-    def heard(self, frame: Frame) -> bytes:
+    def take_received(self, frame: Frame) -> bytes:
         """Take in a frame heard here, of a message in ``SHARED``. Returns its content."""
         key = content(frame.raw)
         if frame.msgid not in OWN:
             return key
         self._heard.note(frame.t_ns, key)
-        self._twins.refuses(HERE, HERE, frame)
-        self._twins.told.clear()  # ``contradicted`` says it, of the nodes
-        ears = self._ears.get(frame.source)
-        if ears is None:
-            if len(self._ears) < VEHICLES_MAX:
-                self._ears[frame.source] = _Ears(frame.t_ns)
+        self._duplicate_ids.rejects(HERE, HERE, frame)
+        self._duplicate_ids.found.clear()  # ``contradicted`` says it, of the nodes
+        vehicle = self._vehicles.get(frame.source)
+        if vehicle is None:
+            if len(self._vehicles) < VEHICLES_MAX:
+                self._vehicles[frame.source] = _VehicleReception(frame.t_ns)
             return key
-        gap_ns = frame.t_ns - ears.heard_ns
+        gap_ns = frame.t_ns - vehicle.heard_ns
         if gap_ns > 0:
-            usual_ns = ears.interval_ns
-            ears.interval_ns = gap_ns if not usual_ns else usual_ns + 0.2 * (gap_ns - usual_ns)
-            ears.heard_ns = frame.t_ns
+            usual_ns = vehicle.interval_ns
+            vehicle.interval_ns = gap_ns if not usual_ns else usual_ns + 0.2 * (gap_ns - usual_ns)
+            vehicle.heard_ns = frame.t_ns
         return key
 
-    def placed(
+    def to_own_timeline(
         self, now_ns: int, node: str, clock: NeighbourClock, shared: SharedFrame
     ) -> Frame | None:
         """A frame that another node heard, with its arrival there on this node's timeline.
@@ -113,7 +113,7 @@ class Hearing:
         None for one that is damaged, that is of no message in ``SHARED``, or that cannot be placed.
         """
         raw = shared.raw
-        ahead = clock.ahead(shared.heard_ns)
+        ahead = clock.offset(shared.heard_ns)
         if ahead is None or len(raw) < SHORTEST or examine(raw, 0, len(raw)) != len(raw):
             return None
         if raw[0] == MAGIC_V2:
@@ -136,41 +136,41 @@ class Hearing:
             doubt_ns=t_ns - least_ns,
         )
 
-    def was_told(self, key: bytes) -> bool:
+    def was_shared(self, key: bytes) -> bool:
         """Whether a report of this content was told by another node of late."""
-        return key in self._told
+        return key in self._shared
 
-    def told(self, now_ns: int, node: str, frame: Frame, key: bytes) -> list[Frame]:
+    def take_shared(self, now_ns: int, node: str, frame: Frame, key: bytes) -> list[Frame]:
         """What the pipeline is to have, now that another node told a frame; mostly nothing."""
         if frame.msgid in OWN:
             return self._report(now_ns, node, frame, key)
-        ears = self._ears.get(frame.source)
-        return [frame] if ears is None or ears.is_silent(now_ns - self.behind_ns) else []
+        vehicle = self._vehicles.get(frame.source)
+        return [frame] if vehicle is None or vehicle.is_silent(now_ns - self.behind_ns) else []
 
     def _report(self, now_ns: int, node: str, frame: Frame, key: bytes) -> list[Frame]:
-        is_new = self._told.note(now_ns, key)
+        is_new = self._shared.note(now_ns, key)
         if key in self._heard or not is_new:
             return []
-        is_refused = self._twins.refuses(node, node, frame)
-        self._twins.told.clear()
+        is_refused = self._duplicate_ids.rejects(node, node, frame)
+        self._duplicate_ids.found.clear()
         if is_refused:
             self.contradicted.append(node)
             return []
-        ears = self._ears.get(frame.source)
-        if ears is None:
+        vehicle = self._vehicles.get(frame.source)
+        if vehicle is None:
             return [frame]
-        ears.missed.append(frame)
-        if not ears.is_silent(now_ns - self.behind_ns):
+        vehicle.missed.append(frame)
+        if not vehicle.is_silent(now_ns - self.behind_ns):
             return []
-        missed = [one for one in ears.missed if one.t_ns > ears.heard_ns]
-        ears.missed.clear()
+        missed = [one for one in vehicle.missed if one.t_ns > vehicle.heard_ns]
+        vehicle.missed.clear()
         return missed
 
     def silent_s(self, uav: str, now_ns: int) -> float | None:
         """How long ago a vehicle was heard here; None: never."""
-        ears = self._ears.get(Source.parse(uav))
-        return None if ears is None else (now_ns - ears.heard_ns) * 1e-9
+        vehicle = self._vehicles.get(Source.parse(uav))
+        return None if vehicle is None else (now_ns - vehicle.heard_ns) * 1e-9
 
     def forget(self, now_ns: int, after_ns: int) -> None:
         """Forget vehicles that were not heard here for so long."""
-        self._ears = {k: v for k, v in self._ears.items() if now_ns - v.heard_ns < after_ns}
+        self._vehicles = {k: v for k, v in self._vehicles.items() if now_ns - v.heard_ns < after_ns}

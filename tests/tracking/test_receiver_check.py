@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from companion.tracking.noise import NoiseSettings
-from companion.tracking.straying import STRAYS_M, Straying
+from companion.tracking.receiver_check import GOOD_DEVIATION_M, ReceiverCheck
 from companion.values import Fix, FloatArray, Refuted, ReportNoise
 
 S = 1_000_000_000
@@ -32,7 +32,7 @@ def flown(
         yield fix(round(t_s * S), place + off, velocity, noise=noise)
 
 
-def told(straying: Straying, fixes: Iterator[Fix]) -> list[tuple[float, Refuted]]:
+def told(straying: ReceiverCheck, fixes: Iterator[Fix]) -> list[tuple[float, Refuted]]:
     looked = ((one.sender_ns / S, straying.look(one, ACCELERATION_MPS2)) for one in fixes)
     return [(at_s, found) for at_s, found in looked if found is not None]
 
@@ -42,39 +42,39 @@ def wave(size_m: float, period_s: float) -> Wander:
 
 
 def test_a_good_receiver_is_believed(fix: MakeFix) -> None:
-    straying = Straying(SETTINGS)
+    straying = ReceiverCheck(SETTINGS)
     rng = np.random.default_rng(1)
     noisy = flown(fix, lambda _t: tuple((0.05 * rng.standard_normal(2)).tolist()))
     assert told(straying, noisy) == []
     assert straying.noise(STATED) is STATED
-    assert straying.usual_m(STATED) == pytest.approx(0.07 * STATED.position_m)
+    assert straying.common_error_m(STATED) == pytest.approx(0.07 * STATED.position_m)
 
 
 def test_one_that_is_off_for_good_cannot_be_seen(fix: MakeFix) -> None:
-    assert told(Straying(SETTINGS), flown(fix, lambda _t: (5.0, 5.0))) == []
+    assert told(ReceiverCheck(SETTINGS), flown(fix, lambda _t: (5.0, 5.0))) == []
 
 
 @pytest.mark.parametrize("size_m", [0.8, 1.6, 3.2])
 def test_one_that_wanders_is_found_while_the_bound_still_holds(fix: MakeFix, size_m: float) -> None:
     """It is told soon, in few words, and what is assumed then holds what it is off by."""
-    straying, wander = Straying(SETTINGS), wave(size_m, 15)
+    straying, wander = ReceiverCheck(SETTINGS), wave(size_m, 15)
     found = told(straying, flown(fix, wander))
     assert 1 <= len(found) <= 12
     first_s, first = found[0]
     assert math.hypot(*wander(first_s)) < STATED.position_m
     assert first.setting == "observer.follow_accuracy"
     assert first.limit == pytest.approx(0.3)
-    assert first.proven > STRAYS_M
+    assert first.proven > GOOD_DEVIATION_M
     raised = straying.noise(STATED)
     assert raised.horizontal_m >= max(DEFAULT.horizontal_m, size_m)
     assert raised.position_m == pytest.approx(math.hypot(raised.horizontal_m, 0.9))
     assert raised.vertical_m == STATED.vertical_m
-    assert straying.usual_m(raised) > size_m / math.sqrt(2)
+    assert straying.common_error_m(raised) > size_m / math.sqrt(2)
 
 
 def test_a_poor_receiver_that_says_so_may_wander(fix: MakeFix) -> None:
     honest = ReportNoise(horizontal_m=2.7, vertical_m=2.7, position_m=3.8, velocity_mps=0.5)
-    assert told(Straying(SETTINGS), flown(fix, wave(0.6, 15), honest)) == []
+    assert told(ReceiverCheck(SETTINGS), flown(fix, wave(0.6, 15), honest)) == []
 
 
 def test_what_is_left_of_the_lag_is_no_fault_of_the_receiver(fix: MakeFix) -> None:
@@ -86,7 +86,7 @@ def test_what_is_left_of_the_lag_is_no_fault_of_the_receiver(fix: MakeFix) -> No
         turn, off_m = 0.1 * t_s, 6 * 0.06 * (1 if t_s % 4 < 2 else -1)
         return -off_m * math.sin(turn), off_m * math.cos(turn)
 
-    assert told(Straying(SETTINGS), flown(fix, lag, late)) == []
+    assert told(ReceiverCheck(SETTINGS), flown(fix, lag, late)) == []
 
 
 def test_what_is_flown_between_two_reports_is_no_fault_of_the_receiver(fix: MakeFix) -> None:
@@ -99,32 +99,34 @@ def test_what_is_flown_between_two_reports_is_no_fault_of_the_receiver(fix: Make
             velocity: FloatArray = np.array([25 * math.cos(rate * t_s), 0.0, 0.0])
             yield fix(round(t_s * S), place, velocity, noise=STATED)
 
-    straying = Straying(SETTINGS)
+    straying = ReceiverCheck(SETTINGS)
     assert [found for one in gusty() if (found := straying.look(one, 125.0))] == []
-    careless = Straying(SETTINGS)
+    careless = ReceiverCheck(SETTINGS)
     assert [found for one in gusty() if (found := careless.look(one, 0.0))]
 
 
 def test_a_leap_is_left_to_the_gate(fix: MakeFix) -> None:
     """It says nothing against the receiver, there nor back again."""
-    assert told(Straying(SETTINGS), flown(fix, lambda t_s: (25.0 * (20 < t_s < 22), 0.0))) == []
+    assert (
+        told(ReceiverCheck(SETTINGS), flown(fix, lambda t_s: (25.0 * (20 < t_s < 22), 0.0))) == []
+    )
 
 
 def test_reports_that_are_far_apart_tell_nothing(fix: MakeFix) -> None:
-    assert told(Straying(SETTINGS), flown(fix, wave(3.0, 15), step_s=0.8)) == []
+    assert told(ReceiverCheck(SETTINGS), flown(fix, wave(3.0, 15), step_s=0.8)) == []
 
 
 def test_who_does_not_rest_on_statements_is_not_judged(fix: MakeFix) -> None:
     for settings, noise in ((NoiseSettings(DEFAULT, None), STATED), (SETTINGS, DEFAULT)):
-        straying = Straying(settings)
+        straying = ReceiverCheck(settings)
         assert told(straying, flown(fix, wave(3.0, 15), noise)) == []
         assert straying.noise(noise) is noise
 
 
 def test_heights_that_differ_count_as_usual_within_the_bound() -> None:
-    straying = Straying(SETTINGS)
+    straying = ReceiverCheck(SETTINGS)
     for apart_m, usual_m in ((0.3, 0.3), (50.0, 0.9)):
         noise = ReportNoise(
             horizontal_m=0.9, vertical_m=0.9, position_m=1.27, velocity_mps=0.5, apart_m=apart_m
         )
-        assert straying.usual_m(noise) == pytest.approx(usual_m)
+        assert straying.common_error_m(noise) == pytest.approx(usual_m)

@@ -9,9 +9,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import examples
 
-from companion.tracking.hindsight import PLAIN, WAYS, WINDOWS, Hindsight, Way, fading, fed
 from companion.tracking.history import ReportHistory
 from companion.tracking.observers.kinematic import KinematicModel, KinematicObserver
+from companion.tracking.past_predictions import (
+    ACCELERATION_MODELS,
+    CONSTANT_VELOCITY,
+    WINDOWS,
+    AccelerationModel,
+    PastPredictions,
+    fading_response,
+    fed_forward,
+)
 from companion.values import Fix
 
 S = 1_000_000_000
@@ -36,8 +44,8 @@ def flown(
     seconds: float,
     noise_mps: float = 0.0,
     noise_m: float = 0.0,
-) -> Hindsight:
-    rng, history, hindsight = np.random.default_rng(1), None, Hindsight()
+) -> PastPredictions:
+    rng, history, hindsight = np.random.default_rng(1), None, PastPredictions()
     for n in range(int(seconds / interval_s)):
         t_s = n * interval_s
         position, velocity = (np.array(one) for one in place(t_s))
@@ -53,31 +61,34 @@ def flown(
         hindsight.smooth(made)
         if hindsight.is_due(made.sender_ns):
             slopes = dict(zip([w[0] for w in WINDOWS], history.accelerations(WINDOWS), strict=True))
-            hindsight.add(made, tuple(slopes.get(way.window_s) for way in WAYS))
+            hindsight.add(made, tuple(slopes.get(way.window_s) for way in ACCELERATION_MODELS))
     return hindsight
 
 
 def test_in_straight_flight_with_noise_nothing_is_fed(fix: Callable[..., Fix]) -> None:
     straight: Place = lambda t_s: ([10 * t_s, 0, 0], [10, 0, 0])  # noqa: E731
-    assert flown(fix, straight, 0.9, seconds=120, noise_mps=0.5, noise_m=1.0).way is PLAIN
+    assert (
+        flown(fix, straight, 0.9, seconds=120, noise_mps=0.5, noise_m=1.0).model
+        is CONSTANT_VELOCITY
+    )
 
 
 def test_in_a_quick_turn_a_short_window_is_taken(fix: Callable[..., Fix]) -> None:
     """An aeroplane's: over five seconds the acceleration turns by a radian."""
-    way = flown(fix, circling(110.0, 22.0), 0.1, seconds=60, noise_mps=0.05, noise_m=0.05).way
+    way = flown(fix, circling(110.0, 22.0), 0.1, seconds=60, noise_mps=0.05, noise_m=0.05).model
     assert 0 < way.window_s <= 2.5
 
 
 def test_in_a_slow_noisy_turn_something_is_fed(fix: Callable[..., Fix]) -> None:
     assert (
-        flown(fix, circling(60.0, 5.0), 0.1, seconds=60, noise_mps=0.05, noise_m=0.02).way
-        is not PLAIN
+        flown(fix, circling(60.0, 5.0), 0.1, seconds=60, noise_mps=0.05, noise_m=0.02).model
+        is not CONSTANT_VELOCITY
     )
 
 
 def test_before_there_is_any_judgement_nothing_is_fed(fix: Callable[..., Fix]) -> None:
-    assert flown(fix, circling(110.0, 22.0), 0.1, seconds=1.0).way is PLAIN
-    assert Hindsight().usual_m(1.0) is None
+    assert flown(fix, circling(110.0, 22.0), 0.1, seconds=1.0).model is CONSTANT_VELOCITY
+    assert PastPredictions().error_p95_m(1.0) is None
 
 
 def test_the_usual_error_covers_what_comes(fix: Callable[..., Fix]) -> None:
@@ -85,20 +96,22 @@ def test_the_usual_error_covers_what_comes(fix: Callable[..., Fix]) -> None:
     place = circling(60.0, 8.0)
     hindsight = flown(fix, place, 0.2, seconds=120, noise_mps=0.2, noise_m=0.5)
     rng, covered, count = np.random.default_rng(2), 0, 2000
-    usual_m = hindsight.usual_m(1.0)
+    usual_m = hindsight.error_p95_m(1.0)
     assert usual_m is not None
     for _ in range(count):
         t_s = rng.uniform(0, 100)
         position, velocity = (np.array(one) for one in place(t_s))
         later, _ = place(t_s + 1.0)
-        noise_m = 0.5 if hindsight.aside == (0.0, 0.0, 0.0) else 0.5 * math.sqrt(0.35 / 1.65)
+        noise_m = (
+            0.5 if hindsight.smoothing_offset == (0.0, 0.0, 0.0) else 0.5 * math.sqrt(0.35 / 1.65)
+        )
         told = position + rng.normal(0, noise_m, 3) + (velocity + rng.normal(0, 0.2, 3))
         acceleration = np.array([-velocity[1], velocity[0], 0]) * 8.0 / 60.0
-        told = told + acceleration * (0.0 if hindsight.way is PLAIN else 0.48)
+        told = told + acceleration * (0.0 if hindsight.model is CONSTANT_VELOCITY else 0.48)
         seen = np.array(later) + rng.normal(0, 0.5, 3)
         covered += float(np.linalg.norm(told - seen)) <= usual_m
     assert 0.9 <= covered / count <= 0.99
-    ages = [hindsight.usual_m(age) for age in (0.0, 0.25, 1.0, 3.0, 10.0)]
+    ages = [hindsight.error_p95_m(age) for age in (0.0, 0.25, 1.0, 3.0, 10.0)]
     assert ages == sorted(ages)  # type: ignore[type-var]
 
 
@@ -111,12 +124,12 @@ def test_in_a_turn_the_velocity_turns(
     speed_mps: float, heading: float, across_mps2: float, along_mps2: float, ahead_s: float
 ) -> None:
     """Against small steps; and no further from straight flight than what is across could go."""
-    way = Way(window_s=1.0, fewest=3, fades_s=3.0, turns=True)
+    way = AccelerationModel(window_s=1.0, fewest=3, fades_s=3.0, turns=True)
     direction = np.array([math.cos(heading), math.sin(heading)])
     aside = np.array([-direction[1], direction[0]])
     given = along_mps2 * direction + across_mps2 * aside
     velocity = speed_mps * direction
-    (north, east, down), gained = fed(
+    (north, east, down), gained = fed_forward(
         way, (*given.tolist(), 1.0), (*velocity.tolist(), 0.0), ahead_s
     )
     turned = max(min(across_mps2 / speed_mps * ahead_s, math.pi), -math.pi)
@@ -127,52 +140,54 @@ def test_in_a_turn_the_velocity_turns(
     last = speed_mps * np.array([math.cos(heading + turned), math.sin(heading + turned)])
     assert np.allclose(velocity + gained[:2], last, atol=1e-6)
     assert math.hypot(north, east) <= abs(across_mps2) * ahead_s**2 / 2 + 1e-6
-    assert (down, gained[2]) == fading(ahead_s, 3.0)
+    assert (down, gained[2]) == fading_response(ahead_s, 3.0)
 
 
 def test_who_stands_has_no_direction_to_turn() -> None:
     turning, straight = (
-        Way(window_s=1.0, fewest=3, fades_s=3.0, turns=True),
-        Way(window_s=1.0, fewest=3, fades_s=3.0),
+        AccelerationModel(window_s=1.0, fewest=3, fades_s=3.0, turns=True),
+        AccelerationModel(window_s=1.0, fewest=3, fades_s=3.0),
     )
     stands = (0.5, -0.5, 1.0)
     for ahead_s in (0.1, 2.0):
-        found = (fed(way, (1.0, 2.0, -1.0), stands, ahead_s) for way in (turning, straight))
+        found = (fed_forward(way, (1.0, 2.0, -1.0), stands, ahead_s) for way in (turning, straight))
         assert next(found) == next(found)
 
 
 def test_in_a_steady_circle_the_turn_is_fed(fix: Callable[..., Fix]) -> None:
-    assert flown(fix, circling(60.0, 12.0), 0.8, seconds=60, noise_mps=0.05, noise_m=0.05).way.turns
+    assert flown(
+        fix, circling(60.0, 12.0), 0.8, seconds=60, noise_mps=0.05, noise_m=0.05
+    ).model.turns
 
 
 def test_positions_of_a_poor_receiver_are_smoothed(fix: Callable[..., Fix]) -> None:
     """Half of the noise is gone, in a turn as well; and a good receiver is believed."""
     straight: Place = lambda t_s: ([10 * t_s, 0, 0], [10, 0, 0])  # noqa: E731
     for place in (straight, circling(60.0, 8.0)):
-        rng, history, hindsight, off = np.random.default_rng(3), None, Hindsight(), []
+        rng, history, hindsight, off = np.random.default_rng(3), None, PastPredictions(), []
         for n in range(200):
             t_s = 0.8 * n
             position, velocity = (np.array(one) for one in place(t_s))
             made = fix(round(t_s * S), position + rng.normal(0, 3.0, 3), velocity)
             history = history or ReportHistory(OBSERVER, made, 5 * S)
             hindsight.smooth(made)
-            hindsight.add(made, (None,) * len(WAYS))
+            hindsight.add(made, (None,) * len(ACCELERATION_MODELS))
             off.append(
                 [np.array(made.position_ned_m) - position,
-                 np.array(made.position_ned_m) + hindsight.aside - position]
+                 np.array(made.position_ned_m) + hindsight.smoothing_offset - position]
             )  # fmt: skip
         reported, taken = (np.array(off)[100:, which] for which in (0, 1))
         assert np.sqrt((taken**2).mean()) < 0.65 * np.sqrt((reported**2).mean())
-    assert math.hypot(*flown(fix, circling(60.0, 8.0), 0.8, seconds=60).aside) < 0.05
+    assert math.hypot(*flown(fix, circling(60.0, 8.0), 0.8, seconds=60).smoothing_offset) < 0.05
 
 
 def test_over_a_gap_nothing_is_smoothed(fix: Callable[..., Fix]) -> None:
-    hindsight = Hindsight()
+    hindsight = PastPredictions()
     for n in range(60):
         made = fix(round(n * 6.0 * S), np.array([5.0 * (-1) ** n, 0, 0]), np.zeros(3))
         hindsight.smooth(made)
-        hindsight.add(made, (None,) * len(WAYS))
-        assert hindsight.aside == (0.0, 0.0, 0.0)
+        hindsight.add(made, (None,) * len(ACCELERATION_MODELS))
+        assert hindsight.smoothing_offset == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("fades_s", [3.0, 10.0])
@@ -180,6 +195,6 @@ def test_a_fading_acceleration(fades_s: float) -> None:
     """Against the integral, twice."""
     times = np.linspace(0, 2.0, 20001)
     speeds = np.concatenate([[0], np.cumsum(np.exp(-(times[:-1] + 5e-5) / fades_s) * 1e-4)])
-    way, gain = fading(2.0, fades_s)
+    way, gain = fading_response(2.0, fades_s)
     assert gain == pytest.approx(speeds[-1], rel=1e-6)
     assert way == pytest.approx(float(np.trapezoid(speeds, times)), rel=1e-6)

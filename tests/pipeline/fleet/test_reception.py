@@ -4,8 +4,8 @@ from pymavlink.dialects.v20 import common
 
 from companion.mavlink.trust.dedupe import content
 from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
-from companion.pipeline.fleet.hearing import Hearing
 from companion.pipeline.fleet.neighbours import NeighbourClock
+from companion.pipeline.fleet.reception import Reception
 from companion.values import Frame, SharedFrame, Source
 
 MS = 1_000_000
@@ -26,24 +26,26 @@ def raw(boot_ms: int, north_m: float = 0.0, msg: str = "position") -> bytes:
 def clock(behind_ns: int = 3 * S, width_ns: int = 2 * MS) -> NeighbourClock:
     """A node whose clock is so much behind this one's, known within ``width_ns``."""
     made = NeighbourClock()
-    made.answered(10 * S, 10 * S + width_ns, 10 * S + width_ns // 2 - behind_ns)
+    made.note_answer(10 * S, 10 * S + width_ns, 10 * S + width_ns // 2 - behind_ns)
     return made
 
 
-def tell(hearing: Hearing, now_ns: int, data: bytes, heard_ns: int, node: str = "b") -> list[Frame]:
+def tell(
+    hearing: Reception, now_ns: int, data: bytes, heard_ns: int, node: str = "b"
+) -> list[Frame]:
     """Frames that the pipeline is to have, when a node 3 s behind tells one that it heard."""
-    frame = hearing.placed(now_ns, node, clock(), SharedFrame(heard_ns - 3 * S, data))
-    return [] if frame is None else hearing.told(now_ns, node, frame, content(frame.raw))
+    frame = hearing.to_own_timeline(now_ns, node, clock(), SharedFrame(heard_ns - 3 * S, data))
+    return [] if frame is None else hearing.take_shared(now_ns, node, frame, content(frame.raw))
 
 
-def hear(hearing: Hearing, now_ns: int, boot_ms: int) -> None:
-    hearing.heard(
+def hear(hearing: Reception, now_ns: int, boot_ms: int) -> None:
+    hearing.take_received(
         Frame(t_ns=now_ns, link="udp", source=UAV, msgid=GLOBAL_POSITION_INT, raw=raw(boot_ms))
     )
 
 
 def test_of_a_vehicle_that_is_heard_here_nothing_else_is_used() -> None:
-    hearing = Hearing()
+    hearing = Reception()
     for number in range(20):
         hear(hearing, 11 * S + number * 100 * MS, 1000 + 100 * number)
     now_ns = 11 * S + 1910 * MS
@@ -53,7 +55,7 @@ def test_of_a_vehicle_that_is_heard_here_nothing_else_is_used() -> None:
 
 
 def test_of_one_that_falls_silent_what_was_missed_is_taken_up() -> None:
-    hearing = Hearing()
+    hearing = Reception()
     for number in range(20):
         hear(hearing, 11 * S + number * 100 * MS, 1000 + 100 * number)
     taken = []
@@ -76,7 +78,7 @@ def test_of_one_that_falls_silent_what_was_missed_is_taken_up() -> None:
 
 def test_nobody_is_silent_whose_reports_wait_here() -> None:
     """A node that is short of time would else take in everybody's reports twice."""
-    hearing = Hearing()
+    hearing = Reception()
     for number in range(20):
         hear(hearing, 11 * S + number * 100 * MS, 1000 + 100 * number)
     now_ns = 11 * S + 1900 * MS + 900 * MS
@@ -89,24 +91,24 @@ def test_nobody_is_silent_whose_reports_wait_here() -> None:
 
 
 def test_who_was_never_heard_here_is_taken_from_others_once() -> None:
-    hearing = Hearing()
+    hearing = Reception()
     assert len(tell(hearing, 12 * S, raw(1000), 12 * S - 5 * MS, "b")) == 1
     assert tell(hearing, 12 * S, raw(1000), 12 * S - 5 * MS, "c") == []
     assert len(tell(hearing, 12 * S, raw(1100), 12 * S - 5 * MS, "c")) == 1
 
 
 def test_what_comes_before_it_can_be_heard_is_a_contradiction() -> None:
-    hearing = Hearing()
+    hearing = Reception()
     assert tell(hearing, 12 * S, raw(1000), 12 * S + 50 * MS) == []
     assert hearing.early == ["b"]
     # Without a clock nothing is placed, and nothing is wrong.
     shared = SharedFrame(12 * S, raw(1000))
-    assert hearing.placed(12 * S, "c", NeighbourClock(), shared) is None
+    assert hearing.to_own_timeline(12 * S, "c", NeighbourClock(), shared) is None
     assert hearing.early == ["b"]
 
 
 def test_a_liar_about_a_vehicle_that_is_heard_here_is_seen() -> None:
-    hearing = Hearing()
+    hearing = Reception()
     for number in range(80):
         now_ns = 11 * S + number * 100 * MS
         hear(hearing, now_ns, 1000 + 100 * number)
@@ -117,17 +119,17 @@ def test_a_liar_about_a_vehicle_that_is_heard_here_is_seen() -> None:
 
 
 def test_damaged_frames_are_none() -> None:
-    hearing = Hearing()
+    hearing = Reception()
     whole = raw(1000)
     for broken in (b"", whole[:-1], whole[:20] + b"\x55" + whole[21:], whole + b"\0", b"\xfd" * 40):
-        assert hearing.placed(12 * S, "b", clock(), SharedFrame(9 * S, broken)) is None
+        assert hearing.to_own_timeline(12 * S, "b", clock(), SharedFrame(9 * S, broken)) is None
     attitude = common.MAVLink_attitude_message(1, 0, 0, 0, 0, 0, 0)
     packed = attitude.pack(common.MAVLink(None, srcSystem=1, srcComponent=1))
-    assert hearing.placed(12 * S, "b", clock(), SharedFrame(9 * S, bytes(packed))) is None
+    assert hearing.to_own_timeline(12 * S, "b", clock(), SharedFrame(9 * S, bytes(packed))) is None
 
 
 def test_what_was_missed_between_reports_that_were_heard_is_no_news() -> None:
-    hearing = Hearing()
+    hearing = Reception()
     for number in range(20):
         hear(hearing, 11 * S + number * 100 * MS, 1000 + 100 * number)
         missed_ns = 11 * S + number * 100 * MS + 50 * MS

@@ -7,7 +7,6 @@ It is read by `make check` alone, and is never imported.
 served.should_exit  # uvicorn's server looks at it
 made.redirect_slashes  # Starlette's router looks at it
 app.openapi  # FastAPI asks for the document by it
-fleet.untold  # shown by the API by its name
 message.position_covariance_type  # a field of protobuf's
 field.type_name, field.proto3_optional, field.oneof_index  # fields of a protobuf descriptor
 Severity.publish_time_ns  # the layout of a record of MCAP
@@ -20,7 +19,6 @@ one.rx_phase, one.rx_gain, one.rx_attenuator  # pyadi-iio writes them to the chi
 one.rx_beam_state, chip.beam_mem_enable  # the same
 one.shows, one.likeness, one.bears_on  # the same
 found.rejections  # the same
-status.of_s  # written to the API by its fields
 one_uav, streamed, healthz, readyz, listing, download, list_scenarios, prediction  # by decorators
 served.readable, served.readinto  # `io` calls them
 exception  # the name of an argument of `__exit__`

@@ -42,7 +42,7 @@ def main() -> int:
         allowed.write_text("".join(f"_.{name}\n" for name in sorted(names)), encoding="utf-8")
         paths = ["companion", "sitl_replay", "tests/vulture_allowed.py", str(allowed)]
         command = [sys.executable, "-m", "vulture", *paths]
-        return subprocess.run(command, cwd=ROOT, check=False).returncode
+        return subprocess.run(command, cwd=ROOT, check=False, timeout=300).returncode
 
 
 if __name__ == "__main__":

@@ -54,7 +54,8 @@ class ReceiverCheck:
         """
         factor, before = self._settings.factor, self._newest
         velocity = fix.velocity_ned_mps
-        if factor is None or velocity is None or not self._rests_on_statement(fix.noise):
+        is_stated = fix.noise.horizontal_m < self._settings.default.horizontal_m
+        if factor is None or velocity is None or not is_stated:
             return None
         if before is not None and fix.sender_ns <= before.sender_ns:
             return None
@@ -106,9 +107,6 @@ class ReceiverCheck:
             seen.popleft()
         (_, north_0, east_0, before_m2), (_, north, east, unseen_m2) = seen[0], seen[-1]
         return math.hypot(north - north_0, east - east_0), math.sqrt(unseen_m2 - before_m2)
-
-    def _rests_on_statement(self, noise: ReportNoise) -> bool:
-        return noise.horizontal_m < self._settings.default.horizontal_m
 
     def noise(self, stated: ReportNoise) -> ReportNoise:
         """The bounds on a report's noise, by what its receiver states and what was seen of it."""

@@ -134,7 +134,7 @@ def test_weights_point_where_the_beams_say(start_node: Any, tmp_path: Path) -> N
         flight.wait(HANG_S)
     assert status == 200
     assert weights.shape == (64, 4)
-    assert weights.dtype == np.complex128
+    assert weights.dtype == np.complex64
     assert np.array(as_json["re"]).shape == (64, 4) == np.array(as_json["im"]).shape
     assert sorted(as_json["uavs"]) == ["1:1", "2:1", "3:1", "4:1"]
     assert raw.size == 64 * 4

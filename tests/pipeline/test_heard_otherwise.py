@@ -9,8 +9,8 @@ import pytest
 from pymavlink.dialects.v20 import all as dialect
 
 from companion.mavlink.wire.cot_link import CotSplitter
+from companion.mavlink.wire.foreign import ForeignSplitter
 from companion.mavlink.wire.transponder import AircraftState
-from companion.mavlink.wire.transponder import frame as transponder_frame
 from companion.pipeline import records, senders
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
@@ -91,8 +91,8 @@ def transponder(t_s: float, **codes: int) -> Frame:
         climb_fpm=0.0,
         **codes,
     )
-    frame = transponder_frame(START_NS + round(t_s * S), "readsb", said, 0)
-    assert frame is not None
+    (frame,) = ForeignSplitter("readsb")._aircraft(START_NS + round(t_s * S), said)
+    assert isinstance(frame, Frame)
     return frame
 
 

@@ -108,7 +108,7 @@ def dual_of_weighted_sum(gram: ComplexArray, snr: FloatArray, worths: FloatArray
         found = np.maximum(pull / pull.sum(), LEAST_SHARE / len(snr))
         scale = weight * receiver.conj() / np.maximum(pull, 1e-300)
         made = _inverse(channel.T, 1.0 / found) * scale
-        power = _power(channel, made)
+        power = float(np.einsum("in,ij,jn->", made.conj(), channel.T, made).real)  # of beams H* Z
         done = np.abs(found - share).max() <= ENOUGH * found.max()
         share = found
         if done or not power > 0.0:  # rounding alone tells them apart: no beams to go on from
@@ -131,11 +131,6 @@ def _beams(channel: ComplexArray, share: FloatArray) -> ComplexArray:
     lengths = np.einsum("in,ij,jn->n", made.conj(), channel.T, made).real
     found: ComplexArray = made / np.sqrt(np.maximum(lengths, 1e-300) * len(share))
     return found
-
-
-def _power(channel: ComplexArray, made: ComplexArray) -> float:
-    """Power of beams H* Z together."""
-    return float(np.einsum("in,ij,jn->", made.conj(), channel.T, made).real)
 
 
 def _kept(share: FloatArray) -> FloatArray:

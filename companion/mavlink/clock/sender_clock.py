@@ -241,7 +241,8 @@ class SenderClock:
         """What is known of the offset, aged to a sender time."""
         kind, low_ns, high_ns, likely_ns = self._now()
         newest_ns = self._line.newest_ns
-        slack_ns = math.ceil(self._drift_at(newest_ns) * abs(x_ns - newest_ns))
+        drift = max(self._timesync.drift_at(newest_ns), self._gnss.drift_at(newest_ns))
+        slack_ns = math.ceil(drift * abs(x_ns - newest_ns))
         least_ns, most_ns = self._line.floor.may_drift_ns(x_ns)
         return (
             kind,
@@ -249,10 +250,6 @@ class SenderClock:
             high_ns + slack_ns + most_ns,
             likely_ns + self._line.floor.drifted_ns(x_ns),
         )
-
-    def _drift_at(self, x_ns: int) -> float:
-        """Greatest drift taken for possible at a sender time, by any evidence; a ratio."""
-        return max(self._timesync.drift_at(x_ns), self._gnss.drift_at(x_ns))
 
     def _now(self) -> tuple[ClockKind, int, int, int]:
         """What is known of the offset as of the newest stamp; kept until more is heard."""

@@ -122,7 +122,9 @@ class Timestamps:
         self._lock = _locked(path)
         try:
             self._kept = _read(path)
-            self._write_now()  # so that a place that cannot be written to is reported at start
+            self._number += 1
+            # Written at once, so that a place that cannot be written to is reported at start.
+            self.write(SigningSnapshot(self._number, self._kept))
         except LinkError:
             os.close(self._lock)
             raise
@@ -183,10 +185,6 @@ class Timestamps:
         self._moves = sum(guard.moves for guard in self._guards.values())
         current = {link: _Kept(guard.state(now_ns), clean) for link, guard in self._guards.items()}
         return SigningSnapshot(self._number, self._kept | current)
-
-    def _write_now(self) -> None:
-        self._number += 1
-        self.write(SigningSnapshot(self._number, self._kept))
 
 
 def _locked(path: Path) -> int:

@@ -162,7 +162,8 @@ class Aircraft:
             DUPLICATE     the position was reported before
             OUT_OF_ORDER  certainly older than a reported one, or not heard for ``FORGOTTEN_S``
         """
-        self._forget(message.t_ns)
+        while self._known and _is_past(next(iter(self._known.values())).news_ns, message.t_ns):
+            self._known.popitem(last=False)
         known = self._known.get(message.uav)
         if known is not None:
             known.hear(message.source, message.t_ns)
@@ -208,10 +209,6 @@ class Aircraft:
         if len(self._known) > AIRCRAFT_MAX:
             self._known.popitem(last=False)
         return known
-
-    def _forget(self, t_ns: int) -> None:
-        while self._known and _is_past(next(iter(self._known.values())).news_ns, t_ns):
-            self._known.popitem(last=False)
 
 
 def _is_past(then_ns: int, t_ns: int) -> bool:

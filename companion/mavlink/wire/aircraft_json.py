@@ -11,8 +11,9 @@ import math
 from collections import OrderedDict
 from typing import Any, Final
 
-from companion.mavlink.wire.transponder import ADSB_VEHICLE, AircraftState, frame
-from companion.values import Frame, Reason, Rejection
+from companion.mavlink.wire.foreign import ForeignSplitter, Items
+from companion.mavlink.wire.transponder import ADSB_VEHICLE, AircraftState
+from companion.values import Reason
 
 DOCUMENT_MAX: Final = 8 << 20  # bytes of a document at most: some 10 000 aircraft
 AIRCRAFT_MAX: Final = 10_000  # aircraft read of one document, and remembered
@@ -20,16 +21,15 @@ _NOT_SEEN: Final = ("mlat", "tisb_icao", "tisb_trackfile", "tisb_other", "mode_s
 """Types of an aircraft that report no position themselves."""
 
 
-class AircraftJson:
-    """Turns documents into frames; ``feed`` takes a whole one. The face is ``Splitter``'s."""
+class AircraftJson(ForeignSplitter):
+    """Turns documents into frames; ``feed`` takes a whole one."""
 
     def __init__(self, link: str) -> None:
-        self.link = link
-        self._seq = 0
+        super().__init__(link)
         self._written: float | None = None
         self._true_at: OrderedDict[int, float] = OrderedDict()  # by ICAO address
 
-    def feed(self, t_ns: int, data: bytes) -> list[Frame | Rejection]:
+    def feed(self, t_ns: int, data: bytes) -> Items:
         """Take in a document that came at ``t_ns``; returns what is new in it."""
         try:
             if len(data) > DOCUMENT_MAX:
@@ -42,50 +42,27 @@ class AircraftJson:
             if written is None or not isinstance(aircraft, list):
                 raise ValueError("no time, or no aircraft")
         except (ValueError, KeyError, RecursionError):
-            return [
-                Rejection(t_ns=t_ns, source=self.link, reason=Reason.GARBAGE, count=len(data) or 1)
-            ]
+            return self._garbage(t_ns, len(data) or 1)
         if written == self._written:  # the same document as before
             return []
         self._written = written
         return [item for one in aircraft[:AIRCRAFT_MAX] for item in self._one(t_ns, one, written)]
 
-    def finish(self, t_ns: int) -> list[Frame | Rejection]:
-        """End the stream: no document is ever half taken in."""
-        return []
-
-    def _one(self, t_ns: int, entry: object, written: float) -> list[Frame | Rejection]:
+    def _one(self, t_ns: int, entry: object, written: float) -> Items:
         try:
             message = _aircraft_state(entry)
             position_age_s = _number(entry, "seen_pos", 0, 86_400)
         except (ValueError, OverflowError) as error:
-            detail = str(error)
-            return [
-                Rejection(
-                    t_ns=t_ns,
-                    source=self.link,
-                    reason=Reason.MALFORMED,
-                    msgid=ADSB_VEHICLE,
-                    detail=detail,
-                )
-            ]
+            return self._refused(t_ns, Reason.MALFORMED, str(error), ADSB_VEHICLE)
         if isinstance(message, str):
-            return [
-                Rejection(
-                    t_ns=t_ns, source=self.link, reason=Reason.UNKNOWN_MESSAGE, detail=message
-                )
-            ]
+            return self._refused(t_ns, Reason.UNKNOWN_MESSAGE, message)
         if (
             message is None
             or position_age_s is None
             or not self._is_news(message, written - position_age_s)
         ):
             return []
-        found = frame(t_ns, self.link, message, self._seq)
-        if found is None:
-            return []
-        self._seq = (self._seq + 1) & 0xFF
-        return [found]
+        return self._aircraft(t_ns, message)
 
     def _is_news(self, message: AircraftState, true_at: float) -> bool:
         """Whether a position is newer than what was read before; ages are in tenths of seconds."""

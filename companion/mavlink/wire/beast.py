@@ -13,9 +13,9 @@ they are is not known.
 import re
 from typing import Final
 
+from companion.mavlink.wire.foreign import MLAT, ForeignSplitter, Items
 from companion.mavlink.wire.mode_s import SIZE, Transponders
-from companion.mavlink.wire.transponder import frame
-from companion.values import Frame, Reason, Rejection
+from companion.values import Reason
 
 _ESCAPE: Final = b"\x1a"
 _SIZES: Final = {0x31: 9, 0x32: 14, 0x33: 21, 0x34: 21, 0xE3: 8}  # bytes behind a message's kind
@@ -27,20 +27,18 @@ _DRIFT: Final = 100e-6
 """Greatest drift of the counter against this clock: ten times a good crystal's."""
 
 
-class BeastSplitter:
-    """Turns the bytes of one connection into frames; ``feed`` and ``finish`` as ``Splitter``'s."""
+class BeastSplitter(ForeignSplitter):
+    """Turns the messages of one connection into frames."""
 
     def __init__(self, link: str) -> None:
-        self.link = link
-        self._pending = b""
+        super().__init__(link)
         self._transponders = Transponders()
         self._lateness = _Lateness()
-        self._seq = 0
 
-    def feed(self, t_ns: int, data: bytes) -> list[Frame | Rejection]:
+    def feed(self, t_ns: int, data: bytes) -> Items:
         """Take in bytes that arrived at ``t_ns``; returns what the messages in them say."""
         data, at, garbage = self._pending + data, 0, 0
-        out: list[Frame | Rejection] = []
+        out: Items = []
         while True:
             found = _START.search(data, at)
             if found is None:
@@ -59,39 +57,21 @@ class BeastSplitter:
             else:
                 out += self._message(t_ns, data[at + 1], body)
             at = end
-        if garbage:
-            out.append(Rejection(t_ns=t_ns, source=self.link, reason=Reason.GARBAGE, count=garbage))
-        return out
+        return out + self._garbage(t_ns, garbage)
 
-    def finish(self, t_ns: int) -> list[Frame | Rejection]:
-        """End the stream: a message that has no end is given up."""
-        stray, self._pending = len(self._pending), b""
-        return (
-            [Rejection(t_ns=t_ns, source=self.link, reason=Reason.GARBAGE, count=stray)]
-            if stray
-            else []
-        )
-
-    def _message(self, t_ns: int, kind: int, body: bytes) -> list[Frame | Rejection]:
+    def _message(self, t_ns: int, kind: int, body: bytes) -> Items:
         if kind != 0x33:  # too short to hold a position, or not of an aircraft
             return []
         if body.startswith(_MLAT):
-            detail = "MLAT: how exact it is, is not known"
-            return [
-                Rejection(t_ns=t_ns, source=self.link, reason=Reason.UNKNOWN_MESSAGE, detail=detail)
-            ]
+            return self._refused(t_ns, Reason.UNKNOWN_MESSAGE, MLAT)
         late_ns = self._lateness.observe(t_ns, int.from_bytes(body[:6], "big"))
         try:
-            said = self._transponders.read(t_ns - late_ns, body[7 : 7 + SIZE])
+            state = self._transponders.read(t_ns - late_ns, body[7 : 7 + SIZE])
         except ValueError:
-            return [Rejection(t_ns=t_ns, source=self.link, reason=Reason.BAD_CRC)]
-        if said is None:
+            return self._refused(t_ns, Reason.BAD_CRC, "")
+        if state is None:
             return []
-        found = frame(t_ns, self.link, said._replace(age_s=late_ns // 1_000_000_000), self._seq)
-        if found is None:
-            return []
-        self._seq = (self._seq + 1) & 0xFF
-        return [found]
+        return self._aircraft(t_ns, state._replace(age_s=late_ns // 1_000_000_000))
 
 
 def _unescaped(data: bytes, at: int, size: int) -> tuple[bytes | None, int]:

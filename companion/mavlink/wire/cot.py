@@ -80,7 +80,7 @@ def from_xml(text: bytes) -> CotEvent:
         time_ms = _time_ms(event["time"])
         uid, kind, how = event["uid"], event["type"], event.get("how", "")
         place = [float(point[key]) for key in ("lat", "lon", "hae", "ce", "le")]
-        motion = [_optional(track.get(key)) for key in ("course", "speed", "slope")]
+        motion = [float(track.get(key, "nan")) for key in ("course", "speed", "slope")]
     except KeyError as missing:
         raise ValueError(f"no {missing.args[0]}") from missing
     return _checked(uid, kind=kind, how=how, time_ms=time_ms, place=place, motion=motion)
@@ -89,10 +89,6 @@ def from_xml(text: bytes) -> CotEvent:
 def _time_ms(text: str) -> int:
     at = datetime.fromisoformat(text)
     return round((at if at.tzinfo else at.replace(tzinfo=UTC)).timestamp() * 1e3)
-
-
-def _optional(text: str | None) -> float:
-    return math.nan if text is None else float(text)
 
 
 def _checked(

@@ -16,7 +16,8 @@ import struct
 from typing import Final
 
 from companion.mavlink.wire.cot import OWN, CotEvent, from_protobuf, from_xml, varint
-from companion.mavlink.wire.encode import Outgoing, pack
+from companion.mavlink.wire.encode import Outgoing
+from companion.mavlink.wire.foreign import ForeignSplitter, Items
 from companion.values import (
     Accuracy,
     AltitudeDatum,
@@ -40,18 +41,13 @@ _END: Final = re.compile(rb"</event\s*>")
 _PLAIN: Final = re.compile(r"[A-Za-z0-9._-]{1,60}")
 
 
-class CotSplitter:
-    """Turns the bytes of one peer into frames; ``feed`` and ``finish`` as ``Splitter``'s."""
+class CotSplitter(ForeignSplitter):
+    """Turns the events of one peer into frames."""
 
-    def __init__(self, link: str) -> None:
-        self.link = link
-        self._pending = b""
-        self._seq = 0
-
-    def feed(self, t_ns: int, data: bytes) -> list[Frame | Rejection]:
+    def feed(self, t_ns: int, data: bytes) -> Items:
         """Take in bytes that arrived at ``t_ns``; returns what the events in them say."""
         data, at, garbage = self._pending + data, 0, 0
-        out: list[Frame | Rejection] = []
+        out: Items = []
         while True:
             begun = _BEGIN.search(data, at)
             if begun is None:
@@ -72,47 +68,22 @@ class CotSplitter:
             out += self._event(t_ns, data[at:end])
             at = end
         self._pending = data[at:]
-        if garbage:
-            out.append(Rejection(t_ns=t_ns, source=self.link, reason=Reason.GARBAGE, count=garbage))
-        return out
+        return out + self._garbage(t_ns, garbage)
 
-    def finish(self, t_ns: int) -> list[Frame | Rejection]:
-        """End the stream: an event that has no end is given up."""
-        stray, self._pending = len(self._pending), b""
-        return (
-            [Rejection(t_ns=t_ns, source=self.link, reason=Reason.GARBAGE, count=stray)]
-            if stray
-            else []
-        )
-
-    def _event(self, t_ns: int, raw: bytes) -> list[Frame | Rejection]:
+    def _event(self, t_ns: int, raw: bytes) -> Items:
         try:
             event = _tak(raw) if raw[0] == _MAGIC else from_xml(raw)
         except (ValueError, OverflowError) as why:
-            detail = str(why)[:80]
-            return [Rejection(t_ns=t_ns, source=self.link, reason=Reason.MALFORMED, detail=detail)]
+            return self._refused(t_ns, Reason.MALFORMED, str(why)[:80])
         if event is None:
             return []
         unfit = _unfit(event)
         if unfit:
-            return [
-                Rejection(t_ns=t_ns, source=self.link, reason=Reason.UNKNOWN_MESSAGE, detail=unfit)
-            ]
+            return self._refused(t_ns, Reason.UNKNOWN_MESSAGE, unfit)
         if event.hae_m is None:
-            return [
-                Rejection(
-                    t_ns=t_ns, source=UavKind.COT.uav(_name(event.uid)), reason=Reason.NO_ALTITUDE
-                )
-            ]
-        frame = Frame(
-            t_ns=t_ns,
-            link=self.link,
-            source=SENDER,
-            msgid=TUNNEL,
-            raw=pack(_outgoing(event), self._seq),
-        )
-        self._seq = (self._seq + 1) & 0xFF
-        return [frame]
+            uav = UavKind.COT.uav(_name(event.uid))
+            return [Rejection(t_ns=t_ns, source=uav, reason=Reason.NO_ALTITUDE)]
+        return [self._frame(t_ns, _outgoing(event))]
 
 
 def _unfit(event: CotEvent) -> str:

@@ -18,9 +18,10 @@ import struct
 from collections.abc import Iterator
 from typing import Any, Final
 
-from companion.mavlink.wire.encode import Outgoing, pack
+from companion.mavlink.wire.encode import Outgoing
+from companion.mavlink.wire.foreign import ForeignSplitter, Items
 from companion.mavlink.wire.remote_id import BASIC_ID, LOCATION, SYSTEM
-from companion.values import Frame, Reason, Rejection, Source
+from companion.values import Reason, Source
 
 SENDER: Final = Source(0, 236)  # who says it: no system, MAV_COMP_ID_ODID_TXRX_1
 OBJECT_MAX: Final = 16 << 10  # bytes of an object at most; a longer one is garbage
@@ -33,71 +34,29 @@ _UAS_LOCATION = struct.Struct("<ifffddffifiiiiif")
 _AT = {"location": 64, "system": 808, "valid": 892, "end": 914}
 
 
-class RidJson:
-    """Turns the bytes of one peer into frames; ``feed`` and ``finish`` as ``Splitter``'s."""
+class RidJson(ForeignSplitter):
+    """Turns the objects of one peer into frames."""
 
-    def __init__(self, link: str) -> None:
-        self.link = link
-        self._pending = b""
-        self._overlong = False
-        self._seq = 0
-
-    def feed(self, t_ns: int, data: bytes) -> list[Frame | Rejection]:
+    def feed(self, t_ns: int, data: bytes) -> Items:
         """Take in bytes that arrived at ``t_ns``; returns what the objects in them say."""
         *lines, self._pending = (self._pending + data).replace(b"\0", b"\n").split(b"\n")
-        out: list[Frame | Rejection] = []
-        garbage = 0
-        for line in lines:
-            if self._overlong or len(line) > OBJECT_MAX:
-                garbage += len(line) + 1
-                self._overlong = False
-            elif line.strip():
-                out += self._object(t_ns, line)
+        kept, garbage = self._lines(lines, OBJECT_MAX)
+        out = [item for line in kept if line.strip() for item in self._object(t_ns, line)]
         if self._pending.rstrip().endswith(b"}") and not self._overlong:  # a datagram has no end
             whole = _parsed(self._pending)
             if whole is not None:
                 out += self._object(t_ns, self._pending)
                 self._pending = b""
-        if len(self._pending) > OBJECT_MAX:
-            garbage += len(self._pending)
-            self._pending, self._overlong = b"", True
-        if garbage:
-            out.append(Rejection(t_ns=t_ns, source=self.link, reason=Reason.GARBAGE, count=garbage))
-        return out
+        return out + self._garbage(t_ns, garbage + self._drop_overlong(OBJECT_MAX))
 
-    def finish(self, t_ns: int) -> list[Frame | Rejection]:
-        """End the stream: an object that has no end is given up."""
-        stray, self._pending, self._overlong = len(self._pending), b"", False
-        return (
-            [Rejection(t_ns=t_ns, source=self.link, reason=Reason.GARBAGE, count=stray)]
-            if stray
-            else []
-        )
-
-    def _object(self, t_ns: int, text: bytes) -> list[Frame | Rejection]:
+    def _object(self, t_ns: int, text: bytes) -> Items:
         found = _parsed(text)
         if found is None:
-            return [
-                Rejection(t_ns=t_ns, source=self.link, reason=Reason.GARBAGE, count=len(text) + 1)
-            ]
+            return self._garbage(t_ns, len(text) + 1)
         try:
-            return [self._frame(t_ns, *one) for one in list(_messages(found))]
+            return [self._frame(t_ns, Outgoing(SENDER, *one)) for one in list(_messages(found))]
         except (ValueError, struct.error, OverflowError) as why:
-            detail = str(why)[:80]
-            return [
-                Rejection(
-                    t_ns=t_ns,
-                    source=self.link,
-                    reason=Reason.MALFORMED,
-                    msgid=LOCATION,
-                    detail=detail,
-                )
-            ]
-
-    def _frame(self, t_ns: int, msgid: int, payload: bytes) -> Frame:
-        raw = pack(Outgoing(SENDER, msgid, payload), self._seq)
-        self._seq = (self._seq + 1) & 0xFF
-        return Frame(t_ns=t_ns, link=self.link, source=SENDER, msgid=msgid, raw=raw)
+            return self._refused(t_ns, Reason.MALFORMED, str(why)[:80], LOCATION)
 
 
 def _parsed(text: bytes) -> dict[str, Any] | None:

@@ -15,8 +15,9 @@ import re
 from datetime import datetime
 from typing import Final
 
-from companion.mavlink.wire.transponder import ADSB_VEHICLE, AircraftState, frame
-from companion.values import Frame, Reason, Rejection
+from companion.mavlink.wire.foreign import MLAT, ForeignSplitter, Items
+from companion.mavlink.wire.transponder import ADSB_VEHICLE, AircraftState
+from companion.values import Reason
 
 LINE_MAX: Final = 512  # bytes of a line at most; a longer one is garbage
 _SILENT: Final = frozenset((b"SEL", b"ID", b"AIR", b"STA", b"CLK"))
@@ -24,71 +25,30 @@ _SILENT: Final = frozenset((b"SEL", b"ID", b"AIR", b"STA", b"CLK"))
 _NUMBER: Final = re.compile(r"-?\d{1,9}(?:\.\d{1,9})?")
 
 
-class SbsSplitter:
-    """Turns the bytes of one connection into frames; ``feed`` and ``finish`` as ``Splitter``'s."""
+class SbsSplitter(ForeignSplitter):
+    """Turns the lines of one connection into frames."""
 
-    def __init__(self, link: str) -> None:
-        self.link = link
-        self._pending = b""
-        self._overlong = False
-        self._seq = 0
-
-    def feed(self, t_ns: int, data: bytes) -> list[Frame | Rejection]:
+    def feed(self, t_ns: int, data: bytes) -> Items:
         """Take in bytes that arrived at ``t_ns``; returns what the lines that end in them say."""
         *lines, self._pending = (self._pending + data).split(b"\n")
-        return self._read(t_ns, lines)
-
-    def finish(self, t_ns: int) -> list[Frame | Rejection]:
-        """End the stream: a line that has no end is given up."""
-        stray, self._pending, self._overlong = len(self._pending), b"", False
-        return (
-            [Rejection(t_ns=t_ns, source=self.link, reason=Reason.GARBAGE, count=stray)]
-            if stray
-            else []
-        )
-
-    def _read(self, t_ns: int, lines: list[bytes]) -> list[Frame | Rejection]:
-        out: list[Frame | Rejection] = []
-        garbage = 0
-        for line in lines:
+        kept, garbage = self._lines(lines, LINE_MAX)
+        out: Items = []
+        for line in kept:
             kind = line.partition(b",")[0].strip()
-            if self._overlong or len(line) > LINE_MAX:
-                garbage += len(line) + 1
-                self._overlong = False
-            elif kind in (b"MSG", b"MLAT"):
+            if kind in (b"MSG", b"MLAT"):
                 out += self._line(t_ns, line, kind)
             elif line.strip() and kind not in _SILENT:
                 garbage += len(line) + 1
-        if len(self._pending) > LINE_MAX:
-            garbage += len(self._pending)
-            self._pending, self._overlong = b"", True
-        if garbage:
-            out.append(Rejection(t_ns=t_ns, source=self.link, reason=Reason.GARBAGE, count=garbage))
-        return out
+        return out + self._garbage(t_ns, garbage + self._drop_overlong(LINE_MAX))
 
-    def _line(self, t_ns: int, line: bytes, kind: bytes) -> list[Frame | Rejection]:
+    def _line(self, t_ns: int, line: bytes, kind: bytes) -> Items:
         if kind == b"MLAT":  # found by other receivers, however well they are placed
-            detail = "MLAT: how exact it is, is not known"
-            return [
-                Rejection(t_ns=t_ns, source=self.link, reason=Reason.UNKNOWN_MESSAGE, detail=detail)
-            ]
+            return self._refused(t_ns, Reason.UNKNOWN_MESSAGE, MLAT)
         try:
-            found = frame(t_ns, self.link, aircraft_state(line.decode("ascii")), self._seq)
+            return self._aircraft(t_ns, aircraft_state(line.decode("ascii")))
         except ValueError as error:
             text = error.reason if isinstance(error, UnicodeDecodeError) else str(error)
-            return [
-                Rejection(
-                    t_ns=t_ns,
-                    source=self.link,
-                    reason=Reason.MALFORMED,
-                    msgid=ADSB_VEHICLE,
-                    detail=text,
-                )
-            ]
-        if found is None:
-            return []
-        self._seq = (self._seq + 1) & 0xFF
-        return [found]
+            return self._refused(t_ns, Reason.MALFORMED, text, ADSB_VEHICLE)
 
 
 def aircraft_state(line: str) -> AircraftState:

@@ -9,8 +9,7 @@ another dialect may add one day is not taken for them.
 import struct
 from typing import Final, NamedTuple
 
-from companion.mavlink.wire.encode import Outgoing, pack
-from companion.values import Frame, Source
+from companion.values import Source
 
 ADSB_VEHICLE: Final = 246
 SENDER: Final = Source(0, 156)  # who says it: no system, MAV_COMP_ID_ADSB
@@ -73,12 +72,3 @@ class AircraftState(NamedTuple):
             min(255, max(0, self.age_s)),
             *(self.nac_p, self.nac_v, self.gva),
         )
-
-
-def frame(t_ns: int, link: str, message: AircraftState, seq: int) -> Frame | None:
-    """The frame that says it, as if it had come over ``link``; None where nothing is known."""
-    payload = message.payload()
-    if payload is None:
-        return None
-    raw = pack(Outgoing(SENDER, ADSB_VEHICLE, payload), seq)
-    return Frame(t_ns=t_ns, link=link, source=SENDER, msgid=ADSB_VEHICLE, raw=raw)

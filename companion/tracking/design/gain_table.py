@@ -214,7 +214,8 @@ def _check(design: KinematicDesign) -> None:
     )
     if not shapes:
         raise DesignError("the tables of a design do not fit its grid")
-    bounds = np.array([design.acceleration_mps2, *_noises(design)], dtype=float)
+    noises = design.position_noise_m, design.velocity_noise_mps or 0.0
+    bounds = np.array([design.acceleration_mps2, *noises], dtype=float)
     numbers = np.concatenate([bounds, design.lyapunov, *design.corrections, *design.multipliers])
     if not (np.all(np.isfinite(numbers)) and np.all(bounds >= 0)):
         raise DesignError("the bounds of a design are finite and at least 0, its gains finite")
@@ -257,7 +258,3 @@ def invariant_bound(design: KinematicDesign, c: ArrayLike = (1.0, 0.0)) -> float
     """
     vector = np.asarray(c, dtype=float)
     return float(np.sqrt(vector @ np.linalg.solve(design.p, vector)))
-
-
-def _noises(design: KinematicDesign) -> tuple[float, float]:
-    return design.position_noise_m, design.velocity_noise_mps or 0.0

@@ -1,8 +1,9 @@
 """Shared by the commands: user mistakes as one line on stderr, and progress on a terminal."""
 
+import json
 import shutil
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -19,6 +20,14 @@ CENTER = click.option(
     metavar="SRC",
     help="What carries the array: SYSID:COMPID, LAT,LON,ALT[,HEADING], home, or the vehicle whose"
     " own log (.bin, .ulg, CSV) is named.",
+)
+LOGS = click.argument(
+    "logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path)
+)
+FOLDER = click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
+SEED = click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
+SECONDS = click.option(
+    "--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after so long."
 )
 LINKS = click.option(
     "--link",
@@ -80,6 +89,15 @@ def make_folder(out: Path) -> None:
                 each.rmdir()
 
     click.get_current_context().call_on_close(tidy)
+
+
+def write_study(
+    out: Path, name: str, answer: dict[str, Any], report: Callable[[], Mapping[str, bytes]]
+) -> None:
+    """Write the answer of a study as JSON, then its page and figures, to the folder ``out``."""
+    (out / f"{name}.json").write_text(json.dumps(answer, indent=1), encoding="utf-8")
+    for file, content in report().items():
+        (out / file).write_bytes(content)
 
 
 class InterruptedByUser(Exception):  # noqa: N818 - it is no error

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from companion.cli.console import CONFIG
+from companion.cli.console import CONFIG, SECONDS
 from companion.values import UserError
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     help="What the device does without beams, and at the end.",
 )
 @click.option("--dry-run", is_flag=True, help="Print what would be sent, and send nothing.")
-@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after so long.")
+@SECONDS
 @click.option("--json", "as_json", is_flag=True, help="How it goes, one JSON object a second.")
 def drive(
     *,

@@ -12,6 +12,7 @@ from companion.cli.console import (
     CONFIG,
     JSON,
     LATENCY,
+    LOGS,
     InterruptedByUser,
     Progress,
     of_log,
@@ -38,7 +39,7 @@ class _OrBeams(click.Command):
 
 
 @click.command(cls=_OrBeams)
-@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@LOGS
 @click.option(
     "--format",
     "form",

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from companion.cli.console import JSON_LINES, Progress, of_log, say
+from companion.cli.console import JSON_LINES, SECONDS, Progress, of_log, say
 from companion.values import UserError
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def fleet() -> None:
 
 @fleet.command()
 @click.argument("url", metavar="[URL]", default="http://127.0.0.1:8080")
-@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after so long.")
+@SECONDS
 @JSON_LINES
 def watch(url: str, seconds: float | None, as_json: bool) -> None:
     """Who is there and who serves whom, as the node at URL sees it, once a second.

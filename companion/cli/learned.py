@@ -5,14 +5,14 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import JSON, Progress
+from companion.cli.console import JSON, SEED, Progress
 
 
 @click.command()
 @click.option(
     "--out", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", required=True
 )
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
+@SEED
 @click.option("--epochs", type=click.IntRange(min=1), default=30, show_default=True)
 @click.option("--flights", type=click.IntRange(min=1), default=240, show_default=True)
 @JSON

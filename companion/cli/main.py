@@ -26,6 +26,8 @@ from companion.cli.console import (
     LATENCY,
     LINKS,
     LISTEN,
+    LOGS,
+    SECONDS,
     InterruptedByUser,
     OneLineErrors,
     Progress,
@@ -113,7 +115,7 @@ def _voice(as_json: bool) -> "Console":
 
 
 @main.command()
-@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after so long.")
+@SECONDS
 @click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True)
 @click.option("--open", "open_page", is_flag=True, help="Open the page in a browser.")
 @JSON_LINES
@@ -140,7 +142,7 @@ def demo(seconds: float | None, port: int, open_page: bool, as_json: bool) -> No
 
 
 @main.command()
-@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@LOGS
 @CONFIG
 @CENTER
 @click.option(

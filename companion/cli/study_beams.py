@@ -5,11 +5,20 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import CENTER, CONFIG, JSON, Progress, make_folder
+from companion.cli.console import (
+    CENTER,
+    CONFIG,
+    FOLDER,
+    JSON,
+    LOGS,
+    Progress,
+    make_folder,
+    write_study,
+)
 
 
 @click.command()
-@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@LOGS
 @CONFIG
 @CENTER
 @click.option(
@@ -21,7 +30,7 @@ from companion.cli.console import CENTER, CONFIG, JSON, Progress, make_folder
     default="",
     help="Compare the three widths and sharp rivals over clean, radio, hostile, noisy.",
 )
-@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
+@FOLDER
 @JSON
 def beams(
     *,
@@ -63,8 +72,6 @@ def beams(
     if any(each.center.source is None for each in settings):
         click.echo("no --center: the array stands where the first report was made", err=True)
     answer, found = study(setting, progress.show)
-    (out / "beams.json").write_text(json.dumps(answer, indent=1), encoding="utf-8")
-    for name, content in report.files(answer, found, progress.show).items():
-        (out / name).write_bytes(content)
+    write_study(out, "beams", answer, lambda: report.files(answer, found, progress.show))
     progress.clear()
     click.echo(json.dumps(answer) if as_json else report.text(found, answer["modes"]))

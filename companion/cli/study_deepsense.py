@@ -5,15 +5,13 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import JSON, Progress, make_folder
+from companion.cli.console import FOLDER, JSON, SEED, Progress, make_folder, write_study
 
 
 @click.command()
 @click.argument("where", metavar="DIR|CSV", type=click.Path(exists=True, path_type=Path))
-@click.option(
-    "--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the random split."
-)
-@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
+@SEED
+@FOLDER
 @JSON
 def deepsense(where: Path, seed: int, out: Path, as_json: bool) -> None:
     """How well a position tells the best beam, on a scenario of DeepSense 6G.
@@ -30,8 +28,6 @@ def deepsense(where: Path, seed: int, out: Path, as_json: bool) -> None:
     samples = measured_beams.read(where)
     make_folder(out)
     answer = study.study(samples, seed, progress.show)
-    (out / "deepsense.json").write_text(json.dumps(answer, indent=1), encoding="utf-8")
-    for name, content in report.files(answer, progress.show).items():
-        (out / name).write_bytes(content)
+    write_study(out, "deepsense", answer, lambda: report.files(answer, progress.show))
     progress.clear()
     click.echo(json.dumps(answer) if as_json else study.text(answer))

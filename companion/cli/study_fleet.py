@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import JSON, Progress, make_folder
+from companion.cli.console import FOLDER, JSON, SEED, Progress, make_folder, write_study
 
 
 def _span(_context: click.Context, _option: click.Parameter, text: str) -> tuple[int, int]:
@@ -48,8 +48,8 @@ def _steps(span: tuple[int, int], steps: int) -> list[int]:
     "--loss", type=click.FloatRange(0, 0.9), default=0.02, show_default=True,
     help="Share of messages between nodes that is lost.",
 )  # fmt: skip
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
-@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
+@SEED
+@FOLDER
 @JSON
 def fleet(
     *,
@@ -73,6 +73,7 @@ def fleet(
     Example: companion study fleet --nodes 3..30 --uavs 100..1000 --out report
     """
     from companion.studies.fleet import report, study
+    from companion.studies.origin import command_line
 
     progress = Progress()
     sizes = tuple(zip(_steps(nodes, steps), _steps(uavs, steps), strict=True))
@@ -81,13 +82,18 @@ def fleet(
     )
     make_folder(out)
     found = list(study.run(asked, time.process_time, progress.show))
-    spans = f"--nodes {nodes[0]}..{nodes[1]} --uavs {uavs[0]}..{uavs[1]} --steps {steps}"
-    command = f"companion study fleet {spans} --seconds {seconds:g} --spacing {spacing:g}"
-    answer = study.answer(
-        asked, found, f"{command} --delay {delay:g} --loss {loss:g} --seed {seed}"
+    command = command_line(
+        "fleet",
+        nodes=f"{nodes[0]}..{nodes[1]}",
+        uavs=f"{uavs[0]}..{uavs[1]}",
+        steps=steps,
+        seconds=seconds,
+        spacing=spacing,
+        delay=delay,
+        loss=loss,
+        seed=seed,
     )
-    (out / "fleet.json").write_text(json.dumps(answer, indent=1), encoding="utf-8")
-    for name, content in report.files(asked, found, answer, progress.show).items():
-        (out / name).write_bytes(content)
+    answer = study.answer(asked, found, command)
+    write_study(out, "fleet", answer, lambda: report.files(asked, found, answer, progress.show))
     progress.clear()
     click.echo(json.dumps(answer) if as_json else report.text(found))

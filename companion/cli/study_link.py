@@ -5,7 +5,16 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import CENTER, CONFIG, JSON, Progress, make_folder
+from companion.cli.console import (
+    CENTER,
+    CONFIG,
+    FOLDER,
+    JSON,
+    SEED,
+    Progress,
+    make_folder,
+    write_study,
+)
 
 
 def _range(_context: click.Context, _option: click.Parameter, text: str) -> list[float]:
@@ -60,8 +69,8 @@ def _range(_context: click.Context, _option: click.Parameter, text: str) -> list
     show_default=True,
     help="Mean delay of the scattered rays, ns; 0: a flat channel.",
 )
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
-@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
+@SEED
+@FOLDER
 @JSON
 def link(
     *,
@@ -114,8 +123,6 @@ def link(
     )
     make_folder(out)
     answer = study(setting, progress.show)
-    (out / "link.json").write_text(json.dumps(answer, indent=1), encoding="utf-8")
-    for name, content in report.files(answer, progress.show).items():
-        (out / name).write_bytes(content)
+    write_study(out, "link", answer, lambda: report.files(answer, progress.show))
     progress.clear()
     click.echo(json.dumps(answer) if as_json else report.text(answer))

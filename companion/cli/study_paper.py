@@ -5,12 +5,12 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import JSON, Progress, make_folder
+from companion.cli.console import FOLDER, JSON, SEED, Progress, make_folder, write_study
 
 
 @click.command()
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
-@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
+@SEED
+@FOLDER
 @JSON
 def paper(seed: int, out: Path, as_json: bool) -> None:
     """The published experiments made again, and every claim judged.
@@ -25,15 +25,13 @@ def paper(seed: int, out: Path, as_json: bool) -> None:
     make_folder(out)
     answer, material = experiments.study(seed, progress.show)
     answer["claims"] = claims.judge(answer)
-    (out / "paper.json").write_text(json.dumps(answer, indent=1), encoding="utf-8")
-    for name, content in page.paper_files(answer, material, progress.show).items():
-        (out / name).write_bytes(content)
+    write_study(out, "paper", answer, lambda: page.paper_files(answer, material, progress.show))
     progress.clear()
     click.echo(json.dumps(answer) if as_json else page.text(answer))
 
 
 @click.command()
-@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
+@FOLDER
 @JSON
 def dt(out: Path, as_json: bool) -> None:
     """How often UAVs must report: feasible intervals and their bounds, as maps.
@@ -47,8 +45,6 @@ def dt(out: Path, as_json: bool) -> None:
     progress = Progress()
     make_folder(out)
     answer, found = maps.study(progress.show)
-    (out / "dt.json").write_text(json.dumps(answer), encoding="utf-8")
-    for name, content in maps.files(answer, found, progress.show).items():
-        (out / name).write_bytes(content)
+    write_study(out, "dt", answer, lambda: maps.files(answer, found, progress.show))
     progress.clear()
     click.echo(json.dumps(answer) if as_json else maps.text(answer))

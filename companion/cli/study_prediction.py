@@ -6,12 +6,23 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import CENTER, CONFIG, JSON, Progress, make_folder, say
+from companion.cli.console import (
+    CENTER,
+    CONFIG,
+    FOLDER,
+    JSON,
+    LOGS,
+    SEED,
+    Progress,
+    make_folder,
+    say,
+    write_study,
+)
 from companion.cli.design import numbers
 
 
 @click.command()
-@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@LOGS
 @CONFIG
 @CENTER
 @click.option(
@@ -45,7 +56,7 @@ from companion.cli.design import numbers
     "--loss", metavar="F", type=float, default=0.1, show_default=True, help="Share that is lost."
 )
 @click.option("--known-delay", is_flag=True, help="The senders' clocks are known, as by TIMESYNC.")
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
+@SEED
 @click.option(
     "--snr",
     "snr_db",
@@ -62,7 +73,7 @@ from companion.cli.design import numbers
 )
 @click.option("--jobs", metavar="N", type=click.IntRange(min=1), help="Processes.  [all cores]")
 @click.option("--cluster", metavar="ADDRESS", help="Work on a Dask cluster, such as tcp://H:8786.")
-@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
+@FOLDER
 @JSON
 def prediction(
     *,
@@ -129,9 +140,7 @@ def prediction(
     if center is None:
         click.echo("no --center: the array stands where the first report was made", err=True)
     answer, found = study(setting, progress.show)
-    (out / "prediction.json").write_text(json.dumps(answer, indent=1), encoding="utf-8")
-    for each, content in report.files(answer, found, progress.show).items():
-        (out / each).write_bytes(content)
+    write_study(out, "prediction", answer, lambda: report.files(answer, found, progress.show))
     progress.clear()
     click.echo(json.dumps(answer) if as_json else tables.text(found))
     took_s = time.monotonic() - began_s

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import CENTER, CONFIG, LATENCY, Progress, tell_vehicles
+from companion.cli.console import CENTER, CONFIG, LATENCY, LOGS, Progress, tell_vehicles
 from companion.values import WeightFormat
 
 
 @click.command()
-@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@LOGS
 @click.option(
     "--at",
     metavar="T",

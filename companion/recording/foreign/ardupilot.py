@@ -11,16 +11,19 @@ import numpy as np
 
 from companion.recording.foreign.dataflash import Bytes, DataflashTable, table, walk
 from companion.recording.foreign.onboard import (
+    NEAR_US,
     Attitudes,
     Fixes,
     Onboard,
     OnboardPositions,
     Truth,
-    between,
+    headings_between,
     in_time,
     moved,
     on_earth,
+    sound_rows,
     turned,
+    vectors_between,
 )
 from companion.recording.foreign.receiver import count, fixes_of, times
 from companion.values import BoolArray, FloatArray, IntArray, Reason
@@ -36,8 +39,6 @@ _BY_BUILD: Final = {1: 10, 2: 2, 3: 1, 4: 5, 7: 12, 12: 7, 13: 4}
 _BY_FRAME: Final = {1: 2, 2: 13, 3: 14, 4: 14, 5: 13, 6: 4, 7: 15, 8: 3, 9: 3, 11: 4, 13: 4}
 """MAV_TYPE by FRAME_CLASS of a copter."""
 _VTOL: Final = 22
-_NEAR_US: Final = 500_000
-"""How far a velocity or heading may be off a position that it is put beside."""
 
 
 def read(data: Bytes) -> Onboard:
@@ -169,24 +170,13 @@ def _received(
     fixes: Fixes, tables: dict[str, DataflashTable], notes: list[str]
 ) -> OnboardPositions | None:
     """The receiver's own positions, where the log has no estimated ones."""
-    fixed = fixes.fix_type >= 3
-    if not fixed.any():
+    fixed = fixes.fixed()
+    if fixed is None:
         return None
     notes.append("no POS in it: positions are those of the receiver")
-    boot_us, lat_1e7 = fixes.boot_us[fixed], fixes.lat_1e7[fixed]
-    lon_1e7, alt_m = fixes.lon_1e7[fixed], fixes.alt_m[fixed]
-    way = moved(boot_us, lat_1e7, lon_1e7, alt_m)
-    velocity = _filled(np.full_like(way, np.nan), boot_us, fixes, way, notes)
-    heading = _headings(boot_us, tables["ATT"])
-    return OnboardPositions(
-        boot_us=boot_us,
-        lat_1e7=lat_1e7,
-        lon_1e7=lon_1e7,
-        alt_m=alt_m,
-        height_m=alt_m - alt_m[0],
-        velocity_ned_mps=velocity,
-        heading_deg=heading,
-    )
+    way = moved(fixed.boot_us, fixed.lat_1e7, fixed.lon_1e7, fixed.alt_m)
+    velocity = _filled(np.full_like(way, np.nan), fixed.boot_us, fixes, way, notes)
+    return fixed.positions(velocity, _headings(fixed.boot_us, tables["ATT"]))
 
 
 def _velocities(boot_us: IntArray, tables: dict[str, DataflashTable]) -> FloatArray:
@@ -206,9 +196,8 @@ def _velocities(boot_us: IntArray, tables: dict[str, DataflashTable]) -> FloatAr
         states = states.rows(core == used)
     said_us = times(states)
     velocity = np.stack([states.numbers(axis) for axis in ("VN", "VE", "VD")], axis=1)
-    sound = np.isfinite(velocity).all(axis=1) & (np.abs(velocity) < 1e4).all(axis=1)
-    order = np.argsort(said_us[sound], kind="stable")
-    return between(boot_us, said_us[sound][order], velocity[sound][order], _NEAR_US)
+    order = np.argsort(said_us, kind="stable")
+    return vectors_between(boot_us, said_us[order], velocity[order], NEAR_US)
 
 
 def _filled(
@@ -219,36 +208,27 @@ def _filled(
     notes.append(f"no estimated velocity at {missing.sum()} of {len(boot_us)} positions")
     put = way.copy()
     if fixes is not None:
-        course = np.radians(fixes.course_deg)
-        level = np.stack([np.cos(course), np.sin(course)], axis=1) * fixes.speed_mps[:, None]
-        sound = np.isfinite(level).all(axis=1) & (np.abs(level) < 1e4).all(axis=1)
-        there = between(boot_us, fixes.boot_us[sound], level[sound], _NEAR_US)
+        there = vectors_between(boot_us, fixes.boot_us, fixes.velocity_mps, NEAR_US)
         put[:, :2] = np.where(np.isnan(there), put[:, :2], there)
     return np.where(missing[:, None], put, velocity)
 
 
 def _headings(boot_us: IntArray, attitude: DataflashTable) -> FloatArray:
-    yaw_deg = attitude.numbers("Yaw")
-    sound = np.isfinite(yaw_deg) & (np.abs(yaw_deg) < 1e4)
-    if not sound.any():
-        return np.full(len(boot_us), np.nan)
-    straight = np.degrees(np.unwrap(np.radians(yaw_deg[sound])))
-    return between(boot_us, times(attitude)[sound], straight, _NEAR_US)
+    return headings_between(boot_us, times(attitude), np.radians(attitude.numbers("Yaw")))
 
 
 def _attitudes(
     of: DataflashTable, gyro: DataflashTable, lost: dict[Reason, int]
 ) -> Attitudes | None:
     angles = np.stack([of.numbers(name) for name in ("Roll", "Pitch", "Yaw")], axis=1)
-    sound = np.isfinite(angles).all(axis=1) & (np.abs(angles) < 1e4).all(axis=1)
+    sound = sound_rows(angles, 1e4)
     count(lost, Reason.MALFORMED, int((~sound).sum()))
     if not sound.any():
         return None
     boot_us, euler = times(of)[sound], np.radians(angles[sound])
     rates = turned(boot_us, euler)
     measured = np.radians(np.stack([gyro.numbers(name) for name in ("R", "P", "Y")], axis=1))
-    sure = np.isfinite(measured).all(axis=1) & (np.abs(measured) < 1e3).all(axis=1)
-    there = between(boot_us, times(gyro)[sure], measured[sure], _NEAR_US // 5)
+    there = vectors_between(boot_us, times(gyro), measured, NEAR_US // 5, 1e3)
     return Attitudes(boot_us, euler, np.where(np.isnan(there), rates, there))
 
 
@@ -265,8 +245,7 @@ def _truth(sim: DataflashTable, motion: DataflashTable, lost: dict[Reason, int])
     if not len(boot_us):
         return None
     velocity = np.stack([motion.numbers(name) for name in ("VN", "VE", "VD")], axis=1)
-    sure = np.isfinite(velocity).all(axis=1) & (np.abs(velocity) < 1e4).all(axis=1)
-    there = between(boot_us, times(motion)[sure], velocity[sure], _NEAR_US // 5)
+    there = vectors_between(boot_us, times(motion), velocity, NEAR_US // 5)
     there = np.where(np.isnan(there), moved(boot_us, lat_1e7, lon_1e7, alt_m), there)
     return Truth(
         boot_us=boot_us,

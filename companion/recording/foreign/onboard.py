@@ -5,7 +5,7 @@ are in order of time.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Final
 
 import numpy as np
@@ -14,6 +14,8 @@ from companion.recording.foreign.gps_time import GpsTime
 from companion.values import BoolArray, FloatArray, IntArray, Reason
 
 REBOOT_US: Final = 10_000_000  # a step back of a boot clock that is no mere disorder in the file
+NEAR_US: Final = 500_000
+"""How far a velocity or heading may be off a position that it is put beside."""
 _NEAR: Final = 4
 _WILD_US: Final = 120_000_000
 """How far a stamp may be off the middle of those around it in the file."""
@@ -59,6 +61,34 @@ class Fixes:
     accuracies: FloatArray  # (N, 3): horizontal m, vertical m, speed m/s; NaN: unknown
     speed_mps: FloatArray  # over ground
     course_deg: FloatArray  # over ground, from true north
+
+    @property
+    def velocity_mps(self) -> FloatArray:
+        """Velocities over ground (N, 2), north and east."""
+        course = np.radians(self.course_deg)
+        velocity: FloatArray = (
+            np.stack([np.cos(course), np.sin(course)], axis=1) * self.speed_mps[:, None]
+        )
+        return velocity
+
+    def fixed(self) -> "Fixes | None":
+        """Those with a position; None without any."""
+        rows = self.fix_type >= 3
+        if not rows.any():
+            return None
+        return Fixes(**{one.name: getattr(self, one.name)[rows] for one in fields(self)})
+
+    def positions(self, velocity_ned_mps: FloatArray, heading_deg: FloatArray) -> OnboardPositions:
+        """The receiver's own positions, where the log has no estimated ones."""
+        return OnboardPositions(
+            boot_us=self.boot_us,
+            lat_1e7=self.lat_1e7,
+            lon_1e7=self.lon_1e7,
+            alt_m=self.alt_m,
+            height_m=self.alt_m - self.alt_m[0],
+            velocity_ned_mps=velocity_ned_mps,
+            heading_deg=heading_deg,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -124,6 +154,28 @@ def on_earth(lat_1e7: IntArray, lon_1e7: IntArray, *others: FloatArray) -> BoolA
     for other in others:
         sound &= np.isfinite(other) & (np.abs(other) < 1e6)
     return sound
+
+
+def sound_rows(values: FloatArray, most: float) -> BoolArray:
+    """Whether all numbers of each row (N, K) are finite and smaller than ``most``."""
+    sound: BoolArray = np.array((np.abs(values) < most).all(axis=1))  # which NaN is not
+    return sound
+
+
+def vectors_between(
+    at_us: IntArray, boot_us: IntArray, values: FloatArray, gap_us: int, most: float = 1e4
+) -> FloatArray:
+    """As ``between`` for (N, K), of those rows alone that ``sound_rows`` takes."""
+    sound = sound_rows(values, most)
+    return between(at_us, boot_us[sound], values[sound], gap_us)
+
+
+def headings_between(at_us: IntArray, boot_us: IntArray, heading_rad: FloatArray) -> FloatArray:
+    """Headings at other times (M,), degrees; NaN where no sample is near."""
+    sound = np.isfinite(heading_rad) & (np.abs(heading_rad) < 1e3)
+    if not sound.any():
+        return np.full(len(at_us), np.nan)
+    return between(at_us, boot_us[sound], np.degrees(np.unwrap(heading_rad[sound])), NEAR_US)
 
 
 def between(at_us: IntArray, boot_us: IntArray, values: FloatArray, gap_us: int) -> FloatArray:

@@ -13,18 +13,21 @@ from companion.recording.foreign import gps_time, ulog
 from companion.recording.foreign.dataflash import Bytes
 from companion.recording.foreign.gps_time import GpsTime
 from companion.recording.foreign.onboard import (
+    NEAR_US,
     Attitudes,
     Fixes,
     Onboard,
     OnboardPositions,
     Truth,
-    between,
     euler_of,
+    headings_between,
     in_time,
     moved,
     on_earth,
     turned,
+    vectors_between,
 )
+from companion.recording.foreign.receiver import count
 from companion.recording.foreign.ulog import UlogTable, table, walk
 from companion.values import BoolArray, FloatArray, IntArray, Reason
 
@@ -39,7 +42,6 @@ _WANTED: Final = (
 )  # fmt: skip
 _PX4: Final = 12
 _ARMED: Final = 2
-_NEAR_US: Final = 500_000
 
 Lost = dict[Reason, int]
 
@@ -57,8 +59,8 @@ def read(data: Bytes) -> Onboard:
     if walked.unknown:
         raise UnknownFlagsError
     lost: Lost = {}
-    _count(lost, Reason.GARBAGE, walked.lost)
-    _count(lost, Reason.MALFORMED, walked.refused)
+    count(lost, Reason.GARBAGE, walked.lost)
+    count(lost, Reason.MALFORMED, walked.refused)
     tables = {name: _timed(table(data, walked, name), lost) for name in _WANTED}
     gps = _timed(table(data, walked, *_GPS), {})
     fixes, clock = _fixes(gps, lost)
@@ -81,12 +83,7 @@ def read(data: Bytes) -> Onboard:
     )
 
 
-def _count(lost: Lost, reason: Reason, number: int) -> None:
-    if number:
-        lost[reason] = lost.get(reason, 0) + number
-
-
-def _times(of: UlogTable) -> IntArray:
+def _times(of: Table) -> IntArray:
     """When samples were true: the time of what they are made of, where it is said."""
     sampled = of.integers("timestamp_sample")
     found = of.integers("timestamp") if sampled is None or not sampled.all() else sampled
@@ -96,10 +93,10 @@ def _times(of: UlogTable) -> IntArray:
 def _timed(of: UlogTable, lost: Lost) -> UlogTable:
     times = _times(of)
     if len(times) != len(of):
-        _count(lost, Reason.MALFORMED, len(of))
+        count(lost, Reason.MALFORMED, len(of))
         return of.rows(np.zeros(0, dtype=np.int64))
     rows, wild = in_time(times)
-    _count(lost, Reason.BAD_STAMP, wild)
+    count(lost, Reason.BAD_STAMP, wild)
     return of.rows(rows)
 
 
@@ -138,7 +135,7 @@ def _fixes(gps: UlogTable, lost: Lost) -> tuple[Fixes | None, GpsTime | None]:
     lat_1e7, lon_1e7 = (_degrees(gps, "lat", "latitude_deg"), _degrees(gps, "lon", "longitude_deg"))
     alt_m = gps.numbers("alt") * 1e-3 if "alt" in gps else gps.numbers("altitude_msl_m")
     sound = on_earth(lat_1e7, lon_1e7, alt_m, gps.numbers("fix_type"))
-    _count(lost, Reason.MALFORMED, int((~sound).sum()))
+    count(lost, Reason.MALFORMED, int((~sound).sum()))
     gps = gps.rows(sound)
     if not len(gps):
         return None, None
@@ -170,7 +167,7 @@ def _positions(
         return None if fixes is None else _received(fixes, local, notes)
     lat_1e7, lon_1e7, alt_m = _place(place)
     sound = on_earth(lat_1e7, lon_1e7, alt_m)
-    _count(lost, Reason.MALFORMED, int((~sound).sum()))
+    count(lost, Reason.MALFORMED, int((~sound).sum()))
     place, boot_us = place.rows(sound), _times(place)[sound]
     lat_1e7, lon_1e7, alt_m = lat_1e7[sound], lon_1e7[sound], alt_m[sound]
     if not len(boot_us):
@@ -204,41 +201,24 @@ def _place(of: UlogTable) -> tuple[IntArray, IntArray, FloatArray]:
 
 def _received(fixes: Fixes, local: UlogTable, notes: list[str]) -> OnboardPositions | None:
     """The receiver's own positions, where the estimator had none."""
-    fixed = fixes.fix_type >= 3
-    if not fixed.any():
+    fixed = fixes.fixed()
+    if fixed is None:
         return None
     notes.append("no vehicle_global_position in it: positions are those of the receiver")
-    boot_us, lat_1e7 = fixes.boot_us[fixed], fixes.lat_1e7[fixed]
-    lon_1e7, alt_m = fixes.lon_1e7[fixed], fixes.alt_m[fixed]
-    velocity = moved(boot_us, lat_1e7, lon_1e7, alt_m)
-    course, speed = np.radians(fixes.course_deg[fixed]), fixes.speed_mps[fixed]
-    level = np.stack([np.cos(course), np.sin(course)], axis=1) * speed[:, None]
+    velocity = moved(fixed.boot_us, fixed.lat_1e7, fixed.lon_1e7, fixed.alt_m)
+    level = fixed.velocity_mps
     velocity[:, :2] = np.where(np.isfinite(level), level, velocity[:, :2])
-    heading = _headings(boot_us, local)
-    return OnboardPositions(
-        boot_us=boot_us,
-        lat_1e7=lat_1e7,
-        lon_1e7=lon_1e7,
-        alt_m=alt_m,
-        height_m=alt_m - alt_m[0],
-        velocity_ned_mps=velocity,
-        heading_deg=heading,
-    )
+    return fixed.positions(velocity, _headings(fixed.boot_us, local))
 
 
 def _velocities(boot_us: IntArray, local: UlogTable) -> FloatArray:
     velocity = np.stack([local.numbers(name) for name in ("vx", "vy", "vz")], axis=1)
-    sound = np.isfinite(velocity).all(axis=1) & (np.abs(velocity) < 1e4).all(axis=1)
-    return between(boot_us, _times(local)[sound], velocity[sound], _NEAR_US)
+    return vectors_between(boot_us, _times(local), velocity, NEAR_US)
 
 
 def _headings(boot_us: IntArray, local: UlogTable) -> FloatArray:
     heading = local.numbers("heading" if "heading" in local else "yaw")
-    sound = np.isfinite(heading) & (np.abs(heading) < 1e3)
-    if not sound.any():
-        return np.full(len(boot_us), np.nan)
-    straight = np.degrees(np.unwrap(heading[sound]))
-    return between(boot_us, _times(local)[sound], straight, _NEAR_US)
+    return headings_between(boot_us, _times(local), heading)
 
 
 def _turns(of: UlogTable, lost: Lost) -> tuple[IntArray, FloatArray]:
@@ -246,7 +226,7 @@ def _turns(of: UlogTable, lost: Lost) -> tuple[IntArray, FloatArray]:
     quaternions = of.numbers("q", 4)
     length = np.linalg.norm(quaternions, axis=1) if len(of) else np.zeros(0)
     sound = np.abs(length - 1) < 0.1
-    _count(lost, Reason.MALFORMED, int((~sound).sum()))
+    count(lost, Reason.MALFORMED, int((~sound).sum()))
     return _times(of)[sound], quaternions[sound] / length[sound, None]
 
 
@@ -256,9 +236,7 @@ def _attitudes(tables: dict[str, UlogTable], lost: Lost) -> Attitudes | None:
         return None
     euler = euler_of(quaternions)
     gyro = tables[_RATES]
-    measured = gyro.numbers("xyz", 3)
-    sure = np.isfinite(measured).all(axis=1) & (np.abs(measured) < 1e3).all(axis=1)
-    rates = between(boot_us, _times(gyro)[sure], measured[sure], _NEAR_US // 5)
+    rates = vectors_between(boot_us, _times(gyro), gyro.numbers("xyz", 3), NEAR_US // 5, 1e3)
     return Attitudes(boot_us, euler, np.where(np.isnan(rates), turned(boot_us, euler), rates))
 
 
@@ -266,7 +244,7 @@ def _truth(tables: dict[str, UlogTable], lost: Lost) -> Truth | None:
     of = tables[f"{_GLOBAL}_groundtruth"]
     lat_1e7, lon_1e7, alt_m = _place(of)
     sound = on_earth(lat_1e7, lon_1e7, alt_m)
-    _count(lost, Reason.MALFORMED, int((~sound).sum()))
+    count(lost, Reason.MALFORMED, int((~sound).sum()))
     boot_us = _times(of)[sound]
     lat_1e7, lon_1e7, alt_m = lat_1e7[sound], lon_1e7[sound], alt_m[sound]
     if not len(boot_us):
@@ -278,7 +256,7 @@ def _truth(tables: dict[str, UlogTable], lost: Lost) -> Truth | None:
     near = np.zeros((len(boot_us), 4))
     if len(turned_at):
         row = np.clip(np.searchsorted(turned_at, boot_us), 0, len(turned_at) - 1)
-        close = np.abs(turned_at[row] - boot_us) < _NEAR_US // 10
+        close = np.abs(turned_at[row] - boot_us) < NEAR_US // 10
         near = np.where(close[:, None], quaternions[row], 0.0)
     return Truth(
         boot_us=boot_us,

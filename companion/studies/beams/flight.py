@@ -12,33 +12,31 @@ Over 300 lines: one study: its settings, its looks, its answer.
 """
 
 import math
-import platform
-import shlex
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-import companion
 from companion.beams.aim import aim, directions
-from companion.beams.array.steering import steering_matrix
 from companion.beams.hardware import codebooks
 from companion.beams.hardware.codebooks import Codebook
-from companion.beams.worth import guarantee, link_budget
+from companion.beams.worth import link_budget
 from companion.node.replay import log_events
 from companion.pipeline import assembly
 from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
 from companion.studies.beams import modes
-from companion.studies.beams.worth import Row, Sample, Worth, summed_up
+from companion.studies.beams.worth import Row, Sample, Worth, given, summed_up
+from companion.studies.origin import command_line, versions
 from companion.studies.prediction.radio_link import LINKS
 from companion.studies.truth import array_truth
 from companion.studies.truth.array_truth import ArrayTruth
 from companion.studies.truth.vehicles import named
-from companion.values import BeamSet, Carrier, FloatArray, Track, Update, UserError, Widen, kind_of
+from companion.values import BeamSet, Carrier, FloatArray, Update, UserError, Widen, kind_of
 
 PROGRESS_EVERY: Final = 20  # looks between two reports of progress
 
@@ -69,16 +67,9 @@ class BeamStudy:
     @property
     def command(self) -> str:
         """The command line that asks for this study."""
-        words = [
-            "companion",
-            "study",
-            "beams",
-            *(str(log) for logs in self.flights for log in logs),
-        ]
-        words += ["--center", self.center] if self.center else []
-        words += ["--config", self.config] if self.config else []
-        words += ["--links", ",".join(self.links)] if self.links else []
-        return shlex.join([*words, "--hz", f"{self.hz:g}"])
+        logs = chain.from_iterable(self.flights)
+        given = {"center": self.center, "config": self.config, "links": self.links, "hz": self.hz}
+        return command_line("beams", *logs, **given)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,9 +80,9 @@ class Watched:
     center: str
     array: str
     codebook_beams: int | None
-    truth: str | None
     widen: bool
     looks: int
+    truth: str | None
     samples: tuple[Sample, ...]
 
     @property
@@ -124,16 +115,7 @@ class Sight:
         if not beam_set.beams:
             return {}
         array, towards = self.pipeline.array, directions(beam_set)
-        bounds = guarantee.covered_bounds(
-            array,
-            self.pipeline.coverage,
-            towards,
-            [beam.pointing_bound_rad for beam in beam_set.beams],
-        )
-        guaranteed = guarantee.guaranteed_gains_db(array, towards, bounds, beam_set.weights)
-        seen = np.array([truly.get(uav, np.full(3, np.nan)) for uav in beam_set.uavs])
-        responses = np.einsum("mn,mn->n", steering_matrix(array, seen), beam_set.weights)
-        power = np.einsum("mn,mn->n", beam_set.weights, beam_set.weights.conj()).real
+        guaranteed, true_gains = given(self.pipeline, beam_set, truly)
         budget, antennas = self.equipment.budget, self.equipment.uav_antennas
         sinr_db = link_budget.sinr_of_beams_db(array, beam_set, towards, budget, antennas)
         efficiency = link_budget.spectral_efficiency(10 ** (sinr_db / 10), beam_set.groups)
@@ -142,7 +124,7 @@ class Sight:
                 gain_db=beam.gain_db,
                 loss_db=beam.loss_db,
                 guaranteed_gain_db=guaranteed[i],
-                true_gain_db=_db(abs(responses[i]) ** 2 / power[i]),
+                true_gain_db=10 * math.log10(true_gains[i]) if beam.uav in truly else None,
                 sinr_db=float(sinr_db[i]),
                 spectral_efficiency=float(efficiency[i]),
                 group=beam.group,
@@ -191,7 +173,7 @@ def look(seen: Sight, update: Update, truth: ArrayTruth | None, t_s: float) -> l
     pipeline, carrier = seen.pipeline, update.carrier
     if carrier is None:
         return [Sample(t_s=t_s, uav=track.uav) for track in update.tracks]
-    truly = _true_directions(update.tracks, carrier, pipeline, truth)
+    truly = array_truth.known_directions(truth, update.tracks, carrier, pipeline.array)
     as_set = update.beams
     sharp = as_set
     if pipeline.precoder.widen is not Widen.NO:
@@ -236,27 +218,9 @@ def look(seen: Sight, update: Update, truth: ArrayTruth | None, t_s: float) -> l
     return samples
 
 
-def _true_directions(
-    tracks: tuple[Track, ...], carrier: Carrier, pipeline: Pipeline, truth: ArrayTruth | None
-) -> dict[str, FloatArray]:
-    if truth is None:
-        return {}
-    found = truth.directions(tracks, carrier, pipeline.array)
-    return {
-        track.uav: towards
-        for track, towards in zip(tracks, found, strict=True)
-        if not np.isnan(towards).any()
-    }
-
-
 def _angle_rad(towards: FloatArray, truly: FloatArray) -> float:
     """Angle between two unit directions (3,); exact for small ones."""
     return math.atan2(float(np.linalg.norm(np.cross(towards, truly))), float(towards @ truly))
-
-
-def _db(power: float) -> float | None:
-    """Decibels of a power; None for NaN, that is, a UAV whose true direction is not known."""
-    return None if math.isnan(power) else 10 * math.log10(max(power, 1e-30))
 
 
 # --- the study ----------------------------------------------------------------------------------
@@ -346,22 +310,10 @@ def study(
         "modes": modes_found,
         "summary": summed_up([sample for watched in found for sample in watched.samples]),
         "logs": [
-            {
-                "log": watched.log,
-                "center": watched.center,
-                "array": watched.array,
-                "codebook_beams": watched.codebook_beams,
-                "widen": watched.widen,
-                "looks": watched.looks,
-                "truth": watched.truth,
-            }
-            for watched in found
+            {field.name: getattr(watched, field.name) for field in fields(Watched)[:-1]}
+            for watched in found  # without its samples
         ],
         "command": setting.command,
-        "versions": {
-            "companion": companion.__version__,
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        },
+        "versions": versions(),
         "hz": setting.hz,
     }, found

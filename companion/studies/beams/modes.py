@@ -19,13 +19,14 @@ from companion.beams import hysteresis
 from companion.beams.aim import aim, directions
 from companion.beams.array.steering import steering_matrix
 from companion.beams.hysteresis import Hysteresis
-from companion.beams.worth import guarantee, link_budget
+from companion.beams.worth import link_budget
 from companion.node.replay import log_events
 from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
 from companion.pipeline.ticks import with_ticks
 from companion.recording.reader import read_flight
 from companion.settings.model import Settings
+from companion.studies.beams.worth import Row, given, mean, percentile, share
 from companion.studies.prediction.baselines import ObservedReport, Predictor
 from companion.studies.prediction.delivery import deliver
 from companion.studies.prediction.kalman import Kalman
@@ -53,8 +54,6 @@ LOOK_EVERY: Final = 4  # ticks from one look to the next; beams are made at each
 ALIKE: Final = 0.9  # correlation of two shapes of one beam below which it has changed
 JUMP_DB: Final = 1.0  # change of a predicted gain from tick to tick that is a jump
 
-Row = dict[str, Any]
-
 
 @dataclass(slots=True, kw_only=True)
 class _Way:
@@ -74,31 +73,19 @@ class _Way:
 
     def row(self) -> Row:
         """The figures; shares are of beams, and None where there is nothing to tell."""
-        sure = np.array(self.sure_db)
         return {
             "beams": self.name,
             "n": len(self.predicted_db),
-            "true_gain_p5_db": _percentile(self.true_db, 5),
-            "true_gain_median_db": _percentile(self.true_db, 50),
-            "predicted_gain_median_db": _percentile(self.predicted_db, 50),
-            "guaranteed_above_0_db_share": float(np.mean(sure > 0)) if len(sure) else None,
-            "guaranteed_gain_median_db": _percentile(self.sure_db, 50),
+            "true_gain_p5_db": percentile(self.true_db, 5),
+            "true_gain_median_db": percentile(self.true_db, 50),
+            "predicted_gain_median_db": percentile(self.predicted_db, 50),
+            "guaranteed_above_0_db_share": share(sure > 0 for sure in self.sure_db),
+            "guaranteed_gain_median_db": percentile(self.sure_db, 50),
             "violations": self.violations,
-            "spectral_efficiency_mean": float(np.mean(self.rates)) if self.rates else None,
-            "changed_shape_share": _share(np.array(self.correlations) < ALIKE),
-            "jump_share": _share(np.array(self.jumps_db) > JUMP_DB),
+            "spectral_efficiency_mean": mean(self.rates),
+            "changed_shape_share": share(one < ALIKE for one in self.correlations),
+            "jump_share": share(jump_db > JUMP_DB for jump_db in self.jumps_db),
         }
-
-
-def _percentile(values: Sequence[float], percent: float) -> float | None:
-    if not values:
-        return None
-    found = float(np.percentile(values, percent, method="inverted_cdf"))  # one that occurred
-    return found if np.isfinite(found) else None
-
-
-def _share(marks: Any) -> float | None:
-    return float(np.mean(marks)) if len(marks) else None
 
 
 # --- the events of a link -----------------------------------------------------------------------
@@ -231,29 +218,22 @@ def _make(
             way.jumps_db.append(abs(way.last[uav][1] - gain_db))
     way.last = seen
     if looks and made.beams:
-        true = None if truth is None else truth.directions(tracks, update.carrier, pipeline.array)
-        by_uav = {} if true is None else dict(zip((t.uav for t in tracks), true, strict=True))
-        _judge(pipeline, made, by_uav, way)
+        true = array_truth.known_directions(truth, tracks, update.carrier, pipeline.array)
+        _judge(pipeline, made, true, way)
 
 
 def _judge(pipeline: Pipeline, made: BeamSet, true: dict[str, FloatArray], way: _Way) -> None:
     array, how = pipeline.array, pipeline.precoder
-    towards = directions(made)
-    bounds = guarantee.covered_bounds(
-        array, pipeline.coverage, towards, [beam.pointing_bound_rad for beam in made.beams]
-    )
-    sure = guarantee.guaranteed_gains_db(array, towards, bounds, made.weights)
+    sure, gains = given(pipeline, made, true)
+    gains_db = 10 * np.log10(gains)
     way.sure_db += [-np.inf if one is None else one for one in sure]
     way.predicted_db += [beam.gain_db for beam in made.beams]
-    there = np.array([true.get(uav, np.full(3, np.nan)) for uav in made.uavs])
-    known = ~np.isnan(there).any(axis=1)
-    there = np.where(known[:, np.newaxis], there, towards)
+    there = directions(made)
+    for n, uav in enumerate(made.uavs):
+        there[n] = true.get(uav, there[n])
     sinr_db = link_budget.sinr_of_beams_db(array, made, there, how.budget, how.uav_antennas)
     rates = link_budget.spectral_efficiency(10 ** (sinr_db / 10), made.groups)
-    towards_true = np.einsum("mn,mn->n", steering_matrix(array, there), made.weights)
-    power = np.einsum("mn,mn->n", made.weights, made.weights.conj()).real
-    gains_db = 10 * np.log10(np.maximum(np.abs(towards_true) ** 2 / power, 1e-30))
-    for n in np.flatnonzero(known).tolist():
+    for n in np.flatnonzero(~np.isnan(gains_db)).tolist():
         way.true_db.append(float(gains_db[n]))
         way.rates.append(float(rates[n]))
         one = sure[n]

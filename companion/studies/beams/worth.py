@@ -1,13 +1,17 @@
 """The worth of beams, look by look, and the figures that sum it up."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
-from companion.values import Method
+from companion.beams.aim import directions
+from companion.beams.array.steering import steering_matrix
+from companion.beams.worth import guarantee
+from companion.pipeline.fold import Pipeline
+from companion.values import BeamSet, FloatArray, Method
 
 Row = dict[str, Any]
 ROUNDING_DB: Final = 1e-9  # difference up to which a true gain below the guaranteed one is rounding
@@ -83,12 +87,12 @@ def summed_up(samples: Sequence[Sample]) -> Row:
     return {
         "without_beam": len(samples) - len(served),
         "n_true": len(known),
-        "pointing_bound_median_deg": _degrees(_percentile(bounds, 50)),
-        "pointing_bound_p95_deg": _degrees(_percentile(bounds, 95)),
-        "pointing_error_p95_deg": _degrees(_percentile([_or(s.off_rad, 0) for s in known], 95)),
+        "pointing_bound_median_deg": _degrees(percentile(bounds, 50)),
+        "pointing_bound_p95_deg": _degrees(percentile(bounds, 95)),
+        "pointing_error_p95_deg": _degrees(percentile([_or(s.off_rad, 0) for s in known], 95)),
         "bound_violations": sum(sample.beyond for sample in known) if known else None,
         "sweep_share_mean": float(np.mean(shares)) if shares else None,
-        "sweep_share_p95": _percentile(shares, 95),
+        "sweep_share_p95": percentile(shares, 95),
         "codebook_misses": sum(miss for miss, _ in missed) if missed else None,
         "codebook_misses_within_bound": sum(miss and not beyond for miss, beyond in missed)
         if missed
@@ -107,30 +111,48 @@ def _of_beams(beams: Sequence[tuple[Worth, bool]], prefix: str) -> Row:
     losses = [worth.loss_db for worth in worths]
     found: Row = {
         "n": len(worths),
-        "gain_p5_db": _percentile(gains, 5),
-        "gain_median_db": _percentile(gains, 50),
-        "guaranteed_share": _share(worth.guaranteed_gain_db is not None for worth in worths),
-        "guaranteed_gain_p5_db": _percentile(sure, 5),
-        "guaranteed_gain_median_db": _percentile(sure, 50),
-        "true_gain_p5_db": _percentile(true, 5),
-        "true_gain_median_db": _percentile(true, 50),
+        "gain_p5_db": percentile(gains, 5),
+        "gain_median_db": percentile(gains, 50),
+        "guaranteed_share": share(worth.guaranteed_gain_db is not None for worth in worths),
+        "guaranteed_gain_p5_db": percentile(sure, 5),
+        "guaranteed_gain_median_db": percentile(sure, 50),
+        "true_gain_p5_db": percentile(true, 5),
+        "true_gain_median_db": percentile(true, 50),
         "violations": sum(worth.violated for worth in worths) if true else None,
         "violations_within_bound": sum(worth.violated and not beyond for worth, beyond in beams)
         if true
         else None,
-        "loss_median_db": _percentile(losses, 50),
-        "loss_p95_db": _percentile(losses, 95),
-        "sinr_median_db": _percentile([worth.sinr_db for worth in worths], 50),
-        "spectral_efficiency_mean": _mean([worth.spectral_efficiency for worth in worths]),
-        "widened_share": _share(worth.widened for worth in worths),
-        "regularised_share": _share(worth.method is Method.REGULARISED for worth in worths),
+        "loss_median_db": percentile(losses, 50),
+        "loss_p95_db": percentile(losses, 95),
+        "sinr_median_db": percentile([worth.sinr_db for worth in worths], 50),
+        "spectral_efficiency_mean": mean([worth.spectral_efficiency for worth in worths]),
+        "widened_share": share(worth.widened for worth in worths),
+        "regularised_share": share(worth.method is Method.REGULARISED for worth in worths),
         "turns_max": max((worth.group + 1 for worth in worths), default=None),
         "condition_number_max": max((worth.condition_number for worth in worths), default=None),
     }
     return {prefix + key: value for key, value in found.items()}
 
 
-def _percentile(values: Sequence[float], percent: float) -> float | None:
+def given(
+    pipeline: Pipeline, made: BeamSet, truly: Mapping[str, FloatArray]
+) -> tuple[Sequence[float | None], FloatArray]:
+    """Guaranteed gains of beams, dB, and their power gains (N,) towards the true directions.
+
+    ``truly`` holds the true directions, (3,) each, by UAV; without one the gain is NaN.
+    """
+    array, towards = pipeline.array, directions(made)
+    wanted = [beam.pointing_bound_rad for beam in made.beams]
+    bounds = guarantee.covered_bounds(array, pipeline.coverage, towards, wanted)
+    guaranteed = guarantee.guaranteed_gains_db(array, towards, bounds, made.weights)
+    there = np.array([truly.get(uav, np.full(3, np.nan)) for uav in made.uavs])
+    responses = np.einsum("mn,mn->n", steering_matrix(array, there), made.weights)
+    power = np.einsum("mn,mn->n", made.weights, made.weights.conj()).real
+    true_gains: FloatArray = np.maximum(np.abs(responses) ** 2 / power, 1e-30)
+    return guaranteed, true_gains
+
+
+def percentile(values: Sequence[float], percent: float) -> float | None:
     """The least value that occurred and is not below ``percent`` of all.
 
     None if it is not finite, or if there are no values.
@@ -141,12 +163,14 @@ def _percentile(values: Sequence[float], percent: float) -> float | None:
     return found if math.isfinite(found) else None
 
 
-def _mean(values: Sequence[float]) -> float | None:
+def mean(values: Sequence[float]) -> float | None:
+    """The mean; None without values."""
     return float(np.mean(values)) if values else None
 
 
-def _share(marks: Iterable[bool]) -> float | None:
-    return _mean([float(mark) for mark in marks])
+def share(marks: Iterable[bool]) -> float | None:
+    """The share of marks that are true; None without marks."""
+    return mean([float(mark) for mark in marks])
 
 
 def _degrees(angle_rad: float | None) -> float | None:

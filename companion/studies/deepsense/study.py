@@ -1,15 +1,14 @@
 """How well a position tells the best beam, on contiguous blocks and on a random split."""
 
-import platform
 from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
 
-import companion
 from companion.studies.deepsense import predictors
 from companion.studies.deepsense.predictors import Fitted, Predictor, own, rank_of
 from companion.studies.deepsense.samples import Samples, blocks, inner, shuffled
+from companion.studies.origin import command_line, versions
 from companion.values import BoolArray, FloatArray, IntArray
 
 BLOCKS: Final = 20
@@ -40,7 +39,7 @@ def study(
             rows.append({"split": split, "predictor": name} | _scores(samples, predictor, folds))
     at, (width, weight) = predictors.chosen(samples, np.ones(count, dtype=bool))
     return {
-        "command": f"companion study deepsense {samples.name} --seed {seed}",
+        "command": command_line("deepsense", samples.name, seed=seed),
         "table": samples.name,
         "samples": count,
         "beams": samples.beams,
@@ -54,11 +53,7 @@ def study(
         "geometry": {name: getattr(at, name) for name in at.__slots__},
         "kernel_width": width,
         "prior_weight": weight,
-        "versions": {
-            "companion": companion.__version__,
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        },
+        "versions": versions(),
     }
 
 

@@ -1,16 +1,13 @@
 """How a fleet does as it grows: bandwidth, processor time, time served, times to take over."""
 
-import platform
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import numpy as np
-
-import companion
 from companion.settings.fleet import FleetSettings
 from companion.studies.fleet.sky import Sky
 from companion.studies.fleet.world import FleetCounts, World
+from companion.studies.origin import versions
 
 SETTLE_S = 8.0  # virtual time that a fleet has to find who serves whom
 AFTER_S = 4.0  # virtual time for which a fleet is watched after a node has died
@@ -158,10 +155,5 @@ def _healed_s(world: World) -> float:
 
 def answer(asked: FleetStudy, found: Sequence[FleetSize], command: str) -> dict[str, Any]:
     """What was asked and found, as JSON has it."""
-    versions = {
-        "companion": companion.__version__,
-        "numpy": np.__version__,
-        "python": platform.python_version(),
-    }
     sizes = [asdict(one) for one in found]
-    return {"sizes": sizes, "asked": asdict(asked), "command": command, "versions": versions}
+    return {"sizes": sizes, "asked": asdict(asked), "command": command, "versions": versions()}

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from companion.studies.figures import plotting
-from companion.studies.paper.experiments import Progress, versions
+from companion.studies.origin import command_line, versions
+from companion.studies.paper.experiments import Progress
 from companion.tracking.design import closed_form
 from companion.values import FloatArray
 
@@ -54,14 +55,8 @@ def maps() -> Maps:
         peak_s[a] = np.array(
             [closed_form.peak_gain(dt_s, d, g) for d, g in zip(feedthrough_s, gains, strict=True)]
         )
-    return Maps(
-        alpha=alpha,
-        feedthrough_s=feedthrough_s,
-        dt_s=dt_s,
-        limit_s=limit_s,
-        gamma_s=gamma_s,
-        peak_gain_s=peak_s,
-    )
+    axes = {"alpha": alpha, "feedthrough_s": feedthrough_s, "dt_s": dt_s}
+    return Maps(**axes, limit_s=limit_s, gamma_s=gamma_s, peak_gain_s=peak_s)
 
 
 def study(progress: Progress) -> tuple[dict[str, Any], Maps]:
@@ -69,7 +64,7 @@ def study(progress: Progress) -> tuple[dict[str, Any], Maps]:
     progress("maps")
     found = maps()
     answer = {
-        "command": "companion study dt",
+        "command": command_line("dt"),
         "versions": versions(),
         "alpha": found.alpha.tolist(),
         "feedthrough_s": found.feedthrough_s.tolist(),

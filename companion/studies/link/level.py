@@ -15,8 +15,6 @@ Uncoded and coded figures come from the same transmissions: the coded bits decid
 what the link would do without a code, in blocks of 936 bits of payload.
 """
 
-import platform
-import shlex
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,7 +22,6 @@ from typing import Any, Final
 
 import numpy as np
 
-import companion
 from companion.beams.array import geometry
 from companion.beams.array.geometry import Array
 from companion.pipeline import assembly
@@ -34,6 +31,7 @@ from companion.studies.link.blocks import BLOCK_BITS, CODED_BITS, BlockErrors, E
 from companion.studies.link.channel import SAMPLE_RATE_HZ, Scattering
 from companion.studies.link.rows import Row, crossing_db, row
 from companion.studies.link.scenario import PositionSource, Reports, Scenario, circles, from_logs
+from companion.studies.origin import command_line, versions
 from companion.studies.prediction.pointing import angles_deg
 from companion.values import ComplexArray, UserError
 
@@ -93,18 +91,21 @@ class LinkStudy:
     @property
     def command(self) -> str:
         """The command line that asks for this study."""
-        words = ["companion", "study", "link", *map(str, self.logs)]
-        words += ["--center", self.center] if self.center else []
-        words += ["--config", self.config] if self.config else []
-        words += ["--snr", ":".join(f"{part:g}" for part in self.snr_db)]
-        words += ["--instants", str(self.instants), "--blocks", str(self.blocks)]
-        words += ["--estimation", self.estimation.value]
-        if not self.logs:
-            words += ["--interval", f"{self.reports.interval_s:g}"]
-            words += ["--latency", f"{self.reports.latency_s:g}"]
-        words += ["--rician-k", f"{self.scattering.rician_k_db:g}"]
-        words += ["--delay-spread", f"{self.scattering.delay_spread_s * 1e9:g}"]
-        return shlex.join([*words, "--seed", str(self.seed)])
+        return command_line(
+            "link",
+            *self.logs,
+            center=self.center,
+            config=self.config,
+            snr=":".join(f"{part:g}" for part in self.snr_db),
+            instants=self.instants,
+            blocks=self.blocks,
+            estimation=self.estimation.value,
+            interval=None if self.logs else self.reports.interval_s,
+            latency=None if self.logs else self.reports.latency_s,
+            rician_k=self.scattering.rician_k_db,
+            delay_spread=self.scattering.delay_spread_s * 1e9,
+            seed=self.seed,
+        )
 
 
 Counts = dict[tuple[str, float], list[BlockErrors]]
@@ -210,11 +211,7 @@ def study(
             "symbol_s": SYMBOL_S,
         },
         "command": setting.command,
-        "versions": {
-            "companion": companion.__version__,
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        },
+        "versions": versions(),
         "seed": setting.seed,
     }
 

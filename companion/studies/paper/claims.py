@@ -7,7 +7,7 @@ Over 300 lines: it is a list of claims.
 """
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Final
 
@@ -27,22 +27,8 @@ class Claim:
     statement: str  # what the paper says
     key: str  # path of the number that decides
     found: str  # text with {value} for the number
-    decides: Callable[[float], bool]  # predicate of the number
-    if_true: ClaimVerdict  # verdict where the predicate is true
-    if_false: ClaimVerdict  # verdict where it is not
+    verdict: Callable[[float], ClaimVerdict]  # what the number makes of it
     correction: str = ""  # what a reader of the paper must change
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Judged:
-    """A row of the table of claims, as JSON has it."""
-
-    statement: str
-    key: str
-    value: float
-    found: str
-    verdict: ClaimVerdict
-    correction: str
 
 
 def lookup(answer: dict[str, Any], key: str) -> float:
@@ -63,21 +49,17 @@ def lookup(answer: dict[str, Any], key: str) -> float:
 
 def judge(answer: dict[str, Any]) -> list[dict[str, Any]]:
     """Every claim with its number, what was found and the verdict."""
-    rows = []
-    for claim in CLAIMS:
-        value = lookup(answer, claim.key)
-        verdict = claim.if_true if claim.decides(value) else claim.if_false
-        found = claim.found.format(value=value)
-        row = Judged(
-            statement=claim.statement,
-            key=claim.key,
-            value=value,
-            found=found,
-            verdict=verdict,
-            correction=claim.correction,
-        )
-        rows.append(asdict(row))
-    return rows
+    return [
+        {
+            "statement": claim.statement,
+            "key": claim.key,
+            "value": (value := lookup(answer, claim.key)),
+            "found": claim.found.format(value=value),
+            "verdict": claim.verdict(value),
+            "correction": claim.correction,
+        }
+        for claim in CLAIMS
+    ]
 
 
 _HOLDS, _CORRECTED, _FAILS = ClaimVerdict.HOLDS, ClaimVerdict.CORRECTED, ClaimVerdict.FAILS
@@ -91,9 +73,7 @@ def _limit(mu: str, infeasible: str) -> Claim:
         key=f"limits/{mu}/off_s",
         found="the first infeasible interval on the paper's grid of 0.01 s differs by {value:.2f}"
         " s",
-        decides=lambda off: off < _NEVER_OFF_S,
-        if_true=_HOLDS,
-        if_false=_FAILS,
+        verdict=lambda off: _HOLDS if off < _NEVER_OFF_S else _FAILS,
         correction="The limit need not be searched for: ΔT_max = δ + √(αμ + (1−α)δ²).",
     )
 
@@ -104,9 +84,7 @@ def _bounded(name: str) -> Claim:
         key=f"levels/{name}/error_over_gamma_bound",
         found="the largest error over many turns is {value:.3f} of the bound, γ the least for this"
         " gain",
-        decides=lambda share: share <= 1,
-        if_true=_HOLDS,
-        if_false=_FAILS,
+        verdict=lambda share: _HOLDS if share <= 1 else _FAILS,
     )
 
 
@@ -117,9 +95,7 @@ CLAIMS: Final = (
         key="designs/0/printed_sign_eigenvalue",
         found="in the “⪯ 0” form the printed matrix has an eigenvalue of {value:+.2f}, and with P"
         " ≻ 0 in its diagonal no choice makes it negative",
-        decides=lambda eigenvalue: eigenvalue > 0,
-        if_true=_CORRECTED,
-        if_false=_HOLDS,
+        verdict=lambda eigenvalue: _CORRECTED if eigenvalue > 0 else _HOLDS,
         correction="The last block must be −P. The inequality is then feasible and the guarantee"
         " follows.",
     ),
@@ -127,9 +103,7 @@ CLAIMS: Final = (
         statement="D is an N × 2N matrix.",
         key="scenario/feedthrough_matrix_rows",
         found="the reports of the four UAVs in the plane have {value:d} rows, and so must D",
-        decides=lambda rows: rows != 4,
-        if_true=_CORRECTED,
-        if_false=_HOLDS,
+        verdict=lambda rows: _CORRECTED if rows != 4 else _HOLDS,
         correction="D is 2N × 2N: with Y = X + D W it has a row for each coordinate that is"
         " reported.",
     ),
@@ -141,9 +115,7 @@ CLAIMS: Final = (
         key="designs/0/feasible_gain",
         found="a solver asked for feasibility at μ ≤ 0.05 returns {value:.3f}: near, and its own"
         " choice",
-        decides=lambda gain: abs(gain - 0.39) < 0.005,
-        if_true=_HOLDS,
-        if_false=_CORRECTED,
+        verdict=lambda gain: _HOLDS if abs(gain - 0.39) < 0.005 else _CORRECTED,
         correction="Any gain of a whole interval is feasible at each level. Which one comes out is"
         " the solver's business; do not expect these digits from another solver.",
     ),
@@ -152,9 +124,7 @@ CLAIMS: Final = (
         key="levels/L = 0.39/angle_error_deg",
         found="with L = 0.39 the direction is still off by up to {value:.2f}°, with L = ΔT/δ ="
         " 0.30 by 0",
-        decides=lambda degrees: degrees > 0.01,
-        if_true=_FAILS,
-        if_false=_HOLDS,
+        verdict=lambda degrees: _FAILS if degrees > 0.01 else _HOLDS,
         correction="They are feasible, not optimal. Where |ΔT − δ| < δ√(1−α) the least μ is 0,"
         " attained in the limit with L = ΔT/δ, which cancels the unknown input altogether.",
     ),
@@ -164,9 +134,7 @@ CLAIMS: Final = (
         key="levels/L = 0.39/gamma_s",
         found="they are what that solution certified; the least that the first gain has is"
         " {value:.3f} s",
-        decides=lambda gamma: gamma < 0.205,
-        if_true=_CORRECTED,
-        if_false=_HOLDS,
+        verdict=lambda gamma: _CORRECTED if gamma < 0.205 else _HOLDS,
         correction="γ is a bound of the solution found, not a property of the gain: the guarantee"
         " of the same gains is up to three times tighter.",
     ),
@@ -176,9 +144,7 @@ CLAIMS: Final = (
         key="alphas/least_step_down",
         found="each step makes the largest error of the positions {value:.1f} times smaller or"
         " more",
-        decides=lambda ratio: ratio > 1,
-        if_true=_HOLDS,
-        if_false=_FAILS,
+        verdict=lambda ratio: _HOLDS if ratio > 1 else _FAILS,
         correction="By the gain that a feasible solution then has, nearer to ΔT/δ; with that gain"
         " there is no error at any α.",
     ),
@@ -186,9 +152,7 @@ CLAIMS: Final = (
         statement="The UAVs stay within 500 m.",
         key="scenario/farthest_m",
         found="the farthest is {value:.0f} m away",
-        decides=lambda farthest: farthest < 500,
-        if_true=_HOLDS,
-        if_false=_FAILS,
+        verdict=lambda farthest: _HOLDS if farthest < 500 else _FAILS,
     ),
     _limit("0.05", "0.89"),
     _limit("0.25", "1.01"),
@@ -199,9 +163,7 @@ CLAIMS: Final = (
         key="unknown_input/L = 0.76/b0_in_scenario",
         found="in the published scenario it reaches {value:.2f} sup‖W‖ at L = 0.76; 3γ is 3.00"
         " there",
-        decides=lambda share: share <= 3,
-        if_true=_HOLDS,
-        if_false=_FAILS,
+        verdict=lambda share: _HOLDS if share <= 3 else _FAILS,
         correction="It held because this input is mild, not because it is a bound; see the next"
         " row.",
     ),
@@ -210,9 +172,7 @@ CLAIMS: Final = (
         key="unknown_input/L = 0.76/b0_adversary",
         found="an input that turns round at the worst moment makes it {value:.3f} sup‖W‖ at L ="
         " 0.76, against 3γ = 3.00 with γ = √μ = 1",
-        decides=lambda reached: reached > 3,
-        if_true=_FAILS,
-        if_false=_HOLDS,
+        verdict=lambda reached: _FAILS if reached > 3 else _HOLDS,
         correction="With Ŵ = (X̂⁺ − X̂)/ΔT the exact peak is 2|Lδ − ΔT|/ΔT for 0 ≤ 1 − L < 1: it"
         " grows without limit as ΔT falls. 2γ sup‖W‖/ΔT is safe. G = [B; D] has √5‖G†‖γ sup‖W‖.",
     ),
@@ -221,9 +181,7 @@ CLAIMS: Final = (
         key="irregular/fixed_over_gamma",
         found="on intervals between 0.05 and 1.2 s a gain that stays reaches {value:.2f} times the"
         " γ that a scheduled gain keeps",
-        decides=lambda share: share > 1,
-        if_true=_CORRECTED,
-        if_false=_HOLDS,
+        verdict=lambda share: _CORRECTED if share > 1 else _HOLDS,
         correction="Real reports come irregularly. Schedule L by the ΔT that occurred: one P ="
         " 1/max μ*(ΔT) serves all intervals, in any order.",
     ),
@@ -232,9 +190,7 @@ CLAIMS: Final = (
         key="array/arccos_error_deg",
         found="half of the time y < 0, and then it points to the mirror image: up to {value:.0f}°"
         " off",
-        decides=lambda degrees: degrees > 0.01,
-        if_true=_CORRECTED,
-        if_false=_HOLDS,
+        verdict=lambda degrees: _CORRECTED if degrees > 0.01 else _HOLDS,
         correction="arccos loses the sign of y. Use the unit vector, or atan2(y, x).",
     ),
     Claim(
@@ -242,9 +198,7 @@ CLAIMS: Final = (
         key="array/opposite_sines_apart",
         found="sin(arccos(x/r)) is |y|/r: of UAVs that face each other these differ by {value:.0e}"
         " at most, two columns of A are one, and AᵀA* has no inverse",
-        decides=lambda apart: apart > 1e-6,
-        if_true=_HOLDS,
-        if_false=_CORRECTED,
+        verdict=lambda apart: _HOLDS if apart > 1e-6 else _CORRECTED,
         correction="Measure θ from broadside: sin θ = x/r for elements along x. (That two and two"
         " UAVs face each other is our guess of where they begin.)",
     ),
@@ -252,9 +206,7 @@ CLAIMS: Final = (
         statement="UAV i receives aᴴ F s, with F = A*(AᵀA*)⁻¹.",
         key="array/conjugated_response_max",
         found="for four UAVs at general places |aᴴf| of the own beam is {value:.3f} at most, not 1",
-        decides=lambda response: response < 0.5,
-        if_true=_CORRECTED,
-        if_false=_HOLDS,
+        verdict=lambda response: _CORRECTED if response < 0.5 else _HOLDS,
         correction="Channel and precoder must agree: aᵀ with F = A*(AᵀA*)⁻¹, for which |aᵀf| = 1.",
     ),
     Claim(
@@ -262,9 +214,7 @@ CLAIMS: Final = (
         key="array/zero_forcing_over_3_db_share",
         found="for {value:.0%} of the reports it costs a UAV more than 3 dB, and at a mirror image"
         " there is no answer",
-        decides=lambda share: share > 0,
-        if_true=_CORRECTED,
-        if_false=_HOLDS,
+        verdict=lambda share: _CORRECTED if share > 0 else _HOLDS,
         correction="A line array cannot tell a direction from its mirror image about its axis,"
         " where the circling UAVs meet. Regularise or serve in time slots there.",
     ),
@@ -273,9 +223,7 @@ CLAIMS: Final = (
         key="scenario/input_sup_mps",
         found="read so, sup‖W‖ is {value:.2f} m/s: the gust is a third faster than the flight"
         " itself",
-        decides=lambda largest: largest > 400,
-        if_true=_CORRECTED,
-        if_false=_HOLDS,
+        verdict=lambda largest: _CORRECTED if largest > 400 else _HOLDS,
         correction="d is then a step in metres for each report, whatever ΔT. Taken for a velocity,"
         " W = v + d. The reading changes every error that is drawn; this study takes it as it is"
         " written.",
@@ -284,18 +232,14 @@ CLAIMS: Final = (
         statement="64 elements have a beam narrow enough to separate users (half-power angle).",
         key="array/sizes/64/half_power_deg",
         found="the gain falls by half at ±{value:.2f}°; with 128 elements at half that angle",
-        decides=lambda degrees: degrees < 1,
-        if_true=_HOLDS,
-        if_false=_FAILS,
+        verdict=lambda degrees: _HOLDS if degrees < 1 else _FAILS,
     ),
     Claim(
         statement="16-QAM with a code of rate 1/3 on 234 subcarriers with a prefix of 64 is the"
         " waveform.",
         key="waveform/most_bit_s_hz",
         found="it carries {value:.2f} bit/s/Hz at most, whatever the SINR",
-        decides=lambda most: most < 2,
-        if_true=_CORRECTED,
-        if_false=_HOLDS,
+        verdict=lambda most: _CORRECTED if most < 2 else _HOLDS,
         correction="Spectral efficiencies above that are capacities, log2(1 + SINR), not rates of"
         " this waveform; so are those here.",
     ),
@@ -304,18 +248,14 @@ CLAIMS: Final = (
         " blockage.",
         key="blockage/gain_over_echo_bit_s_hz/optimum",
         found="with L = 0.30: {value:+.2f} bit/s/Hz a UAV at 15 blockages a minute of 0.5 s",
-        decides=lambda gain: gain > 0,
-        if_true=_HOLDS,
-        if_false=_FAILS,
+        verdict=lambda gain: _HOLDS if gain > 0 else _FAILS,
     ),
     Claim(
         statement="They do so with the paper's own gain.",
         key="blockage/gain_over_echo_bit_s_hz/L = 0.39",
         found="with L = 0.39: {value:+.2f} bit/s/Hz a UAV, for the beam of 64 elements misses the"
         " UAV",
-        decides=lambda gain: gain > 0,
-        if_true=_HOLDS,
-        if_false=_FAILS,
+        verdict=lambda gain: _HOLDS if gain > 0 else _FAILS,
         correction="An error of 6° is eight half-power angles. The advantage is the optimal"
         " gain's. The baseline here is one at its best, not the paper's, whose settings are not"
         " given.",

@@ -8,17 +8,16 @@ Over 300 lines: it is a list, an experiment a function.
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
 from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
 
-import companion
 from companion.beams.array.geometry import Array
 from companion.beams.array.steering import steering_matrix
 from companion.beams.hardware import quantise
 from companion.beams.worth import patterns
+from companion.studies.origin import command_line, versions
 from companion.studies.paper import circles as published_scenario
 from companion.studies.paper import link, mavlink, published, shown
 from companion.studies.paper.circles import PaperFlight, PaperScenario, Tracked
@@ -79,8 +78,8 @@ def study(seed: int, progress: Progress) -> tuple[dict[str, Any], Material]:
     progress("through MAVLink")
     agreement = mavlink.compare(flight)
     answer = {
-        "command": f"companion study paper --seed {seed}",
-        "versions": versions(),
+        "command": command_line("paper", seed=seed),
+        "versions": versions(("numpy", "scipy", "cvxpy", "clarabel", "matplotlib")),
         "seed": seed,
         "scenario": _scenario(flight),
         "levels": _levels(flight, tracked),
@@ -105,12 +104,6 @@ def study(seed: int, progress: Progress) -> tuple[dict[str, Any], Material]:
         compared=compared,
     )
     return answer, material
-
-
-def versions() -> dict[str, str]:
-    """Versions of the programs that computed the numbers."""
-    names = ("numpy", "scipy", "cvxpy", "clarabel", "matplotlib")
-    return {"companion": companion.__version__, **{name: version(name) for name in names}}
 
 
 # --- the observer -------------------------------------------------------------------------------

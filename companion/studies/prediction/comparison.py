@@ -14,21 +14,17 @@ be. ``kalman-peng`` has the noise that the settings state, and is never tuned.
 Each log over each link is a piece of work of its own: see ``companion.studies.running.fan_out``.
 """
 
-import platform
-import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import product as product_of
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
-import companion
 from companion.mavlink.clock.sender_clock import SenderClock
 from companion.pipeline import assembly
 from companion.recording.reader import center_of, flights
 from companion.settings.model import Settings
+from companion.studies.origin import command_line, versions
 from companion.studies.prediction import radio_link, violations
 from companion.studies.prediction.delivery import deliver
 from companion.studies.prediction.kalman import Kalman, Tuning
@@ -105,18 +101,21 @@ class PredictionStudy:
     def command(self) -> str:
         """The command line that asks for this study."""
         radio = self.radio
-        assert radio.latency_s is not None
-        words = ["companion", "study", "prediction", *map(str, self.logs)]
-        words += ["--center", self.center] if self.center else []
-        words += ["--config", self.config] if self.config else []
-        words += ["--lead", ",".join(f"{lead_s:g}" for lead_s in self.leads_s)]
-        words += ["--links", ",".join(dict.fromkeys(self.links))]
-        words += ["--rate", f"{radio.rate_hz:g}"]
-        words += ["--latency", "{:g},{:g}".format(*radio.latency_s)]
-        words += ["--loss", f"{radio.loss:g}", *(["--known-delay"] if radio.known_delay else [])]
-        words += ["--learned", str(self.learned)] if self.learned else []
-        words += ["--snr", f"{self.snr_db:g}"]
-        return shlex.join([*words, "--seed", str(self.seed)])
+        return command_line(
+            "prediction",
+            *self.logs,
+            center=self.center,
+            config=self.config,
+            lead=self.leads_s,
+            links=tuple(dict.fromkeys(self.links)),
+            rate=radio.rate_hz,
+            latency=radio.latency_s,
+            loss=radio.loss,
+            known_delay=radio.known_delay,
+            learned=self.learned,
+            snr=self.snr_db,
+            seed=self.seed,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -238,11 +237,7 @@ def study(
         "rows": rows,
         "unannounced": violations.unannounced(rows),
         "command": setting.command,
-        "versions": {
-            "companion": companion.__version__,
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        },
+        "versions": versions(),
         "seed": setting.seed,
         "snr_db": setting.snr_db,
         "links": [asdict(link) for link in setting.over],

@@ -79,6 +79,20 @@ class ArrayTruth:
         return replace(predicted, position_ned_m=position, body_from_local=local_from_body.T)
 
 
+def known_directions(
+    truth: ArrayTruth | None, tracks: Sequence[Track], predicted: Carrier, array: Array
+) -> dict[str, FloatArray]:
+    """True unit directions (3,) by UAV, of those for which they are known."""
+    if truth is None:
+        return {}
+    found = truth.directions(tracks, predicted, array)
+    return {
+        track.uav: towards
+        for track, towards in zip(tracks, found, strict=True)
+        if not np.isnan(towards).any()
+    }
+
+
 def load(logs: Sequence[Path], pipeline: Pipeline) -> ArrayTruth | None:
     """The truth in the logs of a flight, for the array of a pipeline; None if they hold none.
 

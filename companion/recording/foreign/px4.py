@@ -83,7 +83,7 @@ def read(data: Bytes) -> Onboard:
     )
 
 
-def _times(of: Table) -> IntArray:
+def _times(of: UlogTable) -> IntArray:
     """When samples were true: the time of what they are made of, where it is said."""
     sampled = of.integers("timestamp_sample")
     found = of.integers("timestamp") if sampled is None or not sampled.all() else sampled

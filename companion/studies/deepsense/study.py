@@ -10,7 +10,7 @@ from companion.studies.deepsense.predictors import Fitted, Predictor, own, rank_
 from companion.studies.deepsense.samples import Samples, blocks, inner, shuffled
 from companion.studies.figures.text_tables import text_table
 from companion.studies.origin import command_line, versions
-from companion.values import BoolArray, FloatArray
+from companion.values import BoolArray, FloatArray, IntArray
 
 BLOCKS: Final = 20
 FOLDS: Final = 5
@@ -66,8 +66,7 @@ def _scores(samples: Samples, predictor: Predictor, folds: list[BoolArray]) -> d
         fitted = predictor(samples, ~tested)
         likely = fitted(~tested)
         rank[tested] = rank_of(likely, samples.beam)[tested]
-        reaching = (likely >= _threshold(samples, fitted, ~tested)).sum(axis=1)
-        size[tested] = np.maximum(reaching, 1)[tested]
+        size[tested] = _sizes(likely, _threshold(samples, fitted, ~tested))[tested]
         if samples.power is not None:
             lost_db[tested] = _lost_db(samples.power[tested], likely[tested])
     known = bool(np.isfinite(lost_db).any())
@@ -90,6 +89,12 @@ def _threshold(samples: Samples, fitted: Fitted, learned: BoolArray) -> float:
     for part in inner(learned, *_CALIBRATION):
         reached.append(own(fitted(learned & ~part), samples.beam)[part])
     return float(np.quantile(np.concatenate(reached), 1 - _AIMED))
+
+
+def _sizes(likely: FloatArray, threshold: float) -> IntArray:
+    """How many beams reach a probability, at least one, (N,)."""
+    sizes: IntArray = np.maximum((likely >= threshold).sum(axis=1), 1)
+    return sizes
 
 
 def _lost_db(power: FloatArray, likely: FloatArray) -> FloatArray:

@@ -22,7 +22,6 @@ from companion.values import UserError
     "--seconds",
     type=click.FloatRange(min=0, max=3600),
     default=10.0,
-    show_default=True,
     help="How long to listen; 0: not at all.",
 )
 @JSON

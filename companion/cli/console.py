@@ -1,9 +1,8 @@
 """Shared by the commands: user mistakes as one line on stderr, and progress on a terminal."""
 
-import json
 import shutil
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -24,8 +23,7 @@ CENTER = click.option(
 LOGS = click.argument(
     "logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path)
 )
-FOLDER = click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
-SEED = click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
+SEED = click.option("--seed", type=click.IntRange(min=0), default=1)
 SECONDS = click.option(
     "--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after so long."
 )
@@ -50,7 +48,6 @@ LATENCY = click.option(
     metavar="S",
     type=click.FloatRange(0, 60),
     default=0.0,
-    show_default=True,
     help="Seconds from a sample to its arrival, for vehicles' own logs (.bin, .ulg, CSV), which"
     " tell no arrivals; 0: as if received at once.",
 )
@@ -89,15 +86,6 @@ def make_folder(out: Path) -> None:
                 each.rmdir()
 
     click.get_current_context().call_on_close(tidy)
-
-
-def write_study(
-    out: Path, name: str, answer: dict[str, Any], report: Callable[[], Mapping[str, bytes]]
-) -> None:
-    """Write the answer of a study as JSON, then its page and figures, to the folder ``out``."""
-    (out / f"{name}.json").write_text(json.dumps(answer, indent=1), encoding="utf-8")
-    for file, content in report().items():
-        (out / file).write_bytes(content)
 
 
 class InterruptedByUser(Exception):  # noqa: N818 - it is no error

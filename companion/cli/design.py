@@ -32,15 +32,12 @@ def _alpha(text: str) -> float | None:
     callback=lambda _context, _option, text: [] if text is None else numbers(text),
     help="Seconds between reports.",
 )
-@click.option(
-    "--model", type=click.Choice(["position", "kinematic"]), default="position", show_default=True
-)
-@click.option("--alpha", metavar="A|auto", default="auto", show_default=True, help="In (0, 1).")
+@click.option("--model", type=click.Choice(["position", "kinematic"]), default="position")
+@click.option("--alpha", metavar="A|auto", default="auto", help="In (0, 1).")
 @click.option(
     "--feedthrough",
     type=float,
     default=0.0,
-    show_default=True,
     help="Position model: seconds by which a report leads the position.",
 )
 @click.option(
@@ -52,24 +49,18 @@ def _alpha(text: str) -> float | None:
     help="The kinematic model has only the LMI.  [default: closed-form if there is one]",
 )
 @click.option(
-    "--acceleration",
-    type=float,
-    default=5.0,
-    show_default=True,
-    help="Kinematic: the largest acceleration, m/s^2.",
+    "--acceleration", type=float, default=5.0, help="Kinematic: the largest acceleration, m/s^2."
 )
 @click.option(
     "--position-noise",
     type=float,
     default=0.5,
-    show_default=True,
     help="Kinematic: the largest error of a reported position, m.",
 )
 @click.option(
     "--velocity-noise",
     type=float,
     default=0.2,
-    show_default=True,
     help="Kinematic: the largest error of a reported velocity, m/s.",
 )
 @click.option("--no-velocity", is_flag=True, help="Kinematic: velocity is not reported.")
@@ -77,7 +68,6 @@ def _alpha(text: str) -> float | None:
     "--dt-range",
     metavar="LOW,HIGH",
     default="0.05,2",
-    show_default=True,
     callback=lambda _context, _option, text: numbers(text),
     help="With --out: the intervals that one table of gains must serve.",
 )

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     "--service",
     metavar="URL",
     default="http://127.0.0.1:8080",
-    show_default=True,
     help="Whose beams: the service's address. COMPANION_TOKEN is its bearer token.",
 )
 @CONFIG
@@ -32,22 +31,15 @@ if TYPE_CHECKING:
     "--aim",
     type=click.Choice(["first", "centre"]),
     default="first",
-    show_default=True,
     help="centre: a mount looks at the middle of all of them that have a beam.",
 )
 @click.option(
-    "--rate",
-    "update_hz",
-    type=click.FloatRange(0.1, 1000),
-    default=10.0,
-    show_default=True,
-    help="Updates a second.",
+    "--rate", "update_hz", type=click.FloatRange(0.1, 1000), default=10.0, help="Updates a second."
 )
 @click.option(
     "--on-stale",
     type=click.Choice(["hold", "boresight", "mute"]),
     default="hold",
-    show_default=True,
     help="What the device does without beams, and at the end.",
 )
 @click.option("--dry-run", is_flag=True, help="Print what would be sent, and send nothing.")

@@ -45,7 +45,6 @@ class _OrBeams(click.Command):
     "form",
     type=click.Choice(("csv", "parquet", "rerun")),
     default="csv",
-    show_default=True,
     help="parquet needs the extra [parquet]; rerun: tracks and beams in space, as an MCAP file.",
 )
 @click.option(

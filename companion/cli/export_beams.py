@@ -13,7 +13,6 @@ from companion.cli.console import CONFIG
     "form",
     type=click.Choice(("oai-dbt",)),
     default="oai-dbt",
-    show_default=True,
     help="oai-dbt: OpenAirInterface's digital beam table, CSV of ids and a weight for each port.",
 )
 @click.option(

@@ -13,8 +13,8 @@ from companion.cli.console import JSON, SEED, Progress
     "--out", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", required=True
 )
 @SEED
-@click.option("--epochs", type=click.IntRange(min=1), default=30, show_default=True)
-@click.option("--flights", type=click.IntRange(min=1), default=240, show_default=True)
+@click.option("--epochs", type=click.IntRange(min=1), default=30)
+@click.option("--flights", type=click.IntRange(min=1), default=240)
 @JSON
 def train(out: Path, seed: int, epochs: int, flights: int, as_json: bool) -> None:
     """Train the LSTM predictor on flights made up at random. Needs PyTorch: the extra [learned].

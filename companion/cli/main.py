@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from companion.recording.writer import Writer
 
 
-@click.group(name="companion", cls=OneLineErrors)
+@click.group(name="companion", cls=OneLineErrors, context_settings={"show_default": True})
 @click.version_option(companion.__version__)
 def main() -> None:
     """Predicts where UAVs are from MAVLink, and computes the beams that follow them.
@@ -116,7 +116,7 @@ def _voice(as_json: bool) -> "Console":
 
 @main.command()
 @SECONDS
-@click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True)
+@click.option("--port", type=click.IntRange(0, 65535), default=8080)
 @click.option("--open", "open_page", is_flag=True, help="Open the page in a browser.")
 @JSON_LINES
 def demo(seconds: float | None, port: int, open_page: bool, as_json: bool) -> None:

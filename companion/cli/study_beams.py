@@ -1,37 +1,26 @@
 """The command ``companion study beams``: what an array would have been worth over a flight."""
 
-import json
 from pathlib import Path
 
 import click
 
-from companion.cli.console import (
-    CENTER,
-    CONFIG,
-    FOLDER,
-    JSON,
-    LOGS,
-    Progress,
-    make_folder,
-    write_study,
-)
+from companion.cli.console import CENTER, CONFIG, LOGS, Progress
+from companion.cli.study_output import Studied, study_output
 
 
 @click.command()
 @LOGS
 @CONFIG
 @CENTER
-@click.option(
-    "--hz", type=float, default=5.0, show_default=True, help="Looks a second of the log's time."
-)
+@click.option("--hz", type=float, default=5.0, help="Looks a second of the log's time.")
 @click.option(
     "--links",
     metavar="NAME,...",
     default="",
+    show_default=False,
     help="Compare the three widths and sharp rivals over clean, radio, hostile, noisy.",
 )
-@FOLDER
-@JSON
+@study_output("beams")
 def beams(
     *,
     logs: tuple[Path, ...],
@@ -39,9 +28,8 @@ def beams(
     center: str | None,
     hz: float,
     links: str,
-    out: Path,
-    as_json: bool,
-) -> None:
+    progress: Progress,
+) -> Studied:
     """What an array would have done over a flight: gains, guarantees, what must be swept.
 
     The beams as the settings make them, and beside them the same not widened. Where the log has
@@ -56,7 +44,6 @@ def beams(
     from companion.studies.beams import report
     from companion.studies.beams.flight import BeamStudy, study
 
-    progress = Progress()
     flown = tuple(flights(logs))
     settings = tuple(settings_for(each, config, center) for each in flown)
     over = tuple(name for name in links.split(",") if name)
@@ -68,10 +55,11 @@ def beams(
         config=str(config) if config else None,
         links=over,
     )
-    make_folder(out)
     if any(each.center.source is None for each in settings):
         click.echo("no --center: the array stands where the first report was made", err=True)
     answer, found = study(setting, progress.show)
-    write_study(out, "beams", answer, lambda: report.files(answer, found, progress.show))
-    progress.clear()
-    click.echo(json.dumps(answer) if as_json else report.text(found, answer["modes"]))
+    return Studied(
+        answer=answer,
+        report=lambda: report.files(answer, found, progress.show),
+        text=lambda: report.text(found, answer["modes"]),
+    )

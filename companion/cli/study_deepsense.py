@@ -1,19 +1,18 @@
 """The command ``companion study deepsense``: beams as they were measured."""
 
-import json
 from pathlib import Path
 
 import click
 
-from companion.cli.console import FOLDER, JSON, SEED, Progress, make_folder, write_study
+from companion.cli.console import SEED, Progress
+from companion.cli.study_output import Studied, study_output
 
 
 @click.command()
 @click.argument("where", metavar="DIR|CSV", type=click.Path(exists=True, path_type=Path))
 @SEED
-@FOLDER
-@JSON
-def deepsense(where: Path, seed: int, out: Path, as_json: bool) -> None:
+@study_output("deepsense")
+def deepsense(where: Path, seed: int, progress: Progress) -> Studied:
     """How well a position tells the best beam, on a scenario of DeepSense 6G.
 
     On contiguous blocks, and on a random split beside it, which leaks. Writes DIR/deepsense.json,
@@ -24,10 +23,10 @@ def deepsense(where: Path, seed: int, out: Path, as_json: bool) -> None:
     from companion.studies.deepsense import report, study
     from companion.studies.running import measured_beams
 
-    progress = Progress()
     samples = measured_beams.read(where)
-    make_folder(out)
     answer = study.study(samples, seed, progress.show)
-    write_study(out, "deepsense", answer, lambda: report.files(answer, progress.show))
-    progress.clear()
-    click.echo(json.dumps(answer) if as_json else study.text(answer))
+    return Studied(
+        answer=answer,
+        report=lambda: report.files(answer, progress.show),
+        text=lambda: study.text(answer),
+    )

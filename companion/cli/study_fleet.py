@@ -1,12 +1,11 @@
 """The command ``companion study fleet``: many nodes and UAVs in virtual time."""
 
-import json
 import time
-from pathlib import Path
 
 import click
 
-from companion.cli.console import FOLDER, JSON, SEED, Progress, make_folder, write_study
+from companion.cli.console import SEED, Progress
+from companion.cli.study_output import Studied, study_output
 
 
 def _span(_context: click.Context, _option: click.Parameter, text: str) -> tuple[int, int]:
@@ -29,28 +28,27 @@ def _steps(span: tuple[int, int], steps: int) -> list[int]:
 
 
 @click.command()
-@click.option("--nodes", callback=_span, metavar="FROM..TO", default="3..30", show_default=True)
-@click.option("--uavs", callback=_span, metavar="FROM..TO", default="100..1000", show_default=True)
-@click.option("--steps", type=click.IntRange(1, 20), default=3, show_default=True, help="Sizes.")
+@click.option("--nodes", callback=_span, metavar="FROM..TO", default="3..30")
+@click.option("--uavs", callback=_span, metavar="FROM..TO", default="100..1000")
+@click.option("--steps", type=click.IntRange(1, 20), default=3, help="Sizes.")
 @click.option(
-    "--seconds", type=click.FloatRange(1, 3600), default=10.0, show_default=True,
+    "--seconds", type=click.FloatRange(1, 3600), default=10.0,
     help="Virtual time for which each size is watched.",
 )  # fmt: skip
 @click.option(
-    "--spacing", type=click.FloatRange(10, 1e5), default=1500.0, show_default=True,
+    "--spacing", type=click.FloatRange(10, 1e5), default=1500.0,
     help="Metres between neighbouring nodes on a square grid; each hears 2500 m far.",
 )  # fmt: skip
 @click.option(
-    "--delay", type=click.FloatRange(0, 5), default=0.02, show_default=True,
+    "--delay", type=click.FloatRange(0, 5), default=0.02,
     help="Seconds from one node to another.",
 )  # fmt: skip
 @click.option(
-    "--loss", type=click.FloatRange(0, 0.9), default=0.02, show_default=True,
+    "--loss", type=click.FloatRange(0, 0.9), default=0.02,
     help="Share of messages between nodes that is lost.",
 )  # fmt: skip
 @SEED
-@FOLDER
-@JSON
+@study_output("fleet")
 def fleet(
     *,
     nodes: tuple[int, int],
@@ -61,9 +59,8 @@ def fleet(
     delay: float,
     loss: float,
     seed: int,
-    out: Path,
-    as_json: bool,
-) -> None:
+    progress: Progress,
+) -> Studied:
     """What a fleet of many nodes costs as it grows, and how it hands over.
 
     In one process and virtual time: traffic, processor time of a node, share of the time in which
@@ -75,12 +72,10 @@ def fleet(
     from companion.studies.fleet import report, study
     from companion.studies.origin import command_line
 
-    progress = Progress()
     sizes = tuple(zip(_steps(nodes, steps), _steps(uavs, steps), strict=True))
     asked = study.FleetStudy(
         sizes=sizes, seconds=seconds, delay_s=delay, loss=loss, spacing_m=spacing, seed=seed
     )
-    make_folder(out)
     found = list(study.run(asked, time.process_time, progress.show))
     command = command_line(
         "fleet",
@@ -94,6 +89,8 @@ def fleet(
         seed=seed,
     )
     answer = study.answer(asked, found, command)
-    write_study(out, "fleet", answer, lambda: report.files(asked, found, answer, progress.show))
-    progress.clear()
-    click.echo(json.dumps(answer) if as_json else report.text(found))
+    return Studied(
+        answer=answer,
+        report=lambda: report.files(asked, found, answer, progress.show),
+        text=lambda: report.text(found),
+    )

@@ -1,18 +1,15 @@
 """The commands ``companion study paper`` and ``companion study dt``."""
 
-import json
-from pathlib import Path
-
 import click
 
-from companion.cli.console import FOLDER, JSON, SEED, Progress, make_folder, write_study
+from companion.cli.console import SEED, Progress
+from companion.cli.study_output import Studied, study_output
 
 
 @click.command()
 @SEED
-@FOLDER
-@JSON
-def paper(seed: int, out: Path, as_json: bool) -> None:
+@study_output("paper")
+def paper(seed: int, progress: Progress) -> Studied:
     """The published experiments made again, and every claim judged.
 
     Writes DIR/paper.json, DIR/paper.html and the figures as PNG and SVG.
@@ -21,19 +18,18 @@ def paper(seed: int, out: Path, as_json: bool) -> None:
     """
     from companion.studies.paper import claims, experiments, page
 
-    progress = Progress()
-    make_folder(out)
     answer, material = experiments.study(seed, progress.show)
     answer["claims"] = claims.judge(answer)
-    write_study(out, "paper", answer, lambda: page.paper_files(answer, material, progress.show))
-    progress.clear()
-    click.echo(json.dumps(answer) if as_json else page.text(answer))
+    return Studied(
+        answer=answer,
+        report=lambda: page.paper_files(answer, material, progress.show),
+        text=lambda: page.text(answer),
+    )
 
 
 @click.command()
-@FOLDER
-@JSON
-def dt(out: Path, as_json: bool) -> None:
+@study_output("dt")
+def dt(progress: Progress) -> Studied:
     """How often UAVs must report: feasible intervals and their bounds, as maps.
 
     Writes DIR/dt.json, DIR/dt.html and the figures as PNG and SVG.
@@ -42,9 +38,9 @@ def dt(out: Path, as_json: bool) -> None:
     """
     from companion.studies.interval import maps
 
-    progress = Progress()
-    make_folder(out)
     answer, found = maps.study(progress.show)
-    write_study(out, "dt", answer, lambda: maps.files(answer, found, progress.show))
-    progress.clear()
-    click.echo(json.dumps(answer) if as_json else maps.text(answer))
+    return Studied(
+        answer=answer,
+        report=lambda: maps.files(answer, found, progress.show),
+        text=lambda: maps.text(answer),
+    )

@@ -1,24 +1,14 @@
 """The command ``companion study prediction``: predictors compared on logs."""
 
-import json
 import time
 from pathlib import Path
+from typing import Any
 
 import click
 
-from companion.cli.console import (
-    CENTER,
-    CONFIG,
-    FOLDER,
-    JSON,
-    LOGS,
-    SEED,
-    Progress,
-    make_folder,
-    say,
-    write_study,
-)
+from companion.cli.console import CENTER, CONFIG, LOGS, SEED, Progress, say
 from companion.cli.design import numbers
+from companion.cli.study_output import Studied, study_output
 
 
 @click.command()
@@ -30,31 +20,27 @@ from companion.cli.design import numbers
     "leads_s",
     metavar="S[,S...]",
     default="0,0.1,0.3,1",
-    show_default=True,
-    callback=lambda _context, _option, text: numbers(text),
+    callback=lambda _context, _option, text: tuple(numbers(text)),
     help="Seconds ahead of now that are aimed at.",
 )
 @click.option(
     "--links",
     metavar="NAME[,NAME...]",
     default="clean,radio,hostile",
-    show_default=True,
+    callback=lambda _context, _option, text: tuple(word.strip() for word in text.split(",")),
     help="The log's own link; a slow radio; one whose latency steps, ramps, wanders and holds all"
     " back, regime by regime; and noisy: a report each 0.8 s, of a poor receiver.",
 )
-@click.option("--rate", "rate_hz", metavar="HZ", type=float, default=1.2, show_default=True)
+@click.option("--rate", "rate_hz", metavar="HZ", type=float, default=1.2)
 @click.option(
     "--latency",
     "latency_s",
     metavar="MEDIAN,P95",
     default="0.6,2.2",
-    show_default=True,
     callback=lambda _context, _option, text: numbers(text),
     help="Seconds that the simulated radio adds to each report.",
 )
-@click.option(
-    "--loss", metavar="F", type=float, default=0.1, show_default=True, help="Share that is lost."
-)
+@click.option("--loss", metavar="F", type=float, default=0.1, help="Share that is lost.")
 @click.option("--known-delay", is_flag=True, help="The senders' clocks are known, as by TIMESYNC.")
 @SEED
 @click.option(
@@ -63,7 +49,6 @@ from companion.cli.design import numbers
     metavar="DB",
     type=float,
     default=20.0,
-    show_default=True,
     help="At a UAV with the beam right on it: what the loss in spectral efficiency is of.",
 )
 @click.option(
@@ -73,27 +58,17 @@ from companion.cli.design import numbers
 )
 @click.option("--jobs", metavar="N", type=click.IntRange(min=1), help="Processes.  [all cores]")
 @click.option("--cluster", metavar="ADDRESS", help="Work on a Dask cluster, such as tcp://H:8786.")
-@FOLDER
-@JSON
+@study_output("prediction")
 def prediction(
     *,
-    logs: tuple[Path, ...],
     config: Path | None,
-    center: str | None,
-    leads_s: list[float],
-    links: str,
     rate_hz: float,
     latency_s: list[float],
     loss: float,
     known_delay: bool,
-    seed: int,
-    snr_db: float,
-    learned: Path | None,
-    jobs: int | None,
-    cluster: str | None,
-    out: Path,
-    as_json: bool,
-) -> None:
+    progress: Progress,
+    **asked: Any,
+) -> Studied:
     """Predictors compared on logs, over the link that they had, a slow radio and a hostile link.
 
     Writes DIR/prediction.json, DIR/prediction.html and the figures as PNG and SVG. Without
@@ -113,7 +88,6 @@ def prediction(
     began_s = time.monotonic()
     if len(latency_s) != 2:
         raise click.BadParameter("a latency is MEDIAN,P95 in seconds, such as 0.6,2.2")
-    progress = Progress()
     radio = RadioLink(
         name="radio",
         rate_hz=rate_hz,
@@ -122,30 +96,24 @@ def prediction(
         known_delay=known_delay,
     )
     name = str(config) if config else None
-    setting = PredictionStudy(
-        logs=logs,
-        center=center,
-        leads_s=tuple(leads_s),
-        links=tuple(word.strip() for word in links.split(",")),
-        radio=radio,
-        seed=seed,
-        settings=load(config),
-        config=name,
-        learned=learned,
-        snr_db=snr_db,
-        jobs=jobs,
-        cluster=cluster,
-    )
-    make_folder(out)
-    if center is None:
+    setting = PredictionStudy(**asked, radio=radio, settings=load(config), config=name)
+    if setting.center is None:
         click.echo("no --center: the array stands where the first report was made", err=True)
     answer, found = study(setting, progress.show)
-    write_study(out, "prediction", answer, lambda: report.files(answer, found, progress.show))
-    progress.clear()
-    click.echo(json.dumps(answer) if as_json else tables.text(found))
-    took_s = time.monotonic() - began_s
-    click.echo(f"{len(logs)} logs over {len(setting.over)} links in {took_s:.0f} s", err=True)
-    broken = violations.notice(answer["rows"])
-    if broken is not None:
-        say(f"companion: {broken}", err=True)
-        click.get_current_context().exit(3)
+
+    def at_end() -> None:
+        took_s = time.monotonic() - began_s
+        click.echo(
+            f"{len(setting.logs)} logs over {len(setting.over)} links in {took_s:.0f} s", err=True
+        )
+        broken = violations.notice(answer["rows"])
+        if broken is not None:
+            say(f"companion: {broken}", err=True)
+            click.get_current_context().exit(3)
+
+    return Studied(
+        answer=answer,
+        report=lambda: report.files(answer, found, progress.show),
+        text=lambda: tables.text(found),
+        at_end=at_end,
+    )

@@ -24,14 +24,12 @@ from companion.values import WeightFormat
     "form",
     type=click.Choice([str(form) for form in WeightFormat]),
     default="json",
-    show_default=True,
     help="json holds the beams as well; raw is little-endian complex64, row by row.",
 )
 @click.option(
     "--lead-ms",
     type=click.FloatRange(0, 10_000),
     default=0.0,
-    show_default=True,
     help="Milliseconds ahead of T at which the beams are to be right.",
 )
 @click.option(

@@ -70,7 +70,9 @@ def _sweep(watched: Watched) -> "Figure":
     edges = _edges(watched)
     figure, (axes,) = plotting.new(1, 1, (WIDTH_IN, 3.6))
     for number, (uav, samples) in enumerate(watched.by_uav.items()):
-        most = _worst(samples, edges, lambda s: _or_nan(s.sweep_share), np.fmax)
+        most = _worst(
+            samples, edges, lambda s: np.nan if s.sweep_share is None else s.sweep_share, np.fmax
+        )
         _over_time(axes, edges, 100 * most, uav, plotting.line(number))
     axes.set_ylim(bottom=0)
     axes.set_ylabel(f"to be swept, % of {watched.codebook_beams} stored beams")
@@ -170,10 +172,6 @@ def _of(worth: Worth | None, value: Callable[[Worth], float | None]) -> float:
         return math.nan
     found = value(worth)
     return -math.inf if found is None else found
-
-
-def _or_nan(value: float | None) -> float:
-    return math.nan if value is None else value
 
 
 def _range_db(watched: Watched) -> tuple[float, float]:

@@ -302,7 +302,8 @@ def study(
     modes_found = [
         row
         for logs, settings in zip(setting.flights, setting.settings, strict=True)
-        for link in modes.links(setting.links)
+        for link in LINKS
+        if link.name in setting.links
         for row in modes.compare(logs, settings, link, progress)
     ]
     return {

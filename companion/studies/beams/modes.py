@@ -27,11 +27,12 @@ from companion.pipeline.ticks import with_ticks
 from companion.recording.reader import read_flight
 from companion.settings.model import Settings
 from companion.studies.beams.worth import Row, given, mean, percentile, share
+from companion.studies.figures.text_tables import text_table
 from companion.studies.prediction.baselines import ObservedReport, Predictor
 from companion.studies.prediction.delivery import deliver
 from companion.studies.prediction.kalman import Kalman
 from companion.studies.prediction.predictors import SIMPLE, known_tuning
-from companion.studies.prediction.radio_link import LINKS, RadioLink
+from companion.studies.prediction.radio_link import RadioLink
 from companion.studies.truth import array_truth, vehicles
 from companion.studies.truth.array_truth import ArrayTruth
 from companion.tracking.geodesy import LocalFrame
@@ -240,11 +241,6 @@ def _judge(pipeline: Pipeline, made: BeamSet, true: dict[str, FloatArray], way: 
         way.violations += int(one is not None and one > gains_db[n] + 1e-9)
 
 
-def links(names: Sequence[str]) -> list[RadioLink]:
-    """The links of these names."""
-    return [link for link in LINKS if link.name in names]
-
-
 COLUMNS: Final = (
     ("link", "link"), ("beams", "beams"), ("true 5 %", "true_gain_p5_db"),
     ("true 50 %", "true_gain_median_db"), ("predicted", "predicted_gain_median_db"),
@@ -271,9 +267,4 @@ def cells(row: Row) -> list[str]:
 
 def text(rows: Sequence[Row]) -> str:
     """The table as text."""
-    widths = (9, 31, 9, 10, 10, 12, 10, 8, 9, 9, 8)
-    lines = [[words for words, _ in COLUMNS], *map(cells, rows)]
-    return "\n".join(
-        "  " + "".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
-        for line in lines
-    )
+    return text_table([[words for words, _ in COLUMNS], *map(cells, rows)])

@@ -8,6 +8,7 @@ from companion.studies.beams.charts import charts
 from companion.studies.beams.flight import Watched
 from companion.studies.beams.worth import SHARP, Row, summed_up
 from companion.studies.figures import plotting
+from companion.studies.figures.text_tables import text_table
 
 COMPARED: Final = (
     ("predicted gain, dB: 5 % / median", ("gain_p5_db", "gain_median_db")),
@@ -85,12 +86,10 @@ def text(found: Sequence[Watched], compared: Sequence[Row] = ()) -> str:
 
 def _text(watched: Watched) -> str:
     row = summed_up(watched.samples)
-    lines = [_describe(watched)]
-    lines += [f"  {label:54}{_cells(row, keys, ''):>16}" for label, keys in AS_FOUND]
-    lines.append(f"  {'':54}{'as set':>16}{'sharp':>16}")
-    for label, keys in COMPARED:
-        lines.append(f"  {label:54}{_cells(row, keys, ''):>16}{_cells(row, keys, SHARP):>16}")
-    return "\n".join(lines)
+    rows = [(label, _cells(row, keys, ""), "") for label, keys in AS_FOUND]
+    rows.append(("", "as set", "sharp"))
+    rows += [(label, _cells(row, keys, ""), _cells(row, keys, SHARP)) for label, keys in COMPARED]
+    return f"{_describe(watched)}\n{text_table(rows)}"
 
 
 def _section(watched: Watched, figures: Iterable[str]) -> dict[str, Any]:

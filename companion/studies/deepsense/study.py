@@ -8,6 +8,7 @@ import numpy as np
 from companion.studies.deepsense import predictors
 from companion.studies.deepsense.predictors import Fitted, Predictor, own, rank_of
 from companion.studies.deepsense.samples import Samples, blocks, inner, shuffled
+from companion.studies.figures.text_tables import text_table
 from companion.studies.origin import command_line, versions
 from companion.values import BoolArray, FloatArray, IntArray
 
@@ -111,11 +112,10 @@ def text(answer: dict[str, Any]) -> str:
         f" {answer['neighbours_alike']:.0%} of neighbours share a beam",
         f"{answer['blocks']} contiguous blocks in {answer['folds']} folds; shuffled with seed"
         f" {answer['seed']}",
-        f"{'split':10}{'predictor':22}{'top-1':>7}{'top-3':>7}{'top-5':>7}{'set':>6}{'covers':>8}",
     ]
-    lines += [
-        f"{row['split']:10}{row['predictor']:22}{row['top_1']:7.1f}{row['top_3']:7.1f}"
-        f"{row['top_5']:7.1f}{row['set_size_mean']:6.1f}{100 * row['set_coverage']:7.1f}%"
-        for row in answer["rows"]
-    ]
-    return "\n".join(lines)
+    rows = [["split and predictor", "top-1", "top-3", "top-5", "set", "covers"]]
+    for row in answer["rows"]:
+        shares = [f"{row[key]:.1f}" for key in ("top_1", "top_3", "top_5", "set_size_mean")]
+        covers = f"{100 * row['set_coverage']:.1f}%"
+        rows.append([f"{row['split']}: {row['predictor']}", *shares, covers])
+    return "\n".join([*lines, text_table(rows)])

@@ -5,6 +5,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from companion.studies.figures import plotting
+from companion.studies.figures.text_tables import text_table
 from companion.studies.fleet.sky import Sky
 from companion.studies.fleet.study import FleetSize, FleetStudy
 
@@ -42,12 +43,7 @@ def cells(one: FleetSize) -> list[str]:
 
 def text(found: Sequence[FleetSize]) -> str:
     """The table as text."""
-    rows = [list(COLUMNS), *map(cells, found)]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(COLUMNS))]
-    return "\n".join(
-        "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True))
-        for row in rows
-    )
+    return text_table([COLUMNS, *map(cells, found)])
 
 
 def files(

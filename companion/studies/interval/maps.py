@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from companion.studies.figures import plotting
+from companion.studies.figures.text_tables import text_table
 from companion.studies.origin import command_line, versions
 from companion.studies.paper.experiments import Progress
 from companion.tracking.design import closed_form
@@ -176,22 +177,16 @@ def _rates(answer: dict[str, Any]) -> list[tuple[str, ...]]:
     for row in answer["rates"]:
         by_case.setdefault((row["error_m"], row["speed_mps"]), []).append(row["dt_max_s"])
     return [
-        (f"{error:g}", f"{speed:g}", *(_rate(dt_s) for dt_s in limits))
+        (f"{error:g}", f"{speed:g}", *("none" if s <= 0 else f"{1 / s:.2f}" for s in limits))
         for (error, speed), limits in by_case.items()
     ]
 
 
-def _rate(dt_s: float) -> str:
-    return "none" if dt_s <= 0 else f"{1 / dt_s:.2f}"
-
-
 def text(answer: dict[str, Any]) -> str:
     """The longest intervals as a table for a terminal."""
-    lines = ["  error m  speed m/s  feedthrough s  longest interval s  with alpha"]
+    rows = [["error m", "speed m/s", "feedthrough s", "longest interval s", "with alpha"]]
     for one in answer["rates"]:
         longest = f"{one['dt_max_s']:.3f}" if one["dt_max_s"] > 0 else "none"
-        lines.append(
-            f"  {one['error_m']:7g}  {one['speed_mps']:9g}  {one['feedthrough_s']:13g}"
-            f"  {longest:>18}  {one['alpha']:10g}"
-        )
-    return "\n".join(lines)
+        given = (f"{one[key]:g}" for key in ("error_m", "speed_mps", "feedthrough_s"))
+        rows.append([*given, longest, f"{one['alpha']:g}"])
+    return text_table(rows)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 from companion.studies.figures import plotting
+from companion.studies.figures.text_tables import text_table
 from companion.studies.link import figures
 from companion.studies.link.rows import Row
 
@@ -16,10 +17,9 @@ def files(answer: dict[str, Any], progress: Callable[[str], None]) -> dict[str, 
 
 def text(answer: dict[str, Any]) -> str:
     """A table of the SNR that each kind of positions needs, and its figures at the highest SNR."""
-    lines = [answer["scenario"]["description"], "  ".join(f"{word:>12}" for word in (
-        "positions", "code", "dB at 1e-3", "BER at best", "Mbit/s", "degrees off"))]  # fmt: skip
-    lines += ["  ".join(f"{cell:>12}" for cell in _cells(row)) for row in answer["summary"]]
-    return "\n".join(lines)
+    head = ["positions", "code", "dB at 1e-3", "BER at best", "Mbit/s", "degrees off"]
+    rows = text_table([head, *map(_cells, answer["summary"])])
+    return f"{answer['scenario']['description']}\n{rows}"
 
 
 def _cells(row: Row) -> list[str]:

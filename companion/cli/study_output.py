@@ -1,0 +1,49 @@
+"""What every command of ``companion study`` does with its answer."""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import click
+
+from companion.cli.console import JSON, Progress, make_folder
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Studied:
+    """The outcome of a study."""
+
+    answer: dict[str, Any]
+    report: Callable[[], Mapping[str, bytes]]  # its page and figures, by file name
+    text: Callable[[], str]  # what is printed without --json
+    at_end: Callable[[], None] = lambda: None  # called when all of it is written
+
+
+def study_output(name: str) -> Callable[[Callable[..., Studied]], Callable[..., None]]:
+    """Give a study's command --out and --json, and write what the study returns.
+
+    The study is called with ``progress``. The answer is written as JSON before the figures.
+    """
+
+    def decorate(study: Callable[..., Studied]) -> Callable[..., None]:
+        @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
+        @JSON
+        @wraps(study)
+        def command(*, out: Path, as_json: bool, **options: Any) -> None:
+            progress = Progress()
+            make_folder(out)
+            studied = study(progress=progress, **options)
+            written = json.dumps(studied.answer, indent=1)
+            (out / f"{name}.json").write_text(written, encoding="utf-8")
+            for file, content in studied.report().items():
+                (out / file).write_bytes(content)
+            progress.clear()
+            click.echo(json.dumps(studied.answer) if as_json else studied.text())
+            studied.at_end()
+
+        return command
+
+    return decorate

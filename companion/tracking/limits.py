@@ -36,6 +36,9 @@ class Airframe(StrEnum):
     ADSB = "adsb"
 
 
+ANY_LAG_S: Final = (0.0, 0.06)  # lag of an autopilot of which nothing is known
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AirframeLimits:
     """What is assumed of a kind of aircraft.
@@ -50,30 +53,17 @@ class AirframeLimits:
 
     speed_mps: float
     acceleration_mps2: float
-    lag_s: tuple[float, float]
+    lag_s: tuple[float, float] = ANY_LAG_S
     turn_degps2: float
 
 
-ANY_LAG_S: Final = (0.0, 0.06)  # lag of an autopilot of which nothing is known
 LIMITS: Final = {
-    Airframe.COPTER: AirframeLimits(
-        speed_mps=60.0, acceleration_mps2=4.0, lag_s=ANY_LAG_S, turn_degps2=180.0
-    ),
-    Airframe.AEROPLANE: AirframeLimits(
-        speed_mps=80.0, acceleration_mps2=16.0, lag_s=ANY_LAG_S, turn_degps2=720.0
-    ),
-    Airframe.VTOL: AirframeLimits(
-        speed_mps=80.0, acceleration_mps2=16.0, lag_s=ANY_LAG_S, turn_degps2=720.0
-    ),
-    Airframe.HELICOPTER: AirframeLimits(
-        speed_mps=80.0, acceleration_mps2=8.0, lag_s=ANY_LAG_S, turn_degps2=180.0
-    ),
-    Airframe.ROVER: AirframeLimits(
-        speed_mps=40.0, acceleration_mps2=5.0, lag_s=ANY_LAG_S, turn_degps2=90.0
-    ),
-    Airframe.UNKNOWN: AirframeLimits(
-        speed_mps=80.0, acceleration_mps2=16.0, lag_s=ANY_LAG_S, turn_degps2=270.0
-    ),
+    Airframe.COPTER: AirframeLimits(speed_mps=60.0, acceleration_mps2=4.0, turn_degps2=180.0),
+    Airframe.AEROPLANE: AirframeLimits(speed_mps=80.0, acceleration_mps2=16.0, turn_degps2=720.0),
+    Airframe.VTOL: AirframeLimits(speed_mps=80.0, acceleration_mps2=16.0, turn_degps2=720.0),
+    Airframe.HELICOPTER: AirframeLimits(speed_mps=80.0, acceleration_mps2=8.0, turn_degps2=180.0),
+    Airframe.ROVER: AirframeLimits(speed_mps=40.0, acceleration_mps2=5.0, turn_degps2=90.0),
+    Airframe.UNKNOWN: AirframeLimits(speed_mps=80.0, acceleration_mps2=16.0, turn_degps2=270.0),
     Airframe.ADSB: AirframeLimits(
         speed_mps=400.0, acceleration_mps2=16.0, lag_s=(0.0, 0.0), turn_degps2=720.0
     ),

@@ -11,7 +11,7 @@ from companion.values import ComplexArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
-class ZeroForcingLimits:
+class CostLimits:
     """What zero forcing may cost: the loss of any user, dB, and the condition number."""
 
     loss_db: float
@@ -30,7 +30,7 @@ YOUNG_MARGIN_DB: Final = 1.5  # loss accepted beyond the limit while slots are y
 
 
 def kept_groups(
-    steering: ComplexArray, before: PreviousSlots, limits: ZeroForcingLimits
+    steering: ComplexArray, before: PreviousSlots, limits: CostLimits
 ) -> list[IntArray] | None:
     """The previous groups if they are still within the limits; else None."""
     groups = [np.flatnonzero(before.numbers == n) for n in range(int(before.numbers.max()) + 1)]
@@ -40,7 +40,7 @@ def kept_groups(
     return groups
 
 
-def lost_db(steering: ComplexArray, limits: ZeroForcingLimits) -> float:
+def lost_db(steering: ComplexArray, limits: CostLimits) -> float:
     """What zero forcing costs the worst of the users, dB; infinite past the condition limit.
 
     Judged with columns of one length: that elements radiate less towards a user brings him no
@@ -50,7 +50,7 @@ def lost_db(steering: ComplexArray, limits: ZeroForcingLimits) -> float:
     return _lost_db(unit.T @ unit.conj(), len(steering), limits)
 
 
-def _lost_db(gram: ComplexArray, elements: int, limits: ZeroForcingLimits) -> float:
+def _lost_db(gram: ComplexArray, elements: int, limits: CostLimits) -> float:
     if len(gram) > elements:
         return math.inf
     values, vectors = np.linalg.eigh(gram)
@@ -64,7 +64,7 @@ class _Group:
     """A group that grows: the inverse of its Gram matrix, bordered with each user it takes in."""
 
     def __init__(
-        self, *, gram: ComplexArray, first: int, elements: int, limits: ZeroForcingLimits
+        self, *, gram: ComplexArray, first: int, elements: int, limits: CostLimits
     ) -> None:
         self.members = [first]
         self._gram, self._elements, self._limits = gram, elements, limits
@@ -108,7 +108,7 @@ class _Group:
 
 
 def semi_orthogonal(
-    steering: ComplexArray, order: Sequence[int], limits: ZeroForcingLimits
+    steering: ComplexArray, order: Sequence[int], limits: CostLimits
 ) -> list[IntArray]:
     """Groups of users, each within the limits, in the order in which they are served.
 
@@ -153,7 +153,7 @@ def semi_orthogonal(
 
 
 def without_the_lowest(
-    steering: ComplexArray, order: Sequence[int], limits: ZeroForcingLimits
+    steering: ComplexArray, order: Sequence[int], limits: CostLimits
 ) -> IntArray:
     """The users kept: by descending priority, each that fits with those kept before."""
     unit: ComplexArray = steering / np.linalg.norm(steering, axis=0)

@@ -201,7 +201,7 @@ def _slots(
     everyone = np.arange(steering.shape[1])
     if settings.policy is Policy.REGULARISE or settings.method is not Method.ZERO_FORCING:
         return [everyone], {}
-    limits = grouping.ZeroForcingLimits(settings.loss_limit_db, settings.condition_limit)
+    limits = grouping.CostLimits(settings.loss_limit_db, settings.condition_limit)
     lost_db = grouping.lost_db(steering, limits)
     stays = None if before is None else grouping.kept_groups(steering, before, limits)
     young = before is not None and before.young

@@ -8,8 +8,8 @@ from support import examples
 
 from companion.beams.weights.grouping import (
     YOUNG_MARGIN_DB,
+    CostLimits,
     PreviousSlots,
-    ZeroForcingLimits,
     kept_groups,
     lost_db,
     semi_orthogonal,
@@ -17,7 +17,7 @@ from companion.beams.weights.grouping import (
 )
 from companion.values import ComplexArray
 
-LIMITS = ZeroForcingLimits(3.0, 100.0)
+LIMITS = CostLimits(3.0, 100.0)
 
 
 def drawn(seed: int, elements: int, users: int) -> ComplexArray:

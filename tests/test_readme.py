@@ -82,7 +82,7 @@ def make(words: list[str], _: Path, start_node: Started) -> None:
         "demo": "companion demo",
         "test": "not full",
         "test-all": "HYPOTHESIS_PROFILE=full",
-        "check": "vulture",
+        "check": "dead_code",
         "bench": "benchmark",
         "site": "make_site",
     }

@@ -28,6 +28,7 @@ from companion.pipeline.records import RECORDS_MAX, Records, UavRecords
 from companion.settings.model import Settings
 from companion.tracking import noise
 from companion.values import (
+    Accuracy,
     AdsbVehicle,
     Attitude,
     EstimatorStatus,
@@ -303,14 +304,28 @@ class Senders:
         """
         component = self._components.get(report.source)
         if component is None or component.noise is None or component.receiver is None:
-            return replace(self._noise_settings.default, time_s=time_s)
+            return self._stated(report, replace(self._noise_settings.default, time_s=time_s))
         apart_m = 0.0
         if component.receiver.fix_type >= FIX_3D:
             apart_m2, before = (report.alt_m - component.receiver.alt_m) ** 2, component.apart_m2
             if before is not None:
                 apart_m2 = before + APART_SHARE * (apart_m2 - before)
             component.apart_m2, apart_m = apart_m2, math.sqrt(apart_m2)
-        return replace(component.noise, time_s=time_s, apart_m=apart_m)
+        return self._stated(report, replace(component.noise, time_s=time_s, apart_m=apart_m))
+
+    def _stated(self, report: Report, noise: ReportNoise) -> ReportNoise:
+        """The bounds, widened by what the message itself states: accuracy, and steps of height."""
+        if report.accuracy is None and not report.alt_step_m:
+            return noise
+        said, factor = report.accuracy or Accuracy(), self._noise_settings.factor or 0.0
+        horizontal_m = max(noise.horizontal_m, factor * (said.horizontal_m or 0.0))
+        vertical_m = max(noise.vertical_m, factor * (said.vertical_m or 0.0)) + report.alt_step_m
+        return replace(
+            noise,
+            horizontal_m=horizontal_m,
+            vertical_m=vertical_m,
+            position_m=max(noise.position_m, math.hypot(horizontal_m, vertical_m)),
+        )
 
     def _relayed(self, said: AdsbVehicle) -> FrameOutcome:
         """Place a report of an aircraft that a receiver relays.

@@ -83,6 +83,7 @@ class Report:
         alt_age_s          time between the instants at which position and altitude were true; 0
                            where one message held both
         accuracy           how exact it says that it is; None where its message has no word for it
+        alt_step_m         step in which its message gives heights; 0: too small to count
 
     None stands for what was not sent.
     """
@@ -102,6 +103,7 @@ class Report:
     tslc_s: float | None
     alt_age_s: float = 0.0
     accuracy: Accuracy | None = None
+    alt_step_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

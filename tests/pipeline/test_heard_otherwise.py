@@ -1,5 +1,6 @@
 """Aircraft heard otherwise than by telemetry, in the fold: one stays one, and late is late."""
 
+import math
 from collections import Counter
 from datetime import UTC, datetime
 from typing import Any
@@ -274,3 +275,49 @@ def test_made_up_names_take_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     assert fold.senders._assumed.cache_info().currsize <= RECORDS_MAX
     assert len(fold.tracker.uavs) == seen["used"] == TRACKS_MAX
     assert seen[Reason.TOO_MANY] == 3 * RECORDS_MAX - TRACKS_MAX
+
+
+def summary(t_s: float, **given: int) -> Frame:
+    """HIGH_LATENCY2 of the same aircraft, as an autopilot packs it."""
+    lat, lon, alt = there(t_s)
+    fields = dict.fromkeys(dialect.MAVLink_high_latency2_message.fieldnames, 0)
+    fields |= {
+        "timestamp": round(1000 * (100 + t_s)), "latitude": round(lat * 1e7),
+        "longitude": round(lon * 1e7), "altitude": int(alt), "heading": 0, "groundspeed": 25,
+    } | given  # fmt: skip
+    return framed(t_s, Source(1, 1), dialect.MAVLink_high_latency2_message(**fields))
+
+
+def test_a_uav_that_sends_high_latency2_alone_is_tracked_within_its_bound() -> None:
+    """One report each 5 s, in whole metres of height and without a velocity."""
+    into, estimates, t_s = pipeline(), list[Estimate](), 0.0
+    for step in range(60):
+        t_s = 5.0 * step
+        estimates += [one for one in into.step(summary(t_s)) if isinstance(one, Estimate)]
+        (track,) = into.tracks(START_NS + round((t_s + 2) * S), START_NS + round((t_s + 2) * S))
+        assert into.local is not None
+        true = into.local.localise(*there(t_s + 2), None)[0]
+        off_m = math.dist(true, track.position_ned_m.tolist())
+        assert off_m <= track.bound_m
+    assert len(estimates) == 60
+    assert track.uav == "1:1" and track.dt_s == pytest.approx(5.0)
+    row = heard(summary(t_s), [estimates[-1]])
+    assert row is not None and row.message == "HIGH_LATENCY2"
+
+
+@pytest.mark.parametrize(("eph", "least_m"), [(0, 3.0), (255, 3.0), (80, 24.0)])
+def test_the_bound_on_a_summary_holds_what_it_states(eph: int, least_m: float) -> None:
+    """Its accuracy, three times over, and a metre for the step of its heights."""
+    (estimate,) = (
+        one for one in pipeline().step(summary(0.0, eph=eph)) if isinstance(one, Estimate)
+    )
+    noise = estimate.fix.noise
+    assert noise.horizontal_m == pytest.approx(least_m)
+    assert noise.vertical_m == pytest.approx(pipeline_noise_m() + 1.0)
+    assert noise.position_m >= math.hypot(noise.horizontal_m, noise.vertical_m) - 1e-9
+
+
+def pipeline_noise_m() -> float:
+    """The bound on a height without any accuracy that is stated."""
+    (estimate,) = (one for one in pipeline().step(telemetry(0.0)) if isinstance(one, Estimate))
+    return estimate.fix.noise.vertical_m

@@ -115,6 +115,7 @@ def _own_position(frame: Frame) -> Report:
         boot_ms=said.boot_ms,
         tslc_s=None,
         accuracy=said.accuracy,
+        alt_step_m=said.alt_step_m,
     )
 
 

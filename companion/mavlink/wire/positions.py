@@ -16,6 +16,7 @@ from companion.mavlink.wire.transponder import ADSB_VEHICLE
 from companion.values import Accuracy, Frame, Vector
 
 GLOBAL_POSITION_INT: Final = 33
+HIGH_LATENCY2: Final = 235
 
 
 class OwnPosition(NamedTuple):
@@ -32,6 +33,7 @@ class OwnPosition(NamedTuple):
     velocity_ned_mps: Vector | None  # north, east, down
     heading_deg: float | None  # from true north, clockwise
     accuracy: Accuracy | None = None  # accuracy that the message states
+    alt_step_m: float = 0.0  # step in which the message gives heights
 
 
 class PositionMessage(NamedTuple):
@@ -61,8 +63,35 @@ def _global_position_int(frame: Frame) -> OwnPosition:
     )
 
 
+_HIGH_LATENCY2 = struct.Struct("<Iii2xh10xB7x2B")  # up to eph and epv; what follows is not read
+
+
+def _high_latency2(frame: Frame) -> OwnPosition:
+    """Read HIGH_LATENCY2, a summary every few seconds over a satellite modem or another thin link.
+
+    Its heights are whole metres. It has a ground speed and the direction of the nose, but no
+    velocity: where the wind blows the two disagree. ``eph`` and ``epv`` are the largest errors
+    since the message before, 0.1 m; 0 and 255 are unknown.
+    https://mavlink.io/en/messages/common.html#HIGH_LATENCY2
+    """
+    boot_ms, lat, lon, alt_m, heading, eph, epv = unpack(frame, _HIGH_LATENCY2)
+    horizontal_m, vertical_m = (None if dm in (0, 255) else dm * 0.1 for dm in (eph, epv))
+    return OwnPosition(
+        boot_ms=boot_ms,
+        lat_1e7=lat,
+        lon_1e7=lon,
+        alt_m=float(alt_m),
+        relative_alt_m=None,
+        velocity_ned_mps=None,
+        heading_deg=heading * 2.0 if heading < 180 else None,
+        accuracy=Accuracy(horizontal_m=horizontal_m, vertical_m=vertical_m),
+        alt_step_m=1.0,
+    )
+
+
 POSITIONS: Final = {
     GLOBAL_POSITION_INT: PositionMessage("GLOBAL_POSITION_INT", _global_position_int),
+    HIGH_LATENCY2: PositionMessage("HIGH_LATENCY2", _high_latency2),
     ADSB_VEHICLE: PositionMessage("ADSB_VEHICLE"),
     LOCATION: PositionMessage("OPEN_DRONE_ID_LOCATION"),
     MESSAGE_PACK: PositionMessage("OPEN_DRONE_ID_MESSAGE_PACK"),

@@ -1,12 +1,15 @@
 """The table of position messages, held against the dialect and against those who use it."""
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
 
 from companion.mavlink.voice.component import ACCEPTED_IDS
 from companion.mavlink.wire.decode import DECODED, POSE
-from companion.mavlink.wire.positions import OWN, POSITIONS
+from companion.mavlink.wire.positions import HIGH_LATENCY2, OWN, POSITIONS, read
 from companion.pipeline.fleet.reception import SHARED
+from companion.values import Frame, Source
 
 
 @pytest.mark.parametrize("msgid", POSITIONS)
@@ -19,3 +22,31 @@ def test_a_position_message_is_used_wherever_positions_are() -> None:
     assert OWN
     for users in (POSE, SHARED, ACCEPTED_IDS):
         assert users >= OWN
+
+
+SUMMARIES = st.tuples(
+    st.integers(0, 2**32 - 1),
+    st.integers(-900_000_000, 900_000_000),
+    st.integers(-1_800_000_000, 1_800_000_000),
+    st.integers(-2000, 30_000),
+    st.integers(0, 255),
+    st.integers(0, 255),
+)
+
+
+@given(SUMMARIES)
+def test_high_latency2_is_read_as_the_dialect_packs_it(summary: tuple[int, ...]) -> None:
+    boot_ms, lat, lon, alt, heading, eph = summary
+    kind = dialect.MAVLink_high_latency2_message
+    fields = dict.fromkeys(kind.fieldnames, 7) | {
+        "timestamp": boot_ms, "latitude": lat, "longitude": lon, "altitude": alt,
+        "heading": heading, "eph": eph, "epv": 0,
+    }  # fmt: skip
+    raw = bytes(kind(**fields).pack(dialect.MAVLink(None, srcSystem=3, srcComponent=1)))
+    found = read(Frame(t_ns=0, link="udp", source=Source(3, 1), msgid=HIGH_LATENCY2, raw=raw))
+    assert (found.boot_ms, found.lat_1e7, found.lon_1e7, found.alt_m) == (boot_ms, lat, lon, alt)
+    assert found.heading_deg == (2.0 * heading if heading < 180 else None)
+    assert found.velocity_ned_mps is None and found.accuracy is not None
+    known = eph not in (0, 255)
+    assert found.accuracy.horizontal_m == (pytest.approx(eph * 0.1) if known else None)
+    assert found.accuracy.vertical_m is None

@@ -38,6 +38,8 @@ def placed(settings: Settings) -> geometry.Array:
                 )
             case ArrayKind.UCA:
                 return geometry.uniform_circular(elements, frequency_hz, **spaced)
+            case ArrayKind.HEXAGONAL:
+                return geometry.hexagonal(given.rings, frequency_hz, **spaced)
             case ArrayKind.LIST:
                 placed = _rows(given.positions_m or ())
                 outward = placed[:, 3:6] if placed.shape[1] == 6 else None

@@ -41,6 +41,7 @@ class ArraySettings(Section):
         ula   ``elements`` along y
         ura   ``rows`` down and ``columns`` to the right
         uca   ``elements`` on a circle in the xy plane
+        hexagonal  ``rings`` of hexagons about a middle element, in the yz plane
         list  ``positions_m``: rows of x, y, z, or of x, y, z and the direction the element faces.
               ``positions`` names a file of such rows (CSV or .npy), which is read into
               ``positions_m``
@@ -65,6 +66,7 @@ class ArraySettings(Section):
     elements: Annotated[int, Field(ge=1, le=4096)] = 64
     rows: Annotated[int, Field(ge=1, le=256)] = 8
     columns: Annotated[int, Field(ge=1, le=256)] = 8
+    rings: Annotated[int, Field(ge=1, le=36)] = 4
     positions: str | None = None
     positions_m: Annotated[tuple[tuple[Metres, ...], ...], Field(max_length=4096)] | None = None
     frequency_hz: Annotated[float, Field(ge=1e3, le=1e15)] = 30e9

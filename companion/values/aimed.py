@@ -26,6 +26,7 @@ class ArrayKind(DescribedEnum):
     ULA = "ula", "uniform line along y"
     URA = "ura", "uniform rectangle of rows down and columns to the right"
     UCA = "uca", "uniform circle in the xy plane"
+    HEXAGONAL = "hexagonal", "rings of a triangular lattice in the aperture plane, yz"
     LIST = "list", "elements at listed positions"
 
 

@@ -176,6 +176,38 @@ def uniform_circular(
     )
 
 
+def hexagonal(
+    rings: int,
+    frequency_hz: float,
+    *,
+    spacing_wavelengths: float,
+    array_from_body: FloatArray,
+    element: Element = ISOTROPIC,
+    lever_arm_m: FloatArray | None = None,
+) -> Array:
+    """Rings of hexagons about a middle element, on a triangular lattice in the yz plane.
+
+    1 + 3 R (R + 1) elements for R rings, row by row from the top; neighbours are
+    ``spacing_wavelengths`` apart. For the same grating lobes it takes 13 % fewer elements an area
+    than a square lattice (Van Trees, Optimum Array Processing, 4.1.7).
+    """
+    wavelength_m = _wavelength_m(rings, frequency_hz, spacing_wavelengths)
+    spacing_m = spacing_wavelengths * wavelength_m
+    steps = np.arange(-rings, rings + 1)
+    row, column = (grid.ravel() for grid in np.meshgrid(steps, steps, indexing="ij"))
+    inside = np.abs(row + column) <= rings
+    row, column = row[inside], column[inside]
+    right, down = column + row / 2, row * math.sqrt(3) / 2
+    return listed(
+        np.stack([np.zeros(len(row)), right * spacing_m, down * spacing_m], axis=1),
+        frequency_hz,
+        array_from_body=array_from_body,
+        element=element,
+        lever_arm_m=lever_arm_m,
+        kind=ArrayKind.HEXAGONAL,
+    )
+
+
 def listed(
     elements_m: FloatArray,
     frequency_hz: float,

@@ -7,7 +7,7 @@ import pytest
 
 from companion.beams.array import geometry
 from companion.beams.array.elements import Element, ElementPattern
-from companion.values import FloatArray
+from companion.values import FloatArray, UserError
 
 EYE = np.eye(3)
 LIGHT = geometry.SPEED_OF_LIGHT_MPS
@@ -184,3 +184,27 @@ def test_a_list_that_is_no_array_is_refused(
         geometry.listed(
             places, LIGHT, array_from_body=EYE, element=COSINE, lever_arm_m=None, outward=outward
         )
+
+
+@pytest.mark.parametrize("rings", [1, 2, 5])
+def test_a_hexagon_has_its_elements_on_a_triangular_lattice(rings: int) -> None:
+    """Neighbours are a spacing apart, inner elements have six; 60° of rotation change nothing."""
+    array = geometry.hexagonal(rings, LIGHT, spacing_wavelengths=0.7, array_from_body=EYE)
+    placed = array.elements_m
+    assert (array.kind, array.size) == ("hexagonal", 1 + 3 * rings * (rings + 1))
+    assert placed[:, 0] == pytest.approx(np.zeros(array.size))
+    assert placed.mean(axis=0) == pytest.approx(np.zeros(3))
+    apart_m = np.linalg.norm(placed[:, np.newaxis] - placed, axis=2)
+    neighbours = (np.abs(apart_m - 0.7) < 1e-9).sum(axis=1)
+    assert apart_m[apart_m > 0].min() == pytest.approx(0.7)
+    assert (neighbours == 6).sum() == 1 + 3 * (rings - 1) * rings
+    assert neighbours.min() == 3
+    half, side = 0.5, math.sqrt(3) / 2
+    turned = placed @ np.array([[1, 0, 0], [0, half, side], [0, -side, half]])
+    order = [np.lexsort(np.round(one[:, 1:], 6).T) for one in (placed, turned)]
+    assert turned[order[1]] == pytest.approx(placed[order[0]], abs=1e-9)
+
+
+def test_a_hexagon_of_no_rings_is_refused() -> None:
+    with pytest.raises(UserError, match="at least one element"):
+        geometry.hexagonal(0, 1e9, spacing_wavelengths=0.5, array_from_body=EYE)

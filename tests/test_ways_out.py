@@ -156,6 +156,7 @@ def columns(flown: tuple[Pipeline, Any, list[Update]]) -> dict[str, dict[str, li
             table = Table(name="", row_is="", row_class=TrackRow)
             add("track", "export", ((c.name, c.get(row)) for c in table.columns))
             own = as_json(track, pipeline.utc_ns)
+            assert own["climb_rate_mps"] == -own["velocity_ned_mps"][2]
             add("track", "api", iter(own.items()))
     return found
 

@@ -115,6 +115,7 @@ function factsOf(uav, messages) {
     ["Mode", modeOf(message("HEARTBEAT")) ?? format.UNKNOWN],
     ["Battery", batteryOf(message("SYS_STATUS"))],
     of("UavState", "speed_mps", format.speed(uav.speed_mps)),
+    of("UavState", "climb_rate_mps", format.speed(uav.climb_rate_mps)),
     of("LinkHealth", "needed_gain_db", format.decibels(health?.needed_gain_db)),
     of("LinkHealth", "likely_gain_db", format.decibels(health?.likely_gain_db)),
     of("LinkHealth", "guaranteed_gain_db", format.decibels(health?.guaranteed_gain_db)),

@@ -200,6 +200,11 @@ class Track:
         velocity = self.velocity_ned_mps
         return None if velocity is None else math.hypot(*velocity)
 
+    @property
+    def climb_rate_mps(self) -> Annotated[float | None, Meaning("estimated rate of climb", 26)]:
+        velocity = self.velocity_ned_mps
+        return None if velocity is None else -float(velocity[2])
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Carrier:

@@ -89,7 +89,15 @@ def test_an_optional_field_says_so_to_every_reader() -> None:
     file = FileDescriptorSet.FromString(schemas.TRACK.descriptor_set).file[0]
     [track] = [message for message in file.message_type if message.name == "Track"]
     optional = [field.name for field in track.field if field.proto3_optional]
-    assert optional == ["dt_s", "latency_s", "gamma", "innovation_m", "error_p95_m", "speed_mps"]
+    assert optional == [
+        "dt_s",
+        "latency_s",
+        "gamma",
+        "innovation_m",
+        "error_p95_m",
+        "speed_mps",
+        "climb_rate_mps",
+    ]
 
 
 def test_the_numbers_of_the_fields_stay() -> None:

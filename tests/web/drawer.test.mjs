@@ -46,13 +46,14 @@ test("a click opens the drawer with all that is known of that UAV, and asks for 
   const fields = { clock: { kind: "timesync", guarantee: "measured" }, clock_bound_s: 0.003,
     assumptions: { limits_source: "type", speed_max_mps: 30, acceleration_max_mps2: 4 },
     recent_rejections: [{ at: stampAt(1), reason: "frozen", detail: "" }] };
-  page.service.uavs = [uav("1:1"), uav("2:1", { ...weak(), ...fields })];
+  page.service.uavs = [uav("1:1"), uav("2:1", { ...weak(), ...fields, climb_rate_mps: -1.25 })];
   assert.equal(page.element("drawer").hidden, true);
   await page.time.advance(6 * BEAT_MS);
   const facts = await openDrawer(page, 0); // the weak one is the first
   assert.equal(page.element("drawer").hidden, false);
   assert.deepEqual([page.text("drawer-title"), page.text("drawer-verdict")], ["2:1", "link weak"]);
   assert.equal(page.text("coordinates"), "47.0009000, 8.0000000, 500.0");
+  assert.equal(facts["Climb rate"], "−1.3 m/s");
   assert.deepEqual([facts.Mode, facts.Battery, facts.Clock, facts.Assumed],
     ["Guided, armed", "76 % · 15.1 V", "timesync, measured, to 3 ms", "30.0 m/s, 4.0 m/s² (type)"]);
   assert.equal(page.text("drawer-rejections"), "13:00:01frozen");

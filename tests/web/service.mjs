@@ -29,6 +29,7 @@ export const uav = (id, fields = {}) => ({
   valid_at: stampAt(0), age_s: 0.2, lat_deg: LAT + 0.0009, lon_deg: LON, alt_m: 500,
   north_m: 100, east_m: 0, down_m: -50, velocity_ned_mps: [0, 0, 0], speed_mps: 0,
   bound_m: 4.2, horizontal_bound_m: 4, vertical_bound_m: 2, clock: null, dt_s: 0.25, latency_s: 0.03,
+  climb_rate_mps: 0,
   verdict: "good", health: health(), served_by: null, innovation_m: 0.4, gamma: 1, reports: 10, rejected: {}, recent_rejections: [], ...fields,
 });
 

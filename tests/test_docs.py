@@ -182,3 +182,26 @@ def test_every_class_that_the_glossary_names_is_there() -> None:
     defined = set(re.findall(r"^class (\w+)", sources, re.MULTILINE))
     assert len(named) > 40
     assert named <= defined, named - defined
+
+
+@pytest.mark.parametrize(
+    ("what", "neighbour"),
+    [
+        ("a position message", "HIGH_LATENCY2|alt_step_m"),
+        ("an array geometry", r"HEXAGONAL|hexagonal|given\.rings"),
+        ("a field of the API, recordings and exports", "climb_rate_mps"),
+    ],
+)
+def test_where_to_add_names_every_file_that_a_neighbour_is_in(what: str, neighbour: str) -> None:
+    """What was added last stands in the files that the table names, and in four at most."""
+    text = (DOCS / "architecture.md").read_text(encoding="utf-8")
+    (row,) = (line for line in text.splitlines() if line.startswith(f"| {what} |"))
+    named = set(re.findall(r"`([\w/]+\.\w+)`", row))
+    sources = [*(ROOT / "companion").rglob("*.py"), *(ROOT / "web").glob("*.js")]
+    inside = {
+        path.relative_to(ROOT).as_posix().removeprefix("companion/")
+        for path in sources
+        if re.search(rf"\b({neighbour})\b", path.read_text(encoding="utf-8"))
+    }
+    assert inside <= named, inside - named
+    assert len(inside) <= 4

@@ -295,9 +295,10 @@ def test_whether_somebody_listens_and_who_is_near_is_known(run: Run) -> None:
             assert stays.is_wanted("site/a") and not stays.is_wanted("site/b")
             assert stays.is_wanted("site/a", "data_high")
             await asyncio.to_thread(leaves.close)
-            await near.until(2)
-            assert [is_joined for _, is_joined in near] == [True, False]
-            assert near[0][0] == near[1][0]
+            while near[-1][1]:  # a busy machine may hear twice that it joined
+                await near.until(len(near) + 1)
+            assert {is_joined for _, is_joined in near[:-1]} == {True}
+            assert len({who for who, _ in near}) == 1
             assert not stays.is_wanted("site/a") and not leaves.is_wanted("site/a")
 
     run(test())

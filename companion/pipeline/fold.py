@@ -144,6 +144,8 @@ class Pipeline:
             change = self.senders.round_trip(event)
             source = str(event.source)
             outputs = [] if change is None else self._changed(event.t_ns, source, change)
+        if not outputs:  # most frames
+            return outputs
         told = []
         for output in outputs:
             if isinstance(output, Rejection):

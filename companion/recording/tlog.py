@@ -95,8 +95,9 @@ def read_tlog(data: bytes, link: str) -> Iterator[Event]:
     for group in (first, ahead):
         for stamp_ns, frame, lost in group:
             off_ns = None if stamp_ns is None else timeline.place(stamp_ns)
-            for reason, count in lost.items():
-                yield Rejection(t_ns=timeline.t_ns, source=link, reason=reason, count=count)
+            if lost:  # seldom
+                for reason, count in lost.items():
+                    yield Rejection(t_ns=timeline.t_ns, source=link, reason=reason, count=count)
             if frame is None:
                 return
             if off_ns is not None:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from companion.beams.array import steering
 from companion.beams.array.coverage import Coverage, Sector
 from companion.beams.array.elements import Element, ElementPattern
 from companion.beams.array.geometry import Array, listed, uniform_circular, uniform_linear
-from companion.beams.weights.precoding import Precoder
+from companion.beams.weights.precoding import Precoder, Radio, precode
 from companion.values import (
     Beam,
     BeamSet,
@@ -734,3 +735,28 @@ def test_sparing_all_leaves_nothing() -> None:
     )
     spared = without(full, {"1:1"})
     assert (spared.uavs, spared.groups, spared.weights.shape) == ((), 0, (16, 0))
+
+
+def test_precoding_gets_the_snr_and_the_worth_of_each_uav(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[Radio] = []
+
+    def precoded(*arguments: Any, radio: Radio, **more: Any) -> Any:
+        given.append(radio)
+        return precode(*arguments, radio=radio, **more)
+
+    monkeypatch.setattr("companion.beams.aim.precode", precoded)
+    how = Precoder(rate_weights={"b": 4.0})
+    tracks = [track("a", (100, 0, 0)), track("b", (0, 200, 0))]
+    coverage = Coverage()
+    aim(
+        7,
+        valid_at_ns=9,
+        tracks=tracks,
+        carrier=carrier(),
+        array=ARRAY,
+        precoder=how,
+        coverage=coverage,
+    )
+    (radio,) = given
+    assert radio.worths.tolist() == [1.0, 4.0]
+    assert radio.snr[0] == pytest.approx(4 * radio.snr[1])  # at half the distance

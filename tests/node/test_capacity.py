@@ -8,7 +8,7 @@ from companion.node import capacity
 from companion.node.machine import processor_share
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
-from companion.values import Rejection
+from companion.values import Event, Frame, Rejection, Source, Tick
 
 
 @pytest.fixture(autouse=True)
@@ -38,11 +38,28 @@ def test_what_is_carried_follows_from_what_events_take() -> None:
     assert capacity.measure(Settings(), Slow(1e-6)).uavs is None
 
 
+def test_reports_and_updates_are_timed_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pipeline that needs 1 ms for a report and 20 ms for an update."""
+    now_s = [0.0]
+
+    class Timed:
+        def __init__(self, _: Settings) -> None: ...
+
+        def step(self, event: Event) -> None:
+            now_s[0] += 0.02 if isinstance(event, Tick) else 0.001
+
+    monkeypatch.setattr(capacity, "Pipeline", Timed)
+    found = capacity.measure(Settings(), lambda: now_s[0])
+    assert (found.report_s, found.update_s) == pytest.approx((0.001, 0.02))
+
+
 def test_the_sky_is_one_that_the_pipeline_believes() -> None:
     pipeline = Pipeline(
         Settings().override(center={"source": "47.0,8.0,500.0"}, beams={"targets": "all"})
     )
     refused = []
+    sources = {one.source for one in capacity._sky(3, 10.0) if isinstance(one, Frame)}
+    assert sources == {Source(sysid=number, compid=1) for number in (1, 2, 3)}
     for event in capacity._sky(capacity.MORE, 10.0):
         refused += [x for x in pipeline.step(event) if isinstance(x, Rejection)]
     assert refused == []

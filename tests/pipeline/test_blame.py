@@ -160,3 +160,21 @@ def test_who_is_silent_everywhere_is_not_missed_for_want_of_a_node() -> None:
         found = blame.of_unserved(track, reached=reached, full=full)
         assert found.cause is cause
         assert ("full" in found.reason) is (cause is Cause.UNSERVED and full)
+
+
+def test_a_reason_says_what_is_wrong_and_a_remedy_what_to_do() -> None:
+    out = LeftOut(uav="3:1", cause=Cause.COVERAGE, reason="behind the array")
+    found = [
+        blame.of_left_out(out, TRACK, "no attitude from the carrier"),
+        blame.of_left_out(out, TRACK, None),
+        blame.of_unserved(TRACK, reached=False, full=False),
+        blame.of_unserved(TRACK, reached=True, full=True),
+        blame.of_unserved(TRACK, reached=True, full=False),
+    ]
+    assert [(one.cause, one.reason, one.remedy.split()[0]) for one in found] == [
+        (Cause.CARRIER, "no attitude from the carrier", "see"),
+        (Cause.COVERAGE, "behind the array", "turn"),
+        (Cause.COVERAGE, "no node of the fleet reaches it", "turn"),
+        (Cause.UNSERVED, "every node that reaches it is full", "raise"),
+        (Cause.UNSERVED, "no node of the fleet serves it", "one"),
+    ]

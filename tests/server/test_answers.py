@@ -13,10 +13,12 @@ import pytest
 from pydantic import TypeAdapter
 from starlette.testclient import TestClient
 
+from companion.mavlink.wire.encode import HEARTBEAT, heartbeat, pack
 from companion.server import area_map, models, recordings, responses
 from companion.server.app import create_app
 from companion.server.beam_routes import accepted
 from companion.tracking.design import answers
+from companion.values import Frame, Source
 from companion.values.described import unit
 from companion.views import (
     beam_state,
@@ -69,6 +71,20 @@ def holds(model: Any, answer: Any) -> None:
     adapter = TypeAdapter(models.outward(model))
     read = adapter.validate_json(orjson.dumps(answer), strict=True)
     assert adapter.dump_python(read, mode="json") == answer
+
+
+def test_messages_are_found_by_system_and_component(make_node: Any) -> None:
+    """In this order, where the two numbers differ."""
+    node = make_node(flown=False)
+    raw = pack(heartbeat(Source(sysid=7, compid=9)), 0)
+    node.last_messages.add(
+        Frame(t_ns=1, link="udp", source=Source(sysid=7, compid=9), msgid=HEARTBEAT, raw=raw)
+    )
+    with TestClient(create_app(node)) as client:
+        for sysid, compid, status in ((7, 9, 200), (9, 7, 404)):
+            path = f"/v1/mavlink/vehicles/{sysid}/components/{compid}/messages"
+            assert client.get(path).status_code == status
+            assert client.get(f"{path}/HEARTBEAT").status_code == status
 
 
 @pytest.mark.parametrize("path", PATHS)

@@ -257,3 +257,15 @@ def test_what_is_possible_or_beyond_belief_raises_nothing() -> None:
         assert turns.look(turning(rate), at * 250_000_000, 180.0) is None
     assert turns.limit_degps2(180.0, 0) == 180.0
     assert turns.look(turning(90.0), 1_010_000_000, 180.0) is None  # 10 ms after the last
+
+
+def test_a_contradiction_is_an_angle_in_a_time() -> None:
+    """Two level attitudes without rates, a quarter turn apart within half a second."""
+    before, after = (
+        replace(turning(0.0), t_ns=at_ns, yaw_rad=yaw_rad)
+        for at_ns, yaw_rad in ((0, 0.0), (S // 2, math.pi / 2))
+    )
+    found = carrier.contradiction(before, after, 0.5, HELD)
+    assert found is not None
+    assert (found.apart_rad, found.apart_s) == pytest.approx((math.pi / 2, 0.5))
+    assert found.at(0.25) == pytest.approx(0.75 * math.pi)

@@ -470,3 +470,8 @@ def test_the_steering_matrix_is_not_written_to() -> None:
     before = a.copy()
     precode(a, Precoder())
     assert np.array_equal(a, before)
+
+
+def test_a_part_of_the_radio_keeps_what_is_whose() -> None:
+    part = Radio(np.array([1.0, 2.0, 3.0]), np.array([7.0, 8.0, 9.0])).of(np.array([0, 2]))
+    assert (part.snr.tolist(), part.worths.tolist()) == ([1.0, 3.0], [7.0, 9.0])

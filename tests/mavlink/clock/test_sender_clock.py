@@ -19,6 +19,7 @@ from companion.mavlink.clock.estimates import (
     ClockKind,
     Guarantee,
 )
+from companion.mavlink.clock.floor import Floor, Heights
 from companion.mavlink.clock.sender_clock import SenderClock
 from companion.recording.tlog import read_tlog
 from companion.values import Frame
@@ -590,3 +591,19 @@ def test_what_a_stamp_costs(capsys: pytest.CaptureFixture[str]) -> None:
         with capsys.disabled():
             print(f"\n{name}: {each_us:.1f} us a stamp", end="")
         assert each_us < 1_000.0  # not a benchmark: a bound against a change of complexity
+
+
+def test_evidence_above_the_floor_is_a_step_of_unknown_drift(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where the floor leaves 200 ms, a round trip says that it is 120 ms above the lowest."""
+    clock = fed([(EPOCH_NS + n * 100 * MS, 5_000 + n * 100) for n in range(100)])
+    low_ns, high_ns = EPOCH_NS - 5_100 * MS, EPOCH_NS - 4_900 * MS
+    wide = Heights(sure=low_ns, highest=high_ns, line=low_ns, least=low_ns)
+    monkeypatch.setattr(Floor, "heights", lambda *_: wide)
+    at_ns = 15 * S
+    remote_ns = 5 * S + at_ns - 20 * MS
+    assert clock.timesync(EPOCH_NS + at_ns, EPOCH_NS + at_ns + 2 * MS, remote_ns) is None
+    change = clock.change
+    assert change is not None and change.proven
+    assert (change.step_s, change.drift_ppm) == pytest.approx((0.12, math.inf))

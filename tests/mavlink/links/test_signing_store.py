@@ -158,7 +158,8 @@ def test_the_file_is_there_at_once_and_holds_no_key(path: Path) -> None:
     assert path.stat().st_mode & 0o777 == 0o600
     timestamps.guard(URL, KEY, 0, NOW_NS)
     timestamps.close(NOW_NS)
-    assert fingerprint(KEY) in path.read_text()
+    (link,) = json.loads(path.read_bytes())["links"]
+    assert (link["url"], link["key"]) == (URL, fingerprint(KEY))
     assert KEY.hex() not in path.read_text()
     assert KEY not in path.read_bytes()
     assert {file.name for file in path.parent.iterdir()} == {path.name, path.name + ".lock"}

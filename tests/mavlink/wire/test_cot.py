@@ -231,3 +231,7 @@ def test_no_tunnel_is_a_defect(body: bytes, size: int) -> None:
     raw[1] = len(payload)
     assert isinstance(decode(frame._replace(raw=bytes(raw))), Report | Rejection | None)
     assert not math.isnan(said(XML).alt_m)
+
+
+def test_frames_are_of_no_system_and_a_user_s_component() -> None:
+    assert Source(sysid=0, compid=25) == SENDER

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
 
 from companion.mavlink.wire.decode import decode
-from companion.mavlink.wire.rid_json import OBJECT_MAX, RidJson
-from companion.values import Frame, Reason, Rejection, RemoteId
+from companion.mavlink.wire.rid_json import OBJECT_MAX, SENDER, RidJson
+from companion.values import Frame, Reason, Rejection, RemoteId, Source
 
 MAC = "ac:67:b2:09:50:d4"
 # As https://github.com/sxjack/unix_rid_capture prints one, with a place.
@@ -174,3 +174,7 @@ def test_an_object_without_an_end_takes_no_memory() -> None:
 def test_no_bytes_are_a_defect(data: bytes) -> None:
     for found in fed(data + b"\n"):
         assert isinstance(found, Rejection) or isinstance(decode(found), RemoteId | Rejection)
+
+
+def test_frames_are_of_no_system_and_a_receiver_s_component() -> None:
+    assert Source(sysid=0, compid=236) == SENDER

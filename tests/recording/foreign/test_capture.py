@@ -132,6 +132,14 @@ def test_pcapng(order: str, resolution: int, tmp_path: Path) -> None:
     assert found[-1].t_ns == START_NS + 59 * STEP_NS
 
 
+def test_a_packet_without_a_time_has_that_of_the_one_before(tmp_path: Path) -> None:
+    first, (_, data) = rows()[:1], rows()[1]
+    simple = block(3, struct.pack("<I", len(data)) + data)
+    found = events_of(pcapng(first) + simple, tmp_path)
+    assert raws(found) == FRAMES[:2]
+    assert [event.t_ns for event in found] == [START_NS, START_NS]
+
+
 def test_a_vlan_and_a_padded_packet(tmp_path: Path) -> None:
     tagged = [
         (t_ns, data[:12] + b"\x81\x00\x00\x05" + data[12:] + bytes(9)) for t_ns, data in rows()

@@ -90,6 +90,20 @@ def test_a_position_has_the_velocity_of_the_core_in_use(aeroplane: Path) -> None
     assert same > 190
 
 
+def test_attitudes_are_angles_with_their_rates(aeroplane: Path) -> None:
+    log = ardupilot.read(as_bytes(CUT))
+    assert log.attitudes is not None
+    theirs = peers(aeroplane, ("ATT",))["ATT"]
+    for row, att in enumerate(theirs[: len(log.attitudes.boot_us)]):
+        assert log.attitudes.boot_us[row] == att.TimeUS
+        angles = np.radians([att.Roll, att.Pitch, att.Yaw])
+        assert log.attitudes.euler_rad[row] == pytest.approx(angles, abs=1e-9)
+    turned_rad = np.diff(np.unwrap(log.attitudes.euler_rad[:, 0]))
+    apart_s = np.diff(log.attitudes.boot_us) * 1e-6
+    rolled_rad = log.attitudes.rates_radps[:-1, 0] * apart_s
+    assert np.corrcoef(turned_rad, rolled_rad)[0, 1] > 0.8
+
+
 def test_accuracies_stand_beside_their_fix(aeroplane: Path) -> None:
     log = ardupilot.read(as_bytes(CUT))
     assert log.fixes is not None

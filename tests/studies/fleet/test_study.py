@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -9,6 +10,8 @@ from click.testing import CliRunner
 
 from companion.cli.main import main
 from companion.studies.fleet import study
+from companion.studies.fleet.sky import Sky
+from companion.studies.fleet.world import Counted
 
 
 @pytest.fixture(scope="module")
@@ -69,3 +72,21 @@ def test_a_sample_of_the_reports_counts_for_all() -> None:
         for n in (8, 4)
     )
     assert half.told_kbps["heard"] == pytest.approx(all_of_them.told_kbps["heard"], rel=0.3)
+
+
+def test_shares_are_of_uavs_served_once_twice_and_not_at_all(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Six, one and three of ten; with half of the nodes apart, four of eight are unserved."""
+    counted = [
+        Counted(served=6, twice=1, unserved=3, handovers=4),
+        Counted(served=4, twice=0, unserved=4),
+    ]
+    monkeypatch.setattr(study, "_counted", lambda *_: counted.pop(0))
+    monkeypatch.setattr(study, "_death", lambda _: (1.5, 2))
+    monkeypatch.setattr(study, "_healed_s", lambda _: 2.5)
+    world: Any = SimpleNamespace(sky=Sky(nodes=2, uavs=8), run=lambda _: None, members={})
+    found = study._grown(world, 10.0)
+    assert (found.served, found.twice, found.none, found.parted_none) == (0.6, 0.1, 0.3, 0.5)
+    assert (found.nodes, found.uavs, found.handovers_per_min) == (2, 8, 24.0)
+    assert (found.takeover_s, found.orphans, found.heal_s) == (1.5, 2, 2.5)

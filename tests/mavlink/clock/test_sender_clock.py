@@ -599,7 +599,7 @@ def test_evidence_above_the_floor_is_a_step_of_unknown_drift(
     """Where the floor leaves 200 ms, a round trip says that it is 120 ms above the lowest."""
     clock = fed([(EPOCH_NS + n * 100 * MS, 5_000 + n * 100) for n in range(100)])
     low_ns, high_ns = EPOCH_NS - 5_100 * MS, EPOCH_NS - 4_900 * MS
-    wide = Heights(sure=low_ns, highest=high_ns, line=low_ns, least=low_ns)
+    wide = Heights(upper_bound=low_ns, highest=high_ns, line=low_ns, least=low_ns)
     monkeypatch.setattr(Floor, "heights", lambda *_: wide)
     at_ns = 15 * S
     remote_ns = 5 * S + at_ns - 20 * MS

@@ -38,6 +38,20 @@ def tell(
     return [] if frame is None else hearing.take_shared(now_ns, node, frame, content(frame.raw))
 
 
+def test_a_frame_keeps_its_sender_in_both_versions_of_mavlink() -> None:
+    message = common.MAVLink_global_position_int_message(
+        5000, 473977000, 85456000, 0, 0, 0, 0, 0, 0
+    )
+    for in_version_1, magic in ((True, 0xFE), (False, 0xFD)):
+        mav = common.MAVLink(None, srcSystem=7, srcComponent=9)
+        data = bytes(message.pack(mav, force_mavlink1=in_version_1))
+        assert data[0] == magic
+        heard = SharedFrame(8 * S - 5 * MS, data)
+        frame = Reception().to_own_timeline(11 * S, "b", clock(), heard)
+        assert frame is not None
+        assert (frame.source, frame.msgid) == (Source(7, 9), GLOBAL_POSITION_INT)
+
+
 def hear(hearing: Reception, now_ns: int, boot_ms: int) -> None:
     hearing.take_received(
         Frame(t_ns=now_ns, link="udp", source=UAV, msgid=GLOBAL_POSITION_INT, raw=raw(boot_ms))

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from companion.cli.main import main
 from companion.studies.fleet import study
 from companion.studies.fleet.sky import Sky
-from companion.studies.fleet.world import Counted
+from companion.studies.fleet.world import FleetCounts
 
 
 @pytest.fixture(scope="module")
@@ -79,8 +79,8 @@ def test_shares_are_of_uavs_served_once_twice_and_not_at_all(
 ) -> None:
     """Six, one and three of ten; with half of the nodes apart, four of eight are unserved."""
     counted = [
-        Counted(served=6, twice=1, unserved=3, handovers=4),
-        Counted(served=4, twice=0, unserved=4),
+        FleetCounts(served=6, twice=1, unserved=3, handovers=4),
+        FleetCounts(served=4, twice=0, unserved=4),
     ]
     monkeypatch.setattr(study, "_counted", lambda *_: counted.pop(0))
     monkeypatch.setattr(study, "_death", lambda _: (1.5, 2))

@@ -79,6 +79,14 @@ def test_a_node_listens_on_this_machine_alone_unless_told_otherwise() -> None:
     assert not config.scouting
 
 
+def test_a_status_tells_what_is_sent_from_what_is_heard() -> None:
+    one = node(site="harbour")
+    one._sent.bps, one._heard.bps, one.damaged = 1000.0, 2000.0, 3
+    found = one.status()
+    assert (found.sent_bps, found.heard_bps) == (1000.0, 2000.0)
+    assert (found.site, found.damaged, found.member) == ("harbour", 3, one.member)
+
+
 class Wire:
     """What a node says and asks, in place of a bus; ``takes`` has who takes what of others."""
 

@@ -417,3 +417,16 @@ def test_verdicts_are_in_the_answers_and_in_the_metrics(make_node: Any) -> None:
     for uav in shown:
         assert f'\ncompanion_verdict{{uav="{uav}",verdict="none"}} 1.0' in metrics
         assert f'\ncompanion_verdict{{uav="{uav}",verdict="good"}} 0.0' in metrics
+
+
+def test_a_reported_fix_is_near_the_estimate_and_labels_say_what_is_what(
+    client: TestClient,
+) -> None:
+    for uav in client.get("/v1/uavs").json()["uavs"]:
+        for name, near in (("lat_deg", 0.5), ("lon_deg", 0.5), ("alt_m", 200.0)):
+            assert uav["fix"][name] == pytest.approx(uav[name], abs=near)
+    labels_of = client.get("/v1/labels").json()
+    label = labels_of["values"]["UavState"]["innovation_m"]
+    assert (label["label"], label["unit"]) == ("Innovation", "m")
+    assert label["meaning"].startswith("distance from the prediction")
+    assert labels_of["enumerations"]["Method"]["zf"] == "zero forcing"

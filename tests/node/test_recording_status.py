@@ -10,6 +10,7 @@ from companion.node.replay import writer_for
 from companion.node.served_replay import ReplayRequest, ServedReplay
 from companion.node.service import Service
 from companion.settings.model import Settings
+from companion.values import Severity
 from companion.views.state import RecordingStatus
 
 SETTINGS = Settings().override(center={"source": "5:1"})
@@ -41,6 +42,17 @@ def test_each_figure_of_a_running_recording_is_its_own() -> None:
     )
     recorder.degraded, recorder.written_ns = True, None
     assert (service.recording().state, service.recording().lag_s) == ("degraded", None)
+
+
+def test_news_of_a_recorder_are_notices_about_the_recording() -> None:
+    service: Any = Service(settings=SETTINGS, say=lambda _: None)
+    service._tell_of_recorder(SimpleNamespace(news=lambda: [(Severity.ERROR, "the disk is full")]))
+    newest = service.notices[-1]
+    assert (newest.severity, newest.subject, newest.text) == (
+        Severity.ERROR,
+        "recording",
+        "the disk is full",
+    )
 
 
 def test_each_figure_of_a_replays_recording_is_its_own(short_log: Path, tmp_path: Path) -> None:

@@ -65,6 +65,15 @@ def test_who_serves_a_uav_is_said_of_it(north: StandIn) -> None:
     assert (found["2:1"].verdict, found["2:1"].health) == (None, None)
 
 
+def test_frames_of_a_node_and_those_that_are_used_are_counted_apart(north: StandIn) -> None:
+    assert north.fleet is not None
+    known = north.fleet.member.neighbours["south"]
+    known.frames, known.used = 7, 3
+    nodes = client(north).get("/v1/fleet").json()["nodes"]
+    (south,) = (one for one in nodes if one["node"] == "south")
+    assert (south["frames"], south["used"]) == (7, 3)
+
+
 def test_a_node_that_left_stays_in_the_list(north: StandIn) -> None:
     assert north.fleet is not None
     north.fleet.member.node_left(north.now_ns(), "south")

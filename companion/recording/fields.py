@@ -27,7 +27,7 @@ from companion.values import (
     Tock,
     Track,
 )
-from companion.values.described import Inline, Meaning, Member, members
+from companion.values.described import Inline, Meaning, Member, is_vector, members
 
 T = TypeVar("T")
 
@@ -128,7 +128,7 @@ def _fields(member: Member) -> Iterator[Field]:
     if kind is Source:
         yield field("uint32 sysid", _part(get, "sysid"))
         yield field("uint32 compid", _part(get, "compid"), 1)
-    elif "ndarray" in str(kind):
+    elif is_vector(kind):
         yield field(f"repeated double {name}", _listed(get))
     elif typing.get_origin(kind) is tuple:
         inner = typing.get_args(kind)[0]

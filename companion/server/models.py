@@ -13,7 +13,15 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from companion.values import UtcNs
-from companion.values.described import DescribedEnum, Meaning, Member, bare, members, unit
+from companion.values.described import (
+    DescribedEnum,
+    Meaning,
+    Member,
+    bare,
+    is_vector,
+    members,
+    unit,
+)
 from companion.views.as_json import FORMER_NAMES, name_in_json
 
 
@@ -73,7 +81,7 @@ def _field(member: Member) -> tuple[Any, Any]:
         given["examples"] = [meaning.example]
     if meaning.deprecated:
         given["deprecated"] = True
-    if _is_vector(member.type):
+    if is_vector(member.type):
         kind: Any = list[float]
         given |= {"min_length": 3, "max_length": 3}
     elif member.name.endswith("_ns"):
@@ -81,10 +89,6 @@ def _field(member: Member) -> tuple[Any, Any]:
     else:
         kind = outward(member.type)
     return (kind | None if member.optional else kind), Field(**given)
-
-
-def _is_vector(kind: Any) -> bool:
-    return "ndarray" in str(kind)
 
 
 def outward(kind: Any) -> Any:

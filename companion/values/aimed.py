@@ -143,7 +143,6 @@ class LeftOut:
 class BeamSet:
     """The beams and weights of one update.
 
-
     Zero forcing gives AᵀF = I within a time slot (no conjugate; diagonal under other
     normalisations): each UAV lies in a null of the others' beams. See docs/math.md 7.
     """

@@ -36,6 +36,7 @@ UNITS: Final = {
     "radps": "rad/s", "ppm": "ppm", "bps": "bit/s", "bytes": "bytes", "utc": "UTC",
 }  # fmt: skip
 """How the ending of a name writes its unit."""
+_DEGREES: Final = {"_rad": "_deg", "_radps": "_degps"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +126,24 @@ def bare(annotation: Any) -> tuple[Any, bool]:
         optional = len(kinds) < len(typing.get_args(annotation))
         return functools.reduce(operator.or_, (bare(kind)[0] for kind in kinds)), optional
     return annotation, False
+
+
+def is_vector(kind: Any) -> bool:
+    """True for the type of an array of numbers."""
+    return "ndarray" in str(kind)
+
+
+def in_degrees(name: str) -> str:
+    """The name that an angle in radians, or its rate, has in degrees; other names as they are."""
+    for inside, outside in _DEGREES.items():
+        if name.endswith(inside):
+            return name.removesuffix(inside) + outside
+    return name
+
+
+def is_in_radians(name: str) -> bool:
+    """True for the name of an angle in radians, or of its rate."""
+    return name.endswith(tuple(_DEGREES))
 
 
 def unit(name: str) -> str:

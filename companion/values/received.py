@@ -140,7 +140,6 @@ class AdsbVehicle:
 class RemoteId:
     """What a Remote ID receiver heard from one radio: an id, a position, or both.
 
-
     None stands for what was not sent.
     """
 

@@ -62,9 +62,9 @@ class Refuted:
 class Fix:
     """A report put on the node's timeline and into the local frame.
 
-        sender_ns          when the position was true, on the sender's timeline; intervals between
-                           reports are taken from it, since the link cannot disturb it
-        limits             what the aircraft is taken to be able to do; None: the observer's model
+    sender_ns  when the position was true, on the sender's timeline; intervals between reports are
+               taken from it, since the link cannot disturb it
+    limits     what the aircraft is taken to be able to do; None: the observer's model
 
     ``arrival_ns - t_ns`` is the visible latency. A report without a sender's clock has ``sender_ns
     == t_ns``.
@@ -84,7 +84,6 @@ class Fix:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
     """The observer's answer to an accepted report, at the time of that report.
-
 
     A track is restarted from reports that disagree with it but agree with one another.
     ``innovation_m`` is None for the first report of a track; after a restart it is the jump.

@@ -13,7 +13,14 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from companion.values import UtcNs
-from companion.values.described import Member, is_described, members
+from companion.values.described import (
+    Member,
+    in_degrees,
+    is_described,
+    is_in_radians,
+    is_vector,
+    members,
+)
 
 Json = dict[str, Any]
 Utc = Callable[[int], UtcNs]  # function from a time on the node's timeline to UTC
@@ -28,8 +35,6 @@ FORMER_NAMES: Final[Mapping[str, Mapping[str, str]]] = {
     "UavState": {"altitude_datum": "alt_datum"},
 }
 """Names that values had in the version before, by class: still written, deprecated."""
-
-_DEGREES: Final = {"_rad": "_deg", "_radps": "_degps"}
 
 
 def as_json(item: Any, utc_ns: Utc) -> Json:
@@ -46,10 +51,7 @@ def as_json(item: Any, utc_ns: Utc) -> Json:
 
 def name_in_json(name: str) -> str:
     """The name of a value in the API, by the unit that it has inside the program."""
-    for inside, outside in _DEGREES.items():
-        if name.endswith(inside):
-            return name.removesuffix(inside) + outside
-    return "at" if name == "t_ns" else name.removesuffix("_ns")
+    return "at" if name == "t_ns" else in_degrees(name).removesuffix("_ns")
 
 
 def rfc3339(t_ns: UtcNs) -> str:
@@ -89,7 +91,7 @@ def _plan(kind: Any) -> tuple[Plan, tuple[tuple[str, str], ...]]:
 
 
 def _writer(member: Member) -> Write | None:
-    if member.name.endswith(tuple(_DEGREES)):
+    if is_in_radians(member.name):
         return lambda angle_rad, _: degrees(angle_rad)
     if member.name.endswith("_ns"):
         return lambda t_ns, utc_ns: None if t_ns is None else rfc3339(utc_ns(t_ns))
@@ -100,7 +102,7 @@ def _writer(member: Member) -> Write | None:
         return None  # it is a str
     if typing.get_origin(kind) in (dict, list) and inner[-1] in _PLAIN:
         return None
-    if "ndarray" in str(kind):
+    if is_vector(kind):
         return lambda array, _: None if array is None else array.tolist()
     if typing.get_origin(kind) is list and is_described(inner[0]):
         return lambda items, utc_ns: [as_json(item, utc_ns) for item in items]

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tracks
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -22,7 +23,6 @@ from companion.values import (
     BeamSet,
     Carrier,
     FloatArray,
-    Limits,
     Method,
     Normalisation,
     Policy,
@@ -44,28 +44,13 @@ def track(
     bound_m: float = 2.0,
     velocity: FloatArray | None = None,
 ) -> Track:
-    return Track(
+    return tracks.track(
+        np.array(position, dtype=float),
         uav=uav,
         state=TrackState(state),
         valid_at_ns=9,
-        age_s=0.1,
-        position_ned_m=np.array(position, dtype=float),
         velocity_ned_mps=velocity,
-        unknown_input_mps=None,
-        acceleration_ned_mps2=None,
         bound_m=bound_m,
-        horizontal_bound_m=bound_m,
-        vertical_bound_m=bound_m,
-        set_center_ned_m=np.zeros(3),
-        set_radius_m=bound_m,
-        limits=Limits(60.0, 5.0),
-        error_p95_m=None,
-        clock_bound_s=0.0,
-        dt_s=None,
-        latency_s=None,
-        gamma=None,
-        innovation_m=None,
-        reports=1,
     )
 
 

@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+import tracks
 from support import rounds
 
 from companion.beams.aim import aim
@@ -15,7 +16,7 @@ from companion.beams.array.geometry import (
     uniform_rectangular,
 )
 from companion.beams.weights.precoding import Precoder
-from companion.values import Carrier, ComplexArray, FloatArray, Limits, Track, TrackState, Widen
+from companion.values import Carrier, ComplexArray, FloatArray, Track, Widen
 
 STILL, EYE = np.zeros(3), np.eye(3)
 AT = Carrier(
@@ -67,29 +68,7 @@ class Scene:
 
 
 def track(place: FloatArray, bound_m: float) -> Track:
-    return Track(
-        uav=str(bound_m),
-        state=TrackState.LIVE,
-        valid_at_ns=0,
-        age_s=0.1,
-        position_ned_m=place,
-        velocity_ned_mps=None,
-        unknown_input_mps=None,
-        acceleration_ned_mps2=None,
-        bound_m=bound_m,
-        horizontal_bound_m=bound_m,
-        vertical_bound_m=bound_m,
-        set_center_ned_m=STILL,
-        set_radius_m=bound_m,
-        limits=Limits(60.0, 5.0),
-        error_p95_m=bound_m / 4,
-        clock_bound_s=0.0,
-        dt_s=None,
-        latency_s=None,
-        gamma=None,
-        innovation_m=None,
-        reports=1,
-    )
+    return tracks.track(place, uav=str(bound_m), bound_m=bound_m, error_p95_m=bound_m / 4)
 
 
 def least_alike(one: ComplexArray, other: ComplexArray) -> float:

@@ -5,13 +5,14 @@ import math
 
 import numpy as np
 import pytest
+import tracks
 
 from companion.beams import hysteresis
 from companion.beams.aim import aim
 from companion.beams.array.geometry import Array, uniform_linear, uniform_rectangular
 from companion.beams.hysteresis import Hysteresis
 from companion.beams.weights.precoding import Precoder
-from companion.values import BeamSet, Carrier, Limits, Method, Policy, Track, TrackState, Widen
+from companion.values import BeamSet, Carrier, Method, Policy, Track, Widen
 
 STILL = np.zeros(3)
 AT = Carrier(
@@ -32,29 +33,7 @@ TICK_NS = 100_000_000
 
 
 def track(uav: str, aside_m: float, bound_m: float) -> Track:
-    return Track(
-        uav=uav,
-        state=TrackState.LIVE,
-        valid_at_ns=0,
-        age_s=0.1,
-        position_ned_m=np.array([100.0, aside_m, 0.0]),
-        velocity_ned_mps=None,
-        unknown_input_mps=None,
-        acceleration_ned_mps2=None,
-        bound_m=bound_m,
-        horizontal_bound_m=bound_m,
-        vertical_bound_m=bound_m,
-        set_center_ned_m=STILL,
-        set_radius_m=bound_m,
-        limits=Limits(60.0, 5.0),
-        error_p95_m=None,
-        clock_bound_s=0.0,
-        dt_s=None,
-        latency_s=None,
-        gamma=None,
-        innovation_m=None,
-        reports=1,
-    )
+    return tracks.track(np.array([100.0, aside_m, 0.0]), uav=uav, bound_m=bound_m)
 
 
 def flown(

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import tracks
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -9,33 +10,18 @@ from support import examples
 
 from companion.beams import line_of_sight
 from companion.beams.array.geometry import uniform_linear
-from companion.values import Carrier, FloatArray, Limits, Track, TrackState
+from companion.values import Carrier, FloatArray, Track
 
 
 def flying(rng: np.random.Generator, acceleration: FloatArray | None) -> Track:
     place, velocity = rng.uniform(-300, 300, 3), rng.normal(0, 20, 3)
-    return Track(
+    return tracks.track(
+        place,
         uav="a",
-        state=TrackState.LIVE,
         valid_at_ns=9,
-        age_s=0.1,
-        position_ned_m=place,
         velocity_ned_mps=velocity,
-        unknown_input_mps=None,
         acceleration_ned_mps2=acceleration,
-        bound_m=2.0,
-        horizontal_bound_m=2.0,
-        vertical_bound_m=2.0,
         set_center_ned_m=place,
-        set_radius_m=2.0,
-        limits=Limits(60.0, 5.0),
-        error_p95_m=None,
-        clock_bound_s=0.0,
-        dt_s=None,
-        latency_s=None,
-        gamma=None,
-        innovation_m=None,
-        reports=1,
     )
 
 
@@ -89,28 +75,8 @@ def test_through_the_array_itself_directions_stay_unit_vectors() -> None:
         age_s=None,
     )
     place, velocity = np.array([0.0, 30.0, 0.0]), np.array([0.0, -10.0, 0.0])
-    track = Track(
-        uav="a",
-        state=TrackState.LIVE,
-        valid_at_ns=9,
-        age_s=0.1,
-        position_ned_m=place,
-        velocity_ned_mps=velocity,
-        unknown_input_mps=None,
-        acceleration_ned_mps2=None,
-        bound_m=2.0,
-        horizontal_bound_m=2.0,
-        vertical_bound_m=2.0,
-        set_center_ned_m=place,
-        set_radius_m=2.0,
-        limits=Limits(60.0, 5.0),
-        error_p95_m=None,
-        clock_bound_s=0.0,
-        dt_s=None,
-        latency_s=None,
-        gamma=None,
-        innovation_m=None,
-        reports=1,
+    track = tracks.track(
+        place, uav="a", valid_at_ns=9, velocity_ned_mps=velocity, set_center_ned_m=place
     )
     found = line_of_sight.directions_ahead(track, at, array, np.array([2.0, 3.0, 4.0]))
     assert found is not None

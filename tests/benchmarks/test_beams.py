@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 import pytest
+import tracks
 from figures import Figures
 from scipy.optimize import linprog, minimize
 
@@ -15,13 +16,11 @@ from companion.values import (
     Carrier,
     ComplexArray,
     FloatArray,
-    Limits,
     Method,
     Normalisation,
     Policy,
     Power,
     Track,
-    TrackState,
     Widen,
 )
 
@@ -195,29 +194,7 @@ def flying(users: int, apart_rad: float) -> list[Track]:
         angle = (n - (users - 1) / 2) * apart_rad
         place = 100.0 * np.array([np.cos(angle), np.sin(angle), 0.0])
         found.append(
-            Track(
-                uav=str(n),
-                state=TrackState.LIVE,
-                valid_at_ns=0,
-                age_s=0.1,
-                position_ned_m=place,
-                velocity_ned_mps=STILL,
-                unknown_input_mps=None,
-                acceleration_ned_mps2=None,
-                bound_m=5.0,
-                horizontal_bound_m=5.0,
-                vertical_bound_m=5.0,
-                set_center_ned_m=STILL,
-                set_radius_m=5.0,
-                limits=Limits(60.0, 5.0),
-                error_p95_m=0.5,
-                clock_bound_s=0.0,
-                dt_s=None,
-                latency_s=None,
-                gamma=None,
-                innovation_m=None,
-                reports=1,
-            )
+            tracks.track(place, uav=str(n), velocity_ned_mps=STILL, bound_m=5.0, error_p95_m=0.5)
         )
     return found
 

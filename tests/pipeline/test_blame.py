@@ -4,19 +4,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import tracks
 
 from companion.pipeline import blame
 from companion.pipeline.blame import LinkEvidence
 from companion.values import Beam, Carrier, Cause, LeftOut, Limits, Reason, Track, TrackState
 
 FINE = LinkEvidence(clock_assumed=False, refused=None)
-TRACK = Track(
-    uav="3:1", state=TrackState.LIVE, valid_at_ns=9, age_s=0.1, position_ned_m=np.zeros(3),
-    velocity_ned_mps=np.array([20.0, 0.0, 0.0]), unknown_input_mps=None,
-    acceleration_ned_mps2=None, bound_m=3.0, horizontal_bound_m=3.0, vertical_bound_m=3.0,
-    set_center_ned_m=np.zeros(3), set_radius_m=3.0, limits=Limits(60.0, 5.0), error_p95_m=None,
-    clock_bound_s=0.0, dt_s=0.1, latency_s=0.01, gamma=None, innovation_m=None, reports=9,
-)  # fmt: skip
+TRACK = tracks.track(
+    np.zeros(3),
+    uav="3:1",
+    valid_at_ns=9,
+    velocity_ned_mps=np.array([20.0, 0.0, 0.0]),
+    bound_m=3.0,
+    dt_s=0.1,
+    latency_s=0.01,
+    reports=9,
+)
 CARRIER = Carrier(
     valid_at_ns=9,
     position_ned_m=np.zeros(3),

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import tracks
 
 from companion.beams.aim import aim
 from companion.beams.array.coverage import EVERYWHERE
@@ -14,7 +15,7 @@ from companion.beams.worth.link_budget import LinkBudget
 from companion.pipeline.blame import LinkEvidence
 from companion.pipeline.health import AT_ONCE, HealthMonitor, Site
 from companion.settings.beams import NeedSettings
-from companion.values import Carrier, Limits, Notice, Severity, Track, TrackState, Update
+from companion.values import Carrier, Notice, Severity, Track, TrackState, Update
 
 S = 1_000_000_000
 ARRAY = uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
@@ -38,27 +39,15 @@ PLACES = {"1:1": (100.0, 20.0, -10.0), "2:1": (80.0, -60.0, 5.0), "3:1": (30.0, 
 
 
 def track(uav: str, bound_m: float, usual_m: float, state: str = "live") -> Track:
-    return Track(
+    return tracks.track(
+        np.array(PLACES[uav]),
         uav=uav,
         state=TrackState(state),
         valid_at_ns=9,
-        age_s=0.1,
-        position_ned_m=np.array(PLACES[uav]),
-        velocity_ned_mps=None,
-        unknown_input_mps=None,
-        acceleration_ned_mps2=None,
         bound_m=bound_m,
-        horizontal_bound_m=bound_m,
-        vertical_bound_m=bound_m,
-        set_center_ned_m=np.zeros(3),
-        set_radius_m=bound_m,
-        limits=Limits(60.0, 5.0),
         error_p95_m=usual_m,
-        clock_bound_s=0.0,
         dt_s=0.1,
         latency_s=0.0,
-        gamma=None,
-        innovation_m=None,
         reports=9,
     )
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tracks
 from pymavlink.dialects.v20 import all as dialect
 
 from companion.recording.writer import Writer
@@ -19,7 +20,6 @@ from companion.values import (
     FloatArray,
     Frame,
     LeftOut,
-    Limits,
     Method,
     Normalisation,
     Notice,
@@ -32,7 +32,6 @@ from companion.values import (
     Source,
     Tick,
     Track,
-    TrackState,
     Update,
 )
 
@@ -111,25 +110,16 @@ def events(wire: Callable[..., list[bytes]]) -> Callable[[int], list[Event]]:
 
 
 def _track(uav: str, t_ns: int) -> Track:
-    return Track(
+    return tracks.track(
+        np.array([10.0, 20.0, -30.0]),
         uav=uav,
-        state=TrackState.LIVE,
         valid_at_ns=t_ns + 5,
         age_s=0.25,
-        position_ned_m=np.array([10.0, 20.0, -30.0]),
-        velocity_ned_mps=None,
         unknown_input_mps=np.array([0.1, 0.2, 0.3]),
-        acceleration_ned_mps2=None,
         bound_m=3.0,
         horizontal_bound_m=2.0,
         vertical_bound_m=2.5,
-        set_center_ned_m=np.zeros(3),
-        set_radius_m=3.0,
-        limits=Limits(60.0, 5.0),
-        error_p95_m=None,
-        clock_bound_s=0.0,
         dt_s=0.1,
-        latency_s=None,
         gamma=0.4,
         innovation_m=0.0,
         reports=7,

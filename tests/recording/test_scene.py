@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pymap3d
 import pytest
+import tracks
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -20,10 +21,8 @@ from companion.values import (
     BeamSet,
     Carrier,
     FloatArray,
-    Limits,
     Method,
     Normalisation,
-    Track,
     TrackState,
     Update,
 )
@@ -71,23 +70,13 @@ def update_of(array: Array, turn: tuple[float, float, float], place_ned_m: Float
         gain_db=9.0,
         loss_db=0.0,
     )
-    track = Track(
-        uav="1:1",
-        state=TrackState.LIVE,
+    track = tracks.track(
+        place_ned_m,
         valid_at_ns=NOW_NS,
-        age_s=0.1,
-        position_ned_m=place_ned_m,
-        velocity_ned_mps=None,
-        unknown_input_mps=None,
-        acceleration_ned_mps2=None,
         bound_m=5.0,
         horizontal_bound_m=4.0,
         vertical_bound_m=3.0,
         set_center_ned_m=place_ned_m,
-        set_radius_m=5.0,
-        limits=Limits(60.0, 5.0),
-        error_p95_m=None,
-        clock_bound_s=0.0,
         dt_s=0.1,
         latency_s=0.05,
         gamma=1.0,

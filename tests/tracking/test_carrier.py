@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import tracks
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -13,7 +14,7 @@ from support import rounds
 
 from companion.tracking import carrier
 from companion.tracking.geodesy import LocalFrame
-from companion.values import Attitude, Fix, FloatArray, Limits, Source, Track, TrackState
+from companion.values import Attitude, Fix, FloatArray, Source
 
 HELD = carrier.AttitudeBounds(0.02, 0.0)
 ANGLES = st.floats(-math.pi, math.pi)
@@ -106,28 +107,15 @@ def test_a_vehicle_s_attitude_is_carried_on_to_the_time_of_use(fix: Callable[...
     """Its rates act for as long as its attitude is older than the track's time."""
     local = LocalFrame(47.4, 8.5, 500.0)
     far = (49.0, 12.0)
-    track = Track(
+    track = tracks.track(
+        np.array([1.0, 2, 3]),
         uav="5:1",
-        state=TrackState.LIVE,
         valid_at_ns=12 * S,
         age_s=0.5,
-        position_ned_m=np.array([1.0, 2, 3]),
         velocity_ned_mps=np.array([4.0, 5, 6]),
-        unknown_input_mps=None,
-        acceleration_ned_mps2=None,
         bound_m=4.5,
         horizontal_bound_m=3.6,
         vertical_bound_m=2.7,
-        set_center_ned_m=np.zeros(3),
-        set_radius_m=4.5,
-        limits=Limits(60.0, 5.0),
-        error_p95_m=None,
-        clock_bound_s=0.0,
-        dt_s=None,
-        latency_s=None,
-        gamma=None,
-        innovation_m=None,
-        reports=1,
     )
     attitude = Attitude(
         t_ns=0,

@@ -5,11 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import tracks
 from numpy.typing import ArrayLike
 
 from companion.tracking import noise
 from companion.tracking.identity import RELAYED_MAX, REPORTS_TO_DECIDE, Identities
-from companion.values import Fix, GnssStatus, Limits, ReportNoise, Source, Track, TrackState
+from companion.values import Fix, GnssStatus, ReportNoise, Source, Track
 
 MakeFix = Callable[..., Fix]
 S = 1_000_000_000
@@ -19,28 +20,8 @@ VELOCITY = (20.0, 0.0, 0.0)
 
 def track(uav: str, position: ArrayLike, velocity: ArrayLike | None = VELOCITY) -> Track:
     speeds = None if velocity is None else np.array(velocity, dtype=float)
-    return Track(
-        uav=uav,
-        state=TrackState.LIVE,
-        valid_at_ns=0,
-        age_s=0.0,
-        position_ned_m=np.array(position, dtype=float),
-        velocity_ned_mps=speeds,
-        unknown_input_mps=None,
-        acceleration_ned_mps2=None,
-        bound_m=5.0,
-        horizontal_bound_m=5.0,
-        vertical_bound_m=5.0,
-        set_center_ned_m=np.zeros(3),
-        set_radius_m=5.0,
-        limits=Limits(60.0, 5.0),
-        error_p95_m=None,
-        clock_bound_s=0.0,
-        dt_s=None,
-        latency_s=None,
-        gamma=None,
-        innovation_m=None,
-        reports=1,
+    return tracks.track(
+        np.array(position, dtype=float), uav=uav, age_s=0.0, velocity_ned_mps=speeds, bound_m=5.0
     )
 
 

@@ -27,7 +27,6 @@ BOLTZMANN_JPK: Final = 1.380649e-23
 class LinkBudget:
     """Power of the transmitter and noise of a receiver.
 
-
     Raises ``ValueError`` for a value that is not finite, a bandwidth or temperature not above 0, or
     a noise figure below 0.
     """

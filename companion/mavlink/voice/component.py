@@ -94,7 +94,6 @@ _TIMESYNC = struct.Struct("<qqBB")
 class ComponentSpec:
     """The identity of the service on the network, and the message rates that it wants.
 
-
     A rate of None asks for nothing. Raises ``UserError`` for ids that belong to ground stations,
     autopilots or everybody, for a source that is the carrier, and for rates outside 0.1 to 100 Hz.
     """

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Final
 
-from companion.values.described import Member, members, unit
+from companion.values.described import Member, in_degrees, is_in_radians, is_vector, members, unit
 
 Value = str | int | float | bool | None  # a value in a table; None: unknown, or not there
 _AXES: Final = ("north", "east", "down")
@@ -97,7 +97,7 @@ def _columns(row_class: type) -> Iterator[Column]:
                 )
             utc = name.removesuffix("_ns") + "_utc"
             yield Column(name=utc, kind=ColumnKind.TIME, meaning=meaning, get=get)
-        elif "ndarray" in str(member.type):
+        elif is_vector(member.type):
             for axis, direction in enumerate(_AXES):
                 yield Column(
                     name=_along(name, direction),
@@ -105,9 +105,10 @@ def _columns(row_class: type) -> Iterator[Column]:
                     meaning=f"{meaning}: {direction}",
                     get=_element(get, axis),
                 )
-        elif name.endswith(("_rad", "_radps")):
-            outside = name.replace("_radps", "_degps").replace("_rad", "_deg")
-            yield Column(name=outside, kind=ColumnKind.NUMBER, meaning=meaning, get=_degrees(get))
+        elif is_in_radians(name):
+            yield Column(
+                name=in_degrees(name), kind=ColumnKind.NUMBER, meaning=meaning, get=_degrees(get)
+            )
         else:
             yield Column(name=name, kind=_kind(member), meaning=meaning, get=get)
 

@@ -32,7 +32,6 @@ SPREADS: Final = 5.0  # delay spreads beyond which delays are left out
 class Scattering:
     """Power and delay of the scattered rays.
 
-
     Raises ``UserError`` for a channel without line of sight, or with delays that pass the prefix.
     """
 

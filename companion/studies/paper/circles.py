@@ -27,7 +27,6 @@ GUST_RATE_RATIO: Final = 10.0
 class PaperScenario:
     """The scenario's numbers.
 
-
     UAVs begin a quarter turn from one another.
     """
 

@@ -23,8 +23,7 @@ _S_PER_NS: Final = 1e-9
 class ObservedReport:
     """A report as it reaches a predictor.
 
-
-    The baselines do not use the last two.
+    The baselines do not use ``clock_bound_s`` and ``gnss``.
     """
 
     arrival_ns: int  # when it arrived, node time

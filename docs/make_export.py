@@ -40,8 +40,8 @@ def fields_section() -> str:
             f"\n### companion.{name}\n\n| number | field | type | meaning |\n|---|---|---|---|\n"
         )
         for one in fields.fields(name):
-            kind, _, field = one.declared.rpartition(" ")
-            parts.append(f"| {one.number} | `{field}` | {kind} | {one.meaning} |\n")
+            kind = one.declared.rpartition(" ")[0]
+            parts.append(f"| {one.number} | `{one.name}` | {kind} | {one.meaning} |\n")
     return "".join(parts)
 
 

@@ -92,9 +92,7 @@ def names(subject: dict[str, Any]) -> dict[str, set[str]]:
         stem(name_in_json(one.name)) for one in members(subject["api"])
         if "api" not in one.meaning.absent
     }  # fmt: skip
-    recorded = {
-        stem(one.declared.rpartition(" ")[2]) for one in fields.fields(subject["recording"])
-    }
+    recorded = {stem(one.name) for one in fields.fields(subject["recording"])}
     table = Table(name="", row_is="", row_class=subject["export"])
     return {"api": api, "recording": recorded, "export": {stem(one.name) for one in table.columns}}
 

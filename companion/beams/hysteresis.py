@@ -1,8 +1,8 @@
 """Hysteresis of beams: shapes, method and time slots follow what is known, but not at once.
 
 A report changes what is known of a UAV from one moment to the next, by a factor over a slow radio.
-A beam's shape follows at a limited pace. A method and a set of slots are kept for a while after
-they were chosen, unless they no longer do. The state is that of the last tick of the pipeline.
+A beam's shape follows at a limited pace. A method and a set of slots are kept for ``KEPT_NS`` after
+they were chosen, unless they exceed the limits. The state is that of the last tick of the pipeline.
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ MAX_RATIO_PER_S: Final = 3.0  # largest factor by which the angles of a shape ch
 MAX_ELAPSED_S: Final = 60.0
 """Longest time between two ticks that counts: after days ``MAX_RATIO_PER_S ** s`` overflows."""
 MAX_WIDENING: Final = 3.5
-"""Largest growth in a second, in natural widths: phases at the aperture's ends go with it."""
+"""Largest growth in a second, in natural widths: as fast change phases at the aperture's ends."""
 MAX_NARROWING: Final = 3.0  # largest shrinkage in a second, in natural widths
 MAX_HELD_NARROWING: Final = 1.0
 """The same for a bound that filled its shape within the last ``HELD_NS``.
@@ -32,7 +32,7 @@ GUARANTEE_PLANE_SHARE: Final = 1 / 3
 They change most from one width to the next.
 """
 LEAST_WIDTHS: Final = 0.25
-"""Angle in natural widths that shapes nothing: where growth by factors begins."""
+"""Angle in natural widths below which a shape is unaffected; growth by factors starts here."""
 MOST_WIDTHS: Final = 16.0
 """Angle in natural widths beyond which a wider bound no longer changes the shape."""
 KEPT_NS: Final = 500_000_000  # time for which a method and slots are kept

@@ -25,7 +25,7 @@ LOGS = click.argument(
 )
 SEED = click.option("--seed", type=click.IntRange(min=0), default=1)
 SECONDS = click.option(
-    "--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after so long."
+    "--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after this many seconds."
 )
 LINKS = click.option(
     "--link",

@@ -33,7 +33,12 @@ def _alpha(text: str) -> float | None:
     help="Seconds between reports.",
 )
 @click.option("--model", type=click.Choice(["position", "kinematic"]), default="position")
-@click.option("--alpha", metavar="A|auto", default="auto", help="In (0, 1).")
+@click.option(
+    "--alpha",
+    metavar="A|auto",
+    default="auto",
+    help="Position model: decay of the certificate per report, between 0 and 1, or auto.",
+)
 @click.option(
     "--feedthrough",
     type=float,

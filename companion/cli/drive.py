@@ -34,7 +34,11 @@ if TYPE_CHECKING:
     help="centre: a mount looks at the middle of all of them that have a beam.",
 )
 @click.option(
-    "--rate", "update_hz", type=click.FloatRange(0.1, 1000), default=10.0, help="Updates a second."
+    "--rate",
+    "update_hz",
+    type=click.FloatRange(0.1, 1000),
+    default=10.0,
+    help="Updates per second sent to the device.",
 )
 @click.option(
     "--on-stale",

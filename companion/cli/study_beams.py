@@ -12,7 +12,9 @@ from companion.cli.study_output import Studied, study_output
 @LOGS
 @CONFIG
 @CENTER
-@click.option("--hz", type=float, default=5.0, help="Looks a second of the log's time.")
+@click.option(
+    "--hz", type=float, default=5.0, help="Beam updates evaluated per second of log time."
+)
 @click.option(
     "--links",
     metavar="NAME,...",

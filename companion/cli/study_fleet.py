@@ -30,7 +30,12 @@ def _steps(span: tuple[int, int], steps: int) -> list[int]:
 @click.command()
 @click.option("--nodes", callback=_span, metavar="FROM..TO", default="3..30")
 @click.option("--uavs", callback=_span, metavar="FROM..TO", default="100..1000")
-@click.option("--steps", type=click.IntRange(1, 20), default=3, help="Sizes.")
+@click.option(
+    "--steps",
+    type=click.IntRange(1, 20),
+    default=3,
+    help="Number of fleet sizes, from the first to the last.",
+)
 @click.option(
     "--seconds", type=click.FloatRange(1, 3600), default=10.0,
     help="Virtual time for which each size is watched.",

@@ -31,8 +31,15 @@ def _range(
     callback=_range,
     help="Of a data carrier, beam exactly on the UAV, dB.",
 )
-@click.option("--instants", type=int, default=96, help="Times of the flight.")
-@click.option("--blocks", type=int, default=16, help="To each UAV at each time and SNR.")
+@click.option(
+    "--instants", type=int, default=96, help="Number of instants of the flight that are simulated."
+)
+@click.option(
+    "--blocks",
+    type=int,
+    default=16,
+    help="Number of blocks sent to each UAV at each instant and SNR.",
+)
 @click.option(
     "--estimation",
     type=click.Choice(["pilots", "ideal"]),

@@ -40,7 +40,13 @@ from companion.cli.study_output import Studied, study_output
     callback=lambda _context, _option, text: numbers(text),
     help="Seconds that the simulated radio adds to each report.",
 )
-@click.option("--loss", metavar="F", type=float, default=0.1, help="Share that is lost.")
+@click.option(
+    "--loss",
+    metavar="F",
+    type=float,
+    default=0.1,
+    help="Share of reports that the simulated radio loses, 0 to 1.",
+)
 @click.option("--known-delay", is_flag=True, help="The senders' clocks are known, as by TIMESYNC.")
 @SEED
 @click.option(

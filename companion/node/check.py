@@ -21,7 +21,7 @@ from companion.server.access import bind
 from companion.settings.files import embedded
 from companion.settings.model import Settings
 from companion.settings.outlets import DriveSettings, RecordSettings
-from companion.values import Level, Reason, UserError, Verdict, kind_of
+from companion.values import Level, UserError, Verdict, kind_of
 from companion.views import uav_state
 
 TIMED_UPDATES: Final = 5  # times that beams are computed to tell how long that takes
@@ -77,7 +77,7 @@ def _capacity(settings: Settings) -> Finding:
             subject="settings",
             grade=Grade.FAULT,
             text=str(error),
-            remedy="mend them, or the file they name",
+            remedy="correct the settings, or the file that they name",
         )
     most = f"more than {capacity.MOST}" if found.uavs is None else f"some {found.uavs}"
     text = (
@@ -139,7 +139,9 @@ def _reception(service: Service, settings: Settings) -> Iterator[Finding]:
     if update is None or update.unfit is not None:
         unfit = "no beam update was made" if update is None else str(update.unfit)
         remedy = (
-            f"is it one of {', '.join(own[:NAMED_MAX])}?" if own else "nobody else is heard either"
+            f"is it one of {', '.join(own[:NAMED_MAX])}?"
+            if own
+            else "no vehicle is received: check the links"
         )
         yield Finding(subject=subject, grade=Grade.FAULT, text=unfit, remedy=remedy)
     else:
@@ -151,7 +153,7 @@ def _reception(service: Service, settings: Settings) -> Iterator[Finding]:
 def _links(service: Service) -> Iterator[Finding]:
     for link in service.links():
         subject, heard = f"link {link.url}", sorted(map(str, link.components))
-        bad = link.lost.get(str(Reason.BAD_CRC), 0)
+        bad = link.bad_crc
         said = f"{link.frames} frames of {', '.join(heard[:NAMED_MAX]) or 'nobody'}"
         scheme = link.url.partition(":")[0]
         if scheme not in MAVLINK and link.frames == 0 and link.bytes > 0:
@@ -216,7 +218,10 @@ def _uavs(service: Service) -> Iterator[Finding]:
     if not shown:
         remedy = "wait for a position fix; see what /v1/uavs refuses"
         yield Finding(
-            subject="UAVs", grade=Grade.FAULT, text="none to aim at was heard", remedy=remedy
+            subject="UAVs",
+            grade=Grade.FAULT,
+            text="no UAV that gets a beam was received",
+            remedy=remedy,
         )
     for one in shown:
         track = one.track

@@ -100,7 +100,7 @@ class Gateway:
             notify=self._notify,
             guard=guard,
             lag=self.lag,
-            twins=self._duplicate_ids,
+            duplicate_ids=self._duplicate_ids,
         )
 
     async def run(self) -> None:

@@ -61,9 +61,12 @@ def array(settings: Settings) -> geometry.Array:
             raise ConfigError(f"array.coupling: finite numbers, a row and a column each: {shape}")
         most = max(np.abs(coupling.real).max(), np.abs(coupling.imag).max())
         if not 1 / COUPLING_MAX <= most <= COUPLING_MAX:
-            raise ConfigError(f"array.coupling: {most:.3g} at most is no share of what is fed")
-        if np.linalg.cond(coupling) > WORST_COUPLING:
-            raise ConfigError("array.coupling: elements that it makes alike are none of their own")
+            allowed = f"{1 / COUPLING_MAX:g} .. {COUPLING_MAX:g}"
+            raise ConfigError(f"array.coupling: largest entry {most:.3g} is outside {allowed}")
+        condition = np.linalg.cond(coupling)
+        if condition > WORST_COUPLING:
+            why = f"condition number {condition:.3g}, limit {WORST_COUPLING:g}"
+            raise ConfigError(f"array.coupling: matrix is nearly singular ({why})")
     return replace(
         placed, live=live, coupling=coupling, channel_error=_channel_error(settings, size)
     )

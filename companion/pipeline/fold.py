@@ -88,7 +88,7 @@ class Pipeline:
     """State of the program.
 
     ``step`` takes events in the order of ``values.Event``; the other methods change nothing.
-    ``aiming`` has the beams that a tick in two left to be made; None: there are none to be.
+    ``aiming`` is the beams of a split tick that are still to be computed; None if there are none.
 
     Raises ``UserError`` for settings that do not make sense together.
     """

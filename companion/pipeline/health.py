@@ -66,7 +66,7 @@ class _Link(NamedTuple):
 
 
 class LinkBatch(NamedTuple):
-    """Links that are to be judged: whether a round begins, who still waits in it, and they."""
+    """Links to assess: whether they start a round, which UAVs are still queued, and the links."""
 
     begins: bool
     waiting: list[str]

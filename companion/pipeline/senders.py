@@ -95,7 +95,7 @@ class FrameOutcome:
     """The outcome of one frame.
 
     message    a message with its time; None if nothing is to be done further
-    said       notices and rejections on the way to it
+    outputs    notices and rejections on the way to it
     restarted  the sender whose past is to be forgotten; None if there is none
     change     what the frame showed of a change of its sender's clock; None where it showed none
     """
@@ -271,12 +271,11 @@ class Senders:
         restarted = uav if said else None
         if sender.clock.is_shared(t_ns):
             return FrameOutcome(
-                message=None, outputs=(*said, *_shared_id(sender, uav, t_ns)), restarted=restarted
+                outputs=(*said, *_shared_id(sender, uav, t_ns)), restarted=restarted
             )
         sender.is_shared = False
         if stamp is None:
             return FrameOutcome(
-                message=None,
                 outputs=(*said, Rejection(t_ns=t_ns, source=uav, reason=Reason.UNPLACED_STAMP)),
                 restarted=restarted,
             )

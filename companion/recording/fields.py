@@ -100,7 +100,8 @@ class Field(NamedTuple):
     """One field of a message: its declaration, and how it is read from a value."""
 
     number: int
-    declared: str
+    name: str
+    declared: str  # its type and its name, as in a .proto file
     get: Callable[[Any], Any]
     meaning: str
 
@@ -120,8 +121,13 @@ def _fields(member: Member) -> Iterator[Field]:
     number, name, kind, get = member.meaning.number, member.name, member.type, member.get
 
     def field(declared: str, read: Callable[[Any], Any], offset: int = 0) -> Field:
-        at = (number or 0) + offset
-        return Field(number=at, declared=declared, get=read, meaning=member.meaning.text)
+        return Field(
+            number=(number or 0) + offset,
+            name=declared.rpartition(" ")[2],
+            declared=declared,
+            get=read,
+            meaning=member.meaning.text,
+        )
 
     if number is None:
         return
@@ -166,7 +172,7 @@ def _messages(name: str, get: Callable[[Any], Any]) -> Callable[[Any], list[dict
 
 def values(message: str, value: Any) -> dict[str, Any]:
     """The fields of a message by name."""
-    return {one.declared.rpartition(" ")[2]: one.get(value) for one in fields(message)}
+    return {one.name: one.get(value) for one in fields(message)}
 
 
 def value_of(kind: type[T], found: Any) -> T:

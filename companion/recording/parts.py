@@ -76,7 +76,7 @@ class Hole(NamedTuple):
         except KeyError as error:
             raise ValueError(f"a hole without {error}") from None
         if hole.t_ns >= _LATEST_NS:
-            raise ValueError("a hole beyond all time")
+            raise ValueError("hole out of range")
         if hole.events > EVENTS_MAX:
             raise ValueError("a hole of more events than there are")
         return hole

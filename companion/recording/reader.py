@@ -280,7 +280,7 @@ def _recorded(path: Path) -> Iterator[Event]:
             if event is None:
                 continue
             if event.t_ns >= _LATEST_NS:
-                raise ValueError("an event that is beyond all time")
+                raise ValueError("event time out of range")
             if damaged:
                 yield Rejection(
                     t_ns=t_ns,

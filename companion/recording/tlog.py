@@ -6,12 +6,12 @@ big-endian. Raw MAVLink has no stamps; the sender's boot clock takes their place
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import islice
 from typing import Final, Literal
 
 from companion.mavlink.wire.framing import (
-    BAD_CRC,
-    UNKNOWN_MESSAGE,
+    REASONS,
     Checked,
     Checker,
     Splitter,
@@ -19,6 +19,7 @@ from companion.mavlink.wire.framing import (
     examine,
     next_magic,
 )
+from companion.mavlink.wire.stamps import boot_ms
 from companion.recording.stamps import LINGERS_NS, RepairedStamps
 from companion.values import Event, Frame, Reason, Rejection, Source
 
@@ -26,9 +27,8 @@ STAMP: Final = 8  # bytes of the stamp before each frame of a telemetry log
 _PIECE: Final = 1 << 16
 _MANY_PAIRS: Final = 50
 _SEARCHED_BYTES: Final = 1 << 26  # bytes of a file in which MAVLink is looked for
-_REASON: Final = {UNKNOWN_MESSAGE: Reason.UNKNOWN_MESSAGE, BAD_CRC: Reason.BAD_CRC}
-_BOOT_MS_AT: Final = {33: 0, 30: 0, 2: 8}
-"""Offset of time_boot_ms in the payloads of GLOBAL_POSITION_INT, ATTITUDE and SYSTEM_TIME."""
+_TIMED: Final = frozenset((33, 30, 2))
+"""GLOBAL_POSITION_INT, ATTITUDE and SYSTEM_TIME: by their boot stamps raw MAVLink is dated."""
 _magics = re.compile(b"[\xfd\xfe]").finditer
 
 
@@ -149,7 +149,7 @@ def _skipped(data: bytes, at: int, stop: int) -> dict[Reason, int]:
     while at < stop:
         for start in (at + STAMP, at):
             verdict = examine(data, start, end) if start < stop else 0
-            if reason := _REASON.get(verdict):
+            if reason := REASONS.get(verdict):
                 lost[reason] = lost.get(reason, 0) + 1
                 at = start + claimed_length(data, start, end)
                 break
@@ -193,21 +193,11 @@ def _at(event: Event, t_ns: int) -> Event:
     if isinstance(event, Frame):
         return event._replace(t_ns=t_ns)
     if isinstance(event, Rejection):
-        return Rejection(
-            t_ns=t_ns,
-            source=event.source,
-            reason=event.reason,
-            count=event.count,
-            msgid=event.msgid,
-            detail=event.detail,
-        )
+        return replace(event, t_ns=t_ns)
     return event
 
 
 def _boot_ns(frame: Frame, clock: Source | None) -> int | None:
-    at = _BOOT_MS_AT.get(frame.msgid)
-    if at is None or clock != frame.source:
+    if frame.msgid not in _TIMED or clock != frame.source:
         return None
-    # MAVLink 2 cuts trailing zeros, so what is missing is zero.
-    boot_ms = int.from_bytes(frame.payload[at : at + 4], "little")
-    return boot_ms * 1_000_000
+    return boot_ms(frame) * 1_000_000

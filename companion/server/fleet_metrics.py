@@ -43,11 +43,11 @@ def fleet_metrics(node: Node) -> Iterator[Metric]:
         "companion_fleet_handovers", "UAVs that this node took or gave up", value=member.handed_over
     )
     yield CounterMetricFamily(
-        "companion_fleet_damaged", "Samples of other nodes that were none", value=status.damaged
+        "companion_fleet_damaged", "Malformed fleet messages received", value=status.damaged
     )
     yield CounterMetricFamily(
         "companion_fleet_untold",
-        "Frames that nobody was told of, for want of room",
+        "Frames and round trips not shared: queue full, or too many vehicles heard",
         value=member.sharing.dropped,
     )
     ways = GaugeMetricFamily(

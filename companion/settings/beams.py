@@ -36,15 +36,15 @@ def _once(names: tuple[str, ...]) -> tuple[str, ...]:
 class ArraySettings(Section):
     """The antenna array, and how it is mounted on its carrier.
 
-    ``kind`` is one of four geometries in the array frame (x boresight, y right, z down):
+    ``kind`` is the geometry in the array frame (x boresight, y right, z down):
 
-        ula   ``elements`` along y
-        ura   ``rows`` down and ``columns`` to the right
-        uca   ``elements`` on a circle in the xy plane
+        ula        ``elements`` along y
+        ura        ``rows`` down and ``columns`` to the right
+        uca        ``elements`` on a circle in the xy plane
         hexagonal  ``rings`` of hexagons about a middle element, in the yz plane
-        list  ``positions_m``: rows of x, y, z, or of x, y, z and the direction the element faces.
-              ``positions`` names a file of such rows (CSV or .npy), which is read into
-              ``positions_m``
+        list       ``positions_m``: rows of x, y, z, or of x, y, z and the direction the element
+                   faces. ``positions`` names a file of such rows (CSV or .npy), which is read into
+                   ``positions_m``
 
     ``spacing_m``, where given, takes the place of ``spacing_wavelengths``.
 

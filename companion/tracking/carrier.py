@@ -194,7 +194,7 @@ class AngularAcceleration:
         self._newest = (sender_ns, *rates)
         if before is None:
             return None
-        apart_s = (sender_ns - before[0]) * 1e-9 + 1e-3
+        apart_s = (sender_ns - before[0]) * 1e-9 + STAMP_S
         changed_degps = math.degrees(math.dist(rates, before[1:]))
         proven = (changed_degps - 2 * RATE_NOISE_DEGPS) / apart_s
         limit = self._raised.at(base_degps2, sender_ns)

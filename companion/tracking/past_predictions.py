@@ -61,7 +61,7 @@ AGES_S: Final = (0.25, 1.0, 2.5)
 """Least ages of the predictions whose errors are kept for the usual error."""
 ERRORS_KEPT: Final = 200
 QUANTILE: Final = 0.95
-"""Share of the errors that the usual one is not below: of n the ceil((n + 1) USUAL)-th."""
+"""Share of the errors that the usual one is not below: of n the ceil((n + 1) QUANTILE)-th."""
 ERRORS_LEAST: Final = 20
 SPACING_S: Final = 0.3  # least time between reports that are judged: more often would say no more
 _KEPT: Final = 64

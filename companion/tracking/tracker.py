@@ -191,13 +191,7 @@ class Tracker:
         return False
 
     def _begin(self, fix: Fix, past: _Past, reports: int = 0) -> Estimate:
-        first = Estimate(
-            fix=fix,
-            position_ned_m=fix.position_ned_m,
-            bound_m=fix.noise.position_m,
-            innovation_m=None,
-            dt_s=None,
-        )
+        first = _first(fix)
         past.pace.add(fix)
         self._tracked[fix.uav] = _Tracked(
             past=past,
@@ -264,14 +258,7 @@ class Tracker:
         entry = tracked.history.entries[at]
         predicted = entry.predicted
         if predicted is None:
-            fix = entry.fix
-            return Estimate(
-                fix=fix,
-                position_ned_m=fix.position_ned_m,
-                bound_m=fix.noise.position_m,
-                innovation_m=None,
-                dt_s=None,
-            )
+            return _first(entry.fix)
         if predicted.mu_s2 is not None:
             tracked.mu_max_s2 = max(predicted.mu_s2, tracked.mu_max_s2 or 0.0)
         before_ns = tracked.history.entries[at - 1].fix.sender_ns if at else None
@@ -445,6 +432,17 @@ def _fastest_mps(
         return limits.speed_max_mps
     gained_mps = limits.acceleration_max_mps2 * within_s
     return min(limits.speed_max_mps, math.hypot(*velocity) + bound_mps + gained_mps)
+
+
+def _first(fix: Fix) -> Estimate:
+    """The estimate at a report that nothing predicted: the report itself."""
+    return Estimate(
+        fix=fix,
+        position_ned_m=fix.position_ned_m,
+        bound_m=fix.noise.position_m,
+        innovation_m=None,
+        dt_s=None,
+    )
 
 
 def _rejected(fix: Fix, reason: Reason, detail: str) -> Rejection:

@@ -3,7 +3,7 @@
     age_s: Annotated[float, Meaning("age of the newest accepted report", 4)]
 
 Every way out derives from these declarations: the HTTP API and its OpenAPI document
-(``companion.server.models``), recordings (``companion.recording.schemas``), exported tables
+(``companion.server.models``), recordings (``companion.recording.fields``), exported tables
 (``companion.recording.tables``), the reference pages of ``docs`` and the labels of the dashboard.
 
 A described class is a dataclass or a ``NamedTuple``. A property is described in the annotation of
@@ -48,7 +48,7 @@ class Meaning:
     number      field number in the recording's protobuf message; None: not recorded
     label       short name for tables and charts of the dashboard
     example     for the OpenAPI document
-    wire        protobuf type, where the rule of ``companion.recording.schemas`` gives another
+    wire        protobuf type, where the rule of ``companion.recording.fields`` gives another
     absent      ways out that lack it, each with the reason
     deprecated  what to use instead: the value goes with the next version
     """

@@ -47,7 +47,10 @@ class AltitudeDatum(DescribedEnum):
     """What an altitude is measured from."""
 
     MSL = "msl", "mean sea level"
-    PRESSURE = "pressure", "the standard atmosphere: hundreds of metres off with the weather"
+    PRESSURE = (
+        "pressure",
+        "pressure altitude in the standard atmosphere; weather shifts it by hundreds of metres",
+    )
     GEOMETRIC = "geometric", "the WGS84 ellipsoid"
 
 

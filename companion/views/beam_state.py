@@ -31,7 +31,7 @@ FEWEST_SAMPLES: Final = 32  # as many there are of each, however large the codeb
 MOST_RESPONSES: Final = 2**28
 """Samples times beams of a codebook times elements, for all UAVs of one answer."""
 FULL_SHARE: Final = 8  # UAVs up to which each has all the work that a question may take
-LEAD: Final = "how long after the question the beams apply; up to 10 ms more, as valid_at says"
+LEAD: Final = "requested time from the request to valid_at; valid_at is up to 10 ms later"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,7 +43,7 @@ class StoredBeam:
     next: Annotated[int | None, Meaning("number of the beam that will serve this UAV next")]
     next_in_s: Annotated[float | None, Meaning("time until the next beam")]
     candidates: Annotated[
-        list[int], Meaning("numbers of the beams among which the right one surely is")
+        list[int], Meaning("numbers of all beams that can be the best one, wherever the UAV can be")
     ]
     ssb_candidates: Annotated[
         list[int], Meaning("the candidates in the order of a sweep, the strongest first")
@@ -70,9 +70,10 @@ class BeamState:
         float | None, Meaning("least array gain wherever the UAV can be; null: none")
     ]
     power_dbm: Annotated[float, Meaning("power of this beam in its time slot")]
-    cost_db: Annotated[float, Meaning("`loss_db` plus the share of time of the other time slots")]
+    cost_db: Annotated[float, Meaning("`loss_db` plus 10 log10 of the number of time slots")]
     guaranteed_sinr_db: Annotated[
-        float | None, Meaning("least SINR wherever the UAVs can be; null: none, or too many beams")
+        float | None,
+        Meaning("least SINR wherever the UAVs can be; null: no guarantee, or too many beams"),
     ]
     sinr_db: Annotated[float | None, Meaning("SINR at the predicted directions")]
     codebook: Annotated[StoredBeam | None, Meaning("beam of the device's codebook for this UAV")]

@@ -21,7 +21,7 @@ class NodeState(DescribedEnum):
 
     HERE = "here", "the node that answers"
     THERE = "there", "its messages are current"
-    SILENT = "silent", "no message for a lease"
+    SILENT = "silent", "no message for longer than `[fleet] lease_s`"
     ASIDE = "aside", "excluded, because its messages contradict others"
     GONE = "gone", "it left"
 
@@ -39,7 +39,8 @@ class FleetNode:
         ),
     ]
     near: Annotated[
-        bool, Meaning("whether it can receive or serve what this node can; others are not asked")
+        bool,
+        Meaning("whether its reach meets this node's; only such nodes exchange reports and offers"),
     ] = False
     reason: Annotated[str | None, Meaning("why it is excluded")] = None
     place: Annotated[Place | None, Meaning("position of its array")] = None
@@ -61,11 +62,15 @@ class FleetNode:
         int | None, Meaning("shared frames used here, of vehicles that this node does not receive")
     ] = None
     way_p50_ms: Annotated[
-        float | None, Meaning("median time from reception there to here over the last minute")
+        float | None,
+        Meaning("median delay from reception at that node to reception here, last minute"),
     ] = None
     way_p99_ms: Annotated[
         float | None,
-        Meaning("99th percentile of the time from reception there to here", label="Delay p99"),
+        Meaning(
+            "99th percentile of the delay from reception at that node to reception here",
+            label="Delay p99",
+        ),
     ] = None
 
 
@@ -112,7 +117,7 @@ class Fleet:
     heard_bps: Annotated[float | None, Meaning("data that others share, last second")] = None
     damaged: Annotated[int, Meaning("malformed fleet messages received")] = 0
     untold: Annotated[
-        int, Meaning("frames and round trips not shared because the message was full")
+        int, Meaning("frames and round trips not shared: queue full, or too many vehicles heard")
     ] = 0
 
 

@@ -18,7 +18,7 @@ class FleetStatus:
     site: str  # name of the fleet
     sent_bps: float  # bits per second that it tells, by what it gave to Zenoh over the last second
     heard_bps: float  # bits per second that others told it
-    damaged: int  # samples of others that were none
+    damaged: int  # malformed fleet messages received
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,7 +16,7 @@ LONGEST: Final = 400
 class Setting:
     """One setting, and where it comes from."""
 
-    value: Annotated[Any, Meaning("the value in effect; the key's name has its unit")]
+    value: Annotated[Any, Meaning("value in effect, in the unit that the key's name ends in")]
     default: Annotated[Any, Meaning("the default value")]
     source: Annotated[
         Literal["default", "file", "recording", "option", "program"],

@@ -81,7 +81,10 @@ class Status:
     frames: Annotated[int, Meaning("MAVLink frames processed since the start")]
     updates: Annotated[int, Meaning("beam updates so far")]
     rejected: Annotated[dict[str, int], Meaning("what was received and not used, by reason")]
-    digest: Annotated[str, Meaning("running SHA-256 over every decision: equal for equal events")]
+    digest: Annotated[
+        str,
+        Meaning("running SHA-256 over all estimates and weights; equal events give equal digests"),
+    ]
     replay: Annotated[ReplayStatus | None, Meaning("progress of a replay; null where live")]
 
 

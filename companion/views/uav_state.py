@@ -54,7 +54,10 @@ class UavState:
         Meaning("nodes of the fleet that serve it; null: no fleet, or no beam is wanted"),
     ]
     same_as: Annotated[
-        str | None, Meaning("id under which this aircraft is known better", example="3:1")
+        str | None,
+        Meaning(
+            "id of the better track of this aircraft; null: this is the best track", example="3:1"
+        ),
     ]
     callsign: Annotated[str | None, Meaning("callsign of the aircraft", example="SWR12A")]
     relays: Annotated[list[str], Meaning("components that relay this aircraft")]

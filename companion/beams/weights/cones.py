@@ -15,10 +15,10 @@ from typing import Final
 
 import numpy as np
 
-from companion.beams.array.elements import ElementPattern
 from companion.beams.array.geometry import Array
 from companion.beams.array.steering import steering_matrix
 from companion.beams.weights.shapes import Aperture
+from companion.beams.worth.cone import faces_apart
 from companion.values import ComplexArray, FloatArray, IntArray
 
 FINER: Final = 6  # places in each natural width of a line
@@ -130,11 +130,7 @@ def cones(
     ``seen`` has the cones of the bound and of the likely angle; ``centres`` (M, N) are the steering
     vectors of the directions.
     """
-    apart = (
-        array.element_from_array is not None
-        and array.element.pattern is not ElementPattern.ISOTROPIC
-    )
-    if array.grid is None or apart or array.coupling is not None:
+    if array.grid is None or faces_apart(array) or array.coupling is not None:
         return _asked(array, across, directions, seen)
     waves, counts = _about(across, seen, array.grid, array.wavelength_m)
     turns = centres / np.maximum(np.abs(centres).max(axis=0), 1e-300)

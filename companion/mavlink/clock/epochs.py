@@ -138,7 +138,7 @@ class BootLine:
         if not self.floor.count:
             return False
         x_ns = _unwrap(boot_ms, self.newest_ns)
-        if abs(arrival_ns - x_ns - self.floor.at(x_ns)) > self._late_max_ns // 2:
+        if abs(self.late_ns(arrival_ns, x_ns)) > self._late_max_ns // 2:
             return False
         self.floor.add(x_ns, arrival_ns - x_ns)
         self.newest_ns = max(self.newest_ns, x_ns)

@@ -68,7 +68,8 @@ class ClockEstimate:
 
     kind: Annotated[ClockKind, Meaning("evidence that leaves the least uncertainty")]
     guarantee: Annotated[
-        Guarantee, Meaning("measured: both ends of the interval are; assumed: one end is assumed")
+        Guarantee,
+        Meaning("whether both ends of the clock's interval were measured, or one is assumed"),
     ]
     offset_ns: int  # most likely difference, node time minus sender time
     before_s: Annotated[float, Meaning("how much earlier the sender's time may be than estimated")]
@@ -77,7 +78,8 @@ class ClockEstimate:
         float | None, Meaning("observed drift beyond the largest assumed; 0 where none was seen")
     ]
     constant_delay_s: Annotated[
-        float | None, Meaning("latency of the fastest frame, which is taken off")
+        float | None,
+        Meaning("estimated latency of the fastest frame, already subtracted from the offset"),
     ]
     latency_s: Annotated[float | None, Meaning("latency of the newest time stamp")]
 

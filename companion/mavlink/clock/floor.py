@@ -62,8 +62,8 @@ class _Level:
 
     __slots__ = ("touched_ns", "upper_bound")
 
-    def __init__(self, sure: float, touched_ns: int) -> None:
-        self.upper_bound = sure
+    def __init__(self, touched_ns: int) -> None:
+        self.upper_bound = 0.0
         self.touched_ns = touched_ns
 
     def add(self, x_ns: int, height: float, ahead_ns: int, drift_max: float) -> None:
@@ -201,7 +201,7 @@ class Floor:
     def _drifts(self) -> None:
         """Lay the floor anew along the drift, on the least heights of the window."""
         newest_ns, level = self.newest_ns, self._upper_bound
-        self._level = _Level(0.0, self._touched_ns)
+        self._level = _Level(self._touched_ns)
         self._base = (newest_ns, self._base[1] + round(level))
         points = self._visible.tilt(self.drift, newest_ns, level)
         self._upper_bound = self._line = min(

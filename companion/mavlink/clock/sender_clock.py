@@ -13,8 +13,6 @@ sender time, is an interval, and every stamp and every answer narrows it:
 
 The interval is as of the time asked for, and grows while nothing comes. No report is ever placed
 later than it arrived. See docs/math.md 6. ``epochs.py`` tells which stamps are of one line.
-
-Over 300 lines: stamps, evidence and both timelines are of one clock.
 """
 
 import math

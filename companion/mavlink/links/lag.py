@@ -30,8 +30,7 @@ class LagSeen:
     ]
     max_s: Annotated[float | None, Meaning("longest wait")]
     behind: Annotated[
-        bool,
-        Meaning("whether waits exceeded half a second for a second, until two seconds after that"),
+        bool, Meaning("whether waits exceeded 0.5 s for 1 s; true until none exceeds 0.5 s for 2 s")
     ]
 
 

@@ -49,10 +49,10 @@ class LinkStatus:
     sent: Annotated[int, Meaning("frames sent")] = 0
     send_dropped: Annotated[int, Meaning("frames that could not be sent")] = 0
     arrival: Annotated[
-        Arrival, Meaning("what dates an arrival: the kernel's time stamp, or the reading")
+        Arrival, Meaning("source of arrival times: the kernel's time stamp, or the time of reading")
     ] = "read"
     misstamped: Annotated[
-        int, Meaning("datagrams with an impossible time stamp, dated by their reading")
+        int, Meaning("datagrams with an impossible kernel time stamp; the time of reading was used")
     ] = 0
     receive_buffer_bytes: Annotated[
         int | None, Meaning("receive buffer that the system granted (Linux doubles the request)")

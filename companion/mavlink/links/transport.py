@@ -65,12 +65,13 @@ class MessageSigning(Protocol):
 class Link:
     """One link. Call ``open`` for early errors, then ``run`` until cancelled.
 
-        receive  called on the event loop with the frames and rejections of each datagram or read
-        now_ns   the node's timeline
-        notify   called once when the link is lost, and once when it is back
-        guard    refuses frames and signs what is sent; None: no signing
-        lag      observes how late datagrams are processed
-        twins    refuses what peers say that contradict each other; shared by all links
+        receive        called on the event loop with the frames and rejections of each datagram or
+                       read
+        now_ns         the node's timeline
+        notify         called once when the link is lost, and once when it is back
+        guard          refuses frames and signs what is sent; None: no signing
+        lag            observes how late datagrams are processed
+        duplicate_ids  refuses what peers say that contradict each other; shared by all links
 
     All methods but ``open`` must be called on the event loop; ``open`` is called before it runs.
     """
@@ -84,7 +85,7 @@ class Link:
         notify: Notify | None = None,
         guard: MessageSigning | None = None,
         lag: ArrivalLag | None = None,
-        twins: DuplicateIds | None = None,
+        duplicate_ids: DuplicateIds | None = None,
     ) -> None:
         self.url = url
         self.status = LinkStatus(url=str(url))
@@ -93,7 +94,7 @@ class Link:
         self._notify = notify
         self._guard = guard
         self._lag = lag or ArrivalLag()
-        self._twins = twins or DuplicateIds()
+        self._duplicate_ids = duplicate_ids or DuplicateIds()
         self._peers = Peers(self.status, self._finish, splitter(url))
         upcalls = Upcalls(
             up=self._up,
@@ -178,7 +179,7 @@ class Link:
         """The item itself, or the refusal of what its sender's peers contradict each other in."""
         if isinstance(item, Rejection) or item.msgid not in POSE:
             return item
-        if not self._twins.rejects(str(self.url), peer.address or str(self.url), item):
+        if not self._duplicate_ids.rejects(str(self.url), peer.address or str(self.url), item):
             return item
         who, detail = str(item.source), "two peers contradict each other"
         return Rejection(

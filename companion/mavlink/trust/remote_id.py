@@ -39,7 +39,7 @@ class RemoteIds:
 
         Rejections and their reasons:
 
-            NO_IDENTITY  the address has not message whose it is
+            NO_IDENTITY  the address has not sent the id of its aircraft yet
             NO_ALTITUDE  a position without a height, or with one of another datum than before
             SHARED_ID    it stands for several aircraft
         """

@@ -149,8 +149,8 @@ class ServiceComponent:
         if frame.source == self._source:
             self._own_name(frame, said)
         elif frame.msgid in POSE:
-            is_own = frame.msgid in positions.OWN
-            boot_ms = positions.read(frame).boot_ms if is_own else stamps.boot_ms(frame)
+            is_stamped = frame.msgid in stamps.STAMPED
+            boot_ms = stamps.boot_ms(frame) if is_stamped else positions.read(frame).boot_ms
             self._stamps[frame.source] = (frame.t_ns, boot_ms)
             self._rates.stamped(frame.t_ns, frame.source, frame.msgid, boot_ms)
         else:

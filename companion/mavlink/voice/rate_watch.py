@@ -68,7 +68,7 @@ NO_REQUEST_SEEN: Final = "nobody was heard asking"
 
 
 class RateState(DescribedEnum):
-    """State of the request for one message; see the head of this module."""
+    """State of the request for the rate of one message."""
 
     WATCHING = "watching", "nothing requested"
     ASKED = "asked", "requested"

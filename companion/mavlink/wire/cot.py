@@ -190,5 +190,5 @@ def _bytes(value: object) -> bytes:
 
 def _double(value: object) -> float:
     if not isinstance(value, float):
-        raise ValueError("no number where one should be")
+        raise ValueError("expected a float field")
     return value

@@ -3,8 +3,6 @@
 Sources: the message definitions of https://mavlink.io/en/messages/common.html. MAVLink 2 cuts
 trailing zero bytes of a payload, and a version 1 frame has no extension fields: both are read as
 zeros, as the standard says. Where zero means "not sent" the value is None.
-
-Over 300 lines: a decoder for each message, and nothing else.
 """
 
 import math
@@ -130,7 +128,7 @@ def _adsb_vehicle(frame: Frame) -> AdsbVehicle:
     24 bits (ICAO Annex 10) is refused. Accuracies stand behind it where this program put them
     (``transponder``).
     """
-    fields = _ADSB_VEHICLE.unpack(frame.payload.ljust(_ADSB_VEHICLE.size, b"\0")[:38])
+    fields = unpack(frame, _ADSB_VEHICLE)
     icao, lat, lon, alt_mm, heading_cdeg, speed_cmps, climb_cmps, flags = fields[:8]
     altitude_type, callsign, _, tslc_s = fields[9:]
     if not 0 < icao <= _ICAO_MAX:
@@ -249,7 +247,7 @@ def _ekf_status_report(frame: Frame) -> EstimatorStatus:
     """Decode what ArduPilot's estimator says of its attitude; ``compass_variance`` is a ratio."""
     *_, compass_ratio, _, flags = unpack(frame, _EKF_STATUS_REPORT)
     if not math.isfinite(compass_ratio) or compass_ratio < 0.0:
-        raise _RefusedError(Reason.MALFORMED, "a compass ratio that is none")
+        raise _RefusedError(Reason.MALFORMED, "compass ratio is negative or not finite")
     knows = bool(flags & _KNOWS_ATTITUDE) and not flags & _UNINITIALIZED
     return EstimatorStatus(
         t_ns=frame.t_ns, source=frame.source, knows_attitude=knows, compass_ratio=compass_ratio

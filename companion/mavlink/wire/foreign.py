@@ -8,7 +8,7 @@ from companion.mavlink.wire.transponder import ADSB_VEHICLE, SENDER, AircraftSta
 from companion.values import Frame, Reason, Rejection
 
 Items = list[Frame | Rejection]
-MLAT: Final = "MLAT: how exact it is, is not known"
+MLAT: Final = "MLAT position: its accuracy is not stated"
 """Why a position that several receivers computed from arrival times is not used."""
 
 

@@ -35,7 +35,7 @@ NOT_A_FRAME: Final = -1
 UNKNOWN_MESSAGE: Final = -2
 BAD_CRC: Final = -3
 
-_REASON: Final = {UNKNOWN_MESSAGE: Reason.UNKNOWN_MESSAGE, BAD_CRC: Reason.BAD_CRC}
+REASONS: Final = {UNKNOWN_MESSAGE: Reason.UNKNOWN_MESSAGE, BAD_CRC: Reason.BAD_CRC}
 _SEED: Final = {msgid: bytes([seed]) for msgid, seed in CRC_EXTRA.items()}
 _mcrf4xx = crc16.mcrf4xx
 _find_magic = re.compile(b"[\xfd\xfe]").search
@@ -216,7 +216,7 @@ class Splitter:
                 continue
             if found == INCOMPLETE and not last:
                 break
-            if found in _REASON and at >= claimed_to:
+            if found in REASONS and at >= claimed_to:
                 claims_to = at + claimed_length(buffer, at, end)
             else:
                 claims_to = claimed_to
@@ -247,7 +247,7 @@ class Splitter:
 
         Returns how far the claims of failed frames reach.
         """
-        reason = _REASON.get(verdict)
+        reason = REASONS.get(verdict)
         if reason is not None and at >= claimed_to:
             lost[reason] = lost.get(reason, 0) + 1
             claimed_to = at + claimed_length(buffer, at, len(buffer))

@@ -1,11 +1,12 @@
 """The fields of a payload."""
 
 import struct
+from typing import Any
 
 from companion.values import Frame
 
 
-def unpack(frame: Frame, layout: struct.Struct) -> tuple[int, ...]:
+def unpack(frame: Frame, layout: struct.Struct) -> tuple[Any, ...]:
     """Unpack the fields of a payload.
 
     Fields cut off, or absent in its MAVLink version, are zeros.

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from companion.mavlink.wire import accuracy
+from companion.mavlink.wire.payload import unpack
 from companion.values import Accuracy, AltitudeDatum, Frame, RemoteId, Report, UavKind
 
 BASIC_ID: Final = 12900
@@ -44,22 +45,18 @@ def remote_id(frame: Frame) -> RemoteId | None:
     return said
 
 
-def _payload(frame: Frame, layout: struct.Struct) -> bytes:
-    return frame.payload.ljust(layout.size, b"\0")[: layout.size]
-
-
 def _begun(frame: Frame, heard_as: bytes) -> RemoteId:
     return RemoteId(t_ns=frame.t_ns, source=frame.source, heard_as=heard_as.rstrip(b"\0").hex())
 
 
 def _basic_id(frame: Frame) -> RemoteId:
-    heard_as, kind, uas_id = _BASIC_ID.unpack(_payload(frame, _BASIC_ID))
+    heard_as, kind, uas_id = unpack(frame, _BASIC_ID)
     return _identified(_begun(frame, heard_as), kind, uas_id)
 
 
 def _location(frame: Frame) -> RemoteId:
-    lat, lon, baro_m, geo_m, stamp_s, course, speed, climb, heard_as, *codes = _LOCATION.unpack(
-        _payload(frame, _LOCATION)
+    lat, lon, baro_m, geo_m, stamp_s, course, speed, climb, heard_as, *codes = unpack(
+        frame, _LOCATION
     )
     if not all(map(math.isfinite, (baro_m, geo_m, stamp_s))):
         raise ValueError("a height or a time is not a number")
@@ -81,12 +78,12 @@ def _location(frame: Frame) -> RemoteId:
 
 
 def _system(frame: Frame) -> RemoteId:
-    count, heard_as = _SYSTEM.unpack(_payload(frame, _SYSTEM))
+    count, heard_as = unpack(frame, _SYSTEM)
     return replace(_begun(frame, heard_as), aircraft=count)
 
 
 def _pack(frame: Frame) -> RemoteId:
-    heard_as, size, count, messages = _PACK.unpack(_payload(frame, _PACK))
+    heard_as, size, count, messages = unpack(frame, _PACK)
     if size != _MESSAGE_BYTES or not 0 < count <= _PACK_MAX:
         raise ValueError(f"a pack of {count} messages of {size} bytes")
     said = _begun(frame, heard_as)

@@ -177,7 +177,7 @@ def _location(
 ) -> bytes:
     """The payload of an OPEN_DRONE_ID_LOCATION; what is out of range, or no number, is unknown.
 
-    Raises ``ValueError`` for a place that is none.
+    Raises ``ValueError`` for an invalid place.
     """
     if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
         raise ValueError(f"latitude {lat_deg}, longitude {lon_deg}")

@@ -170,9 +170,7 @@ def command_for(
     named = {beam["uav"]: beam for beam in told["beams"]}
     uav = followed_uavs(named, wanted)
     if uav is None:
-        return DeviceCommand(
-            valid_at_ns=valid_at_ns, unfit="nobody who is to be followed has a beam"
-        )
+        return DeviceCommand(valid_at_ns=valid_at_ns, unfit="none of the UAVs to follow has a beam")
     if wanted.centre:
         several = named if wanted.anybody else wanted.uavs
         return _middle([named[one] for one in several if one in named], valid_at_ns)
@@ -213,7 +211,7 @@ def _middle(beams: list[dict[str, Any]], valid_at_ns: int) -> DeviceCommand:
     if math.hypot(north, east, up) < LEAST_MEAN * len(beams):
         return DeviceCommand(
             valid_at_ns=valid_at_ns,
-            unfit="they are all around: there is no direction to the middle of them",
+            unfit="they are all around: their mean direction is undefined; follow fewer UAVs",
         )
     lat_deg, alt_m = (
         statistics.fmean(beam[name] for beam in beams) for name in ("lat_deg", "alt_m")

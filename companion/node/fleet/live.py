@@ -175,13 +175,13 @@ class LiveFleetNode:
 
     def _declare(self, bus: Bus) -> None:
         base = f"{PREFIX}/{self.settings.site}"
-        bus.serve(f"{base}/{self.name}/time", self._time)
-        bus.serve(f"{base}/{self.name}/schema", lambda key, payload: schemas.SHARED.descriptor_set)
+        bus.serve(self._key("time"), self._time)
+        bus.serve(self._key("schema"), lambda key, payload: schemas.SHARED.descriptor_set)
         bus.subscribe(f"{base}/*/standing", self._taking(self._stands))
         heard, offered = self._taking(self._shared), self._taking(self._offered)
         self._listening = Listening(bus=bus, base=base, heard=heard, offered=offered)
         bus.watch(f"{base}/*/alive", self._seen)
-        bus.alive(f"{base}/{self.name}/alive")
+        bus.alive(self._key("alive"))
 
     def _time(self, key: str, payload: bytes) -> bytes:
         return messages.CLOCK.pack(self._started_ns, self._now_ns())
@@ -232,8 +232,9 @@ class LiveFleetNode:
 
     # --- what it says -----------------------------------------------------------------------
 
-    def _key(self, what: str) -> str:
-        return f"{PREFIX}/{self.settings.site}/{self.name}/{what}"
+    def _key(self, what: str, node: str | None = None) -> str:
+        """The key of what a node publishes; None: of what this node does."""
+        return f"{PREFIX}/{self.settings.site}/{node or self.name}/{what}"
 
     def _put(
         self, what: str, payload: bytes, *, express: bool = False, reliable: bool = True
@@ -276,7 +277,7 @@ class LiveFleetNode:
         if self._bus is None:
             return
         for node in self.member.near:
-            key = f"{PREFIX}/{self.settings.site}/{node}/time"
+            key = self._key("time", node)
             self._unanswered.asked(now_ns, node)
             self._bus.ask(key, b"", ANSWERED_S, self._reading(node, self._now_ns()))
 

@@ -11,8 +11,8 @@ from typing import Final
 
 from google.protobuf.message import DecodeError
 
-from companion.recording import codec, schemas
-from companion.values import Offer, Shared, SharedFrame, Standing
+from companion.recording import fields, schemas
+from companion.values import Offer, RoundTrip, Shared, SharedFrame, Standing
 
 FRAMES_MAX: Final = 4096  # most frames, or round trips, of one message
 CLOCK: Final = struct.Struct("<qq")
@@ -48,7 +48,7 @@ def to_shared(data: bytes) -> Shared:
         raise FleetMessageError("too many frames at once")
     first_ns = message.first_ns
     frames = tuple(SharedFrame(_time(first_ns + one.after_ns), one.raw) for one in message.frame)
-    trips = tuple(codec.to_round_trip(one.SerializeToString()) for one in message.trip)
+    trips = tuple(fields.value_of(RoundTrip, one) for one in message.trip)
     if any(max(trip.source) > 255 or max(trip.t_ns, trip.sent_ns) > _LATEST_NS for trip in trips):
         raise FleetMessageError("a round trip with nobody")
     return Shared(_time(message.told_ns), frames, trips)
@@ -79,7 +79,7 @@ def to_standing(data: bytes, node: str) -> Standing:
         raise FleetMessageError("more UAVs than there can be")
     place = tuple(message.place)
     if len(place) not in (0, 3) or not all(map(math.isfinite, place)):
-        raise FleetMessageError("a place that is none")
+        raise FleetMessageError("invalid place")
     reach_m = message.reach_m if message.HasField("reach_m") else None
     return Standing(
         node=node,
@@ -119,7 +119,7 @@ def to_offers(data: bytes) -> tuple[Offer, ...]:
 
 def _time(t_ns: int) -> int:
     if t_ns > _LATEST_NS:
-        raise FleetMessageError("a time that is beyond all time")
+        raise FleetMessageError("time out of range")
     return t_ns
 
 
@@ -131,5 +131,5 @@ def _number(value: float) -> float:
 
 def _name(text: str) -> str:
     if not text or len(text) > NAME_MAX or not text.isprintable():
-        raise FleetMessageError("a name that is none")
+        raise FleetMessageError("invalid name")
     return text

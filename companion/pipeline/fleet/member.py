@@ -181,11 +181,11 @@ class FleetMember:
         notices = []
         for node in self.reception.early:
             notices += self.trust.note_contradiction(
-                now_ns, node, "tells frames before they can be heard"
+                now_ns, node, "shares frames before they can have been received"
             )
         for node in self.reception.contradicted:
             notices += self.trust.note_contradiction(
-                now_ns, node, "tells reports that contradict others"
+                now_ns, node, "shares reports that contradict those of other nodes"
             )
         self.reception.early.clear()
         self.reception.contradicted.clear()

@@ -48,8 +48,9 @@ class _Held(NamedTuple):
 
 
 class Sharing:
-    """Decides what is told. ``name`` is this node's; ``every_ns`` is the least time between two
-    words.
+    """Decide which frames and round trips this node shares with the others.
+
+    ``name`` is this node's; ``every_ns`` is the least time between two messages.
 
     ``dropped`` counts frames and round trips that were not shared because the queue was full.
     """

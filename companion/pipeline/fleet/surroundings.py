@@ -7,7 +7,7 @@ from companion.pipeline.fleet.member import FleetMember
 from companion.pipeline.fleet.nearness import Place
 from companion.pipeline.fleet.trust import Witness
 from companion.pipeline.fold import Pipeline
-from companion.values import Notice, Vector, kind_of
+from companion.values import Carrier, Notice, Vector, kind_of
 
 RECENT_S: Final = 5.0
 """How long ago a vehicle may have been heard that shows how far this node hears."""
@@ -31,12 +31,13 @@ class Surroundings:
     def reach_m(self, now_ns: int) -> float | None:
         """Distance of the farthest vehicle that is heard here; None: none is."""
         carrier = self._pipeline.last_carrier
-        if carrier is None:
-            return None
+        return None if carrier is None else self._reach_m(carrier, self._positions(), now_ns)
+
+    def _reach_m(self, carrier: Carrier, positions: dict[str, Vector], now_ns: int) -> float | None:
         here, hearing = carrier.position_ned_m.tolist(), self._member.reception
         away_m = [
             math.dist(here, position)
-            for uav, position in self._positions().items()
+            for uav, position in positions.items()
             if (silent_s := hearing.silent_s(uav, now_ns)) is not None and silent_s < RECENT_S
         ]
         return max(away_m, default=None)
@@ -49,7 +50,7 @@ class Surroundings:
         positions, hearing = self._positions(), self._member.reception
         heard = frozenset(u for u in positions if hearing.silent_s(u, now_ns) is not None)
         north, east, down = carrier.position_ned_m.tolist()
-        own = Witness((north, east, down), self.reach_m(now_ns) or 0.0, heard)
+        own = Witness((north, east, down), self._reach_m(carrier, positions, now_ns) or 0.0, heard)
 
         def to_local(place: Place) -> Vector:
             return local.localise(*place, None)[0]

@@ -200,14 +200,20 @@ def moved(boot_us: IntArray, lat_1e7: IntArray, lon_1e7: IntArray, alt_m: FloatA
     """Velocities (N, 3), north-east-down, m/s, by the way between neighbours; 0 for a lone one."""
     if len(boot_us) < 2:
         return np.zeros((len(boot_us), 3))
-    t_s = (boot_us - boot_us[0]) * 1e-6
-    t_s = np.maximum.accumulate(t_s) + np.arange(len(t_s)) * 1e-9  # a reboot steps back
+    t_s = _ascending_s(boot_us)
     scale = METRES_PER_DEGREE * 1e-7
     north = (lat_1e7 - lat_1e7[0]) * scale
     east = (lon_1e7 - lon_1e7[0]) * scale * np.cos(np.radians(lat_1e7 * 1e-7))
     place = np.stack([north, east, -(alt_m - alt_m[0])], axis=1)
     velocity: FloatArray = np.gradient(place, t_s, axis=0)
     return velocity
+
+
+def _ascending_s(boot_us: IntArray) -> FloatArray:
+    """Seconds since the first, strictly ascending: the stamps of a log step back at a reboot."""
+    t_s = (boot_us - boot_us[0]) * 1e-6
+    ascending_s: FloatArray = np.maximum.accumulate(t_s) + np.arange(len(t_s)) * 1e-9
+    return ascending_s
 
 
 def turned(boot_us: IntArray, euler_rad: FloatArray) -> FloatArray:
@@ -217,8 +223,7 @@ def turned(boot_us: IntArray, euler_rad: FloatArray) -> FloatArray:
     """
     if len(boot_us) < 2:
         return np.zeros((len(boot_us), 3))
-    t_s = (boot_us - boot_us[0]) * 1e-6
-    t_s = np.maximum.accumulate(t_s) + np.arange(len(t_s)) * 1e-9
+    t_s = _ascending_s(boot_us)
     roll, pitch, yaw = np.unwrap(euler_rad, axis=0).T
     by_roll, by_pitch, by_yaw = (np.gradient(angle, t_s) for angle in (roll, pitch, yaw))
     return np.stack(

@@ -2,8 +2,6 @@
 
 A claim names the number that decides it by its path in the study's answer. Its verdict and the text
 of what was found are made from that number, so that they cannot disagree with it.
-
-Over 300 lines: it is a list of claims.
 """
 
 from collections.abc import Callable

@@ -209,7 +209,7 @@ def work(piece: Piece, progress: Callable[[str], None] = lambda _text: None) -> 
 
     Raises ``UserError`` or ``LogError`` where it has nothing to study.
     """
-    progress(f"reading {' + '.join(log.name for log in piece.logs)}")
+    progress(f"reading {vehicles.named(piece.logs)}")
     flown = vehicles.load(piece.logs, center_of(piece.logs, piece.setting.center))
     return compare(flown, piece.link, piece.setting, progress)
 

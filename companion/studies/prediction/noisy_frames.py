@@ -9,6 +9,7 @@ import numpy as np
 
 from companion.mavlink.wire.decode import GPS_RAW_INT
 from companion.mavlink.wire.encode import Outgoing, pack
+from companion.mavlink.wire.payload import unpack
 from companion.studies.prediction.radio_link import NOISE_MOST, RadioLink
 from companion.studies.truth.vehicles import Flight
 from companion.values import FloatArray, Frame
@@ -52,7 +53,7 @@ def changed(flight: Flight, added: Noise, link: RadioLink) -> list[Frame]:
 
 
 def _worse_report(frame: Frame, way_m: list[float], speed_mps: list[float]) -> Frame:
-    fields = list(_REPORT.unpack(frame.payload.ljust(_REPORT.size, b"\0")[: _REPORT.size]))
+    fields = list(unpack(frame, _REPORT))
     across = _METRES_PER_DEGREE * math.cos(math.radians(fields[1] * 1e-7))
     fields[1] += round(way_m[0] / _METRES_PER_DEGREE * 1e7)
     fields[2] += round(way_m[1] / across * 1e7)

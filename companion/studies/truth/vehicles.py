@@ -142,7 +142,7 @@ def load(logs: Path | Sequence[Path], center_text: str | None) -> Flown:
         carrier = flights.pop(str(center)).truth
     arrivals = [report.t_ns for stream in streams.values() for report in stream.reports]
     return Flown(
-        log=" + ".join(log.name for log in logs),
+        log=named(logs),
         center=str(center if center_text and center_text != "home" else home),
         flights=tuple(flights.values()),
         carrier=carrier,

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any, Final
 
+from httpx import Response
 from starlette.testclient import TestClient
 
 from companion.node.service import Service
@@ -25,15 +26,20 @@ can be tried. Written by `python docs/make_api.py`.
 Json = dict[str, Any]
 
 
-def document() -> Json:
-    """The OpenAPI document of a service that hears nobody."""
+def answer(path: str) -> Response:
+    """The answer to a GET of a service that receives nothing."""
     settings = Settings().override(
         center={"source": "0,0,0"}, links={"urls": ["udpin:127.0.0.1:0"]}
     )
     with TestClient(
         create_app(Service(settings=settings, say=print)), "http://localhost"
     ) as client:
-        found: Json = client.get("/openapi.json").json()
+        return client.get(path)
+
+
+def document() -> Json:
+    """The OpenAPI document."""
+    found: Json = answer("/openapi.json").json()
     return found
 
 

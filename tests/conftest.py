@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from collected_texts import CollectedTexts, collect
 from figures import FILE, Figures
 from hypothesis import settings
 from soak_table import table  # noqa: F401 - a fixture
@@ -71,11 +72,13 @@ STDERR = pytest.StashKey[int]()
 
 
 FIGURES = pytest.StashKey[Figures]()
+TEXTS = pytest.StashKey[CollectedTexts]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[STDERR] = os.dup(2)
     config.stash[FIGURES] = Figures()
+    config.stash[TEXTS] = collect()
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
@@ -110,6 +113,13 @@ def _watch(item: pytest.Item) -> None:
     if limit_s > 0:
         seconds, file = limit_s + LAST_RESORT_S, item.config.stash[STDERR]
         faulthandler.dump_traceback_later(seconds, exit=True, file=file)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item: pytest.Item) -> None:
+    """Errors, notices and details that a test caused keep the rules for such texts."""
+    faults = item.config.stash[TEXTS].faults()
+    assert not faults or os.environ.get("COLLECT_TEXTS"), "\n".join(faults)
 
 
 # --- fixtures -----------------------------------------------------------------------------------

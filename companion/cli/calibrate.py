@@ -1,4 +1,4 @@
-"""The command ``companion calibrate``: from what was measured to ``[hardware] calibration``."""
+"""The command ``companion calibrate``: compute a ``[hardware] calibration`` from measurements."""
 
 from pathlib import Path
 
@@ -14,16 +14,16 @@ from companion.values import UserError
     "--out",
     required=True,
     type=click.Path(path_type=Path, dir_okay=False),
-    help="The calibration to write.",
+    help="Calibration file to write.",
 )
 @CONFIG
 def calibrate(measured: Path, out: Path, config: Path | None) -> None:
-    """A calibration with its bounds, from measured responses or a Phaser's own files.
+    """Compute a calibration from measured responses, or convert a Phaser's calibration files.
 
     MEASURED is a CSV file of azimuth_deg,elevation_deg,channel,phase_deg,gain_db: the response of
-    each channel by itself to one source at known directions of the array frame. The array, and
-    which element each channel drives, are those of the settings. Or it is the folder with a
-    Phaser's phase_cal_val.pkl and gain_cal_val.pkl.
+    each single channel to one source at known directions in the array frame. The settings give
+    the array and the element of each channel. MEASURED may also be the folder with a Phaser's
+    phase_cal_val.pkl and gain_cal_val.pkl.
 
     Example: companion calibrate responses.csv --config phaser.toml --out measured.csv
     """
@@ -36,7 +36,7 @@ def calibrate(measured: Path, out: Path, config: Path | None) -> None:
         kept = [measured / f"{name}_cal_val.pkl" for name in ("phase", "gain")]
         found = phaser_pickles.calibration(*(path.read_bytes() for path in kept))
         out.write_text(measuring.as_text(found), encoding="utf-8")
-        click.echo(f"{out}: {len(found.order)} channels; how far they are off is not known")
+        click.echo(f"{out}: {len(found.order)} channels; their errors are unknown")
         return
     settings = load(config)
     array = assembly.array(settings)
@@ -49,7 +49,7 @@ def calibrate(measured: Path, out: Path, config: Path | None) -> None:
     fit = measuring.fitted(measuring.parse_responses(text), array, order)
     out.write_text(measuring.as_text(fit.calibration), encoding="utf-8")
     click.echo(
-        f"{out}: {array.size} channels; at most {fit.phase_deg:.2f} degrees and"
-        f" {fit.gain_db:.2f} dB off where it was measured, which takes {fit.cost_db:.2f} dB of"
-        " what a matched beam guarantees"
+        f"{out}: {array.size} channels; largest error in the measured directions"
+        f" {fit.phase_deg:.2f} degrees and {fit.gain_db:.2f} dB, which reduces the guaranteed gain"
+        f" of a matched beam by {fit.cost_db:.2f} dB"
     )

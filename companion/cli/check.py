@@ -1,4 +1,4 @@
-"""The command ``companion check``: is all in order here, and what would hold beams back."""
+"""The command ``companion check``: check the setup, and list what would prevent good beams."""
 
 import json
 import os
@@ -16,13 +16,13 @@ from companion.values import UserError
 @LINKS
 @CENTER
 @LISTEN
-@click.option("--record", metavar="DIR", help="Where recordings would go.")
+@click.option("--record", metavar="DIR", help="Directory for recordings.")
 @INSECURE
 @click.option(
     "--seconds",
     type=click.FloatRange(min=0, max=3600),
     default=10.0,
-    help="How long to listen; 0: not at all.",
+    help="Seconds to listen for traffic; 0: do not listen.",
 )
 @JSON
 def check(
@@ -36,10 +36,10 @@ def check(
     seconds: float,
     as_json: bool,
 ) -> None:
-    """Is all in order here for `companion run` with the same options, and what would hold it back?
+    """Check whether `companion run` would work here with the same options.
 
-    Looks at settings, ports, devices, disk and clock, then listens. Status 1 where a fault would
-    stop a run, or leave it without beams.
+    Checks settings, ports, devices, disk and clock, then listens for traffic. Exit status 1 if a
+    fault would stop a run or leave it without beams.
 
     Example: companion check --config settings.toml
     """
@@ -67,4 +67,4 @@ def check(
         click.echo(json.dumps({"findings": [asdict(finding) for finding in found]}))
     faults = sum(finding.grade == "fault" for finding in found)
     if faults:
-        raise UserError(f"{faults} of {len(found)} things are not as they must be")
+        raise UserError(f"{faults} of {len(found)} checks failed")

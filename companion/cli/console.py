@@ -1,4 +1,4 @@
-"""Shared by the commands: user mistakes as one line on stderr, and progress on a terminal."""
+"""Options that the commands share, one-line errors on stderr, and progress on a terminal."""
 
 import shutil
 import sys
@@ -13,12 +13,12 @@ import click
 from companion.cli.interrupts import interrupts_raised
 from companion.values import UserError, printable
 
-CONFIG = click.option("--config", type=click.Path(path_type=Path), help="Settings: a TOML file.")
+CONFIG = click.option("--config", type=click.Path(path_type=Path), help="Settings file (TOML).")
 CENTER = click.option(
     "--center",
     metavar="SRC",
-    help="What carries the array: SYSID:COMPID, LAT,LON,ALT[,HEADING], home, or the vehicle whose"
-    " own log (.bin, .ulg, CSV) is named.",
+    help="Carrier of the array: SYSID:COMPID; LAT,LON,ALT[,HEADING]; home; or the onboard log"
+    " (.bin, .ulg, CSV) of the carrying vehicle.",
 )
 LOGS = click.argument(
     "logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path)
@@ -32,34 +32,33 @@ LINKS = click.option(
     "links",
     metavar="URL",
     multiple=True,
-    help="udpin|udpout|tcp|tcpin:HOST:PORT or serial:DEVICE:BAUD, zenoh:KEY; receivers: "
+    help="MAVLink: udpin|udpout|tcp|tcpin:HOST:PORT, serial:DEVICE:BAUD, zenoh:KEY; receivers: "
     "sbs|readsb|rid:HOST:PORT, readsb:http://HOST/PATH, rid|cot:udp:HOST:PORT, cot:tcp:HOST:PORT. "
-    "May be given several times.",
+    "May be repeated.",
 )
 LISTEN = click.option(
-    "--listen", metavar="HOST:PORT", help="Where HTTP is served [127.0.0.1:8080]."
+    "--listen", metavar="HOST:PORT", help="Address of the HTTP server [127.0.0.1:8080]."
 )
-INSECURE = click.option(
-    "--insecure", is_flag=True, help="Serve beyond this machine without a token."
-)
+INSECURE = click.option("--insecure", is_flag=True, help="Serve other machines without a token.")
 LATENCY = click.option(
     "--latency",
     "latency_s",
     metavar="S",
     type=click.FloatRange(0, 60),
     default=0.0,
-    help="Seconds from a sample to its arrival, for vehicles' own logs (.bin, .ulg, CSV), which"
-    " tell no arrivals; 0: as if received at once.",
+    help="Seconds between a sample and its arrival, for onboard logs (.bin, .ulg, CSV), which"
+    " contain no arrival times.",
 )
 
 
 def say(text: str, err: bool = False) -> None:
-    """Print lines in which there may be text of a file or of the network."""
+    """Print text that may come from a file or the network, with control characters escaped."""
     click.echo(printable(text), err=err)
 
 
 def tell_vehicles(logs: Sequence[Path]) -> None:
-    """Say on stderr whose own logs are among these, and how well their time is known."""
+    """Print on stderr, for each onboard log among ``logs``, its vehicle and the accuracy of its
+    time."""
     from companion.recording.reader import vehicles
 
     for one in vehicles(logs):
@@ -67,36 +66,36 @@ def tell_vehicles(logs: Sequence[Path]) -> None:
 
 
 JSON_LINES = click.option(
-    "--json", "as_json", is_flag=True, help="One JSON object a second on stdout: how it goes."
+    "--json", "as_json", is_flag=True, help="Print the status as one JSON object per second."
 )
-JSON = click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
+JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
 
 
 def make_folder(out: Path) -> None:
-    """Make the folder that a command writes to, at once: a long one must not fail at its end.
+    """Create the output folder before the work, so that a long command does not fail at its end.
 
-    Where nothing was written by the command's end, it goes again.
+    Folders that were created and are still empty when the command ends are removed.
     """
     made = [each for each in (out, *out.parents) if not each.exists()]
     out.mkdir(parents=True, exist_ok=True)
 
     def tidy() -> None:
         for each in made:
-            with suppress(OSError):  # it is not empty
+            with suppress(OSError):  # the folder is not empty
                 each.rmdir()
 
     click.get_current_context().call_on_close(tidy)
 
 
-class InterruptedByUser(Exception):  # noqa: N818 - it is no error
-    """Ctrl-C during a command, with what the user can do now."""
+class InterruptedByUser(Exception):  # noqa: N818 - not an error
+    """Ctrl-C during a command; its text is the user's next step."""
 
 
 class OneLineErrors(click.Group):
-    """A group whose user mistakes are one line on stderr, without the usage text.
+    """Group that prints a user's mistake as one line on stderr, without the usage text.
 
     A user's mistake is a ``UserError``, or an ``OSError`` about a file, a port or a disk.
-    Everything else is a defect, and ends with its traceback.
+    Any other exception is a defect and ends with its traceback.
     """
 
     def main(
@@ -133,7 +132,7 @@ class OneLineErrors(click.Group):
             self._end(f"{where}{error.strerror or error}", 1)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command; an interrupt is caught before Click, which would print an empty line."""
+        """Run the command; catch interrupts before Click, which would print an empty line."""
         try:
             with interrupts_raised():
                 return super().invoke(ctx)
@@ -146,7 +145,7 @@ class OneLineErrors(click.Group):
 
 
 class Progress:
-    """One line on stderr that is overwritten; nothing where stderr is not a terminal."""
+    """One line on stderr that is overwritten; prints nothing if stderr is not a terminal."""
 
     def __init__(self) -> None:
         self._on = sys.stderr.isatty()
@@ -154,7 +153,7 @@ class Progress:
     def show(self, text: str) -> None:
         """Replace the line."""
         if self._on:
-            width = shutil.get_terminal_size().columns - 1  # what wraps could not be overwritten
+            width = shutil.get_terminal_size().columns - 1  # a wrapped line cannot be overwritten
             click.echo(f"\r\033[K{printable(text)[:width]}", nl=False, err=True)
 
     def clear(self) -> None:
@@ -163,9 +162,9 @@ class Progress:
 
 
 def of_log(progress: Progress, ends_s: float | None) -> Callable[[int, float, float], None]:
-    """Shows how far a log has been read; ``ends_s`` is its length, None where it is not known.
+    """Return a callback that shows the progress through a log of length ``ends_s`` (None: unknown).
 
-    What is returned takes frames, seconds of log, and seconds since it began.
+    Its arguments are frames, seconds of log, and wall-clock seconds since the start.
     """
 
     def show(frames: int, at_s: float, wall_s: float) -> None:

@@ -1,4 +1,4 @@
-"""The command ``companion design``: observer gains, their certificate, tables."""
+"""The command ``companion design``: observer gains, certificates and gain tables."""
 
 import json
 from pathlib import Path
@@ -9,7 +9,7 @@ from companion.cli.console import JSON
 
 
 def numbers(text: str) -> list[float]:
-    """The numbers of an option, commas between them."""
+    """Parse an option's numbers, separated by commas."""
     try:
         return [float(part) for part in text.split(",")]
     except ValueError as error:
@@ -22,7 +22,7 @@ def _alpha(text: str) -> float | None:
     try:
         return float(text)
     except ValueError as error:
-        raise click.BadParameter(f"alpha is 'auto' or a number, not {text!r}") from error
+        raise click.BadParameter(f"alpha {text!r} is neither 'auto' nor a number") from error
 
 
 @click.command()
@@ -37,49 +37,49 @@ def _alpha(text: str) -> float | None:
     "--alpha",
     metavar="A|auto",
     default="auto",
-    help="Position model: decay of the certificate per report, between 0 and 1, or auto.",
+    help="Position model: decay of the certificate per report, 0 < A < 1, or auto.",
 )
 @click.option(
     "--feedthrough",
     type=float,
     default=0.0,
-    help="Position model: seconds by which a report leads the position.",
+    help="Position model: direct effect of the velocity on a report, in seconds.",
 )
 @click.option(
-    "--mu-max", type=click.FloatRange(min=0), help="The largest mu to accept; kinematic: in m^2."
+    "--mu-max", type=click.FloatRange(min=0), help="Largest accepted mu; kinematic model: in m^2."
 )
 @click.option(
     "--method",
     type=click.Choice(["closed-form", "lmi"]),
-    help="The kinematic model has only the LMI.  [default: closed-form if there is one]",
+    help="The kinematic model supports only lmi.  [default: closed-form for the position model]",
 )
 @click.option(
-    "--acceleration", type=float, default=5.0, help="Kinematic: the largest acceleration, m/s^2."
+    "--acceleration", type=float, default=5.0, help="Kinematic model: largest acceleration, m/s^2."
 )
 @click.option(
     "--position-noise",
     type=float,
     default=0.5,
-    help="Kinematic: the largest error of a reported position, m.",
+    help="Kinematic model: largest error of a reported position, m.",
 )
 @click.option(
     "--velocity-noise",
     type=float,
     default=0.2,
-    help="Kinematic: the largest error of a reported velocity, m/s.",
+    help="Kinematic model: largest error of a reported velocity, m/s.",
 )
-@click.option("--no-velocity", is_flag=True, help="Kinematic: velocity is not reported.")
+@click.option("--no-velocity", is_flag=True, help="Kinematic model: reports have no velocity.")
 @click.option(
     "--dt-range",
     metavar="LOW,HIGH",
     default="0.05,2",
     callback=lambda _context, _option, text: numbers(text),
-    help="With --out: the intervals that one table of gains must serve.",
+    help="With --out: shortest and longest interval that the gain table covers, s.",
 )
 @click.option(
     "--out",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Kinematic: write a table of gains with its proof, for [observer] design.",
+    help="Kinematic model: gain table with its certificate to write, for [observer] design.",
 )
 @JSON
 def design(
@@ -98,17 +98,17 @@ def design(
     out: Path | None,
     as_json: bool,
 ) -> None:
-    """Observer gains, their certificate, and the largest feasible interval between reports.
+    """Compute observer gains, their certificates, and the largest feasible report interval.
 
     Example: companion design --dt 0.15,0.5 --alpha 0.5 --feedthrough 0.5 --mu-max 0.05
     """
     from companion.tracking.design import answers
 
     if not dt and out is None:
-        raise click.UsageError("say --dt, or --out for a table of gains")
+        raise click.UsageError("give --dt, or --out for a gain table")
     if model == "position":
         if out is not None:
-            raise click.UsageError("--out writes tables of the kinematic model only")
+            raise click.UsageError("--out works only with --model kinematic")
         way = method or "closed-form"
         rows = [
             answers.row(
@@ -123,16 +123,18 @@ def design(
         ]
     else:
         if method == "closed-form" or feedthrough:
-            raise click.UsageError("the kinematic model: no closed form, no feedthrough")
+            raise click.UsageError(
+                "--model kinematic supports neither closed-form nor --feedthrough"
+            )
         motion = answers.KinematicLimits(
             acceleration, position_noise, None if no_velocity else velocity_noise
         )
         rows = answers.kinematic_rows(dt, motion, _alpha(alpha), mu_max)
         if out is not None:
             if alpha != "auto":
-                raise click.UsageError("--out searches alpha itself; --alpha is for --dt")
-            if not out.parent.is_dir():  # said before the long work, not after it
-                raise click.UsageError(f"{out}: there is no such directory")
+                raise click.UsageError("--out searches alpha itself; leave out --alpha")
+            if not out.parent.is_dir():  # reported before the long work, not after it
+                raise click.UsageError(f"{out}: directory {out.parent} does not exist; create it")
             designed = answers.table(dt_range, motion)
             out.write_text(designed.to_json(), encoding="utf-8")
             click.echo(f"wrote {out}: {answers.described(designed)}", err=True)

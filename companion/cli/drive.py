@@ -1,4 +1,4 @@
-"""The command ``companion drive``: beams of a running service applied to a device."""
+"""The command ``companion drive``: apply the beams of a running service to a device."""
 
 import json
 import os
@@ -23,15 +23,20 @@ if TYPE_CHECKING:
     "--service",
     metavar="URL",
     default="http://127.0.0.1:8080",
-    help="Whose beams: the service's address. COMPANION_TOKEN is its bearer token.",
+    help="Address of the service. COMPANION_TOKEN in the environment is its bearer token.",
 )
 @CONFIG
-@click.option("--uav", "uavs", multiple=True, help="Whom to follow, in descending order [anybody].")
+@click.option(
+    "--uav",
+    "uavs",
+    multiple=True,
+    help="UAV to follow; may be repeated, highest priority first [any UAV].",
+)
 @click.option(
     "--aim",
     type=click.Choice(["first", "centre"]),
     default="first",
-    help="centre: a mount looks at the middle of all of them that have a beam.",
+    help="A mount points at the first UAV with a beam, or at the centre of all that have one.",
 )
 @click.option(
     "--rate",
@@ -44,11 +49,11 @@ if TYPE_CHECKING:
     "--on-stale",
     type=click.Choice(["hold", "boresight", "mute"]),
     default="hold",
-    help="What the device does without beams, and at the end.",
+    help="State of the device without beams, and after the end.",
 )
-@click.option("--dry-run", is_flag=True, help="Print what would be sent, and send nothing.")
+@click.option("--dry-run", is_flag=True, help="Print the commands instead of sending them.")
 @SECONDS
-@click.option("--json", "as_json", is_flag=True, help="How it goes, one JSON object a second.")
+@click.option("--json", "as_json", is_flag=True, help="Print the status, one JSON object a second.")
 def drive(
     *,
     target: str,
@@ -65,9 +70,9 @@ def drive(
     """Apply the beams of a running service to a device.
 
     TARGET is rotctld:HOST:PORT, gimbal: or gimbal-roi:HOST:PORT:SYSID:COMPID, phaser:URI or
-    phaser-memory:URI (extra [phaser]) or adar1000:BUS.DEVICE[,...] (extra [spi]). Beams are asked
-    for as far ahead as the device takes to apply them. A Phaser's memory holds the [codebook] of
-    --config, which must be the service's own.
+    phaser-memory:URI (extra [phaser]) or adar1000:BUS.DEVICE[,...] (extra [spi]). Beams are
+    requested for the time at which the device will have applied them. phaser-memory stores the
+    [codebook] of --config, which must equal the service's.
 
     Example: companion drive rotctld:127.0.0.1:4533 --uav 1:1
     """
@@ -116,7 +121,7 @@ def drive(
     told = driven.status()
     click.echo(_text(told), err=as_json)
     if not told.applied:
-        raise UserError("nothing was applied: there were no beams, or the device took none")
+        raise UserError("nothing was applied: no beams, or the device rejected them all")
 
 
 def _text(told: "DriveStatus") -> str:

@@ -1,4 +1,4 @@
-"""The command ``companion export``: logs as tables for other programs."""
+"""The command ``companion export``: write logs as tables for other programs."""
 
 import gc
 import json
@@ -20,10 +20,11 @@ from companion.cli.console import (
     tell_vehicles,
 )
 from companion.cli.export_beams import beams
+from companion.cli.replay_text import center_text
 
 
 class _OrBeams(click.Command):
-    """The command on logs, which leaves to another what begins with the word ``beams``."""
+    """Command on logs that hands over to ``beams`` if its first argument is that word."""
 
     def make_context(
         self,
@@ -45,14 +46,14 @@ class _OrBeams(click.Command):
     "form",
     type=click.Choice(("csv", "parquet", "rerun")),
     default="csv",
-    help="parquet needs the extra [parquet]; rerun: tracks and beams in space, as an MCAP file.",
+    help="parquet needs the extra [parquet]; rerun: tracks and beams in 3D, as an MCAP file.",
 )
 @click.option(
     "--out",
     metavar="DIR",
     required=True,
     type=click.Path(path_type=Path, file_okay=False),
-    help="The folder for the tables.",
+    help="Folder for the tables.",
 )
 @CONFIG
 @CENTER
@@ -68,22 +69,22 @@ def export(
     latency_s: float,
     as_json: bool,
 ) -> None:
-    """Logs as tables, for pandas, DuckDB and other programs, by way of a replay.
+    """Replay logs and write tables for pandas, DuckDB and other programs.
 
-    A table each of reports, tracks, beams, updates, rejections and events: what is in their
-    columns is said in docs/export.md. Where a folder has export.json, it is whole. In place of
-    logs, the word beams exports a codebook: companion export beams --help.
+    Writes one table each of reports, tracks, beams, updates, rejections and events; docs/export.md
+    describes their columns. A complete export contains export.json. To export a codebook instead:
+    companion export beams --help.
 
     Example: companion export flight.tlog --center 5:1 --format csv --out tables
     """
     from companion.node import export as exporting
     from companion.node import replay as replaying
 
-    gc.set_threshold(200_000)  # millions of short-lived values, and no cycles among them
+    gc.set_threshold(200_000)  # millions of short-lived values without reference cycles
     progress = Progress()
     settings = replaying.settings_for(logs, config, center)
     if settings.center.source is None:
-        click.echo("no --center: the array stands where the first report was made", err=True)
+        click.echo("no --center: array placed at the position of the first report", err=True)
     tell_vehicles(logs)
     show = of_log(progress, replaying.length_s(logs))
     try:
@@ -98,7 +99,7 @@ def export(
     progress.clear()
     say(json.dumps(summary) if as_json else _text(summary))
     if summary["unaimed"]:
-        say(f"nothing was aimed at: {summary['unaimed']}", err=True)
+        say(f"no beam was computed: {summary['unaimed']}", err=True)
 
 
 def _text(summary: dict[str, Any]) -> str:
@@ -107,10 +108,10 @@ def _text(summary: dict[str, Any]) -> str:
     counts = zip(summary["rows"].values(), tables, strict=clouds is None)
     lines = [
         f"{summary['frames']} frames, {summary['duration_s']:.0f} s of log in"
-        f" {summary['wall_s']:.1f} s; center {summary['center']}",
+        f" {summary['wall_s']:.1f} s; center {center_text(summary['center'])}",
         *(f"  {rows:8} rows  {file}" for rows, file in counts),
         *(f"  missing: {line}" for line in summary["missing"]),
-        f"  whole, by {last}" if clouds is None else f"  {clouds:8} clouds of points  {last}",
+        f"  summary in {last}" if clouds is None else f"  {clouds:8} point clouds  {last}",
         f"digest {summary['digest']}",
     ]
     return "\n".join(lines)

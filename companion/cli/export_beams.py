@@ -1,4 +1,4 @@
-"""The command ``companion export beams``: a codebook for other programs."""
+"""The command ``companion export beams``: write a codebook for other programs."""
 
 from pathlib import Path
 
@@ -13,17 +13,17 @@ from companion.cli.console import CONFIG
     "form",
     type=click.Choice(("oai-dbt",)),
     default="oai-dbt",
-    help="oai-dbt: OpenAirInterface's digital beam table, CSV of ids and a weight for each port.",
+    help="oai-dbt: OpenAirInterface's digital beam table, a CSV of ids and port weights.",
 )
 @click.option(
-    "--out", type=click.Path(path_type=Path, dir_okay=False), help="The file to write [stdout]."
+    "--out", type=click.Path(path_type=Path, dir_okay=False), help="File to write [stdout]."
 )
 @CONFIG
 def beams(form: str, out: Path | None, config: Path | None) -> None:
-    """The stored beams of the settings, [codebook], for a base station that chooses among them.
+    """Write the [codebook] of the settings for a base station that selects among its beams.
 
-    Ports are the array's elements, or the channels of [hardware] calibration. Ids are those of the
-    API, which says for each UAV which of them to sweep (ssb_candidates).
+    Ports are the array's elements, or the channels of [hardware] calibration. Beam ids are those
+    of the API, whose ssb_candidates lists the beams to sweep for each UAV.
 
     Example: companion export beams --format oai-dbt --config panel.toml --out beams.csv
     """
@@ -37,7 +37,7 @@ def beams(form: str, out: Path | None, config: Path | None) -> None:
     array = assembly.array(settings)
     equipment = assembly.equipment(settings, array)
     if equipment.codebook is None:
-        raise UserError('there are no stored beams: [codebook] kind = "dft", or "file"')
+        raise UserError('[codebook]: no stored beams; set kind = "dft" or kind = "file"')
     text = write_oai_dbt(
         equipment.codebook, equipment.calibration or Calibration.ideal(range(array.size))
     )

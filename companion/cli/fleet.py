@@ -1,4 +1,4 @@
-"""The command ``companion fleet``, and replays of a fleet's recordings."""
+"""The command ``companion fleet``, and the replay of a fleet's recordings."""
 
 import json
 import math
@@ -17,12 +17,12 @@ from companion.values import UserError
 if TYPE_CHECKING:
     from companion.client import ServiceError
 
-EVERY_S: Final = 1.0  # time between two looks
+EVERY_S: Final = 1.0  # time between two requests
 
 
 @click.group()
 def fleet() -> None:
-    """Several nodes that share one sky.
+    """Commands for a fleet of nodes that serve the same UAVs.
 
     Example: companion fleet watch http://192.0.2.11:8080
     """
@@ -33,10 +33,10 @@ def fleet() -> None:
 @SECONDS
 @JSON_LINES
 def watch(url: str, seconds: float | None, as_json: bool) -> None:
-    """Who is there and who serves whom, as the node at URL sees it, once a second.
+    """Print the nodes and the UAVs that each serves, as seen by the node at URL, once a second.
 
-    Only the first look must succeed: a node that is restarted is waited for. The token is that of
-    the environment, COMPANION_TOKEN.
+    Only the first request must succeed; later ones are retried, as while a node restarts.
+    COMPANION_TOKEN in the environment is the bearer token.
 
     Example: companion fleet watch http://192.0.2.11:8080 --seconds 60
     """
@@ -60,23 +60,23 @@ def watch(url: str, seconds: float | None, as_json: bool) -> None:
 
 
 def _asked(answer: dict[str, Any], url: str) -> dict[str, Any]:
-    """The answer, if it is that of a fleet's node."""
+    """Return the answer if it comes from a node of a fleet; raise ``UserError`` otherwise."""
     if "node" not in answer:
-        raise UserError(f"{url} is no companion: its /v1/fleet has no node")
+        raise UserError(f"{url}: not a companion: no node in /v1/fleet; check the address")
     if answer["node"] is None:
-        raise UserError(f"{url} is part of no fleet: it has no [fleet] node")
+        raise UserError(f"{url}: node is not in a fleet; set its [fleet] node")
     return answer
 
 
 def _refused(url: str, error: "ServiceError") -> str:
     if error.status is None:
-        return error.title  # which names the URL
+        return error.title  # contains the URL
     hint = " (COMPANION_TOKEN)" if error.status == HTTPStatus.UNAUTHORIZED else ""
     return f"{url}: {error}{hint}"
 
 
 def _text(answer: dict[str, Any]) -> str:
-    """A line for each node, those for UAVs that need a look, and one for the traffic."""
+    """Return lines for nodes, for UAVs that need attention, and for the traffic."""
     lines = [f"{answer['valid_at']}  fleet {answer['site']}, seen from {answer['node']}"]
     width = max(len(node["node"]) for node in answer["nodes"])
     for node in answer["nodes"]:
@@ -91,31 +91,31 @@ def _text(answer: dict[str, Any]) -> str:
             f" {_or_dash(node['most'])}: {names or '-'}{_clock(node)}{way}"
         )
         if node["reason"] is not None:
-            lines.append(f"    not believed: it {node['reason']}")
+            lines.append(f"    not trusted: it {node['reason']}")
     for uav in answer["uavs"]:
         lines += [f"  {uav['uav']} {said}" for said in _about(uav)]
     kbps = answer["sent_bps"] / 1e3, answer["heard_bps"] / 1e3
     damaged = f", {answer['damaged']} damaged" if answer["damaged"] else ""
     return "\n".join(
-        [*lines, f"  tells {kbps[0]:.0f} kbit/s, is told {kbps[1]:.0f} kbit/s{damaged}"]
+        [*lines, f"  sent {kbps[0]:.0f} kbit/s, received {kbps[1]:.0f} kbit/s{damaged}"]
     )
 
 
 def _about(uav: dict[str, Any]) -> list[str]:
-    """What is to be looked at of a UAV; nothing where one node serves it and keeps it."""
+    """Return what needs attention for a UAV; empty if one node serves it and keeps it."""
     by, to = uav["served_by"], uav["handing_to"]
     said = []
     if len(by) != 1:
-        said.append(f"is served by {' and '.join(by) or 'nobody'}")
+        said.append(f"is served by {' and '.join(by) or 'no node'}")
     if to is not None and to not in by:
-        said.append(f"is to be taken over by {to}")
+        said.append(f"is being handed over to {to}")
     if uav["unconfirmed"]:
-        said.append("is heard by one node alone, where others ought to hear it")
+        said.append("is received by one node only, though others should receive it")
     return said
 
 
 def _clock(node: dict[str, Any]) -> str:
-    """The middle of what is possible, and how far it may be off to either side."""
+    """Return the midpoint of the clock offset interval, and half its width."""
     if node["clock_offset_s"] is None:
         return ""
     offset_s, half_s = node["clock_offset_s"], node["clock_doubt_s"] / 2
@@ -130,9 +130,9 @@ def _or_dash(value: int | None) -> str:
 
 
 def replay(logs: Sequence[Path], as_json: bool) -> None:
-    """Replay the recordings of a fleet's nodes, and say how that went.
+    """Replay the recordings of a fleet's nodes and print the result.
 
-    Raises ``UserError`` where one does not come to its digest.
+    Raises ``UserError`` if a replay does not reproduce its recorded digest.
     """
     from companion.node.fleet import replaying
 
@@ -142,13 +142,17 @@ def replay(logs: Sequence[Path], as_json: bool) -> None:
     say(json.dumps(found) if as_json else _replayed(found))
     other = [node["logs"][0] for node in found["nodes"] if node["same"] is False]
     if other:
-        raise UserError(f"{other[0]}: the replay does not come to the digest of the run")
+        raise UserError(f"{other[0]}: replay does not reproduce the recorded digest")
 
 
 def _replayed(found: dict[str, Any]) -> str:
-    said = {True: "as recorded", False: "not as recorded", None: "none was recorded: cut short"}
+    said = {
+        True: "as recorded",
+        False: "not as recorded",
+        None: "none recorded (recording incomplete)",
+    }
     lines = [
-        f"{node['node']:12} {node['frames']:8} frames, {node['told_by_others']} by others;"
+        f"{node['node']:12} {node['frames']:8} frames, {node['told_by_others']} from other nodes;"
         f" digest {node['digest'][:16]}: {said[node['same']]}"
         for node in found["nodes"]
     ]
@@ -156,7 +160,7 @@ def _replayed(found: dict[str, Any]) -> str:
     if served["once"] is not None:
         shares = ", ".join(f"{name} {100 * share:.2f} %" for name, share in served.items())
         lines.append(
-            f"{found['uavs']} UAVs over {found['seconds']:.0f} s that all recorded:"
+            f"{found['uavs']} UAVs over the {found['seconds']:.0f} s that all nodes recorded:"
             f" served {shares}; {found['handovers']} handovers"
         )
     return "\n".join(lines)

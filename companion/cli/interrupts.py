@@ -1,4 +1,4 @@
-"""What Ctrl-C does to a command: while it loads, while it runs, and once it has ended."""
+"""Handling of Ctrl-C: while a command loads, while it runs, and after it has ended."""
 
 import os
 import signal
@@ -7,16 +7,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-IMPORTED_BY_S = 0.02  # how soon an interrupt that met an import asks again
+IMPORTED_BY_S = 0.02  # delay before an interrupt that met an import is tried again
 
 
 @contextmanager
 def interrupts_end(name: str) -> Iterator[None]:
     """Context in which Ctrl-C ends the process at once, with one line under this name.
 
-    An exception raised by the signal would surface in the middle of some package's import, and come
-    out as whatever that package makes of it. While nothing is open yet, the process simply ends.
-    After the context all is said: Ctrl-C ends what is left of the interpreter without a word.
+    An exception raised by the signal could surface inside a package's import, which may turn it
+    into another error. Nothing is open yet, so the process can simply end. After the context,
+    Ctrl-C has its default action: it ends the interpreter silently.
     """
 
     def end(_number: int, _frame: object) -> None:
@@ -32,20 +32,20 @@ def interrupts_end(name: str) -> Iterator[None]:
 
 @contextmanager
 def interrupts_raised() -> Iterator[None]:
-    """Context in which Ctrl-C raises ``KeyboardInterrupt``; outside of imports, which end first.
+    """Context in which Ctrl-C raises ``KeyboardInterrupt``, delayed until running imports end.
 
-    Commands load what they need when they run. Raised in an import, it would come out as whatever
-    the package makes of it: another error, or none.
+    Commands import modules while they run. A package may turn an exception raised during its import
+    into another error, or suppress it.
     """
     if threading.current_thread() is not threading.main_thread():
-        yield  # signals are not its own
+        yield  # only the main thread may set signal handlers
         return
     before = signal.signal(signal.SIGINT, _interrupt)
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
-        signal.setitimer(signal.ITIMER_REAL, 0.0)  # the command ended first
+        signal.setitimer(signal.ITIMER_REAL, 0.0)  # the command ended before the retry
 
 
 def _interrupt(_number: int, at: FrameType | None) -> None:
@@ -57,7 +57,7 @@ def _interrupt(_number: int, at: FrameType | None) -> None:
 
 
 def _imports(at: FrameType | None) -> bool:
-    """Whether this frame, or one that called it, is the machinery of imports."""
+    """Return whether this frame or one of its callers belongs to the import machinery."""
     while at is not None:
         if at.f_code.co_filename.startswith("<frozen importlib"):
             return True

@@ -1,4 +1,4 @@
-"""The command that trains the network for ``companion study prediction --learned``."""
+"""The command ``companion study train``: train the network for ``study prediction --learned``."""
 
 import json
 from pathlib import Path
@@ -17,7 +17,7 @@ from companion.cli.console import JSON, SEED, Progress
 @click.option("--flights", type=click.IntRange(min=1), default=240)
 @JSON
 def train(out: Path, seed: int, epochs: int, flights: int, as_json: bool) -> None:
-    """Train the LSTM predictor on flights made up at random. Needs PyTorch: the extra [learned].
+    """Train the LSTM predictor on random synthetic flights. Needs PyTorch: the extra [learned].
 
     The same seed gives the same network on the same machine.
 

@@ -2,7 +2,7 @@
 
 import os
 
-# Before numpy is loaded: the matrices are small, and more BLAS threads make them slower.
+# Set before numpy loads: for small matrices, several BLAS threads are slower than one.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import gc
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 @click.group(name="companion", cls=OneLineErrors, context_settings={"show_default": True})
 @click.version_option(companion.__version__)
 def main() -> None:
-    """Predicts where UAVs are from MAVLink, and computes the beams that follow them.
+    """Predict the positions of UAVs from MAVLink, and compute beams that follow them.
 
     Example: companion demo
     """
@@ -69,10 +69,11 @@ def main() -> None:
     "--foxglove",
     metavar="PORT",
     type=click.IntRange(0, 65535),
-    help="Live channels for Foxglove and Lichtblick, on this machine. Needs the extra [live].",
+    help="Port of live channels for Foxglove and Lichtblick, on this machine only. Needs the extra"
+    " [live].",
 )
 @INSECURE
-@click.option("--silent", is_flag=True, help="Send nothing over links, whatever the settings say.")
+@click.option("--silent", is_flag=True, help="Send nothing over links; overrides the settings.")
 @JSON_LINES
 def run(
     *,
@@ -86,9 +87,10 @@ def run(
     silent: bool,
     as_json: bool,
 ) -> None:
-    """The live service. COMPANION_TOKEN in the environment sets a bearer token for HTTP.
+    """Run the live service.
 
-    It sends nothing to anybody unless [presence] or [out] in the settings says so.
+    COMPANION_TOKEN in the environment sets the bearer token for HTTP. Nothing is sent over links
+    unless [presence] or [out] in the settings enables it.
 
     Example: companion run --link udpin:0.0.0.0:14550 --center 5:1 --record recordings
     """
@@ -120,7 +122,7 @@ def _voice(as_json: bool) -> "Console":
 @click.option("--open", "open_page", is_flag=True, help="Open the page in a browser.")
 @JSON_LINES
 def demo(seconds: float | None, port: int, open_page: bool, as_json: bool) -> None:
-    """Everything on this machine: four UAVs, the service, the page; recorded to recordings/.
+    """Run the service and its page with four simulated UAVs; record to recordings/.
 
     Example: companion demo --seconds 60
     """
@@ -148,17 +150,17 @@ def demo(seconds: float | None, port: int, open_page: bool, as_json: bool) -> No
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
-    help="The recording to write [recordings/, named after the log].",
+    help="Recording to write [recordings/, named after the log].",
 )
 @click.option("--no-record", is_flag=True, help="Write no recording.")
 @click.option(
-    "--speed", metavar="max|X", help="Pace, in times of the log's own [max; 1 if served]."
+    "--speed", metavar="max|X", help="Speed relative to the log's own [max; 1 with --serve]."
 )
 @LATENCY
 @click.option(
-    "--fleet", is_flag=True, help="The logs are recordings of a fleet's nodes, one of each."
+    "--fleet", is_flag=True, help="The logs are recordings of a fleet, one from each node."
 )
-@click.option("--serve", is_flag=True, help="The page and the API over it, until stopped.")
+@click.option("--serve", is_flag=True, help="Serve the page and the API until interrupted.")
 @LISTEN
 @INSECURE
 @JSON
@@ -177,37 +179,40 @@ def replay(
     insecure: bool,
     as_json: bool,
 ) -> None:
-    """Logs through the same pipeline as the live service.
+    """Replay logs through the same pipeline as the live service.
 
-    Told by content: .tlog, raw MAVLink, captures, .mcap, and what vehicles wrote of themselves:
-    ArduPilot's DataFlash (.bin), PX4's ULog (.ulg), a table (CSV). Several are one flight.
+    Formats, detected by content: .tlog, raw MAVLink, packet captures, .mcap recordings, and
+    onboard logs: ArduPilot's DataFlash (.bin), PX4's ULog (.ulg), a table (CSV). Several logs
+    must be of one flight.
 
-    Without --center (or settings) the array stands where the first report was made. A recording
-    of our own is replayed with the settings that it holds. With --serve, the page shows the
-    replay as it goes, and its end, until SIGINT.
+    Without --center or [center] the array is placed at the position of the first report. A
+    recording of companion is replayed with the settings stored in it. With --serve, the page
+    shows the replay while it runs, and its end, until SIGINT.
 
     Example: companion replay flight.tlog --center 5:1 --json
 
     Example: companion replay uav.bin carrier.bin --center carrier.bin
 
-    With --fleet each node's recording is replayed with its own settings and held against its own
-    digest; no recording is written.
+    With --fleet each node's recording is replayed with its own settings and compared with its
+    own digest; no recording is written.
     """
     from companion.node import replay as replaying
 
     if not serve and (listen or insecure):
-        raise click.UsageError("--listen and --insecure go with --serve")
+        raise click.UsageError("--listen and --insecure need --serve")
     if fleet:
         if config or center or out or speed or serve:
-            raise click.UsageError("--fleet takes recordings as they are: no settings, no --serve")
+            raise click.UsageError(
+                "--fleet excludes --config, --center, --out, --speed and --serve; leave them out"
+            )
         replay_fleet(logs, as_json)
         return
     pace = _speed(speed or ("1" if serve else "max"))
-    gc.set_threshold(200_000)  # millions of short-lived values, and no cycles among them
+    gc.set_threshold(200_000)  # millions of short-lived values without reference cycles
     progress = Progress()
     settings, origins = replaying.layers_for(logs, config, center)
     if settings.center.source is None:
-        click.echo("no --center: the array stands where the first report was made", err=True)
+        click.echo("no --center: array placed at the position of the first report", err=True)
     tell_vehicles(logs)
     begun: list[Writer] = []
 
@@ -217,7 +222,7 @@ def replay(
 
     recorder = None if no_record else record
     if serve:
-        from companion.node import served_replay  # it loads what HTTP takes
+        from companion.node import served_replay  # imports the HTTP server
         from companion.settings.files import load
 
         own = load(config).override(server={"listen": listen})
@@ -247,14 +252,14 @@ def replay(
     progress.clear()
     _show_replay(as_json, summary)
     if summary["unaimed"]:
-        raise UserError(f"nothing was aimed at: {summary['unaimed']}")
+        raise UserError(f"no beam was computed: {summary['unaimed']}")
 
 
 def _left_behind(begun: "list[Writer]") -> str:
-    """What Ctrl-C leaves of a recording, and how to make it whole; empty without one."""
+    """Return how to complete the recording that Ctrl-C interrupted; empty if none was begun."""
     for writer in begun:
         writer.abandon()
-        return f"interrupted; to use what was recorded so far: companion recover {writer.path}"
+        return f"interrupted; to complete the partial recording: companion recover {writer.path}"
     return ""
 
 
@@ -270,7 +275,7 @@ def _speed(text: str) -> float | None:
     except ValueError:
         factor = 0.0
     if not 0 < factor < float("inf"):
-        raise click.BadParameter(f"{text!r} is neither max nor a number above 0")
+        raise click.BadParameter(f"{text!r} is neither max nor a positive number")
     return factor
 
 

@@ -1,4 +1,4 @@
-"""The command ``companion recover``: a recording cut short becomes a finished one."""
+"""The command ``companion recover``: complete a recording that was cut short."""
 
 import json
 from pathlib import Path
@@ -14,7 +14,7 @@ from companion.cli.console import JSON
 )
 @JSON
 def recover(files: tuple[Path, ...], as_json: bool) -> None:
-    """A recording cut short becomes a finished one; says what was lost.
+    """Complete recordings that were cut short, and print how much was lost.
 
     Example: companion recover recordings/companion-20260101T120000Z.mcap.active
     """
@@ -28,6 +28,6 @@ def recover(files: tuple[Path, ...], as_json: bool) -> None:
             "messages": dict(found.messages),
             "lost_bytes": found.lost_bytes,
         }
-        done = "recovered" if found.changed else "complete already"
+        done = "recovered" if found.changed else "already complete"
         text = f"{done}, {sum(found.messages.values())} messages, {found.lost_bytes} bytes lost"
         click.echo(json.dumps(answer) if as_json else f"{found.path}: {text}")

@@ -1,4 +1,4 @@
-"""What ``companion replay`` says at its end."""
+"""Text that ``companion replay`` prints at its end."""
 
 from typing import Any, Final
 
@@ -6,10 +6,10 @@ from companion.values import Reason, kind_of
 
 
 def text(summary: dict[str, Any]) -> str:
-    """The summary of a replay as lines of text."""
+    """Return the summary of a replay as lines of text."""
     lines = [
         f"{summary['frames']} frames, {summary['duration_s']:.0f} s of log in"
-        f" {summary['wall_s']:.1f} s; center {summary['center']}"
+        f" {summary['wall_s']:.1f} s; center {center_text(summary['center'])}"
     ]
     own = {uav: seen for uav, seen in summary["uavs"].items() if kind_of(uav).reports_itself}
     relayed = [seen["reports"] for uav, seen in summary["uavs"].items() if uav not in own]
@@ -24,7 +24,7 @@ def text(summary: dict[str, Any]) -> str:
     beams = summary["beams"]
     lines.append(
         f"{beams['updates']} beam updates, {beams['regularised']} regularised,"
-        f" condition number to {_number(beams['condition_number_max'])}"
+        f" condition number up to {_number(beams['condition_number_max'])}"
     )
     lines += [f"  not used: {n} {_REASONS[why].meaning}" for why, n in summary["rejected"].items()]
     lines += [f"  missing: {line}" for line in summary["missing"]]
@@ -34,6 +34,16 @@ def text(summary: dict[str, Any]) -> str:
 
 
 _REASONS: Final = {str(reason): reason for reason in Reason}
+CENTER_DECIMALS: Final = 7  # about 1 cm of latitude
+
+
+def center_text(center: str) -> str:
+    """Return a center as text, the numbers of a place with at most 7 decimals."""
+    try:
+        numbers = [float(part) for part in center.split(",")]
+    except ValueError:
+        return center  # a vehicle, or home
+    return ",".join(f"{round(number, CENTER_DECIMALS):.12g}" for number in numbers)
 
 
 def _number(value: float | None) -> str:

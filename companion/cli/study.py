@@ -1,4 +1,4 @@
-"""The command ``companion study``: the experiments, a command each."""
+"""The command ``companion study``: one subcommand per experiment."""
 
 import click
 
@@ -13,7 +13,7 @@ from companion.cli.study_prediction import prediction
 
 @click.group()
 def study() -> None:
-    """Experiments: figures and tables as one HTML page, and the numbers as JSON.
+    """Run an experiment; write figures and tables as an HTML page, and the numbers as JSON.
 
     Example: companion study prediction flight.tlog --center 5:1 --out report
     """

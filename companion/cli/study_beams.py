@@ -1,4 +1,4 @@
-"""The command ``companion study beams``: what an array would have been worth over a flight."""
+"""The command ``companion study beams``: evaluate the beams of an array over a flight."""
 
 from pathlib import Path
 
@@ -20,7 +20,8 @@ from companion.cli.study_output import Studied, study_output
     metavar="NAME,...",
     default="",
     show_default=False,
-    help="Compare the three widths and sharp rivals over clean, radio, hostile, noisy.",
+    help="Compare the three settings of beams.widen, and sharp beams by other predictors, over"
+    " these links: clean, radio, hostile, noisy.",
 )
 @study_output("beams")
 def beams(
@@ -32,12 +33,12 @@ def beams(
     links: str,
     progress: Progress,
 ) -> Studied:
-    """What an array would have done over a flight: gains, guarantees, what must be swept.
+    """Evaluate the beams of an array over a flight: gains, guarantees, beams to sweep.
 
-    The beams as the settings make them, and beside them the same not widened. Where the log has
-    the simulator's truth every guarantee is put to the test. Writes DIR/beams.json,
-    DIR/beams.html and the figures as PNG and SVG. A recording of our own is studied with the
-    settings that it holds. Logs that vehicles wrote themselves (.bin, .ulg, CSV) are one flight.
+    Compares the beams of the settings with the same beams without widening. If the log contains
+    the simulator's truth, every guarantee is tested against it. Writes DIR/beams.json,
+    DIR/beams.html and the figures as PNG and SVG. A recording of companion is studied with the
+    settings stored in it. Onboard logs (.bin, .ulg, CSV) must be of one flight.
 
     Example: companion study beams flight.tlog --center 5:1 --links clean,radio --out report
     """
@@ -58,7 +59,7 @@ def beams(
         links=over,
     )
     if any(each.center.source is None for each in settings):
-        click.echo("no --center: the array stands where the first report was made", err=True)
+        click.echo("no --center: array placed at the position of the first report", err=True)
     answer, found = study(setting, progress.show)
     return Studied(
         answer=answer,

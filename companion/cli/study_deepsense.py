@@ -1,4 +1,4 @@
-"""The command ``companion study deepsense``: beams as they were measured."""
+"""The command ``companion study deepsense``: predict measured beams from positions."""
 
 from pathlib import Path
 
@@ -13,10 +13,10 @@ from companion.cli.study_output import Studied, study_output
 @SEED
 @study_output("deepsense")
 def deepsense(where: Path, seed: int, progress: Progress) -> Studied:
-    """How well a position tells the best beam, on a scenario of DeepSense 6G.
+    """Predict the best beam from the position, on a scenario of DeepSense 6G.
 
-    On contiguous blocks, and on a random split beside it, which leaks. Writes DIR/deepsense.json,
-    DIR/deepsense.html and the figure as PNG and SVG. It takes minutes.
+    Splits the samples into contiguous blocks and, for comparison, at random, which leaks. Writes
+    DIR/deepsense.json, DIR/deepsense.html and the figure as PNG and SVG. Takes minutes.
 
     Example: companion study deepsense scenario23_pos_beam.csv --out report
     """

@@ -1,4 +1,4 @@
-"""The command ``companion study fleet``: many nodes and UAVs in virtual time."""
+"""The command ``companion study fleet``: simulate many nodes and UAVs in virtual time."""
 
 import time
 
@@ -15,12 +15,12 @@ def _span(_context: click.Context, _option: click.Parameter, text: str) -> tuple
     except ValueError as error:
         raise click.BadParameter(f"{text!r} is not FROM..TO, such as 3..100") from error
     if not 1 <= found[0] <= found[1] <= 62_500:
-        raise click.BadParameter(f"{text!r}: from 1 to 62500, the smaller first")
+        raise click.BadParameter(f"{text!r} is outside 1..62500, or the smaller is not first")
     return found
 
 
 def _steps(span: tuple[int, int], steps: int) -> list[int]:
-    """Numbers from the first to the last, each as many times the one before."""
+    """Return a geometric sequence of ``steps`` integers from the first to the last of ``span``."""
     first, last = span
     if steps == 1 or first == last:
         return [last] * steps
@@ -34,23 +34,23 @@ def _steps(span: tuple[int, int], steps: int) -> list[int]:
     "--steps",
     type=click.IntRange(1, 20),
     default=3,
-    help="Number of fleet sizes, from the first to the last.",
+    help="Number of fleet sizes between FROM and TO.",
 )
 @click.option(
     "--seconds", type=click.FloatRange(1, 3600), default=10.0,
-    help="Virtual time for which each size is watched.",
+    help="Simulated seconds for each fleet size.",
 )  # fmt: skip
 @click.option(
     "--spacing", type=click.FloatRange(10, 1e5), default=1500.0,
-    help="Metres between neighbouring nodes on a square grid; each hears 2500 m far.",
+    help="Metres between nodes on a square grid; each receives UAVs within 2500 m.",
 )  # fmt: skip
 @click.option(
     "--delay", type=click.FloatRange(0, 5), default=0.02,
-    help="Seconds from one node to another.",
+    help="Delay between two nodes, seconds.",
 )  # fmt: skip
 @click.option(
     "--loss", type=click.FloatRange(0, 0.9), default=0.02,
-    help="Share of messages between nodes that is lost.",
+    help="Fraction of the messages between nodes that is lost.",
 )  # fmt: skip
 @SEED
 @study_output("fleet")
@@ -66,11 +66,12 @@ def fleet(
     seed: int,
     progress: Progress,
 ) -> Studied:
-    """What a fleet of many nodes costs as it grows, and how it hands over.
+    """Simulate fleets of growing size: their traffic, processor time and handovers.
 
-    In one process and virtual time: traffic, processor time of a node, share of the time in which
-    every UAV has one node, what a death and a partition do. Writes DIR/fleet.json, DIR/fleet.html
-    and the figures as PNG and SVG.
+    Runs in one process and in virtual time. Measures the traffic, the processor time per node, the
+    fraction of time in which exactly one node serves each UAV, and the effects of a node failure
+    and of a network partition. Writes DIR/fleet.json, DIR/fleet.html and the figures as PNG and
+    SVG.
 
     Example: companion study fleet --nodes 3..30 --uavs 100..1000 --out report
     """

@@ -1,4 +1,4 @@
-"""The command ``companion study link``: the radio link bit by bit."""
+"""The command ``companion study link``: simulate the radio link bit by bit."""
 
 from pathlib import Path
 from typing import Any
@@ -29,36 +29,33 @@ def _range(
     metavar="FROM:TO:STEP",
     default="-2:30:1",
     callback=_range,
-    help="Of a data carrier, beam exactly on the UAV, dB.",
+    help="SNR of a data subcarrier with the beam exactly on the UAV, dB.",
 )
 @click.option(
-    "--instants", type=int, default=96, help="Number of instants of the flight that are simulated."
+    "--instants", type=int, default=96, help="Number of simulated instants of the flight."
 )
 @click.option(
-    "--blocks",
-    type=int,
-    default=16,
-    help="Number of blocks sent to each UAV at each instant and SNR.",
+    "--blocks", type=int, default=16, help="Number of blocks sent to each UAV per instant and SNR."
 )
 @click.option(
     "--estimation",
     type=click.Choice(["pilots", "ideal"]),
     default="pilots",
-    help="How receivers know their channel.",
+    help="Channel estimation at the receiver.",
 )
 @click.option("--interval", type=float, default=0.15, help="Seconds between reports.")
-@click.option("--latency", type=float, default=0.05, help="Seconds that a report is late.")
+@click.option("--latency", type=float, default=0.05, help="Latency of a report, seconds.")
 @click.option(
     "--rician-k",
     type=float,
     default=10.0,
-    help="Line of sight over all scattered rays, dB; inf: none scattered.",
+    help="Ratio of line of sight to scattered power, dB; inf: no scattering.",
 )
 @click.option(
     "--delay-spread",
     type=float,
     default=50.0,
-    help="Mean delay of the scattered rays, ns; 0: a flat channel.",
+    help="Mean delay of the scattered rays, ns; 0: flat channel.",
 )
 @SEED
 @study_output("link")
@@ -75,10 +72,10 @@ def link(
     progress: Progress,
     **asked: Any,
 ) -> Studied:
-    """Error rates and throughput of 16-QAM OFDM by perfect, predicted and held positions.
+    """Compute error rates and throughput of 16-QAM OFDM for true, predicted and held positions.
 
-    Four UAVs on the paper's circles, reporting each --interval seconds; or those of LOGs of
-    one flight that hold the simulator's truth, through the whole pipeline. Writes DIR/link.json,
+    Simulates four UAVs on the paper's circles that report every --interval seconds. With LOG,
+    replays logs of one flight, which must contain the simulator's truth. Writes DIR/link.json,
     DIR/link.html and the figures as PNG and SVG.
 
     Example: companion study link --out report
@@ -92,7 +89,7 @@ def link(
     from companion.studies.link.scenario import Reports
 
     if not logs and center is not None:
-        raise click.UsageError("--center is for a LOG: the paper's circles are about the array")
+        raise click.UsageError("--center needs a LOG: the paper's circles surround the array")
     setting = LinkStudy(
         logs=logs,
         center=center,

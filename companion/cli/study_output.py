@@ -1,4 +1,4 @@
-"""What every command of ``companion study`` does with its answer."""
+"""Output that all commands of ``companion study`` share."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -17,13 +17,13 @@ class Studied:
     """The outcome of a study."""
 
     answer: dict[str, Any]
-    report: Callable[[], Mapping[str, bytes]]  # its page and figures, by file name
-    text: Callable[[], str]  # what is printed without --json
-    at_end: Callable[[], None] = lambda: None  # called when all of it is written
+    report: Callable[[], Mapping[str, bytes]]  # page and figures, by file name
+    text: Callable[[], str]  # printed without --json
+    at_end: Callable[[], None] = lambda: None  # called after all files are written
 
 
 def study_output(name: str) -> Callable[[Callable[..., Studied]], Callable[..., None]]:
-    """Give a study's command --out and --json, and write what the study returns.
+    """Add --out and --json to a study's command, and write what the study returns.
 
     The study is called with ``progress``. The answer is written as JSON before the figures.
     """

@@ -10,7 +10,7 @@ from companion.cli.study_output import Studied, study_output
 @SEED
 @study_output("paper")
 def paper(seed: int, progress: Progress) -> Studied:
-    """The published experiments made again, and every claim judged.
+    """Repeat the published experiments, and test every claim of the paper.
 
     Writes DIR/paper.json, DIR/paper.html and the figures as PNG and SVG.
 
@@ -30,7 +30,7 @@ def paper(seed: int, progress: Progress) -> Studied:
 @click.command()
 @study_output("dt")
 def dt(progress: Progress) -> Studied:
-    """How often UAVs must report: feasible intervals and their bounds, as maps.
+    """Map the feasible report intervals and their error bounds.
 
     Writes DIR/dt.json, DIR/dt.html and the figures as PNG and SVG.
 

@@ -1,4 +1,4 @@
-"""The command ``companion study prediction``: predictors compared on logs."""
+"""The command ``companion study prediction``: compare predictors on logs."""
 
 import time
 from pathlib import Path
@@ -21,33 +21,40 @@ from companion.cli.study_output import Studied, study_output
     metavar="S[,S...]",
     default="0,0.1,0.3,1",
     callback=lambda _context, _option, text: tuple(numbers(text)),
-    help="Seconds ahead of now that are aimed at.",
+    help="Lead times of the predictions, seconds.",
 )
 @click.option(
     "--links",
     metavar="NAME[,NAME...]",
     default="clean,radio,hostile",
     callback=lambda _context, _option, text: tuple(word.strip() for word in text.split(",")),
-    help="The log's own link; a slow radio; one whose latency steps, ramps, wanders and holds all"
-    " back, regime by regime; and noisy: a report each 0.8 s, of a poor receiver.",
+    help="clean: the log's own link. radio: a slow radio. hostile: a latency that steps, ramps,"
+    " wanders and stalls. noisy: a report every 0.8 s from a poor receiver.",
 )
-@click.option("--rate", "rate_hz", metavar="HZ", type=float, default=1.2)
+@click.option(
+    "--rate",
+    "rate_hz",
+    metavar="HZ",
+    type=float,
+    default=1.2,
+    help="Reports per second over the simulated radio.",
+)
 @click.option(
     "--latency",
     "latency_s",
     metavar="MEDIAN,P95",
     default="0.6,2.2",
     callback=lambda _context, _option, text: numbers(text),
-    help="Seconds that the simulated radio adds to each report.",
+    help="Latency that the simulated radio adds, seconds.",
 )
 @click.option(
     "--loss",
     metavar="F",
     type=float,
     default=0.1,
-    help="Share of reports that the simulated radio loses, 0 to 1.",
+    help="Fraction of the reports that the simulated radio loses, 0 to 1.",
 )
-@click.option("--known-delay", is_flag=True, help="The senders' clocks are known, as by TIMESYNC.")
+@click.option("--known-delay", is_flag=True, help="Assume known sender clocks, as with TIMESYNC.")
 @SEED
 @click.option(
     "--snr",
@@ -55,15 +62,17 @@ from companion.cli.study_output import Studied, study_output
     metavar="DB",
     type=float,
     default=20.0,
-    help="At a UAV with the beam right on it: what the loss in spectral efficiency is of.",
+    help="SNR with the beam exactly on the UAV, dB: reference for losses of spectral efficiency.",
 )
 @click.option(
     "--learned",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Compare with this network as well, which `companion study train` made.",
+    help="Also compare with this network, trained by `companion study train`.",
 )
-@click.option("--jobs", metavar="N", type=click.IntRange(min=1), help="Processes.  [all cores]")
-@click.option("--cluster", metavar="ADDRESS", help="Work on a Dask cluster, such as tcp://H:8786.")
+@click.option(
+    "--jobs", metavar="N", type=click.IntRange(min=1), help="Number of processes.  [all cores]"
+)
+@click.option("--cluster", metavar="ADDRESS", help="Use a Dask cluster, such as tcp://H:8786.")
 @study_output("prediction")
 def prediction(
     *,
@@ -75,14 +84,14 @@ def prediction(
     progress: Progress,
     **asked: Any,
 ) -> Studied:
-    """Predictors compared on logs, over the link that they had, a slow radio and a hostile link.
+    """Compare predictors on logs, over the log's own link and over simulated links.
 
     Writes DIR/prediction.json, DIR/prediction.html and the figures as PNG and SVG. Without
-    --center the array stands where the first report was made. Windows of faults that are declared
-    in LOG.events.json do not count for the bounds.
+    --center the array is placed at the position of the first report. Intervals with faults
+    declared in LOG.events.json do not count for the bounds.
 
-    Exit status 3 means that a bound was broken, and the product had not said that one of its
-    assumptions about that UAV was refuted, neither before nor within the same second.
+    Exit status 3: a bound was violated, and no refuted assumption about that UAV was published
+    before or within the same second.
 
     Example: companion study prediction flight.tlog --center 5:1 --links clean,hostile --out report
     """
@@ -93,7 +102,7 @@ def prediction(
 
     began_s = time.monotonic()
     if len(latency_s) != 2:
-        raise click.BadParameter("a latency is MEDIAN,P95 in seconds, such as 0.6,2.2")
+        raise click.BadParameter("--latency needs MEDIAN,P95 in seconds, such as 0.6,2.2")
     radio = RadioLink(
         name="radio",
         rate_hz=rate_hz,
@@ -104,7 +113,7 @@ def prediction(
     name = str(config) if config else None
     setting = PredictionStudy(**asked, radio=radio, settings=load(config), config=name)
     if setting.center is None:
-        click.echo("no --center: the array stands where the first report was made", err=True)
+        click.echo("no --center: array placed at the position of the first report", err=True)
     answer, found = study(setting, progress.show)
 
     def at_end() -> None:

@@ -1,4 +1,4 @@
-"""How ``run`` and ``demo`` speak: lines, the last of them alive on a terminal; or JSON."""
+"""Output of ``run`` and ``demo``: notices and a status line on a terminal, or JSON."""
 
 import json
 
@@ -10,13 +10,13 @@ from companion.views import glance
 
 
 class Lines:
-    """What happened as lines on stderr, and under them, on a terminal alone, how it goes."""
+    """Notices as lines on stderr; on a terminal, a status line below them."""
 
     def __init__(self) -> None:
         self._progress = Progress()
 
     def say(self, text: str) -> None:
-        """Print a line above the one that is alive."""
+        """Print a line above the status line."""
         self._progress.clear()
         say(text, err=True)
 
@@ -26,12 +26,12 @@ class Lines:
         say(text)
 
     def show(self, service: Service) -> None:
-        """Renew the line that is alive."""
+        """Refresh the status line."""
         self._progress.show(glance.line(service))
 
 
 class JsonLines:
-    """An object a second on stdout: how it goes, and the events since the last. Words on stderr."""
+    """One object a second on stdout: the status, and the new events. Text lines go to stderr."""
 
     def __init__(self) -> None:
         self._seen_ns = 0

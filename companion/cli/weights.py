@@ -1,4 +1,4 @@
-"""The command ``companion weights``: the beams at a time of a log, for a notebook or a device."""
+"""The command ``companion weights``: weights at a time of a log, for a program or a device."""
 
 import json
 import math
@@ -17,23 +17,23 @@ from companion.values import WeightFormat
     "--at",
     metavar="T",
     required=True,
-    help="When: seconds from the beginning of the log, or 2026-01-01T12:00:00Z.",
+    help="Time: seconds from the start of the log, or 2026-01-01T12:00:00Z.",
 )
 @click.option(
     "--format",
     "form",
     type=click.Choice([str(form) for form in WeightFormat]),
     default="json",
-    help="json holds the beams as well; raw is little-endian complex64, row by row.",
+    help="json also contains the beams; raw is little-endian complex64 in row order.",
 )
 @click.option(
     "--lead-ms",
     type=click.FloatRange(0, 10_000),
     default=0.0,
-    help="Milliseconds ahead of T at which the beams are to be right.",
+    help="Milliseconds after T for which the beams are computed.",
 )
 @click.option(
-    "--out", type=click.Path(path_type=Path, dir_okay=False), help="The file to write [stdout]."
+    "--out", type=click.Path(path_type=Path, dir_okay=False), help="File to write [stdout]."
 )
 @CONFIG
 @CENTER
@@ -49,11 +49,11 @@ def weights(
     center: str | None,
     latency_s: float,
 ) -> None:
-    """The weights at a time of a log, as a program or a phased array takes them.
+    """Compute the weights at a time of a log, for a program or a phased array.
 
-    A codebook ([codebook] in the settings) adds to each beam in JSON which stored beam is best,
-    which is next and when, and which must be swept. A device that cannot do what is wanted refuses
-    with the reason; [hardware] in the settings names its calibration.
+    With [codebook] in the settings, each beam in JSON also gives the best stored beam, the next
+    one with its time, and those to sweep. [hardware] in the settings names the calibration of a
+    device. If the device cannot apply the weights, the command ends with the reason.
 
     Example: companion weights flight.tlog --at 120 --center 5:1 --format npy --out w.npy
     """
@@ -63,11 +63,11 @@ def weights(
     from companion.views import beam_state, weight_formats
 
     if math.isnan(lead_ms):
-        raise click.UsageError("--lead-ms nan: 0 to 10000 is allowed")
+        raise click.UsageError("--lead-ms nan: must be 0 to 10000")
     if form in ("npy", "raw") and out is None and sys.stdout.isatty():
-        raise click.UsageError(f"{form} is not text: name a file with --out, or use a pipe")
+        raise click.UsageError(f"--format {form} is binary: give --out FILE, or use a pipe")
     if out is not None and not out.parent.is_dir():
-        raise click.UsageError(f"--out {out}: there is no folder {out.parent}")
+        raise click.UsageError(f"--out {out}: folder {out.parent} does not exist; create it")
     progress = Progress()
     settings = settings_for(logs, config, center)
     tell_vehicles(logs)

@@ -91,15 +91,15 @@ def test_a_look_says_who_serves_whom_and_what_needs_a_look(service: Service) -> 
     ) in lines
     assert lines[3].endswith("of at most -: -  clock +3.000 ± 0.001 s")
     assert lines[4:] == [
-        "    not believed: it has a clock that contradicts itself",
+        "    not trusted: it has a clock that contradicts itself",
         "  west          gone, 61 s ago",
-        "  2:1 is to be taken over by north",
-        "  3:1 is served by nobody",
+        "  2:1 is being handed over to north",
+        "  3:1 is served by no node",
         "  4:1 is served by north and harbour-south",
     ]
     said = done.stdout
-    assert "  4:1 is heard by one node alone" in said
-    assert "  tells 14 kbit/s, is told 54 kbit/s" in said
+    assert "  4:1 is received by one node only" in said
+    assert "  sent 14 kbit/s, received 54 kbit/s" in said
     assert "1:1 is" not in said
 
 
@@ -113,8 +113,8 @@ def test_for_programs_a_line_is_the_answer(service: Service) -> None:
 @pytest.mark.parametrize(
     ("status", "body", "says"),
     [
-        (200, json.dumps(FLEET | {"node": None}), "is part of no fleet: it has no [fleet] node"),
-        (200, "{}", "is no companion: its /v1/fleet has no node"),
+        (200, json.dumps(FLEET | {"node": None}), ": node is not in a fleet; set its [fleet] node"),
+        (200, "{}", ": not a companion: no node in /v1/fleet; check the address"),
         (200, "[1]", "the answer is no JSON object"),
         (200, "<html>", "the answer is not JSON"),
         (404, "", "404: Not Found"),
@@ -162,5 +162,5 @@ def test_a_node_that_is_restarted_is_waited_for(
     assert done.stdout.count("seen from north") == 2
     assert done.stderr.splitlines() == [
         f"no answer: {service.url}: 503: Service Unavailable",
-        f"companion: {service.url} is part of no fleet: it has no [fleet] node",
+        f"companion: {service.url}: node is not in a fleet; set its [fleet] node",
     ]

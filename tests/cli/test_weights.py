@@ -178,11 +178,11 @@ def test_a_time_that_the_log_does_not_hold(cut_log: Path, at: str, said: str) ->
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--lead-ms", "nan"], "--lead-ms nan: 0 to 10000 is allowed"),
+        (["--lead-ms", "nan"], "--lead-ms nan: must be 0 to 10000"),
         (["--lead-ms", "10001"], "--lead-ms"),
         (["--format", "tmytek"], "tmytek drives 16 elements, the array has 64"),
         (["--format", "mat"], "'mat' is not one of"),
-        (["--out", "/nowhere/w.npy"], "there is no folder /nowhere"),
+        (["--out", "/nowhere/w.npy"], "folder /nowhere does not exist"),
         (["--config", "missing.toml"], "missing.toml: No such file"),
         (["--center", "99:1"], "no position from the carrier 99:1"),
     ],

@@ -42,7 +42,7 @@ PATHS = {
     "records": {"udp": ["192.0.2.1:1"], "shared_memory": "{}/written/ring"},
 }  # fmt: skip
 """What a recording may say that a replay has no business with."""
-SHORT = "companion: nothing was aimed at: the log is shorter than one update\n"
+SHORT = "companion: no beam was computed: the log is shorter than one update\n"
 
 
 def foreign(cut_log: Path, path: Path, sections: dict[str, Any]) -> Path:

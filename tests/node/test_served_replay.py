@@ -210,9 +210,9 @@ def test_a_live_service_is_no_replay(start_node: Any) -> None:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (("--listen", "127.0.0.1:0"), "go with --serve"),
+        (("--listen", "127.0.0.1:0"), "need --serve"),
         (("--serve", "--listen", "0.0.0.0:0"), "--insecure"),
-        (("--serve", "--speed", "0"), "'0' is neither max nor a number above 0"),
+        (("--serve", "--speed", "0"), "'0' is neither max nor a positive number"),
     ],
 )
 def test_a_mistake_is_one_line_and_leaves_nothing(

@@ -91,5 +91,5 @@ def test_the_command_writes_the_codebook_of_the_settings(tmp_path: Path) -> None
     nothing = run(main, ["export", "beams"])
     assert nothing.exit_code == 1
     assert nothing.stderr == (
-        'companion: there are no stored beams: [codebook] kind = "dft", or "file"\n'
+        'companion: [codebook]: no stored beams; set kind = "dft" or kind = "file"\n'
     )

@@ -667,7 +667,7 @@ def test_without_a_center_it_says_where_the_array_stands(tmp_path: Path) -> None
     done = run(shared_log("real_bluerobotics_server.tlog"), "--out", tmp_path)
     assert done.exit_code == 1
     said, line = done.stderr.splitlines()
-    assert "the array stands where the first report was made" in said
+    assert "array placed at the position of the first report" in said
     assert "no UAV gets a beam" in line
 
 

@@ -149,7 +149,7 @@ def test_a_log_goes_through_the_pipeline(tmp_path: Path) -> None:
         (("--blocks", 5000), "--blocks 5000: 1 to 1000"),
         (("--interval", 0), "--interval 0: seconds"),
         (("--latency", -1), "--latency -1: seconds"),
-        (("--center", "5:1"), "--center is for a LOG"),
+        (("--center", "5:1"), "--center needs a LOG"),
         (("nowhere.tlog",), "nowhere.tlog"),
     ],
 )

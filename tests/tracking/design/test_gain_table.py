@@ -385,18 +385,18 @@ def test_a_table_without_velocity_costs_little_more_than_its_longest_interval() 
 @pytest.mark.parametrize(
     ("arguments", "fault"),
     [
-        ([], "say --dt, or --out"),
+        ([], "give --dt, or --out"),
         (["--dt", "-1"], "positive number of seconds"),
         (["--dt", "0.1", "--acceleration", "0"], "positive numbers"),
         (["--dt", "0.1", "--velocity-noise", "nan"], "positive numbers"),
-        (["--dt", "0.1", "--method", "closed-form"], "no closed form"),
-        (["--dt", "0.1", "--feedthrough", "0.5"], "no feedthrough"),
+        (["--dt", "0.1", "--method", "closed-form"], "supports neither closed-form"),
+        (["--dt", "0.1", "--feedthrough", "0.5"], "nor --feedthrough"),
         (["--dt", "0.1", "--alpha", "1"], "alpha lies strictly between 0 and 1"),
         (["--dt-range", "2,1", "--out", "x"], "LOW,HIGH: positive, ascending"),
         (["--dt-range", "2", "--out", "x"], "LOW,HIGH: positive, ascending"),
         (["--alpha", "0.5", "--out", "x"], "searches alpha itself"),
         (["--dt", "0.1", "--out", "/nowhere/x", "--dt-range", "0.1,0.2"], "/nowhere/x"),
-        (["--model", "position", "--out", "x"], "kinematic model only"),
+        (["--model", "position", "--out", "x"], "only with --model kinematic"),
     ],
 )
 def test_a_mistake_is_one_line(arguments: list[str], fault: str) -> None:

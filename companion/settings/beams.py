@@ -16,12 +16,12 @@ HiddenSector = tuple[Degrees, Degrees, Degrees, Degrees]
 
 def _rising(interval: Interval) -> Interval:
     if not interval[0] < interval[1]:
-        raise UserError("from and to, the first less than the second")
+        raise UserError("give [from, to] with from < to")
     return interval
 
 
 def _named_width(given: object) -> object:
-    """True and false as earlier settings had them: as wide as the bound, and sharp."""
+    """Convert the booleans of earlier settings: true is GUARANTEE, false is NO."""
     if isinstance(given, bool):
         return Widen.GUARANTEE if given else Widen.NO
     return given
@@ -29,37 +29,36 @@ def _named_width(given: object) -> object:
 
 def _once(names: tuple[str, ...]) -> tuple[str, ...]:
     if len(set(names)) < len(names):
-        raise UserError("each UAV once, in descending order")
+        raise UserError("a UAV is listed twice; list each UAV once, highest priority first")
     return names
 
 
 class ArraySettings(Section):
-    """The antenna array, and how it is mounted on its carrier.
+    """The antenna array, and its mounting on the carrier.
 
     ``kind`` is the geometry in the array frame (x boresight, y right, z down):
 
         ula        ``elements`` along y
         ura        ``rows`` down and ``columns`` to the right
         uca        ``elements`` on a circle in the xy plane
-        hexagonal  ``rings`` of hexagons about a middle element, in the yz plane
-        list       ``positions_m``: rows of x, y, z, or of x, y, z and the direction the element
-                   faces. ``positions`` names a file of such rows (CSV or .npy), which is read into
-                   ``positions_m``
+        hexagonal  ``rings`` of hexagons around a centre element, in the yz plane
+        list       ``positions_m``: rows of x, y, z, or of x, y, z and the direction that the
+                   element faces. ``positions`` names a file of such rows (CSV or .npy), which is
+                   read into ``positions_m``
 
-    ``spacing_m``, where given, takes the place of ``spacing_wavelengths``.
+    ``spacing_m``, if given, replaces ``spacing_wavelengths``.
 
-    The mount angles turn the body frame into the array frame: yaw, then pitch, then roll.
-    ``lever_arm_m`` is the array's place in the body frame (forward, right, down), measured from the
-    point whose position the carrier reports.
+    The mount angles rotate the body frame into the array frame: yaw, then pitch, then roll.
+    ``lever_arm_m`` is the position of the array in the body frame (forward, right, down), measured
+    from the point whose position the carrier reports.
 
-    ``field_of_view_deg`` is the full angle of a cone about boresight. The azimuth and elevation
-    limits are those of the hardware's steering, in the array frame. ``hidden_deg`` lists sectors
-    that the airframe hides, in the body frame: azimuth from and to (clockwise from the nose),
+    ``field_of_view_deg`` is the full angle of a cone around boresight. The azimuth and elevation
+    limits are the steering limits of the hardware, in the array frame. ``hidden_deg`` lists sectors
+    that the airframe blocks, in the body frame: azimuth from and to (clockwise from the nose),
     elevation from and to.
 
-    ``dead`` lists elements, from 0, that radiate nothing: weights are made without them.
-    ``coupling`` is a .npy file of the matrix C (M, M) by which elements carry C f when they are fed
-    with f.
+    ``dead`` lists elements, from 0, that do not radiate; weights are computed without them.
+    ``coupling`` is a .npy file of the matrix C (M, M): elements fed with f radiate C f.
     """
 
     kind: ArrayKind = ArrayKind.ULA
@@ -89,40 +88,43 @@ class ArraySettings(Section):
     def _listed(self) -> Self:
         listed = self.positions is not None or self.positions_m is not None
         if (self.kind is ArrayKind.LIST) != listed:
-            raise UserError('kind = "list" goes with positions or positions_m, and they with it')
+            raise UserError(
+                'kind = "list" needs positions or positions_m; other kinds need neither'
+            )
         if self.kind is ArrayKind.URA and self.rows * self.columns > 4096:
-            raise UserError("rows x columns is at most 4096")
+            raise UserError("too many elements: rows x columns must be at most 4096")
         return self
 
 
 class BeamSettings(Section):
-    """When weights are made, by which method, and what is done where that costs too much gain.
+    """When and how weights are computed, and what happens if that costs too much gain.
 
-        update_hz          how often weights are made unasked, for recordings and the dashboard; a
-                           request over HTTP is answered with weights made for its own time
-        actuation_delay_s  time from making weights to applying them
+        update_hz          rate at which weights are computed for recordings and the dashboard; for
+                           an HTTP request, weights are computed for the time that it asks for
+        actuation_delay_s  time from computing weights to applying them
         targets            which tracks get beams
-        most               UAVs that have beams at a time, those of ``priority`` first and then who
-                           was here first; others would cost all of them their rate and memory
-        method             zero forcing ("zf"), regularised ("rzf"), least mean square error by the
-                           link budget ("mmse") or maximum ratio ("mrt")
+        most               largest number of UAVs with beams: those of ``priority`` first, then
+                           those received first; more would slow down all beams and use more memory
+        method             zero forcing ("zf"), regularised ("rzf"), minimum mean square error by
+                           the link budget ("mmse") or maximum ratio ("mrt")
         regularisation     loading of the regularised method, times the number of elements
-        loss_limit_db      most that zero forcing may cost any UAV against a sharp beam for it alone
+        loss_limit_db      largest loss of any UAV by zero forcing, compared with a sharp beam for
+                           it alone
         condition_limit    largest condition number of the steering matrix
-        policy             what is done beyond either limit: load as little as will do, serve groups
-                           in time slots, or drop the UAVs of lowest priority
-        priority           UAVs in descending order; the others follow in the order first heard
-        widen              how wide beams are: "likely", for the error that is usual, over a floor
-                           within the pointing bound; "guarantee", for the bound: the greatest least
-                           gain within it; "no", sharp. Earlier settings' true is "guarantee", their
+        policy             what happens beyond either limit: load as little as possible, serve
+                           groups in time slots, or drop the UAVs of lowest priority
+        priority           UAVs in descending order; the others follow in the order received
+        widen              width of the beams: "likely", for the usual error, with a gain floor
+                           within the pointing bound; "guarantee", for the bound: the largest least
+                           gain within it; "no", sharp. Earlier settings' true means "guarantee",
                            false "no"
         floor_db           that floor, over an isotropic element, where it leaves 3 dB to the best;
-                           it is given up as it is further out of reach. Unset: 2.9 more than the
-                           link needs ([link] needed_db), of which nulls may take most
-        power              how beams share the power: "equal", "max-min" (the least SINR is the
-                           greatest), "weighted-sum" (of rates); unset: as the normalisation makes
-                           them. With it the normalisation is "total" unless it is "antenna"
-        rate_weights       worth of a UAV's rate for "weighted-sum", by its name; 1 for the others
+                           it is relaxed as it gets further out of reach. Unset: 2.9 dB more than
+                           the link needs ([link] needed_db), most of which nulls may cost
+        power              how beams share the power: "equal", "max-min" (largest minimum SINR),
+                           "weighted-sum" (of rates); unset: as the normalisation scales them. If
+                           set, the default of ``normalisation`` is "total"
+        rate_weights       weight of a UAV's rate for "weighted-sum", by UAV id; 1 for the others
 
     ``condition_limit`` is at most 1000: up to there the zero-forcing identity holds to 1e-9, and
     its error grows with the square of the condition number.
@@ -147,7 +149,7 @@ class BeamSettings(Section):
     @model_validator(mode="before")
     @classmethod
     def _together(cls, given: Any) -> Any:
-        """Shares of power are seen in columns that are scaled together only."""
+        """Default to "total" if power is shared: only jointly scaled columns show the shares."""
         if isinstance(given, dict) and given.get("power") is not None:
             return {"normalisation": Normalisation.TOTAL} | given
         return given
@@ -155,12 +157,12 @@ class BeamSettings(Section):
     @model_validator(mode="after")
     def _shared(self) -> Self:
         if self.power and self.normalisation not in (Normalisation.TOTAL, Normalisation.ANTENNA):
-            raise UserError('power goes with normalisation = "total" or "antenna"')
+            raise UserError('power needs normalisation = "total" or "antenna"')
         return self
 
 
 class CodebookSettings(Section):
-    """The stored beams of an array that can only choose among them.
+    """The stored beams of an array that can only select among them.
 
     dft   for lines and rectangles: ``oversampling`` times as many beams as elements on each
           axis
@@ -174,7 +176,7 @@ class CodebookSettings(Section):
     @model_validator(mode="after")
     def _named(self) -> Self:
         if (self.kind == "file") != (self.file is not None):
-            raise UserError('kind = "file" goes with file, and file with it')
+            raise UserError('kind = "file" needs file; other kinds need none')
         return self
 
 
@@ -182,12 +184,12 @@ class HardwareSettings(Section):
     """The hardware behind the array.
 
     ``calibration`` names a table of its channels (CSV: channel, element, phase_deg, gain_db, and if
-    known phase_error_deg, gain_error_db), or TOML with a table for each of several frequencies
+    known phase_error_deg, gain_error_db), or TOML with one table for each of several frequencies
     (``companion/beams/hardware/calibration_tables.py``).
-    ``phase_error_deg`` and ``gain_error_db`` are the most that each channel is off after it: bounds
-    for which guaranteed gains then hold. A table that says bounds of its own has the last word.
-    ``device`` is what the weights are quantised for: guaranteed gains in the API are then of what
-    it radiates. ``unit`` names a file of what gains a TMYTEK unit can have
+    ``phase_error_deg`` and ``gain_error_db`` bound the error of each calibrated channel; guaranteed
+    gains include them. Bounds in the calibration table take precedence.
+    ``device`` is the device for which weights are quantised; guaranteed gains in the API then hold
+    for what it radiates. ``unit`` names a file with the possible gains of a TMYTEK unit
     (``companion/beams/hardware/unit_gains.py``).
     """
 
@@ -199,7 +201,7 @@ class HardwareSettings(Section):
 
 
 class RadioSettings(Section):
-    """The radio link, from which signal-to-noise figures are computed.
+    """The radio link, from which SNR and SINR are computed.
 
     noise_figure_db  noise figure of the UAVs' receivers
     """
@@ -211,13 +213,13 @@ class RadioSettings(Section):
 
 
 class NeedSettings(Section):
-    """What the link to a UAV needs to be called good.
+    """What a good link to a UAV needs.
 
     needed_db       least array gain over an isotropic antenna, dB
-    needed_sinr_db  in its place, the SINR of the lowest rate, by the budget of ``[radio]``
+    needed_sinr_db  if set, used instead: SINR of the lowest rate, by the budget of ``[radio]``
 
-    A link is good where the gain that is guaranteed is enough, weak where only the one that is
-    likely is, and none otherwise.
+    A link is good if the guaranteed gain suffices, weak if only the likely gain does, and none
+    otherwise.
     """
 
     needed_db: Annotated[float, Field(ge=-60, le=60)] = 0.0

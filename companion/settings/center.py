@@ -1,4 +1,4 @@
-"""Settings of what carries the array: a vehicle, a fixed station, or "home"."""
+"""Settings of the array's carrier: a vehicle, a fixed station, or "home"."""
 
 import math
 from dataclasses import dataclass
@@ -9,12 +9,12 @@ from pydantic import AfterValidator, Field
 from companion.settings.section import Section
 from companion.values import Source, UserError, shown
 
-HEIGHT_MAX_M: Final = 1e5  # most that a station may be above or below the sea
+HEIGHT_MAX_M: Final = 1e5  # largest height of a station above or below mean sea level
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleCenter:
-    """The array rides on a vehicle of the stream, whose position and attitude are followed."""
+    """Center on a vehicle, by its MAVLink source; its position and attitude are tracked."""
 
     source: Source
 
@@ -24,7 +24,7 @@ class VehicleCenter:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FixedCenter:
-    """The array stands level at a fixed place.
+    """Center at a fixed place, level.
 
     Latitude and longitude in degrees, altitude in metres, heading in degrees clockwise from true
     north.
@@ -41,7 +41,7 @@ class FixedCenter:
 
 @dataclass(frozen=True, slots=True)
 class HomeCenter:
-    """A fixed station, level and facing north, where the first accepted report was made."""
+    """Fixed station at the position of the first accepted report, level and facing north."""
 
     def __str__(self) -> str:
         return "home"
@@ -51,9 +51,9 @@ CenterPlace = VehicleCenter | FixedCenter | HomeCenter
 
 
 def parse_center(text: str) -> CenterPlace:
-    """Read ``SYSID:COMPID``, ``LAT,LON,ALT[,HEADING]`` or ``home``.
+    """Parse ``SYSID:COMPID``, ``LAT,LON,ALT[,HEADING]`` or ``home``.
 
-    Raises ``UserError`` otherwise.
+    Raises ``UserError`` for anything else.
     """
     if text == "home":
         return HomeCenter()
@@ -68,9 +68,9 @@ def parse_center(text: str) -> CenterPlace:
     if len(numbers) not in (3, 4) or not all(map(math.isfinite, numbers[2:])):
         raise UserError(f"{shown(text)} is not LAT,LON,ALT[,HEADING], such as 47.4,8.55,500,90")
     if not (abs(numbers[0]) <= 90 and abs(numbers[1]) <= 180):
-        raise UserError(f"{shown(text)}: latitude is within 90 degrees and longitude within 180")
+        raise UserError(f"{shown(text)}: latitude must be -90..90 and longitude -180..180 degrees")
     if abs(numbers[2]) > HEIGHT_MAX_M or any(abs(heading) > 360 for heading in numbers[3:]):
-        raise UserError(f"{shown(text)}: altitude is within 100 km and heading within 360 degrees")
+        raise UserError(f"{shown(text)}: altitude must be within 100 km, heading -360..360 degrees")
     lat_deg, lon_deg, alt_m, *heading_deg = numbers
     return FixedCenter(
         lat_deg=lat_deg,
@@ -86,14 +86,14 @@ def _center_text(text: str) -> str:
 
 
 class CenterSettings(Section):
-    """What carries the array. The ``run`` command refuses to start without it.
+    """Carrier of the array. The ``run`` command needs ``source``.
 
-    ``attitude_bound_deg`` bounds the angular error of a vehicle's attitude, mounting included; it
-    is raised while its estimator contradicts its compass or does not stand by its attitude;
-    ``turn_acceleration_max_degps2`` its angular acceleration since its newest attitude; by its type
-    (HEARTBEAT) unless given, and raised where reported rates refute it.
-    Autopilots' headings are off by a degree or more (simulated: 1.1 degrees in the median;
-    docs/field-notes.md 1).
+    ``attitude_bound_deg`` bounds the angular error of a vehicle's attitude, mounting included. It
+    is raised while the vehicle's estimator contradicts its compass or reports its attitude as
+    invalid. ``turn_acceleration_max_degps2`` bounds its angular acceleration since its newest
+    attitude. If unset it follows from the vehicle type (HEARTBEAT); it is raised if reported rates
+    refute it. Autopilots' headings have errors of a degree or more (simulated: 1.1 degrees in the
+    median; docs/field-notes.md 1).
     """
 
     source: Annotated[str, AfterValidator(_center_text)] | None = None

@@ -1,4 +1,4 @@
-"""Settings read from a TOML file, together with the files that they name."""
+"""Reading of settings from a TOML file, and of the files that they name."""
 
 import errno
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ from companion.values import ComplexArray, FloatArray, UserError
 
 DEFAULT_DESIGN: Final = "kinematic_default.json"
 LARGEST_BYTES: Final = 1 << 24
-"""Most bytes of a file that is read: a codebook of 1024 elements and as many beams."""
+"""Largest file that is read: a codebook of 1024 elements and as many beams."""
 
 
 def load(path: Path | None) -> Settings:
@@ -40,9 +40,9 @@ def load(path: Path | None) -> Settings:
 
 
 def embedded(settings: Settings) -> Settings:
-    """Settings with all files read that they name, so that a recording of them is complete.
+    """Return the settings with the contents of all files that they name, for a complete recording.
 
-    Raises ``ConfigError`` where one cannot be read.
+    Raises ``ConfigError`` if a file cannot be read.
     """
     placed = _with_positions(settings)
     read = {file.attachment: _content(placed, file) for file in NAMED_FILES}
@@ -50,10 +50,9 @@ def embedded(settings: Settings) -> Settings:
 
 
 def layered(path: Path | None, options: Mapping[str, dict[str, Any]]) -> tuple[Settings, Origins]:
-    """The settings of a file with options over them, and where each comes from.
+    """Return the settings of a file, overridden by options, and the origin of each key.
 
-    ``path`` as in ``load``, ``options`` as the sections of ``Settings.override``. Raises
-    ``ConfigError``.
+    ``path`` as in ``load``, ``options`` as in ``Settings.override``. Raises ``ConfigError``.
     """
     loaded = load(path)
     origins = {**given(loaded, Origin("file", str(path))), **of_options(options)}
@@ -61,7 +60,7 @@ def layered(path: Path | None, options: Mapping[str, dict[str, Any]]) -> tuple[S
 
 
 def _with_positions(settings: Settings) -> Settings:
-    """Settings with the element positions read in."""
+    """Return the settings with the element positions read from their file."""
     named = settings.array.positions
     if named is None:
         return settings
@@ -74,11 +73,11 @@ def _with_positions(settings: Settings) -> Settings:
 def numbers_file(key: str, name: str, columns: int) -> FloatArray:
     """Read a table of numbers from a .npy file, or from text separated by commas or blanks.
 
-    Returns (n, k) with k >= ``columns``. Raises ``ConfigError``, naming ``key``, where it cannot.
+    Returns (n, k) with k >= ``columns``. Raises ``ConfigError`` that names ``key``.
     """
     found = _npy_file(key, name, "fiu") if name.endswith(".npy") else _text_file(key, name)
     if found.ndim != 2 or found.shape[1] < columns or not np.isfinite(found).all():
-        raise ConfigError(f"{key} = {name!r}: rows of at least {columns} finite numbers are needed")
+        raise ConfigError(f"{key} = {name!r}: each row must have {columns} or more finite numbers")
     rows: FloatArray = found.astype(np.float64)
     return rows
 
@@ -100,19 +99,19 @@ def _npy_file(key: str, name: str, kinds: str) -> NDArray[Any]:
 
 
 def _npy(where: str, data: bytes, kinds: str) -> NDArray[Any]:
-    """The array in the bytes of a .npy file; as ``_npy_file``."""
+    """Parse the bytes of a .npy file; as ``_npy_file``."""
     try:
         found = np.lib.format.read_array(BytesIO(data), allow_pickle=False)
     except (ValueError, MemoryError, TokenError) as error:  # the header is read as Python text
         first = str(error).splitlines()[0]
         raise ConfigError(f"{where}: not a .npy file of numbers: {first}") from error
     if found.dtype.kind not in kinds:
-        raise ConfigError(f"{where}: {found.dtype} are not the numbers that are needed")
+        raise ConfigError(f"{where}: unsupported dtype {found.dtype}; save it as numbers")
     return found
 
 
 def matrix_of(settings: Settings, file: NamedFile) -> ComplexArray | None:
-    """The matrix in a .npy file that the settings name; None if they name none.
+    """Return the matrix of a .npy file that the settings name; None if they name none.
 
     Raises ``ConfigError`` if the file cannot be read or is not a matrix.
     """
@@ -122,15 +121,15 @@ def matrix_of(settings: Settings, file: NamedFile) -> ComplexArray | None:
     where = _where(settings, file)
     found = _npy(where, data, "fciu")
     if found.ndim != 2:
-        raise ConfigError(f"{where}: not a matrix, but of shape {found.shape}")
+        raise ConfigError(f"{where}: not a matrix: shape {found.shape}; save a 2-dimensional array")
     matrix: ComplexArray = found.astype(np.complex128)
     return matrix
 
 
 def text_of(settings: Settings, file: NamedFile) -> str | None:
-    """The text of a file that the settings name; None if they name none.
+    """Return the text of a file that the settings name; None if they name none.
 
-    Raises ``ConfigError`` if it cannot be read.
+    Raises ``ConfigError`` if the file cannot be read.
     """
     data = _content(settings, file)
     try:
@@ -140,10 +139,7 @@ def text_of(settings: Settings, file: NamedFile) -> str | None:
 
 
 def _content(settings: Settings, file: NamedFile) -> bytes | None:
-    """The bytes of a file, read unless the settings hold them; None if they do not name it.
-
-    Raises ``ConfigError``.
-    """
+    """Return a file's bytes, from the settings or else from disk; None if they name no file."""
     path = _path(settings, file)
     if path is None:
         return None
@@ -161,7 +157,7 @@ def _where(settings: Settings, file: NamedFile) -> str:
 
 
 def _bytes(key: str, name: str) -> bytes:
-    """The bytes of a file that a setting names. Raises ``ConfigError``, naming ``key``."""
+    """Return the bytes of a named file. Raises ``ConfigError`` that names ``key``."""
     try:
         return _read(Path(name))
     except OSError as error:
@@ -169,7 +165,7 @@ def _bytes(key: str, name: str) -> bytes:
 
 
 def _read(path: Path) -> bytes:
-    """The bytes of a file. Raises ``OSError`` where it cannot be read or is too large."""
+    """Return the bytes of a file. Raises ``OSError`` if it cannot be read or is too large."""
     with path.open("rb") as file:
         data = file.read(LARGEST_BYTES + 1)
     if len(data) > LARGEST_BYTES:
@@ -178,9 +174,9 @@ def _read(path: Path) -> bytes:
 
 
 def kinematic_design(settings: Settings) -> KinematicDesign:
-    """The gains of the kinematic observer: those named in the settings, or those of the program.
+    """Return the kinematic observer's gains from the file in the settings, or the built-in ones.
 
-    Their certificate is verified. Raises ``ConfigError`` where they cannot be used.
+    Their certificate is verified. Raises ``ConfigError`` if they are unusable.
     """
     text = text_of(settings, DESIGN)
     if text is None:

@@ -1,4 +1,4 @@
-"""Settings of a fleet: several nodes that share one sky over Zenoh."""
+"""Settings of a fleet: several nodes that share their UAVs over Zenoh."""
 
 import re
 from typing import Annotated, Final, Literal
@@ -12,35 +12,38 @@ _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
 
 
 def is_node_name(text: str) -> bool:
-    """Whether a node may have this name."""
+    """Return whether ``text`` is a valid node name."""
     return _NAME.fullmatch(text) is not None
 
 
 def _name(text: str) -> str:
     if not is_node_name(text):
-        raise UserError(f"{text!r}: letters, digits, dot, dash and underscore, at most 32")
+        raise UserError(
+            f"{text!r} is invalid: give at most 32 letters, digits, dots, dashes or underscores"
+        )
     return text
 
 
 class FleetSettings(Section):
-    """The fleet that this node is part of; it needs the extra ``fleet``.
+    """The fleet of this node; it needs the extra ``fleet``.
 
-    node           this node's name, which no other node has; None: no fleet
-    site           name of the fleet: nodes of other sites are not heard
+    node           name of this node, unique in the fleet; None: no fleet
+    site           name of the fleet; nodes of other sites are ignored
     listen         Zenoh endpoints where other nodes reach this one, such as
-                   tcp/192.0.2.1:7447; on this machine alone unless said otherwise
+                   tcp/192.0.2.1:7447; by default only on this machine
     connect        Zenoh endpoints of other nodes, or of a router
-    mode           "peer" speaks with every other node directly, "client" through one router
-    most           UAVs that this node serves at most; None: as many as it has elements
-    lease_s        time for which a node's word holds: after it others serve its UAVs
-    attempt_s      longest time of an attempt to connect: 3 round trips over TCP, 5 with TLS; longer
-                   ones make a fleet whole again later
-    hysteresis_db  least gain for which a UAV changes its node
-    nulls          whether beams have nulls on UAVs that other nodes serve
-    share_hz       how often what was heard is told, at most
-    ca, certificate, key   TLS by both ends: PEM files of the authority, and of this node's
+    mode           "peer" connects to every other node directly, "client" through one router
+    most           largest number of UAVs that this node serves; None: its number of elements
+    lease_s        validity of a node's last message: after it other nodes serve its UAVs
+    attempt_s      timeout of a connection attempt: 3 round trips over TCP, 5 with TLS; a longer
+                   timeout delays reconnection
+    hysteresis_db  least gain for which a UAV is handed over to another node
+    nulls          whether beams have nulls towards UAVs that other nodes serve
+    share_hz       largest rate at which received frames are shared
+    ca, certificate, key   mutual TLS: PEM files of the authority, and of this node's
                    certificate and private key; endpoints are then tls/HOST:PORT
-    access_control JSON5 file with Zenoh's section of that name: who may say and hear what
+    access_control JSON5 file with Zenoh's section of that name: who may publish and subscribe to
+                   which keys
     """
 
     node: Annotated[str, AfterValidator(_name)] | None = None

@@ -1,4 +1,4 @@
-"""Settings of the links: who is heard, who is tracked, and what is sent."""
+"""Settings of the links: what is received, which UAVs are tracked, and what is sent."""
 
 import re
 from typing import Annotated, Final, Literal, Self
@@ -19,15 +19,16 @@ LinkText = Annotated[str, AfterValidator(_link)]
 
 
 class LinkSettings(Section):
-    """The links on which MAVLink, and what receivers of other kinds say, is received.
+    """The links on which MAVLink, and reports of other receivers, are received.
 
     URLs are ``udpin:``, ``udpout:``, ``tcp:`` or ``tcpin:HOST:PORT``, ``serial:DEVICE:BAUD``,
-    ``zenoh:KEY``, and those of other receivers: ``sbs:`` or ``readsb:HOST:PORT``, ``readsb:http://HOST/PATH``,
-    ``rid:HOST:PORT``, ``rid:udp:HOST:PORT``, ``cot:udp:HOST:PORT``, ``cot:tcp:HOST:PORT``.
+    ``zenoh:KEY``, and those of other receivers: ``sbs:`` or ``readsb:HOST:PORT``,
+    ``readsb:http://HOST/PATH``, ``rid:HOST:PORT``, ``rid:udp:HOST:PORT``, ``cot:udp:HOST:PORT``,
+    ``cot:tcp:HOST:PORT``.
 
-    ``routers`` are peers that are believed where another one contradicts them in where a vehicle
-    is: a link as in ``urls``, HOST, or HOST:PORT. Two peers that tell of one vehicle alike need no
-    word here.
+    ``routers`` are trusted peers: if peers contradict each other about the position of a vehicle,
+    theirs is used. A peer is a link as in ``urls``, HOST, or HOST:PORT. Two peers that agree about
+    a vehicle need no entry.
     """
 
     urls: tuple[LinkText, ...] = ()
@@ -35,16 +36,15 @@ class LinkSettings(Section):
 
 
 class PresenceSettings(Section):
-    """What the service sends over MAVLink: nothing at all unless ``enabled``.
+    """What the service sends over MAVLink: nothing unless ``enabled``.
 
-        system_id     system id it sends as; the carrier's unless given, needed where the array is
-                      fixed
-        component_id  component id it sends as
-        position_hz   rate asked of UAVs whose GLOBAL_POSITION_INT is slower; None: no request
-        attitude_hz   rate of ATTITUDE asked of the carrier; None: no request
+        system_id     its system id; default: the carrier's; needed if the array is fixed
+        component_id  its component id
+        position_hz   rate requested of UAVs whose GLOBAL_POSITION_INT is slower; None: no request
+        attitude_hz   rate of ATTITUDE requested of the carrier; None: no request
 
-    Once enabled it presents itself as an onboard computer: it sends a heartbeat while it is fit to
-    be used, and TIMESYNC requests.
+    If enabled, it acts as an onboard computer: it sends a heartbeat while it can compute beams, and
+    TIMESYNC requests.
     """
 
     enabled: bool = False
@@ -57,12 +57,12 @@ class PresenceSettings(Section):
 class SigningSettings(Section):
     """MAVLink 2 signing.
 
-        keys            a link's URL, as in ``links.urls``, to the file that holds its key
-        allow_unsigned  links with a key that accept unsigned frames all the same
-        timestamps      file that keeps the newest timestamps across restarts, so that a frame heard
-                        before a restart is not accepted again after it
+        keys            file of the key for each link, by URL as in ``links.urls``
+        allow_unsigned  links with a key that also accept unsigned frames
+        timestamps      file that keeps the newest timestamps across restarts, so that a frame
+                        received before a restart is rejected after it
 
-    What is sent over a link with a key is signed.
+    Frames sent over a link with a key are signed.
     """
 
     keys: dict[LinkText, str] = Field(default_factory=dict)
@@ -74,7 +74,9 @@ class SigningSettings(Section):
     def _have_keys(cls, links: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
         for url in links:
             if url not in info.data.get("keys", {}):
-                raise UserError(f"{url} has no key in signing.keys, and takes anything")
+                raise UserError(
+                    f"{url} has no key in signing.keys, so it accepts unsigned frames; remove it"
+                )
         return links
 
 
@@ -88,7 +90,7 @@ _OUT: Final[tuple[Scheme, ...]] = ("udpout", "tcp", "tcpin", "serial", "zenoh", 
 
 def _uav_pattern(text: str) -> str:
     if not _UAV_PATTERN.fullmatch(text):
-        raise UserError(f"{text!r} is not {UAV_FORMS}; * stands for any")
+        raise UserError(f"{text!r} is not {UAV_FORMS}; * matches anything")
     return text
 
 
@@ -99,21 +101,21 @@ UavPattern = Annotated[str, AfterValidator(_uav_pattern)]
 def _out_link(text: str) -> str:
     url = parse_link(text, _OUT)
     if url.port == 0:
-        raise UserError(f"{text!r}: nobody can be found at port 0")
+        raise UserError(f"{text!r}: port 0 is invalid as a destination; give 1 to 65535")
     return text
 
 
 class OutSettings(Section):
-    """What is known goes on to others, on links of its own: nothing unless ``urls`` are given.
+    """Tracks sent to other programs on separate links: nothing unless ``urls`` are given.
 
     urls     ``udpout:``, ``tcp:``, ``tcpin:HOST:PORT``, ``serial:DEVICE:BAUD`` or ``zenoh:KEY`` get
              ``message`` of each vehicle that reports itself; ``cot:udp:HOST:PORT``
              (sends datagrams there, also to a group) and ``cot:tcp:HOST:PORT`` (connects) get
              Cursor on Target of every aircraft
-    message  as what positions are said
-    rate_hz  how often each aircraft is said
-    stale_s  how long an event of Cursor on Target says that it holds, seconds
-    uavs     patterns of those that are said; everyone if empty
+    message  MAVLink message for positions
+    rate_hz  rate for each aircraft
+    stale_s  validity of a Cursor on Target event, seconds
+    uavs     patterns of the UAVs to send; empty: all
     """
 
     urls: tuple[Annotated[str, AfterValidator(_out_link)], ...] = ()
@@ -124,24 +126,24 @@ class OutSettings(Section):
 
 
 class TrackSettings(Section):
-    """Who is tracked, and how a track ages.
+    """Which UAVs are tracked, and how a track ages.
 
-        allow              who is tracked; everyone if empty
-        deny               who is not, whatever ``allow`` says
-        coasting_s         age of the newest report at which a track is coasting, seconds; more over
-                           a link whose own pace is slower
+        allow              UAVs to track; empty: all
+        deny               UAVs not to track; overrides ``allow``
+        coasting_s         age of the newest report at which a track is coasting, seconds; longer
+                           for a link whose reports come less often
         stale_s            age at which it is stale, seconds
         lost_s             age at which it is lost, seconds
         dropped_s          age at which a UAV is forgotten, seconds
-        most               UAVs tracked at a time; further ones are refused, so that memory and time
-                           stay bounded whoever sends
-        window_s           how late a report may come and still be put in order, seconds
-        reacquire_reports  refused reports that must agree among themselves before the track is
-                           begun again from them
+        most               largest number of tracked UAVs; reports of further ones are rejected, so
+                           that memory and time stay bounded
+        window_s           largest delay of a report that is still put in order, seconds
+        reacquire_reports  number of rejected reports that must agree with each other before the
+                           track is restarted from them
         reacquire_s        time over which they must agree, seconds
 
     Patterns are ``3:1``, ``3:*``, ``icao:4CA7B3``, ``icao:*``, ``rid:*`` or ``cot:*``. The carrier
-    is always followed.
+    is always tracked.
     """
 
     allow: tuple[UavPattern, ...] = ()
@@ -159,7 +161,5 @@ class TrackSettings(Section):
     def _in_order(self) -> Self:
         ages = (self.coasting_s, self.stale_s, self.lost_s, self.dropped_s)
         if list(ages) != sorted(ages):
-            raise UserError(
-                "coasting_s <= stale_s <= lost_s <= dropped_s: a track passes its states in order"
-            )
+            raise UserError("ages out of order: need coasting_s <= stale_s <= lost_s <= dropped_s")
         return self

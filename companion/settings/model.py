@@ -1,7 +1,7 @@
-"""All settings as one frozen value, checked once at start.
+"""All settings as one frozen value, validated at the start.
 
-Each section lists its keys with unit, default and range. An error names the key, the value and what
-is allowed.
+Each section lists its keys with unit, default and range. An error names the key, its value and
+the allowed values.
 """
 
 import base64
@@ -41,7 +41,7 @@ from companion.settings.tracking import ClockSettings, ObserverSettings
 from companion.values import UserError, read_toml, shown
 
 NEAR: Final = 0.7
-"""Likeness (difflib's ratio) from which on a setting may have been meant by another name."""
+"""Similarity (difflib's ratio) from which on a name is suggested for an unknown setting."""
 
 MODELLED: Final = frozenset(
     (
@@ -49,15 +49,15 @@ MODELLED: Final = frozenset(
         "link",
     )
 )  # fmt: skip
-"""Sections that make estimates and beams: what a recording has to say to its replay."""
+"""Sections that determine estimates and beams: a replay takes them from the recording."""
 
 
 class NamedFile(NamedTuple):
-    """A file that a setting names, and that recordings have as an attachment."""
+    """File that a setting names; recordings contain it as an attachment."""
 
     setting: str
     attachment: str  # its name in a recording
-    former_key: str  # key that held its contents in older recordings: text, base64 for .npy
+    former_key: str  # key with its contents in older recordings: text, base64 for .npy
 
     @property
     def section(self) -> str:
@@ -104,9 +104,9 @@ class Settings(Section):
 
     @classmethod
     def from_toml(cls, text: str, where: str) -> Self:
-        """Read settings from TOML text.
+        """Parse settings from TOML text.
 
-        Raises ``ConfigError``, its message beginning with ``where``, if they cannot be used.
+        Raises ``ConfigError``, whose message begins with ``where``, if they are unusable.
         """
         found = sections(text, where)
         files = _former_files(found, where)
@@ -114,12 +114,11 @@ class Settings(Section):
 
     @classmethod
     def from_recording(cls, text: str, where: str, attached: Mapping[str, bytes]) -> Self:
-        """Read the settings of a recording, as far as they make estimates and beams.
+        """Parse the settings of a recording, only the sections in ``MODELLED``.
 
-        Whoever made the recording is not trusted with anything else: where it listened, what it
-        sent, where it wrote, and any path are left out. A file that the settings name is in
-        ``attached``, by its name there. Raises ``ConfigError`` as ``from_toml``, and if a file is
-        missing.
+        The recording is untrusted: addresses, outgoing links, directories and paths in it are
+        ignored. Files that the settings name are taken from ``attached``, by their names there.
+        Raises ``ConfigError`` as ``from_toml``, and if a file is missing.
         """
         found = {name: kept for name, kept in sections(text, where).items() if name in MODELLED}
         attached = {**attached, **_former_files(found, where)}
@@ -130,7 +129,7 @@ class Settings(Section):
                     raise _missing(where, file.setting)
                 keys[file.key] = file.attachment
                 files[file.attachment] = attached[file.attachment]
-        if "positions" in _table(found, "array"):  # a recording has ``positions_m`` instead
+        if "positions" in _table(found, "array"):  # recordings have ``positions_m`` instead
             raise _missing(where, "array.positions")
         return cls._from_sections(found, where).with_files(files)
 
@@ -143,24 +142,24 @@ class Settings(Section):
 
     @property
     def files(self) -> Mapping[str, bytes]:
-        """Contents of the files that settings name, as far as they were read; by attachment."""
+        """Contents of the named files that were read, by name of the attachment."""
         return self._files
 
     def with_files(self, files: Mapping[str, bytes]) -> Self:
-        """A copy with other ``files``."""
+        """Return a copy with other ``files``."""
         copy = self.model_copy()
         copy._files = files
         return copy
 
     def to_toml(self) -> str:
-        """All settings, defaults included, as ``from_toml`` reads them."""
+        """Return all settings, defaults included, as TOML for ``from_toml``."""
         return tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
 
     def override(self, **sections: dict[str, Any]) -> "Settings":
-        """A copy with some keys of some sections replaced; a value of None leaves the key as it is.
+        """Return a copy with keys of sections replaced; a value of None keeps the key.
 
-        Which keys were given, as pydantic's ``model_fields_set`` tells, is kept. Raises
-        ``ConfigError`` if the result cannot be used.
+        The set of given keys (pydantic's ``model_fields_set``) is kept. Raises ``ConfigError`` if
+        the result is unusable.
         """
         merged = self.model_dump(mode="json", exclude_none=True, exclude_unset=True)
         for name, keys in sections.items():
@@ -180,9 +179,9 @@ class Settings(Section):
 
 
 def _former_files(found: dict[str, Any], where: str) -> dict[str, bytes]:
-    """Take the contents of files out of the settings of an older recording.
+    """Remove file contents from the settings of an older recording.
 
-    Returns them by the name of their attachment. Raises ``ConfigError``.
+    Returns them by name of the attachment. Raises ``ConfigError``.
     """
     files = {}
     for file in NAMED_FILES:
@@ -203,19 +202,19 @@ def _former_files(found: dict[str, Any], where: str) -> dict[str, bytes]:
 
 
 def _table(found: dict[str, Any], section: str) -> dict[str, Any]:
-    """A section of unchecked settings; empty if it is missing or not a table."""
+    """Return a section of unvalidated settings; empty if it is missing or not a table."""
     keys = found.get(section)
     return keys if isinstance(keys, dict) else {}
 
 
 def _missing(where: str, setting: str) -> ConfigError:
     return ConfigError(
-        f"{where}: what {setting} named is not in the recording: give the settings with --config"
+        f"{where}: file of {setting} is not in the recording; give the settings with --config"
     )
 
 
 def sections(text: str, where: str) -> dict[str, Any]:
-    """The sections of settings in TOML, unchecked. Raises ``ConfigError`` as ``read_toml``."""
+    """Parse TOML into sections, unvalidated. Raises ``ConfigError`` as ``read_toml``."""
     try:
         return read_toml(text)
     except UserError as error:
@@ -223,7 +222,7 @@ def sections(text: str, where: str) -> dict[str, Any]:
 
 
 def _meant(place: tuple[int | str, ...]) -> str:
-    """The setting whose name is nearest, as the end of a message; empty where none is near."""
+    """Return a suggestion of the most similar setting; empty if none is similar."""
     section, *keys = map(str, place)
     if not keys:
         near = difflib.get_close_matches(section, Settings.model_fields, 1, NEAR)
@@ -244,9 +243,9 @@ def _keys(section: Section) -> list[str]:
 
 
 def _first(error: ValidationError) -> str:
-    """The first error as one line: key, value, what is allowed.
+    """Return the first error as one line: key, value, allowed values.
 
-    A key that may be of several types has one error per type; all of them are said.
+    A key with several allowed types has one error per type; the line contains all of them.
     """
     errors = error.errors(include_url=False)
     place = errors[0]["loc"][:2]

@@ -1,4 +1,4 @@
-"""Where each setting comes from: a file, a recording, an option, or the program itself."""
+"""Origin of each setting: a file, a recording, an option, or the program itself."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,18 +9,18 @@ from companion.settings.model import Settings
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Who said a setting; ``name`` is the file or recording that did, None for the others."""
+    """Source that set a value; ``name`` is the file or recording, None for the others."""
 
     kind: Literal["file", "recording", "option", "program"]
     name: str | None = None
 
 
 Origins = Mapping[tuple[str, str], Origin]
-"""By section and key; who is not named there left the setting at its default."""
+"""Origins by section and key; a key without one has its default."""
 
 
 def given(settings: Settings, origin: Origin) -> Origins:
-    """Every key that was given when these settings were made, be it with its default."""
+    """Return the origins of all keys that were given, also of those given as their default."""
     return {
         (section, key): origin
         for section in settings.model_fields_set
@@ -29,7 +29,7 @@ def given(settings: Settings, origin: Origin) -> Origins:
 
 
 def changed(settings: Settings, origin: Origin) -> Origins:
-    """Every key that is not at its default."""
+    """Return the origins of all keys that differ from their default."""
     plain = Settings()
     return {
         (section, key): origin
@@ -40,7 +40,7 @@ def changed(settings: Settings, origin: Origin) -> Origins:
 
 
 def of_options(options: Mapping[str, Mapping[str, Any]]) -> Origins:
-    """Every key that ``Settings.override`` replaces, given the same sections."""
+    """Return the origins of all keys that ``Settings.override`` replaces with these sections."""
     return {
         (section, key): Origin("option")
         for section, keys in options.items()

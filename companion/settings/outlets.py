@@ -1,4 +1,4 @@
-"""Settings of recording, of serving, of records for machines, of a device and of the page."""
+"""Settings of recordings, HTTP, binary records, a driven device and the page."""
 
 import ipaddress
 import re
@@ -13,7 +13,7 @@ _ADDRESS: Final = re.compile(r"(?:\[([0-9A-Fa-f:.]+)\]|([0-9.]+)):([0-9]{1,5})")
 
 
 def host_and_port(text: str) -> tuple[str, int]:
-    """The parts of IP:PORT, IPv6 in brackets. Raises ``UserError`` for anything else."""
+    """Parse IP:PORT, IPv6 in brackets. Raises ``UserError`` for anything else."""
     found = _ADDRESS.fullmatch(text)
     try:
         host = str(ipaddress.ip_address(found[1] or found[2])) if found else ""
@@ -31,12 +31,12 @@ def _addresses(texts: tuple[str, ...]) -> tuple[str, ...]:
 
 
 class RecordSettings(Section):
-    """Where the weights of each update are pushed to machines, as records of one fixed layout.
+    """Destinations of binary records, which contain the weights of each update in a fixed layout.
 
     udp            addresses (IP:PORT) to which datagrams are sent
-    shared_memory  file of a ring of records, such as /dev/shm/uav-beams
-    guaranteed     whether records say the guaranteed gain, which takes milliseconds to compute; it
-                   is NaN without
+    shared_memory  file of a ring buffer of records, such as /dev/shm/uav-beams
+    guaranteed     whether records contain the guaranteed gain, which takes milliseconds to compute;
+                   otherwise it is NaN
     """
 
     udp: Annotated[tuple[str, ...], Field(max_length=16), AfterValidator(_addresses)] = ()
@@ -45,15 +45,15 @@ class RecordSettings(Section):
 
 
 class RecordingSettings(Section):
-    """Where, how often and in which portions recordings are written.
+    """Directory, rates and file sizes of recordings.
 
-        directory   folder of the recordings; None: none are made
-        weights_hz  greatest rate at which weights and tracks are written, or "all"
-        scene_hz    greatest rate at which the scene is written
-        rotate_mb   size at which a new file is begun, millions of bytes; None: no limit
-        rotate_s    time after which a new file is begun, seconds
+        directory   folder of the recordings; None: no recording
+        weights_hz  largest rate of recorded weights and tracks, or "all"
+        scene_hz    largest rate of the recorded scene
+        rotate_mb   size at which a new file begins, millions of bytes; None: no limit
+        rotate_s    time after which a new file begins, seconds
 
-    The files of one run replay together to that run's digest.
+    The files of one run replay together to the digest of that run.
     """
 
     directory: str | None = None
@@ -66,11 +66,11 @@ class RecordingSettings(Section):
 class DriveSettings(Section):
     """A device that the service drives itself.
 
-    target    as ``companion drive`` has it, such as rotctld:HOST:PORT; None: nothing is driven
-    uavs      whom to follow, in descending order; empty: by [beams] priority, then anybody
-    aim       "first": the first of them that has a beam; "centre": a mount looks at the middle of
+    target    as for ``companion drive``, such as rotctld:HOST:PORT; None: no device
+    uavs      UAVs to follow, highest priority first; empty: [beams] priority, then any UAV
+    aim       "first": the first of them that has a beam; "centre": a mount points at the centre of
               all that have one
-    on_stale  what the device does without beams, and at the end
+    on_stale  state of the device without beams, and after the end
     """
 
     target: str | None = None
@@ -80,22 +80,22 @@ class DriveSettings(Section):
 
 
 class PageSettings(Section):
-    """What the page shows beside the state.
+    """Extras of the page.
 
-    ``map`` is a PMTiles file that lies under the plan view; None: range rings alone. It is served
-    from here; nothing is loaded from elsewhere.
+    ``map`` is a PMTiles file for the background of the plan view; None: range rings only. This
+    service serves it; the page loads nothing from elsewhere.
     """
 
     map: str | None = None
 
 
 class ServerSettings(Section):
-    """Where HTTP and the live Foxglove channels are served.
+    """Addresses of the HTTP server and of the live Foxglove channels.
 
-    ``listen`` is HOST:PORT. ``hosts`` are names by which clients may call this machine, beside its
-    addresses, its own name and ``localhost``: those of a reverse proxy, say. ``foxglove`` is a port
-    of this machine on which the channels of a recording are served live (None: nowhere, 0: any free
-    port); it needs the extra ``live``.
+    ``listen`` is HOST:PORT. ``hosts`` are further names by which clients may call this machine,
+    such as that of a reverse proxy; its addresses, its own name and ``localhost`` are always
+    allowed. ``foxglove`` is a port of this machine that serves the channels of a recording live
+    (None: off, 0: any free port); it needs the extra ``live``.
     """
 
     listen: str = "127.0.0.1:8080"

@@ -1,4 +1,4 @@
-"""The base class of all sections of the settings, and the error of unusable settings."""
+"""Base class of all sections of the settings, and the error for unusable settings."""
 
 from pydantic import BaseModel, ConfigDict
 
@@ -6,10 +6,10 @@ from companion.values import UserError
 
 
 class ConfigError(UserError):
-    """Settings that cannot be used."""
+    """Unusable settings."""
 
 
 class Section(BaseModel):
-    """A section of the settings: frozen, and any unknown key is an error."""
+    """Section of the settings: frozen; unknown keys are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)

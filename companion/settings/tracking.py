@@ -9,21 +9,20 @@ from companion.values import UserError
 
 
 class ClockSettings(Section):
-    """How senders' boot clocks are put on the node's timeline.
+    """How senders' boot clocks are mapped to the node's timeline.
 
-        constant_delay_s  the link's smallest latency where it is known, seconds: one-way
-                          observation cannot show it. TIMESYNC or trusted GNSS time takes its place
-        drift_max_ppm     greatest drift of a boot clock against the node's that is taken for
-                          possible; grows for a sender whose messages prove more
-        window_s          how far back latencies are sampled, seconds
-        trust_gnss        believe SYSTEM_TIME where it passes its checks
+        constant_delay_s  smallest latency of the link if it is known, seconds: one-way traffic
+                          cannot show it. TIMESYNC or trusted GNSS time replaces it
+        drift_max_ppm     largest assumed drift of a boot clock against the node's; raised for a
+                          sender whose messages prove more
+        window_s          time over which latencies are sampled, seconds
+        trust_gnss        use SYSTEM_TIME if it passes its checks
         node_utc_error_s  bound on the error of the node's own UTC, seconds; needed by
                           ``trust_gnss``
-        apart_s           most that all times of a UAV may be off beside those of others, seconds,
-                          by its id: a replay of vehicles' own logs says it of each
+        apart_s           largest error of all times of a UAV relative to other UAVs, seconds, by
+                          UAV id; a replay of onboard logs sets it
 
-    By how much a position is older or newer than its own stamp is ``observer.lag_s``. See
-    docs/math.md 6.
+    ``observer.lag_s`` is the age of a position relative to its own stamp. See docs/math.md 6.
     """
 
     constant_delay_s: Annotated[FiniteFloat, Field(ge=0, le=10)] = 0.0
@@ -40,12 +39,12 @@ Lag = tuple[
 
 
 class LimitSettings(Section):
-    """What is assumed of some aircraft; what is not given is as for the others.
+    """Assumptions about some aircraft; unset keys are as for the others.
 
-    speed_max_mps          greatest speed, norm of a 3-vector
-    acceleration_max_mps2  greatest acceleration, norm of a 3-vector
-    lag_s                  least and greatest time by which a reported position is older than its
-                           stamp, seconds; negative: it is where the aircraft will be
+    speed_max_mps          largest speed, norm of a 3-vector
+    acceleration_max_mps2  largest acceleration, norm of a 3-vector
+    lag_s                  least and largest time by which a reported position is older than its
+                           stamp, seconds; negative: it is the aircraft's later position
     """
 
     speed_max_mps: Annotated[float, Field(gt=0, le=1e5)] | None = None
@@ -55,7 +54,7 @@ class LimitSettings(Section):
     @model_validator(mode="after")
     def _in_order(self) -> Self:
         if self.lag_s is not None and self.lag_s[0] > self.lag_s[1]:
-            raise UserError("lag_s is the least and the greatest lag, in this order")
+            raise UserError("lag_s is out of order: give [least, largest]")
         return self
 
 
@@ -63,31 +62,32 @@ AirframeName = Literal["copter", "aeroplane", "vtol", "helicopter", "rover", "un
 
 
 class ObserverSettings(LimitSettings):
-    """The observer and the bounds that it relies on.
+    """The observer and the bounds that it assumes.
 
-    Where reports refute a bound it is raised for their UAV, and that is said.
+    If reports refute a bound, it is raised for their UAV and a notice is published.
 
     model                  "kinematic" (acceleration unknown) or "position" (velocity unknown)
     alpha                  decay rate of the position model's certificate, or "auto"
-    feedthrough_s          position model: time by which a report leads the position, seconds
-    velocity_lead_s        position model: least lead made from a reported velocity, seconds
+    feedthrough_s          position model: direct effect of the velocity on a report, seconds
+    velocity_lead_s        position model: least lead derived from a reported velocity, seconds
     feed_forward           kinematic model: feed an estimated acceleration forward
     design                 kinematic model: file of gains written by ``companion design --model
                            kinematic --out``
-    speed_max_mps          greatest speed, norm of a 3-vector; None: by the type of aircraft
-    acceleration_max_mps2  greatest acceleration, norm of a 3-vector; None: likewise
-    lag_s                  least and greatest lag of positions, seconds; None: by autopilot and type
-    types                  the same three for one type of aircraft, by its HEARTBEAT: copter,
+    speed_max_mps          largest speed, norm of a 3-vector; None: by the type of aircraft
+    acceleration_max_mps2  largest acceleration, norm of a 3-vector; None: likewise
+    lag_s                  least and largest lag of positions, seconds; None: by autopilot and type
+    types                  these three for one type of aircraft, by its HEARTBEAT: copter,
                            aeroplane, vtol, helicopter, rover, unknown; adsb without one
-    uav                    the same three for one UAV, by its id
-    position_noise_m       greatest error of a reported position, norm of a 3-vector
-    velocity_noise_mps     greatest error of a reported velocity, norm of a 3-vector
-    follow_accuracy        where the autopilot states its accuracy (GPS_RAW_INT), use
-    accuracy_factor        this many times that accuracy as the noise instead
-    geoid_m                height of mean sea level above the ellipsoid where this flies, metres
-                           (the undulation, by EGM96 or EGM2008): heights above the ellipsoid are
-                           brought to mean sea level by it; None: they stay, with wider bounds
-    geoid_error_m          most that it is off, over all of the area
+    uav                    these three for one UAV, by its id
+    position_noise_m       largest error of a reported position, norm of a 3-vector
+    velocity_noise_mps     largest error of a reported velocity, norm of a 3-vector
+    follow_accuracy        if the autopilot reports its accuracy (GPS_RAW_INT), derive the noise
+                           from it
+    accuracy_factor        noise bound as a multiple of that accuracy
+    geoid_m                height of mean sea level above the ellipsoid in the area of flight,
+                           metres (the undulation, by EGM96 or EGM2008), which converts heights
+                           above the ellipsoid to mean sea level; None: no conversion, wider bounds
+    geoid_error_m          largest error of ``geoid_m`` over the whole area
     """
 
     model: Literal["kinematic", "position"] = "kinematic"

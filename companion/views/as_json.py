@@ -1,6 +1,6 @@
-"""Described values as the API shows them: degrees, RFC 3339 times in UTC, null for unknown.
+"""Conversion of described values to JSON: degrees, RFC 3339 times in UTC, null for unknown.
 
-The names follow by rule from those inside the program (``companion.values.described``).
+Names in the API follow by rule from those inside the program (``companion.values.described``).
 """
 
 import functools
@@ -34,11 +34,11 @@ FORMER_NAMES: Final[Mapping[str, Mapping[str, str]]] = {
     "MessageRate": {"message_id": "msgid"},
     "UavState": {"altitude_datum": "alt_datum"},
 }
-"""Names that values had in the version before, by class: still written, deprecated."""
+"""Deprecated names from the previous version, by class; they are still written."""
 
 
 def as_json(item: Any, utc_ns: Utc) -> Json:
-    """A described value as JSON."""
+    """Return a described value as JSON."""
     kind: Any = type(item)
     plan, former = _plan(kind)
     shown = {
@@ -50,24 +50,24 @@ def as_json(item: Any, utc_ns: Utc) -> Json:
 
 
 def name_in_json(name: str) -> str:
-    """The name of a value in the API, by the unit that it has inside the program."""
+    """Return the name of a value in the API, by the unit that it has inside the program."""
     return "at" if name == "t_ns" else in_degrees(name).removesuffix("_ns")
 
 
 def rfc3339(t_ns: UtcNs) -> str:
-    """A time in UTC with milliseconds: 2026-11-20T13:00:00.123Z."""
+    """Return a time in UTC with milliseconds, as 2026-11-20T13:00:00.123Z."""
     seconds, milliseconds = divmod(t_ns // 1_000_000, 1000)
     return f"{_to_the_second(seconds)}.{milliseconds:03d}Z"
 
 
 @functools.lru_cache(maxsize=1024)
 def _to_the_second(seconds: int) -> str:
-    """Date and time; an answer has many times of the same few seconds."""
+    """Return date and time; cached, as an answer has many times within the same few seconds."""
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}"
 
 
 def degrees(angle_rad: float | None) -> float | None:
-    """Radians to degrees; None stays null."""
+    """Convert radians to degrees; None stays None."""
     return None if angle_rad is None else float(np.degrees(angle_rad))
 
 
@@ -78,9 +78,9 @@ _PLAIN: Final = (str, int, float, bool)
 
 @functools.cache
 def _plan(kind: Any) -> tuple[Plan, tuple[tuple[str, str], ...]]:
-    """Name, getter and writer of each value of a class, and former names of some of them.
+    """Return name, getter and writer of each value of a class, and former names of some.
 
-    What is JSON as it is has no writer.
+    Values that are JSON already have no writer.
     """
     plan = tuple(
         (name_in_json(member.name), member.get, _writer(member))
@@ -112,7 +112,7 @@ def _writer(member: Member) -> Write | None:
 
 
 def _any(value: Any, utc_ns: Utc) -> Any:
-    """Arrays and tuples as lists, described values within as objects."""
+    """Convert arrays and tuples to lists, described values inside them to objects."""
     if value is None or isinstance(value, str | int | float):
         return value
     if isinstance(value, dict):

@@ -1,7 +1,6 @@
-"""Beams as the API and ``companion weights`` show them: degrees, dB, null for unknown.
+"""Beams as shown by the API and ``companion weights``: degrees, dB, null for unknown.
 
-Everything is computed when it is asked for, from an update that no longer changes, and may
-therefore run on any thread.
+Everything is computed on request from an immutable update, so any thread may do it.
 """
 
 import functools
@@ -25,12 +24,12 @@ from companion.values.described import Inline, Meaning
 from companion.views import guaranteed_gain
 from companion.views.as_json import Json, as_json, degrees
 
-AHEAD_S: Final = 30.0  # how far ahead the next beam of a codebook is looked for
-MOST_SAMPLES: Final = 2000  # most samples of a direction over that time
-FEWEST_SAMPLES: Final = 32  # as many there are of each, however large the codebook
+AHEAD_S: Final = 30.0  # horizon of the search for the next beam of a codebook
+MOST_SAMPLES: Final = 2000  # largest number of sampled directions over that time
+FEWEST_SAMPLES: Final = 32  # smallest number, however large the codebook
 MOST_RESPONSES: Final = 2**28
-"""Samples times beams of a codebook times elements, for all UAVs of one answer."""
-FULL_SHARE: Final = 8  # UAVs up to which each has all the work that a question may take
+"""Limit on samples times codebook beams times elements, over all UAVs of one answer."""
+FULL_SHARE: Final = 8  # number of UAVs up to which each gets the full work limit of a request
 LEAD: Final = "requested time from the request to valid_at; valid_at is up to 10 ms later"
 
 
@@ -62,12 +61,12 @@ class Pointing:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BeamState:
-    """One beam. Azimuth and elevation are in the array's frame, the bearing is from north."""
+    """One beam. Azimuth and elevation are in the array frame, the bearing is from true north."""
 
     beam: Annotated[Beam, Inline()]
     pointing: Annotated[Pointing, Inline()]
     guaranteed_gain_db: Annotated[
-        float | None, Meaning("least array gain wherever the UAV can be; null: none")
+        float | None, Meaning("least array gain wherever the UAV can be; null: no guarantee")
     ]
     power_dbm: Annotated[float, Meaning("power of this beam in its time slot")]
     cost_db: Annotated[float, Meaning("`loss_db` plus 10 log10 of the number of time slots")]
@@ -109,10 +108,10 @@ class Beams:
     beams: Annotated[list[BeamState], Meaning("the beams, in the order of the weights' columns")]
     array: Annotated[ArrayState, Meaning("the antenna array")]
     policy: Annotated[
-        Policy, Meaning("what is done where zero forcing would cost a UAV too much gain")
+        Policy, Meaning("what happens if zero forcing would cost a UAV too much gain")
     ]
     codebook_beams: Annotated[int | None, Meaning("beams in the device's codebook")]
-    unfit: Annotated[str | None, Meaning("why there are no beams; null: there can be beams")]
+    unfit: Annotated[str | None, Meaning("why beams are impossible; null: they are possible")]
     left_out: Annotated[list[LeftOut], Meaning("UAVs without a beam, and why")]
 
 
@@ -131,7 +130,7 @@ class Weights:
 def beams(
     pipeline: Pipeline, equipment: Equipment, update: Update, age_s: float, lead_ms: float
 ) -> Json:
-    """The answer of ``/v1/beams`` for one update."""
+    """Return the answer of ``/v1/beams`` for one update."""
     beam_set, array, unfit = update.beams, pipeline.array, update.unfit
     boresight_deg = None
     if update.carrier is not None:
@@ -161,15 +160,13 @@ def beams(
 
 @functools.lru_cache(maxsize=4)
 def _beamwidths_rad(array: Array) -> tuple[float | None, float | None]:
-    """Widths at half power of the beam along boresight, in azimuth and elevation.
-
-    Cached by array.
-    """
+    """Return the half-power beamwidths of a boresight beam in azimuth and elevation; cached by
+    array."""
     return patterns.half_power_beamwidths_rad(array, np.array([1.0, 0.0, 0.0]))
 
 
 def pointing(pipeline: Pipeline, update: Update) -> list[Pointing]:
-    """Where each beam points over the ground; empty while the carrier's attitude is unknown."""
+    """Return where each beam points over the ground; empty if the carrier's attitude is unknown."""
     carrier, beam_set = update.carrier, update.beams
     if carrier is None or not beam_set.beams:
         return []
@@ -210,7 +207,7 @@ def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> Iterat
 def _stored(
     pipeline: Pipeline, equipment: Equipment, update: Update, beam: Beam, towards: FloatArray
 ) -> StoredBeam | None:
-    """Which stored beam serves a UAV, which is next and when, and which must be swept."""
+    """Return the best stored beam for a UAV, the next one with its time, and those to sweep."""
     codebook, array = equipment.codebook, pipeline.array
     if codebook is None:
         return None
@@ -232,7 +229,7 @@ def _stored(
 def _next_best(
     pipeline: Pipeline, equipment: Equipment, update: Update, beam: Beam
 ) -> codebooks.NextBest | None:
-    """The next stored beam, if the UAV flies on as it does; None where that is not known."""
+    """Return the next stored beam if the UAV keeps its motion; None if that is unknown."""
     codebook, carrier, array = equipment.codebook, update.carrier, pipeline.array
     track = next((track for track in update.tracks if track.uav == beam.uav), None)
     if codebook is None or carrier is None or track is None:
@@ -257,7 +254,7 @@ def _next_best(
 
 
 def weights(pipeline: Pipeline, beam_set: BeamSet, lead_ms: float) -> Json:
-    """The answer of ``/v1/beams/weights`` as JSON: M rows, columns in the order of ``uavs``."""
+    """Return the answer of ``/v1/beams/weights``: M rows, columns in the order of ``uavs``."""
     shown = Weights(
         made=beam_set,
         lead_ms=lead_ms,

@@ -1,4 +1,4 @@
-"""What carries the array, as the API shows it: its position and attitude."""
+"""Position and attitude of the array's carrier, as shown by the API."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -49,23 +49,21 @@ class LastPose:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Center:
-    """What carries the array; its values are null while its position is unknown."""
+    """The carrier of the array; its values are null while its position is unknown."""
 
     source: Annotated[
         str, Meaning("the vehicle SYSID:COMPID, the coordinates, or home", example="5:1")
     ]
     fixed: Annotated[bool, Meaning("whether it is a fixed station")]
     pose: Annotated[Pose | None, Inline()] = None
-    unfit: Annotated[str | None, Meaning("why its position is unknown; null where it is known")] = (
-        None
-    )
+    unfit: Annotated[str | None, Meaning("why its position is unknown; null: it is known")] = None
     last_known: Annotated[
         LastPose | None, Meaning("last known position, while the present one is unknown")
     ] = None
 
 
 def center(pipeline: Pipeline, now_ns: int) -> Center:
-    """Position and attitude of the carrier, as far as they are known."""
+    """Return position and attitude of the carrier, or the reason why they are unknown."""
     place = pipeline.center.place
     source, fixed = str(place), isinstance(place, FixedCenter)
     found = pipeline.carrier(now_ns, now_ns)

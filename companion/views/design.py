@@ -31,9 +31,9 @@ class Assumed(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Certificate:
-    """Certificate of the table of gains: e'Pe <= scale^2 holds for every order of intervals.
+    """Certificate of the gain table: e'Pe <= scale^2 holds for every order of intervals.
 
-    ``scale`` is how much larger the assumed bounds are than those of the table.
+    ``scale`` is the ratio of the assumed bounds to those of the table.
     """
 
     P: Annotated[Matrix, Meaning("matrix of the quadratic form, (position, velocity) in one axis")]
@@ -62,11 +62,11 @@ class UavDesign:
     ]
     peak_gain: Annotated[
         float | None,
-        Meaning("largest error in the long run: per m/s of unknown input, s; kinematic: m"),
+        Meaning("largest steady-state error: per m/s of unknown input, s; kinematic: in m"),
     ]
     residual: Annotated[
         float | None,
-        Meaning("smallest eigenvalue of the matrix inequalities; at least 0: they hold"),
+        Meaning("smallest eigenvalue of the matrix inequalities, which hold if it is not negative"),
     ]
     feasible: Annotated[bool, Meaning("whether the design has a solution")]
     dt_limit_s: Annotated[float | None, Meaning("longest interval for which the gain is certified")]
@@ -93,7 +93,7 @@ def _bounds(given: ObserverSettings, limits: Limits) -> Assumed:
 
 
 class DesignView:
-    """Shows the observer of one node's settings; the table of gains is read once.
+    """Observer design of one node's settings; the gain table is read once.
 
     Raises ``ConfigError`` if that fails.
     """
@@ -104,11 +104,11 @@ class DesignView:
         self._table = None if self._observer.model == "position" else kinematic_design(settings)
 
     def show(self, pipeline: Pipeline, now_ns: int) -> Json:
-        """The answer of ``/v1/design``.
+        """Return the answer of ``/v1/design``.
 
-        ``designs`` has the keys of ``companion design --json``, one entry for each UAV with a known
-        interval. ``feasible``: the interval is in the certified range; beyond it the gains are
-        those at its end.
+        ``designs`` has the keys of ``companion design --json``, with one entry for each UAV with a
+        known interval. ``feasible``: the interval is in the certified range; beyond it, the gains
+        at its end apply.
         """
         shown = Design(
             valid_at_ns=now_ns,
@@ -144,9 +144,9 @@ class DesignView:
 
 
 def _scale(table: KinematicDesign, given: Assumed) -> float:
-    """How many times larger the assumed bounds are than those of the table.
+    """Return the largest ratio of an assumed bound to that of the table.
 
-    The errors obey a linear equation, so the guarantee grows by the same factor (docs/math.md 4).
+    The error dynamics are linear, so the guarantee scales by the same factor (docs/math.md 4).
     """
     ratios = [
         given.limits.acceleration_max_mps2 / table.acceleration_mps2,
@@ -158,7 +158,7 @@ def _scale(table: KinematicDesign, given: Assumed) -> float:
 
 
 def _certificate(table: KinematicDesign, given: Assumed) -> Certificate:
-    """The certificate for every order of intervals within the range."""
+    """Return the certificate, valid for every order of intervals within the range."""
     scale = _scale(table, given)
     return Certificate(
         P=table.p.tolist(),
@@ -171,9 +171,9 @@ def _certificate(table: KinematicDesign, given: Assumed) -> Certificate:
 
 
 def _kinematic(table: KinematicDesign, given: Assumed, dt_s: float) -> Json:
-    """Gains by the table.
+    """Return the gains from the table.
 
-    Mu, gamma and residual are those of its certificate, one for all intervals.
+    Mu, gamma and residual are those of its certificate, which covers all intervals.
     """
     bound_m = _scale(table, given) * gain_table.invariant_bound(table)
     noise_mps = None if table.velocity_noise_mps is None else given.velocity_noise_mps
@@ -188,10 +188,7 @@ def _kinematic(table: KinematicDesign, given: Assumed, dt_s: float) -> Json:
 
 
 def _shared(given: Assumed, dt_s: float) -> Json:
-    """Gains for a UAV without a reported velocity: a fixed share of what two reports show.
-
-    They have no certificate.
-    """
+    """Return the gains for a UAV that reports no velocity: a fixed share, without a certificate."""
     gain = np.array([[1 + VELOCITY_SHARE], [VELOCITY_SHARE / dt_s]])
     return _row(dt_s, gain, given, None) | {
         "alpha": None,

@@ -1,4 +1,4 @@
-"""The fleet as the API shows it: nodes, who serves whom, what each offers, handovers."""
+"""The fleet as shown by the API: nodes, UAVs that each serves, offers, handovers."""
 
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -22,7 +22,7 @@ class NodeState(DescribedEnum):
     HERE = "here", "the node that answers"
     THERE = "there", "its messages are current"
     SILENT = "silent", "no message for longer than `[fleet] lease_s`"
-    ASIDE = "aside", "excluded, because its messages contradict others"
+    ASIDE = "aside", "excluded, because its messages contradict those of others"
     GONE = "gone", "it left"
 
 
@@ -40,7 +40,9 @@ class FleetNode:
     ]
     near: Annotated[
         bool,
-        Meaning("whether its reach meets this node's; only such nodes exchange reports and offers"),
+        Meaning(
+            "whether its range overlaps this node's; only such nodes exchange reports and offers"
+        ),
     ] = False
     reason: Annotated[str | None, Meaning("why it is excluded")] = None
     place: Annotated[Place | None, Meaning("position of its array")] = None
@@ -76,7 +78,7 @@ class FleetNode:
 
 @dataclass(frozen=True, slots=True)
 class FleetOffer:
-    """What a node's array would offer a UAV, if it served that UAV alone."""
+    """The gain and SINR that a node's array would give a UAV, if it served that UAV alone."""
 
     node: Annotated[str, Meaning("node that offers")]
     offer: Annotated[Offer, Inline(omit=("uav",))]
@@ -90,9 +92,9 @@ class FleetUav:
     served_by: Annotated[
         list[str], Meaning("nodes that serve it; two during a handover or in a split fleet")
     ]
-    handing_to: Annotated[str | None, Meaning("node that is to take it over")]
+    handing_to: Annotated[str | None, Meaning("node to which it is being handed over")]
     unconfirmed: Annotated[
-        bool, Meaning("whether a single node reports it, where others ought to receive it")
+        bool, Meaning("whether only one node reports it, though others should receive it")
     ]
     offers: Annotated[list[FleetOffer], Meaning("what each node offers it")]
 
@@ -117,12 +119,12 @@ class Fleet:
     heard_bps: Annotated[float | None, Meaning("data that others share, last second")] = None
     damaged: Annotated[int, Meaning("malformed fleet messages received")] = 0
     untold: Annotated[
-        int, Meaning("frames and round trips not shared: queue full, or too many vehicles heard")
+        int, Meaning("frames and round trips not shared: queue full, or too many vehicles received")
     ] = 0
 
 
 def fleet(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Json:
-    """The answer of ``/v1/fleet``; ``node`` is null where there is no fleet."""
+    """Return the answer of ``/v1/fleet``; ``node`` is null without a fleet."""
     shown = Fleet(valid_at_ns=now_ns)
     if status is not None:
         member = status.member
@@ -142,7 +144,7 @@ def fleet(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Json:
 
 
 def nodes(member: FleetMember, now_ns: int) -> list[FleetNode]:
-    """This node, then the others by name, and then those that left."""
+    """Return this node, then the others by name, and then those that left."""
     own = FleetNode(
         node=member.name,
         is_self=True,
@@ -190,7 +192,7 @@ def _node(name: str, member: FleetMember, now_ns: int) -> FleetNode:
 
 
 def _ways_ms(known: Neighbour, now_ns: int) -> tuple[float | None, float | None]:
-    """Median and 99th percentile of how long reports were on their way; None: none came."""
+    """Return median and 99th percentile of the delays of reports; None if none came."""
     ways_ns = known.delays_ns(now_ns)
     if not ways_ns:
         return None, None
@@ -203,7 +205,7 @@ def _place(place: tuple[float, float, float] | None) -> Place | None:
 
 
 def _uavs(member: FleetMember, now_ns: int) -> list[FleetUav]:
-    """Every UAV that some node offers to serve or serves, and by whom it is served."""
+    """Return every UAV that a node serves or offers to serve."""
     offers, by = offers_of(member), served_by(member, now_ns)
     handing = dict(member.duties.handing)
     for said in standing(member, now_ns).values():
@@ -221,7 +223,7 @@ def _uavs(member: FleetMember, now_ns: int) -> list[FleetUav]:
 
 
 def _natural(uav: str) -> tuple[int, int, str]:
-    """Telemetry by its numbers, then the others by name."""
+    """Return a sort key: telemetry by its numbers, then the others by name."""
     sysid, _, compid = uav.partition(":")
     is_plain = sysid.isdecimal() and compid.isdecimal()
     return (int(sysid), int(compid), uav) if is_plain else (256, 0, uav)

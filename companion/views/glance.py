@@ -1,5 +1,4 @@
-"""The running service in a few words: for a terminal's last line, and for a program that reads
-lines."""
+"""Short status of the running service, for a terminal's status line and for JSON lines."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,11 +11,11 @@ from companion.views import health
 from companion.views.as_json import Json, as_json, rfc3339
 from companion.views.state import Node, summary
 
-NAMED: Final = 2  # most UAVs that the line names
+NAMED: Final = 2  # largest number of UAVs in the status line
 
 
 def glance(node: Node) -> Json:
-    """What matters of the state: links, UAVs with their verdicts, recording, the headline."""
+    """Return links, UAVs with their verdicts, recording and headline."""
     pipeline, now_ns = node.pipeline, node.now_ns()
     verdicts, update = pipeline.health.verdicts, pipeline.last_update
     machine = health.behind(node.arrival_lag.seen(now_ns))
@@ -43,7 +42,7 @@ def glance(node: Node) -> Json:
 
 
 def line(node: Node) -> str:
-    """The same in a line: who is heard, how good the links are, and the worst of them."""
+    """Return the status as one line, with the worst links."""
     now_ns, verdicts = node.now_ns(), node.pipeline.health.verdicts
     up = sum(link.state == "up" for link in node.links())
     frames_hz = node.rates().get("frames_hz")
@@ -66,19 +65,19 @@ def line(node: Node) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Events:
-    """The newest notices, the oldest first."""
+    """The newest notices, oldest first."""
 
     valid_at_ns: Annotated[int, Meaning("the instant for which the values hold")]
-    events: Annotated[list[Notice], Meaning("the notices, the oldest first")]
+    events: Annotated[list[Notice], Meaning("the notices, oldest first")]
 
 
 def events(node: Node) -> Json:
-    """The answer of ``/v1/events``."""
+    """Return the answer of ``/v1/events``."""
     return as_json(Events(node.now_ns(), node.events()), node.pipeline.utc_ns)
 
 
 def as_events(node: Node, notices: Sequence[Notice]) -> list[Json]:
-    """Notices as ``/v1/events`` has them."""
+    """Return notices as in ``/v1/events``."""
     return [as_json(notice, node.pipeline.utc_ns) for notice in notices]
 
 
@@ -89,7 +88,7 @@ def _verdict(pipeline: Pipeline, found: Verdict | None, machine: Blame | None) -
 
 
 def _worst_first(verdicts: list[Verdict]) -> list[Verdict]:
-    """Those that are not good."""
+    """Return the verdicts that are not good, worst first."""
     ranks = {Level.NONE: 0, Level.WEAK: 1}
     poor = [verdict for verdict in verdicts if verdict.level in ranks]
     return sorted(poor, key=lambda verdict: ranks[verdict.level])

@@ -1,4 +1,4 @@
-"""Least gain and least SINR of beams wherever the UAVs truly are, as the API shows them."""
+"""Least gain and least SINR of beams over all positions that the bounds allow."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -13,11 +13,11 @@ from companion.values import ComplexArray, FloatArray, Update, UserError
 from companion.views.quantised import device_table
 
 MOST_AT_WORST: Final = 16
-"""Most beams for which guaranteed SINRs are computed: the leakage between them grows squared."""
+"""Largest number of beams with guaranteed SINRs; the work grows with its square."""
 
 
 def gains_db(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[float | None]:
-    """The guaranteed gain of each beam of one update, as the API shows it."""
+    """Return the guaranteed gain of each beam of an update; None without a guarantee."""
     if not update.beams.beams:
         return []
     weights = _radiated(pipeline, equipment, update)
@@ -33,9 +33,9 @@ def of_beams(
     towards: FloatArray,
     powers_w: FloatArray,
 ) -> tuple[Sequence[float | None], Sequence[float | None]]:
-    """Least gain and least SINR of each beam, wherever the UAVs truly are.
+    """Return least gain and least SINR of each beam within its UAV's bound.
 
-    None where a UAV may be out of coverage, in a null, or anywhere. The SINR is None for all where
+    A gain is None if the UAV may be out of coverage, in a null, or anywhere. All SINRs are None if
     there are more than ``MOST_AT_WORST`` beams.
     """
     array, beam_set = pipeline.array, update.beams
@@ -69,18 +69,18 @@ def of_beams(
 def _least(
     pipeline: Pipeline, update: Update, towards: FloatArray, weights: ComplexArray
 ) -> tuple[Sequence[float | None], Sequence[float | None]]:
-    """Pointing bound of each beam, None where it leaves the coverage, and least gain within it."""
+    """Return each pointing bound, None if it leaves the coverage, and the least gain within."""
     angles = [beam.pointing_bound_rad for beam in update.beams.beams]
     bounds = guarantee.covered_bounds(pipeline.array, pipeline.coverage, towards, angles)
     return bounds, guarantee.guaranteed_gains_db(pipeline.array, towards, bounds, weights)
 
 
 def _radiated(pipeline: Pipeline, equipment: Equipment, update: Update) -> ComplexArray | None:
-    """The weights, as the device has them if there is one; None where it cannot have them."""
+    """Return the weights, quantised for a device if any; None if it cannot apply them."""
     if equipment.device is None:
         return update.beams.weights
     try:
         table = device_table(equipment.device, update.beams, pipeline.array, equipment)
-    except UserError:  # who asks for the device's table is told why
+    except UserError:  # a request for the device's table gets the reason
         return None
     return table.weights

@@ -1,7 +1,7 @@
-"""Verdicts on the links to UAVs as the API shows them.
+"""Verdicts on the links to UAVs, as shown by the API.
 
-Where this machine is behind, that is the cause of every link that is not good: the pipeline then
-sees old reports only.
+If this machine is overloaded, that is the cause of every link that is not good: the pipeline
+then receives only old reports.
 """
 
 from collections import Counter
@@ -16,7 +16,7 @@ from companion.values.described import Inline, Meaning
 
 @dataclass(frozen=True, slots=True)
 class LinkHealth:
-    """What is behind the verdict on the link to a UAV; gains are those of the array."""
+    """Cause and gains of the verdict on the link to a UAV; gains are those of the array."""
 
     blame: Annotated[Blame | None, Inline()]
     verdict: Annotated[Verdict | None, Inline()]
@@ -24,36 +24,34 @@ class LinkHealth:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Headline:
-    """How many links to UAVs are good, weak, none; and the same in words."""
+    """Number of good, weak and missing links to UAVs; and as text."""
 
     good: Annotated[int, Meaning("links with the guaranteed gain they need")]
     weak: Annotated[int, Meaning("links that usually have the gain they need")]
     none: Annotated[int, Meaning("links without the gain they need, or without a beam")]
-    headline: Annotated[
-        str, Meaning("how many links are good, in words", example="3 of 4 links good")
-    ]
+    headline: Annotated[str, Meaning("number of good links, as text", example="3 of 4 links good")]
     behind: Annotated[
-        str | None, Meaning("that this machine does not keep up, in words; null where it does")
+        str | None, Meaning("that this machine is overloaded, as text; null: it is not")
     ]
 
 
 def behind(seen: LagSeen) -> Blame | None:
-    """What is to blame where this machine does not keep up; None where it does."""
+    """Return the cause if this machine is overloaded; None otherwise."""
     if not seen.behind:
         return None
     return Blame(
         Cause.MACHINE,
-        f"this machine is behind: frames wait {seen.max_s or 0.0:.1f} s for it",
-        "close other programs and pages, or lower [beams] update_hz",
+        f"this machine is overloaded: frames wait up to {seen.max_s or 0.0:.1f} s",
+        "close other programs and pages, or lower `[beams] update_hz`",
     )
 
 
 def verdict(
     found: Verdict | None, machine: Blame | None, unserved: Blame | None = None
 ) -> tuple[Level | None, LinkHealth | None]:
-    """The verdict on one UAV's link, and what is behind it.
+    """Return the verdict on one UAV's link, and its cause.
 
-    ``unserved`` is why no node of the fleet serves the UAV, where none does: it has no link then.
+    ``unserved`` is the reason why no node of the fleet serves the UAV, which then has no link.
     """
     if unserved is not None:
         return Level.NONE, LinkHealth(machine or unserved, None)
@@ -66,9 +64,9 @@ def verdict(
 def summary(
     verdicts: Iterable[Verdict], machine: Blame | None, *, unserved: int = 0, elsewhere: int = 0
 ) -> Headline:
-    """How many links there are of each level, the same in words, and whether all of it is late.
+    """Count the links of each level, and return the counts also as text.
 
-    ``unserved`` UAVs have no node of the fleet; ``elsewhere`` counts those of other nodes.
+    ``unserved`` UAVs have no node of the fleet; ``elsewhere`` counts those that other nodes serve.
     """
     counts = Counter(found.level for found in verdicts)
     counts[Level.NONE] += unserved

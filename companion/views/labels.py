@@ -1,4 +1,4 @@
-"""Names, units and meanings of what the API shows, for pages: they need no copy of their own."""
+"""Names, units and meanings of the values in the API; the page takes its labels from here."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ SHOWN: Final = (
     BeamState, Center, Fleet, FleetNode, FleetUav, HeardLink, LinkHealth, LinkReports,
     RecordingStatus, Status, UavState,
 )  # fmt: skip
-"""Classes whose values pages show."""
+"""Classes whose values the page shows."""
 ENUMERATIONS: Final[tuple[type[DescribedEnum], ...]] = (
     Cause, Level, Method, NodeState, Policy, RateState, Reason, Severity, TrackState,
 )  # fmt: skip
@@ -28,10 +28,10 @@ ENUMERATIONS: Final[tuple[type[DescribedEnum], ...]] = (
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """How one value is named and what it means."""
+    """Name, unit and meaning of one value."""
 
     label: Annotated[str, Meaning("short name", example="Innovation")]
-    unit: Annotated[str, Meaning("unit; empty where there is none", example="m")]
+    unit: Annotated[str, Meaning("unit; empty without one", example="m")]
     meaning: Annotated[str, Meaning("what the value means")]
 
 
@@ -44,7 +44,7 @@ class Labels:
 
 
 def labels() -> Labels:
-    """The answer of ``/v1/labels``."""
+    """Return the answer of ``/v1/labels``."""
     values = {shown.__name__: dict(_labels(shown)) for shown in SHOWN}
     enumerations = {kind.__name__: {str(one): one.meaning for one in kind} for kind in ENUMERATIONS}
     return Labels(values, enumerations)

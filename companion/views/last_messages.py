@@ -1,4 +1,4 @@
-"""The newest frame of every kind from every sender, decoded only if anybody asks."""
+"""The newest frame of every message from every sender; frames are decoded only on request."""
 
 from collections import OrderedDict
 from dataclasses import dataclass
@@ -7,15 +7,15 @@ from typing import Final
 from companion.values import Frame, Source
 
 KEPT_MAX: Final = 8192
-"""Frames kept; beyond it the one heard longest ago is dropped.
+"""Frames kept, so that a flood of forged senders cannot exhaust the memory.
 
-A flood of made-up senders must not fill the memory.
+Beyond it the least recently received one is dropped.
 """
 
 
 @dataclass(slots=True)
 class Kept:
-    """The newest frame of one message from one sender, how many came, and when the first did."""
+    """Newest frame of one message from one sender, number of frames, and arrival of the first."""
 
     frame: Frame
     first_ns: int
@@ -29,14 +29,14 @@ class Kept:
 
 
 class LastMessages:
-    """The newest frames by sender and message id. ``add`` is called for every frame."""
+    """Newest frames by sender and message id. ``add`` is called for every frame."""
 
     def __init__(self, most: int = KEPT_MAX) -> None:
         self._most = most
         self._kept: OrderedDict[tuple[Source, int], Kept] = OrderedDict()
 
     def add(self, frame: Frame) -> None:
-        """Keep a frame in place of the one before."""
+        """Keep a frame instead of the previous one."""
         key = frame.source, frame.msgid
         kept = self._kept.get(key)
         if kept is not None:
@@ -49,11 +49,11 @@ class LastMessages:
             self._kept.popitem(last=False)
 
     def find(self, source: Source, msgid: int) -> Kept | None:
-        """The newest message of a kind from a sender; None if it is not known."""
+        """Return the newest message of a kind from a sender; None if there is none."""
         return self._kept.get((source, msgid))
 
     def by_sender(self) -> dict[Source, list[Kept]]:
-        """Copies of all that is kept, which another thread may read; senders and ids ascend."""
+        """Return copies of all frames, safe for another thread, ordered by sender and id."""
         found: dict[Source, list[Kept]] = {}
         for (source, _), kept in sorted(self._kept.items()):
             copy = Kept(kept.frame, kept.first_ns, kept.count)

@@ -1,4 +1,4 @@
-"""Links and requested message rates as the API shows them."""
+"""Links and requested message rates, as shown by the API."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -30,7 +30,7 @@ class LinkReports:
 
 @dataclass(frozen=True, slots=True)
 class LinkState:
-    """One link; ``lost`` counts refused frames by reason, garbage in bytes."""
+    """One link; ``lost`` counts rejected frames by reason, garbage in bytes."""
 
     status: Annotated[LinkStatus, Inline()]
     age_s: Annotated[float | None, Meaning("time since the last frame")]
@@ -39,7 +39,7 @@ class LinkState:
 
 @dataclass(frozen=True, slots=True)
 class Component:
-    """One component heard over a link."""
+    """One component received over a link."""
 
     id: Annotated[Source, Meaning("SYSID:COMPID", example="3:1")]
     status: Annotated[ComponentStatus, Inline()]
@@ -48,10 +48,10 @@ class Component:
 
 @dataclass(frozen=True, slots=True)
 class HeardLink:
-    """One link and the components heard over it."""
+    """One link and the components received over it."""
 
     link: Annotated[LinkState, Inline()]
-    components: Annotated[list[Component], Meaning("components heard, by id")]
+    components: Annotated[list[Component], Meaning("components received, by id")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,16 +69,16 @@ class OutLink:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Links:
-    """Links, the components heard over each, and the requested message rates."""
+    """Links, the components received over each, and the requested message rates."""
 
     valid_at_ns: Annotated[int, Meaning("the instant for which the values hold")]
     links: Annotated[list[HeardLink], Meaning("the links, in the order of the settings")]
-    out: Annotated[list[OutLink], Meaning("links of [out]: they send and are not read")]
+    out: Annotated[list[OutLink], Meaning("links of [out], which only send")]
     message_rates: Annotated[list[MessageRate], Meaning("rates requested of UAVs")]
 
 
 def link(item: LinkStatus, share: LinkShare, now_ns: int) -> LinkState:
-    """One link of ``/v1/status`` and ``/v1/links``."""
+    """Return one link of ``/v1/status`` and ``/v1/links``."""
     age_s = None if item.heard_ns is None else (now_ns - item.heard_ns) * 1e-9
     total, latencies = share.first + share.repeats, list(share.latencies_s)
     p50, p95 = np.percentile(latencies, [50, 95]).tolist() if latencies else (None, None)
@@ -97,7 +97,7 @@ def link(item: LinkStatus, share: LinkShare, now_ns: int) -> LinkState:
 
 
 def components(item: LinkStatus, now_ns: int) -> list[Component]:
-    """Components heard over a link, by system and component."""
+    """Return the components received over a link, ordered by system and component."""
     return [
         Component(who, heard, (now_ns - heard.heard_ns) * 1e-9)
         for who, heard in sorted(item.components.items())

@@ -1,13 +1,12 @@
-"""Last messages in the shape that users of mavlink2rest know (github.com/mavlink/mavlink2rest).
+"""Last messages in the format of mavlink2rest (github.com/mavlink/mavlink2rest).
 
 ``{"message": {"type": NAME, fields…}, "status": {"time": {…}}}``. An enumeration is ``{"type":
-"MAV_…"}``, a bit mask ``{"bits": N}``, and characters come as a list. A field that is called
-``type`` is called ``mavtype``, because ``type`` is the message's name. What is not a number is
-null. ``frequency`` is null after a single message.
+"MAV_…"}``, a bit mask ``{"bits": N}``, and characters are a list. A field named ``type`` is
+written as ``mavtype``, since ``type`` is the message's name. NaN is null. ``frequency`` is null
+after a single message.
 
 Decoding needs pymavlink's generated dialect, which takes half a second to load on a small computer:
-``dialect`` loads it when it is first asked for, and must be called on another thread than the event
-loop's.
+``dialect`` loads it on first use and must not be called on the event loop's thread.
 """
 
 import functools
@@ -27,7 +26,7 @@ _PLAIN: Final = {"char", "float", "double"}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MessageTime:
-    """When a message came, how many, and how often."""
+    """First and last arrival, number and rate of a message."""
 
     first_update: Annotated[str, Meaning("arrival of the first of its kind")]
     last_update: Annotated[str, Meaning("arrival of the newest of its kind")]
@@ -39,7 +38,7 @@ class MessageTime:
 class MessageStatus:
     """Status of a message, as in mavlink2rest."""
 
-    time: Annotated[MessageTime, Meaning("when it came, how many, how often")]
+    time: Annotated[MessageTime, Meaning("arrival times, number and rate")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +52,7 @@ class MavlinkMessage:
             example={"type": "SYSTEM_TIME", "time_unix_usec": 0, "time_boot_ms": 81},
         ),
     ]
-    status: Annotated[MessageStatus, Meaning("when it came, how many, how often")]
+    status: Annotated[MessageStatus, Meaning("arrival times, number and rate")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,11 +82,11 @@ class Dialect:
         self._ids: Final = {kind.msgname: msgid for msgid, kind in self._classes.items()}
 
     def msgid(self, name: str) -> int | None:
-        """The id of a message; None for a name that is not known."""
+        """Return the id of a message; None for an unknown name."""
         return self._ids.get(name)
 
     def message(self, kept: Kept, utc_ns: Callable[[int], UtcNs]) -> Json | None:
-        """One message and its status; None for an id that is not known."""
+        """Return one message and its status; None for an unknown id."""
         kind = self._classes.get(kept.frame.msgid)
         if kind is None:
             return None
@@ -108,7 +107,8 @@ class Dialect:
         }
 
     def _fields(self, kind: Any, payload: bytes) -> Iterator[tuple[str, Any]]:
-        """Names and values. MAVLink 2 cuts zeros off a payload, and a later dialect adds to it."""
+        """Yield names and values. Pads zeros that MAVLink 2 truncates; ignores fields of later
+        dialects."""
         size = kind.unpacker.size
         values = iter(kind.unpacker.unpack(payload[:size].ljust(size, b"\0")))
         types = dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
@@ -124,7 +124,7 @@ class Dialect:
 
     def _value(self, kind: Any, types: dict[str, str], field: str, value: Any) -> Any:
         if types[field] == "float":
-            return np.float32(value)  # written with as many digits as it has
+            return np.float32(value)  # so that JSON has no more digits than a float32
         enum = kind.fieldenums_by_name.get(field)
         if enum is None or types[field] in _PLAIN:
             return value
@@ -136,18 +136,18 @@ class Dialect:
 
 @functools.cache
 def dialect() -> Dialect:
-    """The dialect, loaded once."""
+    """Return the dialect; loads it once."""
     return Dialect()
 
 
 def messages(kept: Iterable[Kept], utc_ns: Callable[[int], UtcNs]) -> Json:
-    """The messages of one component, by message name."""
+    """Return the messages of one component by message name."""
     shown = (dialect().message(one, utc_ns) for one in kept)
     return {one["message"]["type"]: one for one in shown if one is not None}
 
 
 def vehicles(by_sender: dict[Source, list[Kept]], utc_ns: Callable[[int], UtcNs]) -> Json:
-    """All vehicles, their components, and the last messages of these."""
+    """Return all vehicles, their components, and the components' last messages."""
     found: Json = {}
     for source, kept in by_sender.items():
         vehicle = found.setdefault(str(source.sysid), {"id": source.sysid, "components": {}})

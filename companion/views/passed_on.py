@@ -1,8 +1,7 @@
-"""What goes on to others: each aircraft's position at this moment, by all that is known.
+"""Positions sent to other programs: each aircraft at this moment, from its track.
 
-Said are tracks that are live or coasting; of the others there is nothing to say. A report that
-comes late changes what is known of the past, and so the next position, but never when it is of: the
-times of what is said of an aircraft only go forward.
+Only live and coasting tracks are sent. A late report may change the next position, but the times
+sent for an aircraft never go backwards.
 """
 
 import math
@@ -21,22 +20,22 @@ from companion.tracking.noise import GEOID_M
 from companion.values import AltitudeDatum, Source, Track, TrackState, kind_of
 
 KNOWN: Final = (TrackState.LIVE, TrackState.COASTING)
-_REBOOT_MS: Final = 60_000  # a step back of a boot clock beyond which its owner has booted anew
+_REBOOT_MS: Final = 60_000  # a larger backward step of a boot clock means a reboot
 
 
 class Positions:
-    """The position of each vehicle that reports itself, as if it had said it now.
+    """Position of each vehicle that reports itself, as a message from that vehicle.
 
-    ``utm``: as UTM_GLOBAL_POSITION, ``every_s`` apart, else as GLOBAL_POSITION_INT.
+    ``utm``: as UTM_GLOBAL_POSITION, ``every_s`` apart; otherwise as GLOBAL_POSITION_INT.
     """
 
     def __init__(self, *, utm: bool = False, every_s: float = 0.0) -> None:
         self._utm = utm
         self._every_s = every_s
-        self._boot_ms: dict[str, int] = {}  # of what was said last
+        self._boot_ms: dict[str, int] = {}  # boot time in the last message, by UAV
 
     def outgoing(self, pipeline: Pipeline, tracks: Iterable[Track]) -> list[Outgoing]:
-        """What is to be said of the tracks at their time, by their own clocks."""
+        """Return the messages for the tracks at their time, stamped by the senders' clocks."""
         found = [
             message
             for track in tracks
@@ -82,7 +81,7 @@ class Positions:
         relative_alt_m: float | None,
         velocity_ned_mps: tuple[float, float, float],
     ) -> Outgoing:
-        """Its height is above the ellipsoid: it is said where the geoid's height is known."""
+        """Its height is above the ellipsoid, so it is sent only if the undulation is known."""
         known = pipeline.settings.observer.geoid_m is not None
         undulation_m, off_m = _geoid(pipeline) if known else (0.0, 0.0)
         lat_deg, lon_deg, alt_m = place
@@ -101,7 +100,7 @@ class Positions:
 
 
 def events(pipeline: Pipeline, tracks: Iterable[Track], stale_s: float) -> list[bytes]:
-    """An event of Cursor on Target for each aircraft that is known, under its best name alone."""
+    """Return a Cursor on Target event for each live or coasting aircraft, without duplicates."""
     return [
         _event(pipeline, track, stale_s)
         for track in tracks
@@ -115,7 +114,7 @@ def _event(pipeline: Pipeline, track: Track, stale_s: float) -> bytes:
     newest = pipeline.tracker.newest(track.uav)
     datum = AltitudeDatum.PRESSURE if newest is None else newest.report.alt_datum
     known = datum is not AltitudeDatum.PRESSURE
-    undulation_m, geoid_m = 0.0, 0.0  # the schema's height is above the ellipsoid
+    undulation_m, geoid_m = 0.0, 0.0  # in the schema, height is above the ellipsoid
     if datum is AltitudeDatum.MSL:
         undulation_m, geoid_m = _geoid(pipeline)
     course_deg = speed_mps = None
@@ -137,13 +136,13 @@ def _event(pipeline: Pipeline, track: Track, stale_s: float) -> bytes:
 
 
 def _geoid(pipeline: Pipeline) -> tuple[float, float]:
-    """Height of mean sea level above the ellipsoid, and most that it is off."""
+    """Return the height of mean sea level above the ellipsoid, and its largest error."""
     given = pipeline.settings.observer
     return (0.0, GEOID_M) if given.geoid_m is None else (given.geoid_m, given.geoid_error_m)
 
 
 def _remarks(track: Track, datum: AltitudeDatum, geoid_m: float) -> str:
-    """What the numbers of an event are."""
+    """Return text that explains the numbers of an event."""
     words = [
         f"ce {track.horizontal_bound_m:.1f} m and le are guaranteed bounds, not standard deviations"
     ]
@@ -151,8 +150,9 @@ def _remarks(track: Track, datum: AltitudeDatum, geoid_m: float) -> str:
         words.append(f"95 of 100 errors stay below {track.error_p95_m:.1f} m")
     words.append(
         {
-            AltitudeDatum.MSL: f"height above mean sea level: le has {geoid_m:.0f} m for the geoid",
-            AltitudeDatum.PRESSURE: "height by pressure alone, so none is said",
+            AltitudeDatum.MSL: f"height from mean sea level: le includes {geoid_m:.0f} m for the"
+            " geoid",
+            AltitudeDatum.PRESSURE: "only a pressure altitude is known, so hae is not given",
             AltitudeDatum.GEOMETRIC: "height above the ellipsoid",
         }[datum]
     )
@@ -167,7 +167,7 @@ def _place(pipeline: Pipeline, track: Track) -> tuple[float, float, float]:
 def _velocity_ned_mps(
     pipeline: Pipeline, track: Track, place: tuple[float, float, float]
 ) -> tuple[float, float, float] | None:
-    """North, east and down where the aircraft is."""
+    """Return the velocity in north, east and down at the aircraft's position."""
     if track.velocity_ned_mps is None or pipeline.local is None:
         return None
     there_from_local = pipeline.local.local_from_ned(place[0], place[1]).T

@@ -1,4 +1,4 @@
-"""The array's response along a cut through each beam, as the API shows it."""
+"""The array's response along a cut through each beam, as shown by the API."""
 
 import math
 from dataclasses import dataclass
@@ -50,7 +50,7 @@ class Pattern:
 def pattern(
     pipeline: Pipeline, update: Update, cut: Cut, *, points: int, only: str | None, lead_ms: float
 ) -> Json:
-    """The answer of ``/v1/pattern``: the response of each beam (or one) along a cut through it."""
+    """Return the answer of ``/v1/pattern``: the response of all beams, or of one, along a cut."""
     array, beam_set = pipeline.array, update.beams
     entries, angles = [], np.empty(0)
     for i, beam in enumerate(beam_set.beams):

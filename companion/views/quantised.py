@@ -1,4 +1,4 @@
-"""Weights as a device can be set to them."""
+"""Weights quantised to the settings of a device."""
 
 from companion.beams.aim import directions
 from companion.beams.array.geometry import Array
@@ -17,10 +17,10 @@ def device_table(
     equipment: Equipment,
     only: str | None = None,
 ) -> tables.DeviceTable:
-    """The settings of a device that come nearest to the weights.
+    """Return the settings of a device that best approximate the weights.
 
-    Each beam, or only that of one UAV, is fitted towards its own UAV and away from the others of
-    its group. Raises ``UserError``, with the reason, for what the device cannot do.
+    Each beam, or only that of one UAV, is fitted towards its own UAV and away from the others in
+    its group. Raises ``UserError`` with the reason if the device cannot apply them.
     """
     steering = steering_matrix(array, directions(beam_set))
     wanted = []

@@ -1,8 +1,8 @@
-"""Updates as records for machines: one fixed little-endian layout that says what it holds.
+"""Updates as binary records: one fixed, self-describing little-endian layout.
 
 A record is a header, an entry for each beam, and the weights: beam after beam, complex64 by
-element. ``examples/c/uav_beams.h`` reads the same layout. Unknown is NaN. A record of more bytes
-than a way out can carry is said in parts, each a whole record of some of the beams.
+element. ``examples/c/uav_beams.h`` reads the same layout. Unknown values are NaN. An update that
+exceeds the size limit of its transport is split into several records, each with some of the beams.
 """
 
 import math
@@ -19,29 +19,30 @@ from companion.values import BeamSet, Normalisation
 
 MAGIC: Final = b"UAVBEAMS"
 VERSION: Final = 1
-COMPLEX64: Final = 1  # dtype of weights that are pairs of float32, real part first
-WIDENED: Final = 1  # flag of a beam whose main lobe was broadened
-EXACT: Final = 1  # flag of a record in which each UAV lies in a null of all other beams of its slot
+COMPLEX64: Final = 1  # dtype of weights as pairs of float32, real part first
+WIDENED: Final = 1  # flag of a beam with a widened main lobe
+EXACT: Final = 1  # flag of a record in which each UAV is in a null of all other beams of its slot
 CHECKED_FROM: Final = 20
-"""First byte that the checksum (CRC-32 as of zlib) covers; it ends with the record."""
+"""First byte covered by the checksum (CRC-32 as in zlib), which extends to the end of the record.
+"""
 ID_BYTES: Final = 72
 
 HEADER: Final = np.dtype(
     [
         ("magic", "S8"),
         ("version", "<u4"),
-        ("bytes", "<u4"),  # of the whole record
+        ("bytes", "<u4"),  # size of the whole record
         ("crc32", "<u4"),
         ("header_bytes", "<u4"),
-        ("sequence", "<u8"),  # of the update, from 0
+        ("sequence", "<u8"),  # number of the update, from 0
         ("made_at_ns", "<i8"),  # UTC, ns since the Unix epoch, by the service's wall clock
         ("valid_at_ns", "<i8"),
         ("elements", "<u4"),  # M
         ("beams", "<u4"),  # N in this record
-        ("first_beam", "<u4"),  # number of its first beam among all of the update
+        ("first_beam", "<u4"),  # index of its first beam among all of the update
         ("all_beams", "<u4"),
         ("dtype", "<u4"),
-        ("beam_bytes", "<u4"),  # of an entry
+        ("beam_bytes", "<u4"),  # size of an entry
         ("beams_at", "<u4"),  # offset of the first entry
         ("weights_at", "<u4"),  # offset of the weights
         ("normalisation", "<u4"),
@@ -65,11 +66,11 @@ BEAM: Final = np.dtype(
     ]
 )
 NORMALISATIONS: Final = tuple(Normalisation)
-"""What ``normalisation`` counts: unit-response is 0, then stream, total, antenna."""
+"""Values of ``normalisation`` by index: 0 is unit-response, then stream, total, antenna."""
 
 
 def in_utc(pipeline: Pipeline, beam_set: BeamSet) -> BeamSet:
-    """The same with its times in UTC, as machines elsewhere count them."""
+    """Return the beams with their times in UTC instead of on the node's timeline."""
     t_ns, valid_at_ns = map(pipeline.utc_ns, (beam_set.t_ns, beam_set.valid_at_ns))
     return replace(beam_set, t_ns=t_ns, valid_at_ns=valid_at_ns)
 
@@ -80,13 +81,13 @@ def encode(
     guaranteed_db: Sequence[float | None] | None = None,
     most_bytes: int | None = None,
 ) -> Iterator[bytes]:
-    """The records of one update: one, or as many as ``most_bytes`` makes necessary.
+    """Yield the records of one update: one, or as many as ``most_bytes`` requires.
 
         sequence       number of the update
-        guaranteed_db  guaranteed gain of each beam; None: not asked for
+        guaranteed_db  guaranteed gain of each beam; None: not computed
         most_bytes     largest record; a beam of 4096 elements takes 33 kB
 
-    Raises ``ValueError`` where not even one beam fits, or for a name that is too long.
+    Raises ``ValueError`` if a single beam does not fit, or if a UAV's name is too long.
     """
     size, count = beam_set.weights.shape
     each = BEAM.itemsize + 8 * size

@@ -1,6 +1,6 @@
-"""What the charts show of the last minutes: a sample of every UAV each second.
+"""Samples for the charts: one per second of every UAV, over the last minutes.
 
-The page keeps its own minutes; these are for a page that has just been opened.
+The page collects its own samples; these are for a page that has just been opened.
 """
 
 from collections import deque
@@ -30,7 +30,7 @@ class UavHistory:
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """A sample each second, the oldest first."""
+    """One sample per second, oldest first."""
 
     valid_at_ns: Annotated[int, Meaning("the instant for which the values hold")]
     at: Annotated[list[str], Meaning("when each sample was taken")]
@@ -39,7 +39,7 @@ class History:
 
 FIELDS: Final = tuple(member.name for member in members(UavHistory))
 Sample = tuple[int, dict[str, tuple[float | None, ...]]]
-"""The time of an update, ns, and the values of ``FIELDS`` for each UAV."""
+"""Time of an update, ns, and the values of ``FIELDS`` for each UAV."""
 
 
 class Series:
@@ -49,7 +49,7 @@ class Series:
         self._samples: deque[Sample] = deque(maxlen=SAMPLES)
 
     def add(self, pipeline: Pipeline) -> None:
-        """Take a sample of the newest update, if it is time."""
+        """Sample the newest update if a sample is due."""
         update = pipeline.last_update
         if update is None or (self._samples and 0 <= update.t_ns - self._samples[-1][0] < EVERY_NS):
             return
@@ -67,12 +67,12 @@ class Series:
         self._samples.append((update.t_ns, sample))
 
     def samples(self) -> list[Sample]:
-        """The samples so far, the oldest first; they no longer change."""
+        """Return the samples so far, oldest first; they are immutable."""
         return list(self._samples)
 
 
 def show(samples: list[Sample], now_ns: int, utc_ns: Utc) -> Json:
-    """The answer of ``/v1/history``: columns. May run on any thread."""
+    """Return the answer of ``/v1/history``, in columns. May run on any thread."""
     uavs = dict.fromkeys(uav for _, sample in samples for uav in sample)
     nothing = (None,) * len(FIELDS)
     return {

@@ -1,4 +1,4 @@
-"""Which nodes of the fleet serve which UAVs, and why none serves a UAV."""
+"""Nodes of the fleet that serve each UAV, and reasons why no node serves a UAV."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,31 +12,31 @@ from companion.values import Blame, Offer, Standing
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FleetStatus:
-    """This node's place in a fleet."""
+    """State of this node in its fleet."""
 
-    member: FleetMember  # what it knows and decides
+    member: FleetMember  # its knowledge and decisions
     site: str  # name of the fleet
-    sent_bps: float  # bits per second that it tells, by what it gave to Zenoh over the last second
-    heard_bps: float  # bits per second that others told it
+    sent_bps: float  # bits per second passed to Zenoh over the last second
+    heard_bps: float  # bits per second received from others
     damaged: int  # malformed fleet messages received
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Served:
-    """Who serves the UAVs for which beams are wanted."""
+    """Nodes that serve the UAVs for which beams are wanted."""
 
     node: str  # this node
-    by: Mapping[str, list[str]]  # nodes that serve each UAV, those put aside not among them
-    nobody: Mapping[str, Blame]  # why nobody serves a UAV, for each such UAV
-    elsewhere: int  # how many other nodes serve, and this one does not
+    by: Mapping[str, list[str]]  # nodes that serve each UAV, without excluded nodes
+    nobody: Mapping[str, Blame]  # UAVs that no node serves, with the reason
+    elsewhere: int  # number of UAVs that only other nodes serve
 
     def is_here(self, uav: str) -> bool:
-        """Whether this node serves a UAV. A verdict on another is of the time when it did."""
+        """Return whether this node serves a UAV. Its verdicts on other UAVs are outdated."""
         return self.node in self.by.get(uav, [])
 
 
 def served_uavs(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Served | None:
-    """Who serves whom, and why nobody does; None where there is no fleet."""
+    """Return which nodes serve each UAV, and why none does; None without a fleet."""
     if status is None:
         return None
     member = status.member
@@ -58,7 +58,7 @@ def served_uavs(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> 
 
 
 def offers_of(member: FleetMember) -> dict[str, dict[str, Offer]]:
-    """What each node that is believed offers, by UAV and node."""
+    """Return the offers of all trusted nodes, by UAV and node."""
     found: dict[str, dict[str, Offer]] = {}
     for uav, offer in member.offers.items():
         found.setdefault(uav, {})[member.name] = offer
@@ -69,20 +69,20 @@ def offers_of(member: FleetMember) -> dict[str, dict[str, Offer]]:
 
 
 def standing(member: FleetMember, now_ns: int) -> dict[str, Standing]:
-    """The other nodes that are there and believed, by name."""
+    """Return the state of the other nodes that are present and trusted, by name."""
     others = sorted(member.duties.others(now_ns).items())
     return {name: said for name, said in others if member.trust.is_trusted(name)}
 
 
 def _full(member: FleetMember, now_ns: int) -> dict[str, bool]:
-    """Whether each node that is there serves as many as it may."""
+    """Return for each node that is present whether it serves as many UAVs as it may."""
     others = standing(member, now_ns).items()
     full = {name: len(said.serves) >= said.most for name, said in others}
     return full | {member.name: len(member.duties.serves) >= member.most}
 
 
 def served_by(member: FleetMember, now_ns: int) -> dict[str, list[str]]:
-    """The nodes that serve each UAV, this one first; nodes put aside are not believed."""
+    """Return the nodes that serve each UAV, this one first; untrusted nodes are ignored."""
     served_by: dict[str, list[str]] = {uav: [member.name] for uav in member.duties.serves}
     for name, said in standing(member, now_ns).items():
         for uav, _ in said.serves:

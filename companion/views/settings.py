@@ -1,4 +1,4 @@
-"""The effective settings as the API shows them: each with its default, and where it comes from."""
+"""The effective settings as shown by the API: each with its default and its origin."""
 
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Literal
@@ -9,12 +9,12 @@ from companion.values.described import Meaning
 from companion.views.as_json import Json
 
 LONGEST: Final = 400
-"""Most characters of a text that is shown whole; what files held may be millions."""
+"""Longest text shown in full; contents of files may have millions of characters."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setting:
-    """One setting, and where it comes from."""
+    """One setting and its origin."""
 
     value: Annotated[Any, Meaning("value in effect, in the unit that the key's name ends in")]
     default: Annotated[Any, Meaning("the default value")]
@@ -33,9 +33,9 @@ class EffectiveSettings:
 
 
 def show(settings: Settings, origins: Origins) -> Json:
-    """The answer of ``/v1/settings``.
+    """Return the answer of ``/v1/settings``.
 
-    What differs from its default, and nobody is known to have said, the program itself has set.
+    A value that differs from its default and has no recorded origin was set by the program itself.
     """
     plain, effective = Settings().model_dump(mode="json"), settings.model_dump(mode="json")
     return {

@@ -1,4 +1,4 @@
-"""The state of the program as the API shows it."""
+"""The state of the program as shown by the API."""
 
 from collections.abc import Awaitable, Mapping
 from dataclasses import dataclass
@@ -29,13 +29,13 @@ class RecordingStatus:
 
     state: Annotated[
         Literal["recording", "degraded", "off"],
-        Meaning("recording; degraded: something is lost; off"),
+        Meaning("recording; degraded: some events are lost; off"),
     ]
     file: Annotated[str | None, Meaning("name of the file")]
     bytes: Annotated[int, Meaning("size of the file so far")]
     messages: Annotated[int, Meaning("messages recorded so far")]
     dropped: Annotated[int, Meaning("events that could not be recorded")]
-    queued: Annotated[int, Meaning("events that wait to be written")] = 0
+    queued: Annotated[int, Meaning("events waiting to be written")] = 0
     lag_s: Annotated[float | None, Meaning("age of the newest written event")] = None
 
 
@@ -64,7 +64,7 @@ class Throughput:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Status:
-    """The service at a glance; ``replay`` is null where it is live."""
+    """The service at a glance; ``replay`` is null in a live service."""
 
     version: Annotated[str, Meaning("version of the program")]
     node: Annotated[
@@ -72,26 +72,26 @@ class Status:
     ]
     time_ns: Annotated[int, Meaning("the service's own time")]
     uptime_s: Annotated[float, Meaning("time since the start")]
-    center: Annotated[Center, Meaning("what carries the array")]
-    health: Annotated[Headline, Meaning("how many links are good")]
+    center: Annotated[Center, Meaning("the carrier of the array")]
+    health: Annotated[Headline, Meaning("number of good, weak and missing links")]
     links: Annotated[list[LinkState], Meaning("the links, in the order of the settings")]
     recording: Annotated[RecordingStatus, Meaning("the recording that is being written")]
-    arrival_lag: Annotated[LagSeen, Meaning("how long frames waited for this machine")]
+    arrival_lag: Annotated[LagSeen, Meaning("how long frames waited to be read")]
     rates: Annotated[Throughput, Meaning("rates over the last seconds")]
     frames: Annotated[int, Meaning("MAVLink frames processed since the start")]
     updates: Annotated[int, Meaning("beam updates so far")]
-    rejected: Annotated[dict[str, int], Meaning("what was received and not used, by reason")]
+    rejected: Annotated[dict[str, int], Meaning("number of rejections by reason")]
     digest: Annotated[
         str,
         Meaning("running SHA-256 over all estimates and weights; equal events give equal digests"),
     ]
-    replay: Annotated[ReplayStatus | None, Meaning("progress of a replay; null where live")]
+    replay: Annotated[ReplayStatus | None, Meaning("progress of a replay; null: live service")]
 
 
 class Node(Protocol):
-    """What the server reads: the running service, a replay, or a test's substitute for them.
+    """Interface that the server reads: the running service, a replay, or a test double.
 
-    ``replay`` returns None where the node is live, ``fleet_status`` where it is part of no fleet.
+    ``replay`` returns None in a live service, ``fleet_status`` without a fleet.
     """
 
     pipeline: Pipeline
@@ -117,7 +117,7 @@ class Node(Protocol):
 
 
 def links(node: Node) -> Json:
-    """The answer of ``/v1/links``."""
+    """Return the answer of ``/v1/links``."""
     now_ns = node.now_ns()
     heard = [
         HeardLink(
@@ -134,7 +134,7 @@ def links(node: Node) -> Json:
 
 
 def status(node: Node, version: str) -> Json:
-    """The answer of ``/v1/status``."""
+    """Return the answer of ``/v1/status``."""
     pipeline, now_ns = node.pipeline, node.now_ns()
     fleet_status, senders = node.fleet_status(), pipeline.senders
     shown = Status(
@@ -158,7 +158,7 @@ def status(node: Node, version: str) -> Json:
 
 
 def summary(node: Node, now_ns: int) -> Headline:
-    """How good the links are, those included that no node of a fleet serves."""
+    """Return the headline, including UAVs that no node of a fleet serves."""
     pipeline = node.pipeline
     served = served_uavs(pipeline, node.fleet_status(), now_ns)
     verdicts, machine = pipeline.health.verdicts, health.behind(node.arrival_lag.seen(now_ns))

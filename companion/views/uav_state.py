@@ -1,4 +1,4 @@
-"""UAVs as the API shows them."""
+"""UAVs as shown by the API."""
 
 from dataclasses import dataclass
 from typing import Annotated, Final
@@ -19,7 +19,7 @@ from companion.views.state import Node
 
 @dataclass(frozen=True, slots=True)
 class ReportedFix:
-    """The newest reported position of a UAV, and when the UAV was there."""
+    """The newest reported position of a UAV, and its time."""
 
     t_ns: Annotated[int, Meaning("when the UAV was there")]
     place: Annotated[Place, Inline()]
@@ -27,10 +27,10 @@ class ReportedFix:
 
 @dataclass(frozen=True, slots=True)
 class Assumptions:
-    """What the bounds of one UAV assume, and how often its reports or time stamps refuted that."""
+    """Assumptions of the bounds of one UAV, and how often its reports or stamps refuted them."""
 
     limits: Annotated[Limits, Inline()]
-    refuted: Annotated[int, Meaning("times that reports or time stamps refuted an assumption")]
+    refuted: Annotated[int, Meaning("how often reports or time stamps have refuted an assumption")]
 
 
 _BOUND_AXES: Final = Meaning(
@@ -41,14 +41,14 @@ _BOUND_AXES: Final = Meaning(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UavState:
-    """One UAV as it is at ``valid_at``; north, east and down are measured from the array."""
+    """One UAV at ``valid_at``; north, east and down are measured from the array."""
 
     id: Annotated[str, Meaning("SYSID:COMPID, icao:HEX, rid:ID or cot:UID", example="3:1")]
     verdict: Annotated[
         Level | None, Meaning("whether its beam has the gain that the link needs", label="Link")
     ]
-    health: Annotated[LinkHealth | None, Meaning("what is behind the verdict")]
-    target: Annotated[bool, Meaning("whether a beam is wanted for it, of whichever node")]
+    health: Annotated[LinkHealth | None, Meaning("cause and gains of the verdict")]
+    target: Annotated[bool, Meaning("whether a beam is wanted for it, from any node")]
     served_by: Annotated[
         list[str] | None,
         Meaning("nodes of the fleet that serve it; null: no fleet, or no beam is wanted"),
@@ -71,10 +71,10 @@ class UavState:
     track: Annotated[
         Track, Inline(omit=("speed_max_mps", "acceleration_max_mps2", "limits_source"))
     ]
-    assumptions: Annotated[Assumptions, Meaning("what the bounds of this UAV assume")]
+    assumptions: Annotated[Assumptions, Meaning("assumptions of the bounds of this UAV")]
     clock: Annotated[ClockEstimate | None, Meaning("the sender's clock; null for relayed aircraft")]
-    rejected: Annotated[dict[str, int], Meaning("what was received and not used, by reason")]
-    recent_rejections: Annotated[list[Rejection], Meaning("last reports that were not used")]
+    rejected: Annotated[dict[str, int], Meaning("number of rejections by reason")]
+    recent_rejections: Annotated[list[Rejection], Meaning("latest rejections")]
 
     @property
     def bound_cylinder_ned_m(self) -> Annotated[Vector, _BOUND_AXES]:
@@ -91,20 +91,20 @@ class UavState:
 
 @dataclass(frozen=True, slots=True)
 class Uavs:
-    """Every UAV that was heard, at ``valid_at``."""
+    """Every UAV with a track, at ``valid_at``."""
 
     valid_at_ns: Annotated[int, Meaning("the instant for which the values hold")]
     uavs: Annotated[list[UavState], Meaning("the UAVs")]
 
 
 def uavs(node: Node) -> Json:
-    """The answer of ``/v1/uavs``."""
+    """Return the answer of ``/v1/uavs``."""
     now_ns, utc_ns = node.now_ns(), node.pipeline.utc_ns
     return as_json(Uavs(now_ns, states(node, now_ns)), utc_ns)
 
 
 def states(node: Node, now_ns: int, only: str | None = None) -> list[UavState]:
-    """Every UAV, or one, as it is now."""
+    """Return every UAV, or one, as it is now."""
     pipeline = node.pipeline
     tracks = [
         track for track in pipeline.tracks(now_ns, now_ns) if only is None or track.uav == only
@@ -132,7 +132,7 @@ def _state(
     machine: Blame | None,
     served: Served | None,
 ) -> UavState:
-    """One UAV; ``machine`` is what to blame for weak links where this machine is behind."""
+    """Return one UAV; ``machine`` is the cause of weak links if this machine is overloaded."""
     north_m, east_m, down_m = (
         (None, None, None)
         if carrier is None

@@ -1,6 +1,6 @@
-"""Weights in the formats that programs and devices take.
+"""Weights in the formats of programs and devices.
 
-``raw`` is interleaved little-endian complex64, row-major, and nothing else: what describes it is in
+``raw`` is interleaved little-endian complex64, row-major, without metadata, which is in
 ``headers``. ``npy`` holds the same numbers, in C order.
 """
 
@@ -21,7 +21,7 @@ from companion.views.quantised import device_table
 
 
 def headers(pipeline: Pipeline, beam_set: BeamSet) -> dict[str, str]:
-    """What describes the weights, as HTTP headers: with ``raw`` they are all that does."""
+    """Return the metadata of the weights as HTTP headers; ``raw`` has no other."""
     valid_at_ns = pipeline.utc_ns(beam_set.valid_at_ns)
     return {
         "x-format": "complex64-le-row-major-1",
@@ -39,9 +39,9 @@ def headers(pipeline: Pipeline, beam_set: BeamSet) -> dict[str, str]:
 def encode(
     form: WeightFormat, beam_set: BeamSet, pipeline: Pipeline, equipment: Equipment, lead_ms: float
 ) -> bytes:
-    """The weights in a format.
+    """Return the weights in a format.
 
-    Raises ``UserError``, with the reason, for what a device cannot do.
+    Raises ``UserError`` with the reason if a device cannot apply them.
     """
     match form:
         case WeightFormat.JSON:

@@ -83,7 +83,7 @@ SAYS: list[tuple[str, int, str]] = [
     ("replay good.tlog --config .", 1, "Is a directory"),
     ("replay good.tlog --center here", 1, "'here' is not SYSID:COMPID"),
     ("replay good.tlog --center 999:1", 1, "at most 255"),
-    ("replay good.tlog --center 95,8,500", 1, "latitude is within 90 degrees"),
+    ("replay good.tlog --center 95,8,500", 1, "latitude must be -90..90"),
     ("replay good.tlog --center 47,8", 1, "is not LAT,LON,ALT"),
     ("replay good.tlog --centre 5:1", 2, "No such option '--centre'"),
     ("replay good.tlog --no-record", 1, "no beam was computed: no UAV reported a position"),

@@ -127,7 +127,7 @@ def test_frames_that_waited_arrived_when_they_came_and_replay_says_so_too(tmp_pa
         assert link["reports"]["latency_p95_s"] < SOON_S
         assert "\ncompanion_arrival_lag_max_seconds 0." in await flight.ask("/metrics")
         reasons = (await flight.ask("/readyz"))["reasons"]
-        assert not [reason for reason in reasons if "this machine is behind" in reason]
+        assert not [reason for reason in reasons if "this machine is overloaded" in reason]
 
     flight = fly(tmp_path, course)
     (log,) = tmp_path.iterdir()
@@ -154,11 +154,11 @@ def test_a_machine_that_stays_behind_is_not_fit_and_says_why(tmp_path: Path) -> 
                 break
         assert status["arrival_lag"]["behind"]
         assert not readiness["ready"]
-        (reason,) = [one for one in readiness["reasons"] if "this machine is behind" in one]
-        assert reason.startswith("this machine is behind: frames wait ")
+        (reason,) = [one for one in readiness["reasons"] if "this machine is overloaded" in one]
+        assert reason.startswith("this machine is overloaded: frames wait up to ")
         assert readiness["reasons"] == [reason]  # what is late then is late for that
         said = [one["text"] for one in (await flight.ask("/v1/events"))["events"]]
-        told = [text.startswith("this machine is behind") for text in said if "machine" in text]
+        told = [text.startswith("this machine is overloaded") for text in said if "machine" in text]
         assert any(told) and all(
             a != b for a, b in pairwise(told)
         )  # once, and once that it is over

@@ -109,7 +109,7 @@ def test_equipment_that_a_recording_only_names_is_refused(
     wanted = file if file.startswith("/") else f"{{}}/{file}"
     sections = json.loads(json.dumps(named).replace("{}/FILE", wanted))
     log = foreign(cut_log, tmp_path / "theirs.mcap", sections)
-    with pytest.raises(ConfigError, match=r"is not in the recording: give the settings with"):
+    with pytest.raises(ConfigError, match=r"is not in the recording; give the settings with"):
         settings_for([log], None, None)
     config = tmp_path / "mine.toml"
     config.write_text("[center]\nsource = '5:1'\n")

@@ -347,7 +347,7 @@ def test_how_far_the_machine_is_behind(make_node: Any) -> None:
         holds(state.Status, status)
         lag = {"newest_s": 0.700000019, "p95_s": 0.700000018, "max_s": 0.700000019, "behind": True}
         assert status["arrival_lag"] == pytest.approx(lag, abs=1e-10)
-        assert status["health"]["behind"] == "this machine is behind: frames wait 0.7 s for it"
+        assert status["health"]["behind"] == "this machine is overloaded: frames wait up to 0.7 s"
         metrics = client.get("/metrics").text
     for name in ("", "_p95", "_max"):
         assert f"\ncompanion_arrival_lag{name}_seconds 0.7000000" in metrics

@@ -39,7 +39,7 @@ def refusal(text: str) -> str:
 WRONG = [
     ("center", "source", '"there"', "there", "SYSID:COMPID"),
     ("center", "source", '"300:1"', "300:1", "at most 255"),
-    ("center", "source", '"91,0,0"', "91,0,0", "latitude is within 90"),
+    ("center", "source", '"91,0,0"', "91,0,0", "latitude must be -90..90"),
     ("center", "source", "5", "5", "string"),
     ("links", "urls", '"udpin:0.0.0.0:1"', "udpin", "tuple"),
     ("links", "urls", "[7]", "7", "string"),
@@ -95,7 +95,7 @@ WRONG = [
     ("array", "element_exponent", "-1", "-1", "greater than or equal to 0"),
     ("array", "lever_arm_m", "[1, 2]", "1, 2", "required"),
     ("array", "field_of_view_deg", "361", "361", "less than or equal to 360"),
-    ("array", "azimuth_limits_deg", "[30, -30]", "30, -30", "first less than the second"),
+    ("array", "azimuth_limits_deg", "[30, -30]", "30, -30", "from < to"),
     ("array", "dead", "[-1]", "-1", "greater than or equal to 0"),
     ("hardware", "phase_error_deg", "-1", "-1", "greater than or equal to 0"),
     ("hardware", "device", '"phaser"', "phaser", "'adar1000', 'tmytek' or 'sivers'"),
@@ -349,12 +349,12 @@ def test_a_bad_flag_is_an_error_of_settings() -> None:
     ],
 )
 def test_a_list_of_elements_goes_with_its_kind(text: str) -> None:
-    assert "goes with positions" in refusal(text)
+    assert "needs positions" in refusal(text)
 
 
 def test_a_codebook_file_goes_with_its_kind() -> None:
     for text in ('kind = "file"', 'file = "beams.npy"', 'kind = "dft"\nfile = "beams.npy"'):
-        assert "goes with file" in refusal(f"[codebook]\n{text}\n")
+        assert "needs file" in refusal(f"[codebook]\n{text}\n")
 
 
 def test_a_rectangle_is_not_larger_than_a_line_may_be() -> None:
@@ -393,11 +393,11 @@ def test_element_positions_are_read_into_the_settings(
     ("text", "said"),
     [
         (None, "No such file"),
-        ("0, 0\n0, 1\n", "rows of at least 3"),
+        ("0, 0\n0, 1\n", "must have 3 or more finite numbers"),
         ("0, 0, x\n", "not a table of numbers"),
         ("0, 0, 0\n0, 0\n", "not a table of numbers"),
         ("0, 0, nan\n", "finite"),
-        ("", "rows of at least 3"),
+        ("", "must have 3 or more finite numbers"),
     ],
 )
 def test_a_file_of_positions_that_will_not_do_is_named(
@@ -512,7 +512,7 @@ def test_shares_of_power_need_columns_that_are_scaled_together() -> None:
     assert BeamSettings(power=Power.MAX_MIN).normalisation is Normalisation.TOTAL
     both = BeamSettings(power=Power.EQUAL, normalisation=Normalisation.ANTENNA)
     assert both.normalisation is Normalisation.ANTENNA
-    with pytest.raises(ValidationError, match="power goes with normalisation"):
+    with pytest.raises(ValidationError, match="power needs normalisation"):
         BeamSettings(power=Power.EQUAL, normalisation=Normalisation.STREAM)
 
 
@@ -574,8 +574,8 @@ def test_centers(text: str, center: object) -> None:
         ("47,8,500,90,1", "LAT,LON,ALT"),
         ("47,8,high", "LAT,LON,ALT"),
         ("47,,500", "LAT,LON,ALT"),
-        ("90.1,8,500", "latitude is within 90"),
-        ("47,-180.1,500", "longitude within 180"),
+        ("90.1,8,500", "latitude must be -90..90"),
+        ("47,-180.1,500", "longitude -180..180"),
         ("nan,8,500", "latitude"),
         ("47,inf,500", "longitude"),
     ],

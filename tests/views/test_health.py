@@ -38,7 +38,7 @@ def test_a_verdict_is_shown_with_its_reason_and_the_gains() -> None:
 def test_a_machine_that_is_behind_is_to_blame_for_what_is_not_good() -> None:
     machine = health.behind(LagSeen(newest_s=7.0, p95_s=7.0, max_s=7.04, behind=True))
     assert machine is not None
-    assert machine.reason == "this machine is behind: frames wait 7.0 s for it"
+    assert machine.reason == "this machine is overloaded: frames wait up to 7.0 s"
     weak = shown(WEAK, machine)
     assert weak is not None and weak["reason"] == machine.reason
     good = Verdict(

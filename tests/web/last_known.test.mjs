@@ -40,8 +40,8 @@ test("the carrier is where it is, or where it was last, and why no better", () =
   assert.deepEqual(carrierOf({ ...status, center: { ...center, last_known: null } }),
     { unfit: CAUSE, unseen: true });
   assert.equal(carrierOf(null), null);
-  const late = { ...status, health: { behind: "this machine is behind" } };
-  assert.equal(carrierOf(late).unfit, "this machine is behind");
+  const late = { ...status, health: { behind: "this machine is overloaded" } };
+  assert.equal(carrierOf(late).unfit, "this machine is overloaded");
 });
 
 test("a UAV without an offset is placed from where the carrier was", () => {
@@ -85,12 +85,12 @@ test("weights of a beam stay with it while there are none, and are no other beam
   assert.equal(last.picture.weights, null);
 });
 
-test("where this machine is behind, that is the cause, and no old attitude", async () => {
+test("where this machine is overloaded, that is the cause, and no old attitude", async () => {
   const page = await openPage();
-  loseCarrier(page.service, "this machine is behind: frames wait 7.0 s for it");
+  loseCarrier(page.service, "this machine is overloaded: frames wait up to 7.0 s");
   await page.time.advance(8 * BEAT_MS);
   const plan = await page.drawn();
-  assert.ok(plan.texts.some((text) => text.startsWith("this machine is behind")), "on the plan");
+  assert.ok(plan.texts.some((text) => text.startsWith("this machine is overloaded")), "on the plan");
   assert.ok(!plan.texts.some((text) => text.startsWith(CAUSE)), "no other cause");
   assert.doesNotMatch(page.text("center"), new RegExp(CAUSE));
 });

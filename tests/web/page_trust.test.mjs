@@ -136,7 +136,7 @@ test("a token that is asked for is no connection that fails, and nothing looks l
 
 test("what keeps the service from answering is said in its words where it is known", async () => {
   const page = await openPage();
-  const cause = "this machine is behind: frames wait 2.0 s for it";
+  const cause = "this machine is overloaded: frames wait up to 2.0 s";
   page.service.status.health.behind = cause;
   page.service.answers["/v1/beams"] = { status: 503, body: "{}" };
   await page.time.advance(8 * BEAT_MS);

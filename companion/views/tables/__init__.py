@@ -1,4 +1,4 @@
-"""The tables of an export, a module a subject: every column with its unit, meaning and value.
+"""The tables of an export, one module per subject: columns with unit, meaning and value.
 
-``docs/export.md`` says the same in words, and a test holds it against these.
+``docs/export.md`` is generated from these.
 """

@@ -1,4 +1,4 @@
-"""The table of reports: every position that was received, used or not."""
+"""The table of reports: every received position, used or not."""
 
 import math
 from collections.abc import Sequence
@@ -28,9 +28,9 @@ from companion.values.described import Inline, Meaning
 
 @dataclass(frozen=True, kw_only=True)
 class Heard:
-    """A report that was received: with its estimate where it was used, else why it was not.
+    """A received report: with its estimate if it was used, otherwise with the reason.
 
-    ``said`` is None where the message could not be decoded.
+    ``said`` is None if the message could not be decoded.
     """
 
     frame: Frame
@@ -53,7 +53,7 @@ class Heard:
         return POSITIONS[self.frame.msgid].name
 
     @property
-    def link(self) -> Annotated[str, Meaning("link or log that it came over")]:
+    def link(self) -> Annotated[str, Meaning("link or log over which it arrived")]:
         return self.frame.link
 
     @property
@@ -79,7 +79,7 @@ class Heard:
         return None if self.estimate is None else self.estimate.fix.t_ns
 
     @property
-    def latency_s(self) -> Annotated[float | None, Meaning("time from then to the arrival")]:
+    def latency_s(self) -> Annotated[float | None, Meaning("time from `true` to the arrival")]:
         return None if self.true_ns is None else (self.frame.t_ns - self.true_ns) * 1e-9
 
     @property
@@ -135,13 +135,13 @@ class Heard:
         return None if self.estimate is None else self.estimate.fix.noise
 
     def _number(self, name: str) -> float | None:
-        """A number of the message; None where it has no such field."""
+        """Return a number of the message; None if it has no such field."""
         found: float | None = getattr(self.said, name, None)
         return found
 
 
 def heard(frame: Frame, outputs: Sequence[Output]) -> Heard | None:
-    """The report that a frame held, with what came of it; None where it held none."""
+    """Return the report in a frame with its outcome; None if the frame has no report."""
     if frame.msgid not in POSITIONS:
         return None
     for output in outputs:
@@ -149,12 +149,10 @@ def heard(frame: Frame, outputs: Sequence[Output]) -> Heard | None:
             return Heard(frame=frame, estimate=output, refused=None, said=output.fix.report)
     refused = next((one for one in outputs if isinstance(one, Rejection)), None)
     said = decode(frame)
-    if isinstance(
-        said, RemoteId
-    ):  # what it was refused for names its aircraft, where that is known
+    if isinstance(said, RemoteId):  # the rejection names the aircraft if it is known
         report, named = said.report, None if refused is None else refused.source
         said = replace(report, uav=named) if report is not None and named is not None else report
-    if refused is None and said is None:  # a message that may be a report, and was none
+    if refused is None and said is None:  # this message may contain a report, but did not
         return None
     return Heard(
         frame=frame,
@@ -165,5 +163,5 @@ def heard(frame: Frame, outputs: Sequence[Output]) -> Heard | None:
 
 
 REPORTS: Final = Table(
-    name="reports", row_is="a report received, over whatever message", row_class=Heard
+    name="reports", row_is="a received report, from any message", row_class=Heard
 )

@@ -1,4 +1,4 @@
-"""The tables of what was refused, and of what the program said."""
+"""The tables of rejections and of events."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ REFUTED: Final = "refuted"
 def rows(
     event: Event, outputs: Sequence[Output], local: LocalFrame | None
 ) -> Iterator[tuple[str, Any]]:
-    """All rows that come of an event, in all tables, each with the name of its table."""
+    """Yield all rows that an event adds, each with the name of its table."""
     if isinstance(event, Frame):
         heard = reports.heard(event, outputs)
         if heard is not None:
@@ -47,7 +47,7 @@ class RejectionRow:
         msgid = self.rejection.msgid
         if msgid is None:
             return None
-        from pymavlink.dialects.v20 import all as generated  # loaded where anything was refused
+        from pymavlink.dialects.v20 import all as generated  # loaded only if something was rejected
 
         known = generated.mavlink_map.get(msgid)
         return str(msgid) if known is None else str(known.msgname)

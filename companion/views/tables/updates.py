@@ -1,4 +1,4 @@
-"""The tables of updates: the array, the tracks and the beams, a row each ten times a second."""
+"""The tables of updates: the array, tracks and beams, ten times a second."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from companion.values.described import Inline, Meaning
 
 
 class _OfUpdate:
-    """What every row of an update has: when it was computed, and when its beams are applied."""
+    """Times of a row of an update: when it was computed, and when its beams are applied."""
 
     update: Update
 
@@ -26,7 +26,7 @@ class _OfUpdate:
 
 @dataclass(frozen=True)
 class UpdateRow(_OfUpdate):
-    """An update, with the origin of the local frame and the carrier's place, where known."""
+    """An update, with the origin of the local frame and the carrier's position if known."""
 
     update: Update
     carrier_place: Annotated[Place | None, Inline(prefix="carrier_")]
@@ -55,12 +55,12 @@ class UpdateRow(_OfUpdate):
 
 @dataclass(frozen=True, kw_only=True)
 class TrackRow(_OfUpdate):
-    """A track at an update, and its place."""
+    """A track at an update, and its position."""
 
     update: Update
     track: Annotated[Track, Inline(omit=("valid_at_ns",))]
     place: Annotated[Place, Inline()]
-    left_out: Annotated[str | None, Meaning("why it has no beam; null where it has one")]
+    left_out: Annotated[str | None, Meaning("why it has no beam; null: it has one")]
 
 
 @dataclass(frozen=True)
@@ -72,14 +72,14 @@ class BeamRow(_OfUpdate):
 
 
 def rows(update: Update, local: LocalFrame | None) -> Iterator[tuple[str, Any]]:
-    """The rows of an update, each with the name of its table."""
+    """Yield the rows of an update, each with the name of its table."""
     carrier = None if update.carrier is None else update.carrier.position_ned_m
     origin = None if local is None else Place(*local.origin)
     place = None if local is None or carrier is None else local.place(*carrier.tolist())
     yield UPDATES.name, UpdateRow(update, place, origin)
     left_out = {out.uav: update.unfit or out.reason for out in update.beams.left_out}
     for track in update.tracks:
-        assert local is not None  # it begins with the first report
+        assert local is not None  # it exists from the first report on
         there = local.place(*track.position_ned_m.tolist())
         yield (
             TRACKS.name,

@@ -1,1 +1,1 @@
-"""The fold that turns frames into tracks and beams, and its assembly from the settings."""
+"""The fold that turns frames into tracks and beams, and its construction from the settings."""

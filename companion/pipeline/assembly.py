@@ -1,4 +1,4 @@
-"""Builds the parts of the pipeline from the settings.
+"""Construction of the pipeline's parts from the settings.
 
 Over 300 lines: a function for each section of the settings, and nothing else.
 """
@@ -34,15 +34,15 @@ from companion.tracking.tracker import Ages, Tracker, TrackerSettings
 from companion.values import FloatArray, Limits, LimitSource, ReportNoise, UserError, kind_of
 
 FLOOR_SPARE_DB: Final = 2.9
-"""How much more than the link needs the floor of a likely beam is, unless it is given."""
+"""Default margin of the floor of a likely beam above the gain that the link needs."""
 COUPLING_MAX: Final = 1e6
-"""Most that an element may carry of what another is fed, and one over the least that all do."""
+"""Limit of the largest entry of a coupling matrix; its inverse is the lower limit."""
 WORST_COUPLING: Final = 1e6
-"""Condition number of a coupling matrix above which it tells nothing apart."""
+"""Limit of the condition number of a coupling matrix."""
 
 
 def array(settings: Settings) -> geometry.Array:
-    """The antenna array on its mount, and what its elements and channels do.
+    """Return the antenna array on its mount, with dead elements, coupling and channel errors.
 
     Raises ``ConfigError``.
     """
@@ -51,14 +51,19 @@ def array(settings: Settings) -> geometry.Array:
     live = None
     if dead:
         if dead[-1] >= size or len(dead) == size:
-            raise ConfigError(f"array.dead: {dead[-1]} of {size} elements from 0, not all of them")
+            raise ConfigError(
+                f"array.dead: {dead[-1]} does not exist, or no element is left;"
+                f" list some of 0..{size - 1}, not all"
+            )
         live = np.ones(size, dtype=bool)
         live[dead] = False
     coupling = matrix_of(settings, COUPLING)
     if coupling is not None:
         if coupling.shape != (size, size) or not np.isfinite(coupling).all():
-            shape = f"{coupling.shape} for {size} elements"
-            raise ConfigError(f"array.coupling: finite numbers, a row and a column each: {shape}")
+            raise ConfigError(
+                f"array.coupling: shape {coupling.shape}, or an entry is not finite;"
+                f" give a finite {size} x {size} matrix"
+            )
         most = max(np.abs(coupling.real).max(), np.abs(coupling.imag).max())
         if not 1 / COUPLING_MAX <= most <= COUPLING_MAX:
             allowed = f"{1 / COUPLING_MAX:g} .. {COUPLING_MAX:g}"
@@ -66,14 +71,17 @@ def array(settings: Settings) -> geometry.Array:
         condition = np.linalg.cond(coupling)
         if condition > WORST_COUPLING:
             why = f"condition number {condition:.3g}, limit {WORST_COUPLING:g}"
-            raise ConfigError(f"array.coupling: matrix is nearly singular ({why})")
+            raise ConfigError(
+                f"array.coupling: matrix is nearly singular ({why});"
+                " give measured values or leave it out"
+            )
     return replace(
         placed, live=live, coupling=coupling, channel_error=_channel_error(settings, size)
     )
 
 
 def _channel_error(settings: Settings, size: int) -> FloatArray | None:
-    """Most that each channel is off (M,), by the calibration's own word or the settings'."""
+    """Return the error bound of each channel (M,), from the calibration or else the settings."""
     given, table = settings.hardware, calibration(settings, size)
     if table is not None and table.phase_error_rad:
         return channel_error(np.array(table.phase_error_rad), np.array(table.gain_error_db))
@@ -86,7 +94,7 @@ def _channel_error(settings: Settings, size: int) -> FloatArray | None:
 
 
 def calibration(settings: Settings, size: int) -> Calibration | None:
-    """The calibration of the channels of ``size`` elements; None without one.
+    """Return the calibration of the channels of ``size`` elements; None without one.
 
     Raises ``ConfigError``.
     """
@@ -97,12 +105,12 @@ def calibration(settings: Settings, size: int) -> Calibration | None:
         raise ConfigError(f"hardware.calibration: {error}") from error
     if found is not None and len(found.order) != size:
         channels = f"{len(found.order)} channels for {size} elements"
-        raise ConfigError(f"hardware.calibration: {channels}")
+        raise ConfigError(f"hardware.calibration: {channels}; list one channel per element")
     return found
 
 
 def coverage(settings: Settings) -> Coverage:
-    """The directions in which beams may point. Raises ``ConfigError``."""
+    """Return the directions in which beams may point. Raises ``ConfigError``."""
     given = settings.array
 
     def radians(limits: tuple[float, float] | None) -> tuple[float, float] | None:
@@ -130,18 +138,18 @@ def coverage(settings: Settings) -> Coverage:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Equipment:
-    """What is needed, beside the pipeline, to answer questions about beams."""
+    """Hardware and radio link, which the pipeline itself does not need."""
 
     codebook: Codebook | None  # stored beams; None without
     calibration: Calibration | None  # calibration of the hardware; None without
     budget: LinkBudget  # power, bandwidth and noise figure of the radio link
     uav_antennas: int  # antennas that each UAV combines
-    device: Beamformer | None = None  # what the weights are quantised for; None: nothing
-    unit_gains: UnitGains = RELATIVE  # what a TMYTEK unit's channels can have
+    device: Beamformer | None = None  # device for which weights are quantised
+    unit_gains: UnitGains = RELATIVE  # possible gains of a TMYTEK unit's channels
 
 
 def equipment(settings: Settings, antenna: geometry.Array) -> Equipment:
-    """The equipment that the settings describe; reads the files they name.
+    """Return the equipment that the settings describe; reads the files that they name.
 
     Raises ``ConfigError``.
     """
@@ -175,7 +183,7 @@ def equipment(settings: Settings, antenna: geometry.Array) -> Equipment:
 
 
 def precoder(settings: Settings) -> Precoder:
-    """The method of making weights."""
+    """Return the precoder."""
     given = settings.beams
     budget, antennas = radio(settings)
     worth_db = 0.0 if settings.link.needed_sinr_db is not None else settings.link.needed_db
@@ -198,7 +206,7 @@ def precoder(settings: Settings) -> Precoder:
 
 
 def radio(settings: Settings) -> tuple[LinkBudget, int]:
-    """The link budget, and the antennas that each UAV combines."""
+    """Return the link budget, and the number of antennas that each UAV combines."""
     given = settings.radio
     budget = LinkBudget(
         tx_power_dbm=given.tx_power_dbm,
@@ -209,7 +217,7 @@ def radio(settings: Settings) -> tuple[LinkBudget, int]:
 
 
 def noise(settings: Settings) -> NoiseSettings:
-    """Bounds on the errors of reports."""
+    """Return the bounds on the errors of reports."""
     given = settings.observer
     most_m = given.position_noise_m
     default = ReportNoise(
@@ -223,7 +231,7 @@ def noise(settings: Settings) -> NoiseSettings:
 
 @dataclass(frozen=True, slots=True)
 class AircraftAssumptions:
-    """What is assumed of one aircraft: its limits, the lag of its positions, how it turns."""
+    """Assumptions about one aircraft: limits, lag of its positions, angular acceleration."""
 
     limits: Limits
     lag_s: tuple[float, float]
@@ -231,21 +239,22 @@ class AircraftAssumptions:
 
     @property
     def lag_middle_s(self) -> float:
-        """The lag that is taken off a position's time."""
+        """Middle of the lag interval, subtracted from a position's time."""
         return (self.lag_s[0] + self.lag_s[1]) / 2
 
     @property
     def lag_rest_s(self) -> float:
-        """By how much the lag may be more or less."""
+        """Half width of the lag interval."""
         return (self.lag_s[1] - self.lag_s[0]) / 2
 
 
 def assumed(
     settings: Settings, uav: str, mav_type: int | None, autopilot: int | None
 ) -> AircraftAssumptions:
-    """What is assumed of a UAV: by its own settings, its type's, everybody's, or its type.
+    """Return the assumptions about a UAV: its own settings, else its type's, else the general ones.
 
-    ``mav_type`` and ``autopilot`` are those of its heartbeat; None where none was heard.
+    Without any, the defaults of its type apply. ``mav_type`` and ``autopilot`` are from its
+    heartbeat; None if none was received.
     """
     given = settings.observer
     kind = Airframe.ADSB if kind_of(uav).may_be_manned else airframe(mav_type)
@@ -269,12 +278,12 @@ def assumed(
 
 
 def anyone(settings: Settings) -> Limits:
-    """The limits of an aircraft of which nothing is known."""
+    """Return the limits of an aircraft of unknown type."""
     return assumed(settings, "0:0", None, None).limits
 
 
 def observer(settings: Settings) -> PositionObserver | KinematicObserver:
-    """The observer that every track uses."""
+    """Return the observer that every track uses."""
     given, limits = settings.observer, anyone(settings)
     if given.model == "position":
         return PositionObserver(
@@ -293,7 +302,7 @@ def observer(settings: Settings) -> PositionObserver | KinematicObserver:
 
 
 def clock(settings: Settings) -> SenderClock:
-    """A clock for a new sender."""
+    """Return a clock for a new sender."""
     given = settings.clocks
     return SenderClock(
         ClockAssumptions(
@@ -307,7 +316,7 @@ def clock(settings: Settings) -> SenderClock:
 
 
 def tracker(settings: Settings) -> Tracker:
-    """The tracks of all UAVs, with none yet."""
+    """Return a tracker without tracks."""
     given, kept, limits = settings.observer, settings.tracks, anyone(settings)
     leads = given.model == "position"
     lead_m = abs(given.feedthrough_s) * limits.speed_max_mps if leads else 0.0

@@ -1,4 +1,4 @@
-"""Refuted assumptions: which one was wrong, and which setting holds it. Each is reported once."""
+"""Refuted assumptions, each with the setting that it is in. Each is reported once."""
 
 from typing import Final
 
@@ -6,7 +6,7 @@ from companion.mavlink.clock.estimates import ClockChange
 from companion.pipeline.records import UavRecord, UavRecords
 from companion.values import Estimate, Notice, Refuted, Severity
 
-NOTICE_RATIO: Final = 1.25  # multiple of the value last reported, above which a notice is repeated
+NOTICE_RATIO: Final = 1.25  # multiple of the value last reported above which a notice is repeated
 _UNITS: Final = {
     "observer.speed_max_mps": "m/s",
     "observer.acceleration_max_mps2": "m/s²",
@@ -19,7 +19,7 @@ SILENT_NS: Final = 60_000_000_000  # least time between two notices of a change 
 
 
 def notices(records: UavRecords, *refuted: Refuted | None) -> list[Refuted | Notice]:
-    """The refutations, each followed by a notice if it goes beyond what was reported before."""
+    """Return the refutations, each followed by a notice if it exceeds what was reported before."""
     out: list[Refuted | Notice] = []
     for one in filter(None, refuted):
         out.append(one)
@@ -41,7 +41,7 @@ def notices(records: UavRecords, *refuted: Refuted | None) -> list[Refuted | Not
 def clock_changed(
     record: UavRecord, t_ns: int, sender: str, change: ClockChange, drift_max_ppm: float
 ) -> list[Refuted | Notice]:
-    """A change of a sender's clock, or of its link, as a refutation and a notice."""
+    """Return a change of a sender's clock or link as a refutation and a notice."""
     drift = change.drift_ppm
     record.refuted += 1
     out: list[Refuted | Notice] = [
@@ -72,18 +72,18 @@ def _clock_text(sender: str, change: ClockChange) -> str:
     step = f"{change.step_s * 1e3:.0f} ms"
     if change.leapt:
         way = "later" if change.step_s > 0 else "earlier"
-        why = "that is taken for a leap of its clock, as no link is known to be so slow"
-        return f"all of {sender} comes {abs(change.step_s):.1f} s {way} than before: {why}"
+        step = f"{abs(change.step_s):.1f} s {way}"
+        return f"{sender}: messages arrive {step} than before; treated as a clock jump"
     if change.proven:
-        return f"the clock of {sender} changed by {step} more than clocks.drift_max_ppm"
-    why = "its clock stood still, or its link got slower; both are allowed for"
-    return f"all of {sender} comes {step} later than before: {why}"
+        return f"{sender}: clock changed by {step} more than clocks.drift_max_ppm allows"
+    why = "clock stalled or link slowed down; the bound covers both"
+    return f"{sender}: messages arrive {step} later than before: {why}"
 
 
 def track_restarted(record: UavRecord, begun: Estimate) -> Refuted:
-    """A track that was begun again from reports that were refused, as a refutation.
+    """Return the refutation for a track that was restarted from rejected reports.
 
-    They agree among themselves, so what they were refused by is wrong.
+    The reports agree with each other, so the assumption that rejected them is wrong.
     """
     fix, jump_m = begun.fix, begun.innovation_m or 0.0
     record.refuted += 1
@@ -102,15 +102,17 @@ def track_restarted(record: UavRecord, begun: Estimate) -> Refuted:
 def _refutation_text(one: Refuted) -> str:
     if one.setting == "observer.follow_accuracy":
         return (
-            f"the receiver of {one.uav} states {one.limit:.2g} m, but strays by {one.proven:.2g} m "
-            f"from its velocities ({one.setting}): {one.raised_to:.2g} m is assumed now"
+            f"{one.uav}: receiver states an accuracy of {one.limit:.2g} m, but deviates by"
+            f" {one.proven:.2g} m from its velocities ({one.setting});"
+            f" {one.raised_to:.2g} m is assumed now"
         )
     if one.setting == "center.attitude_bound_deg":
         return (
-            f"the attitude of {one.uav} is taken to be off by up to {one.raised_to:.0f}°, not "
-            f"{one.limit:.3g} ({one.setting}): its estimator doubts it or its compass"
+            f"{one.uav}: an attitude error of up to {one.raised_to:.0f}° is assumed now, not"
+            f" {one.limit:.3g}° ({one.setting}): its estimator reports a problem with its attitude"
+            " or compass"
         )
     return (
-        f"{one.uav} does {one.proven:.3g} {_UNITS[one.setting]}, more than {one.setting}"
-        f" ({one.limit:.3g}): {one.raised_to:.3g} is assumed now"
+        f"{one.uav}: {one.proven:.3g} {_UNITS[one.setting]} exceeds {one.setting}"
+        f" ({one.limit:.3g}); {one.raised_to:.3g} is assumed now"
     )

@@ -1,6 +1,6 @@
-"""What carries the array, and the origin of the local frame.
+"""The carrier of the array, and the origin of the local frame.
 
-The local frame begins at a fixed station, or where the first report was made.
+The origin is the fixed station, or the position of the first report.
 """
 
 import math
@@ -37,20 +37,20 @@ from companion.values import (
 )
 
 HOME_SETTLES_S: Final = 120.0
-"""Time after its first report in which a UAV that is tracked anew moves ``home``."""
-HOME_HEIGHT_M: Final = 20.0  # least height by which the first one must have been wrong
+"""Time after its first report in which a restarted track may move ``home``."""
+HOME_HEIGHT_M: Final = 20.0  # least error of the first height for which ``home`` moves
 
 NOTICE_RATIO: Final = 1.25
-"""Multiple of the bound on attitudes that was told last above which it is told again."""
-PASSED_LEAST: Final = 4  # attitudes that must go on before the newest to take its place
+"""Multiple of the attitude bound last reported above which it is reported again."""
+PASSED_LEAST: Final = 4  # older-stamped attitudes in a row that replace the newest
 PASSED_NS: Final = 500_000_000
-"""Time over which they must; attitudes that are resent come all at once."""
-PACE_NS: Final = 250_000_000  # by how much arrivals and stamps may differ from one to the next
+"""Least duration of that run; attitudes that are resent arrive all at once."""
+PACE_NS: Final = 250_000_000  # largest difference between the steps of arrivals and of stamps
 
 
 @dataclass(frozen=True, slots=True)
 class _AttitudeRun:
-    """Attitudes one after the other: arrival of the first, arrival and stamp of the last."""
+    """Run of attitudes: arrival of the first, arrival and stamp of the last."""
 
     began_ns: int
     last: tuple[int, int]
@@ -60,7 +60,7 @@ class _AttitudeRun:
 class CarrierTracker:
     """Position and attitude of the array.
 
-    place    the fixed station, or the vehicle that is followed; ``home`` until the first report
+    place    the fixed station, or the vehicle that is tracked; ``home`` until the first report
     local    the local frame; None before the first report, unless the station is fixed
     vehicle  id of the carrier; None for a station
     """
@@ -69,14 +69,16 @@ class CarrierTracker:
         self.place: CenterPlace = parse_center(settings.center.source or "home")
         self.local: LocalFrame | None = None
         self.vehicle = str(self.place) if isinstance(self.place, VehicleCenter) else None
-        self._home_from: tuple[str, int] | None = None  # who home began with, and when
+        self._home_from: tuple[str, int] | None = None  # UAV and time of the first report
         self._attitude: tuple[int, Attitude] | None = None  # sender's time, attitude
-        self._contradicted: Contradiction | None = None  # of the newest and the one before
+        self._contradicted: Contradiction | None = (
+            None  # between the newest attitude and the previous one
+        )
         self._angular_acceleration = carrier.AngularAcceleration()
-        self._passed: _AttitudeRun | None = None  # attitudes that were stamped before the newest
+        self._passed: _AttitudeRun | None = None  # attitudes stamped earlier than the newest
         self._least_bound_rad = math.radians(settings.center.attitude_bound_deg)
         self._estimator: EstimatorStatus | None = None
-        self._doubted_rad = self._least_bound_rad  # the most that was told
+        self._doubted_rad = self._least_bound_rad  # largest bound reported so far
         self._attitude_kept_s = settings.tracks.coasting_s
         self._accuracy_factor = assembly.noise(settings).factor
         self._geoid_m = settings.observer.geoid_m
@@ -86,15 +88,15 @@ class CarrierTracker:
 
     @property
     def seeks_home(self) -> bool:
-        """Whether the next report is where ``home`` begins."""
+        """Whether the next report sets ``home``."""
         return self.local is None and isinstance(self.place, HomeCenter)
 
-    # --- what is heard ----------------------------------------------------------------------
+    # --- input ------------------------------------------------------------------------------
 
     def fix(self, placed: PlacedReport) -> tuple[Fix, tuple[Notice, ...]]:
-        """Put a report into the local frame.
+        """Convert a report to the local frame.
 
-        With the first report of all, a notice says where it begins.
+        The first report sets its origin; a notice says where.
         """
         report = self._levelled(placed.report)
         said = (self._first(report),) if self.local is None else ()
@@ -130,7 +132,7 @@ class CarrierTracker:
         return made, said
 
     def _levelled(self, report: Report) -> Report:
-        """A report whose height is above mean sea level, where that can be told."""
+        """Return the report with its height above mean sea level, if the undulation is known."""
         if self._geoid_m is None or report.alt_datum is not AltitudeDatum.GEOMETRIC:
             return report
         above_sea_m = report.alt_m - self._geoid_m
@@ -139,7 +141,7 @@ class CarrierTracker:
     def turn(self, placed: PlacedAttitude, turn_degps2: float) -> Refuted | None:
         """Take in an attitude of the carrier, unless it is older than the newest.
 
-        Returns what it refutes of ``turn_degps2``, the greatest angular acceleration assumed.
+        Returns the refutation of ``turn_degps2``, the largest assumed angular acceleration, if any.
         """
         if self._attitude is not None and placed.sender_ns <= self._attitude[0]:
             if not self._goes_on_before(placed):
@@ -152,7 +154,7 @@ class CarrierTracker:
         return self._angular_acceleration.look(placed.attitude, placed.sender_ns, turn_degps2)
 
     def _contradicts(self, placed: PlacedAttitude, turn_degps2: float) -> Contradiction | None:
-        """What the newest attitude and this one are apart beyond reason: one of them is wrong."""
+        """Return the excess of the difference to the newest attitude: one of both is wrong."""
         if self._attitude is None:
             return None
         before_ns, before = self._attitude
@@ -163,15 +165,15 @@ class CarrierTracker:
 
     @property
     def attitude_bound_rad(self) -> float:
-        """The bound on reported attitudes of the carrier."""
+        """Bound on the error of the carrier's reported attitudes."""
         return carrier.reported_bound_rad(self._estimator, self._least_bound_rad)
 
     def attitude_age_s(self, now: SenderTime) -> float | None:
-        """How old the newest attitude of the carrier is; None where there is none."""
+        """Return the age of the carrier's newest attitude; None if there is none."""
         return None if self._attitude is None else (now.sender_ns - self._attitude[0]) * 1e-9
 
     def trust(self, status: EstimatorStatus) -> Refuted | None:
-        """Take in what the carrier's estimator says of its attitude. Returns it if it is news."""
+        """Take in the estimator status of the carrier. Returns a refutation if the bound grew."""
         self._estimator = status
         if self.attitude_bound_rad <= NOTICE_RATIO * self._doubted_rad:
             return None
@@ -188,10 +190,10 @@ class CarrierTracker:
         )
 
     def _goes_on_before(self, placed: PlacedAttitude) -> bool:
-        """Whether attitudes go on at their pace before the newest, which none has followed.
+        """Return whether a run of older-stamped attitudes shows that the newest has a wrong stamp.
 
-        The newest was stamped ahead of its time then, and must not keep all others out. A slower
-        link's attitudes lie before those of a faster one too, but these go on meanwhile.
+        A newest attitude stamped in the future must not block all later ones. Attitudes from a
+        slower link are also older, but then the newest keeps advancing meanwhile.
         """
         at = (placed.attitude.t_ns, placed.sender_ns)
         run = self._passed
@@ -204,7 +206,7 @@ class CarrierTracker:
         return at[0] - began_ns >= PASSED_NS and count + 1 >= PASSED_LEAST
 
     def restarted(self, uav: str) -> None:
-        """Drop the carrier's attitude if the carrier was restarted: its stamps mean nothing now."""
+        """Drop the carrier's attitude if the carrier rebooted, since its stamps start again."""
         if uav == self.vehicle:
             self._attitude = None
             self._contradicted = None
@@ -213,21 +215,21 @@ class CarrierTracker:
             self._angular_acceleration = carrier.AngularAcceleration()
 
     def _first(self, report: Report) -> Notice:
-        """Make the first position of all the origin of the local frame, and of ``home``."""
+        """Make the first position the origin of the local frame, and ``home``."""
         home = FixedCenter(lat_deg=report.lat_deg, lon_deg=report.lon_deg, alt_m=report.alt_m)
         self._begin(home)
         place = f"{home.lat_deg:.6f}, {home.lon_deg:.6f}, {home.alt_m:.1f} m"
         if self.vehicle is not None:
-            text = f"local frame begins at {place}"
+            text = f"local frame: origin set to {place}"
             return Notice(t_ns=report.t_ns, severity=Severity.INFO, subject="origin", text=text)
         self.place, self._home_from = home, (report.uav, report.t_ns)
-        text = f"home is where {report.uav} first reported: {place}; level, facing north"
+        text = f"home set to the first report of {report.uav}: {place}; level, facing north"
         return Notice(t_ns=report.t_ns, severity=Severity.INFO, subject="home", text=text)
 
     def moved(self, placed: PlacedReport, anew: Estimate) -> Notice | None:
-        """Move ``home`` if the UAV that it began with was tracked anew soon, far above or below.
+        """Move ``home`` if the track that set it was soon restarted at a very different height.
 
-        Its first height was not one that its autopilot stands by. None if home stays.
+        An autopilot's first height may be wrong. Returns None if home stays.
         """
         if self._home_from is None or anew.fix.uav != self._home_from[0]:
             return None
@@ -237,16 +239,16 @@ class CarrierTracker:
         if abs(anew.fix.position_ned_m[2]) < HOME_HEIGHT_M:
             return None
         said = self._first(placed.report)
-        text = f"home moves, for the first height was wrong: {said.text}"
+        text = f"home moved, because the first height was wrong: {said.text}"
         return Notice(t_ns=said.t_ns, severity=Severity.WARNING, subject="home", text=text)
 
     def _begin(self, at: FixedCenter) -> None:
         self.local = LocalFrame(at.lat_deg, at.lon_deg, at.alt_m)
 
-    # --- where the array is -----------------------------------------------------------------
+    # --- pose of the array ------------------------------------------------------------------
 
     def station(self, valid_at_ns: int) -> Carrier | str:
-        """The array of a fixed station, or the reason why its place is not known."""
+        """Return the array of a fixed station, or the reason why its position is unknown."""
         at = self.place
         if self.local is None or not isinstance(at, FixedCenter):
             return "no report yet"
@@ -261,13 +263,13 @@ class CarrierTracker:
         at: SenderTime,
         turn_degps2: float,
     ) -> Carrier | str:
-        """The array aboard the vehicle, or the reason why its position or attitude is not known.
+        """Return the array on the vehicle, or the reason why its position or attitude is unknown.
 
             track        the carrier's track at the time ``at``; None if it has none
             newest       its newest accepted report
             now          the present
-            at           the time asked for
-            turn_degps2  the greatest angular acceleration assumed of it
+            at           the requested time
+            turn_degps2  largest assumed angular acceleration
 
         Times are on the vehicle's timeline.
         """

@@ -1,4 +1,4 @@
-"""A digest of the pipeline's outputs, by which two runs are compared."""
+"""Digest of the pipeline's outputs, to compare two runs."""
 
 import hashlib
 import struct
@@ -11,13 +11,13 @@ _NUMBERS: Final = struct.Struct("<q4d")
 
 
 class Digest:
-    """SHA-256 over every estimate and every set of weights, in order."""
+    """SHA-256 over all estimates and weights, in order."""
 
     def __init__(self) -> None:
         self._hash = hashlib.sha256()
 
     def add(self, output: Estimate | Update) -> None:
-        """Take in one output: little-endian doubles and integers, names in UTF-8."""
+        """Add one output: little-endian doubles and integers, names in UTF-8."""
         if isinstance(output, Estimate):
             self._estimate(output.fix.uav, output.fix.t_ns, output.position_ned_m, output.bound_m)
             return
@@ -33,5 +33,5 @@ class Digest:
         self._hash.update(uav.encode() + _NUMBERS.pack(t_ns, *position_ned_m, bound_m))
 
     def hexdigest(self) -> str:
-        """The digest so far."""
+        """Return the digest so far."""
         return self._hash.hexdigest()

@@ -1,4 +1,4 @@
-"""Builds the elements of the array from the settings."""
+"""Construction of the array's elements from the settings."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from companion.values import ArrayKind, FloatArray, UserError
 
 
 def placed(settings: Settings) -> geometry.Array:
-    """The elements on their mount. Raises ``ConfigError``."""
+    """Return the elements on their mount. Raises ``ConfigError``."""
     given = settings.array
     mount = body_from_ned(
         *np.radians([given.mount_roll_deg, given.mount_pitch_deg, given.mount_yaw_deg])
@@ -51,5 +51,5 @@ def placed(settings: Settings) -> geometry.Array:
 def _rows(positions_m: tuple[tuple[float, ...], ...]) -> FloatArray:
     lengths = {len(row) for row in positions_m}
     if lengths not in ({3}, {6}):
-        raise UserError("positions_m are rows of 3 numbers, or all of 6")
+        raise UserError("positions_m must have rows of 3 numbers each, or of 6 each")
     return np.array(positions_m)

@@ -1,17 +1,18 @@
-"""The whole program as a fold over events. The live service, replay and the tests all use it.
+"""The whole program as a fold over events, used by the live service, replay and the tests.
 
-Pure and synchronous. Time comes with the events; the same events give the same outputs and the same
-digest, whoever feeds them. A report passes through these parts in the order of the flow:
+Pure and synchronous. Time comes with the events; the same events always give the same outputs and
+the same digest. A report passes through these parts in order:
 
-1. ``senders``: who sent it, and when it was true; or why it is rejected;
-2. ``center``: where that is in the local frame;
-3. ``tracker``: the track that it belongs to, and the estimate;
+1. ``senders``: its sender and its time; or why it is rejected;
+2. ``center``: its position in the local frame;
+3. ``tracker``: its track and the estimate;
 
-and a relayed aircraft's report also goes to ``targets``, which returns nothing. A tick asks
-``tracker`` for the tracks that ``targets`` wants and ``center`` for the array, and aims the beams;
-or it comes in two, with what is received meanwhile between it and its ``Tock``.
+and a relayed aircraft's report also goes to ``targets``, which returns nothing. A tick takes the
+tracks that ``targets`` selects from ``tracker`` and the array from ``center``, and computes the
+beams. A split tick does so in two steps; events received meanwhile come between it and its
+``Tock``.
 
-Over 300 lines: every event comes in here, and every look goes out.
+Over 300 lines: all events enter here, and all queries are answered here.
 """
 
 import math
@@ -64,19 +65,19 @@ from companion.values import (
 )
 
 DROP_EVERY: Final = 100
-"""Updates between two searches for tracks that have been silent for too long."""
+"""Number of updates between two searches for tracks without recent reports."""
 PROTECTED_SHARE: Final = 4
-"""Elements of the array for each protected UAV of another node: a null costs one."""
+"""Number of array elements per protected UAV of another node: each null costs one."""
 NOTICED_STEP_S: Final = 0.5
-"""Step of the wall clock that is told; shorter ones are followed in silence."""
+"""Least step of the wall clock that is reported; smaller ones are applied silently."""
 NEAR_M: Final = 2000.0
 """Largest distance between two reports of one aircraft, whatever its speed and their latency."""
 
 
 class Aiming(NamedTuple):
-    """The beams of a tick in two, until its ``Tock``.
+    """Beams of a split tick, until its ``Tock``.
 
-    made   makes them and weighs their links, once, on whichever thread asks first
+    made   computes them and assesses their links, once, on the first calling thread
     local  the local frame that they are in
     """
 
@@ -88,9 +89,9 @@ class Pipeline:
     """State of the program.
 
     ``step`` takes events in the order of ``values.Event``; the other methods change nothing.
-    ``aiming`` is the beams of a split tick that are still to be computed; None if there are none.
+    ``aiming``: beams of a split tick that are still to be computed; None if none are pending.
 
-    Raises ``UserError`` for settings that do not make sense together.
+    Raises ``UserError`` for settings that are inconsistent with each other.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -102,9 +103,7 @@ class Pipeline:
         self.last_update: Update | None = None
         self.last_carrier: Carrier | None = None
         self.aiming: Aiming | None = None
-        self._hysteresis: Hysteresis | None = (
-            None  # changes with ticks alone, so that looks change nothing
-        )
+        self._hysteresis: Hysteresis | None = None  # updated by ticks only, so that looks are pure
         self.digest = Digest()
         self.array = assembly.array(settings)
         self.coverage = assembly.coverage(settings)
@@ -127,8 +126,8 @@ class Pipeline:
     # --- the fold ---------------------------------------------------------------------------
 
     def step(self, event: Event) -> list[Output]:
-        """Take in one event. Returns rejections, notices, estimates, and the update of a tick."""
-        if isinstance(event, Frame):  # first and without a match: nearly all events are frames
+        """Process one event. Returns rejections, notices, estimates, and the update of a tick."""
+        if isinstance(event, Frame):  # first, for speed: nearly all events are frames
             outputs = self._frame(event)
         elif isinstance(event, Tick):
             outputs = self._tick(event)
@@ -161,9 +160,7 @@ class Pipeline:
         if abs(step_s) < NOTICED_STEP_S:
             return []
         way = "forward" if step_s > 0 else "back"
-        text = (
-            f"this machine's clock was set {way} by {abs(step_s):.3f} s: all times are said by it"
-        )
+        text = f"this machine's clock was set {way} by {abs(step_s):.3f} s; UTC times now follow it"
         return [Notice(t_ns=event.t_ns, severity=Severity.WARNING, subject="clock", text=text)]
 
     def _frame(self, frame: Frame) -> list[Output]:
@@ -191,7 +188,7 @@ class Pipeline:
         return said
 
     def _changed(self, t_ns: int, sender: str, change: ClockChange) -> list[Output]:
-        """Tell that a sender's clock, or its link, changed, if it is one that is tracked."""
+        """Report a change of the clock or link of a sender that is tracked."""
         if sender not in self.tracker:
             return []
         drift_max_ppm = self.settings.clocks.drift_max_ppm
@@ -208,7 +205,7 @@ class Pipeline:
         said: list[Output] = [*begun, *assumptions.notices(self.records, *refuted)]
         if isinstance(accepted, Rejection):
             return [*said, accepted]
-        fix = accepted.fix  # with what reports have shown of its bounds
+        fix = accepted.fix  # with bounds that reports have raised
         self.refusals.used(fix.uav)
         if not kind_of(fix.uav).reports_itself:
             near = self.targets.better_known(fix.uav, self.tracker.near(fix.position_ned_m, NEAR_M))
@@ -216,7 +213,7 @@ class Pipeline:
         if accepted.reacquired:
             said.append(assumptions.track_restarted(self.records[fix.uav], accepted))
             said += self._move_home(placed, accepted)
-            text = f"{fix.uav} is tracked anew: its reports agree, but not with its past"
+            text = f"{fix.uav}: track restarted: its reports agree, but not with the old track"
             return [
                 *said,
                 Notice(t_ns=fix.arrival_ns, severity=Severity.WARNING, subject=fix.uav, text=text),
@@ -225,7 +222,7 @@ class Pipeline:
         return [*said, accepted]
 
     def _move_home(self, placed: PlacedReport, anew: Estimate) -> list[Output]:
-        """Begin the local frame again if the track that it began with was wrong in its height."""
+        """Restart the local frame if the track that set its origin had a wrong height."""
         moved = self.center.moved(placed, anew)
         if moved is None:
             return []
@@ -245,7 +242,7 @@ class Pipeline:
         return [*dropped] if tick.in_two else [*dropped, *self._tock(tick.t_ns)]
 
     def _tock(self, now_ns: int) -> list[Output]:
-        """Take in the beams of the last tick, and judge links.
+        """Take the beams of the last tick, and assess links.
 
         Recompute the beams if the local frame was re-anchored meanwhile.
         """
@@ -294,7 +291,7 @@ class Pipeline:
         return clock is not None and clock.guarantee is Guarantee.ASSUMED
 
     def _drop_silent(self, now_ns: int) -> list[Notice]:
-        """Drop tracks that have been silent for long, so that they take no more memory or time."""
+        """Drop tracks without recent reports, to save memory and time."""
         silent = self.tracker.silent(now_ns, self.settings.tracks.dropped_s)
         dropped = self.targets.dropped(now_ns, silent)
         for uav in silent:
@@ -303,16 +300,17 @@ class Pipeline:
         self.senders.forget_silent(now_ns)
         return dropped
 
-    # --- looking ----------------------------------------------------------------------------
+    # --- queries ----------------------------------------------------------------------------
 
     def look(self, now_ns: int, lead_s: float = 0.0) -> Update:
-        """Targets and beams at the actuation delay plus ``lead_s`` from now. Changes nothing."""
+        """Return targets and beams at the actuation delay plus ``lead_s`` from now. Changes
+        nothing."""
         return self.sighted(now_ns, lead_s)()
 
     def sighted(self, now_ns: int, lead_s: float = 0.0) -> Callable[[], Update]:
-        """What ``look`` makes of all as it is now: predictions, made at once, and then the beams.
+        """Predict the tracks now, and return a function that computes the beams of ``look``.
 
-        Those are made when it is called, at any later time, on any thread.
+        That function may be called at any later time, on any thread.
         """
         delay_s = self.settings.beams.actuation_delay_s + lead_s
         valid_at_ns = now_ns + round(delay_s * 1e9)
@@ -345,9 +343,9 @@ class Pipeline:
         return made
 
     def _selected(self, now_ns: int) -> tuple[list[str], list[LeftOut]]:
-        """Targets that get beams, and those beyond ``[beams] most``.
+        """Return the targets that get beams, and those beyond ``[beams] most``.
 
-        UAVs of priority come first, then those that report, then those tracked for longest.
+        Order: UAVs of ``priority``, then those with recent reports, then those tracked longest.
         """
         wanted, most = self.targets.among(self.tracker.uavs), self.settings.beams.most
         if len(wanted) <= most:
@@ -355,15 +353,15 @@ class Pipeline:
         first = frozenset(self.settings.beams.priority)
         silent = frozenset(self.tracker.silent(now_ns, self.settings.tracks.lost_s))
         ranked = sorted(wanted, key=lambda uav: (uav not in first, uav in silent))
-        why = f"{most} others have beams, which is the most"
+        why = f"limit of {most} UAVs with beams is reached"
         selected = frozenset(ranked[:most])
         left = [LeftOut(uav, Cause.MACHINE, why) for uav in ranked[most:]]
         return [uav for uav in wanted if uav in selected], left
 
     def _protected(self, now_ns: int, valid_at_ns: int, carrier: Carrier | None) -> list[Track]:
-        """UAVs of other nodes to protect by nulls: the nearest, as many as cost little.
+        """Return the UAVs of other nodes to protect by nulls: the nearest ones, up to a limit.
 
-        There are some in a fleet alone, where ``[fleet] nulls`` asks for them.
+        Empty unless ``[fleet] nulls`` is set.
         """
         protected = self._tracks(self.targets.protected(self.tracker.uavs), now_ns, valid_at_ns)
         if carrier is None or not protected:
@@ -374,9 +372,10 @@ class Pipeline:
     def tracks(
         self, now_ns: int, valid_at_ns: int, uavs: Iterable[str] | None = None
     ) -> list[Track]:
-        """Every UAV heard of, target or not, predicted to ``valid_at_ns``; without the carrier.
+        """Return every tracked UAV, target or not, predicted to ``valid_at_ns``; without the
+        carrier.
 
-        ``uavs`` names those that are wanted; None: all.
+        ``uavs`` limits them; None: all.
         """
         others = self.tracker.uavs if uavs is None else uavs
         others = [uav for uav in others if uav != self.center.vehicle]
@@ -389,7 +388,7 @@ class Pipeline:
         return [track for track in found if track is not None]
 
     def carrier(self, now_ns: int, valid_at_ns: int) -> Carrier | str:
-        """Position and attitude of the array, or the reason why they are not known."""
+        """Return position and attitude of the array, or the reason why they are unknown."""
         vehicle = self.center.vehicle
         if vehicle is None:
             return self.center.station(valid_at_ns)
@@ -400,29 +399,29 @@ class Pipeline:
         return self.center.aboard(track, self.tracker.newest(vehicle), now, at, turn_degps2)
 
     def utc_ns(self, t_ns: int) -> UtcNs:
-        """A time of the node's timeline in UTC, by the wall clock as it was set last."""
+        """Convert a time of the node's timeline to UTC, by the current wall clock."""
         return UtcNs(t_ns + self.utc_offset_ns)
 
     def reporters(self) -> list[Source]:
-        """Senders that report their own position, the carrier among them."""
+        """Return the senders that report their own position, including the carrier."""
         return [Source.parse(uav) for uav in self.tracker.uavs if kind_of(uav).reports_itself]
 
     def refuted(self, uav: str) -> int:
-        """How often assumptions about a UAV were refuted."""
+        """Return how often assumptions about a UAV were refuted."""
         record = self.records.get(uav)
         return 0 if record is None else record.refuted
 
     def clock_estimate(self, uav: str) -> ClockEstimate | None:
-        """The state of a UAV's clock; None for a UAV that has none."""
+        """Return the state of a UAV's clock; None if it has none."""
         return self.senders.clock_estimate(uav)
 
     @property
     def local(self) -> LocalFrame | None:
-        """The local frame; None before the first report, unless the station is fixed."""
+        """Local frame; None before the first report, unless the station is fixed."""
         return self.center.local
 
     def geodetic(self, position_ned_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Latitude and longitude in degrees and height in metres of local points, (N, 3).
+        """Convert local points (N, 3) to latitude and longitude in degrees and height in metres.
 
         Raises ``ValueError`` before the first report, when there is no local frame.
         """

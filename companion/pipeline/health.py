@@ -1,9 +1,8 @@
-"""Verdicts on the links to all UAVs, and the notices when one changes.
+"""Verdicts on the links to all UAVs, and notices when they change.
 
-Once a second the gain that each beam surely has, and the one that it likely has, is held against
-what the link needs. Links are judged in batches, one at each update, so that all of them delay no
-update. A verdict changes only once it has been another for a while, and not for a hair's
-breadth, so that it does not flap.
+Once a second, the guaranteed and the likely gain of each beam are compared with the gain that the
+link needs. Links are assessed in batches, one per update, so that no update is delayed. A verdict
+changes only after a hold time and with a gain margin, so that it does not flap.
 """
 
 import math
@@ -35,20 +34,20 @@ from companion.values import (
 )
 
 EVERY_NS: Final = 1_000_000_000
-"""Time between two judgements of a link, and for which one round through all of them lasts."""
+"""Interval between two assessments of a link; one round through all links takes as long."""
 AT_ONCE: Final = 16
-"""Links that one update judges at least; more where a round would last for too long."""
-WORSE_NS: Final = 1_000_000_000  # time for which a link must be judged worse before it is called so
-BETTER_NS: Final = 3_000_000_000  # time for which it must be judged better
+"""Least number of links assessed per update; more if a round would take too long."""
+WORSE_NS: Final = 1_000_000_000  # hold time before a verdict gets worse
+BETTER_NS: Final = 3_000_000_000  # hold time before a verdict gets better
 SLACK_DB: Final = 1.0
-"""How far a gain may fall below what is needed before a link that had it is judged worse."""
-NAMED: Final = 6  # most UAVs that one notice names
+"""Gain margin: a link keeps its level until the gain falls this far below what it needs."""
+NAMED: Final = 6  # largest number of UAVs named in one notice
 RANK: Final = {Level.NONE: 0, Level.WEAK: 1, Level.GOOD: 2}  # levels from the worst to the best
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Site:
-    """What stands behind every beam: the array, its reach, its radio."""
+    """Properties common to all beams: the array, its coverage, its radio."""
 
     array: Array
     coverage: Coverage
@@ -57,7 +56,8 @@ class Site:
 
 
 class _Link(NamedTuple):
-    """A beam, the gain that its link needs, and what it surely and likely has; None: none."""
+    """A beam, the gain that its link needs, its guaranteed and its likely gain (None: no such
+    gain)."""
 
     beam: Beam
     needed_db: float
@@ -74,23 +74,23 @@ class LinkBatch(NamedTuple):
 
 
 class HealthMonitor:
-    """The verdicts. ``verdicts`` holds the present one of each target, by its name."""
+    """The verdicts. ``verdicts`` contains the current one of each target, by its id."""
 
     def __init__(self, need: NeedSettings, site: Site) -> None:
         self.verdicts: dict[str, Verdict] = {}
         self._need = need
         self._site = site
-        self._begun_ns: int | None = None  # the present round
-        self._last_ns: int | None = None  # the update before
-        self._waiting: list[str] = []  # those that the round has not come to
-        self._noticed: dict[str, Verdict] = {}  # verdicts when last something was told
-        self._unsettled: dict[str, tuple[bool, int]] = {}  # judged better or worse, since when
+        self._begun_ns: int | None = None  # start of the current round
+        self._last_ns: int | None = None  # time of the previous update
+        self._waiting: list[str] = []  # UAVs still queued in this round
+        self._noticed: dict[str, Verdict] = {}  # verdicts at the last notice
+        self._unsettled: dict[str, tuple[bool, int]] = {}  # pending change: better?, since when
         self._unfit: str | None = None
 
     def next_batch(self, update: Update) -> LinkBatch | None:
-        """The next batch of links to assess, with what they have and need; None: none is due.
+        """Return the next batch of links to assess, with their gains; None if none is due.
 
-        Changes nothing. It takes milliseconds, and may be made on any thread.
+        Changes nothing. Takes milliseconds, and may run on any thread.
         """
         begun_ns, last_ns = self._begun_ns, self._last_ns
         begins = begun_ns is None or not 0 <= update.t_ns - begun_ns < EVERY_NS
@@ -122,10 +122,10 @@ class HealthMonitor:
     def judge(
         self, update: Update, weighed: LinkBatch | None, evidence: Callable[[str], LinkEvidence]
     ) -> list[Notice]:
-        """Judge one batch of links; return notices of what changed once all batches are done.
+        """Assess one batch of links; return notices of changes at the end of a round.
 
-        ``evidence`` says what is known of a UAV beside its track; it is asked of UAVs whose link is
-        not good.
+        ``evidence`` returns what is known about a UAV in addition to its track; it is called for
+        UAVs whose link is not good.
         """
         self._last_ns = update.t_ns
         if weighed is None:
@@ -170,7 +170,8 @@ class HealthMonitor:
     def _least_db(
         self, beam_set: BeamSet, towards: FloatArray, which: Sequence[int]
     ) -> tuple[Sequence[float | None], Sequence[float | None]]:
-        """The least gain of these beams where their UAVs can be, and where they usually are."""
+        """Return the least gain of these beams within their UAVs' bounds, and within the usual
+        error."""
         array, beams = self._site.array, [beam_set.beams[i] for i in which]
         both = np.tile(towards[which], (2, 1))
         angles = [beam.pointing_bound_rad for beam in beams]
@@ -183,7 +184,7 @@ class HealthMonitor:
     def _level(
         self, uav: str, needed_db: float, sure_db: float | None, likely_db: float | None
     ) -> Level:
-        """What the gains say; a level that the link has is kept within ``SLACK_DB``."""
+        """Return the level by the gains; the current level is kept within ``SLACK_DB``."""
         held = self.verdicts.get(uav)
         rank = RANK[held.level] if held else RANK[Level.NONE]
 
@@ -196,7 +197,8 @@ class HealthMonitor:
         return Level.WEAK if enough(likely_db, Level.WEAK) else Level.NONE
 
     def _settled(self, fresh: Verdict) -> Verdict:
-        """The verdict to hold: the fresh one, or its news under the level that was held so far."""
+        """Return the new verdict, or the current level with the new values until the hold time
+        ends."""
         uav, held = fresh.uav, self.verdicts.get(fresh.uav)
         if held is None:
             return fresh
@@ -208,7 +210,7 @@ class HealthMonitor:
         if was_better is not better:
             since_ns = fresh.since_ns
         self._unsettled[uav] = (better, since_ns)
-        # Without a beam there is nothing that could waver: it is said at once.
+        # Without a beam no gain can fluctuate, so the verdict changes at once.
         wait_ns = BETTER_NS if better else WORSE_NS if fresh.needed_gain_db is not None else 0
         if fresh.since_ns - since_ns >= wait_ns:
             del self._unsettled[uav]
@@ -217,7 +219,7 @@ class HealthMonitor:
         return replace(fresh, level=held.level, blame=why, since_ns=held.since_ns)
 
     def _notices(self, update: Update) -> list[Notice]:
-        """What changed: for all at once where the carrier is the cause, which all share."""
+        """Return notices of changes; a single one if the carrier is the cause for all."""
         before, self._noticed = self._noticed, self.verdicts
         was, self._unfit = self._unfit, update.unfit
         if update.unfit is not None:
@@ -234,14 +236,14 @@ class HealthMonitor:
             if held is None or held.level is verdict.level:
                 continue
             cause = verdict.blame.cause if verdict.blame else None
-            # That a UAV is stale or lost, and therefore without a beam, is told by itself.
+            # A UAV that is stale or lost, and therefore without a beam, has its own notice.
             if cause is not Cause.SILENT or verdict.needed_gain_db is not None:
                 changed.setdefault((verdict.level, cause), []).append(verdict)
         return [_notice(update.t_ns, alike) for alike in changed.values()]
 
 
 def _notice(t_ns: int, alike: Sequence[Verdict]) -> Notice:
-    """One notice for all links that became the same for the same cause."""
+    """Return one notice for all links that changed to the same level for the same cause."""
     names = ", ".join(verdict.uav for verdict in alike[:NAMED])
     rest = f" and {len(alike) - NAMED} more" if len(alike) > NAMED else ""
     one, links = alike[0], "links" if len(alike) > 1 else "link"
@@ -267,10 +269,9 @@ def _of_left_out(update: Update, tracks: dict[str, Track]) -> dict[str, Verdict]
 def _needed_db(
     need: NeedSettings, site: Site, beam_set: BeamSet, towards: FloatArray
 ) -> list[float]:
-    """The array gain that each link needs.
+    """Return the array gain that each link needs.
 
-    By the SINR, it is the gain that would be left of what the beam has if all of the SINR above the
-    one that is needed were lost.
+    With ``needed_sinr_db`` it is the beam's gain less the excess of its SINR.
     """
     beams = beam_set.beams
     if need.needed_sinr_db is None:

@@ -1,4 +1,4 @@
-"""What is remembered of each sender and UAV: a record each, in tables of bounded size."""
+"""Records kept for each sender and UAV, in tables of bounded size."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -8,18 +8,18 @@ from typing import Final, TypeVar
 from companion.values import Reason
 
 RECORDS_MAX: Final = 4096
-"""Records kept. Beyond it those that nothing protects are dropped, the oldest first."""
-DROPPED_AT_ONCE: Final = 256  # records dropped at once: made-up ids may come in any number
+"""Limit on records. Beyond it, the oldest unprotected ones are dropped."""
+DROPPED_AT_ONCE: Final = 256  # records dropped at once: forged ids may come in any number
 
 _T = TypeVar("_T")
 
 
 class Records(dict[str, _T]):
-    """Records by id. ``records[uav]`` begins one where there is none; to forget is to drop it.
+    """Records by id. ``records[uav]`` creates a missing one; deleting it forgets the id.
 
-    ``make`` makes a new record, ``is_kept`` says which ids are never dropped for want of room.
-    There may be more of these than ``RECORDS_MAX``: the table is searched again only after as many
-    were added as are dropped at once.
+    ``make`` creates a record, ``is_kept`` says which ids are never dropped to make room. There may
+    be more of those than ``RECORDS_MAX``, so the table is searched again only after
+    ``DROPPED_AT_ONCE`` additions.
     """
 
     def __init__(self, make: Callable[[], _T], is_kept: Callable[[str], bool]) -> None:
@@ -39,7 +39,7 @@ class Records(dict[str, _T]):
 
 @dataclass(slots=True, kw_only=True)
 class UnusedRun:
-    """A run of reports of which none was used: since when, and why the newest was not."""
+    """Run of reports that were all rejected: its start, and the reason of the newest."""
 
     since_ns: int
     reason: Reason
@@ -49,16 +49,16 @@ class UnusedRun:
 
 @dataclass(slots=True, kw_only=True)
 class UavRecord:
-    """What is remembered of a UAV until it is restarted or its track is dropped.
+    """What is remembered of a UAV until it reboots or its track is dropped.
 
-    proven          greatest value that was reported of each refuted setting
+    proven          largest reported value of each refuted setting
     """
 
     refuted: int = 0  # how often assumptions about it were refuted
     proven: dict[str, float] = field(default_factory=dict)
     clock_notice_ns: int | None = None  # when a change of its clock or link was last reported
-    waits_ns: int | None = None  # since when its GNSS receiver has not confirmed its reports
-    unused: UnusedRun | None = None  # the present run of reports that are not used
+    waits_ns: int | None = None  # start of the wait for its GNSS receiver to confirm its reports
+    unused: UnusedRun | None = None  # current run of rejected reports
     unused_notice_ns: int | None = None  # when such a run was last reported
 
 

@@ -1,4 +1,4 @@
-"""Counts of what was received and not used, by sender and reason."""
+"""Counts of rejections, by sender and reason."""
 
 from collections import Counter, OrderedDict, deque
 from dataclasses import dataclass, field
@@ -8,8 +8,8 @@ from companion.pipeline.records import UavRecords, UnusedRun
 from companion.values import Notice, Reason, Rejection, Severity, kind_of
 
 UNHEARD_NS: Final = 1_000_000_000
-"""Time for which no report of a sender is used before that is told."""
-NOTICE_INTERVAL_NS: Final = 10_000_000_000  # least time between two such notices of one sender
+"""Time without an accepted report of a sender after which a notice is published."""
+NOTICE_INTERVAL_NS: Final = 10_000_000_000  # least time between two such notices about one sender
 OF_REPORTS: Final = frozenset(
     {
         Reason.UNREACHABLE,
@@ -22,25 +22,25 @@ OF_REPORTS: Final = frozenset(
         Reason.SHARED_ID,
     }
 )
-"""Reasons for which a report that is about its sender itself is not used."""
+"""Reasons to reject a sender's report about itself."""
 RECENT: Final = 8  # recent rejections kept per sender
 SENDERS_MAX: Final = 4096
-"""Senders remembered; beyond it the one heard longest ago is forgotten.
+"""Senders remembered, so that a flood of forged addresses cannot exhaust the memory.
 
-A flood of made-up addresses must not fill the memory.
+Beyond it the least recently rejected one is forgotten.
 """
 
 
 @dataclass(slots=True)
 class OfSender:
-    """Rejections of one sender (a UAV, a component or a link): counts by reason, and the newest."""
+    """Rejections of one sender (a UAV, component or link): counts by reason, and the newest."""
 
     counts: Counter[Reason] = field(default_factory=Counter)
     recent: deque[Rejection] = field(default_factory=lambda: deque(maxlen=RECENT))
 
 
 class Refusals:
-    """Counts rejections. ``total`` includes those of senders that were forgotten."""
+    """Counts of rejections. ``total`` includes senders that were forgotten."""
 
     def __init__(self, records: UavRecords) -> None:
         self.total: Counter[Reason] = Counter()
@@ -50,7 +50,7 @@ class Refusals:
     def add(self, refused: Rejection) -> Notice | None:
         """Count one rejection.
 
-        Returns a notice where no report of the sender has been used for a second.
+        Returns a notice if no report of the sender has been accepted for a second.
         """
         self._count(refused)
         uav = refused.source
@@ -66,7 +66,7 @@ class Refusals:
         if run.is_reported or run.reports < 2 or lasted_ns < UNHEARD_NS:
             return None
         if refused.reason is Reason.SHARED_ID:
-            return None  # that is told by itself
+            return None  # a shared id has its own notice
         run.is_reported = True
         told_ns = record.unused_notice_ns
         if told_ns is not None and refused.t_ns - told_ns < NOTICE_INTERVAL_NS:
@@ -77,13 +77,13 @@ class Refusals:
         return Notice(t_ns=refused.t_ns, severity=Severity.WARNING, subject=uav, text=text)
 
     def used(self, uav: str) -> None:
-        """Note that a report was used."""
+        """Note that a report was accepted."""
         record = self._records.get(uav)
         if record is not None:
             record.unused = None
 
     def unheard(self, uav: str) -> Reason | None:
-        """Why the newest reports of a sender are not used; None where they are."""
+        """Return why the newest reports of a sender are rejected; None if they are used."""
         record = self._records.get(uav)
         run = None if record is None else record.unused
         return run.reason if run is not None and run.reports > 1 else None
@@ -101,5 +101,5 @@ class Refusals:
         sender.recent.append(refused)
 
     def of(self, sender: str) -> OfSender:
-        """The rejections of one sender; empty for one that is not known."""
+        """Return the rejections of one sender; empty for an unknown one."""
         return self._senders.get(sender) or OfSender()

@@ -1,10 +1,10 @@
-"""Senders of frames: which of them sent a message, and when it was true. Every frame comes here.
+"""Senders of frames: finds the sender and the time of every message.
 
-There is a record of each sender's clock, and one of what each component says beside positions:
-heartbeat, GNSS status, and the bounds on noise that follow from it. A message leaves here with its
-time on the sender's and on the node's timeline, or as a rejection with its reason.
+Each sender has a record of its clock; each component one of its other messages: heartbeat, GNSS
+status, and the noise bounds derived from it. A message leaves here with its time on the sender's
+and on the node's timeline, or as a rejection with its reason.
 
-Over 300 lines: every kind of message comes through here.
+Over 300 lines: every kind of message passes through here.
 """
 
 import math
@@ -50,21 +50,23 @@ from companion.values import (
     kind_of,
 )
 
-WAITS_NS: Final = 10_000_000_000  # time for which a track waits for its receiver to vouch for it
+WAITS_NS: Final = 10_000_000_000  # time for which a new track waits for its GNSS receiver
 STATED_LATE_US: Final = 30_000_000
-"""Greatest time by which what a receiver states may come after something newer; a longer step back
-is another boot's. As long as reports are remembered (``dedupe``)."""
-KEPT_NS: Final = 3_600_000_000_000
-"""How long a silent sender without a track is kept: each clock takes some 50 kB."""
-FIX_3D: Final = 3  # GPS_FIX_TYPE_3D_FIX; better fixes have greater numbers
-NEAR_HEIGHT_M: Final = 50.0
-"""Greatest distance between a receiver's own height and the autopilot's that stands by it.
+"""Largest delay of a receiver status that is out of order; a larger step back means a reboot.
 
-Before an autopilot stands by its height it may be hundreds of metres off (docs/field-notes.md 1).
+As long as reports are remembered (``dedupe``).
+"""
+KEPT_NS: Final = 3_600_000_000_000
+"""Time for which a silent sender without a track is kept; each clock takes some 50 kB."""
+FIX_3D: Final = 3  # GPS_FIX_TYPE_3D_FIX; better fixes have larger numbers
+NEAR_HEIGHT_M: Final = 50.0
+"""Largest difference between the heights of receiver and autopilot in a valid report.
+
+Before an autopilot's height is valid it may be off by hundreds of metres (docs/field-notes.md 1).
 """
 
 
-APART_SHARE: Final = 0.1  # share of the newest report in how far the two heights are apart of late
+APART_SHARE: Final = 0.1  # weight of the newest report in the mean square height difference
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,7 +81,7 @@ class PlacedReport:
     sender_ns: int  # when it was true, on the sender's timeline
     t_ns: int  # the same instant on the node's timeline
     noise: ReportNoise | None
-    limits: Limits  # what the aircraft is taken to be able to do
+    limits: Limits  # assumed limits of the aircraft
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,10 +96,10 @@ class PlacedAttitude:
 class FrameOutcome:
     """The outcome of one frame.
 
-    message    a message with its time; None if nothing is to be done further
-    outputs    notices and rejections on the way to it
-    restarted  the sender whose past is to be forgotten; None if there is none
-    change     what the frame showed of a change of its sender's clock; None where it showed none
+    message    a message with its time; None if nothing remains to be done
+    outputs    notices and rejections
+    restarted  sender whose past is to be forgotten; None if none is
+    change     change of the sender's clock that the frame showed; None without one
     """
 
     message: PlacedReport | PlacedAttitude | EstimatorStatus | None = None
@@ -106,44 +108,44 @@ class FrameOutcome:
     change: ClockChange | None = None
 
 
-NOTHING: Final = FrameOutcome()  # the outcome of a frame that asks for nothing further
+NOTHING: Final = FrameOutcome()  # outcome of a frame without further effect
 
 
 @dataclass(slots=True)
 class Sender:
-    """A sender with a clock: a vehicle, or an aircraft that broadcasts its own time stamps."""
+    """A sender with a clock: a vehicle, or an aircraft that broadcasts its own stamps."""
 
     clock: SenderClock
-    stamped_ns: int | None = None  # when the clock was last given a stamp; None if never
-    is_shared: bool = False  # whether it was reported that two senders share this id
+    stamped_ns: int | None = None  # arrival of the clock's newest stamp; None: none yet
+    is_shared: bool = False  # whether a notice said that two senders share this id
 
 
 @dataclass(slots=True, kw_only=True)
 class ComponentState:
-    """What a MAVLink component says beside positions.
+    """State of a MAVLink component other than its positions.
 
-    stated_us  the receiver's own time of that status; 0 if unknown, or of the boot before
-    apart_m2   mean square of the receiver's height less the autopilot's of late, m²
+    stated_us  the receiver's own time of that status; 0 if unknown or from before a reboot
+    apart_m2   mean square of the receiver's height less the autopilot's, m²
     """
 
-    heard_ns: int = 0  # when it last said any of this
+    heard_ns: int = 0  # arrival of the newest of these messages
     presence: Presence | None = None  # its newest heartbeat
     receiver: GnssStatus | None = None  # its newest GNSS status
     stated_us: int = 0
-    noise: ReportNoise | None = None  # bounds on the noise of its reports, by that status
+    noise: ReportNoise | None = None  # bounds on the noise of its reports, from that status
     apart_m2: float | None = None
 
 
 class Senders:
     """All senders of frames.
 
-        carrier  id of the vehicle that carries the array: it is admitted whatever the lists say,
-                 and only its attitude is used
-        records  those of the UAVs
-        tracked  ids of the present tracks, whose clocks are kept
+        carrier  id of the vehicle that carries the array: always admitted, and the only one whose
+                 attitude is used
+        records  records of the UAVs
+        tracked  ids of the current tracks, whose clocks are kept
 
-    Clocks are kept by the id under which reports are tracked: aircraft of Remote ID and Cursor on
-    Target have a clock, and no MAVLink source of their own.
+    Clocks are kept by the id under which reports are tracked: Remote ID and Cursor on Target
+    aircraft have a clock, but no MAVLink source of their own.
     """
 
     def __init__(
@@ -168,10 +170,10 @@ class Senders:
         self._assumed = lru_cache(RECORDS_MAX)(partial(assembly.assumed, settings))
         self._utc_offset_ns = 0  # UTC less the node's timeline
 
-    # --- what they say ----------------------------------------------------------------------
+    # --- messages ---------------------------------------------------------------------------
 
     def hear(self, frame: Frame) -> FrameOutcome:
-        """Take in one frame of a message that is decoded (``decode.DECODED``)."""
+        """Process one frame of a message that is decoded (``decode.DECODED``)."""
         if frame.msgid == ATTITUDE and frame.source != self._carrier_source:
             change = self.notice(frame)
             return NOTHING if change is None else FrameOutcome(change=change)
@@ -204,12 +206,12 @@ class Senders:
     def _take_other(
         self, frame: Frame, message: GnssStatus | SystemTime | Presence
     ) -> FrameOutcome:
-        """Take in what is said beside positions: of a receiver, a clock, a vehicle."""
+        """Process a message other than positions: receiver, clock or vehicle status."""
         match message:
             case GnssStatus():
                 component = self._component(message)
                 stated_us, newest_us = message.time_us, component.stated_us
-                # What is older comes over a second link that lags behind.
+                # An older status comes over a second, slower link.
                 if not 0 < stated_us < newest_us <= stated_us + STATED_LATE_US:
                     component.stated_us = stated_us
                     component.noise = noise.reported(message, self._noise_settings)
@@ -231,9 +233,9 @@ class Senders:
         return component
 
     def notice(self, frame: Frame) -> ClockChange | None:
-        """Take in the stamp of a frame that is not decoded otherwise, for its sender's clock.
+        """Pass the stamp of an otherwise ignored frame to its sender's clock.
 
-        Returns what it showed of a change of that clock.
+        Returns the change of that clock that it showed.
         """
         sender = self._senders.get(str(frame.source))
         if sender is None:
@@ -242,22 +244,22 @@ class Senders:
         return sender.clock.change
 
     def round_trip(self, event: RoundTrip) -> ClockChange | None:
-        """Take in a TIMESYNC round trip, as evidence of its sender's clock.
+        """Pass a TIMESYNC round trip to its sender's clock.
 
-        Returns what it showed of a change of that clock.
+        Returns the change of that clock that it showed.
         """
         clock = self._senders[str(event.source)].clock
         clock.timesync(event.sent_ns, event.t_ns, event.remote_ns)
         return clock.change
 
     def utc_is(self, offset_ns: int) -> None:
-        """Take in by how much UTC is beyond the node's timeline, from now on."""
+        """Set the difference between UTC and the node's timeline, from now on."""
         self._utc_offset_ns = offset_ns
         for sender in self._senders.values():
             sender.clock.forget_gnss()
 
     def _telemetry(self, report: Report, doubt_ns: int = 0) -> FrameOutcome:
-        """Place a report by its stamp; its noise is a vehicle's own matter if it reports itself.
+        """Place a report by its stamp; noise bounds are set only for a vehicle that reports itself.
 
         ``doubt_ns`` is that of its frame.
         """
@@ -265,7 +267,7 @@ class Senders:
         uav, t_ns = report.uav, report.t_ns
         is_own = kind_of(uav).reports_itself
         if uav not in self._senders and len(self._senders) >= RECORDS_MAX and not is_own:
-            return _refused(report, Reason.TOO_MANY)  # any number of names can be made up
+            return _refused(report, Reason.TOO_MANY)  # ids can be forged in any number
         sender = self._senders[uav]
         stamp, said = self._stamp(sender, uav, t_ns, report.boot_ms, doubt_ns)
         restarted = uav if said else None
@@ -296,10 +298,10 @@ class Senders:
         )
 
     def _errors(self, report: Report, time_s: float) -> ReportNoise:
-        """Bounds on the errors of a report, with by how much two heights differ of late.
+        """Return bounds on a report's errors, with the recent height difference of receiver and
+        autopilot.
 
-        These are a receiver's own and its autopilot's; ``time_s`` is the greatest error of the
-        report's time.
+        ``time_s`` is the largest error of the report's time.
         """
         component = self._components.get(report.source)
         if component is None or component.noise is None or component.receiver is None:
@@ -313,7 +315,7 @@ class Senders:
         return self._stated(report, replace(component.noise, time_s=time_s, apart_m=apart_m))
 
     def _stated(self, report: Report, noise: ReportNoise) -> ReportNoise:
-        """The bounds, widened by what the message itself states: accuracy, and steps of height."""
+        """Widen bounds by what the message itself states: accuracy, and steps of height."""
         if report.accuracy is None and not report.alt_step_m:
             return noise
         said, factor = report.accuracy or Accuracy(), self._noise_settings.factor or 0.0
@@ -329,7 +331,8 @@ class Senders:
     def _relayed(self, said: AdsbVehicle) -> FrameOutcome:
         """Place a report of an aircraft that a receiver relays.
 
-        A track is begun anew when the altitude datum changes, since datums differ by the weather.
+        The track restarts when the altitude datum changes, since the difference depends on the
+        weather.
         """
         datum = self.aircraft.datum(said.uav)
         merged = self.aircraft.merge(said)
@@ -342,7 +345,7 @@ class Senders:
         )
         if datum in (None, merged.alt_datum):
             return FrameOutcome(message=placed)
-        text = f"{said.uav} is tracked anew: its altitude is {merged.alt_datum} now, not {datum}"
+        text = f"{said.uav}: track restarted: altitude datum is {merged.alt_datum} now, not {datum}"
         return FrameOutcome(
             message=placed,
             outputs=(Notice(t_ns=said.t_ns, severity=Severity.INFO, subject=said.uav, text=text),),
@@ -350,7 +353,7 @@ class Senders:
         )
 
     def _remote_id(self, frame: Frame, said: RemoteId) -> FrameOutcome:
-        """Place a position that an aircraft broadcasts, by the stamp that it has."""
+        """Place a broadcast position by its stamp."""
         named = self.remote_ids.merge(said)
         if named is None:
             return NOTHING
@@ -377,11 +380,11 @@ class Senders:
         )
 
     def may_begin(self, report: Report, always: bool) -> bool:
-        """Take in a report that would begin a track. Returns whether one may begin with it.
+        """Return whether a track may begin with this report.
 
-        Its sender's receiver, if one was heard, has to have a 3-D fix near the report's height. For
-        that no more than ``WAITS_NS`` are waited, as heights may be of other data for good; home
-        waits ``always``.
+        Its sender's receiver, if one was received, must have a 3D fix near the report's height.
+        After ``WAITS_NS`` the track begins anyway, as heights may permanently have different
+        datums; home waits ``always``.
         """
         component = self._components.get(report.source)
         receiver = None if component is None else component.receiver
@@ -395,12 +398,12 @@ class Senders:
             record.waits_ns = report.t_ns
         return not always and report.t_ns - record.waits_ns >= WAITS_NS
 
-    # --- when they said it ------------------------------------------------------------------
+    # --- times ------------------------------------------------------------------------------
 
     def _stamp(
         self, sender: Sender, name: str, arrival_ns: int, boot_ms: int, doubt_ns: int = 0
     ) -> tuple[Stamp | None, tuple[Notice, ...]]:
-        """Place a stamp on the sender's timeline; a notice says where it shows a reboot."""
+        """Place a stamp on the sender's timeline; returns a notice if it shows a reboot."""
         stamp = sender.clock.observe(arrival_ns, boot_ms, doubt_ns)
         sender.stamped_ns = arrival_ns
         if stamp is None or not stamp.rebooted:
@@ -411,7 +414,7 @@ class Senders:
         return stamp, (Notice(t_ns=arrival_ns, severity=Severity.WARNING, subject=name, text=text),)
 
     def time(self, uav: str, node_ns: int) -> SenderTime:
-        """A node time on a UAV's own timeline; a relayed aircraft's timeline is the node's."""
+        """Convert a node time to a UAV's own timeline; for a relayed aircraft they are the same."""
         sender = self._senders.get(uav)
         known = sender.clock.time(node_ns) if sender else None
         if known is None:
@@ -428,12 +431,12 @@ class Senders:
         )
 
     def clock_estimate(self, uav: str) -> ClockEstimate | None:
-        """The state of a UAV's clock; None for a UAV that has none."""
+        """Return the state of a UAV's clock; None if it has none."""
         sender = self._senders.get(uav)
         return sender.clock.estimate() if sender else None
 
     def assumed(self, uav: str) -> assembly.AircraftAssumptions:
-        """What is assumed of a UAV, by its newest heartbeat."""
+        """Return the assumptions about a UAV, by its newest heartbeat."""
         vehicle = kind_of(uav).reports_itself
         component = self._components.get(Source.parse(uav)) if vehicle else None
         heard = None if component is None else component.presence
@@ -444,10 +447,10 @@ class Senders:
     # --- memory -----------------------------------------------------------------------------
 
     def forget_silent(self, now_ns: int) -> None:
-        """Drop what is known of senders without a track that were silent for long.
+        """Drop records of silent senders without a track.
 
-        Who comes and goes all day takes no memory. Of components the oldest are dropped, too,
-        beyond ``RECORDS_MAX``.
+        This bounds the memory for transient senders. Beyond ``RECORDS_MAX``, the oldest components
+        are dropped too.
         """
         silent_ns, senders, components = now_ns - KEPT_NS, self._senders, self._components
         for name in [n for n, one in senders.items() if (one.stamped_ns or now_ns) < silent_ns]:
@@ -463,7 +466,7 @@ class Senders:
         return name in self._tracked or name == self._carrier
 
     def link_share(self, link: str) -> LinkShare:
-        """What a link has contributed to the reports so far."""
+        """Return what a link has contributed to the reports so far."""
         return self._dedupe.shares.get(link) or LinkShare()
 
 
@@ -472,12 +475,12 @@ def _refused(message: Report | AdsbVehicle, reason: Reason) -> FrameOutcome:
 
 
 def _shared_id(sender: Sender, uav: str, t_ns: int) -> tuple[Notice | Rejection, ...]:
-    """Reject a report under an id with two boot clocks; the notice is given once."""
+    """Reject a report under an id with two boot clocks, with one notice."""
     refused = Rejection(
         t_ns=t_ns, source=uav, reason=Reason.SHARED_ID, detail="two boot clocks under this id"
     )
     if sender.is_shared:
         return (refused,)
     sender.is_shared = True
-    text = f"two vehicles share the id {uav}: neither is believed"
+    text = f"two vehicles send under the id {uav}; the reports of both are rejected"
     return Notice(t_ns=t_ns, severity=Severity.WARNING, subject=uav, text=text), refused

@@ -1,4 +1,4 @@
-"""Targets: the tracks for which beams are wanted, and the notices when their states change."""
+"""Targets: the UAVs for which beams are wanted, and notices when their states change."""
 
 from collections.abc import Iterable, Mapping
 
@@ -8,14 +8,14 @@ from companion.values import Duty, Notice, Severity, TrackState, kind_of
 
 
 class Targets:
-    """Decides for which UAVs beams are wanted.
+    """Selection of the UAVs for which beams are wanted.
 
-    ``identities`` tells which relayed aircraft is which better known track: two beams on one
-    aircraft would make zero forcing all but singular.
+    ``identities`` maps relayed aircraft to better tracks of the same aircraft: two beams on one
+    aircraft would make zero forcing nearly singular.
 
-    Wanted are UAVs that report themselves, relayed aircraft only if the settings say so, and never
-    the carrier (``carrier`` is its id, None for a station). Of a fleet's node it is those that are
-    its ``duty``; None: there is no fleet.
+    Beams are wanted for UAVs that report themselves, for relayed aircraft only if the settings say
+    so, and never for the carrier (``carrier`` is its id, None for a station). In a fleet, they are
+    limited to this node's ``duty``; None: no fleet.
     """
 
     def __init__(self, settings: Settings, carrier: str | None) -> None:
@@ -27,13 +27,13 @@ class Targets:
         self.duty: Duty | None = None
 
     def wants(self, uav: str) -> bool:
-        """Whether a beam is wanted for this UAV."""
+        """Return whether a beam is wanted for this UAV."""
         if uav == self._carrier or self.identities.same_as(uav) is not None:
             return False
         return self._all or kind_of(uav).reports_itself
 
     def among(self, uavs: Iterable[str]) -> list[str]:
-        """The UAVs for which beams are wanted, in the order given."""
+        """Return the UAVs for which beams are wanted, in the order given."""
         wanted = [uav for uav in uavs if self.wants(uav)]
         if self.duty is None:
             return wanted
@@ -41,31 +41,33 @@ class Targets:
         return [uav for uav in wanted if uav in served]
 
     def protected(self, uavs: Iterable[str]) -> list[str]:
-        """UAVs of other nodes that nulls are to protect, in the order given."""
+        """Return the UAVs of other nodes to protect by nulls, in the order given."""
         spares = frozenset(self.duty.spares if self.duty else ())
         return [uav for uav in uavs if uav in spares and self.wants(uav)]
 
     def better_known(self, uav: str, others: Iterable[str]) -> list[str]:
-        """Those of the others by which a relayed aircraft would rather be known.
+        """Return those of the others whose id is preferred to that of a relayed aircraft.
 
-        Telemetry before Remote ID, ADS-B and Cursor on Target, in this order; tracks already
-        merged into another one are excluded.
+        Preferred are telemetry, then Remote ID, ADS-B and Cursor on Target. Tracks already merged
+        into another one are excluded.
         """
         own = kind_of(uav).rank
         same_as = self.identities.same_as
         return [one for one in others if kind_of(one).rank < own and same_as(one) is None]
 
     def forget(self, uav: str) -> None:
-        """Forget a UAV that is dropped: its state, and what it was compared with if relayed."""
+        """Forget a dropped UAV: its state, and its comparisons if it is relayed."""
         self.identities.forget(uav)
         self._states.pop(uav, None)
 
-    # --- what is said of them ---------------------------------------------------------------
+    # --- notices ----------------------------------------------------------------------------
 
     def changes(self, now_ns: int, states: Mapping[str, TrackState]) -> list[Notice]:
-        """One notice for each target, or the carrier, whose state changed since the last call."""
+        """Return notices for targets and the carrier whose state changed since the last call."""
         changed = [uav for uav, state in states.items() if self._states.get(uav) is not state]
-        elsewhere = {} if self.duty is None else self._states  # whom another node served meanwhile
+        elsewhere = (
+            {} if self.duty is None else self._states
+        )  # UAVs that other nodes served meanwhile
         self._states = {**elsewhere, **states}
         notices = []
         for uav in changed:
@@ -77,16 +79,13 @@ class Targets:
         return notices
 
     def dropped(self, now_ns: int, silent: Iterable[str]) -> list[Notice]:
-        """One notice for each target that is dropped.
-
-        Relayed traffic that is no target goes unmentioned.
-        """
+        """Return a notice for each target that is dropped; other traffic has none."""
         return [
             Notice(
                 t_ns=now_ns,
                 severity=Severity.INFO,
                 subject=uav,
-                text=f"{uav} is dropped: nothing of it for {self._dropped_s:.0f} s",
+                text=f"{uav} is dropped: no report for {self._dropped_s:.0f} s",
             )
             for uav in self.among(silent)
         ]

@@ -1,4 +1,4 @@
-"""Ticks of a timer, for logs that have none."""
+"""Timer ticks for logs that have none."""
 
 from collections.abc import Iterable, Iterator
 from typing import Final
@@ -6,17 +6,17 @@ from typing import Final
 from companion.values import Event, Tick
 
 LONGEST_PAUSE_NS: Final = 3_600_000_000_000
-"""Longest pause of several logs together that is ticked through: none of them alone has more."""
-PAUSE_NS: Final = 60_000_000_000  # what counts as a pause: after it every track is lost
+"""Longest single pause with ticks; a single log has no longer one."""
+PAUSE_NS: Final = 60_000_000_000  # least duration of a pause: after it every track is lost
 PAUSES_NS: Final = 4 * LONGEST_PAUSE_NS
-"""Pauses of a log, together, that are ticked through.
+"""Limit on the total of a log's pauses with ticks.
 
-A few bytes of a made-up log are an hour without anything, and an hour is 36 000 ticks.
+A forged log of a few bytes can claim hours without events, and each hour is 36 000 ticks.
 """
 
 
 def with_ticks(events: Iterable[Event], update_hz: float) -> Iterator[Event]:
-    """Events of a log with the ticks among them that a timer of ``update_hz`` would have made."""
+    """Yield the events of a log with the ticks of a timer of ``update_hz`` among them."""
     period_ns = round(1e9 / update_hz)
     due_ns: int | None = None
     paused_ns = 0

@@ -20,7 +20,7 @@ def fleet(answer: dict[str, Any], uavs: list[str]) -> dict[str, Any]:
     nodes = [
         {
             "node": name, "is_self": state == "here", "state": state,
-            "reason": "has a clock that contradicts itself" if state == "aside" else None,
+            "reason": "has an inconsistent clock" if state == "aside" else None,
             "place": {"lat_deg": 47.3977 + 0.002 * number, "lon_deg": 8.5456, "alt_m": 480.0},
             "reach_m": 900.0, "serves": 12, "most": 64, "heard_s": 75.2,
             "clock_offset_s": -0.0123, "clock_doubt_s": 0.0009, "frames": 100_000, "used": 12_345,

@@ -20,7 +20,7 @@ NODE: dict[str, Any] = {
 OTHER = NODE | {"node": "harbour-south", "state": "there", "clock_offset_s": -0.0015,
                 "clock_doubt_s": 0.0008, "way_p99_ms": 41.6}  # fmt: skip
 LIAR = NODE | {"node": "liar", "state": "aside", "most": None, "clock_offset_s": 3.0,
-               "clock_doubt_s": 0.002, "reason": "has a clock that contradicts itself"}  # fmt: skip
+               "clock_doubt_s": 0.002, "reason": "has an inconsistent clock"}  # fmt: skip
 WENT = NODE | {"node": "west", "is_self": False, "state": "gone", "heard_s": 61.3}
 
 
@@ -91,7 +91,7 @@ def test_a_look_says_who_serves_whom_and_what_needs_a_look(service: Service) -> 
     ) in lines
     assert lines[3].endswith("of at most -: -  clock +3.000 ± 0.001 s")
     assert lines[4:] == [
-        "    not trusted: it has a clock that contradicts itself",
+        "    not trusted: it has an inconsistent clock",
         "  west          gone, 61 s ago",
         "  2:1 is being handed over to north",
         "  3:1 is served by no node",

@@ -83,8 +83,8 @@ def test_no_device_within_its_calibration_s_bounds_has_less(cut_log: Path, tmp_p
 @pytest.mark.parametrize(
     ("keys", "said"),
     [
-        ("dead = [16]", "array.dead: 16 of 16 elements"),
-        (f"dead = {list(range(16))}", "array.dead: 15 of 16 elements from 0, not all"),
+        ("dead = [16]", "array.dead: 16 does not exist"),
+        (f"dead = {list(range(16))}", "or no element is left; list some of 0..15, not all"),
     ],
 )
 def test_dead_elements_are_some_of_those_there_are(tmp_path: Path, keys: str, said: str) -> None:
@@ -96,7 +96,7 @@ def test_dead_elements_are_some_of_those_there_are(tmp_path: Path, keys: str, sa
 @pytest.mark.parametrize(
     ("matrix", "said"),
     [
-        (np.eye(3), "3, 3. for 16 elements"),
+        (np.eye(3), "shape .3, 3.*give a finite 16 x 16 matrix"),
         (np.ones((16, 16)), "nearly singular"),
         (np.full((16, 16), np.nan), "finite"),
         (np.eye(16) * 1e150, "outside 1e-06"),

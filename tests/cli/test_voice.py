@@ -27,7 +27,7 @@ def test_json_is_an_object_a_second_with_the_events_since_the_last(tmp_path: Pat
     assert found[-1]["links"][0]["state"] == "up"
     assert found[-1]["recording"]["state"] == "recording"
     said = [event["text"] for each in found for event in each["events"]]
-    assert any("local frame begins" in text for text in said)
+    assert any("local frame: origin set to" in text for text in said)
     assert len(said) == len({(e["at"], e["text"]) for each in found for e in each["events"]})
 
 

@@ -112,7 +112,7 @@ def test_times_follow_the_clock_that_was_set_live_and_in_a_replay(
     node = flown(short_log, machine, tmp_path / "recordings", said)
     told = [text for text in said if "clock" in text]
     assert told == [
-        "this machine's clock was set forward by 1700000000.000 s: all times are said by it"
+        "this machine's clock was set forward by 1700000000.000 s; UTC times now follow it"
     ]
     shown = state.status(node, __version__)
     assert shown["time"].startswith("2023-11-14T22:")  # 1 700 000 000 s, and some of the first

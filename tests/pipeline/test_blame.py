@@ -59,13 +59,13 @@ def blamed(
 @pytest.mark.parametrize(
     ("changed", "cause", "reason"),
     [
-        ({}, Cause.POSITION, "100 m away, its position is only known to 3 m"),
+        ({}, Cause.POSITION, "at 100 m, its position is uncertain by 3 m"),
         ({"dt_s": 1.1, "age_s": 0.9, "bound_m": 5.0}, Cause.RATE, "reports 1.1 s apart"),
         ({"age_s": 0.9, "latency_s": 0.6, "dt_s": 0.2, "bound_m": 3.0}, Cause.LATE,
-         "reports come 0.6 s late"),
+         "reports arrive 0.6 s late"),
         ({"limits": Limits(60.0, 190.0), "age_s": 0.2, "bound_m": 5.0}, Cause.AGILE,
-         "it may accelerate by 190 m/s²"),
-        ({"clock_bound_s": 0.1}, Cause.CLOCK, "its clock is only known to 100 ms"),
+         "it may accelerate by up to 190 m/s²"),
+        ({"clock_bound_s": 0.1}, Cause.CLOCK, "its clock is uncertain by 100 ms"),
         ({"age_s": 1.2}, Cause.SILENT, "no report for 1.2 s"),
     ],
 )  # fmt: skip
@@ -81,7 +81,7 @@ def test_a_clock_in_doubt_is_to_blame_for_the_turns_that_are_possible_meanwhile(
         TRACK, velocity_ned_mps=np.array([11.5, 0.0, 0.0]), limits=Limits(60.0, 4.0), age_s=2.8,
         dt_s=3.5, clock_bound_s=4.8, bound_m=173.0,
     )  # fmt: skip
-    assert blamed(doubted)[:2] == (Cause.CLOCK, "its clock is only known to 4.8 s")
+    assert blamed(doubted)[:2] == (Cause.CLOCK, "its clock is uncertain by 4.8 s")
 
 
 def test_without_a_velocity_an_old_report_says_little() -> None:
@@ -98,13 +98,13 @@ def test_slow_reports_are_not_silence() -> None:
 def test_an_assumed_clock_is_helped_by_timesync() -> None:
     assumed = LinkEvidence(clock_assumed=True, refused=None)
     cause, reason, remedy = blamed(replace(TRACK, clock_bound_s=0.1), evidence=assumed)
-    assert (cause, reason) == (Cause.CLOCK, "clock only assumed, to 100 ms")
+    assert (cause, reason) == (Cause.CLOCK, "its clock is unmeasured, uncertain by 100 ms")
     assert "TIMESYNC" in remedy
 
 
 def test_the_carrier_is_to_blame_for_its_attitude_and_its_position() -> None:
     turned = blamed(carrier=replace(CARRIER, attitude_bound_rad=0.2))
-    assert turned[:2] == (Cause.CARRIER, "the carrier's attitude is only known to 11°")
+    assert turned[:2] == (Cause.CARRIER, "the carrier's attitude is uncertain by 11°")
     assert "10 Hz" in turned[2]
     as_given = replace(FINE, attitude_bound_rad=0.18)
     compass = blamed(carrier=replace(CARRIER, attitude_bound_rad=0.2), evidence=as_given)
@@ -119,14 +119,14 @@ def test_the_carrier_is_to_blame_for_its_attitude_and_its_position() -> None:
         assert clock[:2] == turned[:2]
         assert word in clock[2]
     placed = blamed(carrier=replace(CARRIER, bound_m=8.0))
-    assert placed[:2] == (Cause.CARRIER, "the carrier's own position is only known to 8 m")
+    assert placed[:2] == (Cause.CARRIER, "the carrier's position is uncertain by 8 m")
 
 
 def test_reports_that_come_and_are_not_used_are_told_before_all_else() -> None:
     refused = LinkEvidence(clock_assumed=False, refused=Reason.UNREACHABLE)
     far = replace(CARRIER, attitude_bound_rad=0.5)
     found = blamed(replace(TRACK, age_s=9.0), far, evidence=refused)
-    assert found[:2] == (Cause.REFUSED, "its reports are not used: unreachable")
+    assert found[:2] == (Cause.REFUSED, "its reports are rejected: unreachable")
 
 
 def test_a_sharp_beam_without_gain_is_crowded_or_too_far() -> None:
@@ -135,7 +135,7 @@ def test_a_sharp_beam_without_gain_is_crowded_or_too_far() -> None:
     weak = replace(BEAM, gain_db=4.0, widened=False)
     assert blamed(beam=weak)[:2] == (
         Cause.RANGE,
-        "100 m away it needs 10 dB, and the array gives 4",
+        "at 100 m it needs 10 dB, but the array gives 4 dB",
     )
     assert blamed(beam=replace(crowded, widened=True))[0] is Cause.POSITION
 
@@ -176,9 +176,9 @@ def test_a_reason_says_what_is_wrong_and_a_remedy_what_to_do() -> None:
         blame.of_unserved(TRACK, reached=True, full=False),
     ]
     assert [(one.cause, one.reason, one.remedy.split()[0]) for one in found] == [
-        (Cause.CARRIER, "no attitude from the carrier", "see"),
+        (Cause.CARRIER, "no attitude from the carrier", "check"),
         (Cause.COVERAGE, "behind the array", "turn"),
         (Cause.COVERAGE, "no node of the fleet reaches it", "turn"),
         (Cause.UNSERVED, "every node that reaches it is full", "raise"),
-        (Cause.UNSERVED, "no node of the fleet serves it", "one"),
+        (Cause.UNSERVED, "no node of the fleet serves it", "wait"),
     ]

@@ -598,7 +598,7 @@ def test_a_track_that_is_begun_again_is_said_once() -> None:
         outputs += pipeline.step(position(number / 10, "1:1", place, (0, 1, 0)))
     (notice,) = (output for output in outputs if isinstance(output, Notice))
     assert (notice.subject, notice.severity) == ("1:1", Severity.WARNING)
-    assert "1:1 is tracked anew" in notice.text
+    assert "1:1: track restarted" in notice.text
     estimate = outputs[outputs.index(notice) + 1]
     assert isinstance(estimate, Estimate)
     assert estimate.reacquired
@@ -931,7 +931,7 @@ def test_who_is_long_gone_is_dropped_and_comes_back_as_new() -> None:
     said = [one.text for one in outputs if isinstance(one, Notice) and one.subject == "1:1"]
     assert said == [
         *(f"1:1 is {state}" for state in ("live", "coasting", "stale", "lost")),
-        "1:1 is dropped: nothing of it for 8 s",
+        "1:1 is dropped: no report for 8 s",
     ]
     now_ns = START_NS + 30 * S
     assert [track.uav for track in pipeline.tracks(now_ns, now_ns)] == ["2:1"]

@@ -312,7 +312,7 @@ def test_beams_are_for_the_first_and_for_those_of_priority() -> None:
     assert update.beams.uavs == ("1:1", "2:1", "90:1")
     assert {out.uav for out in update.beams.left_out} == {f"{n}:1" for n in range(3, 41)}
     assert {out.reason for out in update.beams.left_out} == {
-        "3 others have beams, which is the most"
+        "limit of 3 UAVs with beams is reached"
     }
     assert {out.cause for out in update.beams.left_out} == {Cause.MACHINE}
     assert pipeline.health.verdicts["7:1"].blame is not None

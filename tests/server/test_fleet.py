@@ -120,7 +120,7 @@ def test_the_headline_counts_those_of_nobody_and_names_the_others(north: StandIn
 
 def test_a_node_put_aside_serves_nobody(north: StandIn) -> None:
     assert north.fleet is not None
-    north.fleet.member.trust.excluded["south"] = "has a clock that contradicts itself"
+    north.fleet.member.trust.excluded["south"] = "has an inconsistent clock"
     assert uavs(north)["2:1"].served_by == []
     answer = models.model(fleet_view.Fleet).model_validate(client(north).get("/v1/fleet").json())
     assert [node.state for node in answer.nodes] == ["here", "aside"]

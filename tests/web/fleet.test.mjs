@@ -42,7 +42,7 @@ test("the nodes stand with their state, their clock and their way; an unknown is
     otherNode("north", { is_self: true, state: "here", serves: 1 }),
     otherNode("south"),
     otherNode("west", { state: "silent", heard_s: 4.2, clock_offset_s: null, way_p99_ms: null }),
-    otherNode("liar", { state: "aside", reason: "has a clock that contradicts itself",
+    otherNode("liar", { state: "aside", reason: "has an inconsistent clock",
       clock_offset_s: 3 }),
     otherNode("east", { state: "gone", heard_s: 61, clock_offset_s: null, way_p99_ms: null }),
   ] }));
@@ -59,7 +59,7 @@ test("the nodes stand with their state, their clock and their way; an unknown is
   assert.deepEqual(items.map(({ facts }) => facts), ["1 of 8",
     "1 of 8 | +1.5 ± 0.4 ms | 12 ms | 7", "1 of 8 | – | – | 7",
     "1 of 8 | +3.000 ± 0.000 s | 12 ms | 7", "1 of 8 | – | – | 7"]);
-  assert.match(items[3].item.textContent, /not believed: it has a clock that contradicts itself$/);
+  assert.match(items[3].item.textContent, /not believed: it has an inconsistent clock$/);
   assert.match(plain(page.text("fleet-traffic")), /^tells 14\.0 kbit\/s · hears 900 bit\/s$/);
 });
 

@@ -1,1 +1,1 @@
-"""A fleet of nodes: what they share, whose clock is whose, who serves whom, who is not believed."""
+"""A fleet of nodes: shared frames, clocks of other nodes, assignment of UAVs, trust."""

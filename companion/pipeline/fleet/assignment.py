@@ -1,17 +1,16 @@
-"""Which node serves which UAV: the same answer on every node that has the same offers.
+"""Assignment of UAVs to nodes: identical on all nodes that have the same offers.
 
-A node is worth to a UAV the signal over noise that it guarantees it, in dB: by gain alone a node
-far away would win, from which the same doubt of a position is a smaller angle. Its power is shared
-by all that it serves, so a place at a node that has n already costs all of them together
+The value of a node to a UAV is the SNR that it guarantees, in dB. The gain alone would favour a
+distant node, from which the same position error is a smaller angle. A node shares its power among
+the UAVs that it serves, so one more UAV at a node with n costs all of them together
 
     10 (n + 1) log10(n + 1) - 10 n log10(n)   dB.
 
-From what is, UAVs without a node are given one; then UAVs move, one or several, each to the place
-that the next one leaves, while there is a ring of such moves that gains anything. Where there is
-none left the assignment is the best of all: a place more at a node costs more than the one before,
-so this is a flow of least cost, and such rings are all that can better one (Klein, "A primal method
-for minimal cost flows", 1967). To stay where it is is worth ``hysteresis_db`` to a UAV. No order of
-arrival, no chance and no leader is in it.
+Starting from the current assignment, UAVs without a node are placed. Then UAVs move in rings, each
+into the place that the next one leaves, while such a ring gains anything. Each further place at a
+node costs more than the one before, so this is a minimum cost flow: without an improving ring the
+assignment is optimal (Klein, "A primal method for minimal cost flows", 1967). A UAV's current node
+has a bonus of ``hysteresis_db``. The result depends on no order of arrival, chance or leader.
 """
 
 from collections.abc import Mapping
@@ -23,22 +22,22 @@ from companion.values import FloatArray, IntArray, Offer
 
 LIKELY_PENALTY_DB: Final = 10.0
 """Deduction for a gain that is only likely, not guaranteed."""
-STEP_DB: Final = 0.1  # offers are told in whole steps, so that every node has the same numbers
+STEP_DB: Final = 0.1  # offers are rounded to steps, so that all nodes have the same numbers
 UNSERVED_DB: Final = -1e6
-"""Value of not being served: so low that every UAV that can be served is."""
-MOVES: Final = 1000  # most rings of moves that one decision makes
-ROUNDING_DB: Final = 1e-7  # what is less is no gain, but arithmetic
+"""Value of not being served: so low that every UAV is served if possible."""
+MOVES: Final = 1000  # largest number of rings of moves per decision
+ROUNDING_DB: Final = 1e-7  # a smaller gain is a rounding error
 
 
 def offer_value_db(offer: Offer) -> float | None:
-    """Value of an offer to its UAV; None where the node cannot serve it."""
+    """Return the value of an offer to its UAV; None if the node cannot serve it."""
     if offer.sinr_db is None or offer.sure_db is not None:
         return offer.sinr_db
     return offer.sinr_db - LIKELY_PENALTY_DB
 
 
 def offer_values_db(offers: Mapping[str, Offer]) -> dict[str, float]:
-    """The value of each offer that has one."""
+    """Return the values of all offers that have one."""
     found = ((uav, offer_value_db(offer)) for uav, offer in offers.items())
     return {uav: worth for uav, worth in found if worth is not None}
 
@@ -50,13 +49,13 @@ def assign(
     hysteresis_db: float,
     beside: Mapping[str, int] | None = None,
 ) -> dict[str, str]:
-    """The node that is to serve each UAV; UAVs that no node has room for are left out.
+    """Return the node that should serve each UAV, without UAVs for which no node has room.
 
-    offers         worth of each node's offers, dB, by node and UAV
-    holders        who serves a UAV now
-    most           UAVs that each node serves at most
-    hysteresis_db  least gain for which a UAV that is served changes its node
-    beside         UAVs that a node serves beside those of the offers; None: none does
+    offers         value of each node's offers, dB, by node and UAV
+    holders        node that serves a UAV now
+    most           largest number of UAVs that each node serves
+    hysteresis_db  least gain for which a served UAV changes its node
+    beside         UAVs that a node serves in addition to those of the offers; None: none
     """
     nodes = sorted(offers)
     uavs = sorted({uav for given in offers.values() for uav in given})
@@ -79,7 +78,7 @@ def assign(
 
 
 def _price_db(load: IntArray) -> FloatArray:
-    """What one more costs all that a node serves, by how many it has; with nobody it is nothing."""
+    """Return the cost of one more UAV by the node's load; zero for not being served."""
     more = load + 1.0
     price: FloatArray = 10.0 * (more * np.log10(more) - load * np.log10(np.maximum(load, 1.0)))
     price[-1] = 0.0
@@ -87,7 +86,7 @@ def _price_db(load: IntArray) -> FloatArray:
 
 
 def _place(worth: FloatArray, room: IntArray, at: IntArray, load: IntArray) -> None:
-    """Give UAVs without a node the best that has room: where moves begin, and no more."""
+    """Assign each UAV without a node to the best node with room, as a start for the moves."""
     nobody = len(room) - 1
     for i in np.flatnonzero(at == nobody):
         load[nobody] -= 1
@@ -96,7 +95,7 @@ def _place(worth: FloatArray, room: IntArray, at: IntArray, load: IntArray) -> N
 
 
 def _improve(worth: FloatArray, room: IntArray, at: IntArray, load: IntArray) -> None:
-    """Move UAVs, each to the place that the next one leaves, while that gains anything."""
+    """Move UAVs in rings, each into the place that the next one leaves, while that gains."""
     for _ in range(MOVES):
         gain, who = _gains_db(worth, at)
         left = _price_db(np.maximum(load - 1, 0))
@@ -106,16 +105,16 @@ def _improve(worth: FloatArray, room: IntArray, at: IntArray, load: IntArray) ->
         if not moves:
             return
         for a, b in moves:
-            if b == outside:  # the last one takes a place at a
+            if b == outside:  # the last move fills a place at a
                 load[a] += 1
-            elif a == outside:  # the first one leaves a place at b
+            elif a == outside:  # the first move frees a place at b
                 load[b] -= 1
             else:
                 at[who[a, b]] = b
 
 
 def _gains_db(worth: FloatArray, at: IntArray) -> tuple[FloatArray, IntArray]:
-    """What it gains at most that one UAV moves from a node to another, (from, to), and which."""
+    """Return the largest gain of moving one UAV between two nodes, (from, to), and which UAV."""
     count = worth.shape[1]
     gain, who = np.full((count, count), -np.inf), np.zeros((count, count), dtype=int)
     for a in range(count):
@@ -128,9 +127,9 @@ def _gains_db(worth: FloatArray, at: IntArray) -> tuple[FloatArray, IntArray]:
 
 
 def _ring(edges: FloatArray) -> list[tuple[int, int]]:
-    """A ring of edges whose sum is more than nothing; empty where there is none (Bellman, Ford).
+    """Return a ring of edges with a positive sum; empty if none exists (Bellman, Ford).
 
-    ``edges`` are from row to column.
+    ``edges`` lead from row to column.
     """
     count = len(edges)
     best, before = np.zeros(count), np.full(count, -1)

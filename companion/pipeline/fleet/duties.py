@@ -1,15 +1,17 @@
-"""Who serves whom: claims, leases and handovers, without a leader.
+"""Duties of nodes: claims, leases and handovers, without a leader.
 
-Every node says some times a second whom it serves (``Standing``). A word holds for one lease; a
-node that was not heard for so long, or whose liveliness went, holds nothing.
+Every node publishes several times a second which UAVs it serves (``Standing``). A message is valid
+for one lease. A node without a message for that time, or whose liveliness token is gone, serves
+nothing.
 
-- A UAV that nobody serves is claimed by the node that the assignment names, at once where its
-  holder is gone, else after ``GRACE_NS``; by the next one if that does not happen within a lease.
-- A UAV that should be elsewhere is handed over: its holder says to whom, and serves on until that
-  node says that it serves it. It is served by two then for one message's way, by none never.
-- Of two that serve the same UAV without a handover, as after a partition, the one lets go to which
-  it was worth less when it was claimed: a number that both see and that does not change, so that
-  never both let go. Names decide between equals.
+- A UAV without a node is claimed by the assigned node: at once if its holder left, otherwise after
+  ``GRACE_NS``. If the assigned node does not claim it within a lease, the next one does.
+- A UAV that belongs elsewhere is handed over: its holder announces the new node, and serves until
+  that node announces that it serves. Two nodes then serve it for the delay of one message, and
+  never none.
+- If two nodes serve the same UAV without a handover, as after a partition, the one drops it whose
+  value at its claim was lower. Both see these constant numbers, so never both drop it. Names decide
+  between equal values.
 """
 
 from collections.abc import Mapping
@@ -21,15 +23,15 @@ from companion.values import Standing
 from companion.values.described import Meaning
 
 GRACE_NS: Final = 500_000_000
-"""Time without a holder after which a UAV is claimed: longer than a word takes to come."""
-ASSIGNED_NS: Final = 500_000_000  # time between two assignments while the same nodes are there
+"""Time without a holder after which a UAV is claimed; longer than the delay of a message."""
+ASSIGNED_NS: Final = 500_000_000  # time between two assignments while the nodes are the same
 SETTLED_NS: Final = 2_000_000_000
 """Time for which a UAV must belong elsewhere before it is handed over."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Handover:
-    """A change of the node that serves a UAV, in which this node took part."""
+    """A change of the node that serves a UAV, with this node as one side."""
 
     t_ns: Annotated[int, Meaning("when this node changed it")]
     uav: Annotated[str, Meaning("UAV that changed its node", example="3:1")]
@@ -41,12 +43,12 @@ class Duties:
     """The duties of one node.
 
     name           its name
-    most           UAVs that it serves at most
-    lease_ns       how long another node's word holds
+    most           largest number of UAVs that it serves
+    lease_ns       validity of another node's message
     hysteresis_db  least gain for which a UAV changes its node
 
-    ``serves`` are the UAVs that it serves with their worth when it claimed them, dB; ``handing``
-    those of them that another is to take.
+    ``serves`` maps the UAVs that it serves to their values when it claimed them, dB; ``handing``
+    maps those in a handover to the new node.
     """
 
     def __init__(self, *, name: str, most: int, lease_ns: int, hysteresis_db: float) -> None:
@@ -56,40 +58,40 @@ class Duties:
         self._most = most
         self._lease_ns = lease_ns
         self._hysteresis_db = hysteresis_db
-        self._others: dict[str, tuple[int, Standing]] = {}  # with when that was heard
+        self._others: dict[str, tuple[int, Standing]] = {}  # with the time of reception
         self._free_since: dict[str, int] = {}
         self._elsewhere: dict[str, tuple[str, int]] = {}
         self._begun_ns: int | None = None
         self._wanted: dict[str, str] = {}
         self._assigned: tuple[int, frozenset[str]] = (0, frozenset())
 
-    # --- what others say --------------------------------------------------------------------
+    # --- input ------------------------------------------------------------------------------
 
     def hear(self, now_ns: int, said: Standing) -> None:
-        """Take in what another node says of itself."""
+        """Take in the standing of another node."""
         self._others[said.node] = (now_ns, said)
 
     def gone(self, now_ns: int, node: str) -> None:
-        """A node is gone: whom it served may be claimed at once."""
+        """Remove a node that left: the UAVs that it served may be claimed at once."""
         _, said = self._others.pop(node, (0, None))
         for uav, _ in said.serves if said else ():
             self._free_since[uav] = now_ns - GRACE_NS
 
     def others(self, now_ns: int) -> dict[str, Standing]:
-        """What the other nodes said last, of those whose word still holds."""
+        """Return the newest standing of each other node whose lease has not expired."""
         for name in [n for n, (t_ns, _) in self._others.items() if now_ns - t_ns > self._lease_ns]:
             self.gone(now_ns, name)
         return {name: said for name, (_, said) in self._others.items()}
 
-    # --- what follows -----------------------------------------------------------------------
+    # --- decisions --------------------------------------------------------------------------
 
     def decide(
         self, now_ns: int, offers: Mapping[str, Mapping[str, float]], trusted: frozenset[str]
     ) -> list[Handover]:
-        """Decide anew whom this node serves. Returns what changed.
+        """Decide which UAVs this node serves. Returns the changes.
 
-        offers   worth of each node's offers, dB, by node and UAV, this node's among them
-        trusted  names of the other nodes that are believed
+        offers   value of each node's offers, dB, by node and UAV, including this node's
+        trusted  names of the other nodes that are trusted
         """
         if self._begun_ns is None:
             self._begun_ns = now_ns
@@ -116,9 +118,9 @@ class Duties:
         standing: Mapping[str, Standing],
         offers: Mapping[str, Mapping[str, float]],
     ) -> dict[str, str]:
-        """Who is to serve each UAV that is this node's matter: that it offers to serve, or serves.
+        """Assign the UAVs that this node offers to serve, or serves.
 
-        Where all nodes hear all UAVs these are all, and every node finds the same.
+        If all nodes receive all UAVs, these are all UAVs, and every node finds the same assignment.
         """
         matters = {*offers.get(self._name, {}), *self.serves}
         given = {
@@ -146,7 +148,7 @@ class Duties:
         standing: Mapping[str, Standing],
         offers: Mapping[str, Mapping[str, float]],
     ) -> None:
-        """Let go of what another has taken over, or has by better right."""
+        """Drop UAVs that another node has taken over, or has a better claim to."""
         for uav in [uav for uav in self.serves if uav in claims]:
             rivals = {
                 node: worth
@@ -157,7 +159,7 @@ class Duties:
             if self.handing.get(uav) in rivals or _keeper(rivals | mine) != self._name:
                 self._drop(uav)
         for uav in [uav for uav in self.serves if all(uav not in one for one in offers.values())]:
-            self._drop(uav)  # nobody can serve it
+            self._drop(uav)  # no node can serve it
 
     def _drop(self, uav: str) -> None:
         self.serves.pop(uav, None)
@@ -167,7 +169,7 @@ class Duties:
     def _hand_over(
         self, now_ns: int, wanted: Mapping[str, str], offers: Mapping[str, Mapping[str, float]]
     ) -> None:
-        """Say of UAVs that have belonged elsewhere for long who is to take them."""
+        """Announce the new node of UAVs that have belonged elsewhere for some time."""
         for uav in self.serves:
             to = wanted.get(uav, self._name)
             if to == self._name:
@@ -190,7 +192,7 @@ class Duties:
         standing: Mapping[str, Standing],
         offers: Mapping[str, Mapping[str, float]],
     ) -> None:
-        """Take what is handed to this node, and what nobody serves and is this node's to serve."""
+        """Take the UAVs handed to this node, and unserved ones that it should serve."""
         mine = offers.get(self._name, {})
         handed = {uav for said in standing.values() for uav, to in said.handing if to == self._name}
         has_listened = self._begun_ns is not None and now_ns - self._begun_ns >= self._lease_ns
@@ -211,7 +213,7 @@ class Duties:
 
 
 def _claims(standing: Mapping[str, Standing]) -> dict[str, dict[str, float]]:
-    """Who of the others serves each UAV, and what it was worth to them when they claimed it."""
+    """Return the other nodes that serve each UAV, with its value to them when they claimed it."""
     claims = dict[str, dict[str, float]]()
     for node, said in standing.items():
         for uav, worth in said.serves:
@@ -220,5 +222,5 @@ def _claims(standing: Mapping[str, Standing]) -> dict[str, dict[str, float]]:
 
 
 def _keeper(claims: Mapping[str, float]) -> str:
-    """The one of several nodes that keeps a UAV: the worthiest, by name between equals."""
+    """Return the node that keeps a UAV: the one with the highest value, by name between equals."""
     return max(sorted(claims), key=lambda node: claims[node])

@@ -1,9 +1,9 @@
-"""One node of a fleet: everything that it does beside its own pipeline, without any network.
+"""One node of a fleet: everything beyond its own pipeline, without a network.
 
-Pure: time is an argument, what others say comes in by methods, what is to be said comes out. The
+Pure: time is an argument, messages come in by methods, and outgoing messages are returned. The
 live node and the study of many nodes in virtual time use the same class.
 
-Over 300 lines: whatever a node hears or says in a fleet meets here.
+Over 300 lines: all that a node receives or sends in a fleet meets here.
 """
 
 from collections import deque
@@ -33,24 +33,24 @@ from companion.values import (
     Vector,
 )
 
-NODES_MAX: Final = 256  # other nodes followed; one more is not heard
+NODES_MAX: Final = 256  # limit on other nodes; further ones are ignored
 HANDOVERS_KEPT: Final = 500
 OFFERS_KEPT_NS: Final = 10_000_000_000
-"""How long a node's offers stand while it says nothing new of them."""
+"""Validity of a node's offers."""
 FORGET_NS: Final = 600_000_000_000
-GONE_MAX: Final = 64  # nodes that went, and are remembered
+GONE_MAX: Final = 64  # limit on remembered nodes that left
 
 ToLocal = Callable[[Place], Vector]
 
 
 class FleetMember:
-    """One node's part. ``name`` is its name; ``elements`` is the size of its array.
+    """One node of a fleet. ``name`` is its name; ``elements`` is the size of its array.
 
     ``neighbours`` are the other nodes by name, ``offers`` this node's own, ``handovers`` the newest
-    changes of who serves whom that this node took part in, of ``handed_over`` in all; ``place`` and
-    ``reach_m`` are what it said last of where its array is and how far it hears. ``near`` are the
-    others whose reports and offers are to be listened to (``nearness.py``). ``gone`` are those that
-    went, in their order, until they are back or forgotten: when, and where they were.
+    ones of this node, of ``handed_over`` in total. ``place`` and ``reach_m`` are the position of
+    its array and its range, as last published. ``near`` are the other nodes whose reports and
+    offers are used (``nearness.py``). ``gone`` are nodes that left, in order, with time and
+    position, until they return or are forgotten.
     """
 
     def __init__(
@@ -79,10 +79,10 @@ class FleetMember:
         self._duty: tuple[tuple[str, ...], tuple[str, ...]] | None = None
         self._looked_ns = started_ns
 
-    # --- what this node hears itself --------------------------------------------------------
+    # --- own input --------------------------------------------------------------------------
 
     def frame_received(self, now_ns: int, frame: Frame) -> None:
-        """Take in a frame that came over one of this node's own links, as it is read."""
+        """Take in a frame received over one of this node's own links."""
         self.reception.behind_ns = max(now_ns - frame.t_ns, 0)
         if frame.msgid in SHARED:
             key = self.reception.take_received(frame)
@@ -90,18 +90,18 @@ class FleetMember:
                 self.sharing.frame_received(now_ns, frame, key)
 
     def round_trip_measured(self, trip: RoundTrip) -> None:
-        """Take in a TIMESYNC round trip of this node's own."""
+        """Take in a TIMESYNC round trip of this node."""
         if self.neighbours:
             self.sharing.round_trip_measured(trip)
 
-    # --- what other nodes say ---------------------------------------------------------------
+    # --- input from other nodes -------------------------------------------------------------
 
     def node_joined(self, now_ns: int, node: str) -> None:
-        """Another node is there."""
+        """Note that another node is present."""
         self._neighbour(now_ns, node)
 
     def node_left(self, now_ns: int, node: str) -> list[Notice]:
-        """Another node is gone: its process ended, or its connection did."""
+        """Note that another node left: its process or its connection ended."""
         self.duties.gone(now_ns, node)
         known = self.neighbours.get(node)
         if known is None:
@@ -110,7 +110,7 @@ class FleetMember:
         while len(self.gone) >= GONE_MAX:
             del self.gone[next(iter(self.gone))]
         self.gone[node] = now_ns, None if known.standing is None else known.standing.place
-        text = f"node {node} is gone"
+        text = f"node {node} disconnected"
         return [Notice(t_ns=now_ns, severity=Severity.WARNING, subject=f"node {node}", text=text)]
 
     def _drop(self, node: str) -> None:
@@ -122,15 +122,13 @@ class FleetMember:
         self, node: str, started_ns: int, sent_ns: int, received_ns: int, remote_ns: int
     ) -> list[Notice]:
         """Take in a reading of another node's clock, between two times of this one's."""
-        known = self.neighbours.get(node)  # an answer is no word: Zenoh's threads give it
+        known = self.neighbours.get(node)  # no sign of life: Zenoh's threads answer
         if known is None:
             return []
-        if known.started_ns != started_ns:  # another life has another timeline
+        if known.started_ns != started_ns:  # a restarted node has another timeline
             known.started_ns, known.clock = started_ns, NeighbourClock()
         if known.clock.note_answer(sent_ns, received_ns, remote_ns) is not None:
-            return self.trust.note_contradiction(
-                received_ns, node, "has a clock that contradicts itself"
-            )
+            return self.trust.note_contradiction(received_ns, node, "has an inconsistent clock")
         ahead = known.clock.newest_offset()
         if known.apart_told or ahead is None:
             return []
@@ -140,7 +138,7 @@ class FleetMember:
         known.apart_told = True
         way = "behind" if ahead.low_ns > 0 else "ahead of"
         text = (
-            f"node {node}'s clock is {apart_ns * 1e-9:.3f} s {way} this one's; that is allowed for"
+            f"node {node}'s clock is {apart_ns * 1e-9:.3f} s {way} this one's; times are corrected"
         )
         return [
             Notice(t_ns=received_ns, severity=Severity.WARNING, subject=f"node {node}", text=text)
@@ -149,7 +147,7 @@ class FleetMember:
     def take_shared(
         self, now_ns: int, node: str, said: Shared
     ) -> tuple[list[Frame | RoundTrip], list[Notice]]:
-        """Take in what another node heard. Returns what the pipeline is to have, and notices."""
+        """Take in frames from another node. Returns the events for the pipeline, and notices."""
         known = self._neighbour(now_ns, node)
         if known is None or not self.trust.is_trusted(node):
             return [], []
@@ -165,7 +163,7 @@ class FleetMember:
                 continue
             key = content(frame.raw)
             if frame.msgid in OWN:
-                if not self.reception.was_shared(key):  # the second time it is late, and no matter
+                if not self.reception.was_shared(key):  # a repeat has no meaningful delay
                     known.note_delay(now_ns, now_ns - frame.t_ns + frame.doubt_ns)
                 self.sharing.note_shared(now_ns, node, frame.source, key, way_ns)
             events += self.reception.take_shared(now_ns, node, frame, key)
@@ -192,27 +190,27 @@ class FleetMember:
         return notices
 
     def take_standing(self, now_ns: int, said: Standing) -> None:
-        """Take in what another node says of itself."""
+        """Take in the standing of another node."""
         known = self._neighbour(now_ns, said.node)
         if known is not None:
             known.standing = said
             self.duties.hear(now_ns, said)
 
     def take_offers(self, now_ns: int, node: str, offers: tuple[Offer, ...]) -> None:
-        """Take in another node's offers, all of them."""
+        """Take in all offers of another node."""
         known = self._neighbour(now_ns, node)
         if known is not None:
             known.offers = {offer.uav: offer for offer in offers}
             known.offered_ns = now_ns
 
-    # --- what follows -----------------------------------------------------------------------
+    # --- decisions --------------------------------------------------------------------------
 
     def set_offers(self, offers: Mapping[str, Offer]) -> None:
-        """Take in this node's own offers, as it tells them to the others."""
+        """Set this node's own offers, as published."""
         self.offers = dict(offers)
 
     def decide(self, now_ns: int) -> tuple[Duty | None, list[Notice]]:
-        """Decide whom this node serves: its new duty, None where it is as before; and notices."""
+        """Decide which UAVs this node serves: returns its duty, None if unchanged, and notices."""
         notices = self.trust.readmit(now_ns)
         trusted = frozenset(node for node in self.neighbours if self.trust.is_trusted(node))
         offers = {self.name: offer_values_db(self.offers)}
@@ -236,10 +234,10 @@ class FleetMember:
         return Duty(now_ns, *duty), notices
 
     def _forget(self, now_ns: int) -> None:
-        """Forget vehicles and nodes that were silent for long.
+        """Forget vehicles and nodes without recent messages.
 
-        A word that was on its way when its node went makes it known again, with no sign of life to
-        end.
+        A message in transit when its node left makes that node known again without a liveliness
+        token.
         """
         self.reception.forget(now_ns, FORGET_NS)
         self.sharing.forget(now_ns, FORGET_NS)
@@ -253,9 +251,10 @@ class FleetMember:
     def check_vehicles(
         self, now_ns: int, positions: Mapping[str, Vector], own: Witness, local: ToLocal
     ) -> list[Notice]:
-        """Hold vehicles that only one other node has heard against all who ought to hear them.
+        """Check vehicles that only one other node receives against all nodes that should receive
+        them.
 
-        ``positions`` are those of all vehicles known here, ``own`` is what this node can say.
+        ``positions`` are those of all vehicles known here, ``own`` is what this node receives.
         """
         witnesses = {self.name: own}
         hearers = dict[str, list[str]]()
@@ -279,14 +278,11 @@ class FleetMember:
         return self.trust.check_vehicles(now_ns, told, witnesses, counts)
 
     def own_standing(self, now_ns: int, place: Place | None, reach_m: float | None) -> Standing:
-        """What this node says of itself: where its array is, and how far it hears.
-
-        By that and by what others said, ``near`` is found anew.
-        """
+        """Return this node's standing, with position and range of its array; updates ``near``."""
         self.place, self.reach_m = place, reach_m
         others = {node: known.standing for node, known in self.neighbours.items()}
         self.near = near(place, reach_m, others, self.near)
-        for node in others.keys() - self.near:  # they are out of date from now on
+        for node in others.keys() - self.near:  # no longer updated from now on
             self.neighbours[node].offers = None
         return Standing(
             node=self.name,
@@ -298,7 +294,8 @@ class FleetMember:
         )
 
     def _neighbour(self, now_ns: int, node: str) -> Neighbour | None:
-        """The node of which there is word now; None for this one, and where there are too many."""
+        """Return the record of a node that sent a message; None for this one, and beyond
+        ``NODES_MAX``."""
         if node == self.name:
             return None
         known = self.neighbours.get(node)

@@ -1,9 +1,9 @@
-"""Which other nodes matter to this one: those that can hear or serve what it can.
+"""Near nodes: those that may receive or serve the same UAVs as this one.
 
-Far from one another, two arrays have no UAV in common, and what one hears is nothing to the other.
-So a node listens to the reports and the offers of those alone that are near, or whose reach meets
-its own, and what it is told of UAVs does not grow with the fleet. What nodes say of themselves they
-all hear: from that it follows who is near, and that a UAV has one node wherever it is.
+Distant arrays have no UAV in common. So a node uses only the reports and offers of near nodes:
+those within a fixed distance, or whose ranges overlap. Its traffic then does not grow with the
+fleet. All nodes receive the standing of all others, which shows which are near, and ensures that
+each UAV has one node wherever it is.
 """
 
 from collections.abc import Mapping
@@ -14,10 +14,13 @@ from companion.values import Standing
 
 Place = tuple[float, float, float]
 COMES: Final = 1.1
-"""Share of both reaches within which a node is near: more than 1, as reach is what was heard."""
-GOES: Final = 1.3  # share of both beyond which one that was near is so no more
+"""Factor on the overlap of both ranges within which a node becomes near.
+
+More than 1, as a range is only the distance of the farthest vehicle received so far.
+"""
+GOES: Final = 1.3  # factor beyond which a near node ceases to be near
 ALWAYS_M: Final = 10_000.0
-"""Distance that is near whatever is heard: the farthest vehicle of a moment is no array's limit."""
+"""Distance within which a node is always near: a range is not the limit of an array."""
 
 
 def near(
@@ -26,12 +29,12 @@ def near(
     others: Mapping[str, Standing | None],
     before: frozenset[str],
 ) -> frozenset[str]:
-    """The nodes that are near; all of which it is not known, since silence is no distance.
+    """Return the near nodes; all of them if this node's position is unknown.
 
-    place, reach_m  of this node's array, and how far it hears; who hears nobody has the other's
-                    reach, as it may stand in a shadow
-    others          what the others said last of themselves; None: nothing so far
-    before          who was near until now
+    place, reach_m  position and range of this node's array; without a range, the other's is used,
+                    as this array may be shadowed
+    others          newest standing of each other node; None: none so far
+    before          nodes that were near until now
     """
     if place is None:
         return frozenset(others)

@@ -1,13 +1,13 @@
 """Other nodes, and their clocks on this node's timeline.
 
-Each node's timeline is its own. A question sent at s and answered at r, with the other clock's
+Each node has its own timeline. A request sent at s and answered at r, with the other clock's
 reading x in between, proves that
 
     s - x  <=  this timeline less the other  <=  r - x
 
-(docs/math.md 6). What the other heard is put at the latest time at which it can have been, with
-the width of that interval as its doubt: "arrived by then" stays true whatever the clocks do within
-their drift.
+(docs/math.md 6). Frames received by the other node are placed at the latest possible time, with the
+width of the interval as uncertainty: "arrived by then" stays true for any clock drift within the
+limit.
 """
 
 import math
@@ -19,25 +19,25 @@ from companion.mavlink.clock.evidence import DriftProven, Interval, OffsetEviden
 from companion.values import Offer, RoundTrip, Standing
 
 DRIFT_MAX: Final = 200e-6
-"""Greatest drift between two nodes' clocks, a ratio: two ordinary crystals, disciplined or not."""
+"""Largest drift between two nodes' clocks, a ratio: two ordinary crystals, disciplined or not."""
 ANSWERS: Final = 3
-"""Answers from which on what a node hears is used: the first, slow one would leave its doubt."""
+"""Number of answers from which on a node's frames are used; the first answers are slow."""
 DELAYS_KEPT: Final = 4096
-DELAYS_WINDOW_NS: Final = 60_000_000_000  # time for which the delay of a report is remembered
+DELAYS_WINDOW_NS: Final = 60_000_000_000  # time for which delays of reports are kept
 NOTICED_OFFSET_NS: Final = 100_000_000
-"""Difference of two nodes' clocks from which on it is told: with NTP there is none."""
+"""Clock offset between two nodes from which on a notice is published; with NTP it is smaller."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
-    """By how much this node's timeline is ahead of another's: an interval, ns."""
+    """This node's timeline less another's: an interval, ns."""
 
     low_ns: int
     high_ns: int
 
     @property
     def width_ns(self) -> int:
-        """The width of the interval."""
+        """Width of the interval."""
         return self.high_ns - self.low_ns
 
 
@@ -50,18 +50,18 @@ class NeighbourClock:
         self._answers = 0
 
     def note_answer(self, sent_ns: int, received_ns: int, remote_ns: int) -> DriftProven | None:
-        """Take in a reading of the other clock; returns what it contradicts, None where nothing."""
+        """Take in a reading of the other clock; return the contradiction that it proves."""
         self._newest_ns = remote_ns
         self._answers += 1
         return self._evidence.add(Interval(remote_ns, sent_ns - remote_ns, received_ns - remote_ns))
 
     @property
     def is_settled(self) -> bool:
-        """Whether frames can be placed by it; a sender's clock keeps the doubt of the worst."""
+        """Whether frames can be placed; a sender's clock would keep the widest interval."""
         return self._answers >= ANSWERS
 
     def offset(self, remote_ns: int) -> ClockOffset | None:
-        """What is known at a time of the other node; None before the first answer."""
+        """Return the offset at a time of the other node; None before the first answer."""
         known = self._evidence.at(remote_ns)
         return (
             None
@@ -70,39 +70,39 @@ class NeighbourClock:
         )
 
     def newest_offset(self) -> ClockOffset | None:
-        """What was known at the newest answer; None before the first."""
+        """Return the offset at the newest answer; None before the first."""
         return None if self._newest_ns is None else self.offset(self._newest_ns)
 
 
 @dataclass(slots=True, kw_only=True)
 class Neighbour:
-    """Another node, as it is known here."""
+    """State of another node."""
 
-    clock: NeighbourClock  # its clock
+    clock: NeighbourClock
     started_ns: int | None = None
-    standing: Standing | None = None  # what it said last of itself; None before it did
-    heard_ns: int = 0  # when there was word of it last
+    standing: Standing | None = None  # its newest standing; None before the first
+    heard_ns: int = 0  # time of its newest message
     offered_ns: int = 0
     offers: dict[str, Offer] | None = None  # its offers by UAV
-    frames: int = 0  # frames that it told, used those that the pipeline had
-    used: int = 0
+    frames: int = 0  # frames that it shared
+    used: int = 0  # those of them that the pipeline used
     apart_told: bool = False
     _delays_ns: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=DELAYS_KEPT))
 
     def note_delay(self, now_ns: int, way_ns: int) -> None:
-        """Note the most that a report from this node was on its way."""
+        """Note the largest possible delay of a report from this node."""
         self._delays_ns.append((now_ns, way_ns))
 
     def delays_ns(self, now_ns: int) -> list[int]:
-        """The most that each recent report was on its way."""
+        """Return the largest possible delays of recent reports."""
         oldest_ns = now_ns - DELAYS_WINDOW_NS
         return [way_ns for came_ns, way_ns in self._delays_ns if came_ns > oldest_ns]
 
 
 def here(trip: RoundTrip, clock: NeighbourClock) -> RoundTrip | None:
-    """A round trip of another node on this node's timeline, not shorter than it was.
+    """Convert another node's round trip to this node's timeline, not shortened.
 
-    None while that node's clock is not known.
+    None while that node's clock is unknown.
     """
     sent, received = clock.offset(trip.sent_ns), clock.offset(trip.t_ns)
     if sent is None or received is None:

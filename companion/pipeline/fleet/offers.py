@@ -1,7 +1,7 @@
-"""What this node offers each UAV: the gain that its array would have, if it served it alone.
+"""Offers of this node: the gain and SINR that it would give each UAV, if it served that UAV alone.
 
-Offers are made in batches, one at each call: for a new UAV at once, else every two seconds or so.
-UAVs are predicted by whoever holds the pipeline; the beams are made on any thread.
+Offers are computed in batches: for a new UAV at once, otherwise about every two seconds. The
+caller holds the pipeline while UAVs are predicted; the beams are computed on any thread.
 """
 
 import math
@@ -17,12 +17,13 @@ from companion.pipeline.fleet.assignment import STEP_DB
 from companion.pipeline.fold import Pipeline
 from companion.values import BeamSet, Method, Offer, Policy, Power
 
-ROUND_NS: Final = 2_000_000_000  # time in which the offers for all UAVs are renewed
-LEAST: Final = 2  # UAVs at least that one call makes offers for
+ROUND_NS: Final = 2_000_000_000  # time in which all offers are renewed
+LEAST: Final = 2  # least number of UAVs per batch
 
 
 class Offers:
-    """The offers of one node. ``silent_s`` says how long ago a UAV was heard here; None: never."""
+    """The offers of one node. ``silent_s`` returns the age of a UAV's last report here; None:
+    never."""
 
     def __init__(self, pipeline: Pipeline, silent_s: Callable[[str, int], float | None]) -> None:
         self.made: dict[str, Offer] = {}
@@ -35,10 +36,10 @@ class Offers:
         self._last_ns: int | None = None
 
     def look(self, now_ns: int) -> Callable[[], dict[str, Offer]] | None:
-        """What makes the offers that are due, on any thread; None: none is due.
+        """Return a function that computes the offers that are due, on any thread; None if none is.
 
-        Give what it makes to ``take``. Call this some times a second, not at every update: it costs
-        milliseconds, however few UAVs it is for.
+        Pass its result to ``take``. Call this a few times a second, not at every update: it takes
+        milliseconds even for few UAVs.
         """
         pipeline = self._pipeline
         wanted = [uav for uav in pipeline.tracker.uavs if pipeline.targets.wants(uav)]
@@ -53,11 +54,11 @@ class Offers:
         return self._made_of(now_ns, chosen) if chosen else None
 
     def take(self, made: dict[str, Offer]) -> None:
-        """Take in offers that were made."""
+        """Store computed offers."""
         self.made |= made
 
     def _made_of(self, now_ns: int, uavs: list[str]) -> Callable[[], dict[str, Offer]]:
-        """What makes the offers for these, where they are predicted now."""
+        """Predict these UAVs now, and return a function that computes their offers."""
         pipeline = self._pipeline
         at_ns = now_ns + round(pipeline.settings.beams.actuation_delay_s * 1e9)
         carrier = pipeline.carrier(now_ns, at_ns)
@@ -108,7 +109,7 @@ class Offers:
         return made
 
     def _least_db(self, made: BeamSet, angles_rad: list[float | None]) -> tuple[float | None, ...]:
-        """The least gain of each beam within these angles of where its UAV is predicted."""
+        """Return the least gain of each beam within these angles of its UAV's direction."""
         array, towards = self._pipeline.array, directions(made)
         bounds = guarantee.covered_bounds(array, self._pipeline.coverage, towards, angles_rad)
         return guarantee.guaranteed_gains_db(array, towards, bounds, made.weights)

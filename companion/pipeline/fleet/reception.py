@@ -1,9 +1,9 @@
-"""Frames that this node receives itself, and those that it takes from others: its own first.
+"""Frames that this node receives itself, and those shared by other nodes; its own have priority.
 
-A report that another node heard is used only of a vehicle that is silent here: one that sends
-wrong reports in a vehicle's name can then do nothing to those whom this node hears. What is told of
-a vehicle that is heard here is compared with that (``mavlink/trust/duplicate_ids.py``); what
-was missed here is taken up when the vehicle falls silent.
+A shared report is used only if its vehicle is silent here. A node that sends wrong reports under a
+vehicle's id then cannot affect vehicles that this node receives. Shared reports of a vehicle that
+is received here are compared with its own reports (``mavlink/trust/duplicate_ids.py``); those
+missed here are used once the vehicle falls silent.
 """
 
 from collections import OrderedDict, deque
@@ -19,21 +19,21 @@ from companion.pipeline.fleet.neighbours import NeighbourClock
 from companion.values import Frame, SharedFrame, Source
 
 SHARED: Final = OWN | {HEARTBEAT, GPS_RAW_INT}
-"""Messages that nodes tell one another: where a vehicle is, how exact, and what it is."""
-KEPT_NS: Final = 10_000_000_000  # how long it is remembered what was heard, and by whom
+"""Messages that nodes share: position, accuracy and type of a vehicle."""
+KEPT_NS: Final = 10_000_000_000  # time for which contents of frames are remembered
 SILENT_INTERVALS: Final = 2.5
-"""Usual intervals without a report after which a vehicle is silent here."""
-SILENT_NS: Final = (200_000_000, 2_000_000_000)  # least and greatest time for that
-MISSED: Final = 64  # reports kept of each vehicle that were told by others and not heard here
+"""Usual report intervals without a report after which a vehicle is silent here."""
+SILENT_NS: Final = (200_000_000, 2_000_000_000)  # least and largest time for that
+MISSED: Final = 64  # shared reports kept per vehicle that were not received here
 VEHICLES_MAX: Final = 4096
-"""Vehicles followed; reports of any other are taken from other nodes as they come."""
+"""Limit on vehicles with a record; shared reports of others are used as they come."""
 FUTURE_NS: Final = 1_000_000
-"""By how much a frame may have been heard after now, by all that is known of the clocks."""
+"""Tolerance for frames received in the future, by the bounds on the clocks."""
 HERE: Final = "here"
 
 
 class RecentFrames:
-    """Contents of frames, each remembered for ``KEPT_NS`` after it was first noted."""
+    """Contents of frames, each kept for ``KEPT_NS`` after it was first noted."""
 
     def __init__(self) -> None:
         self._seen: OrderedDict[bytes, int] = OrderedDict()
@@ -53,27 +53,26 @@ class RecentFrames:
 
 @dataclass(slots=True)
 class _VehicleReception:
-    """Reception of one vehicle: time of the last report, interval, and what other nodes shared."""
+    """Reception of one vehicle: last report, usual interval, and missed shared reports."""
 
     heard_ns: int
     interval_ns: float = 0.0
     missed: deque[Frame] = field(default_factory=lambda: deque(maxlen=MISSED))
 
     def is_silent(self, now_ns: int) -> bool:
-        """Whether nothing was heard of it for too long, all being read until ``now_ns``."""
+        """Return whether its last report is too old, if all frames until ``now_ns`` were read."""
         least_ns, most_ns = SILENT_NS
         wait_ns = min(max(SILENT_INTERVALS * self.interval_ns, least_ns), most_ns)
         return now_ns - self.heard_ns > wait_ns
 
 
 class Reception:
-    """Frames received here, and which of the others' frames the pipeline is to have.
+    """Frames received here, and selection of the shared frames for the pipeline.
 
-    ``contradicted`` and ``early`` hold names of nodes whose frames contradicted what is heard here
-    or another node, or came before they can have been heard; whoever reads them empties them.
-    ``behind_ns`` is how old the newest frame of this node's own was when it was read: a vehicle is
-    not silent whose reports wait here. Else a node that is short of time would take in what the
-    others tell of everybody as well, and have less.
+    ``contradicted`` and ``early`` contain names of nodes whose frames contradict those of this or
+    another node, or come too early; the reader clears them. ``behind_ns`` is the age of this node's
+    newest frame when it was read: a vehicle whose reports are still queued here is not silent.
+    Otherwise an overloaded node would also use all shared frames, and be more overloaded.
     """
 
     def __init__(self) -> None:
@@ -86,13 +85,13 @@ class Reception:
         self._duplicate_ids = DuplicateIds({HERE})
 
     def take_received(self, frame: Frame) -> bytes:
-        """Take in a frame heard here, of a message in ``SHARED``. Returns its content."""
+        """Take in a frame received here, of a message in ``SHARED``. Returns its content."""
         key = content(frame.raw)
         if frame.msgid not in OWN:
             return key
         self._heard.note(frame.t_ns, key)
         self._duplicate_ids.rejects(HERE, HERE, frame)
-        self._duplicate_ids.found.clear()  # ``contradicted`` says it, of the nodes
+        self._duplicate_ids.found.clear()  # reported per node, in ``contradicted``
         vehicle = self._vehicles.get(frame.source)
         if vehicle is None:
             if len(self._vehicles) < VEHICLES_MAX:
@@ -108,9 +107,9 @@ class Reception:
     def to_own_timeline(
         self, now_ns: int, node: str, clock: NeighbourClock, shared: SharedFrame
     ) -> Frame | None:
-        """A frame that another node heard, with its arrival there on this node's timeline.
+        """Return a shared frame with its arrival at the other node on this node's timeline.
 
-        None for one that is damaged, that is of no message in ``SHARED``, or that cannot be placed.
+        None if it is damaged, not in ``SHARED``, or cannot be placed.
         """
         raw = shared.raw
         ahead = clock.offset(shared.heard_ns)
@@ -137,11 +136,11 @@ class Reception:
         )
 
     def was_shared(self, key: bytes) -> bool:
-        """Whether a report of this content was told by another node of late."""
+        """Return whether another node recently shared a report with this content."""
         return key in self._shared
 
     def take_shared(self, now_ns: int, node: str, frame: Frame, key: bytes) -> list[Frame]:
-        """What the pipeline is to have, now that another node told a frame; mostly nothing."""
+        """Return the frames for the pipeline after another node shared a frame; usually none."""
         if frame.msgid in OWN:
             return self._report(now_ns, node, frame, key)
         vehicle = self._vehicles.get(frame.source)
@@ -167,10 +166,10 @@ class Reception:
         return missed
 
     def silent_s(self, uav: str, now_ns: int) -> float | None:
-        """How long ago a vehicle was heard here; None: never."""
+        """Return the age of a vehicle's last report received here; None: never received."""
         vehicle = self._vehicles.get(Source.parse(uav))
         return None if vehicle is None else (now_ns - vehicle.heard_ns) * 1e-9
 
     def forget(self, now_ns: int, after_ns: int) -> None:
-        """Forget vehicles that were not heard here for so long."""
+        """Forget vehicles that were not received here for this time."""
         self._vehicles = {k: v for k, v in self._vehicles.items() if now_ns - v.heard_ns < after_ns}

@@ -1,10 +1,10 @@
-"""What this node tells the others: each report is told once, by whoever is its speaker.
+"""Sharing of this node's frames with the others: each report is shared once, by its speaker.
 
-Nodes that hear the same vehicle would all tell the same. So one of them speaks for it, at once; the
-others hold what they heard for a moment and tell it only if nobody has. Who had to tell two in a
-row becomes the speaker; of two speakers the one whose name comes first stays. No message is needed
-for that, and what only one hears is never lost: a vehicle that only B hears has B for its speaker
-after two reports.
+Several nodes that receive the same vehicle would all share the same reports. So one of them is its
+speaker and shares at once; the others hold a report for a moment and share it only if no other node
+has. A node that had to do so for two reports in a row becomes a speaker; of two speakers the one
+whose name comes first remains. This needs no extra message and loses no report: a vehicle that only
+B receives has B as its speaker after two reports.
 """
 
 from collections import deque
@@ -16,15 +16,15 @@ from companion.pipeline.fleet.reception import VEHICLES_MAX, RecentFrames
 from companion.values import Frame, RoundTrip, Shared, SharedFrame, Source
 
 HOLD_NS: Final = (60_000_000, 2_000_000_000)
-"""Least and greatest time for which a report is held back: longer than a word from another node."""
-HOLD: Final = 1.5  # multiple of the longest way of another's word for which a report is held
-HOLD_DECAY: Final = 0.999  # share of that time left after each report that another shared in time
+"""Least and largest time for which a report is held; longer than a message takes."""
+HOLD: Final = 1.5  # hold time as a multiple of the longest message delay
+HOLD_DECAY: Final = 0.999  # factor on the hold time after each report shared by another in time
 SPEAKER_AFTER: Final = 2
-"""Reports in a row that nobody else told, after which this node speaks for the vehicle."""
+"""Reports in a row that no other node shared, after which this node becomes the speaker."""
 HELD_MAX: Final = 20_000
-"""Frames held back, frames to be told and round trips to be told, of each at most."""
+"""Limit each on held frames, queued frames and queued round trips."""
 AT_ONCE: Final = 500
-"""Most frames, and most round trips, that are told at once; the others come with the next word."""
+"""Limit on frames, and on round trips, per message; the rest goes into the next one."""
 
 
 _T = TypeVar("_T")
@@ -32,8 +32,9 @@ _T = TypeVar("_T")
 
 @dataclass(slots=True)
 class _SpeakerState:
-    """A vehicle heard here: when last, whether this node speaks for it, and how many reports in a
-    row it told late.
+    """A vehicle received here: last reception, whether this node is its speaker, and late reports.
+
+    ``late`` counts reports in a row that this node had to share after holding them.
     """
 
     heard_ns: int
@@ -48,10 +49,9 @@ class _Held(NamedTuple):
 
 
 class Sharing:
-    """Decide which frames and round trips this node shares with the others.
+    """Selection of the frames and round trips that this node shares with the others.
 
     ``name`` is this node's; ``every_ns`` is the least time between two messages.
-
     ``dropped`` counts frames and round trips that were not shared because the queue was full.
     """
 
@@ -69,11 +69,11 @@ class Sharing:
         self._trips: deque[RoundTrip] = deque()
 
     def frame_received(self, now_ns: int, frame: Frame, key: bytes) -> None:
-        """Take in a frame heard here, with its content, as it is read.
+        """Take in a frame received here, with its content.
 
-        It is held from now on and not from when it came: where frames wait to be read, what others
-        tell of them waits as well. Else a node that is short of time would tell everybody's
-        reports too, and leave the others less.
+        The hold time starts now, not at its arrival: if frames are queued here, so are the other
+        nodes' messages. Otherwise an overloaded node would also share what the others have shared,
+        and slow them down too.
         """
         speaker = self._speakers.get(frame.source)
         if speaker is None:
@@ -90,13 +90,13 @@ class Sharing:
             self._wait(self._held, _Held(now_ns + round(self._hold_ns), key, frame))
 
     def round_trip_measured(self, trip: RoundTrip) -> None:
-        """Take in a round trip with a vehicle for which this node speaks."""
+        """Take in a round trip; it is shared if this node is the vehicle's speaker."""
         speaker = self._speakers.get(trip.source)
         if speaker is not None and speaker.is_own:
             self._wait(self._trips, trip)
 
     def note_shared(self, now_ns: int, node: str, source: Source, key: bytes, way_ns: int) -> None:
-        """Note that another node shared a report, and the most that its message took."""
+        """Note that another node shared a report, with the largest delay of its message."""
         self._by_others.note(now_ns, key)
         if key in self._by_me:
             speaker = self._speakers.get(source)
@@ -107,7 +107,7 @@ class Sharing:
             self._hold_ns = max(HOLD_DECAY * self._hold_ns, HOLD_NS[0])
 
     def next_message(self, now_ns: int) -> Shared | None:
-        """The message to publish now; None if nothing waits, or if the last was just now."""
+        """Return the message to publish now; None if there is none, or the last is too recent."""
         self._release_held(now_ns)
         if 0 <= now_ns - self._said_ns < self._every_ns:
             return None
@@ -136,7 +136,7 @@ class Sharing:
             self._queue_frame(now_ns, key, frame)
 
     def wait_ns(self, now_ns: int) -> int | None:
-        """How long it is until something is to be told; None: nothing is, and nothing is held."""
+        """Return the time until the next message; None if nothing is queued or held."""
         if self._frames or self._trips:
             due_ns = self._said_ns + self._every_ns
         elif self._held:
@@ -146,11 +146,11 @@ class Sharing:
         return max(due_ns - now_ns, 0)
 
     def forget(self, now_ns: int, after_ns: int) -> None:
-        """Forget vehicles that were not heard here for so long."""
+        """Forget vehicles that were not received here for this time."""
         self._speakers = {k: v for k, v in self._speakers.items() if now_ns - v.heard_ns < after_ns}
 
     def clear(self) -> None:
-        """Forget all: no other node is connected."""
+        """Forget everything: no other node is connected."""
         self._speakers.clear()
         self._held.clear()
         self._frames.clear()
@@ -162,7 +162,7 @@ class Sharing:
         self._wait(self._frames, SharedFrame(frame.t_ns, frame.raw))
 
     def _wait(self, waiting: deque[_T], one: _T) -> None:
-        """Let one more wait; where there is no room the oldest is given up."""
+        """Add to a queue; drop its oldest entry if it is full."""
         if len(waiting) >= HELD_MAX:
             waiting.popleft()
             self.dropped += 1
@@ -170,5 +170,5 @@ class Sharing:
 
 
 def _first(waiting: deque[_T]) -> tuple[_T, ...]:
-    """Take the first ``AT_ONCE``."""
+    """Take the first ``AT_ONCE`` entries."""
     return tuple(waiting.popleft() for _ in range(min(AT_ONCE, len(waiting))))

@@ -1,4 +1,4 @@
-"""What is around a node: where its array is, how far it hears, vehicles that none else hears."""
+"""Surroundings of a node: position and range of its array, and unconfirmed vehicles."""
 
 import math
 from typing import Final
@@ -10,18 +10,18 @@ from companion.pipeline.fold import Pipeline
 from companion.values import Carrier, Notice, Vector, kind_of
 
 RECENT_S: Final = 5.0
-"""How long ago a vehicle may have been heard that shows how far this node hears."""
+"""Largest age of a vehicle's last report for it to count for the range."""
 
 
 class Surroundings:
-    """The sky of one node, as its pipeline has it, for its part in the fleet."""
+    """UAVs and carrier of one node's pipeline, for its part in the fleet."""
 
     def __init__(self, pipeline: Pipeline, member: FleetMember) -> None:
         self._pipeline = pipeline
         self._member = member
 
     def place(self) -> Place | None:
-        """Where this node's array is: latitude, longitude, height; None: not known."""
+        """Return latitude, longitude and height of this node's array; None if unknown."""
         carrier, local = self._pipeline.last_carrier, self._pipeline.local
         if carrier is None or local is None:
             return None
@@ -29,7 +29,7 @@ class Surroundings:
         return place.lat_deg, place.lon_deg, place.alt_m
 
     def reach_m(self, now_ns: int) -> float | None:
-        """Distance of the farthest vehicle that is heard here; None: none is."""
+        """Return the distance of the farthest vehicle received here; None without any."""
         carrier = self._pipeline.last_carrier
         return None if carrier is None else self._reach_m(carrier, self._positions(), now_ns)
 
@@ -43,7 +43,8 @@ class Surroundings:
         return max(away_m, default=None)
 
     def phantoms(self, now_ns: int) -> list[Notice]:
-        """Hold vehicles that only one other node has heard against who ought to hear them."""
+        """Check vehicles that only one other node receives against the nodes that should receive
+        them."""
         local, carrier = self._pipeline.local, self._pipeline.last_carrier
         if local is None or carrier is None:
             return []
@@ -58,7 +59,7 @@ class Surroundings:
         return self._member.check_vehicles(now_ns, positions, own, to_local)
 
     def _positions(self) -> dict[str, Vector]:
-        """Where every vehicle that reports itself was last, in the local frame."""
+        """Return the newest position of every vehicle that reports itself, in the local frame."""
         tracker = self._pipeline.tracker
         names = [uav for uav in tracker.uavs if kind_of(uav).reports_itself]
         found = ((name, tracker.newest(name)) for name in names)

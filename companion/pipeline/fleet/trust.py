@@ -1,13 +1,13 @@
-"""Which nodes are trusted. Contradictions exclude a node for a while, with a notice.
+"""Trust in other nodes. Repeated contradictions exclude a node for some time, with a notice.
 
-A node is excluded that
+A node is excluded if it
 
-- tells frames before they can have been heard, by all that is known of its clock;
-- has a clock that contradicts itself: round trips that no drift explains, again and again;
-- tells reports that contradict what is heard here, or what others tell;
-- tells of several vehicles that only it has ever heard, though they are said to be where others
-  hear everybody: ``PHANTOMS`` of them for ``UNHEARD_NS``, and most of what it hears. A few such
-  vehicles may be hidden: they are told, and stay unconfirmed.
+- shares frames before they can have been received, by the bounds on its clock;
+- has an inconsistent clock: repeated round trips that no drift explains;
+- shares reports that contradict those received here or by other nodes;
+- shares vehicles that only it receives, at positions where others receive everything: at least
+  ``PHANTOMS`` of them for ``UNHEARD_NS``, and most of what it receives. A few such vehicles may be
+  hidden by an obstacle: they cause a notice and stay unconfirmed.
 """
 
 import math
@@ -19,24 +19,24 @@ from companion.values import Notice, Severity
 
 CONTRADICTIONS: Final = 3  # contradictions within WITHIN_NS after which a node is excluded
 WITHIN_NS: Final = 30_000_000_000
-EXCLUDED_NS: Final = 300_000_000_000  # how long a node is excluded
-PHANTOMS: Final = 2  # vehicles that nobody else can hear, from which on their node is excluded
+EXCLUDED_NS: Final = 300_000_000_000  # duration of an exclusion
+PHANTOMS: Final = 2  # number of phantom vehicles from which on their node is excluded
 UNHEARD_NS: Final = 8_000_000_000
-"""Time after which a vehicle that others ought to hear is one that they cannot."""
+"""Time after which a vehicle that others should receive, but do not, counts as a phantom."""
 REACH_SHARE: Final = 0.7
-"""Share of the distance to the farthest vehicle that a node hears, within which it hears all."""
+"""Fraction of a node's range within which it receives every vehicle."""
 
 
 class Witness(NamedTuple):
-    """A node that can say whether a vehicle is where another says."""
+    """A node that can confirm or refute that a vehicle is at a position."""
 
-    place_ned_m: tuple[float, float, float]  # of its array, in the local frame
-    reach_m: float  # distance of the farthest vehicle that it hears itself
-    heard: frozenset[str]  # vehicles that it has heard itself
+    place_ned_m: tuple[float, float, float]  # position of its array in the local frame
+    reach_m: float  # distance of the farthest vehicle that it receives itself
+    heard: frozenset[str]  # vehicles that it has received itself
 
 
 class UnconfirmedVehicle(NamedTuple):
-    """A vehicle that only one other node has told of: which, and where it is said to be."""
+    """A vehicle that only one other node has shared, with that node and its position."""
 
     uav: str
     node: str
@@ -44,7 +44,7 @@ class UnconfirmedVehicle(NamedTuple):
 
 
 class Trust:
-    """Trust in the other nodes. ``excluded`` holds the nodes that are not, with the reason."""
+    """Trust in the other nodes. ``excluded`` maps excluded nodes to the reason."""
 
     def __init__(self) -> None:
         self.excluded: dict[str, str] = {}
@@ -54,11 +54,11 @@ class Trust:
         self._notified: set[str] = set()
 
     def is_trusted(self, node: str) -> bool:
-        """Whether the messages of a node are used."""
+        """Return whether the messages of a node are used."""
         return node not in self.excluded
 
     def note_contradiction(self, now_ns: int, node: str, what: str) -> list[Notice]:
-        """Take in a contradiction, in words that go on after "it"."""
+        """Note a contradiction; ``what`` is a predicate, to follow "it"."""
         times = self._times.setdefault((node, what), deque(maxlen=CONTRADICTIONS))
         times.append(now_ns)
         if len(times) < CONTRADICTIONS or now_ns - times[0] > WITHIN_NS:
@@ -72,9 +72,10 @@ class Trust:
         witnesses: Mapping[str, Witness],
         heard: Mapping[str, int],
     ) -> list[Notice]:
-        """Hold vehicles that only one other node tells of against who ought to hear them.
+        """Check vehicles that only one other node shares against the nodes that should receive
+        them.
 
-        ``heard`` is how many vehicles each node says that it has heard.
+        ``heard`` is the number of vehicles that each node claims to receive.
         """
         before, self._unheard = self._unheard, {}
         for one in told:
@@ -91,10 +92,13 @@ class Trust:
         for node, uavs in phantoms.items():
             names = ", ".join(sorted(uavs)[:6])
             if len(uavs) >= PHANTOMS and 2 * len(uavs) > heard.get(node, 0):
-                what = f"tells of vehicles where nobody else hears one: {names}"
+                what = f"shares vehicles that other nodes should receive, but do not: {names}"
                 said += self._exclude(now_ns, node, what)
             elif not self._notified.issuperset(uavs):
-                text = f"tells of {names}, where nobody else hears one: hidden, or made up"
+                text = (
+                    f"shares {names}, which other nodes should receive, but do not:"
+                    " hidden by an obstacle, or forged"
+                )
                 said.append(_notice(now_ns, node, text, Severity.WARNING))
             self._notified.update(uavs)
         self._notified &= self._unheard.keys()
@@ -102,32 +106,32 @@ class Trust:
 
     @property
     def unconfirmed(self) -> frozenset[str]:
-        """Vehicles of which only one node tells, where others ought to hear them."""
+        """Vehicles that only one node shares, though others should receive them."""
         return frozenset(self._unheard)
 
     def forget(self, now_ns: int) -> None:
-        """Forget contradictions that count no more."""
+        """Forget contradictions that have expired."""
         before_ns = now_ns - WITHIN_NS
         self._times = {what: times for what, times in self._times.items() if times[-1] > before_ns}
 
     def readmit(self, now_ns: int) -> list[Notice]:
-        """Try again those whose time is over."""
+        """Trust nodes again whose exclusion has expired."""
         over = [node for node, until_ns in self._until_ns.items() if now_ns >= until_ns]
         for node in over:
             del self._until_ns[node], self.excluded[node]
-        return [_notice(now_ns, node, "is believed again", Severity.INFO) for node in over]
+        return [_notice(now_ns, node, "is trusted again", Severity.INFO) for node in over]
 
     def _exclude(self, now_ns: int, node: str, what: str) -> list[Notice]:
         if node in self.excluded:
             return []
         self.excluded[node] = what
         self._until_ns[node] = now_ns + EXCLUDED_NS
-        text = f"is not believed for {EXCLUDED_NS / 60e9:.0f} minutes: it {what}"
+        text = f"is excluded for {EXCLUDED_NS / 60e9:.0f} minutes: it {what}"
         return [_notice(now_ns, node, text, Severity.WARNING)]
 
 
 def _should_receive(witness: Witness, told: UnconfirmedVehicle) -> bool:
-    """Whether a vehicle is said to be where a node hears everybody."""
+    """Return whether a vehicle is at a position where this node receives everything."""
     away_m = math.dist(witness.place_ned_m, told.position_ned_m)
     return away_m < REACH_SHARE * witness.reach_m
 

@@ -48,7 +48,7 @@ def test_a_node_says_where_its_array_is_and_how_much_it_can_do() -> None:
 def test_a_word_that_comes_after_its_node_went_is_forgotten_in_the_end() -> None:
     node = member()
     node.node_joined(START_NS, "b")
-    assert [notice.text for notice in node.node_left(START_NS + S, "b")] == ["node b is gone"]
+    assert [notice.text for notice in node.node_left(START_NS + S, "b")] == ["node b disconnected"]
     assert node.gone == {"b": (START_NS + S, None)}
     node.take_standing(START_NS + 2 * S, standing("b"))
     assert list(node.neighbours) == ["b"]
@@ -118,7 +118,11 @@ def test_a_vehicle_that_one_node_alone_hears_is_said_with_that_node() -> None:
         said += node.check_vehicles(now_ns, places, own, lambda _: (5000.0, 0.0, 0.0))
     assert node.trust.unconfirmed == {"66:1"}
     assert [(one.subject, one.text) for one in said] == [
-        ("node b", "node b tells of 66:1, where nobody else hears one: hidden, or made up")
+        (
+            "node b",
+            "node b shares 66:1, which other nodes should receive, but do not: hidden by an"
+            " obstacle, or forged",
+        )
     ]
 
 

@@ -40,12 +40,12 @@ def test_one_contradiction_is_none_and_several_are() -> None:
         for t in range(CONTRADICTIONS)
         for n in trust.note_contradiction((101 + t) * S, "b", "lies")
     ]
-    assert "node b is not believed for 5 minutes: it lies" in notice.text
+    assert "node b is excluded for 5 minutes: it lies" in notice.text
     assert not trust.is_trusted("b")
     assert trust.is_trusted("c")
     assert trust.readmit(110 * S) == []
     (again,) = trust.readmit(110 * S + EXCLUDED_NS)
-    assert "believed again" in again.text
+    assert "trusted again" in again.text
     assert trust.is_trusted("b")
 
 
@@ -58,7 +58,7 @@ def test_vehicles_that_nobody_else_can_hear_put_their_node_aside() -> None:
     far = Witness((5000.0, 0.0, 0.0), 1000.0, frozenset())  # it can say nothing
     said = look(trust, phantoms, {"a": HERE, "c": far}, UNHEARD_NS // S + 2)
     assert len(said) == 1
-    assert "node b is not believed" in said[0]
+    assert "node b is excluded for 5 minutes" in said[0]
     assert "66:1, 67:1" in said[0]
 
 
@@ -66,7 +66,10 @@ def test_one_hidden_vehicle_is_unconfirmed_and_no_lie() -> None:
     trust = Trust()
     hidden = [UnconfirmedVehicle("66:1", "b", (300.0, 0.0, 0.0))]
     (said,) = look(trust, hidden, {"a": HERE}, 60)
-    assert "node b tells of 66:1, where nobody else hears one: hidden, or made up" in said
+    assert (
+        "node b shares 66:1, which other nodes should receive, but do not: hidden by an obstacle,"
+        " or forged"
+    ) in said
     assert trust.unconfirmed == {"66:1"}
     assert trust.is_trusted("b")
 

@@ -109,7 +109,7 @@ def test_refusals_have_a_status_and_a_title(guarded: Node) -> None:
     with pytest.raises(ServiceError, match=r"422: query\.lead_ms: ") as raised:
         client.beams(lead_ms=-1)
     assert raised.value.status == 422
-    with pytest.raises(ServiceError, match="404: no UAV '9:9' has been heard"):
+    with pytest.raises(ServiceError, match="404: no UAV '9:9' is tracked"):
         client.get("/v1/uavs/9:9")
     with pytest.raises(ServiceError, match="4422: uav: 'x' is not SYSID:COMPID") as raised:
         next(client.stream(uavs=["x"]))

@@ -1,4 +1,4 @@
-"""Access control: anybody on this machine; from elsewhere only with a bearer token."""
+"""Access control: this machine is trusted; other machines need a bearer token."""
 
 import base64
 import binascii
@@ -17,30 +17,29 @@ from companion.server.responses import problem
 from companion.values import UserError
 
 OPEN_PATHS: Final = frozenset({"/healthz", "/docs", "/openapi.json"})
-"""Paths that need no token, beside the page's own files: nothing in them is secret."""
+"""Paths that need no token, in addition to the page's own files; they contain no secrets."""
 SUBPROTOCOL: Final = "companion.v1"
-"""Subprotocol with which a WebSocket client that names any is answered."""
+"""Subprotocol selected for a WebSocket client that offers any."""
 BEARER: Final = "bearer."
 """Prefix of a subprotocol that carries the token, base64url without padding.
 
-A page in a browser cannot set headers, and an address with a token in it ends up in logs and
-histories.
+A page in a browser cannot set headers, and a token in the URL would end up in logs and histories.
 """
-UNAUTHORISED: Final = 4401  # code with which a WebSocket without a right token is closed
+UNAUTHORISED: Final = 4401  # close code of a WebSocket without a valid token
 
 UNSENT_BYTES: Final = 16_384
-"""Bytes that the system queues for a client that does not read; connections inherit it.
+"""Limit on unsent bytes in the kernel for a slow client; connections inherit it.
 
-The default is megabytes, and a slow reader of a stream would be sent what is long past.
+The default is megabytes, so a slow reader of a stream would receive outdated data.
 """
 
 
 class ListenError(UserError):
-    """An address that cannot be listened on. The message is one line for the user."""
+    """Address on which the server cannot listen."""
 
 
 def parse_listen(text: str) -> tuple[str, int]:
-    """Read ``HOST:PORT`` (IPv6 in brackets). Raises ``ListenError`` otherwise."""
+    """Parse ``HOST:PORT`` (IPv6 in brackets). Raises ``ListenError`` for anything else."""
     host, _, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
     if not host or not port.isdecimal() or int(port) > 65535:
@@ -49,7 +48,7 @@ def parse_listen(text: str) -> tuple[str, int]:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches the address."""
+    """Return whether only this machine can reach the address."""
     if host == "localhost":
         return True
     try:
@@ -59,16 +58,16 @@ def is_loopback(host: str) -> bool:
 
 
 def bind(listen: str, *, token: str | None, insecure: bool) -> socket.socket:
-    """The listening socket.
+    """Return the listening socket.
 
-    Raises ``ListenError`` if the address cannot be had, or could be reached from elsewhere without
-    a token.
+    Raises ``ListenError`` if the address is unavailable, or if other machines could reach it
+    without a token.
     """
     host, port = parse_listen(listen)
     if not is_loopback(host) and not token and not insecure:
         raise ListenError(
-            f"{listen} can be reached from elsewhere: set COMPANION_TOKEN to a bearer token, "
-            "or say --insecure"
+            f"{listen}: other machines can reach this address; set COMPANION_TOKEN to a bearer"
+            " token, or give --insecure"
         )
     try:
         family, kind, proto, _, address = socket.getaddrinfo(
@@ -90,18 +89,18 @@ def bind(listen: str, *, token: str | None, insecure: bool) -> socket.socket:
 
 
 def _own_names() -> frozenset[str]:
-    """What this machine is called in its own network; no name of the internet is among them."""
+    """Return this machine's names in the local network, none of which is a public name."""
     name = socket.gethostname().lower().partition(".")[0]
     return frozenset(("localhost", name, f"{name}.local"))
 
 
 class KnownHosts:
-    """ASGI middleware: requests must name this machine in ``Host``, by address or by a known name.
+    """ASGI middleware: ``Host`` must name this machine, by address or by a known name.
 
-    A page from anywhere may have its own name resolve to this machine (DNS rebinding) and then read
-    what is served here as if it were its own. Its requests bear that name. Addresses are nobody's
-    name; ``names`` are further ones, as of a reverse proxy. Others are answered with 421, and their
-    WebSockets refused.
+    A page from elsewhere may let its own name resolve to this machine (DNS rebinding) and then read
+    this API as its own origin. Its requests carry that name. Addresses are always allowed;
+    ``names`` are further names, such as that of a reverse proxy. Other requests are answered with
+    421, and their WebSockets rejected.
     """
 
     def __init__(self, app: ASGIApp, names: Collection[str] = ()) -> None:
@@ -112,19 +111,19 @@ class KnownHosts:
         if scope["type"] == "lifespan" or self._are_known(Headers(scope=scope).getlist("host")):
             await self._app(scope, receive, send)
         elif scope["type"] == "websocket":
-            await WebSocket(scope, receive, send).close()  # before it is open: 403
+            await WebSocket(scope, receive, send).close()  # closed before it is open: 403
         else:
-            title = "this name is not known to be of this service: [server] hosts"
+            title = "unknown host name; add it to [server] hosts"
             await problem(421, title)(scope, receive, send)
 
     def _are_known(self, hosts: list[str]) -> bool:
-        """Whether all are; no browser leaves it out, nor names two."""
+        """Return whether all are known; browsers always send exactly one."""
         names = [_host_name(host) for host in hosts]
         return all(name in self._names or _is_address(name) for name in names)
 
 
 def _host_name(host: str) -> str:
-    """The name or address in a Host header: without port, brackets and the dot of the root."""
+    """Return name or address of a Host header, without port, brackets and trailing dot."""
     name = host.strip().lower()
     if name.startswith("["):
         return name[1:].partition("]")[0]
@@ -142,9 +141,9 @@ def _is_address(name: str) -> bool:
 class BearerToken:
     """ASGI middleware: every path needs ``Authorization: Bearer TOKEN``, except ``open_paths``.
 
-    A WebSocket may bring the token as a subprotocol instead (``BEARER``), beside ``SUBPROTOCOL``.
-    Without a right token it is opened and closed with 4401, whatever its path: a page in a browser
-    cannot see the status of a handshake that is refused.
+    A WebSocket may send the token as a subprotocol instead (``BEARER``), beside ``SUBPROTOCOL``.
+    Without a valid token it is opened and closed with 4401, whatever its path: a page in a browser
+    cannot see the status of a rejected handshake.
     """
 
     def __init__(self, app: ASGIApp, token: str, open_paths: Collection[str] = OPEN_PATHS) -> None:

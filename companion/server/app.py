@@ -1,4 +1,4 @@
-"""The HTTP API and the dashboard's files, over a running node. Read only."""
+"""The HTTP API and the dashboard's files for a running node. Read only."""
 
 from pathlib import Path
 from typing import Annotated, Final
@@ -28,24 +28,24 @@ from companion.views.state import Node
 
 CONTENT_POLICY: Final = b"default-src 'self'; frame-ancestors 'none'"
 DRAWN_POLICY: Final = CONTENT_POLICY + b"; style-src 'self' 'unsafe-inline'; img-src 'self' data:"
-"""For ``/docs``: Swagger UI brings pictures in its style sheet, and styles with what it draws."""
+"""Policy of ``/docs``: Swagger UI embeds images in its style sheet, and sets inline styles."""
 UavId = Annotated[str, PathParameter(description=UAV_FORMS)]
 DESCRIPTION: Final = """Location-aware beamforming from MAVLink. Read only.
 
-Angles in degrees, distances in metres; null is not known, never 0. Estimates are worked out for
-the moment at which they are asked for: `valid_at` says which, so no answer has an ETag. Errors are
+Angles in degrees, distances in metres; null means unknown, never 0. Estimates are computed for
+the time of the request, given as `valid_at`, so answers have no ETag. Errors are
 `application/problem+json` (RFC 9457). `WS /v1/stream?uav=…&topic=…&rate_hz=…` sends `uavs`,
 `beams`, `weights`, `status`, `links`, `fleet` and `events` as they change, and `records` in binary.
 """
 
 
 def create_app(node: Node, token: str | None = None, area: Path | None = None) -> ASGIApp:
-    """The ASGI application for a node.
+    """Return the ASGI application for a node.
 
     ``area`` is the map under the plan view (``companion.server.area_map``).
 
-    With a token, all but ``/healthz`` and the page's own files asks for it: the page is shown, and
-    asks the user.
+    With a token, all paths need it except ``/healthz`` and the page's own files; the page asks the
+    user for the token.
     """
     app = FastAPI(
         title="companion",
@@ -53,7 +53,7 @@ def create_app(node: Node, token: str | None = None, area: Path | None = None) -
         description=DESCRIPTION,
         docs_url=None,  # FastAPI's own pages load from elsewhere
         redoc_url=None,
-        openapi_url=None,  # its own route would make the document on the event loop
+        openapi_url=None,  # FastAPI's route would build the document on the event loop
     )
     app.router.redirect_slashes = False
     responses.install(app)
@@ -77,7 +77,7 @@ def create_app(node: Node, token: str | None = None, area: Path | None = None) -
     async def streamed(websocket: WebSocket) -> None:
         await stream.serve(websocket)
 
-    # Not mounted: a mount at / would match before a path whose method is wrong, and hide the 405.
+    # Not mounted: a mount at / would match paths with a wrong method first, and hide the 405.
     app.router.default = _Files(StaticFiles(directory=web_directory(), html=True))
     secured: ASGIApp = _Edge(app)
     if token:
@@ -86,14 +86,14 @@ def create_app(node: Node, token: str | None = None, area: Path | None = None) -
 
 
 def web_directory() -> Path:
-    """Folder of the dashboard's files: inside the installed package, or beside it in a checkout."""
+    """Return the folder of the dashboard's files: in the installed package, or in a checkout."""
     package = Path(companion.__file__).parent
     installed = package / "_web"
     return installed if installed.is_dir() else package.parent / "web"
 
 
 def _page_paths() -> frozenset[str]:
-    """The paths of the dashboard's files. They are the same for everybody."""
+    """Return the paths of the dashboard's files, which contain no secrets."""
     root = web_directory()
     files = {f"/{file.relative_to(root).as_posix()}" for file in root.rglob("*") if file.is_file()}
     return frozenset({"/"} | files)
@@ -104,15 +104,15 @@ def _health_routes(app: FastAPI, node: Node, stream: Stream) -> None:
     registry.register(NodeCollector(node, stream))
     ProcessCollector(registry=registry)
 
-    @app.get("/healthz", summary="The process answers", responses=answers(models.Health))
+    @app.get("/healthz", summary="Liveness of the process", responses=answers(models.Health))
     async def healthz() -> Response:
         return answer({"status": "ok"})
 
     @app.get(
         "/readyz",
-        summary="Fit to be used, or why not (503)",
+        summary="Whether the service is ready, or why not (503)",
         responses=answers(models.Readiness)
-        | {503: {"model": models.model(models.Readiness), "description": "Not fit to be used"}},
+        | {503: {"model": models.model(models.Readiness), "description": "Not ready"}},
     )
     async def readyz() -> Response:
         reasons = node.unfit()
@@ -120,7 +120,7 @@ def _health_routes(app: FastAPI, node: Node, stream: Stream) -> None:
 
     @app.get(
         "/metrics",
-        summary="Prometheus",
+        summary="Prometheus metrics",
         response_class=Response,
         responses={200: {"content": {"text/plain": {}}}},
     )
@@ -151,12 +151,12 @@ def _state_routes(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
     async def one_uav(uav: UavId) -> Response:
         found = uav_state.states(node, node.now_ns(), only=uav)
         if not found:
-            raise HTTPException(404, f"no UAV {uav!r} has been heard")
+            raise HTTPException(404, f"no UAV {uav!r} is tracked")
         return answer(as_json(found[0], node.pipeline.utc_ns))
 
     @app.get(
         "/v1/links",
-        summary="Links, who is heard over each, and the rates asked for",
+        summary="Links, the components received over each, and the requested message rates",
         responses=answers(Links),
     )
     async def links() -> Response:
@@ -164,21 +164,21 @@ def _state_routes(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
 
     @app.get(
         "/v1/fleet",
-        summary="The nodes of the fleet, and who serves whom",
+        summary="The nodes of the fleet, and the UAVs that each serves",
         responses=answers(fleet_view.Fleet),
     )
     async def fleet() -> Response:
         return answer(fleet_view.fleet(node.pipeline, node.fleet_status(), node.now_ns()))
 
     @app.get(
-        "/v1/events", summary="What was said to the operator last", responses=answers(glance.Events)
+        "/v1/events", summary="The newest notices to the operator", responses=answers(glance.Events)
     )
     async def events() -> Response:
         return answer(glance.events(node))
 
     @app.get(
         "/v1/history",
-        summary="What the charts show, each second of the last five minutes",
+        summary="Samples of the charts, one per second of the last five minutes",
         responses=answers(series.History, 503),
     )
     async def history() -> Response:
@@ -188,7 +188,7 @@ def _state_routes(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
 
     @app.get(
         "/v1/settings",
-        summary="The effective settings, and where each comes from",
+        summary="The effective settings, and the origin of each",
         responses=answers(settings.EffectiveSettings),
     )
     async def effective() -> Response:
@@ -214,7 +214,7 @@ def _state_routes(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
 
 
 class _Files:
-    """ASGI application for paths outside the API: the dashboard's files, or nothing."""
+    """ASGI application for paths outside the API: the dashboard's files."""
 
     def __init__(self, files: StaticFiles) -> None:
         self._files = files
@@ -223,14 +223,14 @@ class _Files:
         if scope["type"] == "http":
             await self._files(scope, receive, send)
         else:
-            await WebSocket(scope, receive, send).close()  # before it is open: 403
+            await WebSocket(scope, receive, send).close()  # closed before it is open: 403
 
 
 class _Edge:
     """ASGI middleware for HEAD requests and security headers.
 
-    HEAD is served as GET, and the server leaves out the body. The headers allow a page to load
-    nothing from elsewhere.
+    HEAD is handled as GET, and the server omits the body. The headers allow a page to load nothing
+    from elsewhere.
     """
 
     def __init__(self, app: ASGIApp) -> None:

@@ -1,7 +1,7 @@
-"""The map that lies under the plan view: a PMTiles file of the user's, served in ranges.
+"""The map under the plan view: a PMTiles file of the user, served by byte ranges.
 
-Format: PMTiles, version 3 (github.com/protomaps/PMTiles). It is named in the node's own settings,
-never in a recording's: a replay must not serve files that whoever recorded has chosen.
+Format: PMTiles, version 3 (github.com/protomaps/PMTiles). Its path comes from the node's own
+settings, never from a recording: the author of a recording must not choose which files are served.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class AreaMap:
 
 
 def find(named: str | None) -> Path | None:
-    """The file that ``[page] map`` names. Raises ``UserError`` where it is no PMTiles file."""
+    """Return the file of ``[page] map``. Raises ``UserError`` if it is not a PMTiles file."""
     if named is None:
         return None
     try:
@@ -36,7 +36,7 @@ def find(named: str | None) -> Path | None:
     except OSError as error:
         raise UserError(f"page.map = {named!r}: {error.strerror}") from error
     if head != MAGIC:
-        raise UserError(f"page.map = {named!r}: not a PMTiles file of version 3")
+        raise UserError(f"page.map = {named!r}: not a PMTiles file, version 3; convert it")
     return Path(named)
 
 
@@ -45,7 +45,7 @@ def add(app: FastAPI, file: Path | None) -> None:
 
     @app.get(
         "/v1/map",
-        summary="The map under the plan view, where the settings name one",
+        summary="The map under the plan view, if the settings name one",
         responses=answers(AreaMap),
     )
     async def area_map() -> Response:
@@ -53,7 +53,7 @@ def add(app: FastAPI, file: Path | None) -> None:
 
     @app.get(
         "/v1/map/tiles",
-        summary="Its tiles, by Range",
+        summary="Tiles of the map, by Range",
         response_class=Response,
         responses={
             200: {"content": {MEDIA_TYPE: {}}},
@@ -63,5 +63,5 @@ def add(app: FastAPI, file: Path | None) -> None:
     )
     async def tiles() -> Response:
         if file is None or not file.is_file():
-            raise HTTPException(404, "there is no map")
+            raise HTTPException(404, "no map; name one in [page] map")
         return FileResponse(file, media_type=MEDIA_TYPE)

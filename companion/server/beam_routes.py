@@ -1,4 +1,4 @@
-"""The routes ``/v1/beams``, ``/v1/beams/weights`` and ``/v1/pattern``, computed when asked for."""
+"""The routes ``/v1/beams``, ``/v1/beams/weights`` and ``/v1/pattern``, computed on request."""
 
 import re
 from typing import Annotated, Any, Final
@@ -16,19 +16,19 @@ from companion.views import pattern as pattern_view
 from companion.views.state import Node
 
 MOST_ANGLES: Final = 20_000
-"""Beams times angles that one answer may hold: more than half a second's work."""
+"""Limit on beams times angles in one answer; at the limit, an answer takes half a second."""
 LeadMs = Annotated[float, Query(ge=0, le=10_000, description="milliseconds ahead of now")]
 Cut = Annotated[
     pattern_view.Cut, Query(description="the angle that varies; the other is the beam's own")
 ]
 Points = Annotated[int, Query(ge=2, le=3601, description="angles along the cut")]
-Only = Annotated[str | None, Query(description="SYSID:COMPID; every beam without it")]
+Only = Annotated[str | None, Query(description="SYSID:COMPID; default: every beam")]
 _JSON = {"schema": {"$ref": "#/components/schemas/Weights"}}
 _BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
 
 
 def add(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
-    """Add the routes to the application; what they compute is done in ``work_slots``."""
+    """Add the routes to the application; their computations run in ``work_slots``."""
     pipeline, equipment = node.pipeline, node.equipment
     moments = Moments(node, work_slots)
 
@@ -53,7 +53,7 @@ def add(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
         form = accepted(request.headers.get("accept", "*/*"))
         if form is None:
             raise HTTPException(
-                406, f"weights come as {', '.join(form.media_type for form in WeightFormat)}"
+                406, f"supported types: {', '.join(form.media_type for form in WeightFormat)}"
             )
 
         def make(update: Update) -> tuple[bytes, dict[str, str]]:
@@ -63,7 +63,7 @@ def add(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
 
         try:
             body, headers = await moments.made(lead_ms, form, make)
-        except UserError as error:  # what the device cannot do, as the beams are now
+        except UserError as error:  # the device cannot apply the current beams
             raise HTTPException(409, str(error)) from error
         return Response(body, media_type=form.media_type, headers=headers)
 
@@ -78,11 +78,11 @@ def add(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
         def make(update: Update) -> bytes:
             served = update.beams.uavs
             if uav is not None and uav not in served:
-                raise HTTPException(404, f"there is no beam on {uav!r}")
+                raise HTTPException(404, f"no beam for {uav!r}")
             shown = 1 if uav is not None else len(served)
             if shown * points > MOST_ANGLES:
                 wanted = f"{shown} beams at {points} angles"
-                raise HTTPException(422, f"{wanted}: say uav, or fewer points")
+                raise HTTPException(422, f"too large: {wanted}; give uav, or fewer points")
             return encode(
                 pattern_view.pattern(
                     pipeline, update, cut, points=points, only=uav, lead_ms=lead_ms
@@ -94,7 +94,7 @@ def add(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
 
 def _weight_answers() -> dict[int | str, dict[str, Any]]:
     kinds = dict.fromkeys((form.media_type for form in WeightFormat), _BINARY)
-    # The model is named for its schema to be in the document; the content says where it applies.
+    # The model puts its schema into the document; the content says where it applies.
     content = {
         "model": models.model(beam_state.Weights),
         "content": kinds | {"application/json": _JSON},
@@ -103,7 +103,7 @@ def _weight_answers() -> dict[int | str, dict[str, Any]]:
 
 
 def accepted(accept: str) -> WeightFormat | None:
-    """The format that an Accept header prefers; None where it takes none of them.
+    """Return the format that an Accept header prefers; None if it accepts none.
 
     RFC 9110: the highest q, the first of equal ones.
     """
@@ -121,6 +121,6 @@ def accepted(accept: str) -> WeightFormat | None:
 
 
 def _quality(part: str) -> float:
-    """The q of one part of an Accept header; 1 where there is none that can be read."""
+    """Return the q of one part of an Accept header; 1 if missing or malformed."""
     found = re.search(r";q=([01](?:\.\d*)?)(?:;|$)", part)
     return float(found[1]) if found else 1.0

@@ -1,7 +1,7 @@
-"""HTTP connections within bounds: of heads, of waiting, and of their number.
+"""HTTP connections with limits on the size of heads, on waiting, and on their number.
 
-uvicorn reads a head of any length, waits for ever for one that never ends, and takes connections
-until there are no descriptors left. All of that comes before any token is looked at.
+uvicorn reads heads of any length, waits forever for incomplete ones, and accepts connections until
+no descriptors are left. All of that happens before any token is checked.
 """
 
 import asyncio
@@ -11,32 +11,32 @@ from typing import Any, Final
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 HEAD_BYTES: Final = 16_384
-"""Most bytes of a request's line and headers; browsers send one or two thousand."""
-BODY_BYTES: Final = 65_536  # most bytes of a request's body: nothing here takes any
+"""Limit on a request's line and headers; browsers send one or two thousand bytes."""
+BODY_BYTES: Final = 65_536  # limit on a request's body; no route uses one
 HEAD_S: Final = 10.0
-"""How long a client may take from connecting, or from its last answer, to a whole head."""
-STALLED_S: Final = 60.0  # how long a client may take nothing of an answer
+"""Time limit from connecting, or from the last answer, to a complete head."""
+STALLED_S: Final = 60.0  # time limit for a client that reads nothing of an answer
 _MOST: Final = 512
-_OWN: Final = 96  # descriptors that are left for links, recordings and files
+_OWN: Final = 96  # descriptors reserved for links, recordings and files
 
 
 def most_connections() -> int:
-    """Connections taken at a time, so that links and recordings always have descriptors."""
+    """Return the limit on connections, so that links and recordings always have descriptors."""
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     return _MOST if soft == resource.RLIM_INFINITY else max(8, min(_MOST, soft - _OWN))
 
 
 class TooLongError(Exception):
-    """A head that is longer than any that is meant well."""
+    """A head that exceeds its limit."""
 
 
 class BoundedProtocol(HttpToolsProtocol):
-    """uvicorn's protocol within bounds. When there are too many, who waits longest goes."""
+    """uvicorn's protocol with limits. Beyond the limit, the longest idle connection is closed."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._in_head = True
-        self._unparsed = 0  # bytes since the last head; a header that goes on is not told before
+        self._unparsed = 0  # bytes since the last head; the parser reports only whole headers
         self._head_bytes = 0
         self._body_bytes = 0
         self._deadline: asyncio.TimerHandle | None = None
@@ -44,7 +44,7 @@ class BoundedProtocol(HttpToolsProtocol):
         self._waiting_since_s = 0.0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Take a connection, if need be in the place of one on which nothing is asked."""
+        """Accept a connection, if necessary by closing an idle one."""
         if len(self.connections) >= most_connections():
             waiting = [
                 one
@@ -59,68 +59,68 @@ class BoundedProtocol(HttpToolsProtocol):
         self._await_head()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The connection is gone; see ``asyncio.Protocol``."""
+        """Clean up; see ``asyncio.Protocol``."""
         self._cancel()
         if self.transport is not None:
             super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Bytes of a client; see ``asyncio.Protocol``."""
+        """Process bytes of a client; see ``asyncio.Protocol``."""
         if self.transport is None or self.transport.is_closing():
             return
         self._unparsed += len(data)
         super().data_received(data)
         if self._in_head and self._unparsed > HEAD_BYTES and not self.transport.is_closing():
-            self.send_400_response("No request has such a head.")
+            self.send_400_response("The request head is too long.")
 
     @property
     def is_waiting(self) -> bool:
-        """Whether no request is being answered."""
+        """Whether the connection is idle: no request is being answered."""
         return self.cycle is None or self.cycle.response_complete
 
-    # --- what the parser finds ----------------------------------------------------------------
+    # --- callbacks of the parser --------------------------------------------------------------
 
     def on_message_begin(self) -> None:
-        """A request begins."""
+        """Start a request."""
         self._head_bytes = self._body_bytes = 0
         super().on_message_begin()
 
     def on_url(self, url: bytes) -> None:
-        """A piece of the address."""
+        """Take a piece of the URL."""
         self._count(len(url))
         super().on_url(url)
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """A header."""
+        """Take a header."""
         self._count(len(name) + len(value) + 4)
         super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
-        """The head is whole, and the request is answered."""
+        """Start the answer: the head is complete."""
         self._cancel()
         self._in_head = False
         super().on_headers_complete()
 
     def on_body(self, body: bytes) -> None:
-        """A piece of a body, which nobody reads."""
+        """Take a piece of a body, which is ignored."""
         self._body_bytes += len(body)
         if self._body_bytes > BODY_BYTES:
             raise TooLongError
         super().on_body(body)
 
     def on_message_complete(self) -> None:
-        """A request is whole; what follows is another's head."""
+        """End a request; further bytes belong to the next head."""
         self._in_head, self._unparsed = True, 0
         super().on_message_complete()
 
     def on_response_complete(self) -> None:
-        """An answer was sent."""
+        """End an answer."""
         super().on_response_complete()
         if not self.transport.is_closing() and self.is_waiting:
             self._await_head()
 
     def _count(self, size: int) -> None:
-        """Raise where the head grows beyond its bound; the parser then refuses the request."""
+        """Raise if the head exceeds its limit; the parser then rejects the request."""
         self._head_bytes += size
         if self._head_bytes > HEAD_BYTES:
             raise TooLongError
@@ -128,12 +128,12 @@ class BoundedProtocol(HttpToolsProtocol):
     # --- waiting ------------------------------------------------------------------------------
 
     def pause_writing(self) -> None:
-        """The client does not read."""
+        """Start the time limit: the client does not read."""
         super().pause_writing()
         self._stalled = self.loop.call_later(STALLED_S, self.transport.abort)
 
     def resume_writing(self) -> None:
-        """The client reads again."""
+        """Cancel the time limit: the client reads again."""
         super().resume_writing()
         if self._stalled is not None:
             self._stalled.cancel()

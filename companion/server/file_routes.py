@@ -14,7 +14,7 @@ from companion.views.state import Node
 
 SystemId = Annotated[int, Path(ge=0, le=255, description="MAVLink system id")]
 ComponentId = Annotated[int, Path(ge=0, le=255, description="MAVLink component id")]
-RecordingName = Annotated[str, Path(description="name of the file, as /v1/recordings has it")]
+RecordingName = Annotated[str, Path(description="name of the file, as in /v1/recordings")]
 MessageName = Annotated[str, Path(description="MAVLink name, such as GLOBAL_POSITION_INT")]
 Range = Annotated[str | None, Header(alias="range", description="bytes=FIRST-LAST")]
 
@@ -34,7 +34,7 @@ def _recordings(app: FastAPI, node: Node) -> None:
 
     @app.get(
         "/v1/recordings",
-        summary="The recordings: name, bytes, state, when begun",
+        summary="The recordings: name, size, state and start",
         responses=answers(recordings.Recordings),
     )
     async def listing() -> Response:
@@ -42,7 +42,7 @@ def _recordings(app: FastAPI, node: Node) -> None:
 
     @app.get(
         "/v1/recordings/{name}",
-        summary="A recording, or a range of its bytes; one being written as far as it is flushed",
+        summary="A recording, or a range of its bytes; an unfinished one up to the last flush",
         response_class=Response,
         responses={
             200: {"content": {recordings.MEDIA_TYPE: {}}},
@@ -53,7 +53,7 @@ def _recordings(app: FastAPI, node: Node) -> None:
     async def download(name: RecordingName, wanted: Range = None) -> Response:
         found = await run_in_threadpool(recordings.opened, where, name, current())
         if found is None:
-            raise HTTPException(404, f"there is no recording {name!r}")
+            raise HTTPException(404, f"no recording {name!r}")
         file, size = found
         try:
             part = recordings.span(wanted, size)
@@ -82,7 +82,7 @@ def _mavlink(app: FastAPI, node: Node) -> None:
 
     @app.get(
         "/v1/mavlink/vehicles",
-        summary="The last messages of everybody, as mavlink2rest has them",
+        summary="The last messages of all components, as in mavlink2rest",
         responses=answers(dict[str, mavlink_messages.MavlinkVehicle]),
     )
     async def vehicles() -> Response:
@@ -97,12 +97,12 @@ def _mavlink(app: FastAPI, node: Node) -> None:
     async def messages(sys: SystemId, comp: ComponentId) -> Response:
         found = kept.by_sender().get(Source(sys, comp))
         if found is None:
-            raise HTTPException(404, f"nothing has been heard of {sys}:{comp}")
+            raise HTTPException(404, f"no message received from {sys}:{comp}")
         return answer(await run_in_threadpool(mavlink_messages.messages, found, utc_ns))
 
     @app.get(
         "/v1/mavlink/vehicles/{sys}/components/{comp}/messages/{name}",
-        summary="The last message of a kind, as mavlink2rest has it",
+        summary="The last message of a kind, as in mavlink2rest",
         responses=answers(mavlink_messages.MavlinkMessage, 404, 422),
     )
     async def message(sys: SystemId, comp: ComponentId, name: MessageName) -> Response:
@@ -110,5 +110,5 @@ def _mavlink(app: FastAPI, node: Node) -> None:
         msgid = dialect.msgid(name)
         found = None if msgid is None else kept.find(Source(sys, comp), msgid)
         if found is None:
-            raise HTTPException(404, f"{sys}:{comp} has sent no {name!r}")
+            raise HTTPException(404, f"no {name!r} received from {sys}:{comp}")
         return answer(dialect.message(found, utc_ns))

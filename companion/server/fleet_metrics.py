@@ -1,4 +1,4 @@
-"""Prometheus metrics of the fleet: none where the node is part of none."""
+"""Prometheus metrics of the fleet; none for a node without a fleet."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ from companion.views.state import Node
 
 
 def fleet_metrics(node: Node) -> Iterator[Metric]:
-    """Who is there, who serves whom, and the way between the nodes."""
+    """Yield metrics of nodes, served UAVs, and delays between nodes."""
     status, now_ns = node.fleet_status(), node.now_ns()
     served = served_uavs(node.pipeline, status, now_ns)
     if status is None or served is None:
@@ -20,9 +20,7 @@ def fleet_metrics(node: Node) -> Iterator[Metric]:
     shown = fleet.nodes(member, now_ns)
     states = Counter(one.state for one in shown)
     nodes = GaugeMetricFamily(
-        "companion_fleet_nodes",
-        "Nodes of the fleet by state, this one being here",
-        labels=["state"],
+        "companion_fleet_nodes", "Nodes of the fleet by state; this one is `here`", labels=["state"]
     )
     for state in fleet.NodeState:
         nodes.add_metric([str(state)], states[state])
@@ -31,10 +29,10 @@ def fleet_metrics(node: Node) -> Iterator[Metric]:
         "companion_fleet_serves", "UAVs that this node serves", value=len(member.duties.serves)
     )
     yield GaugeMetricFamily(
-        "companion_fleet_most", "UAVs that this node serves at most", value=member.most
+        "companion_fleet_most", "Largest number of UAVs that this node serves", value=member.most
     )
     yield GaugeMetricFamily(
-        "companion_fleet_elsewhere", "UAVs that other nodes alone serve", value=served.elsewhere
+        "companion_fleet_elsewhere", "UAVs that only other nodes serve", value=served.elsewhere
     )
     yield GaugeMetricFamily(
         "companion_fleet_unserved", "UAVs that no node serves", value=len(served.nobody)
@@ -47,17 +45,17 @@ def fleet_metrics(node: Node) -> Iterator[Metric]:
     )
     yield CounterMetricFamily(
         "companion_fleet_untold",
-        "Frames and round trips not shared: queue full, or too many vehicles heard",
+        "Frames and round trips not shared: queue full, or too many vehicles received",
         value=member.sharing.dropped,
     )
     ways = GaugeMetricFamily(
         "companion_fleet_way_p99_seconds",
-        "How long frames of another node are on their way, 99 of 100 at most",
+        "99th percentile of the delay of frames from another node",
         labels=["node"],
     )
     doubts = GaugeMetricFamily(
         "companion_fleet_clock_doubt_seconds",
-        "How closely another node's clock is known",
+        "Width of the possible interval of another node's clock offset",
         labels=["node"],
     )
     for one in shown:

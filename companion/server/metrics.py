@@ -1,7 +1,7 @@
-"""Prometheus metrics, read from the node when they are asked for.
+"""Prometheus metrics, read from the node on request.
 
-Names follow Prometheus: base units, ``_total`` for what only grows. The process's own metrics
-(memory, CPU, open files) are those of the client library.
+Names follow Prometheus: base units, ``_total`` for counters. The process's own metrics (memory,
+CPU, open files) come from the client library.
 """
 
 from collections.abc import Iterator
@@ -31,7 +31,7 @@ GAINS: Final = ("needed", "guaranteed", "likely")
 
 
 def _help(described: Any, name: str) -> str:
-    """What a value means, as in the API."""
+    """Return the meaning of a value, as in the API."""
     text = meaning(described, name).text
     return text[0].upper() + text[1:]
 
@@ -44,7 +44,7 @@ class NodeCollector(Collector):
         self._stream = stream
 
     def collect(self) -> Iterator[Metric]:
-        """All metrics at this moment."""
+        """Yield all metrics at this moment."""
         yield from self._service()
         yield from self._arrival_lag()
         yield from self._links()
@@ -62,29 +62,29 @@ class NodeCollector(Collector):
             "companion_uptime_seconds", "Time since the start", value=node.uptime_s()
         )
         yield GaugeMetricFamily(
-            "companion_ready", "1 if fit to be used", value=float(not node.unfit())
+            "companion_ready", "1 if the service is ready", value=float(not node.unfit())
         )
         yield CounterMetricFamily(
-            "companion_frames", "MAVLink frames whose checksum held", value=pipeline.frames
+            "companion_frames", "MAVLink frames with a valid checksum", value=pipeline.frames
         )
         yield CounterMetricFamily("companion_updates", "Beam updates", value=pipeline.updates)
         rejected = CounterMetricFamily(
-            "companion_rejected", "What was received and not used, by reason", labels=["reason"]
+            "companion_rejected", "Rejections by reason", labels=["reason"]
         )
         for reason, count in pipeline.refusals.total.items():
             rejected.add_metric([str(reason)], count)
         yield rejected
         yield HistogramMetricFamily(
             "companion_event_loop_lag_seconds",
-            "How late the ticks of the timer came",
+            "Delay of the timer's ticks",
             buckets=node.lateness.buckets(),
             sum_value=node.lateness.sum_s,
         )
         yield GaugeMetricFamily(
-            "companion_stream_clients", "Connected to /v1/stream", value=self._stream.clients
+            "companion_stream_clients", "Clients of /v1/stream", value=self._stream.clients
         )
         yield CounterMetricFamily(
-            "companion_stream_messages", "Sent over /v1/stream", value=self._stream.sent
+            "companion_stream_messages", "Messages sent over /v1/stream", value=self._stream.sent
         )
 
     def _arrival_lag(self) -> Iterator[Metric]:
@@ -105,7 +105,9 @@ class NodeCollector(Collector):
             for name in LINK_COUNTS
         }
         lost = CounterMetricFamily(
-            "companion_link_lost", "Refused, by reason; garbage in bytes", labels=["link", "reason"]
+            "companion_link_lost",
+            "Rejected frames by reason; garbage in bytes",
+            labels=["link", "reason"],
         )
         for link in self._node.links():
             up.add_metric([link.url], float(link.state == "up"))

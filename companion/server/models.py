@@ -1,7 +1,7 @@
-"""Models of the API's answers, made from described values, for the OpenAPI document only.
+"""Models of the API's answers, built from described values, for the OpenAPI document only.
 
-Nothing is validated by them in flight. Names and units follow by the rules of
-``companion.views.as_json``; a value's description is its meaning and its unit.
+They do not validate answers. Names and units follow the rules of ``companion.views.as_json``; a
+value's description is its meaning and its unit.
 """
 
 import functools
@@ -30,30 +30,28 @@ class Problem:
     """An error (RFC 9457). ``title`` says what is wrong, in one line."""
 
     type: Annotated[Literal["about:blank"], Meaning("kind of problem (RFC 9457)")]
-    title: Annotated[
-        str, Meaning("what is wrong, in one line", example="no UAV '9:9' has been heard")
-    ]
+    title: Annotated[str, Meaning("what is wrong, in one line", example="no UAV '9:9' is tracked")]
     status: Annotated[int, Meaning("status of the HTTP answer", example=404)]
 
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """The process answers."""
+    """Liveness of the process."""
 
     status: Annotated[Literal["ok"], Meaning("ok: the process answers")]
 
 
 @dataclass(frozen=True, slots=True)
 class Readiness:
-    """Whether the service is fit to be used; ``reasons`` say why not."""
+    """Whether the service is ready; ``reasons`` say why not."""
 
-    ready: Annotated[bool, Meaning("whether the service is fit to be used")]
-    reasons: Annotated[list[str], Meaning("why it is not", example=["no link is up"])]
+    ready: Annotated[bool, Meaning("whether the service is ready")]
+    reasons: Annotated[list[str], Meaning("why it is not ready", example=["no link is up"])]
 
 
 @functools.cache
 def model(described: type) -> type[BaseModel]:
-    """The pydantic model of a described class, under the same name."""
+    """Return the pydantic model of a described class, under the same name."""
     fields: dict[str, Any] = {}
     for member in members(described):
         if "api" not in member.meaning.absent:
@@ -92,7 +90,7 @@ def _field(member: Member) -> tuple[Any, Any]:
 
 
 def outward(kind: Any) -> Any:
-    """A type as it is in JSON: described classes as models, tuples as lists."""
+    """Return a type as in JSON: described classes as models, tuples as lists."""
     kind, optional = bare(kind)
     if optional:
         return outward(kind) | None
@@ -117,7 +115,7 @@ def outward(kind: Any) -> Any:
 
 
 def describe_enumerations(schemas: dict[str, Any]) -> None:
-    """Add to each enumeration of an OpenAPI document what its values mean."""
+    """Add the meanings of their values to the enumerations of an OpenAPI document."""
     for kind in DescribedEnum.__subclasses__():
         if kind.__name__ in schemas:
             meanings = [f"{one}: {one.meaning}" for one in kind]

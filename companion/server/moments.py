@@ -1,8 +1,8 @@
-"""Answers about beams, made once for all who ask for the same moment.
+"""Answers about beams, computed once for all clients that ask for the same moment.
 
-Moments are ``EVERY_NS`` apart. Who asks between two of them is answered for the next one: beams are
-never for a time that has passed, and at most that much later than asked for. On the event loop UAVs
-are predicted, as all is known there; the rest is done in a work slot off it.
+Moments are ``EVERY_NS`` apart. A request between two of them is answered for the next one: beams
+are never for a past time, and at most that much later than requested. UAVs are predicted on the
+event loop, where the state is consistent; the rest is computed in a work slot off the loop.
 """
 
 import asyncio
@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 
 class Moments:
-    """What was made for the present moment. One for a node, used on its event loop."""
+    """Answers for the current moment. One per node, used on its event loop."""
 
     def __init__(self, node: Node, work_slots: WorkSlots) -> None:
         self._node = node
@@ -30,11 +30,11 @@ class Moments:
         self._answers: dict[tuple[float, Hashable], asyncio.Task[Any]] = {}
 
     async def made(self, lead_ms: float, what: Hashable, make: Callable[[Update], T]) -> T:
-        """``make`` of the beams that are applied ``lead_ms`` from the moment, on another thread.
+        """Return ``make`` of the beams applied ``lead_ms`` from the moment, computed on another
+        thread.
 
-        Unless it was made before: ``what`` names it among all that is made of the same beams.
-        Raises what ``make`` raises, and ``HTTPException`` 503 where too many ask for different
-        things.
+        ``what`` identifies the answer among those made from the same beams; an existing one is
+        reused. Raises what ``make`` raises, and ``HTTPException`` 503 if the work slots are full.
         """
         now_ns = self._node.now_ns()
         moment = -(-now_ns // EVERY_NS)
@@ -44,16 +44,16 @@ class Moments:
             self._answers.clear()
         task = self._answers.get((lead_ms, what))
         if task is None:
-            self._work_slots.refuse_if_full()  # before anything is predicted
+            self._work_slots.refuse_if_full()  # before predicting
             look = self._look(now_ns, moment * EVERY_NS - now_ns, lead_ms)
             task = asyncio.create_task(self._work_slots.run(lambda: make(look())))
             task.add_done_callback(_seen)
             self._answers[lead_ms, what] = task
-        found: T = await asyncio.shield(task)  # one who leaves does not take it from the others
+        found: T = await asyncio.shield(task)  # a client that leaves must not cancel it for others
         return found
 
     def _look(self, now_ns: int, until_ns: int, lead_ms: float) -> Callable[[], Update]:
-        """What makes the beams that are applied ``lead_ms`` from the moment, once for all."""
+        """Return the function that computes the beams for ``lead_ms``, shared by all answers."""
         found = self._looks.get(lead_ms)
         if found is None:
             lead_s = until_ns * 1e-9 + lead_ms * 1e-3
@@ -62,7 +62,8 @@ class Moments:
 
 
 def _once(make: Callable[[], T]) -> Callable[[], T]:
-    """What ``make`` makes, for whichever thread asks first; the others wait and have it too."""
+    """Return a function that calls ``make`` on the first calling thread; others wait for its
+    result."""
     lock, made = threading.Lock(), list[T]()
 
     def found() -> T:
@@ -75,6 +76,6 @@ def _once(make: Callable[[], T]) -> Callable[[], T]:
 
 
 def _seen(task: asyncio.Task[Any]) -> None:
-    """Look at an error that all who asked have left, so that nothing warns of it."""
+    """Retrieve an error whose clients have all left, so that asyncio does not warn about it."""
     if not task.cancelled():
         task.exception()

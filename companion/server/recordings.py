@@ -1,8 +1,8 @@
 """The files of ``/v1/recordings``, and their bytes, whole or in part.
 
-Only files that lie in the recording directory itself and are called like a recording: no folders,
-no links to elsewhere. A recording that is being written can be read as far as it has been flushed:
-it opens in every reader that takes a file cut short, and ``companion recover`` finishes it.
+Only files directly in the recording directory that are named like a recording: no folders, no
+symbolic links. A recording in progress can be read up to its last flush: every reader that accepts
+truncated files can open it, and ``companion recover`` completes it.
 """
 
 import os
@@ -28,12 +28,12 @@ _PIECE_BYTES: Final = 1 << 18
 
 
 class UnsatisfiableRangeError(ValueError):
-    """A range that begins beyond the end of the file."""
+    """Range that begins beyond the end of the file."""
 
 
 @dataclass(frozen=True, slots=True)
 class Current:
-    """The recording that is being written: its name, and how many bytes are on the disk."""
+    """The recording in progress: its name, and the number of bytes on disk."""
 
     name: str | None
     bytes: int
@@ -41,7 +41,7 @@ class Current:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recording:
-    """A file that can be had at ``/v1/recordings/{name}``."""
+    """A file available at ``/v1/recordings/{name}``."""
 
     name: Annotated[str, Meaning("name of the file", example="companion-20261120T130000Z.mcap")]
     bytes: Annotated[int | None, Meaning("size of the file")]
@@ -49,7 +49,7 @@ class Recording:
         Literal["recording", "finished", "unfinished"],
         Meaning("being written; finished; unfinished: cut short"),
     ]
-    started: Annotated[str | None, Meaning("when it was begun")]
+    started: Annotated[str | None, Meaning("when it was started")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,13 +60,13 @@ class Recordings:
 
 
 def listed(where: str | None, current: Current) -> list[Json]:
-    """The recordings, by name. ``where`` as in the settings: a folder, or one file."""
+    """Return the recordings by name. ``where`` as in the settings: a folder, or one file."""
     entries = sorted(_entries(where), key=lambda entry: entry.name)
     return [_shown(entry, current) for entry in entries]
 
 
 def _entries(where: str | None) -> Iterator[os.DirEntry[str]]:
-    """Entries that are recordings; none where there is no folder, or it cannot be read."""
+    """Yield the entries that are recordings; none if the folder is missing or unreadable."""
     if where is None:
         return
     path = Path(where)
@@ -90,7 +90,7 @@ def _shown(entry: os.DirEntry[str], current: Current) -> Json:
         size: int | None = (
             current.bytes if is_current else entry.stat(follow_symlinks=False).st_size
         )
-    except FileNotFoundError:  # finished, or tidied away, since the folder was read
+    except FileNotFoundError:  # renamed or deleted since the folder was read
         size = None
     return {
         "name": entry.name,
@@ -106,11 +106,9 @@ def _utc_ns(text: str) -> UtcNs:
 
 
 def opened(where: str | None, name: str, current: Current) -> tuple[BinaryIO, int] | None:
-    """An open recording, and how many of its bytes may be read.
+    """Return an open recording, and how many of its bytes may be read; None if there is none.
 
-    None where there is no such recording.
-
-    Once open it stays the same file, whatever becomes of its name.
+    It remains the same file if its name changes afterwards.
     """
     found = next((entry for entry in _entries(where) if entry.name == name), None)
     if found is None:
@@ -125,9 +123,9 @@ def opened(where: str | None, name: str, current: Current) -> tuple[BinaryIO, in
 
 
 def span(header: str | None, size: int) -> tuple[int, int] | None:
-    """First byte of a Range header, and the one after the last; None: the whole file is meant.
+    """Return the first byte of a Range header and the one after the last; None for the whole file.
 
-    RFC 9110, 14.2: a header that cannot be read, or asks for several parts, may be ignored. Raises
+    RFC 9110, 14.2: a malformed header, or one with several ranges, may be ignored. Raises
     ``UnsatisfiableRangeError`` for a range beyond the end.
     """
     found = _RANGE.fullmatch((header or "").replace(" ", ""))
@@ -145,7 +143,7 @@ def span(header: str | None, size: int) -> tuple[int, int] | None:
 
 
 async def pieces(file: BinaryIO, start: int, stop: int) -> AsyncIterator[bytes]:
-    """The bytes from ``start`` to before ``stop``, read off the event loop; closes the file."""
+    """Yield the bytes from ``start`` to before ``stop``, off the event loop; closes the file."""
     with file:
         await run_in_threadpool(file.seek, start)
         while start < stop:

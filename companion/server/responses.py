@@ -1,7 +1,7 @@
-"""The API's responses: JSON written fast, errors as problems (RFC 9457), and both documented.
+"""The API's responses: fast JSON, errors as problems (RFC 9457), and both documented.
 
-No answer is validated on its way out: the models of ``models.py`` only describe it, and the tests
-compare the answers with them.
+Answers are not validated: the models of ``models.py`` only describe them, and the tests compare
+both.
 """
 
 from typing import Any, Final
@@ -17,43 +17,43 @@ from companion.server import models
 
 PROBLEM_TYPE: Final = "application/problem+json"
 _MEANINGS: Final = {
-    404: "There is no such thing",
-    406: "It does not come in any form that is accepted",
-    409: "Not as things are now; the title says why",
-    416: "The file is shorter",
-    503: "Too many ask at once",
-    422: "A parameter is missing, or not of the allowed kind",
+    404: "Not found",
+    406: "No supported media type is accepted",
+    409: "Not possible in the current state; the title says why",
+    416: "The range begins beyond the end of the file",
+    503: "Too many requests at once",
+    422: "A parameter is missing or invalid",
 }
 
 
 def encode(content: object) -> bytes:
-    """JSON bytes; numbers that are not finite become null."""
+    """Return JSON bytes; numbers that are not finite become null."""
     return orjson.dumps(content, option=orjson.OPT_NON_STR_KEYS | orjson.OPT_SERIALIZE_NUMPY)
 
 
 def answer(content: object, status: int = 200) -> Response:
-    """A response with ``content`` as JSON."""
+    """Return a response with ``content`` as JSON."""
     return json_response(encode(content), status)
 
 
 def json_response(body: bytes, status: int = 200) -> Response:
-    """A response of what is JSON already."""
+    """Return a response with a JSON body."""
     return Response(body, status_code=status, media_type="application/json")
 
 
 def problem(status: int, title: str, headers: dict[str, str] | None = None) -> JSONResponse:
-    """An error response as RFC 9457 has it."""
+    """Return an error response by RFC 9457."""
     body = {"type": "about:blank", "title": title, "status": status}
     return JSONResponse(body, status_code=status, headers=headers, media_type=PROBLEM_TYPE)
 
 
 def answers(kind: Any, *problems: int) -> dict[int | str, dict[str, Any]]:
-    """Responses of an operation, for the OpenAPI document: the described class, or a problem."""
+    """Return the responses of an operation for the OpenAPI document: class and problems."""
     return {200: {"model": models.outward(kind)}} | refusals(*problems)
 
 
 def refusals(*problems: int) -> dict[int | str, dict[str, Any]]:
-    """Problems that an operation answers with, for the OpenAPI document."""
+    """Return the problems of an operation, for the OpenAPI document."""
     return {
         status: {"model": models.model(models.Problem), "description": _MEANINGS[status]}
         for status in problems
@@ -61,7 +61,7 @@ def refusals(*problems: int) -> dict[int | str, dict[str, Any]]:
 
 
 def install(app: FastAPI) -> None:
-    """Turn every error of the application into a problem, and document it so."""
+    """Turn every error of the application into a problem, and document it."""
     app.add_exception_handler(HTTPException, _refused)
     app.add_exception_handler(RequestValidationError, _unprocessable)
     app.add_exception_handler(Exception, _failed)
@@ -81,12 +81,12 @@ async def _unprocessable(_request: Request, error: Exception) -> JSONResponse:
 
 
 async def _failed(_request: Request, _error: Exception) -> JSONResponse:
-    """Answer an unexpected error; uvicorn logs the traceback, which is not shown to the client."""
-    return problem(500, "the service failed to answer: its own mistake, which its log shows")
+    """Answer an unexpected error; uvicorn logs the traceback, which the client does not see."""
+    return problem(500, "internal error of the service; see its log")
 
 
 def _document(app: FastAPI) -> dict[str, Any]:
-    """The OpenAPI document, with problems under their own media type, not under JSON's."""
+    """Return the OpenAPI document, with problems under their own media type instead of JSON."""
     if app.openapi_schema is None:
         made = get_openapi(
             title=app.title, version=app.version, description=app.description, routes=app.routes

@@ -3,17 +3,17 @@
     ?uav=1:1&uav=2:1     only these UAVs (default: all)
     &topic=uavs          uavs, beams, weights, records, status, links, fleet, events (default:
                          uavs and beams)
-    &rate_hz=10          greatest rate of each topic; never more than updates
+    &rate_hz=10          largest rate of each topic, limited by the update rate
 
 Every message is a JSON object: the answer of the path of that name, with ``topic`` and
 ``valid_at``. ``records`` are the exception: binary messages, each the whole record of an update
-(``companion.views.records``). Nothing is queued: a client that has taken one message is given what
-is newest then, so a slow one misses messages, holds nobody up and makes no memory grow. A message
-is encoded once for all who asked for the same. ``events`` come when there is a new one.
+(``companion.views.records``). Nothing is queued: after each message a client gets the newest state,
+so a slow client misses messages, delays no other client and uses no more memory. A message is
+encoded once for all clients with the same request. ``events`` are sent when there is a new one.
 
-Closed with: 1003 the client sent something (the stream takes nothing), 1012 the service ends, 1013
-too many streams are open, 4401 no or a wrong token (``access``), 4403 a page from elsewhere asked,
-4422 bad arguments. The reason says more.
+Close codes: 1003 the client sent a message (the stream accepts none), 1012 the service ends, 1013
+too many streams are open, 4401 missing or wrong token (``access``), 4403 request by a page from
+elsewhere, 4422 invalid arguments. The reason has details.
 """
 
 import asyncio
@@ -42,12 +42,12 @@ RATE_HZ: Final = 10.0
 LEAST_HZ, MOST_HZ = 0.1, 100.0
 _UAV: Final = re.compile("|".join(kind.pattern for kind in UavKind), re.ASCII)
 MOST_CLIENTS: Final = 256
-"""Streams at a time: half of the connections, the others are left for questions."""
+"""Limit on streams: half of the connections; the others are left for requests."""
 SLOTS: Final = 32
-"""Number of slots in which clients take turns after an update.
+"""Number of slots that spread the clients' messages after an update.
 
-They span the first half of the time between two updates: a hundred messages sent in one go would
-hold up everything else. A few clients do not wait.
+They span the first half of the update interval: a hundred messages at once would delay everything
+else. A few clients do not wait.
 """
 _EARLY: Final = 0.25
 """Fraction of its period by which a message may be early; updates are not exact."""
@@ -55,7 +55,7 @@ _EARLY: Final = 0.25
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What a client asks for; empty ``uavs`` means all of them."""
+    """Request of a client; empty ``uavs`` means all."""
 
     topics: tuple[Topic, ...] = (Topic.UAVS, Topic.BEAMS)
     uavs: frozenset[str] = frozenset()
@@ -63,10 +63,10 @@ class Wanted:
 
 
 def wanted(query: QueryParams) -> Wanted:
-    """Read the arguments. Raises ``UserError``, which names the first that is wrong."""
+    """Parse the arguments. Raises ``UserError`` that names the first invalid one."""
     unknown = set(query) - {"uav", "topic", "rate_hz"}
     if unknown:
-        raise UserError(f"{min(unknown)[:40]!r} is none of uav, topic, rate_hz")
+        raise UserError(f"unknown argument {min(unknown)[:40]!r}; use uav, topic, rate_hz")
     for uav in query.getlist("uav"):
         if not _UAV.fullmatch(uav):
             raise UserError(f"uav: {uav[:40]!r} is not {UAV_FORMS}")
@@ -76,18 +76,18 @@ def wanted(query: QueryParams) -> Wanted:
     except ValueError:
         rate_hz = 0.0
     if not LEAST_HZ <= rate_hz <= MOST_HZ:
-        raise UserError(f"rate_hz: {text[:40]!r} is not a number of {LEAST_HZ:g} to {MOST_HZ:g}")
+        raise UserError(f"rate_hz: {text[:40]!r} is not a number from {LEAST_HZ:g} to {MOST_HZ:g}")
     names = query.getlist("topic")
     bad = [name for name in names if name not in list(Topic)]
     if bad:
-        raise UserError(f"topic: {bad[0][:40]!r} is none of {', '.join(Topic)}")
+        raise UserError(f"topic: {bad[0][:40]!r} is unknown; use {', '.join(Topic)}")
     topics = tuple(dict.fromkeys(map(Topic, names))) or Wanted().topics
     return Wanted(topics, frozenset(query.getlist("uav")), rate_hz)
 
 
 @dataclass(slots=True)
 class Snapshot:
-    """The messages of one update: each topic is looked up once, each message made once."""
+    """Messages of one update: each topic is looked up once, each message encoded once."""
 
     number: int
     bodies: dict[Topic, "asyncio.Task[Json]"] = field(default_factory=dict)
@@ -106,11 +106,11 @@ class Stream:
         self._slot_s = 0.5 / SLOTS / node.pipeline.settings.beams.update_hz
 
     async def serve(self, websocket: WebSocket) -> None:
-        """Serve one client until it goes, or breaks the rules."""
+        """Serve one client until it disconnects or violates the protocol."""
         offered = websocket.scope.get("subprotocols", [])
         await websocket.accept(SUBPROTOCOL if SUBPROTOCOL in offered else None)
         if not _is_from_here(websocket):
-            await websocket.close(ELSEWHERE, "a page from elsewhere may not ask")
+            await websocket.close(ELSEWHERE, "pages of other sites may not connect")
             return
         if self.clients >= MOST_CLIENTS:
             await websocket.close(TOO_MANY, "too many streams are open")
@@ -126,7 +126,7 @@ class Stream:
         try:
             await self._attend(websocket, asked, slot * self._slot_s)
         except WebSocketDisconnect:
-            pass  # gone while it was being sent to
+            pass  # disconnected while a message was sent
         finally:
             self.clients -= 1
             self._in_slot[slot] -= 1
@@ -138,7 +138,7 @@ class Stream:
             await asyncio.wait({sending, hearing}, return_when=asyncio.FIRST_COMPLETED)
             if hearing.done() and hearing.result()["type"] == "websocket.receive":
                 sending.cancel()
-                await websocket.close(TAKES_NOTHING, "the stream takes no messages")
+                await websocket.close(TAKES_NOTHING, "the stream accepts no messages")
             elif sending.done():
                 sending.result()
         finally:
@@ -147,7 +147,7 @@ class Stream:
             await asyncio.gather(sending, hearing, return_exceptions=True)
 
     async def _send(self, websocket: WebSocket, asked: Wanted, turn_s: float) -> None:
-        """Send changes at each update that is due, ``turn_s`` after it, until cancelled."""
+        """Send changes at each due update, ``turn_s`` after it, until cancelled."""
         loop, period_s = asyncio.get_running_loop(), 1 / asked.rate_hz
         due_s, said = loop.time(), dict[Topic, object]()
         while True:
@@ -164,27 +164,27 @@ class Stream:
                         else:
                             await websocket.send_text(message)
                         self.sent += 1
-            # What came while it was sent to a slow client does not wait for another tick.
+            # A change during the sending to a slow client does not wait for another tick.
             if self._node.pipeline.updates == updates:
                 await self._node.ticked()
             if turn_s:
                 await asyncio.sleep(turn_s)
 
     def _version(self, topic: Topic) -> object:
-        """A value that differs whenever there is something new to say."""
+        """Return a value that differs whenever there is something new to send."""
         if topic is Topic.EVENTS:
             events = self._node.events()
             return events[-1] if events else "none yet"
         return self._node.pipeline.updates
 
     async def _message(self, topic: Topic, uavs: frozenset[str]) -> str | bytes:
-        """The message, made when it is first asked for."""
+        """Return the message; encode it on first use."""
         if self._snapshot.number != self._node.pipeline.updates:
             self._snapshot = Snapshot(self._node.pipeline.updates)
         snapshot = self._snapshot
         if topic not in snapshot.bodies:
             snapshot.bodies[topic] = asyncio.create_task(topics.body(topic, self._node))
-        body = await asyncio.shield(snapshot.bodies[topic])  # others may wait for it too
+        body = await asyncio.shield(snapshot.bodies[topic])  # other clients may wait for it too
         message = snapshot.messages.get((topic, uavs))
         if message is None:
             message = snapshot.messages[topic, uavs] = topics.message(topic, body, uavs)
@@ -192,17 +192,17 @@ class Stream:
 
 
 def _is_from_here(websocket: WebSocket) -> bool:
-    """Whether a WebSocket was opened by this site's own page, or by no page.
+    """Return whether the WebSocket was opened by this site's own page, or by no page.
 
-    Browsers let any page open a WebSocket to any address, and name the page's site in Origin.
+    Browsers let any page open a WebSocket to any address, and send the page's site in Origin.
     """
     origin = websocket.headers.get("origin")
     try:
         return origin is None or urlsplit(origin).netloc == websocket.headers.get("host")
-    except ValueError:  # no address at all
+    except ValueError:  # malformed
         return False
 
 
 def _short(reason: str) -> str:
-    """A reason cut to the room of a closing frame, 123 bytes."""
+    """Truncate a reason to the limit of a close frame, 123 bytes."""
     return reason.encode()[:120].decode(errors="ignore")

@@ -1,4 +1,4 @@
-"""What ``/v1/stream`` sends: a body for each topic, and the part of it that a client asked for."""
+"""Messages of ``/v1/stream``: a body for each topic, and the part of it that a client requested."""
 
 import inspect
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from companion.views.state import Node
 
 
 class Topic(StrEnum):
-    """What can be streamed; each topic is the answer of the path of that name."""
+    """Topic of the stream; its messages are the answers of the path of that name."""
 
     UAVS = "uavs"
     BEAMS = "beams"
@@ -31,14 +31,14 @@ class Topic(StrEnum):
 
 
 def message(topic: Topic, body: Json, uavs: frozenset[str]) -> str | bytes:
-    """A body as it is sent: binary for records, else JSON; of these UAVs alone if there are any."""
+    """Return a body as sent: binary for records, else JSON; only for ``uavs`` if not empty."""
     if topic is Topic.RECORDS:
         return _record(body, uavs)
     return encode({"topic": topic, **(_only(topic, body, uavs) if uavs else body)}).decode()
 
 
 def _record(body: Json, uavs: frozenset[str]) -> bytes:
-    """The record of one update, of these UAVs alone if there are any."""
+    """Return the record of one update, limited to these UAVs if any are given."""
     made: BeamSet = body["beams"]
     kept = [i for i, uav in enumerate(made.uavs) if not uavs or uav in uavs]
     shown = replace(made, beams=tuple(made.beams[i] for i in kept), weights=made.weights[:, kept])
@@ -49,7 +49,7 @@ def _record(body: Json, uavs: frozenset[str]) -> bytes:
 
 
 def _only(topic: Topic, body: Json, uavs: frozenset[str]) -> Json:
-    """A message without the other UAVs; what concerns no UAV stays."""
+    """Return a body without the other UAVs; values of no particular UAV stay."""
     match topic:
         case Topic.UAVS:
             return body | {"uavs": [one for one in body["uavs"] if one["id"] in uavs]}
@@ -85,7 +85,7 @@ def _weights(node: Node) -> Json:
 
 
 async def _records(node: Node) -> Json:
-    """What ``_record`` needs of the newest update."""
+    """Return the input of ``_record`` for the newest update."""
     pipeline = node.pipeline
     update, number = pipeline.last_update, max(pipeline.updates - 1, 0)
     update = update or pipeline.look(node.now_ns())
@@ -117,7 +117,7 @@ BODIES: Final[dict[Topic, Callable[[Node], Any]]] = {
 
 
 async def body(topic: Topic, node: Node) -> Json:
-    """The body of a topic, as the path of its name answers."""
+    """Return the body of a topic, as the path of its name answers."""
     made = BODIES[topic](node)
     found: Json = await made if inspect.isawaitable(made) else made
     return found

@@ -1,4 +1,4 @@
-"""Slots for work off the event loop: few run at once, some wait, and the rest is refused."""
+"""Slots for work off the event loop: a few run at once, some wait, the rest is rejected."""
 
 import asyncio
 from collections.abc import Callable
@@ -8,26 +8,26 @@ from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
 AT_ONCE: Final = 2
-"""Requests that compute at a time; each takes interpreter time from the links."""
+"""Requests that compute at the same time; each takes interpreter time from the links."""
 WAITING: Final = 64  # requests that wait for a slot; one second of work
 
 T = TypeVar("T")
 
 
 class WorkSlots:
-    """Work slots of one node. A request beyond the queue is refused with status 503."""
+    """Work slots of one node. A request beyond the queue is rejected with status 503."""
 
     def __init__(self, at_once: int = AT_ONCE, waiting: int = WAITING) -> None:
         self._free = asyncio.Semaphore(at_once)
         self._room = at_once + waiting
 
     def refuse_if_full(self) -> None:
-        """Raise ``HTTPException`` 503 where there is no room to wait."""
+        """Raise ``HTTPException`` 503 if the queue is full."""
         if self._room == 0:
-            raise HTTPException(503, "too many ask at once", {"retry-after": "1"})
+            raise HTTPException(503, "too many requests at once", {"retry-after": "1"})
 
     async def run(self, work: Callable[[], T]) -> T:
-        """Do the work on another thread when a slot is free. Raises ``HTTPException`` 503."""
+        """Run the work on another thread when a slot is free. Raises ``HTTPException`` 503."""
         self.refuse_if_full()
         self._room -= 1
         try:

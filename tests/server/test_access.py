@@ -8,7 +8,7 @@ from companion.server.access import ListenError, bind
 @pytest.mark.parametrize("token", [None, ""])
 def test_an_address_that_others_reach_wants_a_token_or_a_word(token: str | None) -> None:
     """An empty token is none; a good one, or saying that it may lie open, will do."""
-    with pytest.raises(ListenError, match=r"0\.0\.0\.0:0 can be reached from elsewhere"):
+    with pytest.raises(ListenError, match=r"0\.0\.0\.0:0: other machines can reach this address"):
         bind("0.0.0.0:0", token=token, insecure=False)
     bind("0.0.0.0:0", token="secret", insecure=False).close()
     bind("0.0.0.0:0", token=token, insecure=True).close()

@@ -239,7 +239,7 @@ def test_work_is_done_in_turns_and_the_rest_is_told_to_come_again(make_node: Any
         return [*(str(task.exception()) for task in refused), *rest]
 
     told = run_async(crowd())
-    assert told == ["503: too many ask at once"] * 4 + ["done"] * 5
+    assert told == ["503: too many requests at once"] * 4 + ["done"] * 5
 
 
 async def _first(tasks: list["asyncio.Task[str]"], many: int) -> AsyncIterator["asyncio.Task[str]"]:
@@ -262,7 +262,7 @@ def test_a_pattern_of_everything_is_not_drawn(
         monkeypatch.setattr("companion.server.beam_routes.MOST_ANGLES", 14_000)
         told = client.get("/v1/pattern?points=3600")
         assert told.status_code == 422
-        assert told.json()["title"] == "4 beams at 3600 angles: say uav, or fewer points"
+        assert told.json()["title"] == "too large: 4 beams at 3600 angles; give uav, or fewer points"
         assert client.get("/v1/pattern?points=3601&uav=1:1").status_code == 200
 
 
